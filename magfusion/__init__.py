@@ -1,6 +1,6 @@
 """Navigation from magnetic beacons and inertial sensors.
 
-Conventions, stated once for the whole package.
+Conventions of the whole package.
 
 Frames
     ``world`` (local level, z up), ``body`` (the IMU's axes and origin), ``sensor`` (the
@@ -14,11 +14,11 @@ Perturbations
 Residuals
     Predicted minus measured.
 Units
-    SI in memory and in files: s, m, rad, T, A m^2.  Anything else says so in its name
+    SI in memory and in files: s, m, rad, T, A m^2.  Other units are a suffix of the name
     (``_deg``, ``_hz``, ``_ns``, ``_nt``).  Times are seconds since the log's epoch.
 Phasors
     ``field(t) = Re(phasor * exp(+2j*pi*frequency_hz*(t - epoch)))`` in the magnetometer's own
-    axes, as the instrument gave it: ``measured = matrix @ field_sensor + offset``.
+    axes, as measured by the instrument: ``measured = matrix @ field_sensor + offset``.
 Standard deviations end in ``_sigma``, covariances in ``_cov``.
 """
 

@@ -1,4 +1,4 @@
-"""The command line: one command a job, its options made of the fields of the job's settings."""
+"""The command line: one command per job, with options from the fields of the job's settings."""
 
 import errno
 import gc
@@ -39,7 +39,7 @@ _NOT_WRITTEN = "; default: nothing is written"
 
 
 class Invocation(NamedTuple):
-    """What was typed, and whether the process is there for it alone."""
+    """The command line, and whether the process runs it alone."""
 
     words: list[str]
     is_process: bool
@@ -49,8 +49,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line.
 
     Exits with 0 and the result; with 2 and one sentence for bad input or usage; with 1 and one
-    sentence for an estimator that failed, or for what was not foreseen; with 130 where the user, or
-    SIGTERM, interrupted.  ``--debug``, anywhere, shows where any of them came from.
+    sentence for a failed estimator or an internal error; with 130 if interrupted by the user or
+    SIGTERM.  ``--debug``, anywhere, shows the traceback of any of them.
     """
     given = sys.argv[1:] if arguments is None else arguments
     debug, status = DEBUG in given, 0
@@ -80,7 +80,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _said(error: Exception) -> tuple[int, str]:
-    """Return exit code and sentence of what ended a command."""
+    """Return exit code and message of a command's exception."""
     if isinstance(error, typer.TyperException):
         context = getattr(error, "ctx", None)
         command = "magfusion" if context is None else context.command_path
@@ -92,19 +92,19 @@ def _said(error: Exception) -> tuple[int, str]:
     if isinstance(error, OSError):
         return 2, _file_refusal(error)
     if isinstance(error, MemoryError):
-        return 2, "the memory does not suffice; use a shorter part, by --start and --end"
+        return 2, "not enough memory; use a shorter part, with --start and --end"
     reason = " ".join(f"{type(error).__name__}: {error}".split())[:LONGEST_REASON]
     where = traceback.extract_tb(error.__traceback__)[-1]
     return 1, (
-        f"stopped by what it did not foresee ({reason}; {Path(where.filename).name}, line"
-        f" {where.lineno}): a fault of magfusion; please report it to its maintainers, with the"
-        f" command, its input, and what it prints with {DEBUG}"
+        f"internal error ({reason}; {Path(where.filename).name}, line"
+        f" {where.lineno}); please report it to the maintainers of magfusion, with the"
+        f" command, its input, and its output with {DEBUG}"
     )
 
 
 @contextmanager
 def _terminated_as_interrupted() -> Iterator[None]:
-    """Let SIGTERM end a command as Ctrl-C does: what is unfinished is removed."""
+    """Let SIGTERM end a command as Ctrl-C does: unfinished files are removed."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -116,7 +116,7 @@ def _terminated_as_interrupted() -> Iterator[None]:
 
 
 def _file_refusal(error: OSError) -> str:
-    # Whatever writes a file names it; what is left are the pipes.
+    # Errors on files have a name; those without are of pipes.
     place = error.filename if error.filename is not None else "standard input or output"
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     remedy = "free some space" if full else "allow it, or give another path"
@@ -130,10 +130,10 @@ def _fail(status: int, sentence: str, in_lines: bool = False) -> NoReturn:
 
 
 class _Jobs(TyperGroup):
-    """Commands of which only name and help are known until one is asked for."""
+    """Commands of which only name and help are loaded until one is requested."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the command, made of its job's file."""
+        """Return the command, generated from its job's module."""
         name, listed, rest = super().resolve_command(ctx, args)
         path = name if ctx.parent is None else f"{ctx.info_name} {name}"
         return name, _command(path) if path in JOBS else listed, rest
@@ -172,7 +172,7 @@ def _command(path: str) -> Any:
 
 
 def _example(command: str) -> str:
-    """Return the end of a help."""
+    """Return the last paragraph of a help text."""
     return _plain(f"Example: {command}")
 
 
@@ -209,7 +209,7 @@ def _options(
 
 
 def _callback(path: str, command: Command) -> Callable[..., None]:
-    """Return the function of a command, with the parameters of which typer makes its options."""
+    """Return the function of a command, with parameters from which typer generates its options."""
     wanted = inspect.signature(command.run).parameters
     asked = {field.name: option for field, option in options(command.settings)}
 
@@ -220,7 +220,7 @@ def _callback(path: str, command: Command) -> Callable[..., None]:
         own = {field: _value(asked[field], value) for field, value in values.items()}
         settings = command.settings(**own)
         if output is None and "output" in wanted and not command.output_optional:
-            # A log's name as the user sees it, even where it was given as ".".
+            # A log's name as given by the user, also for ".".
             log = Path(os.path.realpath(own["log"])).name if "log" in own else ""
             log += f"_and_{len(own['more'])}_more" if own.get("more") else ""
             output = Path(command.output or f"{log}_{path.split()[-1].replace('-', '_')}")
@@ -275,7 +275,7 @@ def _parameters(command: Command, writes: bool) -> list[inspect.Parameter]:
 
 
 def _parameter(field: Field[Any], option: Option, hint: Any) -> inspect.Parameter:
-    """Return what typer is to make an argument or an option of."""
+    """Return the argument or option of typer for a field."""
     default = field.default
     if option.words is not None:
         hint = Literal[tuple(option.words)]
@@ -302,20 +302,20 @@ def _keyword(
 
 
 def _value(option: Option, typed: Any) -> Any:
-    """Return the value of a field for what was typed."""
+    """Return the value of a field for typed text."""
     if option.words is not None:
         return option.words.get(typed)
     return tuple(typed) if isinstance(typed, list) else typed
 
 
 def _given(context: typer.Context) -> set[str]:
-    """Return the fields that the user gave, rather than leave them at their defaults."""
+    """Return the fields given by the user, rather than left at their defaults."""
     sources = {name: context.get_parameter_source(name) for name in context.params}
     return {name for name, source in sources.items() if source and source.name == "COMMANDLINE"}
 
 
 def _run(context: typer.Context, settings: Settings, given: set[str]) -> Run:
-    """Return what a page tells of how it came about."""
+    """Return the provenance for a page."""
     values = {field.name: getattr(settings, field.name) for field, _ in options(type(settings))}
     paths = [p for v in values.values() for p in (v if isinstance(v, tuple) else (v,))]
     return Run(
@@ -362,7 +362,7 @@ def _show_failed(figures: Figures | None, as_json: bool) -> None:
 
 
 def _refuse_failed(figures: Figures) -> None:
-    """End with the first reason where a verdict that has been shown is failed."""
+    """End with the first reason where a displayed verdict is failed."""
     reasons = figures.get("reasons")
     if figures.get("verdict") == "failed" and isinstance(reasons, list):
         first = reasons[0]
@@ -370,7 +370,7 @@ def _refuse_failed(figures: Figures) -> None:
 
 
 def _show_result(figures: Figures, output: Path | None, as_json: bool) -> None:
-    """Show the figures of a job as a table, or as one line of JSON where that is asked."""
+    """Show the figures of a job as a table, or as one line of JSON if requested."""
     if sys.stdout is None:
         return
     with until_closed():

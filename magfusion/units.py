@@ -17,5 +17,5 @@ DEGREE = np.pi / 180.0  # rad
 NANOSECOND = 1e-9  # s
 STANDARD_GRAVITY = 9.80665  # m/s^2
 
-# Where states are: at the field epochs, at every inertial sample, or so many a second (Hz).
+# Rate of states: at the field epochs, at every inertial sample, or a number per second (Hz).
 Rate = Literal["field", "imu"] | float

@@ -244,7 +244,7 @@ def test_a_log_in_motion_fails(tmp_path: Path, capfd: pytest.CaptureFixture[str]
     with pytest.raises(SystemExit) as ended:
         main(["allan", str(log), "-o", str(tmp_path / "out")])
     assert ended.value.code == 1
-    assert "it moved or was shaken" in capfd.readouterr().err
+    assert "motion or vibration" in capfd.readouterr().err
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"report.json", "failed"}
 
 
@@ -259,7 +259,7 @@ def test_a_short_log_does_not_know_the_walk_of_a_bias(resting: Path) -> None:
 
 def test_too_few_samples_are_refused(resting: Path, tmp_path: Path, refuse: Refuse) -> None:
     said = refuse("allan", resting, "--end", "1", "-o", tmp_path / "out")
-    assert "has 100 samples in the part to use; record at rest for some minutes" in said
+    assert "has 100 samples in the selected part; record at rest for at least some minutes" in said
     assert "there is no such file" in refuse("allan", tmp_path / "nowhere")
 
 

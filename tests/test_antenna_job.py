@@ -198,8 +198,8 @@ def _renamed(survey: Survey) -> Survey:
     ("change", "sentence"),
     [
         (_swapped, "survey.parquet: coupling 0 has a negative determinant"),
-        (_amplitudes, "survey.parquet: holds amplitudes"),
-        (lambda s: _first(s, 4), "survey.parquet: holds 4 poses"),
+        (_amplitudes, "survey.parquet: contains amplitudes"),
+        (lambda s: _first(s, 4), "survey.parquet: has 4 poses"),
         (_renamed, "survey.parquet: has no tone 0, 1, 2 of beacon T"),
     ],
     ids=["swapped wires", "amplitudes", "too few", "another beacon"],

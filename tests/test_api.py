@@ -250,7 +250,7 @@ def test_a_notebook_shows_the_head_of_the_page(
     result: mf.SmoothedLog, simulated: tuple[mf.Log, mf.Site]
 ) -> None:
     """With the verdict and what led to it; what it is styled by stays within it."""
-    assert "Not judged yet" in result._repr_html_()
+    assert "No verdict yet" in result._repr_html_()
     judged, trust = mf.judged(replace(result, log_name="<b>log"), simulated[0])
     page = judged._repr_html_()
     assert str(trust.verdict).upper() in page

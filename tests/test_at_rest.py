@@ -209,7 +209,7 @@ def test_rests_go_through_demodulate_and_fix_and_silence_is_said(
     assert fields.window[0] == pytest.approx(150.0, abs=1.0)
     run_command("fix", tmp_path / "rests", "-o", tmp_path / "of_rests")
     said = refuse("navigate", tmp_path / "rests", "-o", tmp_path / "now")
-    assert "holds whole rests, of up to 150 s" in said
+    assert "has whole rests, of up to 150 s" in said
     run_command("fix", tmp_path / "log", "--at-rest", "-o", tmp_path / "fix")
     truth = read_log(tmp_path / "log").truth
     assert truth is not None

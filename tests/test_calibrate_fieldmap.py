@@ -140,7 +140,7 @@ def test_a_beacon_that_was_hardly_heard_is_named(world: World, survey: Survey) -
     phasor = points.phasor_sensor.copy()
     phasor[7:, 1] = np.nan
     with pytest.raises(
-        EstimationError, match="beacon M2 was detected at 7 points, and a map needs 8"
+        EstimationError, match="beacon M2 was detected at 7 points; a map requires 8"
     ):
         learn_field_map(world.site, replace(points, phasor_sensor=phasor))
 
@@ -257,7 +257,7 @@ def test_a_survey_of_amplitudes_is_refused(
     path = surveyed / "survey.parquet"
     write_survey(replace(survey, phasor_sensor=None, amplitude=amplitude), path)
     said = refuse("calibrate", "fieldmap", path, "-o", tmp_path / "out")
-    assert f"{path}: holds amplitudes, and a field map needs phasors" in said
+    assert f"{path}: has amplitudes, but a field map requires phasors" in said
 
 
 def test_a_beacon_that_the_site_does_not_have_is_refused(
@@ -265,7 +265,7 @@ def test_a_beacon_that_the_site_does_not_have_is_refused(
 ) -> None:
     save_site(replace(world.site, beacons=world.site.beacons[:2]), surveyed / "site.yaml")
     said = refuse("calibrate", "fieldmap", surveyed, "-o", tmp_path / "out")
-    assert "tone 0 of beacon M3 is unknown to the site (it has M1, M2)" in said
+    assert "tone 0 of beacon M3 is not in the site (it has M1, M2)" in said
 
 
 def test_too_few_points_are_refused(
@@ -282,7 +282,7 @@ def test_too_few_points_are_refused(
     )
     write_survey(few, surveyed / "survey.parquet")
     said = refuse("calibrate", "fieldmap", surveyed, "-o", tmp_path / "out")
-    assert f"{surveyed}: beacon M1 was detected at 7 points, and a map needs 8" in said
+    assert f"{surveyed}: beacon M1 was detected at 7 points; a map requires 8" in said
 
 
 def test_a_survey_has_no_use_for_a_trajectory(
@@ -290,19 +290,19 @@ def test_a_survey_has_no_use_for_a_trajectory(
 ) -> None:
     options = ("--trajectory", worked.smoothed, "-o", tmp_path / "out")
     said = refuse("calibrate", "fieldmap", surveyed, *options)
-    assert "a survey has its own poses; leave --trajectory out" in said
+    assert "a survey has its own poses; omit --trajectory" in said
 
 
 def test_a_survey_without_a_site_is_refused(surveyed: Path, refuse: Refuse, tmp_path: Path) -> None:
     (surveyed / "site.yaml").unlink()
     said = refuse("calibrate", "fieldmap", surveyed, "-o", tmp_path / "out")
-    assert "has no site.yaml beside it; name the site with --site SITE.yaml" in said
+    assert "has no site.yaml next to it; give it with --site SITE.yaml" in said
 
 
 def test_a_log_without_poses_is_refused(log: Path, refuse: Refuse, tmp_path: Path) -> None:
     (log / "truth.parquet").unlink()
     said = refuse("calibrate", "fieldmap", log, "-o", tmp_path / "out")
-    assert f"{log}: holds no truth" in said
+    assert f"{log}: has no truth" in said
     assert "--trajectory" in said
 
 
@@ -320,4 +320,4 @@ def test_more_points_than_a_map_takes_are_refused(
     dense = draw_world(S1, np.random.default_rng(SEED), replace(ROOM, spacing=0.15))
     write_survey(dense.survey(np.random.default_rng(6)), surveyed / "survey.parquet")
     said = refuse("calibrate", "fieldmap", surveyed, "-o", tmp_path / "out")
-    assert "points where a map takes 600" in said
+    assert "points; a map has at most 600" in said

@@ -272,7 +272,7 @@ def test_turning_without_a_rest_is_no_set_of_positions(
 ) -> None:
     given = ("--positions", "--start", 4, "--end", 55)
     told = refuse("calibrate", "magnetometer", turned[1], *given, "-o", tmp_path / "out")
-    assert "no rest" in told
+    assert "no stationary interval" in told
 
 
 def test_a_level_walk_is_told_what_it_lacks(worked: Worked, tmp_path: Path) -> None:

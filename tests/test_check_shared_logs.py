@@ -14,7 +14,7 @@ pytestmark = [
 NOMINAL = ("walk_calibrated", "turn_miscalibrated", "walk_unsynchronised", "fast_nominal")
 NAMED = {
     "beacon_silent_30s": ("silent_beacon", "15.1 to 44.9 s"),
-    "body_iron_undeclared": ("body_iron", "iron or a magnet on the body"),
+    "body_iron_undeclared": ("body_iron", "iron or a magnet is on the body"),
     "imu_gap_10s": ("gap", "25.00 to 35.00 s"),
 }
 REMARKED = {

@@ -53,7 +53,7 @@ def test_fixes_of_one_beacon_are_told_to_be_ambiguous(
     run_command("fix", tmp_path / "log", "-o", tmp_path / "run")
     out, figures = capfd.readouterr().out, _report(tmp_path / "run")
     assert figures["ambiguous_epochs"] == figures["epochs"]
-    assert "epochs are ambiguous: fixes.parquet holds every pose" in out
+    assert "epochs are ambiguous: fixes.parquet has every pose" in out
 
 
 def test_what_one_coil_leaves_open_is_told_and_not_smoothed_over(
@@ -65,14 +65,14 @@ def test_what_one_coil_leaves_open_is_told_and_not_smoothed_over(
     run_command("fix", log, "-o", tmp_path / "fixes")
     out, figures = capfd.readouterr().out, _report(tmp_path / "fixes")
     assert figures["undetermined_epochs"] == figures["epochs"]
-    assert "leave a direction of the pose open" in out
+    assert "do not determine the pose in one direction" in out
     with pytest.raises(SystemExit) as ended:
         main(["smooth", str(log), "-o", str(tmp_path / "run"), "--window", "0.4"])
     err = capfd.readouterr().err
     assert ended.value.code == 1
     assert err.count("\n") == 1
     assert "add a beacon or a coil" in err
-    assert "single-epoch fixes were saved" in err
+    assert "single-epoch fixes are saved" in err
     assert json.loads((tmp_path / "run" / "report.json").read_text())["failed"] in err
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"report.json", "failed"}
     assert (tmp_path / "run" / "failed" / "fixes.parquet").is_file()

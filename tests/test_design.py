@@ -175,7 +175,7 @@ def test_tones_are_told_apart_from_each_other_and_from_the_mains() -> None:
     gaps = np.abs(every[:, None] - every) + 1e3 * np.eye(len(every))
     assert tones.shape == (2, 3)
     assert np.min(gaps) >= 5.0 - 1e-9  # Hz: two periods of the window
-    with pytest.raises(InputError, match="--band 10,100 has room for"):
+    with pytest.raises(InputError, match="--band 10,100 has"):
         frequencies_for(template, 20, BAND, kept)
 
 
@@ -243,6 +243,6 @@ def test_a_hall_that_cannot_be_is_refused(text: str, told: str, tmp_path: Path) 
 def test_beacons_that_find_no_room_are_refused() -> None:
     with pytest.raises(InputError, match="--apart 9 m"):
         designed(task(apart=9.0), starts=1, layouts=0, rng=np.random.default_rng(1))
-    with pytest.raises(InputError, match="mounting places are left"):
+    with pytest.raises(InputError, match="mounting places remain"):
         candidates_of(task(clearance=9.0), task().template)
     assert isinstance(candidates_of(task(), task().template), Candidates)

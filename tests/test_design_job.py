@@ -77,7 +77,7 @@ def test_a_site_that_is_known_exactly_has_nothing_to_calibrate(
         (("--keep", "A,Z"), "no beacon 'Z'"),
         (("--template", "Z"), "--template Z"),
         (("--band", "20"), "--band '20'"),
-        (("--band", "20,21"), "has room for 1 tones"),
+        (("--band", "20,21"), "has 1 tones"),
         (("--moment", 1, "--moment-budget", 4), "not both"),
         (("--spacing", "1e-3"), "--spacing"),
         (("--grid", "1e-3"), "--grid"),

@@ -78,4 +78,4 @@ def test_slots_go_through_the_job_and_what_cannot_be_is_refused(
     said = refuse("design", *here, "--window", 0.05, "-o", tmp_path / "x")
     assert "give --window 0.1 or more" in said
     said = refuse("design", *here, "--keep", "all", "-o", tmp_path / "x")
-    assert "a cycle is designed as a whole" in said
+    assert "can only be designed as a whole" in said

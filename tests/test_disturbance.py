@@ -290,7 +290,7 @@ def test_iron_that_cannot_be_is_refused(
 
 def test_more_iron_than_there_is_room_for_is_refused() -> None:
     config = SimulationConfig(np.array([[0.0, 0.0, 0.0], [0.1, 0.1, 0.1]]), 1.0, iron=1000)
-    with pytest.raises(InputError, match="iron: found 1000 spheres, and room for"):
+    with pytest.raises(InputError, match="iron: found 1000 spheres, but only"):
         simulate_log(demo_site(), config, np.random.default_rng(1))
 
 

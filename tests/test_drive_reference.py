@@ -129,7 +129,7 @@ def test_a_column_in_milliamperes_is_said(wandering: Log) -> None:
     log, _ = with_drives(replace(wandering, drive=replace(wandering.drive, current=wrong)), SITE)
     found = [f for f in log.noticed if f.code == "drive_current"]
     assert len(found) == 4
-    assert "times the one for which its moments are declared" in found[0].text
+    assert "times that of its declared moments" in found[0].text
     log, _ = with_drives(wandering, SITE)
     assert not [f for f in log.noticed if f.code == "drive_current"]
 

@@ -168,12 +168,12 @@ def test_what_is_left_out_is_counted(
 
 def test_an_export_that_cannot_be_is_refused(result: Path, tmp_path: Path, refuse: Refuse) -> None:
     out = tmp_path / "run.mcap"
-    assert "does not say what to write" in refuse("export", result, "-o", tmp_path / "run")
+    assert "unknown file extension" in refuse("export", result, "-o", tmp_path / "run")
     assert "must differ" in refuse("export", result, "-o", out, "--child", "world")
     assert "/robot/nav" in refuse("export", result, "-o", out, "--namespace", "a b")
     assert "no such directory" in refuse("export", result, "-o", tmp_path / "no" / "a.csv")
     (result / "trajectory.parquet").unlink()
-    assert "holds no trajectory.parquet" in refuse("export", result, "-o", out)
+    assert "has no trajectory.parquet" in refuse("export", result, "-o", out)
     (result / "report.json").write_text('{"verdict": "failed"}')
     assert "its verdict is failed" in refuse("export", result, "-o", out)
     lost = StateTrust((Verdict.FAILED,) * N, np.full(N, np.nan), np.full(N, np.nan), ((),) * N)

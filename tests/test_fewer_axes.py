@@ -178,7 +178,7 @@ def test_what_does_not_fit_the_declared_axes_is_refused(
     save_site(demo_site(), log / "site.yaml")
     said = refuse("smooth", log, "-o", tmp_path / "run")
     assert "the magnetometer of" in said
-    assert "have x, z; declare the axes that the receiver has" in said
+    assert "have x, z; declare the axes of the receiver" in said
     save_site(with_axes(demo_site(), "xz"), log / "site.yaml")
     said = refuse("survey", log, "--poses", log / "site.yaml", "-o", tmp_path / "run")
     assert said
@@ -219,15 +219,15 @@ def test_what_one_axis_cannot_do_is_refused(
     prior = MotionPrior(2.0, 3.0)
     save_site(replace(site, platform=replace(site.platform, motion_prior=prior)), log / "site.yaml")
     said = refuse("coverage", log / "site.yaml", "-o", tmp_path / "run")
-    assert "is [z], and this job needs all three axes" in said
+    assert "is [z], but this job requires all three axes" in said
     save_site(demo_site(), tmp_path / "whole.yaml")
     write_log(simulated.log, tmp_path / "whole")
     said = refuse(
         *("smooth", tmp_path / "whole", "--site", tmp_path / "whole.yaml"),
         *("--free", "gain", "-o", tmp_path / "run"),
     )
-    assert "is the one gain of a receiver of one axis" in said
-    assert "smooth frees gain alone" in refuse("smooth", log, "--free", "phase", "-o", log)
+    assert "is the common gain of a receiver of one axis" in said
+    assert "smooth estimates gain only" in refuse("smooth", log, "--free", "phase", "-o", log)
 
 
 @pytest.mark.slow

@@ -58,7 +58,7 @@ def told(capfd: pytest.CaptureFixture[str], line: str) -> str:
 
 BOTH = "imu.csv mag.csv"
 SLIPS = [
-    ("", "nothing to import"),
+    ("", "no recording given"),
     ("nowhere.csv mag.csv", "nowhere.csv: there is no such file"),
     ("imu.csv", "No table is given for the magnetometer; give --magnetometer FILE"),
     ("--imu imu.csv --magnetometer imu.csv", "imu.csv: no column is found for magnetometer.field"),
@@ -91,7 +91,7 @@ SLIPS = [
     ),
     (f"{BOTH} --map 'imu.gyro=GyrX_dps,GyrY_dps,GyrZ_dps[10*rad/s]'", "imu.csv as imu.*deg/s"),
     (f"{BOTH} --map 'magnetometer.field=Bx_nT,By_nT,Bz_nT[uT]'", "mag.csv as magnetometer.*unit"),
-    (f"{BOTH} --rate-hz 'imu=200@500'", "imu and magnetometer have no moment in common.*one clock"),
+    (f"{BOTH} --rate-hz 'imu=200@500'", "imu and magnetometer do not overlap.*one clock"),
 ]
 
 

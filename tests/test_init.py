@@ -204,7 +204,7 @@ def test_what_is_said_is_held_against_the_recording(recorded: Path, tmp_path: Pa
     figures = run_init(settings, tmp_path / "site.yaml")
     assert figures is not None
     said = {one["code"]: str(one["text"]) for one in figures["reasons"]}  # type: ignore[union-attr,index]
-    assert said["silent_beacon"].startswith("beacon A is not heard at 28.3 Hz")
+    assert said["silent_beacon"].startswith("beacon A is not detected at 28.3 Hz")
     assert said["undeclared_line"].startswith("31.3 Hz")
 
 
@@ -240,7 +240,7 @@ def test_questions_are_asked_again_until_the_answer_can_be_read(
     )
     assert settings.imu == "BMI088"
     said = capsys.readouterr().err
-    assert "it is needed here" in said
+    assert "it is required here" in said
     assert "did you mean BMI055" in said
     run_init(settings, tmp_path / "site.yaml")
     assert load_site(tmp_path / "site.yaml").beacons[0].synchronised
@@ -277,7 +277,7 @@ def test_a_beacon_that_cannot_be_read_is_refused_in_one_sentence(said: str, sent
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ((), "nothing is described"),
+        ((), "no description given"),
         (("--beacon", "A position_m=0,0,1"), "frequency_hz is missing"),
         (("--beacon", "A frequency_hz=1e9"), "beacons[0].frequency_hz: found 1000000000.0"),
         (("--beacon", A, "--beacon", A), "is given twice"),
@@ -304,7 +304,7 @@ def test_what_makes_no_site_is_refused_and_nothing_is_written(
 
 def test_a_file_that_is_there_is_kept(tmp_path: Path, refuse: Refuse) -> None:
     (tmp_path / "site.yaml").write_text("mine")
-    assert "is there already" in refuse("init", "--beacon", A, "-o", tmp_path / "site.yaml")
+    assert "already exists" in refuse("init", "--beacon", A, "-o", tmp_path / "site.yaml")
     assert (tmp_path / "site.yaml").read_text() == "mine"
 
 

@@ -120,7 +120,7 @@ def test_logs_that_cannot_be_refined_together_are_refused(
         )
     other = refuse("calibrate", "log", tmp_path / "log0", tmp_path / "log1", *out)
     assert "share its file: give it with --site" in other
-    assert "divides one log" in refuse(*command, "--cross-validate", 2)
+    assert "splits one log" in refuse(*command, "--cross-validate", 2)
     assert "nothing to refine together" in refuse(*command, "--estimate", "none")
     assert "nothing to refine together" in refuse(*command, "--estimate", "phase,time-offset")
     loose = ("smooth", *given(recorded, "log0", "log1"), "--coupling", "loose", *out)
@@ -160,10 +160,10 @@ def test_nothing_is_left_out_in_silence() -> None:
     failed = row("c", used="no", verdict="failed", code="no_solution", reason="No start.")
     found = trust_of_all([*good, failed], agreed, [], 0.0)
     assert [(f.code, f.verdict) for f in found.findings] == [("log_left_out", "doubtful")]
-    assert "Log c has no part in this, as it failed alone: No start." in found.findings[0].text
+    assert "Log c is not used, as it failed alone: No start." in found.findings[0].text
     (unheard,) = trust_of_all(good, agreed, ["D"], 0.0).findings
     assert unheard.code == "silent_beacon"
-    assert "None of the logs hears beacon D" in unheard.text
+    assert "Beacon D is not detected in any log" in unheard.text
     (unsettled,) = trust_of_all(good, agreed, [], 0.2).findings
     assert unsettled.code == "not_converged"
     said = Finding("logs_disagree", "Log a contradicts log b: it takes all elsewhere.")

@@ -28,7 +28,7 @@ def test_a_platform_is_in_one_layer_and_away_from_beacons() -> None:
     with pytest.raises(InputError, match="surface"):
         layered_effect(beacon, POINTS, Layers((0.5,), (0.01,)))
     near = replace(beacon, position_world=np.array([0.0, 0.0, 3.5]))
-    with pytest.raises(InputError, match="too near to beacon A"):
+    with pytest.raises(InputError, match="too close to beacon A"):
         layered_effect(near, POINTS, Layers((100.0,), (0.01,)))
 
 

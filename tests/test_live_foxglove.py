@@ -192,7 +192,7 @@ def test_a_pipe_is_followed_live(log: Path) -> None:
 @pytest.mark.parametrize("address", ["", ":", "home", "127.0.0.1:", "127.0.0.1:70000", ":8765"])
 def test_a_bad_address_is_refused(log: Path, refuse: Refuse, address: str) -> None:
     said = refuse("navigate", "-", "--site", log / "site.yaml", "--foxglove", address)
-    assert f"--foxglove {address!r}: is no address to listen at; write a port" in said
+    assert f"--foxglove {address!r}: is not an address to listen at; write a port" in said
 
 
 def test_a_port_that_is_taken_is_refused(log: Path, refuse: Refuse, server: FoxgloveServer) -> None:

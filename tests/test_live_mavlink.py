@@ -297,11 +297,11 @@ def test_the_replay_of_a_log_sends_them_too(
 @pytest.mark.parametrize(
     ("address", "sentence"),
     [
-        ("127.0.0.1:14550", "is no address to send to; write udpout:HOST:PORT"),
-        ("udpout:127.0.0.1", "is no address to send to"),
-        ("udpout:127.0.0.1:70000", "is no address to send to"),
-        ("tcp:127.0.0.1:5760", "is no address to send to"),
-        ("udpout:no..body:14550", "the host no..body is not known"),
+        ("127.0.0.1:14550", "is not an address to send to; write udpout:HOST:PORT"),
+        ("udpout:127.0.0.1", "is not an address to send to"),
+        ("udpout:127.0.0.1:70000", "is not an address to send to"),
+        ("tcp:127.0.0.1:5760", "is not an address to send to"),
+        ("udpout:no..body:14550", "the host no..body is unknown"),
     ],
 )
 def test_a_bad_address_is_refused(

@@ -158,15 +158,15 @@ def test_a_lost_state_is_not_published(domain: int, topic: str) -> None:
 @pytest.mark.parametrize("name", ["odometry", "/", "/robot/", "/my topic", "/1st"])
 def test_a_name_that_is_no_topic_is_refused(log: Path, refuse: Refuse, name: str) -> None:
     said = refuse("navigate", "-", "--site", log / "site.yaml", "--ros2", name)
-    assert f"--ros2 {name!r}: is no topic; write one as /robot/odometry" in said
+    assert f"--ros2 {name!r}: is not a topic; write one like /robot/odometry" in said
 
 
 def test_frames_are_named_for_somebody(log: Path, refuse: Refuse) -> None:
     said = refuse("navigate", "-", "--site", log / "site.yaml", "--frame", "map")
-    assert "--frame and --child are for --foxglove and --ros2; give one of them" in said
+    assert "--frame and --child require --foxglove or --ros2; give one of them" in said
     for names in (("--frame", "body"), ("--child", "world"), ("--child", " ")):
         said = refuse("navigate", "-", "--site", log / "site.yaml", "--ros2", "/odometry", *names)
-        assert "must differ" in said or "must name a frame" in said
+        assert "must differ" in said or "must not be empty" in said
 
 
 @pytest.mark.parametrize("number", ["233", "-1", "home"])

@@ -68,7 +68,7 @@ def test_a_robots_hard_iron_is_found_by_turning_as_far_as_a_wrist_does() -> None
 def test_a_field_that_is_not_the_sites_is_named_as_the_cause(imu: bool) -> None:
     given = ("jitter", "30 uT indoors", "room for iron")
     row = scenario.judged(scenario.Case(180.0, 2, *given, imu, duration=20.0))
-    told = r"field of (29|30|31)[.\d]* uT .* the site declares 47.9 uT: steel is near"
+    told = r"field of (29|30|31)[.\d]* uT.* the site declares 47.9 uT: steel is near"
     assert row.verdict == "failed"
     assert re.search(told, row.said), row.said
 

@@ -257,7 +257,7 @@ def test_bursts_that_are_of_no_use_are_counted() -> None:
 @pytest.mark.parametrize(
     ("marks", "sentence"),
     [
-        (None, "nothing marks them"),
+        (None, "the log has no marks"),
         (Marks(np.array([1.1]), np.array([1.2]), np.array([7])), "slot 7 at 1.1.* is of no coil"),
         (
             Marks(np.array([1.1, 1.15]), np.array([1.2, 1.3]), np.array([0, 1])),

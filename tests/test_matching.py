@@ -226,7 +226,7 @@ def test_building_keeps_to_one_side_of_the_fold_and_a_database_of_both_is_refuse
         prepare(AttitudeDatabase(field_body, rpy, "roll-pitch", "log"))
 
 
-@pytest.mark.parametrize(("angles", "told"), [(None, "gravity"), ("roll", "axis of roll turns")])
+@pytest.mark.parametrize(("angles", "told"), [(None, "gravity"), ("roll", "axis of roll rotates")])
 def test_three_angles_of_one_vector_are_refused_with_what_is_lacking(
     angles: str | None, told: str
 ) -> None:
@@ -239,7 +239,7 @@ def test_three_angles_of_one_vector_are_refused_with_what_is_lacking(
 
 def test_too_few_attitudes_are_refused() -> None:
     rpy = np.repeat(attitudes(3), 100, axis=0)
-    with pytest.raises(InputError, match="needs 12"):
+    with pytest.raises(InputError, match="requires 12"):
         build_database(predict_field(rpy, FIELD_WORLD), matrices(rpy), "log")
 
 

@@ -147,7 +147,7 @@ def test_both_pitches_are_written_where_there_are_two(logs: Path, tmp_path: Path
 
 def test_a_platform_whose_yaw_wanders_makes_no_database(logs: Path, refuse: Refuse) -> None:
     told = refuse("calibrate", "attitude-database", logs / "wander", "-o", logs / "none")
-    assert "yaw turns by" in told
+    assert "yaw rotates by" in told
     assert "gravity" in told
 
 
@@ -157,15 +157,15 @@ def test_a_platform_whose_yaw_wanders_makes_no_database(logs: Path, refuse: Refu
         ((), "give the yaw"),
         (("--angles", "roll-pitch-yaw"), "two of three angles"),
         (("--angles", "roll-pitch-yaw", "--database", "nod_table"), "two of three angles"),
-        (("--angles", "roll", "--database", "nod_table"), "holds roll-pitch"),
-        (("--angles", "roll", "--yaw-deg", "3"), "needs --pitch-deg"),
+        (("--angles", "roll", "--database", "nod_table"), "has roll-pitch"),
+        (("--angles", "roll", "--yaw-deg", "3"), "requires --pitch-deg"),
         (("--yaw-deg", "nan"), "--yaw-deg"),
         (("--yaw-deg", "3", "--database", "nod_table"), "those of the database"),
         (("--yaw-deg", "3", "--method", "nearest"), "--database"),
         (("--gravity", "--yaw-deg", "3"), "all three"),
         (("--gravity", "--raw"), "--raw"),
         (("--yaw-deg", "3", "--step", "1e-5"), "--step"),
-        (("--yaw-deg", "3", "--raw", "--step", "1"), "--raw takes every sample"),
+        (("--yaw-deg", "3", "--raw", "--step", "1"), "--raw uses every sample"),
         (("--database", "nod_again"), "attitudes.parquet"),
     ],
 )
@@ -224,4 +224,4 @@ def test_a_dead_magnetometer_is_refused(logs: Path, tmp_path: Path, refuse: Refu
         ],
     )
     told = refuse("match", spoilt, "--yaw-deg", 3, "-o", tmp_path / "out")
-    assert "no field at" in told
+    assert "the field is zero at" in told

@@ -187,7 +187,7 @@ def test_the_live_view_draws_every_state(phasors: Path, tmp_path: Path) -> None:
         (("--lag", 0.1), "--lag must lie between 0.5 and 60 s; got 0.1"),
         (("--delay", -1), "--delay must lie between 0 and 10 s"),
         (("--every", 0), "--every must lie between"),
-        (("--keep-going",), "--keep-going and --format belong to a stream"),
+        (("--keep-going",), "--keep-going and --format require a stream"),
         (("--estimator", "ukf"), "'ukf' is not one of"),
     ],
 )
@@ -203,7 +203,7 @@ def test_a_log_too_short_for_a_state_fails_and_leaves_no_result(
     with pytest.raises(SystemExit) as ended:
         main(["navigate", str(worked.log), "-o", str(tmp_path / "run"), "--end", "3"])
     assert ended.value.code == 1
-    assert "lead to no state: Record longer." in capfd.readouterr().err
+    assert "give no state: Record longer." in capfd.readouterr().err
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"report.json", "failed"}
     figures = json.loads((tmp_path / "run" / "report.json").read_text())
     assert figures["verdict"] == "failed"

@@ -224,7 +224,7 @@ def test_bad_lines_are_counted_and_passed_over_where_that_is_asked(
     assert found == clean
     assert "line 51: found" in told
     assert "line 202: imu: its clock jumped ahead" in told
-    assert told.splitlines()[-1] == "magfusion: 2 records were passed over"
+    assert told.splitlines()[-1] == "magfusion: 2 records were skipped"
 
 
 def test_message_pack_that_breaks_off_inside_is_refused(site: Path) -> None:
@@ -269,7 +269,7 @@ def test_a_stream_needs_a_site_and_takes_no_options_of_a_log(
     capfd: pytest.CaptureFixture[str], site: Path
 ) -> None:
     for options, sentence in (
-        (("navigate", "-"), "navigate - needs the site's file"),
+        (("navigate", "-"), "navigate - requires the site's file"),
         (("navigate", "-", "--site", site, "-o", "out"), "--output, --start, --end"),
         (("navigate", "-", "--site", "nowhere.yaml"), "nowhere.yaml: there is no such file"),
     ):

@@ -134,7 +134,7 @@ def test_more_than_three_times_the_noise_is_a_doubt_and_less_is_only_said() -> N
     usual = Tuned("imu", "gyro_noise", 3e-4, 8e-4)
     doubt, remark = tuned_noise([usual, louder, quieter])
     assert doubt.verdict is Verdict.DOUBTFUL
-    assert "beacon B is 0.04 and not 0.005" in doubt.text
+    assert "beacon B is 0.04, declared 0.005" in doubt.text
     assert "gyroscope" not in doubt.text
     assert remark.verdict is Verdict.TRUSTWORTHY
     assert "beacon A" in remark.text

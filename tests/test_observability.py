@@ -164,7 +164,7 @@ def test_the_gauge_is_named_with_what_it_leaves(
     # Four beacons of 5 cm each: their mean is known to 2.5 cm.
     assert "all beacons shifted together along x by 2.5 cm" in words[0]
     assert "no log can determine it" in words[0]
-    assert any("turned together about the vertical" in text for text in words)
+    assert any("rotated together about the vertical" in text for text in words)
     assert any("moments larger together" in text for text in words)
     assert [one.ratio for one in found.gauge] == pytest.approx([1.0] * len(words), abs=1e-6)
     # Tilt and scale are open where there is no IMU, and are told apart from the gauge.
@@ -230,10 +230,10 @@ def test_missing_motion_is_told_from_what_is_open_and_where_the_platform_was() -
     cov = posterior(calibration, blocks, still, 1e-10)
     found = observability(calibration, blocks, cov)
     told = " ".join(missing_motion(covered, calibration, blocks, found))
-    assert f"never came nearer than {to_c:.1f} m to beacon C" in told
-    assert "hardly turned about its x and y and z" in told
+    assert f"never closer than {to_c:.1f} m to beacon C" in told
+    assert "hardly rotated about its x and y and z" in told
     assert "moved by only 0 cm along x, 0 cm along y, 0 cm along z" in told
-    assert "never stood still" in told
+    assert "was never stationary" in told
 
 
 def test_nothing_is_missing_where_all_is_determined() -> None:

@@ -160,7 +160,7 @@ def test_amplitudes_of_two_axes_are_refused_in_a_sentence(
     text = (log / "site.yaml").read_text()
     (tmp_path / "site.yaml").write_text(text.replace("axes: [z]", "axes: [x, z]"))
     said = refuse("fix", log, "--site", tmp_path / "site.yaml", "-o", tmp_path / "run")
-    assert "is [x, z], and the fields of" in said
+    assert "is [x, z], but the fields of" in said
 
 
 def test_what_does_not_fit_the_receiver_is_refused(
@@ -175,7 +175,7 @@ def test_what_does_not_fit_the_receiver_is_refused(
     text = (log / "site.yaml").read_text()
     (tmp_path / "site.yaml").write_text(text.replace("axes: [z]", "axes: [x, y, z]"))
     said = refuse("fix", log, "--site", tmp_path / "site.yaml", "-o", tmp_path / "run")
-    assert "have one amplitude; declare the axes that the receiver has" in said
+    assert "have one amplitude; declare the axes of the receiver" in said
 
 
 def test_the_report_says_what_is_told_and_what_is_not(log: Path, tmp_path: Path) -> None:

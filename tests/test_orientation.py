@@ -108,7 +108,7 @@ def test_what_needs_a_position_is_refused(attached, tmp_path, refuse):
     save_site(site, tmp_path / "log" / "site.yaml")
     ahead = "--rate", "imu", "--horizon", "0.1"
     sentence = refuse("navigate", tmp_path / "log", *ahead, "-o", tmp_path / "run")
-    assert "--horizon is not for a site without beacons" in sentence
+    assert "--horizon is not available for a site without beacons" in sentence
 
 
 def test_a_gap_is_bridged_by_gravity_and_field(attached):

@@ -154,15 +154,15 @@ def test_the_verdict_comes_first_with_its_reasons(page: Page) -> None:
         "DOUBTFUL",
         "beacon_fault",
         "Noticed: The IMU has a gap.",
-        "not checked by these data",
+        "Fixed, not observable",
         "sensor.position 0.1 cm 2 0.01",
         "Plan",
         "Height",
         "Errors against the truth",
         "Residuals by beacon",
         "Calibration, before and after",
-        "What was refused",
-        "How it was run",
+        "Rejected or omitted data",
+        "Command, inputs and versions",
     ]
     places = [text.index(words) for words in order]
     assert places == sorted(places)
@@ -172,7 +172,8 @@ def test_the_page_says_what_was_found_refused_and_how_it_was_run(page: Page) -> 
     assert "-6.000 ± 0.05 -5.750 ± 0.01 +5.00 yes" in page.text  # 0.25 m of a sigma of 0.05
     assert "declared ± 0.05 declared -0.100 ± 0.01 -2.00 yes" in page.text
     assert "windows dropped saturated 17" in page.text
-    refused = page.text[page.text.index("What was refused") : page.text.index("How it was run")]
+    begin, end = map(page.text.index, ("Rejected or omitted data", "Command, inputs and versions"))
+    refused = page.text[begin:end]
     assert "too short" not in refused
     assert f"states without beacon {EVIL}, which contradicts 7" in page.text
     assert "magfusion smooth 'a log'" in page.text
@@ -184,7 +185,7 @@ def test_without_truth_the_page_shows_what_is_claimed(tmp_path: Path) -> None:
     write_report(tmp_path, _figures(), _motion(truth=False))
     found = Page(tmp_path / PAGE)
     found.check()
-    assert "Claimed accuracy" in found.text
+    assert "Estimated accuracy" in found.text
     assert "protection level" in found.text
     assert "called from Python" in found.text
 
@@ -218,7 +219,7 @@ def test_of_a_failed_job_the_page_lies_with_what_was_found(tmp_path: Path) -> No
     write_report(tmp_path, heading("match", "log") | trust_figures(failed))
     assert {path.name for path in tmp_path.iterdir()} == {"report.json", FAILED}
     found = Page(tmp_path / FAILED / PAGE)
-    assert "FAILED It must not be used" in found.text
+    assert "FAILED Do not use" in found.text
 
 
 def test_pictures_are_inside_as_far_as_there_is_room(tmp_path: Path) -> None:
@@ -228,7 +229,7 @@ def test_pictures_are_inside_as_far_as_there_is_room(tmp_path: Path) -> None:
     found = Page(tmp_path / PAGE)
     found.check()
     assert found.addresses == ["data:image/png;base64,iVBORw=="]
-    assert "see large.png, beside this page" in found.text
+    assert "see large.png, in the same directory" in found.text
 
 
 def test_a_command_tells_its_page_how_it_was_called(

@@ -160,8 +160,8 @@ def test_json_has_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     [
         (("004", "32"), "paper 004 has no '32'; it has eq 1 to 31, table 1, fig 1 to 11, claim 1"),
         (("002", "table", "1"), "paper 002 has no 'table 1'; it has eq 1 to 33, fig 1 to 10"),
-        (("004", "the", "third"), "'the third' is no number of paper 004; it has eq 1 to 31"),
-        (("004", "eq", "7", "8"), "'eq 7 8' is no number of paper 004; it has eq 1 to 31"),
+        (("004", "the", "third"), "'the third' is not an entry of paper 004; it has eq 1 to 31"),
+        (("004", "eq", "7", "8"), "'eq 7 8' is not an entry of paper 004; it has eq 1 to 31"),
         (("003",), "there is no paper '003'; give one of 000, 001, 002, 004"),
     ],
 )

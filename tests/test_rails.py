@@ -112,9 +112,9 @@ def test_what_is_no_rail_is_refused(text: str, said: str) -> None:
 
 
 def test_steel_where_the_platform_moves_is_refused() -> None:
-    with pytest.raises(InputError, match="where the platform moves"):
+    with pytest.raises(InputError, match="the platform's range"):
         laid(rails_option("0.05:-5,0,0:5,0,0"), NOWHERE, NONE)
-    with pytest.raises(InputError, match="what touches is one piece"):
+    with pytest.raises(InputError, match="touching parts are one piece"):
         laid(rails_option("0.05:-5,2,0:5,2,0;0.05:0,1,0:0,3,0"), NOWHERE, NONE)
 
 

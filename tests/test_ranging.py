@@ -191,7 +191,7 @@ def test_a_casing_is_for_ranging_alone(
 ) -> None:
     log = _written(scene, tmp_path)
     save_site(scenario.declared_site(cased=True), log / "site.yaml")
-    assert "magfusion range alone" in refuse("fix", log, "-o", tmp_path / "out")
+    assert "only magfusion range" in refuse("fix", log, "-o", tmp_path / "out")
 
 
 def test_without_inertial_samples_directions_are_the_tools(scene: scenario.Scene) -> None:

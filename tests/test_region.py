@@ -138,7 +138,7 @@ def test_a_region_that_says_nothing_is_refused(line: str, place: str, tmp_path: 
     [
         (Where(("A=+w",)), "a direction is one of"),
         (Where(("Z=+x",)), "no beacon 'Z'"),
-        (Where(("+x",)), "has 4 beacons; say of which it is, as --hemisphere A=+x"),
+        (Where(("+x",)), "has 4 beacons; specify one, e.g. --hemisphere A=+x"),
         (Where(("A=0,0,0",)), "a direction is one of"),
         (Where(region="0,1,0,1"), "six numbers"),
         (Where(region="1,0,0,1,0,1"), "below its upper limit"),

@@ -176,7 +176,7 @@ def test_rests_go_through_log_and_pipe(tmp_path: Path, refuse: Refuse) -> None:
             away = np.abs(np.array(line["position"]) - there)
             assert np.all(away < 5.0 * np.array(line["sigma"]["position"]))
     said = refuse("navigate", tmp_path / "log", "--at-rest", "--rate", "imu", "-o", "x")
-    assert "--rate is of navigation through motion" in said
+    assert "--rate is for navigation in motion" in said
 
 
 @pytest.mark.parametrize(
@@ -186,7 +186,7 @@ def test_rests_go_through_log_and_pipe(tmp_path: Path, refuse: Refuse) -> None:
         ({"reference": {"time": [0.0], "field": [[0, 0]]}}, "three numbers"),
         (
             {"fields": {"time": 1.0, "window": 0.4, "sigma": 1e-9, "phasors": {}}},
-            "leave fields out",
+            "omit fields",
         ),
     ],
 )

@@ -117,7 +117,7 @@ def test_an_angle_that_nobody_measures_is_followed_through_the_field() -> None:
 def test_noise_alone_is_no_magnet() -> None:
     rng = np.random.default_rng(4)
     wave = Waveform(np.arange(3000) / 50.0, 1e-9 * rng.standard_normal((3000, 3)))
-    with pytest.raises(InputError, match="not told from noise"):
+    with pytest.raises(InputError, match="not detected above the noise"):
         followed_angle(wave, SPEED_HZ, ROTOR)
 
 

@@ -48,22 +48,22 @@ SPOILED: dict[str, tuple[Change, tuple[str, ...], str]] = {
     "gyro in deg/s": (imu(gyro=lambda v: RATE * v), ("gyro_units",), "deg/s"),
     "gyro permuted": (imu(gyro=lambda v: v[:, [1, 2, 0]]), ("mounting", "imu_axes"), "120 deg"),
     "gyro swapped": (imu(gyro=lambda v: v[:, [1, 0, 2]]), ("imu_axes",), "left-handed"),
-    "gyro axis dead": (imu(gyro=stuck(0, 0.0)), ("stuck_axis",), "axis x stood still"),
+    "gyro axis dead": (imu(gyro=stuck(0, 0.0)), ("stuck_axis",), "axis x frozen"),
     "accel in g": (imu(accel=lambda v: v / 9.81), ("accel_units",), "it is in g."),
     "accel in mg": (imu(accel=lambda v: v / 9.81e-3), ("accel_units",), "it is in mg"),
     "accel reversed": (imu(accel=lambda v: -v), ("gravity_sign",), "sign is reversed"),
-    "gravity removed": (without_gravity, ("gravity_missing",), "has been removed"),
+    "gravity removed": (without_gravity, ("gravity_missing",), "removed gravity"),
     "imu hung": (imu(frozen(2000, 3000), frozen(2000, 3000)), ("frozen_imu",), "10.00 to 14.99 s"),
-    "imu spikes": (imu(spiky(0.5), spiky(5.0)), ("imu_spikes",), "single samples"),
+    "imu spikes": (imu(spiky(0.5), spiky(5.0)), ("imu_spikes",), "isolated samples"),
     "imu late": (imu(time=lambda t: t + 0.7), ("time_offset",), "0.70 s too late"),
     "imu clock": (imu(time=lambda t: 1.02 * t), ("imu_clock",), "clock runs +"),
     "imu gap": (kept(lambda t: (t < 8.0) | (t > 11.0), of_imu=True), ("gap",), "(3.0"),
-    "imu short": (kept(lambda t: t < 12.0, of_imu=True), ("streams_apart",), "12.0 s only"),
+    "imu short": (kept(lambda t: t < 12.0, of_imu=True), ("streams_apart",), "overlap by 12.0 s"),
     "field in nT": (field(lambda v: 1e9 * v), ("field_units",), "in nT"),
     "field permuted": (field(lambda v: v[:, [1, 2, 0]]), ("mounting",), "120 deg"),
     "field held": (field(held(2)), ("repeated_samples",), "50 %"),
-    "field limited": (field(limited(0.9)), ("saturated",), "range ends there"),
-    "field axis dead": (field(stuck(2, 1e-5)), ("stuck_axis",), "axis z stood still at 10 uT"),
+    "field limited": (field(limited(0.9)), ("saturated",), "is saturated at"),
+    "field axis dead": (field(stuck(2, 1e-5)), ("stuck_axis",), "axis z frozen at 10 uT"),
     "field iron": (
         field(lambda v: v + np.array([9e-6, -6e-6, 3e-6])),
         ("body_iron",),
@@ -128,7 +128,7 @@ def test_removed_gravity_is_no_other_unit() -> None:
     force = one.log.imu.accel_body
     loud = replace(one.log.imu, accel_body=force / np.median(np.linalg.norm(force, axis=1)))
     texts = [f.text for f in first_look(replace(one.log, imu=loud), one.site).trust.reasons]
-    assert "has been removed" in texts[0]
+    assert "removed gravity" in texts[0]
     assert not any("it is in g" in text for text in texts)
 
 

@@ -270,7 +270,7 @@ def test_one_that_hears_nothing_is_named_and_left_out() -> None:
     log = Log("two", 0, "simulation", NO_SAMPLES, fields=replace(found, phasor_sensor=quiet))
     left, alone = without_silent(log, site)
     assert [finding.code for finding in left.noticed] == ["magnetometer_silent"]
-    assert "right hears no beacon in 12 epochs" in left.noticed[0].text
+    assert "right detects no beacon in 12 epochs" in left.noticed[0].text
     assert [sensor.name for sensor in alone.platform.magnetometers] == ["left"]
     assert left.fields is not None
     np.testing.assert_array_equal(left.fields.phasor_sensor, quiet[:, site.of_sensor(0)])

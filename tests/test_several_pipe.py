@@ -198,7 +198,7 @@ def test_one_that_comes_again_is_heard_again(site: Site, demodulated: Log, tmp_p
                     "slot": 1,
                 }
             },
-            r"line 1: magnetometer: slot beside the samples of several",
+            r"line 1: magnetometer: slots of the samples of several",
         ),
     ],
 )
@@ -219,7 +219,7 @@ def test_samples_and_fields_in_one_stream_are_refused(site: Site, tmp_path: Path
         {"magnetometer": {**samples, "magnetometer": "left"}},
         {"fields": {**fields, "magnetometer": "right"}},
     ]
-    for order, said in ((lines, "fields: they come beside"), (lines[::-1], "come beside fields")):
+    for order, said in ((lines, "fields: they are mixed"), (lines[::-1], "mixed with fields")):
         with pytest.raises(InputError, match=said):
             piped(order, tmp_path)
 
@@ -233,7 +233,7 @@ def test_the_name_of_the_only_one_is_taken_and_another_refused(tmp_path: Path) -
 
 
 def test_the_earth_field_of_several_is_refused(site: Site) -> None:
-    with pytest.raises(InputError, match="--earth measures by one magnetometer"):
+    with pytest.raises(InputError, match="--earth uses a single magnetometer"):
         Navigator(site, NavigatorSettings(earth=True))
 
 

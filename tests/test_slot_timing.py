@@ -136,7 +136,7 @@ def test_a_whole_log_is_followed_as_a_stream_is() -> None:
 
 
 def test_pulses_whose_timing_nobody_knows_are_refused() -> None:
-    with pytest.raises(InputError, match=r"pulses of direct current by a clock of its own"):
+    with pytest.raises(InputError, match=r"direct-current pulses by its own clock"):
         SlotReceiver(_free(0.0)).check()
 
 

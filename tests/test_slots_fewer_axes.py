@@ -125,5 +125,5 @@ def test_slots_of_a_receiver_without_all_axes_are_not_turned() -> None:
 
 def test_one_axis_about_a_lone_source_is_said_to_be_too_little() -> None:
     site = heard_by("z")
-    with pytest.raises(EstimationError, match="three numbers of a lone source of three coils"):
+    with pytest.raises(EstimationError, match="three numbers of a single source of three coils"):
         fix_epochs(cycles_of(site), initial_calibration(site, 0.0))

@@ -98,7 +98,7 @@ def test_smooth_integrates_rests_and_refuses_what_it_cannot(tmp_path: Path, refu
     assert told["nees_mean"] < 16.0
     log = tmp_path / "log"
     assert "integrates one log" in refuse("smooth", log, log, "--at-rest", "-o", "x")
-    assert "leave --earth and" in refuse("smooth", log, "--at-rest", "--earth", "-o", "x")
+    assert "omit --earth and" in refuse("smooth", log, "--at-rest", "--earth", "-o", "x")
 
 
 def test_the_derivative_of_a_zero_rate_is_that_of_differences() -> None:

@@ -92,9 +92,9 @@ def test_a_damaged_checkpoint_is_refused_and_kept(log: Path, left: Path, tmp_pat
 
 
 def test_what_has_no_passes_to_keep_is_refused(log: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--resume goes on from a file"):
+    with pytest.raises(InputError, match="--resume requires a file"):
         SmoothSettings(log=log, resume=True)
-    with pytest.raises(InputError, match="--checkpoint keeps the passes over one log"):
+    with pytest.raises(InputError, match="--checkpoint stores the passes over one log"):
         SmoothSettings(log=log, more=(log,), checkpoint=tmp_path / "passes.bin")
-    with pytest.raises(InputError, match="is no directory; make it"):
+    with pytest.raises(InputError, match="is no directory; create it"):
         run(SmoothSettings(log=log, checkpoint=tmp_path / "none" / "p.bin"), tmp_path / "run")

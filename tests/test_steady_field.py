@@ -59,7 +59,7 @@ def test_another_size_is_no_turn() -> None:
     assert not off.of_survey
     assert off.turn == pytest.approx(0.4)
     assert off.shift(np.ones(3)) == 0.0
-    assert "axes or scale of the magnetometer" in off.finding.text
+    assert "magnetometer's axes and scale" in off.finding.text
 
 
 def test_a_smoothed_log_is_doubted_where_the_survey_has_other_axes() -> None:

@@ -91,4 +91,4 @@ def test_free_fall_throughout_is_a_cause_of_missing_gravity() -> None:
         for one in recorded(Log("odd", 0, "test", samples(np.zeros(3), np.zeros(3))), None)
         if one.code == "gravity_missing"
     ]
-    assert "falls freely" in found[0].text
+    assert "free fall" in found[0].text

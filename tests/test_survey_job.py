@@ -282,7 +282,7 @@ def _without(columns: dict[str, Any], dropped: set[str], points: int = 1000) -> 
 
 @pytest.mark.parametrize(
     ("dropped", "points", "told"),
-    [({"A", "B"}, 1000, "need 3 rotating beacons"), (set(), 3, "holds 3 points")],
+    [({"A", "B"}, 1000, "require 3 rotating beacons"), (set(), 3, "has 3 points")],
 )
 def test_a_survey_of_too_few_beacons_or_points_is_refused(
     dropped: set[str],
@@ -321,7 +321,7 @@ def test_epochs_that_hear_too_little_are_refused_with_the_reason(
         ),
     )
     sentence = _refused_fix(log, surveyed[1], tmp_path, refuse)
-    assert "fewer than three beacons heard" in sentence
+    assert "fewer than three beacons detected" in sentence
 
 
 @pytest.mark.parametrize(

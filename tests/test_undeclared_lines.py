@@ -69,7 +69,7 @@ def test_what_is_fitted_is_said_and_no_reason_for_doubt(radiated: SimulatedLog) 
     ]
     assert [one.code for one in found] == ["fitted_line"]
     assert found[0].verdict is Verdict.TRUSTWORTHY
-    assert "fitted beside" in found[0].text
+    assert "fitted with the tones" in found[0].text
     assert "30.0" in found[0].text
     assert "35.0" in found[0].text
 

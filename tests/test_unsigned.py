@@ -117,7 +117,7 @@ def test_jobs_that_take_no_amplitudes_say_so(
     write_log(Log("few", 0, "test", ImuSamples.empty(), fields=fields), tmp_path / "log")
     save_site(calibration.site, tmp_path / "log" / "site.yaml")
     said = refuse("check", tmp_path / "log")
-    assert "amplitudes without sign are taken by fix, smooth and navigate alone" in said
+    assert "unsigned amplitudes are supported by fix, smooth and navigate only" in said
 
 
 def test_the_pipe_takes_amplitudes_as_a_log_has_them(calibration: Calibration) -> None:
@@ -153,7 +153,7 @@ def test_amplitudes_among_phasors_are_refused(calibration: Calibration) -> None:
     site, samples = calibration.site, amplitudes(calibration, poses(), 1e-10)
     navigator = Navigator(site, NavigatorSettings("ekf"))
     navigator.add_fields(samples.rows(slice(0, 1)))
-    with pytest.raises(InputError, match="amplitudes without sign come among phasors"):
+    with pytest.raises(InputError, match="amplitudes without sign are mixed with phasors"):
         navigator.add_fields(replace(samples.rows(slice(1, 2)), signed=True))
 
 

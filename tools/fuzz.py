@@ -86,9 +86,9 @@ def _wrong(
 ) -> str | None:
     if status not in (0, 1, 2):
         return f"exit {status}: {said}"
-    if "did not foresee" in said or "Traceback" in said:
+    if "internal error" in said or "Traceback" in said:
         return said
-    if "memory does not suffice" in said:
+    if "not enough memory" in said:
         return f"memory: {said}"
     if status and not passed and (said.count("\n") != 1 or not said.startswith("magfusion")):
         return f"exit {status} with other than one sentence: {said!r}"

@@ -1,1 +1,1 @@
-"""Calibration of beacons, antennas and sensors from what they measured, each with a covariance."""
+"""Calibration of beacons, antennas and sensors from measurements, each with a covariance."""

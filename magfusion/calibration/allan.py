@@ -1,11 +1,11 @@
-"""Allan variance of a stream of any length, in a memory that does not grow with it.
+"""Overlapping Allan variance of a stream of any length, in constant memory.
 
 Samples are averaged in pairs, and pairs of pairs, level by level; a level keeps a few averages, of
 which the clusters of `CLUSTERS` neighbours are compared at every step of the level.  So clusters
 overlap by all but a quarter to a seventh, which is as good as overlapping them at every sample.
 
-What is missing is counted as such: an average knows which share of it there is, and a cluster takes
-part where nearly all of it is.
+Missing samples are tracked: each average has the share of samples present, and a cluster is
+used only where nearly all of its samples are present.
 """
 
 from dataclasses import dataclass, field
@@ -34,7 +34,7 @@ class AllanVariance:
     count : ndarray of int, shape (n,)
         Differences of clusters, which overlap.
     clusters : ndarray, shape (n,)
-        How many of them would stand side by side.
+        Number of non-overlapping clusters.
     octave : bool ndarray, shape (n,)
         Whether a cluster time is a power of two samples: those are nearly independent.
     """
@@ -64,7 +64,7 @@ class _Level:
         self.count = dict.fromkeys(self.sizes, 0)
 
     def add(self, mean: Array, share: Array) -> None:
-        """Take further averages (n, axes), each with the share (n,) of it that is there."""
+        """Process further averages (n, axes), each with its share (n,) of samples present."""
         mean = np.concatenate([self.mean, mean])
         share = np.concatenate([self.share, share])
         fresh = len(mean) - len(self.mean)
@@ -93,7 +93,7 @@ class _Level:
         self.mean, self.share = mean[-_KEPT:], share[-_KEPT:]
 
     def pairs(self, mean: Array, share: Array) -> tuple[Array, Array]:
-        """Return the averages of pairs; one that is left over waits for its neighbour."""
+        """Return the averages of pairs; an unpaired average is kept for the next call."""
         if self.odd is not None:
             mean = np.concatenate([self.odd[0], mean])
             share = np.concatenate([self.odd[1], share])
@@ -107,12 +107,12 @@ class _Level:
 
 
 class AllanStream:
-    """Allan variance of samples that come in pieces.
+    """Allan variance of samples that arrive in blocks.
 
     Parameters
     ----------
     axes : int
-        How many channels there are.
+        Number of channels.
     """
 
     def __init__(self, axes: int) -> None:
@@ -123,7 +123,7 @@ class AllanStream:
         self.missing = 0
 
     def add(self, values: Array) -> None:
-        """Take further samples (n, axes), evenly spaced; a row that holds NaN is a missing one."""
+        """Process further samples (n, axes), evenly spaced; a row with a NaN counts as missing."""
         there = np.asarray(np.isfinite(values).all(axis=1))
         if self._origin is None:
             if not there.any():
@@ -145,14 +145,14 @@ class AllanStream:
             level += 1
 
     def skip(self, count: int) -> None:
-        """Take note of samples that are missing."""
+        """Register missing samples."""
         while count > 0:
             piece = min(count, CHUNK)
             self.add(np.full((piece, self._axes), np.nan))
             count -= piece
 
     def result(self, step: float) -> AllanVariance:
-        """Return what the samples so far say.
+        """Return the Allan variance of the samples so far.
 
         Parameters
         ----------

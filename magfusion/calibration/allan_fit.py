@@ -1,10 +1,11 @@
-"""White noise, bias instability and random walk of an Allan variance, with their intervals.
+"""White noise, bias instability and random walk from an Allan variance, with their intervals.
 
 ``variance(tau) = 3 q^2 / tau^2 + n^2 / tau + 2 ln 2 / pi b^2 + k^2 tau / 3``, each square at least
-zero (IEEE Std 952-1997, annex C): steps of a converter, white noise, flicker, walk.  An Allan
-variance is distributed as a chi square of at least as many degrees of freedom as it has clusters,
-by which it is weighed.  Cluster times of a factor of two are alike by half where noise is white,
-and by 0.88 where it walks (2^14 samples, 600 channels, simulated): the intervals know that.
+zero (IEEE Std 952-1997, annex C): quantization, white noise, flicker noise, random walk.  An
+Allan variance is distributed as a chi square with at least as many degrees of freedom as it has
+clusters, which sets its weight.  Estimates at cluster times a factor of two apart are correlated by
+0.5 for white noise and by 0.88 for random walk (2^14 samples, 600 channels, simulated); the
+intervals account for it.
 """
 
 from dataclasses import dataclass
@@ -24,14 +25,14 @@ GOOD = 0.6  # of the chi square a degree of freedom, from which another beginnin
 MISFIT = 2.5  # of the same, from which the noise is of another kind
 PASSES, SETTLED = 30, 1e-5
 TWO_SIDED, ONE_SIDED = 1.96, 1.645  # of 95 %
-# How alike cluster times are that lie 0, 1, 2 ... octaves apart.
+# Correlation of cluster times that are 0, 1, 2 ... octaves apart.
 _ALIKE_WHITE = np.array([1.0, 0.52, 0.2, 0.05])
 _ALIKE_WALK = np.array([1.0, 0.88, 0.65, 0.46, 0.31, 0.2, 0.12, 0.06])
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """One number with its interval of 95 %; ``low`` is zero where it may not be there at all."""
+    """An estimate with its 95 % interval; ``low`` is zero where it may be absent."""
 
     value: float
     low: float
@@ -39,30 +40,30 @@ class Fitted:
 
     @property
     def found(self) -> bool:
-        """Whether it is told from zero."""
+        """Whether it differs significantly from zero."""
         return self.low > 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class AllanFit:
-    """What an Allan deviation of one axis is made of.
+    """Noise components of the Allan deviation of one axis.
 
     Parameters
     ----------
     white : Fitted
         ``n``, in the stream's unit times sqrt(s).
     instability : Fitted
-        ``b``, in the stream's unit: the least Allan deviation is 0.664 of it where it is flat.
+        ``b``, in the stream's unit: the minimum Allan deviation is 0.664 of it where it is flat.
     walk : Fitted
         ``k``, in the stream's unit per sqrt(s).
     steps : float
         ``q``, in the stream's unit times s.
     least, least_tau : float
-        The least Allan deviation of the fit within the cluster times, and where (s).
+        The minimum Allan deviation of the fit within the cluster times, and where (s).
     turns : bool
-        Whether it rises again behind that.
+        Whether it rises again after the minimum.
     misfit : float
-        Chi square a degree of freedom.
+        Reduced chi square.
     worst_tau, worst : float
         Where the fit deviates most (s), and by which factor of the deviation.
     first_tau : float
@@ -88,10 +89,10 @@ class AllanFit:
 
     @property
     def covering_walk(self) -> float:
-        """The random walk that, beside the white noise alone, covers the least and what follows.
+        """The random walk that, with white noise alone, covers the minimum and the rise after it.
 
-        An estimator knows white noise and a walk, and no flicker: with ``sqrt(3) v / (2 n)`` their
-        least Allan variance is the ``v`` that was found.
+        An estimator models white noise and a random walk, but no flicker: with ``sqrt(3) v / (2
+        n)`` their minimum Allan variance is the estimated ``v``.
         """
         walk = self.walk.value if self.walk.found else self.walk.high
         if self.white.value == 0.0:
@@ -100,10 +101,10 @@ class AllanFit:
 
 
 def fit_allan(found: AllanVariance, axis: int) -> AllanFit | None:
-    """Return what the Allan variance of an axis is made of; None of too few cluster times.
+    """Return the noise components of an axis' Allan variance; None for too few cluster times.
 
-    An instrument's own filter makes short clusters smoother than white noise: where the fit does
-    not explain them, it begins later.
+    An instrument's own filter makes short clusters smoother than white noise.  Where the fit does
+    not match them, it begins at longer cluster times.
     """
     enough = np.asarray(found.clusters >= LEAST_CLUSTERS)
     usable = np.logical_and.reduce([found.octave, enough, found.variance[:, axis] > 0.0])
@@ -161,7 +162,7 @@ def _fit(tau: Array, variance: Array, clusters: Array) -> AllanFit:
 
 
 def _not_negative(design: Array, value: Array) -> Array:
-    """Return the least squares of few unknowns, none negative: the best of all that may be zero."""
+    """Return the non-negative least-squares solution, the best over all sets of zero unknowns."""
     scale = np.linalg.norm(design, axis=0)
     best, cost = np.zeros(design.shape[1]), float(value @ value)
     for count in range(1, design.shape[1] + 1):
@@ -179,10 +180,10 @@ def _not_negative(design: Array, value: Array) -> Array:
 def _covariance(
     design: Array, model: Array, relative: Array, clusters: Array, square: Array
 ) -> Array:
-    """Return the covariance of the squares, of estimates that are alike where their times are near.
+    """Return the covariance of the squares, with neighbouring cluster times correlated.
 
-    Flicker and walk are left free even where they were found to be zero; converter steps only
-    where they were not.
+    Flicker and walk are estimated even where their squares are zero; quantization only where its
+    square is not.
     """
     free = [k for k in range(4) if k > 0 or square[0] > 0.0]
     weighed = design[:, free] / model[:, None] / relative[:, None]
@@ -206,10 +207,10 @@ def _covariance(
 
 
 def _fitted(square: float, sigma: float) -> Fitted:
-    """Return the root of a square with its interval."""
+    """Return the square root of an estimated square, with its interval."""
     if square <= ONE_SIDED * sigma:
         return Fitted(float(np.sqrt(square)), 0.0, float(np.sqrt(square + ONE_SIDED * sigma)))
-    # Of a square that is well above zero, the logarithm is the more symmetric.
+    # For a square well above zero, the logarithm is more symmetric.
     width = float(np.exp(TWO_SIDED * sigma / (2.0 * square)))
     root = float(np.sqrt(square))
     return Fitted(root, root / width, root * width)

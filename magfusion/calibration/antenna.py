@@ -32,7 +32,7 @@ Observe = Callable[[Antenna, Array, Array], Coupling]  # as `observe_antenna`
 
 @dataclass(frozen=True, eq=False)
 class AntennaSurvey:
-    """Couplings at poses of the sensor in the beacon's axes; leading axes hold many surveys.
+    """Couplings at poses of the sensor in beacon axes; leading axes are surveys.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def fit_at_known_poses(
     weight = 1.0 / survey.sigma.reshape(-1, n)[..., None, None]
 
     def normal(rows: IntArray, scaled: Array) -> Normal:
-        """Take what times the root is (vector - mean)."""
+        """Return the product of the root and (vector - mean)."""
         antenna = antenna_from_vector((mean[rows] + scaled @ root.T)[:, None])
         seen = model(antenna, rotation[rows], position[rows])
         error = (seen.value - coupling[rows]) * weight[rows]
@@ -163,8 +163,8 @@ def fit_at_known_poses(
     found = minimise(normal, np.zeros_like(mean), passes=ITERATIONS, absolute=CONVERGED**2)
     if not np.all(found.converged):
         raise EstimationError(
-            f"the antenna's calibration does not converge in {ITERATIONS} steps: poses and"
-            " couplings disagree by far more than the prior allows"
+            f"the antenna calibration does not converge in {ITERATIONS} iterations: poses and"
+            " couplings are inconsistent by far more than the prior allows"
         )
     cov = root @ np.linalg.inv(found.information) @ root.T
     return AntennaFit(
@@ -178,11 +178,11 @@ def fit_at_known_poses(
 
 
 def with_receiver_gain(fit: AntennaFit, declared: Antenna) -> AntennaFit:
-    """Return a fit whose sensitivities are as large as declared in their geometric mean.
+    """Return a fit scaled so that the geometric mean of its sensitivities is as declared.
 
-    Couplings determine the product of moments and sensitivities alone.  The prior shares it out,
-    with a sigma that is no error of any coupling; here the receiver's mean gain is fixed, and the
-    sigmas are those of everything else (the S-transformation of geodesy).
+    Couplings determine only the product of moments and sensitivities.  The prior splits it, with a
+    sigma that is no error of any coupling.  Here the receiver's mean gain is fixed, and the sigmas
+    are those of all other parameters (the S-transformation of geodesy).
 
     Parameters
     ----------

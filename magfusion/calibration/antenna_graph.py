@@ -1,7 +1,7 @@
-"""Calibration of a tracker's antennas at poses that are uncertain, in a GTSAM graph.
+"""Calibration of a tracker's antennas at uncertain poses, in a GTSAM graph.
 
-A turntable's error of a tenth of a degree is larger than the couplings' noise; taken as exact it
-goes into the antenna.  Here every pose is a variable with its prior.
+A turntable error of a tenth of a degree is larger than the noise of the couplings; if the poses
+were fixed, it would bias the antenna.  Here every pose is a variable with its prior.
 """
 
 import gtsam
@@ -40,11 +40,11 @@ def fit_at_uncertain_poses(
     start : Antenna
         Mean of the prior.
     sigma : ndarray, shape (k,) or (k, k)
-        Of the prior (`magfusion.calibration.antenna.prior_sigma`), or a factor of its covariance:
-        it holds the gauges too.
+        Of the prior (`magfusion.calibration.antenna.prior_sigma`), or a factor of its covariance,
+        which also fixes the gauges.
     rotation_sigma, position_sigma : float
-        Of each axis of a pose (rad, m).  Infinite where the poses are not known at all: then the
-        antenna's shape is found, but neither its frames nor its scale (self-calibration).
+        Of each axis of a pose (rad, m).  Infinite where the poses are unknown: then only the
+        antenna's shape is estimated, neither its frames nor its scale (self-calibration).
     model : callable
         Predicts the couplings.
 
@@ -71,7 +71,7 @@ def fit_at_uncertain_poses(
             (seen.antenna * weight[..., None] @ root).reshape(n, 9, -1),
         )
 
-    # Zero where a pose is not known: no prior on it at all.
+    # Zero where a pose is unknown: it has no prior.
     precision = np.repeat([rotation_sigma**-2, position_sigma**-2], 3)
     noise = gtsam.noiseModel.Diagonal.Precisions(precision)
     native, values = gtsam.NonlinearFactorGraph(), gtsam.Values()

@@ -1,7 +1,7 @@
-"""What a survey determines of a tracker's antennas: rank, null space in words, fewest poses.
+"""Observability of a tracker's antennas from a survey: rank, null space and minimum pose count.
 
-By singular values of the whitened Jacobian; what is not known of the poses is eliminated first, so
-that its columns may take up whatever they can.
+Computed from singular values of the whitened Jacobian; uncertain pose components are eliminated
+first by projection.
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ _PARTS = {
 
 @dataclass(frozen=True, eq=False)
 class Observability:
-    """What couplings at some poses determine.
+    """Observability of the antennas from couplings at some poses.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class Observability:
     null_space : tuple of str
         One line for each group of undetermined combinations, in words.
     fewest_poses : int
-        Of these poses, in their order, with which the rank is reached.
+        Number of these poses, in their order, with which the rank is reached.
     """
 
     parameters: int
@@ -62,19 +62,19 @@ def observability(
     positions_known: bool = True,
     centred: bool = False,
 ) -> Observability:
-    """Return what a survey determines of the antennas, without any prior.
+    """Return the observability of the antennas from a survey, without any prior.
 
     Parameters
     ----------
     survey : AntennaSurvey
         One survey; its couplings are not used.
     antenna : Antenna
-        Where the Jacobian is taken: a linear statement.  Symmetric opposites ((p, c, b) to
-        -(p, c, b), (m, s) to -(m, s)) are beyond it.
+        Linearisation point.  Symmetric opposites ((p, c, b) to -(p, c, b), (m, s) to -(m, s)) are
+        beyond a linear analysis.
     attitudes_known, positions_known : bool
-        What the survey knows of its poses.
+        Whether the survey provides the attitudes and positions of its poses.
     centred : bool
-        All coils of an antenna at its origin: the centres are no parameters.
+        All coils of an antenna are at its origin; the centres are no parameters.
     """
     free = ([] if attitudes_known else [0, 1, 2]) + ([] if positions_known else [3, 4, 5])
     columns = np.arange(antenna.vector().shape[-1])
@@ -109,7 +109,7 @@ def _scale(antenna: Antenna, distance: float) -> Array:
 
 
 def _remaining(survey: AntennaSurvey, antenna: Antenna, scale: Array, free: list[int]) -> Array:
-    """Return the whitened Jacobian of each pose, less what the pose can take up, (n, rows, k)."""
+    """Return the whitened Jacobian of each pose, less its projection on the pose, (n, rows, k)."""
     seen = observe_antenna(antenna, survey.beacon_from_sensor, survey.position_beacon)
     weight = 1.0 / survey.sigma[:, None, None]
     rows = (seen.antenna * weight[..., None] * scale).reshape(len(weight), 9, -1)
@@ -129,7 +129,7 @@ def _fewest(rows: Array, rank: int) -> int:
 
 
 def _gauges(antenna: Antenna, beacon_from_sensor: Array) -> dict[str, Array]:
-    """Return the combinations that some surveys cannot see, rows of unscaled parameters."""
+    """Return the unobservable combinations of some surveys, rows of unscaled parameters."""
     moments, centres = antenna.moments_beacon, antenna.centres_beacon
     axes, arms = antenna.sensitivities_sensor, antenna.centres_sensor
     unit, zero = np.eye(3), np.zeros((3, 3))
@@ -186,7 +186,7 @@ def _in_words(null: Array, gauges: dict[str, Array], scale: Array) -> tuple[str,
 
 
 def _without(null: Array, known: Array) -> Array:
-    """Return an orthonormal basis of what is left of a null space beside directions within it."""
+    """Return an orthonormal basis of a null space's complement to directions within it."""
     if not len(known):
         return null
     basis = np.linalg.qr(known.T)[0]

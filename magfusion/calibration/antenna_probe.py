@@ -1,8 +1,8 @@
-"""Calibration of one antenna on a bench: a probe reads the field of each coil driven alone.
+"""Calibration of one antenna on a bench: a probe measures the field of each coil driven alone.
 
-Any points and any axes of the probe do: the four of paper 000 about each coil, the two on its own
-axis that the paper lacks, or a grid.  What they leave open keeps its prior.  A receiving antenna is
-driven as a small transmitting one.
+Any points and probe axes are supported: the four of paper 000 about each coil, the two on its
+axis that the paper lacks, or a grid.  Parameters that they do not determine keep their prior.  A
+receiving antenna is driven as a small transmitting one.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ MOMENTS, CENTRES, SIZES = slice(0, 9), slice(9, 18), slice(18, None)  # of one a
 
 @dataclass(frozen=True, eq=False)
 class ProbeFit:
-    """One antenna as a probe found it.
+    """An antenna calibrated with a probe.
 
     Parameters
     ----------
@@ -47,12 +47,12 @@ Predict = Callable[[Array, ProbeReadings], Array]  # what a probe reads of an an
 
 
 def read_of_term(vector: Array, readings: ProbeReadings) -> Array:
-    """Return what a probe reads of dipoles with the first term of their size, shape (n,) (T)."""
+    """Return a probe's readings of dipoles with the first-order size term, shape (n,) (T)."""
     return _term(vector, readings)[0]
 
 
 def read_of_beacon(beacon: Beacon, put: Callable[[Beacon, Array], Beacon]) -> Predict:
-    """Return what a probe reads of a beacon's coils as a site has them.
+    """Return a probe's readings of a site's beacon coils.
 
     Parameters
     ----------
@@ -145,9 +145,9 @@ def fit_by_probe(
 
 
 def in_units_of_sensitivity(readings: ProbeReadings, vector: Array) -> ProbeReadings:
-    """Return readings of a driven receiver as if its coils' moments were their sensitivities.
+    """Return the readings of a driven receiver, with coil moments equal to its sensitivities.
 
-    What current it was driven with is not known, and need not be: one factor is taken off.
+    The drive current is unknown and not needed: a common factor is removed.
     """
     unit = read_of_term(vector, readings)
     factor = float(readings.reading @ unit) / float(unit @ unit)
@@ -161,7 +161,7 @@ def left_out_errors(
     predict: Predict = read_of_term,
     folds: int = 6,
 ) -> tuple[Array, Array]:
-    """Return errors of readings relative to the field there, by the start and by fits without them.
+    """Return leave-one-point-out errors relative to the field there, of the start and of fits.
 
     All readings at a point are left out together.
     """

@@ -1,7 +1,7 @@
-"""Antennas as a site declares them: predicted by its own model, and written into it.
+"""Antennas declared by a site: predicted with the site's model, and written into it.
 
 A site's coils are loops or current sheets, of which `magfusion.model.antenna` has the first term.
-What is fitted and judged here is the site's model, so that what is written is what was fitted.
+The site's own model is fitted and assessed here, so that the written model is the fitted one.
 """
 
 from dataclasses import dataclass, replace
@@ -46,11 +46,11 @@ class BodySurvey:
     sigma: Array
 
     def rows(self, chosen: Array) -> "BodySurvey":
-        """Return some of the poses."""
+        """Return a subset of the poses."""
         return BodySurvey(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
     def of_sensor(self, beacon: Beacon, sensor: Magnetometer) -> AntennaSurvey:
-        """Return it at the poses of the sensor in beacon axes."""
+        """Return the survey at poses of the sensor in beacon axes."""
         place = self.position_world + self.world_from_body @ sensor.position_body
         return AntennaSurvey(
             beacon.world_from_beacon.T @ self.world_from_body @ sensor.body_from_sensor,
@@ -61,7 +61,7 @@ class BodySurvey:
 
 
 def of_site(beacon: Beacon, sensor: Magnetometer) -> Observe:
-    """Return the model of antennas that are put into a site's coils and magnetometer."""
+    """Return a model that puts antennas into a site's coils and magnetometer."""
     mounted = replace(sensor, position_body=np.zeros(3), body_from_sensor=np.eye(3))
     placed = replace(beacon, position_world=np.zeros(3), world_from_beacon=np.eye(3))
     undone = np.exp(-1j * np.array([coil.phase for coil in beacon.coils]))
@@ -94,7 +94,7 @@ def coils_of(beacon: Beacon, antenna: Antenna) -> Beacon:
 
 
 def _of_size(coil: Coil, kappa: float) -> Coil:
-    """Return the coil as the circular, or long, one of this size."""
+    """Return the coil as a circular, or long, coil of this size."""
     if abs(kappa) < SMALLEST_KAPPA and coil.length is None:
         return replace(coil, radius=None)
     radius, length = coil_shape(kappa, coil.length)
@@ -137,14 +137,14 @@ def with_fit(site: Site, beacon: Beacon, fit: AntennaFit) -> Site:
 def into_mounting(
     fit: AntennaFit, sensor: Magnetometer, declared: Array
 ) -> tuple[AntennaFit, Magnetometer]:
-    """Return a fit whose receiver is turned and shifted as little as can be, and the mounting.
+    """Return a fit whose receiver is rotated and shifted as little as possible, and the mounting.
 
     Parameters
     ----------
     sensor : Magnetometer
         Mounted as in the fit.
     declared : ndarray, shape (3, 3)
-        Matrix from which the fitted one is to differ least.
+        Matrix from which the fitted matrix is to differ least.
     """
     rows = fit.antenna.sensitivities_sensor
     turn, shift = _nearest_turn(rows, declared), np.mean(fit.antenna.centres_sensor, axis=0)
@@ -180,6 +180,6 @@ def into_mounting(
 
 
 def _nearest_turn(rows: Array, declared: Array) -> Array:
-    """Return the rotation Q for which ``rows @ Q`` is next to what is declared."""
+    """Return the rotation Q for which ``rows @ Q`` is nearest to the declared matrix."""
     left, _, right = np.linalg.svd(rows.T @ declared)
     return np.asarray(left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right)

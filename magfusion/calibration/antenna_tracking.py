@@ -1,9 +1,9 @@
-"""What fixes with a site err by at surveyed poses, the survey's own error taken off.
+"""Errors of fixes at surveyed poses, with the survey's own error subtracted.
 
-A fix and the survey's pose differ by the errors of both.  What noise and calibration should make of
-the fix's own is scaled by two witnesses: by what the declared error of the survey leaves of the
-differences, which drowns where the survey errs more than the tracker; and by the residuals that no
-pose takes up, and that are no error of a pose.
+The difference between a fix and the surveyed pose contains the errors of both.  The error
+predicted for the fix from noise and calibration is scaled by two checks: the differences less the
+survey's declared error, which dominates where the survey is less accurate than the tracker; and
+the residuals that no pose explains, which are no error of a pose.
 """
 
 from dataclasses import dataclass, replace
@@ -33,9 +33,9 @@ class PoseErrors:
     difference : ndarray, shape (n, 2)
         From the surveyed poses.
     rms, rms_sigma : ndarray, shape (2,)
-        Of the fixes themselves, and how well that is known.
+        Of the fixes themselves, and its standard deviation.
     survey : ndarray, shape (2,)
-        What the survey's poses err by, as declared.
+        Declared error of the survey's poses.
     """
 
     difference: Array
@@ -45,7 +45,7 @@ class PoseErrors:
 
 
 def fixed_poses(site: Site, beacon: Beacon, survey: BodySurvey) -> tuple[Array, Array]:
-    """Return world_from_body and position (m) of the fixes that are next to the surveyed poses.
+    """Return world_from_body and position (m) of the fixes nearest to the surveyed poses.
 
     By `magfusion.estimation.snapshot.likelihood.fix_epochs`, as ``magfusion fix`` does.
     """
@@ -68,7 +68,7 @@ def fixed_poses(site: Site, beacon: Beacon, survey: BodySurvey) -> tuple[Array, 
 
 
 def differences(site: Site, beacon: Beacon, survey: BodySurvey) -> Array:
-    """Return how far fixes are from the surveyed poses, shape (n, 2) (rad, m)."""
+    """Return the errors of fixes relative to the surveyed poses, shape (n, 2) (rad, m)."""
     rotation, position = fixed_poses(site, beacon, survey)
     turn = np.swapaxes(survey.world_from_body, -1, -2) @ rotation
     off = np.linalg.norm(position - survey.position_world, axis=-1)
@@ -77,13 +77,13 @@ def differences(site: Site, beacon: Beacon, survey: BodySurvey) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """What noise and calibration make of fixes, pose by pose.
+    """Errors of fixes predicted from noise and calibration, per pose.
 
     Parameters
     ----------
     square : ndarray, shape (n, 2)
         Mean square error (rad^2, m^2).
-    excess : ndarray, shape (n,)
+    Square of the residuals that no pose explains, relative to its expected value.
         Square of the residuals that no pose takes up, by what is expected of it.
     """
 
@@ -92,14 +92,14 @@ class Expected:
 
 
 def expected(site: Site, beacon: Beacon, fit: AntennaFit, survey: BodySurvey) -> Expected:
-    """Return what fixes with a site should err by at poses that its antennas were not fitted to.
+    """Return the predicted errors of fixes at poses that the antennas were not fitted to.
 
     Parameters
     ----------
     site, beacon
         With the antennas of the fit.
     survey : BodySurvey
-        At whose poses.
+        Its poses are the evaluation points.
     """
     sensor = site.platform.magnetometer
     own = survey.of_sensor(beacon, sensor)
@@ -128,9 +128,9 @@ def expected(site: Site, beacon: Beacon, fit: AntennaFit, survey: BodySurvey) ->
 
 
 def turned_elsewhere(site: Site, beacon: Beacon, fit: AntennaFit, survey: BodySurvey) -> Array:
-    """Return what fixes should err by where the body was surveyed but turned anyhow, shape (2,).
+    """Return the predicted errors where the body has any attitude at surveyed points, shape (2,).
 
-    Root mean square (rad, m): what a survey of few attitudes leaves open is felt in others.
+    Root mean square (rad, m); parameters undetermined by few attitudes increase it in others.
     """
     n = len(survey.sigma)
     turn = Rotation.random(n, rng=np.random.default_rng(0)).as_matrix()
@@ -139,7 +139,7 @@ def turned_elsewhere(site: Site, beacon: Beacon, fit: AntennaFit, survey: BodySu
 
 
 def own_errors(difference: Array, survey: Array, predicted: Expected | None) -> PoseErrors:
-    """Return what fixes err by themselves.
+    """Return the errors of the fixes alone.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def own_errors(difference: Array, survey: Array, predicted: Expected | None) -> 
     survey : ndarray, shape (2,)
         Error of these, one sigma an axis.
     predicted : Expected, optional
-        What the fixes should err by.
+        Predicted errors of the fixes.
     """
     n, of_survey = len(difference), 3.0 * survey**2
     square = difference**2 - of_survey
@@ -157,7 +157,7 @@ def own_errors(difference: Array, survey: Array, predicted: Expected | None) -> 
         own, variance = np.maximum(plain, np.mean(difference**2, axis=0) / n), spread
     else:
         own, variance = _scaled(square, of_survey, predicted)
-        # A prediction of another shape than the errors have says nothing of them.
+        # A prediction of another shape than the errors is not informative about them.
         other = np.abs(plain - own) > DEVIATES * np.sqrt(spread + variance)
         own, variance = np.where(other, plain, own), np.where(other, spread, variance)
     rms = np.sqrt(np.maximum(own, 0.0))
@@ -165,16 +165,16 @@ def own_errors(difference: Array, survey: Array, predicted: Expected | None) -> 
 
 
 def _scaled(square: Array, of_survey: Array, predicted: Expected) -> tuple[Array, Array]:
-    """Return the mean square of the errors, and its variance, by the scale of the prediction.
+    """Return the mean square of the errors, and its variance, from the scaled prediction.
 
-    Far poses err by many times what near ones do; each tells as much of the scale.
+    Errors at far poses are many times those at near ones; each is equally informative of the scale.
     """
     model = predicted.square
     share = model / (model + of_survey)
     gain = np.sum(share**2 * square / model, axis=0) / np.sum(share**2, axis=0)
     residual = float(np.mean(predicted.excess))
     size = np.maximum(gain, residual)
-    # Three components a pose, of which each is a square of a normal number.
+    # Three components per pose, each the square of a normal variable.
     of_gain = size**2 * (2.0 / 3.0) / np.sum(share**2, axis=0)
     of_residual = (MODELLED * size) ** 2
     weight = of_residual / (of_residual + of_gain)

@@ -1,9 +1,9 @@
-"""Where a beacon is, how it is turned, and its moments, from magnetometers at known poses.
+"""Position, attitude and moments of a beacon from magnetometers at known poses.
 
-The exact method beside that of paper 002 (`magfusion.papers.p002_beacon.calibration`).  The phasors
-are linear in the moments, so that of nine unknowns (centre and two moments, imbalance and angle
-between the coils included) only the centre has to be searched for: variable projection, from a
-grid, because from a single start one fit in two ends in a wrong minimum.
+The exact alternative to paper 002 (`magfusion.papers.p002_beacon.calibration`).  The phasors are
+linear in the moments.  Of nine unknowns (centre and two moments, imbalance and angle between the
+coils included) only the centre needs a search: variable projection from a grid, because every
+second fit from a single start ends in a local minimum.
 """
 
 from dataclasses import dataclass, replace
@@ -28,7 +28,7 @@ LARGEST_CONDITION = 1e7  # of the scaled Jacobian
 
 @dataclass(frozen=True, eq=False)
 class BeaconMeasurements:
-    """What magnetometers at known poses measured of one beacon.
+    """Measurements of one beacon by magnetometers at known poses.
 
     Parameters
     ----------
@@ -37,10 +37,10 @@ class BeaconMeasurements:
     world_from_body : ndarray, shape (points, 3, 3)
     position_world : ndarray, shape (points, 3)
         Origin of the body (m).
-    phasor_sensor : complex ndarray, shape (runs, points, tones, 3)
+    (T), measured axes; NaN where missing.
         (T), measured axes; NaN where one is missing.
     sigma : ndarray, shape (points, tones, 2)
-        Of each component of the real, and of the imaginary part, in all runs (T).
+        Of each component of the real and of the imaginary part, in all runs (T).
     """
 
     beacon: Beacon
@@ -58,7 +58,7 @@ class BeaconMeasurements:
 
     @property
     def unit_moments(self) -> ComplexArray:
-        """The moments of all tones for one of each unknown, shape (unknowns, tones, 3), world."""
+        """The moments of all tones per unit of each unknown, shape (unknowns, tones, 3), world."""
         units: list[ComplexArray] = []
         for tone, real in enumerate(self.real_tones):
             drive = self.beacon.excitation[:, tone].sum()
@@ -75,13 +75,13 @@ class BeaconMeasurements:
 
     @property
     def valid(self) -> BoolArray:
-        """Which points and tones all runs hold, shape (points, tones)."""
+        """Which points and tones are present in all runs, shape (points, tones)."""
         return np.all(np.isfinite(self.phasor_sensor), axis=(0, 3))
 
 
 @dataclass(frozen=True, eq=False)
 class BeaconFits:
-    """The best fit of each run, and its rivals.
+    """The best fit of each run, and other local minima.
 
     Parameters
     ----------
@@ -109,13 +109,13 @@ class BeaconFits:
 def calibrate_beacon(measured: BeaconMeasurements, reach: float = REACH) -> BeaconFits:
     """Find centre and moments of a beacon by variable projection, seeded on a grid.
 
-    Its coils are points: the field of a coil of true size is linear in its current alone, not in
-    its axis; `magfusion.calibration.beacon_refined.calibrate_one` knows the size.
+    Its coils are points: the field of a coil of finite size is linear in its current, but not in
+    its axis; `magfusion.calibration.beacon_refined.calibrate_one` models the size.
 
     Parameters
     ----------
     reach : float
-        How far from the declared place the beacon may be (m).
+        Maximum distance of the beacon from its declared position (m).
 
     Raises
     ------
@@ -154,8 +154,8 @@ def _refuse_too_few(measured: BeaconMeasurements) -> None:
     points = int(np.count_nonzero(valid.any(axis=1)))
     if points < 2:
         raise InputError(
-            f"beacon {name} was measured at {points} point{'s' * (points != 1)}; the range and the"
-            " moments of a beacon need two magnetometers at least"
+            f"beacon {name} was measured at {points} point{'s' * (points != 1)}; its range and"
+            " moments require at least two magnetometers"
         )
     silent = np.flatnonzero(~valid.any(axis=0))
     if len(silent):
@@ -165,8 +165,8 @@ def _refuse_too_few(measured: BeaconMeasurements) -> None:
         centres = beacon.centres_beacon[beacon.excitation[:, tone] != 0.0]
         if np.any(np.ptp(centres, axis=0) > 0.0):
             raise InputError(
-                f"beacon {name}: the coils of tone {tone} have centres of their own; drive them in"
-                " tones or slots of their own to calibrate them"
+                f"beacon {name}: the coils of tone {tone} have separate centres; drive them in"
+                " separate tones or slots to calibrate them"
             )
 
 
@@ -178,7 +178,7 @@ def whitened_parts(measured: BeaconMeasurements, columns: ComplexArray) -> Array
 
 
 def _columns(measured: BeaconMeasurements, centre: Array) -> tuple[Array, Array]:
-    """Return the whitened phasors of unit moments, world axes, and their slope by the centre.
+    """Return the whitened phasors of unit moments, world axes, and their derivative by the centre.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def _columns(measured: BeaconMeasurements, centre: Array) -> tuple[Array, Array]
     for tone in range(len(beacon.tones)):
         own = np.flatnonzero(units[:, tone].any(axis=-1))
         coil = beacon.coils[int(np.flatnonzero(beacon.excitation[:, tone])[0])]
-        # The field of a moment along each axis of the world, as if in slots of their own.
+        # The field of a moment along each axis of the world, as if in separate slots.
         axes = tuple(
             replace(coil, moment_beacon=axis, phase=0.0, slot=slot, radius=None, length=None)
             for slot, axis in enumerate(beacon.world_from_beacon)
@@ -217,14 +217,14 @@ def _columns(measured: BeaconMeasurements, centre: Array) -> tuple[Array, Array]
 def _projected(
     measured: BeaconMeasurements, seen: Array, centre: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return what the best moments leave, its slope by the centre, the moments, all slopes."""
+    """Return residuals of the best moments, their derivative by the centre, moments, all slopes."""
     design, by_centre = _columns(measured, centre)
     basis, upper = np.linalg.qr(design)
     across = np.swapaxes(basis, -1, -2) @ seen[..., None]
     moments = np.linalg.solve(upper, across)[..., 0]
     slope = -np.einsum("kdmc,km->kdc", by_centre, moments)
     residual = seen - (basis @ across)[..., 0]
-    # Kaufman: the slope without what a change of the moments takes up.
+    # Kaufman: the derivative, less its projection on the moments.
     kept = slope - basis @ (np.swapaxes(basis, -1, -2) @ slope)
     return residual, kept, moments, np.concatenate([slope, -design], axis=-1)
 
@@ -239,8 +239,8 @@ def _grid_starts(measured: BeaconMeasurements, seen: Array, reach: float) -> Arr
     clear = np.min(gap, axis=1) > CLEARANCE
     if not clear.any():
         raise InputError(
-            f"beacon {measured.beacon.name}: every magnetometer is at its declared place; correct"
-            " position_m"
+            f"beacon {measured.beacon.name}: every magnetometer is at the declared position;"
+            " correct position_m"
         )
     cost = np.full((len(seen), len(places)), np.inf)
     indices = np.flatnonzero(clear)
@@ -251,7 +251,7 @@ def _grid_starts(measured: BeaconMeasurements, seen: Array, reach: float) -> Arr
     box = cost.reshape(len(seen), *cube.shape[:3])
     lowest = scipy.ndimage.minimum_filter(box, size=(1, 3, 3, 3), mode="nearest")
     ranked = np.where(box == lowest, box, np.inf).reshape(cost.shape)
-    # Where there are fewer minima, the next lowest places.
+    # Where there are fewer minima, use the next lowest points.
     order = np.lexsort((cost, ranked), axis=-1)[:, :STARTS]
     return places[order]
 
@@ -262,7 +262,7 @@ def _inverse(jacobian: Array, reach: float) -> Array:
     Raises
     ------
     InputError
-        Where a combination of unknowns, or the place itself, is not determined.
+        Where a combination of unknowns, or the position itself, is not determined.
     """
     scale = np.linalg.norm(jacobian, axis=-2)
     safe = np.where(scale > 0.0, scale, 1.0)
@@ -279,6 +279,6 @@ def _inverse(jacobian: Array, reach: float) -> Array:
     if np.any(worst > reach):
         raise InputError(
             f"the magnetometers determine the centre of the beacon to {np.max(worst):.2g} m only;"
-            " measure nearer to it, or at more points"
+            " measure closer to it, or at more points"
         )
     return cov

@@ -1,4 +1,4 @@
-"""From fitted moments to a beacon: its attitude, its coils, and how well each is known."""
+"""Attitude and coils of a beacon from its fitted moments, with their sigmas."""
 
 from dataclasses import dataclass, replace
 
@@ -24,17 +24,17 @@ OPEN = 0.1  # of the moment that a turn moves, below which it goes with the driv
 
 @dataclass(frozen=True, eq=False)
 class RefinedBeacon:
-    """One beacon after its calibration.
+    """A beacon after calibration.
 
     Parameters
     ----------
     beacon : Beacon
-        With the posterior sigmas; it predicts what was fitted, but for the drive phase of an
+        With the posterior sigmas; it predicts the fitted phasors, except for the drive phase of an
         unsynchronised beacon.
     phase : ndarray, shape (tones,)
-        Drive phase that was found beyond the coils' own (rad); zero where it is known.
+        Estimated drive phase, in addition to the coils' own (rad); zero where it is known.
     open_beacon : ndarray, shape (n, 3)
-        Axes, declared beacon axes, about which the field tells no rotation: there the declared
+        Axes, declared beacon axes, about which rotation is unobservable: there the declared
         attitude and its sigma are kept.
     """
 
@@ -44,10 +44,10 @@ class RefinedBeacon:
 
 
 def attitudes(beacon: Beacon, moments_world: ComplexArray) -> tuple[Array, Array]:
-    """Return the attitude in which the declared moments fit the found ones best.
+    """Return the attitude in which the declared moments best match the estimated ones.
 
     The polar decomposition of paper 002's problem: imbalance and angle between the coils are
-    split evenly.  Of rotations that fit alike, the one nearest to the declared.
+    split evenly.  Of equally good rotations, the one nearest to the declared is returned.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def attitudes(beacon: Beacon, moments_world: ComplexArray) -> tuple[Array, Array
     -------
     world_from_beacon : ndarray, shape (runs, 3, 3)
     phase : ndarray, shape (runs, tones)
-        Of the drive beyond the declared (rad); zero for a synchronised beacon.
+        Of the drive, in addition to the declared (rad); zero for a synchronised beacon.
     """
     declared = _drive(beacon)
     unit = declared / np.linalg.norm(declared, axis=-1, keepdims=True) ** 2
@@ -86,7 +86,7 @@ def coil_moments(
 ) -> Array:
     """Return the moments of the coils in beacon axes, shape (runs, coils, 3) (A m^2).
 
-    Where a tone drives more coils than its field can tell apart, they change least.
+    Where a tone drives more coils than its field can separate, the change is the smallest possible.
     """
     turned = (moments_world * np.exp(-1j * phase)[..., None]) @ world_from_beacon
     change = turned - _drive(beacon)
@@ -98,7 +98,7 @@ def coil_moments(
 def open_axes(beacon: Beacon) -> Array:
     """Return the axes, beacon frame, about which a rotation cannot be determined, shape (n, 3).
 
-    A coil's own axis, and, where the drive phase is unknown, the axis of a rotating field.
+    A coil's own axis and, where the drive phase is unknown, the axis of a rotating field.
     """
     drive = _drive(beacon)
     turns = np.stack([np.cross(axis, drive).ravel() for axis in np.eye(3)], axis=-1)
@@ -114,11 +114,11 @@ def _parts(columns: ComplexArray) -> Array:
 
 
 def calibrate_one(measured: BeaconMeasurements, reach: float) -> tuple[BeaconFits, RefinedBeacon]:
-    """Calibrate a beacon whose coils may have centres and sizes of their own, from one run.
+    """Calibrate a beacon whose coils may have separate centres and sizes, from one run.
 
-    Their offsets turn with the attitude that is to be found, and so does what their size adds to
-    the field of points, which is taken off the measurements: the fit is repeated with what it
-    found until that stays.
+    The coils' offsets rotate with the attitude to be estimated, and so does the contribution of
+    their size to the field, which is subtracted from the measurements.  The fit is iterated until
+    both converge.
 
     Parameters
     ----------
@@ -137,14 +137,14 @@ def calibrate_one(measured: BeaconMeasurements, reach: float) -> tuple[BeaconFit
 
 
 def _of_size(measured: BeaconMeasurements, found: RefinedBeacon) -> ComplexArray:
-    """Return what the coils' size adds to the phasors of points, shape (points, tones, 3)."""
+    """Return the contribution of the coils' size to the phasors, shape (points, tones, 3)."""
     place = (measured.magnetometer, measured.world_from_body, measured.position_world)
     phase = np.broadcast_to(found.phase, (len(measured.position_world), len(found.phase)))
     return predict(found.beacon, *place, phase) - predict(as_points(found.beacon), *place, phase)
 
 
 def refine(measured: BeaconMeasurements, fits: BeaconFits, run: int = 0) -> RefinedBeacon:
-    """Return the beacon as one run of the calibration found it, with posterior sigmas."""
+    """Return the beacon of one calibration run, with posterior sigmas."""
     declared, moments = measured.beacon, fits.moments_world[run : run + 1]
     rotation, phase = attitudes(declared, moments)
     coils = coil_moments(declared, moments, rotation, phase)[0]
@@ -176,7 +176,7 @@ def refine(measured: BeaconMeasurements, fits: BeaconFits, run: int = 0) -> Refi
 def _spread(
     measured: BeaconMeasurements, moments: ComplexArray, rotation: Array, coils: Array
 ) -> Array:
-    """Return how attitude and log-moments follow the fitted moments, by central differences."""
+    """Return the derivatives of attitude and log-moments by the moments, by central differences."""
     step = 1e-5 * float(np.max(np.abs(moments)))
     units = step * measured.unit_moments
     sides = np.concatenate([units, -units])
@@ -196,7 +196,7 @@ def fit_known_moments(
     Parameters
     ----------
     centre_world : ndarray, shape (runs, 3)
-        Where to start (m), e.g. `calibrate_beacon`.
+        Start (m), e.g. from `calibrate_beacon`.
     world_from_beacon : ndarray, shape (runs, 3, 3)
 
     Returns
@@ -210,7 +210,7 @@ def fit_known_moments(
 
     def model(rows: IntArray, pose: Array) -> Normal:
         rotation, centre = pose[:, :9].reshape(-1, 3, 3), pose[:, 9:]
-        # The beacon stays; magnetometers move with the frame in which it has the asked pose.
+        # The beacon is fixed; magnetometers move with the frame in which it has the requested pose.
         back = measured.beacon.world_from_beacon @ np.swapaxes(rotation, -1, -2)
         position = (measured.position_world - centre[:, None]) @ np.swapaxes(back, -1, -2)
         found = observe(

@@ -1,8 +1,8 @@
-"""Calibration from turning alone: the readings lie on an ellipsoid, the field on a sphere.
+"""Calibration from rotation alone: the readings lie on an ellipsoid, the field on a sphere.
 
-The ellipsoid has nine parameters of the twelve: it does not see by which rotation its shape became
-a sphere.  With the vertical known in the sensor's axes beside each reading, the angle between field
-and vertical must be the same in all of them, which fixes the rotation too.
+The ellipsoid has nine of the twelve parameters: the rotation between the ellipsoid and the sphere
+is unobservable.  If the vertical in sensor axes is known for each reading, the angle between field
+and vertical must be the same in all of them, which determines the rotation too.
 """
 
 from collections.abc import Callable
@@ -22,16 +22,16 @@ from magfusion.units import Array, IntArray
 
 FEWEST_READINGS = 9
 EXACT = 1e-12  # of the field; a residual that is rounding
-# What is no ellipsoid of readings, by margins that no rounding reaches and no instrument either.
+# Thresholds for readings on no ellipsoid, far from rounding errors and from any real instrument.
 NARROWEST = 0.03  # shortest over longest axis
 OFF_SURFACE = 0.1  # of the field; by which readings miss the surface
 LOOSEST = 0.3  # of the longest axis; sigma of the shape
-_NO_ELLIPSOID = "the readings lie on no ellipsoid; turn the sensor all round, away from iron"
+_NO_ELLIPSOID = "the readings lie on no ellipsoid; rotate the sensor about all axes, away from iron"
 _SYMMETRIC = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
 
 
 def fit_ellipsoid(measured: Array, field_size: float) -> MagnetometerFit:
-    """Fit the ellipsoid on which readings lie, by least squares of the field's size.
+    """Fit an ellipsoid to readings, by least squares of the field's magnitude.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def fit_ellipsoid(measured: Array, field_size: float) -> MagnetometerFit:
     Returns
     -------
     MagnetometerFit
-        The symmetric matrix of this shape; the covariance holds the rotation as known.
+        The symmetric matrix of this shape; the covariance assumes a known rotation.
 
     Raises
     ------
@@ -81,23 +81,23 @@ def fit_ellipsoid(measured: Array, field_size: float) -> MagnetometerFit:
 
 
 def fit_ellipsoid_gravity(measured: Array, up_sensor: Array, field_size: float) -> MagnetometerFit:
-    """Fit all twelve parameters to the field's size and to its angle with the vertical.
+    """Fit all twelve parameters to the field's magnitude and to its angle with the vertical.
 
     Parameters
     ----------
     measured : ndarray, shape (..., n, 3)
         (T)
     up_sensor : ndarray, shape (..., n, 3)
-        The vertical, by the accelerometer at rest, of any length.
+        The vertical, measured by the accelerometer at rest, of any length.
     field_size : float
         (T)
 
     Returns
     -------
     MagnetometerFit
-        The dip is estimated beside it: it costs nothing where the orientations are varied.  Both
-        residuals of a reading stem from the same noise and are correlated; the fit weighs them as
-        if they were not (the graph does better), the covariance does not.
+        The dip is also estimated, at no loss of accuracy for varied orientations.  Both residuals
+        of a reading stem from the same noise and are correlated; the fit ignores the correlation
+        (the graph does not), the covariance includes it.
 
     Raises
     ------
@@ -132,12 +132,12 @@ def _field(measured: Array, inverse: Array, centre: Array) -> Array:
 def _solved(
     rows_at: Callable[..., tuple[Array, Array]], start: Array, *readings: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the state (..., k) of least squares with its residuals and their Jacobian.
+    """Return the least-squares state (..., k) with its residuals and their Jacobian.
 
     Raises
     ------
     EstimationError
-        Where the readings leave a direction of the state open, or the search does not settle.
+        Where the readings do not determine the state, or the search does not converge.
     """
     each = [part.reshape(-1, *part.shape[-2:]) for part in readings]
 

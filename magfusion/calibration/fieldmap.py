@@ -1,9 +1,9 @@
-"""Learn where, and by how much, a beacon's field is not what its model says.
+"""Map the deviation of a beacon's field from its model over a room.
 
-Fingerprinting carried to its end: the model where there is one, a map where it fails.  The
-logarithm of the gain and a small rotation are a Gaussian process of position; a survey measures
-both through the phasors, linearly but for a small step, so that the posterior is exact whatever
-the number of coils and tones, and whatever they leave open.
+Model-based fingerprinting: the model where it is valid, a map where it is not.  The logarithm of
+the gain and a small rotation are a Gaussian process of position.  A survey measures both through
+the phasors, linearly except for a small step, so that the posterior is exact for any number of
+coils and tones, whatever components they leave unobservable.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ _LIMITS = ((0.1, 30.0), (1e-4, 2.0), (1e-4, 0.6), (1e-4, 0.3))
 
 @dataclass(frozen=True, eq=False)
 class MapPoints:
-    """What was measured of every beacon at known poses.
+    """Measurements of every beacon at known poses.
 
     Parameters
     ----------
@@ -49,8 +49,8 @@ class MapPoints:
     sigma : ndarray, shape (n, channels)
         Of each component (T).
     phase : ndarray, shape (n, channels), optional
-        Drive phase beyond what the coils declare (rad).  None leaves that of unsynchronised
-        beacons free at each point.
+        Drive phase in addition to the coils' own (rad).  If None, the phase of unsynchronised
+        beacons is estimated at each point.
     """
 
     world_from_body: Array
@@ -63,7 +63,7 @@ class MapPoints:
         return len(self.position_world)
 
     def rows(self, rows: IntArray) -> "MapPoints":
-        """Return some of the points."""
+        """Return a subset of the points."""
         phase = None if self.phase is None else self.phase[rows]
         return MapPoints(
             self.world_from_body[rows],
@@ -76,15 +76,15 @@ class MapPoints:
 
 @dataclass(frozen=True, eq=False)
 class MapFit:
-    """A site with its map, and what the map is worth.
+    """A site with its map, and the map's accuracy.
 
     Parameters
     ----------
     error_without, error_with : dict of str to float
-        Relative error of each beacon's modelled field at points that the map was not learnt from,
-        root mean square over the points.
+        Relative error of each beacon's modelled field at points not used for the map, root mean
+        square over the points.
     points : dict of str to int
-        That the map of each beacon rests on.
+        Number of points used for the map of each beacon.
     """
 
     site: Site
@@ -114,12 +114,12 @@ class _Process(NamedTuple):
 
 
 def learn_field_map(site: Site, points: MapPoints) -> MapFit:
-    """Learn the map of every beacon; the process is common to all.
+    """Estimate the map of every beacon; all beacons share the process.
 
     Parameters
     ----------
     site : Site
-        Maps that it has already are replaced.
+        Existing maps are replaced.
 
     Raises
     ------
@@ -130,8 +130,8 @@ def learn_field_map(site: Site, points: MapPoints) -> MapFit:
     for beacon, found in zip(site.beacons, detected, strict=True):
         if len(found.sensor_world) < FEWEST_POINTS:
             raise EstimationError(
-                f"beacon {beacon.name} was detected at {len(found.sensor_world)} points, and a map"
-                f" needs {FEWEST_POINTS}; survey more of the room"
+                f"beacon {beacon.name} was detected at {len(found.sensor_world)} points; a map"
+                f" requires {FEWEST_POINTS}; survey more of the room"
             )
     process = _best_process(detected)
     maps = [_conditioned(found, process) for found in detected]
@@ -167,7 +167,7 @@ def _all_detected(site: Site, points: MapPoints) -> list[_DetectedFields]:
         if phase is None and not beacon.synchronised:
             plain = _aligned(plain, measured)
         there = np.isfinite(measured).all(axis=(1, 2))
-        # A matrix near the identity leaves white noise white.
+        # A near-identity matrix leaves white noise white.
         variance = np.tile(points.sigma[:, tones] ** 2, 2)
         found.append(
             _DetectedFields(
@@ -181,7 +181,7 @@ def _all_detected(site: Site, points: MapPoints) -> list[_DetectedFields]:
 
 
 def _aligned(plain: ComplexArray, measured: ComplexArray) -> ComplexArray:
-    """Return the model with the drive phase of each tone that the measurement has."""
+    """Return the model with the measured drive phase of each tone."""
     lag = np.angle(np.sum(np.conj(plain) * measured, axis=-1, keepdims=True))
     return plain * np.exp(1j * lag)
 
@@ -191,7 +191,7 @@ def _stacked(phasor: ComplexArray) -> Array:
 
 
 def _reduced(detected: _DetectedFields, state: Array, residual: float) -> tuple[Array, Array]:
-    """Return what each point knows of gain and rotation: information (m, 4, 4), vector (m, 4).
+    """Return each point's information on gain and rotation (m, 4, 4), and its vector (m, 4).
 
     Linear about ``state`` (m, 4): gain and rotation at each point.
     """
@@ -212,7 +212,7 @@ def _reduced(detected: _DetectedFields, state: Array, residual: float) -> tuple[
 def _plain_gain(detected: _DetectedFields) -> Array:
     """Return the log-gain of each point on its own, shape (m,).
 
-    From a gain of one, a step towards one of a half or of two errs by a fifth.
+    For a gain between a half and two, one step from a gain of one errs by at most a fifth.
     """
     gain = np.sum(detected.measured * detected.model, axis=(1, 2)) / np.sum(
         detected.model**2, axis=(1, 2)
@@ -230,7 +230,7 @@ def _conditioned(detected: _DetectedFields, process: _Process) -> FieldMap:
         system = np.eye(len(kernel)) + block_diagonal(information) @ kernel
         weights = np.linalg.solve(system, vector.ravel())
         before, state = state, (kernel @ weights).reshape(count, COMPONENTS)
-        # Where a survey is not of these beacons, steps would grow beyond any gain.
+        # Where a survey is of other beacons, steps would diverge.
         state[:, 0] = np.clip(state[:, 0], np.log(_WEAKEST), -np.log(_WEAKEST))
         if np.max(np.abs(state - before)) < SETTLED:
             break
@@ -246,9 +246,9 @@ def _conditioned(detected: _DetectedFields, process: _Process) -> FieldMap:
 
 
 def _best_process(detected: Sequence[_DetectedFields]) -> _Process:
-    """Return the process that predicts points left out best, by Student's t.
+    """Return the process that predicts left-out points best, by Student's t.
 
-    The greatest likelihood would let the few points beside iron decide: it explains all by noise.
+    The maximum likelihood would be dominated by the few points near iron and explain all as noise.
     """
     parts = [_folds(_evenly(h, LEARNT_FROM), FOLDS) for h in detected]
     count = sum(asked.model.size for folds in parts for _, asked in folds)
@@ -262,7 +262,7 @@ def _best_process(detected: Sequence[_DetectedFields]) -> _Process:
 
 
 def _folds(detected: _DetectedFields, folds: int) -> list[tuple[_DetectedFields, _DetectedFields]]:
-    """Return pairs of points that are known and points that are asked for."""
+    """Return pairs of known points and query points."""
     fold = np.arange(len(detected.sensor_world)) % folds
     return [
         (
@@ -274,7 +274,7 @@ def _folds(detected: _DetectedFields, folds: int) -> list[tuple[_DetectedFields,
 
 
 def _surprise(known: _DetectedFields, asked: _DetectedFields, process: _Process) -> float:
-    """Return minus the log-score of what a map predicts, but for a constant."""
+    """Return the negative log-score of a map's predictions, up to a constant."""
     found = _conditioned(known, process)
     strength = np.mean(np.sum(asked.model**2, axis=2), axis=1)
     error = found.relative_variance(asked.sensor_world)
@@ -301,7 +301,7 @@ def _evenly(detected: _DetectedFields, most: int) -> _DetectedFields:
 
 
 def _cross_validated(detected: _DetectedFields, process: _Process) -> tuple[float, float]:
-    """Return the relative error at points left out, without the map and with it."""
+    """Return the relative error at left-out points, without the map and with it."""
     without, left = [], []
     for known, asked in _folds(detected, FOLDS):
         without.append(_relative(asked.model, asked.measured))
@@ -319,7 +319,7 @@ def _rms(value: Array) -> float:
 
 
 def thinned(points: MapPoints, site: Site, spacing: float) -> MapPoints:
-    """Return one point of each cube of a grid: the one with the least noise.
+    """Return one point per cube of a grid: the one with the least noise.
 
     Parameters
     ----------

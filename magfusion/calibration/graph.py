@@ -1,8 +1,8 @@
-"""The graph of a calibration: uncertain poses or attitudes, and one dense calibration beside them.
+"""The graph of a calibration: uncertain poses or attitudes, and one dense calibration.
 
-GTSAM's own factors hold the poses; what the instruments read at all of them is linearised in one
-batched call and enters as Jacobian factors, because a Python factor is called with a copy of all
-values.
+GTSAM's own factors constrain the poses.  The instruments' readings at all poses are linearised in
+one batched call and enter as Jacobian factors, because a Python factor is called with a copy of
+all values.
 """
 
 from collections.abc import Callable
@@ -21,12 +21,12 @@ CALIBRATION_KEY = gtsam.symbol("c", 0)
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What the loop moves.
+    """The estimate that the optimiser updates.
 
     Parameters
     ----------
     values : gtsam.Values
-        Pose or attitude X(i) of each reading, and what else the native factors know.
+        Pose or attitude X(i) of each reading, and the other variables of the native factors.
     calibration : ndarray, shape (k,)
     """
 
@@ -47,12 +47,11 @@ class CalibrationGraph:
         Returns whitened residuals (n, m) with derivatives by pose (n, m, d) and by calibration
         (n, m, k).
     native : gtsam.NonlinearFactorGraph
-        What is known of the poses, linearised by GTSAM.
+        Prior factors of the poses, linearised by GTSAM.
     declared, cov : ndarray, shape (k,) and (k, k)
         Prior of the calibration.
     steps : dict of int to ndarray
-        Each key of the values, in the order of elimination, with the step that a damping of one
-        holds back.
+        Each key of the values, in the order of elimination, with the step scale of unit damping.
     """
 
     rows: Rows
@@ -63,7 +62,7 @@ class CalibrationGraph:
 
     @property
     def ordering(self) -> gtsam.Ordering:
-        """Of elimination: the calibration last."""
+        """Elimination order: the calibration last."""
         out = gtsam.Ordering()
         for key in (*self.steps, CALIBRATION_KEY):
             out.push_back(key)
@@ -91,13 +90,13 @@ class CalibrationGraph:
         return graph
 
     def moved(self, estimate: Estimate, step: gtsam.VectorValues) -> Estimate:
-        """Return the estimate moved by a step of every variable."""
+        """Return the estimate updated by a step of every variable."""
         return Estimate(
             estimate.values.retract(step), estimate.calibration + step.at(CALIBRATION_KEY)
         )
 
     def damping_scales(self) -> list[tuple[int, Array]]:
-        """Return, for each key, the step that a damping of one holds back."""
+        """Return, for each key, the step scale of unit damping."""
         return [*self.steps.items(), (CALIBRATION_KEY, np.sqrt(np.diag(self.cov)))]
 
 
@@ -109,20 +108,20 @@ def solve(
     Parameters
     ----------
     name : str
-        Of what is calibrated, for the messages.
+        Of the calibrated device, for the messages.
     iterations, tolerance
         As in `magfusion.estimation.solve.bordered.optimise`.
 
     Raises
     ------
     EstimationError
-        Where the loop does not converge, or the graph leaves something open.
+        Where the loop does not converge, or the graph leaves a variable undetermined.
     """
     found = optimise(graph, start, iterations=iterations, tolerance=tolerance)
     if not found.converged:
         raise EstimationError(
-            f"the calibration of the {name} does not converge in {iterations} steps: readings and"
-            " priors disagree by far more than their sigmas allow"
+            f"the calibration of the {name} does not converge in {iterations} iterations: readings"
+            " and priors are inconsistent by far more than their sigmas allow"
         )
     linear, ordering = graph.linearized(found.estimate), graph.ordering
     try:

@@ -1,4 +1,4 @@
-"""The error model of a magnetometer, and what every calibration of one hands back.
+"""The error model of a magnetometer, and the result of its calibrations.
 
 ``measured = matrix @ field_sensor + offset``, as logs and sites have it.  Paper 001 has
 ``V = b + K o (B + E B)`` (Eq 1-3, with ``ezy Bz`` for the ``ezy By`` of Eq 2): the same with
@@ -6,7 +6,7 @@
 
 Gravity and angular rate are known in body axes, the field in sensor axes.  A rotation of the
 mounting and one of the matrix cannot be separated: here the mounting ``body_from_sensor`` is kept
-as declared and the matrix takes the rest, so that it need not be symmetric.
+as declared and the matrix contains the rest, so that it need not be symmetric.
 """
 
 from dataclasses import dataclass, replace
@@ -62,7 +62,7 @@ def to_paper(matrix: Array, offset: Array) -> tuple[Array, Array, Array]:
 
 
 def field_from_measured(measured: Array, matrix: Array, offset: Array) -> Array:
-    """Return the field that made the readings.
+    """Return the field from calibrated readings.
 
     Parameters
     ----------
@@ -81,13 +81,13 @@ def field_from_measured(measured: Array, matrix: Array, offset: Array) -> Array:
 
 
 def spread(field: Array) -> float:
-    """Return standard deviation over mean of the size of a field, shape (n, 3)."""
+    """Return standard deviation over mean of the magnitude of a field, shape (n, 3)."""
     size = np.linalg.norm(field, axis=1)
     return float(np.std(size) / np.mean(size))
 
 
 def missing_orientations(up_sensor: Array) -> list[str]:
-    """Say in words which orientations a calibration lacks.
+    """Describe which orientations a calibration lacks.
 
     Parameters
     ----------
@@ -113,9 +113,9 @@ def missing_orientations(up_sensor: Array) -> list[str]:
 def prior_cov(declared: Magnetometer) -> Array:
     """Return the covariance of matrix and offset before the data, shape (12, 12).
 
-    A sigma of zero, by which a site says that it takes a value for known, is no prior for the job
-    that is to find that value: `WIDE_MATRIX` and `WIDE_OFFSET` stand in for it.  The uncertainty of
-    the mounting is added, because the matrix takes its error.
+    A sigma of zero, by which a site declares a value as known, is no prior for the job that
+    estimates this value: `WIDE_MATRIX` and `WIDE_OFFSET` replace it.  The uncertainty of the
+    mounting is added, because the matrix absorbs its error.
     """
     sigma = declared.sigma
     matrix = np.where(sigma.matrix > 0.0, sigma.matrix, WIDE_MATRIX)
@@ -127,11 +127,11 @@ def prior_cov(declared: Magnetometer) -> Array:
 
 
 def refined(declared: Magnetometer, fit: MagnetometerFit) -> Magnetometer:
-    """Return the magnetometer as calibrated, with sigmas that a site can hold.
+    """Return the calibrated magnetometer, with sigmas in the form of a site.
 
     A site has one sigma for each entry of the matrix and one for each axis of the mounting, no
     correlations.  They are chosen so that the symmetric and the antisymmetric part of the matrix
-    keep their variances: what the antisymmetric part is more uncertain by goes to the mounting.
+    keep their variances: the excess of the antisymmetric part goes to the mounting.
     """
     square = fit.cov[:9, :9].reshape(3, 3, 3, 3)
     matrix = np.sqrt(np.einsum("ijij->ij", square))

@@ -1,8 +1,8 @@
 """Calibration as a factor graph: an attitude for each epoch, and the magnetometer's twelve numbers.
 
-What the ellipsoid knows as a size and an angle is here the vector itself, so that the noise has the
-weight it should.  The attitudes are tied together by what there is: the vertical by the
-accelerometer, the turn from one epoch to the next by the gyro, a turntable's setting.
+The residual is the full vector, not magnitude and angle as in the ellipsoid fit, so that the noise
+has its correct weight.  The attitudes are constrained by the available sensors: the vertical from
+the accelerometer, the rotation between epochs from the gyro, and the turntable's settings.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ ATTITUDE_STEP, GYRO_BIAS_STEP = np.full(3, 0.3), np.full(3, 0.01)  # rad, rad/s
 
 @dataclass(frozen=True, eq=False)
 class Epochs:
-    """What the instruments read at each attitude, and what is known of the attitudes.
+    """Readings of the instruments at each attitude, and the priors of the attitudes.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class Epochs:
     accel_sigma : ndarray, shape (n,), optional
         Of each component, motion included (m/s^2).
     turns : tuple, optional
-        One for each interval: the gyro's preintegrated turn, or None where it has none.
+        One for each interval: the gyro's preintegrated rotation, or None without gyro data.
     world_from_body : ndarray, shape (n, 3, 3), optional
         As a turntable was set.
     table_sigma : float, optional
@@ -62,7 +62,7 @@ class Epochs:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known before the data, and fixed where its sigma is zero.
+    """Priors of the calibration; a sigma of zero fixes a value.
 
     Parameters
     ----------
@@ -72,11 +72,11 @@ class Prior:
     cov : ndarray, shape (12, 12)
         Of the matrix, row by row, and the offset (1, T).
     field_world : ndarray, shape (3,)
-        Earth field (T); where its size is fixed it sets the scale of the matrix.
+        Earth field (T); where its magnitude is fixed it sets the scale of the matrix.
     dip_sigma : float
         Of the angle between field and vertical (rad).
     size_sigma : float
-        Of the natural logarithm of the field's size.
+        Of the natural logarithm of the field's magnitude.
     gravity : float
         (m/s^2)
     accel_bias_sigma, gyro_bias_sigma : float
@@ -97,12 +97,12 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class GraphFit:
-    """A calibrated magnetometer with everything found beside it.
+    """A calibrated magnetometer with the other estimates.
 
     Parameters
     ----------
     world_from_body : ndarray, shape (n, 3, 3)
-        Where only the field gives the heading, the world turns with the field's declination.
+        Where only the field gives the heading, the world frame is rotated by the declination.
     dip_change : float
         Of the field's angle below the horizon (rad).
     accel_bias_body, gyro_bias_body : ndarray, shape (3,)
@@ -112,7 +112,7 @@ class GraphFit:
     chi_square : float
         Of all factors.
     size_ratio : float
-        Size of the field, as found, over that of the prior.
+        Estimated magnitude of the field over that of the prior.
     """
 
     fit: MagnetometerFit
@@ -127,9 +127,9 @@ class GraphFit:
 
 
 class Readings:
-    """What all epochs read, in units of the field and of gravity, which keep all numbers near one.
+    """Readings of all epochs, in units of the field and of gravity (numbers near one).
 
-    The calibration is what is estimated of the seventeen columns.
+    The calibration is the estimated subset of the seventeen columns.
     """
 
     def __init__(self, epochs: Epochs, prior: Prior) -> None:
@@ -151,7 +151,7 @@ class Readings:
         self.declared[:12] = np.concatenate([prior.matrix.ravel(), prior.offset / self.size])
 
     def prior_cov(self) -> Array:
-        """Return the covariance of what is estimated, before the data."""
+        """Return the prior covariance of the estimated columns."""
         cov = np.zeros((COLUMNS, COLUMNS))
         cov[:12, :12] = self.prior.cov * np.outer(self.unit[:12], self.unit[:12])
         cov[12, 12] = self.prior.dip_sigma**2
@@ -160,7 +160,7 @@ class Readings:
         return cov[np.ix_(self.active, self.active)]
 
     def all_columns(self, estimate: Estimate) -> Array:
-        """Return the seventeen columns: what is estimated among what is fixed."""
+        """Return all seventeen columns, estimated and fixed."""
         out = self.declared.copy()
         out[self.active] = estimate.calibration
         return out
@@ -205,17 +205,17 @@ class Readings:
 
 
 def fit_graph(epochs: Epochs, prior: Prior, start: MagnetometerFit | None = None) -> GraphFit:
-    """Find matrix, offset, attitudes and the inertial biases that explain all readings best.
+    """Estimate matrix, offset, attitudes and inertial biases from all readings.
 
     Parameters
     ----------
     start : MagnetometerFit, optional
-        Where to begin; the prior's values where it is not given.
+        Initial estimate; by default the prior's values.
 
     Raises
     ------
     EstimationError
-        Where the graph leaves attitudes open, or the search does not settle.
+        Where the graph leaves attitudes undetermined, or the search does not converge.
     """
     readings = Readings(epochs, prior)
     first = _start(readings, epochs, start)

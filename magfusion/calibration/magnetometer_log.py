@@ -1,4 +1,4 @@
-"""A magnetometer calibrated from the log of slow turning by hand, or of stops all round."""
+"""Magnetometer calibration from a log of slow rotation by hand, or of static orientations."""
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -36,8 +36,8 @@ WIDE_SIZE = 3.0  # sigma of the logarithm of the field's size, where nobody decl
 ACCEL_FLOOR = 0.03  # m/s^2; scale errors of MEMS accelerometers
 GYRO_SCALE = 0.001  # relative; errors of scale and axes of a calibrated MEMS gyro
 SHAKEN = 5  # epochs over which disturbed specific force is looked for
-# Of the sigma by which a motion disturbs the vertical: a hand tilts in step with its acceleration,
-# so that many shaken epochs tell no more than a few.
+# Of the sigma by which motion disturbs the vertical: a hand tilts in step with its acceleration,
+# so that many shaken epochs are no more informative than a few.
 IN_STEP = 4.0
 FIRST_SIGMA = 1e-3  # of the field, before its noise is measured
 FIELD_SCALES = (0.05, 20.0)  # by which the first guess of an undeclared field's size may be wrong
@@ -47,27 +47,27 @@ PASSES = 3
 
 @dataclass(frozen=True, eq=False)
 class LogCalibration:
-    """A calibration from a log, and what it rests on.
+    """A calibration from a log, and the data it is based on.
 
     Parameters
     ----------
     magnetometer : Magnetometer
         As calibrated.
     readings : SteadyField
-        What the graph took.
+        Readings used in the graph.
     field_sigma : float
-        Noise of a reading, measured (T).
+        Estimated noise of a reading (T).
     missing : list of str
-        Orientations that were not there, in words.
+        Descriptions of missing orientations.
     scale_known : bool
         Whether the site's Earth field set the scale; else the declared matrix did.
     spread_unseen : float, optional
-        Standard deviation over mean of the field's size in each half of the log by the calibration
-        on the other half; None where a half is not enough.
+        Standard deviation over mean of the field's magnitude in each half of the log with the
+        calibration of the other half; None where a half is too short.
     shape_kept : bool
-        Whether the declared shape and offset did as well on the unseen half, and were kept.
+        Whether the declared shape and offset fit the other half as well, and were kept.
     rival : ndarray, shape (3,), optional
-        Another offset (T), far from the one found, that explains the readings nearly as well.
+        Another offset (T), far from the estimate, that explains the readings nearly as well.
     """
 
     magnetometer: Magnetometer
@@ -85,7 +85,7 @@ class LogCalibration:
 def calibrate_log(
     waveform: Waveform, imu: ImuSamples, site: Site, *, at_stops: bool = False
 ) -> LogCalibration:
-    """Calibrate the magnetometer of a platform that was turned.
+    """Calibrate the magnetometer of a rotated platform.
 
     Parameters
     ----------
@@ -93,13 +93,13 @@ def calibrate_log(
         Beacons may transmit; their tones average out.
     site : Site
         Its sigmas of the magnetometer are the prior, its Earth field sets the scale.
-    at_stops : bool
+    Use only the stops, of which twelve are needed, with each axis up and down among them.
         Take only the stops, of which twelve are needed, each axis up and down among them.
 
     Raises
     ------
     InputError
-        Where the platform was turned too little, or stood still too rarely for ``at_stops``.
+        Where the platform is rotated too little, or has too few stops for ``at_stops``.
     EstimationError
         Where the graph has no solution.
     """
@@ -160,20 +160,20 @@ def _readings(
         readings = steady_field(waveform, imu, site, magnetometer=known)
         if len(readings) < FEWEST_EPOCHS:
             raise InputError(
-                f"magnetometer: the log gives {len(readings)} readings, and {FEWEST_EPOCHS} are"
-                " needed; turn the sensor slowly for a minute"
+                f"magnetometer: the log gives {len(readings)} readings; {FEWEST_EPOCHS} are"
+                " required; rotate the sensor slowly for a minute"
             )
         return readings
     stops = find_stops(imu, site.platform.motion)
     if len(stops) == 0:
         raise InputError(
-            "imu: no rest was found; set the sensor down for three seconds in each of the twelve"
-            " positions, or leave --positions away"
+            "imu: no stationary interval was found; keep the sensor at rest for three seconds in"
+            " each of the twelve positions, or omit --positions"
         )
     if len(stops) < POSITIONS:
         raise InputError(
-            f"imu: {len(stops)} stops were found and {POSITIONS} are needed; set the sensor down"
-            " for three seconds in each position, or leave --positions away"
+            f"imu: {len(stops)} stops were found and {POSITIONS} are required; keep the sensor at"
+            " rest for three seconds in each position, or omit --positions"
         )
     offset = site.platform.imu.time_offset
     window = np.minimum(stops.length, LONGEST)
@@ -184,21 +184,21 @@ def _refuse_one_axis(
     readings: SteadyField, known: Magnetometer, field_world: Array | None, missing: list[str]
 ) -> None:
     field = field_from_measured(readings.measured_sensor, known.matrix, known.offset)
-    # Not the directions of the readings: a hard iron that is yet to be found hides their turning.
+    # Not the directions of the readings: an unknown hard iron hides their rotation.
     size = np.linalg.norm(field if field_world is None else field_world, axis=-1)
     spreads = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(field.T)), 0.0)) / np.median(size)
     if spreads[1] < ONE_AXIS:
         raise InputError(
             "magnetometer: too few orientations to calibrate on: "
-            + (", ".join(missing) or "the field kept to one line in the sensor")
-            + "; turn it slowly about all its axes"
+            + (", ".join(missing) or "the field stays along one line in the sensor")
+            + "; rotate it slowly about all its axes"
         )
 
 
 def _refuse_few_stops(found: int, missing: list[str]) -> None:
     if missing or found < POSITIONS:
         raise InputError(
-            f"imu: the stops have {found} different orientations and {POSITIONS} are needed"
+            f"imu: the stops have {found} different orientations and {POSITIONS} are required"
             + "".join(f"; {sentence}" for sentence in missing)
             + "; stop with each axis up and down, at two headings each"
         )
@@ -225,7 +225,7 @@ def _prior(site: Site, readings: SteadyField) -> Prior:
 
 
 def _field_seen(readings: SteadyField, known: Magnetometer, matrix: Array, offset: Array) -> Array:
-    """Return the Earth field in a world whose north it sets, as a calibration sees it (T)."""
+    """Return the Earth field (T) in a world frame whose north is defined by the field."""
     field_body = field_from_measured(readings.measured_sensor, matrix, offset)
     field_body = field_body @ known.body_from_sensor.T
     size = float(np.median(np.linalg.norm(field_body, axis=1)))
@@ -242,7 +242,7 @@ def _starts(
     prior: Prior,
     missing: list[str],
 ) -> tuple[MagnetometerFit, ...]:
-    """Return where to begin: by the ellipsoid where the readings go all round, else by the gyro."""
+    """Return the initial estimate: from the ellipsoid where readings surround it, else the gyro."""
     known, size = site.platform.magnetometer, float(np.linalg.norm(prior.field_world))
     if not missing:
         with suppress(EstimationError):
@@ -252,7 +252,7 @@ def _starts(
 
 
 def _accel_sigma(readings: SteadyField, site: Site, at_rest: bool) -> Array:
-    """Return the noise of the specific force, with what the motion adds to gravity."""
+    """Return the noise of the specific force, motion included."""
     imu = site.platform.imu
     variance = 1.5 * imu.accel_noise**2 / readings.window + ACCEL_FLOOR**2
     if not at_rest:
@@ -262,7 +262,7 @@ def _accel_sigma(readings: SteadyField, site: Site, at_rest: bool) -> Array:
 
 
 def _field_sigma(readings: SteadyField, found: Magnetometer, prior: Prior) -> float:
-    """Return the noise of a reading by the field's size, which no attitude changes."""
+    """Return the noise of a reading from the field's magnitude, which is attitude-independent."""
     field = field_from_measured(readings.measured_sensor, found.matrix, found.offset)
     size = np.linalg.norm(prior.field_world)
     left = np.linalg.norm(field, axis=1) - size
@@ -273,7 +273,7 @@ def _field_sigma(readings: SteadyField, found: Magnetometer, prior: Prior) -> fl
 def _turns(
     imu: ImuSamples, site: Site, epoch: Array
 ) -> tuple[gtsam.PreintegratedAhrsMeasurements | None, ...]:
-    """Return the gyro's turn over each interval; None where its stream has a gap."""
+    """Return the gyro's rotation over each interval; None where its stream has a gap."""
     time = imu.time + site.platform.imu.time_offset
     usual = float(np.median(np.diff(time)))
     grid = np.union1d(time[(time > epoch[0]) & (time < epoch[-1])], epoch)
@@ -289,7 +289,7 @@ def _turns(
         part = slice(begin, end)
         angle = float(np.sum(np.linalg.norm(mean[part], axis=1) * step[part]))
         whole = float(grid[end] - grid[begin])
-        # The same error in every turn, given as an independent one that averages out no further.
+        # A common error of all rotations, modelled as independent errors that do not average out.
         systematic = GYRO_SCALE**2 * len(epoch) * angle**2
         density = site.platform.imu.gyro_noise**2 + systematic / whole
         parameters = gtsam.PreintegrationParams.MakeSharedU(site.gravity)
@@ -302,20 +302,20 @@ def _turns(
 
 
 def _sized(prior: Prior, graph: GraphFit) -> Prior:
-    """Return the prior about the field's size as it was found.
+    """Return the prior with the estimated magnitude of the field.
 
-    The first guess of that size is as wrong as the declared offset.
+    The initial magnitude is as wrong as the declared offset.
     """
     if not FIELD_SCALES[0] < graph.size_ratio < FIELD_SCALES[1]:
         raise EstimationError(
-            f"the size of the field comes out {graph.size_ratio:.3g} times that of the readings;"
-            " declare the offset of the magnetometer, or the Earth field (earth_field_t)"
+            f"the estimated magnitude of the field is {graph.size_ratio:.3g} times that of the"
+            " readings; declare the offset of the magnetometer, or the Earth field (earth_field_t)"
         )
     return replace(prior, field_world=graph.size_ratio * prior.field_world)
 
 
 def _spread_unseen(epochs: Epochs, prior: Prior, start: MagnetometerFit) -> float | None:
-    """Return the spread of the field in either half by what the other half alone tells."""
+    """Return the spread of the field in each half with the calibration of the other half."""
     half, n = len(epochs) // 2, len(epochs)
     fields = []
     for own, other in ((slice(half), slice(half, n)), (slice(half, n), slice(half))):
@@ -343,10 +343,10 @@ def _part(epochs: Epochs, part: slice) -> Epochs:
 def _no_better(
     unseen: float, readings: SteadyField, known: Magnetometer, field_world: Array | None
 ) -> bool:
-    """Return whether the spread is not below the declared calibration's by more than chance.
+    """Return whether the spread is not significantly below that of the declared calibration.
 
-    A large hard iron makes a large field, of which any scatter is a small share: the declared
-    calibration must leave the size right, too.
+    A large hard iron makes a large field, relative to which any scatter is small: the declared
+    calibration must also give the correct magnitude.
     """
     declared = field_from_measured(readings.measured_sensor, known.matrix, known.offset)
     sizes = np.linalg.norm(declared, axis=1)
@@ -356,7 +356,7 @@ def _no_better(
 
 
 def _turned_only(known: Magnetometer, fit: MagnetometerFit, prior: Prior) -> MagnetometerFit:
-    """Return the declared shape and offset, known as before, with the rotation that was found."""
+    """Return the declared shape and offset and their covariance, with the estimated rotation."""
     left, _, right = np.linalg.svd(np.linalg.inv(known.matrix) @ fit.matrix)
     turn = np.stack([(known.matrix @ skew(axis)).ravel() for axis in np.eye(3)], axis=1)
     rotation = np.zeros((12, 12))

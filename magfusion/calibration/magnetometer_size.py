@@ -1,8 +1,8 @@
-"""A magnetometer calibrated without an IMU: by the field's size, which no turning changes.
+"""Magnetometer calibration without an IMU, from the rotation-invariant magnitude of the field.
 
-Size alone does not tell by which rotation the readings' ellipsoid became a sphere: of the matrix
-the mounting's part stays as it was declared.  What little turning leaves open, the declared sigmas
-decide; of readings in one plane, on which side of it the offset is, nothing does.
+The magnitude does not determine the rotation between the readings' ellipsoid and the sphere: the
+mounting's part of the matrix stays as declared.  Too little rotation leaves parameters at their
+declared sigmas; readings in one plane do not determine on which side of it the offset is.
 """
 
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ SETTLED = 1e-4  # of a chi square, which another step would gain
 
 @dataclass(frozen=True, eq=False)
 class _Sphere:
-    """Least squares of the field's size; the state is matrix, offset, and the size over ours."""
+    """Least squares of the field's magnitude; the state is matrix, offset and magnitude scale."""
 
     measured: Array
     size: float
@@ -66,18 +66,19 @@ class _Sphere:
         return Normal(*(one + other for one, other in zip(told, prior, strict=True)))
 
     def minima(self, begun: list[MagnetometerFit]) -> list[tuple[Array, Array, float]]:
-        """Return state, covariance (13, 13) and cost of the minima that are reached.
+        """Return state, covariance (13, 13) and cost of the converged minima.
 
         Raises
         ------
         EstimationError
-            Where none is.
+            Where no start converges.
         """
         start = np.array([[*one.matrix.ravel(), *one.offset, 1.0] for one in begun])
         found = minimise(self.normal, start, absolute=SETTLED)
         if not np.any(found.converged):
             raise EstimationError(
-                "the field's size does not tell the calibration: turn the sensor about all its axes"
+                "the field's magnitude does not determine the calibration; rotate the sensor about"
+                " all axes"
             )
         rows = np.flatnonzero(found.converged)
         unit = np.linalg.inv(self.root)
@@ -90,7 +91,7 @@ class _Sphere:
 
 
 def calibrate_alone(waveform: Waveform, site: Site) -> LogCalibration:
-    """Calibrate a magnetometer that was turned, by the size of the field alone.
+    """Calibrate a rotated magnetometer from the magnitude of the field alone.
 
     Parameters
     ----------
@@ -101,7 +102,7 @@ def calibrate_alone(waveform: Waveform, site: Site) -> LogCalibration:
     Raises
     ------
     InputError
-        Where it was turned too little.
+        Where it is rotated too little.
     EstimationError
         Where the calibration has no solution.
     """
@@ -159,7 +160,7 @@ def calibrate_alone(waveform: Waveform, site: Site) -> LogCalibration:
 
 
 def _apart(readings: SteadyField, known: Magnetometer) -> SteadyField:
-    """Return readings between which the field turned: at rest, many tell no more than one."""
+    """Return readings between which the field rotates; repeated readings at rest add nothing."""
     field = field_from_measured(readings.measured_sensor, known.matrix, np.zeros(3))
     reach = NEW * 0.5 * float(np.max(np.ptp(field, axis=0)))
     kept = [0]
@@ -176,11 +177,11 @@ def _apart(readings: SteadyField, known: Magnetometer) -> SteadyField:
 
 
 def _refuse_little(readings: SteadyField, known: Magnetometer, site: Site) -> None:
-    remedy = "turn it slowly about all its axes for a minute, or record an IMU beside it"
+    remedy = "rotate it slowly about all its axes for a minute, or record an IMU as well"
     if len(readings) < FEWEST:
         raise InputError(
             f"magnetometer: the log gives {len(readings)} readings of different directions, and"
-            f" {FEWEST} are needed; {remedy}"
+            f" {FEWEST} are required; {remedy}"
         )
     field = field_from_measured(readings.measured_sensor, known.matrix, known.offset)
     size = np.linalg.norm(
@@ -189,13 +190,13 @@ def _refuse_little(readings: SteadyField, known: Magnetometer, site: Site) -> No
     across = np.sqrt(max(float(np.linalg.eigvalsh(np.cov(field.T))[1]), 0.0))
     if across < NARROW * float(np.median(size)):
         raise InputError(
-            "magnetometer: too few orientations to calibrate on: the field kept to one line in the"
-            f" sensor; {remedy}"
+            "magnetometer: too few orientations to calibrate on: the field stays along one line in"
+            f" the sensor; {remedy}"
         )
 
 
 def _begun(readings: SteadyField, prior: Prior, size: float) -> list[MagnetometerFit]:
-    """Return where to begin: the centre of the sphere, on either side where that is open."""
+    """Return initial estimates: the centre of the sphere, on both sides where that is ambiguous."""
     inverse = np.linalg.inv(prior.matrix)
     field = (readings.measured_sensor - prior.offset) @ inverse.T
     middle = np.mean(field, axis=0)

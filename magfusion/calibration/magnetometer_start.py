@@ -1,9 +1,9 @@
-"""Where the calibration of a magnetometer begins: by what the gyro says of its turning.
+"""Initial estimates for magnetometer calibration, from the gyro's rotation.
 
-A field that stays in the world turns in the sensor as the gyro does, and a hard iron does not.  Of
-two readings a few seconds apart that is linear in the offset, however large it is and however
-little was turned.  About the one direction that the turning tells least of, the field's size gives
-two places, each the other's mirror image.
+A field that is constant in the world rotates in the sensor as the gyro measures, a hard iron does
+not.  For two readings a few seconds apart this is linear in the offset, whatever its size and
+however small the rotation.  Along the least observable direction, the field's magnitude gives two
+solutions, mirror images of each other.
 """
 
 from collections.abc import Iterator
@@ -37,7 +37,7 @@ def starts(
     offset_cov: Array,
     size: float,
 ) -> tuple[MagnetometerFit, ...]:
-    """Return the offsets to begin with, one or several, with the matrix as it was declared.
+    """Return one or several initial offsets, with the matrix as declared.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def starts(
 
 
 def mirrored(measured: Array, fit: MagnetometerFit) -> MagnetometerFit | None:
-    """Return the calibration beyond the plane of the readings (n, 3); None where they leave it."""
+    """Return the fit mirrored at the readings' plane (n, 3); None where they are not flat."""
     field = field_from_measured(measured, fit.matrix, fit.offset)
     spread, axes = np.linalg.eigh(np.cov(field.T))
     size = float(np.mean(np.linalg.norm(field, axis=1)))
@@ -89,7 +89,7 @@ def mirrored(measured: Array, fit: MagnetometerFit) -> MagnetometerFit | None:
 
 
 def likeliest(epochs: Epochs, prior: Prior, begun: tuple[MagnetometerFit, ...]) -> GraphFit:
-    """Return the likeliest of the solutions that are reached from several places."""
+    """Return the most probable of the solutions reached from several starts."""
     found, failure = [], EstimationError("")
     for start in begun:
         try:
@@ -104,7 +104,7 @@ def likeliest(epochs: Epochs, prior: Prior, begun: tuple[MagnetometerFit, ...]) 
 def rival_offset(epochs: Epochs, prior: Prior, graph: GraphFit) -> Array | None:
     """Return another offset (T) that explains the readings nearly as well, if there is one.
 
-    Of readings in one plane the mirror image is as good: the field is of one size on either side.
+    For readings in one plane the mirror image fits equally well: the magnitude is the same.
     """
     fit = graph.fit
     mirror = mirrored(epochs.measured_sensor, fit)
@@ -123,20 +123,20 @@ def rival_offset(epochs: Epochs, prior: Prior, graph: GraphFit) -> Array | None:
 
 @contextmanager
 def saying(missing: list[str], *, field_known: bool) -> Iterator[None]:
-    """Add to a failure which orientations were not there, and what to do."""
+    """Add the missing orientations, and a remedy, to a failure."""
     try:
         yield
     except EstimationError as failure:
         lack = "".join(f", {sentence}" for sentence in missing)
-        remedy = "turn it slowly about all its axes"
+        remedy = "rotate it slowly about all its axes"
         if not field_known:
-            remedy += ", or give the Earth field (earth_field_t): without its size, turning about"
-            remedy += " one axis leaves the offset along that axis open"
+            remedy += ", or give the Earth field (earth_field_t): without its magnitude, rotation"
+            remedy += " about one axis does not determine the offset along that axis"
         raise EstimationError(f"{failure}{lack}; {remedy}") from failure
 
 
 def places(field: Array, direction: Array, size: float) -> Array:
-    """Return how far along a direction a field (n, 3) has its size best (T): one place, or two."""
+    """Return where along a direction a field (n, 3) has its nominal magnitude (T): one or two."""
     tried = np.linspace(-FARTHEST, FARTHEST, STEPS)
     along = field @ direction
     across = np.sum(field**2, axis=1) - along**2

@@ -1,6 +1,6 @@
-"""A stream of samples at rest, of any length: even spacing, what is missing, and whether it moved.
+"""A stream of samples at rest, of any length: even spacing, gaps, and whether it moved.
 
-What is kept describes the stream: Allan sums, and a summary of `MOST_BLOCKS` stretches at most.
+Memory is bounded: Allan sums, and a summary of at most `MOST_BLOCKS` stretches.
 """
 
 from dataclasses import dataclass
@@ -31,9 +31,9 @@ class Blocks:
         (s)
     mean : ndarray, shape (n, axes)
     scatter : ndarray, shape (n, axes)
-        Largest standard deviation of a second in it.
+        Largest one-second standard deviation.
     change : ndarray, shape (n, axes)
-        Largest change of the mean from a second to the next.
+        Largest change of the mean from one second to the next.
     """
 
     begin: Array
@@ -43,7 +43,7 @@ class Blocks:
     change: Array
 
     def unlike(self) -> BoolArray:
-        """Tell which stretches are shaken, knocked or frozen, measured by the others, (n,)."""
+        """Return which stretches are shaken, knocked or frozen relative to the others, (n,)."""
         if len(self.begin) < 4:
             return np.zeros(len(self.begin), dtype=bool)
         usual = np.median(self.scatter, axis=0)
@@ -54,13 +54,13 @@ class Blocks:
         return np.asarray(frozen | loud.any(axis=1))
 
     def departed(self, limit: Array) -> BoolArray:
-        """Tell in which stretches an axis left its middle, or scatters, beyond limits (axes,)."""
+        """Return in which stretches an axis deviates or scatters beyond limits (axes,)."""
         off = np.abs(self.mean - np.median(self.mean, axis=0))
         return np.asarray(((off > limit) | (self.scatter > limit)).any(axis=1))
 
 
 class RestStream:
-    """Samples of one stream, taken piece by piece.
+    """Samples of one stream, processed in blocks.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class RestStream:
         return self.allan.samples
 
     def add(self, time: Array, values: Array) -> None:
-        """Take further samples: times (n,) (s), values (n, axes), NaN where one is missing."""
+        """Process further samples: times (n,) (s), values (n, axes), NaN where one is missing."""
         if self._last is not None:
             fresh = np.flatnonzero(np.diff(time, prepend=self._last[0]) > 0.0)
         else:
@@ -114,17 +114,17 @@ class RestStream:
 
     @property
     def step(self) -> float:
-        """From sample to sample, on average (s)."""
+        """Mean sample interval (s)."""
         return (self._end - self._begin) / max(self._slots - 1, 1)
 
     @property
     def duration(self) -> float:
-        """From the first sample to the last (s)."""
+        """Duration from the first sample to the last (s)."""
         return self._end - self._begin
 
     @property
     def mean(self) -> Array:
-        """Of all samples, shape (axes,)."""
+        """Mean of all samples, shape (axes,)."""
         return self._origin + self._sum / max(len(self), 1)
 
     @property
@@ -134,11 +134,11 @@ class RestStream:
 
     @property
     def repeated(self) -> Array:
-        """Share of the samples, of those that are not all as before, of which an axis is."""
+        """Share of saturated samples, among those that are not all the same."""
         return self._alike / max(self._changed, 1)
 
     def allan_variance(self) -> AllanVariance:
-        """Return what the samples so far say."""
+        """Return the Allan variance of the samples so far."""
         return self.allan.result(self.step)
 
     def blocks(self) -> Blocks:
@@ -159,7 +159,7 @@ class RestStream:
         self._changed += int(np.sum(changed))
 
     def _fill(self, values: Array, missing: IntArray) -> None:
-        """Put samples into their places on an even grid."""
+        """Put samples on an even grid."""
         long = np.flatnonzero(missing > LONGEST_FILL)
         for part, gap in zip(
             np.split(np.arange(len(values)), long), [0, *missing[long]], strict=True
@@ -183,7 +183,7 @@ class RestStream:
             self._slots += len(even)
 
     def _summarise(self, even: Array) -> None:
-        """Describe each second."""
+        """Summarise each second."""
         begin = self._begin + self._step * (self._slots - len(self._rest))
         rows = np.concatenate([self._rest, even])
         length = max(2, round(BLOCK / self._step))
@@ -220,16 +220,16 @@ def _merged(
 
 
 def _usual_step(time: Array) -> float:
-    """Return the mean of the steps that are near the median one: it knows their sum."""
+    """Return the mean of the steps near the median step, to within their sum."""
     step = np.diff(time)
     ratio = step / np.median(step)
     return float(np.mean(step[(ratio > 1.0 - GAP) & (ratio < 1.0 + GAP)]))
 
 
 def _missing(steps: Array) -> IntArray:
-    """Return how many samples are missing before each, by the steps in units of the usual one.
+    """Return the number of samples missing before each, from steps in units of the nominal step.
 
-    A late stamp is followed by a short step; where a sample is missing, none makes up for it.
+    A late stamp is followed by a short step; a missing sample is not.
     """
     excess = steps - 1.0
     padded = np.concatenate([[0.0], excess, [0.0]])

@@ -1,8 +1,8 @@
-"""The steady part of a magnetometer's waveform while it is turned by hand: one reading an epoch.
+"""The static part of a magnetometer's waveform during rotation by hand: one reading an epoch.
 
-The beacons' tones and the mains average out over a tapered window of several of their periods.  The
-window is long against the motion, so that each sample is first turned by the gyro into the axes of
-the window's centre, with the calibration that is known so far.
+The beacons' tones and the mains average out over a tapered window of several of their periods.
+The window is long relative to the motion, so that each sample is first rotated into the axes of
+the window's centre, by the gyro and the current calibration.
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ class SteadyField:
     window : ndarray, shape (n,)
         Length of each (s).
     measured_sensor : ndarray, shape (n, 3)
-        As the instrument would read at the centre (T).
+        Reading at the centre (T).
     accel_body : ndarray, shape (n, 3)
         Mean specific force in the axes of the centre (m/s^2).
     """
@@ -63,8 +63,8 @@ def window_length(site: Site) -> float:
     length = max(SHORTEST, PERIODS / lowest)
     if length > LONGEST:
         raise InputError(
-            f"a tone at {lowest:g} Hz is too low to average out while the sensor turns; switch that"
-            f" beacon off, or use tones above {PERIODS / LONGEST:g} Hz"
+            f"a tone at {lowest:g} Hz is too low to average out while the sensor rotates; switch"
+            f" that beacon off, or use tones above {PERIODS / LONGEST:g} Hz"
         )
     return length
 
@@ -72,12 +72,12 @@ def window_length(site: Site) -> float:
 def steady_field(
     waveform: Waveform, imu: ImuSamples, site: Site, *, magnetometer: Magnetometer | None = None
 ) -> SteadyField:
-    """Average a waveform over windows that follow each other.
+    """Average a waveform over consecutive windows.
 
     Parameters
     ----------
     magnetometer : Magnetometer, optional
-        The calibration known so far; the site's where it is not given.
+        The current calibration; by default the site's.
 
     Raises
     ------
@@ -95,14 +95,14 @@ def steady_field(
 
 
 def steady_alone(waveform: Waveform, site: Site) -> SteadyField:
-    """Average a waveform that no gyro tells the turning of, over windows as short as may be.
+    """Average a waveform without a gyro, over windows that are as short as possible.
 
-    Windows in which the field turns by more than `TURNED` are left out: its mean is too small.
+    Windows in which the field rotates by more than `TURNED` are omitted: their mean is too small.
 
     Raises
     ------
     InputError
-        Where no window is left.
+        Where no window remains.
     """
     time = waveform.time
     usual = float(np.median(np.diff(time)))
@@ -112,8 +112,8 @@ def steady_alone(waveform: Waveform, site: Site) -> SteadyField:
     whole = _whole(time, centre, window)
     if np.sum(whole) < 2:
         raise InputError(
-            "magnetometer: no stretch is long enough without a gap; record at least a minute of"
-            " slow turning"
+            "magnetometer: no stretch without a gap is long enough; record at least a minute of"
+            " slow rotation"
         )
     centre, window = centre[whole], window[whole]
     mean = _tapered_means(time, waveform.measured_sensor, centre, window)
@@ -132,28 +132,28 @@ def average(
     centre: Array,
     window: Array,
 ) -> SteadyField:
-    """Average waveform and specific force over the windows given, leaving out those with a gap.
+    """Average waveform and specific force over given windows, without those that have a gap.
 
     Parameters
     ----------
     time_offset : float
         Added to the IMU's stamps (s).
     magnetometer : Magnetometer
-        Calibration with which samples are turned.
+        Calibration for the rotation of the samples.
     centre, window : ndarray, shape (n,)
         (s)
 
     Raises
     ------
     InputError
-        Where no window is left.
+        Where no window remains.
     """
     imu_time = imu.time + time_offset
     whole = _whole(waveform.time, centre, window) & _whole(imu_time, centre, window)
     if not np.any(whole):
         raise InputError(
-            "magnetometer: no stretch is long enough without a gap for the beacons' tones to"
-            " average out; record at least a minute of slow turning"
+            "magnetometer: no stretch without a gap is long enough for the beacons' tones to"
+            " average out; record at least a minute of slow rotation"
         )
     centre, window = centre[whole], window[whole]
     attitude = attitude_from_gyro(imu_time, imu.gyro_body)
@@ -175,7 +175,7 @@ def _turned_means(
 
 
 def _whole(time: Array, centre: Array, window: Array) -> BoolArray:
-    """Tell which windows lie in a stream without a gap."""
+    """Return which windows have no gap in a stream."""
     step = np.diff(time)
     usual = max(float(np.median(step)), float(np.percentile(step, UP_TO)))
     longest = min(GAP * usual, MOST_OF_WINDOW * float(np.min(window)))

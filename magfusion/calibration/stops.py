@@ -1,4 +1,4 @@
-"""The stops of a sensor that is set down in one orientation after another."""
+"""Stationary intervals of a sensor that is placed in one orientation after another."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ SAME = 10.0 * DEGREE  # stops whose vertical and turn differ by less are one ori
 
 @dataclass(frozen=True, eq=False)
 class Stops:
-    """Stretches in which the platform stood still.
+    """Stationary intervals of the platform.
 
     Parameters
     ----------
@@ -42,19 +42,19 @@ class Stops:
 
 
 def find_stops(imu: ImuSamples, motion: MotionModel, shortest: float = SHORTEST) -> Stops:
-    """Find where the platform stood still for long enough.
+    """Find sufficiently long stationary intervals.
 
     Parameters
     ----------
     motion : MotionModel
-        What is called rest.
+        Defines rest.
     shortest : float
         Length of the shortest stop (s).
 
     Returns
     -------
     Stops
-        In order of time; a slow even turn, which scatters as little as a rest, is none.
+        In order of time; a slow even rotation, which scatters as little as rest, is excluded.
     """
     still = resting(imu.time, imu.gyro_body, imu.accel_body, motion=motion)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))

@@ -1,22 +1,22 @@
-"""One file a job: its settings, its run, its command."""
+"""One module per job: its settings, its run, its command."""
 
-# Path of each command, in the order of the listing: the file of its job, and what it does.
+# Path of each command, in listing order: the module of its job, and a description.
 JOBS = {
     "smooth": (
         "smooth",
-        "Smooth a log into the best trajectory, with the calibration in the same solution.",
+        "Smooth a log: trajectory and calibration in one solution.",
     ),
     "fix": (
         "fix",
-        "Fix the pose at every epoch on its own, with every hypothesis that survives.",
+        "Fix the pose at every epoch on its own, with every remaining hypothesis.",
     ),
     "import": (
         "import_log",
-        "Import tables of any names and units, a bag or a EuRoC folder: a log, and its check.",
+        "Import tables of any names and units, a bag or a EuRoC folder, and check the log.",
     ),
     "check": (
         "check",
-        "Check a log in seconds: what its streams, fields and first fixes say against it.",
+        "Check a log in seconds: consistency of streams, fields and first fixes.",
     ),
     "init": (
         "init",
@@ -24,11 +24,11 @@ JOBS = {
     ),
     "allan": (
         "allan",
-        "Measure the noise of the instruments at rest, in the keys of a site, by Allan deviations.",
+        "Measure the instruments' noise at rest, in the keys of a site, by Allan deviations.",
     ),
     "navigate": (
         "navigate",
-        "Navigate online: along a log, or by records on standard input (-).",
+        "Navigate online: along a log, or from records on standard input (-).",
     ),
     "evaluate": (
         "evaluate",
@@ -36,7 +36,7 @@ JOBS = {
     ),
     "export": (
         "export",
-        "Hand a result on: as a ROS 2 bag (MCAP, db3), TUM, KITTI or CSV.",
+        "Export a result as a ROS 2 bag (MCAP, db3), TUM, KITTI or CSV.",
     ),
     "view": ("view", "Open the recording of a result in the rerun viewer."),
     "demo": (
@@ -45,26 +45,26 @@ JOBS = {
     ),
     "demodulate": (
         "demodulate",
-        "Turn a log's waveform into phasors: a log that every other command reads.",
+        "Demodulate a log's waveform to phasors: a log that every other command reads.",
     ),
     "survey": (
         "survey",
-        "Make a fingerprint survey of a log: the fields at places with known poses.",
+        "Make a fingerprint survey from a log: the fields at places with known poses.",
     ),
     "range": (
         "range_wells",
-        "Range one well from another by a turning magnet: distance, direction, along the hole.",
+        "Range one well from another with a rotating magnet: distance, direction, along-hole.",
     ),
     "match": (
         "match",
-        "Find roll, or roll and pitch, from the Earth's field, by a database or in closed form.",
+        "Estimate roll, or roll and pitch, from the Earth's field, by a database or closed form.",
     ),
-    "replay": ("replay", "Print a log as the records that magfusion navigate - reads."),
+    "replay": ("replay", "Print a log as records for magfusion navigate -."),
     "papers": (
         "papers",
-        "Say of any equation, table, figure or claim of four papers where it is and if it holds.",
+        "Show where an equation, table, figure or claim of four papers is, and if it holds.",
     ),
-    "simulate": ("simulate", "Simulate a log, with truth, in the files a user has."),
+    "simulate": ("simulate", "Simulate a log, with truth, in the usual file formats."),
     "coverage": (
         "coverage",
         "Show where an installation can navigate: bounds of position and attitude over a volume.",
@@ -75,23 +75,23 @@ JOBS = {
     ),
     "drift": (
         "drift",
-        "Test that the online estimators do not drift, on days of simulated data.",
+        "Test the long-term stability of the online estimators on days of simulated data.",
     ),
     "calibrate beacon": (
         "calibrate_beacon",
-        "Find the magnetic centre, attitude and moments of beacons from a survey around them.",
+        "Estimate the magnetic centre, attitude and moments of beacons from a survey.",
     ),
     "calibrate fieldmap": (
         "calibrate_fieldmap",
-        "Learn where the beacons' fields differ from their model, for every later job.",
+        "Map the deviation of the beacons' fields from their model, for every later job.",
     ),
     "calibrate magnetometer": (
         "calibrate_magnetometer",
-        "Calibrate the magnetometer on a log of slow turning by hand, in the Earth's field.",
+        "Calibrate the magnetometer from a log of slow rotation by hand, in the Earth's field.",
     ),
     "calibrate log": (
         "calibrate_log",
-        "Refine the site by a log of ordinary motion, and report what motion is missing.",
+        "Refine the site with a log of ordinary motion, and report missing motion.",
     ),
     "calibrate antenna": (
         "calibrate_antenna",

@@ -24,18 +24,18 @@ AXES = "xyz"
 
 @dataclass(frozen=True, kw_only=True)
 class AllanSettings(LogSettings):
-    """Which log, recorded at rest; with a site, one with the measured noise is written."""
+    """Log recorded at rest; given a site, a site with the measured noise is written."""
 
 
 def run_allan(settings: AllanSettings, output: Path, report: Report = quiet) -> Figures:
-    """Measure white noise, instability and random walk of the instruments of a log at rest.
+    """Estimate white noise, instability and random walk of the instruments of a log at rest.
 
-    The log is read piece by piece: hours of it need no more memory than a minute.
+    The log is read in blocks; memory does not grow with its length.
 
     Raises
     ------
     InputError
-        Where the log cannot be read, or is too short for any figure.
+        Where the log cannot be read, or is too short for any estimate.
     """
     from magfusion.jobs.allan_noise import measured
     from magfusion.jobs.inputs import claim, found_in
@@ -65,9 +65,9 @@ def _site(job: Job) -> Site | None:
 
 
 def with_noise(site: Site, found: Measured) -> Site:
-    """Return a site with the noise that was found; a bias's sigma is only ever raised.
+    """Return a site with the estimated noise; a bias sigma is only ever increased.
 
-    One switching on tells what a bias can be, and not how much less it may be.
+    One switch-on gives a lower limit of the bias's sigma, but no upper limit.
     """
     imu, magnetometer = site.platform.imu, site.platform.magnetometer
     keys = found.keys

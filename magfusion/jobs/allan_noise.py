@@ -1,4 +1,4 @@
-"""What a log at rest says of its instruments: their noise, and what speaks against it."""
+"""Noise of the instruments of a log at rest, and findings that invalidate it."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from magfusion.model.trust import Finding, Trust, Unverified, Verdict
 from magfusion.units import DEGREE, Array
 
 WITNESSES = (uneven_stamps, frozen_samples, repeated_samples, clipped_samples, false_samples)
-# Stamps say little of noise that is evenly sampled; what is missing is known as such.
+# Stamps contain little noise if evenly sampled; missing samples are tracked.
 COPED = frozenset({"jitter", "samples_lost", "repeated_stamps", "missing_samples"})
 MOST_LOST = 0.05  # share of the samples, from which it matters after all
 MOVED = 0.2  # share of the time, from which it was no rest
 STANDARD_GRAVITY, GRAVITY_UNSURE = 9.80665, 0.03  # m/s^2, without a site
 DENSITY = np.sqrt(2.0)  # one-sided density over what an Allan deviation shows
 HALF = 0.5
-# What steps larger than the noise look like.
+# Signature of steps larger than the noise.
 OF_STEPS = frozenset({"false_samples", "imu_spikes", "repeated_samples", "frozen_imu"})
 LEAST_SAMPLES = 200
 AXES = "xyz"
@@ -47,7 +47,7 @@ class Instrument:
     Parameters
     ----------
     key : str
-        As the keys of a site begin: ``gyro``, ``accel``, ``magnetometer``.
+        Prefix of the keys of a site: ``gyro``, ``accel``, ``magnetometer``.
     fits : tuple of AllanFit or None
     """
 
@@ -61,25 +61,25 @@ class Instrument:
 
     @property
     def coarse(self) -> bool:
-        """Whether its steps hide its noise."""
+        """Whether quantization masks its noise."""
         return bool(np.max(self.repeated) > QUANTISED)
 
     @property
     def known(self) -> list[AllanFit]:
-        """The fits of the axes that have one."""
+        """The available fits of the axes."""
         return [fit for fit in self.fits if fit is not None]
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """What was found.
+    """Estimated noise.
 
     Parameters
     ----------
     keys : dict
         Of a site: the worst axis.
     intervals : dict
-        Of 95 %, of that axis.
+        95 % interval, of that axis.
     """
 
     trust: Trust
@@ -97,7 +97,7 @@ class Measured:
 
 @dataclass
 class _Said:
-    """What the pieces of a stream said, the worst of each kind."""
+    """Findings of the blocks of a stream, the worst of each kind."""
 
     pieces: int = 0
     worst: dict[tuple[str, str], tuple[int, Finding]] = field(default_factory=dict)
@@ -124,7 +124,7 @@ class _Said:
 
 
 def measured(job: Job, site: Site | None, report: Report) -> Measured:
-    """Measure the noise of a log at rest.
+    """Estimate the noise of a log at rest.
 
     Raises
     ------
@@ -160,12 +160,12 @@ def measured(job: Job, site: Site | None, report: Report) -> Measured:
 
 
 def _gathered(job: Job, stream: str, width: int) -> tuple[RestStream, _Said]:
-    """Return the samples of a stream at rest, and what its pieces said.
+    """Return the samples of a stream at rest, and the findings of its blocks.
 
     Raises
     ------
     InputError
-        Where there are too few.
+        Where there are too few samples.
     """
     rest, said = RestStream(width), _Said()
     for piece in _pieces(job, stream):
@@ -173,8 +173,8 @@ def _gathered(job: Job, stream: str, width: int) -> tuple[RestStream, _Said]:
         said.add(_of_piece(stream, piece))
     if said.pieces and len(rest) < LEAST_SAMPLES:
         raise InputError(
-            f"{job.log_path}: {stream} has {len(rest)} samples in the part to use; record"
-            " at rest for some minutes at least, better for hours"
+            f"{job.log_path}: {stream} has {len(rest)} samples in the selected part; record at rest"
+            " for at least some minutes, better for hours"
         )
     return rest, said
 
@@ -184,7 +184,7 @@ def _pieces(job: Job, stream: str) -> Iterator[Piece]:
 
 
 def _limits(rest: RestStream, motion: MotionModel) -> Array:
-    """Return by how much each axis may leave its middle at rest."""
+    """Return the allowed deviation of each axis from its median at rest."""
     inertial = np.repeat([motion.rest_gyro, motion.rest_accel], 3)
     return inertial if len(rest.mean) == len(inertial) else np.full(len(rest.mean), np.inf)
 
@@ -204,7 +204,7 @@ def _without_motion(rest: RestStream, job: Job, stream: str, motion: MotionModel
     return quiet
 
 
-# Of each stream, the instruments whose axes its columns are.
+# Per stream, the instruments of its columns.
 _STREAMS = {
     "imu": (("gyro", "gyroscope", "rad/s"), ("accel", "accelerometer", "m/s^2")),
     "magnetometer": (("magnetometer", "magnetometer", "T"),),
@@ -237,7 +237,7 @@ def _of_piece(stream: str, piece: Piece) -> list[Finding]:
 
 
 def _moved(rest: RestStream, motion: MotionModel) -> Iterator[Finding]:
-    """Yield where an inertial sensor was not at rest."""
+    """Yield the intervals in which an inertial sensor was not at rest."""
     blocks = rest.blocks()
     if len(blocks.begin) == 0:
         return
@@ -256,34 +256,34 @@ def _moved(rest: RestStream, motion: MotionModel) -> Iterator[Finding]:
     far = float(np.mean(away)) > MOVED
     yield Finding(
         "not_at_rest",
-        f"imu: it moved or was shaken from {places}{more}, {100.0 * share:.2g} % of the"
-        f" time{': that is no rest' if far else ', which is left out'}. Record where nothing moves,"
-        " or cut it out by --start and --end.",
+        f"imu: motion or vibration from {places}{more}, {100.0 * share:.2g} % of the"
+        f" time{': the log is not at rest' if far else ', which is omitted'}. Record without"
+        " motion, or cut it out with --start and --end.",
         Verdict.FAILED if far else Verdict.DOUBTFUL,
         1e3 * share + 10.0,
     )
 
 
 def _judged(one: Instrument, duration: float) -> Iterator[Finding]:
-    """Yield what is to be said of the Allan deviations of an instrument."""
+    """Yield findings on the Allan deviations of an instrument."""
     if len(one.known) < 3:
         yield Finding(
             "few_data",
-            f"{one.name}: {duration:.0f} s are too few for its noise, or an axis stands still;"
-            " record at rest for some minutes at least.",
+            f"{one.name}: {duration:.0f} s are too short for its noise, or an axis is constant;"
+            " record at rest for at least some minutes.",
             Verdict.DOUBTFUL,
             50.0,
         )
         return
     worst = max(one.known, key=lambda fit: fit.misfit)
     if worst.misfit > MISFIT:
-        tones = ", as where beacons or mains transmit" if one.key == "magnetometer" else ""
+        tones = ", e.g. of beacons or mains" if one.key == "magnetometer" else ""
         yield Finding(
             "noise_shape",
             f"{one.name}: the Allan deviation of axis {AXES[one.fits.index(worst)]} is"
-            f" {worst.worst:.2g} times what white noise, flicker and a walk explain at"
-            f" {worst.worst_tau:.3g} s: there is a vibration, a warming up, or a tone{tones}."
-            " Look at allan.png; record again without it.",
+            f" {worst.worst:.2g} times that of white noise, flicker and random walk at"
+            f" {worst.worst_tau:.3g} s, due to vibration, warm-up, or a tone{tones}. See allan.png;"
+            " record again without it.",
             Verdict.DOUBTFUL,
             worst.misfit,
         )
@@ -292,8 +292,8 @@ def _judged(one: Instrument, duration: float) -> Iterator[Finding]:
         yield Finding(
             "quantised",
             f"{one.name}: axis {AXES[int(np.argmax(one.repeated))]} repeats its value in"
-            f" {100.0 * often:.0f} % of the samples: its steps are larger than its noise, which"
-            " they hide. Choose a smaller range, or let the instrument give more digits.",
+            f" {100.0 * often:.0f} % of the samples: quantization masks its noise. Choose a"
+            " smaller range, or a higher output resolution.",
             Verdict.DOUBTFUL,
             20.0 * often,
         )
@@ -304,10 +304,10 @@ def _judged(one: Instrument, duration: float) -> Iterator[Finding]:
         high = max(fit.walk.high for fit in one.known if not fit.walk.found)
         yield Finding(
             "few_data",
-            f"{one.name}: the log of {_span(duration)} is too short for the walk of its bias on"
+            f"{one.name}: the log of {_span(duration)} is too short for the bias random walk on"
             f" {'axis' if len(open_) == 1 else 'axes'} {', '.join(open_)}: it is below {high:.2g}"
-            f" {one.unit}/sqrt(s) (95 %), which is taken for it. Record longer at rest, ten times"
-            " as long at least.",
+            f" {one.unit}/sqrt(s) (95 %), and this limit is used. Record at rest for at least ten"
+            " times as long.",
             Verdict.DOUBTFUL,
             5.0,
         )

@@ -1,4 +1,4 @@
-"""The fits of a tracker's bench: by the probe first, then with what it found by the survey."""
+"""The fits of a tracker's bench: the probe first, then the survey with the probe's result."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ if TYPE_CHECKING:
     from magfusion.model.probe import ProbeReadings
 
 FOLDS = 5  # each pose is judged by an antenna that was fitted without it
-# What a nominal antenna may be off by; wide, since the couplings say more.
+# Prior uncertainty of a nominal antenna; wide, since the couplings are more accurate.
 GAIN_SIGMA, TILT_SIGMA, CENTRE_SIGMA, KAPPA_SIGMA = 0.05, 0.05, 0.01, 1e-3
 KAPPA_KEPT = 1e-12  # m^2; a micrometre squared
 
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """What was read of which antennas; ``site`` has the mounting that is believed."""
+    """Readings and their antennas; ``site`` has the assumed mounting."""
 
     site: Site
     beacon: Beacon
@@ -73,15 +73,15 @@ class Solved:
     Parameters
     ----------
     prior : ndarray, shape (k,)
-        Mean of what was known before the survey: by the site, and by the probe.
+        Mean before the survey: from the site and the probe.
     root : ndarray, shape (k, k)
         Factor of its covariance.
     observed : Observability, optional
         What the survey's poses determine.
     probed : dict
-        Relative errors of readings at points left out, before and after.
+        Relative leave-one-out errors of readings, before and after.
     elsewhere : ndarray, shape (2,), optional
-        What fixes should err by in other attitudes than were surveyed (rad, m).
+        Predicted errors of fixes in attitudes that were not surveyed (rad, m).
     """
 
     fit: AntennaFit
@@ -93,13 +93,13 @@ class Solved:
 
 
 def declared_sigma(start: Antenna, *, sizes: bool) -> Array:
-    """Return what the site's antennas may be off by; their size where it is asked for."""
+    """Return the prior sigmas of the site's antennas, sizes included if requested."""
     kappa = KAPPA_SIGMA if sizes else KAPPA_KEPT
     return prior_sigma(start, GAIN_SIGMA, TILT_SIGMA, CENTRE_SIGMA, kappa)
 
 
 def solved(bench: Bench, settings: AntennaSettings) -> Solved:
-    """Return the antennas that all readings together make likely.
+    """Return the maximum-likelihood antennas of all readings.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def _by_survey(
     else:
         turn, place = settings.pose_rotation_deg * DEGREE, settings.pose_position_m
         fit = fit_at_uncertain_poses(own, start, root, turn, place, model)
-    # A probe reads tesla, and so knows the moments that couplings do not.
+    # A probe measures tesla, and so determines the moments, which couplings do not.
     return fit if "transmitter" in bench.probed else with_receiver_gain(fit, bench.start)
 
 
@@ -152,7 +152,7 @@ def _by_probe(
     cov: Array,
     settings: AntennaSettings,
 ) -> tuple[Array, Array, tuple[float, int], tuple[Array, Array]]:
-    """Return mean and covariance of all numbers, chi square and readings, and errors left out."""
+    """Return mean and covariance of all parameters, chi square and readings, and test errors."""
     columns = columns_of(side, len(mean))
     start, sigma = mean[columns], np.sqrt(np.diagonal(cov))[columns]
     predict: Predict = read_of_term
@@ -177,7 +177,7 @@ def _by_probe(
 
 
 def _of_coils(beacon: Beacon, size: int) -> Predict:
-    """Return what a probe reads of the beacon's coils, as a site has them."""
+    """Return a probe's readings of the site's beacon coils."""
     none = np.zeros((3, 3))
 
     def put(coils: Beacon, vector: Array) -> Beacon:
@@ -191,9 +191,9 @@ def _of_coils(beacon: Beacon, size: int) -> Predict:
 def left_out(
     bench: Bench, declared: Site, found: Solved, settings: AntennaSettings
 ) -> tuple[PoseErrors, PoseErrors]:
-    """Return errors of fixes with the declared site, and with sites written without each pose.
+    """Return errors of fixes with the declared site, and with sites fitted without each pose.
 
-    Every fold's site is written to a file and read again: what is judged is what others will load.
+    Every fold's site is written to a file and read again, so that the file itself is tested.
     """
     survey, name = bench.survey, bench.beacon.name
     assert survey is not None

@@ -1,4 +1,4 @@
-"""What a bench gives the antennas' calibration: a tracker, poses with couplings, probe readings."""
+"""Inputs of the antenna calibration: a tracker, poses with couplings, probe readings."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FEWEST_POSES = 5  # four determine the antenna; with less than one to spare noth
 
 
 def tracker(site: Site, name: str | None) -> Beacon:
-    """Return the beacon of a site that is a tracker's source.
+    """Return the site's beacon that is a tracker's source.
 
     Raises
     ------
@@ -48,8 +48,8 @@ def tracker(site: Site, name: str | None) -> Beacon:
     if len(found) != 1:
         what = "no beacon" if not found else f"{len(found)} beacons"
         raise InputError(
-            f"has {what} of three coils, each in a tone or slot of its own; describe the tracker,"
-            " or choose one with --beacon"
+            f"has {what} of three coils, each in a separate tone or slot; describe the tracker, or"
+            " choose one with --beacon"
         )
     if not found[0].synchronised:
         raise InputError(
@@ -58,8 +58,8 @@ def tracker(site: Site, name: str | None) -> Beacon:
         )
     if found[0].field_map is not None:
         raise InputError(
-            f"beacon {found[0].name} has a field map, learnt with the old antennas; calibrate the"
-            " antennas first and learn the map anew"
+            f"beacon {found[0].name} has a field map of the old antennas; calibrate the antennas"
+            " first, then calibrate the map again"
         )
     return found[0]
 
@@ -73,12 +73,12 @@ def couplings(survey: Survey, beacon: Beacon) -> tuple[BodySurvey, int]:
         Where it has no phasors of the tracker, or too few poses with all of them.
     """
     if survey.phasor_sensor is None:
-        raise InputError("holds amplitudes, and antennas need phasors; survey again")
+        raise InputError("contains amplitudes, but antennas require phasors; survey again")
     wanted = [(beacon.name, tone) for tone in range(3)]
     missing = [str(tone) for name, tone in wanted if (name, tone) not in survey.channels]
     if missing:
         raise InputError(
-            f"has no tone {', '.join(missing)} of beacon {beacon.name}; a tracker's survey holds"
+            f"has no tone {', '.join(missing)} of beacon {beacon.name}; a tracker's survey contains"
             " the tones or slots 0, 1 and 2"
         )
     columns = [survey.channels.index(channel) for channel in wanted]
@@ -86,7 +86,7 @@ def couplings(survey: Survey, beacon: Beacon) -> tuple[BodySurvey, int]:
     whole = np.isfinite(phasor).all(axis=(1, 2))
     if np.sum(whole) < FEWEST_POSES:
         raise InputError(
-            f"holds {np.sum(whole)} poses with all three tones of beacon {beacon.name}; survey at"
+            f"has {np.sum(whole)} poses with all three tones of beacon {beacon.name}; survey at"
             f" least {FEWEST_POSES}, at different positions and attitudes"
         )
     # Tones are in the order of the coils, one each.
@@ -104,7 +104,7 @@ def couplings(survey: Survey, beacon: Beacon) -> tuple[BodySurvey, int]:
 
 
 def refuse_swapped(survey: BodySurvey, antenna: Antenna) -> None:
-    """Refuse couplings that no pose of the declared antenna explains.
+    """Raise an error for couplings that match no pose of the declared antenna.
 
     Raises
     ------
@@ -118,9 +118,9 @@ def refuse_swapped(survey: BodySurvey, antenna: Antenna) -> None:
 
 
 def mounted_by_fixes(survey: BodySurvey, site: Site, beacon: Beacon) -> Site:
-    """Return the site with the magnetometer where a tracker's fields say that it is on the body.
+    """Return the site with the magnetometer pose estimated from a tracker's fields.
 
-    Its pose at each reading is that of the closed form; on the body it is their mean.
+    Its pose at each reading is the closed-form solution; on the body it is their mean.
     """
     sensor = site.platform.magnetometer
     receiver = np.asarray(np.linalg.inv(sensor.matrix))

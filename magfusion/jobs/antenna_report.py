@@ -1,4 +1,4 @@
-"""What the antennas' calibration tells: its figures."""
+"""Figures of the antenna calibration."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _AXES = "xyz"
 
 
 def estimates(fit: AntennaFit, start: Antenna, *, sizes: bool) -> list[Estimate]:
-    """Return every number of the antennas with its sigma and that of its prior."""
+    """Return every parameter of the antennas with its sigma and that of its prior."""
     blocks = ("transmitter.moment", "transmitter.centre", "receiver.matrix", "receiver.centre")
     names = [f"{block}_{coil}{axis}" for block in blocks for coil in _AXES for axis in _AXES]
     names += [*(f"transmitter.kappa_{c}" for c in _AXES), "receiver.kappa"] if sizes else []
@@ -40,7 +40,7 @@ def estimates(fit: AntennaFit, start: Antenna, *, sizes: bool) -> list[Estimate]
 
 
 def read_figures(bench: Bench, dropped: int) -> Figures:
-    """Return how much was read."""
+    """Return the number of readings."""
     found = []
     if bench.survey is not None:
         found += [Figure("poses", len(bench.survey.sigma)), Figure("poses_dropped", dropped)]
@@ -50,7 +50,7 @@ def read_figures(bench: Bench, dropped: int) -> Figures:
 
 
 def error_figures(errors: tuple[PoseErrors, PoseErrors] | None, solved: Solved) -> Figures:
-    """Return errors before and after: of fixes at poses, and of what a probe reads at points."""
+    """Return errors before and after: of fixes at poses, and of probe readings at points."""
     found, probed = [], solved.probed
     for k, (name, unit, size) in enumerate((("attitude", "deg", DEGREE), ("position", "m", 1.0))):
         for when, one in zip(("before", "after"), errors or (), strict=False):
@@ -59,7 +59,7 @@ def error_figures(errors: tuple[PoseErrors, PoseErrors] | None, solved: Solved) 
             words = f"{name} error {when}"
             found.append(Figure(key, float(one.rms[k]) / size, unit, label=words))
             found.append(
-                Figure(f"{key}_against_survey", raw, unit, label=f"{words}, with the survey's own")
+                Figure(f"{key}_against_survey", raw, unit, label=f"{words}, incl. the survey's own")
             )
             if when == "after":
                 known = float(one.rms_sigma[k]) / size
@@ -78,7 +78,7 @@ def error_figures(errors: tuple[PoseErrors, PoseErrors] | None, solved: Solved) 
 def figures(
     fit: AntennaFit, observed: Observability | None, start: Antenna, settings: AntennaSettings
 ) -> Figures:
-    """Return what was found of the antennas, and what was not."""
+    """Return estimated and undetermined parameters of the antennas."""
     sigma = np.sqrt(np.diagonal(fit.cov))
     found = fit.antenna.vector()
     change = found - start.vector()
@@ -121,7 +121,7 @@ def _observed_figures(observed: Observability, *, exact: bool) -> list[Figure]:
 
 
 def mounting_figures(site: Site, declared: Site) -> Figures:
-    """Return by how much the receiver is mounted otherwise than declared, and its sigmas."""
+    """Return the change of the receiver's mounting relative to the declared, and its sigmas."""
     found, before = site.platform.magnetometer, declared.platform.magnetometer
     turn = before.body_from_sensor.T @ found.body_from_sensor
     turned = float(Rotation.from_matrix(turn).magnitude()) / DEGREE

@@ -1,4 +1,4 @@
-"""Whether calibrated antennas are to be believed."""
+"""Trust in calibrated antennas."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def judged(
     estimates: list[Estimate],
     errors: tuple[PoseErrors, PoseErrors] | None,
 ) -> tuple[AntennaFit, Trust]:
-    """Return a fit with a covariance that its witnesses allow, and what they say.
+    """Return a fit with a covariance consistent with its tests, and their findings.
 
     Parameters
     ----------
     errors : tuple of PoseErrors, optional
-        Of fixes at surveyed poses with the declared antenna, and with one that was fitted without
-        the pose; None where there was no survey.
+        Of fixes at surveyed poses with the declared antenna, and with one fitted without the pose;
+        None without a survey.
     """
     fit = found.fit
     fitted = unexplained(
@@ -54,7 +54,7 @@ def judged(
     if found.observed is not None and found.observed.null_space:
         text = (
             f"These poses do not determine {', '.join(found.observed.null_space)}: the declared"
-            " values and wide sigmas are kept there."
+            " values and wide sigmas are kept."
         )
         findings.append(Finding("geometry", text, Verdict.TRUSTWORTHY))
     if errors and found.elsewhere is not None:
@@ -75,8 +75,8 @@ def _transferred(before: PoseErrors, after: PoseErrors) -> list[Finding]:
         )
         if ratio > WORSE and sure:
             text = (
-                f"At poses that an antenna was not fitted to, its {what} errs by"
-                f" {after.rms[k] / size:.2g} {unit}, and the declared one by"
+                f"At poses not used in the fit, the {what} error of the antenna is"
+                f" {after.rms[k] / size:.2g} {unit}, that of the declared one"
                 f" {before.rms[k] / size:.2g}: survey more poses, or keep the declared antenna."
             )
             findings.append(Finding("transfer", text, weight=ratio))
@@ -84,33 +84,34 @@ def _transferred(before: PoseErrors, after: PoseErrors) -> list[Finding]:
 
 
 def _in_other_attitudes(elsewhere: Array, after: PoseErrors) -> list[Finding]:
-    """Return whether fixes should be worse in attitudes that were not surveyed."""
+    """Return whether fixes are predicted to be worse in attitudes that were not surveyed."""
     ratio = elsewhere / np.maximum(after.rms, 1e-12)
     if float(np.max(ratio)) <= ALIKE:
         return []
     (turn, place), (turned, placed) = elsewhere, after.rms
     text = (
-        f"The surveyed poses are alike: in other attitudes fixes should err by"
-        f" {turn / DEGREE:.2g} deg and {1e3 * place:.2g} mm, and by {turned / DEGREE:.2g} deg and"
-        f" {1e3 * placed:.2g} mm in those. Survey attitudes turned about all axes."
+        f"The surveyed attitudes are too similar: predicted errors of fixes in other attitudes are"
+        f" {turn / DEGREE:.2g} deg and {1e3 * place:.2g} mm, in the surveyed ones"
+        f" {turned / DEGREE:.2g} deg and {1e3 * placed:.2g} mm. Survey attitudes rotated about all"
+        " axes."
     )
     return [Finding("transfer", text, weight=float(np.max(ratio)) / ALIKE)]
 
 
 def _of_probe(found: Solved, estimates: list[Estimate]) -> list[Finding]:
-    """Return what the probe's readings leave open, and that no pose was tried."""
+    """Return what the probe's readings do not determine, and that no pose was tested."""
     own = tuple(f"{side}." for side in found.probed)
     open_ones = [e.key for e in estimates if e.key.startswith(own) and not e.determined]
     findings = []
     if open_ones:
         text = (
             f"The probe's readings do not determine {', '.join(open_ones)}: the declared values and"
-            " wide sigmas are kept there. Read the points on each coil's own axis too, or turn the"
+            " wide sigmas are kept. Read the points on each coil's own axis too, or rotate the"
             " probe to its other axes."
         )
         findings.append(Finding("geometry", text, Verdict.TRUSTWORTHY))
     text = (
-        "No pose was tried: what fixes err by with these antennas is not known. Give a survey of"
-        f" some known poses beside --probe ({', '.join(sorted(found.probed))} read)."
+        "No pose was tested: the errors of fixes with these antennas are unknown. Give a survey of"
+        f" some known poses with --probe ({', '.join(sorted(found.probed))} read)."
     )
     return [*findings, Finding("few_data", text, Verdict.TRUSTWORTHY)]

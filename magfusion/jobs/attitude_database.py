@@ -41,24 +41,24 @@ _TAPER = 1.5  # by which a raised cosine averages white noise less than equal we
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling(Settings):
-    """How the steady field is taken from the waveform: averages over which tones vanish, or raw."""
+    """Extraction of the static field from the waveform: averages that remove tones, or raw."""
 
     raw: bool = option(
         False,
-        "Take every sample as it is: no beacon radiates, or it spins fast",
+        "Use every sample as it is: no beacon transmits, or the platform spins fast",
         common=True,
     )
     step: float | None = option(
-        None, "Distance of epochs", unit="s", note="default: half a window", common=True
+        None, "Interval of epochs", unit="s", note="default: half a window", common=True
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class DatabaseSettings(LogSettings, Sampling):
-    """What a database is to determine, and where its attitudes come from."""
+    """Angles of a database, and the source of its attitudes."""
 
     angles: Literal["roll", "roll-pitch", "roll-pitch-yaw"] | None = option(
-        None, "What varies in the log", note="default: as it is found"
+        None, "Angles that vary in the log", note="default: detected"
     )
     step_deg: float = option(
         1.0,
@@ -73,7 +73,7 @@ class DatabaseSettings(LogSettings, Sampling):
 
 
 class Steady(NamedTuple):
-    """The steady field of a log, calibrated.
+    """The calibrated static field of a log.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class Steady(NamedTuple):
     field_body : ndarray, shape (n, 3)
         (T)
     force_body : ndarray, shape (n, 3), optional
-        Mean specific force (m/s^2); None where every sample is taken as it is.
+        Mean specific force (m/s^2); None for raw samples.
     sigma, force_sigma : float
         White noise of each component (T, m/s^2).
     length : float
@@ -98,7 +98,7 @@ class Steady(NamedTuple):
 
 
 def run_attitude_database(settings: DatabaseSettings, output: Path) -> Figures:
-    """Build the database of a log whose attitudes are known: table, picture and report.
+    """Build the database of a log with known attitudes: table, picture and report.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def run_attitude_database(settings: DatabaseSettings, output: Path) -> Figures:
         found = steady(log, site, settings)
     poses, known = interpolate(reference, found.time, MAX_GAP)
     if not np.any(known):
-        raise InputError(f"{place}: does not cover the magnetometer's time; give one that does")
+        raise InputError(f"{place}: does not cover the magnetometer's time; give a longer one")
     with named(job.log_path):
         built = build_database(
             found.field_body[known],
@@ -156,10 +156,10 @@ def run_attitude_database(settings: DatabaseSettings, output: Path) -> Figures:
 
 
 def judged(index: Index, site: Site, log: Log) -> Trust:
-    """Return whether a database holds what one field would make at its attitudes.
+    """Return whether a database is consistent with one uniform field.
 
-    Iron on the platform may distort it, for which a database is made; what no uniform field
-    resembles has attitudes that are not those of the field.
+    Iron on the platform may distort it, which is the purpose of a database; attitudes without any
+    similarity to a uniform field are wrong.
     """
     found = list(recorded(log, site, BRIDGED))
     size = float(np.linalg.norm(index.field_world))
@@ -192,13 +192,13 @@ def _reference(job: Job, log: Log, trajectory: Path | None) -> tuple[Trajectory,
         return read_estimate(trajectory, log.epoch_ns), trajectory
     if log.truth is None:
         raise InputError(
-            f"{job.log_path}: holds no truth; name the result of magfusion smooth with --trajectory"
+            f"{job.log_path}: has no truth; give the result of magfusion smooth with --trajectory"
         )
     return log.truth, job.log_path
 
 
 def steady(log: Log, site: Site, sampling: Sampling) -> Steady:
-    """Return the calibrated steady field of a log in body axes.
+    """Return the calibrated static field of a log in body axes.
 
     Raises
     ------
@@ -207,11 +207,10 @@ def steady(log: Log, site: Site, sampling: Sampling) -> Steady:
     """
     if log.waveform is None:
         raise InputError(
-            "holds no magnetometer.parquet, in whose steady part the Earth's field is; give the raw"
-            " log"
+            "has no magnetometer.parquet, whose static part is the Earth's field; give the raw log"
         )
     if sampling.raw and sampling.step is not None:
-        raise InputError("--raw takes every sample; leave out --step")
+        raise InputError("--raw uses every sample; omit --step")
     sensor, imu = site.platform.magnetometer, site.platform.imu
     if sampling.raw:
         time, measured, force = log.waveform.time, log.waveform.measured_sensor, None
@@ -227,8 +226,9 @@ def steady(log: Log, site: Site, sampling: Sampling) -> Steady:
     weakest = int(np.argmin(np.linalg.norm(field_body, axis=1)))
     if np.linalg.norm(field_body[weakest]) < LEAST_FIELD:
         raise InputError(
-            f"magnetometer: no field at {time[weakest]:.3f} s, where the Earth's is everywhere;"
-            " check the instrument and its calibration, or leave that part out by --start and --end"
+            f"magnetometer: the field is zero at {time[weakest]:.3f} s, despite the Earth's field;"
+            " check the instrument and its calibration, or exclude that part with --start and"
+            " --end"
         )
     return Steady(
         time=time,

@@ -108,7 +108,7 @@ def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
 def _survey(
     settings: AntennaSettings, beacon: Beacon, start: Antenna
 ) -> tuple[BodySurvey | None, int]:
-    """Return what was read at known poses, if anything was, and how many poses are left out."""
+    """Return the readings at known poses, if any, and the number of omitted poses."""
     from magfusion.jobs.inputs import named
 
     if settings.survey is None:

@@ -1,4 +1,4 @@
-"""The job that finds where beacons are and how they are turned: survey in, refined site out."""
+"""The job that estimates positions and attitudes of beacons: survey in, refined site out."""
 
 from __future__ import annotations
 
@@ -59,20 +59,20 @@ class _Calibrated:
 
 @dataclass(frozen=True, kw_only=True)
 class BeaconSettings(Settings):
-    """What was surveyed, and which beacons are calibrated by it."""
+    """Survey, and the beacons to calibrate."""
 
-    survey: Path = argument("Survey: what magnetometers at known poses measured")
+    survey: Path = argument("Survey: measurements of magnetometers at known poses")
     site: Path = required("Site file with the declared beacons")
     beacon: tuple[str, ...] = option(
-        (), "Name of a beacon; repeatable", note="default: all that were surveyed"
+        (), "Name of a beacon; repeatable", note="default: all surveyed beacons"
     )
 
 
 def run_calibrate_beacon(settings: BeaconSettings, output: Path, report: Report = quiet) -> Figures:
     """Calibrate beacons from magnetometers at the known poses of a survey.
 
-    A beacon that is not synchronised must have had one drive phase at all points, as for
-    magnetometers that record at the same time.
+    A beacon that is not synchronised must have had one drive phase at all points, as with
+    magnetometers that record simultaneously.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def run_calibrate_beacon(settings: BeaconSettings, output: Path, report: Report 
     survey = read_survey(survey_path)
     if survey.phasor_sensor is None:
         raise InputError(
-            f"{survey_path}: holds amplitudes, and the calibration of a beacon needs phasors;"
+            f"{survey_path}: contains amplitudes, but the calibration of a beacon requires phasors;"
             " survey again"
         )
     beacons = _chosen(site, survey, settings.beacon, survey_path)
@@ -123,8 +123,8 @@ def _chosen(site: Site, survey: Survey, names: tuple[str, ...], path: Path) -> l
     strange = [name for name in detected if name not in known]
     if strange and not names:
         raise InputError(
-            f"{path}: beacon {strange[0]} is unknown to the site (it has {', '.join(known)}); give"
-            " the site that was surveyed, or choose with --beacon"
+            f"{path}: beacon {strange[0]} is not in the site (it has {', '.join(known)}); give the"
+            " site of the survey, or choose with --beacon"
         )
     _check_tones(survey, known, path)
     return [known[name] for name in dict.fromkeys(names or detected)]
@@ -135,7 +135,7 @@ def _check_tones(survey: Survey, known: dict[str, Beacon], path: Path) -> None:
         if name in known and tone >= len(known[name].tones):
             raise InputError(
                 f"{path}: beacon {name} has no tone {tone} in the site (it has"
-                f" {len(known[name].tones)}); give the site that was surveyed"
+                f" {len(known[name].tones)}); give the site of the survey"
             )
 
 
@@ -247,13 +247,13 @@ def _estimates(found: _Calibrated) -> list[Estimate]:
 
 
 def judged(found: _Calibrated) -> tuple[_Calibrated, Trust]:
-    """Return a calibration with sigmas that its witnesses allow, and what they say."""
+    """Return a calibration with sigmas consistent with its tests, and their findings."""
     name = found.refined.beacon.name
     fitted = unexplained(
         f"beacon {name}",
         float(found.fits.chi_square[0]),
         found.freedom,
-        "Check the poses of the survey, iron near the beacon, and that it stood still.",
+        "Check the poses of the survey, iron near the beacon, and whether it was moved.",
     )
     closed = [one for one in _estimates(found) if not one.is_open]
     prior = np.diag([one.prior_sigma**2 for one in closed])
@@ -269,15 +269,15 @@ def judged(found: _Calibrated) -> tuple[_Calibrated, Trust]:
     findings = [
         Finding(
             "ambiguous",
-            f"Beacon {name} could be at {np.round(place, 3).tolist()} as well: the chi square is"
-            f" only {worse:.2g} larger there; measure at more points.",
+            f"Beacon {name} could also be at {np.round(place, 3).tolist()}: the chi square there is"
+            f" higher by only {worse:.2g}; measure at more points.",
         )
         for place, worse in _rivals(found)
     ]
     if len(found.refined.open_beacon):
         text = (
-            f"The field does not determine a rotation of beacon {name} about its own axis: there"
-            " the declared attitude and its sigma are kept."
+            f"The field does not determine a rotation of beacon {name} about its own axis: the"
+            " declared attitude and its sigma are kept."
         )
         findings.append(Finding("geometry", text, Verdict.TRUSTWORTHY))
     sigma, scale = found.refined.beacon.sigma, float(np.sqrt(excess))
@@ -318,7 +318,7 @@ def _figures(path: Path, survey: Survey, found: list[_Calibrated], trust: Trust)
 
 
 def _bent_deg(found: _Calibrated) -> float:
-    """Return the largest angle of a coil from where it should be in its beacon (deg)."""
+    """Return the largest angle between a coil and its nominal direction in its beacon (deg)."""
     old, new = (
         b.moments_beacon / np.linalg.norm(b.moments_beacon, axis=1, keepdims=True)
         for b in (found.measured.beacon, found.refined.beacon)

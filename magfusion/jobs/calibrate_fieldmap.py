@@ -1,4 +1,4 @@
-"""The job that learns where the field is not what the model says: survey or log in, site out."""
+"""The job that maps deviations of the field from the model: survey or log in, site out."""
 
 from __future__ import annotations
 
@@ -42,23 +42,21 @@ WORSE = 1.2  # the same with the map by that without it
 
 @dataclass(frozen=True, kw_only=True)
 class MapSettings(Settings):
-    """Where the points of a map come from.
+    """Source of a map's points.
 
-    Poses of a log that were found by the same field have taken up its error, and teach little.
+    Poses estimated from the same field contain its error, and are of little use.
     """
 
-    source: Path = argument("Survey (a table, or a directory that holds one), or a log")
-    site: Path | None = option(None, "Site file", note="default: beside the survey or log")
+    source: Path = argument("Survey (a table, or a directory with one), or a log")
+    site: Path | None = option(None, "Site file", note="default: site.yaml with the survey or log")
     trajectory: Path | None = option(
-        None, "Of a log: poses, best not from this field", note="default: the log's truth"
+        None, "For a log: poses, best not from this field", note="default: the log's truth"
     )
-    spacing: float = option(
-        0.25, "Of a log: one point in each cube of this edge", unit="m", above=0.0
-    )
+    spacing: float = option(0.25, "For a log: one point per cube of this edge", unit="m", above=0.0)
 
 
 def run_calibrate_fieldmap(settings: MapSettings, output: Path, report: Report = quiet) -> Figures:
-    """Learn the field map of a site's beacons; write the site that carries it.
+    """Estimate the field map of a site's beacons; write the site with the map.
 
     Raises
     ------
@@ -78,7 +76,7 @@ def run_calibrate_fieldmap(settings: MapSettings, output: Path, report: Report =
         streams = ()
     if len(points) > MOST_POINTS:
         raise InputError(
-            f"{settings.source}: gives {len(points)} points where a map takes {MOST_POINTS};"
+            f"{settings.source}: gives {len(points)} points; a map has at most {MOST_POINTS};"
             " choose a larger --spacing"
         )
     report("learning", 1, 2)
@@ -100,7 +98,7 @@ def run_calibrate_fieldmap(settings: MapSettings, output: Path, report: Report =
 
 
 def judged(fit: MapFit, streams: tuple[Finding, ...] = ()) -> Trust:
-    """Return whether a map holds at points that it was not learnt from.
+    """Return whether a map is valid at points not used in it.
 
     Parameters
     ----------
@@ -111,14 +109,14 @@ def judged(fit: MapFit, streams: tuple[Finding, ...] = ()) -> Trust:
     for beacon, error in fit.error_with.items():
         without = fit.error_without[beacon]
         said = (
-            f"Beacon {beacon}: at points left out the field with the map is {100.0 * error:.2g} %"
-            f" wrong, without it {100.0 * without:.2g} %"
+            f"Beacon {beacon}: at left-out points the field error with the map is"
+            f" {100.0 * error:.2g} %, without it {100.0 * without:.2g} %"
         )
         if error > UNEXPLAINED:
             text = f"{said}: check that the survey is of this site, and its frame and units."
             found.append(Finding("transfer", text, Verdict.FAILED, error / UNEXPLAINED))
         elif error > WORSE * without:
-            text = f"{said}: survey more densely, or do without a map."
+            text = f"{said}: survey more densely, or omit the map."
             found.append(Finding("transfer", text, weight=error / without))
     return Trust((*found, *streams))
 
@@ -132,11 +130,11 @@ def _survey_path(path: Path) -> Path | None:
 
 def _from_survey(settings: MapSettings, path: Path) -> tuple[Site, MapPoints, Figures]:
     if settings.trajectory is not None:
-        raise InputError(f"{path}: a survey has its own poses; leave --trajectory out")
+        raise InputError(f"{path}: a survey has its own poses; omit --trajectory")
     beside = path.parent / "site.yaml"
     site_path = beside if settings.site is None else settings.site
     if settings.site is None and not beside.is_file():
-        raise InputError(f"{path}: has no site.yaml beside it; name the site with --site SITE.yaml")
+        raise InputError(f"{path}: has no site.yaml next to it; give it with --site SITE.yaml")
     site = three_axes(load_site(site_path), site_path)
     return site, points_of(read_survey(path), site, path), Figures()
 
@@ -147,16 +145,16 @@ def points_of(survey: Survey, site: Site, path: Path) -> MapPoints:
     Raises
     ------
     InputError
-        Where the survey holds amplitudes only, or channels that the site does not have.
+        Where the survey has amplitudes only, or channels that are not in the site.
     """
     if survey.phasor_sensor is None:
-        raise InputError(f"{path}: holds amplitudes, and a field map needs phasors; survey again")
+        raise InputError(f"{path}: has amplitudes, but a field map requires phasors; survey again")
     for beacon, tone in survey.channels:
         if (beacon, tone) not in site.channels:
             known = ", ".join(b.name for b in site.beacons)
             raise InputError(
-                f"{path}: tone {tone} of beacon {beacon} is unknown to the site (it has {known});"
-                " give the site that was surveyed"
+                f"{path}: tone {tone} of beacon {beacon} is not in the site (it has {known}); give"
+                " the site of the survey"
             )
     shape = (len(survey), len(site.channels))
     phasor = np.full((*shape, 3), np.nan + 0j)
@@ -177,8 +175,7 @@ def _from_log(settings: MapSettings) -> tuple[Site, MapPoints, Figures, tuple[Fi
     log, site = read_job(Job(settings.source, site_path, Path()))
     if result is None and log.truth is None:
         raise InputError(
-            f"{settings.source}: holds no truth; smooth it and name the result with"
-            " --trajectory RUN"
+            f"{settings.source}: has no truth; smooth it and give the result with --trajectory RUN"
         )
     poses = log.truth if result is None else read_estimate(result, log.epoch_ns)
     assert poses is not None
@@ -196,7 +193,7 @@ def _from_log(settings: MapSettings) -> tuple[Site, MapPoints, Figures, tuple[Fi
 
 
 def _samples(log: Log, site: Site, poses: Trajectory) -> tuple[FieldSamples, dict[str, int]]:
-    """Return phasors; with the motion in each window taken off where the poses are its own."""
+    """Return phasors, corrected for motion in each window where the poses are the log's own."""
     from magfusion.estimation.demodulation.demodulation import demodulated
 
     source = demodulated(log, site, None)

@@ -1,4 +1,4 @@
-"""The job that refines a site by a log: what it determined, what it could not, what is missing."""
+"""The job that refines a site with a log: estimated, unobservable and missing parts."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ OVERLAP = 2.0  # windows that share their samples
 
 
 class Score(NamedTuple):
-    """How well a part of a log is explained with the calibration fixed.
+    """Fit of a part of a log with the calibration fixed.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class Score(NamedTuple):
 
 
 class Transfer(NamedTuple):
-    """What the calibrations of some parts of a log are worth on its other parts.
+    """Cross-validation of calibrations between parts of a log.
 
     Parameters
     ----------
@@ -68,8 +68,8 @@ class Transfer(NamedTuple):
         Of each pair of parts: calibrated on the one, scored on the other.
     pairs : list of (int, int)
     disagreement : float
-        Largest difference of two parts' calibrations along a direction that both determined, in
-        its sigmas.
+        Largest difference of two parts' calibrations along a direction that both determine, in its
+        sigmas.
     """
 
     declared: list[Score]
@@ -80,22 +80,22 @@ class Transfer(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class LogCalibrationSettings(LogsSettings, WindowSettings, EstimateSettings):
-    """What is calibrated by a log of ordinary motion."""
+    """Settings of the calibration from a log of ordinary motion."""
 
     cross_validate: int | None = option(
-        None, "Calibrate on each of so many parts of the log, score on the others"
+        None, "Calibrate on each of this many parts of the log, score on the others"
     )
 
 
 def run_calibrate_log(
     settings: LogCalibrationSettings, output: Path, report: Report = quiet
 ) -> Figures:
-    """Calibrate a site by a log of ordinary motion, or by several together.
+    """Calibrate a site with a log of ordinary motion, or with several together.
 
     Raises
     ------
     InputError
-        Where the log or the site cannot be used, or nothing is to be calibrated.
+        Where the log or the site is not usable, or no parameter is to be calibrated.
     EstimationError
         Where the smoother fails, or the verdict is failed.
     """
@@ -118,7 +118,7 @@ def run_calibrate_log(
         from magfusion.jobs.joint_result import run_joint
 
         if settings.cross_validate is not None:
-            raise InputError("--cross-validate divides one log; several were given")
+            raise InputError("--cross-validate splits one log; several were given")
         return run_joint(JOB, settings, smoother, output, report)
     claimed = claim(output, JOB)
     log, site = read_job(job, unknown=True, report=report)
@@ -127,8 +127,8 @@ def run_calibrate_log(
         result, placed = smooth_and_place(log, site, smoother, report)
     if not result.blocks:
         raise InputError(
-            f"{job.site_path or job.log_path}: the site's sigmas are zero or negligible, so there"
-            " is nothing to calibrate; declare how well the survey is known"
+            f"{job.site_path or job.log_path}: the site's sigmas are zero or negligible, so that no"
+            " parameter can be calibrated; declare the uncertainty of the survey"
         )
     honest, trust = judged(result, log)
     result, moved = against_site(honest, grown(result, honest))
@@ -165,19 +165,19 @@ def run_calibrate_log(
 
 
 def _told_once(trust: Trust, moved: Trust) -> Trust:
-    """Return both together, what both say in the words of the first."""
+    """Return the union; a finding in both keeps the text of the first."""
     moved = Trust(tuple(f for f in moved.findings if f.code not in _said(trust, f.verdict)))
     kept = tuple(f for f in trust.findings if f.code not in _said(moved, f.verdict))
     return Trust(kept, trust.unverified) | moved
 
 
 def _said(trust: Trust, verdict: Verdict) -> set[str]:
-    """Return the codes of what is said with a verdict that is as bad, or worse."""
+    """Return the codes of findings with a verdict at least as bad."""
     return {f.code for f in trust.findings if f.verdict.rank >= verdict.rank}
 
 
 def grown(result: Smoothed, honest: Smoothed) -> float:
-    """Return by what the covariance of the poses was enlarged, median over the states."""
+    """Return the factor on the covariance of the poses, median over the states."""
     before, after = result.states.pose_cov, honest.states.pose_cov
     if before is None or after is None:
         return 1.0
@@ -186,12 +186,12 @@ def grown(result: Smoothed, honest: Smoothed) -> float:
 
 
 def against_site(result: Smoothed, least: float = 1.0) -> tuple[Smoothed, Trust]:
-    """Return a result with sigmas of the calibration that its fit allows, and what that says.
+    """Return a result with calibration sigmas consistent with its fit, and the findings.
 
     Parameters
     ----------
     least : float
-        What the covariance of the calibration is multiplied by at least.
+        Minimum factor on the covariance of the calibration.
     """
     from magfusion.results.refinement import parameter_estimates
 
@@ -202,15 +202,14 @@ def against_site(result: Smoothed, least: float = 1.0) -> tuple[Smoothed, Trust]
         "the fields of the beacons",
         float(np.sum(result.residual[known] ** 2)) / OVERLAP,
         float(np.sum(known)) / OVERLAP,
-        "Check the survey of the beacons, iron among them, and the noise that the site declares.",
+        "Check the survey of the beacons, iron near them, and the declared noise.",
     )
     moved = contradiction(
         [estimate.key for estimate in parameter_estimates(result.declared, *parts)],
         difference(result.declared, result.calibration, result.blocks),
         prior - result.calibration_cov,
         prior,
-        "Check what the site declares of them; where it is only roughly known, declare larger"
-        " sigmas.",
+        "Check their declared values; where they are only roughly known, declare larger sigmas.",
     )
     trust, excess = trust_of(fitted, moved)
     factor = max(excess, least)
@@ -218,13 +217,13 @@ def against_site(result: Smoothed, least: float = 1.0) -> tuple[Smoothed, Trust]
 
 
 def transferred(compared: Transfer) -> Trust:
-    """Return whether the calibrations of parts of a log agree, and serve its other parts."""
+    """Return whether the calibrations of parts of a log agree, and improve its other parts."""
     found = []
     if compared.disagreement > APART:
         text = (
             f"The calibrations of parts of the log disagree by {compared.disagreement:.1f} sigmas"
-            " along a direction that both determined: something changed during the log, or the"
-            " sigmas that the site declares are too small."
+            " along a direction that both determine: a change during the log, or too small declared"
+            " sigmas."
         )
         found.append(Finding("transfer", text, weight=compared.disagreement / APART))
     before, after = (
@@ -233,8 +232,8 @@ def transferred(compared: Transfer) -> Trust:
     )
     if after > WORSE * before:
         text = (
-            f"A calibration by one part of the log leaves a residual of {after:.3g} on the others,"
-            f" where the declared one leaves {before:.3g}: record more motion."
+            f"A calibration on one part of the log has a residual of {after:.3g} on the others, the"
+            f" declared one {before:.3g}: record more motion."
         )
         found.append(Finding("transfer", text, weight=after / before))
     return Trust(tuple(found))
@@ -262,12 +261,12 @@ def _cuts(job: Job, log: Log, site: Site, parts: int | None) -> list[float | Non
         raise InputError(f"--cross-validate must lie between 2 and {MOST_PARTS}; got {parts}")
     if any(beacon.unknown is not None for beacon in site.beacons):
         raise InputError(
-            "--cross-validate compares with the survey, and a beacon has none; place it first"
+            "--cross-validate compares with the survey, but a beacon has none; survey it first"
         )
     first, last = float(log.imu.time[0]), float(log.imu.time[-1])
     if last - first < parts * SHORTEST_PART:
         raise InputError(
-            f"{job.log_path}: {last - first:.3g} s make no {parts} parts of at least"
+            f"{job.log_path}: {last - first:.3g} s are too short for {parts} parts of at least"
             f" {SHORTEST_PART:g} s; record longer, or use fewer parts"
         )
     inner = np.linspace(first, last, parts + 1)[1:-1]

@@ -1,4 +1,4 @@
-"""The job that calibrates a magnetometer: a log of turning in, a refined site out."""
+"""The job that calibrates a magnetometer: a log of rotation in, a refined site out."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ _AXES = "xyz"
 
 @dataclass(frozen=True, kw_only=True)
 class MagnetometerSettings(LogSettings):
-    """Which part of a log calibrates the magnetometer."""
+    """Part of a log used to calibrate the magnetometer."""
 
     positions: bool = option(False, "Use only the stops of the log: twelve or more")
 
 
 def run(settings: MagnetometerSettings, output: Path) -> Figures:
-    """Calibrate the magnetometer as the settings ask; see `run_calibrate_magnetometer`."""
+    """Calibrate the magnetometer; see `run_calibrate_magnetometer`."""
     return run_calibrate_magnetometer(settings.job(output), positions=settings.positions)
 
 
@@ -65,15 +65,15 @@ def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
     Parameters
     ----------
     job : Job
-        Its log holds the raw waveform; inertial samples tell more than the field's size.
+        Its log has the raw waveform; inertial samples add to the field's magnitude.
     positions : bool
-        Use only the stops, twelve of them, instead of all the turning.
+        Use only the stops, at least twelve, instead of the whole rotation.
 
     Raises
     ------
     InputError
-        For what a user must correct: no waveform, NaN or a wrong unit in it, too few orientations,
-        no rest for ``positions``, or ``job.output`` in the way.
+        For invalid input: no waveform, NaN or a wrong unit in it, too few orientations, no rest
+        for ``positions``, or ``job.output`` in the way.
     EstimationError
         Where the calibration has no solution.
     """
@@ -83,11 +83,11 @@ def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
     claimed = claim(job.output, JOB)
     log, site = read_job(job, without=True)
     if positions:
-        require_imu(job, log, "it tells the stops of --positions; leave the option away")
+        require_imu(job, log, "it is needed to find the stops of --positions; omit the option")
     if log.waveform is None:
         raise InputError(
-            f"{job.log_path}: holds no waveform, only phasors, which do not hold the Earth's field;"
-            " give the log with magnetometer.parquet"
+            f"{job.log_path}: has only phasors, no waveform, and phasors do not contain the Earth's"
+            " field; give the log with magnetometer.parquet"
         )
     with named(job.log_path):
         found, trust = calibrated(log, site, positions=positions)
@@ -130,7 +130,7 @@ def _refined_site(
 
 
 def estimates_of(found: LogCalibration, declared: Magnetometer) -> list[Estimate]:
-    """Return the twelve numbers as found, beside those that a site declared."""
+    """Return the twelve estimated parameters, with those declared in a site."""
     fit, prior = found.graph.fit, found.prior
     names = [f"magnetometer.matrix_{row}{column}" for row in _AXES for column in _AXES]
     names += [f"magnetometer.offset_nt_{axis}" for axis in _AXES]
@@ -196,7 +196,7 @@ def _figures(
 
 
 def calibrated(log: Log, site: Site, *, positions: bool = False) -> tuple[LogCalibration, Trust]:
-    """Return what a log's waveform says of the magnetometer, and what is to be said of that.
+    """Return the calibration from a log's waveform, and findings on it.
 
     Raises
     ------
@@ -215,7 +215,7 @@ def calibrated(log: Log, site: Site, *, positions: bool = False) -> tuple[LogCal
 
 
 def judged(found: LogCalibration, site: Site, log: Log) -> tuple[LogCalibration, Trust]:
-    """Return a calibration with sigmas that its witnesses allow, and what they say."""
+    """Return a calibration with sigmas consistent with its tests, and their findings."""
     declared, prior, fit = site.platform.magnetometer, found.prior, found.graph.fit
     estimates = estimates_of(found, declared)
     change = np.concatenate([(fit.matrix - declared.matrix).ravel(), fit.offset - declared.offset])
@@ -239,17 +239,17 @@ def judged(found: LogCalibration, site: Site, log: Log) -> tuple[LogCalibration,
 
 
 def _beside(found: LogCalibration) -> Contradiction:
-    """Return whether what was found beside the calibration contradicts the site."""
+    """Return whether the other estimated parameters contradict the site."""
     graph, prior = found.graph, found.prior
     names = ["earth.dip", *(f"imu.{k}_bias_{axis}" for k in ("accel", "gyro") for axis in _AXES)]
     change = np.concatenate([[graph.dip_change], graph.accel_bias_body, graph.gyro_bias_body])
     sigma = np.repeat([prior.dip_sigma, prior.accel_bias_sigma, prior.gyro_bias_sigma], [1, 3, 3])
     cov = np.diag(sigma**2)
     remedy = (
-        "Check the Earth field and the mounting in the site, and that gravity is in the specific"
-        " force; turn more slowly, away from iron."
+        "Check the Earth field and the mounting in the site, and that the specific force includes"
+        " gravity; rotate more slowly, away from iron."
     )
-    return contradiction(names, change, cov, cov, remedy, "What was found beside the calibration")
+    return contradiction(names, change, cov, cov, remedy, "The other estimated parameters")
 
 
 def _doubts(found: LogCalibration, site: Site) -> Iterator[Finding]:
@@ -258,8 +258,8 @@ def _doubts(found: LogCalibration, site: Site) -> Iterator[Finding]:
         own, other = (_microtesla(b) for b in (found.magnetometer.offset, found.rival))
         yield Finding(
             "ambiguous",
-            f"Two offsets explain the readings, {own} and {other} uT, each the other's mirror"
-            " image: the sensor turned about one axis only. Turn it about a second.",
+            f"Two offsets fit the readings, {own} and {other} uT, mirror images of each other: the"
+            " sensor was rotated about one axis only. Rotate it about a second axis.",
             Verdict.FAILED,
         )
     yield from _of_another_size(found, site)
@@ -268,8 +268,8 @@ def _doubts(found: LogCalibration, site: Site) -> Iterator[Finding]:
     if sigma > LOOSE * size:
         yield Finding(
             "few_data",
-            f"The offset is known to {1e6 * sigma:.2g} uT only, {100.0 * sigma / size:.2g} % of the"
-            " field, and is not determined: turn the sensor further, about all its axes.",
+            f"The offset sigma is {1e6 * sigma:.2g} uT, {100.0 * sigma / size:.2g} % of the field:"
+            " it is not determined. Rotate the sensor further, about all its axes.",
             Verdict.FAILED if sigma > USELESS * size else Verdict.DOUBTFUL,
             weight=sigma / (LOOSE * size),
         )
@@ -277,9 +277,9 @@ def _doubts(found: LogCalibration, site: Site) -> Iterator[Finding]:
     if disturbed > site.earth.strength_sigma:
         yield Finding(
             "earth_field",
-            f"The size of the calibrated field scatters by {100.0 * disturbed:.2g} %, and the site"
-            f" declares a disturbance of {100.0 * site.earth.strength_sigma:.2g} %"
-            " (world.earth.strength_sigma). Turn the sensor in one place, away from iron.",
+            f"The magnitude of the calibrated field scatters by {100.0 * disturbed:.2g} %, but the"
+            f" site declares a disturbance of {100.0 * site.earth.strength_sigma:.2g} %"
+            " (world.earth.strength_sigma). Rotate the sensor in one place, away from iron.",
             weight=disturbed / site.earth.strength_sigma,
         )
 
@@ -289,9 +289,9 @@ def _microtesla(offset: Array) -> str:
 
 
 def _of_another_scale(found: LogCalibration, site: Site) -> Iterator[Finding]:
-    """Yield that only another scale of the sensor makes the readings the declared field's.
+    """Yield a finding if only another scale of the sensor matches the declared field.
 
-    It is said before what the calibration says against its prior, of which it is the cause.
+    It precedes findings of the calibration against its prior, of which it is the cause.
     """
     declared = site.platform.magnetometer.matrix
     ratio = float(np.cbrt(np.linalg.det(found.graph.fit.matrix) / np.linalg.det(declared)))
@@ -300,33 +300,33 @@ def _of_another_scale(found: LogCalibration, site: Site) -> Iterator[Finding]:
     if far < 1.0:
         return
     text = (
-        f"The scale of the magnetometer came out {ratio:.3g} times the declared one: the"
-        " readings are in another unit, or the site's Earth field is of another size."
+        f"The estimated scale of the magnetometer is {ratio:.3g} times the declared one: the"
+        " readings have another unit, or the site's Earth field has another magnitude."
     )
     if site.earth_field_world is not None and abs(ratio - 1.0) < 1.0:
         size = 1e6 * float(np.linalg.norm(site.earth_field_world))
         text = (
-            f"The readings are of a field of {ratio * size:.3g} uT where the sensor is as declared,"
-            f" and the site declares {size:.3g} uT: steel is near, the field is another place's, or"
-            " the readings are in another unit. Calibrate away from steel, or declare the field"
-            " that is there (earth_field_t)."
+            f"With the declared calibration the readings are of a field of {ratio * size:.3g} uT,"
+            f" but the site declares {size:.3g} uT: steel is near, the field is of another place,"
+            " or the readings have another unit. Calibrate away from steel, or declare the local"
+            " field (earth_field_t)."
         )
     yield Finding("earth_field", text, Verdict.FAILED, FIRST + far)
 
 
 def _of_another_size(found: LogCalibration, site: Site) -> Iterator[Finding]:
-    """Yield that the calibrated field is not of the declared size, or of no size on Earth."""
+    """Yield findings if the magnitude of the calibrated field is not as declared, or impossible."""
     size = float(np.mean(np.linalg.norm(_fields(found, found.magnetometer), axis=1)))
     remedy = (
-        " A hard iron remains that this motion does not tell from the field: turn the sensor about"
-        " all its axes, and declare a larger sigma of its offset"
+        " A hard iron remains that this motion does not separate from the field: rotate the sensor"
+        " about all its axes, and declare a larger sigma of its offset"
     )
     if site.earth_field_world is None:
         if not SMALLEST < size < LARGEST:
             yield Finding(
                 "earth_field",
-                f"The calibrated field is {1e6 * size:.3g} uT, and the Earth's is 22 to 67."
-                f"{remedy}; or give the field there (earth_field_t).",
+                f"The calibrated field is {1e6 * size:.3g} uT, outside the Earth's 22 to 67."
+                f"{remedy}; or give the local field (earth_field_t).",
                 Verdict.FAILED,
                 size / LARGEST,
             )
@@ -336,7 +336,7 @@ def _of_another_size(found: LogCalibration, site: Site) -> Iterator[Finding]:
     if off > site.earth.strength_sigma:
         yield Finding(
             "earth_field",
-            f"The calibrated field is {1e6 * size:.3g} uT, and the site declares"
+            f"The calibrated field is {1e6 * size:.3g} uT, but the site declares"
             f" {1e6 * declared:.3g} (within {100.0 * site.earth.strength_sigma:.2g} %).{remedy}.",
             Verdict.FAILED if off > SCALE else Verdict.DOUBTFUL,
             off / site.earth.strength_sigma,
@@ -349,22 +349,22 @@ def _remarks(found: LogCalibration, log: Log) -> Iterator[Finding]:
         yield Finding("few_data", text, Verdict.TRUSTWORTHY)
     if not log.inertial:
         text = (
-            "The log has no IMU: the field's size alone tells no rotation of the sensor, which"
-            " stays as declared. Record an IMU beside it to find that too."
+            "The log has no IMU: the field's magnitude does not determine the rotation of the"
+            " sensor, which stays as declared. Record an IMU as well to estimate it."
         )
         yield Finding("few_data", text, Verdict.TRUSTWORTHY)
     if not found.scale_known:
         yield Finding(
             "few_data",
-            "The site has no Earth field: the scale of the matrix is the declared one, and only"
-            " ratios, angles and offset are found; give earth_field_t or a location.",
+            "The site has no Earth field: the scale of the matrix is as declared, and only ratios,"
+            " angles and offset are estimated; give earth_field_t or a location.",
             Verdict.TRUSTWORTHY,
         )
     if found.shape_kept:
         yield Finding(
             "transfer",
-            "The declared shape and offset leave no more spread than what one half of the log finds"
-            " for the other: they were kept, and only the sensor's rotation was taken.",
+            "The declared shape and offset fit each half of the log as well as the calibration of"
+            " the other half: they are kept, and only the sensor's rotation is estimated.",
             Verdict.TRUSTWORTHY,
         )
 

@@ -1,4 +1,4 @@
-"""The job that checks a log in seconds: streams, fields, compasses, first fixes; a verdict."""
+"""The job that checks a log in seconds: streams, fields, compass, first fixes; a verdict."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class CheckSettings(LogSettings, WindowSettings):
-    """How a log is checked; without a site the recording alone is."""
+    """Settings of a check; without a site only the recording is checked."""
 
 
 def run_check(
     settings: CheckSettings, output: Path | None = None, report: Report = quiet
 ) -> Figures:
-    """Check a log: what its streams, fields, compasses and first fixes say against it.
+    """Check a log: consistency of its streams, fields, compass and first fixes.
 
     Parameters
     ----------
     output : Path, optional
-        Where report and picture are written; nowhere unless it is given.
+        Directory of report and picture; by default nothing is written.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def _of_several(looks: Mapping[str, Look]) -> Figures:
 
 
 def check_figures(look: Look) -> Figures:
-    """Return the figures of a look at a log."""
+    """Return the figures of a quick check."""
     figures = Figures()
     for one in look.timings:
         figures |= Figures(
@@ -108,11 +108,11 @@ def check_figures(look: Look) -> Figures:
     for name, snr, share in look.heard_as():
         figures |= Figures(
             Figure("snr_{beacon}", snr, beacon=name, label="signal to noise"),
-            Figure("heard_{beacon}", share, beacon=name, label="share of the epochs heard"),
+            Figure("heard_{beacon}", share, beacon=name, label="share of the epochs detected"),
         )
     for name, (distance, depths) in look.depths.items():
         figures |= Figures(
-            Figure("range_{beacon}_m", distance, "m", beacon=name, label="range by strength"),
+            Figure("range_{beacon}_m", distance, "m", beacon=name, label="range from strength"),
             Figure("skin_depths_{beacon}", depths, beacon=name, label="skin depths away"),
         )
     if look.lines is not None:
@@ -129,7 +129,7 @@ def check_figures(look: Look) -> Figures:
 
 
 def _of_compasses(look: Look) -> Figures:
-    """Return the sizes of gravity and field, and the angle between them."""
+    """Return the magnitudes of gravity and field, and the angle between them."""
     means = look.means
     if len(means) == 0:
         return Figures()
@@ -139,8 +139,8 @@ def _of_compasses(look: Look) -> Figures:
         size = float(np.nanmedian(np.linalg.norm(means.field_body, axis=1)))
         angle = float(np.degrees(np.nanmedian(means.angle)))
         figures |= Figures(
-            Figure("steady_field_ut", 1e6 * size, "uT", label="steady field"),
-            Figure("field_from_vertical_deg", angle, "deg", label="steady field from the vertical"),
+            Figure("steady_field_ut", 1e6 * size, "uT", label="static field"),
+            Figure("field_from_vertical_deg", angle, "deg", label="static field from the vertical"),
         )
     return figures
 

@@ -1,4 +1,4 @@
-"""A navigator that goes on from a checkpoint, whatever the job keeps beside it."""
+"""A navigator resumed from a checkpoint, with other state of the job."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,7 @@ Beside = TypeVar("Beside")
 
 @dataclass(frozen=True)
 class Kept:
-    """What a run along a log keeps beside its navigator: the rows made so far, and its time (s)."""
+    """State of a run along a log apart from its navigator: number of rows, and its time (s)."""
 
     rows: Mark | None = None
     elapsed: float = 0.0
@@ -29,7 +29,7 @@ class Kept:
 
 @dataclass(frozen=True, eq=False)
 class Begun(Generic[Beside]):
-    """A navigator, the position of its run, and what else its checkpoint contained."""
+    """A navigator, the position of its run, and the other state of its checkpoint."""
 
     navigator: Navigator
     position: int
@@ -45,23 +45,23 @@ def begin(
     *,
     resume: bool,
 ) -> Begun[Beside]:
-    """Return a navigator as its checkpoint left it, or a new one where there is none.
+    """Return the navigator of a checkpoint, or a new one where there is none.
 
     Parameters
     ----------
     place : Path, optional
-        Of the checkpoint; None where none is kept.
+        Of the checkpoint; None for no checkpoint.
     key : str
         Of the run.
-    beside : object
-        What a new run keeps beside its navigator; the checkpoint holds one of the same type.
+    `beside` : object
+        Other state of a new run; that in the checkpoint has the same type.
     resume : bool
-        Otherwise the run begins anew, and an earlier checkpoint will be overwritten.
+        If false, the run starts from the beginning, and an existing checkpoint is overwritten.
 
     Raises
     ------
     InputError
-        Where the checkpoint is damaged or another's, or something else is in its place.
+        Where the checkpoint is damaged or of another run, or the place is not a checkpoint.
     """
     found = read_checkpoint(place, key) if place is not None and resume else None
     if place is None or found is None:
@@ -77,6 +77,6 @@ def begin(
 
 
 def save(navigator: Navigator, position: int, beside: object, place: Path, key: str) -> None:
-    """Write a checkpoint of a navigator, with what the run keeps beside it."""
+    """Write a checkpoint of a navigator, with the other state of the run."""
     content = {"navigator": navigator.checkpoint(), "beside": to_plain(beside)}
     write_checkpoint(Checkpoint(key, position, content), place)

@@ -38,27 +38,27 @@ MOST_POINTS = 100_000
 
 @dataclass(frozen=True, kw_only=True)
 class CoverageSettings(RiskSettings):
-    """Where and how to bound; None takes what fits the site."""
+    """Volume and grid of the bounds; None selects defaults from the site."""
 
     site: Path = argument("Site file of the installation")
     box: str | None = option(
         None,
         "Volume, m: xmin,xmax,ymin,ymax,zmin,zmax",
-        note="default: about the beacons",
+        note="default: around the beacons",
     )
     height: float | None = option(None, "A single height", unit="m")
     spacing: float | None = option(
-        None, "Of the points", unit="m", above=0.0, note="default: a twentieth of the volume"
+        None, "Spacing of points", unit="m", above=0.0, note="default: a twentieth of the volume"
     )
     window: float | None = option(
         None,
-        "Time over which the tones are averaged",
+        "Averaging time of the tones",
         unit="s",
         least=1e-3,
         most=3600.0,
         note="default: from the tones' spacing",
     )
-    extra_beacon: bool = option(False, "Find where one more beacon adds most")
+    extra_beacon: bool = option(False, "Find the best position of one more beacon")
 
 
 def run_coverage(settings: CoverageSettings, output: Path) -> Figures:
@@ -103,8 +103,8 @@ def _window(site: Site, site_path: Path, given: float | None) -> float:
         in_turn = [b.name for b in site.beacons if any(slot is not None for _, slot in b.tones)]
         if in_turn:
             raise InputError(
-                f"{site_path}: beacon {in_turn[0]} is driven in time slots, whose length the site"
-                " does not give; give the time of one round with --window"
+                f"{site_path}: beacon {in_turn[0]} is driven in time slots, whose length is not in"
+                " the site; give the time of one round with --window"
             )
         with named(site_path):
             return default_settings(site).window
@@ -115,7 +115,7 @@ def _spacing(box: Array, settings: CoverageSettings) -> float:
     size = box[1] - box[0]
     if settings.height is not None:
         if not abs(settings.height) < 1e6:
-            raise InputError(f"--height must be a height in metres; got {settings.height:g}")
+            raise InputError(f"--height must be finite; got {settings.height:g}")
         size = size[:2]
     spacing = float(np.max(size)) / 20.0 if settings.spacing is None else settings.spacing
     if float(np.prod(size / spacing + 1.0)) > MOST_POINTS:
@@ -155,7 +155,7 @@ def _figures(
             )
         ),
         *level_figures(found),
-        Figure("beacons_heard_least", int(np.min(found.beacons)), label="beacons in reach, least"),
+        Figure("beacons_heard_least", int(np.min(found.beacons)), label="beacons in range, least"),
     ]
     if extra is not None:
         figures += [
@@ -170,7 +170,7 @@ def _figures(
 
 
 def level_figures(found: Coverage) -> list[Figure]:
-    """Return median and worst of the protection levels, and where there is one."""
+    """Return median and worst of the protection levels, and where they exist."""
     parts = (
         ("m", "position", found.protection_level_m),
         ("deg", "attitude", found.protection_level_deg),
@@ -193,7 +193,7 @@ def level_figures(found: Coverage) -> list[Figure]:
 
 
 def finite(value: float) -> float | None:
-    """Return a number as JSON has it: none where the pose is not determined."""
+    """Return a number as in JSON: null where the pose is not determined."""
     return float(value) if np.isfinite(value) else None
 
 

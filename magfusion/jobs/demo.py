@@ -19,7 +19,7 @@ from magfusion.simulation.motion import Rests
 
 @dataclass(frozen=True, kw_only=True)
 class DemoSettings(RandomSettings):
-    """What is simulated and shown."""
+    """Settings of the demonstration."""
 
     show: bool = option(True, "Open the recording in the viewer")
     duration: float = option(120.0, "Length of the walk", unit="s", least=5.0, most=3600.0)

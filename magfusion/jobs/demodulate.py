@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class DemodulateSettings(LogSettings, WindowSettings, RestSettings):
-    """How a waveform becomes phasors."""
+    """Settings of the demodulation."""
 
 
 def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = quiet) -> Figures:
-    """Demodulate a waveform: a log that holds phasors in its place.
+    """Demodulate a waveform: a log with phasors instead.
 
     Raises
     ------
@@ -61,12 +61,12 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     )
     if used and log.waveforms:
         raise InputError(
-            "--at-rest integrates the samples of one magnetometer; leave it out, or give a site of"
-            " the one to integrate"
+            "--at-rest integrates the samples of one magnetometer; omit it, or give a site of the"
+            " one to integrate"
         )
     if log.waveform is None and not log.waveforms:
         raise InputError(
-            f"{job.log_path}: holds no magnetometer.parquet to demodulate; give the raw log"
+            f"{job.log_path}: has no magnetometer.parquet to demodulate; give the raw log"
         )
     report("demodulating", 0, 1)
     with named(job.log_path):
@@ -103,12 +103,12 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
 
 
 def _phasor_figures(samples: FieldSamples, every: bool) -> Figures:
-    """Return how many phasors there are, and how sure.
+    """Return the number of phasors, and their sigmas.
 
     Parameters
     ----------
     every : bool
-        Whether a tone is told of that no window has.
+        Whether a tone that is in no window is reported.
     """
     sigma = np.sqrt(np.trace(samples.phasor_cov, axis1=2, axis2=3) / 3.0)
     return Figures(
@@ -129,7 +129,7 @@ def _phasor_figures(samples: FieldSamples, every: bool) -> Figures:
 
 
 def _of(samples: FieldSamples, channel: int, joint: str) -> str:
-    """Return the name of the magnetometer that a channel is of; nothing where there is one."""
+    """Return the name of a channel's magnetometer; empty for a single magnetometer."""
     if not samples.magnetometers:
         return ""
     name = samples.magnetometers[channel]
@@ -137,7 +137,7 @@ def _of(samples: FieldSamples, channel: int, joint: str) -> str:
 
 
 def _freed(log: Log, site: Site) -> Site:
-    """Return the site of phasors that the magnetometer's temperature has no part in any more."""
+    """Return the site of phasors in which the magnetometer's temperature is compensated."""
     magnetometer = site.platform.magnetometer
     missing = any(finding.code == "temperature_missing" for finding in log.noticed)
     if magnetometer.warming is None or missing:

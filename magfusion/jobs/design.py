@@ -71,7 +71,7 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
     )
     before = found.median_random if alone else site
     assert before is not None
-    words = "the site as it is" if before is site else "a random layout, the median one"
+    words = "the given site" if before is site else "a random layout, the median one"
     with claimed as directory:
         save_site(found.site, directory / "site.yaml")
         new = load_site(directory / "site.yaml")
@@ -112,7 +112,7 @@ def _hall(settings: DesignSettings, site: Site) -> tuple[Hall, float]:
     ):
         if points > most:
             raise InputError(
-                f"--{name} {step:g} gives more than {most} points; choose a larger one"
+                f"--{name} {step:g} gives more than {most} points; choose a larger value"
             )
     return hall, spacing
 
@@ -121,9 +121,9 @@ def _points(hall: Hall, spacing: float) -> Array:
     points = points_of_use(hall, spacing)
     if not 0 < len(points) <= MOST_POINTS:
         raise InputError(
-            f"--spacing {spacing:g} gives {len(points)} points where it is to be navigated; 1 to"
-            f" {MOST_POINTS} can be compared, so choose another spacing, or in the hall's use"
-            " another margin_m, or a polygon_m that lies in the hall"
+            f"--spacing {spacing:g} gives {len(points)} points of use; 1 to {MOST_POINTS} are"
+            " possible; choose another spacing, or in the hall's use another margin_m, or a"
+            " polygon_m inside the hall"
         )
     return points
 
@@ -153,25 +153,25 @@ def _task(settings: DesignSettings, site: Site, hall: Hall, spacing: float) -> T
 
 
 def _check_turns(settings: DesignSettings, kept: Site, template: Beacon) -> None:
-    """Refuse beacons in time slots beside others, and a window that does not hold a cycle."""
+    """Reject beacons in time slots with others, and a window shorter than a cycle."""
     in_turn = [beacon for beacon in (*kept.beacons, template) if is_in_turn(beacon)]
     if kept.beacons and in_turn:
         raise InputError(
-            f"--keep: beacon {in_turn[0].name} is driven in time slots, and a cycle is designed as"
-            " a whole; leave --keep out, or plan by coverage --extra-beacon"
+            f"--keep: beacon {in_turn[0].name} is driven in time slots, and a cycle can only be"
+            " designed as a whole; omit --keep, or plan with coverage --extra-beacon"
         )
     if not is_in_turn(template):
         return
     cycle = cycle_of(template, settings.beacons)
     if cycle is not None and settings.window < cycle * (1.0 - 1e-9):
         raise InputError(
-            f"--window {settings.window:g} s does not hold a cycle of {settings.beacons} beacons in"
-            f" time slots; give --window {cycle:.3g} or more"
+            f"--window {settings.window:g} s is shorter than a cycle of {settings.beacons} beacons"
+            f" in time slots; give --window {cycle:.3g} or more"
         )
 
 
 def _kept(site: Site, keep: str | None) -> Site:
-    """Return the site with the beacons that stay alone."""
+    """Return the site with only the beacons that stay."""
     names = [beacon.name for beacon in site.beacons]
     if keep == ALL and ALL not in names:
         return site
@@ -179,7 +179,7 @@ def _kept(site: Site, keep: str | None) -> Site:
     unknown = [name for name in wanted if name not in names]
     if unknown:
         raise InputError(
-            f"--keep {keep}: the site has no beacon {unknown[0]!r}; it has {', '.join(names)}, and"
+            f"--keep {keep}: the site has no beacon {unknown[0]!r}; it has {', '.join(names)};"
             f" {ALL} keeps them all"
         )
     gone = [name for name in names if name not in wanted]
@@ -200,7 +200,7 @@ def _band(settings: DesignSettings, site: Site) -> Band:
         low = high = np.nan
     if not 0.0 < low <= high <= 1e6:
         raise InputError(
-            f"--band {settings.band!r}: two frequencies in Hz are needed, the lower one first, as"
+            f"--band {settings.band!r}: give two frequencies in Hz, the lower one first, e.g."
             " --band 10,100"
         )
     response = site.platform.magnetometer.response

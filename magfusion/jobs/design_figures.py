@@ -1,4 +1,4 @@
-"""What the report of a design says."""
+"""Report of a design."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 def design_figures(
     settings: DesignSettings, task: Task, found: Design, panels: list[Panel], spacing: float
 ) -> Figures:
-    """Return the report of a design: what it is worth, before and after, and its beacons.
+    """Return the report of a design: its accuracy, before and after, and its beacons.
 
     Parameters
     ----------
@@ -65,12 +65,12 @@ def design_figures(
 
 
 _OUT_OF_TIME = (
-    "The search ended because its time was over: this is the best layout up to then; give more"
-    " --minutes, or go on from its site.yaml by --continue."
+    "Search time limit reached: this is the best layout so far; increase --minutes, or continue"
+    " from its site.yaml with --continue."
 )
 _OPEN = (
-    "Somewhere there is no protection level: without one of the beacons nothing determines the pose"
-    " there. Place more beacons, or stronger ones."
+    "At some points there is no protection level: without one of the beacons the pose there is not"
+    " determined. Place more beacons, or stronger ones."
 )
 
 
@@ -87,7 +87,7 @@ def _sigma_figures(found: Coverage) -> list[Figure]:
 
 
 def _random_figures(worst_m: Array, reached_m: float) -> list[Figure]:
-    """Return what random layouts of the same candidates have, and what the design gains."""
+    """Return the figures of random layouts of the same candidates, and the design's gain."""
     if not len(worst_m):
         return []
     median, best = float(np.median(worst_m)), float(np.min(worst_m))

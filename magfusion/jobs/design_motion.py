@@ -1,4 +1,4 @@
-"""The part of `design` that says where to hold the sensor next, for a calibration."""
+"""The part of `design` that proposes stops of the platform for a calibration."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def run_motion(
     Raises
     ------
     InputError
-        Where the site says that everything is known, or ``output`` is in the way.
+        Where the site declares all parameters as known, or ``output`` is in the way.
     """
     from magfusion.jobs.inputs import claim
     from magfusion.results.plots.motion import write_motion_plot
@@ -42,8 +42,8 @@ def run_motion(
     found = next_motion(site, points, settings.motion, settings.stop, known=settings.poses_known)
     if not len(found.parameters.sigma):
         raise InputError(
-            f"{settings.site}: all sigmas are zero, so that nothing is left to calibrate; declare"
-            " how well beacons and magnetometer are known"
+            f"{settings.site}: all sigmas are zero, so that there is no parameter to calibrate;"
+            " declare the uncertainty of beacons and magnetometer"
         )
     figures = _figures(settings, found)
     with claimed as directory:
@@ -54,7 +54,7 @@ def run_motion(
 
 
 def said(found: Motion, number: int) -> str:
-    """Return what to do at a stop, and what it is for."""
+    """Return the instruction for a stop, and its purpose."""
     stop, parameters = found.stops[number], found.parameters
     x, y, z = stop.position_world
     roll, pitch, yaw = stop.rpy_deg
@@ -75,7 +75,7 @@ def _figures(settings: DesignSettings, found: Motion) -> Figures:
     if beyond:
         notes.append(
             f"No such stops determine {', '.join(beyond)}: only a better survey does, or"
-            " poses that are measured; of the lever arm, turning on the spot with an IMU."
+            " measured poses; for the lever arm, rotation on the spot with an IMU."
         )
     figures = [
         Figure("stops", len(found.stops)),

@@ -1,4 +1,4 @@
-"""What the design of an installation is asked for."""
+"""Settings of the design of an installation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ALL = "all"
 
 @dataclass(frozen=True, kw_only=True)
 class DesignSettings(RiskSettings, RandomSettings):
-    """Which hall, how many beacons of what kind, and how long to seek."""
+    """Hall, number and kind of beacons, and search time."""
 
     site: Path = argument("Site file: its platform, and a beacon of which copies are placed")
     beacons: int = option(4, "New beacons to place", least=1, most=30)
@@ -24,42 +24,42 @@ class DesignSettings(RiskSettings, RandomSettings):
     box: str | None = option(
         None,
         "A hall without a file, m: xmin,xmax,ymin,ymax,zmin,zmax",
-        note="default: about the site's beacons",
+        note="default: around the site's beacons",
     )
     keep: str | None = option(
         None,
         f"Beacons of the site that stay: their names, or {ALL}",
         metavar="NAME,...",
-        note="default: none; all are placed anew",
+        note="default: none; all are placed again",
     )
     template: str | None = option(
         None, "Beacon of the site of which copies are placed", note="default: the first"
     )
     objective: Literal["worst", "D", "A"] = option(
         "worst",
-        "What is made small: the worst protection level; the mean logarithm of the determinant (D)"
-        " or the mean trace (A) of the position's covariance",
+        "Criterion to minimise: the worst protection level; the mean logarithm of the determinant"
+        " (D) or the mean trace (A) of the position's covariance",
     )
     axes: Literal["3", "7", "13"] = option(
         "7", "Directions of a beacon's axis: the world's, and diagonals"
     )
     grid: float | None = option(
-        None, "Of the mounting places", unit="m", above=0.0, note="default: as --spacing"
+        None, "Spacing of the mounting places", unit="m", above=0.0, note="default: as --spacing"
     )
     spacing: float | None = option(
         None,
-        "Of the points of use",
+        "Spacing of the points of use",
         unit="m",
         above=0.0,
         note="default: a twentieth of the hall's longer side",
     )
-    apart: float = option(1.0, "Least distance of two beacons", unit="m", least=0.2, most=1e4)
+    apart: float = option(1.0, "Minimum distance of two beacons", unit="m", least=0.2, most=1e4)
     clearance: float = option(
-        0.5, "Least distance of a beacon from the points of use", unit="m", least=0.2, most=1e4
+        0.5, "Minimum distance of a beacon from the points of use", unit="m", least=0.2, most=1e4
     )
     moment: float | None = option(
         None,
-        "Of each new beacon's strongest coil",
+        "Moment of each new beacon's strongest coil",
         unit="A m^2",
         least=1e-6,
         most=1e6,
@@ -67,36 +67,34 @@ class DesignSettings(RiskSettings, RandomSettings):
     )
     moment_budget: float | None = option(
         None,
-        "Of all new beacons together, divided as serves best",
+        "Total moment of all new beacons, distributed optimally",
         unit="A m^2",
         least=1e-6,
         most=1e7,
     )
-    band: str = option("10,100", "Where tones may be, Hz: low,high")
+    band: str = option("10,100", "Frequency band of tones, Hz: low,high")
     window: float = option(
         0.4,
-        "Over which tones are averaged and told apart",
+        "Time over which tones are averaged and separated",
         unit="s",
         least=0.02,
         most=4.0,
     )
     mains_hz: float = option(
-        50.0, "Mains, whose harmonics are kept free", unit="Hz", least=0.0, most=1e3, note="0: none"
+        50.0, "Mains (harmonics are avoided)", unit="Hz", least=0.0, most=1e3, note="0: none"
     )
-    starts: int = option(8, "Random layouts from which the search starts", least=1, most=1000)
+    starts: int = option(8, "Random initial layouts of the search", least=1, most=1000)
     random: int = option(0, "Random layouts to compare with", least=0, most=10_000)
-    minutes: float = option(
-        10.0, "After which the search ends with the best that it has", least=0.01, most=1e5
-    )
+    minutes: float = option(10.0, "Time limit of the search", least=0.01, most=1e5)
     motion: int | None = option(
         None,
-        "Place no beacons: say where to hold the platform next for a calibration, so many stops",
+        "Place no beacons: propose this number of stops of the platform for a calibration",
         least=1,
         most=100,
     )
     stop: float = option(2.0, "Length of such a stop", unit="s", least=0.02, most=3600.0)
     poses: Literal["open", "known"] = option(
-        "open", "Whether the stops' poses are measured: known for calibrate beacon"
+        "open", "Whether the stops' poses are measured (known, for calibrate beacon)"
     )
     earlier: Path | None = option(
         None, "Start from the site.yaml of an earlier design of the same hall", name="continue"
@@ -105,7 +103,7 @@ class DesignSettings(RiskSettings, RandomSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.moment is not None and self.moment_budget is not None:
-            raise InputError("give --moment, or --moment-budget to have it divided; not both")
+            raise InputError("give --moment, or --moment-budget to distribute it; not both")
         if self.hall is not None and self.box is not None:
             raise InputError("give --hall, or --box where there is no file; not both")
 

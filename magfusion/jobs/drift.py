@@ -1,4 +1,4 @@
-"""The job that proves, or disproves, that an online estimator is stable over days."""
+"""The job that tests the stability of an online estimator over days."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ LOOK = 1.0  # s between two looks at how far the runs are
 
 @dataclass(frozen=True, kw_only=True)
 class DriftSettings(RandomSettings):
-    """What is tried.
+    """Settings of the stability test.
 
-    A declared phase together with a clock error is what the test must find.
+    A declared phase with a clock error is a case that the test must detect.
     """
 
     hours: float = option(48.0, "Simulated length", unit="h", least=SHORTEST, most=LONGEST)
@@ -53,7 +53,7 @@ class DriftSettings(RandomSettings):
     )
     phase_known: bool = option(
         False,
-        "Declared of the drives: own clocks, or synchronised",
+        "Declared clocks of the drives: separate, or synchronised",
         name="phase",
         words={"free": False, "known": True},
     )
@@ -62,10 +62,10 @@ class DriftSettings(RandomSettings):
         "Error of the drives' common clock",
         least=-100.0,
         most=100.0,
-        note="with --phase known: a trap",
+        note="with --phase known: a model error",
     )
     cluster: str | None = option(
-        None, "Dask scheduler, tcp://host:8786, whose workers see the results"
+        None, "Dask scheduler, tcp://host:8786, whose workers can access the results"
     )
     workers: int | None = option(None, "Processes on this machine", note="default: one a core")
     resume: bool = option(False, "Continue an interrupted run")
@@ -91,16 +91,16 @@ class DriftSettings(RandomSettings):
 
 
 def run_drift(settings: DriftSettings, output: Path, report: Report | None = None) -> Figures:
-    """Run estimators through days of simulated worlds and judge them.
+    """Run estimators through days of simulated worlds and assess them.
 
-    Until all is done, ``output`` holds what is needed to go on.
+    Until all runs are complete, ``output`` contains the files needed to resume.
 
     Raises
     ------
     InputError
         Where the settings do not fit, or ``output`` is in the way.
     EstimationError
-        Where an estimator finds no start.
+        Where an estimator does not start.
     """
     from magfusion.jobs.drift_world import claim_place, run_world
     from magfusion.jobs.inputs import UNFINISHED_DRIFT, claim
@@ -146,7 +146,7 @@ def run_drift(settings: DriftSettings, output: Path, report: Report | None = Non
 def summarise(settings: DriftSettings, runs: list[WorldRun]) -> Figures:
     """Return the figures of all runs, the verdict first, and the judgements as sentences.
 
-    An instability that is found makes the estimates doubtful; a run too short to tell does not.
+    A detected instability makes the estimates doubtful; a run too short to decide does not.
     """
     from magfusion.jobs.drift_figures import STABILITY, judged
 
@@ -190,13 +190,13 @@ _WORD = {"pass": "PASS", "fail": "FAIL", "undecided": "INCONCLUSIVE"}
 
 
 def overall(verdicts: list[Verdict]) -> Verdict:
-    """Return the worst."""
+    """Return the worst verdict."""
     order: tuple[Verdict, ...] = ("fail", "undecided", "pass")
     return min(verdicts, key=order.index)
 
 
 def courses(settings: DriftSettings, runs: list[WorldRun]) -> list[Course]:
-    """Return what is drawn of each estimator: its errors, and its pace in the first world."""
+    """Return the plotted data of each estimator: its errors, and its pace in the first world."""
     from magfusion.jobs.drift_figures import MINUTE, minutes
 
     out = []
@@ -208,7 +208,7 @@ def courses(settings: DriftSettings, runs: list[WorldRun]) -> list[Course]:
 
 @contextmanager
 def _progress(tasks: list[WorldTask], report: Report | None) -> Iterator[None]:
-    """Report the progress of the runs, in whichever process they run."""
+    """Report the progress of the runs, in any process."""
     from magfusion.jobs.drift_world import stretches_done
 
     if report is None:

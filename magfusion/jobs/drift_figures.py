@@ -1,4 +1,4 @@
-"""The figures of an estimator's runs, and a verdict with its sentence for each criterion."""
+"""Figures of an estimator's runs, with a verdict and its sentence for each criterion."""
 
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -30,24 +30,25 @@ from magfusion.simulation.endurance import BLOCK
 from magfusion.units import Array, BoolArray
 
 MINUTE = 60.0  # s; errors count at the phasors of whole minutes, which rests and walks have alike
-# Of the interval of chi square in which the NEES of right sigmas lies: one run in fifty is blamed
-# without a cause, fewer as the rests of a world are partly independent of each other.
+# False-alarm rate of the chi-square test of the NEES: one run in fifty, fewer as the rests of a
+# world are partly independent of each other.
 NEES_PROBABILITY = 0.98
 CARRIED_LIMIT = 1.0  # m, at rest for a minute without a phasor
 MEMORY_RATIO, MEMORY_GROWTH = 1.10, 20.0  # last hour to second; MiB
 LATENCY_LIMIT = 1.10  # last hour to second, at rest, beside a bare loop of the same minutes
 TIME, SECONDS, UPDATES, MEMORY, DISTORTION, BARE_SAMPLE = range(len(PACE))
 FREEDOM = 6  # of a NEES of one world: the errors of its survey are drawn once, whatever its length
-# Standard deviations by which a line through the length of an error of three components grows: of
-# stationary errors, however long they are alike, less than once in a thousand by more than two.
+# Threshold, in standard deviations, on the growth of a line through the length of an error of three
+# components: stationary errors, however long their correlation, exceed two less than once in a
+# thousand.
 CLAIMED = 2.5
-# The first walk begins the run; the start is found in it.
+# The first walk begins the run and contains the start.
 _STARTED = 60.0  # s
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """One criterion and how the runs meet it.
+    """One criterion and its verdict.
 
     Parameters
     ----------
@@ -98,7 +99,7 @@ def minutes(run: WorldRun) -> ErrorSeries:
 
 
 def settled(run: WorldRun) -> ErrorSeries:
-    """Return the same after the time from which slopes count."""
+    """Return those after the time from which slopes count."""
     series = minutes(run)
     return series.rows(series.time >= settled_after(run.task.hours))
 
@@ -147,7 +148,7 @@ def _drifts(runs: list[WorldRun]) -> tuple[list[Figure], list[Judgement]]:
 
 
 def _common(quantity: Quantity, runs: list[WorldRun]) -> tuple[list[Figure], Judgement]:
-    """Judge whether the components drift in the same direction in all worlds."""
+    """Test whether the components drift in the same direction in all worlds."""
     every = [settled(run) for run in runs]
     slope = common_slope(
         [s.time for s in every], [quantity.scale * s.error[:, quantity.part] for s in every]
@@ -166,19 +167,19 @@ def _common(quantity: Quantity, runs: list[WorldRun]) -> tuple[list[Figure], Jud
     ]
     word = "a" if slope.verdict == "fail" else "no"
     sentence = (
-        f"the errors of {name.replace('_', ' ')} have {word} drift in common in all worlds: mean"
-        f" slope of a component at most {most:.1f} standard errors, probability by chance"
+        f"the errors of {name.replace('_', ' ')} have {word} common drift in all worlds: mean slope"
+        f" of a component at most {most:.1f} standard errors, probability by chance"
         f" {slope.probability:.2g}, limit {THREE_SIGMA:g}"
     )
     return figures, Judgement(f"{name}_common_drift", slope.verdict, sentence)
 
 
 def verdict_of_one(quantity: Quantity, slope: Slope, series: ErrorSeries) -> Verdict:
-    """Judge one world by what the estimator claims, too.
+    """Test one world, with the estimator's own sigmas.
 
     A bias is a random walk: its errors may lie on a line for hours without any drift, which only
-    several worlds can show.  What grew by less than the estimated standard deviation has not been
-    seen to drift; `CLAIMED` of them, however long errors are alike, it has.
+    several worlds can show.  Growth by less than the estimated standard deviation is not evidence
+    of drift; `CLAIMED` of them is, however long the errors are correlated.
     """
     days = float(np.ptp(series.time)) / DAY
     claimed = _rms(quantity.scale * np.linalg.norm(series.sigma[:, quantity.part], axis=1))
@@ -197,7 +198,7 @@ _DRIFTS = {
 
 
 def _carried(runs: list[WorldRun]) -> tuple[list[Figure], list[Judgement]]:
-    """Judge the states at rest between two phasors, which are propagated by the IMU alone."""
+    """Test the states at rest between two phasors, which are propagated by the IMU alone."""
     found = []
     for run in runs:
         errors = run.errors
@@ -223,7 +224,7 @@ def _at_minutes(series: ErrorSeries) -> BoolArray:
 
 
 def nees_limits(worlds: int) -> tuple[float, float]:
-    """Return between what the mean NEES per degree of freedom of so many worlds lies by chance."""
+    """Return the interval of the mean NEES per degree of freedom for so many worlds."""
     freedom = FREEDOM * worlds
     low, high = chi2.interval(NEES_PROBABILITY, freedom)
     return float(low) / freedom, float(high) / freedom
@@ -326,7 +327,7 @@ _SLOWER = {
 
 
 def _costs(run: WorldRun) -> tuple[Array, Array]:
-    """Return what updates at rest cost in bare loops, of each stretch of the hours compared."""
+    """Return the cost of updates at rest in bare loops, for each compared stretch of hours."""
     out = []
     for pace in _hours(run):
         rest = _resting(pace)
@@ -361,7 +362,7 @@ def _losses(runs: list[WorldRun]) -> tuple[list[Figure], list[Judgement]]:
 
 
 def _hour(run: WorldRun) -> float:
-    """Return the length of what is compared (s): an hour, or a quarter of a run below four."""
+    """Return the length of the compared stretches (s): an hour, or a quarter of a short run."""
     return 3600.0 * min(1.0, 0.25 * run.task.hours)
 
 

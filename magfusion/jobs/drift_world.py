@@ -1,4 +1,4 @@
-"""One estimator through one simulated world of hours: what it errs, what it takes; resumable."""
+"""One estimator through one simulated world of hours: errors and cost; resumable."""
 
 import os
 import re
@@ -41,9 +41,9 @@ from magfusion.units import Array, BoolArray
 STRETCH = 10  # blocks that are made, navigated and written at once
 PIECE = 10.0  # s that are fed at once
 BARE = 6000  # samples of each stretch on which the bare loop is timed
-# A good MEMS, beside the walk that the site declares.
+# A good MEMS, in addition to the walk declared in the site.
 INSTABILITY = BiasInstability(gyro=1e-5, accel=1e-4, time=300.0)
-# What the user of such a drive declares of a moment (log): heat and wander.
+# Declared moment uncertainty (log) of such a drive: heating and drift.
 MOMENT_SIGMA = {"current": 0.005, "voltage": 0.08}
 Estimator = Literal["ekf", "smoother"]
 PACE = ("time", "seconds", "updates", "memory_mib", "distortion", "bare_sample_seconds")
@@ -62,9 +62,9 @@ class WorldTask:
     drive : {'current', 'voltage'}
     phase_known : bool
         Whether the drives are declared synchronised; otherwise each beacon has a clock of its own.
-    clock_rate : float
+    Relative error of the clock common to all drives.
         Relative error of the clock that all drives share.
-    place : str, optional
+    Directory of the files needed to resume; None stores nothing.
         Directory of what is needed to go on; None keeps nothing.
     """
 
@@ -79,13 +79,13 @@ class WorldTask:
 
     @property
     def progress(self) -> Path:
-        """File of what is needed to go on; the rows made so far are beside it."""
+        """File needed to resume; the finished rows are in the same directory."""
         assert self.place is not None
         return Path(self.place) / f"world_{self.world}_{self.estimator}" / _PROGRESS
 
     @property
     def key(self) -> str:
-        """What two runs share that may go on from each other's."""
+        """Key of runs that may resume from each other's files."""
         return run_key("drift", replace(self, place=None))
 
     @property
@@ -96,20 +96,20 @@ class WorldTask:
 
 @dataclass(frozen=True, eq=False)
 class WorldRun:
-    """What came out.
+    """Result of a run.
 
     Parameters
     ----------
     errors : ErrorSeries
         Of all states.
     pace : ndarray, shape (pieces, 6)
-        Of each piece the columns `PACE`: begin, processor time (s), states made, resident memory
-        (MiB), mean squared innovation in units of its expectation, processor time of the bare loop
-        for one sample in the same minutes (s), by which the machine's own mood cancels.
+        Of each piece the columns `PACE`: begin, processor time (s), number of states, resident
+        memory (MiB), mean squared innovation relative to its expectation, processor time of the
+        bare loop for one sample in the same minutes (s), which removes the machine's load.
     bare_seconds : float
         Processor time of a bare loop over ``integrateMeasurement`` on all samples, extrapolated.
     losses : dict of str to int
-        What the navigator refused, lost and recovered.
+        Counts of refused, lost and recovered epochs.
     """
 
     task: WorldTask
@@ -121,7 +121,7 @@ class WorldRun:
 
 @dataclass(frozen=True, eq=False)
 class _Progress:
-    """What a run needs to go on beside its navigator."""
+    """Other state that a run needs to resume, apart from its navigator."""
 
     biases: Biases
     bare: float
@@ -130,10 +130,10 @@ class _Progress:
 
 
 def declared_site(drive: str, phase_known: bool) -> Site:
-    """Return the site as its user declares it: what drifts in these worlds, and no more.
+    """Return the site as its user declares it: only the drifts of these worlds.
 
-    A moment walks by what its gain wanders, and its coil fades, in an hour; of the field model
-    nothing is wrong but the scale that follows the magnetometer's temperature.
+    A moment has the drift of its gain, and the fading of its coil, in an hour; the only error of
+    the field model is the scale that follows the magnetometer's temperature.
     """
     site, drift = demo_site(synchronised=phase_known), usual_drift(drive, 0.0)
     assert drift.gain is not None
@@ -154,7 +154,7 @@ def declared_site(drive: str, phase_known: bool) -> Site:
 
 
 def draw_task(task: WorldTask) -> World:
-    """Return the world of a task; both estimators see the same."""
+    """Return the world of a task; it is the same for both estimators."""
     config = EnduranceConfig(
         hours=task.hours,
         drift=usual_drift(task.drive, task.clock_rate),
@@ -165,12 +165,12 @@ def draw_task(task: WorldTask) -> World:
 
 
 def run_world(task: WorldTask, _rng: np.random.Generator | None = None) -> WorldRun:
-    """Navigate through a world, from where the run was if it was begun before.
+    """Navigate through a world, from the last checkpoint if there is one.
 
     Raises
     ------
     EstimationError
-        Where the navigator finds no start.
+        Where the navigator does not start.
     """
     if task.place is None:
         with TemporaryDirectory() as place:
@@ -197,7 +197,7 @@ def run_world(task: WorldTask, _rng: np.random.Generator | None = None) -> World
         series, every = _series(errors.rows()), np.column_stack(list(pace.rows().values()))
     if not navigator.started:
         raise EstimationError(
-            f"world {task.world}: {task.hours:g} h lead the {task.estimator} to no state"
+            f"world {task.world}: {task.hours:g} h give no state of the {task.estimator}"
         )
     return WorldRun(task, series, every, progress.bare, navigator.losses)
 
@@ -214,10 +214,10 @@ def _series(rows: dict[str, Array]) -> ErrorSeries:
 
 
 def navigate(navigator: Navigator, world: World, made: Stretch) -> tuple[ErrorSeries, Array]:
-    """Feed a stretch piece by piece; return the errors of its states and their own pace."""
+    """Process a stretch piece by piece; return the errors of its states and their pace."""
     states: list[State] = []
     pace = []
-    # A field when it is measured, then the inertial samples up to the next one.
+    # A field at its time, then the inertial samples up to the next one.
     grid = np.arange(made.imu.time[0], made.imu.time[-1], PIECE)
     starts = np.union1d(grid, made.fields.time)
     inertial = np.searchsorted(made.imu.time, [*starts, np.inf])
@@ -228,7 +228,7 @@ def navigate(navigator: Navigator, world: World, made: Stretch) -> tuple[ErrorSe
         for k in range(detected[i], detected[i + 1]):
             navigator.add_fields(made.fields.rows(slice(k, k + 1)))
         navigator.add_imu(made.imu.time[rows], made.imu.gyro_body[rows], made.imu.accel_body[rows])
-        # What the estimator itself claims: a claim widened by its witnesses would hide a drift.
+        # The estimator's own sigmas: those enlarged by its tests would hide a drift.
         new = [replace(s, cov=s.judgement.estimators(s.cov)) for s in navigator.take()]
         spent = time.process_time() - began
         navigator.take_lagged()
@@ -244,7 +244,7 @@ def navigate(navigator: Navigator, world: World, made: Stretch) -> tuple[ErrorSe
 
 
 def state_errors(states: list[State], truth: Trajectory, measured: BoolArray) -> ErrorSeries:
-    """Return what states err: attitude, position and velocity in world axes, biases in the body's.
+    """Return the errors of states: attitude, position and velocity in world axes, biases in body.
 
     Parameters
     ----------
@@ -295,12 +295,12 @@ def memory_mib() -> float:
 
 
 def stretches_done(tasks: list[WorldTask]) -> int:
-    """Return how many stretches runs have written."""
+    """Return the number of stretches written by runs."""
     return sum(read_position(task.progress) for task in tasks)
 
 
 def claim_place(place: Path) -> None:
-    """See that a directory holds nothing but what unfinished runs left.
+    """Check that a directory contains only files of unfinished runs.
 
     Raises
     ------
@@ -312,4 +312,4 @@ def claim_place(place: Path) -> None:
         elif path.name in (_ERROR_ROWS, _PACE_ROWS):
             claim_rows(path)
         elif not re.fullmatch(abandoned_pattern(r"(progress\.bin|(errors|pace)\.rows)"), path.name):
-            raise InputError(f"{path}: is not of an unfinished drift run and is kept; move it away")
+            raise InputError(f"{path}: is of no unfinished drift run and is kept; move it away")

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateSettings(TopicSettings):
-    """What is compared; both as `magfusion.jobs.inputs.read_estimate`, or a log with truth."""
+    """Trajectories to compare, for `magfusion.jobs.inputs.read_estimate`, or a log with truth."""
 
     estimate: Path = argument("Result directory, TUM file or table")
     truth: Path = argument("Log with truth, TUM file or table")
@@ -44,7 +44,7 @@ def run_evaluate(settings: EvaluateSettings) -> Figures:
 
 
 def _read_truth(settings: EvaluateSettings) -> tuple[Trajectory, int]:
-    """Return the truth, and the zero of the clock (ns) from which its times count."""
+    """Return the truth, and the zero of its clock (ns)."""
     from magfusion.jobs.inputs import read_estimate, topics_option
 
     path, topics = settings.truth, topics_option(settings.topics)
@@ -53,7 +53,7 @@ def _read_truth(settings: EvaluateSettings) -> tuple[Trajectory, int]:
         return read_estimate(path), 0
     log = open_log(path, topics=topics)
     if log.truth is None:
-        raise InputError(f"{path}: holds no truth; name a log, TUM file or table that does")
+        raise InputError(f"{path}: has no truth; give a log with truth, a TUM file or a table")
     return log.truth, log.epoch_ns
 
 

@@ -1,4 +1,4 @@
-"""The job that hands a result on: as a ROS 2 bag, TUM, KITTI or CSV."""
+"""The job that exports a result: as a ROS 2 bag, TUM, KITTI or CSV."""
 
 from __future__ import annotations
 
@@ -27,13 +27,11 @@ _NAMESPACE = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 
 @dataclass(frozen=True, kw_only=True)
 class ExportSettings(FrameSettings):
-    """What is handed on, and how."""
+    """Settings of the export."""
 
     result: Path = argument("Result directory, or a table of states in it")
-    format: Format | None = option(
-        None, "Form of the file", note="default: what its name ends with"
-    )
-    namespace: str = option("/magfusion", "Of the topics odometry and pose, in a bag")
+    format: Format | None = option(None, "File format", note="default: from the file's extension")
+    namespace: str = option("/magfusion", "Namespace of the topics odometry and pose, in a bag")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -41,7 +39,7 @@ class ExportSettings(FrameSettings):
             raise InputError(f"--namespace must be of the form /robot/nav; got {self.namespace!r}")
 
     def format_of(self, output: Path) -> Format:
-        """Return the form of a file.
+        """Return the format of a file.
 
         Raises
         ------
@@ -53,13 +51,13 @@ class ExportSettings(FrameSettings):
         if form is not None:
             return form
         raise InputError(
-            f"{output}: the name does not say what to write; end it with one of"
+            f"{output}: unknown file extension; use one of"
             f" {', '.join('.' + one for one in FORMATS)}, or give --format"
         )
 
 
 def run_export(settings: ExportSettings, output: Path, report: Report = quiet) -> Figures:
-    """Write the states of a result that have a pose, stamped with the log's clock.
+    """Write the states of a result that have a pose, with stamps of the log's clock.
 
     Raises
     ------
@@ -73,7 +71,7 @@ def run_export(settings: ExportSettings, output: Path, report: Report = quiet) -
     refuse_place(output)
     states = read_result_states(path)
     if output.exists() and output.samefile(path):
-        raise InputError(f"{output}: is what is to be exported; give another path")
+        raise InputError(f"{output}: is the result itself; give another path")
     total = len(states.stamp_ns)
     frames = None
     if form in BAGS:
@@ -86,11 +84,11 @@ def run_export(settings: ExportSettings, output: Path, report: Report = quiet) -
         Figure("file", str(output)),
         Figure("format", form),
         Figure("states", total, label="states written"),
-        Figure("states_failed", states.left_out, label="states without a pose, left out"),
+        Figure("states_failed", states.left_out, label="states without a pose, omitted"),
     ]
     lost = told.get("lost_epochs")
     if isinstance(lost, int):
-        figures.append(Figure("lost_epochs", lost, label="states lost, of which there is no row"))
+        figures.append(Figure("lost_epochs", lost, label="states lost, without a row"))
     if "verdict" in told:
         figures.append(
             Figure("result_verdict", str(told["verdict"]), label="verdict of the result")
@@ -99,12 +97,12 @@ def run_export(settings: ExportSettings, output: Path, report: Report = quiet) -
 
 
 def _source(result: Path) -> tuple[Path, dict[str, object]]:
-    """Return the table of a result, and its report as far as there is one."""
+    """Return the table of a result, and its report if there is one."""
     if not result.is_dir():
         if result.suffix not in (".parquet", ".csv"):
             raise InputError(
-                f"{result}: is no result; give the directory that a job wrote, or a table of states"
-                " (.parquet, .csv)"
+                f"{result}: is not a result; give the directory of a job's result, or a table of"
+                " states (.parquet, .csv)"
             )
         return result, {}
     try:
@@ -116,11 +114,11 @@ def _source(result: Path) -> tuple[Path, dict[str, object]]:
     if not table.is_file():
         if told.get("verdict") == "failed":
             raise InputError(
-                f"{result}: its verdict is failed, so that there is no trajectory to export; its"
-                " report.json says why"
+                f"{result}: its verdict is failed, so that there is no trajectory to export; see"
+                " its report.json for the reason"
             )
         raise InputError(
-            f"{result}: holds no trajectory.parquet; give the result of smooth, fix or navigate"
+            f"{result}: has no trajectory.parquet; give the result of smooth, fix or navigate"
         )
     return table, told
 
@@ -129,6 +127,6 @@ COMMAND = Command(
     ExportSettings,
     run_export,
     output_required=True,
-    output_help="File to write, which is replaced",
+    output_help="Output file, which is replaced",
     example="magfusion export run -o run.mcap --frame map --child base_link",
 )

@@ -1,15 +1,14 @@
-"""What is left of a job that failed: a report that says so, where a result would have been."""
+"""Report of a failed job, in place of its result."""
 
 import json
 from pathlib import Path
 
-from magfusion.errors import EstimationError, InputError
+from magfusion.errors import UNOBSERVABLE, EstimationError, InputError
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
 
-OPEN = "the measurements leave a direction of the motion open"
-# They tell of it themselves, and what they were killed in can be gone on with.
+# They report failures themselves, and their files allow a killed run to be resumed.
 _OWN = ("navigate", "drift")
 _SHOWN = {"job": Section.TITLE, "log": Section.TITLE} | dict.fromkeys(
     ("verdict", "reasons", "remarks", "unverified"), Section.VERDICT
@@ -19,7 +18,7 @@ _SHOWN = {"job": Section.TITLE, "log": Section.TITLE} | dict.fromkeys(
 def failed_figures(
     job: str, log: str, output: Path, error: EstimationError, written: bool
 ) -> Figures | None:
-    """Return the figures of a job that raised, and see that its output holds them.
+    """Return the figures of a job that raised, and write them to its output.
 
     Parameters
     ----------
@@ -31,7 +30,7 @@ def failed_figures(
     Returns
     -------
     Figures, optional
-        None where nothing can be written there.
+        None where the report cannot be written.
     """
     if written:
         return _read(output / "report.json")
@@ -63,15 +62,15 @@ def _read(path: Path) -> Figures:
 
 
 def reason_of(error: RuntimeError) -> str:
-    """Return why an estimate failed.
+    """Return the reason of a failed estimate.
 
     Raises
     ------
     RuntimeError
-        The same, where it is not known.
+        The same error, where the reason is unknown.
     """
     if isinstance(error, EstimationError):
         return str(error)
     if "Indeterminate" in str(error):
-        return OPEN
+        return UNOBSERVABLE
     raise error

@@ -1,4 +1,4 @@
-"""The job that fixes the pose at every epoch on its own, by likelihood or as paper 004 does."""
+"""The job that fixes the pose at every epoch on its own, by likelihood or as in paper 004."""
 
 from __future__ import annotations
 
@@ -55,36 +55,36 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class FixSettings(RegionSettings, WindowSettings, RestSettings, RiskSettings):
-    """How an epoch is located.
+    """Settings of single-epoch fixes.
 
     Parameters
     ----------
     survey : Path, optional
-        A survey's table, or the directory that ``magfusion survey`` wrote.
+        A survey's table, or the output directory of ``magfusion survey``.
     """
 
     method: Literal[
         "likelihood", "paper-lines", "paper-knn", "paper-knn-nt", "paper-fingerprint"
     ] = option("likelihood", "Maximum likelihood, or an algorithm of paper 004")
-    survey: Path | None = option(None, "Fingerprint survey, which the paper's methods need")
+    survey: Path | None = option(None, "Fingerprint survey, required by the paper's methods")
     block: float | None = option(
-        None, "Of paper-lines: a line for each block of this size", unit="m", above=0.0
+        None, "For paper-lines: a line for each block of this size", unit="m", above=0.0
     )
     free: str | None = option(
         None,
-        "Find these of every beacon beside the pose, whatever the site says of them (gains are"
-        " found anyway, where nothing less explains the fields)",
+        "Estimate these of every beacon with the pose, overriding the site (gains are estimated in"
+        " any case where the fields require it)",
         metavar="phase,gain",
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.method != "likelihood" and self.free is not None:
-            raise InputError("--free belongs to --method likelihood; leave one of the two out")
+            raise InputError("--free belongs to --method likelihood; omit one of the two")
         if self.method != "likelihood" and self.risks != RiskSettings().risks:
             raise InputError(
-                "--risk and --fault-prior belong to --method likelihood: the algorithms of"
-                " paper 004 have no covariance, and so no protection level"
+                "--risk and --fault-prior belong to --method likelihood: the algorithms of paper"
+                " 004 have no covariance, and so no protection level"
             )
         if self.method == "likelihood" and self.survey is not None:
             raise InputError(
@@ -93,15 +93,15 @@ class FixSettings(RegionSettings, WindowSettings, RestSettings, RiskSettings):
         if self.method != "paper-lines" and self.block is not None:
             raise InputError("--block belongs to --method paper-lines")
         if self.method != "likelihood" and self.at_rest:
-            raise InputError("--at-rest belongs to --method likelihood; leave one of the two out")
+            raise InputError("--at-rest belongs to --method likelihood; omit one of the two")
         if self.method != "likelihood" and self.survey is None:
             raise InputError(
-                f"--method {self.method} locates by a survey; name one with --survey SURVEY"
+                f"--method {self.method} requires a survey; give one with --survey SURVEY"
             )
 
 
 def run(settings: FixSettings, output: Path, report: Report = quiet) -> Figures:
-    """Fix the pose at every epoch by the method that is asked."""
+    """Fix the pose at every epoch by the selected method."""
     job = settings.job(output)
     if settings.method != "likelihood":
         return run_published_fix(job, settings)
@@ -111,13 +111,13 @@ def run(settings: FixSettings, output: Path, report: Report = quiet) -> Figures:
 
 
 def _free(text: str | None) -> tuple[str, ...]:
-    """Read ``phase,gain`` or either."""
+    """Parse ``phase,gain`` or either."""
     chosen = () if text is None else tuple(part.strip() for part in text.split(","))
     unknown = [part for part in chosen if part not in FREE]
     if unknown:
         raise InputError(
-            f"--free {text!r}: {unknown[0] or 'nothing'} is not among what a fix may find beside"
-            f" the pose; choose from {', '.join(FREE)}"
+            f"--free {text!r}: {unknown[0] or 'nothing'} cannot be estimated with the pose; choose"
+            f" from {', '.join(FREE)}"
         )
     return chosen
 
@@ -136,12 +136,12 @@ def run_fix(
     Parameters
     ----------
     free : tuple of str
-        What is found beside the pose, whether or not the fields ask for it, as in
+        Parameters estimated with the pose in any case, as in
         `magfusion.estimation.snapshot.explained_fixes`.
     risk : Risk, optional
-        What the protection levels promise.
+        Specification of the protection levels.
     rest : RestSettings, optional
-        Whether each rest is one epoch.
+        Settings by which each rest is one epoch.
 
     Raises
     ------
@@ -195,7 +195,7 @@ def run_fix(
 def _read(
     job: Job, lockin: LockinSettings | None, *, by_rests: bool, report: Report
 ) -> tuple[Log, Site]:
-    """Return log and site, with what fixes of windows or of whole rests can do with."""
+    """Return log and site, restricted to what fixes of windows or of whole rests can use."""
     from magfusion.jobs.inputs import read_job
 
     log, site = read_job(
@@ -211,7 +211,7 @@ def _read(
     )
     if by_rests and site.platform.magnetometer.lacking:
         raise InputError(
-            "--at-rest integrates samples of three axes; leave it out for a receiver of fewer"
+            "--at-rest integrates samples of three axes; omit it for a receiver of fewer"
         )
     return log, site
 
@@ -222,7 +222,7 @@ def _trust(
     calibration: Calibration,
     of_log: tuple[Finding, ...],
 ) -> Trust:
-    """Return what fixes say, of the place and of several magnetometers too, and the recording."""
+    """Return the findings of fixes, of the place and of several magnetometers; the recording."""
     fixes = found.fixes
     best = (fixes.world_from_body, fixes.position_world, fixes.pose_cov)
     place = of_place(calibration.site, fixes.time, *(part[:, 0] for part in best))
@@ -239,7 +239,7 @@ def _run_coil(
     free: tuple[str, ...],
     report: Report,
 ) -> Figures:
-    """Fix a receiver of one axis, whose roll about it nothing tells."""
+    """Fix a receiver of one axis, whose roll about it is unobservable."""
     from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
     from magfusion.jobs.fix_coil import find_coil
     from magfusion.jobs.inputs import found_in, named, refuse_failed
@@ -285,11 +285,11 @@ def write_fix_result(
     Parameters
     ----------
     relation : ndarray of str, optional
-        As in `write_hypotheses`, where it is not that of the symmetries.
+        As in `write_hypotheses`, if not that of the symmetries.
     columns : mapping, optional
-        More of them.
+        Additional columns.
     nearest : Trajectory, optional
-        What is compared with the truth, where it is not the best hypotheses.
+        Trajectory compared with the truth, if not that of the best hypotheses.
     """
     from magfusion.results.page_motion import Motion
     from magfusion.results.recording import write_recording
@@ -335,8 +335,8 @@ def run_published_fix(job: Job, settings: FixSettings) -> Figures:
     Raises
     ------
     InputError
-        Where the survey names a beacon that the site does not know, it and the site
-        share fewer than three rotating beacons, or as many are detected in no epoch.
+        Where the survey has a beacon that is not in the site, both share fewer than three rotating
+        beacons, or as many are detected in no epoch.
     EstimationError
     """
     from magfusion.estimation.demodulation.demodulation import phasors
@@ -371,7 +371,7 @@ def run_published_fix(job: Job, settings: FixSettings) -> Figures:
         samples.time[fixes.epoch], fixes.world_from_body, fixes.position_world - lever_world
     )
     errors, compared = compared_with_truth(found, log)
-    text = f"--method {settings.method} tells no covariance: how far a pose errs is not known."
+    text = f"--method {settings.method} has no covariance: the accuracy of a pose is unknown."
     trust = Trust((Finding("no_covariance", text), *recorded(log, site, BRIDGED)))
     figures = (
         heading("fix", log.name)

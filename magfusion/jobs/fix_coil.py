@@ -1,4 +1,4 @@
-"""The fix of a receiver of one axis: its place and direction, the roll about it open."""
+"""The fix of a receiver of one axis: its position and direction, the roll about it unknown."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class FoundCoil:
-    """Poses of a receiver of one axis, with all that is said of them.
+    """Poses of a receiver of one axis, with their findings.
 
     Parameters
     ----------
     log : Log
-        Whose truth is turned to the roll that was chosen.
+        With the truth rotated to the selected roll.
     columns : dict
-        More columns of the hypotheses' table, shape (n, hypotheses) each.
+        Additional columns of the hypotheses' table, shape (n, hypotheses) each.
     compared : Trajectory, optional
-        Of the places told the nearest to the truth, with their own covariance.
+        Of the reported positions nearest to the truth, with their own covariance.
     """
 
     log: Log
@@ -71,12 +71,12 @@ def find_coil(
     fields : FieldSamples
         Channels in the site's order.
     free : tuple of str
-        ``gain`` where nothing is known of it, ``phase`` where nothing is known of drive phases.
+        ``gain`` where the gain is unknown, ``phase`` where drive phases are unknown.
 
     Raises
     ------
     EstimationError
-        Where no epoch holds enough channels.
+        Where no epoch has enough channels.
     """
     began = time.perf_counter()
     report("fixing", 1, 3)
@@ -88,9 +88,9 @@ def find_coil(
     enough = epochs.told >= least
     if not np.any(enough):
         raise EstimationError(
-            f"{log.name}: no epoch holds as many as {least} beacons, which place, direction and"
-            " gain of a receiver of one axis need (of those that rotate half as many); add beacons,"
-            " write their fields at one time, or smooth, so that the inertial sensor helps"
+            f"{log.name}: no epoch has {least} beacons, which position, direction and gain of a"
+            " receiver of one axis require (half as many if they rotate); add beacons, write their"
+            " fields at one time, or smooth, to use the inertial sensor"
         )
     kept = epochs.rows(enough)
     calibration = initial_calibration(site, float(np.mean(kept.time)))
@@ -108,7 +108,7 @@ def find_coil(
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     compared = None
     if log.truth is not None:
-        # Against the other mirror nothing would be compared but how far apart the two are.
+        # A comparison with the other mirror would only measure their separation.
         compared, other = nearest_told(judged.alone, log.truth, site)
         turned = nearest_truth(log.truth, compared, site, signed=kept.signed)
         log = replace(log, truth=turned)
@@ -138,7 +138,7 @@ def _columns(found: CoilFixes) -> dict[str, Array]:
 
 
 def _figures(fixes: Fixes, found: CoilFixes, *, signed: bool) -> Figures:
-    """Return the figures of the fixes: what one axis tells, and what it leaves open."""
+    """Return the figures of the fixes: what one axis determines, and what it does not."""
     columns = _columns(found)
     sigma = float(np.median(columns["position_sigma_m"][:, 0]))
     across = float(np.median(columns["axis_sigma_deg"][:, 0]))

@@ -35,7 +35,7 @@ LATE = 1e8  # s; stamps that count from 1970, or from another day
 
 @dataclass(frozen=True, kw_only=True)
 class ImportSettings(Settings):
-    """Which files become which streams of a log."""
+    """Files of a recording and the streams of a log."""
 
     sources: tuple[str, ...] = option(
         (), "Bag, EuRoC folder, tables, or a directory of tables", positional=True
@@ -43,24 +43,24 @@ class ImportSettings(Settings):
     imu: Path | None = option(
         None,
         "Table of the inertial sensor",
-        note="csv, tsv, txt, parquet, npy, npz, wav, mat, h5; one table may be given for several",
+        note="csv, tsv, txt, parquet, npy, npz, wav, mat, h5; one table may be given several times",
         metavar="FILE",
     )
     gyro: Path | None = option(
-        None, "Table of the gyro, where the accelerometer has its own", metavar="FILE"
+        None, "Table of the gyro, if separate from the accelerometer", metavar="FILE"
     )
     accel: Path | None = option(
-        None, "Table of the accelerometer, where the gyro has its own", metavar="FILE"
+        None, "Table of the accelerometer, if separate from the gyro", metavar="FILE"
     )
     magnetometer: Path | None = option(None, "Table of the magnetometer", metavar="FILE")
     truth: Path | None = option(None, "Table of true poses, or a TUM file", metavar="FILE")
     map: tuple[str, ...] = option(
         (),
-        "Which column of the file is which of the log, in which unit",
+        "Mapping of a file's column to one of the log, with its unit",
         note="e.g. 'imu.gyro_x=-GyrY[deg/s]', 'truth.quaternion=qx,qy,qz,qw[xyzw]'; columns"
         " without names are counted from 0; of a bag e.g. imu=/imu/data, magnetometer=/mag[uT],"
         " truth=/tf:map->base_link; of an attitude in"
-        " angles truth.euler=roll,pitch,yaw[deg] (turned by yaw, then pitch, then roll)",
+        " angles truth.euler=roll,pitch,yaw[deg] (rotated by yaw, then pitch, then roll)",
         metavar="TABLE.COLUMN=NAME[UNIT]",
     )
     map_file: Path | None = option(
@@ -75,19 +75,19 @@ class ImportSettings(Settings):
     )
     offset: tuple[str, ...] = option(
         (),
-        "What is added to the times of a table, of which another clock was read",
+        "Offset added to the times of a table from another clock",
         metavar="TABLE=SECONDS",
     )
     rows: tuple[str, ...] = option(
         (),
-        "Of a table that holds several sensors one below the other, the rows of one",
+        "Rows of one sensor, in a table of several sensors one below the other",
         note="e.g. 'gyro=sensor:gyroscope', the file given by --gyro, --accel, --magnetometer",
         metavar="TABLE=COLUMN:VALUE",
     )
     delimiter: str | None = option(
         None,
-        "Character between cells, or comma, semicolon, tab, pipe, space",
-        note="default: found",
+        "Delimiter: a character, or comma, semicolon, tab, pipe, space",
+        note="default: detected",
     )
     epoch: str | None = option(
         None,
@@ -100,12 +100,12 @@ class ImportSettings(Settings):
 
 
 def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -> Figures:
-    """Import a recording: a log in ``output``, and what its check says.
+    """Import a recording: a log in ``output``, and the findings of its check.
 
     Raises
     ------
     InputError
-        With every problem that was found, and options that would decide what is undecided.
+        With all problems, and options that would resolve ambiguities.
     """
     from magfusion.jobs.inputs import claim
     from magfusion.results.report import write_report
@@ -116,7 +116,7 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
     files = {stream: getattr(settings, stream) for stream in STREAMS}
     if not settings.sources and not any(files.values()) and settings.map_file is None:
         raise InputError(
-            "nothing to import; give a bag, a folder or tables, or --imu FILE --magnetometer FILE"
+            "no recording given; give a bag, a folder or tables, or --imu FILE --magnetometer FILE"
         )
     wanted = asked(
         files,
@@ -164,7 +164,7 @@ def _tell(report: Report, stream: str, plan: Plan, rows: int) -> None:
 
 
 def _refuse(told: Findings) -> None:
-    """Tell all problems at once, and what would decide them."""
+    """Raise all problems at once, with options that resolve them."""
     problems = list(dict.fromkeys(told.problems))
     if not problems:
         return
@@ -173,7 +173,7 @@ def _refuse(told: Findings) -> None:
     count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
     lines = [f"nothing was imported, for {count}:", *(f"  {one}" for one in problems)]
     if told.guessed:
-        lines += ["recognised by name and unit, and used as they are:"]
+        lines += ["recognised by name and unit, and used as is:"]
         lines += [f"  --map {_quoted(one)}" for one in dict.fromkeys(told.guessed)]
     if told.proposals:
         proposals = list(dict.fromkeys(told.proposals))
@@ -199,7 +199,7 @@ def _epoch(text: str | None, found: Gathered) -> str | int:
         pass
     if not found.bags:
         found.told.problems.append(
-            f"--epoch {text!r}: write a stamp in ns, or first; a topic is of a bag."
+            f"--epoch {text!r}: write a stamp in ns, or first; a topic requires a bag."
         )
         return 0
     try:
@@ -210,7 +210,7 @@ def _epoch(text: str | None, found: Gathered) -> str | int:
 
 
 def _refuse_apart(counts: dict[str, Counts], told: Findings) -> None:
-    """Refuse streams whose times have no moment in common: they are of different clocks."""
+    """Reject streams whose times do not overlap: they are of different clocks."""
     if not {"imu", "magnetometer"} <= set(counts):
         return
     for name in set(counts) - {"imu", "gyro", "accel"}:
@@ -221,8 +221,8 @@ def _refuse_apart(counts: dict[str, Counts], told: Findings) -> None:
                 for stream, c in (("imu", one), (name, other))
             ]
             told.problems.append(
-                f"the times of imu and {name} have no moment in common ({', '.join(spans)}): bring"
-                " them to one clock, by the unit of a time, --offset TABLE=SECONDS or --rate-hz"
+                f"the times of imu and {name} do not overlap ({', '.join(spans)}): bring them to"
+                " one clock, by the unit of a time, --offset TABLE=SECONDS or --rate-hz"
                 " TABLE=HZ@SECONDS."
             )
 
@@ -241,7 +241,7 @@ def _write_header(directory: Path, output: Path, found: Gathered, epoch_ns: int)
 
 
 def _checked(directory: Path, output: Path, found: Gathered, site: Path | None) -> Figures:
-    """Return what the check of the log says, of which no reader knows the unfinished name."""
+    """Return the findings of the check of the log, with the final file names."""
     try:
         figures = run_check(CheckSettings(log=directory, site=site))
     except InputError as error:
@@ -251,7 +251,7 @@ def _checked(directory: Path, output: Path, found: Gathered, site: Path | None) 
         for stream, plan in plans.items():
             file = str(directory / f"{stream}.parquet")
             if file in sentence:
-                # The remedy of a log's reader is to change the numbers.
+                # The remedy in the message of a log's reader is to change the numbers.
                 fact = sentence.rpartition(";")[0].replace(file, _place(plan))
                 sentence = f"{fact}; correct the units in --map."
         raise InputError(sentence.replace(str(directory), str(output))) from error
@@ -265,7 +265,7 @@ def _place(plan: Plan) -> str:
 def _figures(
     found: Gathered, counts: dict[str, Counts], epoch_ns: int, is_first: bool, note: str
 ) -> Figures:
-    """Return what was read, what was left out, and what was understood."""
+    """Return the numbers of read and omitted rows, and the interpreted columns."""
     figures = Figures(
         Figure("epoch_ns", epoch_ns, "ns", label="epoch" + (", first sample" * is_first))
     )
@@ -279,7 +279,7 @@ def _figures(
                 Figure(
                     f"{stream}_dropped_{reason.replace(' ', '_')}",
                     count,
-                    label=f"{stream}, rows left out {reason}",
+                    label=f"{stream}, rows omitted {reason}",
                 )
                 for reason, count in one.left_out.items()
             ),
@@ -287,12 +287,12 @@ def _figures(
     forms = {p.source.place: p.source.form for p in found.plans.values() if p.source.form}
     lines = [line for plan in found.plans.values() for line in plan.options()]
     shown = [f"{place}: {form}" for place, form in forms.items()]
-    shown += ["understood as:", *(f"  --map {_quoted(line)}" for line in lines)]
+    shown += ["interpreted as:", *(f"  --map {_quoted(line)}" for line in lines)]
     figures |= Figures(
         Figure("map", lines, section=Section.REPORT),
         Figure("understood", shown, section=Section.REMARKS),
     )
-    notes = [f"Passed over: {reason}" for reason in found.passed_over]
+    notes = [f"Skipped: {reason}" for reason in found.passed_over]
     notes += [note] if note else []
     begin = (_first(counts) - epoch_ns) * 1e-9
     if not is_first and abs(begin) > LATE:

@@ -1,4 +1,4 @@
-"""The job that writes a site's file: from options, a recording's tones, or questions."""
+"""The job that writes a site file: from options, a recording's tones, or questions."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ NEAR_HZ = 0.5  # of a declared frequency, a line is that beacon
 
 
 def run_init(settings: InitSettings, output: Path) -> Figures | None:
-    """Write a commented site file; what nobody said is marked in it.
+    """Write a commented site file, in which undeclared values are marked.
 
     Parameters
     ----------
     output : Path
-        File to write; one that is there is kept.
+        File to write; an existing file is not overwritten.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def run_init(settings: InitSettings, output: Path) -> Figures | None:
         _list(settings)
         return None
     if output.exists() or output.is_symlink():
-        raise InputError(f"{output}: is there already; name another file with -o, or remove it")
+        raise InputError(f"{output}: already exists; give another file with -o, or remove it")
     heard = _heard(settings)
     settings, heard = _asked(settings, heard)
     draft, findings = _draft(settings, heard)
@@ -69,7 +69,7 @@ def run_init(settings: InitSettings, output: Path) -> Figures | None:
 
 
 def _heard(settings: InitSettings) -> Transmitted | None:
-    """Return what transmits in the recording, if there is one."""
+    """Return the transmitters in the recording, if there is one."""
     if settings.log is None:
         return None
     from magfusion.jobs.inputs import topics_option
@@ -77,21 +77,21 @@ def _heard(settings: InitSettings) -> Transmitted | None:
     log = open_log(settings.log, topics=topics_option(settings.topics))
     if log.waveform is None:
         raise InputError(
-            f"{settings.log}: holds no magnetometer samples to find tones in; leave --log out, and"
-            " give frequency_hz with each --beacon"
+            f"{settings.log}: has no magnetometer samples to find tones in; omit --log, and give"
+            " frequency_hz with each --beacon"
         )
     site = _bare_site(settings)
     found = transmitted(mended(log, site), site if settings.mounting is not None else None)
     if found is None:
         raise InputError(
-            f"{settings.log}: is too short for a spectrum; record ten seconds at least, or leave"
-            " --log out"
+            f"{settings.log}: is too short for a spectrum; record at least ten seconds, or omit"
+            " --log"
         )
     if not found.tones and not settings.beacon:
         others = f" ({'; '.join(found.others)})" if found.others else ""
         raise InputError(
-            f"{settings.log}: no tone stands out of the magnetometer's spectrum{others}; switch the"
-            " beacons on, or describe them with --beacon"
+            f"{settings.log}: the magnetometer's spectrum has no significant tone{others}; switch"
+            " the beacons on, or describe them with --beacon"
         )
     return found
 
@@ -99,7 +99,7 @@ def _heard(settings: InitSettings) -> Transmitted | None:
 def _asked(
     settings: InitSettings, heard: Transmitted | None
 ) -> tuple[InitSettings, Transmitted | None]:
-    """Ask for what nobody said, where there is somebody to ask."""
+    """Prompt for undeclared values on a terminal."""
     if settings.described:
         return settings, heard
     if sys.stdin is not None and sys.stdin.isatty():
@@ -109,8 +109,8 @@ def _asked(
         return answered(settings, () if heard is None else heard.tones), heard
     if heard is None:
         raise InputError(
-            "nothing is described; give --beacon, --log or --imu (see magfusion init --help), or"
-            " run it on a terminal, where it asks"
+            "no description given; give --beacon, --log or --imu (see magfusion init --help), or"
+            " run it on a terminal for questions"
         )
     return settings, heard
 
@@ -120,7 +120,7 @@ def _draft(settings: InitSettings, heard: Transmitted | None) -> tuple[SiteDraft
     names = [beacon.name for beacon in beacons]
     for name in names:
         if names.count(name) > 1:
-            raise InputError(f"--beacon {name}: is given twice; give each beacon its own name")
+            raise InputError(f"--beacon {name}: is given twice; use unique names")
     beacons, findings = _with_tones(beacons, heard)
     place = None if settings.location is None else place_of(settings.location)
     lever, mounting = settings.lever, settings.mounting
@@ -138,7 +138,7 @@ def _draft(settings: InitSettings, heard: Transmitted | None) -> tuple[SiteDraft
 def _with_tones(
     beacons: list[BeaconDraft], heard: Transmitted | None
 ) -> tuple[list[BeaconDraft], list[Finding]]:
-    """Return the beacons with the tones of the recording, and what the two say of each other."""
+    """Return the beacons with the tones of the recording, and findings on their consistency."""
     silent = [beacon.name for beacon in beacons if beacon.frequency_hz is None]
     if heard is None:
         if silent:
@@ -151,8 +151,8 @@ def _with_tones(
     findings = _switched_off(beacons, heard.tones, free)
     if len(silent) > 1 or (silent and len(free) != 1):
         raise InputError(
-            f"--beacon {silent[0]}: frequency_hz is missing, and the recording does not tell it:"
-            f" {_listed(free) or 'no other tone'} stands out; give frequency_hz"
+            f"--beacon {silent[0]}: frequency_hz is missing, and the recording does not determine"
+            f" it (significant: {_listed(free) or 'no other tone'}); give frequency_hz"
         )
     if not beacons:
         tones = zip(_names(), heard.tones, strict=False)
@@ -163,7 +163,7 @@ def _with_tones(
 
 
 def _near(tone: Tone, frequencies_hz: Iterable[float]) -> bool:
-    """Tell whether a tone is at one of some frequencies."""
+    """Return whether a tone is at one of some frequencies."""
     return any(abs(tone.frequency_hz - f) <= NEAR_HZ for f in frequencies_hz)
 
 
@@ -176,12 +176,13 @@ def _free_tones(beacons: list[BeaconDraft], tones: Iterable[Tone]) -> list[Tone]
 def _switched_off(
     beacons: list[BeaconDraft], tones: Iterable[Tone], free: list[Tone]
 ) -> list[Finding]:
-    """Return which frequencies of beacons are not in a recording, and what else is."""
+    """Return which frequencies of beacons are not in a recording, and the other tones."""
     return [
         Finding(
             "silent_beacon",
-            f"beacon {beacon.name} is not heard at {f:g} Hz in the recording: it is switched off,"
-            f" far away, or its frequency is another ({_listed(free) or 'no other stands out'}).",
+            f"beacon {beacon.name} is not detected at {f:g} Hz in the recording: it is switched"
+            " off, far away, or has another frequency"
+            f" ({_listed(free) or 'no other tone is significant'}).",
         )
         for beacon in beacons
         for f in beacon.frequency_hz or ()
@@ -190,7 +191,7 @@ def _switched_off(
 
 
 def _undeclared(tones: Iterable[Tone]) -> list[Finding]:
-    """Return that some tones of a recording are of no beacon."""
+    """Return findings on tones of a recording that belong to no beacon."""
     return [
         Finding(
             "undeclared_line",
@@ -228,7 +229,7 @@ def _bare_site(settings: InitSettings) -> Site:
 
 
 def _write(text: str, output: Path) -> None:
-    """Write a site's file, once it is known that it can be read.
+    """Write a site file after validation.
 
     Raises
     ------
@@ -240,7 +241,7 @@ def _write(text: str, output: Path) -> None:
             load_site(unfinished, unknown=True, without=True)
         except InputError as error:
             said = str(error).replace(f"{unfinished}: ", "")
-            raise InputError(f"what is described can be no site: {said}") from error
+            raise InputError(f"the description is not a valid site: {said}") from error
 
 
 def _figures(draft: SiteDraft, heard: Transmitted | None) -> Figures:
@@ -292,7 +293,7 @@ COMMAND = Command(
     InitSettings,
     run_init,
     output="site.yaml",
-    output_help="File to write; one that is there is kept",
+    output_help="File to write; an existing file is not overwritten",
     example="magfusion init --imu BMI088 --magnetometer RM3100 --beacon 'A position_m=0,0,1"
     " rpy_deg=0,0,90 frequency_hz=25 moment_a_m2=220 axes=xy' -o new_site.yaml",
 )

@@ -1,4 +1,4 @@
-"""The questions of ``magfusion init``, on a terminal: each answer is checked as it is given."""
+"""The questions of ``magfusion init``, on a terminal: each answer is validated at once."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -19,8 +19,8 @@ _SCREEN = Console(stderr=True, highlight=False, emoji=False)
 
 
 def recording() -> Path | None:
-    """Ask for a recording."""
-    _SCREEN.print("An empty answer leaves open what is asked, or takes what is in brackets.")
+    """Prompt for a recording."""
+    _SCREEN.print("An empty answer skips the question, or uses the default in brackets.")
 
     def there(text: str) -> Path | None:
         if not text:
@@ -34,12 +34,12 @@ def recording() -> Path | None:
 
 
 def answered(settings: InitSettings, tones: Iterable[Tone]) -> InitSettings:
-    """Ask for all that makes a site.
+    """Prompt for all values of a site.
 
     Parameters
     ----------
     tones : iterable of Tone
-        Of the recording; each is asked for a name, and so is nothing else.
+        Of the recording; the name of each is a question.
     """
     heard = list(tones)
     beacons: list[str] = []
@@ -67,13 +67,13 @@ def answered(settings: InitSettings, tones: Iterable[Tone]) -> InitSettings:
 
 
 def _beacon(before: list[str], tone: Tone | None) -> list[str]:
-    """Return a beacon as an option has it; none where there is no more, or a line is no beacon."""
+    """Return a beacon from an option; None if there are no more, or a line is no beacon."""
     taken = {text.split()[0] for text in before}
     free = next((c for c in "ABCDEFGHIJKLMNOPQRSTUVWXYZ" if c not in taken), "")
 
     def new(text: str) -> str:
         if text in taken:
-            raise InputError(f"{text} has been described already; give another name")
+            raise InputError(f"{text} is already described; give another name")
         if text:
             beacon_draft(text)
         return text
@@ -102,7 +102,7 @@ def _beacon(before: list[str], tone: Tone | None) -> list[str]:
 def _key(words: str, key: str, question: str, usual: str = "", needed: bool = False) -> str:
     def read(text: str) -> str:
         if not text and needed:
-            raise InputError("it is needed here; or give a recording")
+            raise InputError("it is required here; or give a recording")
         said = f" {key}={text.replace(' ', '')}" if text else ""
         beacon_draft(words + said)
         return said
@@ -123,14 +123,14 @@ def _place(text: str) -> str | None:
 
 
 def _ask(question: str, read: Callable[[str], Answer], usual: str = "") -> Answer:
-    """Ask until the answer can be read."""
+    """Prompt until the answer is valid."""
     shown = f"{question} \\[{usual}]" if usual else question
     while True:
         try:
             text = Prompt.ask(shown, console=_SCREEN, default=usual, show_default=False)
         except EOFError:
             raise InputError(
-                "the answers ended before the last question; answer them all"
+                "the answers ended before the last question; answer all questions"
             ) from None
         try:
             return read(text.strip())

@@ -1,4 +1,4 @@
-"""What is said of an installation when its site file is begun."""
+"""Description of an installation from which its site file is generated."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from magfusion.jobs.settings import TopicSettings, option
 
 @dataclass(frozen=True, kw_only=True)
 class InitSettings(TopicSettings):
-    """What is said of an installation; on a terminal, what nobody said is asked."""
+    """Description of an installation; on a terminal, missing values are requested."""
 
     beacon: tuple[str, ...] = option(
         (),
@@ -21,10 +21,8 @@ class InitSettings(TopicSettings):
     log: Path | None = option(
         None, "Recording in which to find the tones of the beacons", note="default: none"
     )
-    imu: str | None = option(None, "Inertial sensor, of those that --list-imus names")
-    magnetometer: str | None = option(
-        None, "Magnetometer, of those that --list-magnetometers names"
-    )
+    imu: str | None = option(None, "Inertial sensor, from --list-imus")
+    magnetometer: str | None = option(None, "Magnetometer, from --list-magnetometers")
     lever: str | None = option(None, "Magnetometer from the IMU, in its axes, m", metavar="X,Y,Z")
     mounting: str | None = option(
         None, "Magnetometer against the IMU, degrees", metavar="ROLL,PITCH,YAW"
@@ -37,6 +35,6 @@ class InitSettings(TopicSettings):
 
     @property
     def described(self) -> bool:
-        """Whether anything was said of the installation itself."""
+        """Whether the installation itself is described."""
         said = (self.imu, self.magnetometer, self.lever, self.mounting, self.location)
         return bool(self.beacon) or any(one is not None for one in said)

@@ -1,4 +1,4 @@
-"""What a job reads, and where it may write."""
+"""Inputs and output directory of a job."""
 
 import json
 import re
@@ -53,20 +53,20 @@ from magfusion.results.report import FAILED
 
 @dataclass(frozen=True)
 class Job:
-    """What every job on a log needs.
+    """Inputs of every job on a log.
 
     Parameters
     ----------
     site_path : Path, optional
-        None takes ``site.yaml`` in the log's directory.
+        By default ``site.yaml`` in the log's directory.
     output : Path
         Directory of the results; an earlier result there is replaced.
     start, end : float, optional
         Part of the log to use, seconds since its epoch.
     topics : Topics, optional
-        Of a bag that has several of one type.
+        Of a bag with several of one type.
     where : Where
-        The magnetometer is, beside what the site says of it.
+        Constraint on the magnetometer's position, in addition to the site's.
     """
 
     log_path: Path
@@ -85,16 +85,16 @@ class Job:
 
 NOT_USED = Finding(
     "reference_unused",
-    "The reference sensor is not used: what it tells of noise is taken off at rest alone, by"
-    " demodulate, fix, smooth or navigate with --at-rest.",
+    "The reference sensor is not used: it reduces noise at rest only, with demodulate, fix, smooth"
+    " or navigate with --at-rest.",
     Verdict.TRUSTWORTHY,
 )
 
 
 def _may_be_replaced(path: Path, kinds: tuple[str, ...]) -> bool:
-    """Return whether a directory holds nothing but an earlier result of these jobs."""
+    """Return whether a directory contains only an earlier result of these jobs."""
     found = {entry.name for entry in path.iterdir()}
-    # A checkpoint that was being written when its run was killed.
+    # An incomplete checkpoint of a killed run.
     abandoned = re.compile(abandoned_pattern(r"checkpoint\.(bin|rows)"))
     found = {name for name in found if not abandoned.fullmatch(name)}
     if any(found <= UNFINISHED.get(kind, set()) for kind in kinds):
@@ -108,14 +108,14 @@ def _may_be_replaced(path: Path, kinds: tuple[str, ...]) -> bool:
 
 
 def claim(output: Path, *kinds: str) -> AbstractContextManager[Path]:
-    """Return a context whose directory becomes ``output`` only if nothing fails.
+    """Return a context whose directory becomes ``output`` only on success.
 
-    What is in the way is refused at once, before the work is done.
+    An obstacle raises an error at once, before the work.
 
     Raises
     ------
     InputError
-        Where ``output`` holds anything but an earlier result of these jobs.
+        Where ``output`` contains anything but an earlier result of these jobs.
     """
 
     def replaces(path: Path) -> bool:
@@ -126,12 +126,12 @@ def claim(output: Path, *kinds: str) -> AbstractContextManager[Path]:
 
 
 def keep_results(whole: Path, logs: list[tuple[str, Path, Path]]) -> None:
-    """Copy what is kept of several logs into the directory that becomes the output.
+    """Copy the files of several logs into the directory that becomes the output.
 
     Parameters
     ----------
     logs : list of (str, Path, Path)
-        Name of each, the file that is kept of it, and the directory of its results.
+        Name of each, its file, and the directory of its results.
     """
     (whole / KEPT).mkdir()
     for name, kept, results in logs:
@@ -142,7 +142,7 @@ def keep_results(whole: Path, logs: list[tuple[str, Path, Path]]) -> None:
 
 
 def found_in(directory: Path, trust: Trust) -> Path:
-    """Return where results go: of a verdict that is failed, under a name that says so."""
+    """Return the directory of results: a separate one for a failed verdict."""
     if trust.verdict is not Verdict.FAILED:
         return directory
     (directory / FAILED).mkdir()
@@ -150,7 +150,7 @@ def found_in(directory: Path, trust: Trust) -> Path:
 
 
 def refuse_failed(place: Path, output: Path, trust: Trust) -> None:
-    """End a job whose verdict is failed, once its report is written.
+    """Raise an error for a failed verdict, after its report is written.
 
     Raises
     ------
@@ -159,14 +159,14 @@ def refuse_failed(place: Path, output: Path, trust: Trust) -> None:
     """
     if trust.verdict is Verdict.FAILED:
         raise EstimationError(
-            f"{place}: failed: {trust.ordered[0].text} The reasons are in"
-            f" {output / 'report.json'}, what was found in {output / FAILED}"
+            f"{place}: failed: {trust.ordered[0].text} The reasons are in {output / 'report.json'},"
+            f" the estimates in {output / FAILED}"
         )
 
 
 @contextmanager
 def named(place: Path | str) -> Iterator[None]:
-    """Name the file in the refusals of what knows only its content."""
+    """Add the file name to errors raised from its content alone."""
     try:
         yield
     except InputError as error:
@@ -176,7 +176,7 @@ def named(place: Path | str) -> Iterator[None]:
 
 
 def topics_option(text: str | None) -> Topics | None:
-    """Read ``role=name,...``.
+    """Parse ``role=name,...``.
 
     Raises
     ------
@@ -202,21 +202,21 @@ def read_site(
     Parameters
     ----------
     unknown : bool
-        Whether the job can do with beacons that were never surveyed.
+        Whether the job accepts beacons that were never surveyed.
     without : bool
-        Whether it can do without any.
+        Whether it accepts a site without beacons.
     several : bool
-        Whether it can do with several magnetometers.
+        Whether it accepts several magnetometers.
 
     Raises
     ------
     InputError
     """
     if job.site_path is None and not job.declared_path.is_file():
-        # A log that is not there is the nearer cause.
+        # A missing log is the more direct cause.
         _open(job)
         raise InputError(
-            f"{job.log_path}: holds no site.yaml; name the site's file with --site SITE.yaml"
+            f"{job.log_path}: has no site.yaml; give the site's file with --site SITE.yaml"
         )
     site = load_site(job.declared_path, unknown=unknown, without=without, several=several)
     return job.where.bounded(site)
@@ -239,39 +239,39 @@ def read_job(
     heard: bool = True,
     report: Report = quiet,
 ) -> tuple[Log, Site]:
-    """Read the log and the site of a job, and see that they belong together.
+    """Read the log and the site of a job, and check their consistency.
 
     Parameters
     ----------
     unknown : bool
-        Whether the job can do with beacons that were never surveyed.
+        Whether the job accepts beacons that were never surveyed.
     without : bool
-        Whether it can do without any.
+        Whether it accepts a site without beacons.
     fewer : bool
-        Whether it can do with a receiver of fewer than three axes.
+        Whether it accepts a receiver of fewer than three axes.
     amplitudes : bool
-        Whether it can do with amplitudes that have no sign.
+        Whether it accepts unsigned amplitudes.
     reference : bool
-        Whether it uses a reference sensor; that it does not is said.
+        Whether it uses a reference sensor; if not, that is reported.
     rotor : bool
-        Whether it takes the angle of a rotor and a casing itself.
+        Whether it handles the angle of a rotor and a casing itself.
     apart : bool
-        Whether each epoch may have a phase of its own.
+        Whether each epoch may have a separate phase.
     several : bool
-        Whether it can do with several magnetometers.
+        Whether it accepts several magnetometers.
     raw : bool
         Whether it demodulates the samples of several itself.
-    anew : bool
+    `anew` : bool
         Whether it demodulates them again, once the motion is known.
     lockin : LockinSettings, optional
-        By which the samples of several are demodulated.
-    heard : bool
-        Whether, of many beacons, those alone are of use that are heard in a window.
+        Demodulation settings for the samples of several magnetometers.
+    `heard` : bool
+        Whether only the beacons detected in a window are used, of many.
 
     Raises
     ------
     InputError
-        For anything in either file that a user must correct.
+        For invalid content of either file.
     """
     site = read_site(job, unknown=unknown, without=without, several=several)
     log = _as_known(job, _open(job, report), site)
@@ -305,11 +305,11 @@ def read_job(
 
 
 def _require_described(job: Job, log: Log, site: Site) -> None:
-    """Refuse inertial samples of a site without an IMU, and tones that no receiver can part."""
+    """Reject inertial samples of a site without an IMU, and tones too close for any receiver."""
     if log.inertial and site.platform.imu == NO_IMU:
         raise InputError(
-            f"{job.declared_path}: platform.imu: is missing, and {job.log_path} holds inertial"
-            " samples; describe the sensor, or remove its samples to do without"
+            f"{job.declared_path}: platform.imu: is missing, but {job.log_path} has inertial"
+            " samples; describe the sensor, or remove its samples"
         )
     if log.waveform is not None and site.beacons:
         with named(job.declared_path):
@@ -324,14 +324,14 @@ def _as_known(job: Job, log: Log, site: Site) -> Log:
         return log
     if log.fields is None and not log.waveforms:
         raise InputError(
-            f"{job.log_path}: the samples do not say which of the site's magnetometers took them;"
-            " add a column magnetometer with its name to magnetometer.parquet"
+            f"{job.log_path}: the samples do not specify which of the site's magnetometers took"
+            " them; add a column magnetometer with its name to magnetometer.parquet"
         )
     return replace(log, waveform=None, fields=None if log.waveforms else log.fields)
 
 
 def require_imu(job: Job, log: Log, what: str) -> None:
-    """Refuse a log without inertial samples.
+    """Raise an error for a log without inertial samples.
 
     Raises
     ------
@@ -339,13 +339,13 @@ def require_imu(job: Job, log: Log, what: str) -> None:
     """
     if not log.inertial:
         raise InputError(
-            f"{job.log_path}: holds no imu.parquet or imu.csv, and {what}; record the inertial"
-            " sensor beside the magnetometer"
+            f"{job.log_path}: has no imu.parquet or imu.csv, and {what}; record the inertial sensor"
+            " with the magnetometer"
         )
 
 
 def read_recording(job: Job, report: Report = quiet) -> tuple[Log, Site | None]:
-    """Read a log, and its site where there is one: a log alone can be judged too.
+    """Read a log, and its site if there is one: a log alone can be checked too.
 
     Raises
     ------
@@ -367,8 +367,8 @@ def read_recording(job: Job, report: Report = quiet) -> tuple[Log, Site | None]:
             )
             if site.platform.further and not log.waveforms:
                 raise InputError(
-                    f"{job.log_path}: holds only phasors of several magnetometers, of which check"
-                    " judges the samples; give the log with magnetometer.parquet"
+                    f"{job.log_path}: has only phasors of several magnetometers, but check requires"
+                    " the samples; give the log with magnetometer.parquet"
                 )
             return log, site
         return mended(_open(job, report), site), site
@@ -379,8 +379,8 @@ def _open(job: Job, report: Report = quiet) -> Log:
     log = open_log(job.log_path, job.start, job.end, job.topics, report)
     if log.waveform is None and log.fields is None and not log.waveforms:
         raise InputError(
-            f"{job.log_path}: holds no magnetometer samples in the part to use; record the"
-            " magnetometer beside the inertial sensor"
+            f"{job.log_path}: has no magnetometer samples in the selected part; record the"
+            " magnetometer with the inertial sensor"
         )
     return log
 
@@ -395,7 +395,7 @@ def read_estimate(path: Path, epoch_ns: int = 0) -> Trajectory:
     """
     if path.is_dir():
         if not (path / "trajectory.parquet").is_file():
-            raise InputError(f"{path}: holds no trajectory.parquet; give the result of a job")
+            raise InputError(f"{path}: has no trajectory.parquet; give the result of a job")
         return read_trajectory(path / "trajectory.parquet", epoch_ns)
     if path.suffix in (".parquet", ".csv"):
         return read_trajectory(path, epoch_ns)

@@ -1,4 +1,4 @@
-"""A log among several, smoothed alone, as a file: a rerun takes up what is done."""
+"""File of a log that was smoothed alone, among several; a rerun resumes from it."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def save_alone(path: Path, key: str, alone: Alone) -> None:
 
 
 def load_alone(path: Path, key: str, site: Site) -> Alone | None:
-    """Return a log that was smoothed alone by what the key says; None where there is none."""
+    """Return the log smoothed alone under a key; None where there is none."""
     kept = load_kept(path, key)
     if kept is None:
         return None

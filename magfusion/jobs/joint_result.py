@@ -1,4 +1,4 @@
-"""The result of several logs of one site: the site that they refine, and their table."""
+"""The result of several logs of one site: the refined site, and their table."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def run_joint(
     rate: Rate = "field",
     risk: Risk | None = None,
 ) -> Figures:
-    """Refine one site by several logs together.
+    """Refine one site with several logs together.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def run_joint(
 
 
 def _calibration(joint: Joint) -> Calibration:
-    """Return the joint calibration, with the noise that the logs found (geometric mean)."""
+    """Return the joint calibration, with the noise estimated from the logs (geometric mean)."""
     found: dict[tuple[str, str], list[Tuned]] = {}
     for log in joint.logs:
         for tuned in log.noise:

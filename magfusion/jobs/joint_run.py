@@ -1,6 +1,6 @@
-"""Several logs of one site: each alone, then rounds until all have one calibration, then the last.
+"""Several logs of one site: each alone, then rounds to a common calibration, then a final pass.
 
-What is done of a log alone is kept in the output, by what made it; the rounds go on from there.
+The results of a log alone are stored in the output under a key; the rounds resume from them.
 """
 
 from __future__ import annotations
@@ -55,18 +55,18 @@ _SITE_FILES = ("site.yaml", "site_field_map.parquet", "site_correlation.parquet"
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """What several logs made of one site.
+    """Joint solution of several logs of one site.
 
     Parameters
     ----------
     known : Known
         Of the shared calibration.
     excess : float
-        By what its variances are too small, as the logs contradict each other.
+        Factor on its variances, as the logs contradict each other.
     logs : tuple of OfLog
-        Those that took part.
+        The logs in the solution.
     table : list of dict
-        A row for each log that was given.
+        A row for each given log.
     """
 
     shared: Shared
@@ -79,7 +79,7 @@ class Joint:
 
 
 def tasks_of(jobs: Sequence[Job], smoother: SmootherSettings, output: Path) -> list[LogTask]:
-    """Return the tasks of some logs, once it is clear that they are different logs of one site.
+    """Return the tasks of some logs, after checking that they are different logs of one site.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def tasks_of(jobs: Sequence[Job], smoother: SmootherSettings, output: Path) -> l
         content = digest_of_files([job.log_path], without=frozenset(_SITE_FILES))
         if content in seen:
             raise InputError(
-                f"{job.log_path}: is the same log as {seen[content]}, and would count twice; give"
+                f"{job.log_path}: is the same log as {seen[content]} and would count twice; give"
                 " each log once"
             )
         seen[content] = job.log_path
@@ -124,15 +124,15 @@ def _one_site(jobs: Sequence[Job], smoother: SmootherSettings) -> str:
     shared = shared_of(read_site(jobs[0]), smoother)
     if smoother.coupling == "loose" or not shared.blocks:
         raise InputError(
-            f"{jobs[0].declared_path}: the logs have nothing to refine together, as nothing of the"
-            " calibration is estimated that they share; declare how well the survey is known, leave"
-            " --coupling tight and --estimate as they are, or smooth each log on its own"
+            f"{jobs[0].declared_path}: the logs estimate no shared calibration, so that there is"
+            " nothing to refine together; declare the uncertainty of the survey, keep --coupling"
+            " tight and --estimate as they are, or smooth each log on its own"
         )
     return next(iter(found))
 
 
 def _names(paths: list[Path]) -> list[str]:
-    """Return a name for each log: its own, with those of directories above where others have it."""
+    """Return a name for each log: its own, with parent directories where it is not unique."""
     parts = [real(path).with_suffix("").parts[1:] for path in paths]
     most = max(len(p) for p in parts)
     for count in range(1, most + 1):
@@ -152,7 +152,7 @@ def refine(
     risk: Risk | None = None,
     report: Report,
 ) -> Joint:
-    """Refine one site by all logs together.
+    """Refine one site with all logs together.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def refine(
     InputError
         Where a log cannot be used, or the cluster not be reached.
     EstimationError
-        Where no log is left.
+        Where no log remains.
     """
     site = _declared(tasks)
     shared = shared_of(site, tasks[0].smoother)
@@ -183,7 +183,7 @@ def refine(
         used, logs = [task for task, _ in some], [log for _, log in some]
         before = _agreement(used, logs, shared)
         logs, known, moved, rounds = _rounds(hands, used, logs, shared, report)
-        # Held to what the others say, a robust loss soon refuses what says otherwise.
+        # Given the prior of the others, a robust loss soon rejects contradicting measurements.
         agreed = before if any(before.of_log) else _agreement(used, logs, shared)
         given = [
             LastTask(one, agreed.excess, said, writes, rate, risk)
@@ -203,7 +203,7 @@ def refine(
 
 
 def _declared(tasks: list[LogTask]) -> Site:
-    """Return the site, with nothing that joins what is shared to what is each log's own."""
+    """Return the site, without correlations between shared and own parameters of each log."""
     site = read_site(tasks[0].job)
     return uncoupled(site, shared_of(site, tasks[0].smoother).blocks)
 
@@ -231,10 +231,10 @@ def _agreement(tasks: list[LogTask], logs: list[OfLog], shared: Shared) -> Agree
 def _rounds(
     hands: Crew, tasks: list[LogTask], logs: list[OfLog], shared: Shared, report: Report
 ) -> tuple[list[OfLog], Known, float, int]:
-    """Repeat until no log takes the shared calibration elsewhere.
+    """Repeat until no log moves the shared calibration.
 
-    Where a round moves it farther than the one before, as among logs that contradict each other,
-    what they say is changed by a share only from then on.
+    Where a round moves it farther than the one before, as with contradicting logs, further updates
+    are damped.
     """
     at = np.mean([log.said.step for log in logs], axis=0)
     known = known_by(shared, [log.said for log in logs], at)
@@ -264,7 +264,7 @@ def _unheard(site: Site, first: Sequence[Alone]) -> list[str]:
 def _row(
     task: LogTask, before: dict[str, Any], after: dict[str, Any] | None, far: float | None
 ) -> dict[str, Any]:
-    """Return the row of a log: in the joint solution, and beside it what it was alone."""
+    """Return the row of a log: in the joint solution, and as smoothed alone."""
     row: dict[str, Any] = {"log": task.name, "path": str(task.job.log_path), "used": "yes"}
     if after is None:
         return row | {"used": "no", **{k: before[k] for k in ("verdict", "code", "reason")}}
@@ -277,22 +277,22 @@ def _row(
 def trust_of_all(
     table: list[dict[str, Any]], agreed: Agreement, unheard: list[str], moved: float
 ) -> Trust:
-    """Return the verdict on all: what the logs say of each other, then what is said of each.
+    """Return the joint verdict: consistency between the logs, then the findings of each.
 
     Parameters
     ----------
     table : list of dict
         A row for each log.
-    unheard : list of str
-        Beacons that no log hears.
+    `unheard` : list of str
+        Beacons that are detected in no log.
     moved : float
-        By how many sigmas the last round moved the shared calibration.
+        Change of the shared calibration in the last round, in sigmas.
     """
     found = [finding for said in agreed.of_log for finding in said]
     contradicted = {finding.text for finding in found}
     for row in table:
         if row["used"] == "no":
-            text = f"Log {row['log']} has no part in this, as it failed alone: {row['reason']}"
+            text = f"Log {row['log']} is not used, as it failed alone: {row['reason']}"
             found.append(Finding("log_left_out", text, weight=100.0))
         elif row["code"] and row["reason"] not in contradicted:
             text = f"Log {row['log']}: {row['reason']}"
@@ -300,14 +300,14 @@ def trust_of_all(
             found.append(Finding(row["code"], text, verdict))
     for name in unheard:
         text = (
-            f"None of the logs hears beacon {name}: the site says of it what it said before. Were"
-            " these logs made there?"
+            f"Beacon {name} is not detected in any log; its entry is unchanged. Check that the logs"
+            " are of this site."
         )
         found.append(Finding("silent_beacon", text, weight=50.0))
     if not moved < UNSETTLED:
         text = (
-            f"The logs did not settle on one calibration: the last of {MOST_ROUNDS} rounds still"
-            f" moved it by {moved:.2g} sigma. Leave out the log that is farthest from the others."
+            f"The logs did not converge to one calibration: the last of {MOST_ROUNDS} rounds still"
+            f" moved it by {moved:.2g} sigma. Omit the log that is farthest from the others."
         )
         found.append(Finding("not_converged", text))
     return Trust(tuple(found))

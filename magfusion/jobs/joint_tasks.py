@@ -1,4 +1,4 @@
-"""What is done with one log among several, in whatever process: alone, a round, and the last."""
+"""Tasks of one log among several, in any process: alone, a round, and the final pass."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ class LogTask:
     Parameters
     ----------
     name : str
-        Of its own among them.
+        Its unique name among them.
     job : Job
-        Its files, and where its own results go.
+        Its files, and the directory of its own results.
     kept : Path
-        File of what it is alone.
+        File of its solution alone.
     key : str
-        Of all that makes it.
+        Hash of all its inputs.
     """
 
     name: str
@@ -59,14 +59,14 @@ class LogTask:
 
 @dataclass(frozen=True, eq=False)
 class RoundTask:
-    """One of several logs, with what the others say.
+    """One of several logs, with the prior from the others.
 
     Parameters
     ----------
     log : OfLog
     shared : Shared
     prior : Known
-        By all others and the survey.
+        From all others and the survey.
     """
 
     task: LogTask
@@ -77,14 +77,14 @@ class RoundTask:
 
 @dataclass(frozen=True, eq=False)
 class LastTask:
-    """The last of a log, in the joint solution.
+    """The final pass of a log, in the joint solution.
 
     Parameters
     ----------
     excess : float
-        By what variances are too small, as the logs contradict each other.
-    said : tuple of Finding
-        Of this log among the others.
+        Factor on the variances, as the logs contradict each other.
+    `said` : tuple of Finding
+        On the consistency of this log with the others.
     writes : bool
         Whether its trajectory is written.
     """
@@ -98,29 +98,30 @@ class LastTask:
 
 
 def read_shared(task: LogTask) -> tuple[Log, Site, Shared]:
-    """Return a log, its site, and what it shares with the others."""
+    """Return a log, its site, and the parameters it shares with the others."""
     log, site = read_job(task.job)
     site = uncoupled(site, shared_blocks(task.smoother.blocks(site)[0]))
     return replace(log, name=task.name), site, shared_of(site, task.smoother)
 
 
 def together_settings(smoother: SmootherSettings) -> SmootherSettings:
-    """Return the settings with which several logs are smoothed.
+    """Return the smoother settings for several logs.
 
-    What a survey knows well enough for one log, several tell better, and what it is wrong by is the
-    same in all of them: everything that has a sigma is estimated, unless the user says otherwise.
+    Several logs can determine parameters for which one log relies on the survey, and errors of
+    these are common to all logs: all parameters with a sigma are estimated, unless the user
+    declares otherwise.
     """
     return replace(smoother, estimate=GROUPS) if smoother.estimate is None else smoother
 
 
 def shared_of(site: Site, smoother: SmootherSettings) -> Shared:
-    """Return what logs of a site share."""
+    """Return the parameters shared by the logs of a site."""
     blocks, _ = smoother.blocks(site)
     return Shared(initial_calibration(site, 0.0), shared_blocks(blocks))
 
 
 def alone(task: LogTask, _rng: np.random.Generator) -> Alone:
-    """Smooth a log alone and keep it, or take up what was kept."""
+    """Smooth a log alone and store it, or load the stored result."""
     log, site, shared = read_shared(task)
     known = load_alone(task.kept, task.key, site)
     if known is not None:
@@ -141,14 +142,14 @@ def alone(task: LogTask, _rng: np.random.Generator) -> Alone:
 
 
 def one_round(task: RoundTask, _rng: np.random.Generator) -> OfLog:
-    """Solve a log with what the others say."""
+    """Solve a log with the prior from the others."""
     log, site, _ = read_shared(task.task)
     done = solve_round(log, site, task.task.smoother, task.log, task.shared, task.prior)
     return after_round(task.log, done, task.shared)
 
 
 def last(given: LastTask, _rng: np.random.Generator) -> dict[str, Any]:
-    """Judge a log in the joint solution, write its results, and return its row of the table."""
+    """Assess a log in the joint solution, write its results, and return its row of the table."""
     own = given.round
     log, site, _ = read_shared(own.task)
     blocks, _ = own.task.smoother.blocks(site)
@@ -162,7 +163,7 @@ def last(given: LastTask, _rng: np.random.Generator) -> dict[str, Any]:
 
 
 def _written(result: Smoothed, log: Log, site: Site, given: LastTask) -> tuple[Smoothed, Trust]:
-    """Judge a log and write its results."""
+    """Assess a log and write its results."""
     from magfusion.jobs.smooth_result import finished, with_errors, write_finished
 
     task = given.round.task
@@ -176,7 +177,7 @@ def _written(result: Smoothed, log: Log, site: Site, given: LastTask) -> tuple[S
 
 
 def judged_among(result: Smoothed, log: Log, given: LastTask) -> tuple[Smoothed, Trust]:
-    """Judge a log, and hear what the others say of it."""
+    """Assess a log, with the findings against the others."""
     result, trust = judged(result, log)
     assert result.states.pose_cov is not None
     wider = replace(result.states, pose_cov=given.excess * result.states.pose_cov)
@@ -184,7 +185,7 @@ def judged_among(result: Smoothed, log: Log, given: LastTask) -> tuple[Smoothed,
 
 
 def table_facts(result: Smoothed, trust: Trust, log: Log) -> dict[str, Any]:
-    """Return what the table of logs says of one."""
+    """Return the facts of one log for the table of logs."""
     states, cov = result.states, result.states.pose_cov
     assert cov is not None
     sigma = np.median(np.sqrt(np.diagonal(cov, axis1=1, axis2=2)).reshape(-1, 2, 3), (0, 2))

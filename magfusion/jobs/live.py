@@ -1,4 +1,4 @@
-"""Where states go as they are made, beside the files: the viewer, and what robots listen to."""
+"""Live outputs of states, in addition to the files: the viewer, and robot middleware."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
 
 
 class StateSink(Protocol):
-    """Takes states one by one, and never makes the estimator wait."""
+    """Receives states one by one, and never blocks the estimator."""
 
     def take(self, state: JudgedState | None, told: Mapping[str, Any], /) -> None:
-        """Take a state, None before the first, with what the pipe tells of it."""
+        """Receive a state, None before the first, with its representation in the pipe."""
 
     def close(self) -> str | None:
-        """End; return what went wrong on the way, as a sentence without its full stop."""
+        """Close; return an error as a sentence without its full stop."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LiveSettings(FrameSettings):
-    """Who is told of states as they are made."""
+    """Live outputs of the states."""
 
     live: bool = option(False, "Show the states in the viewer")
     mavlink: str | None = option(
@@ -54,19 +54,19 @@ class LiveSettings(FrameSettings):
         super().__post_init__()
         named = (self.frame, self.child) != (FrameSettings.frame, FrameSettings.child)
         if named and self.foxglove is None and self.ros2 is None:
-            raise InputError("--frame and --child are for --foxglove and --ros2; give one of them")
+            raise InputError("--frame and --child require --foxglove or --ros2; give one of them")
 
 
 @contextmanager
 def state_sinks(
     settings: LiveSettings, site: Site, epoch_ns: int, messages: TextIO
 ) -> Iterator[tuple[StateSink, ...]]:
-    """Yield what takes the states, and tell at the end what went wrong with it.
+    """Yield the outputs of the states, and report their errors at the end.
 
     Parameters
     ----------
     epoch_ns : int
-        When the time of states is zero (ns since 1970).
+        Zero of the states' time (ns since 1970).
 
     Raises
     ------

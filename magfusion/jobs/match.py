@@ -1,4 +1,4 @@
-"""The job that finds attitudes from the Earth's field: a log in, a table of angles out."""
+"""The job that estimates attitudes from the Earth's field: a log in, a table of angles out."""
 
 from __future__ import annotations
 
@@ -52,22 +52,22 @@ _BY = " (--yaw-deg; --gravity; magfusion smooth)"
 
 @dataclass(frozen=True, kw_only=True)
 class MatchSettings(LogSettings, Sampling):
-    """How attitudes are found, and what is given for it."""
+    """Method and known angles of the attitude match."""
 
     database: Path | None = option(
         None,
         "Result of calibrate attitude-database",
-        note="default: the site's Earth field, exactly",
+        note="default: the site's Earth field, as exact",
     )
     method: Method | None = option(
-        None, "Default: interpolated in the database; the closed form without one"
+        None, "Method", note="default: interpolated in the database; the closed form without one"
     )
     angles: Literal["roll", "roll-pitch", "roll-pitch-yaw"] | None = option(
-        None, "What is asked", note="default: all that can be determined"
+        None, "Angles to estimate", note="default: all that can be determined"
     )
-    yaw_deg: float | None = option(None, "Yaw of the platform, known", unit="degrees")
-    pitch_deg: float | None = option(None, "Pitch, where that is known too", unit="degrees")
-    gravity: bool = option(False, "All three angles, by the accelerometer, at rest")
+    yaw_deg: float | None = option(None, "Known yaw of the platform", unit="degrees")
+    pitch_deg: float | None = option(None, "Known pitch", unit="degrees")
+    gravity: bool = option(False, "Estimate all three angles, with the accelerometer, at rest")
 
 
 class _Found(NamedTuple):
@@ -77,13 +77,13 @@ class _Found(NamedTuple):
 
 
 def run_match(settings: MatchSettings, output: Path) -> Figures:
-    """Find the attitude of every epoch from the Earth's field: table, picture and report.
+    """Estimate the attitude of every epoch from the Earth's field: table, picture and report.
 
     Raises
     ------
     InputError
-        Where more angles are asked than the vectors determine, in one sentence that says what is
-        lacking; where a file cannot be read, or ``output`` is in the way.
+        Where more angles are requested than the vectors determine, with a remedy; where a file
+        cannot be read, or ``output`` is in the way.
     """
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed, require_imu
     from magfusion.results.plots.match import write_match_plot
@@ -93,7 +93,7 @@ def run_match(settings: MatchSettings, output: Path) -> Figures:
     job, claimed = settings.job(output), claim(output, "match")
     log, site = read_job(job, without=True)
     if settings.gravity:
-        require_imu(job, log, "gravity is by the accelerometer")
+        require_imu(job, log, "gravity requires the accelerometer")
     with named(job.log_path):
         taken = steady(log, site, settings)
     found = _match(job, log, site, taken, settings)
@@ -131,7 +131,7 @@ def run_match(settings: MatchSettings, output: Path) -> Figures:
 
 
 def _check(settings: MatchSettings) -> None:
-    """Refuse what cannot be asked together, and more than the vectors determine."""
+    """Reject incompatible options, and more angles than the vectors determine."""
     if settings.gravity:
         _check_gravity(settings)
         return
@@ -148,11 +148,11 @@ def _check(settings: MatchSettings) -> None:
 def _check_gravity(settings: MatchSettings) -> None:
     if settings.angles not in (None, "roll-pitch-yaw") or _given(settings):
         raise InputError(
-            "--gravity determines all three angles; leave out --angles, --pitch-deg, --yaw-deg,"
+            "--gravity determines all three angles; omit --angles, --pitch-deg, --yaw-deg,"
             " --database and --method"
         )
     if settings.raw:
-        raise InputError("--gravity needs the specific force of each epoch; leave out --raw")
+        raise InputError("--gravity requires the specific force of each epoch; omit --raw")
 
 
 def _check_given(settings: MatchSettings) -> None:
@@ -163,13 +163,14 @@ def _check_given(settings: MatchSettings) -> None:
         if value is not None and not abs(value) <= limit:
             raise InputError(f"{name} must lie within {limit:g} degrees of zero; got {value:g}")
     if settings.method not in (None, "closed-form"):
-        raise InputError(f"--method {settings.method} looks up a database; name it by --database")
+        raise InputError(f"--method {settings.method} requires a database; give it with --database")
     if settings.yaw_deg is None:
         raise InputError(f"without a database {THREE_ANGLES}{_BY}")
     asked = "roll-pitch" if settings.pitch_deg is None else "roll"
     if settings.angles not in (None, asked):
         raise InputError(
-            "--angles roll needs --pitch-deg beside --yaw-deg, and --angles roll-pitch has none"
+            "--angles roll requires --pitch-deg and --yaw-deg; --angles roll-pitch takes no"
+            " --pitch-deg"
         )
 
 
@@ -204,7 +205,7 @@ def _match(job: Job, log: Log, site: Site, taken: Steady, settings: MatchSetting
 
 
 def _resting(log: Log, site: Site, time: Array) -> BoolArray:
-    """Tell at which times the platform rests: else its acceleration passes for gravity."""
+    """Return at which times the platform is at rest: otherwise its acceleration acts as gravity."""
     stamps = log.imu.time + site.platform.imu.time_offset
     still = resting(stamps, log.imu.gyro_body, log.imu.accel_body, motion=site.platform.motion)
     return still[np.minimum(np.searchsorted(stamps, time), len(stamps) - 1)]
@@ -217,7 +218,7 @@ def _by_database(place: Path, taken: Steady, settings: MatchSettings) -> _Found:
     database = read_database(path)
     if settings.angles not in (None, database.angles):
         raise InputError(
-            f"--angles {settings.angles}: {path} holds {database.angles}; build another by"
+            f"--angles {settings.angles}: {path} has {database.angles}; build another with"
             " magfusion calibrate attitude-database"
         )
     with named(path):
@@ -244,7 +245,7 @@ def _earth_field(job: Job, site: Site) -> Array:
         name = job.log_path / "site.yaml" if job.site_path is None else job.site_path
         raise InputError(
             f"{name}: gives no Earth field; add world.earth_field_t or world.location, or give a"
-            " database by --database"
+            " database with --database"
         )
     day = datetime.date.fromisoformat(place.date)
     return earth_field_world(place.latitude_deg, place.longitude_deg, place.height_m, day)
@@ -279,7 +280,7 @@ def _compared(log: Log, time: Array, found: _Found) -> tuple[Array | None, Figur
 
 
 def _whole_attitude(poses: Trajectory, rpy: Array, used: BoolArray) -> Figure:
-    """Return the error of the attitude with the angles that were given, and of what was given."""
+    """Return the error of the attitude with the given angles, and of these angles."""
     true = Rotation.from_matrix(poses.world_from_body[used])
     turn = true.inv() * Rotation.from_euler("xyz", rpy[used])
     rms = float(np.sqrt(np.mean(turn.magnitude() ** 2)) / DEGREE)
@@ -287,7 +288,7 @@ def _whole_attitude(poses: Trajectory, rpy: Array, used: BoolArray) -> Figure:
 
 
 def _true_angles(world_from_body: Array, given: Array, angles: tuple[int, ...]) -> Array:
-    """Return the true angles about those that were given."""
+    """Return the true values of the given angles."""
     if 2 in angles:
         heading = np.arctan2(world_from_body[:, 1, 0], world_from_body[:, 0, 0])
         return angles_about(world_from_body, heading)

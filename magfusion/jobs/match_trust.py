@@ -1,4 +1,4 @@
-"""Whether attitudes from the steady field are to be believed."""
+"""Trust in attitudes from the static field."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 FEW = 0.05  # share of epochs that may be undetermined
 OTHER_SIZE = 0.3  # of the Earth's field, by which it contradicts the site
 EXPLAINED = 1.5  # residual by what is declared, as of whitened residuals
-# Numbers of a field vector that are left when so many angles have been found by it.
+# Remaining degrees of freedom of a field vector for each number of estimated angles.
 _LEFT = {"roll": 2, "roll-pitch": 1, "roll-pitch-yaw": 2}
 _NAMES = ("roll", "pitch", "yaw")
 
@@ -34,15 +34,15 @@ def judged(
     site: Site,
     log: Log,
 ) -> tuple[Matches, Trust]:
-    """Return matches with sigmas that their residuals allow, and what is to be said of them.
+    """Return matches with sigmas consistent with their residuals, and findings.
 
     Parameters
     ----------
     angles : tuple of int
-        That were found, of roll, pitch and yaw.
+        Estimated angles, of roll, pitch and yaw.
     field_world : ndarray, shape (3,), optional
-        The field that was taken as exact (T); none with a database, which refuses what it does not
-        know by itself.
+        The field assumed as exact (T); None with a database, which rejects unmatched fields by
+        itself.
     """
     findings = [*_undetermined(matches), *recorded(log, site, BRIDGED)]
     unverified = []
@@ -58,10 +58,10 @@ def judged(
             findings.append(
                 Finding(
                     "earth_field",
-                    f"The matched field misses the measured one by {rms / NANOTESLA:.3g} nT (rms),"
-                    f" and noise, calibration and the building's iron are declared as"
-                    f" {declared / NANOTESLA:.3g} nT: calibrate the magnetometer, or check the"
-                    " Earth field and the angles that were given. The sigmas have been enlarged.",
+                    f"The matched field differs from the measured one by {rms / NANOTESLA:.3g} nT"
+                    " (rms), declared for noise, calibration and the building's iron:"
+                    f" {declared / NANOTESLA:.3g} nT. Calibrate the magnetometer, or check the"
+                    " Earth field and the given angles. The sigmas are enlarged.",
                     weight=rms / declared,
                 )
             )
@@ -75,14 +75,14 @@ def judged(
 
 
 def _residual(matches: Matches, angles: tuple[int, ...]) -> float:
-    """Return the root mean square of what is left of a component (T)."""
+    """Return the root mean square residual of a component (T)."""
     left = _LEFT["-".join(_NAMES[k] for k in angles)]
     own = matches.residual[:, 0][matches.determined[:, 0]]
     return float(np.sqrt(np.mean(own**2) / left)) if len(own) else 0.0
 
 
 def _sensor_sigma(site: Site, size: float) -> float:
-    """Return what is declared of the magnetometer's calibration, of a component (T)."""
+    """Return the declared uncertainty of the magnetometer's calibration, per component (T)."""
     sigma = site.platform.magnetometer.sigma
     matrix = float(np.sqrt(np.mean(np.sum(sigma.matrix**2, axis=1)))) * size
     return float(np.hypot(matrix, np.sqrt(np.mean(sigma.offset**2))))
@@ -93,17 +93,17 @@ def _undetermined(matches: Matches) -> Iterator[Finding]:
     if missing > FEW * count:
         yield Finding(
             "geometry",
-            f"{missing} of {count} epochs have no attitude: the field lies near the axes that are"
-            " asked for, is none that the database holds, or the platform moves. They are marked"
-            " in attitude.parquet (determined); add gravity at rest (--gravity), or beacons.",
+            f"{missing} of {count} epochs have no attitude: the field is nearly parallel to the"
+            " requested axes, is not in the database, or the platform moves. They are marked in"
+            " attitude.parquet (determined); add gravity at rest (--gravity), or beacons.",
             weight=missing / count / FEW,
         )
     both = int(np.sum(matches.ambiguous))
     if both:
         yield Finding(
             "ambiguous",
-            f"In {both} of {count} epochs the field has two attitudes: first stands that on the"
-            " side of a level body, the other beside it.",
+            f"In {both} of {count} epochs the field has two attitudes: the first is on the side of"
+            " a level body, the second on the other.",
             Verdict.TRUSTWORTHY,
         )
 
@@ -114,7 +114,7 @@ def _other_size(taken: Steady, size: float) -> Iterator[Finding]:
     if off > OTHER_SIZE:
         yield Finding(
             "earth_field",
-            f"The steady field is {1e6 * measured:.3g} uT and the Earth's, of the site, is"
+            f"The static field is {1e6 * measured:.3g} uT, but the site's Earth field is"
             f" {1e6 * size:.3g} uT: check the unit of magnetometer.parquet, the sensor's"
             " calibration, and the Earth field in the site.",
             Verdict.FAILED,

@@ -1,4 +1,4 @@
-"""The job that navigates along a log as if it were live: states as they were when made."""
+"""The job that navigates along a log as if it were live: states as first estimated."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ OF_A_LOG = {"output", "start", "end", "topics", "realtime", "as_json"}
 def run(
     settings: NavigateSettings, output: Path, given: set[str], report: Report = quiet
 ) -> Figures | None:
-    """Navigate as the settings ask; see `run_navigate` and `run_stream`."""
+    """Navigate along a log or stream; see `run_navigate` and `run_stream`."""
     if settings.at_rest:
         return run_at_rest(settings, output, given, report)
     if str(settings.log) == "-":
@@ -66,7 +66,7 @@ def run(
         refuse_without_beacons(given)
         return run_orientation("navigate", job, settings.rates, back=False, report=report)
     if given & {"form", "keep_going"}:
-        raise InputError("--keep-going and --format belong to a stream; give - in place of a log")
+        raise InputError("--keep-going and --format require a stream; give - instead of a log")
     return run_navigate(settings, output, report)
 
 
@@ -74,11 +74,11 @@ def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
     from magfusion.jobs.stream import StreamSettings, run_stream
 
     if settings.site is None:
-        raise InputError("navigate - needs the site's file; name it with --site SITE.yaml")
+        raise InputError("navigate - requires the site's file; give it with --site SITE.yaml")
     if given & OF_A_LOG:
         raise InputError(
-            "--output, --start, --end, --topics, --realtime and --json belong to a log; leave them"
-            " out with -"
+            "--output, --start, --end, --topics, --realtime and --json require a log; omit them"
+            " with -"
         )
     site = load_site(settings.site, without=True, several=True)
     if not site.beacons:
@@ -110,9 +110,9 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
     Raises
     ------
     InputError
-        For anything in the input that a user must correct.
+        For invalid input.
     EstimationError
-        Where the log leads to no state.
+        Where the log gives no state.
     """
     from magfusion.jobs.inputs import CHECKPOINT, claim, found_in, named, read_job, refuse_failed
     from magfusion.jobs.navigate_results import motion_of, write_navigated
@@ -125,7 +125,7 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
         claim_rows(_rows_path(path))
         if path != place or not settings.resume:
             claim_checkpoint(path)
-    # As of a stream: which beacons will be heard is not known beforehand.
+    # As of a stream: the beacons that will be detected are not known beforehand.
     log, site = read_job(
         job,
         fewer=True,
@@ -167,23 +167,23 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
 
 
 def _refuse_phasors(path: Path, log: Log, settings: NavigateSettings) -> None:
-    """Refuse phasors where they cannot do what is asked, and those of whole rests."""
+    """Reject phasors that do not support the requested options, and those of whole rests."""
     if settings.earth and log.waveform is None:
         raise InputError(
-            f"{path}: holds only phasors, which know nothing of the Earth field; give the"
-            " log with magnetometer.parquet, or leave --earth out"
+            f"{path}: has only phasors, which do not contain the Earth field; give the log with"
+            " magnetometer.parquet, or omit --earth"
         )
     if log.waveform is None and log.fields is not None:
         longest = float(max(log.fields.window))
         if longest > LONGEST_EPOCH:
             raise InputError(
-                f"{path}: holds whole rests, of up to {longest:.3g} s, which are known when"
-                " they are over; run magfusion fix or smooth, or navigate the raw log"
+                f"{path}: has whole rests, of up to {longest:.3g} s, which are known only after"
+                " their end; run magfusion fix or smooth, or navigate the raw log"
             )
 
 
 def _results(run: NavigateRun) -> tuple[Figures, Trust, NavigateResults | None]:
-    """Return figures and verdict of a run, and its results where it led to a state."""
+    """Return figures and verdict of a run, and its results if it has a state."""
     from magfusion.estimation.integrity.diagnosis import with_cause
     from magfusion.jobs.navigate_results import navigated, no_start
 
@@ -199,7 +199,7 @@ def _results(run: NavigateRun) -> tuple[Figures, Trust, NavigateResults | None]:
 
 @dataclass(eq=False)
 class NavigateRun:
-    """A run along a log, as far as it has come."""
+    """Progress of a run along a log."""
 
     replay: Replay
     site: Site
@@ -213,7 +213,7 @@ class NavigateRun:
 
 
 def _make_parent(place: Path) -> list[Path]:
-    """Make the checkpoint's directory; return what was made for it."""
+    """Create the checkpoint's directory; return the created directory."""
     made = [p for p in (place.parent, *place.parent.parents) if not p.exists()]
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -267,7 +267,7 @@ def _open_run(
 
 
 def _advance(run: NavigateRun, settings: NavigateSettings, report: Report) -> None:
-    """Take in the pieces that are left, and leave a checkpoint from time to time."""
+    """Process the remaining pieces, and write checkpoints from time to time."""
     began = time.perf_counter() - run.elapsed
     every, told = max(1, round(settings.every / PIECE)), -np.inf
     for k, piece in paced(run.replay.pieces(run.position), settings.realtime):
@@ -300,7 +300,7 @@ def _advance(run: NavigateRun, settings: NavigateSettings, report: Report) -> No
 
 
 def _tell(run: NavigateRun, state: JudgedState) -> None:
-    """Tell who listens of a state."""
+    """Send a state to the live outputs."""
     if run.sinks:
         from magfusion.jobs.stream import state_content
 

@@ -1,4 +1,4 @@
-"""Navigation of rests as they last: by a log, or by records on standard input."""
+"""Navigation of rests as they last: along a log, or from records on standard input."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from magfusion.receiver.windows import LockinSettings
 
 PIECE = 1.0  # s; of a log that is replayed
-# Of `navigate`, what has a part in it.
+# Options of `navigate` that it uses.
 TAKEN = {
     *("site", "log", "output", "start", "end", "topics", "as_json", "form", "keep_going"),
     *("at_rest", "false_alarm", "window", "step", "mains_hz", "risk", "fault_prior"),
@@ -46,7 +46,7 @@ _PLACE = {"json": "line", "msgpack": "record"}
 
 @dataclass(frozen=True)
 class How:
-    """How rests are integrated: as `magfusion.estimation.rests.rest_stream.RestNavigator`."""
+    """Settings of rest integration: as `magfusion.estimation.rests.rest_stream.RestNavigator`."""
 
     lockin: LockinSettings | None
     false_alarm: float
@@ -62,7 +62,7 @@ class How:
 def run_at_rest(
     settings: NavigateSettings, output: Path, given: set[str], report: Report
 ) -> Figures | None:
-    """Tell where the platform stands, as it stands."""
+    """Estimate the position of a stationary platform during its rest."""
     refuse_other(given)
     pipe = str(settings.log) == "-"
     job = settings.job(Path() if pipe else output)
@@ -70,7 +70,7 @@ def run_at_rest(
     if not pipe:
         return run_rests(job, how, report)
     if settings.site is None:
-        raise InputError("navigate - needs the site's file; name it with --site SITE.yaml")
+        raise InputError("navigate - requires the site's file; give it with --site SITE.yaml")
     site = settings.where.bounded(load_site(settings.site))
     with until_closed():
         streams = (binary_input(), binary_output(), sys.stderr)
@@ -79,7 +79,7 @@ def run_at_rest(
 
 
 def refuse_other(given: set[str]) -> None:
-    """Refuse options of `navigate` that have no part in it.
+    """Reject options of `navigate` that do not apply.
 
     Raises
     ------
@@ -88,13 +88,13 @@ def refuse_other(given: set[str]) -> None:
     other = sorted(given - TAKEN)
     if other:
         raise InputError(
-            f"--{other[0].replace('_', '-')} is of navigation through motion, and --at-rest tells"
-            " where the platform stands; leave one of the two out"
+            f"--{other[0].replace('_', '-')} is for navigation in motion, --at-rest for a"
+            " stationary platform; omit one of the two"
         )
 
 
 def replayed(log: Log, navigator: RestNavigator, report: Report = quiet) -> list[RestState]:
-    """Return the states of a log that is given to a navigator as it was recorded."""
+    """Return the states of a log as a navigator receives it in real time."""
     wave, imu, other = log.waveform, log.imu, log.reference
     assert wave is not None
     edges = np.arange(wave.time[0], wave.time[-1] + PIECE, PIECE) + PIECE
@@ -118,12 +118,12 @@ def replayed(log: Log, navigator: RestNavigator, report: Report = quiet) -> list
 
 
 def run_rests(job: Job, how: How, report: Report = quiet) -> Figures:
-    """Navigate the rests of a log: a pose after every stretch of a rest, with what came before.
+    """Navigate the rests of a log: a pose after every stretch of a rest, with the data so far.
 
     Raises
     ------
     InputError, EstimationError
-        Where it does not rest, or no beacon is heard.
+        Where it does not rest, or no beacon is detected.
     """
     from magfusion.jobs.inputs import claim, named, read_job, refuse_failed
 
@@ -131,7 +131,7 @@ def run_rests(job: Job, how: How, report: Report = quiet) -> Figures:
     log, site = read_job(job, reference=True, heard=False, report=report)
     if log.waveform is None:
         raise InputError(
-            f"{job.log_path}: holds no magnetometer.parquet to integrate at rest; give the raw log"
+            f"{job.log_path}: has no magnetometer.parquet to integrate at rest; give the raw log"
         )
     began = time.perf_counter()
     with named(job.log_path):
@@ -139,7 +139,7 @@ def run_rests(job: Job, how: How, report: Report = quiet) -> Figures:
         states = replayed(log, navigator, report)
     told = [one for one in states if one.found is not None]
     if not told:
-        text = "the platform rests nowhere for long enough"
+        text = "the platform is nowhere at rest for long enough"
         if any(one.standing for one in states):
             text = states[-1 if states[-1].standing else -2].trust.ordered[0].text
         raise EstimationError(f"{job.log_path}: {text}")
@@ -158,7 +158,7 @@ def run_rests(job: Job, how: How, report: Report = quiet) -> Figures:
 
 
 def _newest_of_rests(states: list[RestState]) -> list[RestState]:
-    """Return the last state of each rest in which a beacon is heard."""
+    """Return the last state of each rest in which a beacon is detected."""
     out: list[RestState] = []
     held: RestState | None = None
     for one in states:
@@ -196,7 +196,7 @@ def _written(whole: Path, log: Log, site: Site, told: list[RestState], trust: Tr
 
 
 def _said(newest: list[RestState]) -> Figures:
-    """Return what each rest came to."""
+    """Return the final figures of each rest."""
     sigma = [
         float(np.sqrt(np.trace(one.found.fixes.pose_cov[0, 0, 3:, 3:])))
         for one in newest
@@ -224,17 +224,17 @@ def run_rests_stream(
     sink: BinaryIO,
     messages: TextIO,
 ) -> int:
-    """Navigate rests by the records of a stream; one line of JSON for each state.
+    """Navigate rests from the records of a stream; one line of JSON for each state.
 
     Returns
     -------
     int
-        How many records were passed over.
+        Number of skipped records.
 
     Raises
     ------
     InputError
-        Where a record is none and ``keep_going`` is not set.
+        Where a record is invalid and ``keep_going`` is not set.
     """
     navigator, refused = how.navigator(site), 0
     for numbered in read_records(source, form):
@@ -247,7 +247,7 @@ def run_rests_stream(
             if not keep_going:
                 raise InputError(sentence) from error
             refused += 1
-            messages.write(f"magfusion: {sentence} (passed over)\n")
+            messages.write(f"magfusion: {sentence} (skipped)\n")
             continue
         for state in navigator.take():
             sink.write(json_line(rest_content(state)))
@@ -270,11 +270,11 @@ def _take_in(navigator: RestNavigator, record: Record) -> None:
         time, field = whole_rows(record.magnetometer.time, record.magnetometer.field)
         navigator.add_magnetometer(time, field)
     if record.fields is not None:
-        raise InputError("--at-rest integrates samples of the magnetometer; leave fields out")
+        raise InputError("--at-rest integrates samples of the magnetometer; omit fields")
 
 
 def rest_content(state: RestState) -> dict[str, Any]:
-    """Return a state of a rest as it is written; what is not known is null."""
+    """Return a state of a rest as written; unknown values are null."""
     from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
 
     trust, names = state.trust, () if state.samples is None else state.samples.channels

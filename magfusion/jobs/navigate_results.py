@@ -1,4 +1,4 @@
-"""What a navigation along a log comes to: trajectories with their verdicts, figures and files."""
+"""Results of navigation along a log: trajectories with their verdicts, figures and files."""
 
 import resource
 import sys
@@ -51,7 +51,7 @@ _VERDICTS = tuple(Verdict)
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """States of one kind, with what is said of each."""
+    """States of one kind, with their findings."""
 
     states: Trajectory
     trust: StateTrust
@@ -59,15 +59,15 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class NavigateResults:
-    """What is written of a run.
+    """Results of a run.
 
     Parameters
     ----------
     current, lagged : Part
-        States as they were made, and as they left the smoother's window, where there is one.
-        Those that were lost have no pose and are not among them, unless all have failed.
+        States as first estimated, and as they left the smoother's window, if there is one.  Lost
+        states have no pose and are excluded, unless all have failed.
     carried : Part, optional
-        States between the epochs, where they were asked for.
+        States between the epochs, if requested.
     """
 
     trust: Trust
@@ -80,14 +80,14 @@ class NavigateResults:
 
 
 def no_start(seconds: float, why: NoStart) -> Trust:
-    """Return what is to be said where a log led to no state."""
-    text = f"{seconds:.3g} s of data lead to no state: {why.reason}"
+    """Return the findings of a log without a state."""
+    text = f"{seconds:.3g} s of data give no state: {why.reason}"
     weight = 0.0 if why.trust.findings else 1.0
     return why.trust | Trust((Finding("no_start", text, Verdict.FAILED, weight),))
 
 
 def _not_said_again(online: Trust, heard: tuple[Finding, ...]) -> Trust:
-    """Leave out what was said of the beginning and is said of the whole recording as well."""
+    """Remove findings of the beginning that also apply to the whole recording."""
     every: dict[tuple[str, str], int] = {}
     for finding in heard:
         every[_subject(finding)] = max(finding.verdict.rank, every.get(_subject(finding), 0))
@@ -96,7 +96,7 @@ def _not_said_again(online: Trust, heard: tuple[Finding, ...]) -> Trust:
 
 
 def _subject(finding: Finding) -> tuple[str, str]:
-    """Return what is wrong and the sensor that leads the sentence: numbers differ with the span."""
+    """Return the code, and the sensor that begins the text: numbers differ with the span."""
     return finding.code, finding.text.partition(":")[0]
 
 
@@ -108,7 +108,7 @@ def _chosen(rows: dict[str, Array], trust: Trust, kind: float) -> BoolArray:
 
 
 def _freed(rows: dict[str, Array], site: Site) -> Detected:
-    """Return which beacons were heard at the epochs, the motion inside the windows taken off."""
+    """Return which beacons were detected at the epochs, corrected for motion in the windows."""
     own = rows["lagged"][:, 0] == CURRENT
     names = tuple(beacon.name for beacon in site.beacons)
     return Detected(rows["time"][own, 0], names, rows["heard"][own] > 0.0)
@@ -142,7 +142,7 @@ def navigated(
     Parameters
     ----------
     rows : mapping
-        Of `row_columns`, all that were made.
+        Of `row_columns`, all rows.
     elapsed : float
         (s)
     """
@@ -186,7 +186,7 @@ def _calibration(navigator: Navigator, name: str) -> tuple[list[Estimate], Site]
     """Return the estimates of the calibration, and the refined site."""
     state = navigator.state(-np.inf)
     blocks, _ = navigator.settings.blocks(navigator.site)
-    # What is only considered follows what is estimated.
+    # Parameters that are only considered follow the estimated ones.
     own = slice(MOTION, MOTION + dimension(blocks))
     cov = state.cov[own, own]
     declared = initial_calibration(navigator.site, state.calibration.reference_time)
@@ -235,7 +235,7 @@ def _run_figures(navigator: Navigator, current: Trajectory) -> Figures:
 
 
 def _update_figures(latency: Array, elapsed: float) -> Figures:
-    """Return how long an update took; the first state, which a smoother finds, is no update."""
+    """Return the time of an update, without the first state, which a smoother finds."""
     spent = [Figure("elapsed_s", elapsed, "s"), Figure("memory_mb", _memory_mb(), "MB")]
     known = 1e3 * latency[np.isfinite(latency)]
     if len(known):
@@ -248,7 +248,7 @@ def _update_figures(latency: Array, elapsed: float) -> Figures:
 
 
 def _memory_mb() -> float | None:
-    """Return the most memory that the process has had; None where the system does not report it."""
+    """Return the peak memory of the process; None where the system does not report it."""
     if sys.platform == "win32":
         return None
     unit = 1 << 20 if sys.platform == "darwin" else 1 << 10  # macOS reports bytes
@@ -256,14 +256,14 @@ def _memory_mb() -> float | None:
 
 
 def motion_of(log: Log, results: NavigateResults) -> Motion:
-    """Return what the page of a navigation shows."""
+    """Return the content of the page of a navigation."""
     current, innovations = results.current, results.innovations
     own = (results.refined, current.states, log.truth, results.errors, innovations)
     return Motion(*own, current.trust)
 
 
 def write_navigated(directory: Path, log: Log, results: NavigateResults) -> None:
-    """Write all but the report."""
+    """Write all files but the report."""
     current, lagged, carried = results.current, results.lagged, results.carried
     written = current if carried is None else carried
     write_tum(written.states, directory / "trajectory.tum", log.epoch_ns)

@@ -1,4 +1,4 @@
-"""What navigation is asked for, along a log or by records on standard input."""
+"""Settings of navigation, along a log or from records on standard input."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class NavigateSettings(
     LiveSettings,
     RateSettings,
 ):
-    """How to navigate as data come, along a log or by records on standard input."""
+    """Online navigation, along a log or from records on standard input."""
 
     log: Path = argument("Log to replay, or - for records on standard input")
     estimator: Literal["smoother", "ekf"] = option(
@@ -47,31 +47,31 @@ class NavigateSettings(
     lag: float = option(4.0, "Window of the smoother", unit="s", least=0.5, most=60.0)
     delay: float = option(
         0.0,
-        "How late samples may come",
+        "Maximum delay of samples",
         unit="s",
         least=0.0,
         most=10.0,
-        note="so much later are states",
+        note="states have this latency",
     )
     horizon: float = option(
         0.0,
-        "So far ahead of the inertial samples are states between epochs",
+        "Prediction of states between epochs beyond the inertial samples",
         unit="s",
         least=0.0,
         most=1.0,
     )
     blend: float = option(
         0.0,
-        "So long a correction takes to enter states between epochs",
+        "Time over which a correction is smoothed into states between epochs",
         unit="s",
         least=0.0,
         most=10.0,
-        note="0: at once",
+        note="0: immediate",
     )
     checkpoint: Path | None = option(
         None, "Checkpoint file", note="default: in the output while the job runs"
     )
-    every: float = option(30.0, "Between checkpoints", unit="s", least=0.1, most=86400.0)
+    every: float = option(30.0, "Interval of checkpoints", unit="s", least=0.1, most=86400.0)
     resume: bool = option(False, "Continue from the checkpoint, if there is one")
     keep_going: bool = option(False, "Count bad records, and skip them")
 
@@ -79,7 +79,7 @@ class NavigateSettings(
         super().__post_init__()
         if self.rate == "field" and (self.horizon or self.blend):
             raise InputError(
-                "--horizon and --blend are of states between epochs; give --rate imu, or --rate HZ"
+                "--horizon and --blend require states between epochs; give --rate imu, or --rate HZ"
             )
 
     def navigator(self, job: Job) -> NavigatorSettings:

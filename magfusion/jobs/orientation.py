@@ -1,4 +1,4 @@
-"""What smooth and navigate do with a site without beacons: the orientation, at the IMU's rate."""
+"""Orientation at the IMU's rate, from smooth and navigate with a site without beacons."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _PLACE = {"json": "line", "msgpack": "record"}
 
 
 def run_orientation(name: str, job: Job, rate: Rate, *, back: bool, report: Report) -> Figures:
-    """Find the orientation of a log: trajectory, report, recording, and the site as found.
+    """Estimate the orientation of a log: trajectory, report, recording, and the estimated site.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def run_orientation(name: str, job: Job, rate: Rate, *, back: bool, report: Repo
         Without beacons there are no field epochs: states are at every inertial sample, or so many
         a second (Hz).
     back : bool
-        Whether later samples count too.
+        Whether later samples are used too.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def run_orientation(name: str, job: Job, rate: Rate, *, back: bool, report: Repo
     """
     claimed = claim(job.output, name)
     log, site = read_job(job, without=True, report=report)
-    require_imu(job, log, "without beacons only the gyroscope tells how it turns")
+    require_imu(job, log, "without beacons the rotation is known only from the gyroscope")
     began = time.perf_counter()
     with named(job.log_path):
         found = oriented(log, site, back=back, report=report)
@@ -87,7 +87,7 @@ def run_orientation(name: str, job: Job, rate: Rate, *, back: bool, report: Repo
 
 
 def _trajectory(found: Oriented, log: Log, site: Site) -> Trajectory:
-    """Return the states at the inertial samples; the position is not known."""
+    """Return the states at the inertial samples; the position is unknown."""
     ends, time = found.ends, found.time
     index = np.clip(np.searchsorted(ends, time), 0, len(ends) - 1)
     noise = site.platform.imu.gyro_noise
@@ -170,7 +170,7 @@ def _rms(value: Array) -> float:
 
 
 def _refined(site: Site, last: Orientation) -> Site:
-    """Return the site with the magnetometer's offset as it was in the end."""
+    """Return the site with the magnetometer's final offset."""
     old: Magnetometer = site.platform.magnetometer
     turn = old.matrix @ old.body_from_sensor.T @ last.world_from_body.T
     cov = turn @ last.cov[OFFSET, OFFSET] @ turn.T
@@ -182,17 +182,17 @@ def _refined(site: Site, last: Orientation) -> Site:
 def run_orientation_stream(
     site: Site, form: Format, keep_going: bool, source: BinaryIO, sink: BinaryIO, messages: TextIO
 ) -> int:
-    """Tell the orientation by the records of a stream; one line of JSON for each inertial sample.
+    """Write the orientation for the records of a stream; a line of JSON per inertial sample.
 
     Returns
     -------
     int
-        How many records were passed over.
+        Number of skipped records.
 
     Raises
     ------
     InputError
-        Where a record is none and ``keep_going`` is not set.
+        Where a record is invalid and ``keep_going`` is not set.
     """
     navigator, refused = OrientationNavigator(site), 0
     for numbered in read_records(source, form):
@@ -205,7 +205,7 @@ def run_orientation_stream(
             if not keep_going:
                 raise InputError(sentence) from error
             refused += 1
-            messages.write(f"magfusion: {sentence} (passed over)\n")
+            messages.write(f"magfusion: {sentence} (skipped)\n")
             continue
         for state in navigator.take():
             sink.write(json_line(_told(navigator, state)))
@@ -223,11 +223,11 @@ def _take_in(navigator: OrientationNavigator, record: Any) -> None:
         if len(time):
             navigator.add_magnetometer(time, field)
     if record.fields is not None:
-        raise InputError("phasors of beacons that the site does not have; describe them in it")
+        raise InputError("phasors of beacons that are not in the site; describe them there")
 
 
 def _told(navigator: OrientationNavigator, state: JudgedState) -> dict[str, Any]:
-    """Return a state as it is written; what is not known is null."""
+    """Return a state as written; unknown values are null."""
     sigma = np.sqrt(np.diagonal(state.cov))
     quaternion = Rotation.from_matrix(state.world_from_body).as_quat(scalar_first=True)
     judgement = state.judgement

@@ -1,4 +1,4 @@
-"""The job that says where an equation of a paper is, whether it is right, and how that is known."""
+"""The job that shows where an equation of a paper is, whether it is right, and the evidence."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ _MARGIN = 11  # of what an entry says, behind what it is
 
 @dataclass(frozen=True, kw_only=True)
 class PapersSettings(Settings):
-    """What is asked of which paper."""
+    """Selected entries of a paper."""
 
     paper: str | None = argument("Paper: 000, 001, 002 or 004", None)
     number: tuple[str, ...] = argument(
-        "Equation (7, eq 7), table 1, fig 8, claim 3, or all claims; nothing lists the paper", ()
+        "Equation (7, eq 7), table 1, fig 8, claim 3, or all claims; by default the whole paper", ()
     )
-    json: bool = option(False, "Print it as JSON instead")
+    json: bool = option(False, "Print as JSON")
 
 
 def run_papers(settings: PapersSettings) -> None:
-    """Print what is known of the papers, of one, or of one thing in it.
+    """Print the register of all papers, of one, or of one entry.
 
     Raises
     ------
     InputError
-        Where there is no such paper, or the paper has no such number.
+        Where there is no such paper or entry.
     """
     if settings.paper is None:
         found = papers()
@@ -67,7 +67,7 @@ def _source(one: Paper) -> tuple[str, str]:
 
 
 def _head(one: Paper) -> str:
-    """Return what a paper is about, where it is, and how many findings there are of each kind."""
+    """Return the subject of a paper, its source, and the number of findings of each kind."""
     counts = Counter(entry.entry.finding for entry in one.entries)
     found = ", ".join(f"{count} {finding}" for finding, count in counts.most_common())
     title = _filled(f"Paper {one.number}: {one.about}")
@@ -83,7 +83,7 @@ def _line(one: Numbered) -> str:
 
 
 def card(one: Numbered) -> str:
-    """Return all that is known of one entry, for a reader."""
+    """Return one entry in full, for a reader."""
     entry = one.entry
     place = f", section {entry.where}" if entry.where else ""
     rows = [

@@ -1,4 +1,4 @@
-"""The job that ranges one well from another, by a magnet that turns in it."""
+"""The job that ranges one well from another, with a rotating magnet in it."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ VAGUE = 0.2  # of the distance
 
 @dataclass(frozen=True, kw_only=True)
 class RangeSettings(LogSettings):
-    """What is known of the depths, and how the waveform is cut."""
+    """Depths, and demodulation of the waveform."""
 
     window: float = option(10.0, "Length of a window", unit="s", least=0.5, most=600.0)
     depth_sigma: float = option(
-        0.02, "Of the magnet's depth in a window, 1 sigma", unit="m", least=0.0, most=100.0
+        0.02, "Sigma of the magnet's depth in a window", unit="m", least=0.0, most=100.0
     )
     depth_scale_sigma: float = option(
-        1e-3, "Of the scale of its depths, by stretch of the string, 1 sigma", least=0.0, most=0.1
+        1e-3, "Sigma of the depths' scale, by stretch of the string", least=0.0, most=0.1
     )
     mains_hz: float = option(50.0, "Mains frequency", unit="Hz", least=0.0, most=1e3)
 
 
 def run_range(settings: RangeSettings, output: Path) -> Figures:
-    """Find where the well of a turning magnet is from that of a sensor at rest.
+    """Estimate the position of a rotating magnet's well relative to that of a sensor at rest.
 
     Raises
     ------
     InputError
-        Where the site has no rotor, or more than it; or the log lacks what ranging needs.
+        Where the site has no rotor, or other beacons; or the log lacks data for ranging.
     """
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
     from magfusion.results.plots.ranging import RangePicture, write_range_plot
@@ -110,42 +110,43 @@ def _judged(log: Log, told: RangingLog, found: Ranged) -> tuple[Trust, float]:
     fields = told.windows.fields
     name = fields.channels[0][0]
     remedy = (
-        "Check casing, depths and axes of the sensor, keep to the way on which both wells are"
-        " straight (--start, --end), or declare a larger model_error."
+        "Check casing, depths and axes of the sensor, use the part in which both wells are straight"
+        " (--start, --end), or declare a larger model_error."
     )
     fitted = unexplained(f"the magnet {name}", found.chi_square, found.freedom, remedy)
     trust, excess = trust_of(fitted)
     findings = []
     if found.rival_chi_square < AMBIGUOUS_CHI_SQUARE * excess:
         text = (
-            "The wells could lie otherwise as well: the chi square is only"
-            f" {found.rival_chi_square:.2g} larger there. Let the magnet go on, past the sensor."
+            f"A second well geometry fits almost equally well: its chi square is higher by only"
+            f" {found.rival_chi_square:.2g}. Continue the pass beyond the sensor."
         )
         findings.append(Finding("ambiguous", text))
     if not found.converged:
         findings.append(
             Finding(
                 "not_converged",
-                "The last pass still moved the wells. Let the magnet go by on a longer way.",
+                "The iteration did not converge: the last pass still moved the wells. Record a"
+                " longer pass.",
             )
         )
     snr = np.abs(fields.phasor_sensor[:, 0]) ** 2
     noise = np.trace(fields.phasor_cov[:, 0], axis1=1, axis2=2)
     strongest = float(np.sqrt(np.max(np.sum(snr, axis=1) / np.maximum(noise, 1e-300))))
     if strongest < LEAST_SNR:
-        text = f"The magnet is not told from noise: {strongest:.2g} times it at most. Come nearer."
+        text = f"Signal below noise (SNR {strongest:.2g}). Reduce the distance."
         findings.append(Finding("low_signal", text, Verdict.FAILED))
     if not told.high_side:
-        why = "holds no inertial samples" if not log.inertial else "is from an upright hole"
+        why = "holds no inertial samples" if not log.inertial else "is of an upright hole"
         text = (
             f"The log {why}, so that directions are from the sensor's third axis, not from the high"
-            " side, and the sensor is taken not to have turned."
+            " side, and the sensor is assumed not to rotate."
         )
         findings.append(Finding("assumed", text))
     if not told.windows.angle_known:
         text = (
-            "The angle of the shaft was followed through the field, not measured: how the magnet"
-            " is turned about it stays open. Distance and direction do not need it."
+            "The angle of the shaft is estimated from the field, not measured: the magnet's angle"
+            " about it is undetermined. Distance and direction do not depend on it."
         )
         findings.append(Finding("geometry", text, Verdict.TRUSTWORTHY))
     return trust | Trust(tuple(findings)), excess
@@ -156,8 +157,8 @@ def _vague(wells: Wells, sensor: float) -> Trust:
     if one.distance_sigma <= VAGUE * one.distance:
         return Trust()
     text = (
-        f"The distance, {one.distance:.3g} m, is known to {one.distance_sigma:.2g} m only. Let the"
-        " magnet go by on a way as long as the distance, on both sides of the sensor."
+        f"The sigma of the distance, {one.distance:.3g} m, is {one.distance_sigma:.2g} m. Record a"
+        " pass as long as the distance, on both sides of the sensor."
     )
     return Trust((Finding("few_data", text),))
 
@@ -172,7 +173,7 @@ def _figures(told: RangingLog, found: Ranged, wells: Wells, sensor: object) -> F
         Figure(
             "residual_rms",
             float(np.sqrt(found.chi_square / found.freedom)),
-            label="residual (1 is expected)",
+            label="residual (1 expected)",
         ),
     ]
     if told.inclination is not None:

@@ -1,4 +1,4 @@
-"""The option of who tells states between epochs: where."""
+"""The option for the rate of states."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ LOWEST_RATE, HIGHEST_RATE = 0.1, 1e4  # Hz
 
 @dataclass(frozen=True, kw_only=True)
 class RateSettings(Settings):
-    """Where states are told."""
+    """Rate of states."""
 
     rate: str = option(
         "field",
-        "States at the field epochs, at every inertial sample, or so many a second",
+        "States at the field epochs, at every inertial sample, or at this rate",
         note=f"{LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz",
         metavar="field|imu|HZ",
     )
@@ -44,18 +44,18 @@ class RateSettings(Settings):
 
     @property
     def rates(self) -> Rate:
-        """Return it as the estimators take it, a number in Hz."""
+        """Return the rate as the estimators take it, a number in Hz."""
         if self.rate == "field":
             return "field"
         return "imu" if self.rate == "imu" else float(self.rate)
 
 
 def refuse_rate(path: Path, log: Log, rate: Rate) -> None:
-    """Refuse states at inertial samples that a log has not.
+    """Reject states at inertial samples for a log without any.
 
     Raises
     ------
     InputError
     """
     if rate == "imu" and not log.inertial:
-        raise InputError(f"{path}: holds no inertial samples to tell states at; give --rate HZ")
+        raise InputError(f"{path}: has no inertial samples for the states; give --rate HZ")

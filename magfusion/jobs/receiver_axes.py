@@ -1,4 +1,4 @@
-"""Whether a log has the components that its site declares of the receiver, and a job needs."""
+"""Consistency of a log's components with the site's receiver and with a job."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +11,7 @@ from magfusion.model.site import Site
 def check_axes(
     declared_path: Path, log_path: Path, log: Log, site: Site, *, fewer: bool, amplitudes: bool
 ) -> None:
-    """Refuse components that are not those of the site's receiver, or that a job cannot take."""
+    """Reject components other than those of the site's receiver, or unsupported by a job."""
     sensor, fields, wave = site.platform.magnetometer, log.fields, log.waveform
     measured = {stream.axes for stream in (fields, wave) if stream is not None}
     amplitude = fields is not None and not fields.signed
@@ -20,25 +20,25 @@ def check_axes(
     key = f"{declared_path}: platform.magnetometer.axes:"
     if len(sensor.axes) < 3 and (sensor.warming is not None or sensor.coil_kappa != 0.0):
         raise InputError(
-            f"{key} of a receiver of fewer than three axes neither warming nor coil_kappa_m2 is"
-            " taken into account; leave them out"
+            f"{key} for a receiver of fewer than three axes, warming and coil_kappa_m2 are not"
+            " modelled; omit them"
         )
     for stream, has in _other_axes(log, sensor.axes):
         raise InputError(
-            f"{key} is [{', '.join(sensor.axes)}], and the {stream} of {log_path} have {has};"
-            " declare the axes that the receiver has"
+            f"{key} is [{', '.join(sensor.axes)}], but the {stream} of {log_path} have {has};"
+            " declare the axes of the receiver"
         )
     if not fewer:
         three_axes(site, declared_path)
     if amplitude and not amplitudes:
         raise InputError(
-            f"{log_path}: amplitudes without sign are taken by fix, smooth and navigate alone;"
-            " run one of these, or give phasors (re and im)"
+            f"{log_path}: unsigned amplitudes are supported by fix, smooth and navigate only; run"
+            " one of these, or give phasors (re and im)"
         )
 
 
 def _other_axes(log: Log, declared: str) -> Iterator[tuple[str, str]]:
-    """Yield the streams of a log whose axes are not those declared, and what they have."""
+    """Yield the streams of a log whose axes differ from the declared, and their axes."""
     if log.fields is not None and not log.fields.signed:  # amplitudes are of any one axis
         if len(declared) != 1:
             yield "fields", "one amplitude"
@@ -59,8 +59,8 @@ def three_axes(site: Site, path: Path) -> Site:
     declared = site.platform.magnetometer.axes
     if len(declared) < len("xyz"):
         raise InputError(
-            f"{path}: platform.magnetometer.axes: is [{', '.join(declared)}], and this job needs"
-            " all three axes; of a receiver of fewer check, demodulate, fix, navigate and smooth"
-            " (of one log) make what can be known"
+            f"{path}: platform.magnetometer.axes: is [{', '.join(declared)}], but this job requires"
+            " all three axes; with fewer, use check, demodulate, fix, navigate or smooth (of one"
+            " log)"
         )
     return site

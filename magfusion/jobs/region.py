@@ -1,4 +1,4 @@
-"""The settings of a log whose receiver is known to be on one side of a beacon, or in a room."""
+"""Settings of a log whose receiver is known to be on one side of a beacon, or in a room."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class RegionSettings(LogSettings):
 
     hemisphere: tuple[str, ...] = option(
         (),
-        "The magnetometer is on this side of a beacon, in its axes: +x, -z, or three numbers; name"
-        " it where there are several; may be given again",
+        "The magnetometer is on this side of a beacon, in its axes: +x, -z, or three numbers;"
+        " with the beacon's name if there are several; repeatable",
         metavar="[BEACON=]DIRECTION",
     )
     region: str | None = option(
@@ -34,11 +34,11 @@ class RegionSettings(LogSettings):
 
     @property
     def where(self) -> Where:
-        """Return both as the jobs take them."""
+        """Return both in the form of the jobs."""
         return Where(self.hemisphere, self.region)
 
     def job(self, output: Path) -> Job:
-        """Return what a job on a log reads and where it writes.
+        """Return inputs and output of a job on a log.
 
         Raises
         ------

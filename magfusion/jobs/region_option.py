@@ -1,4 +1,4 @@
-"""What the user says of where the magnetometer is, as the command line has it."""
+"""The user's constraint on the magnetometer's position, as on the command line."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LARGEST = 1e6  # m
 
 @dataclass(frozen=True)
 class Where:
-    """What the user says of the place, beside what the site does.
+    """The user's constraint on the position, in addition to the site's.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class Where:
     region: str | None = None
 
     def bounded(self, site: Site) -> Site:
-        """Return the site with them.
+        """Return the site with the constraints.
 
         Raises
         ------
@@ -60,7 +60,7 @@ def _in_front(site: Site, text: str) -> Site:
         )
     if not equals and len(known) != 1:
         raise InputError(
-            f"--hemisphere {text!r}: the site has {len(known)} beacons; say of which it is, as"
+            f"--hemisphere {text!r}: the site has {len(known)} beacons; specify one, e.g."
             f" --hemisphere {known[0] if known else 'A'}={text}"
         )
     side = _direction(direction, text)
@@ -94,8 +94,8 @@ def _box(text: str) -> Array:
         box = np.array([float(part) for part in text.split(",")]).reshape(3, 2).T
     except ValueError:
         raise InputError(
-            f"--region {text!r}: six numbers in metres are needed, the limits of x, y and z; inf"
-            " where there is none"
+            f"--region {text!r}: give six numbers in metres, the limits of x, y and z; inf for no"
+            " limit"
         ) from None
     limits = box[np.isfinite(box)]
     if np.any(np.isnan(box)) or not np.all(box[0] < box[1]) or not len(limits):

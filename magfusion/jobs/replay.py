@@ -1,4 +1,4 @@
-"""A log as the stream that it once was: small pieces in the order of their arrival."""
+"""Replays a log as a real-time stream: small pieces in the order of their arrival."""
 
 from __future__ import annotations
 
@@ -43,16 +43,16 @@ PIECE = 0.05  # s
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """What arrives together.
+    """Data that arrive together.
 
     Parameters
     ----------
     arrival : float
-        When all of it has been measured (s).
+        End of the last measurement (s).
     fields : tuple of FieldSamples
         One epoch each.
     waveforms : tuple of (str, Waveform)
-        Of several magnetometers, those that have samples or marks in it.
+        Of several magnetometers, those with samples or marks in it.
     """
 
     arrival: float
@@ -63,7 +63,7 @@ class Piece:
 
     @property
     def waves(self) -> Iterator[tuple[str | None, Waveform]]:
-        """The samples with the name of their magnetometer, None of the only one."""
+        """The samples with the name of their magnetometer, None for a single one."""
         if self.waveform is not None:
             yield None, self.waveform
         yield from self.waveforms
@@ -115,7 +115,7 @@ class Replay:
         )
 
     def _of_several(self, k: int) -> tuple[tuple[str, Waveform], ...]:
-        """Return what each of several magnetometers took; the first has the marks."""
+        """Return the samples of each of several magnetometers; the first has the marks."""
         found: list[tuple[str, Waveform]] = []
         for name, wave in self.log.waveforms.items():
             marks = None if found else self._marks(wave, k)
@@ -131,13 +131,13 @@ class Replay:
         return waveform.marks.rows(slice(first if k else 0, last))
 
     def pieces(self, first: int = 0) -> Iterator[tuple[int, Piece]]:
-        """Yield the pieces from the first on with their number."""
+        """Yield the pieces from the first on, with their index."""
         for k in range(first, len(self)):
             yield k, self.piece(k)
 
 
 def feed(navigator: Navigator, piece: Piece) -> None:
-    """Give a piece to a navigator."""
+    """Feed a piece to a navigator."""
     if len(piece.imu) and navigator.site.platform.inertial:
         navigator.hear_imu(piece.imu.time, piece.imu.gyro_body, piece.imu.accel_body)
     for name, wave in piece.waves:
@@ -151,7 +151,7 @@ def feed(navigator: Navigator, piece: Piece) -> None:
 
 
 def paced(pieces: Iterable[tuple[int, Piece]], realtime: bool) -> Iterator[tuple[int, Piece]]:
-    """Yield pieces with their number, by the log's clock where asked."""
+    """Yield pieces with their index, in real time if requested."""
     began: float | None = None
     for k, piece in pieces:
         now = time.monotonic()
@@ -173,7 +173,7 @@ def _field_arrival(fields: FieldSamples | None) -> Array:
 
 
 def _of_long(log: LongLog) -> Iterator[tuple[int, Piece]]:
-    """Yield the pieces of a log that is read while they are used."""
+    """Yield the pieces of a log that is read concurrently."""
     imu, waveform = log.imu(), log.waveform()
     arrival = _field_arrival(log.fields)
     known = [first for first in (imu.first, waveform.first) if first is not None]
@@ -196,7 +196,7 @@ def _of_long(log: LongLog) -> Iterator[tuple[int, Piece]]:
 
 
 def _currents(log: Log | LongLog) -> DriveSamples | None:
-    """Return the currents of coils, or those that stand for the angles of rotors."""
+    """Return the currents of coils, or those that represent the angles of rotors."""
     if isinstance(log, LongLog) or log.drive is not None or log.rotation is None:
         return None if isinstance(log, LongLog) else log.drive
     return cosines(log.rotation)
@@ -216,7 +216,7 @@ def _contents(piece: Piece) -> Iterator[dict[str, Any]]:
 
 
 class _Beside:
-    """What goes with the samples of a log, and is known before them."""
+    """Data with the samples of a log that are known before them."""
 
     def __init__(self, log: Log | LongLog) -> None:
         degrees = log.temperatures or Temperatures()
@@ -225,7 +225,7 @@ class _Beside:
         self._reference = None if isinstance(log, LongLog) else log.reference
 
     def until(self, arrival: float) -> Iterator[dict[str, Any]]:
-        """Yield the records of what has come up to a time (s)."""
+        """Yield the records up to a time (s)."""
         while self._readings and self._readings[0][0] < arrival:
             yield temperature_content(*self._readings.popleft())
         if self._currents is not None:
@@ -254,7 +254,7 @@ def run_replay(log: Log | LongLog, sink: BinaryIO, form: Format, realtime: bool)
 
 @dataclass(frozen=True, kw_only=True)
 class ReplaySettings(PartSettings, ReplayedSettings):
-    """How a log is printed."""
+    """Settings of the replay."""
 
 
 def run(settings: ReplaySettings) -> None:

@@ -20,11 +20,11 @@ class RestSettings(Settings):
     """Whether whole rests are integrated."""
 
     at_rest: bool = option(
-        False, "Make one epoch of each rest, however long, of beacons far below the noise"
+        False, "Make one epoch of each rest, of any length, for beacons far below the noise"
     )
     false_alarm: float = option(
         1e-3,
-        "Of --at-rest: probability, a rest and beacon, that noise is taken for it",
+        "With --at-rest: false-alarm probability per rest and beacon",
         least=1e-9,
         most=0.1,
     )
@@ -32,12 +32,12 @@ class RestSettings(Settings):
     def integrated(
         self, log: Log, site: Site, lockin: LockinSettings | None, least: int = 1
     ) -> AtRest | None:
-        """Return the rests of a log as they are asked for; None where they are not.
+        """Return the requested rests of a log; None if not requested.
 
         Parameters
         ----------
         least : int
-            So many epochs are made, at the least.
+            Minimum number of epochs.
 
         Raises
         ------

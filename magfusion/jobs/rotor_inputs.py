@@ -1,4 +1,4 @@
-"""What a job needs to know of beacons that are magnets on shafts."""
+"""Input checks for beacons that are magnets on shafts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ALL = ""  # as the name of a current that flows through the coils of all
 
 
 def is_for_ranging(site: Site) -> bool:
-    """Return whether a site is of a magnet on a shaft that is to be found from another well."""
+    """Return whether a site has a magnet on a shaft to be located from another well."""
     return (
         len(site.beacons) == 1
         and site.beacons[0].rotor is not None
@@ -27,14 +27,14 @@ def is_for_ranging(site: Site) -> bool:
 
 
 def check_rotors(place: Path, log_path: Path, log: Log, site: Site, *, apart: bool) -> None:
-    """Refuse rotors whose angle a job needs and no one tells, and what is ranged alone.
+    """Reject rotors without a required angle, and sites for ranging only.
 
     Parameters
     ----------
     place : Path
         File of the site.
     apart : bool
-        Whether each epoch may have a phase of its own.
+        Whether each epoch may have a separate phase.
 
     Raises
     ------
@@ -43,12 +43,13 @@ def check_rotors(place: Path, log_path: Path, log: Log, site: Site, *, apart: bo
     if is_for_ranging(site):
         raise InputError(
             f"{place}: beacons[0]: the pose of rotor {site.beacons[0].name} is unknown, and it is"
-            " the only beacon; magfusion range finds the sensor's well from the magnet's"
+            " the only beacon; use magfusion range to locate the sensor's well relative to the"
+            " magnet's"
         )
     if site.platform.magnetometer.casing is not None:
         raise InputError(
-            f"{place}: platform.magnetometer.casing: through steel a sensor is ranged by magfusion"
-            " range alone; leave it out for other commands"
+            f"{place}: platform.magnetometer.casing: only magfusion range supports a sensor in"
+            " steel casing; omit it for other commands"
         )
     raw = log.waveform is not None or bool(log.waveforms)
     recorded = set[str]() if log.rotation is None else set(log.rotation.angle)
@@ -58,23 +59,23 @@ def check_rotors(place: Path, log_path: Path, log: Log, site: Site, *, apart: bo
             continue
         remedy = (
             f"add the angle of its shaft as rotor_{beacon.name} to magnetometer.parquet, declare"
-            " speed_sigma_hz of a shaft that a clock turns"
+            " speed_sigma_hz of a clocked shaft"
         )
         if beacon.synchronised and raw:
             raise InputError(
-                f"{place}: rotor of beacon {beacon.name}: is synchronised, and {log_path} does not"
-                f" say how it turned; {remedy}, or write synchronised: false for magfusion fix"
+                f"{place}: rotor of beacon {beacon.name}: is synchronised, but {log_path} has no"
+                f" rotor angle; {remedy}, or write synchronised: false for magfusion fix"
             )
         if not beacon.synchronised and not apart:
             raise InputError(
-                f"{place}: rotor of beacon {beacon.name}: nobody measures its angle, and its speed"
-                f" wanders farther than a clock's; {remedy}, or place each epoch by itself with"
+                f"{place}: rotor of beacon {beacon.name}: its angle is not measured, and its speed"
+                f" drifts more than a clock's; {remedy}, or fix each epoch on its own with"
                 " magfusion fix"
             )
 
 
 def check_streamed_rotors(place: Path, site: Site) -> None:
-    """Refuse rotors whose angle a stream cannot tell.
+    """Reject rotors whose angle cannot be known from a stream.
 
     Raises
     ------
@@ -83,25 +84,25 @@ def check_streamed_rotors(place: Path, site: Site) -> None:
     for beacon in _wandering(site):
         if not beacon.synchronised:
             raise InputError(
-                f"{place}: rotor of beacon {beacon.name}: online its angle has to be measured;"
-                " write synchronised: true, and send the cosine of its angle in records of drive"
+                f"{place}: rotor of beacon {beacon.name}: online its angle must be measured; write"
+                " synchronised: true, and send the cosine of its angle in records of drive"
             )
 
 
 class AwaitedAngles:
-    """Misses the angles of rotors in a stream."""
+    """Monitor of missing rotor angles in a stream."""
 
     def __init__(self, site: Site) -> None:
         self._left = {beacon.name for beacon in _wandering(site)}
         self._first: float | None = None
 
     def see(self, record: Record | None) -> None:
-        """Take notice of a record.
+        """Check a record.
 
         Raises
         ------
         InputError
-            Where samples have come for some time, and no angle.
+            Where samples have arrived for some time without an angle.
         """
         if record is None or not self._left:
             return
@@ -115,14 +116,14 @@ class AwaitedAngles:
         if self._left and float(record.magnetometer.time[-1]) > self._first + PATIENCE:
             name = min(self._left)
             raise InputError(
-                f"standard input: {PATIENCE:g} s of samples, and no record of drive with"
-                f" drive_{name}: beacon {name} is a rotor; send the cosine of its angle beside the"
+                f"standard input: {PATIENCE:g} s of samples without a record of drive with"
+                f" drive_{name}: beacon {name} is a rotor; send the cosine of its angle with the"
                 " samples"
             )
 
 
 def _wandering(site: Site) -> list[Beacon]:
-    """Return the rotors whose speed wanders farther than a clock's that is searched for."""
+    """Return the rotors whose speed drifts more than the search range of a clock."""
     return [
         beacon
         for beacon in site.beacons

@@ -1,7 +1,7 @@
-"""What a job asks of its user: fields that know their help, unit and bounds.
+"""Settings of jobs: fields with help, unit and bounds.
 
-The command line is made of them (`magfusion.cli`) before BLAS threads are set, so NumPy is not
-imported here, and gtsam, rerun and matplotlib not at the top of any job but inside ``run``.
+The command line is generated from them (`magfusion.cli`) before BLAS threads are set, so NumPy is
+not imported here, and gtsam, rerun and matplotlib only inside ``run``.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ if TYPE_CHECKING:
 
 
 class Option(NamedTuple):
-    """What a field is on the command line.
+    """Command-line properties of a field.
 
     Parameters
     ----------
     help : str
-        Without unit, bounds, note and full stop, which are added.
+        Without unit, bounds, note and full stop, which are appended.
     name : str, optional
-        Of the option, where it is not the field's.
+        Of the option, if not the field's.
     unit : str
-        As it is written behind a number.
+        Written after a number.
     least, most, above : float, optional
         Bounds; ``above`` is the one that is excluded.
     note : str
-        What else there is to say, as what the default is where it is no value.
+        Additional remark, such as a default that is not a value.
     words : mapping, optional
-        The choices: what is typed, and the value that it means.
+        The choices: typed word and its value.
     metavar : str, optional
-        How a text is written.
+        Placeholder of a text.
     positional : bool
         An argument rather than an option.
     common : bool
-        Of many jobs; listed after a job's own.
+        Used by many jobs; listed after a job's own.
     """
 
     help: str
@@ -69,7 +69,7 @@ class Option(NamedTuple):
         return (f"{text}; {self.note}" if self.note else text) + "."
 
     def check(self, name: str, value: float) -> None:
-        """Refuse a number that is out of bounds, or none.
+        """Raise an error for a number out of bounds, or NaN.
 
         Raises
         ------
@@ -97,13 +97,13 @@ def option(default: Any, help: str, **facts: Any) -> Any:
 
 
 def argument(help: str, default: Any = dataclasses.MISSING, **facts: Any) -> Any:
-    """Return a field that is given by its place; it must be where it has no default."""
+    """Return a positional field; it is required if it has no default."""
     asked = {"option": Option(help, positional=True, **facts)}
     return dataclasses.field(default=default, metadata=asked)
 
 
 def required(help: str, **facts: Any) -> Any:
-    """Return a field that must be given, by its name."""
+    """Return a required option."""
     return dataclasses.field(metadata={"option": Option(help, **facts)})
 
 
@@ -115,7 +115,7 @@ def options(settings: type[Settings]) -> list[tuple[dataclasses.Field[Any], Opti
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What one run of a job is asked for.
+    """Settings of one run of a job.
 
     Raises
     ------
@@ -131,28 +131,28 @@ class Settings:
 
 
 class Command(NamedTuple):
-    """How a job is called; its name and what it does are in `magfusion.jobs.JOBS`.
+    """Call of a job; its name and description are in `magfusion.jobs.JOBS`.
 
     Parameters
     ----------
     run : callable
-        Takes the settings and, of these, what it names: ``output``, where the results go;
-        ``report``, to report the progress; ``given``, the names of the options that were given.
-        Returns the figures of the report, if it makes one.
+        Takes the settings and, of these, those it names: ``output``, the directory of results;
+        ``report``, to report the progress; ``given``, the names of the given options.  Returns the
+        figures of the report, if any.
     output : str, optional
-        Where results go unless the user says; None names them by the log and the job.
+        Default directory of results; if None, it is named by the log and the job.
     output_optional : bool
-        Whether it writes only where the user says.
+        Whether it writes only if ``--output`` is given.
     reports : bool
-        Whether it makes a report, which ``--json`` prints.
+        Whether it returns a report, which ``--json`` prints.
     output_help : str
-        What ``--output`` is; `magfusion.cli` adds its default.
+        Help of ``--output``; `magfusion.cli` appends its default.
     fails : bool
-        Whether a verdict that is failed ends it with exit code 1.
+        Whether a failed verdict ends it with exit code 1.
     after : callable, optional
-        Called with settings and output when the result has been shown.
+        Called with settings and output after the result is shown.
     example : str
-        With which the help ends.
+        Example at the end of the help.
     """
 
     settings: type[Settings]
@@ -169,11 +169,11 @@ class Command(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class TopicSettings(Settings):
-    """Topics of a bag that has several of one type."""
+    """Topics of a bag with several of one type."""
 
     topics: str | None = option(
         None,
-        "Topics of a bag that has several, e.g. imu=/imu/data,magnetometer=/mag,truth=/odom",
+        "Topics for a bag with several of a type, e.g. imu=/imu/data,magnetometer=/mag,truth=/odom",
         metavar="ROLE=NAME,...",
         common=True,
     )
@@ -181,14 +181,14 @@ class TopicSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class PartSettings(TopicSettings):
-    """Which log, and which part of it."""
+    """A log, and the part of it to use."""
 
     log: Path = argument("Log: a directory, a EuRoC folder, or a bag of ROS")
     start: float | None = option(
-        None, "Use the log from here", unit="s since its epoch", common=True
+        None, "Start of the part to use", unit="s since its epoch", common=True
     )
     end: float | None = option(
-        None, "Use the log up to here", unit="s since its epoch", common=True
+        None, "End of the part to use", unit="s since its epoch", common=True
     )
 
 
@@ -199,7 +199,7 @@ class LogSettings(PartSettings):
     site: Path | None = option(None, "Site file", note="default: site.yaml in the log")
 
     def job(self, output: Path) -> Job:
-        """Return what a job on a log reads and where it writes.
+        """Return inputs and output of a job on a log.
 
         Raises
         ------
@@ -216,20 +216,18 @@ class LogSettings(PartSettings):
 class LogsSettings(LogSettings):
     """A log, or several of one site that are refined together."""
 
-    more: tuple[Path, ...] = argument(
-        "More logs of the same site, to refine it by all of them together", ()
-    )
+    more: tuple[Path, ...] = argument("More logs of the same site, to refine it jointly", ())
     cluster: str | None = option(
-        None, "Dask scheduler, tcp://host:8786, whose workers see logs and results; several logs"
+        None, "Dask scheduler, tcp://host:8786, with access to logs and results; for several logs"
     )
     workers: int | None = option(
-        None, "Processes on this machine; several logs", note="default: one a core"
+        None, "Processes on this machine; for several logs", note="default: one a core"
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.more and (self.cluster is not None or self.workers is not None):
-            raise InputError("--cluster and --workers share out several logs; one log was given")
+            raise InputError("--cluster and --workers are for several logs; one log was given")
 
     def jobs(self, output: Path) -> list[Job]:
         """Return a job for every log.
@@ -247,25 +245,25 @@ LOWEST_MAINS = 10.0  # Hz; below, its harmonics would be fitted to the motion
 
 @dataclass(frozen=True, kw_only=True)
 class WindowSettings(Settings):
-    """How a waveform is demodulated."""
+    """Settings of the demodulation of a waveform."""
 
     window: float | None = option(
         None, "Lock-in window", unit="s", note="default: from the tones' spacing", common=True
     )
     step: float | None = option(
-        None, "Distance of windows", unit="s", note="default: half a window", common=True
+        None, "Interval of windows", unit="s", note="default: half a window", common=True
     )
     mains_hz: float = option(
         50.0, "Mains frequency", unit="Hz", least=0.0, most=1e3, note="0 for none", common=True
     )
 
     def lockin(self, job: Job) -> LockinSettings | None:
-        """Return window and step for the site of a job; None leaves them to the estimator.
+        """Return window and step for the site of a job; None selects the default.
 
         Raises
         ------
         InputError
-            Where they do not fit the site's tones.
+            Where they do not suit the site's tones.
         """
         if 0.0 < self.mains_hz < LOWEST_MAINS:
             raise InputError(
@@ -298,12 +296,12 @@ class WindowSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class EstimateSettings(Settings):
-    """What the estimators of motion take for unknown, and what they measure."""
+    """Parameters estimated by the estimators of motion, and the Earth field."""
 
     estimate: str | None = option(
         None,
         f"Calibration to estimate: any of {','.join(GROUPS)}, or none",
-        note="default: what the site's sigmas leave open",
+        note="default: the uncertain ones, by the site's sigmas",
     )
 
     @property
@@ -330,30 +328,28 @@ class EstimateSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class EarthSettings(Settings):
-    """Whether the Earth field is measured."""
+    """Option to use the Earth field."""
 
-    earth: bool = option(
-        False, "Measure the Earth field too: it gives the heading where no beacon does"
-    )
+    earth: bool = option(False, "Use the Earth field as well: it gives the heading without beacons")
 
 
 @dataclass(frozen=True, kw_only=True)
 class RiskSettings(Settings):
-    """What protection levels promise."""
+    """Specification of protection levels."""
 
     risk: float = option(
         1e-4,
-        "Probability, an epoch, that an error beyond its protection level goes unnoticed",
+        "Probability per epoch of an undetected error beyond its protection level",
         least=1e-9,
         most=0.1,
     )
     fault_prior: float = option(
-        1e-3, "Probability, an epoch, that a beacon is false", least=0.0, most=0.1
+        1e-3, "Probability per epoch of a faulty beacon", least=0.0, most=0.1
     )
 
     @property
     def risks(self) -> Risk:
-        """Return them as the estimators take them."""
+        """Return them in the form of the estimators."""
         from magfusion.model.trust import Risk
 
         return Risk(total=self.risk, fault=self.fault_prior)
@@ -361,7 +357,7 @@ class RiskSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayedSettings(Settings):
-    """How a log comes as data, and what data in a pipe look like."""
+    """Format and pace of data in a pipe."""
 
     form: Literal["json", "msgpack"] = option("json", "Records in the pipe", name="format")
     realtime: bool = option(False, "Pace by the log's clock")
@@ -369,22 +365,22 @@ class ReplayedSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class FrameSettings(Settings):
-    """What ROS and Foxglove call the frames."""
+    """Frame names for ROS and Foxglove."""
 
     frame: str = option("world", "Frame of the poses, for ROS and Foxglove")
-    child: str = option("body", "Frame that they are the poses of, for ROS and Foxglove")
+    child: str = option("body", "Child frame of the poses, for ROS and Foxglove")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("frame", "child"):
             if not getattr(self, name).strip():
-                raise InputError(f"--{name} must name a frame; got nothing")
+                raise InputError(f"--{name} must not be empty; give a frame")
         if self.frame == self.child:
             raise InputError(f"--frame and --child must differ; got {self.frame!r} for both")
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomSettings(Settings):
-    """What is drawn."""
+    """Random seed."""
 
-    seed: int = option(0, "Of every random draw", least=0)
+    seed: int = option(0, "Seed of the random numbers", least=0)

@@ -1,4 +1,4 @@
-"""The job that simulates a log, with truth, in the files a user has."""
+"""The job that simulates a log, with truth, in the usual file formats."""
 
 from __future__ import annotations
 
@@ -40,64 +40,64 @@ LATE = 0.037  # s; the clock of a reference
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateSettings(ShaftSettings):
-    """What is simulated."""
+    """Settings of a simulation."""
 
     site: Path | None = option(None, "Site file", note="default: the demo's four beacons")
-    motion: Literal["walk", "turn", "static"] = option("walk", "How the platform moves")
+    motion: Literal["walk", "turn", "static"] = option("walk", "Motion of the platform")
     duration: float = option(120.0, "Length", unit="s", least=1.0, most=1e6)
     box: str | None = option(None, "Room to move in, m: xmin,xmax,ymin,ymax,zmin,zmax")
     rate: float | None = option(
         None,
-        "Magnetometer samples",
+        "Magnetometer sampling rate",
         unit="Hz",
         least=10.0,
         most=1e6,
         note="default: 400, or as many as the tones and time slots of the site need",
     )
-    imu_rate: float = option(200.0, "Inertial samples", unit="Hz", least=10.0, most=1e4)
+    imu_rate: float = option(200.0, "Inertial sampling rate", unit="Hz", least=10.0, most=1e4)
     perturb: bool = option(True, "Draw the true calibration from the site's sigmas")
-    iron: int = option(0, "Steel spheres about the room, 0.5 m from it or more", least=0, most=200)
+    iron: int = option(0, "Steel spheres around the room, at least 0.5 m away", least=0, most=200)
     ambient: Literal["quiet", "day-night"] = option(
         "quiet",
-        "White noise of the surroundings",
+        "White ambient noise",
         note="day-night: 0.2 nT/sqrt(Hz) at night, 0.4 at 14:00 UTC",
     )
     drift: float = option(
         0.0,
-        "Random change of the steady field within ten minutes, rms",
+        "Random change of the static field within ten minutes, rms",
         unit="T",
         least=0,
         most=1e-4,
     )
     storms: float = option(
         0.0,
-        "Noise that is the same everywhere, density at 1 Hz, falling with its root",
+        "Noise common to all magnetometers, density at 1 Hz, falling with its root",
         unit="T/sqrt(Hz)",
         least=0.0,
         most=1e-6,
     )
     reference: str | None = option(
         None,
-        "A second magnetometer that hears it, too; where it stands, m: x,y,z",
+        "Position of a second magnetometer with the same ambient noise, m: x,y,z",
         note="its clock is late by 37 ms",
     )
     random_field: float = option(
         0.0,
-        "Smooth random error of each beacon's field, rms share of it",
+        "Smooth random error of each beacon's field, rms relative to it",
         least=0.0,
         most=1.0,
-        note="alike within the site's model_error_correlation_m",
+        note="correlated over the site's model_error_correlation_m",
     )
     burst: float = option(
-        0.002, "Length of a burst, where the site's slots are marked", unit="s", least=1e-4, most=10
+        0.002, "Length of a burst, for a site with marked slots", unit="s", least=1e-4, most=10
     )
     pause: float = option(
-        0.002, "Longest pause between such bursts; each is drawn", unit="s", least=0.0, most=60.0
+        0.002, "Maximum pause between such bursts, random", unit="s", least=0.0, most=60.0
     )
     ground: str | None = option(
         None,
         "Layers of ground under air, height:S/m from above, e.g. 0:0.01,-20:0.05",
-        note="default: the site's conductivity_s_m without end; needs empymod",
+        note="default: the site's conductivity_s_m as a full space; requires empymod",
     )
     rails: str | None = option(
         None,
@@ -107,7 +107,7 @@ class SimulateSettings(ShaftSettings):
 
 
 def box_option(text: str | None) -> Array | None:
-    """Read ``xmin,xmax,ymin,ymax,zmin,zmax`` (m) as lower and upper corner, shape (2, 3).
+    """Parse ``xmin,xmax,ymin,ymax,zmin,zmax`` (m) to lower and upper corner, shape (2, 3).
 
     Raises
     ------
@@ -119,20 +119,20 @@ def box_option(text: str | None) -> Array | None:
         box = np.array([float(part) for part in text.split(",")]).reshape(3, 2).T
     except ValueError:
         raise InputError(
-            f"--box {text!r}: six numbers in metres are needed, x, y, z limits"
+            f"--box {text!r}: give six numbers in metres, the limits of x, y and z"
         ) from None
     if not np.all(np.isfinite(box)) or np.any(box[0] >= box[1]):
         raise InputError(f"--box {text!r}: each lower limit must be below its upper limit")
     if np.max(np.abs(box)) > LARGEST_BOX or np.min(box[1] - box[0]) < SMALLEST_BOX:
         raise InputError(
-            f"--box {text!r}: limits must lie within {LARGEST_BOX:g} m of the origin and"
+            f"--box {text!r}: limits must lie within {LARGEST_BOX:g} m of the origin and at least"
             f" {SMALLEST_BOX:g} m apart"
         )
     return box
 
 
 def reference_option(text: str | None) -> Reference | None:
-    """Read ``x,y,z`` (m).
+    """Parse ``x,y,z`` (m).
 
     Raises
     ------
@@ -146,14 +146,14 @@ def reference_option(text: str | None) -> Reference | None:
         place = np.full(3, np.nan)
     if not np.all(np.abs(place) <= LARGEST_BOX):
         raise InputError(
-            f"--reference {text!r}: three numbers in metres are needed, x, y, z within"
-            f" {LARGEST_BOX:g} m of the origin"
+            f"--reference {text!r}: give three numbers in metres, x, y, z within {LARGEST_BOX:g} m"
+            " of the origin"
         )
     return Reference(place, late=LATE)
 
 
 def run(settings: SimulateSettings, output: Path) -> Figures:
-    """Simulate a log as the settings ask; see `run_simulate`."""
+    """Simulate a log; see `run_simulate`."""
     site = demo_site()
     if settings.site is not None:
         site = load_site(settings.site, several=True, unknown=True)
@@ -193,7 +193,7 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
 
 
 def _rails(text: str | None, box_world: Array, site: Site) -> Steel | None:
-    """Return the steel that is asked for, laid about a room (m, shape (2, 3)) and its beacons."""
+    """Return the requested steel around a room (m, shape (2, 3)) and its beacons."""
     if text is None:
         return None
     beacons_world = np.array([beacon.position_world for beacon in site.beacons]).reshape(-1, 3)
@@ -201,19 +201,19 @@ def _rails(text: str | None, box_world: Array, site: Site) -> Steel | None:
 
 
 def _passes(settings: SimulateSettings, site: Site, output: Path) -> Figures:
-    """Simulate passes of a magnet in a well, where nothing else is asked for."""
+    """Simulate passes of a magnet in a well, without incompatible options."""
     usual = SimulateSettings(seed=settings.seed)
     without = ("motion", "box", "iron", "ambient", "drift", "storms", "reference", "random_field")
     for name in without:
         if getattr(settings, name) != getattr(usual, name):
             raise InputError(
-                f"--{name.replace('_', '-')}: the magnet of {settings.site} goes through a well, of"
-                " which nothing of the kind is simulated; leave it out, or survey the beacon (no"
-                " unknown) for a platform that moves"
+                f"--{name.replace('_', '-')}: is not simulated for a site with a magnet in a well"
+                f" ({settings.site}); omit it, or survey the beacon (no unknown) for a moving"
+                " platform"
             )
     if site.platform.further:
         raise InputError(
-            f"{settings.site}: platform.magnetometers: a well is ranged by one sensor; describe one"
+            f"{settings.site}: platform.magnetometers: ranging uses one sensor; describe one"
         )
     return run_passes(
         site,
@@ -229,12 +229,12 @@ def _passes(settings: SimulateSettings, site: Site, output: Path) -> Figures:
 def _refuse_wells(settings: SimulateSettings, site: Site) -> None:
     if settings.wells is not None:
         raise InputError(
-            "--wells: is of a site whose only beacon has rotor and unknown: pose; leave it out"
+            "--wells: requires a site whose only beacon has rotor and unknown: pose; omit it"
         )
     if any(one.casing is not None for one in site.platform.magnetometers):
         raise InputError(
-            f"{settings.site}: casing: is simulated of a sensor in a well alone, whose site's only"
-            " beacon has rotor and unknown: pose; leave it out"
+            f"{settings.site}: casing: is simulated only for a sensor in a well, where the site's"
+            " only beacon has rotor and unknown: pose; omit it"
         )
 
 
@@ -244,7 +244,7 @@ def run_simulate(site: Site, config: SimulationConfig, output: Path, seed: int) 
     Parameters
     ----------
     site : Site
-        What the user would declare; written beside the log as ``site.yaml``.
+        The user's declared site; written with the log as ``site.yaml``.
 
     Raises
     ------

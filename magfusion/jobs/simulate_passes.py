@@ -1,4 +1,4 @@
-"""What `simulate` makes of a magnet that turns in one well, and is to be ranged from another."""
+"""Simulation of a rotating magnet in one well, to be ranged from another."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ AHEAD = 2.0  # m, at most, of the magnet from where it is abreast, in the middle
 
 @dataclass(frozen=True, kw_only=True)
 class ShaftSettings(RandomSettings):
-    """How magnets on shafts turn, and two wells."""
+    """Rotation of magnets on shafts, and two wells."""
 
     wells: Path | None = option(
         None,
@@ -55,22 +55,22 @@ class ShaftSettings(RandomSettings):
     )
     shaft_drift: float | None = option(
         None,
-        "Drift of a rotor's speed, rms, gained by its speed_walk_hz_rts",
+        "Drift of a rotor's speed, rms, at the rate of its speed_walk_hz_rts",
         unit="Hz",
         least=0.0,
         most=10.0,
         note="default: its speed_sigma_hz",
     )
     shaft_whirl: float = option(
-        0.0, "By which a rotor's shaft leans and circles backward", unit="deg", least=0.0, most=30.0
+        0.0, "Lean of a rotor's shaft in backward whirl", unit="deg", least=0.0, most=30.0
     )
     encoder: bool = option(True, "Record the angles of rotors")
     encoder_sigma: float = option(
-        0.1, "Of a recorded angle, 1 sigma", unit="deg", least=0.0, most=30.0
+        0.1, "Sigma of a recorded angle", unit="deg", least=0.0, most=30.0
     )
 
     def shaft_errors(self) -> ShaftErrors:
-        """Return what they say of shafts."""
+        """Return the errors of shafts."""
         return ShaftErrors(
             self.shaft_drift,
             self.shaft_whirl * DEGREE,
@@ -80,7 +80,7 @@ class ShaftSettings(RandomSettings):
 
 
 def laid_wells(entry: WellsEntry, rng: np.random.Generator) -> TwoWells:
-    """Return the wells of a file; how the magnet is turned on its shaft is drawn."""
+    """Return the wells of a file; the magnet's angle on its shaft is drawn."""
     return TwoWells(
         distance=entry.distance_m,
         direction=entry.high_side_deg * DEGREE,
@@ -105,7 +105,7 @@ def run_passes(
     layers: Layers | None = None,
     beside: tuple[Pipe, ...] = (),
 ) -> Figures:
-    """Simulate what a sensor in a well records of a magnet that goes by in another.
+    """Simulate the record of a sensor in a well during passes of a magnet in another.
 
     Parameters
     ----------
@@ -113,8 +113,8 @@ def run_passes(
         As `is_for_ranging`.
     rate_hz : float, optional
         Of the magnetometer.
-    beside : tuple of Pipe
-        Steel beside the wells.
+    `beside` : tuple of Pipe
+        Steel near the wells.
     """
     from magfusion.jobs.inputs import claim
     from magfusion.results.report import write_report
@@ -153,7 +153,7 @@ def run_passes(
 
 
 def _laid(beside: tuple[Pipe, ...], passes: tuple[Pass, ...], wells: TwoWells) -> tuple[Pipe, ...]:
-    """Return steel in segments that are short against how near sensor and magnet come."""
+    """Return steel in segments that are short relative to the distance of sensor and magnet."""
     ways_world = [np.stack([one.sensor_world for one in passes])]
     for one in passes:
         way = np.linspace(0.0, one.depth[1] - one.depth[0], WAY_POINTS)
@@ -193,7 +193,7 @@ def _around(
 def _figures(
     settings: ShaftSettings, wells: TwoWells, passes: tuple[Pass, ...], stretch: float
 ) -> Figures:
-    """Return what is true, in the words of `range`; depths of the magnet as they are read."""
+    """Return the true values under the names of `range`; depths of the magnet as recorded."""
     figures = [
         Figure("seed", settings.seed),
         Figure("passes", len(passes)),

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from magfusion.errors import EstimationError, InputError
+from magfusion.errors import UNOBSERVABLE, EstimationError, InputError
 from magfusion.estimation.data_checks.recording import BRIDGED, beyond, recorded
 from magfusion.estimation.snapshot.coil_gain import with_found_gain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
-from magfusion.jobs.failure import OPEN, reason_of
+from magfusion.jobs.failure import reason_of
 from magfusion.jobs.fix import write_fix_result
 from magfusion.jobs.rates import RateSettings, refuse_rate
 from magfusion.jobs.region import RegionSettings
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from magfusion.units import Rate
 
 
-CONTRADICTION = "fields and inertial data contradict each other so much that nothing can be solved"
+CONTRADICTION = "the inconsistency of fields and inertial data is too large for a solution"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class SmoothSettings(
     RiskSettings,
     RateSettings,
 ):
-    """How a log is smoothed."""
+    """Settings of the smoother."""
 
     coupling: Literal["tight", "loose"] = option("tight", "Phasors or fixes in the graph")
     robust: str | None = option(
@@ -69,22 +69,22 @@ class SmoothSettings(
         words={"none": None, "huber": "huber", "cauchy": "cauchy"},
     )
     tune: bool = option(
-        True, "Find noise and model error from the residuals; what is declared is a prior"
+        True, "Estimate noise and model error from the residuals, with the declared as a prior"
     )
     checkpoint: Path | None = option(
-        None, "File that keeps what each pass over the log left, while the job runs"
+        None, "File that stores the result of each pass over the log, while the job runs"
     )
     resume: bool = option(False, "Continue from the checkpoint, if there is one")
     free: str | None = option(
-        None, "What nobody measured of a receiver of one axis: gain", metavar="gain"
+        None, "Unknown parameter of a receiver of one axis: gain", metavar="gain"
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.earth and self.coupling == "loose":
-            raise InputError("--earth needs the phasors themselves; leave --coupling loose out")
+            raise InputError("--earth requires phasors; omit --coupling loose")
         if self.free not in (None, "gain"):
-            raise InputError(f"--free {self.free!r}: smooth frees gain alone; write --free gain")
+            raise InputError(f"--free {self.free!r}: smooth estimates gain only; write --free gain")
         if self.at_rest:
             if self.more:
                 raise InputError(
@@ -93,18 +93,18 @@ class SmoothSettings(
                 )
             if self.earth or self.free:
                 raise InputError(
-                    "--at-rest gives phasors of whole rests, which know nothing of the Earth field"
-                    " nor of a common gain; leave --earth and --free out"
+                    "--at-rest gives phasors of whole rests, which do not support the Earth field"
+                    " or a common gain; omit --earth and --free"
                 )
         if self.resume and self.checkpoint is None:
-            raise InputError("--resume goes on from a file; name it with --checkpoint FILE")
+            raise InputError("--resume requires a file; give it with --checkpoint FILE")
         if self.checkpoint is not None and self.more:
             raise InputError(
-                "--checkpoint keeps the passes over one log; of several what is done is kept in"
-                " the output: leave it out and repeat the command"
+                "--checkpoint stores the passes over one log; with several, finished logs are"
+                " stored in the output: omit it and repeat the command"
             )
         if self.free and self.more:
-            raise InputError("--free gain is found in one log; smooth the logs one by one")
+            raise InputError("--free gain uses one log; smooth the logs one by one")
 
     def smoother(self, job: Job) -> SmootherSettings:
         """Return the settings of the estimator."""
@@ -121,7 +121,7 @@ class SmoothSettings(
 
 
 def run(settings: SmoothSettings, output: Path, report: Report = quiet) -> Figures:
-    """Smooth a log as the settings ask, or several together; see `run_smooth`, `run_joint`."""
+    """Smooth a log, or several together; see `run_smooth`, `run_joint`."""
     from magfusion.jobs.without_beacons import without_beacons
 
     job = settings.job(output)
@@ -164,21 +164,21 @@ def run_smooth(
     Parameters
     ----------
     rate : 'field', 'imu' or float
-        Where the states of the written trajectory are: at the field epochs, at every inertial
-        sample, or so many a second (Hz).
+        Rate of the written trajectory: at the field epochs, at every inertial sample, or so many
+        a second (Hz).
     risk : Risk, optional
-        What the protection levels promise.
+        Specification of the protection levels.
     free_gain : bool
-        Whether the gain of a receiver of one axis is begun where single epochs find it.
+        Whether the gain of a receiver of one axis starts at the single-epoch estimate.
     rest : RestSettings, optional
-        By which whole rests are integrated, in place of windows.
+        Settings for integration of whole rests, instead of windows.
     kept : tuple of (Path, bool), optional
-        File that keeps what each pass left, and whether to go on from it.
+        File with the result of each pass, and whether to resume from it.
 
     Raises
     ------
     InputError, EstimationError
-        In the latter case the single-epoch fixes have been saved in the output directory.
+        In the latter case the single-epoch fixes are saved in the output directory.
     """
     from magfusion.estimation.batch.self_survey import smooth_and_place
     from magfusion.jobs.inputs import claim, named, refuse_failed
@@ -208,7 +208,7 @@ def run_smooth(
         with claimed as whole:
             told = _save_fixes_instead(whole, settings, log, site, reason)
         raise EstimationError(
-            f"{job.log_path}: {told}; the single-epoch fixes were saved in {job.output / FAILED}"
+            f"{job.log_path}: {told}; the single-epoch fixes are saved in {job.output / FAILED}"
         ) from error
     give_back_memory()
     said += () if rested is None else beyond(recording, log, site)
@@ -225,23 +225,23 @@ def run_smooth(
 
 
 def _has_unknown(site: Site) -> bool:
-    """Tell whether a site has beacons that were never surveyed."""
+    """Return whether a site has beacons that were never surveyed."""
     return any(beacon.unknown is not None for beacon in site.beacons)
 
 
 def _refuse_placing(job: Job, site: Site) -> None:
-    """Refuse beacons that were never surveyed where there are several magnetometers."""
+    """Reject beacons that were never surveyed with several magnetometers."""
     if site.platform.further and _has_unknown(site):
         raise InputError(
-            f"{job.declared_path}: beacons that were never surveyed are placed by one magnetometer;"
-            " give a site that has one"
+            f"{job.declared_path}: beacons that were never surveyed require a single magnetometer;"
+            " give a site with one"
         )
 
 
 def _read(
     job: Job, settings: SmootherSettings, *, by_rests: bool, report: Report
 ) -> tuple[Log, Site]:
-    """Return log and site, with what smoothing by windows or by whole rests can do with."""
+    """Return log and site, restricted to what smoothing of windows or whole rests can use."""
     from magfusion.jobs.inputs import read_job
 
     return read_job(
@@ -261,15 +261,13 @@ def _read(
 def _passes(
     place: Path, resume: bool, log: Log, site: Site, settings: SmootherSettings
 ) -> PassFile:
-    """Return the file that keeps the passes, of a log with this site and these settings."""
+    """Return the file of the passes, for a log with this site and these settings."""
     from magfusion.estimation.batch.passes import PassFile
 
     if any(beacon.unknown is not None for beacon in site.beacons):
-        raise InputError(
-            "--checkpoint keeps the passes over a log whose beacons are all surveyed; leave it out"
-        )
+        raise InputError("--checkpoint requires a site whose beacons are all surveyed; omit it")
     if not place.parent.is_dir():
-        raise InputError(f"{place.parent}: is no directory; make it, or give another path")
+        raise InputError(f"{place.parent}: is no directory; create it, or give another path")
     streams = [s for s in (log.imu, log.waveform, log.fields) if s is not None]
     key = run_key("smooth", site, settings, log.epoch_ns, streams)
     if resume:
@@ -282,13 +280,13 @@ def _passes(
 def _rested(
     job: Job, log: Log, site: Site, rest: RestSettings, settings: SmootherSettings
 ) -> AtRest:
-    """Return the rests of a log, of which at least one beacon is heard in any."""
+    """Return the rests of a log, in any of which at least one beacon is detected."""
     from magfusion.jobs.inputs import named
 
     if site.platform.further:
         raise InputError(
-            f"{job.declared_path}: --at-rest integrates the samples of one magnetometer; leave it"
-            " out, or give a site of the one to integrate"
+            f"{job.declared_path}: --at-rest integrates the samples of one magnetometer; omit it,"
+            " or give a site of the one to integrate"
         )
     with named(job.log_path):
         rested = rest.integrated(log, site, settings.lockin, least=2)
@@ -299,14 +297,14 @@ def _rested(
 
 
 def _with_gain(job: Job, log: Log, site: Site, settings: SmootherSettings) -> Site:
-    """Return the site with the gain that the epochs of a receiver of one axis tell."""
+    """Return the site with the gain estimated from the epochs of a receiver of one axis."""
     from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
     from magfusion.jobs.inputs import named
 
     if len(site.platform.magnetometer.axes) != 1:
         raise InputError(
-            "--free gain: is the one gain of a receiver of one axis; of more axes declare how well"
-            " gains are known as platform.magnetometer.sigma.matrix"
+            "--free gain: is the common gain of a receiver of one axis; for more axes declare the"
+            " uncertainty of the gains as platform.magnetometer.sigma.matrix"
         )
     with named(job.log_path):
         fields, _ = fix_inputs(phasors(log, site, settings.lockin)[0], log, site)
@@ -316,7 +314,7 @@ def _with_gain(job: Job, log: Log, site: Site, settings: SmootherSettings) -> Si
 def _agreed(
     log: Log, site: Site, settings: SmootherSettings, result: Smoothed, risk: Risk | None
 ) -> tuple[Log, Site, Smoothed, tuple[Finding, ...]]:
-    """Return all without a magnetometer that contradicts the others, and what is said of it."""
+    """Return the result without a contradicting magnetometer, and the findings on it."""
     if not site.platform.further:
         return log, site, result, ()
     from magfusion.estimation.batch.batch import smooth
@@ -337,7 +335,7 @@ def _agreed(
 def _save_fixes_instead(
     whole: Path, settings: SmootherSettings, log: Log, site: Site, reason: str
 ) -> str:
-    """Write the fixes where there is no trajectory, below a name that says so; return why."""
+    """Write the fixes where there is no trajectory, to the failed directory; return the reason."""
     from magfusion.estimation.demodulation.demodulation import first_fixes, phasors
     from magfusion.estimation.integrity.diagnosis import OF_CATCH_ALL, with_cause
     from magfusion.jobs.inputs import found_in
@@ -346,9 +344,9 @@ def _save_fixes_instead(
     samples, dropped = phasors(log, site, settings.lockin)
     fixes = first_fixes(samples, log, initial_calibration(site, float(np.mean(samples.time))))
     code = "no_solution"
-    if reason.startswith(OPEN):
+    if reason.startswith(UNOBSERVABLE):
         code = "geometry" if np.mean(fixes.determined[:, 0]) < 0.5 else "diverged"
-        what = f"{OPEN}: add a beacon or a coil"
+        what = f"{UNOBSERVABLE}: add a beacon or a coil"
         reason = what if code == "geometry" else CONTRADICTION
     text = f"There is no trajectory: {reason}."
     none = Finding(code, text, Verdict.FAILED, weight=0.0)

@@ -1,4 +1,4 @@
-"""The result of a smoothed log: judged, with its figures, and written."""
+"""The result of a smoothed log: assessed, with its figures, and written."""
 
 from __future__ import annotations
 
@@ -78,14 +78,14 @@ def finished(
     excess: float = 1.0,
     said: tuple[Finding, ...] = (),
 ) -> Finished:
-    """Judge a smoothed log.
+    """Assess a smoothed log.
 
     Parameters
     ----------
     excess : float
-        By what the variances of its poses are too small, as other logs have it.
-    said : tuple of Finding
-        By other logs.
+        Factor on the variances of its poses, from other logs.
+    `said` : tuple of Finding
+        From other logs.
     """
     separated = separated_smooth(result, risk)
     give_back_memory()
@@ -107,13 +107,13 @@ def finished(
 
 
 def open_signs(result: Smoothed) -> tuple[Finding, ...]:
-    """Return what is to be said of amplitudes that were left out."""
+    """Return findings on omitted amplitudes."""
     if not result.open_signs:
         return ()
     given = result.open_signs + int(np.sum(result.fields.valid))
     text = (
-        f"{result.open_signs} of {given} amplitudes are too near zero where the trajectory passes"
-        " for their sign to be known; they were left out."
+        f"{result.open_signs} of {given} amplitudes are too close to zero near the trajectory to"
+        " have a known sign; they are omitted."
     )
     return (Finding("sign_open", text, Verdict.TRUSTWORTHY),)
 
@@ -129,7 +129,7 @@ def with_errors(
     Parameters
     ----------
     fixed : Site and SmootherSettings, optional
-        With which the log is smoothed once more, its survey fixed: what estimating it was worth.
+        With which the log is smoothed again, the survey fixed, to show the gain of estimating it.
     """
     result = done.result
     own = comparable(log, result.states, result.declared.site)
@@ -141,7 +141,7 @@ def with_errors(
 
 
 def write_finished(whole: Path, log: Log, done: Finished, *, rate: Rate) -> None:
-    """Write all files of a smoothed log: below `FAILED` where its verdict is that."""
+    """Write all files of a smoothed log: to `FAILED` for that verdict."""
     result, by_state = done.result, done.states
     if not log.inertial:  # the prior's bias is the rate, and no bias
         states = replace(result.states, gyro_bias_body=None, accel_bias_body=None)
@@ -187,7 +187,7 @@ def _innovations(result: Smoothed) -> dict[str, tuple[Array, Array]]:
 def _fixed_survey_figures(
     log: Log, site: Site, settings: SmootherSettings, result: Smoothed
 ) -> Figures:
-    """Return the errors with the calibration as surveyed: what estimating it was worth."""
+    """Return the errors with the calibration as surveyed: the gain of estimating it."""
     kept = ("phase", "time-offset")
     if all(block.group in kept for block in result.blocks):
         return Figures()

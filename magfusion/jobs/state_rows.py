@@ -1,4 +1,4 @@
-"""The states of a run along a log as rows of a file, with what is said of each."""
+"""The states of a run along a log as rows of a file, with their findings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from magfusion.model.site import Site
     from magfusion.units import Array
 
-# What a row is: an epoch's state as it was made, as it left the smoother's window, or carried.
+# Kind of a row: an epoch's state as first estimated, as it left the window, or propagated.
 CURRENT, LAGGED, CARRIED = 0.0, 1.0, 2.0
 STATE = {
     "time": 1,
@@ -31,7 +31,7 @@ TOGETHER = 32  # rows whose levels are found at once
 
 
 def row_columns(site: Site) -> dict[str, int]:
-    """Return what is kept of each state as it is made, with the number of values."""
+    """Return the stored columns of each state, with their number of values."""
     beacons = len(site.beacons)
     told = {
         "lagged": 1,
@@ -45,7 +45,7 @@ def row_columns(site: Site) -> dict[str, int]:
 
 
 class StateRows:
-    """Rows of a run, the newest of which wait to be written with others.
+    """Rows of a run, of which the newest are buffered.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class StateRows:
         self._waiting: list[tuple[dict[str, Array | float], Levels]] = []
 
     def add(self, navigator: Navigator, state: JudgedState, latency: float, kind: float) -> None:
-        """Add a state that a navigator has just made; the latency (s) is NaN where it is none."""
+        """Add a new state of a navigator; the latency (s) is NaN if there is none."""
         levels = state.judgement.levels or Levels((None, None))
         self._waiting.append((_row(navigator, state, latency, kind), levels))
         if len(self._waiting) == TOGETHER:
@@ -75,7 +75,7 @@ class StateRows:
         return self._rows.rows()
 
     def settle(self) -> Mark:
-        """See that all rows are on the disk; return how far the file goes."""
+        """Write all rows to the disk; return the length of the file."""
         self._write()
         return self._rows.settle()
 

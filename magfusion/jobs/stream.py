@@ -1,4 +1,4 @@
-"""Navigation in a pipe: records in, a state out at every epoch, or of now at any rate."""
+"""Navigation in a pipe: records in, a state out at every epoch, or current states at any rate."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -38,30 +38,30 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
 
 _PLACE = {"json": "line", "msgpack": "record"}
-NOT_ONLINE = "its samples are used by navigate --at-rest alone."
+NOT_ONLINE = "its samples are used by navigate --at-rest only."
 WAITING = 1.0  # s; before the first state, as often a sign of life
 
 
 @dataclass(frozen=True)
 class StreamSettings:
-    """How a stream is navigated.
+    """Settings of a stream.
 
     Parameters
     ----------
     form : {"json", "msgpack"}
         Of the records.
     keep_going : bool
-        Count and pass over what is no record.
+        Count and skip invalid records.
     live : LiveSettings
-        Who else is told of the states.
+        Other outputs of the states.
     checkpoint : Path, optional
-        Where to leave what is needed to go on.
+        Checkpoint file.
     every : float
-        Between checkpoints (s of the stream).
+        Interval of checkpoints (s of the stream).
     resume : bool
-        Go on from the checkpoint, if there is one, with what comes now.
+        Resume from the checkpoint, if there is one, with the next data.
     where : Where
-        The magnetometer is, beside what the site says of it.
+        Constraint on the magnetometer's position, in addition to the site's.
     """
 
     navigator: NavigatorSettings = field(default_factory=NavigatorSettings)
@@ -77,24 +77,24 @@ class StreamSettings:
 def run_stream(
     site_path: Path, settings: StreamSettings, source: BinaryIO, sink: BinaryIO, messages: TextIO
 ) -> int:
-    """Navigate by the records of a stream; write one line of JSON for each state.
+    """Navigate from the records of a stream; write one line of JSON for each state.
 
     Parameters
     ----------
     source, sink : file
-        Binary; each line is written out at once.
+        Binary; each line is flushed.
     messages : file
-        Where records that are passed over are reported.
+        Receives messages on skipped records.
 
     Returns
     -------
     int
-        How many were passed over.
+        Number of skipped records.
 
     Raises
     ------
     InputError
-        Where the site cannot be read, or a record is none and ``keep_going`` is not set.
+        Where the site cannot be read, or a record is invalid and ``keep_going`` is not set.
     """
     site = settings.where.bounded(load_site(site_path, several=True))
     check_streamed_rotors(site_path, site)
@@ -123,7 +123,7 @@ def _navigate(
             if not settings.keep_going:
                 raise InputError(sentence) from error
             refused += 1
-            messages.write(f"magfusion: {sentence} (passed over)\n")
+            messages.write(f"magfusion: {sentence} (skipped)\n")
             continue
         angles.see(numbered.record)
         told.epochs()
@@ -139,12 +139,12 @@ def _navigate(
     for stream, count in missing.items():
         messages.write(f"magfusion: {stream}: {count} samples are NaN. They are left out.\n")
     if refused:
-        messages.write(f"magfusion: {refused} records were passed over\n")
+        messages.write(f"magfusion: {refused} records were skipped\n")
     return refused
 
 
 class _Told:
-    """Writes states as they are made, and hands them to whoever else listens.
+    """Writes states as they are estimated, and sends them to the other outputs.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ class _Told:
     Attributes
     ----------
     reference : bool
-        Whether samples of a reference sensor have come, which are not used here.
+        Whether samples of a reference sensor have arrived, which are not used here.
     """
 
     def __init__(self, navigator: Navigator, sink: BinaryIO, others: tuple[StateSink, ...]) -> None:
@@ -163,20 +163,20 @@ class _Told:
         self.reference = False
 
     def tell(self, state: JudgedState | None, told: dict[str, Any]) -> None:
-        """Write what is told of a state, None before the first."""
+        """Write a state, or the status before the first (None)."""
         self._sink.write(json_line(told))
         for other in self._others:
             other.take(state, told)
 
     def now(self) -> None:
-        """Write the states of now, before anything else is worked out."""
+        """Write the current states, before any other processing."""
         for state in self._navigator.take_carried():
             self.tell(state, state_content(self._navigator, state))
             self._newest = state.time
         self._sink.flush()
 
     def epochs(self) -> None:
-        """Write the states of the epochs, but for those that are older than one of now."""
+        """Write the states of the epochs, except those older than a written current one."""
         for state in self._navigator.take():
             if state.time > self._newest:
                 self.tell(state, state_content(self._navigator, state))
@@ -190,7 +190,7 @@ def _take_in(
     missing: Counter[str],
     told: _Told,
 ) -> float:
-    """Give a record to the navigator, and count what it lacks; return the newest time in it (s)."""
+    """Feed a record to the navigator, and count missing data; return its newest time (s)."""
     if numbered.record is None:
         raise InputError(numbered.refusal)
     record, newest = numbered.record, -np.inf
@@ -224,7 +224,7 @@ def _count_missing(missing: Counter[str], stream: str, number: int) -> None:
 
 
 def _take_in_beside(navigator: Navigator, record: Record) -> None:
-    """Give the navigator what it is to know before the samples that it goes with."""
+    """Feed the navigator the data that must precede its samples."""
     if record.temperature is not None:
         for part, degc in record.temperature.degc.items():
             navigator.add_temperature(part, record.temperature.time, degc)
@@ -241,7 +241,7 @@ def _last(time: Array) -> float:
 
 
 def _waiting(navigator: Navigator, time: float) -> dict[str, Any]:
-    """Return a sign of life before the first state, with the reason why a start was refused."""
+    """Return a status before the first state, with the reason why a start was rejected."""
     nothing: dict[str, Any] = {"time": time, "started": False, "lost": False, "verdict": None}
     why = navigator.why_no_start
     reasons = why.trust.reasons
@@ -256,9 +256,9 @@ def _said(findings: tuple[Finding, ...]) -> list[dict[str, str]]:
 
 
 def state_content(navigator: Navigator, state: JudgedState) -> dict[str, Any]:
-    """Return a state as it is written: SI units, sigmas of position and velocity in world axes.
+    """Return a state as written: SI units, sigmas of position and velocity in world axes.
 
-    Where the platform is lost there is no pose, nor anything that follows from one.
+    A lost platform has no pose, nor anything derived from it.
     """
     told = {
         "time": state.time,
@@ -300,7 +300,7 @@ def state_content(navigator: Navigator, state: JudgedState) -> dict[str, Any]:
 def _of_imu(
     navigator: Navigator, state: JudgedState
 ) -> tuple[dict[str, list[float]], dict[str, list[float]]]:
-    """Return the biases of the IMU and their sigmas; of a motion prior the rate, body axes."""
+    """Return the biases of the IMU and their sigmas; for a motion prior the rate, body axes."""
     gyro, accel = _sigma(state.cov[GYRO_BIAS, GYRO_BIAS]), _sigma(state.cov[ACCEL_BIAS, ACCEL_BIAS])
     if not navigator.site.platform.inertial:
         return {"rate": (-state.gyro_bias_body).tolist()}, {"rate": gyro}

@@ -37,7 +37,7 @@ GAP = 1.5  # of the distance of two windows, beyond which they belong to two sto
 
 @dataclass(frozen=True, kw_only=True)
 class SurveySettings(LogSettings, WindowSettings):
-    """What becomes a point of the survey; of points too near each other, the first."""
+    """Selection of survey points; of points too close to each other, the first."""
 
     trajectory: Path | None = option(
         None,
@@ -45,7 +45,7 @@ class SurveySettings(LogSettings, WindowSettings):
         note="default: the log's truth",
     )
     points: Points = option("rests", "One point a stop, or one an epoch")
-    spacing: float = option(0.0, "Least distance of two points", unit="m", least=0.0)
+    spacing: float = option(0.0, "Minimum distance of two points", unit="m", least=0.0)
 
 
 class _Point(NamedTuple):
@@ -82,7 +82,7 @@ def run_survey(settings: SurveySettings, output: Path) -> Figures:
         reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
         raise InputError(
             f"{job.log_path}: none of its {len(samples)} epochs can be a point of a survey"
-            f" ({reasons}); rest at known places, or take moving epochs with --points epochs"
+            f" ({reasons}); rest at known places, or use moving epochs with --points epochs"
         )
     figures = _figures(log, site, survey, dropped) | dropped_figures(windows_dropped)
     with claimed as directory:
@@ -99,8 +99,7 @@ def _poses(job: Job, settings: SurveySettings, log: Log) -> Trajectory:
         return read_estimate(settings.trajectory, log.epoch_ns)
     if log.truth is None:
         raise InputError(
-            f"{job.log_path}: holds no truth to take the poses from; name a smoothed result with"
-            " --trajectory"
+            f"{job.log_path}: has no truth for the poses; give a smoothed result with --trajectory"
         )
     return log.truth
 
@@ -114,10 +113,10 @@ def make_survey(
     points: Points = "rests",
     spacing: float = 0.0,
 ) -> tuple[Survey, dict[str, int]]:
-    """Return the survey, and how many epochs were dropped for each reason.
+    """Return the survey, and the number of dropped epochs for each reason.
 
     A stop's phasors are averaged with the pose over its windows; those of an unsynchronised beacon
-    are first turned to one drive phase, which drifts.  ``sigma`` counts overlapping windows once.
+    are first rotated to one drive phase, which drifts.  ``sigma`` counts overlapping windows once.
     """
     known, exists = interpolate(poses, samples.time, MAX_GAP)
     detected = samples.valid.any(axis=1)
@@ -127,7 +126,7 @@ def make_survey(
     used = np.flatnonzero(exists & detected & still)
     dropped = {
         "outside the trajectory": int(np.sum(~exists)),
-        "no beacon heard": int(np.sum(exists & ~detected)),
+        "no beacon detected": int(np.sum(exists & ~detected)),
         "moving": int(np.sum(exists & detected & ~still)),
     }
     at = np.searchsorted(np.flatnonzero(exists), used)
@@ -167,7 +166,7 @@ def _at_rest(samples: FieldSamples, log: Log, site: Site) -> BoolArray:
 
 
 def _stands(samples: FieldSamples, poses: Trajectory) -> BoolArray:
-    """Return during which windows the known poses stay within `STILL`, where no IMU tells."""
+    """Return during which windows the known poses stay within `STILL`, without an IMU."""
     still = np.ones(len(samples), dtype=bool)
     ends = []
     for sign in (-0.5, 0.5):
@@ -181,7 +180,7 @@ def _stands(samples: FieldSamples, poses: Trajectory) -> BoolArray:
 
 
 def _stops(time: Array, position: Array) -> IntArray:
-    """Return the number of the stop to which each window at rest belongs, from 0 in time."""
+    """Return the index of the stop of each window at rest, from 0 in time."""
     number = np.zeros(len(time), dtype=np.int64)
     usual = np.median(np.diff(time)) if len(time) > 1 else 0.0
     first = 0
@@ -217,13 +216,13 @@ def _mean(
 
 
 def _windows_beside(samples: FieldSamples, rows: IntArray) -> float:
-    """Return how many windows that do not overlap fit into a stop."""
+    """Return the number of non-overlapping windows in a stop."""
     time, window = samples.time[rows], samples.window[rows]
     return float((time[-1] - time[0]) / np.median(window)) + 1.0
 
 
 def _spaced(position: Array, spacing: float) -> IntArray:
-    """Return the points, in their order, that no earlier one is nearer to than the spacing."""
+    """Return the points, in order, without those closer to an earlier one than the spacing."""
     if spacing == 0.0 or len(position) == 0:
         return np.arange(len(position))
     keep = np.ones(len(position), dtype=bool)
@@ -258,7 +257,7 @@ def _figures(log: Log, site: Site, survey: Survey, dropped: dict[str, int]) -> F
                     int(np.sum(own)),
                     "",
                     name,
-                    label="points in reach of",
+                    label="points in range of",
                 )
                 for name, own in by_beacon.items()
             ),

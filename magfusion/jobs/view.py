@@ -9,13 +9,13 @@ from magfusion.jobs.settings import Command, Settings, argument
 
 @dataclass(frozen=True, kw_only=True)
 class ViewSettings(Settings):
-    """What is shown."""
+    """Recording to show."""
 
     result: Path = argument("Result directory, or its run.rrd")
 
 
 def run_view(settings: ViewSettings) -> None:
-    """Open a recording in a viewer of its own.
+    """Open a recording in a separate viewer.
 
     Raises
     ------
@@ -27,10 +27,10 @@ def run_view(settings: ViewSettings) -> None:
     result = settings.result
     path = result / "run.rrd" if result.is_dir() else result
     if not path.is_file():
-        raise InputError(f"{path}: no recording there; run magfusion smooth first")
+        raise InputError(f"{path}: has no recording; run magfusion smooth first")
     with path.open("rb") as stream:
         if stream.read(3) != b"RRF":
-            raise InputError(f"{path}: is no recording; give a result's directory or its run.rrd")
+            raise InputError(f"{path}: not a recording; give a result's directory or its run.rrd")
     open_viewer(path)
 
 

@@ -1,4 +1,4 @@
-"""What each job writes, by name: what of it is in the way of another."""
+"""Files that each job writes, by name; those of one job may block another."""
 
 from magfusion.results.report import FAILED
 
@@ -15,7 +15,7 @@ _LOG = {"log.yaml", *_SITE, *_TRUE_SITE, "report.json", *_TABLES}
 UNFINISHED_DRIFT = "unfinished"
 KEPT, LOGS, LOGS_TABLE = "kept", "logs", "logs.csv"  # of several logs
 CHECKPOINT, ROWS = "checkpoint.bin", "checkpoint.rows"
-# What is in the directory while these jobs run.
+# In the directory while these jobs run.
 UNFINISHED = {
     "navigate": {CHECKPOINT, ROWS},
     "drift": {UNFINISHED_DRIFT},

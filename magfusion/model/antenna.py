@@ -1,10 +1,10 @@
-"""The measurement model of a three-axis tracker, coil by coil: both antennas' 36 parameters.
+"""Measurement model of a three-axis tracker, coil by coil: all 36 parameters of both antennas.
 
-The same formula as `magfusion.model.field.observe`, whose beacons and magnetometers are given as
-poses, matrices and logarithms; here every coil's moment, sensitivity and centre is a vector with
-its derivative, many antennas are predicted in one call, and the coils may have a size.  A separate
-function, because no fix, smoother or map should pay for the 36 columns that only a calibration
-needs; a test holds the two to the same numbers.
+The same formula as `magfusion.model.field.observe`, whose beacons and magnetometers are poses,
+matrices and logarithms.  Here every coil's moment, sensitivity and centre is a vector with its
+derivative, many antennas are predicted in one call, and coils may have a size.  It is a separate
+function, so that no fix, smoother or map computes the 36 columns that only a calibration needs; a
+test compares the two.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from magfusion.units import Array
 
 MOMENTS, CENTRES = slice(0, 9), slice(9, 18)  # of the transmitting antenna, coil by coil
 SENSITIVITIES, SENSOR_CENTRES = slice(18, 27), slice(27, 36)  # of the receiving one
-KAPPAS = slice(36, 40)  # of the transmitting coils one by one, and of the receiving ones
+KAPPAS = slice(36, 40)  # of each transmitting coil, and of the receiving ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +69,12 @@ class Antenna:
         return np.concatenate(parts, axis=-1)
 
     def at(self, index: int | tuple[int | slice | None, ...]) -> "Antenna":
-        """Return some of many antennas, or the same with other leading axes."""
+        """Return a subset of the antennas, or the same with other leading axes."""
         return antenna_from_vector(self.vector()[index])
 
 
 def antenna_from_vector(vector: Array) -> Antenna:
-    """Return the antenna whose `Antenna.vector` is given, shape (..., 36) or (..., 40)."""
+    """Return the antenna of an `Antenna.vector`, shape (..., 36) or (..., 40)."""
     lead = vector.shape[:-1]
     blocks = [
         vector[..., columns].reshape(*lead, 3, 3)
@@ -85,12 +85,12 @@ def antenna_from_vector(vector: Array) -> Antenna:
 
 
 def antenna_of(beacon: Beacon, magnetometer: Magnetometer) -> Antenna:
-    """Return the antenna that a site declares; without sizes where no coil has one.
+    """Return the declared antenna of a site; without sizes where no coil has one.
 
     Raises
     ------
     InputError
-        Where the beacon has not three coils, each alone in its tone or time slot.
+        Where the beacon does not have three coils, each alone in its tone or time slot.
     """
     if len(beacon.coils) != 3 or len(beacon.tones) != 3:
         raise InputError(
@@ -120,7 +120,7 @@ class Coupling(NamedTuple):
     pose : ndarray, shape (..., 3, 3, 6)
         Right perturbation of beacon_from_sensor: rotation, translation, sensor axes.
     antenna : ndarray, shape (..., 3, 3, 36) or (..., 3, 3, 40)
-        By `Antenna.vector`.
+        With respect to `Antenna.vector`.
     """
 
     value: Array

@@ -1,20 +1,20 @@
-"""Arguments of another type than a function takes, refused where they are given."""
+"""Type checks of function arguments, with errors that name the swapped or wrong one."""
 
 from itertools import permutations
 
 
 def check_arguments(function: str, **arguments: tuple[object, type]) -> None:
-    """Refuse arguments of other types; the function's own parameters are the keywords, in order.
+    """Reject arguments of wrong types; the keywords are the function's parameters, in order.
 
     Parameters
     ----------
     **arguments : (object, type)
-        What was given, and what it must be.
+        The value, and its required type.
 
     Raises
     ------
     TypeError
-        In one sentence, which says so where they were swapped.
+        In one sentence, which reports swapped arguments.
     """
     given = [value for value, _ in arguments.values()]
     wanted = [kind for _, kind in arguments.values()]

@@ -1,8 +1,8 @@
-"""Which beacons are heard where, and what of it is whose where several send on one frequency.
+"""Detectable beacons at a position, and the owner of a phasor on a shared frequency.
 
-A frequency may be used again where the beacons do not hear each other.  A receiver then finds one
-phasor for all of them: it is taken for that of the loudest, and nobody's where another is heard
-beside it.
+A frequency may be reused by beacons that are out of range of each other.  A receiver then measures
+one phasor for all of them.  It is assigned to the strongest beacon, or to none where a second one
+is detectable as well.
 """
 
 from dataclasses import replace
@@ -15,18 +15,18 @@ from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Beacon, Site
 from magfusion.units import MU0_OVER_4PI, Array, BoolArray, IntArray
 
-MANY = 24  # beacons; of more a job asks which are heard at all
-DROWNED = 0.5  # of a beacon's field: what others on its frequency may add to its phasor
-NEAREST = 0.1  # m; within which no field is foreseen
+MANY = 24  # beacons; with more, a job selects the detectable ones
+DROWNED = 0.5  # of a beacon's field: largest contribution of others on its frequency to its phasor
+NEAREST = 0.1  # m; smallest distance for a predicted field
 
 
 class Tones(NamedTuple):
-    """The frequencies that are sent, each once.
+    """Distinct transmitted frequencies.
 
     Parameters
     ----------
     frequencies_hz : ndarray, shape (tones,)
-        In the order in which channels name them.
+        In the order of the channels.
     of_channel : int ndarray, shape (channels of a magnetometer,)
     """
 
@@ -35,22 +35,22 @@ class Tones(NamedTuple):
 
     @property
     def reused(self) -> bool:
-        """Whether any is sent by several beacons."""
+        """Whether any is shared by several beacons."""
         return len(self.frequencies_hz) < len(self.of_channel)
 
 
 def are_many(site: Site) -> bool:
-    """Return whether a site has so many beacons that those alone are calculated that are heard.
+    """Return whether a site has so many beacons that only detectable ones are computed.
 
-    Of several magnetometers all are calculated at every epoch.
+    With several magnetometers all are computed at every epoch.
     """
     return len(site.beacons) > MANY and not site.platform.further
 
 
 def tones_of(site: Site) -> Tones:
-    """Return the tones of a site; those of time slots are told apart by when they are sent.
+    """Return the tones of a site; those of time slots are distinguished by their slots.
 
-    A beacon that is only planned will have frequencies of its own.
+    A planned beacon is assumed to have its own frequencies.
     """
     alone = any(slot is not None for beacon in site.beacons for _, slot in beacon.tones)
     planned = tuple(k if b.planned else -1 for k, b in enumerate(site.beacons) for _ in b.tones)
@@ -74,19 +74,19 @@ def _tones(hz: tuple[float, ...], planned: tuple[int, ...], *, alone: bool) -> T
 
 
 def phasor_sigma(site: Site, window: float) -> float:
-    """Return the noise of a phasor's component in a window (s), as declared (T)."""
+    """Return the declared noise of a phasor's component in a window (s) (T)."""
     return float(site.platform.magnetometer.noise_density / np.sqrt(window))
 
 
 def largest_fields(site: Site, sensor_world: Array, margin: Array | float = 0.0) -> Array:
-    """Return what each phasor of a magnetometer does not exceed, shape (n, channels) (T).
+    """Return the upper limit of each phasor of a magnetometer, shape (n, channels) (T).
 
     Parameters
     ----------
     sensor_world : ndarray, shape (n, 3)
         (m)
     margin : ndarray, shape (n, 1), or float
-        How much nearer the beacons may be (m); negative for farther.
+        Reduction of the distance to the beacons (m); negative for an increase.
     """
     places = np.array([beacon.position_world for beacon in site.beacons])
     owner = [i for i, beacon in enumerate(site.beacons) for _ in beacon.tones]
@@ -97,21 +97,21 @@ def largest_fields(site: Site, sensor_world: Array, margin: Array | float = 0.0)
 
 
 def unheard_by_each_other(a: Beacon, b: Beacon, sigma: float) -> bool:
-    """Return whether neither of two beacons is heard where the other stands, above a noise (T)."""
+    """Return whether each of two beacons is below the noise (T) at the other's position."""
     distance = float(np.linalg.norm(a.position_world - b.position_world))
     moment = max(float(np.max(beacon.tone_moments)) for beacon in (a, b))
     return 2.0 * MU0_OVER_4PI * moment / max(distance, NEAREST) ** 3 < sigma
 
 
 class Owned(NamedTuple):
-    """Whose the phasors of a tone are.
+    """Owners of the phasors of each tone.
 
     Parameters
     ----------
     channels : bool ndarray, shape (n, channels)
-        Of the loudest on its frequency, where it drowns the others.
+        Channels of the strongest beacon on each frequency, if it dominates the others.
     others : ndarray, shape (n, channels)
-        What the others on the frequency do to its phasor at most (T).
+        Largest contribution of the others on the frequency to its phasor (T).
     """
 
     channels: BoolArray
@@ -121,17 +121,17 @@ class Owned(NamedTuple):
 def owned_at(
     site: Site, sensor_world: Array, margin: Array | float = 0.0, unknown: Array | float = 1.0
 ) -> Owned:
-    """Return whose the phasors of a magnetometer are where it is.
+    """Return the owners of the phasors of a magnetometer at its positions.
 
     Parameters
     ----------
     sensor_world : ndarray, shape (n, 3)
         (m)
     margin : ndarray, shape (n, 1), or float
-        By how much those places may be wrong (m).
+        Error of the positions (m).
     unknown : ndarray, shape (n, channels), or float
-        Share of each one's field that is not foreseen, where what is foreseen was taken off; those
-        that are not heard at the end.
+        Share of each beacon's field that is not predicted, after a prediction has been
+        subtracted; undetected beacons last.
     """
     count = len(site.tone_frequencies_hz)
     site = replace(site, beacons=(*site.beacons, *(b for _, b in site.unheard)), unheard=())
@@ -142,13 +142,13 @@ def owned_at(
     shared = np.sum(of_tone, axis=0)[tones.of_channel] > 1.0
     beside = np.where(shared, (near @ of_tone)[:, tones.of_channel] - near, 0.0)
     others = np.where(shared, (missed @ of_tone)[:, tones.of_channel] - missed, 0.0)
-    # A coil's field is half as strong across its axis as along it.
+    # The field of a coil is half as strong in its equatorial plane as on its axis.
     channels = beside <= DROWNED * 0.5 * far
     return Owned(channels[:, :count], others[:, :count])
 
 
 def only_owned(samples: FieldSamples, owned: Owned) -> FieldSamples:
-    """Return phasors with those missing that are not of one beacon."""
+    """Set phasors to missing that do not belong to one beacon."""
     added = np.where(owned.channels, owned.others, 0.0) ** 2 / 3.0
     return replace(
         samples,

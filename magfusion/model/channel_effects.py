@@ -1,7 +1,6 @@
-"""What is known of each channel beside moments and phases: temperature, current, response.
+"""Effects on a channel besides moment and phase: temperature, current, frequency response.
 
-A channel is a tone of a beacon; what is said here is the same for the three components of its
-phasor.
+A channel is a tone of a beacon; the effects are equal for the three components of its phasor.
 """
 
 import numpy as np
@@ -12,12 +11,12 @@ from magfusion.units import Array, ComplexArray
 
 
 def are_driven(site: Site) -> bool:
-    """Return whether anything is known of the currents of a site's beacons."""
+    """Return whether currents of a site's beacons were recorded."""
     return site.drives is not None and bool(site.drives.readings)
 
 
 def driven(site: Site, time: Array) -> tuple[Array, Array] | None:
-    """Return what recorded currents do to channels.
+    """Return the effect of recorded currents on channels.
 
     Parameters
     ----------
@@ -27,8 +26,8 @@ def driven(site: Site, time: Array) -> tuple[Array, Array] | None:
     Returns
     -------
     tuple of ndarray, or None, each of shape (..., channels)
-        By how much they raise the logarithms of amplitudes, and by which phases they are ahead of
-        those declared (rad); None where no current was recorded.
+        Increase of the logarithms of amplitudes, and phase lead against those declared (rad);
+        None where no current was recorded.
     """
     if not are_driven(site):
         return None
@@ -40,10 +39,10 @@ def driven(site: Site, time: Array) -> tuple[Array, Array] | None:
 
 
 def responded(site: Site) -> tuple[Array, Array] | None:
-    """Return how the magnetometers answer to each channel's frequency: log-gain and phase (rad).
+    """Return the response of the magnetometers at each channel: log-gain and phase (rad).
 
-    Each of shape (channels,); None where all are measured as they are.  Of axes that answer each in
-    its own way, see `axis_factors`.
+    Each of shape (channels,); None if all have a unit response.  For axes with different
+    responses, see `axis_factors`.
     """
     sensors = site.platform.magnetometers
     alike = [s.response if isinstance(s.response, FrequencyResponse) else None for s in sensors]
@@ -59,9 +58,9 @@ def responded(site: Site) -> tuple[Array, Array] | None:
 
 
 def axis_factors(site: Site) -> ComplexArray | None:
-    """Return what each axis measures of a channel's field beyond `responded`, (channels, 3).
+    """Return the response of each axis at each channel relative to `responded`, (channels, 3).
 
-    None where no magnetometer has axes that answer each in its own way.
+    None if no magnetometer has axes with different responses.
     """
     sensors = site.platform.magnetometers
     if not site.beacons or not any(isinstance(s.response, AxisResponses) for s in sensors):
@@ -77,13 +76,13 @@ def axis_factors(site: Site) -> ComplexArray | None:
 
 
 def of_all_sensors(site: Site, by_tone: Array) -> Array:
-    """Return what is of the channels (...) of any magnetometer for all of them."""
+    """Repeat a quantity of the channels (...) of one magnetometer for all of them."""
     count = len(site.platform.magnetometers)
     return by_tone if count == 1 else np.concatenate([by_tone] * count, axis=-1)
 
 
 def warmed(site: Site, time: Array) -> Array | None:
-    """Return by how much temperature raises the logarithm of each channel's moments.
+    """Return the increase of the logarithm of each channel's moments by temperature.
 
     Parameters
     ----------
@@ -93,7 +92,7 @@ def warmed(site: Site, time: Array) -> Array | None:
     Returns
     -------
     ndarray or None, shape (..., channels)
-        None where nothing is declared of it, or nothing measured.
+        None where no coefficient is declared, or no temperature measured.
     """
     known = site.temperatures
     if known is None or all(beacon.warming is None for beacon in site.beacons):

@@ -1,12 +1,12 @@
-"""The fields of a beacon's coils as they are declared: dipoles, loops, current sheets.
+"""Fields of a beacon's coils by their declared form: dipoles, loops, current sheets.
 
-A coil without a size is a dipole.  One with a radius is a thin loop, one with a length as well a
-uniform current sheet, one with a length alone a line of dipoles: those with a
-length are as many loops, or dipoles, as Gauss and Legendre's rule has nodes.  The relative error
-is below 1e-9 from half a length off the axis, and below 1e-6 from three tenths of it.
+A coil without a size is a dipole.  A coil with a radius is a thin loop, with a length as well a
+uniform current sheet, with a length alone a line of dipoles.  A length is represented by as many
+loops, or dipoles, as the Gauss-Legendre rule has nodes.  The relative error is below 1e-9 from half
+a length off the axis, and below 1e-6 from three tenths of it.
 
-In conducting ground or water each of these keeps its field and gains what conduction adds to that
-of a dipole in its place: to first order in size over distance, and that of a small part.
+In conducting ground or water the effect of conduction on a dipole in its place is added to each of
+these: to first order in size over distance, and of the effect itself.
 """
 
 from dataclasses import replace
@@ -35,7 +35,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 
 class Loops(NamedTuple):
-    """What stands for the coils of a beacon, or of several: with an axis of them, and of one."""
+    """Loops that represent the coils of a beacon, or of several with an axis of beacons."""
 
     centre: Array  # (..., loops, 3), beacon axes (m)
     moment: Array  # (..., loops, 3), beacon axes (A m^2)
@@ -44,7 +44,7 @@ class Loops(NamedTuple):
 
 
 class Sources(NamedTuple):
-    """A beacon, or several of one form side by side, as arrays that broadcast against points.
+    """Beacon, or several of one form, as arrays that broadcast against points.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class Sources(NamedTuple):
     field_map : FieldMap, optional
         Of one beacon.
     decay : complex ndarray, shape (loops,) or (beacons, 1, loops), optional
-        Of each loop's field in conducting ground (1/m); None where nothing conducts.
+        Of each loop's field in conducting ground (1/m); None without conduction.
     """
 
     position_world: Array
@@ -71,14 +71,14 @@ class Sources(NamedTuple):
     decay: ComplexArray | None = None
 
 
-# As long as beacon and site live: an estimator makes others at every step.
+# Cached as long as beacon and site live: an estimator creates others at every step.
 _ALONE: WeakKeyDictionary[Beacon, Sources] = WeakKeyDictionary()
 _BESIDE: WeakKeyDictionary[Site, "Groups"] = WeakKeyDictionary()
 Groups = tuple[tuple[tuple[int, ...], Sources], ...]
 
 
 def alone(beacon: Beacon) -> Sources:
-    """Return a beacon as the source that it is."""
+    """Return the source of one beacon, cached."""
     known = _ALONE.get(beacon)
     if known is None:
         known = _ALONE[beacon] = _source(beacon)
@@ -105,14 +105,14 @@ def _decay(beacon: Beacon) -> ComplexArray:
 
 
 def side_by_side(site: Site) -> Groups:
-    """Return a site's beacons as few sources: those of one form together, one with a map alone.
+    """Return a site's beacons in few sources: those of one form together, one with a map alone.
 
-    A field is evaluated of several at once at the cost of one where the points are few.
+    With few points, the field of several beacons costs as much as that of one.
 
     Returns
     -------
     tuple
-        Of the numbers of beacons, and their source.
+        Indices of beacons, and their source.
     """
     known = _BESIDE.get(site)
     if known is None:
@@ -121,9 +121,9 @@ def side_by_side(site: Site) -> Groups:
 
 
 def keep_sources(site: Site, other: Site) -> None:
-    """Let a site have the sources of one that differs in sizes of moments alone, if known."""
+    """Reuse the sources of a site for one that differs in the size of moments only, if cached."""
     known = _BESIDE.get(site)
-    # The places of the loops that stand for a long coil hang on its moment's direction.
+    # The loops of a long coil depend on the direction of its moment.
     if known is None or any(c.length is not None for b in other.beacons for c in b.coils):
         return
     _BESIDE[other] = tuple(
@@ -169,12 +169,12 @@ def _stacked(sources: list[Sources]) -> Sources:
 
 
 def is_sized(beacon: Beacon) -> bool:
-    """Tell whether a coil of the beacon is declared with a size."""
+    """Return whether a coil of the beacon is declared with a size."""
     return any(coil.radius is not None or coil.length is not None for coil in beacon.coils)
 
 
 def as_points(beacon: Beacon) -> Beacon:
-    """Return the beacon with a dipole in place of each coil."""
+    """Return the beacon with each coil replaced by a dipole."""
     points = tuple(replace(coil, radius=None, length=None) for coil in beacon.coils)
     return replace(beacon, coils=points)
 
@@ -235,7 +235,7 @@ def coil_fields_by_log_conductivity(source: Sources, offset_beacon: Array) -> Co
     Returns
     -------
     complex ndarray, shape (..., coils, 3)
-        Beacon axes (T); None where nothing conducts.
+        Beacon axes (T); None without conduction.
     """
     if source.decay is None:
         return None
@@ -284,14 +284,14 @@ def coil_fields_and_gradients(source: Sources, offset_beacon: Array) -> tuple[An
 
 
 class Driven(NamedTuple):
-    """The field of coils that carry known currents.
+    """Field of coils with known currents.
 
     Parameters
     ----------
     field : ndarray, shape (n, 3)
         (T)
     along : ndarray, shape (n, 3), optional
-        Its derivative along a displacement (T a unit of it).
+        Its derivative along a displacement (T per unit of it).
     """
 
     field: Array
@@ -301,7 +301,7 @@ class Driven(NamedTuple):
 def driven_dipoles(
     source: Sources, offset_beacon: Array, current: Array, along_beacon: Array | None
 ) -> Driven:
-    """Return the field of coils without a size: of those at one place that of one moment.
+    """Return the field of coils without a size; concentric ones are summed to one moment.
 
     Parameters
     ----------
@@ -331,5 +331,5 @@ def driven_dipoles(
 
 
 def _of_matrices(of_points: Array) -> Array:
-    """Return the array of each beacon's coils without the axis that is for its points."""
+    """Return the array of each beacon's coils without the axis of its points."""
     return of_points[..., 0, :, :] if of_points.ndim > 2 else of_points

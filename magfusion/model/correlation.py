@@ -1,7 +1,7 @@
-"""How the errors of calibrated parameters go together.
+"""Correlations between the errors of calibrated parameters.
 
-A log tells where beacons stand to each other far better than where all of them stand: each sigma is
-then of centimetres and their differences are known to a millimetre.  Sigmas alone would forget it.
+A log determines the relative positions of beacons far better than their absolute positions: each
+sigma is then centimetres, and their differences are known to a millimetre.  Sigmas alone lose that.
 """
 
 from collections.abc import Callable, Iterable
@@ -24,21 +24,21 @@ class Component(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Correlation:
-    """Correlation coefficients of the errors that a site's sigmas stand for.
+    """Correlation coefficients of the errors behind a site's sigmas.
 
     Parameters
     ----------
     parameters : tuple of Component
         All others are independent.
     coefficients : ndarray, shape (n, n)
-        With ones on the diagonal.
+        With unit diagonal.
     """
 
     parameters: tuple[Component, ...]
     coefficients: Array
 
     def kept(self, wanted: Callable[[Component], bool]) -> "Correlation | None":
-        """Return the part between some parameters; None where none is left."""
+        """Return the part between some parameters; None if it is empty."""
         rows = [i for i, parameter in enumerate(self.parameters) if wanted(parameter)]
         if not rows:
             return None
@@ -46,12 +46,12 @@ class Correlation:
         return Correlation(names, self.coefficients[np.ix_(rows, rows)])
 
     def without(self, groups: tuple[str, ...], owners: Iterable[str]) -> "Correlation | None":
-        """Return the part without some groups of some owners, which were found anew, apart."""
+        """Return the part without re-estimated groups of some owners."""
         gone = set(owners)
         return self.kept(lambda p: p.group not in groups or p.owner not in gone)
 
     def among(self, parameters: list[Component]) -> Array:
-        """Return the coefficients between given parameters, those of strangers zero, (k, k)."""
+        """Return the coefficients between given parameters, zero for unknown ones, (k, k)."""
         index = {parameter: i for i, parameter in enumerate(self.parameters)}
         mine = [j for j, parameter in enumerate(parameters) if parameter in index]
         theirs = [index[parameters[j]] for j in mine]
@@ -61,7 +61,7 @@ class Correlation:
 
 
 def joined(parts: list[Correlation | None]) -> Correlation | None:
-    """Return several correlations as one; between them there is none."""
+    """Join correlations that are mutually independent."""
     some = [part for part in parts if part is not None]
     if not some:
         return None

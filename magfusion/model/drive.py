@@ -1,9 +1,9 @@
-"""Drive currents of coils as they were recorded, beside those for which moments are declared.
+"""Recorded drive currents of coils, relative to those for which moments are declared.
 
-A reading is a complex share: of a window, or of a time slot, the phasor of the current through the
-coils of a tone over the phasor of the current that the site declares.  In between amplitude and
-phase are linear, and so they go on for one interval beyond the last reading, before they are held:
-a running estimator asks for the time that the next reading will be of.
+A reading is a complex ratio: of a window, or of a time slot, the phasor of the current through the
+coils of a tone over the phasor of the declared current.  Amplitude and phase are linear between
+readings and are extrapolated by one interval beyond the last, then constant: a running estimator
+needs them at the time of the next reading.
 """
 
 from collections.abc import Mapping
@@ -14,53 +14,53 @@ import numpy as np
 from magfusion.units import Array, BoolArray, ComplexArray
 
 REMEMBERED = 1000  # readings of each channel that a running estimator keeps
-LEAST_SHARE = 1e-6  # a drive that is off; its logarithm is to be finite
+LEAST_SHARE = 1e-6  # of a drive that is off, to keep its logarithm finite
 LEAST_ON = 0.05  # of the declared current; below, the drive is off and has no phase
 
 
 @dataclass(frozen=True, eq=False)
 class DriveSamples:
-    """Currents as they were sampled.
+    """Sampled currents.
 
     Parameters
     ----------
     time : ndarray, shape (n,)
         Seconds since the log's epoch, strictly increasing.
     current : mapping of str to ndarray, shape (n,)
-        Of each beacon, by its name (A); ``""`` is of all that have none of their own.
+        Current of each beacon, by its name (A); ``""`` for all that have none of their own.
     """
 
     time: Array
     current: Mapping[str, Array]
 
     def rows(self, kept: slice | BoolArray) -> "DriveSamples":
-        """Return some samples."""
+        """Return a subset of the samples."""
         own = {name: values[kept] for name, values in self.current.items()}
         return DriveSamples(self.time[kept], own)
 
 
 class DriveShares:
-    """Readings of several channels, whole or as they come.
+    """Readings of several channels, complete or streamed.
 
     Parameters
     ----------
     readings : mapping, optional
-        By channel, as of `key`, shape (3, n): times, increasing (s), logarithms of the shares'
-        sizes, and their angles, without jumps (rad).
+        By channel, as of `key`, shape (3, n): times, increasing (s), logarithms of the ratios'
+        magnitudes, and their angles, unwrapped (rad).
     """
 
-    readings: dict[str, Array]  # what a checkpoint holds
+    readings: dict[str, Array]  # part of a checkpoint
 
     def __init__(self, readings: Mapping[str, Array] | None = None) -> None:
         self.readings = {} if readings is None else dict(readings)
 
     @staticmethod
     def key(beacon: str, tone: int) -> str:
-        """Return what a channel's readings stand under."""
+        """Return the key of a channel's readings."""
         return f"{tone} {beacon}"
 
     def hear(self, beacon: str, tone: int, time: Array, share: ComplexArray) -> None:
-        """Take readings of a channel, in order of time, later than those known."""
+        """Add readings of a channel, in order of time, later than the stored ones."""
         key = self.key(beacon, tone)
         known = self.readings.get(key, np.zeros((3, 0)))
         angle = np.angle(share)
@@ -72,13 +72,13 @@ class DriveShares:
         self.readings[key] = np.concatenate([known, [time, size, angle]], axis=1)
 
     def forget(self) -> None:
-        """Keep no more than what a running estimator needs."""
+        """Discard readings that a running estimator no longer needs."""
         self.readings = {key: known[:, -REMEMBERED:] for key, known in self.readings.items()}
 
     def at(self, beacon: str, tone: int, time: Array) -> tuple[Array, Array] | None:
-        """Return log-sizes and angles (rad) of a channel, of the shape of the times (s).
+        """Return log-magnitudes and angles (rad) of a channel, of the shape of the times (s).
 
-        None where nothing is known of it.
+        None without readings of it.
         """
         known = self.readings.get(self.key(beacon, tone))
         if known is None:
@@ -88,7 +88,7 @@ class DriveShares:
 
 
 def _gone_on(known: Array) -> Array:
-    """Return readings with the one that would follow, where the drive was on."""
+    """Return readings with one extrapolated reading, where the drive was on."""
     if known.shape[1] < 2 or np.min(known[1, -2:]) < np.log(LEAST_ON):
         return known
     return np.column_stack([known, 2.0 * known[:, -1] - known[:, -2]])

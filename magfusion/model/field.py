@@ -1,4 +1,4 @@
-"""The one measurement model: what a magnetometer sees of a beacon, and how that changes.
+"""The measurement model: the phasors of a beacon at a magnetometer, and their Jacobian.
 
 Every solver predicts through `observe`; the simulator does not.
 """
@@ -28,7 +28,7 @@ from magfusion.model.receive_coils import (
 from magfusion.model.site import Beacon, Magnetometer
 from magfusion.units import AnyArray, Array, ComplexArray
 
-_ALIKE = np.eye(3)  # of components whose errors are alike and apart
+_ALIKE = np.eye(3)  # covariance shape of components with equal, independent errors
 
 
 def _source(beacon: Beacon | Sources) -> Sources:
@@ -43,22 +43,20 @@ def _offset_beacon(
 
 
 def _turned(excitation: ComplexArray, phase: Array | None) -> ComplexArray:
-    """Excitation with the drive phase applied, shape (..., coils, tones)."""
+    """Return the excitation with the drive phase applied, shape (..., coils, tones)."""
     return excitation if phase is None else excitation * np.exp(1j * phase)[..., None, :]
 
 
 class _Mapped(NamedTuple):
-    """What a field map makes of the model, beacon axes."""
+    """Effect of a field map on the model, beacon axes."""
 
     model_beacon: AnyArray  # (..., coils, 3), field of each coil without the map
     correction: Array  # (..., 1, 3, 3), multiplies it
-    slope: (
-        AnyArray  # (..., coils, 3, 3), what the map's change along each axis adds to the gradient
-    )
+    slope: AnyArray  # (..., coils, 3, 3), contribution of the map's gradient to the field gradient
 
 
 def _mapped(source: Sources, offset_beacon: Array, model_beacon: AnyArray) -> _Mapped | None:
-    """Evaluate the beacon's map at the sensor; None where it has none."""
+    """Evaluate the beacon's map at the sensor; None without a map."""
     if source.field_map is None:
         return None
     world_from_beacon = source.world_from_beacon
@@ -116,14 +114,14 @@ def observe(
         Y = S sensor_from_body body_from_world C world_from_beacon [B_j(r_j)]_j X
             diag(exp(i phase))
 
-    B_j is the field of a coil as it is declared (`magfusion.model.coil_field`), and C the
-    beacon's field map at the sensor, the identity where it has none.
+    B_j is the field of a coil by its declared form (`magfusion.model.coil_field`), and C the
+    beacon's field map at the sensor, the identity without a map.
 
     Parameters
     ----------
     beacon : Beacon or Sources
-        Coils with their moments, centres, and complex drive in each tone; of several beacons of
-        `magfusion.model.coil_field.side_by_side`, what is returned has an axis of them in front.
+        Coils with their moments, centres, and complex drive in each tone; for several beacons of
+        `magfusion.model.coil_field.side_by_side`, results have a leading axis of them.
     magnetometer : Magnetometer
         Matrix, mounting and lever arm.
     world_from_body : ndarray, shape (..., 3, 3)
@@ -156,7 +154,7 @@ def observe(
     by_body = platform_pose[..., 3:]
     by_beacon_offset = by_body @ seen.body_from_beacon[..., None, :, :]
     turned = measured_from_beacon @ skew(field_beacon)
-    if seen.mapped is not None:  # the map stays where it is when the beacon moves
+    if seen.mapped is not None:  # the map does not move with the beacon
         flat = seen.mapped.slope.reshape(*seen.mapped.slope.shape[:-2], 9)
         slope = (seen.tones_from_coils @ flat).reshape(*field_beacon.shape, 3)
         by_beacon_offset = by_beacon_offset - measured_from_beacon @ slope
@@ -204,7 +202,7 @@ def observe_from(
 
 
 class _Seen(NamedTuple):
-    """What the blocks of an observation have in common."""
+    """Quantities shared by the blocks of an observation."""
 
     phasor_sensor: ComplexArray
     platform_pose: ComplexArray
@@ -216,7 +214,7 @@ class _Seen(NamedTuple):
 
 
 def _times(left: AnyArray, right: Array) -> AnyArray:
-    """Return ``left @ right`` of many and one, or one a beacon: few products beat many small."""
+    """Return ``left @ right`` for stacks with few matrix products instead of many small ones."""
     if right.ndim == 2:
         return (left.reshape(-1, 3) @ right).reshape(left.shape)
     return (left.reshape(-1, 3) @ right).reshape(len(right), *left.shape)
@@ -236,13 +234,13 @@ def _seen(
     beacon_from_body = np.swapaxes(body_from_beacon, -1, -2)
     body_from_sensor = magnetometer.body_from_sensor @ magnetometer.matrix.T  # not a rotation
     measured_from_beacon = np.swapaxes(_times(beacon_from_body, body_from_sensor), -1, -2)
-    # Coil by coil all is real where nothing conducts; only their sum in a tone is complex.
+    # Each coil's field is real without conduction; only their sum in a tone is complex.
     mapped = _mapped(source, offset_beacon, coils)
     if mapped is not None:
         coils = (mapped.correction @ coils[..., None])[..., 0]
         gradients = mapped.correction @ gradients + mapped.slope
     in_body = coils @ beacon_from_body
-    # All coils at once: one product of a pose where there would be many.
+    # All coils at once: one product per pose instead of many.
     flat = gradients.reshape(*gradients.shape[:-3], -1, 3) @ beacon_from_body
     by_body = measured_from_beacon[..., None, :, :] @ flat.reshape(gradients.shape)
     turning = -np.swapaxes(_times(skew(in_body), body_from_sensor), -1, -2)
@@ -268,7 +266,7 @@ def driven_field(
     current: AnyArray,
     along_world: Array | None = None,
 ) -> Driven:
-    """Return the field of a beacon at points, its coils' currents given, world axes.
+    """Return the field of a beacon at points for given coil currents, world axes.
 
     Parameters
     ----------
@@ -277,8 +275,8 @@ def driven_field(
     position_world : ndarray, shape (n, 3)
         (m)
     current : ndarray, shape (n, coils) or (beacons, n, coils)
-        Of each coil, as a share of its peak; complex, and turning with time, where the ground
-        conducts: what is returned is then the real part.
+        Of each coil, as a share of its peak; complex and rotating with time in conducting
+        ground: the result is then the real part.
     along_world : ndarray, shape (n, 3), optional
         A displacement of the points, or their velocity.
     """
@@ -310,7 +308,7 @@ def _driven_coils(source: Sources, offset: Array, current: AnyArray, along: Arra
 
 
 class EarthObservation(NamedTuple):
-    """Predicted steady field with its Jacobian blocks, by what is on the other side of each.
+    """Predicted steady field with its Jacobian blocks, named by the variable of each.
 
     Parameters
     ----------
@@ -325,7 +323,7 @@ class EarthObservation(NamedTuple):
     offset : ndarray, shape (..., 3, 3)
         Of the magnetometer.
     earth_world : ndarray, shape (..., 3, 3)
-        The field itself, world axes.
+        Steady field, world axes.
     """
 
     measured_sensor: Array
@@ -339,7 +337,7 @@ class EarthObservation(NamedTuple):
 def observe_earth(
     magnetometer: Magnetometer, world_from_body: Array, earth_field_world: Array
 ) -> EarthObservation:
-    """Predict the steady part of what a magnetometer reads, with the Jacobian in the same call.
+    """Predict the steady field measured by a magnetometer, with the Jacobian in the same call.
 
     ::
 
@@ -374,10 +372,10 @@ def predict_earth(
 
 
 def model_error_cov(phasor_sensor: ComplexArray, model_error: float | Array) -> Array:
-    """Return the variance that an inexact field model adds to each component of a phasor.
+    """Return the variance that a field-model error adds to each component of a phasor.
 
-    ``eps^2 |b|^2 / 3``, with ``|b|^2`` the mean square of the two quadratures: plain white-noise
-    weights let the nearest beacon's model error swamp everything else (paper 004 re-examined).
+    ``eps^2 |b|^2 / 3``, with ``|b|^2`` the mean square of the two quadratures: with weights for
+    white noise alone the nearest beacon's model error dominates (paper 004 re-examined).
 
     Parameters
     ----------

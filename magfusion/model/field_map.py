@@ -1,8 +1,8 @@
-"""What the field of one beacon is, relative to its model, over the places where it was surveyed.
+"""Field of one beacon relative to its model, over the surveyed positions.
 
 ``field = exp(g) (model + w x model)``: a Gaussian process of the logarithm g of the gain and of a
-small rotation w, functions of the sensor's position.  `magfusion.calibration.fieldmap` learns it;
-`magfusion.model.field.observe` applies it.
+small rotation w, functions of the sensor's position.  `magfusion.calibration.fieldmap` estimates
+it; `magfusion.model.field.observe` applies it.
 """
 
 from dataclasses import dataclass
@@ -27,14 +27,14 @@ class FieldMap:
     weights : ndarray, shape (m, 4)
         The mean at x is ``sigma^2 sum_j rho(x, x_j) weights_j``.
     information : ndarray, shape (m, 4, 4)
-        What the survey knew at each point of gain and rotation.
+        Information of the survey on gain and rotation at each point.
     length_scale : float
         (m)
     gain_sigma, rotation_sigma : float
-        Of the process, where nothing was surveyed; the latter in rad.
+        Of the process, far from surveyed points; the latter in rad.
     residual : float
-        Relative error of the field that no smooth map explains, one sigma; it takes the place of
-        the site's ``model_error``.
+        Relative error of the field not explained by a smooth map, one sigma; it replaces the
+        site's ``model_error``.
     """
 
     points_world: Array
@@ -64,7 +64,7 @@ class FieldMap:
         return np.median(self.variance(self.points_world), axis=0)
 
     def mean(self, position_world: Array) -> tuple[Array, Array]:
-        """Return the map with its gradient.
+        """Return the map and its gradient.
 
         Parameters
         ----------
@@ -76,7 +76,7 @@ class FieldMap:
         value : ndarray, shape (..., 4)
             Log-gain and rotation (rad, world axes).
         gradient : ndarray, shape (..., 4, 3)
-            By the position, world axes (1/m).
+            With respect to the position, world axes (1/m).
         """
         flat = position_world.reshape(-1, 3)
         value, gradient = np.empty((len(flat), 4)), np.empty((len(flat), 4, 3))
@@ -113,14 +113,14 @@ class FieldMap:
         Parameters
         ----------
         position_world : ndarray, shape (n, 3), optional
-            Of the sensor (m); where it is not known yet, a typical place of the survey is meant.
+            Of the sensor (m); None for a typical surveyed position.
 
         Returns
         -------
         ndarray, shape (n,) or ()
         """
         known = self.typical_variance if position_world is None else self.variance(position_world)
-        # A rotation moves the field by the two of its components that are across.
+        # A rotation changes the field by its two components across the field.
         return self.residual**2 + known[..., 0] + 2.0 * known[..., 1]
 
 
@@ -137,7 +137,7 @@ def process_covariance(points_world: Array, length_scale: float, sigma: Array) -
 
 
 def block_diagonal(blocks: Array) -> Array:
-    """Return matrices of shape (..., k, m, m) as one, shape (..., k m, k m)."""
+    """Return block-diagonal matrices of blocks (..., k, m, m), shape (..., k m, k m)."""
     count, size = blocks.shape[-3:-1]
     out = np.zeros((*blocks.shape[:-3], count, size, count, size))
     for i in range(count):

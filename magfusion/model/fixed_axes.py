@@ -1,4 +1,4 @@
-"""Covariances of poses about axes that do not move with the body, as robots exchange them."""
+"""Pose covariances in world axes, as robots exchange them."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ from magfusion.units import Array
 
 
 def fixed_axes_covariance(world_from_body: Array, pose_cov: Array) -> Array:
-    """Return covariances as ROS and MAVLink mean them: position, then rotation, in world axes.
+    """Return covariances by the ROS and MAVLink convention: position, rotation, world axes.
 
-    Ours is of a small motion on the right: rotation, then translation, both in body axes.  That of
-    ``geometry_msgs/PoseWithCovariance`` is of x, y, z and of rotations about the X, Y and Z axes of
-    the header's frame, which do not move the position.  To first order both parts are turned into
+    Here, a covariance is of a right perturbation: rotation, then translation, both in body axes.
+    That of ``geometry_msgs/PoseWithCovariance`` is of x, y, z and of rotations about the X, Y and Z
+    axes of the header's frame, which do not move the position.  To first order both parts rotate to
     the world: ``d_position_world = R d_position_body`` and ``R exp(d) = exp(R d) R``.
 
     Parameters

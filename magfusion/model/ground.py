@@ -1,4 +1,4 @@
-"""Ground or water that conducts, about all the beacons of a site."""
+"""Conducting ground or water around all beacons of a site."""
 
 from dataclasses import replace
 
@@ -9,28 +9,28 @@ from magfusion.model.physics.conduction import skin_depth
 from magfusion.model.site import Beacon, Site
 from magfusion.units import MU0_OVER_4PI, Array, ComplexArray
 
-# Beyond so many skin depths hardly a hundredth of the field is left, and what is left says more of
-# the ground than of the place.
+# Beyond so many skin depths about a hundredth of the field remains, which depends more on the
+# ground than on the position.
 DEEPEST = 5.0
 
-_NEARER = 3.0  # e-folds of range that conduction may take off
+_NEARER = 3.0  # e-folds by which conduction may reduce the range
 _HALVINGS = 24
 _TINY = 1e-300
 
 
 def conductivity_of(site: Site) -> float:
-    """Return the conductivity that the beacons of a site are in (S/m); zero without any."""
+    """Return the conductivity around the beacons of a site (S/m); zero for none."""
     return site.beacons[0].conductivity if site.beacons else 0.0
 
 
 def in_ground(site: Site, conductivity: float) -> Site:
-    """Return a site in ground or water of a conductivity (S/m)."""
+    """Return a site with a conductivity of its ground or water (S/m)."""
     beacons = tuple(replace(b, conductivity=conductivity) for b in site.beacons)
     return replace(site, beacons=beacons)
 
 
 def skin_depths(beacon: Beacon, distance: Array) -> Array:
-    """Return how many skin depths of a beacon's highest tone some distances (m) are."""
+    """Return distances (m) in skin depths of a beacon's highest tone."""
     frequency = float(beacon.tone_frequencies_hz.max())
     return np.asarray(distance / skin_depth(frequency, beacon.conductivity))
 
@@ -46,7 +46,7 @@ def ground_error(site: Site, distance: Array) -> Array:
     Returns
     -------
     ndarray, shape (n, beacons)
-        Of the field in the plane of the dipole's equator.
+        Of the field in the dipole's equatorial plane.
     """
     depths = [skin_depths(b, distance[:, k]) for k, b in enumerate(site.beacons)]
     x = (1.0 + 1.0j) * np.minimum(np.stack(depths, axis=1), 2.0 * DEEPEST)
@@ -54,7 +54,7 @@ def ground_error(site: Site, distance: Array) -> Array:
 
 
 def range_of_strength(beacon: Beacon, phasor: ComplexArray, direction_beacon: Array) -> Array:
-    """Return how far along each direction a beacon's field is as strong as its phasors.
+    """Return the range in each direction at which a beacon's field is as strong as its phasors.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def range_of_strength(beacon: Beacon, phasor: ComplexArray, direction_beacon: Ar
     total = np.sum(np.abs(phasor) ** 2, axis=(1, 2))[:, None] + _TINY
     drive = beacon.moments_beacon.T @ beacon.excitation  # (3, tones)
     loudest = 2.0 * MU0_OVER_4PI * np.sqrt(np.sum(np.abs(drive) ** 2))
-    # Conduction makes the field nowhere stronger than the dipole's at its poles.
+    # With conduction the field is nowhere stronger than that of the dipole at its poles.
     far = np.log(np.cbrt(loudest / np.sqrt(total))) + np.zeros(len(direction_beacon))
     near, source = far - _NEARER, alone(beacon)
     for _ in range(_HALVINGS):

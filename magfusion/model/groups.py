@@ -1,4 +1,4 @@
-"""Names of the calibration groups of `magfusion.model.parameters`, for who only names them."""
+"""Names of the calibration groups of `magfusion.model.parameters`, without their classes."""
 
 GROUPS = (
     "beacons",

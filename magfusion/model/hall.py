@@ -1,4 +1,4 @@
-"""A hall: where its walls are, where beacons may be mounted, and where it is to be navigated."""
+"""Hall geometry: its walls, the mounting places for beacons, and the volume to navigate in."""
 
 from dataclasses import dataclass
 
@@ -6,17 +6,17 @@ import numpy as np
 
 from magfusion.units import Array, BoolArray
 
-ON_THE_LINE = 1e-6  # m, of an edge
+ON_THE_LINE = 1e-6  # m; distance from an edge
 
 
 @dataclass(frozen=True, eq=False)
 class Prism:
-    """What lies above a polygon, between two heights.
+    """Volume over a polygon, between two heights.
 
     Parameters
     ----------
     polygon : ndarray, shape (k, 2)
-        Corners in their order, world x and y (m).
+        Corners in order, world x and y (m).
     heights : ndarray, shape (2,)
         Lowest and highest (m).
     """
@@ -26,23 +26,23 @@ class Prism:
 
     @property
     def box_world(self) -> Array:
-        """Lower and upper corner of the box around it, shape (2, 3) (m)."""
+        """Lower and upper corner of the bounding box, shape (2, 3) (m)."""
         low, high = self.polygon.min(axis=0), self.polygon.max(axis=0)
         return np.array([[*low, self.heights[0]], [*high, self.heights[1]]])
 
     @property
     def edges(self) -> Array:
-        """Both ends of each edge, shape (k, 2, 2) (m); the first leaves the first corner."""
+        """Both ends of each edge, shape (k, 2, 2) (m); the first begins at the first corner."""
         return np.stack([self.polygon, np.roll(self.polygon, -1, axis=0)], axis=1)
 
     def contains(self, points: Array) -> BoolArray:
-        """Tell of points (n, 3) whether they are in it or on its surface."""
+        """Return whether points (n, 3) are inside or on the surface."""
         low, high = self.heights[0] - ON_THE_LINE, self.heights[1] + ON_THE_LINE
         between = (points[:, 2] >= low) & (points[:, 2] <= high)
         return between & self.over(points[:, :2])
 
     def over(self, plan: Array) -> BoolArray:
-        """Tell of points (n, 2) whether they are in the polygon or on one of its edges."""
+        """Return whether points (n, 2) are in the polygon or on one of its edges."""
         x, y = plan.T
         inside = np.zeros(len(plan), dtype=bool)
         for (ax, ay), (bx, by) in self.edges:
@@ -72,17 +72,17 @@ def prism_of(box_world: Array) -> Prism:
 
 @dataclass(frozen=True, eq=False)
 class Mounts:
-    """Where beacons may be mounted in a hall.
+    """Mounting places for beacons in a hall.
 
     Parameters
     ----------
     walls : tuple of int
         Edges of the hall's polygon, counted from 0.
     heights : ndarray, shape (2,)
-        Of what is mounted on walls (m).
+        Heights of mounting on walls (m).
     ceiling, floor : bool
     forbidden : tuple of Prism
-        Where none may be.
+        Volumes without mounting places.
     """
 
     walls: tuple[int, ...]
@@ -94,14 +94,14 @@ class Mounts:
 
 @dataclass(frozen=True, eq=False)
 class Hall:
-    """A hall with what is to be done in it.
+    """A hall and the volume to navigate in.
 
     Parameters
     ----------
     use : Prism
-        Where it is to be navigated.
+        Volume to navigate in.
     margin : float
-        From the walls, that is not used (m).
+        Distance from the walls that is not used (m).
     """
 
     room: Prism
@@ -111,7 +111,7 @@ class Hall:
 
 
 def points_of_use(hall: Hall, spacing: float) -> Array:
-    """Return the points of a grid where it is to be navigated, shape (n, 3) (m).
+    """Return grid points in the volume to navigate in, shape (n, 3) (m).
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def points_of_use(hall: Hall, spacing: float) -> Array:
     """
     low, high = hall.use.box_world
     inside = np.array([hall.margin, hall.margin, 0.0])
-    low = np.maximum(low, hall.room.box_world[0] + inside)  # up to the margin, not a step short
+    low = np.maximum(low, hall.room.box_world[0] + inside)  # includes the margin itself
     high = np.maximum(np.minimum(high, hall.room.box_world[1] - inside), low)
     x, y, z = (_steps(low[i], high[i], spacing) for i in range(3))
     mesh = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -131,7 +131,7 @@ def points_of_use(hall: Hall, spacing: float) -> Array:
 
 
 def mounting_places(hall: Hall, spacing: float) -> Array:
-    """Return where beacons may be mounted, on a grid of each surface, shape (n, 3) (m)."""
+    """Return mounting places for beacons, on a grid of each surface, shape (n, 3) (m)."""
     mounts, room = hall.mounts, hall.room
     heights = _steps(mounts.heights[0], mounts.heights[1], spacing)
     found = []
@@ -156,5 +156,5 @@ def mounting_places(hall: Hall, spacing: float) -> Array:
 
 
 def _steps(low: float, high: float, spacing: float) -> Array:
-    """Return evenly spaced numbers from one to another, both of them included."""
+    """Return evenly spaced numbers over an interval, both ends included."""
     return np.linspace(low, high, int(np.ceil((high - low) / spacing * (1.0 - 1e-9))) + 1)

@@ -1,7 +1,7 @@
-"""Cubics through values and slopes.
+"""Cubic Hermite interpolation.
 
-As `scipy.interpolate.CubicHermiteSpline`, which first makes the cubics between all known times:
-of a hundred times among five thousand it takes fifty times as long.
+Equivalent to `scipy.interpolate.CubicHermiteSpline`, which first computes the cubics between all
+known times and takes fifty times as long for a hundred times among five thousand.
 """
 
 import numpy as np
@@ -10,9 +10,9 @@ from magfusion.units import Array
 
 
 def hermite(known: Array, value: Array, slope: Array, wanted: Array) -> tuple[Array, Array]:
-    """Return values and slopes at some times of the cubics through those at the known ones.
+    """Return values and slopes of the interpolating cubics at some times.
 
-    Beyond the ends the last cubics go on.
+    Beyond the ends the last cubics are extrapolated.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def hermite(known: Array, value: Array, slope: Array, wanted: Array) -> tuple[Ar
     tuple of ndarray, shape (m, k)
     """
     index = known.searchsorted(wanted, side="right") - 1
-    index = np.minimum(np.maximum(index, 0), len(known) - 2)  # as clip, which costs more of few
+    index = np.minimum(np.maximum(index, 0), len(known) - 2)  # faster than clip for few
     later, from_time, from_value = index + 1, known[index], value[index]
     step = (known[later] - from_time)[:, None]
     share = (wanted - from_time)[:, None] / step

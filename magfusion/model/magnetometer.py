@@ -1,4 +1,4 @@
-"""A magnetometer on the platform, or a triad of receive coils, and how well it is known."""
+"""Magnetometer, or triad of receive coils, on the platform, with its calibration uncertainty."""
 
 from dataclasses import dataclass
 
@@ -56,17 +56,17 @@ class Magnetometer:
     coil_kappa : float
         Finite size of each axis's coil (m^2, `magfusion.model.receive_coils`); zero for a point.
     warming : SensorWarming, optional
-        How matrix and offset change with temperature.
+        Temperature dependence of matrix and offset.
     response : FrequencyResponse or AxisResponses, optional
-        To fields that are not steady; None where they are measured as steady ones are.
+        Response to alternating fields; None if equal to that of steady fields.
     axes : str
-        Letters of the axes that it has.
+        Names of its axes.
     casing : Casing, optional
-        Steel tube that it is in.
+        Steel tube around it.
     name : str
-        By which data and reports call it where there are several.
+        Identifies it in data and reports where there are several.
     clock_offset : float
-        What it stamps t was taken at t + clock_offset on the log's clock (s).
+        A sample stamped t was taken at t + clock_offset on the log's clock (s).
     """
 
     __repr__ = short_repr
@@ -89,5 +89,5 @@ class Magnetometer:
 
     @property
     def lacking(self) -> tuple[int, ...]:
-        """Numbers of the axes that it has not."""
+        """Indices of the missing axes."""
         return tuple(k for k, axis in enumerate("xyz") if axis not in self.axes)

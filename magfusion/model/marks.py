@@ -1,4 +1,4 @@
-"""Bursts of a multiplexer: when which coil was driven, as whoever switched it wrote down."""
+"""Bursts of a multiplexer: times at which coils were driven, recorded by their driver."""
 
 from dataclasses import dataclass
 
@@ -6,20 +6,20 @@ import numpy as np
 
 from magfusion.units import Array, BoolArray, IntArray
 
-SILENT = -1  # the slot of a stretch in which no coil is driven
-UNTOLD = -2  # of samples of which nothing is said: the current settles
+SILENT = -1  # slot of a time without a driven coil
+UNTOLD = -2  # slot of samples to ignore, while the current settles
 
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """Bursts in order of time, which do not overlap.
+    """Bursts in order of time, without overlap.
 
     Parameters
     ----------
     begin, end : ndarray, shape (n,)
         On the clock of the waveform, seconds since the log's epoch.
     slot : int ndarray, shape (n,)
-        Of the coils that are driven; `SILENT` where none is.
+        Slot of the driven coils; `SILENT` for none.
     """
 
     begin: Array
@@ -31,20 +31,20 @@ class Marks:
 
     @staticmethod
     def none() -> "Marks":
-        """Return no burst."""
+        """Return an empty set of bursts."""
         return Marks(np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64))
 
     def rows(self, kept: BoolArray | IntArray | slice) -> "Marks":
-        """Return some bursts."""
+        """Return a subset of the bursts."""
         return Marks(self.begin[kept], self.end[kept], self.slot[kept])
 
     def joined(self, later: "Marks") -> "Marks":
-        """Return these and later ones."""
+        """Return these and later bursts."""
         pairs = zip(vars(self).values(), vars(later).values(), strict=True)
         return Marks(*(np.concatenate(pair) for pair in pairs))
 
     def on_clock(self, stamps: Array, time: Array) -> "Marks":
-        """Return the bursts where the samples' stamps are replaced by other times (s)."""
+        """Return the bursts on another clock, given both stamps and times of the samples (s)."""
         return Marks(_moved(self.begin, stamps, time), _moved(self.end, stamps, time), self.slot)
 
 
@@ -55,16 +55,16 @@ def _moved(edge: Array, stamps: Array, time: Array) -> Array:
 
 
 class SlotColumn:
-    """Bursts of the slots that stand beside samples, in whatever pieces these come.
+    """Bursts from the slots given per sample, in pieces of any size.
 
-    A burst is told when a sample of another slot follows it.  It begins and ends half a step
+    A burst is complete when a sample of another slot follows.  It begins and ends half a step
     outside its samples.
     """
 
-    # What a checkpoint holds: of the run that is still open.
+    # Part of a checkpoint: state of the current run.
     _first: float
     _last: float
-    _before: float  # the sample before it
+    _before: float  # time of the sample before it
     _slot: int
     _count: int
 
@@ -74,16 +74,16 @@ class SlotColumn:
 
     @property
     def open_since(self) -> float:
-        """When the run that is still open began (s)."""
+        """Time at which the current run began (s)."""
         return self._first
 
     def hear(self, time: Array, slot: IntArray) -> Marks:
-        """Return the bursts that samples end; those that are not later than before are passed over.
+        """Return the bursts completed by samples; samples not later than earlier ones are skipped.
 
         Parameters
         ----------
         slot : int ndarray, shape (n,)
-            Of each sample; `UNTOLD` where nothing is said.
+            Of each sample; `UNTOLD` for samples to ignore.
         """
         newest = np.maximum.accumulate(np.append(self._last, time))
         later = time > newest[:-1]
@@ -93,7 +93,7 @@ class SlotColumn:
         starts = np.flatnonzero(np.diff(slot, prepend=self._slot) != 0)
         found: list[tuple[float, float, int]] = []
         ends = np.append(starts, len(time))
-        if ends[0] > 0:  # the open run goes on
+        if ends[0] > 0:  # the current run continues
             self._last, self._count = float(time[ends[0] - 1]), self._count + int(ends[0])
         for first, last in zip(starts.tolist(), ends[1:].tolist(), strict=True):
             found += self._closed(float(time[first]))
@@ -103,7 +103,7 @@ class SlotColumn:
         return _marks(found)
 
     def ended(self) -> Marks:
-        """Return the burst that is still open, where no sample follows."""
+        """Return the current burst, if no sample follows."""
         return _marks(self._closed(np.inf))
 
     def _closed(self, following: float) -> list[tuple[float, float, int]]:
@@ -122,6 +122,6 @@ def _marks(found: list[tuple[float, float, int]]) -> Marks:
 
 
 def marks_of_column(time: Array, slot: IntArray) -> Marks:
-    """Return the bursts of the slots that stand beside all samples of a waveform."""
+    """Return the bursts from the slot of each sample of a waveform."""
     column = SlotColumn()
     return column.hear(time, slot).joined(column.ended())

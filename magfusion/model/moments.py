@@ -1,4 +1,4 @@
-"""A site whose beacons have larger or smaller moments, as an estimator makes it at every step."""
+"""Sites with scaled beacon moments, which an estimator creates at every step."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -9,12 +9,12 @@ from magfusion.units import Array
 
 
 def with_moments(site: Site, moments_beacon: Mapping[str, Array]) -> Site:
-    """Return the site with moments of another size of some beacons.
+    """Return the site with scaled moments of some beacons.
 
     Parameters
     ----------
     moments_beacon : mapping of str to ndarray, shape (coils, 3)
-        By beacon's name, of the same direction (A m^2).
+        By beacon name, in the same direction (A m^2).
     """
     beacons = tuple(
         _changed(beacon, moments_beacon[beacon.name]) if beacon.name in moments_beacon else beacon

@@ -1,4 +1,4 @@
-"""How much a phasor counts: noise, model error, and the error of the survey."""
+"""Weights of phasors: noise, model error, and survey error."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ def calibration_error(site: Site, distance: Array, sensor: int = 0) -> Array:
     distance : ndarray, shape (n, beacons)
         (m)
     sensor : int
-        Which of the magnetometers measures it.
+        Index of the magnetometer.
 
     Returns
     -------
@@ -47,7 +47,7 @@ def calibration_error(site: Site, distance: Array, sensor: int = 0) -> Array:
 
 
 def _distances(site: Site, square: Array) -> Array:
-    """Range of each beacon from the strength of its field alone, within a sixth."""
+    """Estimate the range of each beacon from its field strength alone, within a sixth."""
     out, start = [], 0
     for beacon in site.beacons:
         rows = slice(start, start + len(beacon.tones))
@@ -61,14 +61,14 @@ def _distances(site: Site, square: Array) -> Array:
 def squares(site: Site, samples: FieldSamples, sensor_world: Array | None = None) -> Array:
     """Return the squared amplitude of each component, shape (n, channels, 3) (T^2).
 
-    Where a channel lacks components all of its three are the mean of the field that the model has
-    at the place: the error of the model does not vanish with the component along a coil.  Without a
-    place they are the mean of those that are there.
+    Where a channel lacks components, all three are the mean of the model field at the position:
+    the model error does not vanish with the component along a coil.  Without a position they are
+    the mean of the available components.
 
     Parameters
     ----------
     sensor_world : ndarray, shape (n, magnetometers, 3), optional
-        Where they are (m).  Of several each has all three components.
+        Their positions (m).  With several magnetometers each has all three components.
     """
     square, partial = np.abs(samples.phasor_sensor) ** 2, samples.partial
     if not np.any(partial):
@@ -98,7 +98,7 @@ def model_error(site: Site, sensor_world: Array | None = None) -> Array:
     Parameters
     ----------
     sensor_world : ndarray, shape (n, magnetometers, 3), optional
-        Where they are (m): a field map is not equally well known everywhere.
+        Their positions (m): the uncertainty of a field map depends on position.
 
     Returns
     -------
@@ -124,7 +124,7 @@ def model_error(site: Site, sensor_world: Array | None = None) -> Array:
 
 @once_a_site
 def _model_error_anywhere(site: Site) -> Array | None:
-    """Return the relative error of each channel, (channels,); None where a map tells of places."""
+    """Return the relative error of each channel, (channels,); None if a map makes it local."""
     if any(beacon.field_map is not None for beacon in site.beacons):
         return None
     own = [site.model_error if b.model_error is None else b.model_error for b in site.beacons]
@@ -133,17 +133,17 @@ def _model_error_anywhere(site: Site) -> Array | None:
 
 @once_a_site
 def _noise_share(site: Site) -> Array:
-    """Return by how much the noise of each channel is larger than is measured, (channels,)."""
+    """Return the ratio of each channel's noise to the measured noise, (channels,)."""
     return np.array([b.noise_factor for b in site.beacons])[site.owner] ** 2
 
 
 def sensor_positions(site: Site, poses: Trajectory) -> Array:
-    """Return where the magnetometers are at each pose, (n, magnetometers, 3), world (m)."""
+    """Return the positions of the magnetometers at each pose, (n, magnetometers, 3), world (m)."""
     return sensors_at(site, poses.world_from_body, poses.position_world)
 
 
 def sensors_at(site: Site, world_from_body: Array, position_world: Array) -> Array:
-    """Return the same at poses of any number (n, ...)."""
+    """Return the positions of the magnetometers at poses of any shape (n, ...)."""
     sensors = site.platform.magnetometers
     if len(sensors) == 1:
         return (position_world + world_from_body @ sensors[0].position_body)[:, None]
@@ -151,15 +151,15 @@ def sensors_at(site: Site, world_from_body: Array, position_world: Array) -> Arr
 
 
 def alike_beside(site: Site, valid: BoolArray) -> Array:
-    """Return how many magnetometers of an epoch have the error of a field model, (n, channels).
+    """Return how many magnetometers of an epoch share a field-model error, (n, channels).
 
-    It is that of iron, and much the same at places that lie closer than its length: what two of
-    them tell does not average it.
+    The error is caused by iron and correlated over its length scale, so that several
+    magnetometers within it do not average it.
 
     Parameters
     ----------
     valid : bool ndarray, shape (n, channels)
-        What the epochs hold.
+        Available channels of the epochs.
     """
     places = np.array([sensor.position_body for sensor in site.platform.magnetometers])
     if len(places) == 1 or site.model_error_length <= 0.0:
@@ -182,21 +182,21 @@ def measurement_cov(
 ) -> Array:
     """Return the covariance of each phasor component: noise and model error.
 
-    What several epochs share does not average over them: each then counts as a part of one.
+    Errors shared by several epochs do not average over them: each epoch gets a part of the weight.
 
     Parameters
     ----------
     survey_error : bool
-        Add what the sigmas of the site's calibration cause, for a solver that does not estimate it.
+        Add the effect of the calibration sigmas, for a solver that does not estimate them.
     sensor_world : ndarray, shape (n, magnetometers, 3), optional
-        Where they are (m), as far as it is known: how well a field map is known there.
+        Their approximate positions (m), for the uncertainty of a field map.
     windows : float
-        How many windows hold each sample, and with it its noise.
+        Number of windows that contain each sample, and its noise.
     alike : ndarray, shape (n,), or float
-        How many epochs have the same model error.
+        Number of epochs that share a model error.
     beside : bool
-        Whether magnetometers beside each other count as one for what they share of it; not where
-        the estimate considers what is shared.
+        Whether magnetometers next to each other count as one for their shared error; not where
+        the estimate considers it.
 
     Returns
     -------
@@ -220,11 +220,11 @@ def weighed_and_alone(
     *,
     beside: bool = True,
 ) -> tuple[Array, Array]:
-    """Return `measurement_cov` of epochs that share noise and model error, and were they alone.
+    """Return `measurement_cov` of epochs with shared noise and model error, and as independent.
 
     Parameters
     ----------
-    sensor_world, windows, alike, beside
+    `sensor_world`, `windows`, `alike`, `beside`
         As of `measurement_cov`.
     """
     ways = (windows, alike), (1.0, 1.0)
@@ -240,7 +240,7 @@ def _covs(
     *,
     beside: bool,
 ) -> tuple[list[Array], Array, Array]:
-    """Return noise and model error as shared in some ways, with the squares and their power."""
+    """Return noise and model error for several ways of sharing, with squares and their power."""
     own = model_error(site, sensor_world)
     share = None
     if beside and site.platform.further:
@@ -258,7 +258,7 @@ def _covs(
 
 
 def _relative_error(site: Site, square: Array) -> Array:
-    """Return the relative error that the survey's sigmas cause, shape (n, channels)."""
+    """Return the relative error caused by the survey's sigmas, shape (n, channels)."""
     parts = []
     for sensor in range(len(site.platform.magnetometers)):
         mine = site.of_sensor(sensor)
@@ -272,9 +272,9 @@ def _relative_error(site: Site, square: Array) -> Array:
 
 
 def cholesky(cov: Array) -> Array:
-    """Return lower factors of covariances (..., k, k) of trace k or so.
+    """Return lower factors of covariances (..., k, k) of a trace of about k.
 
-    Where rounding leaves one indefinite, as a false sample does, all are larger by `ROUNDING`.
+    If rounding makes one indefinite, as for a faulty sample, all are increased by `ROUNDING`.
     """
     try:
         return np.asarray(np.linalg.cholesky(cov))
@@ -289,8 +289,8 @@ def whitening(cov: Array, there: BoolArray) -> Array:
     ----------
     cov : ndarray, shape (..., 3, 3)
     there : bool ndarray, shape (..., 3) or (...)
-        Of each component, or of all three.  The covariance of the components that are there is
-        what is inverted: what is missing was not measured, however large its noise is.
+        Of each component, or of all three.  The covariance of the available components is
+        inverted, independent of the noise of missing ones.
     """
     each = there.ndim == cov.ndim - 1
     if there.all():
@@ -319,11 +319,11 @@ def paired_whitening(cov: Array, there: BoolArray) -> Array:
 
 
 def twice(there: BoolArray) -> BoolArray:
-    """Return what is said of components (..., 3) of real part, then imaginary part, (..., 6)."""
+    """Repeat a quantity of components (..., 3) for real and imaginary part, (..., 6)."""
     return np.concatenate([there, there], axis=-1)
 
 
 def stacked(phasor: ComplexArray) -> Array:
-    """Return complex vectors as real part, then imaginary part; zero where they are NaN."""
+    """Stack complex vectors as real part, then imaginary part; zero where they are NaN."""
     parts = np.concatenate([phasor.real, phasor.imag], axis=-1)
     return parts if np.isfinite(parts).all() else np.nan_to_num(parts)

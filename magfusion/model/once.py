@@ -1,4 +1,4 @@
-"""What hangs on a site alone, and is asked for at every epoch, is worked out once for each."""
+"""Cache, by site, of quantities that depend on the site alone and are needed at every epoch."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -11,9 +11,9 @@ Found = TypeVar("Found")
 
 
 def once_a_site(find: Callable[[Site], Found]) -> Callable[[Site], Found]:
-    """Return a function that keeps what it returns for a site as long as that lives.
+    """Return a function that caches its result for a site as long as the site lives.
 
-    What is returned must not be changed, nor refer to the site.  What is refused is not kept.
+    The result must not be modified, nor refer to the site.  Exceptions are not cached.
     """
     kept: WeakKeyDictionary[Site, Found] = WeakKeyDictionary()
 

@@ -1,8 +1,8 @@
-"""A receiver of one axis: which way its coil points, where it is, and the roll that nothing tells.
+"""Receiver of one axis: direction and position of its coil, and the unobservable roll.
 
-Without an IMU nothing tells the roll about the coil.  The estimators then follow a frame that does
-not turn about the coil, which any roll of the platform's is as good as, and what they say of it is
-opened: the roll may be any, and with it the place of the body on its circle about the coil.
+Without an IMU the roll about the coil is unobservable.  The estimators then follow a frame that
+does not rotate about the coil, equivalent to any roll of the platform.  Their covariance is widened
+to any roll, and with it the position of the body on its circle about the coil.
 """
 
 import numpy as np
@@ -12,18 +12,18 @@ from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.site import Magnetometer, Site
 from magfusion.units import Array
 
-ANY_ROLL = np.pi / np.sqrt(3.0)  # rad; standard deviation of a turn of which nothing is known
-CIRCLE = 1.5  # of a lever's square, for a place on a circle about the coil and not on its tangent
+ANY_ROLL = np.pi / np.sqrt(3.0)  # rad; standard deviation of a uniformly distributed angle
+CIRCLE = 1.5  # of a lever's square, for a position on a circle about the coil, not on its tangent
 
 
 def axis_of(sensor: Magnetometer) -> Array:
-    """Return the direction that a magnetometer of one axis feels, body axes, shape (3,)."""
+    """Return the sensitive direction of a magnetometer of one axis, body axes, shape (3,)."""
     felt = sensor.body_from_sensor @ sensor.matrix["xyz".index(sensor.axes)]
     return np.asarray(felt / np.linalg.norm(felt))
 
 
 def coil_lever(sensor: Magnetometer) -> Array:
-    """Return where its coil is, body axes, shape (3,) (m)."""
+    """Return the position of its coil, body axes, shape (3,) (m)."""
     if sensor.coil_centres_sensor is None:
         return sensor.position_body
     own = sensor.coil_centres_sensor["xyz".index(sensor.axes)]
@@ -31,27 +31,27 @@ def coil_lever(sensor: Magnetometer) -> Array:
 
 
 def least_turn(from_vector: Array, to_vector: Array) -> Array:
-    """Return the smallest rotations that take directions to others, shape (..., 3, 3)."""
+    """Return the smallest rotations between pairs of directions, shape (..., 3, 3)."""
     start = np.broadcast_to(from_vector, to_vector.shape)
     across = np.cross(start, to_vector)
     sine = np.linalg.norm(across, axis=-1, keepdims=True)
     angle = np.arctan2(sine, np.sum(start * to_vector, axis=-1, keepdims=True))
     smallest = np.eye(3)[np.argmin(np.abs(start), axis=-1)]
-    other = np.cross(start, smallest)  # any axis across, for the opposite direction
+    other = np.cross(start, smallest)  # any perpendicular axis, for the opposite direction
     other = other / np.linalg.norm(other, axis=-1, keepdims=True)
     about = np.where(sine > 1e-12, across / np.maximum(sine, 1e-300), other)
     return Rotation.from_rotvec(about * angle).as_matrix()
 
 
 def roll_is_open(site: Site) -> bool:
-    """Tell whether neither fields nor an IMU tell the roll about the one axis."""
+    """Return whether neither fields nor an IMU determine the roll about the single axis."""
     platform = site.platform
     one = not platform.further and len(platform.magnetometer.axes) == 1
     return one and (platform.imu == NO_IMU or not platform.inertial)
 
 
 def opened_poses(site: Site, pose_cov: Array) -> Array:
-    """Return covariances of poses (..., 6, 6), body axes, with any roll about the coil."""
+    """Add any roll about the coil to covariances of poses (..., 6, 6), body axes."""
     sensor = site.platform.magnetometer
     axis, lever = axis_of(sensor), coil_lever(sensor)
     along = np.concatenate([axis, np.cross(lever, axis)])
@@ -64,20 +64,20 @@ def opened_poses(site: Site, pose_cov: Array) -> Array:
 def opened_state(
     site: Site, cov: Array, world_from_body: Array, gyro_bias_body: Array, rate_sigma: float
 ) -> Array:
-    """Return the covariance of a state's tangent with any roll about the coil.
+    """Add any roll about the coil to the covariance of a state's tangent.
 
     Parameters
     ----------
     cov : ndarray, shape (k, k)
         Pose (body axes), velocity (world), accelerometer and gyro bias, calibration.
     gyro_bias_body : ndarray, shape (3,)
-        The rate reversed, of a motion prior (rad/s).
+        Negative rate of a motion prior (rad/s).
     rate_sigma : float
         Of the rate about the coil (rad/s).
     """
     sensor = site.platform.magnetometer
     axis, lever = axis_of(sensor), coil_lever(sensor)
-    # The rate turns with the roll, in body axes; about the coil it may be any of the prior's.
+    # The rate rotates with the roll, in body axes; about the coil it has the prior's spread.
     rolled, spun = np.zeros(len(cov)), np.zeros(len(cov))
     swing, rate = np.cross(axis, lever), -gyro_bias_body
     rolled[6:9] = -world_from_body @ np.cross(rate, swing)

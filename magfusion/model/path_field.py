@@ -1,7 +1,7 @@
-"""The field of coils along a path whose points are dense, by fields and gradients at some of them.
+"""Field of coils along a densely sampled path, interpolated between nodes.
 
-Between two nodes the field follows the cubic of its values and slopes there, and beside the line
-that joins them its gradient.  A node costs as much as a sample did, and there are a tenth as many.
+Between two nodes the field follows the cubic of its values and slopes, and off the line between
+them its gradient.  A node costs as much as a sample, and there are a tenth as many.
 """
 
 import numpy as np
@@ -10,20 +10,20 @@ from magfusion.model.coil_field import Driven, Sources, coil_fields_and_gradient
 from magfusion.model.field import driven_field
 from magfusion.units import AnyArray, Array
 
-# Of the distance to a coil: with nodes so far apart the cubic errs by some millionths of the field,
-# and so does the gradient where a path bends away from the line by so much.
+# Relative to the distance to a coil: at this node spacing the cubic errs by some millionths of the
+# field, as does the gradient where the path bends away from the line by as much.
 APART, ASIDE = 0.04, 1e-3
-FEWEST, MOST = 4, 32  # samples from node to node; with fewer nothing is gained
+FEWEST, MOST = 4, 32  # samples between nodes; with fewer nothing is gained
 FEWEST_POINTS = 64
-AT_ONCE = 1 << 11  # samples that have nodes as far apart as their nearest coil asks
+AT_ONCE = 1 << 11  # samples with one node spacing, that of their nearest coil
 
 
 def field_along_path(
     source: Sources, position_world: Array, current: AnyArray, along_world: Array | None = None
 ) -> Driven:
-    """Return the field of a source at points of a path, as `driven_field` does one by one.
+    """Return the field of a source at points of a path, as `driven_field`.
 
-    Of a beacon with a map, and where points are too far apart, they are taken one by one.
+    With a field map, or where points are too far apart, they are evaluated one by one.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def field_along_path(
 
 
 def _from_node_to_node(source: Sources, offset_beacon: Array) -> int:
-    """Return how many samples may lie from one node to the next, at most `MOST`."""
+    """Return how many samples may separate two nodes, at most `MOST`."""
     loops = source.loops
     reach = np.linalg.norm(loops.centre, axis=-1)
     if loops.radius is not None:
@@ -80,7 +80,7 @@ def _between_nodes(
     samples: int,
 ) -> Driven:
     count = offset_beacon.shape[-2]
-    number = -(-count // samples)  # of stretches from node to node; the last may be shorter
+    number = -(-count // samples)  # of intervals between nodes; the last may be shorter
     node = np.minimum(np.arange(number + 1) * samples, count - 1)
     row = np.minimum(np.arange(number * samples), count - 1).reshape(number, samples)
     length = np.maximum(node[1:] - node[:-1], 1)
@@ -100,7 +100,7 @@ def _between_nodes(
     values = value[..., :-1, None, :], value[..., 1:, None, :]
 
     def driven(of_coils: AnyArray) -> Array:
-        """Return what the currents make of the field of each coil, shape (..., n, 3)."""
+        """Return the sum over coils of currents and fields, shape (..., n, 3)."""
         flat = of_coils.reshape(*of_coils.shape[:-3], number * samples, of_coils.shape[-1])
         flat, parts = flat[..., :count, :], range(coils.shape[-2])
         each = [current[..., k, None] * flat[..., 3 * k : 3 * k + 3] for k in parts]
@@ -115,7 +115,7 @@ def _between_nodes(
 
 
 def _in_world(source: Sources, of_coils: AnyArray) -> AnyArray:
-    """Return vectors of each coil, shape (..., coils, 3), in a row (..., 3 * coils), world axes."""
+    """Return vectors of each coil, shape (..., coils, 3), as (..., 3 * coils), world axes."""
     turned = of_coils.reshape(*source.world_from_beacon.shape[:-2], -1, 3)
     turned = turned @ np.swapaxes(source.world_from_beacon, -1, -2)
     return np.asarray(turned.reshape(*of_coils.shape[:-2], -1))

@@ -1,4 +1,4 @@
-"""What derivatives by a small turn, and by the entries of a matrix, are made of."""
+"""Building blocks of derivatives by a small rotation and by the entries of a matrix."""
 
 from typing import overload
 

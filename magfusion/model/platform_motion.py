@@ -1,28 +1,28 @@
-"""How the platform moves, what of it an IMU measures, and what is assumed where there is none."""
+"""Models of the platform's motion and its IMU, and the motion prior without one."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class MotionModel:
-    """How the platform moves, and what counts as rest; by default that of a hand.
+    """Motion of the platform, and its rest thresholds; the defaults suit a hand.
 
     Parameters
     ----------
     rest_gyro, rest_accel : float
-        It rests where rate (rad/s) and specific force (m/s^2) deviate less from their means.
+        At rest, rate (rad/s) and specific force (m/s^2) deviate by less from their means.
     rest_span : float
-        Duration of that (s).
+        Minimum duration of rest (s).
     rest_speed_sigma : float
-        Of the zero velocity (m/s).
+        Of the zero-velocity update (m/s).
     rest_known_speed : float
-        A velocity with a larger sigma is not taken for zero (m/s).
+        A velocity with a larger sigma is not set to zero (m/s).
     speed_sigma : float
         Usual speed (m/s).
     accel_sigma : float
         Of the mean specific force against gravity, in motion (m/s^2).
     accel_span : float
-        Over which it is averaged (s).
+        Averaging time of the specific force (s).
     start_speed_sigma : float
         Prior of the first velocity (m/s).
     """
@@ -45,8 +45,8 @@ A_HAND = MotionModel()
 class ImuModel:
     """Inertial noise: densities per square root of hertz, walks per square root of second.
 
-    ``time_offset`` says that the sample stamped t was taken at t + offset on the log's clock (s);
-    that is of the first sample, and grows by ``clock_rate`` from there on.
+    A sample stamped t was taken at t + ``time_offset`` on the log's clock; the offset is that of
+    the first sample and grows by ``clock_rate``.
     """
 
     gyro_noise: float
@@ -63,20 +63,20 @@ class ImuModel:
 
 @dataclass(frozen=True)
 class HeldModel(ImuModel):
-    """What stands for an IMU by a motion prior that has no rate about an axis.
+    """Model of a motion prior without rotation about an axis, in place of an IMU.
 
-    Of a receiver of one axis, whose roll about its coil nothing tells.
+    For a receiver of one axis, whose roll about its coil is unobservable.
 
     Parameters
     ----------
     held_axis : tuple of float
-        Body axes, of length one.
+        Unit vector in body axes.
     """
 
     held_axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
 
-# Of a site that describes none: nothing is known by it.
+# Default of a site that declares none: nothing is known from it.
 NO_IMU = ImuModel(
     gyro_noise=float("inf"),
     accel_noise=float("inf"),
@@ -91,16 +91,16 @@ NO_IMU = ImuModel(
 
 @dataclass(frozen=True)
 class MotionPrior:
-    """What is assumed of the motion where no IMU measures it: white accelerations.
+    """Motion assumed where no IMU measures it: white accelerations.
 
     Parameters
     ----------
     accel_density : float
-        Of the acceleration, each axis (m/s^2/sqrt(Hz)): velocity walks by it.
+        Of the acceleration, each axis (m/s^2/sqrt(Hz)); velocity is its random walk.
     angular_accel_density : float
-        Of the angular acceleration, each axis (rad/s^2/sqrt(Hz)): the rate walks by it.
+        Of the angular acceleration, each axis (rad/s^2/sqrt(Hz)); the rate is its random walk.
     rate_sigma : float
-        Of the rate at the beginning (rad/s).
+        Of the initial rate (rad/s).
     """
 
     accel_density: float = 2.0
@@ -110,7 +110,7 @@ class MotionPrior:
 
 @dataclass(frozen=True)
 class Replaced:
-    """What of a site stands aside while the motion prior is in its place."""
+    """Parts of a site that the motion prior replaces, stored to restore them."""
 
     imu: ImuModel
     motion: MotionModel

@@ -1,4 +1,4 @@
-"""What is known of a calibration beforehand: the site's sigmas, and how they go together."""
+"""Prior of a calibration: the site's sigmas and their correlations."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from magfusion.units import Array
 
 
 def parameters_of(blocks: tuple[Block, ...]) -> list[Component]:
-    """Return the parameter that each column of a tangent vector is."""
+    """Return the parameter of each column of a tangent vector."""
     return [
         Component(block.group, block.owner, block.kind, i)
         for block in blocks
@@ -18,12 +18,12 @@ def parameters_of(blocks: tuple[Block, ...]) -> list[Component]:
 
 
 def prior_sqrt_covariance(site: Site, blocks: tuple[Block, ...]) -> Array:
-    """Return the triangular matrix that makes a draw of the prior out of unit noise.
+    """Return the triangular matrix that transforms unit noise to a sample of the prior.
 
     Parameters
     ----------
     site : Site
-        The declared one: its correlation counts.
+        The declared one, with its correlation.
     blocks : tuple of Block
         Parameters not among them are marginalised.
 
@@ -40,7 +40,7 @@ def prior_sqrt_covariance(site: Site, blocks: tuple[Block, ...]) -> Array:
 
 
 def prior_sqrt_information(site: Site, blocks: tuple[Block, ...]) -> Array:
-    """Return the matrix that whitens a step away from the prior's mean: its spread inverted."""
+    """Return the matrix that whitens a deviation from the prior's mean: the inverse spread."""
     if site.correlation is None:
         return np.diag(1.0 / prior_sigma(blocks))
     return np.asarray(np.linalg.inv(prior_sqrt_covariance(site, blocks)))

@@ -1,4 +1,4 @@
-"""What a probe reads on a bench about an antenna whose coils are driven one by one."""
+"""Bench readings of a field probe around an antenna whose coils are driven one by one."""
 
 from dataclasses import dataclass
 
@@ -7,16 +7,16 @@ from magfusion.units import Array, IntArray
 
 @dataclass(frozen=True, eq=False)
 class ProbeReadings:
-    """What a probe of one axis read; one of three axes gives three readings.
+    """Readings of a one-axis probe; a three-axis probe gives three readings.
 
     Parameters
     ----------
     coil : ndarray of int, shape (n,)
-        That was driven, from 0.
+        Driven coil, from 0.
     position : ndarray, shape (n, 3)
         Of the probe, antenna axes (m).
     axis : ndarray, shape (n, 3)
-        Along which it measures, unit vectors, antenna axes.
+        Measured direction, unit vectors, antenna axes.
     reading, sigma : ndarray, shape (n,)
         Signed amplitude, and its standard deviation (T).
     """
@@ -31,5 +31,5 @@ class ProbeReadings:
         return len(self.coil)
 
     def rows(self, chosen: Array) -> "ProbeReadings":
-        """Return some of the readings."""
+        """Return a subset of the readings."""
         return ProbeReadings(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))

@@ -1,7 +1,7 @@
-"""Products of many rotations at once, and vectors turned by them, on arrays.
+"""Quaternion products and rotation of vectors, vectorised on arrays.
 
-SciPy's `Rotation` converts fast but multiplies one by one; here the components are the first axis,
-so that each operation is one over all rotations: 25 to 400 times as fast from fifty on.
+SciPy's `Rotation` converts fast but multiplies one by one.  Here the components are the first axis,
+so that each operation applies to all rotations: 25 to 400 times as fast from fifty on.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from magfusion.units import Array
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-_NO_TURN = np.finfo(np.float64).eps  # rad; its sine is as large
+_NO_TURN = np.finfo(np.float64).eps  # rad; equal to its sine
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
@@ -31,7 +31,7 @@ def product(a: Array, b: Array) -> Array:
 
 
 def turned(quaternion: Array, vector: Array) -> Array:
-    """Return vectors, shape (3, ...), turned by unit quaternions, shape (4, ...)."""
+    """Return vectors, shape (3, ...), rotated by unit quaternions, shape (4, ...)."""
     lever = 2.0 * cross(quaternion[1:], vector)
     return np.asarray(vector + quaternion[0] * lever + cross(quaternion[1:], lever))
 
@@ -66,7 +66,7 @@ def of_vectors(rotation: Array) -> Array:
 def vectors(quaternion: Array) -> Array:
     """Return the rotation vectors, shape (3, ...) (rad), of unit quaternions, shape (4, ...)."""
     size = np.sqrt(np.sum(quaternion[1:] ** 2, axis=0))
-    # Of the two ways to write it that of the shorter turn.
+    # Of the two equivalent quaternions, that of the smaller rotation.
     half = np.arctan2(np.where(quaternion[0] < 0.0, -size, size), np.abs(quaternion[0]))
     return 2.0 * np.where(size > 0.0, half / np.where(size > 0.0, size, 1.0), 1.0) * quaternion[1:]
 
@@ -94,7 +94,7 @@ def matrices(quaternion: Array) -> Array:
 def of_matrices(rotation: Array) -> Array:
     """Return the quaternions, shape (4, n), scalar first, of rotation matrices, shape (n, 3, 3).
 
-    By the largest component: of the other way to write it, none is lost in rounding.
+    By the largest component, which avoids loss by rounding.
     """
     (a, b, c), (d, e, f), (g, h, i) = rotation.transpose(1, 2, 0)
     trace = a + e + i
@@ -111,7 +111,7 @@ def of_matrices(rotation: Array) -> Array:
 
 
 def unit(quaternion: Array) -> Array:
-    """Return quaternions, shape (4, ...), without what rounding adds to their length."""
+    """Normalise quaternions, shape (4, ...)."""
     return quaternion / np.sqrt(_square(quaternion))
 
 

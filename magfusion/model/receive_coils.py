@@ -1,10 +1,10 @@
-"""Axes of a magnetometer that are coils of their own: each at its centre, and of some size.
+"""Magnetometer axes with separate coils: each at its centre, and of finite size.
 
 The flux through a coil is the mean over it of a field without divergence and curl, the field at its
 centre and its second derivative along the axis: ``(1 - kappa d^2/dn^2) n . B``, for a flat coil
-``radius^2 / 8``, for a long one ``-length^2 / 24`` (`magfusion.model.physics.finite_size`).  Here
-that is a sum over three points on the axis, a long coil's that of Gauss and Legendre; what is left
-is of the fourth power of size over distance.
+``radius^2 / 8``, for a long one ``-length^2 / 24`` (`magfusion.model.physics.finite_size`).  It is
+computed as a sum over three points on the axis, for a long coil by the Gauss-Legendre rule.  The
+error is of fourth order in size over distance.
 """
 
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ class Observation:
     time_offset : complex ndarray, optional
         IMU time offset; no further axis (T/s).  None where no twist was given.
     log_conductivity : complex ndarray, optional
-        Logarithm of the ground's conductivity; no further axis (T).  None where nothing conducts.
+        Logarithm of the ground's conductivity; no further axis (T).  None without conduction.
     """
 
     phasor_sensor: ComplexArray
@@ -57,7 +57,7 @@ class Observation:
 
 
 def is_apart(magnetometer: Magnetometer) -> bool:
-    """Tell whether the axes do not measure the field at one and the same point."""
+    """Return whether the axes measure the field at different points."""
     return magnetometer.coil_centres_sensor is not None or magnetometer.coil_kappa != 0.0
 
 
@@ -67,7 +67,7 @@ def _centres_sensor(magnetometer: Magnetometer) -> Array:
 
 
 def _along(magnetometer: Magnetometer) -> tuple[Array, Array]:
-    """Return places along a coil's axis (m), and their weights, which sum to one."""
+    """Return positions along a coil's axis (m), and their weights, which sum to one."""
     kappa = magnetometer.coil_kappa
     if kappa == 0.0:
         return np.zeros(1), np.ones(1)
@@ -77,7 +77,7 @@ def _along(magnetometer: Magnetometer) -> tuple[Array, Array]:
 
 
 def points_apart(magnetometer: Magnetometer) -> list[Magnetometer]:
-    """Return a magnetometer at each point, axis by axis: only that axis of it is true."""
+    """Return a magnetometer at each point, axis by axis, of which only that axis is valid."""
     centres, (places, _) = _centres_sensor(magnetometer), _along(magnetometer)
     axes = magnetometer.matrix / np.linalg.norm(magnetometer.matrix, axis=1, keepdims=True)
     return [
@@ -94,12 +94,12 @@ def points_apart(magnetometer: Magnetometer) -> list[Magnetometer]:
 
 
 def joined_phasors(apart: list[ComplexArray], magnetometer: Magnetometer) -> ComplexArray:
-    """Return what the coils measure, of the phasors (..., tones, 3) at `points_apart`."""
+    """Return the phasors of the coils from those (..., tones, 3) at `points_apart`."""
     return _joined_axes(apart, magnetometer)
 
 
 def joined_samples(apart: list[Array], magnetometer: Magnetometer) -> Array:
-    """Return what the coils measure, of the samples (..., 3) at `points_apart`."""
+    """Return the samples of the coils from those (..., 3) at `points_apart`."""
     return _joined_axes(apart, magnetometer)
 
 
@@ -111,7 +111,7 @@ def _joined_axes(apart: Sequence[Any], magnetometer: Magnetometer) -> Any:
 
 
 def joined(apart: list[Observation], magnetometer: Magnetometer) -> Observation:
-    """Return the observation of the coils, of those at `points_apart`."""
+    """Return the observation of the coils from those at `points_apart`."""
     centres, (places, weights) = _centres_sensor(magnetometer), _along(magnetometer)
     count, names = len(weights), ("platform_pose", "beacon_pose", "log_moments")
     blocks: dict[str, list[ComplexArray]] = {n: [] for n in (*names, "matrix", "body_from_sensor")}
@@ -125,7 +125,7 @@ def joined(apart: list[Observation], magnetometer: Magnetometer) -> Observation:
             parts = {name: getattr(seen, name)[..., i, :] for name in names}
             mounting = seen.body_from_sensor[..., i, :].copy()
             matrix = seen.matrix[..., i, :].copy()
-            # The mounting turns the coil's points, and the row of the matrix turns its axis.
+            # The mounting rotates the coil's points; the row of the matrix rotates its axis.
             mounting[..., :3] -= np.cross(mounting[..., 3:], centre + place * axis)
             matrix[..., 3 * i : 3 * i + 3] += place * mounting[..., 3:] @ across
             parts |= {"matrix": matrix, "body_from_sensor": mounting}
@@ -144,6 +144,6 @@ def joined(apart: list[Observation], magnetometer: Magnetometer) -> Observation:
 def _joined_if_there(
     parts: list[ComplexArray | None], magnetometer: Magnetometer
 ) -> ComplexArray | None:
-    """Return the derivatives of the coils, of those at `points_apart` that have them."""
+    """Return the derivatives of the coils from those at `points_apart`, if available."""
     there = [part for part in parts if part is not None]
     return joined_phasors(there, magnetometer) if there else None

@@ -1,7 +1,7 @@
-"""Where the magnetometer may be: in a room, on one side of a plane, in front of a beacon.
+"""Region of the magnetometer: a room, one side of a plane, or the front of a beacon.
 
-The field of a dipole is even in the offset, so that a lone beacon leaves the pose on its opposite
-side open; what the user knows of the place decides it.
+The field of a dipole is even in the offset, so that a single beacon has a second solution on its
+opposite side; a region excludes it.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ class HalfSpace:
     Parameters
     ----------
     normal_world : ndarray, shape (3,)
-        Of any length, to the side where the magnetometer is.
+        Normal of any length, towards the magnetometer.
     through_world : ndarray, shape (3,)
         A point of the plane (m).
     """
@@ -31,7 +31,7 @@ class HalfSpace:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Where the magnetometer is, whatever the fields say.
+    """Region that contains the magnetometer, independent of the fields.
 
     Parameters
     ----------
@@ -56,16 +56,16 @@ class _Source(Protocol):
 
 
 class Bounds(NamedTuple):
-    """Planes that the magnetometer does not cross.
+    """Planes that bound the magnetometer's position.
 
     Parameters
     ----------
     normal_world : ndarray, shape (k, 3)
         Unit vectors inwards.
     offset : ndarray, shape (k,)
-        It is inside where ``normal_world @ position`` is larger (m).
+        Inside, ``normal_world @ position`` is larger (m).
     names : tuple of str
-        Of the planes, in words.
+        Of the planes, for messages.
     """
 
     normal_world: Array
@@ -78,12 +78,12 @@ class Bounds(NamedTuple):
 
 
 def bounds_of(region: Region | None, sources: Sequence[_Source]) -> Bounds | None:
-    """Return the planes of a region and of the hemispheres of beacons; None where there are none.
+    """Return the planes of a region and of the hemispheres of beacons; None if there are none.
 
     Parameters
     ----------
     sources : sequence of Beacon
-        One whose place is not known yet bounds nothing.
+        A beacon of unknown position adds no plane.
     """
     found: list[tuple[Array, float, str]] = []
     box = None if region is None else region.box_world

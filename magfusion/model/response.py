@@ -1,7 +1,7 @@
-"""How a magnetometer answers to fields of some frequencies, beside how it answers to steady ones.
+"""Frequency response of a magnetometer relative to its response to steady fields.
 
-Fluxgates, search coils and the filters before a converter lose amplitude and turn the phase of a
-tone.  In between the frequencies that are given, both are linear in the frequency's logarithm.
+Fluxgates, search coils and anti-aliasing filters attenuate a tone and shift its phase.  Between
+the given frequencies both are linear in the frequency's logarithm.
 """
 
 from dataclasses import dataclass
@@ -13,16 +13,16 @@ from magfusion.units import Array, ComplexArray
 
 @dataclass(frozen=True, eq=False)
 class FrequencyResponse:
-    """Of all three axes, or of one.
+    """Response of all three axes, or of one.
 
     Parameters
     ----------
     frequency_hz : ndarray, shape (n,)
         Increasing, above zero (Hz).
     gain : ndarray, shape (n,)
-        Amplitude that is measured, as a share of the field's.
+        Measured amplitude relative to the field's.
     phase : ndarray, shape (n,)
-        Of what is measured, ahead of the field's (rad); below zero where it lags.
+        Measured phase relative to the field's (rad); negative for a lag.
     """
 
     frequency_hz: Array
@@ -31,13 +31,13 @@ class FrequencyResponse:
 
     @property
     def axes(self) -> tuple["FrequencyResponse", ...]:
-        """What each axis has: all the same."""
+        """Response of each axis: all the same."""
         return self, self, self
 
     def at(self, frequency_hz: Array) -> tuple[Array, Array]:
         """Return logarithm of the gain, and phase (rad), at some frequencies (Hz).
 
-        A steady field is measured as it is.
+        The gain at zero frequency is one.
         """
         steady = frequency_hz == 0.0
         where = np.log(np.where(steady, 1.0, frequency_hz))
@@ -50,7 +50,7 @@ class FrequencyResponse:
 
 @dataclass(frozen=True, eq=False)
 class AxisResponses:
-    """Of axes that answer each in its own way.
+    """Responses of axes that differ.
 
     Parameters
     ----------
@@ -63,10 +63,10 @@ class AxisResponses:
 
     @property
     def axes(self) -> tuple[FrequencyResponse, FrequencyResponse, FrequencyResponse]:
-        """All three."""
+        """Responses of the three axes."""
         return self.x, self.y, self.z
 
     def factor(self, frequency_hz: Array) -> ComplexArray:
-        """Return what is measured as a share of the field, shape (n, 3), at frequencies (n,)."""
+        """Return the complex gain of each axis, shape (n, 3), at frequencies (n,)."""
         parts = [axis.at(frequency_hz) for axis in self.axes]
         return np.stack([np.exp(size + 1j * phase) for size, phase in parts], axis=-1)

@@ -1,4 +1,4 @@
-"""A permanent magnet that turns with a shaft: two coils in quadrature, and what it does beside."""
+"""Permanent magnet on a rotating shaft: two coils in quadrature, harmonics and steady part."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,12 +10,12 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class Harmonic:
-    """A part of the moment that turns several times as fast, or along the shaft, not at all.
+    """Part of the moment at a multiple of the shaft's angle, or steady along the shaft.
 
     Parameters
     ----------
     order : int
-        Turns in one of the shaft: ``moment_beacon * cos(order * angle + phase)``.
+        Multiple of the angle: ``moment_beacon * cos(order * angle + phase)``.
     moment_beacon : ndarray, shape (3,)
         Peak (A m^2).
     phase : float
@@ -29,28 +29,28 @@ class Harmonic:
 
 @dataclass(frozen=True, eq=False)
 class Rotor:
-    """How a magnet is on its shaft, and how that turns.
+    """Mounting of a magnet on its shaft, and rotation of the shaft.
 
     ``m(angle) = moment cos(tilt) (zero cos(angle) + (axis x zero) sin(angle)) + moment sin(tilt)
-    axis``, and harmonics.  The part along the axis is steady, and no tone shows it.
+    axis``, and harmonics.  The part along the axis is steady and appears in no tone.
 
     Parameters
     ----------
     moment : float
         (A m^2)
     axis_beacon : ndarray, shape (3,)
-        Unit vector about which it turns by the right hand; of a magnet in a well down the hole.
+        Unit vector of rotation by the right-hand rule; for a magnet in a well down the hole.
     zero_beacon : ndarray, shape (3,)
-        Unit vector across the axis, of the moment at angle zero.
+        Unit vector perpendicular to the axis, along the moment at angle zero.
     tilt : float
-        Of the moment out of the plane across the axis (rad).
+        Of the moment out of the plane perpendicular to the axis (rad).
     ellipse_sigma : float
-        Of how far the moment's circle is from one, each of two numbers, as a share of the moment:
-        by an angle that errs twice a turn, as a joint or iron about the magnet make it.
+        Of the ellipticity of the moment, each of two numbers, relative to the moment: from an
+        angle error of two periods a turn, as by a joint or iron around the magnet.
     speed_sigma_hz : float
-        Of the speed about the declared frequency, where nobody measures the angle.
+        Of the speed about the declared frequency, where the angle is not measured.
     speed_walk_hz_rts : float
-        What it gains in a second, one sigma, likewise.
+        Random walk of the speed, gained in one second, one sigma.
     length : float
         Of the magnets along the shaft (m).
     """
@@ -67,21 +67,21 @@ class Rotor:
 
     @property
     def turning_moments(self) -> Array:
-        """Moments of the two coils in quadrature that stand for it (A m^2), shape (2, 3)."""
+        """Moments of the two equivalent coils in quadrature (A m^2), shape (2, 3)."""
         across = np.stack([self.zero_beacon, np.cross(self.axis_beacon, self.zero_beacon)])
         return np.asarray(self.moment * np.cos(self.tilt) * across)
 
 
 @dataclass(frozen=True, eq=False)
 class RotorAngles:
-    """Angles of shafts as encoders have them, beside the samples of the magnetometer.
+    """Shaft angles from encoders, recorded with the magnetometer.
 
     Parameters
     ----------
     time : ndarray, shape (n,)
         Seconds since the log's epoch, strictly increasing.
     angle : mapping of str to ndarray, shape (n,)
-        Of each rotor, by its beacon's name (rad), with or without whole turns.
+        Of each rotor, by its beacon's name (rad), wrapped or unwrapped.
     """
 
     time: Array
@@ -90,17 +90,17 @@ class RotorAngles:
 
 @dataclass(frozen=True, eq=False)
 class Depths:
-    """How far along its hole a part is: that of a beacon, or the magnetometer's.
+    """Measured depth along its hole of a part: a beacon, or the magnetometer.
 
     Parameters
     ----------
     readings : mapping of str to ndarray, shape (2, n)
-        Times, increasing (s), and measured depths (m); linear in between, held beyond.
+        Times, increasing (s), and measured depths (m); linear in between, constant beyond.
     """
 
     readings: Mapping[str, Array]
 
     def at(self, part: str, time: Array) -> Array | None:
-        """Return the depths of a part at times (m); None where it has none."""
+        """Return the depths of a part at times (m); None without readings."""
         known = self.readings.get(part)
         return None if known is None else np.interp(time, known[0], known[1])

@@ -1,4 +1,4 @@
-"""The streams of a log as arrays, time first."""
+"""Streams of a log as arrays, time first."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -43,13 +43,13 @@ class ImuSamples:
 
     @staticmethod
     def empty() -> "ImuSamples":
-        """Return no sample."""
+        """Return a stream without samples."""
         return ImuSamples(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 @dataclass(frozen=True, eq=False)
 class Waveform:
-    """Raw magnetometer stream, as the instrument gave it.
+    """Raw magnetometer stream of the instrument.
 
     Parameters
     ----------
@@ -58,9 +58,9 @@ class Waveform:
     measured_sensor : ndarray, shape (n, 3)
         Uncalibrated flux density (T); zero in the columns of axes that the receiver lacks.
     marks : Marks, optional
-        When which coil was driven, where that was recorded; bursts outside the samples, too.
+        Times at which coils were driven, if recorded; includes bursts outside the samples.
     axes : str
-        Those that the receiver has: the other columns say nothing.
+        Axes of the receiver; the other columns are invalid.
     """
 
     __repr__ = short_repr
@@ -74,7 +74,7 @@ class Waveform:
         return len(self.time)
 
     def rows(self, kept: IntArray | BoolArray | slice) -> "Waveform":
-        """Return some samples."""
+        """Return a subset of the samples."""
         return Waveform(self.time[kept], self.measured_sensor[kept], self.marks, self.axes)
 
 
@@ -93,20 +93,20 @@ class FieldSamples:
     phasor_sensor : complex ndarray, shape (n, channels, 3)
         (T), measured axes; NaN where the channel, or a component of it, is missing.
     phasor_cov : ndarray, shape (n, channels, 3, 3)
-        Covariance of the real part, and of the imaginary part alike (T^2).
+        Covariance of the real part, and equally of the imaginary part (T^2).
     ahead : ndarray, shape (n, channels), optional
-        How much later than at ``time`` the sensor was where each phasor was measured (s): of coils
-        driven in turn, whose phasors are in the sensor's axes of ``time`` all the same.
+        Time of each measurement after ``time`` (s): of coils driven in turn, whose phasors are
+        nevertheless in the sensor's axes of ``time``.
     axes : str
         Components that the receiver has; the others are NaN.
     signed : bool
-        False of amplitudes, whose sign and phase, if any, are those of a prediction: of the one
-        axis.
+        False for amplitudes of a one-axis receiver, whose sign and phase, if any, are those of a
+        prediction.
     magnetometers : tuple of str
-        Name of the one that measures each channel; empty where there are not several.
+        Name of the magnetometer of each channel; empty for a single one.
     turned : ndarray, shape (n, channels, 3, 3), optional
-        From the body's axes when each phasor was measured to those of ``time``, where phasors are
-        in the axes of then: of coils driven in turn, by a receiver that lacks axes.
+        From the body's axes at the measurement to those at ``time``, where phasors are in the
+        former: of coils driven in turn, by a receiver that lacks axes.
     """
 
     __repr__ = short_repr
@@ -138,35 +138,35 @@ class FieldSamples:
 
     @property
     def of_rests(self) -> bool:
-        """Whether each epoch is a whole rest: long, and without a part of any other."""
+        """Whether each epoch is a whole stationary interval: long, without overlap."""
         if len(self) == 0 or float(np.max(self.window)) <= LONGEST_IN_MOTION:
             return False
         end, begin = self.time + 0.5 * self.window, self.time - 0.5 * self.window
         return bool(np.all(begin[1:] >= end[:-1] - 1e-6))
 
     def at_rest(self, time: Array) -> BoolArray:
-        """Tell which times lie in a whole rest that is an epoch, shape (n,)."""
+        """Return which times are within a stationary interval that is an epoch, shape (n,)."""
         if not self.of_rests:
             return np.zeros(len(time), dtype=bool)
         begin, end = self.rest_about(time)
         return np.asarray((time >= begin - 1e-6) & (time <= end + 1e-6))
 
     def rest_about(self, time: Array) -> tuple[Array, Array]:
-        """Return beginning and end of the whole rest that is nearest after times, or last (s)."""
+        """Return begin and end of the stationary interval nearest after times, or the last (s)."""
         end = self.time + 0.5 * self.window
         at = np.minimum(np.searchsorted(end, time - 1e-6), len(self) - 1)
         return end[at] - self.window[at], end[at]
 
     @staticmethod
     def empty(channels: tuple[tuple[str, int], ...]) -> "FieldSamples":
-        """Return no epoch of these channels."""
+        """Return samples of these channels without epochs."""
         shape = (0, len(channels), 3)
         none, phasor = np.zeros(0), np.zeros(shape, dtype=np.complex128)
         return FieldSamples(none, none, channels, phasor, np.zeros((*shape, 3)))
 
     @staticmethod
     def joined(parts: list["FieldSamples"]) -> "FieldSamples":
-        """Return the epochs of several, one after the other."""
+        """Concatenate the epochs of several."""
         return FieldSamples(
             time=np.concatenate([p.time for p in parts]),
             window=np.concatenate([p.window for p in parts]),
@@ -182,11 +182,11 @@ class FieldSamples:
         )
 
     def epochs(self) -> list["FieldSamples"]:
-        """Return each epoch alone."""
+        """Return each epoch separately."""
         return [self.rows(slice(i, i + 1)) for i in range(len(self))]
 
     def rows(self, kept: IntArray | BoolArray | slice) -> "FieldSamples":
-        """Return some epochs."""
+        """Return a subset of the epochs."""
         return FieldSamples(
             self.time[kept],
             self.window[kept],
@@ -201,7 +201,7 @@ class FieldSamples:
         )
 
     def of_magnetometer(self, name: str) -> "FieldSamples":
-        """Return the channels of one magnetometer at the epochs that hold any of them."""
+        """Return the channels of one magnetometer at the epochs that have any of them."""
         own = np.array([magnetometer == name for magnetometer in self.magnetometers], dtype=bool)
         channels = tuple(c for c, mine in zip(self.channels, own, strict=True) if mine)
         phasor, cov = self.phasor_sensor[:, own], self.phasor_cov[:, own]
@@ -218,38 +218,38 @@ class FieldSamples:
 
     @property
     def ahead_or_zero(self) -> Array:
-        """How much later each phasor was measured (s), shape (n, channels)."""
+        """Time of each phasor after that of its row (s), shape (n, channels)."""
         shape = (len(self.time), len(self.channels))
         return np.zeros(shape) if self.ahead is None else self.ahead
 
     @property
     def there(self) -> BoolArray:
-        """Which components each row holds, shape (n, channels, 3)."""
+        """Which components each row has, shape (n, channels, 3)."""
         return np.isfinite(self.phasor_sensor)
 
     @property
     def valid(self) -> BoolArray:
-        """Of which channels each row holds a component at least, shape (n, channels)."""
-        there = self.there  # of three components: a reduction over so few costs more
+        """Channels of which each row has at least one component, shape (n, channels)."""
+        there = self.there  # three components: a reduction over so few is slower
         return np.asarray(there[..., 0] | there[..., 1] | there[..., 2])
 
     @property
     def partial(self) -> BoolArray:
-        """Of which channels each row holds some components and lacks others, (n, channels)."""
+        """Channels of which each row has some components and lacks others, (n, channels)."""
         there = self.there
         x, y, z = there[..., 0], there[..., 1], there[..., 2]
         return np.asarray((x | y | z) & ~(x & y & z))
 
     @property
     def numbers(self) -> IntArray:
-        """How many real numbers of each channel each row holds, shape (n, channels)."""
+        """Number of real values of each channel in each row, shape (n, channels)."""
         return (2 if self.signed else 1) * np.sum(self.there, axis=2)
 
     @property
     def told(self) -> BoolArray:
-        """Which real, then imaginary, parts each row tells, shape (n, channels, 6).
+        """Real, then imaginary, parts measured in each row, shape (n, channels, 6).
 
-        An amplitude tells one part, in the place of the real one.
+        An amplitude is one part, in place of the real one.
         """
         there = self.there
         return np.concatenate([there, there & self.signed], axis=2)
@@ -279,13 +279,13 @@ class SteadyFields:
         return len(self.time)
 
     def rows(self, kept: BoolArray | slice) -> "SteadyFields":
-        """Return some epochs."""
+        """Return a subset of the epochs."""
         return SteadyFields(self.time[kept], self.measured_sensor[kept], self.cov[kept])
 
 
 @dataclass(frozen=True)
 class StreamClock:
-    """How the stamps of a stream lie about the even clock that it was sampled by.
+    """Time stamps of a stream relative to its uniform sampling clock.
 
     Parameters
     ----------
@@ -294,9 +294,9 @@ class StreamClock:
     scatter : float
         Root mean square of the stamps about the clock (s).
     lost : int
-        Samples that are missing, gaps aside.
+        Missing samples outside gaps.
     replaced : bool
-        Whether the clock has taken the stamps' place; otherwise the samples were taken at them.
+        Whether the clock replaces the stamps; otherwise the samples were taken at the stamps.
     """
 
     step: float
@@ -307,16 +307,15 @@ class StreamClock:
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """One recording; streams that it does not hold are None, an IMU that it does not is empty.
+    """One recording; missing streams are None, a missing IMU is empty.
 
     ``epoch_ns`` is the log clock's zero, to which drive phases and every ``time`` refer.
-    ``steady`` goes with ``fields``, at the same times; no file holds it.  ``clocks`` says of which
-    streams the stamps scatter, ``noticed`` what else was mended in it.  Where not ``inertial``, the
-    samples of the IMU are those of a motion prior (`magfusion.model.without_imu`), and measured
-    nothing.  ``temperatures`` are those of whatever the samples are not yet freed of,
-    ``drive`` is what was recorded of the currents of coils beside the waveform, ``reference`` the
-    samples of a second magnetometer that stands elsewhere, by its own stamps,
-    ``rotation`` the angles of rotors.  ``depths`` are those of wells, for ranging.
+    ``steady`` has the times of ``fields`` and is not stored in a file.  ``clocks`` lists streams
+    with scattered stamps, ``noticed`` other repairs.  If not ``inertial``, the samples of the IMU
+    are those of a motion prior (`magfusion.model.without_imu`), not measurements.
+    ``temperatures`` are those for which the samples are not corrected yet.  ``drive`` has the
+    recorded currents of coils, ``reference`` the samples of a remote second magnetometer by its own
+    stamps, ``rotation`` the angles of rotors, ``depths`` those of wells, for ranging.
     ``waveforms`` are the samples of several magnetometers, by name and each by its own stamps; then
     ``waveform`` is None.
     """
@@ -343,6 +342,6 @@ class Log:
 
     @property
     def vectors(self) -> Waveform | None:
-        """Raw samples of all three axes; None where there are none."""
+        """Raw samples of all three axes; None if axes are missing."""
         wave = self.waveform
         return None if wave is None or wave.axes != "xyz" else wave

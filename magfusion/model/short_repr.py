@@ -1,4 +1,4 @@
-"""One line for `repr` of records that hold arrays: a notebook shows it after every cell."""
+"""One-line `repr` of records that contain arrays, as shown by notebooks."""
 
 from collections.abc import Sized
 from dataclasses import Field, fields
@@ -17,7 +17,7 @@ class _Dataclass(Protocol):
 def short_repr(self: _Dataclass) -> str:
     """Return class and fields: arrays by their shape, objects by class and length.
 
-    Fields that are empty or at their default are left out.
+    Fields that are empty or at their default are omitted.
     """
     values = [(f.name, getattr(self, f.name), f.default) for f in fields(self)]
     parts = [f"{name}={_shown(v)}" for name, v, default in values if not _absent(v, default)]
@@ -25,7 +25,7 @@ def short_repr(self: _Dataclass) -> str:
 
 
 def one_line(name: str, parts: list[str]) -> str:
-    """Return a name with facts in parentheses, cut at `LONGEST`."""
+    """Return a name with facts in parentheses, truncated at `LONGEST`."""
     line = f"{name}({', '.join(parts)})"
     return line if len(line) <= LONGEST else f"{line[: LONGEST - 4]}...)"
 

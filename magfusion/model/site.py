@@ -1,4 +1,4 @@
-"""The installation: beacons, the platform that moves among them, and how well each is known."""
+"""The site: beacons, the moving platform, and the uncertainty of their calibration."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -39,13 +39,13 @@ class Coil:
     centre_beacon : ndarray, shape (3,)
         Magnetic centre relative to the beacon's origin (m).
     radius, length : float, optional
-        Finite size (m), of which `magfusion.model.coil_field` makes the field; None for a dipole.
+        Finite size (m), see `magfusion.model.coil_field`; None for a dipole.
     frequency_hz : float, optional
         Drive frequency where it differs from the beacon's (frequency division).
     slot : int, optional
         Time slot, counted from 0, where coils are driven in turn (time division).
     current : float, optional
-        Peak current for which the moment is declared (A).
+        Peak current of the declared moment (A).
     """
 
     moment_beacon: Array
@@ -59,9 +59,9 @@ class Coil:
 
 
 def rotor_coils(rotor: Rotor, frequency_hz: float) -> tuple[Coil, ...]:
-    """Return the coils that stand for a magnet on a shaft that turns at a frequency.
+    """Return the coils equivalent to a magnet on a shaft rotating at a frequency.
 
-    Their current is one, of which the cosine of a measured angle is the record.
+    Their current is one; a measured angle is recorded as its cosine.
     """
     cosine, sine = rotor.turning_moments
     turning = (Coil(cosine, current=1.0), Coil(sine, -np.pi / 2.0, current=1.0))
@@ -103,27 +103,27 @@ class Beacon:
     synchronised : bool
         False where the drive phase relative to the log clock is unknown and drifts.
     field_map : FieldMap, optional
-        How its field differs from the model where it was surveyed.
+        Deviation of its field from the model where it was surveyed.
     slots : Slots or MarkedSlots, optional
-        When its coils are driven, where they are driven in turn and that is known; a frequency of
-        zero then means pulses of direct current.
+        Time slots of its coils, if driven in turn on a known schedule; a frequency of zero then
+        means pulses of direct current.
     unknown : {"pose", "position", "attitude"}, optional
-        What was never surveyed, so that a log must place it; the values in its stead are NaN.
+        Unsurveyed part, to be estimated from a log; its values are NaN.
     model_error : float, optional
-        Of its own field; the site's where it is None.
+        Of its own field; the site's if None.
     noise_factor : float
-        Noise of its phasors in units of what the receiver measures beside its tones.
+        Noise of its phasors relative to that measured near its tones.
     warming : Warming, optional
-        How its moments change with temperature.
+        Temperature dependence of its moments.
     hemisphere_beacon : ndarray, shape (3,), optional
-        Direction, of any length, in front of which the magnetometer always is.
+        Direction, of any length, of the half space that contains the magnetometer.
     conductivity : float
-        Of the ground or water that it and the magnetometer are in (S/m), the same in all
-        directions and without end; one for all beacons of a site.
+        Of the surrounding ground or water (S/m), uniform, isotropic and unbounded; equal for all
+        beacons of a site.
     rotor : Rotor, optional
-        Of which its coils are made, where it is a magnet on a shaft.
+        Magnet on a shaft from which its coils are derived.
     planned : bool
-        Whether its frequency is yet to be chosen, so that it shares it with no other.
+        Whether its frequency is not chosen yet, so that it is shared with no other beacon.
     """
 
     __repr__ = short_repr
@@ -148,7 +148,7 @@ class Beacon:
 
     @cached_property
     def tones(self) -> tuple[tuple[float, int | None], ...]:
-        """Distinct (frequency in Hz, slot) pairs in the order in which the coils name them."""
+        """Distinct (frequency in Hz, slot) pairs in the order of the coils."""
         return tuple(
             dict.fromkeys((c.frequency_hz or self.frequency_hz, c.slot) for c in self.coils)
         )
@@ -169,7 +169,7 @@ class Beacon:
 
     @cached_property
     def tone_moments(self) -> Array:
-        """Size of the complex moment of each tone (A m^2), shape (tones,)."""
+        """Magnitude of the complex moment of each tone (A m^2), shape (tones,)."""
         return np.asarray(np.linalg.norm(self.moments_beacon.T @ self.excitation, axis=0))
 
     @cached_property
@@ -190,13 +190,13 @@ class Beacon:
 
 @dataclass(frozen=True)
 class ClockModel:
-    """How the drive of a beacon without synchronisation runs, and how steady all drives are.
+    """Clock of an unsynchronised beacon, and stability of all drives.
 
     Parameters
     ----------
     drift_sigma, drift_largest : float
-        Of a clock's relative error before any log, as of an ordinary crystal; and the largest
-        error that is searched.
+        Prior sigma of a clock's relative error, as of an ordinary crystal; and the largest error
+        that is searched.
     phase_walk, drift_walk, log_moment_walk : float
         Standard deviation that drive phase (rad), relative error of the clock, and logarithm of a
         moment gain in an hour, by temperature and ageing.
@@ -211,7 +211,7 @@ class ClockModel:
 
 @dataclass(frozen=True)
 class EarthModel:
-    """How far a building's iron changes the declared Earth field, outside of steel halls.
+    """Change of the declared Earth field by a building's iron, outside of steel halls.
 
     Parameters
     ----------
@@ -220,8 +220,8 @@ class EarthModel:
     strength_sigma : float
         Of its horizontal and of its vertical part, relative to its size.
     declination_walk, strength_walk : float
-        Standard deviation that azimuth (rad) and parts (T) gain in an hour: where the platform goes
-        in that time, the field is another.
+        Standard deviation that azimuth (rad) and parts (T) gain in an hour: the field changes as
+        the platform moves.
     """
 
     declination_sigma: float = float(np.deg2rad(3.0))
@@ -232,20 +232,20 @@ class EarthModel:
 
 @dataclass(frozen=True)
 class Platform:
-    """What moves: an IMU and one magnetometer or several, rigidly mounted beside it.
+    """Moving platform: an IMU and one or several magnetometers, rigidly mounted together.
 
     Parameters
     ----------
     magnetometer : Magnetometer
-        The only one, or the first.
+        The single or first one.
     further : tuple of Magnetometer
-        Those beside it.
+        The other magnetometers.
     left_out : tuple of (int, Magnetometer)
-        Those that a log gave reason to leave out, each with its place among those then there.
+        Magnetometers excluded for a log, each with its index at that time.
     motion_prior : MotionPrior, optional
-        What is assumed of the motion where a log has no inertial samples.
+        Assumed motion if a log has no inertial samples.
     replaced : Replaced, optional
-        What that prior takes the place of (`magfusion.model.without_imu`); None where the IMU
+        Parts that the prior replaces (`magfusion.model.without_imu`); None if the IMU
         measures.
     """
 
@@ -276,7 +276,7 @@ class Platform:
 
 @dataclass(frozen=True)
 class Location:
-    """Where and when, for the geomagnetic reference field; ``date`` is ISO 8601 (YYYY-MM-DD)."""
+    """Location and date for the geomagnetic reference field; ``date`` is ISO 8601 (YYYY-MM-DD)."""
 
     latitude_deg: float
     longitude_deg: float
@@ -286,7 +286,7 @@ class Location:
 
 @dataclass(frozen=True, eq=False)
 class Site:
-    """Everything that is known before a log is read.
+    """Prior knowledge before a log is read.
 
     Parameters
     ----------
@@ -295,26 +295,26 @@ class Site:
     model_error : float
         Relative error of the field model, one sigma per phasor.
     model_error_length : float
-        Distance over which that error stays much the same (m): it is that of iron, which is
-        constant in place, and does not average over epochs that lie closer.
+        Correlation length of that error (m): it is caused by iron, is constant in place, and does
+        not average over epochs that are closer.
     earth_field_world : ndarray, shape (3,), optional
-        (T); from ``location`` by the IGRF where that is given instead.
+        (T); from ``location`` by the IGRF if that is given instead.
     calibration : mapping, optional
-        Where refined values came from: log, parameters that it determined and that it did not.
+        Source of refined values: log, and parameters that it did and did not determine.
     correlation : Correlation, optional
-        Of the errors that the sigmas stand for; None where all are independent.
+        Of the errors behind the sigmas; None if all are independent.
     region : Region, optional
-        Where the magnetometer is, whatever the fields say.
+        Region that contains the magnetometer.
     temperatures : Temperatures, optional
-        Of its beacons, as a log or a stream has them.
+        Of its beacons, from a log or a stream.
     drives : DriveShares, optional
-        Of its beacons' currents, likewise.
+        Of its beacons' currents, from a log or a stream.
     log_conductivity_sigma : float
-        Of the logarithm of the conductivity that its beacons have; zero means known.
+        Of the logarithm of its conductivity; zero means known.
     reference_world : ndarray, shape (3,), optional
-        Where a second magnetometer stands that witnesses the noise (m).
+        Position of a second magnetometer that measures the noise (m).
     unheard : tuple of (int, Beacon)
-        Beacons that a log does not hear, with their places among all; they stay as declared.
+        Beacons not detected in a log, with their indices among all; they remain as declared.
     """
 
     __repr__ = short_repr
@@ -339,12 +339,12 @@ class Site:
 
     @cached_property
     def bounds(self) -> Bounds | None:
-        """Planes that the magnetometer does not cross; None where nothing is said of its place."""
+        """Planes that bound the magnetometer's position; None if none is declared."""
         return bounds_of(self.region, self.beacons)
 
     @property
     def every_beacon(self) -> tuple[Beacon, ...]:
-        """Those that are heard, and those that are not, in the order of the file."""
+        """Detected and undetected beacons, in the order of the file."""
         every = list(self.beacons)
         for number, beacon in self.unheard:
             every.insert(number, beacon)
@@ -354,7 +354,7 @@ class Site:
     def channels(self) -> tuple[tuple[str, int], ...]:
         """(beacon, tone) of each phasor, in site order: the channel axis of `FieldSamples`.
 
-        Of several magnetometers those of the first, then those of the next.
+        With several magnetometers, those of the first, then of the next.
         """
         own = tuple((b.name, k) for b in self.beacons for k in range(len(b.tones)))
         return own * len(self.platform.magnetometers)
@@ -366,13 +366,13 @@ class Site:
 
     @cached_property
     def owner(self) -> IntArray:
-        """Which beacon each channel is of, shape (channels,)."""
+        """Index of each channel's beacon, shape (channels,)."""
         own = [i for i, beacon in enumerate(self.beacons) for _ in beacon.tones]
         return np.array(own * len(self.platform.magnetometers), dtype=np.int64)
 
     @cached_property
     def sensor(self) -> IntArray:
-        """Which magnetometer each channel is measured by, shape (channels,)."""
+        """Index of each channel's magnetometer, shape (channels,)."""
         count = len(self.platform.magnetometers)
         return np.repeat(np.arange(count), len(self.channels) // count)
 

@@ -1,4 +1,4 @@
-"""Attitude and motion between samples from the inertial stream, without a loop over samples."""
+"""Attitude and motion between inertial samples, without a loop over samples."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from magfusion.units import Array, BoolArray, IntArray
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-CHUNK = 65_536  # samples at a time: what is computed of them stays in the cache
-LONG = 1 << 18  # samples whose turns are multiplied at once
+CHUNK = 65_536  # samples at a time, to fit the CPU cache
+LONG = 1 << 18  # samples whose rotations are multiplied at once
 
 
 def rotation_increments(time: Array, gyro_body: Array) -> Rotation:
-    """Return the rotation from each sample to the next, the rate taken as linear between them.
+    """Return the rotation from each sample to the next, for a rate linear between them.
 
     Parameters
     ----------
@@ -44,9 +44,9 @@ def _increments(time: Array, gyro_body: Array) -> Array:
 
 
 def _prefix_products(quaternion: Array) -> Array:
-    """Products of the first 1, 2, ... rotations: those of neighbouring pairs, then the odd ones.
+    """Return the products of the first 1, 2, ... rotations, by neighbouring pairs.
 
-    Of and to shape (4, n), scalar first.
+    From and to shape (4, n), scalar first.
     """
     n = quaternion.shape[1]
     out = quaternion.copy()
@@ -81,7 +81,7 @@ def turn_from_gyro(time: Array, gyro_body: Array) -> Array:
     out = np.empty((4, len(time)))
     out[:, :1] = [[1.0], [0.0], [0.0], [0.0]]
     for lo in range(0, len(time), LONG):
-        piece = slice(lo, lo + LONG + 1)  # from the last turn of the piece before
+        piece = slice(lo, lo + LONG + 1)  # from the last rotation of the previous piece
         steps = np.concatenate(
             [out[:, lo : lo + 1], of_vectors(_increments(time[piece], gyro_body[piece]).T)], axis=1
         )
@@ -123,7 +123,7 @@ def turn_at(turn: Array, time: Array, gyro_body: Array, wanted: Array) -> Array:
 
 
 def attitude_from_gyro_at(time: Array, gyro_body: Array, wanted: Array) -> Rotation:
-    """Return the attitude at some times only: of a long stream it takes less than at every sample.
+    """Return the attitude at some times; faster than all samples for a long stream.
 
     Parameters
     ----------
@@ -160,9 +160,9 @@ def turn_from_gyro_at(time: Array, gyro_body: Array, wanted: Array) -> Array:
 
 
 def _products_of_first(quaternion: Array, count: IntArray) -> Array:
-    """Products of the first rotations, as many as each count tells, by products of pairs.
+    """Return the products of the first rotations for each count, by products of pairs.
 
-    Of shape (4, n) to shape (4, len(count)), scalar first.
+    From shape (4, n) to shape (4, len(count)), scalar first.
     """
     n = quaternion.shape[1]
     if n == 1:
@@ -180,7 +180,7 @@ def _sample_before(time: Array, wanted: Array) -> IntArray:
 
 
 def _turn_since(index: IntArray, time: Array, gyro_body: Array, wanted: Array) -> Array:
-    """Return the turn from samples to the times that follow them, shape (4, m), scalar first."""
+    """Return the rotation from samples to the times that follow, shape (4, m), scalar first."""
     after = np.minimum(index + 1, len(time) - 1)
     span = np.where(after > index, time[after] - time[index], 1.0)
     ahead = wanted - time[index]
@@ -190,7 +190,7 @@ def _turn_since(index: IntArray, time: Array, gyro_body: Array, wanted: Array) -
 
 
 def mean_about(time: Array, vector: Array, wanted: Array, span: float) -> Array:
-    """Return the means of sampled vectors over a span about some times, shape (m, 3).
+    """Return the means of sampled vectors over a span centred at some times, shape (m, 3).
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def mean_about(time: Array, vector: Array, wanted: Array, span: float) -> Array:
     wanted : ndarray, shape (m,)
         (s)
     span : float
-        Where it holds no sample, the nearest one counts (s).
+        Without a sample in it, the nearest one is used (s).
     """
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(vector, axis=0)])
     lo = np.searchsorted(time, wanted - span / 2)
@@ -211,12 +211,12 @@ def mean_about(time: Array, vector: Array, wanted: Array, span: float) -> Array:
 
 
 def triad(field_world: Array, up_body: Array, field_body: Array) -> Array:
-    """Return attitudes with the vertical exact and the heading by the field (TRIAD).
+    """Return attitudes with the vertical exact and the heading from the field (TRIAD).
 
     Parameters
     ----------
     field_world : ndarray, shape (3,)
-        Of any size, as all vectors here; not vertical.
+        Of any length, as all vectors here; not vertical.
     up_body, field_body : ndarray, shape (..., 3)
 
     Returns
@@ -253,16 +253,16 @@ def resting(
     gyro_body, accel_body : ndarray, shape (n, 3)
         (rad/s, m/s^2)
     span : float, optional
-        Length of the stretch around each sample that must be quiet (s), other than the model's.
+        Length of the stretch around each sample that must be quiet (s), overriding the model's.
     motion : MotionModel
-        What is called rest.
+        Thresholds of rest.
     at : int ndarray, shape (k,), optional
-        Those that are asked of; all where it is not given.
+        Samples to test; default all.
 
     Returns
     -------
     bool ndarray, shape (n,) or (k,)
-        Where rate and specific force scatter less about their means over the stretch than they may.
+        Where rate and specific force scatter about their means by less than the thresholds.
     """
     span = motion.rest_span if span is None else span
     centre = np.concatenate([gyro_body.mean(axis=0), accel_body.mean(axis=0)])

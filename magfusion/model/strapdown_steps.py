@@ -1,4 +1,4 @@
-"""Steps of dead reckoning in closed form, on arrays: rate and specific force constant in each."""
+"""Dead-reckoning steps in closed form, on arrays: rate and specific force constant in each."""
 
 from typing import NamedTuple
 
@@ -7,18 +7,18 @@ import numpy as np
 from magfusion.model.field import skew
 from magfusion.units import Array
 
-SMALL = 0.03  # rad; below it the series are as exact as the closed forms
+SMALL = 0.03  # rad; below it the series are as accurate as the closed forms
 
 
 class Turned(NamedTuple):
-    """What steps do, in body axes at the beginning of each.
+    """Increments of steps, in body axes at the beginning of each.
 
     Parameters
     ----------
     rotation : ndarray, shape (n, 3, 3)
         ``before_from_after``.
     velocity, position : ndarray, shape (n, 3)
-        What the specific force alone gains (m/s, m).
+        Gain from the specific force alone (m/s, m).
     """
 
     rotation: Array
@@ -27,7 +27,7 @@ class Turned(NamedTuple):
 
 
 def steps_of(gyro_body: Array, accel_body: Array, dt: Array) -> Turned:
-    """Return what steps do whose rate and specific force stay as they are in body axes.
+    """Return the increments of steps with constant rate and specific force in body axes.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def steps_of(gyro_body: Array, accel_body: Array, dt: Array) -> Turned:
     safe = np.where(near, 1.0, angle)
     half = np.sin(0.5 * safe)
     sine, cosine = np.sin(safe), 2.0 * half**2
-    # Of the turn, its integral and the integral of that, with powers of the angle taken out.
+    # Rotation, its integral and double integral, with powers of the angle factored out.
     first = np.where(near, 1.0 - square / 6.0 * (1.0 - square / 20.0), sine / safe)
     second = np.where(near, 0.5 - square / 24.0 * (1.0 - square / 30.0), cosine / safe**2)
     third = np.where(

@@ -1,6 +1,6 @@
-"""Temperatures of coils and of the magnetometer, and what changes with them.
+"""Temperatures of coils and of the magnetometer, and their effects.
 
-A reading holds for its time; in between it is linear, and beyond the first and the last it is held.
+Readings are interpolated linearly, and constant before the first and after the last.
 """
 
 from collections.abc import Iterator, Mapping
@@ -11,13 +11,13 @@ import numpy as np
 
 from magfusion.units import Array
 
-MAGNETOMETER = "magnetometer"  # the part of that name; all others are beacons
+MAGNETOMETER = "magnetometer"  # name of that part; all others are beacons
 REMEMBERED = 1000  # readings of each part that a running estimator keeps
 
 
 @dataclass(frozen=True)
 class Warming:
-    """How the moments of a beacon's coils change with their temperature.
+    """Temperature dependence of the moments of a beacon's coils.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Warming:
 
 @dataclass(frozen=True, eq=False)
 class SensorWarming:
-    """How a magnetometer's matrix and offset change with its temperature.
+    """Temperature dependence of a magnetometer's matrix and offset.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class SensorWarming:
     reference_degc: float = 20.0
 
     def to_reference(self, matrix: Array, degc: Array) -> tuple[Array, Array]:
-        """Return what turns samples into those of the reference temperature, and their offset.
+        """Return the matrix that corrects samples to the reference temperature, and their offset.
 
         Parameters
         ----------
@@ -61,9 +61,9 @@ class SensorWarming:
         Returns
         -------
         ndarray, shape (n, 3, 3)
-            To be applied to what a sample is beyond its offset.
+            Applied to samples after subtraction of the offset.
         ndarray, shape (n, 3)
-            By how much the offset is larger (T).
+            Increase of the offset (T).
         """
         warmer = np.asarray(degc) - self.reference_degc
         grown = np.eye(3) + warmer[:, None, None] * (self.matrix_per_k @ np.linalg.inv(matrix))
@@ -71,7 +71,7 @@ class SensorWarming:
 
 
 class Temperatures:
-    """Readings of several parts, whole or as they come.
+    """Readings of several parts, complete or streamed.
 
     Parameters
     ----------
@@ -79,19 +79,19 @@ class Temperatures:
         Of each part, shape (2, n): times, increasing (s), and temperatures (degrees Celsius).
     """
 
-    readings: dict[str, Array]  # what a checkpoint holds
+    readings: dict[str, Array]  # part of a checkpoint
 
     def __init__(self, readings: Mapping[str, Array] | None = None) -> None:
         self.readings = {} if readings is None else dict(readings)
 
     def hear(self, part: str, time: float, degc: float) -> None:
-        """Take a reading; one that is older than the last is passed over."""
+        """Add a reading; one older than the last is ignored."""
         known = self.readings.get(part, np.zeros((2, 0)))
         if known.shape[1] == 0 or time > known[0, -1]:
             self.readings[part] = np.column_stack([known[:, -REMEMBERED:], [time, degc]])
 
     def at(self, part: str, time: Array) -> Array | None:
-        """Return temperatures of a part at some times, of their shape; None without a reading."""
+        """Return temperatures of a part at times, same shape; None without a reading."""
         known = self.readings.get(part)
         return None if known is None else np.asarray(np.interp(time, *known))
 
@@ -101,5 +101,5 @@ class Temperatures:
             yield from zip(time.tolist(), repeat(part), degc.tolist())
 
     def without(self, part: str) -> "Temperatures":
-        """Return those of all other parts."""
+        """Return the readings of all other parts."""
         return Temperatures({k: v for k, v in self.readings.items() if k != part})

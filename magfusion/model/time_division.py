@@ -1,4 +1,4 @@
-"""Time division: when the coils of a beacon are driven, where they are driven in turn."""
+"""Time division: schedules of coils that are driven in turn."""
 
 from dataclasses import dataclass
 
@@ -16,9 +16,9 @@ class Slots:
     duration : float
         Of one slot (s).
     count : int
-        Slots in a cycle; those that no coil names are silent.
+        Slots in a cycle; those without a coil are silent.
     start : float
-        When slot 0 of a cycle begins on the log's clock (s).
+        Begin of slot 0 of a cycle on the log's clock (s).
     """
 
     duration: float
@@ -31,17 +31,17 @@ class Slots:
         return self.duration * self.count
 
     def running(self, time: Array) -> IntArray:
-        """Return the number of the slot at each time, counted on since ``start``.
+        """Return the running slot number at each time since ``start``.
 
-        Modulo ``count`` it is the slot in its cycle; a time that rounding takes from the beginning
-        of a slot belongs to that slot.
+        Modulo ``count`` it is the slot in its cycle.  A time that rounding places before the
+        beginning of a slot belongs to that slot.
         """
         return np.floor((time - self.start) / self.duration + 1e-6).astype(np.int64)
 
 
 @dataclass(frozen=True)
 class MarkedSlots:
-    """Time division by a clock that nobody knows beforehand: the log says when each is driven.
+    """Time division without a known schedule: the log marks when each coil is driven.
 
-    A slot is then a number that its marks name (`magfusion.model.marks`), and has no length.
+    A slot is then the number in its marks (`magfusion.model.marks`), and has no length.
     """

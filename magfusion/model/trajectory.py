@@ -1,4 +1,4 @@
-"""A trajectory: poses over time."""
+"""Trajectory: poses over time."""
 
 from dataclasses import dataclass
 
@@ -21,7 +21,7 @@ _SHAPES: tuple[tuple[str, tuple[int, ...]], ...] = (
 
 
 class PoseAccess:
-    """Position and attitude under short names, of what has one pose or a pose a row."""
+    """Short names for position and attitude, for one pose or a pose per row."""
 
     world_from_body: Array
     position_world: Array
@@ -33,12 +33,12 @@ class PoseAccess:
 
     @property
     def rotation(self) -> Rotation:
-        """Attitude, which takes vectors from body to world axes, as SciPy's `Rotation`."""
+        """Attitude from body to world axes, as SciPy's `Rotation`."""
         return Rotation.from_matrix(self.world_from_body)
 
     @property
     def euler(self) -> Array:
-        """Roll, pitch, yaw, shape (..., 3) (rad): turned by yaw, then pitch, then roll.
+        """Roll, pitch, yaw, shape (..., 3) (rad): rotation by yaw, then pitch, then roll.
 
         As ``rpy_deg`` of a site, and as ``rotation.as_euler("xyz")``.
         """
@@ -47,7 +47,7 @@ class PoseAccess:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory(PoseAccess):
-    """Poses of the body over time; optional parts are None where they are not known.
+    """Poses of the body over time; optional parts are None if unknown.
 
     Parameters
     ----------
@@ -101,10 +101,10 @@ class Trajectory(PoseAccess):
 def interpolate(
     trajectory: Trajectory, time: Array, max_gap: float
 ) -> tuple[Trajectory, BoolArray]:
-    """Return the poses at those of ``time`` that lie on a sample or in a short enough step.
+    """Interpolate the poses at those of ``time`` that lie on a sample or in a short enough step.
 
-    Positions are joined by straight lines, attitudes by the shortest turn (slerp); the parts of
-    the trajectory beside its poses are left out.
+    Positions are interpolated linearly, attitudes along the shortest rotation (slerp); other parts
+    of the trajectory are omitted.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def interpolate(
     poses : Trajectory
         At the m times that exist.
     exists : ndarray of bool, shape (n,)
-        Which of ``time`` they are.
+        Which of ``time`` have a pose.
     """
     known = trajectory.time
     if len(known) == 0:
@@ -138,9 +138,9 @@ def interpolate(
 
 
 def interpolated(wanted: Array, time: Array, values: Array) -> Array:
-    """Return columns, shape (m, k), on straight lines between their values at times (n,) (s).
+    """Return columns, shape (m, k), linearly interpolated between values at times (n,) (s).
 
-    Before the first time and after the last one the values there.
+    Constant before the first time and after the last one.
     """
     return np.stack([np.interp(wanted, time, column) for column in values.T], axis=1)
 

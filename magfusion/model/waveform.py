@@ -1,7 +1,7 @@
-"""What a magnetometer reads along a motion, sample by sample, and how that changes.
+"""Predicted magnetometer samples along a motion, with their derivative.
 
-Of real numbers all through: the coils' currents at every sample, and the field that they make.
-Where the ground conducts the field lags behind them, and both are complex until they are summed.
+Computed in real numbers: the coils' currents at every sample, and their field.  In conducting
+ground the field lags behind the currents, and both are complex until they are summed.
 """
 
 from typing import NamedTuple
@@ -21,12 +21,12 @@ from magfusion.units import AnyArray, Array, ComplexArray
 
 
 class Motion(NamedTuple):
-    """How a motion changes, shape (n, 3) both, world axes.
+    """Rate of change of a motion, shape (n, 3) both, world axes.
 
     Parameters
     ----------
     rotation_world : ndarray
-        (rad/s, or rad of whatever it changes by)
+        (rad/s, or rad per unit of another variable)
     position_world : ndarray
         Of the body (m/s)
     """
@@ -36,7 +36,7 @@ class Motion(NamedTuple):
 
 
 def carriers(frequencies_hz: Array, time: Array) -> ComplexArray:
-    """Return what the phasors turn with, shape (n, channels)."""
+    """Return the carrier of each phasor, shape (n, channels)."""
     return np.exp(2j * np.pi * frequencies_hz * time[:, None])
 
 
@@ -49,7 +49,7 @@ def predicted_waveform(
     *,
     through_nodes: bool = False,
 ) -> tuple[Array, Array]:
-    """Return the samples that a magnetometer takes along a motion.
+    """Return the samples of a magnetometer along a motion.
 
     Parameters
     ----------
@@ -60,21 +60,21 @@ def predicted_waveform(
     carrier : complex ndarray, shape (n, channels)
         As of `carriers`.
     change : Motion, optional
-        Of the motion.
+        Derivative of the motion.
     through_nodes : bool
-        Whether fields that cost much are found as by `magfusion.model.path_field`.
+        Whether expensive fields are interpolated by `magfusion.model.path_field`.
 
     Returns
     -------
     ndarray, shape (n, 3)
         (T), measured axes, without noise.
     ndarray, shape (n, 3)
-        By what it changes with; zero where no change is given.
+        Derivative of the samples; zero without a change.
     """
     factors = axis_factors(calibration.site)
     if factors is None:
         return _read(motion, calibration, earth_field_world, carrier, change, through_nodes)
-    # What an axis answers is what all would, if its currents were those that it answers to.
+    # An axis's response is that of all axes to currents scaled by its own factors.
     read = [
         _read(
             motion,
@@ -98,7 +98,7 @@ def _read(
     change: Motion | None,
     through_nodes: bool,
 ) -> tuple[Array, Array]:
-    """Return the samples of axes that answer alike, as `predicted_waveform`."""
+    """Return the samples of axes with equal response, as `predicted_waveform`."""
     magnetometer = calibration.site.platform.magnetometer
     currents = _currents(calibration, motion.time, carrier)
     if not is_apart(magnetometer):
@@ -150,7 +150,7 @@ def _at_point(
     change: Motion | None,
     through_nodes: bool,
 ) -> tuple[Array, Array]:
-    """Return what a magnetometer reads whose axes are at one point, without its offset."""
+    """Return the samples of a magnetometer with concentric axes, without its offset."""
     rotation = motion.world_from_body
     lever = rotation @ magnetometer.position_body
     along = None
@@ -159,7 +159,7 @@ def _at_point(
     field, by = np.tile(earth_field_world, (len(rotation), 1)), np.zeros((len(rotation), 3))
     for (_, source), current in zip(side_by_side(site), currents, strict=True):
         place = motion.position_world + lever
-        # Dipoles cost less than what would save them.
+        # For dipoles the interpolation costs more than it saves.
         dear = source.loops.radius is not None or source.decay is not None
         field_at = field_along_path if dear and through_nodes else driven_field
         driven = field_at(source, place, current, along)

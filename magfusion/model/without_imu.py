@@ -1,9 +1,9 @@
-"""A motion prior in the place of an IMU.
+"""Motion prior in place of an IMU.
 
-White acceleration, and a rate that walks by white angular acceleration, are what an inertial sensor
-of a particular kind would tell: it measures nothing but zeros where nothing pulls, with so much
-noise of its accelerometer, and its gyro's bias, which walks, is the rate of the platform reversed.
-The estimators take such samples as any others, in batch, window and filter, with the same factors.
+White acceleration, and a rate that walks by white angular acceleration, equal an inertial sensor
+with particular noise.  It measures zeros, its accelerometer noise is the acceleration, and its
+gyro bias, a random walk, is the negative rate of the platform.  The estimators process such samples
+as any others, in batch, window and filter, with the same factors.
 """
 
 from dataclasses import replace
@@ -16,17 +16,17 @@ from magfusion.model.platform_motion import HeldModel, ImuModel, MotionPrior, Re
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
 
-STEPS = 4  # samples at least between two epochs: within a step the noise of the rate is none
+STEPS = 4  # least samples between two epochs: rate noise within a step is neglected
 LONGEST_STEP = 0.02  # s
-# What a factor needs to be regular, and nobody notices: rad/s/sqrt(Hz), m/s^2 and that per root s.
+# Negligible noise that keeps factors regular: rad/s/sqrt(Hz), m/s^2 and the latter per root s.
 LEAST_GYRO, LEAST_ACCEL = 1e-4, 1e-4
 EXAMPLE = "{accel_density_m_s2_rthz: 2, angular_accel_density_rad_s2_rthz: 3}"
 
 
 def on_motion_prior(site: Site) -> Site:
-    """Return a site whose motion prior has taken the place of IMU, gravity and rest.
+    """Return a site whose motion prior replaces IMU, gravity and rest detection.
 
-    That of a hand where the site declares none.
+    A site without a motion prior gets that of a hand.
     """
     if not site.platform.inertial:
         return site
@@ -45,7 +45,7 @@ def on_motion_prior(site: Site) -> Site:
     if axis is not None:
         imu = HeldModel(**vars(imu), held_axis=axis)
     platform, motion = site.platform, site.platform.motion
-    never = replace(motion, rest_gyro=0.0, rest_accel=0.0)  # zeros must not pass for rest
+    never = replace(motion, rest_gyro=0.0, rest_accel=0.0)  # zeros must not be detected as rest
     replaced = Replaced(platform.imu, motion, site.gravity)
     return replace(
         site,
@@ -55,7 +55,7 @@ def on_motion_prior(site: Site) -> Site:
 
 
 def _held(site: Site) -> tuple[float, float, float] | None:
-    """Return the coil about which nothing tells a turn; None where there are more axes."""
+    """Return the axis of the coil with unobservable roll; None if there are more axes."""
     platform = site.platform
     if platform.further or len(platform.magnetometer.axes) != 1:
         return None
@@ -64,7 +64,7 @@ def _held(site: Site) -> tuple[float, float, float] | None:
 
 
 def as_declared(site: Site) -> Site:
-    """Return a site with what its motion prior had replaced, and the densities that were found."""
+    """Return a site with the replaced parts restored, and the estimated densities."""
     platform, replaced = site.platform, site.platform.replaced
     if replaced is None:
         return site
@@ -86,9 +86,9 @@ def as_declared(site: Site) -> Site:
 
 
 def without_imu(log: Log, site: Site) -> tuple[Log, Site]:
-    """Return a log that has no inertial samples, and its site, as the estimators take them.
+    """Return a log without inertial samples, and its site, prepared for the estimators.
 
-    Samples of zeros cover the log: the accelerometer of `on_motion_prior` measures no more.
+    Samples of zeros cover the log, for the accelerometer of `on_motion_prior`.
     """
     times = [
         s.time
@@ -107,12 +107,12 @@ def without_imu(log: Log, site: Site) -> tuple[Log, Site]:
 
 
 def logged(log: Log, site: Site) -> tuple[Log, Site]:
-    """Return a log and its site as they are, or as `without_imu` where it has no samples."""
+    """Return a log and its site unchanged, or as `without_imu` if it has no inertial samples."""
     return (log, site) if len(log.imu) else without_imu(log, site)
 
 
 def require_motion_prior(site: Site) -> None:
-    """Refuse a site that says too little of the motion that no IMU measures.
+    """Reject a site without a motion prior.
 
     Raises
     ------
@@ -120,7 +120,7 @@ def require_motion_prior(site: Site) -> None:
     """
     if not site.platform.inertial and site.platform.motion_prior is None:
         raise InputError(
-            "holds no inertial samples (imu.parquet), and its site no platform.motion_prior to"
-            " smooth by; record the IMU, or declare how the platform moves:"
-            f" motion_prior: {EXAMPLE} is a hand's"
+            "has no inertial samples (imu.parquet), and its site has no platform.motion_prior;"
+            " record the IMU, or declare the motion of the platform, e.g. that of a hand:"
+            f" motion_prior: {EXAMPLE}"
         )

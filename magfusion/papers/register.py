@@ -1,7 +1,7 @@
-"""What four papers say and what is true of it: every equation, table, figure and claim.
+"""Register of four papers: every equation, table, figure and claim, and whether it is right.
 
-`magfusion papers` prints it and a page of the documentation is made of it; a test holds that
-nothing is missing and that every function, test and scenario that an entry names is there.
+`magfusion papers` prints it and a page of the documentation is generated from it; a test checks
+that it is complete and that every function, test and scenario that an entry names exists.
 """
 
 import re
@@ -21,8 +21,8 @@ FINDINGS: dict[Finding, str] = {
     "right": "it holds as printed",
     "misprint": "a symbol is wrong, and it is clear which one is meant",
     "false": "it does not hold; the counter-example is given",
-    "not reproducible": "what it depends on is not printed, or does not lead to what is",
-    "unclear": "the source has lost it, or does not say enough; what is here is a reading",
+    "not reproducible": "its inputs are not printed, or do not lead to the printed result",
+    "unclear": "the source is incomplete or not specific; this is a reading",
 }
 KINDS: dict[Kind, str] = {"equation": "Eq", "table": "Table", "figure": "Fig", "claim": "Claim"}
 ROOMS = {
@@ -35,7 +35,7 @@ _ASKED = re.compile(r"(?:(eq|tab|fig|claim)[a-z]*)?[\s.(]*(\d*)[\s.)]*", re.ASCI
 
 
 class Citation(StrictModel):
-    """Where a paper was published; ``doi_note`` says where the DOI is from, or that none is."""
+    """Where a paper was published; ``doi_note`` is the source of the DOI, or that none exists."""
 
     authors: list[str]
     title: str
@@ -64,22 +64,22 @@ class Entry(StrictModel):
 
     Parameters
     ----------
-    says : str
-        What the paper says, in a few words.
+    `says` : str
+        The paper's statement, in a few words.
     where : str
-        The section, of what has no printed number.
+        The section, for entries without a printed number.
     finding : str
         One of `FINDINGS`.
     why : str
-        The correction, the counter-example, or what is missing.
+        The correction, the counter-example, or the missing information.
     figures : str
-        What the paper prints, and what is found here.
+        The numbers that the paper prints, and those computed here.
     functions : list of str
-        Where it can be called; a name without dots is one of the room's ``equations``.
+        Callable functions; a name without dots is in the paper's ``equations``.
     tests : list of str
-        Node ids of what shows it.
+        Node ids of the tests that show it.
     scenario : str, optional
-        The file that shows it at length.
+        The scenario file that shows it in full.
     """
 
     says: str
@@ -94,9 +94,9 @@ class Entry(StrictModel):
     @model_validator(mode="after")
     def _told(self) -> Self:
         if self.finding != "right" and not self.why:
-            raise ValueError(f"a finding of {self.finding} needs its why")
+            raise ValueError(f"a finding of {self.finding} requires a reason (why)")
         if not (self.why or self.functions or self.tests or self.scenario):
-            raise ValueError("nothing shows it; give why, functions, tests or scenario")
+            raise ValueError("no evidence; give why, functions, tests or scenario")
         return self
 
 
@@ -114,7 +114,7 @@ class _File(StrictModel):
 
 
 class Numbered(StrictModel):
-    """An entry with its paper and number, as a reader asks for it."""
+    """An entry with its paper and number."""
 
     paper: str
     category: Kind
@@ -123,17 +123,17 @@ class Numbered(StrictModel):
 
     @property
     def name(self) -> str:
-        """As ``Eq 7``."""
+        """Name, such as ``Eq 7``."""
         return f"{KINDS[self.category]} {self.number}"
 
     @property
     def functions(self) -> list[str]:
-        """Whole dotted paths of what computes it."""
+        """Full dotted paths of its functions."""
         room = f"magfusion.papers.{ROOMS[self.paper]}.equations"
         return [f if "." in f else f"{room}.{f}" for f in self.entry.functions]
 
     def content(self) -> dict[str, object]:
-        """Return it as plain values, as ``--json`` prints it."""
+        """Return the entry as plain values, as printed by ``--json``."""
         named = {"paper": self.paper, "name": self.name, "category": self.category}
         return (
             named
@@ -144,7 +144,7 @@ class Numbered(StrictModel):
 
 
 class Paper(StrictModel):
-    """A paper and all that it says, in the order of its numbers; a note on our copy of it."""
+    """A paper and all its entries, in the order of its numbers; a note on our copy of it."""
 
     number: str
     about: str
@@ -157,16 +157,16 @@ class Paper(StrictModel):
         return [one for one in self.entries if one.category == kind]
 
     def asked(self, words: str) -> list[Numbered]:
-        """Return what is asked for as ``7``, ``eq 7``, ``fig. 8`` or ``claims``.
+        """Return the entries selected by ``7``, ``eq 7``, ``fig. 8`` or ``claims``.
 
         Raises
         ------
         InputError
-            Where the paper has no such thing.
+            Where the paper has no such entry.
         """
         parts = _ASKED.fullmatch(words.lower())
         if parts is None or not any(parts.groups()):
-            raise InputError(f"{words!r} is no number of paper {self.number}; {self._offer()}")
+            raise InputError(f"{words!r} is not an entry of paper {self.number}; {self._offer()}")
         kind = next(k for k in get_args(Kind) if k.startswith(parts[1] or "eq"))
         found = [one for one in self.of(kind) if int(parts[2] or one.number) == one.number]
         if not found:

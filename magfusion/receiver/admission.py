@@ -1,7 +1,7 @@
-"""Which windows of a waveform are demodulated: one set of rules, for whole logs and for pieces.
+"""Rules that decide which windows of a waveform are demodulated, for whole logs and for pieces.
 
-A window is judged when it is complete, by what was measured until then: what comes later changes
-nothing, so that a log drops the same windows whether it is read at once or as it arrives.
+A window is assessed once, when it is complete, from the samples up to then.  A log therefore drops
+the same windows whether it is read at once or streamed.
 """
 
 from collections.abc import Callable
@@ -22,10 +22,10 @@ NO_INERTIAL = "no inertial data"
 INERTIAL_GAP = "gap in the inertial stream"
 REASONS = (MAGNETOMETER_GAP, TOO_FEW, STILL, SATURATED, NO_INERTIAL, INERTIAL_GAP)
 
-MOST_GROWTH = 4.0  # of the variance of a phasor, by missing samples
+MOST_GROWTH = 4.0  # largest growth of a phasor's variance by missing samples
 LONGEST_GAP = 0.02  # s; of inertial samples: the motion between is a straight line
 LATEST_USE = 0.6  # steps before a window's end after which no inertial sample is needed
-ROUNDING = 1e-6  # of a step; what arithmetic may take from a window
+ROUNDING = 1e-6  # of a step; tolerance for rounding of a window's limits
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Windows:
     Parameters
     ----------
     number : int ndarray, shape (n,)
-        Counted on along the grid.
+        Running number on the grid.
     centre : ndarray, shape (n,)
         (s)
     first, count : int ndarray, shape (n,)
@@ -43,7 +43,7 @@ class Windows:
     length : ndarray, shape (n,)
         (s)
     place : int ndarray, shape (n,)
-        In a cycle of slots; of windows that are alike zero.
+        Place in a cycle of slots; zero for windows of one kind.
     """
 
     number: IntArray
@@ -57,11 +57,11 @@ class Windows:
         return len(self.number)
 
     def rows(self, kept: BoolArray | IntArray | slice) -> "Windows":
-        """Return some windows."""
+        """Return a subset of the windows."""
         return Windows(*(part[kept] for part in vars(self).values()))
 
     def joined(self, others: "Windows") -> "Windows":
-        """Return these and others of the same grid, in order."""
+        """Return these windows and others of the same grid, in order."""
         rows = zip(vars(self).values(), vars(others).values(), strict=True)
         both = Windows(*(np.concatenate(pair) for pair in rows))
         return both.rows(np.argsort(both.number))
@@ -75,22 +75,22 @@ class Windows:
 
 @dataclass(frozen=True)
 class Grid:
-    """Windows of one length that follow each other by a fixed step.
+    """Windows of one length at a fixed step.
 
     Parameters
     ----------
     centre : float
-        Of window 0 (s).
+        Centre of window 0 (s).
     step, length : float
         (s)
     early : float
-        How long before a window the interval of its first sample begins (s).
+        Time from the start of the first sample's interval to the start of the window (s).
     rounding : float
-        What a stamp may be early and still belong to a window (s).
+        Tolerance by which a time stamp may precede its window (s).
     wait : float
-        After a window's end, until its last sample has come for sure (s).
+        Time after a window's end until its last sample has certainly arrived (s).
     together : int
-        Windows that are judged at once, when the last of them is complete.
+        Windows assessed at once, when the last of them is complete.
     """
 
     centre: float
@@ -102,7 +102,7 @@ class Grid:
     together: int = 1
 
     def last(self, until: float) -> int:
-        """Return the number of the last window that can be judged at a time (s)."""
+        """Return the number of the last window that can be assessed at a time (s)."""
         complete = self.centre + self.length / 2.0 + self.wait
         number = int(np.floor((until - complete) / self.step + ROUNDING))
         return (number + 1) // self.together * self.together - 1
@@ -114,7 +114,7 @@ class Grid:
         return int(np.floor((end - self.centre) / self.step + ROUNDING))
 
     def windows(self, number: IntArray, time: Array) -> Windows:
-        """Return the samples at these times that some windows hold."""
+        """Return windows by number, with their samples among these times."""
         centre = np.asarray(self.centre + self.step * number, dtype=np.float64)
         half = self.length / 2.0
         first = np.searchsorted(time, centre - half - self.rounding)
@@ -124,7 +124,7 @@ class Grid:
 
 
 def usual_step(time: Array, stream: str) -> float:
-    """Return the usual time between two samples (s).
+    """Return the median time between two samples (s).
 
     Raises
     ------
@@ -137,7 +137,7 @@ def usual_step(time: Array, stream: str) -> float:
 
 
 def sample_rate_hz(waveform: Waveform) -> float:
-    """Return the usual sampling rate (Hz).
+    """Return the median sampling rate (Hz).
 
     Raises
     ------
@@ -152,26 +152,26 @@ Growth = Callable[[Windows, Array], Array]
 
 @dataclass(eq=False)
 class Admission:
-    """The rules by which windows are judged, in the order of their numbers.
+    """Rules by which windows are admitted, applied in the order of their numbers.
 
     Parameters
     ----------
     magnetometer_step, imu_step : float
         Usual time between two samples (s).
     imu_begin : float
-        First inertial sample (s).
+        Time of the first inertial sample (s).
     imu_margin : float
         How far a window may reach beyond the inertial samples (s).
     clips : bool
         Whether a constant extreme is saturation.
     needs_turn : bool
-        Whether a window without inertial samples is of no use; otherwise it is one of more noise.
+        Whether a window without inertial samples is dropped; otherwise its noise is larger.
     least_share : float
-        Of the samples that a window should hold.
+        Least share of its nominal samples that a window must hold.
     slack : int
-        Samples by which windows may lie askew of the sampling.
+        Samples by which windows may be offset from the sampling.
     ends : tuple of RangeEnds
-        What is known of each axis's range so far.
+        Range of each axis as observed so far.
     """
 
     magnetometer_step: float
@@ -192,14 +192,14 @@ class Admission:
         Parameters
         ----------
         windows : Windows
-            Those after the ones that were judged last.
+            Those after the windows assessed last.
         waveform : Waveform
             With all samples of these windows and since those before.
         imu_time : ndarray
             On the clock of the waveform (s), likewise.
         growth : callable
-            Takes windows that lack samples and the times of all; returns how many times as large as
-            that of a whole window the variance of their phasors is.
+            Takes windows with missing samples and the times of all samples; returns the variance of
+            their phasors relative to a whole window.
         """
         half = windows.length / 2.0 + grid.early
         begin, end = windows.centre - half, windows.centre + windows.length / 2.0 - grid.early
@@ -238,7 +238,7 @@ def longest_step(step: float) -> float:
 
 
 def silences(imu_time: Array, step: float, margin: float) -> tuple[Array, Array]:
-    """Return where the gaps of an inertial stream begin and end, the last behind it (s).
+    """Return begin and end of each gap of an inertial stream; the last follows its end (s).
 
     Parameters
     ----------
@@ -267,5 +267,5 @@ def meets_silence(
 
 
 def meets(begin: Array, end: Array, span_begin: Array, span_end: Array) -> BoolArray:
-    """Return which spans meet at least one of some stretches, which are sorted and apart (s)."""
+    """Return which spans overlap any of the sorted, disjoint stretches (s)."""
     return np.asarray(begin.searchsorted(span_end) > end.searchsorted(span_begin))

@@ -1,4 +1,4 @@
-"""What was measured while all coils were silent, carried over to the slots in which one was driven.
+"""Ambient field in driven slots, estimated from the slots in which all coils were silent.
 
 Paper 000, Eq 2-8, subtracts the silent slot of the cycle.  That is exact for a field that does not
 change within the cycle and makes hum worse: of a tone f there remains, in units of its amplitude,
@@ -16,21 +16,21 @@ Removal = Literal["none", "subtract", "interpolate", "state"]
 LEAST_TURNS = (
     1.2  # of an alias of the mains in the span of the state, which distinguishes it from a ramp
 )
-HARMONICS = (1, 3, 5)  # of the mains, which are symmetric
-LEAST_TOLD = 0.2  # of a column of ones; a design whose least direction is shorter tells no mains
-FARTHEST, FARTHEST_BURSTS = 1.0, 16.0  # s, or lengths: what is farther off says nothing
-STRETCH = 4  # at most so many times longer a state, where that separates them
+HARMONICS = (1, 3, 5)  # of the mains, whose waveform is symmetric
+LEAST_TOLD = 0.2  # least singular value of a separable design; that of a column of ones is one
+FARTHEST, FARTHEST_BURSTS = 1.0, 16.0  # s, or lengths: slots farther away are not used
+STRETCH = 4  # largest extension of the state where that separates mains and drift
 
 
 def subtraction_gain(frequency_hz: float, duration: float, slots_apart: int) -> float:
-    """Return what subtracting a silent slot leaves of a tone, worst phase, relative to it.
+    """Return the worst-case gain for a tone of subtracting a silent slot.
 
     Parameters
     ----------
     duration : float
-        Of a slot (s).
+        Length of a slot (s).
     slots_apart : int
-        How many slots the silent one comes later.
+        Slots from the driven to the silent one.
     """
     averaged = abs(np.sinc(frequency_hz * duration))
     return float(averaged * 2.0 * abs(np.sin(np.pi * frequency_hz * slots_apart * duration)))
@@ -45,7 +45,7 @@ def ambient_weights(
     cycles: int = 8,
     mains_turns: float = 0.0,
 ) -> tuple[IntArray, Array]:
-    """Return from which silent slots, and with which weights, the ambient field is taken.
+    """Return the silent slots and weights from which the ambient field is estimated.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def ambient_weights(
     index : int ndarray, shape (n, k)
         Into ``silent``.
     weight : ndarray, shape (n, k)
-        NaN where there is no silent slot to take the field from.
+        NaN where no silent slot is near enough.
     """
     if removal == "none" or len(silent) == 0:
         nothing = np.zeros((len(driven), 1))
@@ -94,7 +94,7 @@ def ambient_weights(
 
 
 def _alias(mains_turns: float, count: int) -> float:
-    """Return how far (turns a cycle) the mains are from what silent slots take for a drift.
+    """Return how far the mains' alias at the silent slots is from a drift (turns per cycle).
 
     Zero where a slot averages them out.
     """
@@ -109,8 +109,8 @@ def _state_design(elapsed: Array, near: Array, count: int, mains_turns: float) -
     columns = [np.ones_like(elapsed), elapsed / (span * count + 1.0)]
     if span * _alias(mains_turns, count) >= LEAST_TURNS:
         angle = 2.0 * np.pi * mains_turns * elapsed
-        # At the driven slot the mains are wanted too: cos(0) = 1 there, so that the constant,
-        # less the cosine's own column, holds both.
+        # The ambient field at the driven slot includes the mains: cos(0) = 1 there, so that the
+        # constant, less the cosine's own column, has both.
         columns += [np.cos(angle) - 1.0, np.sin(angle)]
     return np.stack(columns, axis=-1) * near[..., None]
 
@@ -149,11 +149,10 @@ def uneven_weights(
     number: int,
     mains_hz: float,
 ) -> tuple[IntArray, Array]:
-    """Return from which silent bursts, that follow no clock, the ambient field is taken.
+    """Return silent bursts without a fixed schedule and weights to estimate the ambient field.
 
-    The state of `ambient_weights` by the times and lengths of the bursts: a constant, a ramp and,
-    as soon as enough of the nearest tell them from these, the mains with their odd harmonics, or
-    without.
+    Fits the state of `ambient_weights` to the times and lengths of the bursts: a constant, a ramp
+    and, once enough of the nearest bursts separate them, the mains with their odd harmonics.
 
     Parameters
     ----------
@@ -162,7 +161,7 @@ def uneven_weights(
     silent, silent_length : ndarray, shape (m,)
         Likewise, in order of time.
     number : int
-        Bursts in the state; up to four times as many for the mains.
+        Number of bursts in the state; up to four times as many for the mains.
     mains_hz : float
         Zero for none.
 
@@ -199,13 +198,13 @@ def _uneven(
     number: int,
     lines_hz: tuple[float, ...],
 ) -> tuple[IntArray, Array, BoolArray]:
-    """Return index and weights of one design, and where it tells its columns apart."""
+    """Return index and weights of one design, and where its columns are separable."""
     number = min(number, len(silent))
     first = np.searchsorted(silent, driven) - number // 2
     index = np.clip(first, 0, len(silent) - number)[:, None] + np.arange(number)
     elapsed = silent[index] - driven[:, None]
     near = np.abs(elapsed) <= np.maximum(FARTHEST, FARTHEST_BURSTS * driven_length)[:, None]
-    near &= elapsed != 0.0  # a silent burst that is asked of tells nothing of itself
+    near &= elapsed != 0.0  # a silent burst does not predict itself
     span = np.max(np.abs(elapsed) * near, axis=1, keepdims=True)
     ramp = np.where(np.sum(near, axis=1, keepdims=True) > 1, elapsed / np.maximum(span, 1e-9), 0.0)
     columns = [np.ones_like(elapsed), ramp]
@@ -227,7 +226,7 @@ def _uneven(
 def removed(
     driven: ComplexArray, silent: ComplexArray, index: IntArray, weight: Array
 ) -> ComplexArray:
-    """Return the driven slots (n, 3) freed of the ambient field that silent ones (m, 3) tell."""
+    """Return the driven slots (n, 3) less the ambient field estimated from silent ones (m, 3)."""
     if len(silent) == 0:
         return driven + weight
     return driven - np.einsum("nk,nkx->nx", weight, silent[index])

@@ -1,22 +1,22 @@
-"""Stamps of samples that a bus hands over several at a time: nearly one stamp for all of them.
+"""Time stamps of samples that a bus delivers several at a time, with nearly one stamp for all.
 
-They were taken one after the other since the burst before, and arrived together.  Each burst is
-spread over the time since the last one, which is right to a step.
+The samples of a burst were taken one after the other since the burst before.  Each burst is spread
+over the time since the last one, which is accurate to one step.
 """
 
 import numpy as np
 
 from magfusion.units import Array
 
-TOGETHER = 0.2  # of the mean step; what is nearer to the one before arrived with it
-SHARE = 0.4  # of the steps that are so short where samples come in bursts
-LONGEST = 0.1  # s between two bursts; what pauses longer was switched, not handed over
+TOGETHER = 0.2  # of the mean step; samples closer than that arrived in one burst
+SHARE = 0.4  # least share of such short steps where samples come in bursts
+LONGEST = 0.1  # s between two bursts; a longer pause is a switched stream, not a bus
 MOST = 32  # samples in a burst
 PAUSE = 3.0  # times the usual time between bursts: a gap, over which nothing is spread
 
 
 def spread_bursts(stamps: Array) -> Array | None:
-    """Return when samples were taken that arrived in bursts; None where they did not.
+    """Return sampling times of samples that arrived in bursts; None if they did not.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ def spread_bursts(stamps: Array) -> Array | None:
     Returns
     -------
     ndarray, shape (n,), or None
-        Strictly increasing (s); the last of a burst is where its stamp was.
+        Strictly increasing (s); the last sample of a burst keeps its stamp.
     """
     if len(stamps) < 2 * MOST:
         return None

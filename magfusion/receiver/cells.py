@@ -1,9 +1,8 @@
-"""Where a log was recorded, as far as the strengths of tones tell: what is whose, before any fix.
+"""Coarse track of a log from tone amplitudes, to assign shared frequencies before any fix.
 
-A map of the strengths at the nodes of a grid is compared with those of every second or so, and the
-likeliest way through it is that on which nobody moves faster than a vehicle indoors.  Strengths
-do not ask for the attitude, nor for the phase of any drive; that they change between nodes is their
-error.
+A map of the amplitudes at the nodes of a grid is compared with those of about every second.  The
+track is the most probable path at no more than the speed of a vehicle indoors.  Amplitudes depend
+neither on the attitude nor on the drive phases; their change between nodes is the model error.
 """
 
 from dataclasses import replace
@@ -24,20 +23,20 @@ from magfusion.model.site import Magnetometer, Site
 from magfusion.units import Array, IntArray
 
 PITCH = 2.0  # m; of the grid in the plane
-MOST_NODES = 20_000  # in the plane; a larger place has a coarser grid
+MOST_NODES = 20_000  # in the plane; a larger site has a coarser grid
 LEVELS = 3  # of height
-OUTSIDE = 4.0  # m; by which the place is larger than what its beacons span
+OUTSIDE = 4.0  # m; by which the grid exceeds the extent of the beacons
 LOWEST_SPAN = 3.0  # m; of heights, where all beacons are at one
 EVERY = 0.8  # s
 FASTEST = 4.0  # m/s
-NOT_AS_DECLARED = 0.1  # of a strength, beside what it changes by between nodes
-UNLIKE = 30.0  # of chi square in one epoch: so much, and no more, has a false beacon
-AS_LIKELY = 16.0  # of chi square: a place that is worse by more is another's
-MARGIN = 2.0  # m; by which the way may be wrong
+NOT_AS_DECLARED = 0.1  # of an amplitude, in addition to its change between nodes
+UNLIKE = 30.0  # largest chi square of one epoch, which bounds the effect of a faulty beacon
+AS_LIKELY = 16.0  # of chi square, within which another position is possible
+MARGIN = 2.0  # m; position error of the track
 
 
 class Way(NamedTuple):
-    """Where the magnetometer was, within a pitch of the grid or so.
+    """Coarse track of the magnetometer, accurate to about one grid pitch.
 
     Parameters
     ----------
@@ -46,7 +45,7 @@ class Way(NamedTuple):
     position_world : ndarray, shape (n, 3)
         (m)
     spread : ndarray, shape (n,)
-        How far the other places are that are nearly as likely (m).
+        Distance of the farthest position that is nearly as probable (m).
     """
 
     time: Array
@@ -54,13 +53,13 @@ class Way(NamedTuple):
     spread: Array
 
     def at(self, time: Array) -> tuple[Array, Array]:
-        """Return the places at times, and by how much they may be wrong, (n, 3) and (n,) (m)."""
+        """Return the positions at times and their possible errors, (n, 3) and (n,) (m)."""
         place = np.stack([np.interp(time, self.time, p) for p in self.position_world.T], axis=1)
         return place, MARGIN + np.interp(time, self.time, self.spread)
 
 
 class _Grid(NamedTuple):
-    """Nodes, and the strength of every tone there."""
+    """Grid nodes, and the amplitude of every tone there."""
 
     axes: tuple[Array, Array, Array]
     strength: Array  # (nodes, tones) (T)
@@ -81,7 +80,7 @@ class _Grid(NamedTuple):
 
 
 def way_of(samples: FieldSamples, site: Site) -> Way:
-    """Return the likeliest way of a log through its site.
+    """Return the most probable track of a log through its site.
 
     Parameters
     ----------
@@ -109,7 +108,7 @@ def way_of(samples: FieldSamples, site: Site) -> Way:
 
 
 def _thinned(time: Array, step: float) -> IntArray:
-    """Return rows that are a step apart or more."""
+    """Return rows at least one step apart."""
     number = np.floor((time - time[0]) / step)
     return np.unique(number, return_index=True)[1]
 
@@ -144,7 +143,7 @@ def _grid_of(site: Site) -> _Grid:
 
 
 def _plain(site: Site) -> Magnetometer:
-    """Return a magnetometer that reads the field at the origin of the body."""
+    """Return an ideal magnetometer at the origin of the body."""
     sensor = site.platform.magnetometer
     return replace(
         sensor,
@@ -167,7 +166,7 @@ def _cost(grid: _Grid, strength: Array, noise: Array) -> Array:
 
 
 def _both_ways(cost: Array, time: Array, pitch: float) -> Array:
-    """Return the least chi square of any way through each node at each epoch."""
+    """Return the least chi square of any path through each node at each epoch."""
     reach = np.maximum(np.ceil(FASTEST * np.diff(time) / pitch), 1).astype(int)
 
     def towards(order: range, steps: Array) -> Array:
@@ -185,12 +184,12 @@ def _both_ways(cost: Array, time: Array, pitch: float) -> Array:
 
 
 def owned_by(samples: FieldSamples, site: Site) -> FieldSamples:
-    """Return phasors of which each is of one beacon, where some share a frequency.
+    """Assign phasors to beacons where several share a frequency.
 
     Raises
     ------
     InputError
-        Where the strengths do not tell which of them are heard.
+        Where the amplitudes do not determine which beacons are received.
     """
     if not tones_of(site).reused or len(samples) == 0:
         return samples
@@ -198,8 +197,8 @@ def owned_by(samples: FieldSamples, site: Site) -> FieldSamples:
     found = only_owned(samples, owned_at(site, place, margin=margin[:, None]))
     if not np.any(found.valid):
         raise InputError(
-            "beacons share frequencies, and what is heard of them does not tell which they are:"
-            " several places are as likely (ambiguous); record longer, or where more beacons are"
-            " heard"
+            "beacons share frequencies, and the received amplitudes do not identify them:"
+            " several positions are equally probable (ambiguous); record longer, or in range of"
+            " more beacons"
         )
     return found

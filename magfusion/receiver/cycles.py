@@ -1,4 +1,4 @@
-"""Coils driven in turn, taken together again: a cycle of slots as one epoch."""
+"""Combination of a cycle of time slots into one epoch."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from magfusion.receiver.slots import is_marked, schedule
 from magfusion.receiver.turn import Turn, on_clock, turn_of
 from magfusion.units import Array, BoolArray, IntArray
 
-LONGEST_PAUSE = 4.0  # usual ones; after a longer one a marked cycle does not go on
+LONGEST_PAUSE = 4.0  # usual ones; a longer one ends a marked cycle
 
 
 def joins(site: Site, marks: Marks | None = None) -> bool:
@@ -21,7 +21,7 @@ def joins(site: Site, marks: Marks | None = None) -> bool:
     Parameters
     ----------
     marks : Marks, optional
-        Of slots that no clock tells: whether most of their cycles are.
+        Of slots without a schedule: whether most of their cycles are short enough.
     """
     if is_marked(site):
         if marks is None:
@@ -38,9 +38,9 @@ def joins(site: Site, marks: Marks | None = None) -> bool:
 def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSamples:
     """Join the slots of each cycle to one row, as if they were simultaneous.
 
-    The fields are turned by the gyro to the mean time of the slots, or, of a receiver that lacks
-    axes, ``turned`` tells by how much that is; where the body moves, what it moves by within the
-    cycle remains, for which ``ahead`` tells when each was measured.
+    The gyro rotates the fields to the mean time of the slots.  For a receiver that lacks axes,
+    ``turned`` has that rotation instead.  The translation of the body within the cycle remains;
+    ``ahead`` has the time of each measurement.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSam
     Raises
     ------
     InputError
-        Where there is none.
+        Where there is no such cycle.
     """
     found = cycles(samples, turn_of(on_clock(imu, site.platform.imu.time_offset), site), site)
     whole: BoolArray = np.all(found.valid, axis=1)
@@ -72,7 +72,7 @@ def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSam
 def cycles(
     samples: FieldSamples, measured_from_still: Turn, site: Site, epoch: IntArray | None = None
 ) -> FieldSamples:
-    """Join the slots of each cycle to one row, whichever of them there are.
+    """Join the available slots of each cycle to one row.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def cycles(
     cov = np.full((number, *samples.phasor_cov.shape[1:]), np.nan)
     turned = None
     if site.platform.magnetometer.lacking:
-        # Of what lies along the other axes nothing is known: no field can be turned.
+        # The field along the other axes is unknown: no field can be rotated.
         still_from_body = matrices(measured_from_still.still_from_body(samples.time[row]))
         still_from_epoch = matrices(measured_from_still.still_from_body(time))[cycle[row]]
         turned = np.broadcast_to(np.eye(3), cov.shape).copy()
@@ -122,7 +122,7 @@ def cycles(
 
 
 def _lengths(samples: FieldSamples, cycle: IntArray, site: Site) -> Array:
-    """Return how long each cycle is (s); of marked slots, to the end of the last."""
+    """Return the length of each cycle (s); of marked slots, to the end of the last."""
     number = int(cycle[-1]) + 1
     if not is_marked(site):
         return np.full(number, schedule(site).cycle)
@@ -133,9 +133,9 @@ def _lengths(samples: FieldSamples, cycle: IntArray, site: Site) -> Array:
 
 
 def cycle_of(samples: FieldSamples, site: Site) -> IntArray:
-    """Return the cycle of each row, counted from the first: by the coils that it holds.
+    """Return the cycle of each row, counted from the first, from the coils in it.
 
-    A source whose clock runs away from the log's keeps no schedule for long.
+    A source whose clock drifts against the log's does not keep a schedule for long.
     """
     if is_marked(site):
         usual = float(np.median(np.diff(samples.time))) if len(samples) > 1 else 0.0
@@ -151,12 +151,12 @@ def cycle_of(samples: FieldSamples, site: Site) -> IntArray:
 def _marked(
     time: Array, slot: IntArray, *, longest: float = np.inf, pause: float = np.inf
 ) -> IntArray:
-    """Return the cycle of each burst: a coil that comes again begins another.
+    """Return the cycle of each burst: a repeated coil begins a new one.
 
     Parameters
     ----------
     longest, pause : float
-        From its first to its last burst, and between two (s).
+        Longest time from the first to the last burst of a cycle, and between two (s).
     """
     cycle = np.zeros(len(time), dtype=np.int64)
     taken: set[int] = set()

@@ -1,6 +1,6 @@
-"""What a lock-in makes of sample times alone: its design, and the maps from samples to phasors.
+"""Lock-in design and the linear maps from samples to phasors, from sample times alone.
 
-No sample and no motion is in it, so that it is made once of a log, and kept while it fits memory.
+They depend on neither samples nor motion, so they are computed once per log and cached.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -15,12 +15,12 @@ from magfusion.receiver.noise import probes_left
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, BoolArray, IntArray
 
-CHUNK = 64  # windows demodulated at once: what is made of them stays in the cache
-LARGEST = 2**28  # bytes of the maps of so many; of many tones in long windows fewer are at once
-KEPT = 256 * 2**20  # bytes of maps that are kept; what is more is made anew
+CHUNK = 64  # windows demodulated at once, so that their arrays fit the CPU cache
+LARGEST = 2**28  # bytes of the maps of one chunk; many tones in long windows shrink the chunk
+KEPT = 256 * 2**20  # bytes of cached maps; others are recomputed
 EVEN_KEPT = 64  # maps of evenly spaced samples
 FEWEST_ALIKE = 4  # windows for each of their spacings
-WORST_CONDITION = 1e8  # of a normal matrix; beyond, the samples do not tell its columns apart
+WORST_CONDITION = 1e8  # of a normal matrix; beyond, its columns are not separable
 
 
 class Maps(NamedTuple):
@@ -39,9 +39,9 @@ class Maps(NamedTuple):
     variance : ndarray, shape (n, 1 + 2 tones)
         Of these, for samples with a variance of one.
     probes : ndarray, shape (n, tones, 4, m)
-        To what is left beside each tone, of a variance of one.
+        To the residuals of probes next to each tone, scaled to unit variance.
     told : int ndarray, shape (n, tones)
-        How many of those the window tells of.
+        Number of independent probe directions of each tone.
     """
 
     sample: IntArray
@@ -60,12 +60,12 @@ class Designs:
     Parameters
     ----------
     frequencies_hz, nuisance_hz : ndarray
-        Tones, and lines that are fitted beside them (Hz).
+        Tones, and lines that are fitted with them (Hz).
     time : ndarray, shape (samples,)
         (s)
     even : dict
-        Maps of single windows by the spacing of their samples, which are evenly spaced: few
-        spacings come again and again.
+        Maps of single windows by the spacing of their evenly spaced samples: few spacings
+        recur.
     """
 
     settings: LockinSettings
@@ -80,7 +80,7 @@ class Designs:
     def pieces(self) -> Iterator[tuple[slice, Maps]]:
         """Yield windows with their maps, as many at once as fit in memory.
 
-        Those of many windows are kept when they are asked for again: most logs are demodulated
+        Those of many windows are cached on the second request: most logs are demodulated
         once.
         """
         chunk = self._at_once()
@@ -106,16 +106,16 @@ class Designs:
         return sum(map(_size, self.kept.values()))
 
     def design(self, elapsed: Array, weight: BoolArray) -> Array:
-        """Return the columns that are fitted to windows, shape (n, m, columns)."""
+        """Return the columns fitted to windows, shape (n, m, columns)."""
         found = design_of(elapsed, self.settings, self.frequencies_hz, self.nuisance_hz)
         found *= weight[..., None]
         return found
 
     def _maps(self, windows: Windows) -> tuple[Maps, bool]:
-        """Return the maps of some windows, and whether most were made for them alone."""
+        """Return the maps of some windows, and whether most were computed for them alone."""
         index, weight, elapsed = padded(windows, self.time)
         spacings = spacings_of(elapsed, windows.count, float(np.max(self.frequencies_hz)))
-        if len(spacings) == 1 and spacings[0] in self.even:  # as nearly always, one by one
+        if len(spacings) == 1 and spacings[0] in self.even:  # the usual case, one by one
             one = self.even[spacings[0]] = self.even.pop(spacings[0])
             return one._replace(sample=index), False
         distinct = dict.fromkeys(own for own in spacings if own is not None)
@@ -129,7 +129,7 @@ class Designs:
         if rows:
             made = self._made(index[rows], weight[rows], elapsed[rows])
             if rows == list(range(len(windows))) and (uneven or len(windows) > 1):
-                return made, True  # no two are alike, nor was any known
+                return made, True  # all differ, and none was cached
             known |= self._kept(made, new)
             parts = [_rows(made, slice(len(new), None), None)]
         parts = [*map(known.__getitem__, distinct), *parts]
@@ -137,13 +137,13 @@ class Designs:
         return _chosen(index, weight, parts, which), FEWEST_ALIKE * len(rows) > len(windows)
 
     def _known(self, spacings: Iterable[Spacing]) -> dict[Spacing, Maps]:
-        """Return the maps of spacings that were met before, which are the newest from now on."""
+        """Return the cached maps of spacings and mark them as most recently used."""
         known = {own: self.even.pop(own) for own in spacings if own in self.even}
         self.even.update(known)
         return known
 
     def _kept(self, made: Maps, spacings: Sequence[Spacing]) -> dict[Spacing, Maps]:
-        """Keep the maps of spacings, one a row, and drop those that were met longest ago."""
+        """Cache the maps of spacings, one a row, and drop the least recently used."""
         new = {own: _rows(made, slice(k, k + 1), own.number) for k, own in enumerate(spacings)}
         self.even.update(new)
         while len(self.even) > EVEN_KEPT:
@@ -173,9 +173,9 @@ def _size(maps: Maps) -> int:
 
 
 def _rows(maps: Maps, rows: slice, count: int | None) -> Maps:
-    """Return copies of the maps of some windows, of so many samples as they have.
+    """Return copies of the maps of some windows, of their own number of samples.
 
-    A view that is kept would keep the maps of all of them.
+    A view would keep the maps of all of them in memory.
     """
     return Maps(
         sample=maps.sample[rows, :count].copy(),
@@ -189,7 +189,7 @@ def _rows(maps: Maps, rows: slice, count: int | None) -> Maps:
 
 
 def _places(spacings: Sequence[Spacing | None], distinct: Sequence[Spacing]) -> IntArray:
-    """Return which part each window's maps are: of its spacing, or its own behind all of them."""
+    """Return the index of each window's maps: of its spacing, or its own after all of these."""
     at: dict[Spacing | None, int] = {own: k for k, own in enumerate(distinct)}
     which = np.array([at.get(own, -1) for own in spacings])
     uneven = which < 0
@@ -198,7 +198,7 @@ def _places(spacings: Sequence[Spacing | None], distinct: Sequence[Spacing]) -> 
 
 
 def _chosen(index: IntArray, weight: BoolArray, parts: list[Maps], which: IntArray) -> Maps:
-    """Return the maps of windows by their place among those of all parts, padded."""
+    """Return the maps of windows by their index among those of all parts, padded."""
     size, count = index.shape[1], len(index)
     elapsed, solver, probes = (
         np.concatenate([_longer(own, size) for own in each])
@@ -206,7 +206,7 @@ def _chosen(index: IntArray, weight: BoolArray, parts: list[Maps], which: IntArr
     )
     variance = np.concatenate([part.variance for part in parts])
     told = np.concatenate([part.told for part in parts])
-    if len(told) == 1:  # the same of all
+    if len(told) == 1:  # all windows have one number
         return Maps(
             index,
             weight,
@@ -222,7 +222,7 @@ def _chosen(index: IntArray, weight: BoolArray, parts: list[Maps], which: IntArr
 
 
 def _longer(part: Array, size: int) -> Array:
-    """Return an array of samples, the last axis, with zeros up to a size."""
+    """Pad the last axis, samples, with zeros up to a size."""
     if part.shape[-1] == size:
         return part
     more = np.zeros((*part.shape[:-1], size - part.shape[-1]))
@@ -230,7 +230,7 @@ def _longer(part: Array, size: int) -> Array:
 
 
 def nuisances_hz(settings: LockinSettings, frequencies: Array, nyquist_hz: float) -> Array:
-    """Return the harmonics of the mains that are fitted beside the tones (Hz)."""
+    """Return the harmonics of the mains that are fitted with the tones (Hz)."""
     if settings.mains_hz <= 0:
         return np.zeros(0)
     lines = np.arange(settings.mains_hz, 0.95 * nyquist_hz, settings.mains_hz)[:6]
@@ -240,7 +240,7 @@ def nuisances_hz(settings: LockinSettings, frequencies: Array, nyquist_hz: float
 
 
 def padded(windows: Windows, time: Array) -> tuple[IntArray, BoolArray, Array]:
-    """Return the samples of windows, which of them are no padding, and their times (s)."""
+    """Return the sample indices of windows, which are not padding, and their times (s)."""
     reach = np.arange(int(np.max(windows.count)))
     weight = reach < windows.count[:, None]
     index = np.minimum(windows.first[:, None] + reach, len(time) - 1)
@@ -248,7 +248,7 @@ def padded(windows: Windows, time: Array) -> tuple[IntArray, BoolArray, Array]:
 
 
 def separable(step: float, settings: LockinSettings, frequencies_hz: Array) -> bool:
-    """Return whether the samples of a whole window, ``step`` apart (s), tell its columns apart."""
+    """Return whether a whole window of samples ``step`` apart (s) separates its columns."""
     elapsed = _whole_window(step, settings)
     design = design_of(
         elapsed,
@@ -268,16 +268,16 @@ def _whole_window(step: float, settings: LockinSettings) -> Array:
 def variance_growth(
     windows: Windows, time: Array, step: float, settings: LockinSettings, frequencies_hz: Array
 ) -> Array:
-    """Return how many times the variance of a window's phasors is that of a whole window.
+    """Return the variance of a window's phasors relative to that of a whole window.
 
-    By the conditioning of the design at the samples that are there, the worst tone.
+    From the conditioning of the design at the available samples; the worst tone.
 
     Parameters
     ----------
     time : ndarray
-        Of all samples (s).
+        Times of all samples (s).
     step : float
-        Between two samples of a whole window (s).
+        Sampling interval of a whole window (s).
     """
     nuisance_hz = nuisances_hz(settings, frequencies_hz, 0.5 / step)
 
@@ -300,7 +300,7 @@ def variance_growth(
 def design_of(
     elapsed: Array, settings: LockinSettings, frequencies: Array, nuisances: Array
 ) -> Array:
-    """Columns: constant, drift, each tone's cosines, sines and their ramps, mains, other lines."""
+    """Return the columns: constant, drift, tones and their ramps, mains, other lines."""
     ramp = elapsed[..., None] * (2.0 / settings.window)
     other = 2.0 * np.pi * elapsed[..., None] * np.array(settings.lines_hz)
     along, across = np.cos(other), np.sin(other)

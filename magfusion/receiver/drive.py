@@ -1,9 +1,9 @@
-"""Drive currents that were recorded beside the field, demodulated: what phasors are referred to.
+"""Demodulation of the drive currents recorded with the field, the reference of its phasors.
 
-Windows lie on the log's clock, whoever pushes the samples and in whatever pieces.  They are as long
-as those of the lock-in, or the time slots.  In a slot the field is averaged as the current is; in a
-long window the current bends, and what is asked for is its phasor at the centre: the field is
-predicted sample by sample.
+Windows lie on the log's clock, independent of how the samples are pushed.  They have the length of
+the lock-in's windows or the time slots.  In a slot, field and current are averaged in the same way.
+In a long window the current changes, and the phasor is that at the centre: the field is predicted
+sample by sample.
 """
 
 from collections.abc import Iterator, Mapping
@@ -21,12 +21,12 @@ from magfusion.units import Array, ComplexArray
 LEAST_SAMPLES = 0.9  # of a whole window
 A_STEP = 4  # windows that begin within a step of the lock-in: shares are linear in between
 EDGE = 0.05  # of a slot, at each end: there the current rises and falls
-LEARNT = 0.02  # of what a window says of the noise
-SILENT = 0.2  # of the current; noise beyond is no reading
+LEARNT = 0.02  # weight of a window in the noise estimate
+SILENT = 0.2  # of the current; a larger noise makes the reading invalid
 
 
 class Channel(NamedTuple):
-    """A tone as its current's column shows it.
+    """A tone in a current's column.
 
     Parameters
     ----------
@@ -43,12 +43,12 @@ class Channel(NamedTuple):
 
 
 def drive_channels(site: Site, columns: Mapping[str, object]) -> tuple[Channel, ...]:
-    """Return the tones whose currents some columns show.
+    """Return the tones whose currents are recorded in columns.
 
     Raises
     ------
     InputError
-        Where a column is of no beacon, a coil has no current declared, or the beginning of the
+        Where a column names no beacon, a coil has no current declared, or the beginning of the
         time slots is not known.
     """
     names = {beacon.name for beacon in site.beacons}
@@ -69,13 +69,13 @@ def drive_channels(site: Site, columns: Mapping[str, object]) -> tuple[Channel, 
 def _of_beacon(beacon: Beacon, column: str) -> Iterator[Channel]:
     if isinstance(beacon.slots, MarkedSlots):
         raise InputError(
-            f"beacon {beacon.name}: its current is recorded, and its bursts are marked, which are"
-            " not referred to a current yet; leave the drive column out"
+            f"beacon {beacon.name}: its current is recorded, but marked bursts are not referred"
+            " to a current; leave the drive column out"
         )
     if beacon.slots is not None and not beacon.synchronised:
         raise InputError(
-            f"beacon {beacon.name}: its current is recorded, but not when its slots begin; write"
-            " synchronised: true with slots.start_s, or leave the drive column out"
+            f"beacon {beacon.name}: its current is recorded, but the start of its slots is unknown;"
+            " write synchronised: true with slots.start_s, or leave the drive column out"
         )
     for k, (frequency_hz, slot) in enumerate(beacon.tones):
         coil = next(
@@ -85,8 +85,8 @@ def _of_beacon(beacon: Beacon, column: str) -> Iterator[Channel]:
         )
         if coil.current is None:
             raise InputError(
-                f"beacon {beacon.name}: its current is recorded, but not for which current its"
-                " moments are declared; give current_a of its coils, or a winding"
+                f"beacon {beacon.name}: its current is recorded, but the current for its declared"
+                " moments is missing; give current_a of its coils, or a winding"
             )
         declared = coil.current * np.exp(1j * coil.phase)
         yield Channel(column, beacon.name, k, frequency_hz, slot, complex(declared))
@@ -98,12 +98,12 @@ class DriveReceiver:
     Parameters
     ----------
     shares : DriveShares
-        That it adds to.
+        Drive shares to which windows are added.
 
     Raises
     ------
     InputError
-        As `drive_channels`, when the first samples come.
+        As `drive_channels`, at the first samples.
     """
 
     # What a checkpoint holds.
@@ -122,7 +122,7 @@ class DriveReceiver:
         self.next_number, self.step, self.noise = None, 0.0, {}
 
     def push(self, samples: DriveSamples) -> None:
-        """Take samples that follow those that came; columns stay the same.
+        """Add samples after the earlier ones; the columns must not change.
 
         Raises
         ------
@@ -135,7 +135,7 @@ class DriveReceiver:
             self.columns, self.values = columns, np.zeros((0, len(columns)))
         if columns != self.columns:
             raise InputError(
-                "magnetometer: the currents recorded beside it change from record to record; give"
+                "magnetometer: the columns of recorded currents differ between records; give"
                 f" those of {', '.join(f'drive_{c}' if c else 'drive' for c in self.columns)}"
                 " in each"
             )
@@ -147,7 +147,7 @@ class DriveReceiver:
         self._demodulate()
 
     def _demodulate(self) -> None:
-        """Take the windows that have become complete, and forget their samples."""
+        """Demodulate the windows that have become complete, and discard their samples."""
         if len(self.time) < 2:
             return
         if not self.step:
@@ -201,7 +201,7 @@ class DriveReceiver:
         for channel, value in zip(channels, current, strict=True):
             size = abs(value) / abs(channel.declared)
             if size < LEAST_ON:
-                yield channel, 0.0  # it is off, and of no phase
+                yield channel, 0.0  # off: no phase
                 continue
             noise = sigma / abs(value)
             if noise > SILENT:

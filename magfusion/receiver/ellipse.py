@@ -1,8 +1,8 @@
-"""Features of the ellipse that the field of a rotating beacon draws, constant over its period.
+"""Features of the field ellipse of a rotating beacon, constant over its period.
 
 With the phasor Y the field is ``Re(Y exp(i w t)) = Bc cos(w t) + Bs sin(w t)``, so that
-``Bc = Re Y`` and ``Bs = -Im Y``.  None of the features depends on the drive phase, hence none on
-the polarity: they are what an unsynchronised beacon leaves.
+``Bc = Re Y`` and ``Bs = -Im Y``.  None of the features depends on the drive phase or the polarity,
+so they remain for an unsynchronised beacon.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from magfusion.units import Array, ComplexArray
 
 
 def plane_normal(phasor: ComplexArray) -> Array:
-    """Return ``Bc x Bs``, about which the field turns by the right-hand rule.
+    """Return ``Bc x Bs``, about which the field rotates by the right-hand rule.
 
     Paper 004, Eq 5 and 8-11, corrected: the factor ``sin(w t) cos(w t)`` of Eq 5 belongs to the
     instantaneous fields of the two coils and averages to zero, and Eq 8-9, a later field times an
@@ -51,16 +51,16 @@ def semi_axes(phasor: ComplexArray) -> Array:
     power = np.sum(np.abs(phasor) ** 2, axis=-1)
     major = np.sqrt(0.5 * (power + np.abs(np.sum(phasor**2, axis=-1))))
     area = np.linalg.norm(plane_normal(phasor), axis=-1)
-    # The difference of the powers loses the minor axis of a flat ellipse.
+    # The difference of the powers cancels for the minor axis of a flat ellipse.
     minor = np.divide(area, major, out=np.zeros_like(major), where=major > 0.0)
     return np.stack([minor, major], axis=-1)
 
 
 def rms_amplitude(phasor: ComplexArray) -> Array:
-    """Return the root of the mean square of the field over a period.
+    """Return the RMS field over a period.
 
-    Of two equal moments m in quadrature ``K m sqrt((2 + 3 sin^2 phi) / 2) / r^3``: no constant of
-    the range alone, as paper 004, Eq 14, has it, but a factor of 1.58 from pole to equator.
+    Of two equal moments m in quadrature ``K m sqrt((2 + 3 sin^2 phi) / 2) / r^3``: not a function
+    of the range alone, as in paper 004, Eq 14, but with a factor of 1.58 from pole to equator.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A log whose streams are on even clocks, where stamps scatter about one that is."""
+"""Replacement of scattered time stamps by the uniform sampling clock of a stream."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,14 +14,14 @@ from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import default_settings
 from magfusion.units import Array
 
-ASTRAY = 4.0  # steps, by which counted samples may be off where a bus hands over several
+ASTRAY = 4.0  # steps; largest error of counted samples where a bus delivers several at a time
 
 
 def on_even_clocks(log: Log, site: Site) -> Log:
-    """Return a log with stamps that scatter about an even clock replaced by it.
+    """Replace stamps that scatter about a uniform clock by that clock.
 
-    Whether the samples were taken at the ticks or at the stamps the magnetometer decides: at the
-    right times tones and turn leave less of it.  An IMU tells no such thing, and follows.
+    The magnetometer decides between ticks and stamps: at the correct times, tones and rotation
+    leave a smaller residual.  The IMU follows that decision.
     """
     found = {"imu": _clock(log.imu.time, site)}
     if log.waveform is not None:
@@ -39,11 +39,11 @@ def on_even_clocks(log: Log, site: Site) -> Log:
 
 
 def _clock(stamps: Array, site: Site) -> SamplingClock | None:
-    """Return the even clock under stamps, which a bus may have bundled."""
+    """Return the uniform clock of stamps, which a bus may have bundled."""
     apart = None if has_schedule(site) else spread_bursts(stamps)
     if apart is None:
         return sampling_clock(stamps)
-    # Where none is lost, samples are counted; a lost one moves those behind it by a step at most.
+    # Without losses, samples are counted; a lost one shifts the later ones by at most one step.
     steps = np.diff(apart)
     step = float(np.mean(steps[steps < LONGEST]))
     breaks = np.flatnonzero(steps >= LONGEST) + 1
@@ -55,7 +55,7 @@ def _clock(stamps: Array, site: Site) -> SamplingClock | None:
 
 
 def _at(log: Log, clocks: Mapping[str, SamplingClock]) -> Log:
-    """Return a log with the stamps of some streams replaced by their clocks."""
+    """Replace the stamps of some streams by their clocks."""
     if "imu" in clocks:
         log = replace(log, imu=replace(log.imu, time=clocks["imu"].time))
     if "magnetometer" in clocks:
@@ -67,7 +67,7 @@ def _at(log: Log, clocks: Mapping[str, SamplingClock]) -> Log:
 
 
 def _evener(log: Log, even: Log, site: Site) -> bool:
-    """Return whether tones and turn leave less of the samples at the ticks than at the stamps."""
+    """Return whether the demodulation residual is smaller at the ticks than at the stamps."""
     if has_schedule(site) or not site.beacons:
         return True
     settings = default_settings(site)

@@ -1,6 +1,6 @@
-"""Windows whose samples are evenly spaced: few spacings come again and again.
+"""Windows of evenly spaced samples: few spacings recur.
 
-Whether a window is one hangs on its own samples alone, and not on what was asked before or with it.
+Whether a window is even depends on its own samples only, not on other or earlier windows.
 """
 
 from typing import NamedTuple
@@ -9,14 +9,14 @@ import numpy as np
 
 from magfusion.units import Array, IntArray
 
-# Of the fastest tone (rad), by which times are off that pass for evenly spaced: of clocks that tell
-# every digit, and of those that tell nanoseconds.
+# Largest time error of evenly spaced samples (rad of the fastest tone): of clocks with full
+# precision, and of those with nanoseconds.
 ALIKE = (1e-9, 1e-6)
-WITHIN = 1.5  # steps that times may be off by; each of the two numbers of a spacing is half of one
+WITHIN = 1.5  # steps of time error; each of the two numbers of a spacing is rounded to one half
 
 
 class Spacing(NamedTuple):
-    """Evenly spaced samples: how many, and their middle and half their span in small steps."""
+    """Evenly spaced samples: number, and middle and half span in small steps."""
 
     number: int
     middle: int
@@ -24,21 +24,21 @@ class Spacing(NamedTuple):
     step: float  # (s)
 
     def times(self) -> Array:
-        """Return the times that it stands for, shape (number,) (s)."""
+        """Return the sample times, shape (number,) (s)."""
         return self.step * (self.middle + self.half * np.linspace(-1.0, 1.0, self.number))
 
 
 def spacings_of(time: Array, count: IntArray, fastest_hz: float) -> list[Spacing | None]:
-    """Return the spacing of each window, told as finely as may be; None where it is not even.
+    """Return the spacing of each window at the finest valid step; None if it is not even.
 
     Parameters
     ----------
     time : ndarray, shape (n, m)
         Of samples from the centre of each window (s).
     count : int ndarray, shape (n,)
-        How many of them there are.
+        Samples in each window.
     fastest_hz : float
-        Frequency of a tone.
+        Highest frequency of a tone.
     """
     found: list[Spacing | None] = [None] * len(count)
     for alike in ALIKE:
@@ -53,7 +53,7 @@ def spacings_of(time: Array, count: IntArray, fastest_hz: float) -> list[Spacing
 
 
 def _rounded(time: Array, count: IntArray, step: float) -> tuple[Array, Array, Array]:
-    """Return middles and half spans in steps (s), and which windows are even by them."""
+    """Return middles and half spans in steps (s), and which windows they describe."""
     known = np.maximum(count, 2)
     first, last = time[:, 0], time[np.arange(len(count)), known - 1]
     middle, half = np.rint(0.5 * (first + last) / step), np.rint(0.5 * (last - first) / step)

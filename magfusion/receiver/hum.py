@@ -1,4 +1,4 @@
-"""Hum of the mains that wanders: its frequency is followed, so that its harmonics can be fitted."""
+"""Mains hum of variable frequency, tracked so that its harmonics can be fitted."""
 
 from dataclasses import dataclass
 
@@ -7,25 +7,25 @@ import numpy as np
 from magfusion.model.samples import Waveform
 from magfusion.units import Array, ComplexArray
 
-SPAN = 1.0  # s; of the looks by which it is followed, which overlap by half
+SPAN = 1.0  # s; length of the tracking windows, which overlap by half
 MOST_ORDERS = 6
 HIGHEST = 0.95  # of half the sampling rate
-COHERENT = 0.5  # of one look with the next; noise has a sixth
-SMOOTHED = 5  # looks
+COHERENT = 0.5  # coherence of successive windows; of noise it is one sixth
+SMOOTHED = 5  # windows
 
 
 @dataclass(frozen=True, eq=False)
 class Hum:
-    """The mains through a record.
+    """Phase of the mains over a record.
 
     Parameters
     ----------
     frequency_hz : float
-        Its mean.
+        Mean frequency.
     orders : ndarray, shape (harmonics,)
-        That the sampling rate shows.
+        Harmonics below the Nyquist frequency.
     time, turns : ndarray, shape (n,)
-        How many turns it has made at times (s).
+        Turns up to each time (s).
     """
 
     frequency_hz: float
@@ -34,19 +34,19 @@ class Hum:
     turns: Array
 
     def angle(self, time: Array) -> Array:
-        """Return the phase of the fundamental at times, of their shape (rad)."""
+        """Return the phase of the fundamental at times, same shape (rad)."""
         beyond = np.maximum(time - self.time[-1], 0.0) + np.minimum(time - self.time[0], 0.0)
         inside = np.interp(time, self.time, self.turns)
         return np.asarray(2.0 * np.pi * (inside + self.frequency_hz * beyond))
 
 
 def hum_of(waveform: Waveform, mains_hz: float) -> Hum | None:
-    """Return the mains of a waveform at rest: followed where they stand out of the noise.
+    """Return the mains of a stationary waveform, tracked; None if they do not exceed the noise.
 
     Parameters
     ----------
     mains_hz : float
-        About its frequency; none where it is zero.
+        Nominal frequency; zero for none.
     """
     step = float(np.median(np.diff(waveform.time)))
     orders = np.arange(1.0, MOST_ORDERS + 1.0)
@@ -72,7 +72,7 @@ def hum_of(waveform: Waveform, mains_hz: float) -> Hum | None:
 
 
 def _looks(waveform: Waveform, centre: Array, frequencies_hz: Array, step: float) -> ComplexArray:
-    """Return the phasors of short looks, shape (looks, frequencies, 3)."""
+    """Return the phasors of short windows, shape (windows, frequencies, 3)."""
     reach = int(SPAN / step)
     first = np.searchsorted(waveform.time, centre - 0.5 * SPAN)
     out = np.zeros((len(centre), len(frequencies_hz), 3), dtype=np.complex128)

@@ -1,9 +1,8 @@
-"""Pieces of a rest to one phasor a tone, with a covariance that the record itself tells.
+"""Integration of the pieces of a stationary interval to one phasor per tone, with covariance.
 
-The noise about a tone is measured where it is: in the spectrum of the weighted pieces, a few
-resolutions of the whole rest away.  So it need not be white, and what rises towards the tone, as
-its own wandering does, counts as noise.  Pieces that stand out weigh less (Huber), and so do loud
-stretches.
+The noise about a tone is measured in the spectrum of the weighted pieces, a few resolutions of the
+whole interval away.  It need not be white; power rising towards the tone, such as the tone's own
+phase wander, counts as noise.  Outlying pieces (Huber) and noisy stretches get smaller weights.
 """
 
 from dataclasses import dataclass
@@ -15,19 +14,19 @@ from scipy.special import chdtrc, chdtri, fdtrc, gammaln
 from magfusion.receiver.pieces import Pieces
 from magfusion.units import Array, ComplexArray
 
-NEAREST, MOST_BESIDE = 2, 12  # resolutions of the rest: the first whose power is noise; how many
+NEAREST, MOST_BESIDE = 2, 12  # resolutions: the first whose power is noise; how many
 LEAST_BESIDE = 3
-FARTHEST = 0.4  # of the inverse length of a piece, at which its taper still hears
-LEAST_LENGTHS = (NEAREST + LEAST_BESIDE) / FARTHEST  # of a piece, that a rest needs
-LEVEL = 31  # pieces over which the loudness is taken
-HUBER = 2.0  # times the loudness, beyond which a piece weighs less
+FARTHEST = 0.4  # of the inverse length of a piece, at which its taper still has gain
+LEAST_LENGTHS = (NEAREST + LEAST_BESIDE) / FARTHEST  # of a piece, in a stationary interval
+LEVEL = 31  # pieces over which the noise level is estimated
+HUBER = 2.0  # times the noise level, beyond which a piece is down-weighted
 ROUNDS = 3
-PER_RESOLUTION = 4  # frequencies that are tried
+PER_RESOLUTION = 4  # trial frequencies
 
 
 @dataclass(frozen=True, eq=False)
 class Integrated:
-    """One tone of a whole rest.
+    """One tone of a whole stationary interval.
 
     Parameters
     ----------
@@ -36,9 +35,9 @@ class Integrated:
     cov : ndarray, shape (3, 3)
         Of its real, and of its imaginary part (T^2).
     freedom : int
-        Readings behind the covariance.
+        Degrees of freedom of the covariance.
     centroid, spread : float
-        Of the weights in time (s).
+        Of the weights over time (s).
     """
 
     phasor: ComplexArray
@@ -49,19 +48,19 @@ class Integrated:
 
     @property
     def chance(self) -> float:
-        """Probability that noise alone is so loud: of a trace of Lawley and Hotelling."""
+        """Return the probability of such power by noise alone (Lawley-Hotelling trace)."""
         white = np.linalg.solve(np.linalg.cholesky(self._sample_cov()), self.phasor)
         return trace_chance(float(np.sum(np.abs(white) ** 2)), self.freedom)
 
     def _sample_cov(self) -> Array:
-        least = 1e-12 * np.trace(self.cov) + 1e-60  # of an axis that stands still
+        least = 1e-12 * np.trace(self.cov) + 1e-60  # of a constant axis
         return (self.cov + least * np.eye(3)) * (self.freedom - 4.0) / self.freedom
 
 
 def trace_chance(trace: float, freedom: int) -> float:
-    """Return the probability of a larger trace of two vectors of three against their covariance.
+    """Return the probability of a larger Lawley-Hotelling trace of two vectors of three.
 
-    McKeon's approximation by F, with the moments of Lawley's and Hotelling's trace.
+    McKeon's approximation by F, with the moments of the trace.
 
     Parameters
     ----------
@@ -77,12 +76,12 @@ def trace_chance(trace: float, freedom: int) -> float:
 
 
 def integrated(found: Pieces, tone: int, time: float) -> Integrated:
-    """Return a tone of a rest, referred as its pieces are.
+    """Return one tone of a stationary interval, integrated over its pieces.
 
     Parameters
     ----------
     time : float
-        From which centroid and spread are counted (s).
+        Reference time of centroid and spread (s).
     """
     phasor, elapsed = found.phasor[:, tone], found.centre - time
     there = np.isfinite(phasor).all(axis=1)
@@ -98,7 +97,7 @@ def integrated(found: Pieces, tone: int, time: float) -> Integrated:
     power = ((carrier * weight) @ (phasor - mean)) / heard[:, None]
     freedom = 2 * len(offsets_hz)
     sample = np.real(power.T @ np.conj(power)) / freedom
-    # What is left of few readings is too small as often as too large; its inverse is not.
+    # The sample covariance is biased for few readings; its inverse is corrected.
     cov = sample * freedom / (freedom - 4.0)
     centroid = float(weight @ elapsed)
     spread = float(np.sqrt(weight @ (elapsed - centroid) ** 2))
@@ -106,12 +105,12 @@ def integrated(found: Pieces, tone: int, time: float) -> Integrated:
 
 
 def _heard(bins: Array) -> Array:
-    """Return how much of a tone a Hann taper hears so many bins away."""
+    """Return the gain of a Hann taper at an offset in bins."""
     return np.asarray(np.sinc(bins) / (1.0 - bins**2))
 
 
 def _weights(phasor: ComplexArray) -> Array:
-    """Return the weights of pieces, of which the sum is one, shape (n,)."""
+    """Return the weights of pieces, with sum one, shape (n,)."""
     centre = np.median(phasor.real, axis=0) + 1j * np.median(phasor.imag, axis=0)
     weight = np.ones(len(phasor))
     for _ in range(ROUNDS):
@@ -126,14 +125,14 @@ def _weights(phasor: ComplexArray) -> Array:
 
 @dataclass(frozen=True)
 class Search:
-    """What a search for the frequency of a beacon found.
+    """Result of a search for the frequency of a beacon.
 
     Parameters
     ----------
     drift : float
         Relative error of its clock.
     trials : float
-        Range that was searched (Hz), times the root of the variance of a component's slope by it.
+        Searched range (Hz), times the RMS slope of a component with frequency.
     """
 
     drift: float
@@ -141,14 +140,14 @@ class Search:
 
 
 def searched(found: Pieces, tones: list[int], frequencies_hz: Array, largest: float) -> Search:
-    """Return the relative error of a clock under which tones are loudest.
+    """Return the relative clock error that maximises the power of tones.
 
     Parameters
     ----------
     frequencies_hz : ndarray, shape (tones,)
-        By which the pieces were demodulated; of all.
+        Demodulation frequencies of all tones.
     largest : float
-        Relative error that is searched, on either side.
+        Largest relative error searched, on either side.
     """
     there = np.isfinite(found.phasor[:, tones]).all(axis=(1, 2))
     centre = found.centre[there]
@@ -165,7 +164,7 @@ def searched(found: Pieces, tones: list[int], frequencies_hz: Array, largest: fl
     drifts = np.linspace(-largest, largest, 2 * int(np.ceil(largest / fine)) + 1)
     best = float(drifts[np.argmax(_loudness(own, tones, frequencies_hz, elapsed, drifts))])
     for finer in (fine / 4.0, fine / 32.0):
-        # What is tried beyond would not be counted among the trials.
+        # Trials beyond the range are not counted.
         near = np.clip(best + finer * np.arange(-6.0, 7.0), -largest, largest)
         best = float(near[np.argmax(_loudness(own, tones, frequencies_hz, elapsed, near))])
     slope = float(np.pi * half / np.sqrt(3.0))
@@ -185,9 +184,9 @@ def _loudness(
 
 
 def chance_of_any(chances: list[float], trials: float) -> float:
-    """Return the probability that noise alone is so loud at some frequency that was searched.
+    """Return the probability of such power by noise alone at any searched frequency.
 
-    Davies' bound of the maximum of a chi-square process.
+    Davies' bound on the maximum of a chi-square process.
 
     Parameters
     ----------

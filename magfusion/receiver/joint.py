@@ -1,9 +1,9 @@
-"""Windows too short to tell close tones apart, whose samples are kept as they are told together.
+"""Joint reception of close tones in windows too short to separate them.
 
-Tones half a hertz apart ask for windows of seconds, in which somebody walks past a beacon.  A pose
-does not ask for that: a window of a quarter of a second leaves what the tones do together in a few
-directions, and a model that knows all of them predicts each of these directions.  Nothing of what
-the samples tell of the tones is lost, and none of them counts twice.
+Tones half a hertz apart need windows of seconds to be separated, in which a walking user passes a
+beacon.  A pose does not need separate tones: a window of a quarter of a second leaves their joint
+effect in a few directions, and a model of all tones predicts each of these directions.  No
+information of the samples is lost, and none counts twice.
 """
 
 from dataclasses import dataclass, field, replace
@@ -24,21 +24,21 @@ from magfusion.receiver.windows import LockinSettings, default_settings
 from magfusion.units import Array, BoolArray
 
 SHORT_WINDOW = 0.2  # s
-NODES = (-0.87, 0.0, 0.87)  # half windows from the centre: what changes in between is a parabola
-LONGEST_APART = 1.0  # s; a longer window to tell tones apart holds too much of a walk
+NODES = (-0.87, 0.0, 0.87)  # half windows from the centre: changes in between are a parabola
+LONGEST_APART = 1.0  # s; longer windows to separate tones hold too much motion
 SAME_TIMES = 1e-8  # s; sample times that are no farther apart have the same design
-FAINTEST = 1e-3  # of the largest singular value; what is below tells nothing
+FAINTEST = 1e-3  # of the largest singular value; smaller ones carry no information
 PROBES = 6  # on either side of the tones, a window's resolution apart
 CLEAR = 1.5  # resolutions between a probe and a line
 
 
 def joint_settings(site: Site, asked: LockinSettings | None) -> LockinSettings | None:
-    """Return how the close tones of a site are received together; None where they are not.
+    """Return the settings for joint reception of a site's close tones; None if they are not close.
 
     Parameters
     ----------
     asked : LockinSettings, optional
-        Where windows were asked for nothing else is done.
+        Requested windows; then there is no joint reception.
     """
     usual = _long(site, asked)
     if usual is None or bool(site.platform.further) or bool(site.platform.magnetometer.lacking):
@@ -47,7 +47,7 @@ def joint_settings(site: Site, asked: LockinSettings | None) -> LockinSettings |
 
 
 def long_windows(site: Site, asked: LockinSettings | None) -> tuple[Finding, ...]:
-    """Return that close tones are received one by one all the same, and why.
+    """Return a finding, with the reason, if close tones are received separately.
 
     Parameters
     ----------
@@ -59,16 +59,16 @@ def long_windows(site: Site, asked: LockinSettings | None) -> tuple[Finding, ...
         return ()
     why = "several magnetometers" if site.platform.further else "fewer axes than three"
     text = (
-        f"Tones of the beacons are so close that windows of {usual.window:.3g} s tell them apart,"
-        f" and with {why} no shorter ones are used: what the platform does within them is known by"
-        " the IMU alone, and states are few. Set the frequencies farther apart"
+        f"Tones of the beacons are so close that separating them takes windows of"
+        f" {usual.window:.3g} s; with {why} no shorter ones are used. Motion within a window is"
+        " known from the IMU alone, and states are few. Set the frequencies farther apart"
         f"{', or navigate by one magnetometer' if site.platform.further else ''}."
     )
     return (Finding("long_windows", text, Verdict.TRUSTWORTHY, 0.5),)
 
 
 def _long(site: Site, asked: LockinSettings | None) -> LockinSettings | None:
-    """Return the windows that tell close tones apart; None where the tones are not close."""
+    """Return the windows that separate close tones; None where the tones are not close."""
     if asked is not None or len(site.beacons) < 2 or has_schedule(site):
         return None
     if not site.platform.inertial:
@@ -80,16 +80,16 @@ def _long(site: Site, asked: LockinSettings | None) -> LockinSettings | None:
 
 
 class JointDesign(NamedTuple):
-    """What the samples of a window tell of tones together, whatever the tones are.
+    """Information of a window's samples on all tones together.
 
     Parameters
     ----------
     across : ndarray, shape (m, directions)
-        Orthonormal: what is left of the tones beside steady field, drift and mains.
+        Orthonormal: the tones orthogonal to steady field, drift and mains.
     tones : ndarray, shape (nodes, directions, 2 tones)
-        What the cosines and sines of each tone are there, with the part of each node in them.
+        Cosines and sines of each tone in these directions, by node.
     beside : ndarray, shape (m, probes)
-        Orthonormal, beside the tones: what noise does.
+        Orthonormal, next to the tones: directions of noise.
     """
 
     across: Array
@@ -100,14 +100,14 @@ class JointDesign(NamedTuple):
     def of(
         elapsed: Array, frequencies_hz: Array, settings: LockinSettings, directions: int | None
     ) -> "JointDesign":
-        """Return the design of the samples of a window.
+        """Compute the design of a window's samples.
 
         Parameters
         ----------
         elapsed : ndarray, shape (m,)
-            From its centre (s).
+            Times from its centre (s).
         directions : int, optional
-            How many are kept; None for those that tell anything.
+            How many are kept; None for all that carry information.
         """
         nyquist_hz = 0.5 / float(np.median(np.diff(elapsed)))
         mains_hz = nuisances_hz(settings, np.zeros(1), nyquist_hz)
@@ -134,7 +134,7 @@ class JointDesign(NamedTuple):
 
 
 def _parts(elapsed: Array, half: float) -> Array:
-    """Return the part of each node in what changes within a window, (m, nodes) (Lagrange)."""
+    """Return the Lagrange weight of each node at each sample, (m, nodes)."""
     out = np.ones((len(elapsed), len(NODES)))
     for i, node in enumerate(NODES):
         for other in NODES[:i] + NODES[i + 1 :]:
@@ -147,13 +147,13 @@ def _without(columns: Array, fitted: Array) -> Array:
 
 
 def _orthonormal(columns: Array) -> Array:
-    """Return an orthonormal basis of what columns span."""
+    """Return an orthonormal basis of the span of columns."""
     basis, size, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(basis[:, size > FAINTEST * np.max(size, initial=0.0)])
 
 
 def _probes(frequencies_hz: Array, mains_hz: Array, nyquist_hz: float, window: float) -> Array:
-    """Return frequencies beside the tones, clear of all lines (Hz)."""
+    """Return probe frequencies next to the tones, clear of all lines (Hz)."""
     lines = np.concatenate([[0.0, nyquist_hz], frequencies_hz, mains_hz])
     reach = PROBES / window
     asked = np.arange(np.min(frequencies_hz) - reach, np.max(frequencies_hz) + reach, 1.0 / window)
@@ -164,12 +164,12 @@ def _probes(frequencies_hz: Array, mains_hz: Array, nyquist_hz: float, window: f
 
 @dataclass(eq=False)
 class JointDesigns:
-    """The designs of windows as they come: those whose sample times are alike have one.
+    """Designs of successive windows; those with equal sample times share one.
 
     Parameters
     ----------
     directions : int
-        That every design keeps.
+        Number kept by every design.
     """
 
     settings: LockinSettings
@@ -178,7 +178,7 @@ class JointDesigns:
     kept: list[tuple[Array, JointDesign]] = field(default_factory=list)
 
     def of(self, elapsed: Array) -> JointDesign:
-        """Return the design of the samples of a window, times from its centre (s)."""
+        """Return the design for sample times from a window's centre (s)."""
         for known, design in self.kept:
             if len(known) == len(elapsed) and np.max(np.abs(known - elapsed)) < SAME_TIMES:
                 return design
@@ -188,10 +188,10 @@ class JointDesigns:
 
 
 class JointReceiver(LockinReceiver):
-    """Of close tones: short windows side by side, admitted by the rules of all others."""
+    """Receiver of close tones: short contiguous windows, admitted by the common rules."""
 
     def beside_lines(self, found: LockinSettings | None) -> None:
-        """Take lines that were found beside the tones, before anything begins."""
+        """Set extra lines to fit with the tones; call it before `begin`."""
         if found is not None:
             self.beside = replace(self.settings, lines_hz=found.lines_hz)
 
@@ -208,17 +208,17 @@ class JointReceiver(LockinReceiver):
 
     @cached_property
     def frequencies_hz(self) -> Array:
-        """Of the tones, each once (Hz)."""
+        """Distinct frequencies of the tones (Hz)."""
         return tones_of(self.site).frequencies_hz
 
     @property
     def nodes(self) -> Array:
-        """Times from the centre of a window at which the motion is looked at (s)."""
+        """Times from the centre of a window at which the motion is evaluated (s)."""
         return 0.5 * self.settings.window * np.array(NODES)
 
     @cached_property
     def designs(self) -> JointDesigns:
-        """The designs of its windows."""
+        """Designs of its windows."""
         assert self.admission is not None
         step, half = self.admission.magnetometer_step, 0.5 * self.settings.window
         whole = np.arange(-half + 0.5 * step, half, step)
@@ -230,7 +230,7 @@ class JointReceiver(LockinReceiver):
         return self._admitted(waveform, imu)
 
     def _growth(self, windows: Windows, time: Array) -> Array:  # noqa: ARG002
-        """Return one: what samples are missing from the directions costs what they told."""
+        """Return one: directions without samples only lose their information."""
         return np.ones(len(windows))
 
     def _driven(self, windows: Windows) -> BoolArray:

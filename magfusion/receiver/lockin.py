@@ -1,9 +1,8 @@
 """Lock-in: raw waveform to phasors, one least-squares design a window.
 
 The window is long against the motion, so that a plain lock-in leaks the Earth field and the other
-beacons into each tone.  Each sample is therefore first turned by the gyro into axes that stand
-still, what is found back into those of the window's centre, and the design holds a linear ramp for
-each tone.
+beacons into each tone.  The gyro therefore rotates each sample into non-rotating axes, and the
+result back into those at the window's centre; the design has a linear ramp for each tone.
 """
 
 from dataclasses import dataclass
@@ -40,36 +39,37 @@ from magfusion.units import AnyArray, Array, BoolArray, ComplexArray, IntArray
 
 MOST_COMPARED = 50  # windows by which two clocks are compared
 LEAST_COMPARED = 0.8  # of the samples of the fullest
-AT_ONCE = 1 << 14  # samples that are turned at once: what is made of them stays in the cache
-UNSEEN_TURN = 1.0  # rad/s; of a person or a vehicle, while the gyro is silent
+AT_ONCE = 1 << 14  # samples rotated at once, so that they fit the CPU cache
+UNSEEN_TURN = 1.0  # rad/s; of a person or a vehicle, in gaps of the gyro
 
 
 @dataclass(frozen=True, eq=False)
 class WindowOperator:
-    """The linear map from samples to phasors, kept so that a prediction can pass through it.
+    """Linear map from samples to phasors, kept to apply it to predictions as well.
 
     Parameters
     ----------
     designs : Designs
-        Of the sample times alone.
+        From the sample times alone.
     channels : tuple of (str, int)
     tone_of_channel : int ndarray, shape (channels,), optional
-        Where several send on one frequency: each of them has its phasor.
+        Tone of each channel, where several beacons share a frequency.
     body_from_measured : ndarray, shape (3, 3)
     still_from_body : ndarray, shape (4, samples)
-        Takes each sample to axes that do not turn with the body; quaternions, scalar first.
+        Rotates each sample to non-rotating axes; quaternions, scalar first.
     measured_from_still : ndarray, shape (windows, 3, 3)
-        Takes the fields back at the centre of each window.
+        Rotates the fields back at the centre of each window.
     declared_noise : float
         Of a sample, one sigma (T).
     unseen : bool ndarray, shape (windows,)
-        Where the gyro is silent: the ramps follow a turn that it does not see, and what the
-        square of it does is noise.
+        Windows in a gap of the gyro: the ramps follow the unknown rotation, and its square is
+        noise.
     apart : bool ndarray, shape (windows,)
-        Whose noise is not that of their neighbours: there the turn was found without a gyro.
+        Windows whose noise differs from that of their neighbours: their rotation was estimated
+        without a gyro.
     lacking : tuple of int
-        Axes that the receiver has not.  The samples of the others cannot be turned, so that the
-        square of any turn is noise, unless a prediction has been taken off.
+        Axes that the receiver lacks.  The samples of the others cannot be rotated, so that the
+        square of any rotation is noise, unless a prediction has been subtracted.
     """
 
     designs: Designs
@@ -94,15 +94,14 @@ class WindowOperator:
         return np.take(by_tone, self.tone_of_channel, axis=axis)
 
     def demodulate(self, measured_sensor: Array) -> tuple[FieldSamples, SteadyFields]:
-        """Turn raw samples into phasors and the steady field beside them, each with covariance.
+        """Turn raw samples into phasors and the steady field, each with covariance.
 
         Parameters
         ----------
         measured_sensor : ndarray, shape (samples, 3)
-            (T).  Where a prediction has been taken off, the noise is measured without what motion
-            leaks beside the tones.  For the steady field the known offset, or a prediction, should
-            have been taken off: the gyro turns with the samples what does not turn with the
-            platform.
+            (T).  Where a prediction has been subtracted, the noise next to the tones excludes
+            the leakage of motion.  For the steady field, subtract the known offset or a
+            prediction first: the gyro rotates an offset along with the samples.
         """
         samples, steady, _ = self.demodulate_both(measured_sensor)
         return samples, steady
@@ -115,12 +114,12 @@ class WindowOperator:
         Parameters
         ----------
         beside : ndarray, shape (samples, 3), optional
-            The other (T); what is returned of it is empty where it is not given.
+            The other waveform (T); without it the last result is empty.
 
         Returns
         -------
         complex ndarray, shape (n, channels, 3)
-            The last: measured axes at the centre of the window (T).
+            Phasors of the other: measured axes at the centre of the window (T).
         """
         still, parts = self._still(measured_sensor), []
         other = None if beside is None else self._still(beside)
@@ -167,7 +166,7 @@ class WindowOperator:
         return samples, SteadyFields(centre, constant, spread), self._by_channel(by)
 
     def unexplained(self, measured_sensor: Array) -> Array:
-        """Return the power that the design leaves of each window, shape (n,) (T^2)."""
+        """Return the residual power of each window, shape (n,) (T^2)."""
         still, out = self._still(measured_sensor), []
         for _, maps in self.designs.pieces():
             design = self.designs.design(maps.elapsed, maps.weight)
@@ -178,7 +177,7 @@ class WindowOperator:
         return np.concatenate(out)
 
     def _still(self, measured_sensor: Array) -> Array:
-        """Return the samples in axes that stand still, shape (samples, 3)."""
+        """Return the samples in non-rotating axes, shape (samples, 3)."""
         out = np.empty_like(measured_sensor)
         for begin in range(0, len(out), AT_ONCE):
             rows = slice(begin, begin + AT_ONCE)
@@ -187,9 +186,10 @@ class WindowOperator:
         return out
 
     def _bent(self, rows: slice, maps: Maps, found: ComplexArray) -> Array:
-        """Return the variance of phasors (n, tones, 3) by the square of a turn that is not seen.
+        """Return the variance of phasors (n, tones, 3) by the square of an unobserved rotation.
 
-        Shape (n, tones) (T^2): what the design makes of a tone that falls with the square of time.
+        Shape (n, tones) (T^2): the response of the design to a tone that decreases with time
+        squared.
         """
         n = len(self.designs.frequencies_hz)
         out, unseen = np.zeros((len(maps.elapsed), n)), self.unseen[rows] | bool(self.lacking)
@@ -197,7 +197,7 @@ class WindowOperator:
             return out
         elapsed = maps.elapsed[unseen]
         cosine = self.designs.design(elapsed, maps.weight[unseen])[..., 2 : 2 + n]
-        square = (UNSEEN_TURN * elapsed[..., None]) ** 2  # half of it for each axis across
+        square = (UNSEEN_TURN * elapsed[..., None]) ** 2  # half of it for each transverse axis
         out[unseen] = np.einsum("ntm,nmt->nt", maps.solver[unseen, 1 : 1 + n], square * cosine) ** 2
         return out * np.nansum(np.abs(found) ** 2, axis=-1)
 
@@ -213,7 +213,7 @@ class WindowOperator:
 
 
 def _of_windows(still: Array, maps: Maps) -> Array:
-    """Return the samples of windows, zero where they are padded, shape (n, m, 3)."""
+    """Return the samples of windows, zero where padded, shape (n, m, 3)."""
     return still[maps.sample] * maps.weight[..., None]
 
 
@@ -228,7 +228,7 @@ def window_operator(
     nyquist_hz: float | None = None,
     turn: BodyTurn | None = None,
 ) -> WindowOperator:
-    """Return the map from a waveform to phasors, with the gyro's turn of each sample.
+    """Return the map from a waveform to phasors, with the gyro's rotation of each sample.
 
     Parameters
     ----------
@@ -237,21 +237,21 @@ def window_operator(
     site : Site
         Tones, magnetometer matrix and mounting.
     windows : Windows
-        That were admitted.
+        Admitted windows.
     imu_step : float, optional
-        Usual time between two inertial samples (s): a piece of a stream may have none.
+        Median time between two inertial samples (s), if the stream may have none.
     designs : Designs, optional
-        Of the same windows, where they are known.
+        Designs of the same windows, if already computed.
     nyquist_hz : float, optional
-        Of the magnetometer, where it is known.
+        Nyquist frequency of the magnetometer, if known.
     turn : BodyTurn, optional
-        How the stream turns, where that is known; where it has gaps it is found anew.
+        Rotation of the stream, if known; recomputed where it has gaps.
     """
     nyquist_hz = sample_rate_hz(waveform) / 2.0 if nyquist_hz is None else nyquist_hz
     step = usual_step(imu.time, "imu") if imu_step is None else imu_step
     margin = 2.0 * step + 3.0 * site.platform.imu.time_offset_sigma
     silence = silences(imu.time, step, margin)
-    if turn is None or len(silence[0]) > 1:  # the last one is behind the stream
+    if turn is None or len(silence[0]) > 1:  # the last gap follows the stream
         still_from_body = body_turn_of(standing_in(imu, silence))
         turn = BodyTurn(still_from_body(waveform.time), still_from_body(windows.centre))
     from_body, still = measured_from_body(site), turn.at_samples
@@ -280,14 +280,14 @@ def window_operator(
 def designs_of(
     waveform: Waveform, site: Site, settings: LockinSettings, windows: Windows
 ) -> Designs:
-    """Return what the lock-in makes of the sample times of windows."""
+    """Return the lock-in designs for the sample times of windows."""
     frequencies, nyquist_hz = tones_of(site).frequencies_hz, sample_rate_hz(waveform) / 2.0
     nuisances = nuisances_hz(settings, frequencies, nyquist_hz)
     return Designs(settings, frequencies, nuisances, waveform.time, windows)
 
 
 def unexplained(log: Log, site: Site, settings: LockinSettings) -> Array:
-    """Return the power that tones and turn leave of some windows in a row, shape (windows,) (T^2).
+    """Return the residual power of a series of windows, shape (windows,) (T^2).
 
     Parameters
     ----------

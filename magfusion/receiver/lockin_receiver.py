@@ -1,4 +1,4 @@
-"""The receiver of tones that are sent at once: windows that overlap, each a lock-in."""
+"""Receiver of simultaneous tones: overlapping windows, each a lock-in."""
 
 from functools import cached_property
 
@@ -28,14 +28,14 @@ from magfusion.receiver.turn import BodyTurn
 from magfusion.receiver.windows import LockinSettings, default_settings, sent_frequencies_hz
 from magfusion.units import Array, BoolArray, IntArray
 
-LEAST_SHARE = 0.5  # of the samples of a window: its design tells whether they suffice
+LEAST_SHARE = 0.5  # of the samples of a window: its design shows whether they suffice
 
 
 class LockinReceiver(Receiver):
-    """Of tones that are sent at once: windows that overlap, long against the motion."""
+    """Receiver of simultaneous tones: overlapping windows, long against the motion."""
 
     remembered = 0
-    # With the lines that were found beside the tones; of a checkpoint, as the others are.
+    # With the extra lines fitted with the tones; part of a checkpoint.
     beside: LockinSettings | None
 
     def __init__(self, site: Site, settings: LockinSettings | None = None) -> None:
@@ -48,7 +48,7 @@ class LockinReceiver(Receiver):
 
     @property
     def settings(self) -> LockinSettings:
-        """Window and step, chosen by the tones where they were not given."""
+        """Window and step, chosen from the tones if not given."""
         return self._chosen if self.beside is None else self.beside
 
     @cached_property
@@ -77,8 +77,8 @@ class LockinReceiver(Receiver):
         if not separable(1.0 / rate_hz, self.settings, frequencies):
             raise InputError(
                 f"magnetometer: {window * rate_hz:.3g} samples in a window of {window:.3g} s are"
-                " too few to tell tones, drift and steady field apart; choose a longer"
-                f" window (--window), or sample faster than at {rate_hz:.4g} Hz"
+                " too few to separate tones, drift and steady field; choose a longer window"
+                f" (--window), or sample faster than at {rate_hz:.4g} Hz"
             )
         grid = Grid(
             centre=self.settings.first_centre(float(waveform.time[0]) - 0.5 / rate_hz),
@@ -94,13 +94,13 @@ class LockinReceiver(Receiver):
         return windows, owned_by(found, self.site)
 
     def sent(self, waveform: Waveform, imu: ImuSamples) -> FieldSamples:
-        """Return what is received of each channel, of whichever beacon on its frequency."""
+        """Return the phasors of each channel, of any beacon on its frequency."""
         return super().whole(waveform, imu)[1]
 
     def phasors(
         self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
     ) -> tuple[FieldSamples, IntArray]:
-        """Return the phasors of windows without what is known of the motion but the turns."""
+        """Return the phasors of windows, corrected for rotation only."""
         operator = self.operator(waveform, imu, windows, site)
         return operator.demodulate(waveform.measured_sensor)[0], windows.number
 
@@ -114,7 +114,7 @@ class LockinReceiver(Receiver):
     ) -> WindowOperator:
         """Return the map from a waveform to phasors, as of `window_operator`.
 
-        What is made of the sample times alone is kept until others come.
+        What depends on the sample times alone is cached until they change.
         """
         known = self._designs
         if known is None or known.windows is not windows or known.time is not waveform.time:
@@ -145,9 +145,9 @@ class LockinReceiver(Receiver):
         )
 
     def _even_maps(self, tones_hz: Array, nyquist_hz: float) -> tuple[dict[Spacing, Maps], Array]:
-        """Return the maps that are kept of evenly spaced samples, and the lines in their designs.
+        """Return the cached maps of evenly spaced samples, and the lines in their designs.
 
-        None of another setting are kept.
+        The cache is cleared when the settings change.
         """
         by = (self.settings, tones_hz.tobytes(), nyquist_hz)
         if self._even_by != by:

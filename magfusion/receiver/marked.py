@@ -1,4 +1,4 @@
-"""The receiver of coils that a host drives one after the other, and says when: marked bursts."""
+"""Receiver of coils that a host drives in turn and marks in the log: marked bursts."""
 
 from dataclasses import replace
 
@@ -31,13 +31,13 @@ from magfusion.units import Array, BoolArray, IntArray
 
 TOO_SHORT = "burst too short for its tone"
 OUTSIDE = "burst outside of the samples"
-MEMORY = 2.0  # s; for which a burst tells later ones of the noise and the ambient field
-PATIENCE = 0.5  # s; marks that come later than their samples by more are too late
+MEMORY = 2.0  # s; age up to which a burst contributes to the noise and the ambient field
+PATIENCE = 0.5  # s; largest delay of marks after their samples
 ROUNDING = 1e-8  # s; of a stamp
 
 
 class MarkedReceiver(SlotReceiver):
-    """Each burst a row at its own time; those of a short cycle are one epoch."""
+    """Receiver that makes each burst a row at its own time; a short cycle is one epoch."""
 
     bursts: Bursts
     _reached: float
@@ -48,7 +48,7 @@ class MarkedReceiver(SlotReceiver):
 
     @property
     def remembered(self) -> int:
-        """For how many bursts one that was admitted is needed, where they are not too old."""
+        """Number of bursts for which an admitted one is needed, unless they are too old."""
         return history_of(self.site, self.settings) * places(self.site)
 
     @property
@@ -58,28 +58,28 @@ class MarkedReceiver(SlotReceiver):
 
     @property
     def marks(self) -> Marks | None:
-        """The bursts that are kept."""
+        """Stored bursts."""
         return self.bursts.marks
 
     def hear_marks(self, marks: Marks) -> None:
-        """Take bursts, as `Receiver.hear_marks`."""
+        """Add bursts, as `Receiver.hear_marks`."""
         self.bursts.add(marks)
 
     def hear_slots(self, time: Array, slot: IntArray) -> None:
-        """Take the bursts that the slots beside samples end, as `Receiver.hear_slots`."""
+        """Add the bursts that the slots of samples complete, as `Receiver.hear_slots`."""
         self.bursts.add(self.bursts.column.hear(time, slot))
 
     def forget_marks(self, before: float) -> None:
-        """Drop bursts, as `Receiver.forget_marks`."""
+        """Discard bursts, as `Receiver.forget_marks`."""
         self.bursts.forget(self.bursts.since(before))
 
     def check(self) -> None:
-        """Refuse beacons of which not all are marked, as `Receiver.check`."""
+        """Reject beacons that are not all marked, as `Receiver.check`."""
         check_kept(self.site)
         slot_settings_of(self.site, None if isinstance(self._given, SlotSettings) else self._given)
 
     def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
-        """Go on from the first burst that the samples hold, as `Receiver.begin`."""
+        """Start at the first burst within the samples, as `Receiver.begin`."""
         check_kept(self.site)
         rate_hz = sample_rate_hz(waveform)
         highest = float(np.max(carriers_hz(self.site, places(self.site))))
@@ -92,18 +92,18 @@ class MarkedReceiver(SlotReceiver):
             self.bursts.add(waveform.marks)
         if len(self.bursts) == 0:
             raise InputError(
-                "magnetometer: the site's slots are marked, and nothing marks them; give each"
+                "magnetometer: the site's slots are marked, but the log has no marks; give each"
                 " sample its slot, or a table of marks with start_ns, end_ns and slot"
             )
         self.next_number = self.bursts.since(float(waveform.time[0]) - LATE / rate_hz)
-        # The plateau of a pulse is no saturation.
+        # The plateau of a pulse is not saturation.
         clips = not is_pulsed(self.site)
         self._begin(waveform, imu, Grid(0.0, 0.0, 0.0), LEAST_SHARE_OF_SLOT, clips=clips)
         assert self.admission is not None
         self.admission.slack = 1
 
     def _admitted(self, waveform: Waveform, imu: ImuSamples) -> Windows:
-        """Count the bursts that no samples are of, too."""
+        """Return admitted windows; count also the bursts without samples."""
         self.begin(waveform, imu)
         before = self.next_number - self.bursts.first
         found = self.admit(waveform, imu)
@@ -112,7 +112,7 @@ class MarkedReceiver(SlotReceiver):
         return found
 
     def admit(self, waveform: Waveform, imu: ImuSamples, until: float | None = None) -> Windows:
-        """Leave out the bursts that are too short for their tone, too, as `Receiver.admit`."""
+        """Omit also the bursts that are too short for their tone, as `Receiver.admit`."""
         found = super().admit(waveform, imu, until)
         turns = found.length * carriers_hz(self.site, places(self.site))[found.place]
         short = (turns < LEAST_CYCLES) & (turns > 0.0) | (found.count < LEAST_SAMPLES)
@@ -120,7 +120,7 @@ class MarkedReceiver(SlotReceiver):
         return found.rows(~short)
 
     def centre_of(self, number: int) -> float:
-        """Return the middle of a burst (s), as far as it is known."""
+        """Return the middle of a burst (s), or its earliest value if not known yet."""
         centre = self.bursts.next_centre(number)
         known = number < self.bursts.first + len(self.bursts)
         return centre if known else max(centre, self._reached - PATIENCE)
@@ -143,12 +143,12 @@ class MarkedReceiver(SlotReceiver):
         return Windows(number, centre, first, count, marks.end - marks.begin, place)
 
     def _known(self, new: Windows) -> IntArray:
-        """Forget what is too old, and the marks of it."""
+        """Discard old bursts and their marks."""
         known = super()._known(new)
         if len(new):
             centre = self.bursts.rows(known)[1]
             known = known[centre > new.centre[0] - MEMORY]
-        # The one before the first tells how far back samples are needed.
+        # The burst before the first one limits how far back samples are needed.
         self.bursts.forget(min([*known[:1].tolist(), self.next_number]) - 1)
         return known
 
@@ -158,7 +158,7 @@ class MarkedReceiver(SlotReceiver):
     def _held(self, waveform: Waveform, turn: Turn, windows: Windows, site: Site) -> SlotValues:
         """Fit bursts from their first sample to the last.
 
-        A taper askew of the samples leaks of the carrier into the noise beside it.
+        A taper not aligned with the samples leaks carrier power into the noise estimate.
         """
         assert self.admission is not None
         begin = waveform.time[windows.first]
@@ -171,4 +171,4 @@ class MarkedReceiver(SlotReceiver):
         return np.asarray(owners(self.site, places(self.site))[windows.place] >= 0)
 
     def _follow(self, waveform: Waveform) -> None:
-        """Leave the bursts where they are marked."""
+        """Keep the bursts where they are marked."""

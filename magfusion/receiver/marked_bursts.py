@@ -1,4 +1,4 @@
-"""Bursts that were marked and are not demodulated yet, and which of them are one epoch."""
+"""Marked bursts that are not demodulated yet, and their grouping into epochs."""
 
 import numpy as np
 
@@ -8,28 +8,27 @@ from magfusion.model.site import Site
 from magfusion.receiver.slots import is_pulsed, places
 from magfusion.units import Array, IntArray
 
-# s; from the first to the last slot of an epoch. Half as long after its middle, a head that is
-# accelerated by 10 m/s^2 is 0.2 mm from where a steady velocity leads.
+# s; from the first to the last slot of an epoch. In half that time a head accelerated by
+# 10 m/s^2 deviates by 0.2 mm from constant velocity.
 LONGEST_EPOCH = 0.012
-LONGEST_BURST = 1.0  # s; a longer one is taken in pieces
-OVERLAP = 1e-6  # s; that rounding may make
+LONGEST_BURST = 1.0  # s; longer ones are split
+OVERLAP = 1e-6  # s; tolerance for rounding
 LATE = 0.6  # steps before a burst's end, after which no sample of it comes
 
 
 class Bursts:
-    """Bursts with their numbers, counted on, and their epochs.
+    """Bursts with their running numbers and epochs.
 
-    A coil that comes again begins another epoch, as does a burst more than `LONGEST_EPOCH` after
-    the first.
+    A repeated coil begins a new epoch, as does a burst more than `LONGEST_EPOCH` after the first.
 
     Attributes
     ----------
     marks : Marks
-        Those that are kept, no longer than `LONGEST_BURST`.
+        Stored bursts, split to at most `LONGEST_BURST`.
     first : int
         Number of the first of these.
     column : SlotColumn
-        Of samples beside which a slot stands.
+        Slots given per sample.
     """
 
     # What a checkpoint holds.
@@ -54,18 +53,18 @@ class Bursts:
         return len(self.marks)
 
     def add(self, marks: Marks) -> None:
-        """Take bursts that follow those that came.
+        """Add bursts after the earlier ones.
 
         Raises
         ------
         InputError
-            Where they do not, or a slot is of no coil.
+            Where they are not in order, or a slot has no coil.
         """
         self._check(marks)
         if len(marks) == 0:
             return
         self._end = float(marks.end[-1])
-        if not self._silences:  # beside a carrier they determine nothing
+        if not self._silences:  # with a carrier they determine nothing
             marks = marks.rows(marks.slot != SILENT)
         marks = _in_pieces(marks)
         epochs = [self._epoch_of(*one) for one in zip(marks.slot, _centres(marks), strict=True)]
@@ -92,7 +91,7 @@ class Bursts:
             )
 
     def _epoch_of(self, slot: int, centre: float) -> int:
-        """Return the epoch of the next burst; a silent one is of that of the burst before."""
+        """Return the epoch of the next burst; a silent one has that of the burst before."""
         if slot == SILENT:
             return self._newest
         if not self._taken or slot in self._taken or centre - self._since > LONGEST_EPOCH:
@@ -106,7 +105,7 @@ class Bursts:
         return self.first + np.arange(len(self))
 
     def next_centre(self, number: int) -> float:
-        """Return the middle of a burst (s); of one to come when it may begin at the earliest."""
+        """Return the middle of a burst (s); of a future one, its earliest begin."""
         row = number - self.first
         if row < 0:
             return float(self.marks.begin[0]) - LONGEST_BURST if len(self) else -np.inf
@@ -122,7 +121,7 @@ class Bursts:
         Parameters
         ----------
         next_number : int
-            From which on they are asked for.
+            First burst not returned yet.
         """
         begin = max(next_number - self.first, 0)
         own = slice(begin, None)
@@ -135,11 +134,11 @@ class Bursts:
         return self.first + max(epoch, begin) - 1
 
     def since(self, time: float) -> int:
-        """Return the number of the first burst that begins at a time (s) or later."""
+        """Return the number of the first burst that begins at or after a time (s)."""
         return self.first + int(np.searchsorted(self.marks.begin, time))
 
     def until(self, time: float) -> int:
-        """Return the number of the last burst that ends at a time (s) or before."""
+        """Return the number of the last burst that ends at or before a time (s)."""
         return self.first + int(np.searchsorted(self.marks.end, time, side="right")) - 1
 
     def rows(self, number: IntArray) -> tuple[Marks, Array, IntArray]:
@@ -148,7 +147,7 @@ class Bursts:
         return found, _centres(found), found.slot % self._count
 
     def forget(self, number: int) -> None:
-        """Drop the bursts before a number."""
+        """Discard the bursts before a number."""
         gone = min(max(number - self.first, 0), len(self))
         self.marks, self._epoch = self.marks.rows(slice(gone, None)), self._epoch[gone:]
         self.first += gone
@@ -159,7 +158,7 @@ def _centres(marks: Marks) -> Array:
 
 
 def _in_pieces(marks: Marks) -> Marks:
-    """Return bursts of which none is longer than `LONGEST_BURST`."""
+    """Split bursts so that none is longer than `LONGEST_BURST`."""
     length = marks.end - marks.begin
     pieces = np.maximum(np.ceil(length / LONGEST_BURST - 1e-9), 1.0).astype(np.int64)
     if np.all(pieces == 1):

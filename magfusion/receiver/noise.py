@@ -1,4 +1,4 @@
-"""The noise that a window holds, measured beside the tones rather than taken from a data sheet."""
+"""Noise of a window, measured next to the tones rather than taken from a data sheet."""
 
 from itertools import pairwise
 
@@ -6,15 +6,15 @@ import numpy as np
 
 from magfusion.units import Array, BoolArray, IntArray
 
-LEFT = 1e-6  # of what probes are, from which what the design left of them counts
-LEAST_SHARE = 0.1  # of the declared noise; held and coarse samples may show none
+LEFT = 1e-6  # least share of a probe outside the design for its residual to count
+LEAST_SHARE = 0.1  # of the declared noise; constant and coarse samples may show none
 LEAST_NOISE = 1e-18  # T; rounding of the Earth's field
 
 
 def _probe_frequencies(
     tone: int, frequencies_hz: Array, nuisance_hz: Array, window: float
 ) -> Array:
-    """Two probes half-way to the neighbours of a tone, clear of every fitted line."""
+    """Return two probes half-way to the neighbours of a tone, clear of every fitted line."""
     lines = np.concatenate([[0.0], frequencies_hz, nuisance_hz])
     apart = np.abs(lines - frequencies_hz[tone])
     nearest = float(np.min(apart[apart > 0]))
@@ -30,10 +30,10 @@ def probes_left(
     design: Array,
     inverse: Array,
 ) -> tuple[Array, IntArray]:
-    """Return the maps from samples to what a design leaves of probe tones beside each tone.
+    """Return the maps from samples to the residuals of probes next to each tone.
 
-    Their power, divided by what the design left of the probes themselves, is unbiased for white
-    noise.  A short window leaves fewer directions than there are axes.
+    Their power, divided by that of the probes' own residuals, is unbiased for white noise.  A
+    short window leaves fewer directions than there are axes.
 
     Parameters
     ----------
@@ -47,9 +47,10 @@ def probes_left(
     Returns
     -------
     ndarray, shape (n, tones, 4, m)
-        White noise of a variance of one gives as much in each direction that is told, others zero.
+        White noise of unit variance gives unit variance in each observable direction, zero in
+        others.
     int ndarray, shape (n, tones)
-        How many are told.
+        Number of observable directions.
     """
     window = float(np.max(elapsed) - np.min(elapsed))
     tones = range(len(frequencies_hz))
@@ -68,12 +69,12 @@ def probes_left(
 def noise_beside_tones(seen: Array, told: IntArray) -> Array:
     """Return the covariance per sample of the noise around each tone, in the axes of the samples.
 
-    What a window says nothing of is taken for as noisy.
+    Unobserved directions get the mean noise of the observed ones.
 
     Parameters
     ----------
     seen : ndarray, shape (n, tones, 4, 3)
-        What is left of probes (T).
+        Residuals of probes (T).
     told : int ndarray, shape (n, tones)
         As of `probes_left`.
 
@@ -89,12 +90,12 @@ def noise_beside_tones(seen: Array, told: IntArray) -> Array:
 
 
 def not_below(noise_cov: Array, sigma: float) -> Array:
-    """Return noise of which no direction has less than a share of the declared (T), shape as given.
+    """Limit the noise in every direction to at least a share of the declared (T), same shape.
 
-    Held and coarsely quantised samples may be the same all through a window.
+    Repeated and coarsely quantised samples may be constant all through a window.
     """
     least = max(LEAST_SHARE * sigma, LEAST_NOISE) ** 2
-    # The two larger eigenvalues multiply to no more than the square of half their sum.
+    # The two larger eigenvalues have at most the product of half their sum squared.
     half = 0.5 * np.einsum("...ii->...", noise_cov)
     if (np.linalg.det(noise_cov) > least * half**2).all():
         return noise_cov
@@ -112,12 +113,12 @@ def smoothed_over_windows(
 ) -> Array:
     """Average the noise over neighbouring windows, shape (n, tones, 3, 3), never across a gap.
 
-    One window has four degrees of freedom a tone, too few for a weight.
+    One window has four degrees of freedom a tone, too few to weight by.
 
     Parameters
     ----------
     unseen : bool ndarray, shape (n,), optional
-        Windows without the gyro's turn: their noise is their own.
+        Windows in gaps of the gyro, averaged separately.
     """
     if len(centre) == 1:
         return noise_cov

@@ -1,8 +1,8 @@
-"""Tones of a sensor at rest, in pieces of a few seconds: what hours are made of.
+"""Tones of a stationary sensor in pieces of a few seconds, for the integration of long records.
 
-At rest nothing is turned by the gyroscope, whose noise would make noise of the Earth's field.  Each
-piece is fitted under a Hann taper, so that what is far from a tone does not leak into it, and
-pieces overlap by half, so that their mean leaves nothing of the record out.
+Samples are not rotated by the gyro, whose noise would couple in through the Earth's field.  Each
+piece is fitted under a Hann taper, so that distant frequencies do not leak into a tone.  Pieces
+overlap by half, so that their mean uses the whole record.
 """
 
 from dataclasses import dataclass
@@ -15,15 +15,15 @@ from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 CHUNK = 64  # pieces at once
 LEAST_SHARE = 0.9  # of the samples of a piece
-STANDS_OUT = 4.5  # times the median size of what a fit leaves; noise does so once in 10^10
-MOST_BANGS, CUT_TWICE = 0.25, 2  # of the samples of a piece; how often they are left out
+STANDS_OUT = 4.5  # times the median residual; exceeded by noise once in 10^10
+MOST_BANGS, CUT_TWICE = 0.25, 2  # of the samples of a piece; how often they are rejected
 NO_PROBES = np.zeros(0)
-HUM_CLEAR = 2.0  # resolutions of a piece between a tone and a harmonic that is fitted beside it
+HUM_CLEAR = 2.0  # resolutions of a piece between a tone and a fitted harmonic
 
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Phasors of pieces, each referred to the frequency that it was demodulated by.
+    """Phasors of pieces, each referred to its demodulation frequency.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class Pieces:
     phasor : complex ndarray, shape (n, tones, components)
         (T), the axes of the sensor; their phase is that of a cosine at time zero of the log.
     beside : complex ndarray, shape (n, probes, components)
-        The same of what is left at other frequencies.
+        Residual phasors at other frequencies.
     """
 
     centre: Array
@@ -43,7 +43,7 @@ class Pieces:
     beside: ComplexArray
 
     def rows(self, kept: BoolArray) -> "Pieces":
-        """Return some pieces."""
+        """Return a subset of the pieces."""
         return Pieces(self.centre[kept], self.length, self.phasor[kept], self.beside[kept])
 
 
@@ -55,20 +55,20 @@ def pieces(
     hum: Hum | None = None,
     beside_hz: Array = NO_PROBES,
 ) -> Pieces:
-    """Return the phasors of pieces of a waveform at rest.
+    """Return the phasors of pieces of a stationary waveform.
 
     Parameters
     ----------
     span : tuple of float
-        Beginning and end of the rest (s).
+        Begin and end of the stationary interval (s).
     frequencies_hz : ndarray, shape (tones,)
-        As they are sent.
+        Transmitted frequencies.
     length : float
-        Of a piece (s).
+        Length of a piece (s).
     hum : Hum, optional
-        Whose harmonics are fitted beside the tones.
+        Its harmonics are fitted with the tones.
     beside_hz : ndarray, shape (probes,)
-        Other frequencies at which what the fit leaves is told.
+        Other frequencies at which the residual is evaluated.
     """
     time = waveform.time
     step = float(np.median(np.diff(time)))
@@ -93,7 +93,7 @@ def pieces(
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
-    """The fit of pieces, some at once."""
+    """Fit of a batch of pieces."""
 
     waveform: Waveform
     frequencies_hz: Array
@@ -104,7 +104,7 @@ class _Fitted:
     def of(
         self, centre: Array, first: IntArray, held: IntArray
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Return the phasors of tones, and of probes, shape (n, tones or probes, components)."""
+        """Return the phasors of tones and of probes, shape (n, tones or probes, components)."""
         reach, time = np.arange(int(np.max(held))), self.waveform.time
         index = np.minimum(first[:, None] + reach, len(time) - 1)
         elapsed, field = time[index] - centre[:, None], self.waveform.measured_sensor[index]
@@ -134,10 +134,10 @@ def _solved(design: Array, taper: Array, field: Array) -> Array:
 
 
 def _bangs(left: Array, inside: BoolArray) -> BoolArray:
-    """Return samples of the sensor that stand out of what a fit leaves of a piece, (n, m).
+    """Return outliers of the sensor in the residual of a piece, shape (n, m).
 
-    Where they are many they are no bangs.  Those of a reference are left to the weights of pieces:
-    it is not to change what the sensor tells alone.
+    Where they are many, none is rejected.  Outliers of a reference only affect the weights of
+    pieces, so that it does not change the sensor's own result.
     """
     size = np.linalg.norm(left[..., :3], axis=2)
     usual = np.nanmedian(np.where(inside, size, np.nan), axis=1)
@@ -149,13 +149,13 @@ def _bangs(left: Array, inside: BoolArray) -> BoolArray:
 def _design(
     elapsed: Array, time: Array, frequencies_hz: Array, length: float, hum: Hum | None
 ) -> Array:
-    """Return columns: constant, ramp, cosines and sines of tones, bends, hum and its ramps.
+    """Return columns: constant, ramp, tones, curvature, hum and its ramps.
 
     Shape (n, m, columns).
     """
     ramp = elapsed[..., None] * (2.0 / length)
     angle = 2.0 * np.pi * elapsed[..., None] * frequencies_hz
-    # Steel that passes bends the steady field.
+    # Moving steel makes the steady field curve.
     columns = [np.ones_like(ramp), ramp, np.cos(angle), np.sin(angle), ramp**2, ramp**3]
     if hum is not None:
         orders = hum.orders[_clear(hum, frequencies_hz, length)]
@@ -166,6 +166,6 @@ def _design(
 
 
 def _clear(hum: Hum, frequencies_hz: Array, length: float) -> BoolArray:
-    """Return which harmonics a piece tells from every tone."""
+    """Return which harmonics a piece separates from every tone."""
     off = np.abs(hum.orders[:, None] * hum.frequency_hz - frequencies_hz)
     return np.asarray(np.min(off, axis=1, initial=np.inf) * length > HUM_CLEAR)

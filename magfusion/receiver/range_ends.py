@@ -1,7 +1,7 @@
-"""Where an instrument's range ends, by the samples until then.
+"""Detection of the end of an instrument's range from the samples so far.
 
-At the end of its range an axis keeps one value while the others go on.  A magnetometer that is read
-faster than it measures keeps all three, and one that rests between two steps keeps values anywhere.
+At the end of its range an axis is constant while the others change.  A magnetometer that is read
+faster than it measures repeats all three, and one near rest repeats any value between two steps.
 """
 
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from magfusion.model.samples import Waveform
 from magfusion.units import Array, BoolArray, IntArray
 
 SHORTEST = 3  # samples in a row at the end of a range
-LONGEST = 8  # from so many on it is one, whatever is kept elsewhere
+LONGEST = 8  # length of a run that is an end of range, whatever repeats elsewhere
 STEPS = 8.0  # of the instrument, that a range must have before its end is reached
 
 
 @dataclass(eq=False)
 class RangeEnds:
-    """What is known of the range of one axis.
+    """Observed range of one axis.
 
     Parameters
     ----------
@@ -28,9 +28,9 @@ class RangeEnds:
     finest : float
         Smallest change from one sample to the next (T).
     kept : int
-        Samples in a row with one value that was no extreme; at most `LONGEST`.
+        Longest run of a constant value that was no extreme (samples); at most `LONGEST`.
     until : float
-        Last sample that counted (s).
+        Time of the last sample used (s).
     """
 
     low: float = np.inf
@@ -41,7 +41,7 @@ class RangeEnds:
 
 
 def still(waveform: Waveform, first: IntArray, last: IntArray) -> BoolArray:
-    """Return in which windows no sample differs from the one before; as `saturated`."""
+    """Return in which windows all samples are equal; arguments as of `saturated`."""
     changes = np.concatenate([[0], np.cumsum(_changed(waveform.measured_sensor))])
     held = changes[np.maximum(last - 1, first)] == changes[first]
     return np.asarray(held & (last > first + 1))
@@ -56,16 +56,16 @@ def _changed(measured: Array) -> BoolArray:
 def saturated(
     waveform: Waveform, first: IntArray, last: IntArray, ends: tuple[RangeEnds, ...]
 ) -> BoolArray:
-    """Return in which windows an axis stays at the end of its range.
+    """Return in which windows an axis is at the end of its range.
 
     Parameters
     ----------
     waveform : Waveform
         With all samples of the windows.
     first, last : int ndarray, shape (n,)
-        Samples of each window, without the last; windows after those that were judged before.
+        Sample ranges, end exclusive; windows after those assessed before.
     ends : tuple of RangeEnds
-        Of the three axes; they are brought up to date.
+        Of the three axes; they are updated.
     """
     spoilt = np.zeros(len(first), dtype=bool)
     until = int(np.max(last, initial=0))
@@ -74,14 +74,14 @@ def saturated(
     measured = waveform.measured_sensor[:until]
     fresh = np.concatenate([[0], np.flatnonzero(_changed(measured)) + 1])
     begin, end = np.searchsorted(fresh, first), np.searchsorted(fresh, last)
-    # The ends know of those before, but for how long the last of them kept its value.
+    # The ends cover the earlier samples, except the length of the newest run.
     new = int(np.searchsorted(waveform.time[fresh], min(one.until for one in ends), side="right"))
     known_until = max(min(new, int(begin.min())) - LONGEST, 0)
     fresh, begin, end = fresh[known_until:], begin - known_until, end - known_until
     value, time = measured[fresh], waveform.time[fresh]
     known = np.array([(one.low, one.high, one.finest, one.kept) for one in ends]).T
     if known[3].min() >= 1 and (value[1:] != value[:-1]).all():
-        _heard(ends, value, time)  # no axis keeps a value, as nearly always
+        _heard(ends, value, time)  # no axis repeats a value, the usual case
         return spoilt
     low = np.minimum(np.minimum.accumulate(value), known[0])
     high = np.maximum(np.maximum.accumulate(value), known[1])
@@ -108,7 +108,7 @@ def saturated(
 
 
 def _heard(ends: tuple[RangeEnds, ...], value: Array, time: Array) -> None:
-    """Bring ends up to date with samples (n, 3) of which each differs from the one before."""
+    """Update ends with samples (n, 3) that each differ from the one before."""
     low, high = value.min(axis=0).tolist(), value.max(axis=0).tolist()
     finest = np.min(np.abs(value[1:] - value[:-1]), axis=0, initial=np.inf).tolist()
     for axis, one in enumerate(ends):
@@ -118,7 +118,7 @@ def _heard(ends: tuple[RangeEnds, ...], value: Array, time: Array) -> None:
 
 
 class _Runs(NamedTuple):
-    """What is known of one axis at each sample, shape (samples,) each.
+    """Observed range of one axis at each sample, shape (samples,) each.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ class _Runs(NamedTuple):
     low, high, finest, kept : ndarray
         As of `RangeEnds`, until then.
     start : int ndarray
-        Since which sample it has had this value.
+        First sample of the current run.
     """
 
     value: Array
@@ -139,7 +139,7 @@ class _Runs(NamedTuple):
 
 
 def _at_end(runs: _Runs, begin: IntArray, end: IntArray) -> BoolArray:
-    """Return which windows, samples ``begin`` to before ``end``, hold an end of range."""
+    """Return which windows, samples ``begin`` to before ``end``, contain an end of range."""
     value, low, high, finest, start, kept = runs
     found = np.zeros(len(begin), dtype=bool)
     first = np.flatnonzero(start == np.arange(len(value)))

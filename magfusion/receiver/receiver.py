@@ -1,8 +1,8 @@
-"""The receiver: a magnetometer's samples, pushed as they come or all at once, to phasors.
+"""Receiver: magnetometer samples, pushed as they arrive or all at once, to phasors.
 
-Of tones that are sent at once, `LockinReceiver`; of time slots, `SlotReceiver`: this is what they
-share.  Which windows are used `magfusion.receiver.admission` says, for both and whatever the size
-of the pieces.
+Common base of `LockinReceiver`, for simultaneous tones, and `SlotReceiver`, for time slots.
+`magfusion.receiver.admission` selects the windows for both, independent of the size of the
+pieces.
 """
 
 from abc import ABC, abstractmethod
@@ -30,8 +30,8 @@ from magfusion.receiver.turn import on_clock
 from magfusion.units import Array, BoolArray, IntArray
 
 NO_SILENT_SLOT = "no silent slot beside it"
-INERTIAL_MARGIN = 0.1  # s; by which their clocks may be apart, and before a window
-BEFORE = 256  # samples before a window, among which an axis that keeps one value is seen to
+INERTIAL_MARGIN = 0.1  # s; for the offset of their clocks, and before a window
+BEFORE = 256  # samples before a window, used to detect an axis that repeats one value
 
 
 class Receiver(ABC):
@@ -40,19 +40,19 @@ class Receiver(ABC):
     Attributes
     ----------
     grid : Grid, optional
-        Where the windows lie, once it has begun.
+        Positions of the windows, once it has begun.
     next_number : int
-        Of the window that is judged next.
+        Number of the next window to assess.
     recent : int ndarray
-        Numbers of windows that were admitted and that the phasors of later ones need.
+        Numbers of admitted windows that later phasors need.
     dropped : Counter
-        Reason to number of windows.
+        Number of windows by reason.
     needs_turn : bool
-        Whether windows without inertial samples are of no use.
+        Whether windows without inertial samples are dropped.
     joined : bool
-        Whether the slots of a short cycle that are pushed are one epoch.
+        Whether the pushed slots of a short cycle are one epoch.
     without_turn : Windows
-        Of those that were judged last, which lack nothing else.
+        Windows assessed last that lack only inertial samples.
     """
 
     grid: Grid | None
@@ -76,18 +76,18 @@ class Receiver(ABC):
     @property
     @abstractmethod
     def remembered(self) -> int:
-        """For how many windows one that was admitted is needed."""
+        """Number of later windows for which an admitted one is needed."""
 
     @property
     def history(self) -> float:
-        """How much older than a window's centre the samples are that its phasors need (s)."""
+        """Return how far before a window's centre its phasors need samples (s)."""
         if self.grid is None:
             return 0.0
         return self.grid.length + (self.remembered + self.grid.together) * self.grid.step
 
     @abstractmethod
     def check(self) -> None:
-        """Refuse drives that cannot be separated, and settings that do not suit them.
+        """Reject drives that cannot be separated, and settings that do not suit them.
 
         Raises
         ------
@@ -96,7 +96,7 @@ class Receiver(ABC):
 
     @abstractmethod
     def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
-        """Lay the grid by the first samples.
+        """Set up the grid from the first samples.
 
         Raises
         ------
@@ -108,7 +108,7 @@ class Receiver(ABC):
     def phasors(
         self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
     ) -> tuple[FieldSamples, IntArray]:
-        """Return the phasors of windows at what is known, and the number of each row's window.
+        """Return the phasors of windows, and the number of each row's window.
 
         Parameters
         ----------
@@ -121,12 +121,12 @@ class Receiver(ABC):
     def pushed(
         self, waveform: Waveform, imu: ImuSamples, windows: Windows, since: int
     ) -> tuple[FieldSamples, int]:
-        """Return the phasors of windows from a number on, and how many windows they are of.
+        """Return the phasors of windows from a number on, and the number of these windows.
 
         Parameters
         ----------
         windows : Windows
-            With those before that they need.
+            Including the earlier ones that these need.
         """
         found, number = self.phasors(waveform, imu, windows, self.site)
         found = found.rows(number >= since)
@@ -134,34 +134,34 @@ class Receiver(ABC):
 
     @property
     def marks(self) -> Marks | None:
-        """The bursts that are kept; None of drives that keep to a clock."""
+        """Stored bursts; None of drives with a schedule."""
         return None
 
     def hear_marks(self, marks: Marks) -> None:  # noqa: B027
-        """Take bursts as they were marked; drives that keep to a clock need none.
+        """Add marked bursts; drives with a schedule ignore them.
 
         Raises
         ------
         InputError
-            Where they do not follow those that came, or a slot is of no coil.
+            Where they are not in order, or a slot has no coil.
         """
 
     def hear_slots(self, time: Array, slot: IntArray) -> None:  # noqa: B027
-        """Take the slots beside samples, as `hear_marks`."""
+        """Add the slots given per sample, as `hear_marks`."""
 
     def forget_marks(self, before: float) -> None:  # noqa: B027
-        """Drop the bursts before a time (s), as long as none is judged."""
+        """Discard the bursts before a time (s), as long as none has been assessed."""
 
     def _follow(self, waveform: Waveform) -> None:  # noqa: B027
-        """Bring the grid to where the stream shows it."""
+        """Align the grid with the stream."""
 
     @abstractmethod
     def _driven(self, windows: Windows) -> BoolArray:
-        """Tell which windows lead to a row of phasors."""
+        """Return which windows lead to a row of phasors."""
 
     @abstractmethod
     def _growth(self, windows: Windows, time: Array) -> Array:
-        """Return what missing samples do to the variance of phasors, as of `Growth`."""
+        """Return the growth of phasors' variance by missing samples, as `Growth`."""
 
     def push(
         self,
@@ -176,13 +176,13 @@ class Receiver(ABC):
         Parameters
         ----------
         waveform : Waveform
-            With all samples of these windows, and since so long before as `history` says.
+            All samples of these windows, and before them back to `history`.
         imu : ImuSamples
             Likewise.
         until : float
-            When what has come ends (s).
+            End of the received data (s).
         gyro_bias_body, time_offset
-            As of `magfusion.receiver.turn.on_clock`; the offset is the site's where none is given.
+            As of `magfusion.receiver.turn.on_clock`; the offset defaults to the site's.
         """
         assert self.grid is not None
         self._follow(waveform)
@@ -233,11 +233,11 @@ class Receiver(ABC):
         return self.grid.centre + self.grid.step * number
 
     def complete(self, until: float) -> bool:
-        """Return whether there is a window to judge at a time (s)."""
+        """Return whether a window can be assessed at a time (s)."""
         return self.grid is not None and self._last(until) >= self.next_number
 
     def _last(self, until: float) -> int:
-        """Return the number of the last window that can be judged at a time (s)."""
+        """Return the number of the last window that can be assessed at a time (s)."""
         assert self.grid is not None
         return self.grid.last(until)
 
@@ -253,7 +253,7 @@ class Receiver(ABC):
         return self.grid.windows(number, time)
 
     def _known(self, new: Windows) -> IntArray:
-        """Return the numbers of windows that were admitted and may be needed, to the newest."""
+        """Return the numbers of admitted windows that may still be needed, to the newest."""
         return np.concatenate([self.recent, new.number])
 
     def admit(self, waveform: Waveform, imu: ImuSamples, until: float | None = None) -> Windows:
@@ -270,7 +270,7 @@ class Receiver(ABC):
         number = np.arange(self.next_number, max(last + 1, self.next_number))
         self.next_number += len(number)
         windows = self._windows(number, waveform.time)
-        # By the clock as declared: what is learnt of it later changes no verdict.
+        # With the declared clock: a later estimate of it changes no decision.
         stamps = imu.time + self.site.platform.imu.time_offset
         verdict = self.admission.verdicts(self.grid, windows, waveform, stamps, self._growth)
         counts = np.bincount(verdict + 1, minlength=len(REASONS) + 1)[1:]
@@ -282,7 +282,7 @@ class Receiver(ABC):
     def _since(
         self, waveform: Waveform, imu: ImuSamples, time_offset: float | None, number: int
     ) -> tuple[Waveform, ImuSamples]:
-        """Return the samples that windows from a number on can need."""
+        """Return the samples needed for windows from a number on."""
         oldest = self.centre_of(number - 1)
         first = max(int(np.searchsorted(waveform.time, oldest)) - BEFORE, 0)
         offset = self.site.platform.imu.time_offset if time_offset is None else time_offset

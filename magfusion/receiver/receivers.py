@@ -1,4 +1,4 @@
-"""The receiver that suits the drives of a site, and the phasors of a whole waveform."""
+"""Selection of the receiver for a site's drives, and demodulation of a whole waveform."""
 
 from collections import Counter
 
@@ -24,7 +24,7 @@ def receiver_of(site: Site, settings: LockinSettings | SlotSettings | None = Non
     Parameters
     ----------
     settings : LockinSettings or SlotSettings, optional
-        None chooses them by the tones or the time slots.
+        None derives them from the tones or the time slots.
     """
     if is_marked(site):
         return MarkedReceiver(site, settings)
@@ -34,7 +34,7 @@ def receiver_of(site: Site, settings: LockinSettings | SlotSettings | None = Non
 
 
 def windowed(receiver: Receiver) -> LockinReceiver:
-    """Return a receiver whose windows leave a steady field, the Earth's.
+    """Return a receiver whose windows include a steady field, the Earth's.
 
     Raises
     ------
@@ -44,13 +44,12 @@ def windowed(receiver: Receiver) -> LockinReceiver:
     if isinstance(receiver, LockinReceiver):
         return receiver
     raise InputError(
-        "of coils in time slots the Earth field is taken off with the silent slots; leave"
-        " --earth out"
+        "with coils in time slots the silent slots remove the Earth field; leave --earth out"
     )
 
 
 def usual_lockin(site: Site, mains_hz: float = 50.0) -> LockinSettings:
-    """Return the window and step of a site where nothing else is asked: of slots, theirs.
+    """Return the default window and step of a site; of time slots, theirs.
 
     Raises
     ------

@@ -1,9 +1,9 @@
-"""A second magnetometer as a witness of the noise that it has in common with the first.
+"""Noise cancellation with a second, reference magnetometer.
 
-What both hear of storms, mains and machines is related by a matrix of three by three complex
-numbers about each tone.  It is found by least squares from pieces beside the tones, so that no
-signal has a part in it, and its worth from pieces that had no part in it.  A reference that tells
-nothing is left out: then nothing is changed.
+The noise that both magnetometers receive from storms, mains and machines is related by a complex
+3 x 3 matrix about each tone.  It is estimated by least squares from pieces near the tones, which
+contain no signal, and validated on pieces not used for the estimate.  A reference that does not
+reduce the noise is not used, and the result is unchanged.
 """
 
 from dataclasses import dataclass
@@ -16,28 +16,28 @@ from magfusion.receiver.pieces import Pieces
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 LARGEST_LAG = 5.0  # s; of the reference's clock
-BLOCK = 40.96  # s; by which lag and rate of the clock are found
-CLEAR_HZ = 0.6  # about tones and mains, which correlate at any lag of whole turns
-LEAST_PEAK = 8.0  # times the scatter of a correlation about its mean, a lag has
+BLOCK = 40.96  # s; in which lag and rate of the clock are estimated
+CLEAR_HZ = 0.6  # excluded about tones and mains, which correlate at any lag of whole turns
+LEAST_PEAK = 8.0  # times the scatter of the correlation, for a lag
 FINER = 8  # lags in a sampling step
 NEAR_LAG = 8  # samples about the common lag, in which blocks find their own
 BESIDE = 8  # probes about a tone
 APART = 2.0  # resolutions of a piece, between them and from every tone
-GROUPS = 8  # of pieces in a row, of which every other one tells the matrix
-WORTH = 0.95  # of the power that is left, beyond which a reference tells nothing
-MEMORY = 0.7  # of earlier pieces' weight, in each later stretch of a stream
-GAP = 2.5  # steps of the reference, over which it is not filled in
+GROUPS = 8  # of successive pieces, every other one used for the estimate
+WORTH = 0.95  # residual power, beyond which a reference is not used
+MEMORY = 0.7  # weight of earlier pieces in each later stretch of a stream
+GAP = 2.5  # steps of the reference, over which it is not interpolated
 
 
 @dataclass(frozen=True)
 class Lag:
-    """How the clock of a reference lies: what it stamped t happened at t + offset + rate t (s)."""
+    """Clock error of a reference: an event stamped t is at t + offset + rate t (s)."""
 
     offset: float
     rate: float
 
     def of(self, time: Array) -> Array:
-        """Return when it was on the clock of the log (s)."""
+        """Convert times to the clock of the log (s)."""
         return np.asarray(time + self.offset + self.rate * time)
 
 
@@ -45,7 +45,7 @@ NO_LAG = Lag(0.0, 0.0)
 
 
 def beside(waveform: Waveform, reference: Waveform, lag: Lag) -> tuple[Array, BoolArray]:
-    """Return a reference at the samples of a waveform (n, 3), and where it has some (n,)."""
+    """Interpolate a reference to the samples of a waveform (n, 3), and return where it is valid."""
     time = lag.of(reference.time)
     step = float(np.median(np.diff(time)))
     at = np.clip(np.searchsorted(time, waveform.time), 1, len(time) - 1)
@@ -57,12 +57,12 @@ def beside(waveform: Waveform, reference: Waveform, lag: Lag) -> tuple[Array, Bo
 
 
 def lag_of(waveform: Waveform, reference: Waveform, lines_hz: Array) -> Lag:
-    """Return how the clock of a reference lies, by the noise that both hear; none where none is.
+    """Estimate the clock error of a reference from the common noise; zero if there is none.
 
     Parameters
     ----------
     lines_hz : ndarray
-        Tones and mains (Hz), which are left out.
+        Tones and mains (Hz), which are excluded.
     """
     step = float(np.median(np.diff(waveform.time)))
     size = int(BLOCK / step) // 2 * 2
@@ -89,7 +89,7 @@ def lag_of(waveform: Waveform, reference: Waveform, lines_hz: Array) -> Lag:
     finer = 0.5 * (before - after) / np.minimum(before - 2.0 * here + after, -1e-12)
     seen = (near[peak[rows]] + np.clip(finer, -0.5, 0.5)) * step
     rate, offset = np.polyfit(middle[rows], seen, 1)
-    # A line through lags that do not lie on one is worse than their median.
+    # Lags that do not lie on a line are better described by their median.
     left = seen - offset - rate * middle[rows]
     rough = np.std(left) / (np.std(middle[rows]) * np.sqrt(len(rows)) + 1e-300)
     if abs(rate) < 3.0 * rough:
@@ -100,9 +100,9 @@ def lag_of(waveform: Waveform, reference: Waveform, lines_hz: Array) -> Lag:
 def correlations(
     own: Array, other: Array, starts: IntArray, size: int, step: float, lines_hz: Array
 ) -> Array:
-    """Return the power of the correlation in some stretches, at lags up to the largest, (n, lags).
+    """Return the power of the correlation of stretches at lags up to the largest, (n, lags).
 
-    Lags are a part of a step apart: the peak of whitened noise is as narrow as a step.
+    Lags are finer than a step: the peak of whitened noise is as narrow as a step.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def _correlation(own: Array, other: Array, step: float, lines_hz: Array) -> Arra
 
 
 def probes_hz(tone_hz: float, tones_hz: Array, length: float, highest_hz: float) -> Array:
-    """Return the frequencies beside a tone at which the matrix is found, clear of every tone."""
+    """Return the frequencies near a tone used to estimate the matrix, clear of every tone."""
     offsets = (APART / length) * np.arange(1, 4 * BESIDE)
     tried = np.concatenate([tone_hz + offsets, tone_hz - offsets])
     apart = np.min(np.abs(tried[:, None] - tones_hz), axis=1)
@@ -159,12 +159,12 @@ def probes_hz(tone_hz: float, tones_hz: Array, length: float, highest_hz: float)
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """Normal equations of a matrix between a sensor's noise and a reference's.
+    """Normal equations of the matrix between the noise of a sensor and a reference.
 
     Parameters
     ----------
     other, both : complex ndarray, shape (3, 3)
-        Sums of the reference's products, and of those with the sensor's.
+        Sums of the products of the reference, and of those with the sensor.
     """
 
     other: ComplexArray
@@ -172,19 +172,19 @@ class Normal:
 
     @staticmethod
     def of(own: ComplexArray, other: ComplexArray, weight: Array) -> "Normal":
-        """Return those of pieces (n, probes, 3) with a weight each (n,)."""
+        """Compute them from pieces (n, probes, 3) with a weight each (n,)."""
         weighted = np.conj(other) * weight[:, None, None]
         return Normal(
             np.einsum("npi,npj->ij", weighted, other), np.einsum("npi,npj->ij", weighted, own)
         )
 
     def later(self, turn: float) -> "Normal":
-        """Return them as they count for pieces that come after, by a clock put on by ``turn``.
+        """Return their contribution to later pieces, after a clock correction by ``turn``.
 
         Parameters
         ----------
         turn : float
-            Angle by which the reference's phase is less than before (rad).
+            Decrease of the reference's phase (rad).
         """
         return Normal(MEMORY * self.other, MEMORY * np.exp(1j * turn) * self.both)
 
@@ -202,15 +202,15 @@ class Normal:
 
 @dataclass(frozen=True, eq=False)
 class Relation:
-    """What the noise of a sensor is of that of a reference, about a tone.
+    """Relation of the noise of a sensor to that of a reference, about a tone.
 
     Parameters
     ----------
     matrix : complex ndarray, shape (3, 3)
     left : float
-        Power of the noise that it leaves, of that without it, in pieces that it was not found by.
+        Ratio of the noise power with and without it, in pieces not used for the estimate.
     normal : Normal
-        Of which it was found: what goes on to later pieces.
+        Its normal equations, propagated to later pieces.
     """
 
     matrix: ComplexArray
@@ -219,14 +219,14 @@ class Relation:
 
     @property
     def tells(self) -> bool:
-        """Whether it takes anything off."""
+        """Whether it reduces the noise."""
         return self.left < WORTH
 
 
 def relation(
     found: Pieces, there: BoolArray, columns: slice, before: Normal | None = None
 ) -> Relation:
-    """Return how a sensor and its reference go together in the probes beside a tone.
+    """Estimate the relation of a sensor and its reference in the probes near a tone.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def relation(
     power = np.sum(np.abs(own) ** 2, axis=(1, 2))
     witness = np.sum(np.abs(other) ** 2, axis=(1, 2))
     usual = max(float(np.median(power)), 1e-300), max(float(np.median(witness)), 1e-300)
-    # What is loud counts for less: a bang beside one of them is none of the other.
+    # Noisy pieces are down-weighted: an impact at one sensor is not received by the other.
     weight = there / (1.0 + power / usual[0] + witness / usual[1])
     group = np.arange(len(own)) * GROUPS // max(len(own), 1) % 2
     left = power_before = 0.0

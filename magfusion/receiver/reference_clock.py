@@ -1,4 +1,4 @@
-"""The clock of a reference in a stream: a line through the lags of stretches, as they come."""
+"""Clock of a reference in a stream: a line through the lags of successive stretches."""
 
 from dataclasses import dataclass
 
@@ -8,18 +8,18 @@ from magfusion.model.samples import Waveform
 from magfusion.receiver.reference import BLOCK, FINER, NO_LAG, Lag, beside, correlations, peak_of
 from magfusion.units import Array
 
-MEMORY = 0.9  # of what earlier stretches weigh, in each later one
-LAG_SIGMA, RATE_SIGMA = 1e-3, 1e-4  # s, and as a share: of a lag that is found, of any clock
+MEMORY = 0.9  # weight of earlier stretches in each later one
+LAG_SIGMA, RATE_SIGMA = 1e-3, 1e-4  # s, and relative: of an estimated lag, of any clock
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Lags that were found, and the line through them.
+    """Estimated lags, and the line through them.
 
     Parameters
     ----------
     weight : float
-        Of all lags.
+        Sum over all lags.
     time, lag : float
         Weighted means (s).
     square, product : float
@@ -33,7 +33,7 @@ class Clock:
     product: float = 0.0
 
     def heard(self, time: float, lag: float) -> "Clock":
-        """Return it with the lag that was found at a time (s)."""
+        """Return it with the lag at a time added (s)."""
         old = MEMORY * self.weight
         weight = old + 1.0
         off_time, off_lag = time - self.time, lag - self.lag
@@ -48,7 +48,7 @@ class Clock:
 
     @property
     def line(self) -> Lag | None:
-        """The lag by time; None before any was found."""
+        """Lag over time; None before the first estimate."""
         if self.weight == 0.0:
             return None
         rate = self.product / (self.square + (LAG_SIGMA / RATE_SIGMA) ** 2)
@@ -56,12 +56,12 @@ class Clock:
 
 
 def lag_in(waveform: Waveform, reference: Waveform, lines_hz: Array) -> tuple[float, float] | None:
-    """Return when, and by how much, a reference lags in a stretch (s); None where it is not heard.
+    """Return the time and lag of a reference in a stretch (s); None if it is not received.
 
     Parameters
     ----------
     lines_hz : ndarray
-        Tones and mains (Hz), which are left out.
+        Tones and mains (Hz), which are excluded.
     """
     step = float(np.median(np.diff(waveform.time)))
     size = int(BLOCK / step) // 2 * 2

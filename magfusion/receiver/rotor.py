@@ -1,7 +1,7 @@
-"""Phasors of a turning magnet by its angle, not by the clock: a speed that drifts smears nothing.
+"""Phasors of a rotating magnet by its angle instead of time, so that a speed drift does not smear.
 
-A window's design has the cosine and sine of each order of the angle, each with a ramp as the magnet
-passes, a constant with a slope, and mains.  Noise is what the window holds some turns beside.
+The design of a window has the cosine and sine of each order of the angle, each with a ramp as the
+magnet passes, a constant with a slope, and mains.  Noise is measured some turns per window away.
 """
 
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ from magfusion.units import AnyArray, Array
 
 LEAST_SAMPLES = 0.8  # of a whole window
 LEAST_TURNS = 4.0  # in a window
-BESIDE = (3.0, 4.0, 5.0, 6.0)  # turns in a window by which a probe is beside its tone
+BESIDE = (3.0, 4.0, 5.0, 6.0)  # offset of the probes from a tone (turns in a window)
 POOLED = 4  # windows on either side with which noise is averaged
-MAINS = 3  # harmonics of it
+MAINS = 3  # number of harmonics
 
 
 @dataclass(frozen=True, eq=False)
 class RotorPhasors:
-    """Windows of a rotor.
+    """Demodulated windows of a rotor.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class RotorPhasors:
     speed_hz : ndarray, shape (n,)
         Mean of each window.
     dropped : int
-        Windows that lack samples, or in which the magnet hardly turns.
+        Windows that lack samples, or in which the magnet hardly rotates.
     """
 
     fields: FieldSamples
@@ -51,7 +51,7 @@ def demodulate_rotor(
     Parameters
     ----------
     angle : ndarray, shape (n,)
-        Of the shaft at each sample, without jumps (rad); NaN where it is not known.
+        Shaft angle at each sample, unwrapped (rad); NaN where it is unknown.
     window : float
         (s)
     """
@@ -96,7 +96,7 @@ def demodulate_rotor(
 def _of_window(
     elapsed: Array, angle: Array, field: Array, orders: Array, mains_hz: float
 ) -> tuple[AnyArray, Array, Array]:
-    """Return phasors (tones, 3), the variance of a sample (tones, 3, 3), and of units (tones,)."""
+    """Return phasors (tones, 3), sample covariance (tones, 3, 3), unit variance (tones,)."""
     late = elapsed / np.max(np.abs(elapsed))
     waves = np.exp(1j * orders[:, None] * angle)
     nyquist_hz = 0.5 * (len(elapsed) - 1) / (elapsed[-1] - elapsed[0])
@@ -122,7 +122,7 @@ def _of_window(
 
 
 def _pooled(noise: Array, least: float) -> Array:
-    """Return the noise of windows averaged with their neighbours', not below the declared."""
+    """Average the noise of windows with their neighbours', not below the declared."""
     out = np.empty_like(noise)
     for i in range(len(noise)):
         mean = np.mean(noise[max(i - POOLED, 0) : i + POOLED + 1], axis=0)

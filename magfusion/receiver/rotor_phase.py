@@ -1,8 +1,8 @@
-"""The angle of a magnet that nobody measures: found in its field, and followed through a log.
+"""Estimation of the unmeasured angle of a rotating magnet from its field, through a whole log.
 
-First the speed of each piece of some turns, by the likeliest course among all that the declared
-speed and its walk allow (Viterbi); then, in a few passes, what is left of the phase against the
-polarisation of the pieces about it, smoothed as a speed that walks makes it.
+First the speed of each piece of some turns, by the most probable sequence within the declared speed
+and its random walk (Viterbi).  Then, in a few passes, the residual phase against the polarisation
+of the neighbouring pieces, smoothed under the same random walk.
 """
 
 import numpy as np
@@ -17,29 +17,29 @@ from magfusion.units import Array, ComplexArray
 
 TURNS = 6.0  # in a piece
 REACH = 3.0  # sigmas of the declared speed that are searched
-PER_WIDTH = 8.0  # speeds in one over the length of a piece
+PER_WIDTH = 8.0  # speeds per inverse length of a piece
 BEYOND = np.array([3.0, 4.0, 5.0, 6.0])  # over a piece's length, beyond the search: noise alone
 ABOUT = 4  # pieces on either side that share a polarisation
 PASSES = 6
-LEAST_SNR = 3.0  # of the median piece; below, the magnet is not told from noise
+LEAST_SNR = 3.0  # of the median piece; below, the magnet is not detected
 MOST_SPEEDS = 2000
 
 
 def followed_angle(waveform: Waveform, frequency_hz: float, rotor: Rotor) -> Array:
-    """Return the angle at each sample (rad), from an unknown zero.
+    """Estimate the angle at each sample (rad), from an unknown zero.
 
     Raises
     ------
     InputError
-        Where the log is too short, or the magnet is not told from noise.
+        Where the log is too short, or the magnet is not detected above the noise.
     """
     piece = TURNS / frequency_hz
     time, half = waveform.time, 0.5 * piece
     centres = np.arange(time[0] + half, time[-1] - half, half)
     if len(centres) < 2 * ABOUT:
         raise InputError(
-            f"the log is shorter than {(ABOUT + 1) * piece:.3g} s, in which a magnet is followed"
-            " whose angle is not measured; record more, or its angle in a column"
+            f"the log is shorter than {(ABOUT + 1) * piece:.3g} s, too short to track the"
+            " unmeasured angle of a magnet; record longer, or its angle in a column"
         )
     field = waveform.measured_sensor - _slow(waveform, piece)
     low = max(frequency_hz - REACH * rotor.speed_sigma_hz, 2.0 / piece)
@@ -52,8 +52,9 @@ def followed_angle(waveform: Waveform, frequency_hz: float, rotor: Rotor) -> Arr
     snr = np.median(power[np.arange(len(centres)), likeliest] / noise)
     if snr < LEAST_SNR**2:
         raise InputError(
-            f"a magnet that turns at {frequency_hz:g} Hz within {high - frequency_hz:.2g} is not"
-            " told from noise; record its angle, or check frequency_hz and speed_sigma_hz of it"
+            f"a magnet that rotates at {frequency_hz:g} Hz within {high - frequency_hz:.2g} is not"
+            " detected above the noise; record its angle, or check its frequency_hz and"
+            " speed_sigma_hz"
         )
     course = CubicSpline(centres, 2.0 * np.pi * speeds[likeliest])
     node = course.antiderivative()(centres)
@@ -75,7 +76,7 @@ def _slow(waveform: Waveform, piece: float) -> Array:
 
 
 def _gone_on(spline: CubicSpline, time: Array) -> Array:
-    """Return a spline's value, beyond its ends at the speed that it has there."""
+    """Evaluate a spline, extrapolated beyond its ends at constant speed."""
     first, last = spline.x[0], spline.x[-1]
     inside = np.clip(time, first, last)
     beyond = time - inside
@@ -98,7 +99,7 @@ def _powers(time: Array, field: Array, centres: Array, piece: float, speeds: Arr
 
 
 def _course(likelihood: Array, speeds: Array, walk: float) -> Array:
-    """Return the number of the likeliest speed of each piece."""
+    """Return the index of the most probable speed of each piece."""
     step = -0.5 * ((speeds[:, None] - speeds) / max(walk, 0.5 * (speeds[1] - speeds[0]))) ** 2
     best, back = likelihood[0], []
     for own in likelihood[1:]:
@@ -114,7 +115,7 @@ def _course(likelihood: Array, speeds: Array, walk: float) -> Array:
 def _pieces(
     time: Array, field: Array, centres: Array, piece: float, angle: Array
 ) -> tuple[ComplexArray, Array]:
-    """Return the phasor of each piece about an angle (pieces, 3), and one sigma of its phase."""
+    """Return the phasor of each piece about an angle (pieces, 3), and the sigma of its phase."""
     out, sigma = np.zeros((len(centres), 3), dtype=np.complex128), np.full(len(centres), 1e3)
     for i, centre in enumerate(centres):
         rows = slice(*np.searchsorted(time, [centre - 0.5 * piece, centre + 0.5 * piece]))
@@ -130,15 +131,15 @@ def _pieces(
 
 
 def _left(pieces: ComplexArray) -> Array:
-    """Return the phase of each piece against the polarisation of those about it (rad)."""
+    """Return the phase of each piece against the polarisation of its neighbours (rad)."""
     n = len(pieces)
     out = np.zeros(n)
     for i in range(n):
         near = pieces[max(i - ABOUT, 0) : i + ABOUT + 1]
-        # The principal polarisation, whatever the phase of each.
+        # The principal polarisation, independent of each phase.
         _, _, right = np.linalg.svd(near, full_matrices=False)
         out[i] = np.angle(np.vdot(right[0], pieces[i]))
-        if i:  # the polarisation's own phase is free: it goes on from piece to piece
+        if i:  # the polarisation's own phase is arbitrary: continue it from piece to piece
             before = np.angle(np.vdot(right[0], pieces[i - 1]))
             step = np.angle(np.exp(1j * (out[i] - before)))
             out[i] = out[i - 1] + step
@@ -146,7 +147,7 @@ def _left(pieces: ComplexArray) -> Array:
 
 
 def _smoothed(left: Array, sigma: Array, known: Array, walk: float) -> Array:
-    """Return what is left of the phase, smoothed so that the whole is that of a walking speed."""
+    """Smooth the residual phase so that the speed is a random walk."""
     n = len(left)
     weight = 1.0 / sigma**2
     bend = np.array([1.0, -2.0, 1.0])

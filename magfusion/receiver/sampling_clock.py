@@ -1,8 +1,8 @@
-"""The clock that a stream was sampled by, where its stamps scatter about it.
+"""Uniform sampling clock of a stream whose time stamps scatter about it.
 
-Stamps of a host are taken when samples arrive, not when they were measured.  A sampler that ticks
-evenly is found again under them: each sample is given its tick, lost ones leave theirs out, and a
-smooth curve through stamps and ticks is the clock.
+A host stamps samples when they arrive, not when they were measured.  The uniform sampler is
+recovered: each sample is assigned a tick, lost samples skip theirs, and the clock is a smooth curve
+of stamps over ticks.
 """
 
 from typing import NamedTuple
@@ -13,32 +13,32 @@ from scipy.interpolate import make_lsq_spline
 from magfusion.units import Array, ComplexArray, IntArray
 
 EVEN = 0.01  # of a step; stamps that scatter less are a clock's own
-MOST_SCATTER = 0.45  # of a step, root mean square; beyond, ticks cannot be told apart
-PIECE = 200  # samples whose ticks are found at once
+MOST_SCATTER = 0.45  # of a step, root mean square; beyond, ticks are not separable
+PIECE = 200  # samples assigned to ticks at once
 KEPT = 150  # of them: those at the end may belong to another tick
 MOST_LOST = 40  # ticks in a piece; a longer silence is a gap
 GAP = 10.0  # steps
 LOSS = 8.0  # log-likelihood ratio that a lost sample costs
-MEMORY = 2000  # samples that tell where the next ticks are
-MOST_PIECES = 40  # that tell the usual step
+MEMORY = 2000  # samples that predict the next ticks
+MOST_PIECES = 40  # used for the median step
 SEARCHED = 0.08  # of the median step, either way
 KNOT = 10.0  # s; a clock's rate changes more slowly
 FEWEST = 50  # samples
 
 
 class SamplingClock(NamedTuple):
-    """The even clock under a stream's stamps.
+    """Uniform clock of a stream.
 
     Parameters
     ----------
     time : ndarray, shape (n,)
-        When the samples were taken (s).
+        Sampling times (s).
     step : float
         Between two ticks (s).
     scatter : float
         Root mean square of stamps about the clock (s).
     lost : int
-        Ticks without a sample, gaps aside.
+        Ticks without a sample, except in gaps.
     """
 
     time: Array
@@ -48,7 +48,7 @@ class SamplingClock(NamedTuple):
 
 
 def sampling_clock(stamps: Array) -> SamplingClock | None:
-    """Return the even clock under stamps that scatter; None where they scatter little, or none is.
+    """Return the uniform clock of scattered stamps; None if there is none or they scatter little.
 
     Parameters
     ----------
@@ -74,15 +74,15 @@ def sampling_clock(stamps: Array) -> SamplingClock | None:
 
 
 def _even(stamps: Array, step: float) -> bool:
-    """Return whether stamps lie whole steps apart."""
+    """Return whether stamps are whole steps apart."""
     whole = np.diff(stamps) / step
     return bool(np.sqrt(np.mean((whole - np.round(whole)) ** 2)) < EVEN)
 
 
 def _usual_step(stamps: Array) -> float:
-    """Return the time between two ticks (s): the period that the stamps of each piece keep best.
+    """Return the time between two ticks (s): the period that fits the stamps of each piece best.
 
-    By the length of the mean phasor (Rayleigh's test), which lost samples do not change.
+    By the length of the mean phasor (Rayleigh's test), which is insensitive to lost samples.
     """
     usual = float(np.median(np.diff(stamps)))
     count = len(stamps) // PIECE
@@ -96,7 +96,7 @@ def _usual_step(stamps: Array) -> float:
 
 
 def _phasor(stamps: Array, step: float) -> ComplexArray:
-    """Return the mean of each row's phases in a period."""
+    """Return the mean phasor of each row's stamps for a period."""
     return np.asarray(np.mean(np.exp(2j * np.pi * (stamps - stamps[..., :1]) / step), axis=-1))
 
 
@@ -133,21 +133,21 @@ def _phase(stamps: Array, step: float) -> float:
 
 
 def _scatter(stamps: Array, step: float) -> float:
-    """Return how far stamps lie from an even clock (s), lost samples aside."""
+    """Return the scatter of stamps about a uniform clock (s), ignoring lost samples."""
     apart = np.diff(stamps) / step
     apart = step * (apart - np.maximum(np.round(apart), 1.0))
     return float(np.median(np.abs(apart)) / 0.6745 / np.sqrt(2.0))
 
 
 def _slips(late: Array, sigma: float) -> IntArray:
-    """Return how many ticks before each sample of a piece have none, the likeliest way.
+    """Return the most probable number of ticks lost before each sample of a piece.
 
-    Dynamic programming over the number of lost ticks, which only grows.
+    Dynamic programming over the number of lost ticks, which never decreases.
 
     Parameters
     ----------
     late : ndarray, shape (n,)
-        How much later than without a loss each sample is, in ticks.
+        Delay of each sample relative to no loss, in ticks.
     sigma : float
         Scatter of the stamps, in ticks.
     """
@@ -172,10 +172,10 @@ def _slips(late: Array, sigma: float) -> IntArray:
 
 
 def smooth_clock(tick: IntArray, stamps: Array) -> Array:
-    """Return the time of each tick (s): straight lines that bend no oftener than stamps demand.
+    """Return the time of each tick (s): a piecewise linear fit with as few knots as needed.
 
-    A bend that they do not tell of (Schwarz's criterion) only hands their scatter on to the clock,
-    and with it to the phases of all beacons.
+    A knot without support in the data (Schwarz's criterion) would pass the scatter of the stamps
+    to the clock, and with it to the phases of all beacons.
     """
     if len(stamps) < FEWEST:
         return stamps
@@ -194,7 +194,7 @@ def smooth_clock(tick: IntArray, stamps: Array) -> Array:
 
 
 def _bent_lines(tick: IntArray, stamps: Array, lines: int) -> tuple[Array, Array]:
-    """Return so many connected straight lines at the ticks (s), and what stamps are off by (s)."""
+    """Return so many connected straight lines at the ticks (s), and the residual of stamps (s)."""
     inner = np.linspace(tick[0], tick[-1], lines + 1)[1:-1]
     ends = (float(tick[0]), float(tick[-1]))
     knots = np.concatenate([[ends[0]] * 2, inner, [ends[1]] * 2])

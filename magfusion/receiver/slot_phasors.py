@@ -1,9 +1,9 @@
-"""Time division: what each slot holds, and one phasor of each that is driven.
+"""Time division: the value of each slot, and one phasor of each driven slot.
 
-Every slot is stamped with its own time, a row of its own with one channel: what is measured one
-after the other is not simultaneous, and at 100 deg/s slots of 5 ms make 0.7 deg of that.  All
-samples are turned by the gyro into axes that do not turn with the body, in which the Earth's field
-of a silent slot is the one of its neighbours, and back into those of the slot's own time.
+Every slot is a row at its own time with one channel: successive slots are not simultaneous, and at
+100 deg/s slots of 5 ms differ by 0.7 deg.  The gyro rotates all samples into non-rotating axes, in
+which a silent slot has the same Earth field as its neighbours, and back into those of the slot's
+own time.
 """
 
 from dataclasses import dataclass, replace
@@ -30,17 +30,17 @@ from magfusion.receiver.slots import (
 from magfusion.receiver.turn import Turn
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
-LONGEST_PAUSE = 1.0  # s; beyond, the noise of marked bursts is not that of others
+LONGEST_PAUSE = 1.0  # s; longer pauses separate the noise of marked bursts
 
 
 @dataclass(frozen=True, eq=False)
 class SlotValues:
-    """What slots hold, each in the measured axes of its own time.
+    """Values of slots, each in the measured axes of its own time.
 
     Parameters
     ----------
     number : int ndarray, shape (n,)
-        Counted on from the start of the schedule, increasing.
+        Running number from the start of the schedule, increasing.
     centre, time : ndarray, shape (n,)
         Middle of the slot, and mean time of its samples (s).
     value : complex ndarray, shape (n, 3)
@@ -48,11 +48,11 @@ class SlotValues:
     variance : ndarray, shape (n,)
         Of a component, for samples of unit variance.
     noise : ndarray, shape (n, 3, 3)
-        Covariance per sample of what is beside the carrier in this slot alone (T^2).
+        Covariance per sample of the noise near the carrier in this slot alone (T^2).
     length : ndarray, shape (n,)
         (s)
     place : int ndarray, shape (n,)
-        In its cycle.
+        Place in its cycle.
     """
 
     number: IntArray
@@ -72,21 +72,21 @@ class SlotValues:
         return SlotValues(number, nothing, nothing, value, nothing, noise, nothing, number)
 
     def rows(self, kept: BoolArray | IntArray) -> "SlotValues":
-        """Return some slots."""
+        """Return a subset of the slots."""
         return SlotValues(*(part[kept] for part in vars(self).values()))
 
     def joined(self, later: "SlotValues") -> "SlotValues":
-        """Return these and later ones."""
+        """Return these and later slots."""
         pairs = zip(vars(self).values(), vars(later).values(), strict=True)
         return SlotValues(*(np.concatenate(pair) for pair in pairs))
 
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """What least squares makes of each slot."""
+    """Least-squares result of each slot."""
 
     time: Array  # (n,) weighted mean of the sample times
-    value: ComplexArray  # (n, 3) non-turning axes
+    value: ComplexArray  # (n, 3) non-rotating axes
     variance: Array  # (n,) of a component, for samples of unit variance
 
 
@@ -98,18 +98,18 @@ def slot_values(
     windows: Windows,
     rate_hz: float,
 ) -> SlotValues:
-    """Fit what each slot holds, driven or silent, to its raw samples.
+    """Fit the value of each slot, driven or silent, to its raw samples.
 
     Parameters
     ----------
     measured_from_still : Turn
         As from `magfusion.receiver.turn.turn_of`.
     site : Site
-        Whose beacons share one schedule.
+        Its beacons share one schedule.
     windows : Windows
-        The slots that were admitted, numbered from the start of the schedule.
+        Admitted slots, numbered from the start of the schedule.
     rate_hz : float
-        Usual sampling rate.
+        Median sampling rate.
     """
     if len(windows) == 0:
         return SlotValues.none()
@@ -149,7 +149,7 @@ def _applied(turn: Array, vectors: Array | ComplexArray) -> Array | ComplexArray
 def demodulate_slots(
     values: SlotValues, measured_from_still: Turn, site: Site, settings: SlotSettings
 ) -> tuple[FieldSamples, IntArray]:
-    """Turn what the slots of a tracker hold into one phasor for each driven slot.
+    """Turn the slots of a tracker into one phasor for each driven slot.
 
     Pulses of direct current give a real phasor, the field itself.
 
@@ -161,9 +161,9 @@ def demodulate_slots(
     Returns
     -------
     samples : FieldSamples
-        A row for each driven slot with silent ones beside it, at the mean time of its samples, with
-        one channel.  The covariance holds the noise of the slot and of what was taken off; what
-        hum leaves beside that of marked pulses alone, whose silences tell it.
+        A row for each driven slot with silent ones near it, at the mean time of its samples, with
+        one channel.  The covariance contains the noise of the slot and of the subtracted field,
+        and for marked pulses the residual hum estimated from their silent bursts.
     number : int ndarray, shape (n,)
         The slot of each row.
     """
@@ -176,7 +176,7 @@ def demodulate_slots(
     value = removed(still[driven], still[silent], index, weight)
     usable = np.isfinite(value).all(axis=1)
     kept, weight = driven[usable], weight[usable]
-    # Slots share what was taken off them, and no number of slots averages that out.
+    # Slots share the subtracted field, whose error does not average out.
     shared = 0.0 if settings.removal == "none" else 1.0 / max(len(np.unique(place[silent])), 1)
     variance = values.variance[kept] * (1.0 + np.maximum(np.sum(weight**2, axis=1), shared))
     phasor = _applied(turn[kept], value[usable])
@@ -194,7 +194,7 @@ def demodulate_slots(
 def _ambient(
     values: SlotValues, driven: IntArray, silent: IntArray, site: Site, settings: SlotSettings
 ) -> tuple[IntArray, Array]:
-    """Return from which silent slots, and with which weights, the ambient field is taken."""
+    """Return the silent slots and weights from which the ambient field is estimated."""
     mains_hz = settings.mains_hz if is_pulsed(site) else 0.0
     if is_marked(site):
         if settings.removal == "none":
@@ -216,7 +216,7 @@ def _ambient(
 def _hum(
     silent: SlotValues, still: ComplexArray, noise: Array, site: Site, settings: SlotSettings
 ) -> Array:
-    """Return the covariance of what each silent burst holds that its neighbours do not tell."""
+    """Return the covariance of each silent burst that its neighbours do not predict."""
     own = silent.variance[:, None, None] * noise
     state = settings.cycles, settings.mains_hz
     spread = LONGEST_PAUSE, NOISE_CYCLES * places(site)
@@ -225,7 +225,7 @@ def _hum(
 
 @dataclass(frozen=True, eq=False)
 class _Inside:
-    """The samples of some slots, one slot after the other.
+    """Samples of some slots, concatenated.
 
     Parameters
     ----------
@@ -238,7 +238,7 @@ class _Inside:
     elapsed : ndarray, shape (samples,)
         Since the slot began (s).
     still : ndarray, shape (samples, 3)
-        (T), still axes.
+        (T), non-rotating axes.
     hann : ndarray, shape (samples,)
         Taper over the slot.
     slot_begin : ndarray, shape (slots,)
@@ -265,7 +265,7 @@ def _inside(time: Array, still: Array, windows: Windows, rate_hz: float) -> _Ins
 
 
 def _slot_sums(inside: _Inside, carrier_hz: Array, settings: SlotSettings) -> _Sums:
-    """Fit a constant, and beside a carrier its two quadratures, to each slot."""
+    """Fit a constant, and with a carrier its two quadratures, to each slot."""
     at, elapsed, begins = inside.time, inside.elapsed, inside.begins
     weight = inside.hann if settings.taper == "hann" else np.ones(len(at))
     columns = [np.ones(len(at))]
@@ -296,11 +296,10 @@ def _slot_sums(inside: _Inside, carrier_hz: Array, settings: SlotSettings) -> _S
 
 
 def _noise(inside: _Inside, carrier_hz: Array, length: Array, rate_hz: float) -> Array:
-    """Return the covariance per sample of what is beside the carrier, (n, 3, 3), still axes.
+    """Return the covariance per sample of the noise near the carrier, (n, 3, 3), non-rotating axes.
 
-    It is the power three cycles a slot away, tapered so that hum does not leak there.  Nor does a
-    steady field, one that changes evenly, or the carrier, whatever the slot's length: what is seen
-    is blind to all of them.
+    It is the power three cycles a slot away, tapered against leakage of hum.  A steady field, a
+    linear drift and the carrier do not contribute, whatever the slot's length.
     """
     away = 3.0 / length
     above = carrier_hz + away < 0.5 * rate_hz
@@ -323,7 +322,7 @@ def _noise(inside: _Inside, carrier_hz: Array, length: Array, rate_hz: float) ->
 
 
 def _pseudo_inverse(normal: Array) -> Array:
-    """Return `numpy.linalg.pinv` of normal matrices, which are not negative, at half its cost."""
+    """Return `numpy.linalg.pinv` of positive semidefinite normal matrices, at half its cost."""
     value, vector = np.linalg.eigh(normal)
     value, vector = value[..., ::-1], np.ascontiguousarray(vector[..., ::-1])
     told = value > 1e-15 * value.shape[-1] * value[..., :1]
@@ -334,7 +333,7 @@ def _pseudo_inverse(normal: Array) -> Array:
 def _smoothed_noise(
     values: SlotValues, still_from_measured: Array, still: ComplexArray, site: Site
 ) -> Array:
-    """Return the covariance per sample over many cycles, (n, 3, 3), still axes."""
+    """Return the covariance per sample averaged over many cycles, (n, 3, 3), non-rotating axes."""
     cov = still_from_measured @ values.noise @ np.swapaxes(still_from_measured, 1, 2)
     number = NOISE_CYCLES * places(site)
     cycle = LONGEST_PAUSE if is_marked(site) else schedule(site).cycle

@@ -1,4 +1,4 @@
-"""The receiver of coils in time slots: each slot a row at its own time, judged by cycles."""
+"""Receiver of coils in time slots: each slot a row at its own time, assessed by cycles."""
 
 from dataclasses import replace
 from functools import cached_property, reduce
@@ -36,9 +36,9 @@ FOLLOWED_EVERY = 0.2  # s; clocks that are 100 ppm apart drift by 20 us
 
 
 class SlotReceiver(Receiver):
-    """Of coils driven in turn: each slot a row at its own time, judged by whole cycles."""
+    """Receiver of coils driven in turn: each slot a row at its own time, assessed by cycles."""
 
-    _values: SlotValues  # of those that the phasors of later ones need
+    _values: SlotValues  # that the phasors of later slots need
     _followed: float  # when the grid was last compared with the stream (s)
 
     def __init__(self, site: Site, settings: LockinSettings | SlotSettings | None = None) -> None:
@@ -48,23 +48,23 @@ class SlotReceiver(Receiver):
 
     @cached_property
     def settings(self) -> SlotSettings:
-        """Removal and taper, chosen by the drives where they were not given."""
+        """Removal and taper, chosen from the drives if not given."""
         given = self._given
         return given if isinstance(given, SlotSettings) else slot_settings_of(self.site, given)
 
     @property
     def remembered(self) -> int:
-        """For how many slots one that was admitted tells the ambient field and the noise."""
+        """Number of slots to whose ambient field and noise an admitted one contributes."""
         return history_of(self.site, self.settings) * schedule(self.site).count
 
     def check(self) -> None:
-        """Refuse a schedule that not all coils keep, as `Receiver.check`."""
+        """Reject a schedule that not all coils keep, as `Receiver.check`."""
         schedule(self.site)
         check_told(self.site)
         slot_settings_of(self.site, None if isinstance(self._given, SlotSettings) else self._given)
 
     def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
-        """Lay slots by the schedule, from the first that is whole, as `Receiver.begin`."""
+        """Set up slots from the first whole one of the schedule, as `Receiver.begin`."""
         slots = schedule(self.site)
         rate_hz = sample_rate_hz(waveform)
         check_told(self.site)
@@ -74,7 +74,7 @@ class SlotReceiver(Receiver):
             if start is None:
                 raise InputError(
                     "magnetometer: the time slots are not found in the stream; bring the sensor"
-                    " nearer, or give the log's clock (synchronised: true, with start_s)"
+                    " closer, or give the log's clock (synchronised: true, with start_s)"
                 )
             slots, self._followed = replace(slots, start=start), float(waveform.time[-1])
         grid = Grid(
@@ -87,12 +87,12 @@ class SlotReceiver(Receiver):
         )
         elapsed = float(waveform.time[0]) - 1.0 / rate_hz - slots.start
         self.next_number = int(np.ceil(elapsed / slots.duration + ROUNDING))
-        # The plateau of a pulse is no saturation.
+        # The plateau of a pulse is not saturation.
         clips = not is_pulsed(self.site)
         self._begin(waveform, imu, grid, LEAST_SHARE_OF_SLOT, clips=clips)
 
     def _admitted(self, waveform: Waveform, imu: ImuSamples) -> Windows:
-        """Follow slots that are searched through a whole log, as through a stream."""
+        """Track searched slots through a whole log, as through a stream."""
         if not is_searched(self.site):
             return super()._admitted(waveform, imu)
         time, refusal, parts = waveform.time, None, [Windows.none()]
@@ -103,7 +103,7 @@ class SlotReceiver(Receiver):
             rows = slice(int(np.searchsorted(time, newest - 1.01 * span)), end)
             look = waveform.rows(rows)
             if self.grid is None:
-                # Where nothing is heard yet, there is nothing to count on from.
+                # Before the first detection there is no grid to number slots by.
                 try:
                     self.begin(look, imu)
                 except InputError as error:
@@ -121,7 +121,7 @@ class SlotReceiver(Receiver):
     def phasors(
         self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
     ) -> tuple[FieldSamples, IntArray]:
-        """Return the phasors of driven slots, freed of what the silent ones tell."""
+        """Return the phasors of driven slots less the ambient field of the silent ones."""
         turn = slot_turn_of(imu, site)
         values = self._held(waveform, turn, windows, site)
         return demodulate_slots(values, turn, site, self.settings)
@@ -143,11 +143,11 @@ class SlotReceiver(Receiver):
         return found, seen
 
     def _joined(self, found: FieldSamples, number: IntArray, turn: Turn) -> FieldSamples:  # noqa: ARG002
-        """Return the slots of each cycle as one epoch, where it is short."""
+        """Join the slots of each cycle to one epoch, where it is short."""
         return cycles(found, turn, self.site) if joins(self.site) else found
 
     def _follow(self, waveform: Waveform) -> None:
-        """Bring the slots to where the stream shows them, half the way: a look is noisy."""
+        """Move the slots half-way to their position in the stream, as one estimate is noisy."""
         newest = float(waveform.time[-1])
         if newest < self._followed + FOLLOWED_EVERY or not is_searched(self.site):
             return
@@ -170,5 +170,5 @@ class SlotReceiver(Receiver):
         return driven_slots(self.site, windows.number)
 
     def _growth(self, windows: Windows, time: Array) -> Array:  # noqa: ARG002
-        """Return one: the few columns of a slot stay apart without a few samples."""
+        """Return one: the few columns of a slot remain separable without a few samples."""
         return np.ones(len(windows))

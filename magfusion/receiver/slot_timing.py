@@ -1,7 +1,7 @@
-"""When the slots of a tracker begin whose clock nobody knows, by what the stream shows of them.
+"""Estimation of the slot timing of an unsynchronised tracker from the stream.
 
-Folded at the cycle, the size of the carrier is a step in each slot: the slots begin where steps fit
-best, and the silent ones say which is which.
+Folded at the cycle, the amplitude of the carrier is a step in each slot.  The slots begin where
+steps fit best, and the silent ones identify them.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from magfusion.receiver.slots import carriers_hz, is_marked, is_pulsed, owners, 
 from magfusion.units import AnyArray, Array
 
 BINS = 32  # of a slot
-FEWEST_BINS = 6  # of them in which there are samples; a slot has eight
+FEWEST_BINS = 6  # of them with samples; a slot has eight
 FEWEST_CYCLES = 4
 LONGEST_FOLD = 0.3  # s; clocks that are 100 ppm apart drift by 30 us
 STEADY_CYCLES = 4  # of the carrier, over which the mean is the steady field
@@ -23,10 +23,10 @@ LOUDEST_SILENCE = 0.4  # of the weakest driven slot
 
 @once_a_site
 def is_searched(site: Site) -> bool:
-    """Return whether the stream is to tell when a cycle begins.
+    """Return whether the cycle's begin is to be estimated from the stream.
 
-    The schedule's clock is then not the log's, and the silent slots, beside a carrier, are told
-    from each other by their places.
+    The schedule's clock is then not the log's, there is a carrier, and the places of the silent
+    slots identify each slot.
     """
     if is_marked(site) or is_pulsed(site) or all(beacon.synchronised for beacon in site.beacons):
         return False
@@ -37,37 +37,36 @@ def is_searched(site: Site) -> bool:
 
 
 def check_told(site: Site) -> None:
-    """Refuse pulses whose timing nobody knows.
+    """Reject pulses of unknown timing.
 
     Raises
     ------
     InputError
-        Folded at the cycle, the Earth's field under them looks as a coil's does.
+        Folded at the cycle, the Earth's field looks like that of a coil.
     """
     free = [beacon.name for beacon in site.beacons if not beacon.synchronised]
     if free and is_pulsed(site):
         raise InputError(
-            f"beacon {free[0]} gives pulses of direct current by a clock of its own (synchronised:"
-            " false), and nothing in the stream tells which slot is which; record when its cycles"
-            " begin and give that (synchronised: true, with start_s), or drive the coils with a"
-            " carrier"
+            f"beacon {free[0]} sends direct-current pulses by its own clock (synchronised: false),"
+            " and the stream does not identify its slots; record when its cycles begin and give"
+            " that (synchronised: true, with start_s), or drive the coils with a carrier"
         )
 
 
 def heard_for(slots: Slots) -> float:
-    """Return how much of a stream tells when a cycle begins (s)."""
+    """Return the length of stream needed to estimate the begin of a cycle (s)."""
     return max(LONGEST_FOLD, 2.0 * FEWEST_CYCLES * slots.cycle)
 
 
 def slot_start(waveform: Waveform, site: Site, rate_hz: float) -> float | None:
-    """Return when a cycle begins (s), the first in the samples; None where they do not tell.
+    """Return the begin of the first cycle in the samples (s); None if it is ambiguous.
 
     Parameters
     ----------
     waveform : Waveform
-        Its end counts.
+        Its end is used.
     rate_hz : float
-        Usual sampling rate.
+        Median sampling rate.
     """
     slots = schedule(site)
     part = waveform.time >= waveform.time[-1] - heard_for(slots)
@@ -99,7 +98,7 @@ def slot_start(waveform: Waveform, site: Site, rate_hz: float) -> float | None:
 
 
 def _folded(time: Array, measured: Array, site: Site, slots: Slots, rate_hz: float) -> Array | None:
-    """Return the mean size of the carriers in each bin of the cycle, from the first sample on."""
+    """Return the mean carrier amplitude in each bin of the cycle, from the first sample on."""
     size = np.zeros(len(time))
     for carrier_hz in np.unique(carriers_hz(site, slots.count)):
         carried = _alone(measured, round(rate_hz * STEADY_CYCLES / carrier_hz))
@@ -115,17 +114,17 @@ def _folded(time: Array, measured: Array, site: Site, slots: Slots, rate_hz: flo
     mean = np.bincount(bins, size, minlength=len(count))[told] / count[told]
     if len(told) == len(count):
         return np.asarray(mean)
-    # Where whole cycles are whole samples, there are no more places in a cycle than samples.
+    # If whole cycles are whole samples, a cycle has no more bins than samples.
     return np.interp(np.arange(len(count)), told, mean, period=len(count))
 
 
 def _alone(measured: Array, length: int) -> Array:
-    """Return samples without what is steady over so many of them."""
+    """Return samples less their moving mean over ``length`` samples."""
     return np.asarray(measured - _mean_about(measured, length))
 
 
 def _mean_about(values: AnyArray, length: int) -> AnyArray:
-    """Return the mean of an odd number of samples about each, of fewer at the ends."""
+    """Return the mean of an odd number of samples about each, fewer at the ends."""
     half, count = length // 2, len(values)
     total = np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
     index = np.arange(count)

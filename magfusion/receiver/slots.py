@@ -1,4 +1,4 @@
-"""Time division: which schedule coils that are driven in turn keep, and what suits it."""
+"""Time division: the schedule of coils that are driven in turn, and its settings."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -12,26 +12,26 @@ from magfusion.receiver.ambient import STRETCH, Removal
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, BoolArray, IntArray
 
-LEAST_SAMPLES = 8  # in a slot; its noise is measured three cycles a slot beside the carrier
+LEAST_SAMPLES = 8  # in a slot; its noise is measured three cycles a slot from the carrier
 LEAST_CYCLES = 1.0  # of a carrier in a slot
 NOISE_CYCLES = 16  # over which the noise is averaged
 
 
 @dataclass(frozen=True)
 class SlotSettings:
-    """How the slots of a waveform are demodulated.
+    """Settings for the demodulation of time slots.
 
     Parameters
     ----------
     removal : {"none", "subtract", "interpolate", "state"}
-        How the silent slots free the others of the ambient field, see
+        How the silent slots remove the ambient field from the others, see
         `magfusion.receiver.ambient.ambient_weights`.
     taper : {"rectangular", "hann"}
         Weight of the samples within a slot.
     cycles : int
-        Over which the ambient state reaches.
+        Length of the ambient state.
     mains_hz : float
-        Fitted in the ambient state of pulsed direct current; 0 for none.
+        Mains frequency in the ambient state of pulsed direct current; 0 for none.
     """
 
     removal: Removal
@@ -47,7 +47,7 @@ def has_schedule(site: Site) -> bool:
 
 @once_a_site
 def is_marked(site: Site) -> bool:
-    """Return whether the log marks when which coil is driven."""
+    """Return whether the log marks the driven coils."""
     return any(isinstance(beacon.slots, MarkedSlots) for beacon in site.beacons)
 
 
@@ -66,7 +66,7 @@ def schedule(site: Site) -> Slots:
 
 @once_a_site
 def places(site: Site) -> int:
-    """Return into how many slots a cycle is divided; of marked ones the last is the silence."""
+    """Return the number of slots of a cycle; of marked ones the last is the silence."""
     slots = check_kept(site)
     if isinstance(slots, Slots):
         return slots.count
@@ -75,12 +75,12 @@ def places(site: Site) -> int:
 
 @once_a_site
 def check_kept(site: Site) -> Slots | MarkedSlots:
-    """Return what all beacons of the site keep.
+    """Return the schedule of all beacons of the site.
 
     Raises
     ------
     InputError
-        Where a beacon keeps none or another one, or two coils that do not belong together are
+        Where a beacon has none or another one, or two coils that do not belong together are
         driven in one slot.
     """
     first = next(beacon for beacon in site.beacons if beacon.slots is not None)
@@ -110,9 +110,9 @@ def check_kept(site: Site) -> Slots | MarkedSlots:
 
 
 def default_slot_settings(site: Site, mains_hz: float = 50.0) -> SlotSettings:
-    """Choose how to demodulate: the ambient state for pulses, tapered carriers without it.
+    """Choose settings: the ambient state for pulses, no removal for tapered carriers.
 
-    Beside a carrier the silent slots determine nothing and cost noise.
+    With a carrier the silent slots determine nothing and add noise.
     """
     pulsed = any(np.any(beacon.tone_frequencies_hz == 0.0) for beacon in site.beacons)
     if pulsed:
@@ -136,12 +136,12 @@ def slot_lockin(site: Site, mains_hz: float = 50.0) -> LockinSettings:
 
 
 def slot_settings_of(site: Site, lockin: LockinSettings | None) -> SlotSettings:
-    """Return the settings for what the options of a lock-in ask.
+    """Return the settings for the options of a lock-in.
 
     Raises
     ------
     InputError
-        Where they ask for a window that is no slot.
+        Where the options select a window that is not a slot.
     """
     if lockin is None:
         return default_slot_settings(site)
@@ -168,12 +168,12 @@ def is_pulsed(site: Site) -> bool:
 
 
 def history_of(site: Site, settings: SlotSettings) -> int:
-    """Return for how many cycles a slot tells later ones of the noise and the ambient field."""
+    """Return to how many later cycles a slot contributes noise and ambient field."""
     return max(NOISE_CYCLES, settings.cycles * (STRETCH if is_pulsed(site) else 1))
 
 
 def driven_slots(site: Site, number: IntArray) -> BoolArray:
-    """Tell in which slots, counted on, a coil is driven."""
+    """Return in which slots, by running number, a coil is driven."""
     count = places(site)
     return owners(site, count)[number % count] >= 0
 
@@ -189,7 +189,7 @@ def carriers_hz(site: Site, count: int) -> Array:
 
 
 def check_carriers(site: Site, rate_hz: float, settings: SlotSettings) -> None:
-    """Refuse slots and carriers that the sampling rate or the settings do not suit.
+    """Reject slots and carriers that the sampling rate or the settings do not suit.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What the gyro tells of a measured field: how it turns against axes that stand still."""
+"""Rotation of a measured field against non-rotating axes, from the gyro."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,14 +17,14 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class Turn:
-    """How the axes of a magnetometer turn against axes that stand still.
+    """Rotation of the axes of a magnetometer against non-rotating axes.
 
     Parameters
     ----------
     still_from_body : callable
         At times (m,), unit quaternions of shape (4, m), scalar first.
     from_body : ndarray, shape (3, 3)
-        As of `measured_from_body`; no rotation.
+        From `measured_from_body`; not necessarily a rotation.
     """
 
     still_from_body: Callable[[Array], Array]
@@ -64,7 +64,7 @@ class BodyTurn(NamedTuple):
 def on_clock(
     imu: ImuSamples, time_offset: float, gyro_bias_body: Array | None = None
 ) -> ImuSamples:
-    """Return an inertial stream on the clock of the waveform, freed of the gyro's bias.
+    """Return an inertial stream on the clock of the waveform, corrected for the gyro bias.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def on_clock(
 
 
 def standing_in(imu: ImuSamples, silence: tuple[Array, Array]) -> ImuSamples:
-    """Return a stream of rates that says of its gaps that nothing turns there.
+    """Return a stream of angular rates that are zero in its gaps.
 
     Parameters
     ----------
@@ -89,21 +89,21 @@ def standing_in(imu: ImuSamples, silence: tuple[Array, Array]) -> ImuSamples:
     """
     begin, end = silence
     inner = np.stack([0.99 * begin[:-1] + 0.01 * end[:-1], 0.01 * begin[:-1] + 0.99 * end[:-1]])
-    # Behind the last sample its rate goes on for as long as that is no gap.
+    # After the last sample its rate continues for as long as that is no gap.
     last = begin[-1] + np.array([0.0, max(begin[-1] - imu.time[-1], 1e-3)])
     time = np.append(inner.T.ravel(), last)
     at = np.searchsorted(imu.time, time)
     rates = np.zeros((len(time), 3))
     rates[-2] = imu.gyro_body[-1]
     gyro = np.insert(imu.gyro_body, at, rates, axis=0)
-    force = np.broadcast_to(np.zeros(3), gyro.shape)  # of which no turn is made
+    force = np.broadcast_to(np.zeros(3), gyro.shape)  # not used for the rotation
     return ImuSamples(np.insert(imu.time, at, time), gyro, force)
 
 
 def turn_of(imu: ImuSamples, site: Site) -> Turn:
-    """Return how a field turns.
+    """Return the rotation of a field.
 
-    The axes stand still as the body's do at the first inertial sample.
+    The non-rotating axes are those of the body at the first inertial sample.
 
     Parameters
     ----------
@@ -114,9 +114,9 @@ def turn_of(imu: ImuSamples, site: Site) -> Turn:
 
 
 def slot_turn_of(imu: ImuSamples, site: Site) -> Turn:
-    """Return how the field of a slot turns; not at all where a receiver lacks axes.
+    """Return the rotation of a slot's field; none where a receiver lacks axes.
 
-    What of a field lies along the others nobody measured, so that none can be turned into another.
+    The field along the missing axes is not measured, so that no field can be rotated.
     """
     if not site.platform.magnetometer.lacking:
         return turn_of(imu, site)
@@ -124,7 +124,7 @@ def slot_turn_of(imu: ImuSamples, site: Site) -> Turn:
 
 
 def body_turn_of(imu: ImuSamples) -> Callable[[Array], Array]:
-    """Return what gives, at times (m,), the ``still_from_body`` of `turn_of`, shape (4, m).
+    """Return the function from times (m,) to ``still_from_body`` of `turn_of`, shape (4, m).
 
     Quaternions, scalar first.
     """
@@ -134,7 +134,7 @@ def body_turn_of(imu: ImuSamples) -> Callable[[Array], Array]:
 
 @once_a_site
 def measured_from_body(site: Site) -> Array:
-    """Return what takes a field in the body's axes to those of the magnetometer, (3, 3)."""
+    """Return the matrix from the body's to the magnetometer's axes, (3, 3)."""
     sensor = site.platform.magnetometer
     return np.asarray(sensor.matrix @ sensor.body_from_sensor.T)
 

@@ -1,4 +1,4 @@
-"""How a waveform is demodulated: window and step that tell the tones apart."""
+"""Settings of a lock-in: window and step that separate the tones."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,12 @@ from magfusion.units import Array
 LONGEST_WINDOW = 4.0  # s; motion within a longer one is no longer a ramp
 EVEN = 1e-6  # steps; less is rounding of stamps
 CLOSEST_TONES_HZ = 2.0 / LONGEST_WINDOW
-AGAIN_WINDOW = 1.0  # s; in which one beacon on a frequency must not be heard beside another
+AGAIN_WINDOW = 1.0  # s; in which beacons sharing a frequency must not be received together
 
 
 @dataclass(frozen=True)
 class LockinSettings:
-    """How a waveform is demodulated.
+    """Settings of a lock-in.
 
     Parameters
     ----------
@@ -26,12 +26,12 @@ class LockinSettings:
     mains_hz : float
         Mains frequency; 0 for none.  Harmonics below the Nyquist frequency are fitted too.
     noise_windows : int
-        Windows over which the noise beside the tones is averaged.
+        Windows over which the noise near the tones is averaged.
     lines_hz : tuple of float
-        Lines that are no tones of the site; they are fitted beside these as tones are.
+        Additional lines that are fitted as tones are.
     origin : float, optional
-        Where a window is centred, or would be (s); None begins with the first sample. By it the
-        windows of several streams are at the same times.
+        Centre of one window (s), which need not be in the log; None begins with the first sample.
+        It aligns the windows of several streams.
     """
 
     window: float
@@ -53,7 +53,7 @@ def default_settings(site: Site, mains_hz: float = 50.0) -> LockinSettings:
     """Choose window and step from the spacing of the tones.
 
     Two periods of the closest pair (of tones, of a tone and the mains, of a tone and zero)
-    separate them even with a ramp in each; windows follow each other by half their length.
+    separate them even with a ramp in each; windows overlap by half.
 
     Raises
     ------
@@ -73,9 +73,9 @@ def default_settings(site: Site, mains_hz: float = 50.0) -> LockinSettings:
 
 
 def sent_frequencies_hz(site: Site) -> Array:
-    """Return the frequencies that are sent (Hz), refusing tones that cannot be separated.
+    """Return the transmitted frequencies (Hz), rejecting tones that cannot be separated.
 
-    One that beacons use again which do not hear each other stands once.
+    A frequency shared by beacons that are never received together is listed once.
     """
     for beacon in site.beacons:
         if any(slot is not None for _, slot in beacon.tones):
@@ -101,7 +101,7 @@ def sent_frequencies_hz(site: Site) -> Array:
 
 
 def _used_again(site: Site) -> bool:
-    """Return whether no two beacons on one frequency hear each other."""
+    """Return whether no two beacons on one frequency are in range of each other."""
     sigma = phasor_sigma(site, AGAIN_WINDOW)
     on_tone: dict[float, list[Beacon]] = {}
     for beacon in site.beacons:

@@ -1,1 +1,1 @@
-"""What became of it: errors, consistency, observability, figures, pictures, recordings."""
+"""Results: errors, consistency, observability, figures, pictures, recordings."""

@@ -1,8 +1,8 @@
 """Where an installation can navigate: the Cramér-Rao bound of the pose over a volume.
 
-No estimator without bias does better than the inverse of the Fisher information of one window; the
-maximum-likelihood fix comes close to it.  A mirrored pose is another solution, not a wide one: the
-bound is that of whoever knows on which side the platform is.
+No unbiased estimator is better than the inverse of the Fisher information of one window; the
+maximum-likelihood fix comes close to it.  A mirrored pose is a separate solution, not a larger
+sigma: the bound assumes that the side of the platform is known.
 """
 
 from collections.abc import Callable
@@ -35,7 +35,7 @@ COMPARED = 400  # points at which candidates for one more beacon are compared
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Bound of the pose that one window gives, at each point of a volume.
+    """Bound of the pose from one window, at each point of a volume.
 
     Parameters
     ----------
@@ -44,16 +44,17 @@ class Coverage:
     position_sigma : ndarray, shape (n,)
         Root of the sum of the three axes' variances (m); infinite where not determined.
     attitude_sigma : ndarray, shape (n,)
-        The same of the rotation vector (rad); zero where the attitude is known from elsewhere.
+        The same of the rotation vector (rad); zero where the attitude is known independently.
     worst_world : ndarray, shape (n, 3)
         Unit vector along which the position is least certain; zero where not determined.
     beacons : int ndarray, shape (n,)
-        How many beacons are detected above the noise.
+        Number of beacons detected above the noise.
     determined : bool ndarray, shape (n,)
-        False where a direction of the pose is open, or a beacon is too near to be a dipole.
+        False where a direction of the pose is undetermined, or a beacon is too close to be a
+        dipole.
     protection_level_m, protection_level_deg : ndarray, shape (n,), optional
-        What position and attitude stay within though one beacon may be false unnoticed; infinite
-        where nothing is promised.  None where no risk was given.
+        Bounds of the errors of position and attitude with an undetected fault of one beacon;
+        infinite where there is none.  None without a risk.
     """
 
     position_world: Array
@@ -69,24 +70,24 @@ class Coverage:
         return len(self.position_world)
 
     def position_quantile(self, share: float) -> float:
-        """Return the position sigma (m) that a share of the points keeps; infinite where open."""
+        """Return the position sigma (m) met by a share of points; infinite where undetermined."""
         return _quantile(self.position_sigma, share)
 
     def attitude_quantile(self, share: float) -> float:
-        """Return the attitude sigma (rad) that a share of the points keeps."""
+        """Return the attitude sigma (rad) met by a share of the points."""
         return _quantile(self.attitude_sigma, share)
 
 
 @dataclass(frozen=True, eq=False)
 class ExtraBeacon:
-    """What one more beacon adds where it adds most.
+    """Best placement of one more beacon, and its effect.
 
     Parameters
     ----------
     beacon : Beacon
-        A copy of the site's first in its best place.
+        A copy of the site's first at its best position.
     before, after : float
-        Position sigma that the given share of the points keeps, without and with it (m).
+        Position sigma met by the given share of the points, without and with it (m).
     """
 
     beacon: Beacon
@@ -104,7 +105,7 @@ def volume(box_world: Array, spacing: float, heights: Array | None = None) -> Ar
     spacing : float
         Largest distance of neighbours along an axis (m).
     heights : ndarray, optional
-        Heights in place of the box's own (m).
+        Heights instead of the box's own (m).
     """
     steps = np.ceil((box_world[1] - box_world[0]) / spacing * (1.0 - 1e-9)).astype(int)
     x, y, z = (np.linspace(box_world[0, i], box_world[1, i], steps[i] + 1) for i in range(3))
@@ -113,7 +114,7 @@ def volume(box_world: Array, spacing: float, heights: Array | None = None) -> Ar
 
 
 def usual_box(site: Site) -> Array:
-    """Return the box around the beacons, somewhat widened in plan, shape (2, 3) (m)."""
+    """Return the box around the beacons, somewhat enlarged in plan, shape (2, 3) (m)."""
     places = np.array([b.position_world for b in site.beacons])
     low, high = places.min(axis=0), places.max(axis=0)
     margin = 0.2 * float(np.max(high - low)) or 3.0
@@ -134,10 +135,10 @@ def coverage(
 ) -> Coverage:
     """Return the Cramér-Rao bound of the pose at each point, from the fields of one window.
 
-    Noise and model error weigh as in the solvers.  The drive phase of a beacon without
-    synchronisation is free.  The bound of the position hardly depends on the attitude: a turned
-    platform sees the same field in other axes, and only the lever arm and the errors of the
-    magnetometer's matrix turn with it.  So one attitude is enough.
+    Noise and model error have the same weights as in the solvers.  The drive phase of an
+    unsynchronised beacon is estimated.  The bound of the position hardly depends on the attitude: a
+    rotated platform measures the same field in other axes, and only the lever arm and the errors of
+    the magnetometer's matrix rotate with it.  So one attitude is enough.
 
     Parameters
     ----------
@@ -146,13 +147,13 @@ def coverage(
     window : float
         Time over which the tones are averaged (s).
     survey : bool
-        Take what the calibration's sigmas leave open for unknown, with the sigmas as its prior.
+        Whether uncertain calibration parameters are estimated too, with their sigmas as prior.
     attitude_known : bool
-        Take the attitude from elsewhere, without error.
+        Whether the attitude is known independently, without error.
     world_from_body : ndarray, shape (3, 3), optional
-        Level and along the world's axes where it is not given.
+        By default level and along the world's axes.
     risk : Risk, optional
-        What protection levels are to promise; they are found only where it is given.
+        Specification of the protection levels, which are computed only if it is given.
     """
     attitude = np.eye(3) if world_from_body is None else world_from_body
     if are_many(site) and len(position_world):
@@ -167,7 +168,7 @@ def coverage(
 
 
 def _heard_at(site: Site, position_world: Array, window: float) -> Site:
-    """Return a site of those beacons that are heard at any of some points."""
+    """Return a site of the beacons that are detected at any of some points."""
     largest = np.max(largest_fields(site, position_world), axis=0)
     heard = beacons_of(site, np.asarray(largest > phasor_sigma(site, window))).tolist()
     kept = heard or [0]
@@ -229,7 +230,7 @@ def best_extra_beacon(
     position_world: Array,
     share: float = 0.5,
 ) -> ExtraBeacon:
-    """Find where, on the boundary of a box, one more beacon of the first's kind adds most.
+    """Find the best position of one more beacon of the first's kind, on the boundary of a box.
 
     Parameters
     ----------
@@ -238,9 +239,9 @@ def best_extra_beacon(
     bound : callable
         `coverage` of a site at given points.
     position_world : ndarray, shape (n, 3)
-        Where the platform is to navigate (m).
+        Positions of the platform to navigate at (m).
     share : float
-        Part of the points whose position sigma is to be lowered: 0.5 for the median.
+        Share of the points whose position sigma is minimised: 0.5 for the median.
     """
     step = -(-len(position_world) // COMPARED)
     points = position_world[step // 2 :: step]
@@ -267,12 +268,12 @@ def boundary_places(box_world: Array) -> Array:
 def _copy(site: Site, place: Array) -> Beacon:
     names = {b.name for b in site.beacons}
     name = next(n for n in ("extra", *(f"extra {i}" for i in range(len(names)))) if n not in names)
-    # It will have a frequency of its own, at which the field is what it is at the first's.
+    # It will have a separate frequency, at which the field is the same as at the first's.
     return replace(site.beacons[0], name=name, position_world=place, planned=True)
 
 
 def _quantile(sigma: Array, share: float) -> float:
-    # Of the sorted values themselves: between a finite and an infinite one nothing lies.
+    # Use the sorted values themselves: do not interpolate between finite and infinite.
     return float(np.quantile(sigma, share, method="higher"))
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from magfusion.results.coverage import Coverage
 from magfusion.units import Array, IntArray
 
-# From the most accurate to the least; light to dark for those who see no hues.
+# From the most accurate to the least; light to dark for colour-blind readers.
 COLOURS = {
     "yellow": (250, 225, 50),
     "light green": (150, 215, 70),
@@ -28,10 +28,10 @@ def bounds_of(known: Array) -> Array:
 
 
 def colour_of(found: Coverage) -> IntArray:
-    """Return which colour each point has, shape (n,); meaningless where not determined."""
+    """Return the index of each point's colour, shape (n,); meaningless where not determined."""
     return np.digitize(found.position_sigma, bounds(found))
 
 
 def length(metres: float) -> str:
-    """Return a sigma as it is printed."""
+    """Return a sigma as printed."""
     return f"{1e3 * metres:.3g} mm" if metres < 0.1 else f"{metres:.3g} m"

@@ -1,7 +1,7 @@
 """Whether an error grows with time: slopes with their standard errors, Allan deviation, verdicts.
 
-Neighbouring errors of one run are alike, so that a slope's standard error comes from the scatter
-between independent worlds, or, where there is one alone, from how long its errors are alike
+Neighbouring errors of one run are correlated, so that a slope's standard error comes from the
+scatter between independent worlds or, for a single world, from their correlation time
 (`magfusion.results.trend`).
 """
 
@@ -20,7 +20,7 @@ CONFIDENCE = 0.95  # with which a slope is told to be within its limit
 CERTAIN = 0.999  # and beyond it: many slopes are judged, and one may not fail by chance
 FEWEST_COMMON = 5  # worlds whose scatter determines three slopes
 THREE_SIGMA = 0.0027  # how often chance alone goes beyond three standard errors
-# Columns of an error, as of the estimators' states.
+# Columns of an error, as in the estimators' states.
 ATTITUDE, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 ACCEL_BIAS, GYRO_BIAS = slice(9, 12), slice(12, 15)
 
@@ -36,11 +36,11 @@ class ErrorSeries:
     time : ndarray, shape (n,)
         (s)
     measured : ndarray of bool, shape (n,)
-        Whether a field was measured there; the states between are carried on by the IMU.
+        Whether a field was measured there; the states between are propagated by the IMU.
     error, sigma : ndarray, shape (n, 15)
-        Attitude (rad), position (m) and velocity (m/s) in world axes, so that what goes one way
-        for days adds up whatever way the body looks; biases of the accelerometer (m/s^2) and the
-        gyro (rad/s) in body axes.
+        Attitude (rad), position (m) and velocity (m/s) in world axes, so that a steady drift
+        accumulates whatever the body's attitude; biases of the accelerometer (m/s^2) and the gyro
+        (rad/s) in body axes.
     pose_nees, bias_nees : ndarray, shape (n,)
         Normalised errors squared, of six degrees of freedom each.
     """
@@ -56,7 +56,7 @@ class ErrorSeries:
         return len(self.time)
 
     def rows(self, chosen: BoolArray) -> "ErrorSeries":
-        """Return some of the states."""
+        """Return a subset of the states."""
         return ErrorSeries(
             self.time[chosen],
             self.measured[chosen],
@@ -73,7 +73,7 @@ class ErrorSeries:
 
 @dataclass(frozen=True)
 class Slope:
-    """Growth of an error in a day.
+    """Growth of an error per day.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ class Slope:
 
     @property
     def margin(self) -> float:
-        """Half the interval that holds the true slope with `CONFIDENCE`."""
+        """Half the confidence interval of the slope, at `CONFIDENCE`."""
         return self._margin(CONFIDENCE)
 
     def _margin(self, confidence: float) -> float:
@@ -96,15 +96,15 @@ class Slope:
     def verdict(self, limit: float) -> Verdict:
         """Return whether the slope is within plus or minus a limit.
 
-        It passes only where all of its interval does, and fails where none of the interval of
-        `CERTAIN` does: a run too short to tell is not one that has passed, nor has it failed.
+        It passes only if the whole interval is inside, and fails only if the whole interval of
+        `CERTAIN` is outside: a short run that decides neither has not passed and not failed.
         """
         size = abs(self.per_day)
         return within(size - self._margin(CERTAIN), size + self.margin, limit)
 
 
 def within(low: float, high: float, limit: float) -> Verdict:
-    """Return whether an interval lies below a limit: all of it, none of it, or neither."""
+    """Return whether an interval is below a limit: all of it, none of it, or neither."""
     if high < limit:
         return "pass"
     return "fail" if low > limit else "undecided"
@@ -112,10 +112,10 @@ def within(low: float, high: float, limit: float) -> Verdict:
 
 @dataclass(frozen=True, eq=False)
 class CommonSlope:
-    """What the components of an error have in common in all worlds: the way they go with time.
+    """Common drift of the components of an error in all worlds.
 
-    The length of an error hides it: a drift of a millimetre adds nothing to a constant error of a
-    centimetre that lies across it.
+    The length of an error does not show it: a drift of a millimetre adds nothing to a constant
+    error of a centimetre perpendicular to it.
 
     Parameters
     ----------
@@ -124,8 +124,8 @@ class CommonSlope:
     standard_error : ndarray, shape (3,)
         From their scatter.
     probability : float
-        That chance alone gives slopes as far from none, by Hotelling's test of all three
-        components at once; below `THREE_SIGMA` they are beyond three standard errors.
+        Of slopes as far from zero by chance, by Hotelling's test of all three components at once;
+        below `THREE_SIGMA` they are beyond three standard errors.
     """
 
     per_day: Array
@@ -134,7 +134,7 @@ class CommonSlope:
 
     @property
     def verdict(self) -> Verdict:
-        """Return whether the worlds drift one way."""
+        """Return whether the worlds drift in one direction."""
         return "fail" if self.probability < THREE_SIGMA else "pass"
 
 
@@ -144,13 +144,14 @@ def common_slope(times: Sequence[Array], values: Sequence[Array]) -> CommonSlope
     Parameters
     ----------
     times : sequence of ndarray, shape (n,)
-        One of each world (s).
+        One per world (s).
     values : sequence of ndarray, shape (n, 3)
 
     Raises
     ------
     ValueError
-        With fewer than `FEWEST_COMMON` worlds, whose scatter in three components is not known.
+        With fewer than `FEWEST_COMMON` worlds, for which the scatter of three components is
+        unknown.
     """
     worlds = len(values)
     if worlds < FEWEST_COMMON:
@@ -164,7 +165,7 @@ def common_slope(times: Sequence[Array], values: Sequence[Array]) -> CommonSlope
 
 
 def slope_of_one(time: Array, value: Array) -> Slope:
-    """Return the slope of one world's errors, however long they are alike.
+    """Return the slope of one world's errors, for any correlation time.
 
     Parameters
     ----------
@@ -175,7 +176,7 @@ def slope_of_one(time: Array, value: Array) -> Slope:
     Raises
     ------
     ValueError
-        Where fewer than three blocks hold any value.
+        Where fewer than three blocks have any value.
     """
     return Slope(*trend(time / DAY, value))
 
@@ -186,7 +187,7 @@ def slope_over_worlds(times: Sequence[Array], values: Sequence[Array]) -> Slope:
     Parameters
     ----------
     times, values : sequence of ndarray, shape (n,)
-        One of each world (s); a single one is left to `slope_of_one`.
+        One per world (s); for a single one, see `slope_of_one`.
     """
     if len(values) == 1:
         return slope_of_one(times[0], values[0])
@@ -205,11 +206,11 @@ def allan_deviation(value: Array, step: float, points: int = 40) -> tuple[Array,
     Parameters
     ----------
     value : ndarray, shape (n,) or (n, axes)
-        At equal distances; axes are averaged in square.
+        At equal intervals; axes are averaged in square.
     step : float
         (s)
     points : int
-        At most so many times, in equal ratios.
+        Maximum number of times, in equal ratios.
 
     Returns
     -------
@@ -230,7 +231,7 @@ def allan_deviation(value: Array, step: float, points: int = 40) -> tuple[Array,
 
 
 def evenly(series: ErrorSeries, interval: float) -> ErrorSeries:
-    """Return the measured states at multiples of an interval (s): one weight for all hours."""
+    """Return the measured states at multiples of an interval (s): equal weight of all hours."""
     off = np.abs(series.time / interval - np.round(series.time / interval))
     return series.rows(series.measured & (off * interval < 1e-6))
 
@@ -246,7 +247,7 @@ def in_windows(time: Array, value: Array, edges: Array) -> Array:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A part of the error that is judged.
+    """A tested part of the error.
 
     Parameters
     ----------
@@ -257,8 +258,8 @@ class Quantity:
     scale : float
         From SI to the unit.
     limit : float
-        Slope that is still none, by design (unit per day): about what the error itself is of a good
-        installation would take days to gather.
+        Maximum slope, by design (unit per day): it would take days to reach about the error of a
+        good installation.
     """
 
     name: str
@@ -269,7 +270,7 @@ class Quantity:
 
     @property
     def symbol(self) -> str:
-        """The unit as it is printed."""
+        """The unit as printed."""
         return {"deg_h": "deg/h", "m_s2": "m/s^2"}.get(self.unit, self.unit)
 
 
@@ -283,20 +284,20 @@ QUANTITIES = (
 
 
 def settled_after(hours: float) -> float:
-    """Return when slopes begin to count (s): after twelve hours, or a quarter of a shorter run."""
+    """Return the time from which slopes count (s): twelve hours, or a quarter of a shorter run."""
     return HOUR * min(12.0, 0.25 * hours)
 
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """What is drawn of an estimator.
+    """Plotted data of an estimator.
 
     Parameters
     ----------
     worlds : tuple of ErrorSeries
-        Errors in each world, at equal distances.
+        Errors in each world, at equal intervals.
     interval : float
-        These distances (s).
+        This interval (s).
     pace : ndarray, shape (pieces, 6)
         Of the first world: begin (s), processor time (s), updates, memory (MiB), squared
         innovation in units of its expectation, processor time of one sample of a bare loop at that
@@ -314,14 +315,14 @@ class Course:
         return self.worlds[0]
 
     def hourly(self) -> tuple[Array, dict[str, Array]]:
-        """Return the middles of the hours (h) and means over all worlds of what is squared.
+        """Return the middles of the hours (h) and the means of squares over all worlds.
 
         Returns
         -------
         time : ndarray, shape (hours,)
         levels : dict of str to ndarray, shape (hours,)
-            Squared errors of pose and bias, and squared innovations of the first world, all in
-            units of what they should be.
+            Squared errors of pose and bias, and squared innovations of the first world, all
+            relative to their expectation.
         """
         edges = HOUR * np.arange(np.ceil(self.errors.time[-1] / HOUR) + 1)
         time = np.concatenate([w.time for w in self.worlds])

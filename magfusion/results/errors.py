@@ -158,7 +158,7 @@ def trajectory_errors(
     Raises
     ------
     TypeError
-        Where one of them is no trajectory.
+        Where one of them is not a trajectory.
     InputError
         Where fewer than three epochs of the estimate have a truth.
     """
@@ -232,7 +232,7 @@ def relative_errors(
     """
     step, shift = _motion(world_from_body, position_world, pairs)
     true_step, true_shift = _motion(truth.world_from_body, truth.position_world, pairs)
-    # The shifts' difference need not be turned: its length is the same in all axes.
+    # The shifts' difference need not be rotated: its length is the same in all axes.
     return RelativeErrors(
         pairs=pairs,
         translation=np.linalg.norm(shift - true_shift, axis=1),
@@ -255,7 +255,7 @@ def _poses(world_from_body: Array, position_world: Array) -> list[gtsam.Pose3]:
 
 def _align(position: Array, target: Array) -> Array:
     centre, target_centre = position.mean(axis=0), target.mean(axis=0)
-    # Along a line, or at rest, many rotations fit equally well: the residual is theirs all.
+    # Along a line, or at rest, many rotations fit equally well, with the same residual.
     turn = gtsam.Rot3.ClosestTo((target - target_centre).T @ (position - centre)).matrix()
     return np.asarray((position - centre) @ turn.T + target_centre)
 

@@ -1,10 +1,10 @@
-"""Figures of a job: the objects of which both ``report.json`` and the screen are made.
+"""Figures of a job: the objects from which ``report.json`` and the screen are generated.
 
 A figure's key in the flat ``report.json`` is its name, in which ``{beacon}`` is the beacon's name:
 ``{beacon}.position_x_m`` is written ``A.position_x_m``.  A beacon may have any name.
 One that is also the name of another owner of parameters (`OWNERS`), or that begins with
-``beacon:``, is written ``beacon:NAME``; so is one whose key another figure of the report already
-has.  All other names are written as they are.
+``beacon:``, is written ``beacon:NAME``, also if another figure of the report already has this key.
+All other names are written unchanged.
 """
 
 from collections.abc import Iterator, Mapping
@@ -53,21 +53,21 @@ class Figure:
     Parameters
     ----------
     name : str
-        Key of ``report.json``, with ``{beacon}`` in the place of the beacon's name.
+        Key of ``report.json``, with ``{beacon}`` for the beacon's name.
     unit : str
-        As the screen shows it; the key has a suffix of its own.
+        As shown on the screen; the key has a suffix of its own.
     beacon : str, optional
-        Of which it is; the screen lists the same figure of several beacons in one line.
+        Name of the beacon; the screen lists the same figure of several beacons in one line.
     label : str
-        What the screen calls it; default: the name without its unit.
+        Title on the screen; default: the name without its unit.
     column : Column
         Of the section's table.
     note : str
-        A warning that the screen shows beside the figure.
+        A warning that the screen shows with the figure.
     remark : str
         A sentence that the screen shows after all notes.
     refused : bool
-        Whether it counts data that were refused; its title says why.
+        Whether it counts rejected data; its title has the reason.
     """
 
     name: str
@@ -83,7 +83,7 @@ class Figure:
 
     @property
     def key(self) -> str:
-        """Key in the report, unless another figure has it already."""
+        """Key in the report, unless another figure already has it."""
         return self.key_of(self.beacon and owner_key(self.beacon))
 
     def key_of(self, owner: str | None) -> str:
@@ -92,13 +92,13 @@ class Figure:
 
     @property
     def title(self) -> str:
-        """What the screen calls it."""
+        """Title on the screen."""
         unit = self.unit.lower().translate({ord("/"): "_", ord(" "): "_", ord("^"): None})
         plain = self.name.replace("{beacon}", "").removesuffix(f"_{unit}")
         return self.label or plain.strip("_").replace("_", " ")
 
     def entries(self, key: str) -> dict[str, Value]:
-        """Return what the report holds of it under a key."""
+        """Return the report's entries for it under a key."""
         return {key: self.value}
 
 
@@ -109,13 +109,13 @@ class Estimate(Figure):
     Parameters
     ----------
     label : str
-        Of the vector that it is a component of, which is one line on the screen.
+        Of its vector, which is one line on the screen.
     sigma, prior_sigma : float
         Posterior and prior standard deviation; a prior of zero is none.
     is_open : bool
-        Whether the measurements leave it open, whatever its sigma.
+        Whether the measurements do not determine it, whatever its sigma.
     declared : float, optional
-        Its value before, where it has one: of a rotation only the change is a number.
+        Its value before, if any: of a rotation only the change is a number.
     """
 
     section: Section = Section.CALIBRATION
@@ -126,17 +126,17 @@ class Estimate(Figure):
 
     @property
     def change(self) -> float:
-        """From the declared value."""
+        """Change from the declared value."""
         return number(self.value)
 
     @property
     def determined(self) -> bool:
-        """Whether the data, rather than the prior, fixed the parameter."""
+        """Whether the data, rather than the prior, determined the parameter."""
         known = not self.prior_sigma or self.sigma < DETERMINED_RATIO * self.prior_sigma
         return known and not self.is_open
 
     def entries(self, key: str) -> dict[str, Value]:
-        """Return change and sigmas under keys that begin alike."""
+        """Return change and sigmas under keys with a common prefix."""
         sigmas = {f"{key}_sigma": self.sigma, f"{key}_prior_sigma": self.prior_sigma}
         return {key: self.value, **sigmas}
 
@@ -147,7 +147,7 @@ class Figures(Mapping[str, Value]):
     Raises
     ------
     ValueError
-        Where two figures that are of no beacon have one key.
+        Where two figures without a beacon have the same key.
     """
 
     def __init__(self, *figures: Figure) -> None:
@@ -176,16 +176,16 @@ class Figures(Mapping[str, Value]):
         return Figures(*self.all, *other.all)
 
     def prefixed(self, prefix: str) -> "Figures":
-        """Return the same under keys that begin with a prefix."""
+        """Return the same figures under keys with a prefix."""
         return Figures(*(replace(f, name=prefix + f.name) for f in self.all))
 
     def of(self, section: Section) -> list[Figure]:
-        """Return the figures that one part of the screen shows."""
+        """Return the figures of one part of the screen."""
         return [figure for figure in self.all if figure.section is section]
 
 
 def heading(job: str, log: str) -> Figures:
-    """Return the first figures of every report: what was done, and with what."""
+    """Return the first figures of every report: the job and its inputs."""
     return Figures(
         Figure("job", job, section=Section.TITLE), Figure("log", log, section=Section.TITLE)
     )
@@ -202,12 +202,12 @@ def determined_figures(estimates: list[Estimate]) -> Figures:
 
 
 def calibration_record(log_name: str, estimates: list[Estimate]) -> dict[str, object]:
-    """Return what a refined site says of its origin."""
+    """Return a refined site's record of its origin."""
     return {"log": log_name, **determined_figures(estimates)}
 
 
 def owner_key(name: str) -> str:
-    """Return how keys of the report write the name of a beacon."""
+    """Return a beacon's name as in the keys of the report."""
     return f"beacon:{name}" if name in OWNERS or name.startswith("beacon:") else name
 
 

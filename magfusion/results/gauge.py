@@ -1,7 +1,7 @@
-"""Ways to move the calibration that no measurement observes, or hardly any.
+"""Gauge directions: changes of the calibration that no measurement observes, or hardly any.
 
-A common motion of all beacons, turns of a beacon that its drive phase undoes, a rotation that the
-mounting and the magnetometer's matrix share: tangent vectors of the calibration by name.
+A common motion of all beacons, rotations of a beacon compensated by its drive phase, a rotation
+shared by the mounting and the magnetometer's matrix: named tangent vectors of the calibration.
 """
 
 from collections.abc import Iterator
@@ -35,7 +35,7 @@ Parts = dict[tuple[Parameter, str], Array]
 
 
 class Gauge(NamedTuple):
-    """A way to move the calibration that changes no measurement, or hardly any.
+    """A change of the calibration that changes no measurement, or hardly any.
 
     Parameters
     ----------
@@ -57,12 +57,12 @@ class Gauge(NamedTuple):
 
 
 def gauges(calibration: Calibration, blocks: tuple[Block, ...]) -> list[Gauge]:
-    """Return the gauge directions of what is estimated, those that are nearly one last.
+    """Return the gauge directions of the estimated parameters, the approximate ones last.
 
     Parameters
     ----------
     blocks : tuple of Block
-        A gauge that would move what is not among them is none.
+        Estimated blocks; a gauge that would change other parameters is omitted.
     """
     beacons = calibration.site.beacons
     found = [*_shifts(beacons, blocks), *_turns(beacons, blocks, (2,))]
@@ -73,7 +73,7 @@ def gauges(calibration: Calibration, blocks: tuple[Block, ...]) -> list[Gauge]:
 
 
 def _scale(beacons: tuple[Beacon, ...], blocks: tuple[Block, ...]) -> list[Gauge]:
-    """Return what the field cannot observe: a larger world, its moments larger with the cube."""
+    """Return the scale gauge: a larger world, with moments growing with the cube."""
     parts: Parts = {}
     for b in beacons:
         parts[BEACON_POSITION, b.name] = b.position_world
@@ -85,7 +85,7 @@ def _scale(beacons: tuple[Beacon, ...], blocks: tuple[Block, ...]) -> list[Gauge
 
 
 def _joined(blocks: tuple[Block, ...], parts: Parts) -> Array | None:
-    """Return the tangent vector of these parts; None where one of them is not estimated."""
+    """Return the tangent vector of these parts; None where one is not estimated."""
     out, left = np.zeros(dimension(blocks)), dict(parts)
     for block in blocks:
         value = left.pop(block.key, None)
@@ -119,11 +119,11 @@ def _turns(
         if direction is None:
             continue
         if k == 2:
-            name = "all beacons turned together about the vertical"
+            name = "all beacons rotated together about the vertical"
             remedy = "gauge: no log can determine it; survey the bearing between two beacons better"
         else:
             name = f"all beacons tilted together about {_AXES[k]}"
-            remedy = "gravity alone observes it; stand still, in several attitudes"
+            remedy = "gravity alone observes it; record rest in several attitudes"
         found.append(Gauge(name, remedy, DEGREES, direction, exact=k == 2))
     return found
 
@@ -141,13 +141,13 @@ def _of_sensor(calibration: Calibration, blocks: tuple[Block, ...]) -> Iterator[
         turned: Parts = {(SENSOR_ROTATION, SENSOR_ROTATION.owner): step}
         direction = _joined(blocks, turned | {place: (matrix @ skew(step)).ravel()})
         if direction is not None:
-            name = f"the mounting turned about the sensor's {axis} and the matrix turned back"
-            remedy = "gauge: no log can determine it; hold one of the two"
+            name = f"the mounting rotated about the sensor's {axis} and the matrix rotated back"
+            remedy = "gauge: no log can determine it; fix one of the two"
             yield Gauge(name, remedy, DEGREES, direction)
 
 
 def _of_drive(beacon: Beacon, blocks: tuple[Block, ...]) -> list[Gauge]:
-    """Return turns of one beacon that its coils' currents undo, as that of a rotating one."""
+    """Return rotations of one beacon that its coils' currents compensate, as for a rotating one."""
     drive = beacon.moments_beacon.T @ beacon.excitation  # (3, tones)
     turned = [(skew(axis) @ drive).ravel() for axis in np.eye(3)]
     shifted = [
@@ -175,7 +175,7 @@ def _of_drive(beacon: Beacon, blocks: tuple[Block, ...]) -> list[Gauge]:
         if direction is None or turn < NEARLY_NULL:
             continue
         against = " against its drive phase" if tones else ""
-        name = f"beacon {beacon.name} turned about its own axis{against}"
+        name = f"beacon {beacon.name} rotated about its own axis{against}"
         remedy = "gauge: its field does not change; nothing depends on it"
         found.append(Gauge(name, remedy, DEGREES, direction / turn))
     return found

@@ -1,4 +1,4 @@
-"""States as they are made, for Foxglove: a WebSocket server that the app opens."""
+"""Live states for Foxglove: a WebSocket server for the app."""
 
 import time
 from collections.abc import Mapping
@@ -34,21 +34,21 @@ _STATE = {
 class FoxgloveServer:
     """Serves ``/magfusion/state``, and ``/magfusion/pose`` and ``/tf`` of states not lost.
 
-    Who listens too slowly misses messages; nothing waits for that.
+    Slow clients miss messages; the server never blocks.
 
     Parameters
     ----------
     address : str
-        ``[HOST:]PORT``; without a host only this machine is served.
+        ``[HOST:]PORT``; without a host only local clients are served.
     epoch_ns : int
-        When the time of states is zero (ns since 1970).
+        Zero of the states' time (ns since 1970).
     frame, child : str
         Names of the frames.
 
     Raises
     ------
     InputError
-        Where it cannot listen there, or foxglove-sdk is not installed.
+        Where it cannot listen at the address, or foxglove-sdk is not installed.
     """
 
     def __init__(self, address: str, epoch_ns: int, frame: str, child: str) -> None:
@@ -78,11 +78,11 @@ class FoxgloveServer:
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """Address of the server."""
         return self._server.port
 
     def take(self, state: JudgedState | None, told: Mapping[str, Any]) -> None:
-        """Publish what is told of a state, and its pose if it has one."""
+        """Publish a state, and its pose if it has one."""
         stamp = max(0, self._epoch_ns + round(float(told["time"]) * _NS))
         self._state.log(json_line(dict(told)), log_time=stamp)
         if state is None or state.lost:
@@ -108,7 +108,7 @@ class FoxgloveServer:
         self._transform.log(transform, log_time=stamp)
 
     def close(self) -> None:
-        """End; who is still connected is told, after what is on its way to them."""
+        """Close, after pending messages and a notice to connected clients."""
         if self._state.has_sinks():  # the server drops what it has not sent when it stops
             time.sleep(LINGER)
         self._server.stop()
@@ -124,7 +124,7 @@ def _parted(address: str) -> tuple[str, int]:
     host, _, port = address.rpartition(":")
     if not port.isdecimal() or int(port) > 65535 or address.startswith(":"):
         raise InputError(
-            f"--foxglove {address!r}: is no address to listen at; write a port, as 8765, or"
-            " HOST:PORT, as 0.0.0.0:8765 for everybody on the network"
+            f"--foxglove {address!r}: is not an address to listen at; write a port, e.g. 8765, or"
+            " HOST:PORT, e.g. 0.0.0.0:8765 for the whole network"
         )
     return host.strip("[]") or HOST, int(port)

@@ -1,4 +1,4 @@
-"""What a log's motion covered, and what motion is missing for what the calibration left open."""
+"""Motion covered by a log, and the missing motion for undetermined parameters."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,20 +30,20 @@ _AXES = "xyz"
 
 @dataclass(frozen=True, eq=False)
 class MotionCoverage:
-    """Where the platform was and how it was turned.
+    """Range of the platform's positions and attitudes.
 
     Parameters
     ----------
     nearest : mapping
-        Beacon to the sensor's least distance from it (m).
+        Beacon to the sensor's minimum distance from it (m).
     spread_deg : mapping
         Beacon to the largest angle, seen from it, between the sensor and its mean direction.
     extent_world : ndarray, shape (3,)
-        Between the extremes of the position (m).
+        Range of the position (m).
     turned_deg : ndarray, shape (3,)
-        Root mean square of the turn from the mean attitude, about each axis of the body.
+        Root mean square of the rotation from the mean attitude, about each axis of the body.
     rest_share : float
-        Of the samples at which the platform stood still.
+        Share of stationary samples.
     """
 
     nearest: Mapping[str, float]
@@ -56,12 +56,12 @@ class MotionCoverage:
 def motion_coverage(
     states: Trajectory, calibration: Calibration, imu: ImuSamples
 ) -> MotionCoverage:
-    """Return what a motion covered.
+    """Return the range of a motion.
 
     Parameters
     ----------
     imu : ImuSamples
-        Its rests are counted.
+        Used to find rests.
     """
     sensor_world = sensor_positions(calibration.site, states)[:, 0]
     nearest, spread = {}, {}
@@ -91,27 +91,27 @@ def missing_motion(
     blocks: tuple[Block, ...],
     found: Observability,
 ) -> list[str]:
-    """Return sentences on what motion would determine what is open, the gauge left aside."""
+    """Return sentences on the motion that would determine open parameters, except gauges."""
     open_ = _open(calibration, blocks, found)
     out = [_of_beacon(covered, b.name, open_.get(b.name, [])) for b in calibration.site.beacons]
     out += [_of_turning(covered, blocks, found), _of_extent(covered, blocks, found)]
     if covered.rest_share < FEW_RESTS:
         out.append(
-            "The platform never stood still: the IMU's biases, and with them the vertical, rest"
-            " on its motion alone; add stops of some seconds, in several attitudes."
+            "The platform was never stationary: the IMU's biases, and with them the vertical, are"
+            " only determined by its motion; add stops of some seconds, in several attitudes."
         )
     return [sentence for sentence in out if sentence]
 
 
 def _is_open(found: Observability, columns: slice) -> BoolArray:
-    """Tell which parameters of a block the log left open; what is all gauge is not among them."""
+    """Return which parameters of a block the log does not determine, apart from gauges."""
     return np.nan_to_num(found.ratio_but_for_gauge[columns]) > DETERMINED_RATIO
 
 
 def _open(
     calibration: Calibration, blocks: tuple[Block, ...], found: Observability
 ) -> dict[str, list[str]]:
-    """Return each beacon's open parameters with their sigmas, weakest first."""
+    """Return each beacon's undetermined parameters with their sigmas, weakest first."""
     names, prior = parameter_names(blocks, calibration), prior_sigma(blocks)
     listed: dict[str, list[tuple[float, str]]] = {}
     for block in blocks:
@@ -133,8 +133,8 @@ def _of_beacon(covered: MotionCoverage, name: str, open_: list[str]) -> str:
         return ""
     more = f" and {len(open_) - MOST_NAMED} more" if len(open_) > MOST_NAMED else ""
     return (
-        f"The platform never came nearer than {covered.nearest[name]:.1f} m to beacon {name} and"
-        f" saw it within {covered.spread_deg[name]:.0f} deg of one direction: open are"
+        f"The platform was never closer than {covered.nearest[name]:.1f} m to beacon {name}, within"
+        f" {covered.spread_deg[name]:.0f} deg of one direction from it: not determined are"
         f" {', '.join(open_[:MOST_NAMED])}{more}; pass it closer, and on another side."
     )
 
@@ -151,13 +151,13 @@ def _of_turning(covered: MotionCoverage, blocks: tuple[Block, ...], found: Obser
     axes = " and ".join(_AXES[k] for k in hardly)
     angles = ", ".join(f"{covered.turned_deg[k]:.0f}" for k in hardly)
     return (
-        f"The platform hardly turned about its {axes} ({angles} deg rms): open is"
-        f" {' and '.join(waiting)}; turn it about all three axes."
+        f"The platform hardly rotated about its {axes} ({angles} deg rms): not determined is"
+        f" {' and '.join(waiting)}; rotate it about all three axes."
     )
 
 
 def _of_extent(covered: MotionCoverage, blocks: tuple[Block, ...], found: Observability) -> str:
-    """Name the axes along which it hardly moved, where beacons' places along them are open."""
+    """Return the axes of little motion, if positions of beacons along them are undetermined."""
     waiting = np.zeros(3, dtype=bool)
     for block in blocks:
         if block.parameter == BEACON_POSITION:
@@ -166,4 +166,4 @@ def _of_extent(covered: MotionCoverage, blocks: tuple[Block, ...], found: Observ
     if not len(hardly):
         return ""
     listed = ", ".join(f"{100.0 * covered.extent_world[k]:.0f} cm along {_AXES[k]}" for k in hardly)
-    return f"The platform moved by only {listed}, where places of beacons are open; move farther."
+    return f"The platform moved by only {listed}: positions of beacons are open; move farther."

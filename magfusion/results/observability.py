@@ -1,9 +1,9 @@
-"""What a log determines of the calibration: how many directions, which not, and why, in words.
+"""Observability of the calibration from a log: determined directions, and the others in words.
 
 The posterior is compared with the prior: in the tangent space scaled by the prior's sigmas the
 eigenvalues of the posterior covariance are the squared ratios of posterior to prior sigma, one
-where the log said nothing.  Some of these directions are gauge: they leave every measurement as it
-is, so that no log can determine them, and only a better survey helps.
+where the log adds no information.  Some of these directions are gauge: they do not change any
+measurement, so that no log can determine them, and only a better survey helps.
 """
 
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ SMALLEST_LISTED = 1e-4  # m, rad or relative; a common shift below it is of no i
 
 
 class Weakness(NamedTuple):
-    """A direction of the calibration that the log left open.
+    """A direction of the calibration that the log does not determine.
 
     Parameters
     ----------
@@ -40,18 +40,18 @@ class Weakness(NamedTuple):
 
 
 class Observability(NamedTuple):
-    """What a log determined of the calibration.
+    """Observability of the calibration.
 
     Parameters
     ----------
     ratio : ndarray, shape (dimension,)
         Posterior over prior sigma of each parameter.
     ratio_but_for_gauge : ndarray, shape (dimension,)
-        The same, the open gauge taken out of both; NaN where nothing of the parameter is left.
+        The same, without the open gauge in either; NaN where nothing of the parameter remains.
     direction_ratio : ndarray, shape (dimension,)
         Posterior over prior sigma of each direction, ascending.
     gauge : tuple of Weakness
-        Gauge directions, which are open whatever the log.
+        Gauge directions, which are open for any log.
     weakest : tuple of Weakness
         The weakest of the other directions that are open.
     """
@@ -74,7 +74,7 @@ def observability(calibration: Calibration, blocks: tuple[Block, ...], cov: Arra
     Parameters
     ----------
     calibration : Calibration
-        Where the covariance was taken.
+        At the posterior.
     blocks : tuple of Block
         With the prior's sigmas.
     cov : ndarray, shape (dimension, dimension)
@@ -105,7 +105,7 @@ def gauge_basis(calibration: Calibration, blocks: tuple[Block, ...]) -> Array:
     Returns
     -------
     ndarray, shape (dimension, gauges)
-        What gravity or acceleration may determine is not among them.
+        Without those that gravity or acceleration may determine.
     """
     prior = prior_sigma(blocks)
     columns = [q for gauge, q, _ in _orthonormal(calibration, blocks, prior) if gauge.exact]
@@ -115,7 +115,7 @@ def gauge_basis(calibration: Calibration, blocks: tuple[Block, ...]) -> Array:
 def _orthonormal(
     calibration: Calibration, blocks: tuple[Block, ...], prior: Array
 ) -> Iterator[tuple[Gauge, Array, float]]:
-    """Yield each gauge with what it adds to those before it, and the length of that."""
+    """Yield each gauge's component orthogonal to those before it, and its length."""
     known: Array = np.zeros((len(prior), 0))
     for gauge in gauges(calibration, blocks):
         scaled = gauge.direction / prior
@@ -130,7 +130,7 @@ def _orthonormal(
 def _open_gauge(
     calibration: Calibration, blocks: tuple[Block, ...], scaled: Array, prior: Array
 ) -> tuple[tuple[Weakness, ...], tuple[Weakness, ...], Array]:
-    """Return the gauges that are open, those that are nearly one, and their orthonormal basis."""
+    """Return the open gauges, the approximate ones, and their orthonormal basis."""
     known: list[Weakness] = []
     nearly: list[Weakness] = []
     columns = []
@@ -156,7 +156,7 @@ def _weakest(
     gauge: Array,
     prior: Array,
 ) -> tuple[Weakness, ...]:
-    """Return the weakest directions beside the gauge, weakest first."""
+    """Return the weakest directions apart from the gauge, weakest first."""
     size = len(prior)
     if size == gauge.shape[1]:
         return ()
@@ -195,7 +195,7 @@ def _simplest(basis: Array, rounds: int = 50) -> Array:
 def parameter_names(
     blocks: tuple[Block, ...], calibration: Calibration
 ) -> list[tuple[str, str, float]]:
-    """Return what each parameter is called, its unit, and the size of the unit in SI."""
+    """Return the name of each parameter, its unit, and the size of the unit in SI."""
     return [
         (b.parameter.called(calibration.site, b.owner, i), *b.parameter.spoken)
         for b in blocks
@@ -226,6 +226,6 @@ def _in_words(
 
 
 def _alike(values: Array) -> bool:
-    """Return whether the coils of a beacon go together."""
+    """Return whether the coils of a beacon move together."""
     low, high = np.min(values), np.max(values)
     return len(values) > 1 and bool(low * high > 0.0 and abs(low - high) < 0.5 * abs(low + high))

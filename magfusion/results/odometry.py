@@ -1,4 +1,4 @@
-"""One state as robots take it: pose and velocity, and what both may be off by."""
+"""One state in the form of robot middleware: pose and velocity, with covariances."""
 
 from dataclasses import dataclass
 
@@ -39,16 +39,16 @@ class Odometry:
 
 
 def odometry_of(state: State, epoch_ns: int = 0) -> Odometry:
-    """Return what robots take of a state.
+    """Return the odometry of a state.
 
     Parameters
     ----------
     epoch_ns : int
-        When the time of states is zero (ns since 1970); no format has stamps before that.
+        Zero of the states' time (ns since 1970); no format has earlier stamps.
     """
     world_from_body = state.world_from_body
     velocity_body = world_from_body.T @ state.velocity_world
-    # v_body = exp(-phi) R^T v_world: an attitude that is off turns the velocity, too.
+    # v_body = exp(-phi) R^T v_world: an attitude error rotates the velocity, too.
     x, y, z = velocity_body
     by_rotation = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     jacobian = np.zeros((3, 9))

@@ -21,7 +21,7 @@ _DEPTH = 10  # messages that a reader may be late by, as the default of ROS
 
 
 def odometry_message(odometry: Odometry, frame: str, child: str) -> Any:
-    """Return a message; rates of turning, which no state has, are zero and their variance is huge.
+    """Return a message; angular rates, which no state has, are zero with a huge variance.
 
     Parameters
     ----------
@@ -49,19 +49,19 @@ class RosPublisher:
     topic : str
         As ROS writes it, ``/robot/odometry``.
     epoch_ns : int
-        When the time of states is zero (ns since 1970).
+        Zero of the states' time (ns since 1970).
     frame, child : str
         Names of the frames.
 
     Raises
     ------
     InputError
-        Where the topic or the domain is none, or cyclonedds is not installed.
+        Where the topic or the domain is invalid, or cyclonedds is not installed.
     """
 
     def __init__(self, topic: str, epoch_ns: int, frame: str, child: str) -> None:
         if not _TOPIC.fullmatch(topic):
-            raise InputError(f"--ros2 {topic!r}: is no topic; write one as /robot/odometry")
+            raise InputError(f"--ros2 {topic!r}: is not a topic; write one like /robot/odometry")
         domain = _domain()
         try:
             from cyclonedds.core import DDSException, Policy, Qos
@@ -73,7 +73,7 @@ class RosPublisher:
             raise InputError(
                 "--ros2: cyclonedds is not installed; pip install 'magfusion[ros2]'"
             ) from error
-        # Reliable, since readers of ROS ask for that, but it waits for none.
+        # Reliable, since ROS subscribers request that, but it never blocks.
         asked = Qos(
             Policy.Reliability.Reliable(max_blocking_time=duration(seconds=0)),
             Policy.History.KeepLast(_DEPTH),
@@ -86,7 +86,7 @@ class RosPublisher:
             )
         except DDSException as error:
             raise InputError(
-                f"--ros2 {topic!r}: DDS does not start in domain {domain} ({error}); see to the"
+                f"--ros2 {topic!r}: DDS does not start in domain {domain} ({error}); check the"
                 " network, ROS_DOMAIN_ID and CYCLONEDDS_URI"
             ) from error
         self._refusal, self._epoch_ns, self._frames = DDSException, epoch_ns, (frame, child)
@@ -102,7 +102,7 @@ class RosPublisher:
             self._unsent, self._why = self._unsent + 1, str(error)
 
     def close(self) -> str | None:
-        """Leave the domain; return what went wrong."""
+        """Leave the domain; return an error."""
         del self._writer, self._participant
         if not self._unsent:
             return None
@@ -110,7 +110,7 @@ class RosPublisher:
 
 
 def _domain() -> int:
-    """Return the domain that ROS would take.
+    """Return the domain that ROS would use.
 
     Raises
     ------

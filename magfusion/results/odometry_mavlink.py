@@ -1,4 +1,4 @@
-"""States as MAVLink's ODOMETRY over UDP, as PX4 and ArduPilot take them from outside."""
+"""States as MAVLink ODOMETRY over UDP, as external input of PX4 and ArduPilot."""
 
 import socket
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.model.trust import Verdict
 from magfusion.results.odometry import Odometry, odometry_of
 
-# Of the vehicle that it is on board of, which is 1 unless somebody changed it.
+# System id of the vehicle, 1 by default.
 SYSTEM = 1
 HEARTBEAT = 1.0  # s
 # Forward, right, down of forward, left, up.
@@ -22,10 +22,10 @@ _ADDRESS = "udpout:HOST:PORT"
 
 
 def quality_percent(state: JudgedState) -> int:
-    """Return how good a state is, from 1 to 100 as MAVLink has it; 0 says that nobody knows.
+    """Return the quality of a state, from 1 to 100 as in MAVLink; 0 is unknown.
 
-    Who receives it can set a limit: ``100 / (1 + protection level in metres)``, half of that where
-    the state is doubtful.  50 asks for a trustworthy one that is protected to a metre.
+    For a threshold at the receiver: ``100 / (1 + protection level in metres)``, half of that where
+    the state is doubtful.  A threshold of 50 requires a trustworthy state protected to a metre.
     """
     level = state.judgement.protection_level_m
     if level is None:
@@ -37,13 +37,13 @@ def quality_percent(state: JudgedState) -> int:
 def odometry_message(odometry: Odometry, quality: int, resets: int) -> Any:
     """Return a message ODOMETRY, from MAV_FRAME_BODY_FRD to MAV_FRAME_LOCAL_FRD.
 
-    Both frames are ours turned by half a turn about x.  The local one has a heading of its own, as
-    our world: it is not north.  Rates of turning, which no state has, are NaN.
+    Both frames are ours rotated by half a turn about x.  The local one has an arbitrary heading, as
+    our world: it is not north.  Angular rates, which no state has, are NaN.
 
     Parameters
     ----------
     resets : int
-        How often the estimate has jumped.
+        Number of jumps of the estimate.
     """
     from pymavlink.dialects.v20 import common
 
@@ -61,7 +61,7 @@ def odometry_message(odometry: Odometry, quality: int, resets: int) -> Any:
         (np.tile(_FRD_COV, (2, 2)) * odometry.pose_cov)[_UPPER].tolist(),
         velocity_cov[_UPPER].tolist(),
         reset_counter=resets % 256,
-        # There is no word for magnetic beacons, and PX4 refuses what it does not take for vision.
+        # There is no type for magnetic beacons, and PX4 rejects all but vision.
         estimator_type=common.MAV_ESTIMATOR_TYPE_VIO,
         quality=quality,
     )
@@ -70,19 +70,19 @@ def odometry_message(odometry: Odometry, quality: int, resets: int) -> Any:
 class MavlinkSender:
     """Sends a heartbeat and the odometry of every state that is not lost.
 
-    Nothing waits for who receives it, or minds that nobody does.
+    It never blocks, and ignores missing receivers.
 
     Parameters
     ----------
     address : str
         ``udpout:HOST:PORT``.
     epoch_ns : int
-        When the time of states is zero (ns since 1970).
+        Zero of the states' time (ns since 1970).
 
     Raises
     ------
     InputError
-        Where it is no address, or pymavlink is not installed.
+        Where the address is invalid, or pymavlink is not installed.
     """
 
     def __init__(self, address: str, epoch_ns: int) -> None:
@@ -102,7 +102,7 @@ class MavlinkSender:
         self._unsent, self._why = 0, ""
 
     def take(self, state: JudgedState | None, told: Mapping[str, Any]) -> None:
-        """Send what there is to say; a lost state has no odometry, only the heartbeat says so."""
+        """Send the messages of a state; for a lost one only the heartbeat, without odometry."""
         found = state if state is not None and not state.lost else None
         time = float(told["time"])
         if not self._beat <= time < self._beat + HEARTBEAT:
@@ -114,14 +114,14 @@ class MavlinkSender:
             self._mav.send(odometry_message(odometry, quality, found.reset_counter))
 
     def write(self, message: bytes) -> None:
-        """Send the bytes of a message, or count that it cannot be."""
+        """Send the bytes of a message, or count it as unsent."""
         try:
             self._socket.sendto(message, self._to)
         except OSError as error:
             self._unsent, self._why = self._unsent + 1, error.strerror or str(error)
 
     def close(self) -> str | None:
-        """End; return what went wrong."""
+        """Close; return an error."""
         self._socket.close()
         if not self._unsent:
             return None
@@ -147,14 +147,14 @@ def _resolved(address: str) -> tuple[int, Any]:
     host, _, port = place.rpartition(":")
     if kind != "udpout" or not host or not (port.isdecimal() and 0 < int(port) < 65536):
         raise InputError(
-            f"--mavlink {address!r}: is no address to send to; write {_ADDRESS}, as in"
+            f"--mavlink {address!r}: is not an address to send to; write {_ADDRESS}, e.g."
             " udpout:192.168.4.1:14540"
         )
     try:
         found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as error:
         raise InputError(
-            f"--mavlink {address!r}: the host {host} is not known"
+            f"--mavlink {address!r}: the host {host} is unknown"
             f" ({getattr(error, 'strerror', None) or error}); give its IP address"
         ) from error
     family, _, _, _, to = found[0]

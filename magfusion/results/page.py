@@ -1,7 +1,7 @@
-"""A result as one page for those who review a measurement: ``report.html``.
+"""A result as one page for reviewers of a measurement: ``report.html``.
 
-The page is one file that asks nothing of the network: pictures are inside, there is no script, and
-all that comes from a file of the user's (a beacon's name, a path) is escaped.
+The page is one file without network access: pictures are embedded, there is no script, and all
+content from a user's file (a beacon's name, a path) is escaped.
 """
 
 import base64
@@ -35,38 +35,38 @@ PAGE = "report.html"
 LARGEST = 4_500_000  # bytes, of which a mail takes one
 FAR = 3.0  # sigmas; a change beyond is marked
 _MEANING = {
-    "trustworthy": "Nothing in the data speaks against it; its claimed accuracy holds.",
-    "doubtful": "Use it with care, for these reasons; what is claimed of the accuracy of a pose has"
-    " been widened to cover them.",
-    "failed": "It must not be used: what is shown below is kept for diagnosis only.",
+    "trustworthy": "The data are consistent; the reported accuracy is valid.",
+    "doubtful": "Use with care, for these reasons; the reported accuracy of a pose is enlarged to"
+    " cover them.",
+    "failed": "Do not use: the content below is for diagnosis only.",
 }
-NO_JUDGE = "This job judges nothing."
+NO_JUDGE = "This job has no verdict."
 _CAPTIONS = {
-    "antenna": "Antennas: residuals, and what was found",
-    "attitude": "Angles found over time, and their errors where there is a truth",
-    "attitudes": "Attitudes that the database holds",
+    "antenna": "Antennas: residuals and estimates",
+    "attitude": "Estimated angles over time, and their errors against the truth, if any",
+    "attitudes": "Attitudes in the database",
     "beacon": "Beacons: residuals of the survey",
-    "calibration": "What the log determined: sigma after over sigma before",
-    "check": "Spectrum, signal to noise, and the two free compasses: gravity and steady field",
+    "calibration": "Observability of the calibration: posterior sigma over prior sigma",
+    "check": "Spectrum, signal to noise, gravity and static field",
     "coverage": "Where the installation can navigate",
     "design": "Protection levels before and after",
-    "drift": "Errors and claims over the days",
-    "field_map": "Where the beacons' fields differ from their model",
+    "drift": "Errors and their sigmas over the days",
+    "field_map": "Deviation of the beacons' fields from their model",
     "magnetometer": "Magnetometer: field before and after",
-    "motion": "Where to hold the platform next, and what that determines",
-    "range": "Where the magnet's well is, down the hole and by depth",
+    "motion": "Next stops of the platform, and the parameters they determine",
+    "range": "Position of the magnet's well, down the hole and by depth",
     "stability": "Stability of the estimates",
-    "survey": "Places of the survey",
+    "survey": "Points of the survey",
 }
 
 
 def write_page(directory: Path, figures: Figures, motion: Motion | None = None) -> None:
-    """Write ``report.html`` with the pictures (``.png``) that lie in the directory.
+    """Write ``report.html`` with the pictures (``.png``) in the directory.
 
     Parameters
     ----------
     motion : Motion, optional
-        Where the job found one.
+        The estimated motion, if any.
     """
     blocks = _head(figures)
     if motion is not None:
@@ -77,9 +77,9 @@ def write_page(directory: Path, figures: Figures, motion: Motion | None = None) 
         ]
     blocks.append(_section("Calibration, before and after", _calibration(figures)))
     after = [
-        _section("What was refused or left out", _refused(figures, motion)),
+        _section("Rejected or omitted data", _refused(figures, motion)),
         _section("Notes", _list(_notes(figures))),
-        _section("How it was run", _how(current_run())),
+        _section("Command, inputs and versions", _how(current_run())),
         _section("All figures of report.json", _all(figures)),
     ]
     room = LARGEST - sum(len(block.encode()) for block in (*blocks, *after, STYLE))
@@ -96,7 +96,7 @@ def write_page(directory: Path, figures: Figures, motion: Motion | None = None) 
 
 
 def head_in_notebook(figures: Figures, unjudged: str = NO_JUDGE) -> str:
-    """Return the head of the page as a part of another one, whose own style it leaves alone.
+    """Return the head of the page as a part of another page, with its style in its own scope.
 
     Parameters
     ----------
@@ -104,17 +104,17 @@ def head_in_notebook(figures: Figures, unjudged: str = NO_JUDGE) -> str:
         Shown where there is no verdict.
     """
     parts = "\n".join(filter(None, _head(figures, unjudged)))
-    # The rules of a style sheet within those of a class are of what lies in elements of it.
+    # The rules of a style sheet nested in a class apply to elements inside it.
     style = f"<style>.magfusion{{{STYLE}}}</style>"
     return f'<div class="magfusion">{style}<div class="page">\n{parts}\n</div></div>'
 
 
 def _head(figures: Figures, unjudged: str = NO_JUDGE) -> list[str]:
-    """Return title, verdict and main figures; what is empty has no place."""
+    """Return title, verdict and main figures, without empty sections."""
     return [
         f"<h1>magfusion {escape(_name(figures))}</h1>",
         _verdict(figures, unjudged),
-        _section("Held, and not checked by these data", _unverified(figures)),
+        _section("Fixed, not observable in this log", _unverified(figures)),
         _section("Logs", "".join(_table(log_rows(f)) for f in figures.of(Section.LOGS))),
         _section("Main figures", _main(figures)),
     ]
@@ -164,8 +164,8 @@ def _unverified(figures: Figures) -> str:
     if not rows:
         return ""
     said = (
-        "<p>These parameters were taken as declared. Were one of them wrong by its declared sigma,"
-        " nothing in the data would tell, and the pose would be wrong by:</p>"
+        "<p>These parameters are fixed at their declared values. If one of them were wrong by its"
+        " declared sigma, the data would not show it, and the pose would be wrong by:</p>"
     )
     head = ["parameter", "declared sigma", "position (mm)", "attitude (deg)"]
     return said + _table([head, *rows])
@@ -180,7 +180,7 @@ def _main(figures: Figures) -> str:
 
 
 def _calibration(figures: Figures) -> str:
-    """Return what is known of each parameter before and after, from its declared value on."""
+    """Return the estimate of each parameter before and after, starting at its declared value."""
     estimates = [f for f in figures.all if isinstance(f, Estimate)]
     if not estimates:
         return ""
@@ -197,8 +197,8 @@ def _calibration(figures: Figures) -> str:
         told = "" if change is None else f"{change:+.2f}"
         rows.append([one.key, before, after, told, "yes" if one.determined else "no"])
     said = (
-        "<p>Each with one sigma; the change is in sigmas of what was declared, and marked beyond"
-        f" {FAR:g}. What these data do not determine stays as uncertain as it was.</p>"
+        "<p>Each with one sigma; the change is in sigmas of the declared value, and marked beyond"
+        f" {FAR:g}. Parameters that these data do not determine keep their uncertainty.</p>"
     )
     return said + _table([head, *rows], far)
 
@@ -215,7 +215,7 @@ def _refused(figures: Figures, motion: Motion | None) -> str:
     rows = [[labelled(f), number_text(f.value)] for f in figures.all if f.refused and f.value]
     rows += [[what, str(n)] for what, n in ([] if motion is None else excluded_rows(motion))]
     if rows:
-        return _table([["what, and why", "count"], *rows])
+        return _table([["data and reason", "count"], *rows])
     return "<p>Nothing.</p>" if any(f.refused for f in figures.all) else ""
 
 
@@ -234,7 +234,7 @@ def _pictures(directory: Path, room: int) -> str:
         caption = escape(_CAPTIONS.get(path.stem, path.stem))
         size = 4 * path.stat().st_size // 3 + 200
         if size > room:
-            parts.append(f"<p>{caption}: see {escape(path.name)}, beside this page.</p>")
+            parts.append(f"<p>{caption}: see {escape(path.name)}, in the same directory.</p>")
             continue
         room -= size
         data = base64.b64encode(path.read_bytes()).decode()
@@ -290,7 +290,7 @@ def _list(items: Iterable[str]) -> str:
 
 
 def _table(rows: Sequence[Sequence[str]], marked: Iterable[int] = ()) -> str:
-    """Return a table, its head first (empty for none), some of its rows marked."""
+    """Return a table, its head first (empty for none), with some rows marked."""
     head, *body = rows
     marked = set(marked)
     parts = ["<tr>", *(f"<th>{escape(cell)}</th>" for cell in head), "</tr>"] if head else []

@@ -1,4 +1,4 @@
-"""What a page shows of a motion: its path, its errors or sigmas in time, residuals by beacon."""
+"""Motion on a page: its path, its errors or sigmas over time, residuals by beacon."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ _GAP = 10.0  # times the usual step; a line across it would invent states
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A trajectory with what is known of it; as `magfusion.results.recording.write_recording`.
+    """A trajectory with its results; as `magfusion.results.recording.write_recording`.
 
     Parameters
     ----------
     residual : ndarray, shape (n,), optional
-        Of each state, RMS over all beacons, where those of each are not known.
+        Of each state, RMS over all beacons, where those of each are unknown.
     """
 
     site: Site
@@ -76,7 +76,7 @@ def error_section(motion: Motion) -> tuple[str, str]:
         return "Errors against the truth", _charts([*_of_axes(motion.errors), *size_charts(motion)])
     charts = size_charts(motion)
     return (
-        ("Claimed accuracy (there is no truth to compare with)", _charts(charts))
+        ("Estimated accuracy (no truth available)", _charts(charts))
         if charts
         else (
             "",
@@ -86,7 +86,7 @@ def error_section(motion: Motion) -> tuple[str, str]:
 
 
 def residual_section(motion: Motion) -> str:
-    """Return a chart for each beacon; one scale, so that the worst stands out."""
+    """Return a chart for each beacon, all with one scale, so that the worst is visible."""
     found = {f"Beacon {name}": rows for name, rows in (motion.innovations or {}).items()}
     if motion.residual is not None:
         found["All beacons together"] = (motion.states.time, motion.residual)
@@ -106,15 +106,15 @@ def residual_section(motion: Motion) -> str:
     left = len(found) - len(charts)
     more = f"<p>{left} more beacons are in run.rrd.</p>" if left else ""
     return (
-        "<p>What the fields leave unexplained, in units of its declared sigma: about 1 (the line)"
-        " where noise and model are as declared; values above the frame are drawn at its edge.</p>"
+        "<p>Residuals of the fields, in units of their declared sigma: about 1 (the line) where"
+        " noise and model are as declared; values above the frame are drawn at its edge.</p>"
         + _charts(charts)
         + more
     )
 
 
 def excluded_rows(motion: Motion) -> list[tuple[str, int]]:
-    """Return of how many states each beacon was left out."""
+    """Return the number of states in which each beacon was excluded."""
     counts: dict[str, int] = {}
     for names in () if motion.trust is None else motion.trust.excluded:
         for name in names:
@@ -231,7 +231,7 @@ def _interrupted(states: Trajectory) -> Array:
 
 
 def _beacons_near(motion: Motion) -> tuple[list[Mark], list[str]]:
-    """Return those that the plan can show, and what is to be said of the others."""
+    """Return the beacons inside the plan, and a note on the others."""
     path = motion.states.position_world[:, :2]
     low, high = path.min(axis=0), path.max(axis=0)
     reach = _FAR * max(float(np.max(high - low)), 3.0)

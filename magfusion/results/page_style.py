@@ -1,4 +1,4 @@
-"""What pages look like: one style sheet, for screen and paper."""
+"""Style of pages: one style sheet, for screen and paper."""
 
 STYLE = """
 .page{margin:0 auto;max-width:1080px;padding:0 20px 40px;background:#fff;color:#1d2530;

@@ -1,8 +1,8 @@
-"""What the fields of one window tell of a pose, and what they still tell without one beacon.
+"""Information of one window's fields on a pose, and its remainder without one beacon.
 
-The rows are whitened as in the solvers; what the survey leaves open is marginalised by QR of
-Jacobian and prior: where the survey is fine and the field strong, the difference of normal matrices
-would leave only rounding.
+The rows are whitened as in the solvers.  Uncertain survey parameters are marginalised by QR of
+Jacobian and prior: for an accurate survey and a strong field, the difference of normal matrices
+would be dominated by rounding.
 """
 
 from collections.abc import Sequence
@@ -35,13 +35,13 @@ class PoseRows:
     Parameters
     ----------
     by_pose : ndarray, shape (n, rows, 6)
-        Rotation, then position, body axes; the position alone where the attitude is known.
+        Rotation, then position, body axes; the position alone for a known attitude.
     by_nuisance : ndarray, shape (n, rows, nuisances)
-        By what the survey leaves open.
+        By the uncertain survey parameters.
     owner : int ndarray, shape (rows,)
         Beacon of each row.
     detected : int ndarray, shape (n,)
-        How many beacons are heard above the noise.
+        Number of beacons detected above the noise.
     """
 
     by_pose: Array
@@ -50,22 +50,21 @@ class PoseRows:
     detected: IntArray
 
     def without(self, beacon: int) -> "PoseRows":
-        """Return the rows as they are without one beacon: its own are empty."""
+        """Return the rows without one beacon: its own are empty."""
         kept = (self.owner != beacon)[:, None]
         return replace(self, by_pose=self.by_pose * kept, by_nuisance=self.by_nuisance * kept)
 
     def at_known_attitude(self) -> "PoseRows":
-        """Return the rows with the attitude known from elsewhere."""
+        """Return the rows with the attitude known independently."""
         return replace(self, by_pose=self.by_pose[..., 3:])
 
 
 def phasor_variance(site: Site, window: float) -> Array:
-    """Return the variance that white noise leaves in each phasor component, (channels,) (T^2).
+    """Return the variance of each phasor component due to white noise, (channels,) (T^2).
 
     A tone fitted to ``N = T rate`` samples of variance ``d^2 rate / 2`` (``d`` the one-sided
     density) has the variance ``2 / N`` of theirs in its cosine and in its sine: ``d^2 / T``,
-    whatever the rate.  Coils driven in turn share the window.  What a beacon's `noise_factor` says
-    of its phasors counts.
+    at any rate.  Coils driven in turn share the window.  A beacon's `noise_factor` is included.
     """
     slots = [slot for b in site.beacons for _, slot in b.tones]
     turns = 1 + max((slot for slot in slots if slot is not None), default=0)
@@ -86,7 +85,7 @@ def whitened(
     Parameters
     ----------
     variance : ndarray, shape (channels,)
-        Of a phasor's components by noise alone (T^2).
+        Of a phasor's components, due to noise alone (T^2).
     attitude : ndarray, shape (3, 3)
         world_from_body, the same everywhere.
     position_world : ndarray, shape (n, 3)
@@ -122,12 +121,12 @@ def whitened(
 
 
 def is_free(blocks: tuple[Block, ...]) -> BoolArray:
-    """Tell of which nuisances nothing is known beforehand, shape (nuisances,)."""
+    """Return which nuisances have no prior, shape (nuisances,)."""
     return np.array([b.parameter == PHASE for b in blocks for _ in b.sigma], dtype=bool)
 
 
 def prior_of(site: Site, blocks: tuple[Block, ...]) -> tuple[Array, Array]:
-    """Return what makes nuisances of unit ones, and the rows that say these are about zero."""
+    """Return the scale from unit nuisances, and the prior rows of these about zero."""
     free = is_free(blocks)
     spread = prior_sqrt_covariance(site, blocks)
     spread[free, free] = 1.0
@@ -140,11 +139,11 @@ def root_information(seen: PoseRows, spread: Array, prior: Array, shared: int = 
     Parameters
     ----------
     spread : ndarray, shape (nuisances, nuisances)
-        What makes nuisances of those that the prior is of.
+        Scale from the nuisances of the prior.
     prior : ndarray, shape (k, nuisances)
         Rows of the prior.
     shared : int
-        So many of the last nuisances stay, in front of the pose.
+        Number of the last nuisances that remain, in front of the pose.
 
     Returns
     -------
@@ -152,7 +151,7 @@ def root_information(seen: PoseRows, spread: Array, prior: Array, shared: int = 
     """
     told = np.any(seen.by_nuisance, axis=(0, 1)) | np.any(prior, axis=0)
     told[len(told) - shared :] = True
-    # A column of zeros would take a row of the triangle with it that others need.
+    # A column of zeros would use a row of the triangle that others need.
     by_nuisance, prior = (seen.by_nuisance @ spread)[..., told], prior[:, told]
     count, _, width = by_nuisance.shape
     known = np.zeros((count, len(prior), width + seen.by_pose.shape[-1]))
@@ -169,7 +168,7 @@ def root_information(seen: PoseRows, spread: Array, prior: Array, shared: int = 
 def bound(sqrt_information: Array) -> tuple[Array, BoolArray]:
     """Return the pose's covariance, shape (n, 6, 6), and whether it is determined, shape (n,).
 
-    An attitude that is known has no variance; infinite where a direction is open.
+    A known attitude has no variance; infinite where a direction is undetermined.
     """
     length = np.linalg.norm(sqrt_information, axis=1)
     length = np.where(length > 0.0, length, 1.0)
@@ -189,8 +188,8 @@ def protected(
 ) -> Array:
     """Return the protection levels of position (m) and attitude (deg), shape (n, 2).
 
-    Those of `magfusion.estimation.posterior.separation` with the covariances that a best estimate
-    has: nothing is measured yet.  Infinite where there is none.
+    Those of `magfusion.estimation.posterior.separation` with the covariances of a best estimate,
+    without measurements.  Infinite where there is none.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How a result came about: command, options, input files, version, date and duration."""
+"""Provenance of a result: command, options, input files, version, date and duration."""
 
 import hashlib
 import platform
@@ -26,13 +26,13 @@ class Run:
     Parameters
     ----------
     command : str
-        As it was typed.
+        As typed.
     options : mapping
         Value of every option.
     given : set of str
-        Those that were typed rather than left at their defaults.
+        Those typed rather than left at their defaults.
     inputs : tuple of Path
-        Files and directories that were named.
+        Input files and directories.
     """
 
     command: str
@@ -44,17 +44,17 @@ class Run:
 
     @property
     def elapsed(self) -> float:
-        """Since it began (s)."""
+        """Elapsed time (s)."""
         return time.perf_counter() - self.began
 
 
-# A job knows its settings and not the command: pages are written many calls below it.
+# A job has its settings and not the command: pages are written many calls below it.
 _RUN: ContextVar[Run | None] = ContextVar("run", default=None)
 
 
 @contextmanager
 def recorded_as(run: Run) -> Iterator[None]:
-    """Say what the results that are written meanwhile came of."""
+    """Record the run as the provenance of results written meanwhile."""
     token = _RUN.set(run)
     try:
         yield
@@ -63,13 +63,13 @@ def recorded_as(run: Run) -> Iterator[None]:
 
 
 def current_run() -> Run | None:
-    """Return the run that is being done; None in a program of the user's own."""
+    """Return the current run; None in a program of the user's own."""
     return _RUN.get()
 
 
 @cache
 def versions() -> str:
-    """Return the versions of what computed."""
+    """Return the versions of the software."""
     known = commit()
     at = f" (commit {known})" if known else ""
     libraries = [f"{name} {_version(name)}" for name in _LIBRARIES]
@@ -80,7 +80,7 @@ def versions() -> str:
 
 
 def input_files(run: Run) -> list[tuple[str, int, str]]:
-    """Return name, size (bytes) and SHA-256 of the files that were named, or lie in directories."""
+    """Return name, size (bytes) and SHA-256 of the input files, also those in directories."""
     found = []
     for path in run.inputs:
         own = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
@@ -90,7 +90,7 @@ def input_files(run: Run) -> list[tuple[str, int, str]]:
 
 def _sha256(path: Path) -> str:
     if path.stat().st_size > LARGEST_HASHED:
-        return f"not taken (above {LARGEST_HASHED >> 20} MiB)"
+        return f"not computed (above {LARGEST_HASHED >> 20} MiB)"
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

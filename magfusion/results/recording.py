@@ -1,4 +1,4 @@
-"""Recordings for the rerun viewer: the scene in three dimensions beside the error plots."""
+"""Recordings for the rerun viewer: the scene in three dimensions with the error plots."""
 
 import subprocess
 import sys
@@ -85,18 +85,18 @@ def write_recording(
     path : Path
         Of the ``.rrd`` file; ``open_viewer`` shows it.
     site : Site
-        Beacons as the estimator knows them.
+        Beacons as known to the estimator.
     trajectory : Trajectory
-        The estimate; its biases and covariance are drawn where it has them.
+        The estimate; its biases and covariance are drawn if available.
     errors : TrajectoryErrors, optional
         Of the estimate against the truth.
     innovations : mapping, optional
         Of each beacon: times (s) and RMS of the whitened residual at them, one where noise and
         model are as declared.
     trust : Trust, optional
-        The verdict and its reasons, shown above all.
+        The verdict and its reasons, shown above all views.
     states : StateTrust, optional
-        Of the states of the trajectory: protection levels and where it is in doubt.
+        Of the states of the trajectory: protection levels and doubtful states.
     carried : Trajectory, optional
         The states between those of the trajectory: the body moves along them.
     """
@@ -129,7 +129,7 @@ def write_recording(
 
 
 def _summary(trajectory: Trajectory, errors: TrajectoryErrors | None) -> str:
-    """Return how long the path is, how well it is known, and how well it is met."""
+    """Return the path's length, its sigmas, and its errors."""
     time = trajectory.time
     said = [f"{len(time)} poses in {time[-1] - time[0]:.3g} s"]
     if trajectory.pose_cov is not None:
@@ -147,7 +147,7 @@ def _summary(trajectory: Trajectory, errors: TrajectoryErrors | None) -> str:
 
 
 def open_viewer(path: Path) -> None:
-    """Show a recording in a viewer of its own, and return at once.
+    """Show a recording in a separate viewer, and return at once.
 
     Raises
     ------
@@ -215,7 +215,7 @@ def _log_path(
 
 
 def _log_beads(recording: rr.RecordingStream, truth: Trajectory, scale: Scale) -> None:
-    """Put beads on the true path: a line would vanish in that of a good estimate."""
+    """Put beads on the true path: a line would be hidden by that of a good estimate."""
     places = beads(truth.position_world, 0.02 * scale.size)
     points = rr.Points3D(places[rows_of(len(places))], radii=0.004 * scale.size, colors=_TRUTH)
     recording.log("world/truth/beads", points, static=True)
@@ -264,7 +264,7 @@ def _log_legend(
         "| **blue line, box** | estimate; body axes x red, y green, z blue |",
     ]
     if has_carried:
-        lines.append("| **yellow line** | states of now, carried between field epochs |")
+        lines.append("| **yellow line** | current states, propagated between field epochs |")
     if has_truth:
         lines.append("| **green beads** | true path, with its gaps |")
     if trajectory.pose_cov is not None:
@@ -292,7 +292,7 @@ def _by_axis(kind: ErrorPlot, errors: TrajectoryErrors, span: rr.TimeRange) -> r
 
 
 def scene_view(site: Site, scale: Scale, name: str = "Scene") -> rrb.Spatial3DView:
-    """Return the view of all that is in the world, the beacons' shells hidden."""
+    """Return the view of all entities in the world, the beacons' shells hidden."""
     # Shells would hide the path and catch every click; the viewer's own panel shows them.
     hidden = rrb.EntityBehavior(interactive=False, visible=False)
     return rrb.Spatial3DView(
@@ -305,7 +305,7 @@ def scene_view(site: Site, scale: Scale, name: str = "Scene") -> rrb.Spatial3DVi
 
 
 class _Drawn(NamedTuple):
-    """What is drawn beside the scene."""
+    """Plots next to the scene."""
 
     trajectory: Trajectory
     errors: TrajectoryErrors | None

@@ -28,7 +28,7 @@ def write_coverage_recording(
     spacing : float
         Of the points (m).
     extra : Beacon, optional
-        Where one more beacon adds most.
+        Best position of one more beacon.
     """
     places = np.vstack([found.position_world, *(b.position_world for b in site.beacons)])
     low, high = places.min(axis=0), places.max(axis=0)
@@ -41,7 +41,7 @@ def write_coverage_recording(
                 [extra.position_world],
                 radii=0.012 * scale.size,
                 colors=_EXTRA,
-                labels="one more beacon adds most here",
+                labels="best position of one more beacon",
             )
             recording.log("world/extra_beacon", mark, static=True)
         legend = rr.TextDocument(_legend(found, extra), media_type=rr.MediaType.MARKDOWN)
@@ -84,17 +84,17 @@ def _legend(found: Coverage, extra: Beacon | None) -> str:
     lines.append(f"| **grey** | not determined | {100 * np.mean(~found.determined):.0f} % |")
     lines += [
         "",
-        "The Cramér-Rao bound: no estimator does better from one window of the fields alone.",
+        "The Cramér-Rao bound: no estimator is better with one window of the fields alone.",
         "",
-        "A line through a point is the direction in which it is least certain.",
+        "A line through a point is the direction of its largest uncertainty.",
         "",
         "Arrows and loops are the beacons' moments and coils; a square of the grid is 1 m.",
     ]
     if extra is not None:
-        lines += ["", "The white ball is where one more beacon adds most."]
+        lines += ["", "The white ball is the best position of one more beacon."]
     return "\n".join(lines)
 
 
 def _blueprint(site: Site, scale: Scale) -> rrb.Blueprint:
-    scene = scene_view(site, scale, "Position sigma that one window allows")
+    scene = scene_view(site, scale, "Position sigma from one window")
     return layout(scene, rrb.TextDocumentView(origin="legend", name="Legend"), shares=(3, 1))

@@ -121,12 +121,12 @@ def _legend(panels: list[Panel], between: Array) -> str:
     worst = " | ".join(
         length(float(np.max(p.level))) if np.all(np.isfinite(p.level)) else "none" for p in panels
     )
-    lines += [f"| worst | | {worst} |", "", "How far a fix may err, one beacon false unnoticed."]
-    lines += ["", "The beacons that were chosen; a white line is the axis:", ""]
+    lines += [f"| worst | | {worst} |", "", "Bound of a fix's error with one undetected fault."]
+    lines += ["", "The selected beacons; a white line is the axis:", ""]
     lines += ["| beacon | x, y, z (m) | Hz | A m² |", "|---|---|---|---|"]
     for beacon in panels[-1].site.beacons:
         place = ", ".join(f"{v:.3g}" for v in beacon.position_world)
         tones = ", ".join(f"{f:g}" for f in beacon.tone_frequencies_hz)
         lines.append(f"| {beacon.name} | {place} | {tones} | {peak_moment(beacon):.3g} |")
-    lines += ["", "Red lines: where no beacon may be. A square of the grid is 1 m."]
+    lines += ["", "Red lines: forbidden for beacons. A square of the grid is 1 m."]
     return "\n".join(lines)

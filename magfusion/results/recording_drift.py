@@ -82,7 +82,7 @@ def _log_consistency(recording: rr.RecordingStream, course: Course) -> None:
 
 
 def _hourly(course: Course) -> tuple[Array, dict[str, Array]]:
-    """Return hourly means, the first and the last held to the ends: one hour is a line too."""
+    """Return hourly means, the first and the last extended to the ends: one hour is a line too."""
     hours, levels = course.hourly()
     ends = course.errors.time[[0, -1]]
     time = np.concatenate([ends[:1], np.clip(HOUR * hours, *ends), ends[1:]])
@@ -132,7 +132,7 @@ def _blueprint(courses: list[Course], banner: tuple[str, str]) -> rrb.Blueprint:
 def _side_by_side(
     courses: list[Course], quantities: tuple[Quantity, ...], name: str
 ) -> rrb.Horizontal:
-    """Return a column an estimator, errors of one quantity on one scale."""
+    """Return a column per estimator, errors of one quantity on one scale."""
     columns = []
     values = {q.name: about_zero(*(s for c in courses for s in _drawn(c, q))) for q in quantities}
     for course in courses:
@@ -154,7 +154,7 @@ def _own_columns(courses: list[Course]) -> rrb.Horizontal:
     for course in courses:
         span, (_, levels) = span_of(course.errors.time), _hourly(course)
         squared = readable_range(np.ones(1), *levels.values(), zero=True)
-        name = f"{_title(course)}: hourly squares in units of the claimed (1 expected)"
+        name = f"{_title(course)}: hourly squares relative to the estimated (1 expected)"
         views = [plot(f"{course.name}/consistency", name, span, squared)]
         for place, (_, values) in _pace(course).items():
             title = f"{_title(course)}: {_PACE[place]}"

@@ -1,4 +1,4 @@
-"""A recording on its way into a file, complete or not at all."""
+"""Output of a recording to a file, complete or not at all."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +13,7 @@ from magfusion.files.atomic import whole_file
 def whole_recording(path: Path, name: str) -> Iterator[rr.RecordingStream]:
     """Yield a recording that is written to ``path`` if nothing fails.
 
-    It is kept in memory until then: rerun's own file sink only logs that a disk is full.
+    It is kept in memory until then: rerun's own file sink only logs a full disk.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How a recording opens: the views side by side, their axes, and the verdict above them."""
+"""Initial layout of a recording: the views side by side, their axes, and the verdict above."""
 
 import math
 from typing import Literal
@@ -19,22 +19,22 @@ Part = rrb.Container | rrb.View
 
 
 def readable_range(*shown: Array, zero: bool = False) -> tuple[float, float] | None:
-    """Return a range in which the viewer labels two values at least.
+    """Return a range in which the viewer labels at least two values.
 
-    It labels powers of ten and their multiples, and of these only what stands apart far enough:
-    of a low plot over +-4, zero alone.
+    It labels powers of ten and their multiples, and of these only sufficiently spaced ones: in a
+    low plot over +-4, only zero.
 
     Parameters
     ----------
     shown : ndarray
-        What is drawn; not-a-number is not.
+        The drawn values, which may be NaN.
     zero : bool
         Whether zero is in the range.
 
     Returns
     -------
     tuple of float, optional
-        None where nothing is drawn, or nothing but one value.
+        None for no value or a single one.
     """
     values = np.concatenate([np.ravel(one) for one in shown]) if shown else np.empty(0)
     values = values[np.isfinite(values)]
@@ -52,7 +52,7 @@ def readable_range(*shown: Array, zero: bool = False) -> tuple[float, float] | N
 
 
 def about_zero(*shown: Array) -> tuple[float, float] | None:
-    """Return a readable range with zero in its middle."""
+    """Return a readable range symmetric about zero."""
     return readable_range(*shown, *(-np.asarray(one) for one in shown))
 
 
@@ -77,11 +77,11 @@ def plot(
     Parameters
     ----------
     name : str
-        What a reader is told: the quantity with its unit.
+        Title: the quantity with its unit.
     span : TimeRange, optional
         Of the horizontal axis.
     values : tuple of float, optional
-        Of the vertical axis, as of `readable_range`; found by the viewer if not given.
+        Of the vertical axis, from `readable_range`; by default set by the viewer.
     """
     return rrb.TimeSeriesView(
         origin=origin,
@@ -108,14 +108,14 @@ def layout(
     banner: tuple[str, str] | None = None,
     play: Literal["paused", "following"] = "paused",
 ) -> rrb.Blueprint:
-    """Return a layout of parts side by side, the viewer's own panels out of the way.
+    """Return a layout of parts side by side, with the viewer's own panels collapsed.
 
     Parameters
     ----------
     banner : tuple of str, optional
-        Entity of a text that stands above them, and this text, which tells how high it is.
+        Entity of the text above them, and this text, which determines its height.
     play : {'paused', 'following'}
-        Whether the time waits for the reader, or follows what comes.
+        Whether the time is paused, or follows the data.
     """
     body: rrb.Container = rrb.Horizontal(*parts, column_shares=list(shares))
     if banner is not None:

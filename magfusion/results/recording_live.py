@@ -1,4 +1,4 @@
-"""The rerun viewer, fed while the platform moves."""
+"""The rerun viewer with live states."""
 
 import numpy as np
 import rerun as rr
@@ -48,7 +48,7 @@ class LiveView:
         recording.send_blueprint(_blueprint())
 
     def show(self, state: State, distortion: dict[str, float]) -> None:
-        """Draw a state, and how well each beacon's field is explained."""
+        """Draw a state, and the residual of each beacon's field."""
         recording = self.recording
         recording.set_time(TIMELINE, duration=state.time)
         turn = Rotation.from_matrix(state.world_from_body).as_quat()
@@ -77,7 +77,7 @@ class LiveView:
             recording.log(_innovation(name), rr.Scalars(float(np.sqrt(level))))
 
     def _extend(self, place: list[float]) -> None:
-        """Draw the path in strips, so that no message grows with the run."""
+        """Draw the path in strips, so that message size does not grow with the run."""
         self._path.append(place)
         strip = rr.LineStrips3D([self._path], radii=rr.Radius.ui_points(1.2), colors=_PATH)
         self.recording.log(f"world/estimate/path/{self._strips}", strip, static=True)
@@ -90,7 +90,7 @@ def _innovation(beacon: str) -> str:
 
 
 def open_live_view(site: Site) -> LiveView:
-    """Open a viewer that waits for states.
+    """Open a viewer for live states.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def open_live_view(site: Site) -> LiveView:
         recording.spawn()
     except RuntimeError as error:
         raise InputError(
-            f"--live: the viewer cannot be started ({str(error).splitlines()[0]}); leave it out"
+            f"--live: the viewer cannot be started ({str(error).splitlines()[0]}); omit it"
         ) from error
     return LiveView(site, recording)
 

@@ -19,12 +19,12 @@ _BEACONS = ((240, 165, 30), (205, 115, 220), (245, 100, 60), (240, 228, 66), (30
 
 
 def beacon_colour(index: int) -> tuple[int, int, int]:
-    """Return the colour of a beacon by its place in the site."""
+    """Return the colour of a beacon by its index in the site."""
     return _BEACONS[index % len(_BEACONS)]
 
 
 def rows_of(count: int, limit: int = MAX_ROWS) -> IntArray:
-    """Return rows, evenly, of a series that may be too long."""
+    """Return evenly spaced rows of a series that may be too long."""
     return np.unique(np.linspace(0, count - 1, min(count, limit)).astype(np.int64))
 
 
@@ -71,7 +71,7 @@ def log_position(
 
 
 class ErrorPlot(NamedTuple):
-    """Plots of the components of an error, with what they are called."""
+    """Plots of the components of an error, with their names."""
 
     place: str
     name: str
@@ -87,7 +87,7 @@ class ErrorPlot(NamedTuple):
         return self.scale * error, None if sigma is None else self.scale * sigma
 
     def title(self, axis: str, sigma: bool) -> str:
-        """Return what stands above the plot of a component."""
+        """Return the title of a component's plot."""
         grey = "; grey: 3 sigma" if sigma else ""
         return f"{self.name} {self.axes} {axis} ({self.unit}){grey}"
 
@@ -116,7 +116,7 @@ def log_errors(recording: rr.RecordingStream, errors: TrajectoryErrors) -> None:
 
 
 def biases(trajectory: Trajectory) -> tuple[tuple[str, str, float, Array | None], ...]:
-    """Return of each bias: its plot, what it is called, from SI to its unit, and the bias."""
+    """Return for each bias: its plot, its name, the factor from SI to its unit, and the bias."""
     gyro, accel = trajectory.gyro_bias_body, trajectory.accel_bias_body
     return (
         ("plots/gyro_bias_deg_s", "Gyro bias (deg/s)", float(np.rad2deg(1.0)), gyro),
@@ -139,7 +139,7 @@ def log_innovations(
     innovations: Mapping[str, tuple[Array, Array]],
     span: Array,
 ) -> None:
-    """Draw the whitened residuals of each beacon, and what is expected."""
+    """Draw the whitened residuals of each beacon, and their expectation."""
     colours = {beacon.name: beacon_colour(i) for i, beacon in enumerate(site.beacons)}
     for name, (time, rms) in innovations.items():
         present = np.isfinite(rms)

@@ -1,4 +1,4 @@
-"""What a recording shows of trust: the verdict above all, doubtful states, protection levels."""
+"""Trust in a recording: the verdict above all, doubtful states, protection levels."""
 
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ _LEVEL = (250, 190, 40)
 
 
 class LevelPlot(NamedTuple):
-    """A plot of the length of an error below its protection level."""
+    """A plot of the length of an error and its protection level."""
 
     place: str
     name: str
@@ -53,12 +53,12 @@ def banner_text(verdict: Verdict, lines: list[str]) -> str:
 
 
 def log_verdict(recording: rr.RecordingStream, trust: Trust, summary: str) -> tuple[str, str]:
-    """Write the verdict, its reasons, and what nothing has checked; return entity and text."""
+    """Write the verdict, its reasons, and unverified parameters; return entity and text."""
     lines = [f"- {summary}", *(f"- **{reason.text}**" for reason in trust.reasons)]
     lines += [f"- *noticed:* {remark.text}" for remark in trust.remarks]
     if trust.unverified:
         names = ", ".join(one.name for one in trust.unverified)
-        lines.append(f"- *held, and not checked by these data:* {names}")
+        lines.append(f"- *fixed, not observable in this log:* {names}")
     text = banner_text(trust.verdict, lines)
     recording.log(BANNER, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
     return BANNER, text
@@ -67,7 +67,7 @@ def log_verdict(recording: rr.RecordingStream, trust: Trust, summary: str) -> tu
 def log_doubtful(
     recording: rr.RecordingStream, trajectory: Trajectory, states: StateTrust, radius: float
 ) -> None:
-    """Mark the states that are not trusted on the path, where they are not all alike."""
+    """Mark the untrusted states on the path, where not all have the same verdict."""
     if len(set(states.verdict)) < 2:
         return
     for verdict, colour in ((Verdict.DOUBTFUL, _DOUBTFUL), (Verdict.FAILED, _FAILED)):
@@ -88,12 +88,12 @@ def log_levels(
     states: StateTrust,
     errors: TrajectoryErrors | None,
 ) -> None:
-    """Draw the protection levels beside three sigmas and the errors' lengths."""
+    """Draw the protection levels with three sigmas and the errors' lengths."""
     if not has_levels(states):
         return
     for kind in LEVELS:
         style = rr.SeriesLines(
-            colors=_LEVEL, names="protection level: no larger error unnoticed", widths=1.5
+            colors=_LEVEL, names="protection level: bound of undetected errors", widths=1.5
         )
         log_series(recording, f"{kind.place}/level", trajectory.time, kind.of(states), style)
         if trajectory.pose_cov is not None:

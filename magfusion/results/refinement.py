@@ -74,8 +74,8 @@ def refined_site(
     """Return the site with the fitted values and their posterior sigmas.
 
     Drive phase and drift of an unsynchronised beacon belong to the log, not to the site: they are
-    given in the site's ``calibration`` record and nowhere else.  An Earth field that was estimated
-    takes the place of the location's.
+    given in the site's ``calibration`` record and nowhere else.  An estimated Earth field replaces
+    the location's.
     """
     site, sigma = fitted.site, np.sqrt(np.diagonal(cov))
     for block in blocks:
@@ -93,7 +93,7 @@ def result_site(result: Smoothed, log_name: str) -> Site:
 
 
 def _correlation(site: Site, blocks: tuple[Block, ...], cov: Array) -> Correlation | None:
-    """Return how the errors go together now: those found anew, and those left as they were."""
+    """Return the correlation of the errors: of the new estimates, and of unchanged parameters."""
     known = parameters_of(blocks)
     own = [i for b in blocks if b.parameter.declared for i in range(*b.columns.indices(len(cov)))]
     fresh = None

@@ -1,4 +1,4 @@
-"""Figures that several jobs have in common, and the file that they are written to."""
+"""Common figures of several jobs, and their output file."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ _REPORT, _ERRORS, _SUMMARY = Section.REPORT, Section.ERRORS, Section.SUMMARY
 
 
 def write_report(directory: Path, figures: Figures, motion: Motion | None = None) -> None:
-    """Write ``report.json``, and ``report.html`` with the result: below `FAILED` if that is there.
+    """Write ``report.json``, and ``report.html`` with the result: in `FAILED` if that exists.
 
     Parameters
     ----------
     motion : Motion, optional
-        What the page shows beside the figures, and the pictures that lie with the result.
+        Content of the page in addition to the figures and the pictures in the directory.
     """
     text = json.dumps(dict(figures), indent=1, allow_nan=False, default=float)
     (directory / "report.json").write_text(text + "\n")
@@ -60,7 +60,7 @@ def write_report(directory: Path, figures: Figures, motion: Motion | None = None
 
 
 def where_found(name: str, found: bool, value: Value, label: str = "") -> Figure:
-    """Return a figure that the screen shows only where there is something to say."""
+    """Return a figure that the screen shows only where it matters."""
     return Figure(name, value, section=_SUMMARY if found else _REPORT, label=label)
 
 
@@ -72,7 +72,7 @@ def error_figures(
     Parameters
     ----------
     column : Column
-        Of the screen's table; only errors of the result itself have their consistency shown.
+        Of the screen's table; consistency is shown only for errors of the result itself.
     prefix : str
         Of the keys.
     """
@@ -125,7 +125,7 @@ def sigma_figures(pose_cov: Array) -> Figures:
 
 
 def dropped_figures(dropped: Mapping[str, int], what: str = "windows") -> Figures:
-    """Return how many windows (or epochs) were dropped, in all and for each reason."""
+    """Return the number of dropped windows (or epochs), in all and for each reason."""
     total = sum(dropped.values())
     return Figures(
         where_found(f"{what}_dropped", total > 0, total),
@@ -137,7 +137,7 @@ def dropped_figures(dropped: Mapping[str, int], what: str = "windows") -> Figure
 
 
 def open_figures(site: Site) -> Figures:
-    """Return which directions of every pose nothing tells, where there are any."""
+    """Return the undetermined directions of every pose, if any."""
     if not roll_is_open(site):
         return Figures()
     return Figures(Figure("open_directions", ["roll about the axis"], section=Section.REPORT))
@@ -146,8 +146,8 @@ def open_figures(site: Site) -> Figures:
 def residual_figure(beacon: str, rms: float) -> Figure:
     """Return the whitened residual of a beacon: one where noise and model are as declared."""
     note = (
-        f"The residual of beacon {beacon} is {rms:.3g} where about 1 is expected; check the survey"
-        " of what the beacon is, where it is and how it is driven."
+        f"The residual of beacon {beacon} is {rms:.3g} where about 1 is expected; check the"
+        " beacon's type, position and drive in the survey."
     )
     return Figure(
         "residual_rms_{beacon}",
@@ -169,7 +169,7 @@ def residual_figures(residual: Array, channels: tuple[tuple[str, int], ...]) -> 
 
 
 def rival_figures(chi_square: float | None) -> Figures:
-    """Return by how much the second-best trajectory explains the log worse, and what follows."""
+    """Return the chi-square increase of the second-best trajectory, and a note."""
     ambiguous = chi_square is not None and chi_square < AMBIGUOUS_CHI_SQUARE
     note = (
         f"Another trajectory explains the log nearly as well (its chi square is only"
@@ -184,7 +184,7 @@ def rival_figures(chi_square: float | None) -> Figures:
 
 
 def _earth_figures(result: Smoothed) -> Figures:
-    """Return how the Earth field was explained, and where it had to do without beacons."""
+    """Return the residual of the Earth field, and its use without beacons."""
     if result.earth_residual is None or result.earth_disturbed is None:
         return Figures()
     rms = float(np.sqrt(np.mean(result.earth_residual**2)))
@@ -203,7 +203,7 @@ def smoothed_figures(result: Smoothed, directions: Section = _REPORT) -> Figures
     Parameters
     ----------
     directions : Section
-        Where the screen shows the directions of the calibration that are determined and open.
+        Section of the determined and undetermined directions of the calibration.
     """
     states = result.states
     estimates = parameter_estimates(
@@ -245,7 +245,7 @@ def smoothed_figures(result: Smoothed, directions: Section = _REPORT) -> Figures
 def observability_figures(
     estimates: list[Estimate], found: Observability, section: Section = _REPORT
 ) -> Figures:
-    """Return what a log determined of the calibration, parameter by parameter and in words."""
+    """Return the observability of the calibration, parameter by parameter and in words."""
     count, determined = len(found.direction_ratio), found.determined
     share = f"of {count} directions of the calibration are determined"
     figures = [
@@ -272,7 +272,7 @@ def observability_figures(
 
 
 def placement_figures(placed: tuple[Placement, ...], site: Site) -> Figures:
-    """Return where beacons of unknown place were found, with what else would explain the log."""
+    """Return the estimated positions of unknown beacons, and their alternatives."""
     if not placed:
         return Figures()
     figures = [Figure("placed", [placement.name for placement in placed], section=_REPORT)]
@@ -291,14 +291,14 @@ def placement_figures(placed: tuple[Placement, ...], site: Site) -> Figures:
         ]
         rival = placement.hypotheses[1].chi_square if len(places) > 1 else None
         note = (
-            f"The log leaves more than one place for beacon {name} ({'; '.join(places)}); record"
+            f"The log allows more than one position of beacon {name} ({'; '.join(places)}); record"
             " more motion, in all three directions."
             if rival is not None and rival <= AMBIGUOUS_CHI_SQUARE
             else ""
         )
         remark = (
-            f"beacon {name} was placed at ({_listed(found, 3)}) m; {len(places)} place(s)"
-            " explained its field"
+            f"beacon {name} was placed at ({_listed(found, 3)}) m; {len(places)} place(s) explained"
+            " its field"
         )
         figures += [
             Figure("hypotheses_{beacon}", places, "", name, _REPORT, note=note, remark=remark),
@@ -318,10 +318,10 @@ def fix_figures(fixes: Fixes, site: Site) -> Figures:
     epochs, ambiguous = len(fixes), int(np.sum(second > 0.05))
     undetermined = int(np.sum(~fixes.determined[:, 0]))
     notes = (
-        f"{ambiguous} of {epochs} epochs are ambiguous: fixes.parquet holds every pose that"
-        " explains them; add a beacon, or smooth, so that the motion decides.",
-        f"{undetermined} of {epochs} epochs leave a direction of the pose open (undetermined in"
-        " fixes.parquet); add a beacon or a coil.",
+        f"{ambiguous} of {epochs} epochs are ambiguous: fixes.parquet has every pose that explains"
+        " them; add a beacon, or smooth, so that the motion decides.",
+        f"{undetermined} of {epochs} epochs do not determine the pose in one direction"
+        " (undetermined in fixes.parquet); add a beacon or a coil.",
     )
     words = ambiguities(relations(fixes, site))
     counts = (("ambiguous_epochs", ambiguous), ("undetermined_epochs", undetermined))

@@ -1,4 +1,4 @@
-"""What is said of whole rests that were integrated."""
+"""Figures of integrated rests."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 
 def rest_figures(rested: AtRest) -> Figures:
-    """Return how many rests there are, and how loud each tone is in them.
+    """Return the number of rests, and the strength of each tone in them.
 
-    Amplitudes are the peak of the field's size, freed of what noise adds, of the median rest.
+    Amplitudes are the peak of the field's magnitude, corrected for noise, of the median rest.
     """
     amplitude, heard = rested.amplitude(), rested.heard
     channels = rested.fields.channels
@@ -39,7 +39,7 @@ def rest_figures(rested: AtRest) -> Figures:
                 int(np.sum(heard[:, c])),
                 "",
                 beacon,
-                label=f"rests that hear tone {tone}",
+                label=f"rests with tone {tone}",
             )
             for c, (beacon, tone) in enumerate(channels)
         ),
@@ -48,7 +48,7 @@ def rest_figures(rested: AtRest) -> Figures:
 
 
 def _reference_figures(rested: AtRest) -> Iterator[Figure]:
-    """Yield how many times smaller the reference made each sigma; one where it has no part."""
+    """Yield the factor by which the reference reduces each sigma; one where it is not used."""
     if rested.gain is None:
         return
     gain = np.median(np.where(np.isnan(rested.gain), 1.0, rested.gain), axis=0)

@@ -1,6 +1,6 @@
-"""nav_msgs/Odometry and what it is made of, as ROS 2 sends them by DDS: field by field.
+"""nav_msgs/Odometry and its parts, as ROS 2 sends them by DDS: field by field.
 
-Nothing here is of ROS itself: on the wire a message is its fields in this order, and its name.
+No ROS code is used: on the wire a message is its fields in this order, and its name.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class Time(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
 
 @dataclass
 class Header(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
-    """When, and in which frame."""
+    """Time stamp and frame."""
 
     stamp: Time
     frame_id: str

@@ -1,4 +1,4 @@
-"""What a user sees of a job's figures: the errors first, then what was found, then warnings."""
+"""Screen output of a job's figures: errors first, then estimates, then warnings."""
 
 from itertools import chain
 from pathlib import Path
@@ -23,14 +23,14 @@ _STYLES = {"trustworthy": "bold green", "doubtful": "bold yellow", "failed": "bo
 
 
 def show(figures: Figures, output: Path | None, console: Console | None = None) -> None:
-    """Print the figures of a job for a reader; ``report.json`` has them all.
+    """Print the figures of a job for a reader; ``report.json`` has all of them.
 
     Parameters
     ----------
     output : Path, optional
-        Where the results are.
+        Directory of the results.
     console : Console, optional
-        The standard output where there is none.
+        By default the standard output.
     """
     console = Console(highlight=False, emoji=False) if console is None else console
     name = " of ".join(str(figure.value) for figure in figures.of(Section.TITLE))
@@ -59,7 +59,7 @@ def show(figures: Figures, output: Path | None, console: Console | None = None) 
 
 
 def _show_verdict(figures: Figures, console: Console) -> None:
-    """Print the verdict with its reasons, and what nothing has checked."""
+    """Print the verdict with its reasons, and unverified parameters."""
     if "verdict" not in figures:
         return
     verdict = figures["verdict"]
@@ -69,7 +69,7 @@ def _show_verdict(figures: Figures, console: Console) -> None:
             console.print(f"  {lead}{one['text']}", soft_wrap=True, markup=False)
     names = [str(one["parameter"]) for one in findings(figures, "unverified")]
     if names:
-        sentence = f"held, and not checked by these data: {', '.join(names)}"
+        sentence = f"fixed, not observable in this log: {', '.join(names)}"
         console.print(f"  {sentence}", soft_wrap=True, markup=False)
 
 
@@ -92,7 +92,7 @@ def _of_logs(figure: Figure) -> Table:
 
 
 def _summary(figures: list[Figure]) -> Table:
-    """Return one line for each figure, and one for what several beacons have each."""
+    """Return one line per figure, and one per figure of several beacons."""
     table = Table(box=None, show_header=False)
     for row in summary_rows(figures):
         table.add_row(*row)

@@ -11,7 +11,7 @@ from magfusion.units import Array
 
 
 class Scale(NamedTuple):
-    """Where the scene is, how large it is, and how much sigmas must be magnified to be seen.
+    """Position and size of the scene, and the magnification of sigmas.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ class Scale(NamedTuple):
 
 
 def scene_scale(site: Site, trajectory: Trajectory) -> Scale:
-    """Return the scale of the scene that holds the beacons and the path."""
+    """Return the scale of the scene with the beacons and the path."""
     places = np.vstack([trajectory.position_world, *(b.position_world for b in site.beacons)])
     low, high = places.min(axis=0), places.max(axis=0)
     size = max(float(np.linalg.norm(high - low)), 1.0)
@@ -45,7 +45,7 @@ def scene_scale(site: Site, trajectory: Trajectory) -> Scale:
 def coil_loop(coil: Coil, usual_radius: float) -> Array:
     """Return the circle of a coil's wire in beacon axes (m), shape (points, 3).
 
-    ``usual_radius`` (m) is taken where the coil's own is not known.
+    ``usual_radius`` (m) is used where the coil's own is unknown.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, 49)[:, None]
     _, _, basis = np.linalg.svd(coil.moment_beacon[None])  # the last two rows span its plane
@@ -54,7 +54,7 @@ def coil_loop(coil: Coil, usual_radius: float) -> Array:
 
 
 def coverage_shell(beacon: Beacon, level: float) -> list[Array]:
-    """Return the equator and two meridians of the surface on which the field has a level.
+    """Return the equator and two meridians of the surface at a level of the field.
 
     Parameters
     ----------

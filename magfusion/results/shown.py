@@ -1,15 +1,15 @@
-"""The words and tables in which figures are shown, on the screen and on a page."""
+"""Text and tables of figures, for the screen and for a page."""
 
 import math
 
 from magfusion.results.figures import Column, Figure, Figures, Section, Value
 
-# Codes of reasons that say what the note of a figure would say again.
+# Codes of reasons with the same content as the note of a figure.
 _SAID = {"residual_rms_{beacon}": {"field_residuals"}, "ambiguous": {"ambiguous"}}
 
 
 def notes(figures: Figures) -> list[str]:
-    """Return in words what a reader of the figures must not overlook, beside the verdict."""
+    """Return the warnings of figures, apart from those in the verdict."""
     out = []
     codes = {str(one["code"]) for one in findings(figures, "reasons")}
     for figure in figures.all:
@@ -20,14 +20,14 @@ def notes(figures: Figures) -> list[str]:
 
 
 def findings(figures: Figures, key: str) -> list[dict[str, str | float]]:
-    """Return what a report says under a key: reasons, remarks, or what is unverified."""
+    """Return the entries of a report under a key: reasons, remarks, or unverified parameters."""
     found = figures.get(key, [])
     assert isinstance(found, list)
     return [one for one in found if isinstance(one, dict)]
 
 
 def sentences(figure: Figure) -> list[str]:
-    """Return the sentences that are a figure's value, or that its label and value make."""
+    """Return the sentences of a figure: its value, or made from its label and value."""
     if isinstance(figure.value, list):
         lead = f"{figure.label}: " if figure.label else ""
         return [f"{lead}{sentence}" for sentence in figure.value]
@@ -35,7 +35,7 @@ def sentences(figure: Figure) -> list[str]:
 
 
 def labelled(figure: Figure) -> str:
-    """Return what a figure is called, with its unit."""
+    """Return the title of a figure, with its unit."""
     return f"{figure.title} ({figure.unit})" if figure.unit else figure.title
 
 
@@ -50,7 +50,7 @@ def column_rows(figures: list[Figure], corner: str) -> list[list[str]]:
     return [[corner, *columns], *cells]
 
 
-# Columns of the table of logs that a reader sees, and what they are called.
+# Columns of the table of logs on the screen, and their titles.
 _OF_LOGS = {
     "log": "log",
     "verdict": "verdict",
@@ -74,7 +74,7 @@ def log_rows(figure: Figure) -> list[list[str]]:
 
 
 def summary_rows(figures: list[Figure]) -> list[tuple[str, str]]:
-    """Return one line for each figure, and one for what several beacons have each."""
+    """Return one line per figure, and one per figure of several beacons."""
     rows: list[tuple[str, str]] = []
     lists: dict[str, list[str]] = {}
     for figure in figures:
@@ -88,7 +88,7 @@ def summary_rows(figures: list[Figure]) -> list[tuple[str, str]]:
 
 
 def number_text(value: Value, digits: int = 3) -> str:
-    """Write a value for a reader."""
+    """Return a value as text."""
     if value is None:
         return ""
     if isinstance(value, bool):
@@ -99,7 +99,7 @@ def number_text(value: Value, digits: int = 3) -> str:
 
 
 def as_sure(value: float, sigma: float) -> str:
-    """Write a number to the second digit of its sigma."""
+    """Return a number to the second digit of its sigma."""
     if not sigma > 0.0:
         return number_text(value)
     decimals = max(0, 1 - math.floor(math.log10(sigma)))

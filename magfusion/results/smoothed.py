@@ -1,4 +1,4 @@
-"""What a program or a notebook gets of a smoothed log: a result that shows itself."""
+"""A smoothed log for a program or a notebook: a result with its own display."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from magfusion.results.report import smoothed_figures
 from magfusion.results.trajectory import ResultTrajectory, result_trajectory
 from magfusion.results.verdict import trust_figures
 
-NOT_JUDGED = "Not judged yet: call mf.judged(result, log) for the verdict."
+NOT_JUDGED = "No verdict yet: call mf.judged(result, log) for the verdict."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -22,13 +22,13 @@ class SmoothedLog(Smoothed):
     """The posterior of one log, with the trajectory as a table, a file or a figure.
 
     The fields are those of `magfusion.estimation.batch.batch.Smoothed`: ``states`` and their
-    covariance, ``calibration`` with ``calibration_cov``, ``residual``, and what they came of.  A
-    notebook shows the head of the page of a result.
+    covariance, ``calibration`` with ``calibration_cov``, ``residual``, and the inputs.  A notebook
+    shows the head of the page of a result.
     """
 
     @property
     def trajectory(self) -> ResultTrajectory:
-        """The states, with what is needed to save and plot them."""
+        """The states, with the data needed to save and plot them."""
         return result_trajectory(self.states, self.epoch_ns, self.calibration.site)
 
     def _repr_html_(self) -> str:
@@ -40,7 +40,7 @@ class SmoothedLog(Smoothed):
 def smooth(
     log: Log, site: Site, settings: SmootherSettings | None = None, report: Report = quiet
 ) -> SmoothedLog:
-    """Estimate the best trajectory of a log, with the calibration in the same solution.
+    """Smooth a log: trajectory and calibration in one solution.
 
     Parameters
     ----------
@@ -49,14 +49,14 @@ def smooth(
     site : Site
     settings : SmootherSettings, optional
     report : callable, optional
-        Called with stage, steps done and steps in all.
+        Called with stage, finished steps and number of steps.
 
     Raises
     ------
     TypeError
         Where the arguments are not a log and a site, in this order.
     InputError
-        Where the log holds nothing usable.
+        Where the log has no usable data.
     EstimationError
         Where the graph cannot be solved.
     """

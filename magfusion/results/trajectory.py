@@ -1,4 +1,4 @@
-"""A trajectory that a program can take into a table, a file or a figure."""
+"""A trajectory that a program can convert to a table, a file or a figure."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 class ResultTrajectory(Trajectory):
     """A trajectory on the clock of a log, among the beacons of a site.
 
-    Beside the parts of `Trajectory`: ``time`` (n,) (s), ``position`` (n, 3) (m), ``rotation``
+    Besides the parts of `Trajectory`: ``time`` (n,) (s), ``position`` (n, 3) (m), ``rotation``
     (SciPy's `Rotation`, world from body), ``euler`` (n, 3) (roll, pitch, yaw; rad) and ``cov``
     (n, 6, 6) (rotation, then position; body axes; rad, m).
 
@@ -59,35 +59,35 @@ class ResultTrajectory(Trajectory):
         try:
             return table.to_pandas()
         except ImportError as error:
-            text = "to_pandas needs pandas; install it by: pip install pandas"
+            text = "to_pandas requires pandas; install it with: pip install pandas"
             raise ImportError(text) from error
 
     def save(self, path: Path | str) -> None:
-        """Write the poses in the format that the file's name ends with.
+        """Write the poses in the format of the file's extension.
 
-        ``.parquet`` holds every part, as ``trajectory.parquet`` of a result; ``.csv`` the same
+        ``.parquet`` has every part, as ``trajectory.parquet`` of a result; ``.csv`` the same
         columns as text; ``.tum`` and ``.kitti`` poses alone; ``.mcap`` and ``.db3`` are ROS 2 bags
         of odometry.  Stamps are on the log's clock.
 
         Parameters
         ----------
         path : Path or str
-            Replaced as a whole, or left as it was if anything fails.
+            Replaced as a whole, or unchanged on failure.
 
         Raises
         ------
         InputError
-            Where the name ends otherwise, or nothing can be written there.
+            Where the extension is unknown, or the file cannot be written.
         """
         save_trajectory(self, Path(path), self.epoch_ns)
 
     def plot(self, truth: Trajectory | None = None) -> NDArray[np.object_]:
-        """Draw plan, height, and the size of sigmas, as the page of a result does.
+        """Draw plan, height, and the size of sigmas, as on the page of a result.
 
         Parameters
         ----------
         truth : Trajectory, optional
-            Drawn with it, and its errors.
+            Drawn as well, with the errors.
 
         Returns
         -------
@@ -112,7 +112,7 @@ def result_trajectory(states: Trajectory, epoch_ns: int, site: Site) -> ResultTr
 
 
 def collect_states(states: Sequence[State], epoch_ns: int = 0) -> ResultTrajectory:
-    """Return the states that a `Navigator` gave as one trajectory.
+    """Return the states of a `Navigator` as one trajectory.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ class Agreement(NamedTuple):
     by_parameter : ndarray, shape (parameters,)
         Difference over the root of the sum of both posterior variances.
     by_direction : ndarray, shape (determined,)
-        Along each direction that both logs determined, in the sigmas that the difference has.
+        Along each direction that both logs determine, in sigmas of the difference.
     """
 
     by_parameter: Array
@@ -36,9 +36,9 @@ class Agreement(NamedTuple):
 def agreement(first: Estimated, second: Estimated) -> Agreement:
     """Compare the calibrations of one installation by two logs.
 
-    Both began at the same survey, and where a log says nothing both stay there: such directions,
-    the gauge among them, agree without proof and are left out.  In the others the pull of the
-    survey is taken off the sigma of the difference: with ``K = I - P P0^-1`` it has the covariance
+    Both start at the same survey, and keep it where a log adds no information: such directions, the
+    gauge among them, agree without proof and are omitted.  In the others the pull of the survey is
+    removed from the sigma of the difference: with ``K = I - P P0^-1`` it has the covariance
     ``(K1 - K2) P0 (K1 - K2)^T + sum(P - P P0^-1 P)``, which is less than the sum of the posteriors.
 
     Parameters
@@ -46,7 +46,7 @@ def agreement(first: Estimated, second: Estimated) -> Agreement:
     first, second : Estimated
         With the same parameters and priors.
     """
-    # A log has its phases of its own: they refer to its own middle.
+    # A log has its own phases: they refer to its own middle.
     kept = np.array([b.parameter != PHASE for b in first.blocks for _ in b.sigma], dtype=bool)
     prior = prior_sigma(first.blocks)[kept]
     step = difference(first.calibration, second.calibration, first.blocks)[kept] / prior

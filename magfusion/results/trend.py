@@ -1,13 +1,13 @@
-"""The slope of a series whose errors remember: how long they do is learnt from the series itself.
+"""Slope of a series with correlated errors, whose correlation time is estimated from the series.
 
-A line through a random walk has a slope that no scatter about it betrays.  The errors are a
+A line through a random walk has a slope that the scatter about it does not show.  The errors are a
 Gauss-Markov process of unknown correlation time and white noise of unknown share; short times make
 blocks of them independent, long ones make them a random walk.  The restricted likelihood (H. D.
-Patterson and R. Thompson, Biometrika 58, 1971) tells how likely each is, the line set apart, and
-the slope of generalised least squares is averaged over all of them, so that what the series is too
-short to tell widens the interval.  Before the data, a time is taken for the likelier the longer it
-is, in proportion: of a walk with a line through it the restricted likelihood alone still says too
-often that it forgets (`tests/test_drift.py`).
+Patterson and R. Thompson, Biometrika 58, 1971) gives the probability of each, apart from the line,
+and the slope of generalised least squares is averaged over all of them, so that the interval is
+wider for a short series.  The prior of a time is proportional to it: for a walk with a line the
+restricted likelihood alone still too often selects a short correlation time
+(`tests/test_drift.py`).
 """
 
 from typing import NamedTuple
@@ -42,7 +42,7 @@ class Trend(NamedTuple):
 
 
 def trend(time: Array, value: Array) -> Trend:
-    """Return the slope of a series and how well it is known.
+    """Return the slope of a series and its standard error.
 
     Parameters
     ----------
@@ -53,11 +53,11 @@ def trend(time: Array, value: Array) -> Trend:
     Raises
     ------
     ValueError
-        Where fewer than three blocks hold any value.
+        Where fewer than three blocks have any value.
     """
     when, mean = _block_means(time, value)
     if len(when) < 3:
-        raise ValueError(f"at least three blocks must hold values; got {len(when)}")
+        raise ValueError(f"at least three blocks must have values; got {len(when)}")
     span = when[-1] - when[0]
     design = np.stack([np.ones_like(when), (when - np.mean(when)) / span], axis=1)
     lag = np.abs(when[:, None] - when) / span
@@ -80,7 +80,7 @@ def trend(time: Array, value: Array) -> Trend:
 
 
 def _block_means(time: Array, value: Array) -> tuple[Array, Array]:
-    """Return times and means of blocks of equal length, those that are empty left out."""
+    """Return times and means of blocks of equal length, without empty ones."""
     blocks = min(MOST_BLOCKS, len(time))
     edges = np.linspace(time[0], time[-1], blocks + 1)
     own = np.clip(np.searchsorted(edges, time, side="right") - 1, 0, blocks - 1)
@@ -100,7 +100,7 @@ def _fitted(design: Array, value: Array, shape: Array) -> tuple[float, float, fl
     slope = float(along[1] / upper[1, 1])
     rest = columns[:, 2] - left @ along
     freedom = len(value) - 2
-    # Below it, what is left of a straight line is rounding.
+    # Below it, the residual of a straight line is rounding.
     least = (1e-12 * float(np.max(np.abs(value)) or 1.0)) ** 2
     square = max(float(rest @ rest), least)
     sizes = np.abs(np.concatenate([np.diag(lower), np.diag(upper)]))
@@ -109,7 +109,7 @@ def _fitted(design: Array, value: Array, shape: Array) -> tuple[float, float, fl
 
 
 def _half_width(offset: Array, error: Array, weight: Array, freedom: float, tail: float) -> float:
-    """Return how far from the middle an average of Student's distributions has its quantile."""
+    """Return the quantile of an average of Student's distributions, relative to its middle."""
     reach = float(stdtrit(freedom, tail))
     low, high = 0.0, float(np.max(np.abs(offset) + reach * error))
     for _ in range(60):
@@ -124,7 +124,7 @@ def _half_width(offset: Array, error: Array, weight: Array, freedom: float, tail
 
 
 def _freedom_of(ratio: float, most: float) -> float:
-    """Return the degrees of freedom of which the outer quantile is so many times the inner."""
+    """Return the degrees of freedom with this ratio of the outer to the inner quantile."""
     low, high = 1.0, float(most)
     for _ in range(50):
         half = 0.5 * (low + high)

@@ -7,7 +7,7 @@ from magfusion.results.figures import Figure, Figures, Section
 
 
 def trust_figures(trust: Trust) -> Figures:
-    """Return verdict, reasons, remarks and what is unverified, for the head of a report."""
+    """Return verdict, reasons, remarks and unverified parameters, for the head of a report."""
     return Figures(
         Figure("verdict", str(trust.verdict), section=Section.VERDICT),
         Figure("reasons", _said(trust.reasons), section=Section.VERDICT),
@@ -17,9 +17,9 @@ def trust_figures(trust: Trust) -> Figures:
 
 
 def said_as_notes(trust: Trust) -> Figures:
-    """Return all that was said as the key ``notes``, which these reports always had.
+    """Return all findings as the key ``notes``, which these reports have always had.
 
-    The screen says it with the verdict.
+    The screen shows them with the verdict.
     """
     sentences = [finding.text for finding in trust.ordered]
     return Figures(Figure("notes", sentences, section=Section.REPORT))
@@ -39,7 +39,7 @@ def _unverified(one: Unverified) -> dict[str, str | float]:
 
 
 def level_figures(states: StateTrust) -> Figures:
-    """Return the median protection levels, and in how many states beacons were left out."""
+    """Return the median protection levels, and in how many states beacons were excluded."""
     known = np.isfinite(states.protection_level_m)
     deg = states.protection_level_deg[np.isfinite(states.protection_level_deg)]
     left_out = sum(1 for names in states.excluded if names)

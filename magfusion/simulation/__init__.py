@@ -1,1 +1,1 @@
-"""Motion, inertial sensors, field and waveform: a log in the same files a user has."""
+"""Simulation of motion, inertial sensors, field and waveform, with logs in the usual formats."""

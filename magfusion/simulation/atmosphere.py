@@ -1,4 +1,4 @@
-"""Noise that is the same at every place: storms far away, which a second magnetometer hears too."""
+"""Noise common to all places, from distant storms, which a second magnetometer also receives."""
 
 from dataclasses import dataclass
 
@@ -14,20 +14,20 @@ MARGIN = 10.0  # s, before and after
 
 @dataclass(frozen=True)
 class Atmosphere:
-    """Gaussian noise of a density that falls with the frequency, alike for whoever listens.
+    """Gaussian noise of a density that falls with the frequency, common to all instruments.
 
     Parameters
     ----------
     density : float
         One-sided, at 1 Hz (T/sqrt(Hz)), of each world component.
     seed : int
-        Two instruments with the same hear the same.
+        Instruments with the same seed receive the same noise.
     exponent : float
-        With which power of the frequency the density falls.
+        Power of the frequency with which the density falls.
     duration : float
-        What it covers (s).
+        Length of the noise (s).
     highest_hz : float
-        Above, there is none.
+        Upper cutoff frequency.
     """
 
     density: float
@@ -37,7 +37,7 @@ class Atmosphere:
     exponent: float = 0.5
 
     def field_world(self, time: Array) -> Array:
-        """Return it at times within what it covers, shape (n, 3) (T)."""
+        """Return the noise at times within its duration, shape (n, 3) (T)."""
         step = 0.5 / (self.highest_hz * OVERSAMPLED)
         count = int((self.duration + 2.0 * MARGIN) / step)
         hertz = np.fft.rfftfreq(count, step)
@@ -45,7 +45,7 @@ class Atmosphere:
         size[(hertz > self.highest_hz) | (hertz == 0.0)] = 0.0
         rng = np.random.default_rng(self.seed)
         drawn = rng.standard_normal((len(hertz), 3)) + 1j * rng.standard_normal((len(hertz), 3))
-        # A one-sided density d has a variance of d^2 / (2 step) of white samples.
+        # A one-sided density d is a variance of d^2 / (2 step) of white samples.
         scale = 0.5 * np.sqrt(count / step)
         even = np.fft.irfft(drawn * (size * scale)[:, None], count, axis=0)
         grid = step * np.arange(count) - MARGIN

@@ -1,4 +1,4 @@
-"""A room with four rotating beacons, to try things in."""
+"""A demonstration room with four rotating beacons."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation

@@ -1,4 +1,4 @@
-"""What disturbs the field of the beacons in a true room: iron, day and night, and slow drift."""
+"""Disturbances of the beacons' field in a real room: iron, day and night noise, and slow drift."""
 
 from dataclasses import dataclass
 
@@ -25,7 +25,7 @@ _POINTS = 4096  # of which that many features are held at once
 
 @dataclass(frozen=True, eq=False)
 class Spheres:
-    """Permeable or conducting spheres, which answer every tone with a field of their own.
+    """Permeable or conducting spheres, with an induced field at every tone.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class Spheres:
             if np.any(square < radius**2):
                 raise InputError(
                     f"spheres: the magnetometer passes through sphere {k} of radius {radius:g} m at"
-                    f" {np.round(place, 3).tolist()}; move it out of the way"
+                    f" {np.round(place, 3).tolist()}; move the sphere"
                 )
         polarizability = sphere_polarizability(
             self.radius[:, None],
@@ -99,16 +99,17 @@ def draw_spheres(
     """Return spheres around a box, none near it, near a beacon or in another.
 
     The surface of each is at least `CLEARANCE` from the box and from every beacon's centre; its
-    centre is drawn evenly from the box grown by its radius, `CLEARANCE` and ``reach`` on all sides.
+    centre is drawn uniformly from the box enlarged by its radius, `CLEARANCE` and ``reach`` on all
+    sides.
 
     Parameters
     ----------
     box_world : ndarray, shape (2, 3)
-        Lower and upper corner (m) of where the body moves.
+        Lower and upper corner (m) of the body's range.
     beacons_world : ndarray, shape (beacons, 3)
         (m)
     radius_range : tuple of float
-        Radii are drawn evenly between these (m).
+        Radii are drawn uniformly between these (m).
     permeability, conductivity : float
         Of all spheres (relative; S/m).
     reach : float
@@ -130,8 +131,8 @@ def draw_spheres(
         fits = np.flatnonzero(free & (to_box > radius[k] + CLEARANCE))
         if len(fits) == 0:
             raise InputError(
-                f"iron: found {count} spheres, and room for {k} around where the body moves;"
-                " give fewer, or a larger box"
+                f"iron: found {count} spheres, but only {k} fit around the range of the body; give"
+                " fewer, or a larger box"
             )
         position_world[k] = drawn[fits[0]]
     return Spheres(
@@ -140,14 +141,14 @@ def draw_spheres(
 
 
 def _farther(point: Array, others: Array, least: Array) -> np.ndarray:
-    """Tell which points are farther from all others than the least distance of each."""
+    """Return which points are farther from all others than the minimum distance of each."""
     between = np.linalg.norm(point[:, None] - others, axis=-1)
     return (between > least).all(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothField:
-    """Gaussian random functions of a place (or of time), of a Gaussian covariance.
+    """Gaussian random functions of position (or time), with a Gaussian covariance.
 
     Sums of waves with random vectors and amplitudes (random Fourier features): for any two places
     at distance d the covariance is ``rms^2 exp(-d^2 / (2 length^2))`` in the mean over draws.
@@ -189,7 +190,7 @@ def draw_smooth(
 
 @dataclass(frozen=True, eq=False)
 class Bending:
-    """A smooth random 3 x 3 matrix of place for each beacon, added to unity.
+    """A smooth random 3 x 3 matrix per beacon and position, added to unity.
 
     Parameters
     ----------
@@ -217,23 +218,23 @@ def draw_bending(rng: np.random.Generator, rms: float, length: float, beacons: i
     Parameters
     ----------
     rms : float
-        What it adds to a field, as a share of the field's size.
+        Deviation relative to the field's magnitude.
     length : float
-        Over which it stays much the same (m).
+        Correlation length (m).
     """
     return Bending(draw_smooth(rng, rms / np.sqrt(3.0), length, 9 * beacons))
 
 
 @dataclass(frozen=True)
 class DayNight:
-    """White noise of the surroundings, quiet at night and loud by day, along a cosine.
+    """White ambient noise, weak at night and strong by day, along a cosine.
 
     Parameters
     ----------
     night, day : float
-        One-sided density at its least and at its most (T/sqrt(Hz)).
+        Minimum and maximum one-sided density (T/sqrt(Hz)).
     loudest_time : float
-        When it is most, seconds since the log's epoch; once a day.
+        Time of the maximum, seconds since the log's epoch; once a day.
     """
 
     night: float
@@ -273,7 +274,7 @@ class FieldDrift:
 
 @dataclass(frozen=True, eq=False)
 class Ambient:
-    """Everything in the room beside beacons, Earth and mains; what is None is not there."""
+    """Disturbances other than beacons, Earth and mains; None where absent."""
 
     spheres: Spheres | None = None
     bending: Bending | None = None

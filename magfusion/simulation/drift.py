@@ -1,9 +1,9 @@
-"""Slow change over hours: coils that warm up, gains that wander, clocks that part.
+"""Slow change over hours: coils that warm up, gains that drift, clocks that diverge.
 
-Processes are described by frozen dataclasses; `Drift` says which of them a run has, and
-`draw_drift` draws what they do to each epoch: a gain of each beacon, the lead of the drives' clock
-(hence a phase of each tone), and a scale of the magnetometer.  A change of the ambient field is no
-matter of this module: see `magfusion.simulation.disturbance`.
+Processes are described by frozen dataclasses; `Drift` selects those of a run, and `draw_drift`
+draws their effect at each epoch: a gain of each beacon, the lead of the drives' clock (hence a
+phase of each tone), and a scale of the magnetometer.  For a change of the ambient field see
+`magfusion.simulation.disturbance`.
 """
 
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ COPPER_PER_KELVIN = 3.9e-3  # relative rise of resistance
 
 @dataclass(frozen=True)
 class WarmUp:
-    """A body with one thermal time constant, heated evenly since the log's epoch.
+    """A body with one thermal time constant, heated uniformly since the log's epoch.
 
     Parameters
     ----------
     rise : float
-        In the end (K).
+        Final temperature rise (K).
     time_constant : float
         (s)
     """
@@ -38,12 +38,12 @@ class WarmUp:
 
 @dataclass(frozen=True)
 class DailySwing:
-    """A temperature that follows the day along a cosine.
+    """A daily temperature cycle along a cosine.
 
     Parameters
     ----------
     amplitude : float
-        Half of what lies between least and most (K).
+        Half of the peak-to-peak value (K).
     warmest_time : float
         Seconds since the log's epoch; once a day.
     """
@@ -64,9 +64,9 @@ class Wander:
     Parameters
     ----------
     rms : float
-        In the unit of what wanders.
+        In the unit of the process.
     time_constant : float
-        After which the correlation has fallen to 1/e (s).
+        Time after which the correlation is 1/e (s).
     """
 
     rms: float
@@ -94,7 +94,7 @@ class Wander:
 
 @dataclass(frozen=True)
 class Clock:
-    """The clock of the drives against that of the log; both agree at the log's epoch.
+    """The clock of the drives relative to that of the log; both agree at the log's epoch.
 
     Parameters
     ----------
@@ -102,15 +102,15 @@ class Clock:
         Relative error of its frequency, constant; positive for one that runs fast, as
         `magfusion.simulation.field.Drives.drift`.
     walk : float
-        White noise of its frequency, by which its lead walks (s per root second): what its Allan
-        deviation is at one second.
+        White frequency noise, which makes its lead a random walk (s per root second): the Allan
+        deviation at one second.
     """
 
     rate: float = 0.0
     walk: float = 0.0
 
     def lead(self, time: Array, rng: np.random.Generator) -> Array:
-        """Return by how much the drives are ahead (s), shape (n,).
+        """Return the lead of the drives' clock (s), shape (n,).
 
         Parameters
         ----------
@@ -120,7 +120,7 @@ class Clock:
         Raises
         ------
         ValueError
-            Where time runs backwards, or starts before the epoch.
+            Where time decreases, or starts before the epoch.
         """
         elapsed = np.diff(time, prepend=0.0)
         if np.any(elapsed < 0.0):
@@ -131,19 +131,19 @@ class Clock:
 
 @dataclass(frozen=True)
 class Drift:
-    """What drifts in a run; what is None does not.
+    """Drift of a run; None where absent.
 
     Parameters
     ----------
     coils : WarmUp, optional
-        Temperature of all coils and their amplifiers, which are driven alike.
+        Temperature of all coils and their amplifiers, which are driven equally.
     fading_per_kelvin : float
-        The moment of a coil warmer by T kelvin is ``1 / (1 + fading T)`` of what it was: for a
-        constant voltage `COPPER_PER_KELVIN`, for a constant current what its source loses.
+        The moment of a coil warmer by T kelvin is scaled by ``1 / (1 + fading T)``: for a constant
+        voltage `COPPER_PER_KELVIN`, for a constant current the loss of its source.
     gain : Wander, optional
         Of the logarithm of each beacon's moment, independent between beacons.
     clock : Clock, optional
-        One for all drives, as where one generator feeds them.
+        One for all drives, as of a common generator.
     sensor : DailySwing, optional
         Temperature of the magnetometer.
     scale_per_kelvin : float
@@ -165,11 +165,11 @@ class DriftSeries:
     Parameters
     ----------
     log_gain : ndarray, shape (n, beacons)
-        Natural logarithm of each beacon's moment, relative to what is declared.
+        Natural logarithm of each beacon's moment, relative to the declared.
     lead : ndarray, shape (n,)
-        Of the drives' clock before the log's (s).
+        Of the drives' clock relative to the log's (s).
     sensor_scale : ndarray, shape (n,)
-        Of what the magnetometer gives, relative to what is declared.
+        Of the magnetometer's output, relative to the declared.
     """
 
     log_gain: Array
@@ -177,20 +177,19 @@ class DriftSeries:
     sensor_scale: Array
 
     def phase(self, frequencies_hz: Array) -> Array:
-        """Return the drive phase beyond what is declared (rad), shape (n, tones)."""
+        """Return the drive phase in addition to the declared (rad), shape (n, tones)."""
         return 2.0 * np.pi * self.lead[:, None] * frequencies_hz
 
 
 def draw_drift(drift: Drift, time: Array, beacons: int, rng: np.random.Generator) -> DriftSeries:
-    """Draw what drifts.
+    """Draw a realisation of a drift.
 
     Parameters
     ----------
     time : ndarray, shape (n,)
         Seconds since the log's epoch, increasing.
-    rng : Generator
-        Gains and clock have generators of their own, spawned from it, so that runs which differ in
-        one of them share the other.
+    Gains and clock have separate generators, spawned from it, so that runs that differ in one
+    of them share the other.
     """
     gain_rng, clock_rng = rng.spawn(2)
     log_gain = np.zeros((len(time), beacons))

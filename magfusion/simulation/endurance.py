@@ -1,7 +1,7 @@
-"""Days of samples, made piece by piece: mostly at rest, a walk every hour, and all that drifts.
+"""Days of samples, generated in blocks: mostly at rest, a walk every hour, with all drifts.
 
-All randomness belongs to blocks of a minute, each with a generator of its own, so that neither the
-length of the pieces nor where a run is taken up again changes a sample.
+Each block of a minute has a random generator of its own, so that neither the length of the
+stretches nor where a run is resumed changes a sample.
 """
 
 from dataclasses import dataclass, field, replace
@@ -42,12 +42,12 @@ _WORLD, _IMU, _FIELDS = range(3)  # first key of each stream of random numbers
 
 
 def usual_drift(drive: str, clock_rate: float) -> Drift:
-    """Return what drifts: moments, their gain, one clock for all drives, the sensor's scale.
+    """Return drifts of the moments, their gain, a common drive clock, and the sensor's scale.
 
     Parameters
     ----------
     drive : {'current', 'voltage'}
-        A voltage drives less current through warmer copper.
+        A constant voltage drives less current through warmer copper.
     clock_rate : float
         Relative error of the drives' common clock.
     """
@@ -63,21 +63,21 @@ def usual_drift(drive: str, clock_rate: float) -> Drift:
 
 @dataclass(frozen=True, eq=False)
 class EnduranceConfig:
-    """What happens in the hours.
+    """Configuration of a run of hours.
 
     Parameters
     ----------
     drift : Drift
-        Of moments and sensor, and of the clock that all drives have in common; beacons that are not
-        synchronised part from it besides, each at a rate of its own.
+        Of moments and sensor, and of the clock common to all drives; beacons that are not
+        synchronised also drift relative to it, each at a rate of its own.
     schedule : Rests
         Walks, and the rests between them.
     box_world : ndarray, shape (2, 3)
-        Where the platform goes (m).
+        Range of the platform (m).
     speed : float
         (m/s)
     instability : BiasInstability, optional
-        Of the IMU, beside its bias walk.
+        Of the IMU, in addition to its bias walk.
     noise : DayNight
         Of the field.
     window : float
@@ -101,13 +101,13 @@ class EnduranceConfig:
     walk_interval: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be simulated."""
+        """Raise an error if the configuration cannot be simulated."""
         if not 0.0 < self.hours <= MOST_HOURS:
             raise InputError(f"hours: found {self.hours:g}; give more than 0 and at most 1000")
         for name in ("rest_interval", "walk_interval"):
             ratio = BLOCK / getattr(self, name)
             if ratio < 1.0 or abs(ratio - round(ratio)) > 1e-9:
-                raise InputError(f"{name}: found {getattr(self, name):g} s; give a part of 60 s")
+                raise InputError(f"{name}: found {getattr(self, name):g} s; give a divisor of 60 s")
 
     @property
     def blocks(self) -> int:
@@ -115,7 +115,7 @@ class EnduranceConfig:
         return max(1, round(self.hours * HOUR / BLOCK))
 
     def active(self, time: Array) -> BoolArray:
-        """Tell at which times the platform walks, or is about to, or just has."""
+        """Return at which times the platform walks, is about to walk, or has just walked."""
         rests = self.schedule
         cycle = rests.move + rests.pause
         since = (time - rests.start + MARGIN) % cycle
@@ -125,7 +125,7 @@ class EnduranceConfig:
 
 @dataclass(frozen=True, eq=False)
 class Biases:
-    """Where the bias processes are between two blocks: walks and Gauss-Markov parts, (2, 3) each.
+    """State of the bias processes between two blocks: walks and Gauss-Markov parts, (2, 3) each.
 
     First the gyro's (rad/s), then the accelerometer's (m/s^2).
     """
@@ -136,7 +136,7 @@ class Biases:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Some minutes of samples and what was true.
+    """Some minutes of samples and their true values.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ class Stretch:
     gyro_bias_body, accel_bias_body : ndarray, shape (n, 3)
         At the inertial samples (rad/s, m/s^2).
     after : Biases
-        Where to go on.
+        Start of the next stretch.
     """
 
     first: int
@@ -158,16 +158,16 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """One draw of everything that is true for the whole run; a few megabytes for 48 hours.
+    """One draw of all true values of a run; a few megabytes for 48 hours.
 
     Parameters
     ----------
     site : Site
-        As the estimator knows it.
+        Known to the estimator.
     log_gain : ndarray, shape (blocks + 1, beacons)
         Of the moments, at the blocks' edges.
     phase : ndarray, shape (blocks + 1, channels)
-        Beyond what is declared (rad).
+        In addition to the declared (rad).
     scale : ndarray, shape (blocks + 1,)
         Of the magnetometer.
     seed : tuple of int
@@ -198,7 +198,7 @@ class World:
         first, count : int
             Blocks; no more than there are.
         before : Biases
-            From the stretch before.
+            From the previous stretch.
         """
         count = min(count, self.config.blocks - first)
         inertial, fields = [], []
@@ -221,7 +221,7 @@ class World:
         )
 
     def truth(self, stretch: Stretch, time: Array) -> Trajectory:
-        """Return what was true at times within a stretch."""
+        """Return the true values at times within a stretch."""
         known = stretch.imu.time
         return replace(
             self.motion.trajectory(time),
@@ -244,7 +244,7 @@ class World:
         return time, gyro, accel, bias[0], bias[1], after
 
     def _ideal(self, time: Array) -> tuple[Array, Array]:
-        """Return rate and specific force; what does not move is asked once."""
+        """Return rate and specific force; evaluated once per rest."""
         asked = time if np.any(self.config.active(time)) else time[:1]
         return (
             self.motion.rate_body(asked),
@@ -275,7 +275,7 @@ class World:
         )
 
     def _undisturbed(self, time: Array, still: dict[int, ComplexArray]) -> ComplexArray:
-        """Return the phasors as declared; those of a rest are reckoned once, at its middle."""
+        """Return the phasors as declared; those of a rest are computed once, at its middle."""
         if np.any(self.config.active(time)):
             return self._phasors(time)
         rests = self.config.schedule
@@ -306,7 +306,7 @@ def draw_endurance(site: Site, config: EnduranceConfig, seed: tuple[int, ...]) -
     Parameters
     ----------
     site : Site
-        As the estimator knows it; the true calibration is drawn from its sigmas.
+        Known to the estimator; the true calibration is drawn from its sigmas.
     seed : tuple of int
 
     Raises
@@ -366,7 +366,7 @@ def _carried_on(
     count: int,
     rng: np.random.Generator,
 ) -> tuple[Array, Biases]:
-    """Return the biases at the samples of a block, (2, n, 3), and where they have got to."""
+    """Return the biases at the samples of a block, (2, n, 3), and their final state."""
     steps = np.array([imu.gyro_bias_walk, imu.accel_bias_walk]) / np.sqrt(rate_hz)
     walk = steps[:, None, None] * rng.standard_normal((2, count, 3))
     np.cumsum(walk, axis=1, out=walk)

@@ -1,4 +1,4 @@
-"""The simulator's own field of a beacon: coils of their true size, not dipoles."""
+"""The simulator's own field of a beacon: coils of finite size, not dipoles."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -18,7 +18,7 @@ from magfusion.units import AnyArray, Array, ComplexArray
 
 @dataclass(frozen=True, eq=False)
 class Drives:
-    """True drive of every beacon against the log clock, beyond what its coils declare.
+    """True drive of every beacon relative to the log clock, in addition to its coils' phases.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class Drives:
     drift : ndarray, shape (beacons,)
         Relative frequency error.
     turning : mapping of str to Turning
-        Of beacons that are magnets on shafts, by name; phase and drift are not theirs.
+        Of beacons that are magnets on shafts, by name; phase and drift do not apply to them.
     """
 
     phase: Array
@@ -36,7 +36,7 @@ class Drives:
 
 
 def synchronised_drives(site: Site) -> Drives:
-    """Return drives that run exactly as the site declares."""
+    """Return drives as declared by the site."""
     tones = sum(len(beacon.tones) for beacon in site.beacons)
     return Drives(np.zeros(tones), np.zeros(len(site.beacons)))
 
@@ -83,8 +83,8 @@ def phasors_world(
 ) -> ComplexArray:
     """Return the phasor of each tone without phase or drift of the drive, (n, tones, 3) (T).
 
-    With what the spheres and the rails, if any, add to it, each as if the other were not there;
-    layers take the place of the beacon's full space.
+    Includes the contributions of spheres and rails, if any, without their interaction; layers
+    replace the beacon's full space.
     """
     phasors = _primary_world(beacon, point_world, layers)
     if spheres is not None:

@@ -1,11 +1,11 @@
-"""What conducting ground does to a coil's field, by the simulator's own way.
+"""Effect of conducting ground on a coil's field, by the simulator's own method.
 
 In spherical components about the axis of a dipole, with ``k = sqrt(-j w mu sigma)``, Im k < 0::
 
     B_r = mu0/4pi m cos(theta) 2 (1 + jkR) exp(-jkR) / R^3
     B_theta = mu0/4pi m sin(theta) (1 + jkR - (kR)^2) exp(-jkR) / R^3
 
-A coil of some size is a few such dipoles, spread over its disc and along its axis.
+A coil of finite size is a few such dipoles, spread over its disc and along its axis.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 def dipole_in_ground(
     offset: Array, moment: Array, frequency_hz: float, conductivity: float
 ) -> ComplexArray:
-    """Return the phasor of a dipole in a full space that conducts.
+    """Return the phasor of a dipole in a conducting full space.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def dipole_in_ground(
 def ground_effect(
     offset: Array, coil: Coil, frequency_hz: float, conductivity: float
 ) -> ComplexArray:
-    """Return what conduction adds to the field of a coil at its peak current.
+    """Return the contribution of conduction to the field of a coil at its peak current.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def ground_effect(
 
 
 def _parts(coil: Coil) -> list[tuple[Array, float]]:
-    """Return the places of a coil's dipoles, and the share of its moment that each has."""
+    """Return the positions of a coil's dipoles, and the share of its moment of each."""
     axis = coil.moment_beacon / np.linalg.norm(coil.moment_beacon)
     aside = np.eye(3)[int(np.argmin(np.abs(axis)))]
     first = np.cross(axis, aside) / np.linalg.norm(np.cross(axis, aside))

@@ -20,7 +20,7 @@ _PEAK_TIME = 1.89
 
 @dataclass(frozen=True)
 class BiasInstability:
-    """The flat part of an Allan deviation plot, made by a first-order Gauss-Markov process.
+    """The flat part of an Allan deviation plot, as a first-order Gauss-Markov process.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class BiasInstability:
         return np.array([self.gyro, self.accel]) / _PEAK_HEIGHT
 
     def decay(self, rate_hz: float) -> float:
-        """Return what is left of the process one sample later."""
+        """Return the correlation of the process over one sample."""
         return float(np.exp(-_PEAK_TIME / (self.time * rate_hz)))
 
 
@@ -67,8 +67,8 @@ def simulate_imu(
 ) -> SimulatedImu:
     """Return inertial samples: the exact values of one instant, bias and white noise.
 
-    Samples are not averages over their interval; whoever integrates them takes them as points of
-    a smooth curve.  Noise is discretised as GTSAM's preintegration assumes: white noise of
+    Samples are not averages over their interval; to integrate them, treat them as points of a
+    smooth curve.  Noise is discretised as GTSAM's preintegration assumes: white noise of
     density * sqrt(rate), walk steps of walk / sqrt(rate).
 
     Parameters
@@ -80,16 +80,17 @@ def simulate_imu(
     duration : float
         (s); stamps run from 0 to less than this.
     time_offset : float
-        The sample stamped t is taken at t + time_offset on the log's clock (s), the first one.
+        Offset (s) of the first sample: stamped t, it is taken at t + time_offset on the log's
+        clock.
     instability : BiasInstability, optional
         Added to the bias walk.
     clock_rate : float
-        What the time offset grows by in each second.
+        Rate of change of the time offset (s/s).
 
     Raises
     ------
     InputError
-        If there is less than one sample.
+        If there is no sample.
     """
     count = int(np.floor(duration * rate_hz * (1.0 + 1e-12)))
     if not rate_hz > 0.0 or count < 1:
@@ -114,7 +115,7 @@ def simulate_imu(
 def _bias_walk(
     rng: np.random.Generator, count: int, rate_hz: float, initial_sigma: float, walk: float
 ) -> Array:
-    """Return a random walk from a random start, shape (count, 3)."""
+    """Return a random walk with a random start, shape (count, 3)."""
     steps = rng.normal(0.0, walk / np.sqrt(rate_hz), (count, 3))
     steps[0] = rng.normal(0.0, initial_sigma, 3)
     return np.cumsum(steps, axis=0)

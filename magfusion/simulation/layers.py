@@ -1,8 +1,8 @@
-"""Level layers of ground under air: what the full space of the model leaves out.
+"""Horizontal ground layers under air, which the model's full space neglects.
 
-The fields come from empymod (D. Werthmueller, Geophysics 82(6), 2017), which sums the waves that
-layers reflect.  They are smooth where a platform moves, so they are evaluated on a grid of
-Chebyshev points about it, and interpolated.
+The fields are computed by empymod (D. Werthmueller, Geophysics 82(6), 2017), which includes the
+reflections at the layers.  They are smooth in the platform's range, so they are evaluated on a grid
+of Chebyshev points about it, and interpolated.
 """
 
 from dataclasses import dataclass
@@ -39,13 +39,13 @@ class Layers:
     conductivity: tuple[float, ...]
 
     def of(self, height: Array | float) -> IntArray:
-        """Return the number of the layer at each height, from zero for air."""
+        """Return the index of the layer at each height, zero for air."""
         number = np.searchsorted(-np.array(self.top), -np.asarray(height), side="right")
         return np.asarray(number, dtype=np.int64)
 
 
 def layers_option(text: str) -> Layers:
-    """Read ``height:conductivity`` of each layer, from above, separated by commas.
+    """Parse ``height:conductivity`` of each layer, from above, separated by commas.
 
     Raises
     ------
@@ -60,15 +60,15 @@ def layers_option(text: str) -> Layers:
     if not top or not falls or not all(0.0 < value < 1e3 for value in conductivity):
         raise InputError(
             f"--ground {text!r}: write height:conductivity of each layer in m and S/m, from above,"
-            " e.g. 0:0.01,-20:0.05; above the first is air"
+            " e.g. 0:0.01,-20:0.05; above the first layer is air"
         )
     return Layers(top, conductivity)
 
 
 def layered_effect(beacon: Beacon, point_world: Array, layers: Layers) -> ComplexArray:
-    """Return what layered ground adds to the field of each coil at its peak current.
+    """Return the contribution of layered ground to the field of each coil at its peak current.
 
-    A coil is a dipole in it.
+    The coil is approximated by a dipole.
 
     Parameters
     ----------
@@ -84,13 +84,13 @@ def layered_effect(beacon: Beacon, point_world: Array, layers: Layers) -> Comple
     ------
     InputError
         Where empymod is not installed, the platform passes from one layer to another, or comes too
-        near to a beacon for a polynomial.
+        close to a beacon for a polynomial.
     """
     low, high = np.min(point_world, axis=0), np.max(point_world, axis=0)
     if layers.of(low[2]) != layers.of(high[2]):
         raise InputError(
             f"ground: the platform moves between {low[2]:g} and {high[2]:g} m, through the surface"
-            " of a layer; give a box inside one of them"
+            " of a layer; give a box inside one layer"
         )
     effects = []
     for coil in beacon.coils:
@@ -106,7 +106,7 @@ def layered_effect(beacon: Beacon, point_world: Array, layers: Layers) -> Comple
 def _nodes(
     low: Array, high: Array, centre_world: Array, layers: Layers, name: str
 ) -> tuple[Array, ...]:
-    """Return Chebyshev points on each axis, as many as the nearest singularity asks for."""
+    """Return Chebyshev points on each axis, in a number set by the nearest singularity."""
     middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), THINNEST)
     mirrored = [[*centre_world[:2], 2.0 * top - centre_world[2]] for top in layers.top]
     rate = np.full(3, np.inf)  # of convergence: by how much each node makes the error smaller
@@ -120,8 +120,8 @@ def _nodes(
     count = np.ceil(-np.log(EXACT) / np.maximum(rate, 1e-9))
     if np.any(count > MOST_NODES):
         raise InputError(
-            f"ground: the platform comes too near to beacon {name}, or to a surface, for the way"
-            " that it goes; give a smaller box, or leave --ground out"
+            f"ground: the platform comes too close to beacon {name}, or to a surface, for its range"
+            " of motion; give a smaller box, or omit --ground"
         )
     return tuple(
         m + h * np.cos(np.pi * (np.arange(n) + 0.5) / n)
@@ -136,7 +136,7 @@ def _on_grid(
     frequency_hz: float,
     layers: Layers,
 ) -> ComplexArray:
-    """Return what the ground adds, shape (x, y, z, 3)."""
+    """Return the contribution of the ground, shape (x, y, z, 3)."""
     x, y = np.meshgrid(nodes[0], nodes[1], indexing="ij")
     planes = [
         _in_plane(x.ravel(), y.ravel(), float(z), centre_world, moment_world, frequency_hz, layers)
@@ -154,7 +154,7 @@ def layered_effect_at(
     point_world: Array,
     layers: Layers,
 ) -> ComplexArray:
-    """Return what layered ground adds to a dipole's field at points of one height, shape (n, 3).
+    """Return the ground's contribution to a dipole's field at one height, shape (n, 3).
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def _in_plane(
 
 
 def _interpolated(nodes: tuple[Array, ...], values: ComplexArray, point: Array) -> ComplexArray:
-    """Return the values at points (n, 3), by polynomials through all nodes of each axis."""
+    """Return the interpolated values at points (n, 3), by polynomials on each axis."""
     weight = [
         np.asarray(BarycentricInterpolator(own, np.eye(len(own)))(point[:, axis]))
         for axis, own in enumerate(nodes)
@@ -213,6 +213,6 @@ def _empymod() -> ModuleType:
         import empymod
     except ImportError:
         raise InputError(
-            "ground: layers are simulated by empymod; install it with pip install magfusion[ground]"
+            "ground: layers require empymod; install it with pip install magfusion[ground]"
         ) from None
     return empymod

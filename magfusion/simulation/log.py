@@ -1,4 +1,4 @@
-"""Whole logs from a site: a true calibration is drawn, a body moves, the instruments record."""
+"""Simulated logs of a site: a true calibration is drawn, a body moves, instruments record."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -41,7 +41,7 @@ MotionKind = Literal["walk", "turn", "static"]
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """A second magnetometer that stands somewhere and hears the noise of the surroundings, too.
+    """A second, stationary magnetometer that receives the same ambient noise.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class Reference:
         (m)
     world_from_sensor : ndarray, shape (3, 3)
     late, rate : float
-        What it stamps t happened at t + late + rate t (s).
+        A sample stamped t was taken at t + late + rate t (s).
     """
 
     position_world: Array
@@ -60,23 +60,23 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class SimulationConfig:
-    """What happens in a simulated log.
+    """Configuration of a simulated log.
 
     Parameters
     ----------
     box_world : ndarray, shape (2, 3)
-        Lower and upper corner (m) of where the body moves.
+        Lower and upper corner (m) of the body's range.
     duration : float
         (s)
     motion : {"walk", "turn", "static"}
     speed : float
-        Mean speed while moving (m/s), about.
+        Approximate mean speed while moving (m/s).
     imu_rate_hz, magnetometer_rate_hz : float
         The latter more than 2.5 times the highest tone.
     time_offset : float, optional
-        True time offset of the IMU (s); that which the site declares where it is None.
+        True time offset of the IMU (s); by default as declared.
     clock_rate : float, optional
-        True rate of the IMU's clock, by which its time offset grows; as declared where it is None.
+        True rate of the IMU's clock, by which its time offset grows; by default as declared.
     perturb : bool
         Whether the true calibration is drawn from the site's prior, or is as declared.
     noise_scale : float
@@ -84,21 +84,21 @@ class SimulationConfig:
     quantisation : float, optional
         Step of the magnetometer (T).
     instability : BiasInstability, optional
-        Of the IMU, beside its bias walk.
+        Of the IMU, in addition to its bias walk.
     ambient : Ambient, optional
         Iron, noise and drift of the room.
     reference : Reference, optional
         Of the same noise density and rate as the magnetometer.
     iron : int
-        Steel spheres drawn around the box, by `magfusion.simulation.disturbance.draw_spheres`;
-        where there are any they take the place of the ambient's.
+        Steel spheres drawn around the box, by `magfusion.simulation.disturbance.draw_spheres`; they
+        replace those of the ambient.
     random_field : float
-        Smooth random error of each beacon's field, as a share of it, alike within the site's
-        ``model_error_length``; where there is one it takes the place of the ambient's bending.
+        Smooth random error of each beacon's field, relative to it, correlated over the site's
+        ``model_error_length``; it replaces the ambient's bending.
     multiplexer : Multiplexer
-        By which coils are driven whose slots the site declares as marked.
+        Drives the coils whose slots the site declares as marked.
     shafts : ShaftErrors
-        How beacons turn that are magnets on shafts.
+        Rotation errors of beacons that are magnets on shafts.
     """
 
     __repr__ = short_repr
@@ -127,7 +127,7 @@ class SimulationConfig:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedLog:
-    """A log and everything that was true while it was recorded.
+    """A log and its true values.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ class SimulatedLog:
     motion : Motion
         Exact truth at any time.
     ambient : Ambient, optional
-        With the iron that was drawn.
+        With the drawn iron.
     """
 
     __repr__ = short_repr
@@ -160,8 +160,8 @@ class SimulatedLog:
 def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator) -> SimulatedLog:
     """Return a simulated log of a body moving among the beacons of a site.
 
-    Calibration, motion, IMU, magnetometer, iron and random field have generators of their own,
-    spawned from it: a change to one leaves the draws of the others as they were.
+    Calibration, motion, IMU, magnetometer, iron and random field have separate generators, spawned
+    from it: a change to one does not affect the draws of the others.
 
     Raises
     ------
@@ -211,8 +211,8 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
     several = bool(true_site.platform.further)
     if several and turning and config.shafts.encoder:
         raise InputError(
-            "encoder: beside the samples of several magnetometers no angle of a rotor is recorded;"
-            " simulate it without, or one magnetometer"
+            "encoder: the angle of a rotor cannot be recorded with several magnetometers; simulate"
+            " without an encoder, or with one magnetometer"
         )
     waveform = None if several else recorded(among, magnetometer_rng, None)
     waveforms = _of_each(among, recorded, magnetometer_rng) if several else {}
@@ -223,7 +223,7 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         rotation = replace(angles, time=waveform.time)
     reference = None
     if config.reference is not None:
-        # Spawned later than those of old, whose draws stay as they were.
+        # Spawned last, so that earlier draws do not change.
         reference = simulate_reference(
             config.reference, among, drives, config, rng.spawn(1)[0], ambient, marks
         )
@@ -257,7 +257,7 @@ def _of_each(
     recorded: Callable[[Site, np.random.Generator, np.random.Generator | None], Waveform],
     rng: np.random.Generator,
 ) -> dict[str, Waveform]:
-    """Return what each records: the surroundings are the same, its noise is its own."""
+    """Return the record of each magnetometer: common ambient field, separate noise."""
     surroundings = int(rng.integers(1 << 62))
     sensors = site.platform.magnetometers
     return {
@@ -279,9 +279,9 @@ def simulate_reference(
     ambient: Ambient | None,
     marks: Marks | None = None,
 ) -> Waveform:
-    """Return what a reference records, with its stamps.
+    """Return the record of a reference, with its stamps.
 
-    Mains and the noise of one place are not in it.
+    It contains no mains and no local noise.
     """
     count = int(config.duration * config.magnetometer_rate_hz)
     stamps: Array = np.arange(count) / config.magnetometer_rate_hz
@@ -315,19 +315,19 @@ def simulate_fields(
     Parameters
     ----------
     site : Site
-        The true one.
+        The true site.
     trajectory : Trajectory
         One epoch each (time and pose).
     sigma : float
         Standard deviation of each component's real, and imaginary, part (T).
     drives : Drives, optional
-        As the site declares where there is none.
+        By default as the site declares.
     window : float
-        Length that the samples declare (s); the field is that of the instant.
+        Window length of the samples (s); the field is instantaneous.
     spheres : Spheres, optional
         Iron in the room.
     layers : Layers, optional
-        Of the ground, in place of the full space that the site declares.
+        Of the ground, instead of the full space of the site.
     bending : Bending, optional
         Of each beacon's field.
     """
@@ -390,7 +390,7 @@ def _with_instruments(site: Site, config: SimulationConfig) -> Site:
 
 def _with_iron(site: Site, config: SimulationConfig, rng: np.random.Generator) -> Ambient | None:
     if config.iron < 0:
-        raise InputError(f"iron: found {config.iron} spheres; give none or more")
+        raise InputError(f"iron: found {config.iron} spheres; give zero or more")
     if config.iron == 0:
         return config.ambient
     beacons_world = np.array([beacon.position_world for beacon in site.beacons]).reshape(-1, 3)
@@ -406,8 +406,8 @@ def _with_bending(
     length = site.model_error_length
     if length == 0.0:
         raise InputError(
-            "model_error_correlation_m: found 0; give the site a length over which the random"
-            " field stays alike"
+            "model_error_correlation_m: found 0; declare a correlation length of the random field"
+            " in the site"
         )
     bending = draw_bending(rng, config.random_field, length, len(site.beacons))
     return replace(ambient or Ambient(), bending=bending)
@@ -427,5 +427,5 @@ def _motion(config: SimulationConfig, rng: np.random.Generator) -> Motion:
 
 
 def interpolate(time: Array, known_time: Array, values: Array) -> Array:
-    """Return columns of values (n, k) at other times."""
+    """Return columns of values (n, k), interpolated to other times."""
     return np.column_stack([np.interp(time, known_time, column) for column in values.T])

@@ -1,4 +1,4 @@
-"""How simulated magnetometers answer to tones, and whose channels are whose."""
+"""Frequency response of simulated magnetometers, and the channels of each."""
 
 import numpy as np
 
@@ -10,12 +10,12 @@ from magfusion.units import Array, ComplexArray
 def answered(
     phasor: ComplexArray, response: FrequencyResponse | AxisResponses | None, frequency_hz: Array
 ) -> ComplexArray:
-    """Return what a magnetometer makes of tones, shape (n, tones, 3).
+    """Return the response of a magnetometer to tones, shape (n, tones, 3).
 
     Parameters
     ----------
     phasor : complex ndarray, shape (n, tones, 3)
-        As one whose response is flat would measure them (T).
+        As measured with a flat response (T).
     frequency_hz : ndarray, shape (tones,)
     """
     if response is None:
@@ -32,7 +32,7 @@ def answered(
 
 
 def names_by_channel(site: Site) -> tuple[str, ...]:
-    """Return the magnetometer of each channel; nothing where there is one."""
+    """Return the magnetometer of each channel; empty for a single magnetometer."""
     sensors = site.platform.magnetometers
     count = len(site.channels) // len(sensors)
     if len(sensors) == 1:

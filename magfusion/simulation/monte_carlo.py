@@ -1,4 +1,4 @@
-"""Many independent tasks at once: on all cores of this machine, or on a Dask cluster."""
+"""Parallel independent tasks: on all cores of this machine, or on a Dask cluster."""
 
 import multiprocessing
 import os
@@ -19,7 +19,7 @@ Output = TypeVar("Output")
 Report = Callable[[str, int, int], None]  # stage, done, total
 
 CONNECT_S = 10.0  # patience with a cluster, s
-# A worker has one core: threads of its linear algebra would only fight each other for it.
+# A worker has one core: more threads of linear algebra would compete for it.
 _ONE_THREAD = (OF_ALL, *THREADS)
 
 
@@ -32,23 +32,23 @@ def run_many(
     workers: int | None = None,
     report: Report | None = None,
 ) -> list[Output]:
-    """Run a task on every input, each with random numbers of its own.
+    """Run a task on every input, each with its own random generator.
 
-    The generators are spawned from ``seed`` by the place of the input, so that results depend
+    The generators are spawned from ``seed`` by the index of the input, so that results depend
     neither on the number of workers nor on where they run.
 
     Parameters
     ----------
     task : callable
         Function of an input and a Generator, defined at the top of a module; a block of runs in
-        one call keeps the cost of passing it on small.
+        one call reduces the overhead.
     inputs : sequence
     cluster : str, optional
         Address of a Dask scheduler (``tcp://host:8786``) whose workers have magfusion installed.
     workers : int, optional
-        Processes on this machine, all cores by default; one runs the tasks right here.
+        Processes on this machine, all cores by default; one runs the tasks in this process.
     report : callable, optional
-        Called with the stage, the tasks done and all tasks.
+        Called with the stage, the number of finished tasks and of all tasks.
 
     Returns
     -------
@@ -60,7 +60,7 @@ def run_many(
     InputError
         Where the cluster cannot be used, or ``workers`` is below one.
     EstimationError
-        Where a process of this machine was ended from outside.
+        Where a process of this machine was killed.
     """
     with crew(len(inputs), cluster=cluster, workers=workers) as hands:
         return hands.run(task, inputs, seed=seed, report=report)
@@ -68,12 +68,12 @@ def run_many(
 
 @dataclass(frozen=True)
 class Crew:
-    """Processes that stay for several calls, so that starting them is paid for once.
+    """Processes that persist over several calls, so that they are started once.
 
     Parameters
     ----------
     executor : Executor, optional
-        None runs the tasks right here.
+        None runs the tasks in this process.
     """
 
     executor: Executor | None
@@ -97,12 +97,12 @@ class Crew:
 
 @contextmanager
 def crew(most: int, *, cluster: str | None = None, workers: int | None = None) -> Iterator[Crew]:
-    """Yield who runs tasks: this process, others of this machine, or a Dask cluster.
+    """Yield an executor of tasks: this process, others of this machine, or a Dask cluster.
 
     Parameters
     ----------
     most : int
-        Tasks at once.
+        Maximum number of concurrent tasks.
     cluster, workers : str, int, optional
         As of `run_many`.
 
@@ -161,7 +161,7 @@ def _gather(
 
 @contextmanager
 def _processes(count: int) -> Iterator[Executor]:
-    # Spawned, not forked: a fork copies the locks of other threads as they happen to be.
+    # Spawned, not forked: a fork copies the locks of other threads in their current state.
     context = multiprocessing.get_context("spawn")
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
@@ -170,8 +170,7 @@ def _processes(count: int) -> Iterator[Executor]:
             yield executor
     except BrokenProcessPool as error:
         raise EstimationError(
-            "a worker process was ended from outside, perhaps for want of memory; give fewer"
-            " --workers"
+            "a worker process was killed, possibly for lack of memory; reduce --workers"
         ) from error
     finally:
         for name, value in before.items():
@@ -193,8 +192,8 @@ def _dask(address: str) -> Iterator[Executor]:
         client = Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise InputError(
-            f"--cluster {address}: no Dask scheduler answers there; start one with dask scheduler,"
-            " and give the address that it prints"
+            f"--cluster {address}: no Dask scheduler responds; start one with dask scheduler, and"
+            " give the address that it prints"
         ) from error
     with client:
         try:
@@ -204,6 +203,6 @@ def _dask(address: str) -> Iterator[Executor]:
                 f"--cluster {address}: the scheduler has no workers; start some with dask worker"
                 f" {address}"
             ) from error
-        # Equal inputs are still runs of their own.
+        # Equal inputs are separate runs.
         with client.get_executor(pure=False) as executor:
             yield executor

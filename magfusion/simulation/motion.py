@@ -1,8 +1,8 @@
-"""True motion as an analytic function of time, so that rate and specific force are exact.
+"""True motion as an analytic function of time, for exact rate and specific force.
 
 A motion is a geometric path (position and attitude over a path parameter) and the progress along
-it over time.  The path parameter counts seconds of moving; where progress halts, all comes to rest
-at once.
+it over time.  The path parameter counts seconds of moving; where progress halts, the body comes to
+rest.
 """
 
 from dataclasses import dataclass
@@ -113,18 +113,18 @@ def random_walk_motion(
     duration : float
         (s)
     box_world : ndarray, shape (2, 3)
-        Lower and upper corner (m), which the path never leaves.
+        Lower and upper corner (m) of the path's bounds.
     speed : float
-        Mean speed while moving (m/s), about; slower where the box is small, to stay smooth.
+        Approximate mean speed while moving (m/s); lower where the box is small, to stay smooth.
     tilt_rms : float
-        Of the angle between the body's z axis and the vertical (rad), about.
+        Of the angle between the body's z axis and the vertical (rad), approximate.
     heading_rate_rms : float
-        (rad/s), about.
+        Approximate (rad/s).
 
     Raises
     ------
     InputError
-        If the box, the duration or the speed cannot be.
+        If the box, the duration or the speed is invalid.
     """
     rate, moving, knots = _progress(duration, rests or Rests())
     tilt = rng.normal(0.0, tilt_rms / np.sqrt(2.0), (len(knots), 3)) * [1.0, 1.0, 0.0]
@@ -143,19 +143,19 @@ def turning_motion(
     rate_rms: float = 0.6,
     rests: Rests | None = None,
 ) -> Motion:
-    """Return a motion that turns about all axes, as of a body turned by hand to calibrate it.
+    """Return a rotation about all axes, as of a body rotated by hand for calibration.
 
     Parameters
     ----------
     rng, duration, box_world, speed, rests
         As in `random_walk_motion`.
     rate_rms : float
-        Of the angular rate (rad/s), about.
+        Of the angular rate (rad/s), approximate.
 
     Raises
     ------
     InputError
-        If the box, the duration or the speed cannot be.
+        If the box, the duration or the speed is invalid.
     """
     rate, moving, knots = _progress(duration, rests or Rests())
     attitudes = [Rotation.random(rng=rng)]
@@ -188,7 +188,7 @@ def progress_rate(duration: float, rests: Rests) -> BPoly:
         begin = end + rests.pause
     times.append(duration)
     rates.append(0.0)
-    # Where a rest has no length its two ends are one knot.
+    # The two ends of a rest of zero length are one knot.
     keep = np.append(np.diff(times) > 1e-9, True)
     keep[0] = keep[0] or not keep[1]
     knots, values = np.array(times)[keep], np.array(rates)[keep]
@@ -205,7 +205,7 @@ def _progress(duration: float, rests: Rests) -> tuple[BPoly, float, Array]:
 def _path_in_box(
     rng: np.random.Generator, box_world: Array, speed: float, moving: float
 ) -> BSpline:
-    """Return a quintic B-spline whose control points, and so all of it, lie in the box."""
+    """Return a quintic B-spline whose control points, and hence all of it, lie in the box."""
     box = np.asarray(box_world, dtype=float)
     if box.shape != (2, 3) or np.any(box[0] > box[1]):
         raise InputError(

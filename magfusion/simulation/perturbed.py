@@ -1,4 +1,4 @@
-"""A true site that errs by as much as the declared one says, and has the field of its place."""
+"""A true site with errors drawn from the declared sigmas, and with the field of its place."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,12 +16,11 @@ Draw = Callable[[str, str, str, Array], Array]
 
 
 def perturb_site(site: Site, rng: np.random.Generator) -> Site:
-    """Return a site whose calibration is drawn from the priors that the given one declares.
+    """Return a site whose calibration is drawn from the declared priors.
 
     Rotations are perturbed on the right, in beacon and in sensor axes; positions in world axes
     (beacons) and in body axes (magnetometer); moments and the ground's conductivity by the
-    exponential of their logarithm's.
-    What goes together is drawn together.
+    exponential of their logarithm's.  Correlated parameters are drawn together.
     """
     draw = _draws(site.correlation, rng)
     beacons = tuple(_perturb_beacon(beacon, draw) for beacon in site.beacons)
@@ -36,7 +35,7 @@ def perturb_site(site: Site, rng: np.random.Generator) -> Site:
 
 
 def _draws(correlation: Correlation | None, rng: np.random.Generator) -> Draw:
-    """Return a function that draws the error of a parameter, in unison with its relatives."""
+    """Return a function that draws the error of a parameter, jointly with correlated ones."""
     own: dict[Component, float] = {}
     if correlation is not None:
         unit = rng.standard_normal(len(correlation.parameters))

@@ -1,10 +1,11 @@
-"""Steel beside and about a sensor: casing of wells, and rails.
+"""Steel around a sensor: casing of wells, and rails.
 
-A pipe's wall gathers the field along it and is magnetised along and across.  Cut into segments,
-each is a dipole in the field of the source and of all other segments, for which a linear system is
-solved; its demagnetisation is that of a segment of its own size.  A sensor inside a tube sees what
-comes through the wall: the exact solution in Bessel functions of a long tube of any wall in a
-uniform field, across and along; the estimators' formula for a thin wall (Kaden) is no part of this.
+A pipe's wall concentrates the field along it and is magnetised along and across.  Cut into
+segments, each is a dipole in the field of the source and of all other segments, for which a linear
+system is solved; its demagnetisation is that of a segment of its own size.  A sensor inside a tube
+receives the field through the wall: the exact solution in Bessel functions of a long tube of any
+wall in a uniform field, across and along.  The estimators' thin-wall formula (Kaden) is not used
+here.
 """
 
 from dataclasses import dataclass
@@ -38,7 +39,7 @@ class Pipe:
     conductivity : float
         (S/m)
     segment : float
-        Length of a segment, at most (m).
+        Maximum length of a segment (m).
     """
 
     start_world: Array
@@ -51,13 +52,13 @@ class Pipe:
 
     @property
     def axis_world(self) -> Array:
-        """Unit vector along it."""
+        """Unit vector along the axis."""
         along = self.end_world - self.start_world
         return np.asarray(along / np.linalg.norm(along))
 
     @property
     def length(self) -> float:
-        """From end to end (m)."""
+        """Length (m)."""
         return float(np.linalg.norm(self.end_world - self.start_world))
 
     @property
@@ -78,14 +79,14 @@ class Pipe:
         return self.start_world + share[:, None] * (self.end_world - self.start_world)
 
     def through(self, frequency_hz: float) -> "Through":
-        """Return what comes through the wall."""
+        """Return the response of the wall."""
         return wall_transmission(self, frequency_hz)
 
 
 class Through(NamedTuple):
-    """Field inside over field outside, by phasors of exp(+j w t), and what the wall answers.
+    """Field inside over field outside, as phasors of exp(+j w t), and the wall's response.
 
-    ``dipole`` is the moment across of a metre of the tube, over the field outside times 2 pi
+    ``dipole`` is the transverse moment of a metre of the tube, over the field outside times 2 pi
     radius^2 / mu0; ``wall`` the mean field along the wall's steel, over that of its surface.
     """
 
@@ -96,7 +97,7 @@ class Through(NamedTuple):
 
 
 def wall_transmission(pipe: Pipe, frequency_hz: float) -> Through:
-    """Return the exact response of a long tube in a uniform field that alternates."""
+    """Return the exact response of a long tube in a uniform alternating field."""
     outer, inner = pipe.radius, pipe.radius - pipe.wall
     mu = pipe.permeability
     k = np.sqrt(2j * np.pi * max(frequency_hz, 1e-6) * MU0 * mu * pipe.conductivity)
@@ -133,13 +134,13 @@ def wall_transmission(pipe: Pipe, frequency_hz: float) -> Through:
 
 @dataclass(frozen=True, eq=False)
 class Steel:
-    """Some pipes, each answering the others.
+    """Interacting pipes.
 
     Parameters
     ----------
     pipes : tuple of Pipe
     about : int, optional
-        Number of the one that the sensor is in, on its axis.
+        Index of the pipe around the sensor, which is on its axis.
     """
 
     pipes: tuple[Pipe, ...]
@@ -156,7 +157,7 @@ class Steel:
         point_world: Array,
         frequency_hz: float,
     ) -> ComplexArray:
-        """Return what a sensor sees of sources, steel included, shape (k, 3) (T).
+        """Return the field of sources at a sensor, steel included, shape (k, 3) (T).
 
         Parameters
         ----------
@@ -204,7 +205,7 @@ class Steel:
             steel = pipe.area * span * (pipe.permeability * through.wall - 1.0)
             across = 2.0 * np.pi * pipe.radius**2 * span * through.dipole
             answer[own] = (steel * along + across * (np.eye(3) - along)) / MU0
-            # What a pipe does to itself across is in its response; along there are its poles.
+            # A pipe's effect on itself: across it is in its response, along it in its poles.
             middle = (pipe.centres_world() - pipe.start_world) @ axis
             rings = np.stack([_ring_field(pipe, float(x)) for x in middle])
             tensor[own, own] = rings[..., None, None] * along
@@ -224,9 +225,9 @@ def dipole_tensor(offset: Array) -> Array:
 def _ring_field(pipe: Pipe, place: float) -> Array:
     """Return the field along the axis of each segment's poles, over its moment, shape (n,).
 
-    At a place on the axis (m from the start); the poles lie in the middle of the wall.  Between
-    segments the moment is a smooth curve through theirs, for the poles nearest to a place on the
-    axis are not farther from it than the radius.
+    At positions on the axis (m from the start); the poles lie in the middle of the wall.  Between
+    segments the moment is a smooth curve through theirs, because the nearest poles are as close to
+    a point on the axis as the radius.
     """
     count = len(pipe.centres_world())
     finer = max(int(np.ceil(pipe.span / (FINE * pipe.radius))), 1) if count > LEAST_CURVE else 1
@@ -245,14 +246,14 @@ def _ring_field(pipe: Pipe, place: float) -> Array:
 
 @cache
 def _curve(count: int, span: float, place: tuple[float, ...]) -> Array:
-    """Return the curve through values at segments at places, over each value (places, n)."""
+    """Return the interpolating curve at positions, per value of each segment (places, n)."""
     centres = span * (np.arange(count) + 0.5)
     inside = np.clip(place, centres[0], centres[-1])
     return np.asarray(CubicSpline(centres, np.eye(count))(inside))
 
 
 def inside_world(pipe: Pipe, outside_world: AnyArray, frequency_hz: float) -> ComplexArray:
-    """Return what a sensor inside a tube sees of a field outside, shape (..., 3) (T)."""
+    """Return the field at a sensor inside a tube, from the field outside, shape (..., 3) (T)."""
     through, axis = pipe.through(frequency_hz), pipe.axis_world
     along = np.outer(axis, axis)
     tensor = through.along * along + through.across * (np.eye(3) - along)

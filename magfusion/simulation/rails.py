@@ -1,7 +1,7 @@
-"""Rails and pipes of steel in the room: straight bars and tubes, each answering the others.
+"""Rails and pipes of steel in the room: interacting straight bars and tubes.
 
-They are those of `magfusion.simulation.pipe`, with segments short enough for where the platform
-moves and the beacons stand.
+They are those of `magfusion.simulation.pipe`, with segments that are short relative to the distance
+of the platform and the beacons.
 """
 
 from dataclasses import replace
@@ -28,7 +28,7 @@ USAGE = (
 
 
 def rails_option(text: str) -> tuple[Pipe, ...]:
-    """Read ``radius[/wall]:x,y,z:x,y,z`` of each (m), separated by semicolons.
+    """Parse ``radius[/wall]:x,y,z:x,y,z`` of each (m), separated by semicolons.
 
     Raises
     ------
@@ -56,19 +56,19 @@ def _pipe(part: str, text: str) -> Pipe:
 
 
 def laid(pipes: tuple[Pipe, ...], box_world: Array, beacons_world: Array) -> Steel:
-    """Return steel about a room, in segments that are short against every distance to it.
+    """Return steel around a room, in segments that are short relative to every distance to it.
 
     Parameters
     ----------
     box_world : ndarray, shape (2, 3)
-        Lower and upper corner (m) of where the body moves.
+        Lower and upper corner (m) of the body's range.
     beacons_world : ndarray, shape (beacons, 3)
         (m)
 
     Raises
     ------
     InputError
-        If steel comes nearer than `NEAREST` to the box or to a beacon, or crosses itself.
+        If steel comes closer than `NEAREST` to the box or to a beacon, or crosses itself.
     """
     whole = []
     for number, pipe in enumerate(pipes, 1):
@@ -78,8 +78,8 @@ def laid(pipes: tuple[Pipe, ...], box_world: Array, beacons_world: Array) -> Ste
         away = min(float(np.min(to_box)), float(np.min(to_beacon, initial=np.inf))) - pipe.radius
         if away < NEAREST:
             raise InputError(
-                f"--rails: number {number} comes within {max(away, 0.0):.2g} m of where the"
-                f" platform moves (--box) or of a beacon; keep {NEAREST:g} m"
+                f"--rails: number {number} comes within {max(away, 0.0):.2g} m of the platform's"
+                f" range (--box) or of a beacon; keep a distance of {NEAREST:g} m"
             )
         whole.append(replace(pipe, segment=_segment(pipe, away)))
     _check_count(whole)
@@ -88,12 +88,12 @@ def laid(pipes: tuple[Pipe, ...], box_world: Array, beacons_world: Array) -> Ste
 
 
 def beside_wells(pipes: tuple[Pipe, ...], ways_world: list[Array]) -> tuple[Pipe, ...]:
-    """Return steel beside the ways (n, 3) (m) of a sensor and of a magnet, in short segments.
+    """Return steel near the paths (n, 3) (m) of a sensor and of a magnet, in short segments.
 
     Raises
     ------
     InputError
-        If steel comes nearer than `NEAREST` to a way, or crosses itself.
+        If steel comes closer than `NEAREST` to a path, or crosses itself.
     """
     whole = []
     for number, pipe in enumerate(pipes, 1):
@@ -104,8 +104,8 @@ def beside_wells(pipes: tuple[Pipe, ...], ways_world: list[Array]) -> tuple[Pipe
         away = float(np.min(apart)) - pipe.radius
         if away < NEAREST:
             raise InputError(
-                f"--rails: number {number} comes within {max(away, 0.0):.2g} m of the sensor or of"
-                f" the magnet's way; keep {NEAREST:g} m"
+                f"--rails: number {number} comes within {max(away, 0.0):.2g} m of the path of the"
+                f" sensor or of the magnet; keep a distance of {NEAREST:g} m"
             )
         whole.append(replace(pipe, segment=_segment(pipe, away)))
     _check_count(whole)
@@ -121,8 +121,8 @@ def _check_count(pipes: list[Pipe]) -> None:
     count = sum(len(pipe.centres_world()) for pipe in pipes)
     if count > MOST_SEGMENTS:
         raise InputError(
-            f"--rails: {count} segments are too many (at most {MOST_SEGMENTS}); lay shorter ones,"
-            " or farther from where the platform moves"
+            f"--rails: {count} segments are too many (at most {MOST_SEGMENTS}); use shorter rails,"
+            " or place them farther from the platform"
         )
 
 
@@ -135,15 +135,14 @@ def _check_apart(pipes: list[Pipe]) -> None:
             if away < pipe.radius + other.radius + 0.5 * min(pipe.segment, other.segment):
                 raise InputError(
                     f"--rails: numbers {second + 1} and {first + 1} come within {away:.2g} m of"
-                    " each other; what touches is one piece: leave one out, or lay them farther"
-                    " apart"
+                    " each other; touching parts are one piece; omit one, or increase the distance"
                 )
 
 
 def secondary_world(
     steel: Steel, at_segments_world: ComplexArray, frequencies_hz: Array, point_world: Array
 ) -> ComplexArray:
-    """Return the phasors that steel adds at points.
+    """Return the phasors of steel at points.
 
     Parameters
     ----------
@@ -178,9 +177,9 @@ def secondary_world(
 
 
 def layered_at(steel: Steel, beacon: Beacon, layers: Layers) -> ComplexArray:
-    """Return what layered ground adds to each coil's field at the segments, (n, coils, 3) (T).
+    """Return the contribution of layered ground at the segments, (n, coils, 3) (T).
 
-    Segments may lie in any layer, and as far along as rails do: each is calculated, by heights.
+    Segments may lie in any layer and at any distance: each is computed directly, by height.
     """
     point_world = steel.points_world()
     added = np.zeros((len(point_world), len(beacon.coils), 3), dtype=np.complex128)
@@ -198,6 +197,6 @@ def layered_at(steel: Steel, beacon: Beacon, layers: Layers) -> ComplexArray:
 
 
 def magnetised_world(steel: Steel, earth_field_world: Array, point_world: Array) -> Array:
-    """Return what the Earth's field (T), which magnetises steel, adds at points (n, 3) (T)."""
+    """Return the field of steel magnetised by the Earth's field (T) at points (n, 3) (T)."""
     even = np.broadcast_to(earth_field_world, (len(steel.points_world()), 1, 3))
     return np.real(secondary_world(steel, even.astype(complex), np.zeros(1), point_world)[:, 0])

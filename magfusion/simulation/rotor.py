@@ -1,8 +1,8 @@
-"""A magnet that turns on a shaft in one well, a sensor at rest in another: what it records.
+"""Log of a sensor at rest in one well while a magnet rotates on a shaft in another.
 
-The moment itself is turned, sample by sample, with its stack's length, its tilt and the whirl of
-the shaft; nothing here knows of two coils in quadrature.  What the ground's layers and steel do
-to a field that alternates is added as a phasor that turns with the shaft.
+The moment itself is rotated, sample by sample, with its stack's length, its tilt and the whirl of
+the shaft; two coils in quadrature are not used.  The contribution of the ground's layers and of
+steel is added as a phasor that rotates with the shaft.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ NODES_APART = 0.08  # of the distance, between places where steel and layers are
 
 @dataclass(frozen=True, eq=False)
 class Pass:
-    """A sensor at rest while the magnet goes by.
+    """A pass of the magnet at a sensor at rest.
 
     Parameters
     ----------
@@ -37,11 +37,11 @@ class Pass:
     start_world : ndarray, shape (3,)
         Of the magnet (m).
     world_from_rotor : ndarray, shape (3, 3)
-        Its attitude, which stays as it is; it goes along its axis.
+        Its attitude, constant; it moves along its axis.
     depth : tuple of float
         Of the magnet along its hole when the pass begins and ends (m).
     speed : float
-        Of it along the hole (m/s).
+        Speed of the magnet along the hole (m/s).
     """
 
     sensor_depth: float
@@ -54,13 +54,13 @@ class Pass:
 
     @property
     def duration(self) -> float:
-        """How long it takes (s)."""
+        """Duration of the pass (s)."""
         return abs(self.depth[1] - self.depth[0]) / self.speed
 
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What is about the wells."""
+    """Surroundings of the wells."""
 
     layers: Layers | None = None
     steel: Steel | None = None
@@ -79,15 +79,15 @@ def simulate_passes(
     gap: float = 30.0,
     encoder: bool = True,
 ) -> Log:
-    """Return a log of passes, one after the other.
+    """Return a log of consecutive passes.
 
     Parameters
     ----------
     site : Site
-        The true one: its only beacon is a rotor.  Where it is and how it is turned is said by the
+        The true site: its only beacon is a rotor, whose position and attitude are those of the
         passes.
     gap : float
-        Between two passes, in which nothing is recorded (s).
+        Unrecorded interval between two passes (s).
     encoder : bool
         Whether the angle of the shaft is recorded.
     """
@@ -136,7 +136,7 @@ def simulate_passes(
 def passing_phasor(
     site: Site, shaft: Shaft, own: Pass, around: Surroundings, depth: Array
 ) -> ComplexArray:
-    """Return the phasor of once a turn at the sensor, world axes, shape (n, 3) (T).
+    """Return the once-per-turn phasor at the sensor, world axes, shape (n, 3) (T).
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ def passing_phasor(
 
 
 def _stack(shaft: Shaft) -> Array:
-    """Return where the parts of the stack are along the shaft (m)."""
+    """Return the positions of the stack's parts along the shaft (m)."""
     return np.asarray(shaft.length * (np.arange(4) - 1.5) / 4.0)
 
 
@@ -205,7 +205,7 @@ def _added(
     depth: Array,
     stack: Array,
 ) -> ComplexArray | None:
-    """Return the phasor that layers and steel add at each sample, shape (n, 3) (T).
+    """Return the phasor of layers and steel at each sample, shape (n, 3) (T).
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ def _added(
 def _ground(
     frequency_hz: float, moments: Array, at_world: Array, own: Pass, layers: Layers
 ) -> ComplexArray:
-    """Return what layers add of a magnet at places, shape (n, 3, 3): they are level."""
+    """Return the contribution of horizontal layers for a magnet at positions, shape (n, 3, 3)."""
     middle = at_world[len(at_world) // 2]
     seen_from = own.sensor_world + middle - at_world
     seen_from[:, 2] = own.sensor_world[2]  # layers are level; how it climbs changes little of it

@@ -1,7 +1,7 @@
-"""Beacons that are magnets on shafts, about which a platform moves.
+"""Beacons that are magnets on shafts, around which a platform moves.
 
 Each order of the shaft's angle is a tone of the moment's own spectrum, with its own coils; their
-carrier is the angle, not the clock.  The part of the moment that does not turn is steady.
+carrier is the angle, not the clock.  The non-rotating part of the moment is static.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,14 +23,14 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class Turning:
-    """How a beacon's magnet turns.
+    """Rotation of a beacon's magnet.
 
     Parameters
     ----------
     angle : callable
         Of the shaft (rad), of times (s).
     steady_beacon : ndarray, shape (3,)
-        Moment that does not turn (A m^2).
+        Static moment (A m^2).
     encoder_sigma : float
         (rad)
     """
@@ -43,7 +43,7 @@ class Turning:
 def turn_rotors(
     site: Site, errors: ShaftErrors, duration: float, rng: np.random.Generator
 ) -> tuple[Site, dict[str, Turning]]:
-    """Return a site whose rotors have all orders of their true moments, and how they turn."""
+    """Return a site whose rotors have all orders of their true moments, and their rotation."""
     beacons, turning = list[Beacon](), dict[str, Turning]()
     for beacon in site.beacons:
         if beacon.rotor is None:
@@ -62,7 +62,7 @@ def turn_rotors(
 def recorded_angles(
     turning: Mapping[str, Turning], time: Array, rng: np.random.Generator
 ) -> RotorAngles:
-    """Return what encoders record at times (n,) (s)."""
+    """Return encoder records at times (n,) (s)."""
     angles = {
         name: np.mod(
             own.angle(time) + own.encoder_sigma * rng.standard_normal(len(time)), 2.0 * np.pi

@@ -1,6 +1,6 @@
-"""How a magnet on a shaft truly turns: the moment itself, angle by angle.
+"""True rotation of a magnet on a shaft: the moment itself, as a function of angle.
 
-Nothing here knows of the two coils in quadrature by which a rotor is estimated.
+The two coils in quadrature of the rotor's estimation model are not used here.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ LEAST_DRIFT_TIME = 1.0  # s
 
 @dataclass(frozen=True, eq=False)
 class Shaft:
-    """How a magnet truly turns, beyond what its site declares.
+    """True rotation of a magnet, in addition to what its site declares.
 
     Parameters
     ----------
@@ -30,15 +30,15 @@ class Shaft:
     drift_time : float
         Of correlation (s).
     slip : float
-        Amplitude of the angle's error twice a turn, as of a joint that is bent (rad).
+        Amplitude of the angle's error twice per turn, as of a bent joint (rad).
     slip_phase : float
         (rad)
     whirl : float
-        By which the shaft's axis circles against its turning (rad).
+        Angle of the shaft's axis in backward whirl (rad).
     length : float
         Of the stack of magnets along the shaft (m).
     encoder_sigma : float
-        Of an angle as it is recorded (rad).
+        Of a recorded angle (rad).
     """
 
     angle_start: float = 0.3
@@ -53,12 +53,12 @@ class Shaft:
 
 @dataclass(frozen=True)
 class ShaftErrors:
-    """What shafts do beyond what their rotors declare, and how they are recorded.
+    """Rotation errors of shafts in addition to the declared, and their record.
 
     Parameters
     ----------
     drift_hz : float, optional
-        Root mean square of the speed about its mean; the rotor's ``speed_sigma_hz``.
+        Root mean square of the speed about its mean; by default the rotor's ``speed_sigma_hz``.
     whirl : float
         (rad)
     encoder : bool
@@ -74,7 +74,7 @@ class ShaftErrors:
 
 
 def draw_shaft(rotor: Rotor, errors: ShaftErrors, rng: np.random.Generator) -> Shaft:
-    """Draw how a rotor turns: an angle that errs twice a turn makes an ellipse of half its size."""
+    """Draw a rotation: an angle error twice per turn makes an ellipse of half its size."""
     rms = rotor.speed_sigma_hz if errors.drift_hz is None else errors.drift_hz
     first, second = 2.0 * rotor.ellipse_sigma * rng.standard_normal(2)
     return Shaft(
@@ -98,7 +98,7 @@ def turned_moment(rotor: Rotor, shaft: Shaft, angle: Array) -> Array:
     moment = rotor.moment * (moment + np.sin(rotor.tilt) * axis)
     for one in rotor.harmonics:
         moment = moment + np.cos(one.order * true + one.phase) * one.moment_beacon
-    # Backward whirl: the shaft leans by a small angle about a direction that circles against it.
+    # Backward whirl: the shaft leans by a small angle about a direction that rotates against it.
     lean = shaft.whirl * (zero * np.cos(angle)[:, None] - across * np.sin(angle)[:, None])
     size = np.linalg.norm(lean, axis=1, keepdims=True)
     if not shaft.whirl:

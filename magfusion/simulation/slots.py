@@ -1,4 +1,4 @@
-"""Coils that are driven in turn: when each carries its current."""
+"""Coils driven in turn: the times of each current."""
 
 from dataclasses import dataclass
 
@@ -15,14 +15,14 @@ SHORTEST_PAUSE = 0.05  # of the longest
 
 @dataclass(frozen=True)
 class Multiplexer:
-    """A host that drives one coil after the other, and pauses as long as it happens to.
+    """A host that drives one coil after the other, with random pauses.
 
     Parameters
     ----------
     burst : float
         Of each coil, and of the silence after the last (s).
     pause : float
-        Longest between two (s); each is drawn.
+        Maximum pause (s); each is drawn.
     """
 
     burst: float = 0.002
@@ -30,7 +30,7 @@ class Multiplexer:
 
 
 def is_multiplexed(site: Site) -> bool:
-    """Return whether bursts of the site's coils follow no clock."""
+    """Return whether bursts of the site's coils are not clocked."""
     return any(isinstance(beacon.slots, MarkedSlots) for beacon in site.beacons)
 
 
@@ -48,7 +48,7 @@ def draw_marks(
 
 
 def check_slots(beacon: Beacon, rate_hz: float, marks: Marks | None = None) -> None:
-    """Refuse coils in time slots that no schedule drives, or that the samples cannot follow.
+    """Raise an error for time slots that no schedule drives, or that are too short for the samples.
 
     Raises
     ------
@@ -59,9 +59,8 @@ def check_slots(beacon: Beacon, rate_hz: float, marks: Marks | None = None) -> N
     slots = beacon.slots
     if slots is None or (isinstance(slots, MarkedSlots) and marks is None):
         raise InputError(
-            f"beacons.{beacon.name}: found coils in time slots, of which no waveform can be "
-            "simulated without the beacon's slots: {duration_s, count}; add it, or give each coil "
-            "a frequency_hz instead"
+            f"beacons.{beacon.name}: coils in time slots cannot be simulated without the beacon's "
+            "slots: {duration_s, count}; add it, or give each coil a frequency_hz instead"
         )
     if isinstance(slots, MarkedSlots):
         assert marks is not None
@@ -79,7 +78,7 @@ def check_slots(beacon: Beacon, rate_hz: float, marks: Marks | None = None) -> N
 def slot_gates(beacon: Beacon, time: Array, marks: Marks | None = None) -> Array:
     """Return one while a tone's coils are driven and zero otherwise, shape (n, tones).
 
-    The current is switched at once: a real driver takes its time constant.
+    The current is switched instantly: a real driver has a time constant.
     """
     gates = np.ones((len(time), len(beacon.tones)))
     if beacon.slots is None:

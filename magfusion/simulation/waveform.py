@@ -29,7 +29,7 @@ def _vertical() -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Mains:
-    """Hum of the power lines, uniform over the room.
+    """Hum of power lines, uniform over the room.
 
     Parameters
     ----------
@@ -47,12 +47,12 @@ class Mains:
 
 
 def usual_rate_hz(site: Site, burst: float = Multiplexer.burst) -> float:
-    """Return a sampling rate that suits the fastest tone and the shortest time slot (Hz).
+    """Return a sampling rate suitable for the fastest tone and the shortest time slot (Hz).
 
     Parameters
     ----------
     burst : float
-        Length of a slot that no clock tells (s).
+        Length of an unclocked slot (s).
     """
     least = [LEAST_SAMPLES_PER_CYCLE * float(b.tone_frequencies_hz.max()) for b in site.beacons]
     lengths = [
@@ -77,12 +77,12 @@ def simulate_waveform(
     own: np.random.Generator | None = None,
     begin: float = 0.0,
 ) -> Waveform:
-    """Return the field of everything at each sample's own pose, as the magnetometer gives it.
+    """Return the field of all sources at each sample's own pose, as measured.
 
     Parameters
     ----------
     site : Site
-        The true one.  Its Earth field is none where it is not declared.
+        The true site.  A missing Earth field is zero.
     rate_hz : float
         More than 2.5 samples in the fastest cycle.
     duration : float
@@ -95,7 +95,7 @@ def simulate_waveform(
     ambient : Ambient, optional
         Iron, bending, noise and drift of the room.
     marks : Marks, optional
-        When the coils are driven whose slots no clock tells.
+        When the coils of unclocked slots are driven.
     own : Generator, optional
         Of the instrument's noise; without it all is drawn from one.
     begin : float
@@ -149,7 +149,7 @@ def _answered_tones(
     world_from_body: Rotation,
     tones: Iterable[tuple[float, ComplexArray]],
 ) -> Iterator[Array]:
-    """Yield what a magnetometer with a response shows of tones, each with its frequency (Hz)."""
+    """Yield the response of a magnetometer to tones, each with its frequency (Hz)."""
     measured_from_world = (
         magnetometer.matrix @ magnetometer.body_from_sensor.T @ world_from_body.inv().as_matrix()
     )
@@ -163,7 +163,8 @@ def _check_tones(site: Site, rate_hz: float, marks: Marks | None, drives: Drives
     for beacon in site.beacons:
         highest = float(beacon.tone_frequencies_hz.max())
         if beacon.name in drives.turning and beacon.rotor is not None:
-            # What a shaft's slip and whirl add beyond half the rate aliases, as in an instrument.
+            # Components of a shaft's slip and whirl beyond half the rate alias, as in an
+            # instrument.
             orders = (1, *(one.order for one in beacon.rotor.harmonics))
             highest = beacon.frequency_hz * max(orders)
         if rate_hz < LEAST_SAMPLES_PER_CYCLE * highest:
@@ -182,7 +183,7 @@ def beacons_world(
     ambient: Ambient,
     marks: Marks | None = None,
 ) -> Array:
-    """Return the field of all beacons at a place (m) of each time (s), shape (n, 3) (T)."""
+    """Return the field of all beacons at the position (m) of each time (s), shape (n, 3) (T)."""
     field_world = np.zeros((len(time), 3))
     for _, tone_world in _tones_world(site, drives, time, point_world, ambient, marks):
         field_world += np.real(tone_world)
@@ -197,7 +198,7 @@ def _tones_world(
     ambient: Ambient,
     marks: Marks | None,
 ) -> Iterator[tuple[float, ComplexArray]]:
-    """Yield frequency and field of each tone (n, 3), of which the real part is there (Hz, T)."""
+    """Yield frequency and field of each tone (n, 3), whose real part is the signal (Hz, T)."""
     first = 0
     for i, (beacon, drift) in enumerate(zip(site.beacons, drives.drift, strict=True)):
         phasors = phasors_world(beacon, point_world, ambient.spheres, ambient.layers, ambient.rails)

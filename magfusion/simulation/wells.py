@@ -1,4 +1,4 @@
-"""Two wells: a sensor at rest in one, in places one after the other, a magnet that goes by."""
+"""Two wells: a sensor at rest in one, at successive places, and a magnet passing in the other."""
 
 from dataclasses import dataclass, replace
 
@@ -15,29 +15,29 @@ LATERAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])  # right and up of x dow
 
 @dataclass(frozen=True)
 class TwoWells:
-    """How two wells lie.
+    """Geometry of two wells.
 
-    The sensor's leads east, its depth counted from the world's origin.
+    The sensor's well leads east, its depth counted from the world's origin.
 
     Parameters
     ----------
     distance : float
-        Between them, about (m).
+        Approximate distance between them (m).
     direction : float
-        In which the magnet's is, from the high side, clockwise looking down the hole (rad).
+        Of the magnet's well, from the high side, clockwise looking down the hole (rad).
     dip : float
         Of the sensor's well below the horizontal (rad).
     lean : tuple of float
-        Of the magnet's well against the sensor's: turned about the left, and about the high side
-        (rad).
+        Of the magnet's well relative to the sensor's: rotation about the left, and about the high
+        side (rad).
     turn : float
         Of the magnet's angle zero about its shaft (rad).
     ahead : float
-        Of where the magnet is at ``depth`` (m).
+        Of the magnet's position at ``depth`` (m).
     apart : float
-        Of the sensor's two places along its well (m).
+        Between the sensor's two places along its well (m).
     reach : float
-        Of the magnet's way on either side of the sensor (m).
+        Of the magnet's path on either side of the sensor (m).
     speed : float
         Of the magnet along its well (m/s).
     depth : float
@@ -112,12 +112,12 @@ class TwoWells:
     def casing(
         self, half: float, radius: float, steel: tuple[float, float, float], segment: float
     ) -> Pipe:
-        """Return the casing about the sensor.
+        """Return the casing around the sensor.
 
         Parameters
         ----------
         half : float
-            How far it goes both ways from the middle between its places (m).
+            Half length from the middle between its places (m).
         radius : float
             Outside (m).
         steel : tuple of float
@@ -129,10 +129,10 @@ class TwoWells:
         return Pipe(-half * down, half * down, radius, *steel, segment)
 
     def abreast(self, own: Pass) -> tuple[float, float, float]:
-        """Return what is true of a pass.
+        """Return the true values of a pass.
 
-        Its distance (m), direction from the high side (rad), and the magnet's depth when it is
-        nearest (m).
+        Its distance (m), direction from the high side (rad), and the magnet's depth at the closest
+        approach (m).
         """
         along = self.along_world
         body_world = (own.sensor_depth - self.depth) * self.side_world[:, 0]
@@ -144,7 +144,7 @@ class TwoWells:
         return distance, float(np.arctan2(right, up)), own.depth[0] + travel
 
     def leads(self) -> tuple[float, float]:
-        """Return how the magnet's well leads to the right and up, seen from the sensor's (rad)."""
+        """Return the magnet's well direction to the right and up, from the sensor's (rad)."""
         along = self.side_world.T @ self.along_world
         right, up = LATERAL @ along
         return float(np.arctan2(right, along[0])), float(np.arctan2(up, along[0]))
@@ -162,7 +162,7 @@ def _first_from(axis: Array) -> Array:
 
 
 def lean_of(right: float, up: float) -> tuple[float, float]:
-    """Return the lean of a well that leads so from the sensor's (rad)."""
+    """Return the lean of a well of this direction relative to the sensor's (rad)."""
     along = np.array([1.0, -np.tan(right), np.tan(up)])
     along = along / np.linalg.norm(along)
     angle, across = np.arccos(min(along[0], 1.0)), float(np.hypot(along[1], along[2]))
@@ -171,7 +171,7 @@ def lean_of(right: float, up: float) -> tuple[float, float]:
 
 
 def drawn_steel(casing: Casing, rng: np.random.Generator) -> Casing:
-    """Return a casing whose steel errs by as much as is declared."""
+    """Return a casing whose steel errs by as much as declared."""
     wall, permeability, conductivity = np.exp(casing.steel_sigma * rng.standard_normal(3)) * [
         casing.wall,
         casing.permeability,

@@ -1,11 +1,11 @@
-"""The room of paper 004, and the ways in which its field may differ from that of known dipoles.
+"""The room of paper 004, and deviations of its field from that of known dipoles.
 
-A `Scenario` says how a world is disturbed, `draw_world` draws one, and a `World` gives what a
-sensor measures in it, anywhere and with a fingerprint survey.  What an estimator may know is
+A `Scenario` specifies the disturbances of a world, `draw_world` draws one, and a `World` gives a
+sensor's measurements in it, anywhere and with a fingerprint survey.  The estimator's knowledge is
 `World.site`: dipoles, exactly surveyed.  The scenarios are those of the independent analysis of the
 paper: noise alone (S0), a smooth gain error (S1), two sets fitted to the printed errors (F1, F2),
-and physical causes: coils of the true size (P0), and iron beside it, from as far as it is felt (P1,
-P2) or near by (N1, N2).
+and physical causes: coils of finite size (P0), with iron drawn from the whole range of its effect
+(P1, P2) or close by (N1, N2).
 """
 
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ IRON_PERMEABILITY = 1000.0
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where the beacons stand, and where targets and fingerprints lie, all level.
+    """Positions of beacons, targets and fingerprints, all level.
 
     Parameters
     ----------
@@ -41,13 +41,13 @@ class Layout:
         (m)
     frequencies_hz : tuple of float
     targets_world : ndarray, shape (2, 3)
-        Lower and upper corner (m) of where targets are drawn.
+        Lower and upper corner (m) of the targets' range.
     fingerprints_world : ndarray, shape (2, 3)
         First and last point (m) of the survey's grid.
     spacing : float
         Of the grid (m).
     clearance : float
-        Least distance of a target from a beacon (m).
+        Minimum distance of a target from a beacon (m).
     """
 
     beacons_world: Array
@@ -78,7 +78,7 @@ ROOM = Layout(
     beacons_world=np.array([[0.0, 0.0, 0.0], [6.20, 0.54, 0.0], [3.20, 4.28, 0.0]]),
     frequencies_hz=(25.0, 20.0, 30.0),
     targets_world=np.array([[0.6, 0.6, HEIGHT], [5.1, 3.9, HEIGHT]]),
-    # The half metres of the floor that hold all targets between them.
+    # The half metres of the floor that contain all targets.
     fingerprints_world=np.array([[0.5, 0.5, HEIGHT], [5.5, 4.0, HEIGHT]]),
 )
 
@@ -97,7 +97,7 @@ def ring(beacons: int) -> Layout:
 
 @dataclass(frozen=True)
 class Receiver:
-    """What averaging leaves of the noise: level, one epoch from many samples.
+    """Receiver noise after averaging: white, one epoch from many samples.
 
     Parameters
     ----------
@@ -123,28 +123,28 @@ class Receiver:
 
 @dataclass(frozen=True)
 class Scenario:
-    """How worlds are disturbed; where nothing is said there is none of it.
+    """Disturbances of worlds; by default none.
 
     Parameters
     ----------
     gain_rms, gain_length : float
         Smooth random logarithm of each beacon's gain, and its correlation length (m).
     matrix_rms, matrix_length : float
-        Smooth random 3 x 3 matrix added to unity, which turns and bends each beacon's field in
-        world axes: by how much of the field's size (its nine entries are independent, each of this
+        Smooth random 3 x 3 matrix added to unity, which rotates and distorts each beacon's field in
+        world axes: its rms relative to the field (the nine entries are independent, each of this
         divided by the root of three), and its correlation length (m).
     white_rms : float
-        Random relative gain, fresh for each beacon in each epoch.
+        Random relative gain, independent for each beacon in each epoch.
     line_bias_rms : float
         Of `World.line_bias`.
     coil_radius, coil_length : float, optional
         Of the true coils (m).
     spheres : int
-        Permeable, without conductivity, around the survey as `draw_spheres` places them.
+        Permeable, non-conducting, around the survey, placed by `draw_spheres`.
     sphere_radius : tuple of float
-        Least and greatest (m).
+        Minimum and maximum (m).
     iron_reach : float, optional
-        How far from where iron may be at all it is drawn (m); `felt_reach` where it is None.
+        Depth of the shell in which iron is drawn (m); `felt_reach` if None.
     """
 
     name: str
@@ -182,7 +182,7 @@ F2 = Scenario(
 P0 = Scenario("P0", coil_radius=0.23, coil_length=0.20)
 P1 = replace(P0, name="P1", spheres=12, sphere_radius=(0.15, 0.25))
 P2 = replace(P0, name="P2", spheres=12, sphere_radius=(0.25, 0.40))
-# Selected: iron this near disturbs as the independent analysis found, whose reach is not known.
+# Selected: iron this close disturbs as the independent analysis found; its range is unknown.
 N1, N2 = (replace(p, name=f"N{i}", iron_reach=0.25) for i, p in ((1, P1), (2, P2)))
 SCENARIOS = {scenario.name: scenario for scenario in (S0, S1, F1, F2, P0, P1, P2, N1, N2)}
 
@@ -194,17 +194,17 @@ class World:
     Parameters
     ----------
     site : Site
-        What an estimator may know.
+        Known to the estimator.
     true_beacons : tuple of Beacon
-        With their sizes.
+        With finite coil sizes.
     log_gain : SmoothField
         Of place (m); one function a beacon.
     matrix : SmoothField
         Of place (m); nine functions a beacon, the matrix's rows one after the other.
     line_bias : ndarray, shape (beacons,)
-        Error of the intercept of each beacon's amplitude line (natural logarithm): what changed
-        between the campaign in which the lines were fitted and this one.  No measurement of this
-        world holds it; a method by lines adds it to its intercepts.
+        Error of the intercept of each beacon's amplitude line (natural logarithm): the change since
+        the campaign in which the lines were fitted.  It is in no measurement of this world; a
+        method by lines adds it to its intercepts.
     """
 
     site: Site
@@ -230,7 +230,7 @@ class World:
     def measure(
         self, position_world: Array, world_from_body: Array, rng: np.random.Generator
     ) -> FieldSamples:
-        """Return what the sensor, which is the body, measures; one epoch a place.
+        """Return the measurements of the sensor, which is the body; one epoch per position.
 
         Parameters
         ----------
@@ -253,12 +253,12 @@ class World:
         )
 
     def survey(self, rng: np.random.Generator, position_sigma: float = 0.0) -> Survey:
-        """Return fingerprints on the layout's grid, taken by a level sensor.
+        """Return fingerprints on the layout's grid, measured by a level sensor.
 
         Parameters
         ----------
         position_sigma : float
-            Standard deviation of the true places about the grid points, each axis (m).
+            Standard deviation of the true positions about the grid points, each axis (m).
         """
         grid_world = self.layout.grid_world()
         true_world = grid_world + position_sigma * rng.standard_normal(grid_world.shape)
@@ -275,11 +275,11 @@ class World:
 
 
 def felt_reach(radius: float, layout: Layout, receiver: Receiver) -> float:
-    """Return how far the surface of iron may be and still be felt in the middle of a room (m).
+    """Return the distance of iron at which its effect in a room's middle equals the noise (m).
 
-    A sphere of a radius a in the field that it disturbs adds ``2 (a / d)^3`` of it at the distance
-    d from its centre, and is felt where that is the receiver's noise.  Iron is drawn from as far as
-    that, evenly: where nothing is known of a room, none of its iron is nearer than chance has it.
+    A sphere of radius a adds ``2 (a / d)^3`` of the field that it disturbs at distance d from its
+    centre; the limit is the receiver's noise.  Iron is drawn uniformly from this range: in an
+    unknown room, its iron is only as close as chance has it.
     """
     middle_world = np.mean(layout.targets_world, axis=0)
     away = float(np.mean(np.linalg.norm(layout.beacons_world - middle_world, axis=1)))
@@ -299,9 +299,9 @@ def draw_world(
     Parameters
     ----------
     rng : Generator
-        Gain, matrix, line bias and spheres have generators of their own, spawned from it.
-    model_error : float
-        That the site declares.
+            Gain, matrix, line bias and spheres have separate generators, spawned from it.
+        model_error : float
+            Declared in the site.
     """
     gain_rng, matrix_rng, line_rng, sphere_rng = rng.spawn(4)
     receiver = receiver or Receiver()

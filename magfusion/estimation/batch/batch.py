@@ -1,4 +1,4 @@
-"""The whole offline estimate of one log: start, passes over the waveform, posterior."""
+"""Offline estimation of one log: start, passes over the waveform, posterior."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -49,7 +49,7 @@ from magfusion.model.trust import Trust
 from magfusion.model.without_imu import logged, require_motion_prior
 from magfusion.units import Array, BoolArray, IntArray
 
-QUIET = 0.3  # sigmas; a last pass that moved the poses by less has converged all the same
+QUIET = 0.3  # sigmas; a last pass that moved the poses by less counts as converged
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,38 +59,38 @@ class Smoothed:
     Parameters
     ----------
     states : Trajectory
-        With velocity, biases and pose covariance, on the log's clock: at the fields, in gaps of
-        them, and where anything else was measured.
+        With velocity, biases and pose covariance, on the log's clock: at the fields, in gaps
+        between them, and at other measurements.
     epoch : int ndarray, shape (n,)
-        States at which the fields are.
+        State index of each field epoch.
     fields : FieldSamples
         The phasors of the last pass.
     declared, calibration : Calibration
-        Before and after.
+        Before and after the estimation.
     blocks : tuple of Block
-        What was estimated.
+        Estimated parameters.
     considered : tuple of Block
-        What else is uncertain, and in the covariance.
+        Parameters that are not estimated, but whose uncertainty is in the covariance.
     field_errors : tuple of Block
-        Errors of the beacons' fields that are constant in place, likewise.
+        Errors of the beacons' fields that are constant in place, with the same effect.
     calibration_cov : ndarray, shape (dimension, dimension)
     calibration_response : ndarray, shape (dimension, uncertain)
-        What one sigma of what is uncertain does to it; its part is in that covariance.
+        Change by one sigma of each uncertain parameter; included in that covariance.
     residual : ndarray, shape (n, channels, 6)
         Whitened; NaN where a channel is missing, or with loose coupling.
     graph : Graph
-        As it was last optimised.
+        As of the last optimisation.
     estimate : Estimate
-        In it: the states, and the calibration of every segment of a long log.
+        Solution of ``graph``: the states, and the calibration of every segment of a long log.
     rival_chi_square : float, optional
-        How much worse the best trajectory from another chain of hypotheses is, after its first
-        pass: a small figure means that the log leaves a mirrored trajectory possible.  None where
-        there was no other chain, or all came to the same.
+        Excess chi square of the best trajectory from another chain of hypotheses, after its first
+        pass: if small, the log leaves a mirrored trajectory possible.  None without another
+        chain, or where all gave the same trajectory.
     converged : bool
-        Whether the last pass moved nothing, or little in units of its sigma.
+        Whether the last pass moved the poses by nothing, or by little in units of their sigmas.
     last_move : float
-        Root mean square of what the last pass moved the poses by, in sigmas: the gauge of the
-        survey has a large one.
+        Root mean square of the pose changes in the last pass, in sigmas: that of the survey's
+        gauge is large.
     rival : Trajectory, optional
         That trajectory.
     dropped : mapping
@@ -100,21 +100,21 @@ class Smoothed:
     earth_residual : ndarray, shape (n, 3), optional
         Whitened; None where the Earth field was not measured.
     earth_disturbed : bool ndarray, shape (n,), optional
-        Where the motion contradicts it.
+        Where it is inconsistent with the motion.
     fix_response : ndarray, shape (states, 6, parameters), optional
-        What one sigma of the survey does to every pose alike, with loose coupling.
+        Change of every pose by one sigma of the survey, common to all, with loose coupling.
     noise : tuple of Tuned
-        What was found of noise and model error; the site of ``calibration`` has it.
+        Estimated noise and model error, also in the site of ``calibration``.
     open_signs : int
-        Amplitudes that the last pass left out, since their sign was open.
+        Amplitudes that the last pass omitted, since their sign was ambiguous.
     standing : bool ndarray, shape (states,)
-        Where the platform stands.
+        Where the platform is at rest.
     log_name : str
         Of the log.
     epoch_ns : int
         Zero of the log's clock.
     trust : Trust, optional
-        Once `magfusion.estimation.integrity.judge.judged` has judged it.
+        After `magfusion.estimation.integrity.judge.judged`.
     """
 
     states: Trajectory
@@ -159,7 +159,7 @@ class Smoothed:
 
     @property
     def uncertain(self) -> tuple[Block, ...]:
-        """All that is in the covariance without being estimated."""
+        """Considered parameters and field errors: in the covariance without being estimated."""
         return placed((*self.considered, *self.field_errors))
 
 
@@ -170,23 +170,23 @@ def smooth(
     report: Report = quiet,
     passes: PassFile | None = None,
 ) -> Smoothed:
-    """Estimate the best trajectory of a log, with the calibration in the same solution.
+    """Estimate the trajectory of a log and its calibration in one solution.
 
     Parameters
     ----------
     log : Log
         With a waveform, or with phasors in the site's channel order.
     report : callable, optional
-        Called with stage, steps done and steps in all.
+        Called with stage, steps done and total steps.
     passes : PassFile, optional
-        Keeps where the passes are, and knows where those of a run that was stopped were.
+        Checkpoint of the passes, from which a stopped run is resumed.
 
     Raises
     ------
     TypeError
         Where the arguments are not a log and a site, in this order.
     InputError
-        Where the log holds nothing usable.
+        Where the log has no usable data.
     EstimationError
         Where the graph cannot be solved.
     """
@@ -211,7 +211,7 @@ def smooth(
 def _solved(
     log: PreparedLog, settings: SmootherSettings, report: Report, passes: PassFile | None = None
 ) -> Smoothed:
-    """Solve a log, pass by pass until nothing moves, and return its posterior."""
+    """Return the posterior of a log after passes until convergence."""
     first, time, steps = log.declared, log.states.time, settings.passes + 3
     calm = quiet_before(log.imu, time - first.imu_offset(time), first.site.platform.motion)
     known = None if passes is None else passes.begun(log)
@@ -233,12 +233,12 @@ def _solved(
         if settled or now.done >= settings.passes:
             break
         now = relax(log, before, now, solved.graph.blocks)
-        del solved  # of a long log it is most of what there is
+        del solved  # most of the memory in a long log
         give_back_memory()
         if passes is not None:
             passes.keep(now, first, log.blocks)
     report("posterior", steps - 1, steps)
-    # What the receiver keeps for another pass is not needed any more.
+    # Receiver data for another pass are no longer needed.
     log = replace(log, demodulation=replace(log.demodulation, receiver=None))
     give_back_memory()
     found, fields = solved.found, log.samples if wave is None else wave.fields
@@ -261,12 +261,12 @@ def _solved(
 
 
 def solved_again(result: Smoothed, measurements: tuple[Measurement, ...]) -> Smoothed:
-    """Return a posterior with other measurements of the same states, from where it is.
+    """Return a posterior with other measurements of the same states, started from the solution.
 
     Raises
     ------
     RuntimeError
-        GTSAM's own, of a system that these leave open.
+        From GTSAM, where these measurements leave the system singular.
     """
     graph = replace(result.graph, measurements=measurements)
     found = optimise(graph, result.estimate)
@@ -292,14 +292,14 @@ def solved_again(result: Smoothed, measurements: tuple[Measurement, ...]) -> Smo
 def posterior(
     log: PreparedLog, graph: Graph, found: Optimised[Estimate], samples: FieldSamples, gaps: int
 ) -> Smoothed:
-    """Return the posterior of a log whose graph was optimised.
+    """Return the posterior of a log from its optimised graph.
 
     Parameters
     ----------
     samples : FieldSamples
-        As they are measured in the graph.
+        Phasors measured in the graph.
     gaps : int
-        Intervals that were bridged.
+        Number of intervals with a bridged gap.
     """
     estimate = found.estimate
     states, response = read_states(estimate.values, log.states.time), None

@@ -1,9 +1,9 @@
-"""Where a beacon of unknown pose may be, from its phasors along a known trajectory.
+"""Candidate poses of an unknown beacon, from its phasors along a known trajectory.
 
 The field is linear in the drive in world axes once the centre is given, so that centres are
 searched on a grid with all else solved in closed form (variable projection; the ranges that bound
 the grid need no attitude).  The drive in world axes then gives the attitude (Wahba's problem), and
-every place that is left over is refined by the one measurement model.
+every remaining candidate is refined with the full measurement model.
 """
 
 from collections.abc import Iterator
@@ -42,24 +42,24 @@ TRAJECTORY_ERROR = 0.03  # relative; of a field predicted from a trajectory of t
 FEWEST_EPOCHS = 10
 EPOCHS_SEARCHED = 120
 GRID = 24  # points along each axis
-MINIMA = 12  # of the grid that are followed
-MOST_REFINED = 4  # of the places to which they lead
+MINIMA = 12  # of the grid that are refined
+MOST_REFINED = 4  # of the resulting places
 EQUALLY_GOOD = 0.9  # of the best agreement of an attitude with the drive
 RANGE_MARGIN = 1.4  # of a range from the field's strength alone
 SAME_PLACE = 0.05  # m
-NO_PRIOR = (100.0, 10.0)  # m, rad; sigmas that are no information
+NO_PRIOR = (100.0, 10.0)  # m, rad; sigmas without information
 STEPS, SETTLED = 40, 1e-8  # of the refinement; relative decrease that ends it
 
 
 class DetectedFields(NamedTuple):
-    """One beacon as it was detected along a trajectory.
+    """Phasors of one beacon along a trajectory.
 
     Parameters
     ----------
     alone : Calibration
-        Of this beacon alone, with the magnetometer of the trajectory taken for exact.
+        Of this beacon alone; the magnetometer of the trajectory is assumed exact.
     poses : Trajectory
-        Where it was detected.
+        At the epochs of its detection.
     sensor_world : ndarray, shape (n, 3)
         (m)
     measured : ndarray, shape (n, tones, 6)
@@ -79,7 +79,7 @@ class DetectedFields(NamedTuple):
 
     @property
     def beacon(self) -> Beacon:
-        """The beacon, NaN where it is unknown."""
+        """Beacon with NaN for its unknown parameters."""
         return self.alone.site.beacons[0]
 
     @property
@@ -109,14 +109,14 @@ def detected_along(
     Parameters
     ----------
     calibration : Calibration
-        Of the trajectory; its magnetometer and its time offset are taken over.
+        Of the trajectory; its magnetometer and its time offset are used.
     windows_per_sample : float
-        How often the information of a sample is counted.
+        Number of windows that contain each sample.
 
     Raises
     ------
     EstimationError
-        Where it was hardly detected.
+        Where it was detected at too few epochs.
     """
     columns = np.array([name == beacon.name for name, _ in samples.channels], dtype=bool)
     _, ours, theirs = np.intersect1d(samples.time, states.time, return_indices=True)
@@ -125,7 +125,7 @@ def detected_along(
     if len(ours) < FEWEST_EPOCHS:
         raise EstimationError(
             f"beacon {beacon.name} was detected at {len(ours)} epochs, too few to place it: record"
-            " it for longer, nearer to it"
+            " it for longer, at a smaller distance"
         )
     phasor = samples.phasor_sensor[ours][:, columns]
     cov = samples.phasor_cov[ours][:, columns] * windows_per_sample
@@ -148,7 +148,7 @@ def detected_along(
 
 
 def _alone(beacon: Beacon, site: Site) -> Site:
-    """Return a site of one beacon, of whose pose no more is known than it declares."""
+    """Return a site of one beacon, with a wide prior for the pose that it does not declare."""
     sigma = beacon.sigma
     if beacon.unknown in ("pose", "position"):
         sigma = replace(sigma, position_world=np.full(3, NO_PRIOR[0]))
@@ -162,7 +162,7 @@ def _alone(beacon: Beacon, site: Site) -> Site:
 
 
 def places(detected: DetectedFields) -> list[tuple[float, Beacon]]:
-    """Return every place that is a minimum of the misfit, with its chi square, best first.
+    """Return every place at a minimum of the misfit, with its chi square, best first.
 
     Returns
     -------
@@ -178,7 +178,7 @@ def places(detected: DetectedFields) -> list[tuple[float, Beacon]]:
 
 
 def _centres(detected: DetectedFields) -> list[tuple[Array, float]]:
-    """Return centres, with the clock's error, about which the misfit has a minimum."""
+    """Return centres and clock errors at minima of the misfit."""
     beacon = detected.beacon
     drifts = _drifts(detected)
     if beacon.unknown == "attitude":
@@ -202,9 +202,10 @@ def _centres(detected: DetectedFields) -> list[tuple[Array, float]]:
 
 
 def _mirrors(detected: DetectedFields) -> list[tuple[Array, float]]:
-    """Return what one epoch allows of a beacon of known attitude: its place and its mirrors.
+    """Return the centres that one epoch allows for a beacon of known attitude, with mirrors.
 
-    A platform that hardly moves leaves them all, where the misfit of a free drive has no minimum.
+    These all remain for a platform that hardly moves, where the misfit of a free drive has no
+    minimum.
     """
     if detected.beacon.unknown != "position":
         return []
@@ -218,7 +219,7 @@ def _mirrors(detected: DetectedFields) -> list[tuple[Array, float]]:
 
 
 def _search_axes(detected: DetectedFields) -> list[Array]:
-    """Return a grid about the places whose distances the strength of the field allows."""
+    """Return a grid about the places whose distances agree with the strength of the field."""
     _, sensor_world, _, phasor = detected.thinned()
     _, distance = beacon_directions(detected.beacon, phasor)
     reach = RANGE_MARGIN * np.max(distance, axis=1)[:, None]
@@ -228,7 +229,7 @@ def _search_axes(detected: DetectedFields) -> list[Array]:
 
 
 def _drifts(detected: DetectedFields) -> Array:
-    """Return clock errors close enough that a phase is missed by less than half a radian."""
+    """Return clock errors spaced for a phase error below half a radian."""
     if detected.beacon.synchronised:
         return np.zeros(1)
     turns = 2.0 * np.pi * float(np.max(detected.beacon.tone_frequencies_hz))
@@ -255,7 +256,7 @@ def _tensors(centres: Array, sensor_world: Array) -> Array:
 
 
 def _drive_at(tensor: Array, weight: Array, phasor: ComplexArray) -> tuple[ComplexArray, Array]:
-    """Return the drive in world axes that fits best, (..., 3, tones), and what each explains."""
+    """Return the best-fitting drive in world axes, (..., 3, tones), and the explained squares."""
     weighed = tensor * weight[:, None, None]
     rows = (*tensor.shape[:-3], -1, 3)
     tones = phasor.shape[-2]
@@ -267,7 +268,7 @@ def _drive_at(tensor: Array, weight: Array, phasor: ComplexArray) -> tuple[Compl
 
 
 def _misfit(detected: DetectedFields, centres: Array, drifts: Array) -> Array:
-    """Return what no drive explains, shape (drifts, centres)."""
+    """Return the sum of squares that no drive explains, shape (drifts, centres)."""
     elapsed, sensor_world, weight, phasor = detected.thinned()
     steady = [_undrifted(detected, elapsed, phasor, drift) for drift in drifts]
     columns = np.concatenate(steady, axis=1)  # each clock's phasors side by side
@@ -283,7 +284,7 @@ def _misfit(detected: DetectedFields, centres: Array, drifts: Array) -> Array:
 def _polished(
     detected: DetectedFields, centres: Array, drifts: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the misfit at the minimum near each centre, the centre there, the clock's error."""
+    """Return the misfit at the minimum near each centre, with its centre and clock error."""
     elapsed, sensor_world, weight, phasor = detected.thinned()
     free, largest = not detected.beacon.synchronised, detected.alone.site.clock.drift_largest
     turns = 2.0 * np.pi * elapsed[:, None] * detected.beacon.tone_frequencies_hz
@@ -329,10 +330,10 @@ def _starts(detected: DetectedFields, centre: Array, drift: float) -> Iterator[C
 def _attitudes(
     beacon: Beacon, world: ComplexArray, declared: ComplexArray
 ) -> list[tuple[Array, Array]]:
-    """Return the attitudes and drive phases that take a declared drive to that in the world.
+    """Return the attitudes and drive phases that rotate a declared drive to that in the world.
 
-    A free phase is undone by making the tone's ellipse lie as it does in the beacon, which leaves
-    its polarity: with several tones the coils' own centres may tell.
+    An unknown phase is removed by aligning the tone's ellipse with its declared one.  The polarity
+    remains ambiguous, but with several tones the coils' own centres may determine it.
     """
     tones = len(beacon.tones)
     if beacon.synchronised:
@@ -350,7 +351,7 @@ def _attitudes(
 
 
 def _refined(detected: DetectedFields, starts: list[Calibration]) -> list[tuple[float, Beacon]]:
-    """Return the chi square and the beacon where the measurement model fits best, from each."""
+    """Return chi square and beacon of the measurement model's best fit from each start."""
     if not starts:
         return []
     blocks = choose_blocks(starts[0].site, ("beacons", "moments", "phase"))

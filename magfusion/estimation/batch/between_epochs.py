@@ -1,8 +1,8 @@
-"""The smoothed motion between the epochs: its covariance carried through the inertial stream.
+"""The smoothed motion between the epochs, with its covariance propagated by the inertial stream.
 
-Given the states at both ends of an interval, what happens in between is a Gauss-Markov process that
+Given the states at both ends of an interval, the motion in between is a Gauss-Markov process that
 the inertial stream drives.  Its mean is `motion_at`; here is its covariance, conditioned on both
-ends whose errors belong together.  Nothing is interpolated.
+ends with their correlation.  Nothing is interpolated.
 """
 
 from itertools import pairwise
@@ -30,18 +30,18 @@ CHUNK = 16_384  # samples at a time: their covariances fit the memory
 def at_rate(result: Smoothed, log: Log, rate: Literal["imu"] | float) -> Trajectory:
     """Return the smoothed motion between the first and the last epoch, at another rate.
 
-    With the covariance of the poses.
+    Includes the covariance of the poses.
 
     Parameters
     ----------
     rate : 'imu' or float
-        At every inertial sample, or so many a second (Hz).
+        At every inertial sample, or at this rate (Hz).
     """
     states, offset = result.states, result.calibration.time_offset
     calibration = result.calibration
     imu = calibration.on_log_rate(corrected_imu(calibration, result.blocks, log.imu))
     stamps = imu.time + offset
-    # Every sample is a step of the covariance, whether or not it is asked for.
+    # Every sample is a step of the covariance, whether or not it is requested.
     passed, asked = stamps, np.ones(len(stamps), dtype=bool)
     if rate != "imu":
         first, last = np.ceil(states.time[0] * rate), np.floor(states.time[-1] * rate)
@@ -72,7 +72,7 @@ def at_rate(result: Smoothed, log: Log, rate: Literal["imu"] | float) -> Traject
 
 
 class _Steps(NamedTuple):
-    """Some intervals side by side, padded with steps of no length, world axes.
+    """Several intervals in one array, padded with steps of zero length, world axes.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def _pose_cov(result: Smoothed, dense: Trajectory, stream: ImuSamples, accel_bia
     while begin < len(epochs) - 1:
         reach = np.searchsorted(first, first[begin] + CHUNK, side="right") - 1
         end = min(max(int(reach), begin + 1), len(epochs) - 1)
-        # Short intervals beside a long one would be padded to its length.
+        # Short intervals in a batch with a long one would be padded to its length.
         width = 2 * (first[begin + 1] - first[begin]) + 2
         longer = np.flatnonzero(np.diff(first[begin : end + 1]) > width)
         end = begin + max(int(longer[0]), 1) if len(longer) else end
@@ -139,9 +139,9 @@ def _pose_cov(result: Smoothed, dense: Trajectory, stream: ImuSamples, accel_bia
 
 
 def _joint_cov(result: Smoothed) -> Array:
-    """Return the covariance of every two states that follow each other, shape (n - 1, 30, 30).
+    """Return the covariance of every two successive states, shape (n - 1, 30, 30).
 
-    What is only considered is in it.
+    Includes considered parameters.
     """
     estimate = result.estimate
     tree = eliminate(result.graph.linearized(estimate), result.graph.ordering)
@@ -177,9 +177,9 @@ def _conditioned(steps: _Steps, last: Array, joint: Array, imu: ImuModel) -> Arr
     transition, noise = _carried(steps, imu)
     whole, total = transition[:, -1], noise[:, -1]
     scale = np.sqrt(np.diagonal(total, axis1=1, axis2=2))
-    left = whole[:, None] @ np.linalg.inv(transition)  # what is left to the end
+    left = whole[:, None] @ np.linalg.inv(transition)  # transition of the remaining interval
     across = left @ noise / scale[:, None, :, None]
-    # In units of the noise's sigmas, which span many digits.
+    # In units of the noise's sigmas, which differ by many orders of magnitude.
     rounded = (total / (scale[:, :, None] * scale[:, None, :]))[:, None]
     gain = np.swapaxes(np.linalg.solve(rounded, across), 2, 3)[:, :, :6] / scale[:, None, None]
     by_left = transition[:, :, :6] - gain @ whole[:, None]

@@ -1,8 +1,8 @@
-"""A log whose inertial stream has gaps, with what the fields tell of the motion in them.
+"""A log with gaps in its inertial stream, bridged by the motion estimated from the fields.
 
-The windows that a gap spoils take no part in a start.  Once the states beside it are known, the
-motion is followed through it by the magnetometer's samples; then they are windows as any other, of
-a motion that is known less.
+Windows that overlap a gap are not used for a start.  Once the states next to the gap are known, the
+motion through it is tracked by the magnetometer's samples.  Its windows are then used like others,
+with a larger uncertainty of the motion.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from magfusion.units import Array
 if TYPE_CHECKING:
     from magfusion.estimation.demodulation.motion_from_field import FieldMotion
 
-LONGEST = 120.0  # s; that is followed without an IMU
-# Of the states that it is followed from, one sigma; the fields find them within a few samples.
+LONGEST = 120.0  # s; maximum gap that is tracked without an IMU
+# One sigma of the states before a gap; the fields correct them within a few samples.
 FIRST = np.repeat([0.05, 0.1, 1.0, 0.01, 0.1], 3)  # rad, m, m/s, rad/s, m/s^2
 
 
 def bridged(log: PreparedLog) -> PreparedLog:
-    """Return a log with the windows in the gaps of its inertial stream, as far as fields tell.
+    """Return the log with windows in the gaps of its inertial stream, where fields allow.
 
-    The same where there are none.
+    Unchanged where there are none.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def bridged(log: PreparedLog) -> PreparedLog:
     if log.fixes is not None or not len(source.without_turn):
         return log
     if log.declared.site.platform.magnetometer.lacking:
-        return log  # fewer components than three do not tell a turn
+        return log  # fewer components than three do not determine a rotation
     graph, _ = graph_of(log, log.states, log.declared)
     found = optimise(graph, initial_estimate(log.states, log.declared)).estimate
     states, calibration = read_states(found.values, log.states.time), found.calibration
@@ -71,7 +71,7 @@ Gap = tuple[float, float, "FieldMotion"]
 
 
 def _followed(log: PreparedLog, states: Trajectory, calibration: Calibration) -> list[Gap]:
-    """Return the gaps through which the motion could be followed, with when they begin and end."""
+    """Return the gaps through which the motion was tracked, with their beginnings and ends."""
     source = log.demodulation
     receiver, waveform = source.receiver, source.log.waveform
     assert isinstance(receiver, LockinReceiver)
@@ -105,7 +105,7 @@ def _state(states: Trajectory, row: int, calibration: Calibration) -> State:
 
 
 def _within(log: PreparedLog, gaps: list[Gap]) -> Windows:
-    """Return the windows that lack inertial samples only where a motion was followed."""
+    """Return the windows without inertial samples only where the motion was tracked."""
     source = log.demodulation
     assert isinstance(source.receiver, LockinReceiver)
     windows, half = source.without_turn, source.receiver.settings.window / 2.0
@@ -184,7 +184,7 @@ def _with_windows(
 
 
 def _with_paths(states: Trajectory, motions: list[FieldMotion], time: Array) -> Trajectory:
-    """Return states at more times (s), which the paths hold."""
+    """Return states at more times (s), those in gaps from the tracked motion."""
     old = np.searchsorted(time, states.time)
     turn, place, speed = np.tile(np.eye(3), (len(time), 1, 1)), *np.zeros((2, len(time), 3))
     for path in (motion.path for motion in motions):

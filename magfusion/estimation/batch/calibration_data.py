@@ -1,4 +1,4 @@
-"""Calibrations as plain data: what differs from the declared one."""
+"""Calibrations as plain data: their differences from the declared one."""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
@@ -11,7 +11,7 @@ from magfusion.model.parameters import Block, Calibration
 
 
 def calibration_rules(declared: Calibration, blocks: tuple[Block, ...]) -> Rules:
-    """Return how calibrations become plain data: as what differs from the declared one."""
+    """Return the serialisation rules of calibrations, as differences from the declared one."""
     names = {block.name for block in blocks}
     return Rules(
         {Calibration: lambda found: _changes(declared, found)},
@@ -20,7 +20,7 @@ def calibration_rules(declared: Calibration, blocks: tuple[Block, ...]) -> Rules
 
 
 def _parts(value: Any) -> dict[str, Any] | None:
-    """Return what a calibration's value is made of, by name; None of a single value."""
+    """Return the components of a calibration's value by name; None of a single value."""
     if is_dataclass(value):
         return {f.name: getattr(value, f.name) for f in fields(value)}
     if isinstance(value, tuple):
@@ -29,7 +29,7 @@ def _parts(value: Any) -> dict[str, Any] | None:
 
 
 def _changes(before: Any, after: Any) -> Any:
-    """Return what differs, as nested mappings of the values themselves."""
+    """Return the differences as nested mappings of the values themselves."""
     old, new = _parts(before), _parts(after)
     if old is None or new is None:
         return to_plain(after)
@@ -47,14 +47,14 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def _changed(before: Any, data: Any, names: set[str]) -> Any:
-    """Return ``before`` with what `_changes` found, where that is of the same type and shape.
+    """Return ``before`` with the differences of `_changes`, checked for type and shape.
 
     Parameters
     ----------
     names : set of str
-        Of values that a mapping may hold that has none yet.
+        Of values that may be added to a mapping.
     """
-    wrong = "has a value that is no change of what the site declares"
+    wrong = "has a value that does not match the type or shape of the site's value"
     old = _parts(before)
     if old is None:
         _check(np.asarray(data).dtype == np.float64 and np.all(np.isfinite(data)), wrong)

@@ -1,4 +1,4 @@
-"""A start for the smoother: the chain of hypotheses that the motion joins best."""
+"""Start of the smoother: the chain of hypotheses that agrees best with the motion."""
 
 from dataclasses import dataclass, replace
 
@@ -17,14 +17,14 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
 POSITION_SIGMA = 0.1  # m; added to the fixes' own, which calibration errors exceed
-ROTATION_SIGMA = 0.1  # rad; and what the gyro's bias may add
+ROTATION_SIGMA = 0.1  # rad; and the possible contribution of the gyro's bias
 LEAP_COST = 100.0  # of a jump between unrelated hypotheses: one bad epoch must not break a chain
 RIVAL_COST = 1000.0  # chi square; a chain worse by more is no rival
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """First guess of the states.
+    """Initial estimate of the states.
 
     Parameters
     ----------
@@ -37,9 +37,9 @@ class Start:
     cost : float
         Chi square of the chain.
     determined : bool ndarray, shape (n,)
-        False where the epoch alone leaves a direction of its pose open.
+        False where the epoch alone leaves a direction of its pose unobservable.
     leaps : int
-        Steps between hypotheses that no motion joins.
+        Steps between hypotheses that no motion connects.
     """
 
     __repr__ = short_repr
@@ -55,14 +55,14 @@ class Start:
 def choose_chains(
     fixes: Fixes, imu: ImuSamples, time_offset: float, site: Site
 ) -> tuple[Start, ...]:
-    """Choose chains of hypotheses so that gyro, gravity and speed agree (Viterbi).
+    """Choose chains of hypotheses consistent with gyro, gravity and speed (Viterbi).
 
     Parameters
     ----------
     time_offset : float
         (s)
     site : Site
-        Its gravity, and how its platform moves.
+        Its gravity, and the motion model of its platform.
 
     Returns
     -------
@@ -115,12 +115,12 @@ def _gravity_cost(fixes: Fixes, imu: ImuSamples, time: Array, site: Site) -> Arr
     mean_body = mean_about(time, imu.accel_body, fixes.time, motion.accel_span)
     mean_world = (fixes.world_from_body @ mean_body[:, None, :, None])[..., 0]
     error = mean_world - [0.0, 0.0, site.gravity]
-    # The mean is taken in body axes that turn: a weak vote, enough against a mirrored pose.
+    # The mean is taken in rotating body axes: little information, enough against a mirrored pose.
     return np.minimum(np.sum(error**2, axis=-1) / motion.accel_sigma**2, LEAP_COST)
 
 
 def _link_cost(fixes: Fixes, turn: Array, site: Site) -> Array:
-    """Cost of going from hypothesis i to j between neighbouring epochs, shape (n-1, h, h)."""
+    """Return the cost of each pair of hypotheses at successive epochs, shape (n-1, h, h)."""
     dt = np.diff(fixes.time)
     step = matrices(product(inverse(turn[:, :-1]), turn[:, 1:]))
     expected = fixes.world_from_body[:-1] @ step[:, None]
@@ -155,13 +155,13 @@ def _velocity(time: Array, position: Array) -> Array:
 
 
 def start_phases(calibration: Calibration, time: Array, phase: Array) -> Calibration:
-    """Return the calibration with the drive phase and drift that single-epoch phases suggest.
+    """Return the calibration with drive phase and drift estimated from single-epoch phases.
 
     Parameters
     ----------
     time : ndarray, shape (n,)
     phase : ndarray, shape (n, channels)
-        Beyond the calibration's own (rad).
+        Relative to the calibration's own (rad).
     """
     new_phase, drift = calibration.phase.copy(), calibration.drift.copy()
     elapsed = time - calibration.reference_time
@@ -183,7 +183,7 @@ def start_phases(calibration: Calibration, time: Array, phase: Array) -> Calibra
 
 
 def _dominant_drift(elapsed: Array, phase: Array, frequency_hz: float, largest: float) -> float:
-    """Clock error that lines the phases up best."""
+    """Return the clock error that aligns the phases best."""
     reach = max(float(np.ptp(elapsed)), 1e-3)
     number = int(np.clip(16.0 * largest * frequency_hz * reach, 3, 20_000)) | 1
     rates = np.linspace(-largest, largest, number) * 2.0 * np.pi * frequency_hz

@@ -1,8 +1,7 @@
-"""The calibration that several logs share: what they say together, and what all but one say.
+"""The calibration that several logs share: estimated from all of them, and from all but one.
 
-Each log is solved with what the survey and the other logs say as its prior, which makes its
-solution the joint one as soon as the others were condensed where that is; no log is ever held in
-memory with another.
+Each log is solved with the survey and the other logs as its prior.  This gives the joint solution
+once the other logs are linearised at that solution; only one log is in memory at a time.
 """
 
 from collections.abc import Sequence
@@ -20,7 +19,7 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class Shared:
-    """What logs share, as the site declares it.
+    """Declared calibration parameters that logs share.
 
     Parameters
     ----------
@@ -38,24 +37,24 @@ class Shared:
         return whitening.T @ whitening
 
     def moved(self, step: Array) -> Calibration:
-        """Return the calibration that a step leads to."""
+        """Return the calibration after a step."""
         return retract(self.declared, self.blocks, step)
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What is known of the shared calibration.
+    """Estimate of the shared calibration.
 
     Parameters
     ----------
     step : ndarray, shape (s,)
         From the declared calibration.
     cov : ndarray, shape (s, s)
-        As estimators weigh it: of what is white.
+        As estimators use it: by white noise alone.
     by_common : ndarray, shape (s, c)
-        What one sigma of each parameter that is considered in every log does to it.
+        Change by one sigma of each parameter that is considered in every log.
     apart : ndarray, shape (s, s)
-        Covariance of what else is considered does to it, log by log.
+        Covariance due to parameters that are considered separately in each log.
     """
 
     step: Array
@@ -65,18 +64,18 @@ class Known:
 
     @property
     def honest(self) -> Array:
-        """Its covariance with what is considered, shape (s, s)."""
+        """Covariance including considered parameters, shape (s, s)."""
         return self.cov + self.by_common @ self.by_common.T + self.apart
 
 
 @dataclass(frozen=True, eq=False)
 class Said:
-    """What one log says, and the shared calibration where it was condensed.
+    """Information of one log, and its linearisation point of the shared calibration.
 
     Parameters
     ----------
     step : ndarray, shape (s,)
-        From the declared calibration to there.
+        From the declared calibration to the linearisation point.
     """
 
     step: Array
@@ -84,14 +83,14 @@ class Said:
 
 
 def known_by(shared: Shared, logs: Sequence[Said], at: Array) -> Known:
-    """Return what survey and logs say of the shared calibration: a step of Gauss and Newton.
+    """Return the shared calibration from survey and logs after a Gauss-Newton step.
 
     Parameters
     ----------
-    logs : sequence of Said
+    logs : sequence of `Said`
         Any number.
     at : ndarray, shape (s,)
-        From the declared calibration to where the step is taken.
+        From the declared calibration to the linearisation point of the step.
     """
     here, prior = shared.moved(at), shared.information
     unit = prior_sigma(shared.blocks)
@@ -114,7 +113,7 @@ def known_by(shared: Shared, logs: Sequence[Said], at: Array) -> Known:
 
 
 def between(shared: Shared, old: Said, new: Said, share: float) -> Said:
-    """Return what a log says, changed by a share of its change only, taken where it is new."""
+    """Return the information of a log after a share of its change, linearised at the new point."""
     if share == 1.0:
         return new
     here, there = shared.moved(new.step), shared.moved(old.step)
@@ -124,7 +123,7 @@ def between(shared: Shared, old: Said, new: Said, share: float) -> Said:
 
 
 def apart_in_sigmas(one: Array, other: Array, cov: Array) -> float:
-    """Return the root mean square of a difference, over all directions, in sigmas of each."""
+    """Return the root mean square of a difference over all directions, in sigmas of each."""
     scale = np.sqrt(np.diagonal(cov))
     step = (one - other) / scale
     solved = np.linalg.solve(cov / scale[:, None] / scale, step)
@@ -132,13 +131,13 @@ def apart_in_sigmas(one: Array, other: Array, cov: Array) -> float:
 
 
 def as_prior(known: Known, shared: Shared, blocks: tuple[Block, ...]) -> tuple[Block, ...]:
-    """Return the blocks of a log whose prior is what is known of those that are shared."""
+    """Return the blocks of a log, with the estimate as prior of those that are shared."""
     sigma, at = np.sqrt(np.diagonal(known.cov)), {b.key: b.columns for b in shared.blocks}
     return tuple(b._replace(sigma=sigma[at[b.key]]) if b.key in at else b for b in blocks)
 
 
 def with_prior(known: Known, shared: Shared, declared: Calibration) -> Calibration:
-    """Return what a log declares, with the mean and the correlation of what is known beside it."""
+    """Return a log's declared calibration with the mean and correlation of the estimate."""
     sigma, own = np.sqrt(np.diagonal(known.cov)), parameters_of(shared.blocks)
     fresh = Correlation(tuple(own), known.cov / sigma[:, None] / sigma)
     moved = retract(declared, shared.blocks, known.step)
@@ -148,7 +147,7 @@ def with_prior(known: Known, shared: Shared, declared: Calibration) -> Calibrati
 
 
 def uncoupled(site: Site, shared: tuple[Block, ...]) -> Site:
-    """Return a site in which what is shared, and what each log has of its own, are independent."""
+    """Return a site without correlation between shared parameters and those of each log."""
     if site.correlation is None:
         return site
     own = set(parameters_of(shared))

@@ -1,4 +1,4 @@
-"""One log among several of one site: what is kept of it between two rounds, and a round of it."""
+"""One log among several of one site: its data between two rounds, and one round of it."""
 
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -27,20 +27,20 @@ from magfusion.units import Array, BoolArray
 
 @dataclass(frozen=True, eq=False)
 class OfLog:
-    """What is known of a log between two rounds: all of it can be written down.
+    """Data of a log between two rounds, all of which can be written to a file.
 
     Parameters
     ----------
     begun : Begun
-        Its states, and what was declared of it.
+        Its states, and its declared calibration.
     steps : ndarray, shape (segments, dimension)
-        From what was declared of it to the calibration of each segment of a long log.
+        From its declared calibration to that of each segment of a long log.
     noise : tuple of Tuned
-        Found when it was smoothed alone.
+        Estimated when it was smoothed alone.
     standing : bool ndarray, shape (states,)
-        Where the platform stands.
-    said : Said
-        What it says of the shared calibration.
+        Where the platform is at rest.
+    said : `Said`
+        Its information on the shared calibration.
     """
 
     begun: Begun
@@ -51,7 +51,7 @@ class OfLog:
 
 
 class Round(NamedTuple):
-    """One log, solved with what the others say as its prior."""
+    """One log, solved with the other logs as its prior."""
 
     log: PreparedLog
     graph: Graph
@@ -62,7 +62,7 @@ class Round(NamedTuple):
 
 
 def of_smoothed(result: Smoothed, shared: Shared) -> OfLog:
-    """Return what is kept of a log that was smoothed alone."""
+    """Return the data between rounds of a log that was smoothed alone."""
     begun = Begun(
         replace(result.states, pose_cov=None),
         result.declared,
@@ -79,14 +79,14 @@ def of_smoothed(result: Smoothed, shared: Shared) -> OfLog:
 def solve_round(
     log: Log, site: Site, settings: SmootherSettings, kept: OfLog, shared: Shared, prior: Known
 ) -> Round:
-    """Solve a log from where it was, with what the survey and the other logs say as its prior.
+    """Solve a log from its last states, with the survey and the other logs as its prior.
 
-    The waveform is predicted anew from where it was; the noise stays as it was found alone.
+    The waveform is predicted again from these states; the noise estimated from it alone is kept.
 
     Parameters
     ----------
     prior : Known
-        Of all other logs and the survey.
+        From all other logs and the survey.
 
     Raises
     ------
@@ -109,14 +109,14 @@ def solve_round(
     graph, gaps = graph_of(ready, states, calibration, wave, kept.standing)
     start = initial_estimate(states, calibration, segments)
     found = optimise(graph, start)
-    if found.converged:  # a cost tells steps below its own rounding no better from none
+    if found.converged:  # costs cannot resolve steps below their own rounding
         step = eliminate(graph.linearized(found.estimate), graph.ordering).optimize()
         found = replace(found, estimate=graph.moved(found.estimate, step))
     return Round(ready, graph, found, wave, gaps, _shift(prior, ready))
 
 
 def _shift(prior: Known, log: PreparedLog) -> PriorShift:
-    """Return what is considered does to the prior of a log that the others made."""
+    """Return the shift of a log's prior from other logs by considered parameters."""
     rows = columns_of(log.blocks, own=False)
     by_considered = np.zeros((len(rows), dimension(log.considered)))
     columns = columns_of(log.considered, own=False)
@@ -129,7 +129,7 @@ def _shift(prior: Known, log: PreparedLog) -> PriorShift:
 
 
 def after_round(kept: OfLog, done: Round, shared: Shared) -> OfLog:
-    """Return what is kept of a log after a round."""
+    """Return the data of a log after a round."""
     estimate, log = done.found.estimate, done.log
     states = read_states(estimate.values, log.states.time)
     measured = log.measured_at(done.graph.measurements)
@@ -144,12 +144,12 @@ def after_round(kept: OfLog, done: Round, shared: Shared) -> OfLog:
 
 
 def joint_posterior(kept: OfLog, done: Round, blocks: tuple[Block, ...]) -> Smoothed:
-    """Return the posterior of a log in the joint solution, against what the site declares.
+    """Return the posterior of a log in the joint solution, relative to the declared site.
 
     Parameters
     ----------
     blocks : tuple of Block
-        With the sigmas that the site declares.
+        With the declared sigmas.
     """
     samples = done.log.samples if done.wave is None else done.wave.fields
     graph = replace(done.graph, shift=done.shift)

@@ -1,4 +1,4 @@
-"""Which of several starts the motion prefers, and what is left of a rival."""
+"""Selection among several starts by the motion, with the best rival."""
 
 from dataclasses import replace
 
@@ -14,12 +14,12 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.units import IntArray
 
 AMBIGUOUS_CHI_SQUARE = 20.0  # below this a mirrored trajectory explains the data nearly as well
-DECIDED = 20.0  # times that on a thinned log, from which a rival needs no other look
+DECIDED = 20.0  # times that on a thinned log, above which a rival needs no further comparison
 SHORT = 12  # steps of a comparison
 
 
 def likeliest(starts: list[PreparedLog]) -> PreparedLog:
-    """Let the motion decide between starts that single epochs cannot distinguish.
+    """Return the start that agrees best with the motion, where single epochs are ambiguous.
 
     All are compared on a thinned log, then the best and its rival on the whole one.
 
@@ -55,7 +55,7 @@ def likeliest(starts: list[PreparedLog]) -> PreparedLog:
 
 
 def _part(log: PreparedLog, kept: IntArray) -> PreparedLog:
-    """Return a log with some of its fields only, and states there."""
+    """Return a log with some of its fields, and states there."""
     states = Trajectory(
         **{k: v[log.epoch[kept]] for k, v in vars(log.states).items() if v is not None}
     )

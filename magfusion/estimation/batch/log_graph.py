@@ -1,4 +1,4 @@
-"""The graph of a whole log at an estimate: the inertial stream, and all that was measured."""
+"""The graph of a whole log at an estimate: the inertial stream, and all measurements."""
 
 from dataclasses import dataclass, replace
 
@@ -40,32 +40,32 @@ from magfusion.units import Array, BoolArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class PreparedLog:
-    """A log with a start found.
+    """A log with an initial estimate.
 
     Parameters
     ----------
     samples : FieldSamples
-        Of the fields, before anything is known of the motion.
+        Of the fields, before the motion is known.
     steady : SteadyFields, optional
         Of the same epochs, where the Earth field is measured.
     epoch : int ndarray, shape (n,)
-        States at which the fields are.
+        State index of each field epoch.
     fixes : Fixes, optional
-        Where they enter the graph and not the phasors.
+        Where they enter the graph instead of the phasors.
     states : Trajectory
-        The start at all epochs.
+        Initial estimate at all epochs.
     blocks, considered : tuple of Block
-        What is estimated of the calibration, and what else is uncertain; of fixes the survey's
-        part is added at the end.
+        Estimated and considered calibration parameters; with fixes the survey's part is added at
+        the end.
     loss : {None, 'huber', 'cauchy'}
         Of the fields.
     others : tuple of (ndarray, Measurement)
-        Anything else that was measured, with the times of its rows (s).
+        Further measurements, with the times of their rows (s).
     rival_chi_square, rival : float, Trajectory, optional
         As of `Smoothed`.
     silence : tuple of ndarray, optional
-        Where gaps of the inertial stream begin and end in which what the fields tell of the motion
-        stands in (s).
+        Beginnings and ends of gaps in the inertial stream, filled by the motion from the fields
+        (s).
     """
 
     demodulation: Demodulation
@@ -86,11 +86,11 @@ class PreparedLog:
 
     @property
     def imu(self) -> ImuSamples:
-        """The inertial stream, with what stands in for it."""
+        """Inertial stream with its gaps filled."""
         return self.demodulation.log.imu
 
     def at_fields(self, states: Trajectory) -> Trajectory:
-        """Return the states at which the fields are."""
+        """Return the states at the field epochs."""
         rows = {k: v[self.epoch] for k, v in vars(states).items() if v is not None}
         return Trajectory(**rows)
 
@@ -100,9 +100,9 @@ class PreparedLog:
         return np.unique(np.concatenate([self.epoch, *short])) if short else self.epoch
 
     def compensated(self, calibration: Calibration, states: Trajectory) -> MotionCompensated:
-        """Return the phasors with the motion taken off, by the stream that a calibration corrects.
+        """Return motion-compensated phasors, by the stream that a calibration corrects.
 
-        With those of the beacons that the motion hid.
+        Includes those of beacons that the motion masked.
 
         Parameters
         ----------
@@ -122,7 +122,7 @@ class PreparedLog:
     def with_signs(
         self, calibration: Calibration, states: Trajectory, *, first: bool
     ) -> MotionCompensated:
-        """Return amplitudes with the signs that states give them, as if motion were taken off."""
+        """Return amplitudes with the signs predicted by states, as motion-compensated phasors."""
         here = self.at_fields(states)
         return MotionCompensated.of_slots(with_signs(self.samples, here, calibration, first=first))
 
@@ -134,7 +134,7 @@ class PreparedLog:
     def zero_rates(
         self, standing: BoolArray, time: Array, calibration: Calibration
     ) -> list[Measurement]:
-        """Return what the gyroscope shows at the epochs of whole rests (s), where there are any."""
+        """Return the gyro readings at the epochs of whole rests (s), if any."""
         chosen = np.flatnonzero(standing & self.samples.at_rest(time))
         if not len(chosen) or not self.declared.site.platform.inertial:
             return []
@@ -154,17 +154,17 @@ def graph_of(
     *,
     roughly: bool = False,
 ) -> tuple[Graph, int]:
-    """Return the graph at an estimate, and the number of intervals bridged.
+    """Return the graph at an estimate, and the number of bridged intervals.
 
     Parameters
     ----------
     wave : MotionCompensated, optional
-        Phasors that an estimate has been taken off from; those of before where there are none.
+        Phasors compensated by an estimate; by default those of the log.
     standing : bool ndarray, shape (states,), optional
-        Where the platform is known to stand.
+        Where the platform is known to be at rest.
     roughly : bool
-        Whether another graph will follow, and the noise that stays is not found by this one: the
-        sigmas of the inertial factors may be a tenth off.
+        Whether another graph will follow, and this one does not determine the final noise: the
+        sigmas of the inertial factors may then be a tenth off.
     """
     links, bridged = _links(log, states, calibration, roughly=roughly)
     measurements = [
@@ -193,9 +193,9 @@ def graph_of(
 def _links(
     log: PreparedLog, states: Trajectory, calibration: Calibration, *, roughly: bool
 ) -> tuple[tuple[Link, ...], int]:
-    """Return the inertial stream between the states, and the number of intervals bridged.
+    """Return the inertial stream between the states, and the number of bridged intervals.
 
-    Its derivatives are by what is estimated, then by what is considered.
+    Its derivatives are by the estimated parameters, then by the considered ones.
     """
     site, applied = log.declared.site, calibration
     accel, gyro = states.accel_bias_body, states.gyro_bias_body
@@ -219,7 +219,7 @@ def _links(
 
 
 def _fixes(log: PreparedLog, fixes: Fixes) -> Measurement:
-    """Return the fixes of the start as poses that were measured."""
+    """Return the fixes of the start as pose measurements."""
     cov = fixes.pose_cov[np.arange(len(fixes)), log.start.chosen] * overlap(log.samples)
     return replace(pose_fixes(replace(log.start.states, pose_cov=cov), log.loss), epoch=log.epoch)
 
@@ -231,7 +231,7 @@ def _fields(
     wave: MotionCompensated | None,
     standing: BoolArray | None,
 ) -> list[Measurement]:
-    """Return the phasors, and the Earth field where it is measured."""
+    """Return the phasors, and the Earth field where measured."""
     samples = log.samples if wave is None else wave.fields
     here, site = log.at_fields(states), calibration.site
     if not samples.signed:
@@ -271,7 +271,7 @@ def _with_short(
     standing: BoolArray | None,
     measurements: list[Measurement],
 ) -> list[Measurement]:
-    """Return measurements with those of short windows, where the tones are close."""
+    """Return measurements with those of short windows, where tones are closely spaced."""
     close = log.demodulation.close
     if close is None or wave is None or wave.unexplained_sensor is None:
         return measurements
@@ -286,7 +286,7 @@ def _with_short(
 
 
 def overlap(samples: FieldSamples) -> float:
-    """Return how many windows hold each sample: their information must not be counted twice."""
+    """Return the number of windows that contain each sample, whose information counts once."""
     if samples.magnetometers:
         names = dict.fromkeys(samples.magnetometers)
         each = [samples.of_magnetometer(name) for name in names]
@@ -308,7 +308,7 @@ def noise_of(
     wave: MotionCompensated | None,
     declared: Site,
 ) -> tuple[Tuned, ...]:
-    """Return the noise of a log whose graph was solved with some phasors; see `tune`."""
+    """Return the noise of a log from its solved graph and phasors; see `tune`."""
     samples, here = log.samples if wave is None else wave.fields, log.at_fields(states)
     alike = alike_in_batch(here.position_world, declared.model_error_length)
     blind = log.demodulation.blind

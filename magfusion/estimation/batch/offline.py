@@ -1,9 +1,9 @@
-"""Where the smoother of a log begins: chains of fixes, or gravity and the Earth field.
+"""Start of the smoother: chains of fixes, or gravity and the Earth field.
 
-Where the chains leave a doubt, by a leap, an open direction or a mirrored rival, tracks of the
-hypotheses through the inertial stream are offered too.
-At epochs without any beacon the gyro carries the attitude on from those with one, as it does from
-the fix of a cycle to the slots in it.
+Where the chains are doubtful, by a jump, an unobservable direction or a mirrored rival, tracks of
+the hypotheses through the inertial stream are added.
+At epochs without any beacon the gyro propagates the attitude from those with one, as it does from
+the fix of a cycle to its slots.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ from magfusion.units import Array, IntArray
 if TYPE_CHECKING:
     from magfusion.estimation.batch.search import Found
 
-LEAST_DETECTED = 10  # epochs at which a beacon is detected; fewer give no start
+LEAST_DETECTED = 10  # minimum number of epochs with a detected beacon for a start
 
 
 class OfflineStart(NamedTuple):
-    """A start with the calibration that its drive phases suggest.
+    """A start with the calibration estimated from its drive phases.
 
     Parameters
     ----------
     start : Start
         Of the fixes' hypotheses.
     states : Trajectory
-        Where to begin: those of the start, or what a track made of them.
+        Initial estimate: those of the start, or from a track.
     declared : Calibration
         Unsynchronised drives have no declared phase: their prior is centred on the start.
     fixes : Fixes, optional
@@ -66,22 +66,22 @@ class OfflineStart(NamedTuple):
 def begin(
     samples: FieldSamples, steady: SteadyFields | None, log: Log, calibration: Calibration
 ) -> list[OfflineStart]:
-    """Return the starts from which the motion chooses.
+    """Return the starts between which the motion selects.
 
     Parameters
     ----------
     steady : SteadyFields, optional
-        At the same times; where there is none, every epoch needs a beacon.
+        At the same times; without it every epoch needs a beacon.
     """
     detected = np.asarray(samples.valid.any(axis=1))
     if steady is not None and np.sum(detected) < LEAST_DETECTED:
         start = _by_earth(samples, steady, log.imu, calibration.site)
         return [OfflineStart(start, start.states, calibration, None)]
-    # An epoch that hears nothing has no fix at all, and would end the chain somewhere.
+    # An epoch without a detection has no fix at all, and would end the chain somewhere.
     some = samples.rows(detected) if np.sum(detected) >= LEAST_DETECTED else samples
     epochs, gravity = fix_inputs(some, log, calibration.site)
     fixes = fix_epochs(epochs, calibration, gravity=gravity)
-    # A beacon that fell silent, or is false, would lead the chain astray.
+    # A beacon that has stopped, or is false, would corrupt the chain.
     fixes = separate_fixes(epochs, calibration, fixes, gravity=gravity).fixes
     offset = calibration.time_offset
     imu = unbiased(log.imu, samples, offset)
@@ -90,7 +90,7 @@ def begin(
     out = []
     for start in chains:
         declared = calibration
-        if some.signed:  # of amplitudes any phase is as good
+        if some.signed:  # amplitudes do not depend on the phase
             declared = start_phases(calibration, fixes.time, start.phase)
         whole = start if everywhere else _carried(start, imu, offset, samples.time)
         out.append(OfflineStart(whole, whole.states, declared, fixes))
@@ -105,7 +105,7 @@ def begin(
 
 
 def unbiased(imu: ImuSamples, samples: FieldSamples, time_offset: float) -> ImuSamples:
-    """Return an inertial stream without the rate that it shows in whole rests, where those are."""
+    """Return an inertial stream without the gyro bias measured in whole rests, if any."""
     if not samples.of_rests:
         return imu
     half, stamps = 0.5 * samples.window, samples.time - time_offset
@@ -113,7 +113,7 @@ def unbiased(imu: ImuSamples, samples: FieldSamples, time_offset: float) -> ImuS
 
 
 def _doubtful(chains: tuple[Start, ...]) -> bool:
-    """Tell whether single epochs and their links may have led astray."""
+    """Return whether single epochs and their links may have given a wrong chain."""
     best = chains[0]
     return len(chains) > 1 or best.leaps > 0 or not bool(np.all(best.determined))
 
@@ -121,7 +121,7 @@ def _doubtful(chains: tuple[Start, ...]) -> bool:
 def _tracked(
     found: Found, fixes: Fixes, imu: ImuSamples, calibration: Calibration, time: Array
 ) -> OfflineStart:
-    """Return what a track found as a start, with the hypotheses of the fixes that are nearest."""
+    """Return the trajectory of a track as a start, with the nearest hypotheses of the fixes."""
     offset = calibration.time_offset
     there = carried(found.states, imu, offset, fixes.time)
     away = np.linalg.norm(fixes.position_world - there.position_world[:, None], axis=2)
@@ -139,7 +139,7 @@ def _tracked(
 
 
 def with_rest_bias(states: Trajectory, imu: ImuSamples, calibration: Calibration) -> Trajectory:
-    """Return states with the gyro bias of the rests, where there are any."""
+    """Return states with the gyro bias of the rests, if any."""
     bias, shape = _rest_bias(imu, calibration), (len(states), 3)
     return replace(
         states, gyro_bias_body=np.broadcast_to(bias, shape).copy(), accel_bias_body=np.zeros(shape)
@@ -154,12 +154,12 @@ def _rest_bias(imu: ImuSamples, calibration: Calibration) -> Array:
 
 
 def _by_earth(samples: FieldSamples, steady: SteadyFields, imu: ImuSamples, site: Site) -> Start:
-    """Return attitudes by gravity and the Earth field, at rest amid the beacons.
+    """Return attitudes from gravity and the Earth field, at rest amid the beacons.
 
     Parameters
     ----------
     samples : FieldSamples
-        None of which is used but its times.
+        Only its times are used.
     steady : SteadyFields
         At the same times.
     """
@@ -189,7 +189,7 @@ def _by_earth(samples: FieldSamples, steady: SteadyFields, imu: ImuSamples, site
 
 
 def carried(known: Trajectory, imu: ImuSamples, time_offset: float, time: Array) -> Trajectory:
-    """Return states at other epochs: from the nearest known one, turned by the gyro.
+    """Return states at other epochs: from the nearest known one, rotated by the gyro.
 
     Parameters
     ----------

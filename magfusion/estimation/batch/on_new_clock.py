@@ -1,4 +1,4 @@
-"""States that follow the IMU's clock when it is found to be another."""
+"""Shift of states after a change of the estimated IMU clock."""
 
 from dataclasses import replace
 
@@ -15,19 +15,19 @@ from magfusion.units import BoolArray
 def on_new_clock(
     log: PreparedLog, states: Trajectory, old: Calibration, new: Calibration, standing: BoolArray
 ) -> Trajectory:
-    """Return the states that the platform had where a new clock puts the log's epochs.
+    """Return the states at the log's epochs after a change of the IMU clock.
 
-    The inertial stream was cut by the old clock, and states carry it: a pass tells apart where the
-    platform was at an epoch by the state and the lag between both clocks.  The next pass cuts by
-    the new clock and follows the motion inside its windows from there; without the lag it would
-    follow a motion that comes late by what the pass has just found.
+    The inertial stream was cut by the old clock: a pass determines the platform's motion at an
+    epoch by the state and the lag between both clocks.  The next pass cuts by the new clock and
+    starts from these states.  Without the lag it would use a motion delayed by the estimated
+    clock offset.
 
     Parameters
     ----------
     states : Trajectory
         With velocity and bias, by the old clock.
     standing : bool ndarray, shape (states,)
-        Where the platform is known to stand, and no clock moves it.
+        Where the platform is known to be at rest, so that no clock moves it.
     """
     lag = np.where(standing, 0.0, new.imu_offset(states.time) - old.imu_offset(states.time))
     velocity, bias = states.velocity_world, states.gyro_bias_body

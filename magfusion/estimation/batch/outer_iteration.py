@@ -1,4 +1,4 @@
-"""One pass over a log: its graph about the states of the pass before, solved."""
+"""One pass over a log: solution of the graph linearised at the states of the pass before."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -29,23 +29,23 @@ from magfusion.model.site import MotionModel
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import BoolArray
 
-TUNINGS = 3  # passes after which the noise is found anew; then it stays as it is
+TUNINGS = 3  # passes after which the noise is estimated again; then it is kept
 ON_THE_WAY, CONVERGED = 1e-4, 1e-6  # relative decrease of the cost at which a pass ends
 
 
 class SolvedPass(NamedTuple):
-    """The graph of a pass, and what was found in it.
+    """The solved graph of a pass.
 
     Parameters
     ----------
     states : Trajectory
         Without covariance.
     gaps : int
-        Intervals that were bridged.
+        Number of intervals with a bridged gap.
     stood : bool ndarray, shape (states,)
-        Where the platform was found at rest.
+        Where the platform was detected at rest.
     iterations : int
-        Of the optimiser, with those before the rests were known.
+        Of the optimiser, including those before rests were detected.
     """
 
     graph: Graph
@@ -57,7 +57,7 @@ class SolvedPass(NamedTuple):
 
 
 def begin_passes(log: PreparedLog, settings: SmootherSettings) -> Passed:
-    """Return where a log begins of which no pass was made."""
+    """Return the state of a log before its first pass."""
     return Passed(
         done=0,
         iterations=0,
@@ -72,16 +72,16 @@ def begin_passes(log: PreparedLog, settings: SmootherSettings) -> Passed:
 
 
 class Plan(NamedTuple):
-    """How the next pass is made.
+    """Settings of the next pass.
 
     Parameters
     ----------
     short : bool
         Whether the optimiser may end early.
     finds_noise : bool
-        Whether noise and model error are found from its residuals.
+        Whether noise and model error are estimated from its residuals.
     roughly : bool
-        Whether its graph may be a rough one.
+        Whether approximate sigmas of its graph suffice.
     """
 
     short: bool
@@ -90,21 +90,21 @@ class Plan(NamedTuple):
 
 
 def plan_pass(log: PreparedLog, now: Passed, settings: SmootherSettings) -> Plan:
-    """Return how the next pass is made."""
-    # Another pass is sure to come.
+    """Return the settings of the next pass."""
+    # Another pass will follow.
     short = (now.done == 0 or now.tuning) and now.done + 1 < settings.passes
-    # The noise that stays is told from the residuals by the sigmas as they are.
+    # The final noise is estimated from residuals whitened with the present sigmas.
     finds = now.tuning and (now.done > 0 or not by_waveform(log))
     return Plan(short, finds, short and not (finds and now.done >= TUNINGS))
 
 
 def by_waveform(log: PreparedLog) -> bool:
-    """Return whether each pass demodulates a log anew."""
+    """Return whether each pass demodulates the log again."""
     return log.fixes is None and log.demodulation.anew
 
 
 def demodulate_about(log: PreparedLog, now: Passed) -> MotionCompensated | None:
-    """Return the phasors as the states of the last pass have them; None for those of the log."""
+    """Return the phasors demodulated with the last pass's states; None for those of the log."""
     if now.done > 0 and by_waveform(log):
         wave = log.compensated(now.calibration, now.states)
         give_back_memory()
@@ -121,7 +121,7 @@ def solve_about(
     calm: BoolArray,
     plan: Plan,
 ) -> SolvedPass:
-    """Solve the graph about the states of the last pass.
+    """Solve the graph linearised at the states of the last pass.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def solve_about(
     found = optimise(graph, begun, tolerance=tolerance)
     iterations, after = found.iterations, read_states(found.estimate.values, time)
     stood = _at_rest(graph, found.estimate, after, calm & ~now.standing, motion)
-    if np.any(stood):  # at once: it costs no preintegration
+    if np.any(stood):  # directly: it costs no preintegration
         graph = replace(graph, measurements=(*graph.measurements, log.rests(stood)))
         found = optimise(graph, found.estimate, tolerance=tolerance)
         iterations += found.iterations
@@ -145,7 +145,7 @@ def solve_about(
 
 
 def advance(now: Passed, solved: SolvedPass) -> Passed:
-    """Return where a log is after a pass."""
+    """Return the state of a log after a pass."""
     estimate = solved.found.estimate
     return replace(
         now,
@@ -159,14 +159,14 @@ def advance(now: Passed, solved: SolvedPass) -> Passed:
 
 
 def nothing_moved(before: Passed, after: Passed, solved: SolvedPass) -> bool:
-    """Return whether a pass that is not the first came to where the one before was."""
+    """Return whether a pass, not the first, reproduced the result of the one before."""
     if before.done == 0 or np.any(solved.stood):
         return False
     return settled_at(before.states, after.states, before.calibration, after.calibration)
 
 
 def retune(before: Passed, after: Passed, latest: tuple[Tuned, ...], plan: Plan) -> Passed:
-    """Return where a log is after a pass, with the noise of its residuals if it can be noise."""
+    """Return the state of a log after a pass, with the noise of its residuals if plausible."""
     noise = latest if plausible(latest) else as_declared(latest)
     moves = before.done < TUNINGS and not same_noise(before.tuned, latest)
     return replace(
@@ -180,7 +180,7 @@ def retune(before: Passed, after: Passed, latest: tuple[Tuned, ...], plan: Plan)
 
 
 def relax(log: PreparedLog, before: Passed, after: Passed, blocks: tuple[Block, ...]) -> Passed:
-    """Return from where the next pass goes on: from this one's states, or from before them."""
+    """Return the start of the next pass, after accelerating the fixed-point iteration."""
     moved = before.states, after.states, before.calibration, after.calibration
     step = Step.of(before.step, *moved)
     states, calibration = part_of_the_way(*moved, blocks, step.share)
@@ -191,7 +191,7 @@ def relax(log: PreparedLog, before: Passed, after: Passed, blocks: tuple[Block, 
 def _at_rest(
     graph: Graph, estimate: Estimate, states: Trajectory, asked: BoolArray, motion: MotionModel
 ) -> BoolArray:
-    """Return at which of some epochs with a quiet IMU the platform is at rest."""
+    """Return which epochs with a quiet IMU have the platform at rest."""
     out = np.zeros(len(asked), dtype=bool)
     if np.any(asked):
         assert states.velocity_world is not None

@@ -1,4 +1,4 @@
-"""Where the passes over a log are: what a run that is stopped goes on from."""
+"""State of the passes over a log, and a checkpoint from which a stopped run is resumed."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,22 +24,22 @@ from magfusion.units import BoolArray
 
 @dataclass(frozen=True, eq=False)
 class Passed:
-    """What a pass over a log left for the next.
+    """State of a log after a pass.
 
     Parameters
     ----------
     done, iterations : int
-        Passes, and the iterations in them.
+        Number of passes, and of the iterations in them.
     tuning : bool
-        Whether noise and model error are still being found.
+        Whether noise and model error are still being estimated.
     states : Trajectory
         At all epochs, without covariance.
     declared, calibration : Calibration
-        With the noise that was found.
+        With the estimated noise.
     segments : tuple of Calibration
         Of every segment of a long log.
     standing : bool ndarray, shape (states,)
-        Where the platform is known to stand.
+        Where the platform is known to be at rest.
     tuned : tuple of Tuned
     step : Step, optional
         Of the pass.
@@ -67,7 +67,7 @@ class PassFile:
     key : str
         Of the run (`magfusion.files.checkpoint.run_key`).
     resume : bool
-        Whether to go on from what an earlier run left.
+        Whether to continue from the state of an earlier run.
     """
 
     place: Path
@@ -75,12 +75,12 @@ class PassFile:
     resume: bool
 
     def begun(self, log: PreparedLog) -> Passed | None:
-        """Return where an earlier run was; None where there is none, or a new one is asked for.
+        """Return the state of an earlier run; None without one, or where a new run is requested.
 
         Raises
         ------
         InputError
-            Where the file is damaged, or of another log, site or setting, or no checkpoint.
+            Where the file is damaged, is of another log, site or setting, or is no checkpoint.
         """
         found = read_checkpoint(self.place, self.key) if self.resume else None
         if found is None:
@@ -89,11 +89,11 @@ class PassFile:
         rules = calibration_rules(log.declared, log.blocks)
         passed = from_plain(Passed, found.content, f"{self.place}: passes", rules)
         if passed.done != found.position or not _alike(passed, log):
-            raise InputError(f"{self.place}: is not of this log; run without --resume")
+            raise InputError(f"{self.place}: belongs to another log; run without --resume")
         return passed
 
     def keep(self, passed: Passed, declared: Calibration, blocks: tuple[Block, ...]) -> None:
-        """Write what a pass left; until it is whole, what the pass before left is there.
+        """Write the state of a pass, replacing that of the pass before only when complete.
 
         Parameters
         ----------
@@ -105,7 +105,7 @@ class PassFile:
 
 
 def _alike(passed: Passed, log: PreparedLog) -> bool:
-    """Return whether states are those of a log."""
+    """Return whether the states belong to a log."""
     own, known = passed.states, log.states
     if not (np.array_equal(own.time, known.time) and len(passed.standing) == len(known)):
         return False

@@ -1,4 +1,4 @@
-"""A log made ready to be smoothed: demodulated, with a start that was found, or known before."""
+"""Preparation of a log for smoothing: demodulated, with a new or an earlier start."""
 
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -28,23 +28,23 @@ from magfusion.receiver.cycles import whole_cycles
 from magfusion.receiver.slots import has_schedule
 from magfusion.units import Array
 
-LONGEST_STEP = 5.0  # s; without any field a state is made after so long
-REST_STEP = 2.0  # s; and so long at rest, where each has a zero velocity
-SPARSE = 2.5  # intervals; a longer one than so many usual ones is a gap
+LONGEST_STEP = 5.0  # s; interval of states without any field
+REST_STEP = 2.0  # s; the same at rest, where each has a zero velocity
+SPARSE = 2.5  # times the usual interval; a longer one is a gap
 
 
 @dataclass(frozen=True, eq=False)
 class Begun:
-    """Where an estimate of a log begins that was smoothed before.
+    """Start of a log that was smoothed before.
 
     Parameters
     ----------
     states : Trajectory
         At all its epochs, without covariance.
     declared : Calibration
-        Before it was smoothed, with what was declared of its own.
+        Its declared calibration, before it was smoothed.
     start : Start
-        Of which those came.
+        From which the states were estimated.
     rival_chi_square, rival : float, Trajectory, optional
         As of `magfusion.estimation.batch.batch.Smoothed`.
     """
@@ -57,7 +57,7 @@ class Begun:
 
 
 class _Demodulated(NamedTuple):
-    """A log before it has a start, with the times at which states are made (s)."""
+    """A log before it has a start, with the times of its states (s)."""
 
     log: Log
     demodulation: Demodulation
@@ -68,12 +68,12 @@ class _Demodulated(NamedTuple):
 
 
 def prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) -> PreparedLog:
-    """Return a log with the start that the motion prefers.
+    """Return a log with the start that the motion selects.
 
     Raises
     ------
     InputError
-        Where the log holds nothing usable.
+        Where the log has no usable data.
     EstimationError
         Where it has too few epochs.
     """
@@ -108,18 +108,18 @@ def prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) -
 
 
 def _one_roll(states: Trajectory, site: Site, *, signed: bool) -> Trajectory:
-    """Return states whose rolls, where nothing tells them, are those of one that does not turn."""
+    """Return states with the roll of a platform that does not roll, where it is unobservable."""
     if not roll_is_open(site):
         return states
     return without_roll(states, site, signed=signed)
 
 
 def prepared_again(log: Log, site: Site, settings: SmootherSettings, known: Begun) -> PreparedLog:
-    """Return a log that was smoothed before, at the states that it had then."""
+    """Return a log that was smoothed before, with its states of then."""
     heard = _demodulated(log, site, settings)
     rows = np.isin(known.states.time, heard.time)
     if not np.sum(rows) == len(heard.time):
-        raise EstimationError(f"log {log.name} is not the one that was smoothed before")
+        raise EstimationError(f"log {log.name} differs from the one that was smoothed before")
     own = {k: v[rows] for k, v in vars(known.states).items() if v is not None}
     at_start = replace(known, states=Trajectory(**own))
     ready = bridged(_with_start(heard, settings, at_start, None))
@@ -181,12 +181,12 @@ def _with_start(
 def _in_gaps(
     samples: FieldSamples, imu: ImuSamples, time_offset: float, motion: MotionModel
 ) -> Array:
-    """Return when states are made where no field comes (s), more of them where the IMU is quiet.
+    """Return the times of states where no field is measured (s), more where the IMU is quiet.
 
     Parameters
     ----------
     samples : FieldSamples
-        What comes; between whole rests, and in them, nothing does.
+        Measured; there are none between whole rests, nor within them.
     time_offset : float
         (s)
     """

@@ -1,8 +1,8 @@
-"""Starts that the inertial stream joins: tracks of every hypothesis, to the end and back.
+"""Starts joined by the inertial stream: tracks of every hypothesis, forward and backward.
 
-A track that took the wrong turn where two mirrored poses meet is worse from there on than one that
-begins anew on the other side, for a price.  What is worse by little at the end is a rival, be it
-for the whole log or for a stretch of it.
+A track that took the wrong branch where two mirrored poses meet is worse from there on than one
+that restarts on the other side, at a price.  Tracks that are little worse at the end are rivals,
+for the whole log or for a part of it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,31 +30,31 @@ from magfusion.model.strapdown import attitude_at, attitude_from_gyro, mean_abou
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
-STEP = 0.1  # s; of the epochs that tracks take in, unless windows are longer
-VISITS = 6000  # at most; a longer log has longer steps
+STEP = 0.1  # s; of the epochs that tracks process, unless windows are longer
+VISITS = 6000  # maximum; a longer log has longer steps
 LONGEST_STEP = 2.0  # s; over which an inertial stream still joins fixes
-ANEW = 1.0  # s; between epochs at which tracks may begin anew
-FIRST_ANEW = 4  # of these, at which drive phases may begin anew too
-LEAP = 60.0  # chi square; price of beginning anew
-MOST = 12  # tracks at a time
-WORSE = 250.0  # chi square; a track worse by more is given up
+ANEW = 1.0  # s; between epochs at which tracks may restart
+FIRST_ANEW = 4  # of these, at which drive phases may restart too
+LEAP = 60.0  # chi square; price of a restart
+MOST = 12  # maximum number of tracks at a time
+WORSE = 250.0  # chi square; a track worse by more is discarded
 SAME_PLACE, SAME_TURN = 0.03, 0.03  # m, rad; within which two tracks are one
-RETURNING = 4  # tracks that go back
-OTHERWISE, STRETCH = 0.1, 0.5  # m or rad, and s; a rival is so far off for so long
+RETURNING = 4  # tracks of the backward search
+OTHERWISE, STRETCH = 0.1, 0.5  # m or rad, and s; minimum deviation of a rival, and its duration
 RIVALS = 3
-FIRST_ROTATION, FIRST_POSITION, FIRST_PHASE = 0.5, 1.0, 1.0  # rad, m, rad; where a fix is open
+FIRST_ROTATION, FIRST_POSITION, FIRST_PHASE = 0.5, 1.0, 1.0  # rad, m, rad; if unobservable
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A trajectory that a track took.
+    """Trajectory of a track.
 
     Parameters
     ----------
     states : Trajectory
         At some of the epochs, with velocity.
     phase : ndarray, shape (n, channels)
-        Drive phase beyond the calibration's (rad).
+        Drive phase relative to the calibration's (rad).
     cost : float
         Of its track.
     """
@@ -66,7 +66,7 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """What tracks are followed through."""
+    """Inputs of the search."""
 
     samples: FieldSamples
     hearing: Heard
@@ -81,7 +81,7 @@ class _Search:
 
 @dataclass(frozen=True)
 class _Meeting:
-    """Two tracks that became one at a visited epoch: rows of the epoch before."""
+    """Two tracks that merged at a visited epoch: rows of the epoch before."""
 
     visit: int
     kept: int
@@ -91,13 +91,13 @@ class _Meeting:
 
 @dataclass(frozen=True, eq=False)
 class _Followed:
-    """Tracks of every visited epoch, and those that were given up since they met others."""
+    """Tracks of every visited epoch, and those that were merged into others."""
 
     visits: list[Tracks]
     meetings: list[_Meeting]
 
     def path(self, row: int, visit: int) -> list[tuple[int, int]]:
-        """Return visit and row of a track's history, the latest first."""
+        """Return visit and row of a track's history, newest first."""
         out = []
         for i in range(visit, -1, -1):
             out.append((i, row))
@@ -108,14 +108,14 @@ class _Followed:
 def search(
     samples: FieldSamples, fixes: Fixes, imu: ImuSamples, calibration: Calibration
 ) -> list[Found]:
-    """Return the trajectories that explain a log best, the likeliest first.
+    """Return the trajectories that explain a log best, the most probable first.
 
     Parameters
     ----------
     samples : FieldSamples
         Epochs of the fixes.
     imu : ImuSamples
-        The gyro's bias at rest taken off.
+        With the gyro's bias at rest removed.
     """
     kept = thinned(samples)
     some = samples.rows(kept)
@@ -132,22 +132,22 @@ def search(
     ahead = _follow(asked, _seeds(asked, 0), range(count))
     last = ahead.visits[-1]
     best = last.rows(np.argsort(last.cost)[:RETURNING])
-    # What the way there has told is told again on the way back: it is only where to begin.
+    # The backward search uses the forward data again: that gives only its start.
     again = replace(best, cov=4.0 * best.cov, cost=np.zeros(len(best)))
     back = _follow(asked, replace(again, parent=np.arange(len(again))), range(count - 1, -1, -1))
     return _trajectories(asked, back)
 
 
 def can_search(samples: FieldSamples) -> bool:
-    """Tell whether a log is long enough, and not too long, for tracks."""
+    """Return whether the length of a log suits tracks."""
     return len(samples) > 2 and float(np.ptp(samples.time)) <= VISITS * LONGEST_STEP
 
 
 def thinned(samples: FieldSamples) -> IntArray:
-    """Return which epochs are taken: no two windows share a sample."""
+    """Return which epochs are used, so that no two windows share a sample."""
     usual = float(np.median(np.diff(samples.time)))
     wanted = max(STEP, float(np.median(samples.window)), float(np.ptp(samples.time)) / VISITS)
-    stride = min(round(wanted / usual), len(samples) - 1)  # of the shortest log both ends
+    stride = min(round(wanted / usual), len(samples) - 1)  # both ends of the shortest log
     return np.arange(0, len(samples), max(1, stride))
 
 
@@ -164,7 +164,7 @@ def _upright(imu: ImuSamples, time_offset: float, time: Array, site: Site) -> Gr
 
 
 def _seeds(asked: _Search, k: int) -> Tracks:
-    """Return tracks that begin at the fixes of an epoch, drive phases and all."""
+    """Return tracks that begin at the fixes of an epoch, with their drive phases."""
     hearing, rows = asked.hearing, np.array([k])
     fixes = fix_epochs(
         asked.samples.rows(rows), hearing.calibration, gravity=asked.gravity.rows(rows)
@@ -194,7 +194,7 @@ def _seeds(asked: _Search, k: int) -> Tracks:
 
 
 def _motion_sigma(site: Site) -> Array:
-    """Return how well a track's motion is known before anything is heard, shape (15,)."""
+    """Return the prior sigmas of a track's motion, shape (15,)."""
     imu = site.platform.imu
     sigma = [
         FIRST_ROTATION,
@@ -223,7 +223,7 @@ def _follow(asked: _Search, tracks: Tracks, order: Sequence[int]) -> _Followed:
         tracks = replace(tracks, parent=np.arange(len(tracks)))
         tracks = updated(tracks, hearing, k)
         spent, taken = spent + float(np.min(tracks.cost)) - before, taken + hearing.components[k]
-        # Where the noise is larger than declared, so is every difference.
+        # Noise above the declared one increases every difference as well.
         level = max(1.0, spent / max(taken, 1.0))
         if abs(time[k] - anew) >= ANEW and hearing.components[k] > 0.0:
             anew, begun = time[k], begun + 1
@@ -239,12 +239,12 @@ def _follow(asked: _Search, tracks: Tracks, order: Sequence[int]) -> _Followed:
 
 
 def _light(tracks: Tracks) -> Tracks:
-    """Return tracks without their covariance, to be kept."""
+    """Return tracks without their covariance, for storage."""
     return replace(tracks, cov=np.zeros((len(tracks), 0, 0)))
 
 
 def _with_others(asked: _Search, tracks: Tracks, k: int, level: float, *, fresh: bool) -> Tracks:
-    """Return tracks, and new ones at the hypotheses of an epoch where no track is."""
+    """Return tracks, with new ones at hypotheses of an epoch that no track is near."""
     best = int(np.argmin(tracks.cost))
     price = tracks.cost[best] + LEAP * level
     others = [_anew(asked, tracks, best, k)]
@@ -262,12 +262,12 @@ def _with_others(asked: _Search, tracks: Tracks, k: int, level: float, *, fresh:
 def _anew(asked: _Search, tracks: Tracks, best: int, k: int) -> Tracks:
     """Return tracks at the fixes of an epoch, with the drive phases of the best track.
 
-    What else it has made of the motion may be what led it astray.
+    Its motion is not used, since that may be the cause of its error.
     """
     hearing = asked.hearing
     fixes, row = asked.fixes, k
     if np.any(hearing.free) and not np.all(fixes.determined[row, np.isfinite(fixes.cost[row])]):
-        # With the track's drive phases no azimuth is open.
+        # With the track's drive phases the azimuth is observable.
         site = hearing.site
         known = tuple(replace(beacon, synchronised=True) for beacon in site.beacons)
         calibration = replace(
@@ -302,7 +302,7 @@ def _anew(asked: _Search, tracks: Tracks, best: int, k: int) -> Tracks:
 
 
 def _same(some: Tracks, others: Tracks) -> BoolArray:
-    """Tell which tracks are where others are, shape (some, others)."""
+    """Return which tracks coincide with others, shape (some, others)."""
     away = np.linalg.norm(some.position[:, None] - others.position, axis=-1)
     turn = np.swapaxes(some.rotation, 1, 2)[:, None] @ others.rotation
     near = (away < SAME_PLACE) & (_angle(turn) < SAME_TURN)
@@ -319,7 +319,7 @@ def _angle(turn: Array) -> Array:
 
 
 def _merged(tracks: Tracks, visit: int) -> tuple[Tracks, list[_Meeting]]:
-    """Return tracks without those that have come to where a better one is."""
+    """Return tracks without those that coincide with a better one."""
     if len(tracks) == 1:
         return tracks, []
     tracks = tracks.rows(np.argsort(tracks.cost))
@@ -336,7 +336,7 @@ def _merged(tracks: Tracks, visit: int) -> tuple[Tracks, list[_Meeting]]:
 
 
 def _trajectories(asked: _Search, followed: _Followed) -> list[Found]:
-    """Return the best way, and what differs from it for a while and is not much worse."""
+    """Return the best path, and those that differ from it for a while and are not much worse."""
     last = len(followed.visits) - 1
     order = np.argsort(followed.visits[-1].cost)
     paths = [(float(followed.visits[-1].cost[r]), followed.path(int(r), last)) for r in order]
@@ -353,7 +353,7 @@ def _trajectories(asked: _Search, followed: _Followed) -> list[Found]:
 def _by_stretch(
     followed: _Followed, path: list[tuple[int, int]], cost: float
 ) -> Iterator[tuple[float, list[tuple[int, int]]]]:
-    """Yield ways that part from the best before one of its meetings."""
+    """Yield paths that separate from the best before one of its merges."""
     row_at = dict(path)
     for meeting in followed.meetings:
         if row_at.get(meeting.visit) == meeting.kept:
@@ -362,7 +362,7 @@ def _by_stretch(
 
 
 def differ(some: Trajectory, others: Trajectory) -> bool:
-    """Tell whether two trajectories of the same epochs are apart, or turned, for long enough."""
+    """Return whether two trajectories of the same epochs differ in pose for long enough."""
     away = np.linalg.norm(some.position_world - others.position_world, axis=1)
     between = np.swapaxes(some.world_from_body, 1, 2) @ others.world_from_body
     other = (away > OTHERWISE) | (_angle(between) > OTHERWISE)
@@ -371,7 +371,7 @@ def differ(some: Trajectory, others: Trajectory) -> bool:
 
 
 def _read(asked: _Search, followed: _Followed, path: list[tuple[int, int]], cost: float) -> Found:
-    """Return a way as a trajectory; it was followed backward."""
+    """Return a path as a trajectory; its visits are in backward order."""
     rows = [(followed.visits[visit], row) for visit, row in path]
 
     def values(name: str) -> Array:

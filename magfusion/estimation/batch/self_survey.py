@@ -1,7 +1,7 @@
-"""Beacons that were never surveyed, placed by the log itself.
+"""Self survey: unsurveyed beacons are placed by the log itself.
 
 The known beacons give the trajectory first; along it `magfusion.estimation.batch.beacon_placement`
-finds where an unknown one may be.  Where several places explain its field nearly as well, the whole
+finds candidate poses of an unknown one.  Where several explain its field nearly as well, the whole
 log is smoothed with each, and the motion decides.
 """
 
@@ -28,16 +28,16 @@ if TYPE_CHECKING:
     from magfusion.estimation.batch.beacon_placement import DetectedFields
     from magfusion.estimation.batch.passes import PassFile
 
-FEWEST_KNOWN = 2  # beacons; one alone leaves the trajectory its mirrors
-WIDE_POSITION = 1.0  # m; prior about a place that was found
+FEWEST_KNOWN = 2  # beacons; with a single one the trajectory has mirrors
+WIDE_POSITION = 1.0  # m; prior about an estimated place
 WIDE_ROTATION = 0.5  # rad
-RIVAL = 100.0  # chi square above the best, along the first trajectory, beyond which none is carried
+RIVAL = 100.0  # chi square above the best, along the first trajectory, that excludes a hypothesis
 MOST_SMOOTHED = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Where an unknown beacon may be.
+    """Candidate pose of an unknown beacon.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class Hypothesis:
         Above that of the best: along the known beacons' trajectory, or of the whole log where it
         was smoothed with this place.
     smoothed : bool
-        Which of the two.
+        Whether it is that of the whole log.
     """
 
     beacon: Beacon
@@ -56,7 +56,7 @@ class Hypothesis:
 
 
 class Placement(NamedTuple):
-    """What the log said of the place of one unknown beacon.
+    """Candidate poses of one unknown beacon.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def smooth_and_place(
     report: Report,
     passes: PassFile | None = None,
 ) -> tuple[Smoothed, tuple[Placement, ...]]:
-    """Smooth a log, with those beacons placed that the site declares unknown.
+    """Smooth a log and place the beacons that the site declares unknown.
 
     Parameters
     ----------
@@ -108,23 +108,23 @@ def _refuse(site: Site, unknown: list[Beacon], settings: SmootherSettings) -> No
     known = len(site.beacons) - len(unknown)
     if known < FEWEST_KNOWN:
         raise InputError(
-            f"the site has {known} beacons of known place, and {FEWEST_KNOWN} are needed to place"
-            f" beacon {unknown[0].name}; survey another one"
+            f"the site has {known} beacons of known position, but {FEWEST_KNOWN} are needed to"
+            f" place beacon {unknown[0].name}; survey another one"
         )
     groups = settings.estimate
     if settings.coupling == "loose" or (groups is not None and "beacons" not in groups):
         raise InputError(
-            f"beacon {unknown[0].name} is to be placed by the log, which needs tight coupling and"
-            " the beacons among what is estimated; change --coupling or --estimate"
+            f"placing beacon {unknown[0].name} by the log needs tight coupling and estimated"
+            " beacons; change --coupling or --estimate"
         )
 
 
 def _by_the_known(
     log: Log, site: Site, samples: FieldSamples, settings: SmootherSettings, report: Report
 ) -> tuple[Trajectory, Calibration]:
-    """Return the trajectory, and the calibration of what the known beacons determine.
+    """Return the trajectory and the calibration that the known beacons determine.
 
-    From phasors: the window is that of all beacons, so that they do not leak into each other.
+    From phasors in a window for all beacons, which prevents leakage between them.
     """
     known = replace(site, beacons=tuple(b for b in site.beacons if b.unknown is None))
     kept = np.array([channel in known.channels for channel in samples.channels], dtype=bool)
@@ -154,7 +154,7 @@ def _hypotheses(detected: DetectedFields) -> Placement:
 
 
 def _with_prior(placed: Beacon, declared: Beacon) -> Beacon:
-    """Return a placed beacon whose sigmas leave the graph to find it anew."""
+    """Return a placed beacon with wide sigmas, so that the graph estimates its pose again."""
     sigma = declared.sigma
     if declared.unknown in ("pose", "position"):
         sigma = replace(sigma, position_world=np.full(3, WIDE_POSITION))
@@ -170,7 +170,7 @@ def decide(
     report: Report,
     found: list[Placement],
 ) -> tuple[Smoothed, tuple[Placement, ...]]:
-    """Smooth the log with the likeliest places; the whole graph decides between them.
+    """Smooth the log with the most probable places; the whole graph decides between them.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What an estimator, offline or online, is asked for."""
+"""Settings of estimators, offline and online."""
 
 from dataclasses import dataclass
 
@@ -19,19 +19,19 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, kw_only=True)
 class EstimatorSettings:
-    """What is measured, and what is estimated of the calibration.
+    """Settings of measurements and estimated calibration.
 
     Parameters
     ----------
     estimate : tuple of str, optional
-        Calibration groups; None takes those whose sigma in the site is not negligible.
+        Calibration groups; by default those whose sigma in the site is not negligible.
     lockin : LockinSettings, optional
-        None chooses window and step from the tones' spacing.
+        By default chosen by the tones' spacing.
     earth : bool
-        Measure the Earth field too; where no beacon is detected, it and gravity alone hold the
-        attitude.
+        Measure the Earth field too; where no beacon is detected, it and gravity alone constrain
+        the attitude.
     parameters : tuple of Parameter
-        Kinds of calibration parameters there are.
+        Available kinds of calibration parameters.
     """
 
     estimate: tuple[str, ...] | None = None
@@ -40,7 +40,7 @@ class EstimatorSettings:
     parameters: tuple[Parameter, ...] = PARAMETERS
 
     def blocks(self, site: Site) -> tuple[tuple[Block, ...], tuple[Block, ...]]:
-        """Return the calibration parameters that are estimated, and what else is uncertain."""
+        """Return the calibration parameters that are estimated, and those only considered."""
         kinds = self.parameters if self.earth else of_phasors(self.parameters)
         estimated = choose_blocks(site, self.estimate, parameters=kinds)
         return estimated, considered_blocks(site, estimated, parameters=kinds)
@@ -48,22 +48,22 @@ class EstimatorSettings:
 
 @dataclass(frozen=True)
 class SmootherSettings(EstimatorSettings):
-    """How a log is smoothed; the Earth field is measured with tight coupling only.
+    """Settings of the smoother; the Earth field requires tight coupling.
 
     Parameters
     ----------
     coupling : {'tight', 'loose'}
-        Whether the phasors or the fixes made of them enter the graph.
+        Whether the phasors or their fixes enter the graph.
     loss : {None, 'huber', 'cauchy'}
-        Robust loss of the field measurements: a false beacon is nothing that sums of squares
-        expect, and where all are true it costs nothing.
+        Robust loss of the field measurements, against false beacons, which sums of squares do not
+        model; it costs nothing where all are true.
     passes : int
-        At most so many predictions of the waveform.
+        Maximum number of waveform predictions.
     tune : bool
-        Whether noise and model error are found from the residuals, their declared values being a
-        prior; with tight coupling.
+        Whether noise and model error are estimated from the residuals, with their declared values
+        as a prior; with tight coupling.
     measurements : tuple of (ndarray, Measurement)
-        Anything else that was measured, with the times of its rows (s), at which states are made.
+        Further measurements, with the times of their rows (s), at which states are made.
     """
 
     __repr__ = short_repr
@@ -76,6 +76,6 @@ class SmootherSettings(EstimatorSettings):
 
     def __post_init__(self) -> None:
         if self.earth and self.coupling == "loose":
-            raise ValueError("the Earth field is measured with tight coupling only")
+            raise ValueError("the Earth field requires tight coupling")
         if self.passes < 1:
             raise ValueError(f"passes must be at least 1; got {self.passes}")

@@ -1,4 +1,4 @@
-"""What the inertial stream gains from one epoch to the next, whatever state it is applied to."""
+"""Motion increments of the inertial stream between epochs, independent of the state."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from magfusion.units import Array, BoolArray
 
 @dataclass(frozen=True, eq=False)
 class Strides:
-    """Turn and displacement from each epoch to the next, in the body axes of the earlier.
+    """Rotation and displacement from each epoch to the next, in the body axes of the earlier.
 
     Parameters
     ----------
@@ -22,9 +22,9 @@ class Strides:
     turn : ndarray, shape (n, 3, 3)
         ``earlier_from_later``.
     velocity, displacement : ndarray, shape (n, 3)
-        That the specific force alone makes from rest (m/s, m).
+        By the specific force alone, from rest (m/s, m).
     lever : ndarray, shape (n, 3, 3)
-        Integral of the turn: what a bias of the accelerometer makes of the velocity (s).
+        Integral of the rotation, by which an accelerometer bias changes the velocity (s).
     bridged : bool ndarray, shape (n,)
         Where the stream has a gap.
     """

@@ -1,8 +1,8 @@
-"""Hypotheses of the motion side by side, each an error-state filter, all in the same calls.
+"""Batch of motion hypotheses, each an error-state filter, updated in the same calls.
 
 Tangent of a track: rotation (body axes, right perturbation), position and velocity (world),
-accelerometer and gyro bias, then phase and rate of phase of every tone whose drive is not known.
-All are updated in the same calls: a `PartialUpdateFilter` each takes 2.6 times as long (12 tracks).
+accelerometer and gyro bias, then phase and rate of phase of every tone of unknown drive phase.
+A `PartialUpdateFilter` for each would take 2.6 times as long (12 tracks).
 """
 
 from dataclasses import dataclass, replace
@@ -25,14 +25,14 @@ from magfusion.units import Array, BoolArray, IntArray
 ROTATION, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 ACCEL, GYRO = slice(9, 12), slice(12, 15)
 MOTION = 15
-ROUNDS = 3  # of linearising anew in one update: the first prediction may be wide
-LOUD = 16.0  # times the expected chi square, from which a channel counts less
+ROUNDS = 3  # of linearisation in one update: the first prediction may be wide
+LOUD = 16.0  # times the expected chi square, above which a channel is downweighted
 LEAST_WALK = 1e-9  # of a bias: without any a covariance may become singular
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Filters at one epoch, a row each.
+    """Filters at one epoch, one row each.
 
     Parameters
     ----------
@@ -43,12 +43,12 @@ class Tracks:
     accel_bias, gyro_bias : ndarray, shape (h, 3)
         Body (m/s^2, rad/s).
     phase, rate : ndarray, shape (h, channels of a magnetometer)
-        Drive phase at this epoch (rad), and what it gains in a second beyond the nominal.
+        Drive phase at this epoch (rad), and its rate relative to the nominal one (rad/s).
     cov : ndarray, shape (h, 15 + 2 free, 15 + 2 free)
     cost : ndarray, shape (h,)
-        Minus twice the logarithm of the likelihood, but for what all have in common.
+        Minus twice the logarithm of the likelihood, up to a common constant.
     parent : int ndarray, shape (h,)
-        Row at the epoch before; at the first its own.
+        Row at the epoch before; at the first epoch its own.
     """
 
     rotation: Array
@@ -66,30 +66,30 @@ class Tracks:
         return len(self.cost)
 
     def rows(self, chosen: IntArray | BoolArray) -> "Tracks":
-        """Return some tracks, or tracks repeated."""
+        """Return some tracks, or repeated tracks."""
         return Tracks(**{name: value[chosen] for name, value in vars(self).items()})
 
     def joined(self, other: "Tracks") -> "Tracks":
-        """Return these and others."""
+        """Return these tracks and others."""
         return Tracks(**{k: np.concatenate([v, getattr(other, k)]) for k, v in vars(self).items()})
 
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """The phasors of all epochs as tracks take them in.
+    """Phasors of all epochs, prepared for tracks.
 
     Parameters
     ----------
     measured : ndarray, shape (n, channels, 6)
         (T); zero where missing.
     sqrt_information : ndarray, shape (n, channels, 3, 3)
-        Whitening, the survey's error in it.
+        Whitening, including the survey's error.
     components : ndarray, shape (n,)
-        How many are there.
+        Number of components present.
     free : bool ndarray, shape (channels of a magnetometer,)
-        Whose drive phase is not known.
+        Whether the drive phase is unknown.
     blocks : tuple of Block
-        Of those phases.
+        Of the unknown phases.
     """
 
     calibration: Calibration
@@ -107,7 +107,7 @@ class Heard:
 
 
 def heard(samples: FieldSamples, calibration: Calibration) -> Heard:
-    """Return phasors as tracks take them in."""
+    """Return phasors prepared for tracks."""
     site = calibration.site
     cov = measurement_cov(site, samples, survey_error=True)
     synchronised = {beacon.name: beacon.synchronised for beacon in site.beacons}
@@ -147,7 +147,7 @@ def _turn(vector: Array) -> Array:
 
 
 def carried(tracks: Tracks, strides: Strides, k: int, hearing: Heard, backward: bool) -> Tracks:
-    """Carry tracks over a stride: to its end, or from its end to its beginning."""
+    """Propagate tracks over a stride: to its end, or from its end to its beginning."""
     site, free = hearing.site, hearing.free
     dt, lever = float(strides.dt[k]), strides.lever[k]
     sign = -1.0 if backward else 1.0
@@ -176,7 +176,7 @@ def carried(tracks: Tracks, strides: Strides, k: int, hearing: Heard, backward: 
     step[:, POSITION, VELOCITY] = dt * np.eye(3)
     step[:, POSITION, ACCEL] = -0.5 * dt * first @ lever
     step[:, VELOCITY, ACCEL] = -first @ lever
-    # The attitude errs by the gyro's bias more and more within the stride.
+    # The attitude error by the gyro's bias grows within the stride.
     step[:, POSITION, GYRO] = first @ np.real(skew(shift)) * dt / 3.0
     step[:, VELOCITY, GYRO] = first @ np.real(skew(gained)) * dt / 2.0
     count = int(np.sum(free))
@@ -196,7 +196,7 @@ def _applied(rotation: Array, vector: Array) -> Array:
 
 
 def _noise(site: Site, dt: float, size: int, bridged: bool) -> Array:
-    """Return what a stride adds, but for what the gyro's noise makes of the velocity within it."""
+    """Return a stride's process noise, except the velocity error by gyro noise within it."""
     imu, noise = site.platform.imu, np.zeros((size, size))
     gyro = max(imu.gyro_noise, BRIDGE_GYRO_NOISE) if bridged else imu.gyro_noise
     accel = max(imu.accel_noise, BRIDGE_ACCEL_NOISE) if bridged else imu.accel_noise
@@ -242,16 +242,16 @@ def rows_at(tracks: Tracks, hearing: Heard, k: int) -> tuple[Array, Array]:
 
 
 def updated(tracks: Tracks, hearing: Heard, k: int) -> Tracks:
-    """Take in the phasors of an epoch.
+    """Update tracks by the phasors of an epoch.
 
-    A channel that is explained badly costs, but tears no track away.
+    A badly explained channel increases the cost, but its effect on a track is bounded.
     """
     if hearing.components[k] == 0.0:
         return tracks
     step, there = np.zeros((len(tracks), tracks.cov.shape[1])), tracks
     for _ in range(ROUNDS):
         error, by = rows_at(there, hearing, k)
-        # From the prediction, which holds what is known.
+        # From the prediction, which contains all prior information.
         error = error - (by @ step[..., None])[..., 0]
         excess = _excess(error, by, tracks.cov)
         root = np.repeat(1.0 / np.sqrt(np.maximum(excess, 1.0)), 6, axis=1)
@@ -266,7 +266,7 @@ def updated(tracks: Tracks, hearing: Heard, k: int) -> Tracks:
     gain = np.linalg.solve(spread, np.swapaxes(across, 1, 2))
     cov = tracks.cov - across @ gain
     square = np.einsum("hi,hi->h", error, solved[..., 0])
-    # As of a loss that grows with the logarithm beyond what is credible.
+    # As for a loss that grows with the logarithm beyond a credible error.
     lost = 6.0 * LOUD * np.sum(np.log(np.maximum(excess, 1.0)), axis=1)
     _, volume = np.linalg.slogdet(spread)
     return replace(
@@ -277,7 +277,7 @@ def updated(tracks: Tracks, hearing: Heard, k: int) -> Tracks:
 
 
 def _excess(error: Array, by: Array, cov: Array) -> Array:
-    """Return each channel's chi square against its prediction, of what is credible."""
+    """Return each channel's chi square relative to its prediction, limited to credible errors."""
     apart = error.reshape(len(error), -1, 6)
     blocks = by.reshape(*apart.shape, -1)
     spread = blocks @ cov[:, None] @ np.swapaxes(blocks, -1, -2) + np.eye(6)

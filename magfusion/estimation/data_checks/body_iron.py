@@ -1,9 +1,9 @@
-"""Iron or a magnet on the body: what the steady field does as the body turns.
+"""Iron or magnets on the body: uncompensated hard and soft iron in the static field.
 
-A field that stands still is turned by the gyroscope from one span to the next.  A matrix ``1 + E``
-and an offset ``o`` between it and the instrument leave
-``u' - T u = (E T - T E) b + (1 - T) o``, linear in both, with T that turn.  What a room's iron
-does goes with the place instead and is not explained so; at rest nothing is.
+The gyroscope rotates a static field from one span to the next by T.  A calibration error, matrix
+``1 + E`` and offset ``o``, leaves the residual ``u' - T u = (E T - T E) b + (1 - T) o``, linear in
+both.  Distortion by a room's iron depends on position instead and does not fit this model; without
+rotation nothing is observable.
 """
 
 from collections.abc import Iterator
@@ -15,16 +15,16 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
 
-IRON_SPAN = 0.5  # s; in which the body turns little
+IRON_SPAN = 0.5  # s; short enough for little rotation
 USUAL_MATRIX, USUAL_OFFSET = 0.1, 1.0  # relative to the field's size; of iron, one sigma
 LEAST_STEPS = 20
 LEAST_TURN = 0.1  # rad/s, rms
 USUAL_BIAS = 0.02  # rad/s; of the gyroscope, one sigma
 LIMIT = 8.5  # sigma of twelve numbers, 6 of one
 USUAL_MOUNTING = 0.1  # rad
-LEAST_SHARE = 0.01  # of the field's size, from which iron is said
-EXPLAINED = 0.8  # share of what the turn leaves
-CORRELATED = 2.0  # spans in a row are alike
+LEAST_SHARE = 0.01  # of the field's size, from which iron is reported
+EXPLAINED = 0.8  # share of the residual
+CORRELATED = 2.0  # consecutive spans that share one residual
 # What a turn of the mounting does to matrix and offset, by its three components.
 _MOUNTING = np.zeros((12, 3))
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -32,7 +32,7 @@ for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
 
 
 def iron_on_body(means: StillMeans, site: Site) -> Iterator[Finding]:
-    """Yield a matrix or an offset that the declared calibration does not allow.
+    """Yield the body-fixed iron that the declared calibration does not account for.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def iron_on_body(means: StillMeans, site: Site) -> Iterator[Finding]:
     matrix, hard = found[:9].reshape(3, 3), found[9:]
     soft = 0.5 * (matrix + matrix.T)
     sigma = np.repeat([np.max(sensor.matrix), np.max(sensor.offset) / size], [9, 3])
-    # A mounting that is off is no iron.
+    # A mounting error is not iron.
     allowed = cov + np.diag(sigma**2) + USUAL_MOUNTING**2 * _MOUNTING @ _MOUNTING.T
     weight = float(np.sqrt(found @ np.linalg.solve(allowed, found)))
     share = max(float(np.max(np.abs(soft))), float(np.linalg.norm(hard)))
@@ -67,10 +67,10 @@ def iron_on_body(means: StillMeans, site: Site) -> Iterator[Finding]:
     of_matrix, of_offset = float(np.sqrt(np.mean(soft**2))), size * float(np.linalg.norm(hard))
     yield Finding(
         "body_iron",
-        "magnetometer: as the body turns the steady field does not only turn: there is iron or a"
-        f" magnet on the body that its declared calibration does not have ({weight:.0f} sigma;"
-        f" offset {1e6 * of_offset:.2g} uT, matrix {100.0 * of_matrix:.2g} %). Calibrate it by"
-        " magfusion calibrate magnetometer, or declare platform.magnetometer.sigma as matrix:"
+        "magnetometer: the static field changes with attitude: uncalibrated iron or a magnet is on"
+        f" the body ({weight:.0f} sigma; offset {1e6 * of_offset:.2g} uT, matrix"
+        f" {100.0 * of_matrix:.2g} %). Calibrate it with magfusion calibrate magnetometer, or"
+        " declare platform.magnetometer.sigma as matrix:"
         f" {max(of_matrix, 1e-3):.2g}, offset_t: {max(of_offset, 1e-8):.2g}.",
         Verdict.DOUBTFUL,
         150.0 + min(weight, 100.0),
@@ -88,7 +88,7 @@ def _fitted(turn: Array, before: Array, left: Array) -> tuple[Array, Array, floa
     """
     turned = np.einsum("nij,nj->ni", turn, before)
     eye = np.eye(3)
-    # E T b: row i of E meets T b; T E b: column i of T meets row i of E.
+    # (E T b)_i depends on row i of E; (T E b)_i on column i of T and row i of E.
     by_matrix = np.einsum("ki,nj->nkij", eye, turned) - np.einsum("nki,nj->nkij", turn, before)
     by_offset = eye - turn
     by_bias = -IRON_SPAN * np.cross(turned[:, :, None], eye, axisa=1, axisb=0, axisc=1)
@@ -103,7 +103,7 @@ def _fitted(turn: Array, before: Array, left: Array) -> tuple[Array, Array, floa
         inverse = np.linalg.inv(information)
         found = inverse @ (design.T @ right / noise**2 / CORRELATED)
         noise = max(float(np.sqrt(np.mean((right - design @ found) ** 2))), 1e-6)
-    # What the bias alone explains is no iron.
+    # The part that the gyroscope bias explains is not iron.
     right = right - design[:, 12:] @ found[12:]
     after = float(np.sum((right - design[:, :12] @ found[:12]) ** 2))
     explained = 1.0 - after / max(float(np.sum(right**2)), 1e-30)

@@ -1,9 +1,9 @@
-"""Two free compasses that know of no beacon: gravity and the steady field.
+"""Checks of gravity and the static field, independent of the beacons.
 
-Both are averaged over seconds in axes that the gyroscope keeps still, which motion changes little:
-on real and on fast motion the size of gravity is right to 0.1 m/s^2, that of the field to half a
-percent, and the angle between them to a degree or two.  So units, gravity's absence, signs, a
-quarter turn of one instrument, or iron on the body show in the first seconds, without any beacon.
+Both are averaged over seconds in gyro-stabilized axes, which suppresses motion: on real and on
+fast motion the size of gravity is right to 0.1 m/s^2, that of the field to half a percent, and the
+angle between them to a degree or two.  Wrong units, missing gravity, wrong signs, an instrument
+rotated by 90 deg, or iron on the body therefore show within the first seconds.
 """
 
 from collections.abc import Iterator
@@ -23,14 +23,14 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.units import DEGREE, STANDARD_GRAVITY, Array
 
 SPAN = 4.0  # s; over which specific force and field are averaged
-FULL = 0.8  # of a span's samples that must be there
+FULL = 0.8  # share of a span's samples that must exist
 LIMIT = 6.0  # sigma
 FORCE_LIMIT = 5.0  # sigma of the accelerometer's bias
 MISSING = 0.35  # of gravity; less of it is no gravity
 UNIT = 0.06  # relative; as near gravity in another unit must be
 STEADY = 0.15  # relative scatter of what is gravity in another unit
-NEAR = 1.0  # s; as near in time a pose must be
-LEVEL_FIELD = 0.05  # of the field's size across the vertical; with less it has no heading
+NEAR = 1.0  # s; largest time difference of a pose
+LEVEL_FIELD = 0.05  # least horizontal share of the field that gives a heading
 TILT = 0.05  # rad; of the mean vertical where motion is fast
 CLEAR = 0.5  # cosine; beyond which a vertical points up or down
 UNITS_OF_FORCE = (
@@ -43,16 +43,16 @@ UNITS_OF_FORCE = (
 
 @dataclass(frozen=True, eq=False)
 class StillMeans:
-    """Specific force and field, averaged over spans in axes that stand still.
+    """Specific force and field, averaged over spans in gyro-stabilized axes.
 
     Parameters
     ----------
     time : ndarray, shape (n,)
         Middle of each span, on the log's clock (s).
     force_body, field_body : ndarray, shape (n, 3)
-        In the body's axes at that time (m/s^2, T); the field is NaN where there is none.
+        In body axes at that time (m/s^2, T); the field is NaN where none was measured.
     still_from_body : ndarray, shape (n, 3, 3)
-        Attitude at that time, by the gyroscope from the log's first sample on.
+        Attitude at that time, integrated from the gyroscope since the log's first sample.
     """
 
     time: Array
@@ -112,16 +112,16 @@ def wrong_compasses(
     poses: Trajectory | None = None,
     estimated: Trajectory | None = None,
 ) -> Iterator[Finding]:
-    """Yield what gravity and the steady field say against the accelerometer and the site.
+    """Yield inconsistencies of gravity and static field with the accelerometer and the site.
 
-    The axes are kept still by the gyroscope, which must be right.
+    The gyroscope, which stabilizes the axes, must be correct.
 
     Parameters
     ----------
     poses : Trajectory, optional
-        By the beacons: they tell whether vertical or field is wrong, where both disagree.
+        By the beacons: they decide which of vertical and field is wrong.
     estimated : Trajectory, optional
-        By an estimator that used gravity too: of a reversed vertical they tell whose it is.
+        By an estimator that also used gravity; decides the cause of a reversed vertical.
     """
     means = still_means(log, site)
     if len(means) == 0:
@@ -145,15 +145,15 @@ def wrong_compasses(
 
 
 def _turned_by_gyroscope(log: Log, means: StillMeans, site: Site | None) -> Iterator[Finding]:
-    """Yield that it is the gyroscope by which a specific force of gravity's size keeps no way."""
+    """Yield a gyroscope fault: gravity has its size but no constant direction in its axes."""
     gravity = STANDARD_GRAVITY if site is None else site.gravity
     body = float(np.median(np.linalg.norm(log.imu.accel_body, axis=1)))
     still = float(np.median(np.linalg.norm(means.force_body, axis=1)))
     if still > MISSING * gravity or abs(body / gravity - 1.0) > UNIT:
         return
     said = (
-        f"gyroscope: the specific force has the size of gravity ({body:.3g} m/s^2) and no direction"
-        f" in the axes that the gyroscope keeps still (mean {still:.3g} m/s^2)"
+        f"gyroscope: the specific force has the size of gravity ({body:.3g} m/s^2) but no constant"
+        f" direction in gyro-stabilized axes (mean {still:.3g} m/s^2)"
     )
     slower = replace(log, imu=replace(log.imu, gyro_body=DEGREE * log.imu.gyro_body))
     mended = still_means(slower, site).force_body
@@ -164,20 +164,20 @@ def _turned_by_gyroscope(log: Log, means: StillMeans, site: Site | None) -> Iter
         return
     yield Finding(
         "gyro_sign",
-        f"{said}: the gyroscope's signs, axes or unit are wrong. Turn it about each axis by a right"
-        " angle and compare.",
+        f"{said}: the gyroscope's signs, axes or unit are wrong. Rotate it by 90 deg about each"
+        " axis and compare.",
         Verdict.FAILED,
         2e3,
     )
 
 
 def wrong_force(means: StillMeans, site: Site | None) -> Iterator[Finding]:
-    """Yield what the mean specific force says: its unit, whether gravity is there, and its size."""
+    """Yield errors of the mean specific force: its unit, missing gravity, or its size."""
     gravity = STANDARD_GRAVITY if site is None else site.gravity
     sizes = np.linalg.norm(means.force_body, axis=1)
     size, scatter = float(np.median(sizes)), float(np.std(sizes))
     said = (
-        f"accelerometer: the mean specific force in axes that stand still is {size:.3g} m/s^2 where"
+        f"accelerometer: the mean specific force in gyro-stabilized axes is {size:.3g} m/s^2,"
         f" gravity is {gravity:.4g}"
     )
     for unit, factor in UNITS_OF_FORCE:
@@ -192,29 +192,29 @@ def wrong_force(means: StillMeans, site: Site | None) -> Iterator[Finding]:
     if size < MISSING * gravity:
         yield Finding(
             "gravity_missing",
-            f"{said}: gravity has been removed from it, as some drivers do ('linear acceleration'),"
-            " or the platform falls freely. Record the raw specific force.",
+            f"{said}: a driver has removed gravity ('linear acceleration'), or the platform is in"
+            " free fall. Record the raw specific force.",
             Verdict.FAILED,
             2e3,
         )
         return
     bias = 0.1 if site is None else site.platform.imu.accel_bias_sigma
     motion = A_HAND if site is None else site.platform.motion
-    # What the velocity gains within a span is no gravity; few spans tell little of it.
+    # The change of velocity within a span adds to gravity; few spans determine it poorly.
     usual = np.sqrt(2.0 / 3.0) * motion.speed_sigma / SPAN
     sigma = np.hypot(bias, np.hypot(scatter, usual / np.sqrt(len(sizes))) / np.sqrt(len(sizes)))
     if abs(size - gravity) > max(FORCE_LIMIT * sigma, 0.02 * gravity):
         yield Finding(
             "accel_scale",
-            f"{said}, {abs(size - gravity) / sigma:.1f} sigma of its declared bias off: its scale"
-            " or a bias is wrong, or world.gravity_m_s2 is. Calibrate it in six positions.",
+            f"{said}, off by {abs(size - gravity) / sigma:.1f} sigma of the declared bias: its"
+            " scale, a bias, or world.gravity_m_s2 is wrong. Calibrate it in six positions.",
             Verdict.DOUBTFUL,
             abs(size - gravity) / sigma,
         )
 
 
 def wrong_size(means: StillMeans, site: Site) -> Iterator[Finding]:
-    """Yield a steady field whose size is not the Earth's, as declared with its sigmas."""
+    """Yield a static field whose size differs from the declared Earth field."""
     assert site.earth_field_world is not None
     declared = float(np.linalg.norm(site.earth_field_world))
     sizes = np.linalg.norm(means.field_body, axis=1)
@@ -234,18 +234,18 @@ def wrong_size(means: StillMeans, site: Site) -> Iterator[Finding]:
     )
     inverse = next((u for u, f in (("gauss", 1e4), ("uT", 1e6)) if 0.5 < 1 / factor / f < 2), None)
     if unit is not None:
-        code, cause = "field_units", f"it is in {unit}, or the Earth field is not. Give tesla"
+        code, cause = "field_units", f"it is in {unit}, or earth_field_t is not in T. Use tesla"
     elif inverse is not None:
-        code, cause = "earth_field", f"earth_field_t is in {inverse}. Give tesla"
+        code, cause = "earth_field", f"earth_field_t is in {inverse}. Use tesla"
     else:
         code = "earth_field"
         cause = (
-            "iron or a magnet is on the body or near by all along, or earth_field_t is not of this"
+            "iron or a magnet is on or near the body all along, or earth_field_t is of another"
             " place. Calibrate the magnetometer where it is mounted"
         )
     yield Finding(
         code,
-        f"magnetometer: the steady field is {1e6 * size:.3g} uT (median) and declared as"
+        f"magnetometer: the static field is {1e6 * size:.3g} uT (median), declared"
         f" {1e6 * declared:.3g} uT, {off / sigma:.1f} sigma off: {cause}.",
         Verdict.DOUBTFUL,
         min(off / sigma, 1e3),
@@ -255,14 +255,14 @@ def wrong_size(means: StillMeans, site: Site) -> Iterator[Finding]:
 def wrong_dip(
     means: StillMeans, site: Site, *, mounted: bool = False, upright: bool | None = None
 ) -> Iterator[Finding]:
-    """Yield an angle between vertical and field that is not the Earth's, as declared.
+    """Yield an angle between vertical and field that differs from the declared Earth field's.
 
     Parameters
     ----------
     mounted : bool
         Whether gyroscope and field agree, so that the mounting is as declared.
     upright : bool, optional
-        Whether the accelerometer's vertical points up by the poses; None where that is not known.
+        Whether the poses have the accelerometer's vertical pointing up; None where unknown.
     """
     assert site.earth_field_world is not None
     declared = float(_angle(np.array([0.0, 0.0, 1.0]), site.earth_field_world))
@@ -270,23 +270,23 @@ def wrong_dip(
     if not abs(angle - declared) > LIMIT * sigma:
         return
     said = (
-        f"the steady field is {angle / DEGREE:.0f} deg from the accelerometer's vertical where the"
-        f" declared Earth field is {declared / DEGREE:.0f} deg from it"
+        f"the angle between static field and accelerometer's vertical is {angle / DEGREE:.0f} deg,"
+        f" of the declared Earth field {declared / DEGREE:.0f} deg"
         f" ({abs(angle - declared) / sigma:.0f} sigma)"
     )
     if abs(np.pi - angle - declared) < LIMIT * sigma:
         code, cause = _reversed(means, mounted=mounted, upright=upright)
     else:
         cause = (
-            "the mounting of magnetometer or inertial sensor is not as declared or axes of one are"
-            " permuted, iron disturbs the field, or earth_field_t is of another place"
+            "the mounting of magnetometer or inertial sensor differs from the declared one, axes"
+            " are permuted, iron disturbs the field, or earth_field_t is of another place"
         )
         code = "mounting"
     yield Finding(code, f"{said}: {cause}.", Verdict.DOUBTFUL, abs(angle - declared) / sigma)
 
 
 def _upright(means: StillMeans, poses: Trajectory) -> bool | None:
-    """Tell whether the accelerometer's vertical points up by the poses, where it does either."""
+    """Return whether the poses have the accelerometer's vertical up; None where neither way."""
     here = _at(means, poses)
     if here is None:
         return None
@@ -295,9 +295,9 @@ def _upright(means: StillMeans, poses: Trajectory) -> bool | None:
 
 
 def _reversed(means: StillMeans, *, mounted: bool, upright: bool | None) -> tuple[str, str]:
-    """Return code and cause of a vertical that points the other way."""
+    """Return code and cause of a reversed vertical."""
     level = float(np.median(means.force_body[:, 2])) > 0.7 * STANDARD_GRAVITY
-    of_sign = "the accelerometer's sign is reversed (at rest, level, it has +g on z)"
+    of_sign = "the accelerometer's sign is reversed (level and stationary it reads +g on z)"
     of_earth = "earth_field_t is of the other hemisphere (its z is up)"
     of_mounting = "magnetometer or inertial sensor is mounted upside down"
     if upright:
@@ -310,7 +310,7 @@ def _reversed(means: StillMeans, *, mounted: bool, upright: bool | None) -> tupl
 
 
 def _dip_sigma(means: StillMeans, site: Site) -> float:
-    """Return how well the angle between vertical and field is known beforehand (rad)."""
+    """Return the prior sigma of the angle between vertical and field (rad)."""
     sensor, imu = site.platform.magnetometer, site.platform.imu
     assert site.earth_field_world is not None
     field = float(np.linalg.norm(site.earth_field_world))
@@ -326,7 +326,7 @@ def _dip_sigma(means: StillMeans, site: Site) -> float:
 
 
 class _InWorld(NamedTuple):
-    """Specific force and field by the attitudes of poses, world axes, shape (n, 3)."""
+    """Specific force and field, rotated to world axes by the attitudes of poses, shape (n, 3)."""
 
     up: Array
     field: Array
@@ -358,36 +358,36 @@ def _turned(attitude: Array, vector_body: Array) -> Array:
 
 
 def _tilted(here: _InWorld, site: Site) -> Iterator[Finding]:
-    """Yield an accelerometer's vertical that is not that of the poses."""
+    """Yield an accelerometer's vertical that differs from that of the poses."""
     tilt = float(np.median(_angle(here.up, np.array([0.0, 0.0, 1.0]))))
     sigma = float(np.hypot(site.platform.imu.accel_bias_sigma / site.gravity, TILT))
     if not tilt > LIMIT * sigma:
         return
     reversed_ = _is_reversed(here)
     cause = (
-        "the accelerometer's sign is reversed (at rest, level, it has +g on z)"
+        "the accelerometer's sign is reversed (level and stationary it reads +g on z)"
         if reversed_
-        else "magnetometer or inertial sensor is not mounted as declared, axes of one are permuted,"
-        " or the beacons' attitudes are others"
+        else "the mounting of magnetometer or inertial sensor differs from the declared one, axes"
+        " are permuted, or the declared attitudes of beacons are wrong"
     )
     yield Finding(
         "gravity_sign" if reversed_ else "mounting",
-        f"the accelerometer's vertical is {tilt / DEGREE:.0f} deg off the vertical of the poses by"
-        f" the beacons: {cause}.",
+        f"the accelerometer's vertical is {tilt / DEGREE:.0f} deg off the vertical of the beacon"
+        f" poses: {cause}.",
         Verdict.FAILED,
         500.0 + tilt / sigma,
     )
 
 
 def _is_reversed(here: _InWorld) -> bool:
-    """Tell whether a reversed sign explains the vertical better than any turn by quarters."""
+    """Return whether a reversed sign fits the vertical better than any 90 deg rotation."""
     force = here.force_body / np.linalg.norm(here.force_body, axis=1, keepdims=True)
     best = min(axes(), key=lambda one: float(np.sum((here.up_body @ one.T - force) ** 2)))
     return bool(np.array_equal(best, -np.eye(3)))
 
 
 def wrong_field(here: _InWorld, site: Site) -> Iterator[Finding]:
-    """Yield a steady field that points elsewhere than declared, by poses with a right vertical."""
+    """Yield a static field that points elsewhere than declared, by poses of correct vertical."""
     earth = site.earth_field_world
     assert earth is not None
     field = np.median(here.field / np.linalg.norm(here.field, axis=1, keepdims=True), axis=0)
@@ -401,21 +401,22 @@ def wrong_field(here: _InWorld, site: Site) -> Iterator[Finding]:
     heading = float(np.arctan2(field[1], field[0]) - np.arctan2(earth[1], earth[0]))
     heading = (heading + np.pi) % (2.0 * np.pi) - np.pi
     of_heading = float(np.hypot(site.earth.declination_sigma, sigma / max(across, 1e-3)))
-    said = f"the steady field, by the poses, is {dip / DEGREE:.0f} deg from the vertical"
+    said = f"the static field at the estimated poses is {dip / DEGREE:.0f} deg from the vertical"
     if abs(off_dip) > LIMIT * sigma:
         yield Finding(
             "earth_field",
-            f"{said} and earth_field_t {(dip - off_dip) / DEGREE:.0f} deg, where gravity agrees"
-            " with the poses: earth_field_t is of another place or hemisphere (its z is up), or"
-            " iron turns the field.",
+            f"{said}, earth_field_t {(dip - off_dip) / DEGREE:.0f} deg; gravity agrees with the"
+            " poses: earth_field_t is of another place or hemisphere (its z is up), or iron"
+            " distorts the field.",
             Verdict.DOUBTFUL,
             abs(off_dip) / sigma,
         )
     elif abs(heading) > LIMIT * of_heading and across > LEVEL_FIELD:
         yield Finding(
             "earth_field",
-            f"the steady field, by the poses, points {heading / DEGREE:+.0f} deg from where"
-            " earth_field_t does: it is not in the axes of the beacons' survey, or iron turns it.",
+            "the heading of the static field at the estimated poses differs from earth_field_t by"
+            f" {heading / DEGREE:+.0f} deg: earth_field_t is not in the axes of the beacons'"
+            " survey, or iron distorts the field.",
             Verdict.DOUBTFUL,
             abs(heading) / of_heading,
         )

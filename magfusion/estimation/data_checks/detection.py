@@ -1,4 +1,4 @@
-"""Which beacons are detected: a receiver gives a phasor for every tone, also for an absent one."""
+"""Detection of beacons: a receiver outputs a phasor for every tone, also of an absent beacon."""
 
 from dataclasses import replace
 
@@ -13,18 +13,18 @@ DETECTION_CHI_SQUARE = (
     100.0  # chi square of six components; of a log that is smoothed with the Earth field
 )
 DETECTION_CHI_SQUARE_ONLINE = (
-    40.0  # a weak beacon is worth more than a wrong one costs, which the gate refuses
+    40.0  # a weak beacon helps more than a false one, which the gate rejects, costs
 )
 
 
-LOUD = 25.0  # times the least chi square: a beacon that is never so loud may only be far away
+LOUD = 25.0  # times the least chi square: a beacon that is always weaker may only be far away
 
 
 def without_silence(samples: FieldSamples) -> FieldSamples:
-    """Return samples without the stretches in which a beacon is silent that is loud elsewhere.
+    """Return samples without the stretches in which a beacon that is strong elsewhere is silent.
 
-    Its phasor is then nothing but noise, and a model that expects it is contradicted.  One that
-    fades with the distance loses next to nothing by it.
+    Its phasor there is noise and contradicts the model.  A beacon that fades with distance loses
+    almost nothing.
     """
     heard = detected(samples, DETECTION_CHI_SQUARE_ONLINE)
     loud = detected(samples, LOUD * DETECTION_CHI_SQUARE_ONLINE).any(axis=0)
@@ -33,10 +33,10 @@ def without_silence(samples: FieldSamples) -> FieldSamples:
 
 
 def drowned(samples: FieldSamples) -> BoolArray:
-    """Tell which phasors no beacon would be told from noise in, shape (n, channels).
+    """Return which phasors could not show a beacon above the noise, shape (n, channels).
 
-    Among those that `without_silence` leaves out: were the beacon as loud as usual there, the noise
-    would hide it, as fast motion beside another coil does before it is compensated.
+    Of those that `without_silence` drops: a beacon of its usual strength would be masked by noise,
+    as in fast motion near another coil before that motion is compensated.
     """
     heard = detected(samples, DETECTION_CHI_SQUARE_ONLINE)
     power = np.where(heard, np.nansum(np.abs(samples.phasor_sensor) ** 2, axis=-1), np.nan)
@@ -46,7 +46,7 @@ def drowned(samples: FieldSamples) -> BoolArray:
 
 
 def above_noise(samples: FieldSamples, least: float) -> BoolArray:
-    """Tell which phasors have more than so much of chi square against nothing, (n, channels)."""
+    """Return which phasors exceed a chi square against zero, shape (n, channels)."""
     there = samples.there
     phasor = np.where(there, samples.phasor_sensor, 0.0)
     parts = np.stack([phasor.real, phasor.imag], axis=-1)
@@ -55,39 +55,39 @@ def above_noise(samples: FieldSamples, least: float) -> BoolArray:
 
 
 def detected(samples: FieldSamples, least: float = DETECTION_CHI_SQUARE) -> BoolArray:
-    """Tell which phasors are of a beacon, shape (n, channels): more than noise, and for longer.
+    """Return which phasors are of a beacon, shape (n, channels): above noise for several windows.
 
-    A window in which a beacon falls silent, or begins, holds a part of its tone that nothing tells;
-    those that overlap a window without the beacon are therefore not of it.
+    A window in which a beacon stops or starts contains an unknown part of its tone, so that
+    windows overlapping one without the beacon are not counted.
 
     Parameters
     ----------
     least : float
-        Chi square of a phasor's six components against nothing.
+        Threshold for the chi square of a phasor's six components against zero.
     """
-    # What lies across the axes that a receiver has looks like silence.
+    # A field perpendicular to the available axes looks like silence.
     loud = above_noise(samples, least) | samples.partial
     if len(samples) < 2:
         return loud
     step = float(np.median(np.diff(samples.time)))
     reach = int(np.ceil(np.median(samples.window) / step - 1e-6))
     whole = np.ones((2 * reach + 1, 1), dtype=bool)
-    # What an epoch does not hold has not fallen silent.
+    # A tone that an epoch does not contain has not fallen silent.
     return loud & np.asarray(binary_erosion(loud | ~samples.valid, whole, border_value=1))
 
 
 def only(samples: FieldSamples, channels: BoolArray) -> FieldSamples:
-    """Return samples with the other channels missing."""
+    """Return samples with all other channels set to missing."""
     return replace(
         samples, phasor_sensor=np.where(channels[..., None], samples.phasor_sensor, np.nan)
     )
 
 
 class DetectionFilter:
-    """Follows which channels are detected, epoch by epoch.
+    """Track which channels are detected, epoch by epoch.
 
-    A beacon that appears is left out until a window contains nothing of its silence; one that
-    disappears is refused by the gate, which knows what to expect of it.
+    A beacon that appears is skipped until a window is free of its silence; one that disappears is
+    rejected by the gate, which predicts its field.
     """
 
     _detected_for: IntArray | None  # epochs in a row, by channel
@@ -103,7 +103,7 @@ class DetectionFilter:
         samples : FieldSamples
             One epoch.
         step : float
-            Since the epoch before (s).
+            Since the previous epoch (s).
         """
         loud, valid = detected(samples, DETECTION_CHI_SQUARE_ONLINE), samples.valid[0]
         reach = int(np.ceil(samples.window[0] / step - 1e-6))

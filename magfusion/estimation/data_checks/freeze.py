@@ -1,4 +1,4 @@
-"""An instrument that hangs, noticed as its samples come: it repeats its last one for too long."""
+"""Online detection of a frozen instrument: one that repeats its last sample for too long."""
 
 import numpy as np
 
@@ -7,18 +7,18 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array, BoolArray
 
 SAMPLES = 1e7  # of a stream, among which the chance of a false alarm is `CHANCE`
-FEWEST = 6  # samples alike in a row, at least
+FEWEST = 6  # equal samples in a row, at least
 
 
 class Freeze:
-    """Of one instrument, by its samples in the order in which they come.
+    """Freeze detector of one instrument, fed with its samples in order.
 
     Attributes
     ----------
     since : float
-        Stamp of the first sample that is as the newest is (s).
+        Stamp of the first sample equal to the newest (s).
     found : bool
-        Whether the newest sample is of an instrument that hangs.
+        Whether the instrument is frozen at the newest sample.
     """
 
     since: float
@@ -34,7 +34,7 @@ class Freeze:
         self._repeats, self._alike, self._seen = 0, 0, 0
 
     def stretches(self, time: Array, samples: Array) -> list[tuple[float, float]]:
-        """Return after which sample and up to which (s) samples (k, 3) only repeat it."""
+        """Return begin and end (s) of the stretches in which samples (k, 3) repeat."""
         out: dict[float, float] = {}
         if len(time) == 0:
             return []
@@ -59,7 +59,7 @@ class Freeze:
         return list(out.items())
 
     def _passed(self, time: Array, same: BoolArray) -> bool:
-        """Count samples none of which is repeated for long, as nearly always; else do nothing."""
+        """Count samples quickly where no repetition is long (the usual case)."""
         if not (self.found or same.any() or self._repeats >= FEWEST):
             self._seen, self._alike = (
                 self._seen + len(same) + self._repeats,
@@ -80,7 +80,7 @@ class Freeze:
         return True
 
     def _too_long(self, time: float) -> bool:
-        # Instruments have steps, and may be read faster than they measure.
+        # Instruments quantize, and may be read faster than they measure.
         usual = min(max(self._alike / max(self._seen, 1), 1e-3), 0.97)
         by_chance = np.log(CHANCE / SAMPLES) / np.log(usual)
         return self._repeats >= max(by_chance, FEWEST) and time - self.since >= SHORTEST_FREEZE
@@ -89,20 +89,20 @@ class Freeze:
 def imu_remarks(
     since: float | None, begin: float, end: float, *, bridged: bool
 ) -> tuple[Finding, ...]:
-    """Return what is to be said of the IMU between two epochs (s).
+    """Return the findings on the IMU between two epochs (s).
 
     Parameters
     ----------
     since : float, optional
-        When it hung (s); None where it does not now.
+        Start of a freeze (s); None where there is none.
     bridged : bool
         Whether samples are missing there.
     """
     if since is not None and end > since:
-        text = f"all axes stand still since {since:.2f} s: the sensor or its driver hung. What it"
-        text += " repeats is left out, and bridged by the fields."
+        text = f"all axes are frozen since {since:.2f} s: the sensor or its driver hangs. Repeated"
+        text += " samples are dropped; the magnetic fields bridge the gap."
         return (Finding("frozen_imu", f"IMU: {text}", Verdict.TRUSTWORTHY),)
     if not bridged:
         return ()
-    text = f"samples are missing between {begin:.2f} and {end:.2f} s. They are bridged by the"
-    return (Finding("gap", f"IMU: {text} fields.", Verdict.TRUSTWORTHY),)
+    text = f"samples are missing between {begin:.2f} and {end:.2f} s. The magnetic"
+    return (Finding("gap", f"IMU: {text} fields bridge the gap.", Verdict.TRUSTWORTHY),)

@@ -1,4 +1,4 @@
-"""The white noise of the inertial samples, from the samples alone, against what is declared."""
+"""White noise of the inertial samples, measured from them and compared with the declaration."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -11,24 +11,24 @@ from magfusion.model.site import ImuModel, Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
 
-BLOCK = 128  # samples, in which the noise is measured
-QUIETEST = 0.1  # share of the blocks that are taken for free of vibration
+BLOCK = 128  # samples per noise measurement
+QUIETEST = 0.1  # share of the blocks that are assumed to be without vibration
 FEWEST = 4  # blocks
 MORE = 4.0  # times what is declared; a declared density is a prior with a factor of two
 
 
 def white_density(time: Array, value: Array) -> Array | None:
-    """Return the density of the white noise of each axis, shape (3,); None of too few samples.
+    """Return the white-noise density of each axis, shape (3,); None for too few samples.
 
-    By third differences, in which a motion that a platform makes is nearly nothing and white noise
-    of variance ``v`` has ``20 v``; in the quietest blocks, so that vibration has no part in it.
+    Third differences suppress the platform's motion and turn white noise of variance ``v`` into
+    ``20 v``; only the quietest blocks count, which excludes vibration.
 
     Parameters
     ----------
     time : ndarray, shape (n,)
         (s)
     value : ndarray, shape (n, 3)
-        In a unit; the density is in that unit per square root of hertz.
+        In any unit; the density is in that unit per square root of hertz.
     """
     left = np.diff(value, n=3, axis=0)
     count = len(left) // BLOCK
@@ -40,13 +40,13 @@ def white_density(time: Array, value: Array) -> Array | None:
 
 
 def noisy_inertial(log: Log, site: Site | None) -> Iterator[Finding]:
-    """Yield an inertial sensor whose samples scatter by far more than is declared of it."""
+    """Yield each inertial sensor whose noise is far above the declared density."""
     if site is not None and len(log.imu):
         yield from measured_noise(log.imu, site.platform.imu)[1]
 
 
 def measured_noise(samples: ImuSamples, declared: ImuModel) -> tuple[ImuModel, list[Finding]]:
-    """Return an inertial sensor with the noise that its samples have, where they have far more."""
+    """Return an inertial sensor, its declared noise replaced where the samples have far more."""
     findings, model = [], declared
     for name, key, unit, value in (
         ("gyroscope", "gyro_noise", "rad/s", samples.gyro_body),
@@ -59,21 +59,20 @@ def measured_noise(samples: ImuSamples, declared: ImuModel) -> tuple[ImuModel, l
         density = float(np.median(found))
         model = replace(model, **{key: density})
         text = (
-            f"{name}: even where it is quietest, its samples scatter by {density:.2g}"
-            f" {unit}/sqrt(Hz), {density / usual:.1f} times the declared {key}: what hangs on"
-            f" it is less sure than is claimed. Declare {key}: {density:.2g}, or what its data"
-            " sheet says."
+            f"{name}: the noise is {density:.2g} {unit}/sqrt(Hz) even in the quietest parts,"
+            f" {density / usual:.1f} times the declared {key}: the reported sigmas are too small."
+            f" Declare {key}: {density:.2g}, or the value of the data sheet."
         )
         findings.append(Finding("imu_noise", text, Verdict.DOUBTFUL, 50.0 + density / usual))
     return model, findings
 
 
-# A running estimate asks for it at every state.
+# Called by a running estimator at every state.
 _KNOWN: WeakKeyDictionary[Site, tuple[float, float, Site]] = WeakKeyDictionary()
 
 
 def with_white_noise(site: Site, gyro: float, accel: float) -> Site:
-    """Return a site with other densities of its inertial sensor (rad/s, m/s^2, per root of Hz)."""
+    """Return a site with other noise densities of its IMU (rad/s, m/s^2, per square root of Hz)."""
     imu = site.platform.imu
     if (gyro, accel) == (imu.gyro_noise, imu.accel_noise):
         return site

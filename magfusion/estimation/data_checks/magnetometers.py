@@ -1,4 +1,4 @@
-"""Several magnetometers: a log as some of them recorded it, and without those that hear nothing."""
+"""Subsets of several magnetometers in a log, and removal of those that detect no beacon."""
 
 from dataclasses import replace
 
@@ -9,11 +9,11 @@ from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding
 
-FEWEST = 10  # epochs, before one is called silent
+FEWEST = 10  # epochs, before one is reported as silent
 
 
 def without_magnetometer(log: Log, site: Site, which: int) -> tuple[Log, Site]:
-    """Return a log and its site as if one of several magnetometers were not there."""
+    """Return a log and its site without one of several magnetometers."""
     kept = [k for k in range(len(site.platform.magnetometers)) if k != which]
     return _only(log, site, kept)
 
@@ -31,7 +31,7 @@ def _only(log: Log, site: Site, kept: list[int]) -> tuple[Log, Site]:
     left = replace(site, platform=replace(platform, left_out=(*platform.left_out, *gone)))
     fields = None if log.fields is None else of_sensors(log.fields, site, kept)
     waves = {s.name: log.waveforms[s.name] for s in sensors if s.name in log.waveforms}
-    if waves and len(kept) == 1:  # as a log of one has it, by the log's clock
+    if waves and len(kept) == 1:  # on the log's clock, as a log of a single magnetometer
         wave = waves[sensors[0].name]
         wave = replace(wave, time=wave.time + sensors[0].clock_offset)
         return replace(log, fields=None, waveform=wave, waveforms={}), left
@@ -39,7 +39,7 @@ def _only(log: Log, site: Site, kept: list[int]) -> tuple[Log, Site]:
 
 
 def of_sensors(fields: FieldSamples, site: Site, kept: list[int]) -> FieldSamples:
-    """Return the phasors of some magnetometers, at the epochs that hold any of them."""
+    """Return the phasors of a subset of magnetometers, at the epochs that contain any of them."""
     columns = np.concatenate([np.arange(len(site.channels))[site.of_sensor(k)] for k in kept])
     named = tuple(fields.magnetometers[c] for c in columns.tolist())
     alone = replace(
@@ -54,9 +54,9 @@ def of_sensors(fields: FieldSamples, site: Site, kept: list[int]) -> FieldSample
 
 
 def without_silent(log: Log, site: Site) -> tuple[Log, Site]:
-    """Return a log without magnetometers that hear nothing where another does, and its site.
+    """Return a log without magnetometers that detect nothing where another does, and its site.
 
-    ``noticed`` of the log names them.
+    The log's ``noticed`` lists them.
     """
     if not site.platform.further or log.fields is None:
         return log, site
@@ -68,8 +68,8 @@ def without_silent(log: Log, site: Site) -> tuple[Log, Site]:
     noticed = [
         Finding(
             "magnetometer_silent",
-            f"Magnetometer {sensors[k].name} hears no beacon in {there[k]} epochs, where others do:"
-            " it is left out. Check its supply, its cable and its channel.",
+            f"Magnetometer {sensors[k].name} detects no beacon in {there[k]} epochs in which others"
+            " do, and is not used. Check its supply, its cable and its channel.",
         )
         for k in silent
     ]
@@ -79,7 +79,7 @@ def without_silent(log: Log, site: Site) -> tuple[Log, Site]:
 
 
 def _silent_epochs(fields: FieldSamples, site: Site) -> dict[int, int]:
-    """Return the magnetometers that detect nothing at all, with how many epochs each has."""
+    """Return the magnetometers that detect nothing, with the number of epochs of each."""
     heard = above_noise(fields, DETECTION_CHI_SQUARE_ONLINE)
     mine = {k: site.of_sensor(k) for k in range(len(site.platform.magnetometers))}
     return {

@@ -1,7 +1,7 @@
-"""A recording as the estimators take it: on even clocks, without samples that are false.
+"""Data cleaning: even clocks, and no false samples.
 
-What is mended is said, and no reason for doubt: a sample that is left out is bridged by its
-neighbours, as one that was lost, and an IMU that hung by the fields, as one that fell silent.
+What is corrected is reported and casts no doubt: neighbours bridge a dropped sample like a lost
+one, and the magnetic fields bridge a frozen IMU like a gap.
 """
 
 from dataclasses import replace
@@ -22,9 +22,9 @@ from magfusion.receiver.even_clocks import on_even_clocks
 
 
 def mended(log: Log, site: Site) -> Log:
-    """Return a log with what is wrong with single stamps and samples mended.
+    """Return a log with single wrong stamps and samples corrected.
 
-    ``clocks`` and ``noticed`` of the result say what was.
+    Its ``clocks`` and ``noticed`` report the corrections.
     """
     log = _without_freeze(on_even_clocks(log, site), site)
     found = {stream.name: false_rows(stream, site) for stream in streams(log)}
@@ -43,7 +43,7 @@ def mended(log: Log, site: Site) -> Log:
 
 
 def _without_freeze(log: Log, site: Site) -> Log:
-    """Return a log without the inertial samples of an IMU that hung."""
+    """Return a log without the inertial samples of a frozen IMU."""
     hung = [frozen_rows(s) for s in streams(log) if s.name in ("gyroscope", "accelerometer")]
     rows = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *hung]))
     if len(rows) == 0 or len(rows) >= len(log.imu) - 1:
@@ -51,7 +51,7 @@ def _without_freeze(log: Log, site: Site) -> Log:
     noticed = [
         replace(
             f,
-            text=f"{f.text} Here it is left out, and bridged by the fields.",
+            text=f"{f.text} Here it is left out; the magnetic fields bridge the gap.",
             verdict=Verdict.TRUSTWORTHY,
         )
         for f in frozen_samples(log, site)

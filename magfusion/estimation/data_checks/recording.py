@@ -1,4 +1,4 @@
-"""What the raw streams of a log say against it, whatever is made of them."""
+"""Checks of the raw streams of a log, independent of the estimator."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
@@ -41,12 +41,12 @@ WITNESSES: tuple[Witness, ...] = (
     false_samples,
     noisy_inertial,
 )
-LONGEST = 1200.0  # s; of a longer log the compasses and the spectrum are judged by its beginning
-# Of the gyroscope and the clocks: with them wrong, nothing is still in the axes it keeps.
+LONGEST = 1200.0  # s; of a longer log, compasses and spectrum are checked on its beginning only
+# Of gyroscope and clocks: where they are wrong, the gyro-stabilized axes are wrong too.
 UNSTEADY = frozenset(
     {"gyro_sign", "gyro_units", "gyro_scale", "imu_axes", "imu_clock", "stuck_axis"}
 )
-# What estimators bridge with an honest covariance is said, and no reason for doubt.
+# What estimators bridge with an honest covariance is reported and casts no doubt.
 BRIDGED = frozenset({"gap", "samples_lost", "silent_beacon"})
 
 
@@ -62,25 +62,25 @@ def recorded(
     lockin: LockinSettings | None = None,
     freed: Detected | None = None,
 ) -> tuple[Finding, ...]:
-    """Return what is wrong with a recording; without a site, of the streams alone.
+    """Return the findings on a recording; without a site, on the streams alone.
 
     Parameters
     ----------
     bridged : collection of str
-        Codes of what the estimator copes with.
+        Codes of the findings that the estimator handles.
     poses : Trajectory, optional
-        By the beacons: they tell whose compass is wrong.
+        By the beacons: they decide which of vertical and field is wrong.
     estimated : Trajectory, optional
-        By an estimator that used gravity too: of a reversed vertical they tell whose it is.
+        By an estimator that also used gravity; decides the cause of a reversed vertical.
     beacons : bool
-        Whether the result hangs on the beacons: then it is said how each is heard, and what else
-        transmits.
+        Whether the result depends on the beacons: if so, their reception and undeclared lines
+        are reported.
     hearing : Heard, optional
-        How they are heard, where that is known already.
+        Their reception, if already known.
     lockin : LockinSettings, optional
-        As it was asked for.
+        As requested.
     freed : Detected, optional
-        How they are heard by a solution, the motion inside the windows taken off.
+        Their reception by a solution, with the motion inside the windows compensated.
     """
     found = [*log.noticed, *(one for witness in WITNESSES for one in witness(log, site))]
     log = beginning(log)
@@ -101,7 +101,7 @@ def _of_beacons(
     lockin: LockinSettings | None,
     freed: Detected | None,
 ) -> Iterator[Finding]:
-    """Yield how each beacon is heard, and what else transmits; parameters as of `recorded`."""
+    """Yield findings on each beacon's reception and on other lines; parameters as `recorded`."""
     yield from filter(_matters, undeclared_lines(log, site, lockin))
     if log.waveform is not None or log.waveforms:
         yield from long_windows(site, lockin)
@@ -116,7 +116,7 @@ def _matters(line: Finding) -> bool:
 
 
 def beginning(log: Log, span: float = LONGEST) -> Log:
-    """Return the first part of a log, of this length (s)."""
+    """Return the first part of a log, of a length (s)."""
     end = float(log.imu.time[0]) + span if len(log.imu) else span
     if len(log.imu) and log.imu.time[-1] > end:
         kept = slice(0, int(np.searchsorted(log.imu.time, end)))
@@ -136,15 +136,15 @@ def beginning(log: Log, span: float = LONGEST) -> Log:
 
 
 def beyond(recording: Log, used: Log, site: Site) -> tuple[Finding, ...]:
-    """Return what a recording says against itself that is not seen in what was made of it."""
+    """Return the findings on a recording that do not show in the log made of it."""
     known = recorded(used, site, BRIDGED)
     return tuple(f for f in recorded(recording, site, BRIDGED) if f not in known)
 
 
 def passed_on(log: Log, site: Site) -> Trust:
-    """Return what is to be said of a log whose fields are only put in another form.
+    """Return the findings on a log whose fields are only converted to another form.
 
-    Whoever estimates by them judges them again; what would fail that is doubtful here.
+    An estimator checks them again; what would fail its result is doubtful here.
     """
     found = recorded(log, site, BRIDGED)
     return Trust(

@@ -1,4 +1,4 @@
-"""A mean that forgets, and how many samples it is worth."""
+"""A running mean with exponential weights, and its effective number of samples."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class Running:
-    """Sums with weights that fall exponentially with age.
+    """Sums with weights that decrease exponentially with age.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ class Running:
     def with_sample(
         self, value: Array, time: float, memory: float, weight: float = 1.0
     ) -> "Running":
-        """Return it with another sample, the older ones forgotten over a memory (s)."""
+        """Return the sums with another sample; older ones decay with a time constant (s)."""
         kept = float(np.exp(-max(0.0, time - self.time) / memory))
         return Running(
             kept * self.total + weight * value,
@@ -40,15 +40,15 @@ class Running:
 
     @property
     def mean(self) -> Array:
-        """Of the samples, zero where there is none."""
+        """Mean of the samples; zero without any."""
         return self.total / self.weight if self.weight > 0.0 else 0.0 * self.total
 
     @property
     def count(self) -> float:
-        """Number of equal samples that would tell as much."""
+        """Effective number of samples."""
         return self.weight**2 / self.squares if self.squares > 0.0 else 0.0
 
 
 def nothing(size: int = 1) -> Running:
-    """Return the mean of no samples yet."""
+    """Return a running mean without samples."""
     return Running(np.zeros(size))

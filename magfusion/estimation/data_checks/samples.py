@@ -1,8 +1,7 @@
-"""What the samples say, one by one: frozen, repeated, clipped, and false ones.
+"""Checks of single samples: frozen, repeated, clipped and false ones.
 
-Instruments have steps, so that two samples in a row may well be alike; how often they are is
-measured in the log itself.  A magnetometer that is read faster than it measures holds its values,
-which is no saturation.
+Instruments quantize, so that consecutive samples may be equal; the log itself shows how often.
+A magnetometer that is read faster than it measures repeats values without being saturated.
 """
 
 from collections.abc import Iterator
@@ -17,20 +16,20 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.slots import has_schedule
 from magfusion.units import Array, BoolArray, IntArray
 
-CHANCE = 1e-7  # of a false alarm a stream
+CHANCE = 1e-7  # probability of a false alarm per stream
 SHORTEST_FREEZE = 0.15  # s
-DOUBTFUL_FREEZE = 0.25  # s; within which a beacon is not heard twice
+DOUBTFUL_FREEZE = 0.25  # s; up to here a beacon is missed once at most
 DEAD = 0.5  # share of the log from which a frozen axis is a dead one
-HELD = 0.05  # share of samples that are their predecessors, from which it is said
+HELD = 0.05  # share of repeated samples from which it is reported
 OFTEN = 0.4  # share from which the values are late by more than a step
 ALWAYS = 0.98  # share of the samples
-PILE = 5.0  # times as often as the values next to it, an extreme is a limit
+PILE = 5.0  # an extreme value this many times as frequent as its neighbours is a limit
 LEAST_PILE = 12  # samples at a limit
 LEAST_RUN = 3  # of them in a row, at least once
-SPIKE = 15.0  # times the scatter beside it
-LEAST_SPIKES, SPIKE_SHARE = 5, 2e-4  # of them; fewer may be knocks
-SURE_SPIKE, LEAST_SURE = 30.0, 2  # times the scatter, and how many of those are enough
-SMOOTH_TONE = 0.15  # cycles a sample; of a faster one neighbours say nothing
+SPIKE = 15.0  # times the local scatter
+LEAST_SPIKES, SPIKE_SHARE = 5, 2e-4  # fewer may be knocks
+SURE_SPIKE, LEAST_SURE = 30.0, 2  # times the scatter, and how many of those suffice
+SMOOTH_TONE = 0.15  # cycles a sample; above, neighbours do not predict a sample
 BLOCK = 128  # samples in which the scatter is measured
 AXES = "xyz"
 
@@ -43,9 +42,9 @@ class Stream(NamedTuple):
     time : ndarray, shape (n,)
         (s)
     value : ndarray, shape (n, axes)
-        In the unit times the scale.
+        In the unit divided by the scale.
     axes : str
-        That it has.
+        Names of its axes.
     """
 
     name: str
@@ -72,7 +71,7 @@ def streams(log: Log) -> tuple[Stream, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Stretches of samples: from ``first`` up to but without ``last``, each shape (n,)."""
+    """Stretches of samples ``first`` to ``last``, exclusive, each shape (n,)."""
 
     first: IntArray
     last: IntArray
@@ -82,23 +81,23 @@ class Runs:
 
 
 def runs(flag: BoolArray) -> Runs:
-    """Return where flags (n,) are set in a row."""
+    """Return the runs of set flags (n,)."""
     edge = np.diff(np.concatenate([[False], flag, [False]]).astype(np.int8))
     return Runs(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1))
 
 
 def frozen(stream: Stream, same: BoolArray) -> Runs:
-    """Return the stretches that are longer alike than chance allows.
+    """Return the stretches that are equal for longer than chance allows.
 
     Parameters
     ----------
     same : bool ndarray, shape (n - 1,)
-        Whether a sample is its predecessor.
+        Whether a sample equals its predecessor.
     """
     count = len(same)
     edges = np.linspace(0, count, max(1, count // BLOCK) + 1).astype(np.int64)
     shares = np.add.reduceat(same, edges[:-1], dtype=np.float64) / np.diff(edges)
-    # A freeze itself must not raise what is taken for usual.
+    # A freeze must not raise the usual rate.
     usual = float(np.quantile(shares, 0.4))
     by_chance = np.log(CHANCE / count) / np.log(min(max(usual, 1e-3), 0.97))
     step = float(np.median(np.diff(stream.time)))
@@ -109,7 +108,7 @@ def frozen(stream: Stream, same: BoolArray) -> Runs:
 
 
 def frozen_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
-    """Yield the axes that stand still for longer than an instrument can."""
+    """Yield the axes that are constant for longer than an instrument can be."""
     for stream in streams(log):
         whole = _all_frozen(stream)
         if len(whole):
@@ -127,11 +126,11 @@ def _all_frozen(stream: Stream) -> Runs:
 
 
 def _at_limit(stream: Stream, axis: int, found: Runs) -> bool:
-    """Tell whether an axis stands still only where it goes no farther."""
+    """Return whether an axis is constant only at its limits."""
     value = stream.value[:, axis]
     low, high = float(np.min(value)), float(np.max(value))
     at = value[found.first]
-    if low == high:  # always: where no other axis goes farther
+    if low == high:  # always: if no other axis exceeds it
         return bool(high != 0.0 and abs(high) == np.max(np.abs(stream.value)))
     return bool(np.all((at == low) | (at == high)))
 
@@ -153,8 +152,8 @@ def _freeze(stream: Stream, where: str, found: Runs) -> Finding:
     cause = "it is dead or not connected" if dead else "the sensor or its driver hung"
     return Finding(
         code,
-        f"{stream.name}: {where} stood still{value} from {begin[longest]:.2f} to"
-        f" {end[longest]:.2f} s{more}, {100.0 * share:.0f} % of the log: {cause}. Cut that part out"
+        f"{stream.name}: {where} frozen{value} from {begin[longest]:.2f} to"
+        f" {end[longest]:.2f} s{more}, {100.0 * share:.0f} % of the log: {cause}. Exclude that part"
         " by --start and --end, or repair the sensor.",
         verdict,
         3e3 + share,
@@ -162,9 +161,9 @@ def _freeze(stream: Stream, where: str, found: Runs) -> Finding:
 
 
 def frozen_rows(stream: Stream) -> IntArray:
-    """Return the samples of a stream that hung: all of a stretch but its first.
+    """Return the repeated samples of a frozen stream: all of a stretch but its first.
 
-    None of one that hung for most of the log: there is no stream to bridge.
+    Empty for a stream that is frozen most of the time: it cannot be bridged.
     """
     found = _all_frozen(stream)
     rows = [np.arange(a + 1, b + 1) for a, b in zip(found.first, found.last, strict=True)]
@@ -179,7 +178,7 @@ def repeated_samples(log: Log, site: Site | None) -> Iterator[Finding]:
         for first, last in zip(still.first, still.last, strict=True):
             same[first:last] = False
         share = float(np.mean(np.all(same, axis=1)))
-        # Coarse steps repeat by chance, each axis for itself.
+        # Coarse steps repeat by chance, independently per axis.
         by_chance = float(np.prod(np.mean(same, axis=0))) if same.shape[1] > 1 else 0.0
         held = (share - by_chance) / (1.0 - by_chance) if by_chance < 1.0 else 1.0
         if held < HELD or share > 0.98:
@@ -189,16 +188,16 @@ def repeated_samples(log: Log, site: Site | None) -> Iterator[Finding]:
         timed = stream.name == "magnetometer" and site is not None and len(site.beacons) > 0
         yield Finding(
             "repeated_samples",
-            f"{stream.name}: {100.0 * share:.0f} % of the samples repeat the one before: it is"
-            f" read at {rate_hz:.4g} Hz and measures at about {own:.3g} Hz, so that held values"
-            " are late by up to a step. Read it when it has measured.",
+            f"{stream.name}: {100.0 * share:.0f} % of the samples repeat their predecessor: it is"
+            f" read at {rate_hz:.4g} Hz and measures at about {own:.3g} Hz, so that values are late"
+            " by up to a step. Read it when a new measurement is ready.",
             Verdict.DOUBTFUL if timed or share > OFTEN else Verdict.TRUSTWORTHY,
             100.0 + share / HELD,
         )
 
 
 def clipped_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
-    """Yield the axes that stop at a limit of their instrument."""
+    """Yield the axes that reach the limit of their instrument's range."""
     for stream in streams(log):
         yield from _clipped_axes(stream)
 
@@ -222,23 +221,23 @@ def _clipped_axes(stream: Stream) -> Iterator[Finding]:
             first_at = stream.time[np.argmax(stream.value[:, axis] == sign * limit)]
             yield Finding(
                 "saturated",
-                f"{stream.name}: axis {stream.axes[axis]} stops at"
+                f"{stream.name}: axis {stream.axes[axis]} is saturated at"
                 f" {sign * limit * stream.scale:+.4g} {stream.unit} in {count} samples"
-                f" ({100.0 * share:.2g} %), first at {first_at:.2f} s: its range ends there."
-                " Choose a larger range, or keep away from what drives it there.",
+                f" ({100.0 * share:.2g} %), first at {first_at:.2f} s. Select a larger range, or"
+                " avoid the motion or field that exceeds it.",
                 weight=500.0 + 100.0 * share,
             )
 
 
 def clipped(value: Array, largest: float = np.inf) -> tuple[int, float]:
-    """Return how many samples (n,) are at an upper limit, and the limit; zero where it is none.
+    """Return the number of samples (n,) at an upper limit, and the limit; zero without one.
 
-    A limit is reached far more often than the values just below it, and more than twice in a row.
+    Samples reach a limit far more often than the values just below it, and over twice in a row.
 
     Parameters
     ----------
     largest : float
-        Of all axes: an axis that is at it nearly always is at its limit too.
+        Of all axes: an axis that nearly always has this value is at its limit, too.
     """
     limit = float(np.max(value))
     at = value == limit
@@ -247,7 +246,7 @@ def clipped(value: Array, largest: float = np.inf) -> tuple[int, float]:
         return 0, limit
     highest = min(8 * count, len(value))
     below = np.unique(np.partition(value, -highest)[-highest:])
-    # Of an axis that is always at it, nothing is below.
+    # An axis always at its limit has no values below it.
     nearby = max((int(np.sum(value == one)) for one in below[-4:-1]), default=0)
     if len(below) < 3 and count < ALWAYS * len(value):
         return 0, limit
@@ -261,9 +260,9 @@ def clipped(value: Array, largest: float = np.inf) -> tuple[int, float]:
 
 
 def _spikes(stream: Stream) -> tuple[IntArray, int]:
-    """Return the samples that are false alone, and how many are for sure.
+    """Return the isolated false samples, and how many of them are certain.
 
-    They are off the curve through their neighbours, which agree among each other: a knock moves
+    They are off the curve through their neighbours, which agree with each other; a knock moves
     several samples.
     """
     x = stream.value
@@ -282,7 +281,7 @@ def _spikes(stream: Stream) -> tuple[IntArray, int]:
 
 
 def _scatter(off: Array) -> Array:
-    """Return the usual size of deviations (n, 3) about each of them, over three blocks."""
+    """Return the local scatter of deviations (n, 3), over three blocks about each sample."""
     count = len(off) // BLOCK
     usual = np.median(off[: count * BLOCK].reshape(count, BLOCK, -1), axis=1) / 0.6745
     padded = np.concatenate([usual[:1], usual, usual[-1:]])
@@ -292,9 +291,9 @@ def _scatter(off: Array) -> Array:
 
 
 def false_rows(stream: Stream, site: Site | None) -> IntArray:
-    """Return the samples of a stream that are false alone; none where they are too few to tell."""
+    """Return the isolated false samples of a stream; none where they are too few to be certain."""
     if next(_clipped_axes(stream), None) is not None:
-        return np.zeros(0, dtype=np.int64)  # a limit makes corners
+        return np.zeros(0, dtype=np.int64)  # clipping makes corners
     if stream.name == "magnetometer" and site is not None and not _smooth_between(stream, site):
         return np.zeros(0, dtype=np.int64)
     rows, sure = _spikes(stream)
@@ -303,7 +302,7 @@ def false_rows(stream: Stream, site: Site | None) -> IntArray:
 
 
 def _smooth_between(stream: Stream, site: Site) -> bool:
-    """Return whether the declared drives leave the field smooth from sample to sample."""
+    """Return whether the field of the declared drives is smooth from sample to sample."""
     if has_schedule(site):
         return False
     step = float(np.median(np.diff(stream.time)))
@@ -311,7 +310,7 @@ def _smooth_between(stream: Stream, site: Site) -> bool:
 
 
 def false_samples(log: Log, site: Site | None) -> Iterator[Finding]:
-    """Yield the instruments that give single false samples."""
+    """Yield the instruments with isolated false samples."""
     for stream in streams(log):
         rows = false_rows(stream, site)
         if len(rows) == 0:
@@ -320,9 +319,9 @@ def false_samples(log: Log, site: Site | None) -> Iterator[Finding]:
         off = np.abs(x[rows] - 0.5 * (x[rows - 1] + x[rows + 1])) * stream.scale
         yield Finding(
             "false_samples" if stream.name == "magnetometer" else "imu_spikes",
-            f"{stream.name}: {len(rows)} single samples ({1e3 * len(rows) / len(x):.2g} in a"
-            f" thousand) are off their neighbours, by {np.median(np.max(off, axis=1)):.3g}"
-            f" {stream.unit} (median), first at {stream.time[rows[0]]:.3f} s: probably bits are"
-            " lost between sensor and recorder. Check the cable and the bus speed.",
+            f"{stream.name}: {len(rows)} isolated samples ({1e3 * len(rows) / len(x):.2g} per"
+            f" thousand) are off their neighbours by {np.median(np.max(off, axis=1)):.3g}"
+            f" {stream.unit} (median), first at {stream.time[rows[0]]:.3f} s: probably bit errors"
+            " between sensor and recorder. Check the cable and the bus speed.",
             weight=300.0 + 1e3 * len(rows) / len(x),
         )

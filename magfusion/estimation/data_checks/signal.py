@@ -1,4 +1,4 @@
-"""How well each beacon is heard along a log: never, not for a while, or hardly."""
+"""Reception of each beacon along a log: never, with interruptions, or barely detected."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -20,18 +20,18 @@ from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, BoolArray
 
-HARDLY = 0.05  # share of the epochs; heard in fewer, a beacon is taken for silent
+HARDLY = 0.05  # share of the epochs; a beacon detected in fewer counts as silent
 UNHEARD = 0.1  # share of the epochs without any beacon, from which it casts doubt
-SILENCE = 1.0  # s; a shorter one is not said
-FALLEN = 0.2  # of the amplitude beside it, what is left of a beacon that is switched off
+SILENCE = 1.0  # s; shorter silence is not reported
+FALLEN = 0.2  # of the neighbouring amplitude; below, a beacon is switched off
 LISTED = 3
-SURELY = 3.0  # times the faintest field that is detected: where one of many beacons must be heard
-SAME_WINDOW = 1e-6  # s; between the centres of one and the same window
+SURELY = 3.0  # times the weakest detectable field: beyond, one of many beacons must be detected
+SAME_WINDOW = 1e-6  # s; between the centres of identical windows
 
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """How well the beacons are heard.
+    """Reception of the beacons.
 
     Parameters
     ----------
@@ -41,14 +41,14 @@ class Heard:
     snr : ndarray, shape (n, beacons)
         Amplitude of the strongest tone over its noise, a component each; NaN where it is missing.
     amplitude : ndarray, shape (n, beacons)
-        Of all its tones (T), noise and all.
+        Of all its tones (T), including noise.
     loud : bool ndarray, shape (n, beacons)
-        Whether it is told from noise.
+        Whether it is detected.
     across : bool
-        Whether components are missing: a field across the axes that are there looks like silence.
+        Whether components are missing: a field perpendicular to the others looks like silence.
     passed_by : bool
-        Whether there are so many that each is out of reach for a while: to be left is then no more
-        than that.
+        Whether there are so many beacons that each is out of range for a while, so that the end
+        of its signal need not be a fault.
     """
 
     time: Array
@@ -61,7 +61,7 @@ class Heard:
 
 
 class Detected(NamedTuple):
-    """Which beacons are told from noise in phasors that are freed of motion.
+    """Which beacons are detected in phasors that are compensated for motion.
 
     Parameters
     ----------
@@ -77,10 +77,10 @@ class Detected(NamedTuple):
 
 
 def heard(samples: FieldSamples, site: Site) -> Heard:
-    """Return how well each beacon is heard in phasors.
+    """Return the reception of each beacon from phasors.
 
-    A phasor that is missing is one that was not detected; where coils are driven in turn it may
-    only be another's turn, and where beacons share frequencies another's phasor.
+    A missing phasor is one that was not detected; where coils are driven in turn it may only be
+    another's slot, and where beacons share frequencies another's phasor.
     """
     names = tuple(dict.fromkeys(name for name, _ in samples.channels))
     sqrt_information = whitening(samples.phasor_cov, samples.there)
@@ -111,7 +111,7 @@ def heard(samples: FieldSamples, site: Site) -> Heard:
 
 
 def heard_in(log: Log, site: Site, lockin: LockinSettings | None = None) -> Heard | None:
-    """Return how well each beacon is heard in a log; None where no window is usable."""
+    """Return the reception of each beacon in a log; None where no window is usable."""
     if log.waveform is None:
         return None if log.fields is None else heard(log.fields, site)
     try:
@@ -121,13 +121,13 @@ def heard_in(log: Log, site: Site, lockin: LockinSettings | None = None) -> Hear
 
 
 def detected_in(samples: FieldSamples, site: Site) -> Detected:
-    """Return which beacons are told from noise in the phasors of a solution."""
+    """Return which beacons are detected in the phasors of a solution."""
     found = heard(samples, site)
     return Detected(found.time, found.beacons, found.loud)
 
 
 def heard_with_motion(raw: Heard, freed: Detected) -> Heard:
-    """Return how well the beacons are heard once the motion inside the windows is taken off.
+    """Return the reception with the motion inside the windows compensated.
 
     Parameters
     ----------
@@ -148,14 +148,14 @@ def heard_with_motion(raw: Heard, freed: Detected) -> Heard:
 
 
 def within_reach(found: Heard, site: Site, poses: Trajectory | None) -> Heard:
-    """Return how those of many beacons are heard that are, at all, or that must be.
+    """Return the reception of those of many beacons that are detected at all, or must be.
 
-    A beacon must be heard where its field across its axis is far above the noise.
+    A beacon must be detected where even its weakest field at that distance is far above the noise.
 
     Parameters
     ----------
     poses : Trajectory, optional
-        Where the platform was for sure, at some epochs; None where that is not known.
+        Reliable poses at some epochs; None where unknown.
     """
     due = np.zeros(len(found.beacons), dtype=bool)
     if poses is not None and not has_schedule(site):
@@ -180,13 +180,13 @@ def within_reach(found: Heard, site: Site, poses: Trajectory | None) -> Heard:
 
 
 def _share(found: Heard) -> Array:
-    """Return in which share of its epochs each beacon is told from noise, shape (beacons,)."""
+    """Return the share of its epochs in which each beacon is detected, shape (beacons,)."""
     told = np.maximum(np.sum(np.isfinite(found.snr), axis=0), 1)
     return np.asarray(np.sum(found.loud, axis=0) / told)
 
 
 def unheard(found: Heard, site: Site) -> Iterator[Finding]:
-    """Yield the beacons that are silent, all along or for a while, and a log in which all are."""
+    """Yield the beacons that are silent, always or for a while, and epochs without any beacon."""
     if len(found.time) == 0:
         return
     share = _share(found)
@@ -194,8 +194,8 @@ def unheard(found: Heard, site: Site) -> Iterator[Finding]:
         best = float(np.nanmax(np.nanmedian(np.where(np.isnan(found.snr), 0.0, found.snr), axis=0)))
         yield Finding(
             "low_signal",
-            f"no beacon is heard: the strongest is {best:.2g} times its noise. All are switched off"
-            " or far away, their frequencies are others, or the noise is large.",
+            f"no beacon is detected: the strongest is {best:.2g} times its noise. All are switched"
+            " off, far away or on other frequencies, or the noise is large.",
             Verdict.FAILED,
             1e3,
         )
@@ -205,8 +205,8 @@ def unheard(found: Heard, site: Site) -> Iterator[Finding]:
     if alone > UNHEARD and not found.across:
         yield Finding(
             "low_signal",
-            f"no beacon is told from noise in {100.0 * alone:.0f} % of the epochs: all are far away"
-            " then, or the noise is large.",
+            f"no beacon is detected in {100.0 * alone:.0f} % of the epochs: all are far away there,"
+            " or the noise is large.",
             Verdict.DOUBTFUL,
             100.0,
         )
@@ -216,8 +216,8 @@ def unheard(found: Heard, site: Site) -> Iterator[Finding]:
         if share[k] < HARDLY:
             yield Finding(
                 "silent_beacon",
-                f"beacon {name} is never heard at {tones}: it is switched off, out of reach, or its"
-                " frequency is another. Switch it on, or take it out of the site's file.",
+                f"beacon {name} is never detected at {tones}: it is switched off, out of range, or"
+                " on another frequency. Switch it on, or remove it from site.yaml.",
                 weight=400.0,
             )
         elif not found.across:
@@ -246,15 +246,15 @@ def _silences(found: Heard, k: int, tones: str) -> Iterator[Finding]:
     if off:
         yield Finding(
             "silent_beacon",
-            f"beacon {name} ({tones}) is silent from {_places(off)}: it was switched off then.",
+            f"beacon {name} ({tones}) is silent from {_places(off)}: it was switched off.",
             Verdict.DOUBTFUL,
             50.0 + sum(end - begin for begin, end in off),
         )
     if drowned:
         yield Finding(
             "low_signal",
-            f"beacon {name} ({tones}) cannot be told from noise from {_places(drowned)}: it is far"
-            " away there, or motion and other fields are larger.",
+            f"beacon {name} ({tones}) is below the noise from {_places(drowned)}: it is far away"
+            " there, or motion and other fields dominate.",
             Verdict.TRUSTWORTHY,
         )
 

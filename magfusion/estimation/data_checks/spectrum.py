@@ -1,8 +1,8 @@
-"""Lines in the spectrum of the field that nobody declared: mains, neighbours, other beacons.
+"""Undeclared lines in the spectrum of the field: mains, interference, other beacons.
 
-The samples are first turned into axes that stand still, so that the Earth field and the tones stay
-narrow while the body turns.  What a line does to a tone is what the lock-in leaks of it: of its
-amplitude ``1 / (pi |df| window)``, all of it where it is nearer.
+The samples are first rotated to gyro-stabilized axes, so that the Earth field and the tones stay
+narrow while the body rotates.  A line disturbs a tone by the lock-in's leakage: a share of its
+amplitude of ``1 / (pi |df| window)``, and all of it where it is nearer.
 """
 
 from collections.abc import Iterator
@@ -27,37 +27,37 @@ from magfusion.units import Array
 
 SEGMENT, SHORTEST, SHARE = 8.0, 2.0, 0.35  # s, s, of the log
 LEAST_SEGMENTS = 3
-LOWEST_HZ = 3.0  # below, the motion of the field is no line
-STAND_OUT = 30.0  # times the power beside it, a line has
+LOWEST_HZ = 3.0  # Hz; below, the spectrum is that of motion
+STAND_OUT = 30.0  # a line has this many times the neighbouring power
 BESIDE_HZ = 2.5  # on either side, where that power is measured
 WIDTH_HZ = 0.3  # of a line that motion modulates, on either side
 APART_HZ = 0.5  # of two lines
-TELLABLE = 3.0  # resolutions from a tone at which a line is told from it
-SIDEBAND_HZ = 4.0  # on either side of a tone, what motion makes of it
-MIRRORED = 0.1  # of a sideband's power, at least, the one across or one of another tone has
+TELLABLE = 3.0  # resolutions from a tone at which a line is separable from it
+SIDEBAND_HZ = 4.0  # half width of a tone's motion sidebands
+MIRRORED = 0.1  # least power of the mirrored sideband, or of another tone's, as a share
 MAINS_HZ = (50.0, 60.0)
-MAINS_OFF = 0.008  # relative; more is no mains
+MAINS_OFF = 0.008  # relative; a line farther off is not mains
 HARMONICS = 6
-FORGOTTEN = 3.0  # times what is at a beacon's tone, a line beside it is the beacon itself
-ALIASED = 3  # harmonics of the mains that are sought where they are folded back
+FORGOTTEN = 3.0  # a line near a tone and this many times as strong is the beacon itself
+ALIASED = 3  # harmonics of the mains whose aliases are searched
 CONSEQUENCE = 3.0  # times the model's error of a tone, from which a leak casts doubt
-FITTED_CONSEQUENCE = 25.0  # the same of mains, which the noise beside the tones accounts for
+FITTED_CONSEQUENCE = 25.0  # the same of mains, which the noise near the tones accounts for
 LEAST_MODEL_ERROR = 2e-3
 LISTED = 4
-BEGINNING = 60.0  # s; in which the lines are found that are fitted beside the tones
-MOST_FITTED = 6  # of them
-LONGER = 2.0  # times the usual window, by which a line is told from a tone
+BEGINNING = 60.0  # s; in which the lines to fit with the tones are searched
+MOST_FITTED = 6  # number of fitted lines
+LONGER = 2.0  # times the usual window, to separate a line from a tone
 SEPARATED = 1.5  # over the window, the least distance of a fitted line from a tone
 
 
 class Spectrum(NamedTuple):
-    """Mean power of a field.
+    """Mean power spectrum of a field.
 
     Parameters
     ----------
     frequency_hz : ndarray, shape (n,)
     power : ndarray, shape (n,)
-        Square of the amplitude that a line in the middle of a bin has, over all axes (T^2).
+        Squared amplitude of a line in the middle of the bin, over all axes (T^2).
     """
 
     frequency_hz: Array
@@ -66,13 +66,13 @@ class Spectrum(NamedTuple):
 
     @property
     def resolution_hz(self) -> float:
-        """Between two bins."""
+        """Spacing of the bins."""
         return float(self.frequency_hz[1])
 
     def amplitude(self, frequency_hz: float) -> float:
-        """Return the amplitude about a frequency, with what modulates it (T)."""
+        """Return the amplitude near a frequency, including its modulation (T)."""
         near = np.abs(self.frequency_hz - frequency_hz) <= WIDTH_HZ
-        # The bins of a Hann window hold one and a half times the power of a line.
+        # The bins of a Hann window sum to one and a half times the power of a line.
         return float(np.sqrt(np.sum(self.power[near]) / 1.5))
 
     def peak(self, frequency_hz: float) -> float:
@@ -89,10 +89,10 @@ class Line(NamedTuple):
 
 
 def still_field(log: Log, site: Site | None) -> Array:
-    """Return the field of a waveform in axes that stand still, shape (n, 3) (T).
+    """Return the field of a waveform in gyro-stabilized axes, shape (n, 3) (T).
 
-    Without a site nobody knows how magnetometer and gyroscope are mounted, and of fewer than three
-    axes nothing can be turned: the axes are the body's.
+    In body axes without a site, where the mounting is unknown, and with fewer than three axes,
+    where the field cannot be rotated.
     """
     field = field_body(log, site)
     if log.vectors is None or site is None or len(log.imu) < 2:
@@ -104,7 +104,7 @@ def still_field(log: Log, site: Site | None) -> Array:
 
 
 def spectrum(log: Log, site: Site | None) -> Spectrum | None:
-    """Return the mean spectrum of a waveform in axes that stand still; None of a short one."""
+    """Return the mean spectrum of a waveform in gyro-stabilized axes; None if it is too short."""
     wave = log.waveform
     if wave is None or len(wave) < 2:
         return None
@@ -131,7 +131,7 @@ def spectrum(log: Log, site: Site | None) -> Spectrum | None:
 
 
 def lines(found: Spectrum) -> tuple[Line, ...]:
-    """Return what stands out of a spectrum, strongest first."""
+    """Return the lines of a spectrum, strongest first."""
     power, resolution = found.power, found.resolution_hz
     reach = 2 * int(BESIDE_HZ / resolution) + 1
     beside = median_filter(power, reach, mode="nearest")
@@ -154,12 +154,12 @@ def _tones(site: Site) -> list[tuple[str, float]]:
 
 
 def aliased(frequency_hz: float, rate_hz: float) -> float:
-    """Return where a frequency appears when it is sampled at a rate (Hz)."""
+    """Return the alias of a frequency at a sampling rate (Hz)."""
     return abs(frequency_hz - rate_hz * round(frequency_hz / rate_hz))
 
 
 def mains_of(frequency_hz: float, rate_hz: float) -> tuple[float, int] | None:
-    """Return of which mains (Hz), and which harmonic of it, a line is; None of none."""
+    """Return the mains frequency (Hz) and harmonic of a line; None if it is neither."""
     for mains in MAINS_HZ:
         for order in range(1, HARMONICS + 1):
             folded = aliased(order * mains, rate_hz)
@@ -171,13 +171,13 @@ def mains_of(frequency_hz: float, rate_hz: float) -> tuple[float, int] | None:
 
 
 def named_lines(found: Spectrum, site: Site | None) -> tuple[Line, ...]:
-    """Return tones and undeclared lines, without what motion makes of the tones of a site."""
+    """Return tones and undeclared lines, without the motion sidebands of a site's tones."""
     tones = [] if site is None else [f for _, f in _tones(site)]
     return tuple(line for line in lines(found) if not is_sideband(found, line, tones))
 
 
 def undeclared(found: Spectrum, site: Site) -> tuple[Line, ...]:
-    """Return the lines that are neither a declared tone nor what its motion makes of it."""
+    """Return the lines that are neither a declared tone nor one of its motion sidebands."""
     tones = [f for _, f in _tones(site)]
     out = []
     for line in lines(found):
@@ -190,7 +190,7 @@ def undeclared(found: Spectrum, site: Site) -> tuple[Line, ...]:
 
 
 def is_sideband(found: Spectrum, line: Line, tones: list[float]) -> bool:
-    """Tell whether a line is what motion makes of a tone: its mirror is there too."""
+    """Return whether a line is a motion sideband of a tone: its mirror exists, too."""
     own = found.peak(line.frequency_hz)
     for tone in tones:
         off = line.frequency_hz - tone
@@ -203,21 +203,21 @@ def is_sideband(found: Spectrum, line: Line, tones: list[float]) -> bool:
 
 
 def leaked(line: Line, tone_hz: float, window: float) -> float:
-    """Return what a lock-in takes of a line for a tone (T)."""
+    """Return the leakage of a line into the lock-in of a tone (T)."""
     turns = np.pi * abs(line.frequency_hz - tone_hz) * window
     return float(line.amplitude / max(turns, 1.0))
 
 
 def beside_lines(log: Log, site: Site, lockin: LockinSettings | None) -> LockinSettings | None:
-    """Return settings by which the lines that would disturb the tones are fitted beside them.
+    """Return settings by which the lines that would disturb the tones are fitted with them.
 
-    By the beginning of the log; as given where nothing disturbs, or the tones are of slots.
+    By the beginning of the log; unchanged where nothing disturbs, or the tones are in slots.
 
     Parameters
     ----------
     lockin : LockinSettings, optional
-        As asked for: its window is kept.  One that is chosen by the tones is chosen by the lines,
-        too.
+        As requested: its window is kept.  A window that is chosen by the tones depends on the
+        lines, too.
     """
     wave = log.waveform
     if wave is None or len(wave) < 2 or has_schedule(site) or not site.beacons:
@@ -260,14 +260,14 @@ def _fitting(
     *,
     asked: bool,
 ) -> LockinSettings | None:
-    """Return settings that fit one more line, where a window can be long enough to part it.
+    """Return settings that fit one more line, if a window can be long enough to separate it.
 
     Parameters
     ----------
     others_hz : ndarray
-        Tones, and lines that are fitted already.
+        Tones, and lines that are already fitted.
     asked : bool
-        Whether the window was asked for, and stays.
+        Whether the window was requested, and is kept.
     """
     apart = float(np.min(np.abs(line_hz - others_hz)))
     needed = (SEPARATED if asked else 2.0) / apart
@@ -281,7 +281,7 @@ def _fitting(
 def undeclared_lines(
     log: Log, site: Site | None, lockin: LockinSettings | None = None
 ) -> Iterator[Finding]:
-    """Yield the lines that the site does not declare, with what they do to its tones."""
+    """Yield the lines that the site does not declare, with their effect on its tones."""
     if site is None or has_schedule(site) or len(site.beacons) == 0:
         return
     found = spectrum(log, site)
@@ -295,7 +295,7 @@ def undeclared_lines(
 
 
 def judged_lines(found: Spectrum, site: Site, settings: LockinSettings) -> Iterator[Finding]:
-    """Yield what undeclared lines of a spectrum do to the tones of a site."""
+    """Yield the effect of a spectrum's undeclared lines on the tones of a site."""
     doubtful: list[tuple[float, Line, str]] = []
     seen: list[tuple[float, Line, str]] = []
     fitted: list[str] = []
@@ -309,8 +309,8 @@ def judged_lines(found: Spectrum, site: Site, settings: LockinSettings) -> Itera
     if fitted:
         yield Finding(
             "fitted_line",
-            f"magnetometer: undeclared lines: {'; '.join(fitted)}. They are fitted beside the"
-            f" tones, by a window of {settings.window:.3g} s. Declare what transmits, or switch it"
+            f"magnetometer: undeclared lines: {'; '.join(fitted)}. They are fitted with the tones"
+            f" in a window of {settings.window:.3g} s. Declare the transmitters, or switch them"
             " off.",
             Verdict.TRUSTWORTHY,
         )
@@ -332,11 +332,11 @@ def judged_lines(found: Spectrum, site: Site, settings: LockinSettings) -> Itera
 def _consequence(
     found: Spectrum, line: Line, site: Site, settings: LockinSettings
 ) -> tuple[float, str]:
-    """Return how much a line leaks in units of the model's error, and into what, in words."""
+    """Return a line's leakage in units of the model's error, and its description."""
     error = max(site.model_error, LEAST_MODEL_ERROR)
     mains = settings.mains_hz
     order = max(round(line.frequency_hz / mains), 1) if mains > 0.0 else 1
-    # What is fitted beside the tones leaks only by as much as its frequency is off.
+    # A fitted line leaks only in proportion to its frequency error.
     off = abs(line.frequency_hz - order * mains) * settings.window if mains > 0.0 else np.inf
     fitted = min(1.0, float(np.pi * off)) if off < 1.0 else 1.0
     worst, where, share = 0.0, "", 0.0
@@ -349,24 +349,22 @@ def _consequence(
         return 0.0, ""
     if worst > CONSEQUENCE:
         return worst, (
-            f"By the window of {settings.window:.3g} s they change the field of {where} by up to"
-            f" {100.0 * share:.2g} %. Declare what transmits, switch it off, or give a longer"
+            f"With a window of {settings.window:.3g} s they change the field of {where} by up to"
+            f" {100.0 * share:.2g} %. Declare the transmitters, switch them off, or use a longer"
             " --window."
         )
     return worst, f"They change {where} by {100.0 * share:.2g} % at most."
 
 
 def _named(line: Line, site: Site, found: Spectrum, settings: LockinSettings) -> str:
-    """Return a line in words: where, how strong, and what it probably is."""
+    """Return the description of a line: frequency, amplitude, and probable origin."""
     size = f"{line.frequency_hz:.2f} Hz ({1e9 * line.amplitude:.3g} nT)"
     strongest = max((found.amplitude(f) for _, f in _tones(site)), default=0.0)
     mains = mains_of(line.frequency_hz, found.rate_hz)
     for name, tone in _tones(site):
         near = abs(line.frequency_hz - tone) * settings.window < 2.0 and not mains
         if near and line.amplitude > FORGOTTEN * found.amplitude(tone):
-            return (
-                f"{size}, probably beacon {name} itself, whose frequency_hz is said to be {tone:g}"
-            )
+            return f"{size}, probably beacon {name} itself, whose declared frequency_hz is {tone:g}"
         if near:
             return f"{size}, a neighbour of beacon {name} ({tone:g} Hz)"
         harmonic = None if mains else _order_of(line, tone, found)
@@ -383,7 +381,7 @@ def _named(line: Line, site: Site, found: Spectrum, settings: LockinSettings) ->
 
 
 def _order_of(line: Line, tone: float, found: Spectrum) -> int | None:
-    """Return which harmonic of a tone a weaker line is, if it is one."""
+    """Return the harmonic order of a weaker line with respect to a tone; None if it has none."""
     if line.amplitude >= 0.3 * found.amplitude(tone):
         return None
     for order in range(2, HARMONICS + 1):

@@ -1,4 +1,4 @@
-"""What the stamps of the streams say: rates, gaps, samples lost, jitter, and how long both run."""
+"""Checks of the streams' time stamps: rates, gaps, lost samples, jitter and overlap."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -10,15 +10,15 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array, IntArray
 
-GAP = 0.5  # s; from which the estimators can no longer take it for samples lost
+GAP = 0.5  # s; too long for the estimators to treat as lost samples
 GAP_STEPS = 8.0  # samples, where the stream is slower than that
-LOST = 0.01  # share of the samples from which it is said
+LOST = 0.01  # share of the samples from which it is reported
 JITTER = 0.05  # of a step
-LATTICE = 0.15  # of a step: up to here stamps lie on a lattice, in which a missing one is counted
-BLOCK = 64  # samples over which a clock is taken for even
+LATTICE = 0.15  # of a step: stamps scatter less about a lattice, on which missing ones are counted
+BLOCK = 64  # samples over which a clock is assumed even
 ALIKE = 0.9  # share of the longer stream that the shorter one covers
 ROUNDING = 1e-6  # of a step
-LISTED = 3  # gaps that are named
+LISTED = 3  # gaps that are listed
 
 
 class Timing(NamedTuple):
@@ -28,7 +28,7 @@ class Timing(NamedTuple):
     ----------
     stream : str
     rate_hz : float
-        Usual.
+        Median.
     begin, end : float
         First and last stamp (s).
     jitter : float
@@ -50,7 +50,7 @@ class Timing(NamedTuple):
 
 
 def timing(stream: str, time: Array) -> Timing | None:
-    """Return what the stamps (s) of a stream say; None of fewer than three."""
+    """Return the timing of a stream from its stamps (s); None of fewer than three."""
     if len(time) < 3:
         return None
     step = np.diff(time)
@@ -103,7 +103,7 @@ def timings(log: Log) -> tuple[Timing, ...]:
 
 
 def uneven_stamps(log: Log, _site: Site | None) -> Iterator[Finding]:
-    """Yield what is wrong with the stamps of a log."""
+    """Yield the defects of a log's time stamps."""
     found = timings(log)
     for one in found:
         yield from _of_one(one)
@@ -112,8 +112,8 @@ def uneven_stamps(log: Log, _site: Site | None) -> Iterator[Finding]:
             yield Finding(
                 "jitter",
                 f"{stream}: the stamps jitter by {1e3 * clock.scatter:.2g} ms (rms) about an even"
-                f" clock of {1.0 / clock.step:.4g} Hz, which has taken their place: they tell when"
-                " a sample arrived, not when it was taken. Stamp the samples in the sensor.",
+                f" clock of {1.0 / clock.step:.4g} Hz, which replaces them: they are times of"
+                " arrival, not of measurement. Stamp the samples in the sensor.",
                 Verdict.TRUSTWORTHY,
                 clock.scatter / clock.step / JITTER,
             )
@@ -133,16 +133,16 @@ def _of_one(one: Timing) -> Iterator[Finding]:
         yield Finding(
             "gap",
             f"{one.stream}: no samples from {places}{more}: {float(np.sum(length)):.1f} s of"
-            f" {span:.0f} s are missing. The recorder or its link stalled; what lies within is"
-            " bridged by the other streams alone.",
+            f" {span:.0f} s are missing. The recorder or its link stalled; only the other streams"
+            " bridge the gap.",
             weight=1.0 + float(np.max(length)),
         )
     if one.lost > LOST:
         yield Finding(
             "samples_lost",
             f"{one.stream}: {100.0 * one.lost:.1f} % of the samples are missing, one or a few at a"
-            " time, all along the log: the link or the recorder cannot keep up with"
-            f" {one.rate_hz:.4g} Hz. Record with a larger buffer or at a lower rate.",
+            f" time: link or recorder are too slow for {one.rate_hz:.4g} Hz. Record with a larger"
+            " buffer or at a lower rate.",
             weight=one.lost / LOST,
         )
     if one.jitter > JITTER * usual:
@@ -150,8 +150,8 @@ def _of_one(one: Timing) -> Iterator[Finding]:
             "jitter",
             f"{one.stream}: the stamps jitter by {1e3 * one.jitter:.2g} ms (rms) about an even"
             f" clock of {one.rate_hz:.4g} Hz, {100.0 * one.jitter / usual:.0f} % of a step:"
-            " probably they tell when a sample arrived, not when it was taken. Stamp the samples"
-            " in the sensor.",
+            " probably they are times of arrival, not of measurement. Stamp the samples in the"
+            " sensor.",
             weight=one.jitter / (JITTER * usual),
         )
 
@@ -163,7 +163,7 @@ def _apart(imu: Timing, field: Timing) -> Iterator[Finding]:
         yield Finding(
             "streams_apart",
             f"imu runs from {imu.begin:.1f} to {imu.end:.1f} s and magnetometer from"
-            f" {field.begin:.1f} to {field.end:.1f} s: both for {max(common, 0.0):.1f} s only."
-            " Either one was started late or their clocks differ; stamp both by one clock.",
+            f" {field.begin:.1f} to {field.end:.1f} s: they overlap by {max(common, 0.0):.1f} s."
+            " One was started late, or their clocks differ. Stamp both with one clock.",
             weight=longest / max(common, 0.1 * longest),
         )

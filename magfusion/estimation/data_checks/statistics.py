@@ -1,8 +1,8 @@
-"""Tests that share one budget of false alarms.
+"""Statistical tests that share one budget of false alarms.
 
-A result is tested many times, by parameter, beacon, axis and time.  What counts is that a clean one
-is called in question once in `FALSE_ALARMS`, by whatever test: Holm's procedure.
-Probabilities are kept as logarithms, since those of real faults cannot be held by a float.
+A result is tested many times, by parameter, beacon, axis and time.  By Holm's procedure, all tests
+together raise a false alarm in a share of `FALSE_ALARMS` of correct results.
+Probabilities are logarithms, since those of real faults underflow.
 """
 
 from collections.abc import Sequence
@@ -13,10 +13,10 @@ from scipy.special import chdtrc, gammaln, ndtri_exp
 from magfusion.units import Array, BoolArray
 
 FALSE_ALARMS = 0.005  # of all tests of one result together
-WITNESSES = 5  # that share it alike; each tests by Holm's procedure within its part
+WITNESSES = 5  # that share it equally; each applies Holm's procedure to its part
 WITNESS_BUDGET = FALSE_ALARMS / WITNESSES
-SURE = 1e-9  # probability of six sigma, either way: evidence that may fail a result
-_UNDERFLOW = -600.0  # log probability below which the exact function has no digits left
+SURE = 1e-9  # probability of six sigma, two-sided: evidence that may fail a result
+_UNDERFLOW = -600.0  # log probability below which the exact function underflows
 
 
 def log_p_chi_square(value: Array | float, freedom: Array | float) -> Array:
@@ -25,7 +25,7 @@ def log_p_chi_square(value: Array | float, freedom: Array | float) -> Array:
     Parameters
     ----------
     value, freedom : float or ndarray
-        The degrees of freedom may be a fraction, of correlated numbers.
+        The degrees of freedom may be fractional, for correlated numbers.
 
     Returns
     -------
@@ -36,7 +36,7 @@ def log_p_chi_square(value: Array | float, freedom: Array | float) -> Array:
         np.maximum(np.asarray(value, dtype=float), 0.0), np.asarray(freedom, dtype=float)
     )
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        # As chi2.logsf, which is minus infinity beyond what a float holds.
+        # As chi2.logsf, which is minus infinity below the range of a float.
         exact = np.where(freedom > 0.0, np.log(chdtrc(freedom, value)), np.nan)
         half, shape = 0.5 * value, 0.5 * freedom
         # Far out: the first terms of the asymptotic series of the incomplete gamma function.
@@ -46,17 +46,17 @@ def log_p_chi_square(value: Array | float, freedom: Array | float) -> Array:
 
 
 def sigmas(log_p: Array | float) -> Array:
-    """Return how many standard deviations, either way, are as rare as a probability."""
+    """Return the two-sided number of standard deviations of a probability."""
     return np.asarray(-ndtri_exp(np.minimum(np.asarray(log_p, dtype=float) - np.log(2.0), -0.7)))
 
 
 def holm(log_p: Sequence[float] | Array, budget: float = FALSE_ALARMS) -> BoolArray:
-    """Tell which tests speak, so that all of them together raise a false alarm in ``budget``.
+    """Return which tests are significant, at a family-wise false-alarm rate of ``budget``.
 
     Parameters
     ----------
     log_p : sequence of float
-        Of every test that was made, also of those that found nothing.
+        Of all tests, also of insignificant ones.
     """
     given = np.asarray(log_p, dtype=float)
     out = np.zeros(len(given), dtype=bool)
@@ -68,18 +68,18 @@ def holm(log_p: Sequence[float] | Array, budget: float = FALSE_ALARMS) -> BoolAr
 
 
 def effective_number(residual: Array) -> float:
-    """Return how many independent numbers a series along time holds, from its autocorrelation.
+    """Return the effective number of independent samples of a series, from its autocorrelation.
 
     Parameters
     ----------
     residual : ndarray, shape (n, ...)
-        Along time first; the series side by side are taken to be correlated alike.  NaN is missing.
+        Time first; all series are assumed to have the same correlation.  NaN is missing.
 
     Returns
     -------
     float
-        Of the first axis, at most n: Bartlett's sum for the variance of a sum of squares, up to
-        where the correlation is lost in its own noise.
+        At most n: Bartlett's sum for the variance of a sum of squares, up to where the
+        correlation falls below its own noise.
     """
     flat = residual.reshape(len(residual), -1)
     known = np.isfinite(flat)

@@ -1,8 +1,8 @@
-"""Whether the steady field, by the poses, is the Earth's as the site declares it.
+"""Consistency of the static field with the declared Earth field, at estimated poses.
 
-One test for a state online and for a smoothed log.  What turns the field about the vertical alone
-is a heading: the axes of the beacons' survey are not those of the declared field, and then places
-are turned with them, about the origin of the world.
+One test for a running state and for a smoothed log.  A rotation about the vertical only is a
+heading error: the axes of the beacons' survey differ from those of the declared field, and
+positions are rotated with them about the world's origin.
 """
 
 from typing import NamedTuple
@@ -16,21 +16,21 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding
 from magfusion.units import DEGREE, Array
 
-DOUBT = 5.0  # sigmas; of some fifty tests that are made for hours
-EXPLAINED = 0.2  # share of what is left that a turn about the vertical may leave
+DOUBT = 5.0  # sigmas; for some fifty tests repeated for hours
+EXPLAINED = 0.2  # share of the residual that may remain after a rotation about the vertical
 
 
 class OffEarth(NamedTuple):
-    """A steady field that is not the Earth's.
+    """A static field that is not the Earth's.
 
     Parameters
     ----------
     score : float
-        Sigmas off.
+        Deviation in sigmas.
     turn : float
-        What attitudes may be off by (rad).
+        Possible attitude error (rad).
     of_survey : bool
-        Whether a turn about the vertical explains it, and places may be turned, too.
+        Whether a rotation about the vertical explains it, so that positions may be rotated, too.
     """
 
     finding: Finding
@@ -39,14 +39,14 @@ class OffEarth(NamedTuple):
     of_survey: bool
 
     def shift(self, position_world: Array) -> float:
-        """Return what a place (m) may be off by (m)."""
+        """Return the possible position error at a position (m) (m)."""
         if not self.of_survey:
             return 0.0
         return 2.0 * np.sin(0.5 * self.turn) * float(np.linalg.norm(position_world[:2]))
 
 
 def off_earth(site: Site, left_world: Array, rotation_cov_world: Array) -> OffEarth | None:
-    """Judge what the mean steady field leaves beside the declared one.
+    """Test the mean static field against the declared Earth field.
 
     Parameters
     ----------
@@ -71,20 +71,20 @@ def off_earth(site: Site, left_world: Array, rotation_cov_world: Array) -> OffEa
     off, size = float(np.linalg.norm(left_world)), float(np.linalg.norm(earth))
     heading, rest = _heading(earth, earth + left_world)
     said = (
-        f"The steady field differs from the declared Earth field by {1e6 * off:.2g} uT of"
+        f"The static field differs from the declared Earth field by {1e6 * off:.2g} uT of"
         f" {1e6 * size:.2g} uT at the estimated attitude"
     )
     of_survey = rest < EXPLAINED * off
     if of_survey:
         text = (
-            f"{said}, as if turned by {heading / DEGREE:+.0f} deg about the vertical: the axes of"
-            " the beacons' survey are not those of earth_field_t (a north of another kind, east"
-            " for north), a heading of the magnetometer's mounting, or iron that turns the field."
+            f"{said}, as if rotated by {heading / DEGREE:+.0f} deg about the vertical. Check the"
+            " axes of earth_field_t and of the beacons' survey (true, grid or magnetic north, east"
+            " for north), the magnetometer's mounting (heading), and iron near it."
         )
     else:
         text = (
-            f"{said}: axes or scale of the magnetometer, iron on the platform, or a wrong Earth"
-            " field in the site."
+            f"{said}. Check the magnetometer's axes and scale, iron on the platform, and"
+            " earth_field_t."
         )
     turn = abs(heading) if of_survey else off / size
     return OffEarth(Finding("earth_field", text, weight=score / DOUBT), score, turn, of_survey)
@@ -92,7 +92,7 @@ def off_earth(site: Site, left_world: Array, rotation_cov_world: Array) -> OffEa
 
 @once_a_site
 def _declared_cov(site: Site) -> Array:
-    """Return the covariance of the steady field that the site declares, world axes (T^2)."""
+    """Return the covariance of the static field that the site declares, world axes (T^2)."""
     earth = site.earth_field_world
     assert earth is not None
     size, horizontal = float(np.linalg.norm(earth)), float(np.hypot(earth[0], earth[1]))
@@ -102,7 +102,7 @@ def _declared_cov(site: Site) -> Array:
 
 
 def _usual(site: Site, size: float) -> float:
-    """Return the variance of each component that the site declares (T^2)."""
+    """Return the declared variance of each component (T^2)."""
     sensor = site.platform.magnetometer.sigma
     usual = (site.earth.strength_sigma**2 + AMBIENT_SHARE**2) * size**2
     usual += float(np.max(sensor.matrix)) ** 2 * size**2 + float(np.max(sensor.offset)) ** 2
@@ -110,7 +110,7 @@ def _usual(site: Site, size: float) -> float:
 
 
 def _heading(earth: Array, field: Array) -> tuple[float, float]:
-    """Return the turn about the vertical between two fields (rad), and what it leaves (T)."""
+    """Return the rotation about the vertical between two fields (rad), and the residual (T)."""
     turn = float(np.arctan2(field[1], field[0]) - np.arctan2(earth[1], earth[0]))
     turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
     cosine, sine = np.cos(turn), np.sin(turn)

@@ -1,4 +1,4 @@
-"""What has arrived and is not used up yet: streams in order, and how late they may be."""
+"""Input buffers: samples that are not processed yet, sorted by time, and their clock check."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -8,11 +8,11 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.units import Array
 
-LARGEST_JUMP = 60.0  # s; a stamp farther from the newest of all streams is a clock that jumped
+LARGEST_JUMP = 60.0  # s; a stamp farther from the newest of all streams means a clock jump
 
 
 def check_clock(name: str, time: Array, newest: float) -> None:
-    """Refuse samples of a clock that jumped, ahead or back.
+    """Reject samples after a clock jump, forward or back.
 
     Parameters
     ----------
@@ -20,7 +20,7 @@ def check_clock(name: str, time: Array, newest: float) -> None:
         Of the stream.
     time : ndarray, shape (k,)
     newest : float
-        Stamp of all streams (s): one that was silent for long has not jumped.
+        Newest stamp of all streams (s): a stream that paused for long has not jumped.
 
     Raises
     ------
@@ -29,21 +29,21 @@ def check_clock(name: str, time: Array, newest: float) -> None:
     if len(time) == 0 or newest == -np.inf:
         return
     if time.min() >= newest - LARGEST_JUMP and time.max() <= newest + LARGEST_JUMP:
-        return  # as nearly always
+        return  # the usual case
     later = np.sort(np.append(time[time > newest], newest))
     ahead = float(np.max(np.diff(later), initial=0.0))
     back = newest - float(np.max(time))
     if max(ahead, back) > LARGEST_JUMP:
         way = "back" if back > ahead else "ahead"
         raise InputError(
-            f"{name}: its clock jumped {way} by {max(ahead, back):.4g} s at {newest:.3f} s;"
-            " start a new navigator, or correct the clock"
+            f"{name}: its clock jumped {way} by {max(ahead, back):.4g} s at {newest:.3f} s."
+            " Start a new navigator, or correct the clock"
         )
 
 
 @dataclass(eq=False)
 class _Room:
-    """What samples are kept in, up to an end."""
+    """Storage of samples, with its end."""
 
     time: Array
     rows: Array
@@ -56,9 +56,9 @@ class Buffer:
     Parameters
     ----------
     name : str
-        Of the stream, for refusals.
+        Of the stream, for error messages.
     width : int
-        Numbers in a row.
+        Numbers per row.
     """
 
     newest: float
@@ -77,15 +77,15 @@ class Buffer:
         self.late = 0
 
     def add(self, time: Array, rows: Array) -> None:
-        """Take samples in, in any order but not from before what has been settled.
+        """Insert samples, in any order but not before the settled time.
 
         Raises
         ------
         InputError
-            Where a number is not finite.
+            If a number is not finite.
         """
         if not (np.isfinite(time).all() and np.isfinite(rows).all()):
-            raise InputError(f"{self.name}: a sample is not finite; leave it out of the stream")
+            raise InputError(f"{self.name}: a sample is not finite; drop it from the stream")
         if len(time) == 0:
             return
         fresh = time > self.settled
@@ -97,14 +97,14 @@ class Buffer:
         self.newest = max(self.newest, float(time.max()))
 
     def leave_out(self, after: float, until: float) -> int:
-        """Drop what was heard after a time and up to another (s); return how many samples."""
+        """Drop the samples after a time and up to another (s); return how many."""
         time, rows = self.rows()
         kept = (time <= after) | (time > until)
         self._time, self._rows = time[kept], rows[kept]
         return int(np.sum(~kept))
 
     def rows(self) -> tuple[Array, Array]:
-        """Return all that is kept, in order of time; of equal stamps the first."""
+        """Return all samples, sorted by time; of equal stamps the first."""
         if self._waiting:
             time, rows = self._waiting[0]
             if len(self._waiting) > 1:
@@ -122,13 +122,13 @@ class Buffer:
         return self._time, self._rows
 
     def _follows(self, time: Array) -> bool:
-        """Tell whether stamps are in order, and later than all that is kept."""
+        """Return whether stamps are sorted and newer than all stored ones."""
         if len(self._time) and len(time) and time[0] <= self._time[-1]:
             return False
         return bool((time[1:] > time[:-1]).all())
 
     def _append(self, time: Array, rows: Array) -> None:
-        """Put later samples behind those that are kept, which are copied only now and then."""
+        """Append newer samples; the stored ones are copied only now and then."""
         kept, more, room = len(self._time), len(time), self._room
         if room is None or self._time.base is not room.time or room.end + more > len(room.time):
             size = 2 * (kept + more)
@@ -140,14 +140,14 @@ class Buffer:
         room.end = end
 
     def between(self, begin: float, end: float) -> tuple[Array, Array]:
-        """Return the samples of a stretch, with the neighbours just outside it."""
+        """Return the samples of an interval, with the neighbours just outside it."""
         time, rows = self.rows()
         lo = max(int(time.searchsorted(begin, side="right")) - 1, 0)
         hi = min(int(time.searchsorted(end)) + 1, len(time))
         return time[lo:hi], rows[lo:hi]
 
     def forget(self, before: float, settled: float) -> None:
-        """Drop what is older, but for the last sample of it; refuse what comes before settled."""
+        """Drop older samples except the last; reject later those before the settled time."""
         time, rows = self.rows()
         lo = max(int(time.searchsorted(before, side="right")) - 1, 0)
         self._time, self._rows = time[lo:], rows[lo:]

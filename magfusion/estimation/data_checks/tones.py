@@ -1,8 +1,8 @@
-"""What transmits in a recording: the tones of beacons that nobody has declared yet.
+"""Tones of undeclared beacons in a recording.
 
-The frequency of a tone comes from the turning of ``P . P``, the sum of the squares of a phasor's
-components: no rotation of the sensor changes it, and twice the drive's phase is its phase where the
-field oscillates along a line.
+The frequency of a tone follows from the phase rate of ``P . P``, the sum of the squares of a
+phasor's components: it is invariant to rotation of the sensor, and its phase is twice the drive's
+where the field oscillates along a line.
 """
 
 from dataclasses import dataclass
@@ -26,14 +26,14 @@ from magfusion.model.site import Site
 from magfusion.receiver.ellipse import semi_axes
 from magfusion.units import Array, ComplexArray
 
-FAINTEST = 3e-3  # of the strongest line; a weaker one is not taken for a beacon
+FAINTEST = 3e-3  # of the strongest line; a weaker one is not considered a beacon
 DISTORTION = 0.3  # of a tone, below which its multiple is a harmonic
 LONGEST, SHORTEST = 1.0, 0.25  # s, of a window
-CYCLES_APART = 4.0  # of the beat with the nearest line, a window holds
-# Two equal coils in quadrature give an ellipse of axes from 1:1 to 1:2, a single one a line.
+CYCLES_APART = 4.0  # periods of the beat with the nearest line in a window
+# Two equal coils in quadrature draw an ellipse with axes from 1:1 to 1:2, a single one a line.
 ROTATING = 0.25  # ratio of the axes, above which there are two coils
-CRYSTALS = 5e-5  # relative; drive and recorder may differ by that from what was meant
-ROUND = (1.0, 0.5, 0.1, 0.01)  # Hz; what is meant is a multiple of one of these
+CRYSTALS = 5e-5  # relative deviation of drive and recorder from the nominal frequency
+ROUND = (1.0, 0.5, 0.1, 0.01)  # Hz; a nominal frequency is a multiple of one of these
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,12 @@ class Tone:
     Parameters
     ----------
     frequency_hz, sigma_hz : float
-        As measured, one sigma.
+        Measured value and its sigma.
     amplitude : float
         (T)
     roundness : float
-        Median ratio of the axes of the ellipse that the field draws: 0 for a single coil, 0.5 to 1
-        for two in quadrature.
+        Median axis ratio of the field's ellipse: 0 for a single coil, 0.5 to 1 for two in
+        quadrature.
     """
 
     frequency_hz: float
@@ -63,7 +63,7 @@ class Tone:
 
     @property
     def meant_hz(self) -> float:
-        """The round number that is probably meant, or the frequency to a tenth of its sigma."""
+        """The probable round nominal frequency, or the measured one to a tenth of its sigma."""
         near = 3.0 * self.sigma_hz + CRYSTALS * self.frequency_hz
         for unit in ROUND:
             meant = round(self.frequency_hz / unit) * unit
@@ -74,19 +74,19 @@ class Tone:
 
 @dataclass(frozen=True)
 class Transmitted:
-    """What a recording holds: beacons, and lines that are none."""
+    """Lines of a recording: beacons, and others."""
 
     tones: tuple[Tone, ...]
     others: tuple[str, ...]
 
 
 def transmitted(log: Log, site: Site | None) -> Transmitted | None:
-    """Return the tones of a waveform; None where it is too short for a spectrum.
+    """Return the tones of a waveform; None if it is too short for a spectrum.
 
     Parameters
     ----------
     site : Site, optional
-        How the magnetometer is mounted; its beacons have no part in it.
+        Only for the magnetometer's mounting; its beacons are ignored.
     """
     found = spectrum(log, site)
     if found is None or log.waveform is None:
@@ -141,10 +141,10 @@ def _tone(line: Line, every: Array, time: Array, field: Array) -> Tone:
 def _phasors(
     time: Array, field: Array, frequency_hz: float, window: float
 ) -> tuple[Array, ComplexArray]:
-    """Return centres (n,) and phasors (n, 3) of windows of a Hann shape, half overlapping."""
+    """Return centres (n,) and phasors (n, 3) of Hann windows with half overlap."""
     length = max(8, round(window / float(np.median(np.diff(time)))))
     first = np.arange(0, len(time) - length + 1, max(1, length // 2))
-    whole = time[first + length - 1] - time[first] < 1.5 * window  # no gap within
+    whole = time[first + length - 1] - time[first] < 1.5 * window  # without gap
     rows = first[whole, None] + np.arange(length)
     weight = np.hanning(length + 2)[1:-1]
     piece = field[rows]
@@ -155,10 +155,10 @@ def _phasors(
 
 
 def _turning(centre: Array, phasor: ComplexArray) -> tuple[float, float]:
-    """Return by how much a frequency is off, and its sigma (Hz)."""
+    """Return the frequency error and its sigma (Hz)."""
     square = np.sum(phasor**2, axis=1)
     pair = square[1:] * np.conj(square[:-1])
-    # The coarse step by the mean turn between neighbours, the fine one along the whole.
+    # A coarse step by the mean rotation between neighbours, a fine one over the full length.
     step = np.diff(centre)
     usual = float(np.median(step))
     even = np.abs(step - usual) < 0.1 * usual
@@ -170,6 +170,6 @@ def _turning(centre: Array, phasor: ComplexArray) -> tuple[float, float]:
     spread = float(np.sum(weight * away**2))
     fine = float(np.sum(weight * away * phase)) / spread
     left = phase - float(np.average(phase, weights=weight)) - fine * away
-    # What is left wanders with the motion: ten windows in a row count as one.
+    # The residual varies slowly with the motion: ten consecutive windows count as one.
     sigma = float(np.sqrt(10.0 * np.sum((weight * away * left) ** 2)) / spread)
     return (coarse + fine) / (4.0 * np.pi), sigma / (4.0 * np.pi)

@@ -1,9 +1,9 @@
-"""Whether the steady field turns as the gyroscope says: a compass that knows of no beacon.
+"""Consistency of the static field's rotation with the gyroscope, independent of the beacons.
 
-A field that stands still turns in the body by ``db/dt = -(M rate) x b``, with M the identity where
-both instruments have the axes, the signs, the units and the clock that are declared.  Both sides
-are low-passed alike, below every tone, so that the fit is linear in M and exact; in rooms with iron
-and on real instruments the identity explains 87 to 99.9 % of db/dt.
+A static field changes in body axes by ``db/dt = -(M rate) x b``; M is the identity if axes, signs,
+units and clocks of both instruments are as declared.  Both sides pass the same low-pass filter,
+below every tone, so that the fit is linear in M and exact.  In rooms with iron and on real
+instruments the identity explains 87 to 99.9 % of db/dt.
 """
 
 from functools import cache
@@ -19,20 +19,20 @@ from magfusion.model.site import Site
 from magfusion.units import Array, BoolArray
 
 CUTOFF = 2.0  # Hz
-REACH = 1.6  # of the low-pass on either side, in its own periods
-LEAST_TURN = 0.05  # rad/s; with less there is nothing to compare
+REACH = 1.6  # half width of the low-pass filter, in its own periods
+LEAST_TURN = 0.05  # rad/s; slower rotation is not compared
 CONTRADICTED = 0.5  # explained share of db/dt below which the axes are not those declared
-EXPLAINED = 0.7  # by what is named instead
+EXPLAINED = 0.7  # by the alternative that is reported
 LONGEST_LAG = 3.0  # s
 LAG_STEP = 0.02  # s
-CORRELATED = 2.0  # rows in a row are alike
+CORRELATED = 2.0  # consecutive rows that share one residual
 _EPSILON = np.zeros((3, 3, 3))
 for _i, _k, _j in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _EPSILON[_i, _k, _j], _EPSILON[_i, _j, _k] = 1.0, -1.0
 
 
 class Turning(NamedTuple):
-    """How a field changes in the body, and what the gyroscope says to it.
+    """Rate of change of a field in body axes, and its prediction by the gyroscope.
 
     Parameters
     ----------
@@ -51,25 +51,25 @@ class Turning(NamedTuple):
         return float(np.sqrt(np.mean(np.sum(self.change**2, axis=1)))) if len(self.change) else 0.0
 
     def explained(self, matrix: Array) -> float:
-        """Return the share of the change that a matrix M (3, 3) explains; below 0, worse than 0."""
+        """Return the share of the change that a matrix M (3, 3) explains; may be negative."""
         left = self.change - self.by_matrix @ matrix.ravel()
         return float(1.0 - np.sum(left**2) / np.sum(self.change**2))
 
     @property
     def said(self) -> float:
-        """Root mean square rate at which the gyroscope says that the field turns (rad/s)."""
+        """Root mean square rate of the field's direction predicted by the gyroscope (rad/s)."""
         said = self.by_matrix @ np.eye(3).ravel()
         return float(np.sqrt(np.mean(np.sum(said**2, axis=1))))
 
     def agreement(self, matrix: Array) -> float:
-        """Return what a matrix explains with the scale that suits it best, if that is positive."""
+        """Return the share that a matrix explains with its best positive scale."""
         said = self.by_matrix @ matrix.ravel()
         product = float(np.sum(said * self.change))
         power = float(np.sum(said**2)) * float(np.sum(self.change**2))
         return product * abs(product) / max(power, 1e-30)
 
     def mounting(self) -> tuple[Array, float, float]:
-        """Return the small turn (rad) that explains most, its sigma, and how many times better."""
+        """Return the best small rotation (rad), its sigma, and the residual's improvement."""
         left = self.change - self.by_matrix @ np.eye(3).ravel()
         # M = I + [turn]x
         by_turn = self.by_matrix @ np.swapaxes(_EPSILON, 1, 2).reshape(3, 9).T
@@ -95,14 +95,14 @@ class Turning(NamedTuple):
 
 
 def turning(imu: ImuSamples, field_time: Array, field_body: Array, lag: float = 0.0) -> Turning:
-    """Compare the turn of a field with the gyroscope's.
+    """Compare the rotation of a field with the gyroscope's.
 
     Parameters
     ----------
     field_time : ndarray, shape (n,)
         (s)
     field_body : ndarray, shape (n, 3)
-        By the declared calibration and mounting, tones and all (T).
+        In body axes by the declared calibration and mounting, including tones (T).
     lag : float
         Added to the stamps of the inertial samples (s).
     """
@@ -137,7 +137,7 @@ def _interpolated(time: Array, known: Array, value: Array) -> Array:
 
 
 def _covered(time: Array, known: Array, step: float) -> BoolArray:
-    """Tell at which times a stream has samples near by."""
+    """Return at which times a stream has neighbouring samples."""
     after = np.clip(np.searchsorted(known, time), 1, len(known) - 1)
     usual = float(np.median(np.diff(known)))
     near = known[after] - known[after - 1] < max(0.05, 4.0 * usual)
@@ -147,7 +147,7 @@ def _covered(time: Array, known: Array, step: float) -> BoolArray:
 
 @cache
 def axes() -> tuple[Array, ...]:
-    """Return the 48 ways to take the axes of a triad for others, the identity first."""
+    """Return the 48 signed axis permutations, the identity first."""
     found = [
         np.asarray(np.eye(3)[list(order)] * np.array(sign)[:, None])
         for order in permutations(range(3))
@@ -157,7 +157,7 @@ def axes() -> tuple[Array, ...]:
 
 
 def field_body(log: Log, site: Site | None) -> Array:
-    """Return the raw field in body axes, by the declared calibration (T), shape (n, 3)."""
+    """Return the raw field in body axes by the declared calibration (T), shape (n, 3)."""
     assert log.waveform is not None
     measured = log.waveform.measured_sensor
     if site is None:
@@ -168,7 +168,7 @@ def field_body(log: Log, site: Site | None) -> Array:
 
 
 def agrees(log: Log, site: Site) -> bool:
-    """Tell whether there is a turn, and the gyroscope explains it as declared."""
+    """Return whether the body rotates, and the gyroscope explains it as declared."""
     if log.vectors is None or len(log.imu) < 2:
         return False
     offset = site.platform.imu.time_offset
@@ -181,7 +181,7 @@ def agrees(log: Log, site: Site) -> bool:
 def convolved(value: Array, kernel: Array, mode: Literal["valid", "same"]) -> Array:
     """Return each column of many values convolved with a kernel.
 
-    As `scipy.signal.fftconvolve`, which takes as long to import as all else.
+    As `scipy.signal.fftconvolve`, whose import takes as long as all else.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ def convolved(value: Array, kernel: Array, mode: Literal["valid", "same"]) -> Ar
     kernel : ndarray, shape (m,)
         For 'valid', no longer than the values.
     mode : 'valid' or 'same'
-        Whether only what the kernel fits into is returned, or as many as there are values.
+        Return the values where the kernel fits entirely, or as many as there are.
     """
     whole = len(value) + len(kernel) - 1
     size = next_fast_len(whole, real=True)
@@ -200,9 +200,9 @@ def convolved(value: Array, kernel: Array, mode: Literal["valid", "same"]) -> Ar
 
 
 def _products(vectors: Array) -> Array:
-    """Return columns of which the products sum to squares of cross products, the others taken off.
+    """Return columns whose products sum to squares of cross products.
 
-    By ``|a x b|^2 = |a|^2 |b|^2 - (a b)^2``: the first, and six that are taken off.
+    By ``|a x b|^2 = |a|^2 |b|^2 - (a b)^2``: one column to add, and six to subtract.
     """
     x, y, z = vectors.T
     root = np.sqrt(2.0)
@@ -212,7 +212,7 @@ def _products(vectors: Array) -> Array:
 
 
 class Clocks:
-    """Turn of the field and rates on one grid, by the stamps of each."""
+    """Rotation of the field and rates on one grid, each by its own stamps."""
 
     def __init__(self, log: Log, time: Array, field: Array, offset: float) -> None:
         self.time = np.arange(time[0], time[-1], LAG_STEP)
@@ -225,14 +225,14 @@ class Clocks:
         self.rate = convolved(rate, np.full(average, 1.0 / average), mode="same")
 
     def lag(self, part: slice = slice(None)) -> tuple[float, float]:
-        """Return by which shift of the inertial stamps a part agrees best (s), and how well."""
+        """Return the best time shift of the inertial stamps in a part (s), and its agreement."""
         count = int(LONGEST_LAG / LAG_STEP)
         field, change, rate = self.field[part], self.change[part], self.rate[part]
         if len(field) < 4 * count:
             return 0.0, -np.inf
         field, change = field[count:-count], change[count:-count]
         total = float(np.sum(change**2))
-        # Of the change and the rate by the field; a sample shifted to later is taken from before.
+        # Of field change and field rotation rate; a later sample is read from before.
         turned, rated = _products(field), _products(rate)
         turned[:, 1:] *= -1.0
         pairs = [*zip(rate.T, 2.0 * cross(field.T, change.T), strict=True)]
@@ -246,7 +246,7 @@ class Clocks:
         return (k - count + float(finer)) * LAG_STEP, 1.0 - float(left[k]) / max(total, 1e-30)
 
     def rate_error(self) -> float:
-        """Return how much faster the inertial stamps run, by the lags of both halves."""
+        """Return the relative rate error of the inertial stamps, by the lags of both halves."""
         half = len(self.time) // 2
         (first, one), (second, other) = self.lag(slice(half)), self.lag(slice(half, None))
         if min(one, other) < EXPLAINED:

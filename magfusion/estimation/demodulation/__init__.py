@@ -1,1 +1,1 @@
-"""Phasors of each beacon from samples, along a motion that is known or assumed."""
+"""Phasors of each beacon from samples, along a known or assumed motion."""

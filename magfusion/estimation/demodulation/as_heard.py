@@ -1,4 +1,4 @@
-"""What a magnetometer gave, as the estimator takes it: its own axes alone, at one temperature."""
+"""Raw data as the estimator uses them: on the magnetometer's own axes, at one temperature."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from magfusion.units import Array
 
 
 def samples_heard(site: Site, time: Array, measured_sensor: Array) -> Array:
-    """Return raw samples (k, 3) (T) without what stands for axes that are not there."""
+    """Return raw samples (k, 3) (T) without placeholders of missing axes."""
     known, sensor = site.temperatures, site.platform.magnetometer
     if sensor.lacking:
         measured_sensor = np.array(measured_sensor, dtype=np.float64)
@@ -21,7 +21,7 @@ def samples_heard(site: Site, time: Array, measured_sensor: Array) -> Array:
 
 
 def fields_heard(site: Site, samples: FieldSamples) -> FieldSamples:
-    """Return phasors without what stands for axes that are not there."""
+    """Return phasors without placeholders of missing axes."""
     known, sensor = site.temperatures, site.platform.magnetometer
     samples = along_axis(samples, site)
     if sensor.lacking:

@@ -1,7 +1,7 @@
-"""A log of close tones: its short windows tell of the motion, its long ones of each beacon.
+"""A log of close tones: short windows determine the motion, long ones resolve the beacons.
 
-Samples count once.  The long windows, in which the tones are told apart, keep next to no say in the
-estimate, but all that judges beacon by beacon looks at them.
+Samples count once.  The long windows, which resolve the tones, have next to no weight in the
+estimate, but all tests of single beacons use them.
 """
 
 from dataclasses import replace
@@ -30,7 +30,7 @@ from magfusion.receiver.turn import on_clock
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, BoolArray
 
-NO_SAY = 1e6  # times the variance: a window that is looked at, and does not count
+NO_SAY = 1e6  # times the variance: a window that is tested, but not used
 
 
 class CloseLog(NamedTuple):
@@ -60,7 +60,7 @@ class CloseLog(NamedTuple):
 
     @property
     def nodes(self) -> Array:
-        """Times in the windows at which the motion is looked at, one after the other (s)."""
+        """Sample times of the motion in all windows, concatenated (s)."""
         return np.asarray((self.windows.centre[:, None] + self.receiver.nodes).ravel())
 
     def measured(
@@ -72,18 +72,18 @@ class CloseLog(NamedTuple):
         imu: ImuSamples,
         standing: BoolArray | None,
     ) -> JointPhasors:
-        """Return what the short windows tell.
+        """Return the measurement by the short windows.
 
         Parameters
         ----------
         unexplained_sensor : ndarray, shape (samples, 3)
-            What a prediction along the states leaves of the samples (T).
+            Samples minus their prediction along the states (T).
         nodes : Trajectory
             The motion at `nodes`.
         states : Trajectory
-            At all epochs, among which the centres of the windows are.
+            At all epochs, which include the centres of the windows.
         imu : ImuSamples
-            As the calibration corrects it.
+            As corrected by the calibration.
         standing : bool ndarray, shape (states,), optional
         """
         assert states.gyro_bias_body is not None
@@ -112,12 +112,12 @@ class CloseLog(NamedTuple):
 
 
 def looked_at(phasors: FieldPhasors, joint: JointPhasors, window: float) -> FieldPhasors:
-    """Return phasors that are judged, and have no say where short windows have it.
+    """Return phasors with next to no weight where short windows are used instead.
 
     Parameters
     ----------
     window : float
-        Length of those of the phasors (s): a gap of the short ones may be as long.
+        Length of the phasors' windows (s), the longest gap of the short ones.
     """
     before = np.ones(phasors.measured.shape[:2]) if phasors.excess is None else phasors.excess
     middle = 0.5 * (joint.time[1:] + joint.time[:-1])
@@ -130,7 +130,7 @@ def looked_at(phasors: FieldPhasors, joint: JointPhasors, window: float) -> Fiel
 def without_silent(
     joint: JointPhasors, samples: FieldSamples, states: Trajectory, calibration: Calibration
 ) -> JointPhasors:
-    """Return short windows without the beacons that long ones nearby should hear, and do not.
+    """Return short windows without beacons that long ones nearby should detect, but do not.
 
     Parameters
     ----------

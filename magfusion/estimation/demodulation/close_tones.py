@@ -1,4 +1,4 @@
-"""From samples that a prediction leaves to what they tell of close tones together."""
+"""Joint measurement of close tones from the residuals of a sample prediction."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ from magfusion.receiver.turn import body_turn_of, measured_from_body
 from magfusion.receiver.windows import LONGEST_WINDOW
 from magfusion.units import Array, BoolArray, IntArray
 
-AT_ONCE = 128  # windows, whose covariances fit the cache
+AT_ONCE = 128  # windows whose covariances fit the cache
 
 
 def joint_phasors(
@@ -40,22 +40,22 @@ def joint_phasors(
     standing: BoolArray | None = None,
     noise: Array | None = None,
 ) -> tuple[JointPhasors, Array]:
-    """Return what short windows tell of all tones, weighed at poses that are about right.
+    """Return the joint phasors of all tones in short windows, weighted at approximate poses.
 
     Parameters
     ----------
     time : ndarray, shape (samples,)
         (s)
     left_sensor : ndarray, shape (samples, 3)
-        What the prediction leaves of the samples (T), measured axes.
+        Samples minus their prediction (T), measured axes.
     states : Trajectory
-        At the centres of the windows, as predicted.
+        Predicted, at the centres of the windows.
     nodes : Trajectory
-        The motion at the nodes of the windows, likewise.
+        Predicted, at the nodes of the windows.
     imu : ImuSamples
         As from `magfusion.receiver.turn.on_clock`, without the gyro's bias.
     epoch : int ndarray, shape (n,)
-        States that the windows belong to.
+        State index of each window.
     rate_body : ndarray, shape (n, 3)
         Angular rate without its bias (rad/s).
     applied_offset : ndarray, shape (n,)
@@ -63,13 +63,13 @@ def joint_phasors(
     alike, standing
         As of `magfusion.estimation.measurements.phasors.field_phasors`.
     noise : ndarray, shape (k, 3, 3), optional
-        Of samples in the windows before, to be averaged with what is seen.
+        Sample noise of the windows before, for the average.
 
     Returns
     -------
     JointPhasors
     ndarray, shape (n, 3, 3)
-        Noise of a sample as each window shows it alone (T^2).
+        Sample noise estimated from each window alone (T^2).
     """
     assert states.velocity_world is not None
     site, n = calibration.site, len(windows)
@@ -104,7 +104,7 @@ def joint_phasors(
 
 
 def _averaged(shown: Array, noise: Array | None, windows: Windows, designs: JointDesigns) -> Array:
-    """Return the noise of windows, averaged with that of others; as `joint_phasors` has them."""
+    """Return the noise of windows, averaged with that of others as in `joint_phasors`."""
     if noise is not None:
         return np.asarray(np.mean(np.concatenate([noise, shown]), axis=0, keepdims=True))
     settings = designs.settings
@@ -115,7 +115,7 @@ def _averaged(shown: Array, noise: Array | None, windows: Windows, designs: Join
 
 
 def _at_nodes(nodes: Trajectory, states: Trajectory, site: Site) -> tuple[Array, Array]:
-    """Return when the nodes are, and by how much the sensor moves beyond a steady velocity."""
+    """Return the times of the nodes, and the sensor's displacement from a steady velocity there."""
     n = len(states)
     assert states.velocity_world is not None
     elapsed = nodes.time.reshape(n, -1) - states.time[:, None]
@@ -130,9 +130,9 @@ def _at_nodes(nodes: Trajectory, states: Trajectory, site: Site) -> tuple[Array,
 def _foreseen(
     calibration: Calibration, states: Trajectory, elapsed: Array, shift_body: Array, felt: BoolArray
 ) -> tuple[Array, Array]:
-    """Return the phasors at the nodes (n nodes, channels, 6), and how strong each is there.
+    """Return the phasors at the nodes (n nodes, channels, 6), and their relative strength.
 
-    As a share of what it is at the centre, shape (n, nodes, channels).
+    The latter is relative to the centre, shape (n, nodes, channels).
     """
     assert states.velocity_world is not None
     n, count = elapsed.shape
@@ -157,7 +157,7 @@ def _seen(
     imu: ImuSamples,
     site: Site,
 ) -> tuple[Array, Array, Array]:
-    """Return the directions of windows, what tones are there, and the noise beside."""
+    """Return the directions of windows, the tones present, and the noise besides."""
     turn, from_body = body_turn_of(imu), measured_from_body(site)
     back = from_body @ matrices(inverse(turn(windows.centre)))
     in_body = np.linalg.inv(from_body)
@@ -186,7 +186,7 @@ def _felt(calibration: Calibration, states: Trajectory) -> BoolArray:
 
 
 def _of_channels(by_tone: Array, centre: Array, site: Site, felt: BoolArray) -> Array:
-    """Return directions by cosines and sines as those by real and imaginary part of phasors."""
+    """Return directions by cosines and sines in terms of real and imaginary parts of phasors."""
     tones = tones_of(site)
     count = len(tones.frequencies_hz)
     angle = 2.0 * np.pi * tones.frequencies_hz * centre[:, None, None, None]

@@ -1,4 +1,4 @@
-"""The samples of several magnetometers, each demodulated as if it were alone."""
+"""Separate demodulation of the samples of several magnetometers."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -20,17 +20,17 @@ from magfusion.receiver.windows import LockinSettings
 
 
 class Apart(NamedTuple):
-    """What several magnetometers recorded, demodulated.
+    """Demodulated samples of several magnetometers.
 
     Parameters
     ----------
     log : Log
-        With phasors by the log's clock, in the site's order, in place of the samples, or beside
-        them as they were mended.
+        With phasors on the log's clock, in the site's order, instead of the samples or in addition
+        to the cleaned samples.
     dropped : mapping
         Reason, with the magnetometer's name, to number of windows.
     noticed : tuple of Finding
-        What was mended in the samples of each, and how they were demodulated.
+        Corrections to the samples of each, and how they were demodulated.
     """
 
     log: Log
@@ -39,12 +39,12 @@ class Apart(NamedTuple):
 
 
 def of_site(log: Log, site: Site) -> Log:
-    """Return a log of several magnetometers as a site of one, or of some, knows it.
+    """Return a log of several magnetometers with those of the site.
 
     Raises
     ------
     InputError
-        Where the site knows none of a name, or does not say which it has.
+        Where a name is not in the site, or the site does not declare which magnetometer it has.
     """
     if not log.waveforms:
         return log
@@ -53,8 +53,8 @@ def of_site(log: Log, site: Site) -> Log:
     alone = len(sensors) == 1
     if strange and (not alone or (len(log.waveforms) > 1 and sensors[0] not in log.waveforms)):
         raise InputError(
-            f"The samples are of magnetometer {', '.join(strange)}, which the site does not know"
-            f" (it has {', '.join(sensors)}); give the site in which the log was recorded."
+            f"The samples are of magnetometer {', '.join(strange)}, which the site does not have"
+            f" (it has {', '.join(sensors)}); give the site of the recording."
         )
     if not alone:
         return log
@@ -63,7 +63,7 @@ def of_site(log: Log, site: Site) -> Log:
 
 
 def each_alone(log: Log, site: Site) -> Iterator[tuple[str, Log, Site]]:
-    """Yield the name of each magnetometer that has samples, and the log and the site of it alone.
+    """Yield each magnetometer with samples: its name, and the log and the site of it alone.
 
     Its samples are stamped by the log's clock, as far as that is known.
     """
@@ -80,9 +80,9 @@ def each_alone(log: Log, site: Site) -> Iterator[tuple[str, Log, Site]]:
 
 
 def each_recorded(log: Log, site: Site | None) -> Iterator[tuple[str, Log, Site | None]]:
-    """Yield each magnetometer as `each_alone`, mended; without a site, its samples alone.
+    """Yield each magnetometer as `each_alone`, cleaned; without a site, its samples alone.
 
-    Of which the site has and the log has no samples, nothing is yielded.
+    Magnetometers of the site without samples in the log are skipped.
     """
     if site is not None:
         for name, own, alone in each_alone(log, site):
@@ -97,17 +97,17 @@ def demodulated_apart(
 ) -> Apart:
     """Demodulate each magnetometer by its own mounting, matrix and response, at its own stamps.
 
-    Windows are at the same times of the log's clock, so that they are one epoch.
+    Windows are at the same times of the log's clock, and thus form one epoch.
 
     Parameters
     ----------
     anew : bool
-        Whether the samples are kept, to be demodulated again once the motion is known.
+        Whether to keep the samples, to be demodulated again once the motion is known.
 
     Raises
     ------
     InputError
-        Where no window of one is usable, or its temperature matters.
+        Where no window of a magnetometer is usable, or its temperature matters.
     """
     refuse_warm(site)
     if not has_schedule(site):
@@ -138,22 +138,22 @@ def demodulated_apart(
 
 
 def by_name(said: Mapping[str, tuple[Finding, ...]]) -> Iterator[Finding]:
-    """Yield what is said of each magnetometer with its name; what is said of all, once."""
+    """Yield the findings of each magnetometer with its name, and those of all once."""
     alike = set.intersection(*map(set, said.values()))
     yield from (finding for finding in next(iter(said.values())) if finding in alike)
     for name, findings in said.items():
         for finding in findings:
             if finding not in alike:
-                yield replace(finding, text=f"Of {name}: {finding.text}")
+                yield replace(finding, text=f"Magnetometer {name}: {finding.text}")
 
 
 def _how(names: list[str], missing: list[str], *, anew: bool) -> Iterator[Finding]:
-    text = "" if not missing else f"Of {', '.join(missing)} there are no samples."
+    text = "" if not missing else f"There are no samples of magnetometer {', '.join(missing)}."
     if not anew:
         how = (
-            f"The samples of {', '.join(names)} were demodulated each by itself, as magfusion"
-            " demodulate does, before anything else: of the motion inside a window only the turns"
-            " that the IMU tells are taken off."
+            f"The samples of {', '.join(names)} were demodulated separately, as magfusion"
+            " demodulate does, before estimation. Only the IMU's rotation inside a window is"
+            " compensated."
         )
         text = f"{how} {text}".rstrip()
     if text:

@@ -1,4 +1,4 @@
-"""The phasors and the first fixes of a log that has a waveform, or a table of phasors."""
+"""Phasors and first fixes of a log that has a waveform, or a table of phasors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -42,25 +42,25 @@ REST_EPOCH = 0.5  # s; over which the specific force at rest is averaged
 
 @dataclass(frozen=True, eq=False)
 class Demodulation:
-    """The phasors of a log: a table, or of a waveform that can be demodulated anew.
+    """Phasors of a log: a table, or of a waveform that can be demodulated again.
 
     Parameters
     ----------
     fields : FieldSamples
-        The phasors before anything is known of the motion.
+        The phasors before the motion is known.
     dropped : mapping
         Reason to number of windows.
     receiver : Receiver, optional
-        Of the waveform; None where the log holds phasors.
+        Of the waveform; None where the log has only phasors.
     windows : Windows, optional
-        That it admitted.
+        Windows of the receiver.
     drowned : bool ndarray, shape (n, channels), optional
-        Phasors left out of ``fields`` in which the motion may hide a beacon; None where the log
-        holds phasors.
+        Phasors omitted from ``fields`` in which the motion may mask a beacon; None where the log
+        has only phasors.
     blind : bool ndarray, shape (n,), optional
-        Windows in which what the fields tell of the motion stands in for inertial samples.
+        Windows in which the motion from the fields replaces inertial samples.
     without_turn : Windows
-        That were dropped for want of inertial samples alone.
+        Those dropped only for missing inertial samples.
     close : CloseLog, optional
         Its short windows, where the tones are close.
     """
@@ -77,23 +77,23 @@ class Demodulation:
 
     @property
     def anew(self) -> bool:
-        """Whether there are samples to demodulate again, once the motion is known."""
+        """Whether samples are available to demodulate again, once the motion is known."""
         return self.log.waveform is not None
 
     def steady(self, calibration: Calibration) -> SteadyFields:
-        """Return the Earth field and the offset before anything is known of the motion.
+        """Return the Earth field and the offset before the motion is known.
 
         Raises
         ------
         InputError
-            Where the log holds only phasors, or is of time slots.
+            Where the log has only phasors, or time slots.
         """
         waveform = self.log.waveform
         if self.receiver is None or waveform is None:
             if self.log.steady is None:
                 raise InputError(
-                    "the log holds only phasors, which know nothing of the Earth field; give the"
-                    " log with magnetometer.parquet, or leave --earth out"
+                    "the log has only phasors, which do not contain the Earth field; give the"
+                    " log with magnetometer.parquet, or omit --earth"
                 )
             return self.log.steady
         assert self.windows is not None
@@ -107,16 +107,16 @@ class Demodulation:
     def compensated(
         self, calibration: Calibration, states: Trajectory, path: Trajectory | None = None
     ) -> MotionCompensated:
-        """Return the phasors with the motion inside the windows taken off.
+        """Return the phasors, compensated for the motion inside the windows.
 
-        A slot is too short for more than the gyro's bias to matter.
+        A slot is so short that only the gyro's bias matters.
 
         Parameters
         ----------
         states : Trajectory
             At the centres of the windows.
         path : Trajectory, optional
-            All that there are, where those of the windows are not.
+            All states, where these are not those of the windows.
         """
         waveform, imu, offset = self.log.waveform, self.log.imu, calibration.time_offset
         assert waveform is not None
@@ -132,7 +132,7 @@ class Demodulation:
             waveform, imu, offset, states if path is None else path, windows, site
         )
         operator = self.receiver.operator(waveform, known, windows, site, turn)
-        del known  # of a long log it is as much as the log
+        del known  # as large as the log
         if self.blind is not None:
             operator = replace(operator, apart=self.blind)
         wave = demodulate_about(
@@ -159,7 +159,7 @@ def _integrated_once(
     windows: Windows,
     site: Site,
 ) -> tuple[KnownMotion | None, BodyTurn | None]:
-    """Return the motion along the samples, and how it turns them; None where it comes in parts."""
+    """Return the motion and rotation along the samples; None where it is processed in segments."""
     if len(waveform) > STRETCH:
         return None, None
     shape = MotionShape.of(path, imu, offset, site.gravity)
@@ -174,7 +174,7 @@ def _bias_at(time: Array, states: Trajectory) -> Array:
     return interpolated(time, states.time, states.gyro_bias_body)
 
 
-OFF_GRAVITY = 0.5  # of it; a specific force farther from it is not its opposite
+OFF_GRAVITY = 0.5  # of gravity; a specific force that deviates by more is not its opposite
 
 
 def demodulated(log: Log, site: Site, settings: LockinSettings | None = None) -> Demodulation:
@@ -196,7 +196,7 @@ def demodulated(log: Log, site: Site, settings: LockinSettings | None = None) ->
     windows, fields = receiver.whole(log.waveform, log.imu)
     refuse_too_deep(fields, site)
     heard, hidden = without_silence(fields), drowned(fields)
-    if tones_of(site).reused:  # the states will tell better whose a phasor is
+    if tones_of(site).reused:  # the states will assign phasors to beacons better
         hidden |= ~fields.valid
     without = receiver.without_turn if isinstance(receiver, LockinReceiver) else Windows.none()
     dropped = receiver.dropped
@@ -209,7 +209,7 @@ def demodulated(log: Log, site: Site, settings: LockinSettings | None = None) ->
 def phasors(
     log: Log, site: Site, settings: LockinSettings | None = None
 ) -> tuple[FieldSamples, Mapping[str, int]]:
-    """Return the phasors of a log, and how many windows were dropped; as `demodulated`."""
+    """Return the phasors of a log and the number of dropped windows, as `demodulated`."""
     found = demodulated(log, site, settings)
     return found.fields, found.dropped
 
@@ -220,7 +220,7 @@ def gravity_at_rest(imu: ImuSamples, site: Site, time: Array) -> Gravity | None:
     Parameters
     ----------
     site : Site
-        Its accelerometer bias limits how well the direction is known.
+        Its accelerometer bias limits the accuracy of the direction.
     time : ndarray, shape (n,)
         Epochs (s).
     """
@@ -251,7 +251,7 @@ def first_fixes(
 ) -> Fixes:
     """Return the fix of every epoch, with gravity where the platform rests.
 
-    Of coils driven in turn a whole cycle is one epoch.
+    With time-multiplexed coils a whole cycle is one epoch.
     """
     epochs, gravity = fix_inputs(samples, log, calibration.site)
     return fix_epochs(epochs, calibration, gravity=gravity, free=free)

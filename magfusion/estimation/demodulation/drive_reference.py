@@ -1,4 +1,4 @@
-"""Phasors referred to drive currents that were recorded beside the field."""
+"""Phasors referred to drive currents recorded with the field."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,11 +14,11 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.drive import DriveReceiver
 from magfusion.receiver.sampling_clock import sampling_clock
 
-FAR = 3.0  # times the declared current; more is a mistake of its unit
+FAR = 3.0  # times the declared current; more is an error of its unit
 
 
 def cosines(rotation: RotorAngles) -> DriveSamples:
-    """Return angles of shafts as the currents that stand for them: one ampere at its peak."""
+    """Return shaft angles as equivalent currents: their cosine, with one ampere peak."""
     own = {name: np.cos(angle) for name, angle in rotation.angle.items()}
     return DriveSamples(rotation.time, own)
 
@@ -26,13 +26,13 @@ def cosines(rotation: RotorAngles) -> DriveSamples:
 def turning_currents(log: Log, site: Site) -> Log:
     """Return a log in which an encoder's angle is a current: its cosine, of one ampere.
 
-    What is said of currents holds for it: phasors are referred to it, and the speed may drift
-    within the lock-in's width.
+    It is used like a current: phasors are referred to it, and the speed may drift within the
+    lock-in's width.
 
     Raises
     ------
     InputError
-        Where an angle is of no rotor of the site, or one with harmonics, of which it is no current.
+        Where an angle is of no rotor of the site, or of one with harmonics, which is no current.
     """
     if log.rotation is None:
         return log
@@ -40,13 +40,13 @@ def turning_currents(log: Log, site: Site) -> Log:
     for name in log.rotation.angle:
         if name not in rotors:
             raise InputError(
-                f"rotor_{name}: the site has no rotor of this name; describe beacon {name} with"
-                " rotor, or leave the column out"
+                f"rotor_{name}: the site has no rotor of this name; declare beacon {name} with"
+                " rotor, or omit the column"
             )
         if len(rotors[name].tones) > 1:
             raise InputError(
-                f"rotor_{name}: the angle of a rotor with harmonics is used by magfusion range"
-                " alone; leave harmonics out of the site"
+                f"rotor_{name}: only magfusion range uses the angle of a rotor with harmonics;"
+                " omit harmonics from the site"
             )
     turned, known = cosines(log.rotation), log.drive
     if known is not None:
@@ -59,7 +59,7 @@ def turning_currents(log: Log, site: Site) -> Log:
 
 
 def with_drives(log: Log, site: Site) -> tuple[Log, Site]:
-    """Return a site that knows the currents of a log's coils, and the log with what is said of it.
+    """Return the log with its findings on drive currents, and a site with these currents.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def with_drives(log: Log, site: Site) -> tuple[Log, Site]:
 
 
 def drive_findings(receiver: DriveReceiver, site: Site) -> Iterator[Finding]:
-    """Yield what is wrong with currents."""
+    """Yield the findings of implausible or noisy currents."""
     for beacon in site.beacons:
         limit = site.model_error if beacon.model_error is None else beacon.model_error
         for tone in range(len(beacon.tones)):
@@ -92,17 +92,16 @@ def drive_findings(receiver: DriveReceiver, site: Site) -> Iterator[Finding]:
             if not 1.0 / FAR < times < FAR:
                 yield Finding(
                     "drive_current",
-                    f"The recorded current of beacon {beacon.name} is {times:.3g} times the one for"
-                    " which its moments are declared. Give the column in A, and current_a as its"
-                    " peak.",
+                    f"The recorded current of beacon {beacon.name} is {times:.3g} times that of"
+                    " its declared moments. Give the column in A, and current_a as its peak.",
                     Verdict.DOUBTFUL,
                 )
             elif noise > limit:
                 yield Finding(
                     "drive_current",
-                    f"The recorded current of beacon {beacon.name} is known to no better than"
-                    f" {100.0 * noise:.2g} % in a window, and its field model to"
-                    f" {100.0 * limit:.2g} %. Record it with less noise, or leave it out.",
+                    f"The recorded current of beacon {beacon.name} has a noise of"
+                    f" {100.0 * noise:.2g} % in a window, above its model error of"
+                    f" {100.0 * limit:.2g} %. Record it with less noise, or omit it.",
                     Verdict.DOUBTFUL,
                 )
 
@@ -110,7 +109,7 @@ def drive_findings(receiver: DriveReceiver, site: Site) -> Iterator[Finding]:
 def referred(fields: FieldSamples, site: Site) -> FieldSamples:
     """Return phasors as they would be measured at the declared currents.
 
-    Where a coil was off there is none.
+    NaN where a coil was off.
     """
     known = driven(site, fields.time)
     if known is None:

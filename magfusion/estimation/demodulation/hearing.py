@@ -1,4 +1,4 @@
-"""Which of many beacons a log hears: the others stay as they are declared."""
+"""Selection of the beacons that a log detects, of many: the others remain as declared."""
 
 from dataclasses import replace
 
@@ -18,18 +18,18 @@ from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import IntArray
 
-HEARD = 1.0  # sigmas of a phasor: a beacon that is nowhere so loud is not heard
+HEARD = 1.0  # sigmas of a phasor: a beacon below it everywhere is not detected
 
 
 def heard_site(log: Log, site: Site, settings: LockinSettings | None = None) -> tuple[Log, Site]:
-    """Return a log and its site with those beacons that it hears, where the site has many.
+    """Return a log and its site with the beacons it detects, where the site has many.
 
-    Those that are not heard are kept beside them (`Site.unheard`).
+    Those that are not detected are kept separately (`Site.unheard`).
 
     Raises
     ------
     InputError
-        Where no beacon is heard.
+        Where no beacon is detected.
     """
     known = [beacon.unknown is None for beacon in site.beacons]
     if not are_many(site) or site.unheard or has_schedule(site) or not all(known):
@@ -39,7 +39,7 @@ def heard_site(log: Log, site: Site, settings: LockinSettings | None = None) -> 
         return log, site
     if len(heard) == 0:
         raise InputError(
-            f"none of the {len(site.beacons)} beacons of the site is heard; bring the sensor nearer"
+            f"none of the site's {len(site.beacons)} beacons is detected; reduce the distance"
         )
     every, kept = dict(enumerate(site.beacons)), set(heard.tolist())
     some = replace(
@@ -51,15 +51,15 @@ def heard_site(log: Log, site: Site, settings: LockinSettings | None = None) -> 
     if fields is not None:
         fields = samples_of(fields, channels_of(site, heard))
     text = (
-        f"{len(heard)} of the site's {len(every)} beacons are heard. Of the others nothing is"
-        " learnt: they stay as declared."
+        f"{len(heard)} of the site's {len(every)} beacons are detected. The others are not"
+        " estimated: they remain as declared."
     )
     said = Finding("beacons_unheard", text, Verdict.TRUSTWORTHY, 0.0)
     return replace(log, fields=fields, noticed=(*log.noticed, said)), some
 
 
 def _heard(log: Log, site: Site, settings: LockinSettings | None) -> IntArray:
-    """Return the numbers of the beacons that a log hears."""
+    """Return the indices of the beacons that a log detects."""
     if log.waveform is None:
         assert log.fields is not None
         loud = above_noise(log.fields, DETECTION_CHI_SQUARE_ONLINE)

@@ -1,4 +1,4 @@
-"""What the lock-in makes of motion inside its window, predicted and taken off."""
+"""Prediction and removal of the effect of motion inside a lock-in window."""
 
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -27,26 +27,26 @@ from magfusion.receiver.lockin_receiver import LockinReceiver
 from magfusion.receiver.turn import BodyTurn, on_clock
 from magfusion.units import Array, BoolArray, ComplexArray
 
-# By how much a motion that was found without an IMU errs within a window, one sigma.
+# Error within a window of a motion estimated without an IMU, one sigma.
 MISSED_SPIN, MISSED_PUSH = 1.5, 3.0  # rad/s^2, m/s^2
 
 
 @dataclass(frozen=True, eq=False)
 class MotionCompensated:
-    """Phasors at the centres of the windows, freed of what motion inside the window does.
+    """Phasors at the centres of the windows, without the effect of motion inside the window.
 
     Parameters
     ----------
     by_time_offset : complex ndarray, shape (n, channels, 3)
-        Derivative of what was taken off by the IMU's time offset at fixed states (T/s).
+        Derivative of the removed effect by the IMU's time offset at fixed states (T/s).
     steady : SteadyFields
         The Earth field and the offset.
     unseen : bool
-        Whether nothing was known of the motion, and nothing taken off.
+        Whether the motion was unknown, and nothing was removed.
     unexplained_sensor : ndarray, shape (samples, 3), optional
-        What the prediction leaves of the samples (T), where it is asked for with
+        Samples minus their prediction (T), where requested with ``wanted``.
     wanted : Trajectory, optional
-        the motion at other times.
+        Motion at other times.
     """
 
     fields: FieldSamples
@@ -65,14 +65,14 @@ class MotionCompensated:
 
 
 class TakenOff(NamedTuple):
-    """What a prediction leaves of samples.
+    """Residuals of samples after a prediction.
 
     Parameters
     ----------
     unexplained_sensor, change_sensor : ndarray, shape (samples, 3)
-        What is left (T), and the prediction's derivative by the IMU's time offset (T/s).
+        Residual (T), and the prediction's derivative by the IMU's time offset (T/s).
     wanted : Trajectory, optional
-        The motion at other times that were asked for.
+        Motion at the other requested times.
     """
 
     unexplained_sensor: Array
@@ -83,7 +83,7 @@ class TakenOff(NamedTuple):
 
 
 class KnownMotion(NamedTuple):
-    """The motion along the samples of one window, and its turn at them (4, samples).
+    """Motion along the samples of one window, and its rotation at them (4, samples).
 
     As of `MotionShape.turned_at`.
     """
@@ -102,20 +102,20 @@ def taken_off(
     wanted: Array | None = None,
     known: KnownMotion | None = None,
 ) -> TakenOff:
-    """Return what a prediction along a motion leaves of samples.
+    """Return the residuals of samples after a prediction along a motion.
 
     Parameters
     ----------
     path : Trajectory
-        States between which the motion is interpolated, with the shape of the IMU's.
+        States between which the motion is interpolated by the IMU.
     time_offset : float
         Of the IMU (s).
     window : float
-        A beacon is predicted that is felt in windows so long (s).
+        Window length (s) that sets which beacons are predicted.
     wanted : ndarray, shape (m,), optional
-        Other times at which the motion is asked for (s).
+        Other requested times of the motion (s).
     known : KnownMotion, optional
-        The motion, where it is known.
+        The motion, if known.
     """
     site, measured_sensor = calibration.site, samples.measured_sensor
     earth = np.zeros(3) if site.earth_field_world is None else site.earth_field_world
@@ -158,10 +158,10 @@ def demodulate_about(
     wanted: Array | None = None,
     motion: KnownMotion | None = None,
 ) -> MotionCompensated:
-    """Demodulate what a prediction of the waveform leaves, and add the phasors at the centres.
+    """Demodulate the residuals of a waveform prediction, and add the phasors at the centres.
 
-    The raw samples of each window are predicted from the state and from the IMU's motion inside
-    the window; only what they differ by from the measured ones passes through the lock-in.
+    The raw samples of each window are predicted from the state and the IMU's motion inside the
+    window; only the difference to the measured samples passes through the lock-in.
 
     Parameters
     ----------
@@ -170,11 +170,11 @@ def demodulate_about(
     states : Trajectory
         At the centres of the windows.
     path : Trajectory, optional
-        States between which the motion is interpolated, where they are not those of the windows.
+        States between which the motion is interpolated, where these are not those of the windows.
     wanted : ndarray, shape (m,), optional
-        Other times at which the motion is asked for (s), with what is left of the samples.
+        Other times of the motion (s); with them the residuals are returned too.
     motion : KnownMotion, optional
-        Along the samples, where it is known.
+        Along the samples, if known.
     """
     site, known = calibration.site, states if path is None else path
     samples = Waveform(operator.designs.time, measured_sensor)
@@ -198,10 +198,10 @@ def demodulate_about(
 
 
 def _of_loudest(fields: FieldSamples, sending: Sending, states: Trajectory) -> FieldSamples:
-    """Return phasors of the loudest on each frequency; what is foreseen of the others is off."""
+    """Return phasors of the strongest on each frequency, minus the prediction of the others."""
     site = sending.calibration.site
     places = sensor_positions(site, states)
-    place = places[:, 0]  # samples are demodulated of one magnetometer alone
+    place = places[:, 0]  # samples are of a single magnetometer
     unknown = np.ones((len(place), len(site.channels)))
     felt = sending.along(states)
     far = np.stack([norm(place - b.position_world, axis=1) for b in felt.site.beacons], axis=1)
@@ -216,14 +216,14 @@ def _of_loudest(fields: FieldSamples, sending: Sending, states: Trajectory) -> F
 def _without_motion(
     operator: WindowOperator, measured_sensor: Array, offset: Array
 ) -> MotionCompensated:
-    """Demodulate windows of whose motion nothing is known."""
+    """Demodulate windows of unknown motion."""
     fields, steady = operator.demodulate(measured_sensor - offset)
     steady = replace(steady, measured_sensor=steady.measured_sensor + offset)
     return MotionCompensated(fields, np.zeros_like(fields.phasor_sensor), steady, unseen=True)
 
 
 def _by_strength(operator: WindowOperator, measured_sensor: Array, site: Site) -> MotionCompensated:
-    """Demodulate windows of beacons that share frequencies, wherever they were recorded."""
+    """Demodulate windows of beacons that share frequencies, independent of the position."""
     found = _without_motion(operator, measured_sensor, site.platform.magnetometer.offset)
     try:
         fields = owned_by(found.fields, site)
@@ -244,7 +244,7 @@ def demodulate_predicted(
     blind: bool = False,
     lost: bool = False,
 ) -> MotionCompensated:
-    """Demodulate one window about a prediction.
+    """Demodulate one window about a predicted state.
 
     Parameters
     ----------
@@ -257,9 +257,9 @@ def demodulate_predicted(
     offset : float
         IMU time offset with which the states were propagated (s).
     blind : bool
-        Whether samples stand in for inertial ones.
+        Whether other samples replace inertial ones.
     lost : bool
-        Whether the prediction may be anywhere, so that it tells not whose a phasor is.
+        Whether the predicted position is unknown, so that it does not assign phasors to beacons.
     """
     assert receiver.grid is not None
     window = receiver.grid.windows(np.array([number]), waveform.time)
@@ -298,14 +298,14 @@ def noisier(
     calibration: Calibration,
     window: float,
 ) -> FieldSamples:
-    """Return phasors with the noise of a shape of the motion that was missed.
+    """Return phasors with the noise by an error of the motion's shape.
 
-    It moves all channels alike: that they are taken for independent must not average it out.
+    It is common to all channels: assuming them independent must not average it out.
 
     Parameters
     ----------
     blind : bool ndarray, shape (n,)
-        Windows in which the motion was found without an IMU.
+        Windows whose motion was estimated without an IMU.
     states : Trajectory
         At their centres.
     window : float
@@ -320,7 +320,7 @@ def noisier(
     by = (by_pose * shape).reshape(len(rows), channels, 2, 3, 6)
     cov = samples.phasor_cov.copy()
     missed = 0.5 * channels * np.einsum("nckxi,nckyi->ncxy", by, by)
-    # What is found of the noise of a beacon is not of this.
+    # The estimated noise factor of a beacon does not apply to this.
     site = calibration.site
     factor = np.array([beacon.noise_factor for beacon in site.beacons])[site.owner]
     cov[rows] += missed / factor[:, None, None] ** 2

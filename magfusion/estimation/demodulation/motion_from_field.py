@@ -1,12 +1,13 @@
-"""The motion while the IMU is silent, from the magnetometer's samples one by one.
+"""Motion in a gap of the IMU, from single samples of the magnetometer.
 
-A window of the lock-in is long against a fast turn: without the gyro the Earth field leaks into
-every tone.  But each sample holds the Earth field, whose direction gives two angles at once, and
-the tones, which give the third and the place.  A filter over the samples, from the last state that
-is known, and back again (Rauch, Tung and Striebel), follows a turn of several radians a second.
-Where the gyro is heard, before a gap and behind it, the filter takes its rates: a short gap is as
-good as interpolated.  What it finds takes the place of inertial samples: as the shape of the motion
-only, with the noise of a stretch that has none.
+A window of the lock-in is long compared with a fast turn: without the gyro the Earth field leaks
+into every tone.  But each sample contains the Earth field, whose direction gives two angles at
+once, and the tones, which give the third and the position.  A filter over the samples, from the
+last known state, and back again (Rauch, Tung and Striebel), tracks a turn of several radians a
+second.
+Where gyro samples exist, before and after a gap, the filter uses their rates: a short gap is as
+good as interpolated.  The estimate replaces inertial samples as the shape of the motion only, with
+the noise of a gap.
 """
 
 from dataclasses import dataclass, replace
@@ -23,10 +24,10 @@ from magfusion.units import Array
 
 TURN_NOISE = 20.0  # rad/s^2/sqrt(Hz); of a hand that turns as fast as it can
 PUSH_NOISE = 10.0  # m/s^2/sqrt(Hz); likewise
-FASTEST_TURN = 5.0  # rad/s; of which the rate at the beginning is one sigma
+FASTEST_TURN = 5.0  # rad/s; one sigma of the initial rate
 STEADY_ERROR = 3e-4  # of the steady field: vibration, which no path follows
 FIELD_ERROR = 1e-2  # of the beacons' fields: iron, and the calibration
-FIRST_STEADY = 1e-6  # T; how far the steady field may be from what the first sample says
+FIRST_STEADY = 1e-6  # T; error of the steady field in the first sample
 GYRO_ERROR = 0.05  # rad/s; of a rate between two samples of a gyro: vibration
 WORST_MISFIT = 5.0  # mean squared innovation, in units of its expectation
 FEWEST = 8  # samples
@@ -40,7 +41,7 @@ class _Motion:
     velocity_world: Array
     rate_body: Array
     steady_world: Array
-    cov: Array  # (15, 15): turn and place in body axes, as of a pose
+    cov: Array  # (15, 15): rotation and position in body axes, as of a pose
 
     def moved(self, step: Array, cov: Array) -> "_Motion":
         turn = Rotation.from_rotvec(step[TURN]).as_matrix()
@@ -54,7 +55,7 @@ class _Motion:
         )
 
     def step_to(self, other: "_Motion") -> Array:
-        """Return the step that takes this to another: the inverse of `moved`."""
+        """Return the step from this motion to another: the inverse of `moved`."""
         back = self.world_from_body.T
         return np.concatenate(
             [
@@ -67,7 +68,7 @@ class _Motion:
         )
 
     def after(self, elapsed: float) -> tuple["_Motion", Array]:
-        """Return it a little later, and the transition."""
+        """Return the motion after an interval, and the transition."""
         turn = Rotation.from_rotvec(elapsed * self.rate_body).as_matrix()
         by = np.eye(MOTION)
         by[TURN, TURN] = by[PLACE, PLACE] = turn.T
@@ -87,13 +88,13 @@ class _Motion:
 
 @dataclass(frozen=True, eq=False)
 class FieldMotion:
-    """How the platform moved by the field.
+    """Motion of the platform from the field.
 
     Parameters
     ----------
     imu : ImuSamples
-        What an IMU would have measured, at the times of the magnetometer's samples on the log's
-        clock, with the biases of the state that it was followed from.
+        Equivalent IMU samples, at the times of the magnetometer's samples on the log's clock, with
+        the biases of the initial state.
     path : Trajectory
         Poses and velocities at the same times.
     """
@@ -105,16 +106,16 @@ class FieldMotion:
 def motion_from_field(
     state: State, waveform: Waveform, imu: ImuSamples | None = None, longest_step: float = 0.0
 ) -> FieldMotion | None:
-    """Return how the platform moved while a magnetometer measured; None where that is not told.
+    """Return the motion of the platform from magnetometer samples; None where undetermined.
 
     Parameters
     ----------
     state : State
         At or before the first sample.
     waveform : Waveform
-        Samples that follow.
+        Following samples.
     imu : ImuSamples, optional
-        Of the same stretch, on the log's clock: what there is.
+        Available samples of the same interval, on the log's clock.
     longest_step : float
         Between two inertial samples (s); a longer one is a gap.
     """
@@ -152,7 +153,7 @@ def motion_from_field(
 
 
 def _rates_at(time: Array, imu: ImuSamples | None, longest_step: float) -> Array:
-    """Return the gyro's rates at some times, shape (n, 3); NaN where it is silent (rad/s)."""
+    """Return the gyro's rates at some times, shape (n, 3); NaN in gaps (rad/s)."""
     if imu is None or len(imu) == 0:
         return np.full((len(time), 3), np.nan)
     step = np.concatenate([[np.inf], np.diff(imu.time), [np.inf]])
@@ -162,7 +163,7 @@ def _rates_at(time: Array, imu: ImuSamples | None, longest_step: float) -> Array
 
 
 def _turning(motion: _Motion, rate: Array) -> _Motion:
-    """Return a motion whose rate was measured (rad/s)."""
+    """Return a motion with a measured rate (rad/s)."""
     spread = motion.cov[RATE, RATE] + GYRO_ERROR**2 * np.eye(3)
     gain = np.linalg.solve(spread, motion.cov[RATE]).T
     left = np.eye(MOTION)

@@ -1,4 +1,4 @@
-"""The motion between states, of the IMU's shape; and how it changes with the IMU's time offset."""
+"""Interpolated motion between states by the IMU, and its derivative by the IMU's time offset."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,12 +26,12 @@ from magfusion.model.strapdown import turn_at, turn_from_gyro
 from magfusion.model.trajectory import Trajectory, interpolated
 from magfusion.units import Array
 
-MARGIN = 3  # inertial samples on either side of what is asked
-AT_ONCE = 1 << 14  # samples that are turned at once: what is made of them stays in the cache
+MARGIN = 3  # inertial samples on either side of the requested times
+AT_ONCE = 1 << 14  # samples that are rotated at once: intermediate results stay in the cache
 
 
 class _ByOffset(NamedTuple):
-    """What the IMU's time offset changes, at its samples (n, 3) and at the states.
+    """Derivatives by the IMU's time offset, at its samples (n, 3) and at the states.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class _ByOffset(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MotionShape:
-    """The IMU integrated once over a log, and what it lacks at the states spread between them.
+    """The IMU integrated once over a log, with its errors at the states spread between them.
 
     Parameters
     ----------
@@ -58,21 +58,21 @@ class MotionShape:
     time : ndarray, shape (n,)
         Of the inertial samples, on the log's clock (s).
     gyro_body : ndarray, shape (n, 3)
-        Freed of the bias (rad/s).
+        Without the bias (rad/s).
     chain : ndarray, shape (4, n)
         ``body(0)_from_body(k)``, quaternions, scalar first.
     world_from_start : ndarray, shape (4, states)
         At the states.
     spread : ndarray, shape (3, states - 1)
-        The turn that is spread between each state and the next (rad).
+        Rotation error spread between each state and the next (rad).
     world_from_body : ndarray, shape (4, n)
         At the inertial samples.
     accel_world, velocity_world, position_world : ndarray, shape (n, 3)
         As integrated from rest at the origin (m/s^2, m/s, m).
     reach : int
-        Inertial samples on either side over which `changing_at` averages.
+        Number of inertial samples on either side over which `changing_at` averages.
     usual : float
-        Usual time between two inertial samples (s).
+        Median interval of the inertial samples (s).
     """
 
     states: Trajectory
@@ -107,9 +107,9 @@ class MotionShape:
         gravity : float
             (m/s^2)
         reach : int, optional
-            Where the samples are a part of a stream that has its own.
+            Where the samples are a part of a longer stream.
         usual : float, optional
-            Usual time between two samples (s), where it is known.
+            Usual interval of the samples (s), if known.
         """
         if states.velocity_world is None or states.gyro_bias_body is None:
             raise ValueError("states must have velocity and biases")
@@ -128,7 +128,7 @@ class MotionShape:
             start = _turn_at(states.time, world_from_start, spread, time[rows])
             world_from_body[:, rows] = product(start, chain[:, rows])
             world_accel[rows] = turned(world_from_body[:, rows], accel[rows].T).T
-        del accel  # of a long log each of these is a good part of the log
+        del accel  # each of these takes a good part of the log's memory
         world_accel -= [0.0, 0.0, gravity]
         velocity, position = _integrated(time, world_accel)
         return MotionShape(
@@ -160,7 +160,7 @@ class MotionShape:
         wanted : ndarray, shape (m,)
             Strictly increasing (s).
         turned : ndarray, shape (4, m), optional
-            As of `turned_at`, where it is known.
+            As of `turned_at`, if known.
 
         Returns
         -------
@@ -184,10 +184,9 @@ class MotionShape:
     ) -> tuple[Trajectory, tuple[Array, Array]]:
         """Return the motion at any times as `at`, and its derivative by the IMU's time offset.
 
-        The states stay where they are.  The stream's shape comes later by it: everywhere the body
-        has yet to turn and to move as much as it does in that time, less what it has at the states.
-        Rate and specific force are averaged (`low_passed`): white noise in a derivative would pass
-        for information.
+        The states are fixed, and the stream is delayed: every pose changes by the motion in that
+        time, minus the change at the states.  Rate and specific force are averaged (`low_passed`),
+        since white noise in a derivative would appear as information.
 
         Returns
         -------
@@ -218,13 +217,13 @@ class MotionShape:
         return matrices(unit(product(start, turned)))
 
     def _near(self, wanted: Array) -> slice:
-        """Return the inertial samples that tell of some times, with a few about them."""
+        """Return the inertial samples needed for some times, with a margin."""
         first, last = np.searchsorted(self.time, wanted[[0, -1]])
         return slice(max(min(first, len(self.time)) - MARGIN, 0), last + MARGIN)
 
     @cached_property
     def _lack(self) -> tuple[Array, Array]:
-        """What the integrated position and velocity lack at the states, shape (states, 3)."""
+        """Errors of the integrated position and velocity at the states, shape (states, 3)."""
         states = self.states
         assert states.velocity_world is not None
         path = self.time, self.position_world, self.velocity_world
@@ -233,7 +232,7 @@ class MotionShape:
 
     @cached_property
     def _with_change(self) -> tuple[Array, Array]:
-        """Position and velocity, and what the time offset changes of them, shape (n, 6)."""
+        """Position and velocity, and their derivatives by the time offset, shape (n, 6)."""
         late = self._by_offset
         return (
             np.concatenate([self.position_world, late.position], axis=1),
@@ -242,7 +241,7 @@ class MotionShape:
 
     @cached_property
     def _lack_with_change(self) -> tuple[Array, Array]:
-        """As `_lack`, and the changes that the states hold back, shape (states, 6)."""
+        """As `_lack`, and the derivatives fixed by the states, shape (states, 6)."""
         states = self.states
         assert states.velocity_world is not None
         place, speed = hermite(self.time, *self._with_change, states.time)
@@ -258,7 +257,7 @@ class MotionShape:
         for rows in _pieces(len(rate)):
             rate[rows] = turned(self.world_from_body[:, rows], rate[rows].T).T
         at_states = interpolated(known, self.time, rate)
-        # What the states hold back of the turn tilts the specific force.
+        # The rotation that the states prevent tilts the specific force.
         for rows in _pieces(len(rate)):
             force = self.accel_world[rows] + np.array([0.0, 0.0, self.gravity])
             held = interpolated(self.time[rows], known, at_states)
@@ -269,8 +268,8 @@ class MotionShape:
         speed -= self.accel_world
         position = self._averaged(moved)
         del moved
-        # Beside a gap, and at the ends, a mean is of another time: what has been gathered of speed
-        # since the beginning must not matter there.
+        # Near a gap, and at the ends, a mean is of another time: the speed gained since the
+        # beginning must not matter there.
         since = self.time - self.time[0]
         late = self._averaged(since) - since
         uneven = np.flatnonzero(np.abs(late) > 0.5 * self.usual)
@@ -286,7 +285,7 @@ class MotionShape:
 def motion_at(
     states: Trajectory, imu: ImuSamples, time_offset: float, gravity: float, wanted: Array
 ) -> Trajectory:
-    """Return the motion at any times: the IMU's shape between the states, through the states.
+    """Return the motion at any times, interpolated through the states by the IMU.
 
     Parameters
     ----------
@@ -324,13 +323,13 @@ def _integrated(time: Array, rate: Array) -> tuple[Array, Array]:
 
 
 def _pieces(count: int) -> Iterator[slice]:
-    """Yield rows, as many at once as stay in the cache."""
+    """Yield slices of rows that fit the cache."""
     for begin in range(0, count, AT_ONCE):
         yield slice(begin, min(begin + AT_ONCE, count))
 
 
 def _between(turn: Array) -> Array:
-    """Return the vectors of the turns between neighbours, (4, states) to (3, states - 1) (rad)."""
+    """Return the rotation vectors between neighbours, (4, states) to (3, states - 1) (rad)."""
     between = product(inverse(turn[:, :-1]), turn[:, 1:])
     if not between.shape[1]:
         return np.zeros((3, 0))
@@ -338,9 +337,9 @@ def _between(turn: Array) -> Array:
 
 
 def _turn_at(known: Array, turn: Array, between: Array, wanted: Array) -> Array:
-    """Interpolate slowly varying rotations along great circles, holding the ends.
+    """Interpolate slowly varying rotations along great circles, constant beyond the ends.
 
-    Of shape (4, states) to shape (4, m), scalar first; ``between`` as of `_between`.
+    From shape (4, states) to shape (4, m), scalar first; ``between`` as of `_between`.
     """
     if len(known) == 1:
         return np.repeat(turn, len(wanted), axis=1)

@@ -1,7 +1,7 @@
-"""The motion along a log, a stretch of samples at a time: of a long one the whole is several logs.
+"""The motion along a log in segments of samples, to limit the memory in a long one.
 
-A stretch has the states and inertial samples about it that the motion within hangs on: the shape
-between two states knows nothing of those farther away, but for the averages near them.
+A segment has the states and inertial samples on which its motion depends: the shape between two
+states is independent of those farther away, except for averages near them.
 """
 
 from collections.abc import Iterator
@@ -19,16 +19,16 @@ STRETCH = 1 << 17  # samples; a multiple of those that are predicted at once
 
 
 class Stretch(NamedTuple):
-    """Samples in a row.
+    """Consecutive samples.
 
     Parameters
     ----------
     first, last : int
-        Of the samples, and the one that follows them.
+        Index of the first sample, and of the one after the last.
     since, until : float
         Times that are nearest to them (s).
     shape : MotionShape
-        The motion there.
+        Motion in the segment.
     """
 
     first: int
@@ -38,12 +38,12 @@ class Stretch(NamedTuple):
     shape: MotionShape
 
     def pieces(self, at_once: int) -> Iterator[slice]:
-        """Yield the samples, so many at once."""
+        """Yield slices of the samples, of at most this length."""
         for begin in range(self.first, self.last, at_once):
             yield slice(begin, min(begin + at_once, self.last))
 
     def at_others(self, wanted: Array) -> Trajectory:
-        """Return the motion at those of some times (s) that belong to the stretch."""
+        """Return the motion at those of some times (s) that belong to the segment."""
         own = wanted[(self.since <= wanted) & (wanted < self.until)]
         if not len(own):
             return Trajectory(own, np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
@@ -51,14 +51,14 @@ class Stretch(NamedTuple):
 
 
 def only_stretch(time: Array, shape: MotionShape) -> Iterator[Stretch]:
-    """Yield samples (n,) (s) of which one shape tells the motion."""
+    """Yield all samples (n,) (s) as one segment with a single shape."""
     yield Stretch(0, len(time), -np.inf, np.inf, shape)
 
 
 def stretches(
     time: Array, path: Trajectory, imu: ImuSamples, time_offset: float, gravity: float
 ) -> Iterator[Stretch]:
-    """Yield all samples, a stretch of them after the other.
+    """Yield all samples in consecutive segments.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def stretches(
         yield from only_stretch(time, MotionShape.of(path, imu, time_offset, gravity))
         return
     reach, stamps = low_pass_reach(_usual(imu)), imu.time + time_offset
-    margin = 2 * reach + 2 * MARGIN  # what is averaged is averaged again
+    margin = 2 * reach + 2 * MARGIN  # averages are averaged again
     for first in range(0, len(time), STRETCH):
         last = min(first + STRETCH, len(time))
         states, samples = _about(time[first:last], path.time, stamps, margin)
@@ -88,7 +88,7 @@ def stretches(
 
 
 def joined(parts: list[Trajectory]) -> Trajectory:
-    """Return trajectories that follow each other as one."""
+    """Return consecutive trajectories as one."""
     if len(parts) == 1:
         return parts[0]
     known = (name for name, value in vars(parts[0]).items() if value is not None)
@@ -100,10 +100,10 @@ def _usual(imu: ImuSamples) -> float:
 
 
 def _about(time: Array, known: Array, stamps: Array, margin: int) -> tuple[slice, slice]:
-    """Return the states and the inertial samples that the motion in a stretch hangs on."""
+    """Return the states and the inertial samples on which the motion in a segment depends."""
     first = int(np.searchsorted(known, time[0], side="right")) - 1
     last = int(np.searchsorted(known, time[-1]))
-    begin = end = None  # all that there is, where the stretch is at an end of the log
+    begin = end = None  # unlimited, where the segment is at an end of the log
     if first > 0:
         sample = int(np.searchsorted(stamps, known[first])) - margin
         before = int(np.searchsorted(known, stamps[max(sample, 0)], side="right")) - 2

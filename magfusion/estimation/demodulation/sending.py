@@ -1,4 +1,4 @@
-"""What of a site's beacons is predicted, sample by sample: of many those alone that are felt."""
+"""Prediction of only the beacons of a site with sensed fields, sample by sample."""
 
 from dataclasses import dataclass
 
@@ -9,22 +9,22 @@ from magfusion.model.noise import sensor_positions
 from magfusion.model.parameters import Calibration, beacons_of, of_beacons, with_unheard
 from magfusion.model.trajectory import Trajectory
 
-AT_ONCE = 1 << 14  # samples that are predicted at once: what is made of them fits the cache
-AMONG_MANY = 1 << 11  # the same where the beacons that are felt change with the place
-FAINT = 0.3  # sigmas of a phasor: what is never so loud is not felt
-SEEN_EVERY = 64  # samples; in fewer nobody comes nearer by much
+AT_ONCE = 1 << 14  # samples that are predicted at once: intermediate results fit the cache
+AMONG_MANY = 1 << 11  # the same where the selection of beacons changes with the position
+FAINT = 0.3  # sigmas of a phasor; a beacon always below it is not predicted
+SEEN_EVERY = 64  # samples; in fewer no beacon comes much nearer
 
 
 @dataclass(frozen=True, eq=False)
 class Sending:
-    """The beacons that send.
+    """The beacons that are predicted.
 
     Parameters
     ----------
     calibration : Calibration
-        Of all, heard or not.
+        Of all beacons, detected or not.
     least : float, optional
-        Field of one that is felt (T); None where all are predicted.
+        Minimum field of a predicted beacon (T); None where all are predicted.
     """
 
     calibration: Calibration
@@ -40,11 +40,11 @@ class Sending:
 
     @property
     def at_once(self) -> int:
-        """How many samples are predicted at once."""
+        """Number of samples predicted at once."""
         return AT_ONCE if self.least is None else AMONG_MANY
 
     def along(self, motion: Trajectory) -> Calibration:
-        """Return the calibration of those that are felt along a motion."""
+        """Return the calibration of the beacons sensed along a motion."""
         if self.least is None:
             return self.calibration
         site, few = self.calibration.site, len(motion) <= SEEN_EVERY

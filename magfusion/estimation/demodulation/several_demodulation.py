@@ -1,4 +1,4 @@
-"""The phasors of several magnetometers' samples, each of which can be demodulated anew."""
+"""Phasors of several magnetometers' samples, each of which can be demodulated again."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -22,16 +22,16 @@ from magfusion.units import BoolArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """What one of several magnetometers recorded.
+    """Data of one of several magnetometers.
 
     Parameters
     ----------
     sensor : int
-        Which of the platform's.
+        Index among the platform's.
     rows : int ndarray, shape (n,)
-        The epochs at which its phasors are.
+        Epochs of its phasors.
     demodulation : Demodulation
-        As if it were alone, by the log's clock.
+        Of this magnetometer alone, on the log's clock.
     """
 
     sensor: int
@@ -41,7 +41,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class SeveralDemodulation(Demodulation):
-    """The phasors of several magnetometers, by windows at the same times.
+    """Phasors of several magnetometers, by windows at the same times.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class SeveralDemodulation(Demodulation):
 
     @property
     def anew(self) -> bool:
-        """Whether there are samples to demodulate again, once the motion is known."""
+        """Whether samples are available to demodulate again, once the motion is known."""
         return True
 
     def compensated(
@@ -62,7 +62,7 @@ class SeveralDemodulation(Demodulation):
         states: Trajectory,
         path: Trajectory | None = None,  # noqa: ARG002
     ) -> MotionCompensated:
-        """Return the phasors with the motion inside the windows taken off, of each by its own."""
+        """Return the phasors, compensated for the motion inside the windows of each."""
         fields = self.fields
         phasor = np.full_like(fields.phasor_sensor, np.nan)
         cov = np.full_like(fields.phasor_cov, np.nan)
@@ -80,7 +80,7 @@ class SeveralDemodulation(Demodulation):
 
 
 def same_windows(site: Site, settings: LockinSettings | None) -> LockinSettings | None:
-    """Return how each of several magnetometers is demodulated: at the same times of the log's."""
+    """Return the lock-in settings of each magnetometer, with windows at the same log times."""
     if has_schedule(site):
         return settings
     return replace(usual_lockin(site) if settings is None else settings, origin=0.0)
@@ -94,7 +94,7 @@ def demodulated_several(
     Raises
     ------
     InputError
-        As `magfusion.estimation.demodulation.demodulation.demodulated`, of one that it names.
+        As `magfusion.estimation.demodulation.demodulation.demodulated`, with the name.
     """
     lockin = same_windows(site, settings)
     sensors = [sensor.name for sensor in site.platform.magnetometers]

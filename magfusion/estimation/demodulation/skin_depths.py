@@ -1,4 +1,4 @@
-"""How deep in conducting ground a log was recorded, by the strength of its fields alone."""
+"""Depth of a log in conducting ground, in skin depths, by the strength of its fields alone."""
 
 import numpy as np
 
@@ -12,9 +12,9 @@ DIRECTIONS, EPOCHS = 24, 50
 
 
 def depths_of(samples: FieldSamples, site: Site) -> dict[str, tuple[float, float]]:
-    """Return range (m) and skin depths of each beacon that is detected, within a sixth.
+    """Return range (m) and skin depths of each detected beacon, within a sixth.
 
-    Medians over the log and all directions; nothing where nothing conducts.
+    Medians over the log and all directions; empty where the ground does not conduct.
     """
     found: dict[str, tuple[float, float]] = {}
     if not conductivity_of(site):
@@ -34,7 +34,7 @@ def depths_of(samples: FieldSamples, site: Site) -> dict[str, tuple[float, float
 
 
 def refuse_too_deep(samples: FieldSamples, site: Site) -> None:
-    """Refuse a log whose fields say more of the ground than of the place.
+    """Raise an error for a log whose fields depend more on the ground than on the position.
 
     Raises
     ------
@@ -44,6 +44,6 @@ def refuse_too_deep(samples: FieldSamples, site: Site) -> None:
         if depths * np.exp(-0.5 * site.log_conductivity_sigma) > DEEPEST:
             raise InputError(
                 f"beacon {name} is about {distance:.0f} m away, {depths:.1f} skin depths in ground"
-                f" of {conductivity_of(site):g} S/m, and beyond {DEEPEST:g} its field says more of"
-                " the ground than of the place; lower its frequency, come nearer, or remove it"
+                f" of {conductivity_of(site):g} S/m; beyond {DEEPEST:g} its field depends more on"
+                " the ground than on the position; reduce its frequency or the distance, or omit it"
             )

@@ -1,7 +1,7 @@
-"""Logs and streams freed of what temperature does to them, as far as a site declares it.
+"""Temperature compensation of logs and streams, as far as a site declares coefficients.
 
-The magnetometer's samples are brought to the temperature for which its matrix and offset are
-declared; how the moments of beacons change is a part of the model.
+The magnetometer's samples are converted to the temperature of its declared matrix and offset; the
+temperature dependence of the beacons' moments is a part of the model.
 """
 
 from collections.abc import Iterator
@@ -20,10 +20,10 @@ AT_ONCE = 1 << 14  # samples whose matrix is made at a time
 
 
 def at_reference(log: Log, site: Site) -> tuple[Log, Site]:
-    """Return a log whose magnetometer was at its reference temperature, and the site with the rest.
+    """Return a log at its magnetometer's reference temperature, and the site with the remainder.
 
-    A site that declares what a temperature changes and a log without it are noticed: the reference
-    is taken for it.
+    If a site declares temperature coefficients and the log has no temperature, a finding is added
+    and the reference temperature is assumed.
 
     Raises
     ------
@@ -48,7 +48,7 @@ def at_reference(log: Log, site: Site) -> tuple[Log, Site]:
 
 
 def refuse_warm(site: Site) -> None:
-    """Refuse what temperature does to one of several magnetometers: no record says which it is of.
+    """Raise an error for coefficients of several magnetometers, as records do not name them.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def refuse_warm(site: Site) -> None:
     if warm:
         raise InputError(
             f"platform.magnetometers: {', '.join(warm)}: warming of several magnetometers is not"
-            " taken into account yet; leave it out of the site"
+            " supported yet; omit it from the site"
         )
 
 
@@ -71,9 +71,8 @@ def _missing(known: Temperatures, site: Site) -> Iterator[Finding]:
     if parts:
         yield Finding(
             "temperature_missing",
-            f"The site declares how {', '.join(parts)} changes with temperature, and nothing was"
-            " recorded of that: the temperature is taken for the one of reference. Record it in"
-            " temperature.parquet.",
+            f"The site declares how {', '.join(parts)} changes with temperature, but no temperature"
+            " was recorded: the reference is assumed. Record it in temperature.parquet.",
             Verdict.TRUSTWORTHY,
         )
 
@@ -81,7 +80,7 @@ def _missing(known: Temperatures, site: Site) -> Iterator[Finding]:
 def heard_at_reference(
     known: Temperatures | None, magnetometer: Magnetometer, time: Array, measured: Array
 ) -> Array:
-    """Return samples of a stream as of `samples_at_reference`, as far as its temperature is known.
+    """Return samples of a stream as of `samples_at_reference`, where its temperature is known.
 
     Parameters
     ----------
@@ -107,7 +106,7 @@ def heard_fields_at_reference(
 
 
 def samples_at_reference(measured: Array, degc: Array, magnetometer: Magnetometer) -> Array:
-    """Return samples as the magnetometer would have taken them at its reference temperature.
+    """Return samples converted to the magnetometer's reference temperature.
 
     Parameters
     ----------
@@ -128,7 +127,7 @@ def samples_at_reference(measured: Array, degc: Array, magnetometer: Magnetomete
 def phasors_at_reference(
     fields: FieldSamples, degc: Array, magnetometer: Magnetometer
 ) -> FieldSamples:
-    """Return phasors as they would have been measured at the magnetometer's reference temperature.
+    """Return phasors converted to the magnetometer's reference temperature.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What parameters that are held do to everything that a graph estimates."""
+"""Effect of fixed parameters on all estimates of a graph."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,8 +14,8 @@ from magfusion.model.parameters import Block
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.units import Array
 
-AT_ONCE = 2e8  # bytes; parameters that are held are taken in groups of so much
-PER_COLUMN = 400.0  # bytes that one of them takes of each state, in the graph and eliminated
+AT_ONCE = 2e8  # bytes; fixed parameters are processed in groups of this size
+PER_COLUMN = 400.0  # bytes per parameter and state, in the graph and eliminated
 
 
 def responses(
@@ -24,8 +24,8 @@ def responses(
     """Yield the step of every variable that considered parameters cause.
 
     One for each column of their prior's spread: one sigma of each where they are independent.
-    They are left over when all else is eliminated, so that one elimination serves them all, or of
-    a long log as many as fit in memory.
+    They are eliminated last, so that one elimination serves all of them, or in a long log as many
+    as fit in memory.
     """
     assert graph.declared is not None
     spread, shift = prior_sqrt_covariance(graph.declared.site, considered), None
@@ -46,7 +46,7 @@ def _conditional(
     spread: Array,
     shift: Array | None,
 ) -> gtsam.GaussianBayesNet:
-    """Return everything that is estimated, given columns of what is considered."""
+    """Return the conditionals of all estimates, given columns of considered parameters."""
     assert graph.declared is not None
     linear = replace(graph, declared=None).beside(
         estimate, considered, spread, graph.by_considered(spread)
@@ -59,9 +59,9 @@ def _conditional(
 def steps_of_others(
     conditional: gtsam.GaussianBayesNet, count: int
 ) -> Iterator[gtsam.VectorValues]:
-    """Yield the step of every variable that a unit of each parameter that is held causes.
+    """Yield the step of every variable that a unit of each fixed parameter causes.
 
-    One at a time: of a long log all of them are as much as the log.
+    One at a time: in a long log all of them take as much memory as the log.
     """
     for one in np.eye(count):
         given = gtsam.VectorValues()

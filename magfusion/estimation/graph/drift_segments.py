@@ -1,4 +1,4 @@
-"""A long log in segments: what drifts has values of its own in each, and may step between them."""
+"""Segments of a long log: drifting parameters have a value in each, with a step between them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,19 +13,19 @@ from magfusion.estimation.graph.process_noise import calibration_process_noise
 from magfusion.model.parameters import Block, Calibration, difference, dimension
 from magfusion.units import Array, IntArray
 
-SEGMENT = 1800.0  # s; of a long log, within which nothing is taken to drift
+SEGMENT = 1800.0  # s; of a long log, within which drifting parameters are constant
 
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Stretches of a long log, each with values of its own of what drifts.
+    """Segments of a long log, each with its own values of the drifting parameters.
 
     Parameters
     ----------
     of_epoch : int ndarray, shape (epochs,)
         Segment of each epoch; empty where there is one for all.
     main : int
-        The segment whose values the calibration's own variable holds, with all that stays.
+        Segment whose values are in the calibration's own variable, with all constant parameters.
     drifting : int ndarray, shape (k,)
         Columns of the calibration's tangent vector.
     sqrt_information : ndarray, shape (segments - 1, k, k)
@@ -45,15 +45,15 @@ class Segments:
         return self.of_epoch[epoch] if len(self) > 1 else np.zeros_like(epoch)
 
     def own(self, segment: int) -> tuple[int, IntArray] | None:
-        """Return key and columns of a segment's own variable; None of the main one."""
+        """Return key and columns of a segment's own variable; None for the main one."""
         return None if segment == self.main else (gtsam.symbol("d", segment), self.drifting)
 
     def variables(self) -> Iterator[tuple[int, IntArray]]:
-        """Yield key and columns of every variable beside the calibration's own."""
+        """Yield key and columns of every variable besides the calibration's own."""
         return filter(None, map(self.own, range(len(self))))
 
     def key(self, segment: int) -> int:
-        """Return the key of the variable that holds what drifts."""
+        """Return the key of the variable of a segment's drifting parameters."""
         own = self.own(segment)
         return CALIBRATION_KEY if own is None else own[0]
 
@@ -89,7 +89,7 @@ ONE_SEGMENT = Segments(_NONE, 0, _NONE, np.zeros((0, 0, 0)))
 
 
 def segments_of(time: Array, calibration: Calibration, blocks: tuple[Block, ...]) -> Segments:
-    """Return the segments of a log: one where it is short, or nothing drifts.
+    """Return the segments of a log: one where it is short, or no parameter drifts.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""One linear factor an epoch of a measurement, on its state and on the calibration.
+"""Linear factors of a measurement, one per epoch, on its state and on the calibration.
 
 GTSAM copies all values into every Python callback of a native optimizer, which makes it quadratic.
 Here a measurement is linearised in one call, and each epoch owns one JacobianFactor whose memory is
@@ -30,7 +30,7 @@ def _constant(key: int) -> Key:
 
 
 class Factors:
-    """One linear factor an epoch of a measurement, on its state and on the calibration.
+    """Linear factors of a measurement, one per epoch, on its state and on the calibration.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class Factors:
     blocks : tuple of Block
         Calibration parameters that are estimated.
     own : tuple of int and int ndarray, optional
-        Key of the segment's own variable, and which columns of the calibration it holds.
+        Key of the segment's own variable, and its columns of the calibration.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Factors:
         return 0.5 * float(np.sum(rho))
 
     def linearize(self, states: States, calibration: Calibration) -> gtsam.GaussianFactorGraph:
-        """Return the factors at a new estimate: those of before, rewritten."""
+        """Return the factors at a new estimate, rewritten in place."""
         rows = self.rows(states, calibration, self.blocks)
         parts = self._parts(rows)
         jacobian = np.concatenate([part for _, part in parts], axis=-1)
@@ -90,20 +90,20 @@ class Factors:
         explaining: bool = False,
         nuisance: tuple[Block, ...] = (),
     ) -> gtsam.GaussianFactorGraph:
-        """Return the factors with other parameters, and nothing to explain.
+        """Return the factors with other parameters, and a zero right-hand side.
 
-        With the robust weights of the factors, since an outlier that has little say in the estimate
-        passes little of the others' errors on.
+        The robust weights are those of the factors, since a downweighted outlier transmits little
+        of the other parameters' errors.
 
         Parameters
         ----------
         others : tuple of Block
         spread : ndarray, shape (dimension, dimension)
-            What makes a step of them out of unit noise.
+            Maps unit noise to a step of the other parameters.
         explaining : bool
-            With the residuals to explain after all.
+            With the residuals as right-hand side.
         nuisance : tuple of Block
-            More parameters, as a variable of their own.
+            More parameters, as a separate variable.
         """
         graph = gtsam.GaussianFactorGraph()
         for piece in self.pieces():
@@ -122,14 +122,14 @@ class Factors:
 
     @cached_property
     def told(self) -> list[slice | IntArray]:
-        """Rows of each epoch's factor: all, or of many beacons those that are predicted."""
+        """Rows of each epoch's factor: all, or with many beacons those that are predicted."""
         predicted = self.measurement.predicted_groups()
         if predicted is None:
             return [slice(None)] * len(self.measurement.epoch)
         return [np.flatnonzero(np.repeat(own, 6)) for own in predicted]
 
     def pieces(self) -> Iterator["Factors"]:
-        """Yield the factors of some epochs after the other: derivatives of all take much memory."""
+        """Yield the factors in blocks of epochs, to limit the memory of derivatives."""
         for begin in range(0, len(self.measurement.epoch), PIECE):
             part = self.measurement.rows(slice(begin, begin + PIECE))
             yield Factors(part, self.blocks, self.segment, self.own)
@@ -154,13 +154,13 @@ class Factors:
         return parts
 
     def rows(self, states: States, calibration: Calibration, blocks: tuple[Block, ...]) -> Rows:
-        """Return the rows at an estimate, weighed by the robust loss."""
+        """Return the rows at an estimate, weighted by the robust loss."""
         own = states.rows(self.measurement.epoch)
         found = self.measurement.linearize(own, calibration, blocks)
         return found.weighed(self.measurement.loss)[0]
 
     def _parts(self, rows: Rows) -> list[tuple[Key, Array]]:
-        """Return key and derivative, shape (n, rows, k), of every variable that it feels."""
+        """Return key and derivative, shape (n, rows, k), of every variable involved."""
         by_calibration = rows.by_calibration if self.blocks else None
         every = ((X, rows.by_pose), (V, rows.by_velocity), (B, rows.by_bias))
         parts: list[tuple[Key, Array]] = [
@@ -196,7 +196,7 @@ def empty_factor(parts: Sequence[tuple[int, int]], rows: int) -> gtsam.JacobianF
     parts : sequence of (int, int)
         Key and width of each variable, in the order of the columns.
     rows : int
-        That are to be filled; there may be a few more, which stay zero.
+        To be filled; there may be a few more, which stay zero.
     """
     groups = [parts[i : i + 3] for i in range(0, len(parts), 3)]  # no constructor takes more
     graph, ordering = gtsam.GaussianFactorGraph(), gtsam.Ordering()

@@ -1,4 +1,4 @@
-"""The graph of a log or of a window: inertial factors, measurements, a calibration beside them."""
+"""Graph of a log or a window: inertial factors and measurements, with a shared calibration."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -34,7 +34,7 @@ from magfusion.model.short_repr import short_repr
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
-# The step that a damping of one holds back: metres, radians, m/s, m/s^2, rad/s.
+# Step that a unit damping allows: metres, radians, m/s, m/s^2, rad/s.
 POSE_STEP = np.repeat([0.1, 0.3], 3)
 VELOCITY_STEP = np.full(3, 1.0)
 BIAS_STEP = np.repeat([0.1, 0.01], 3)
@@ -42,16 +42,16 @@ BIAS_STEP = np.repeat([0.1, 0.01], 3)
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What the smoother moves.
+    """Variables that the smoother estimates.
 
     Parameters
     ----------
     values : gtsam.Values
         Pose X(i), velocity V(i) and bias B(i) of each epoch.
     calibration : Calibration
-        Of the main segment of a log that is long enough for some.
+        Of the main segment, where a log is long enough for several.
     segments : tuple of Calibration
-        Of every segment; empty where all have the same.
+        Of every segment; empty where it is the same in all.
     """
 
     __repr__ = short_repr
@@ -74,18 +74,18 @@ class Graph:
     native : gtsam.NonlinearFactorGraph
         Inertial factors and priors of the motion, linearised by GTSAM.
     measurements : tuple of Measurement
-        Each of a kind of its own, for one call each.
+        One per kind, for one call each.
     declared : Calibration, optional
-        Mean of the calibration's prior; None where something else holds it.
+        Mean of the calibration's prior; None where another factor constrains it.
     blocks : tuple of Block
         Calibration parameters that are estimated.
     links : tuple of Link
         Of the last inertial factors of ``native``, where parameters act on the inertial stream;
-        their columns are those of ``blocks``, then of what is considered.
+        their columns are those of ``blocks``, then of the considered parameters.
     segments : Segments
         Of a long log in which the calibration drifts.
     shift : PriorShift, optional
-        What else is uncertain does this to the mean of the prior, where other logs made it.
+        Shift of the prior's mean by other uncertain parameters, where other logs made the prior.
     """
 
     __repr__ = short_repr
@@ -109,7 +109,7 @@ class Graph:
                 yield Factors(part, self.blocks, k, self.segments.own(k))
 
     def _parts(self, measurement: Measurement) -> Iterator[tuple[int, Measurement]]:
-        """Yield the segments that a measurement touches, with its rows in each."""
+        """Yield the segments of a measurement's epochs, with its rows in each."""
         if len(self.segments) == 1:
             yield 0, measurement
             return
@@ -119,7 +119,7 @@ class Graph:
 
     @property
     def ordering(self) -> gtsam.Ordering:
-        """Of elimination: halves before what parts them, the calibration last."""
+        """Elimination order: halves before their separators, the calibration last."""
         if not self.blocks:
             return nested_dissection(self.epochs, None)
         count = range(len(self.segments))
@@ -182,7 +182,7 @@ class Graph:
         return Estimate(values, segments[self.segments.main], tuple(segments))
 
     def damping_scales(self) -> list[tuple[int, Array]]:
-        """Return, for each key, the step that a damping of one holds back."""
+        """Return, for each key, the step that a unit damping allows."""
         scales = {X: POSE_STEP, V: VELOCITY_STEP, B: BIAS_STEP}
         terms = [(symbol(i), step) for symbol, step in scales.items() for i in range(self.epochs)]
         if not self.blocks:
@@ -199,7 +199,7 @@ class Graph:
         Parameters
         ----------
         by_others : ndarray, shape (intervals, 15, others), optional
-            Whitened columns of parameters that are not estimated.
+            Whitened columns of considered parameters.
         """
         graph = self.native.linearize(estimate.values)
         count = len(self.links) if by_others is None else len(by_others)
@@ -233,7 +233,7 @@ class Graph:
         return out
 
     def _by_blocks(self, k: int) -> Array | None:
-        """Return what is estimated does to an inertial factor, if anything."""
+        """Return the columns of estimated parameters in an inertial factor, if any."""
         size = dimension(self.blocks)
         if not self.links or not size:
             return None
@@ -242,13 +242,13 @@ class Graph:
         return by[:, :size]
 
     def by_considered(self, spread: Array) -> Array | None:
-        """Return what considered parameters do to the inertial factors, if anything."""
+        """Return the columns of considered parameters in the inertial factors, if any."""
         if not self.links:
             return None
         size = dimension(self.blocks)
         every = [link.by_calibration for link in self.links]
         known = [by[:, size:] for by in every if by is not None]
-        # What the fields alone tell of comes last, and does nothing here.
+        # Parameters of the fields alone come last, and have no effect here.
         return np.array([by @ spread[: by.shape[1]] for by in known])
 
     def beside(
@@ -261,18 +261,18 @@ class Graph:
         explaining: bool = False,
         nuisance: tuple[Block, ...] = (),
     ) -> gtsam.GaussianFactorGraph:
-        """Return the linear graph at an estimate with the columns of parameters that are held.
+        """Return the linear graph at an estimate with the columns of fixed parameters.
 
         Parameters
         ----------
         spread : ndarray, shape (dimension, columns)
-            What makes a step of them out of each column.
+            Maps each column to a step of the parameters.
         by_others : ndarray, shape (intervals, 15, columns), optional
-            What they do to the inertial factors, whitened.
+            Their effect on the inertial factors, whitened.
         explaining : bool
-            With the residuals to explain, which are zero otherwise.
+            With the residuals as right-hand side, which is zero otherwise.
         nuisance : tuple of Block
-            What is uncertain besides, as the variable `NUISANCE_KEY` with its prior.
+            Other uncertain parameters, as the variable `NUISANCE_KEY` with its prior.
         """
         graph = self.inertial(estimate, by_others)
         for drift in self.segments.factors(self._calibrations(estimate), self.blocks):

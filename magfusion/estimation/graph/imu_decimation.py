@@ -1,12 +1,12 @@
-"""Fewer steps of an inertial stream between epochs far apart, that integrate to the same.
+"""Decimation of an inertial stream between distant epochs, with the same integral.
 
 GTSAM integrates one step a call.  Here the steps of a long interval are joined by tens or more, two
-joined steps at a time: their rates make the turns of the two halves, their specific forces the
-velocity and the position gained over both, exactly as the Galilean group composes them of the
-single steps.  The noise's covariance and the derivatives by the biases are those of the longer
-steps.  GTSAM's scheme of the covariance is of first order: the sigmas differ by less than half a
-step's share of the interval.  The derivatives differ by a twelfth of the square of the turn in a
-step, of a change of bias that the next pass makes nothing.
+joined steps at a time.  Their rates give the rotations of the two halves, their specific forces the
+velocity and position gained over both, exactly as the Galilean group composes them from the single
+steps.  The covariance of the noise and the derivatives by the biases are those of the longer steps.
+GTSAM's covariance scheme is of first order: the sigmas differ by less than half a step's share of
+the interval.  The derivatives differ by a twelfth of the square of the rotation in a step, times a
+change of bias that vanishes with the next iteration.
 """
 
 from bisect import bisect_left
@@ -25,12 +25,12 @@ from magfusion.model.site import ImuModel
 from magfusion.receiver.admission import meets
 from magfusion.units import Array, BoolArray, IntArray
 
-JOINED = (25, 20, 10)  # steps made one
-FEWEST_LEFT = 20  # joined steps of an interval that is thinned: sigmas differ by some thousandths
-ROUGHLY_JOINED, ROUGHLY_LEFT = (20, 10, 7, 5), 8  # where sigmas a tenth wrong do no harm
+JOINED = (25, 20, 10)  # steps joined to one
+FEWEST_LEFT = 20  # minimum of joined steps in an interval: sigmas differ by some thousandths
+ROUGHLY_JOINED, ROUGHLY_LEFT = (20, 10, 7, 5), 8  # where errors of sigmas by a tenth are harmless
 MOST_TURN = 0.5  # rad; within a joined step, for the series and for the derivatives
-CHUNK = 32_768  # steps joined at a time: what is computed of them stays in the cache
-STRETCH = 200_000  # samples cut at a time: what is made of them is no multiple of a long log
+CHUNK = 32_768  # steps joined at a time: intermediate results stay in the cache
+STRETCH = 200_000  # samples cut at a time: bounds the memory in a long log
 _AT_REST = np.concatenate([np.eye(3), 0.5 * np.eye(3)], axis=1)
 # Of `_coefficients` the factors of 1, x^2, x^4 ...
 _SERIES = np.array(
@@ -43,7 +43,7 @@ _SERIES = np.array(
         for k in range(5)
     ]
 )
-# The square up to which, after the first, 1, 2, ... terms do: the next is nothing beside the first.
+# Squares up to which 1, 2, ... terms after the first suffice: the next is negligible.
 _FEW_TERMS = [
     (1e-17 / np.max(np.abs(_SERIES[k] / _SERIES[0]))) ** (1 / k) for k in range(2, len(_SERIES))
 ]
@@ -61,7 +61,7 @@ def preintegrate_stream(
     *,
     roughly: bool = False,
 ) -> tuple[list[gtsam.PreintegratedCombinedMeasurementsG], BoolArray]:
-    """Preintegrate a whole stream between epochs, a stretch of it at a time.
+    """Preintegrate a whole stream between epochs, in segments.
 
     Parameters
     ----------
@@ -74,9 +74,9 @@ def preintegrate_stream(
     accel_bias, gyro_bias : ndarray, shape (n, 3)
         At which to linearise (m/s^2, rad/s).
     silence : tuple of ndarray, optional
-        Where gaps begin and end in which other samples stand in for inertial ones (s).
+        Beginnings and ends of gaps that are filled by other samples (s).
     roughly : bool
-        Whether the sigmas matter little, and intervals of some tens of samples are thinned too.
+        Whether approximate sigmas suffice, so that intervals of some tens of samples are decimated.
 
     Returns
     -------
@@ -92,7 +92,7 @@ def preintegrate_stream(
     while begin < len(epochs) - 1:
         reach = int(np.searchsorted(before, before[begin] + STRETCH))
         end = min(max(reach, begin + 1), len(epochs) - 1)
-        # With a sample beyond each end, and one more for what adding the offset rounds.
+        # With a sample beyond each end, and one more for the rounding of the offset.
         rows = slice(max(int(before[begin]) - 2, 0), int(before[end]) + 2)
         here = slice(begin, end + 1)
         stream = ImuSamples(imu.time[rows], imu.gyro_body[rows], imu.accel_body[rows])
@@ -123,16 +123,16 @@ def thinned(
         At which they will be preintegrated (m/s^2, rad/s): there the result is the same to
         rounding.
     ways : tuple of int
-        Numbers of steps that may be joined to one, falling.  Of each interval that is taken which
-        leaves the fewest steps, of those that leave enough.
+        Numbers of steps that may be joined to one, falling.  For each interval the one that leaves
+        the fewest steps, but at least ``fewest``.
     fewest : int
-        Joined steps of an interval that are enough.
+        Minimum number of joined steps of an interval.
 
     Returns
     -------
     Increments
-        The given ones where no interval is long.  Left single are intervals with a gap, steps that
-        fill no pair, and those of a fast turn.
+        The given ones where no interval is long.  Intervals with a gap, steps that fill no pair,
+        and steps of fast rotation are not joined.
     """
     steps = increments.first[1:] - increments.first[:-1]
     steps[increments.bridged] = 0
@@ -185,7 +185,7 @@ def _pairs(increments: Increments, joined: int, long: BoolArray) -> tuple[IntArr
 
 
 def _one_after_the_other(moved: Array) -> Array:
-    """Return the product of k matrices, (k, ..., 5, 5): of neighbours, and of these again."""
+    """Return the product of k matrices, (k, ..., 5, 5), by a tree of pairwise products."""
     while len(moved) > 1:
         even = len(moved) - len(moved) % 2
         pairs = moved[0:even:2] @ moved[1:even:2]
@@ -194,7 +194,7 @@ def _one_after_the_other(moved: Array) -> Array:
 
 
 def _of_steps(steps: Array, bias: Array) -> tuple[Array, Array]:
-    """Return the motion in single steps, and the angle that each turns through (rad).
+    """Return the motion in single steps, and the rotation angle of each (rad).
 
     Parameters
     ----------
@@ -204,8 +204,8 @@ def _of_steps(steps: Array, bias: Array) -> tuple[Array, Array]:
     Returns
     -------
     moved : ndarray, shape (k, 2, n, 5, 5)
-        Turn, velocity and position from rest at the beginning of the step, its length: an element
-        of the Galilean group, of which GTSAM's integration is a product.
+        Rotation, velocity and position from rest at the beginning of the step, and its length: an
+        element of the Galilean group, of which GTSAM's integration is a product.
     angle : ndarray, shape (k, 2, n)
     """
     dt = steps[6]
@@ -225,10 +225,10 @@ def _of_steps(steps: Array, bias: Array) -> tuple[Array, Array]:
 
 
 def _joined(steps: Array, bias: Array) -> tuple[Array, BoolArray]:
-    """Return two steps that integrate to what many do.
+    """Return two steps with the same integral as many.
 
-    Constant over each step, they give the turns of the halves, and together velocity and position
-    of the whole.
+    Constant over each step, they give the rotations of the halves, and together velocity and
+    position of the whole.
 
     Parameters
     ----------
@@ -242,7 +242,7 @@ def _joined(steps: Array, bias: Array) -> tuple[Array, BoolArray]:
     both : ndarray, shape (7, 2, n)
         Rate, specific force and length.
     gentle : ndarray of bool, shape (n,)
-        Whether neither half turns far.
+        Whether the rotation of both halves is small.
     """
     single, angle = _of_steps(steps, bias)
     halves = _one_after_the_other(single)
@@ -265,7 +265,7 @@ def _joined(steps: Array, bias: Array) -> tuple[Array, BoolArray]:
 
 
 def _small_vectors(turn: Array) -> Array:
-    """Return the rotation vectors, (3, ...), of matrices of turns below a right angle (rad)."""
+    """Return the rotation vectors, (3, ...), of rotation matrices below a right angle (rad)."""
     odd = 0.5 * (turn - turn.swapaxes(-1, -2))
     axis = np.array([odd[..., 2, 1], odd[..., 0, 2], odd[..., 1, 0]])
     sine = np.sqrt(np.einsum("i...,i...->...", axis, axis))
@@ -273,12 +273,12 @@ def _small_vectors(turn: Array) -> Array:
 
 
 def _by_force(rotation: Array) -> Array:
-    """Return velocity and position by a constant specific force, of a unit of time.
+    """Return velocity and position by a constant specific force over a unit of time.
 
     Parameters
     ----------
     rotation : ndarray, shape (3, ...)
-        Turned through at a constant rate (rad).
+        Rotation vector at a constant rate (rad).
 
     Returns
     -------

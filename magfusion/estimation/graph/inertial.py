@@ -1,4 +1,4 @@
-"""Inertial factors between states, and what calibration parameters of the IMU do to them."""
+"""Inertial factors between states, and their derivatives by calibration parameters of the IMU."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ ROWS = 15  # of an inertial factor
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """What the measurement of one interval is made of again.
+    """Data to preintegrate the measurement of one interval again.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class Link:
     calibration : Calibration
         With which the stream was corrected.
     steps : Steps, optional
-        Of a link that a checkpoint may have to keep.
+        Of a link that a checkpoint may have to store.
     """
 
     measurement: Preintegrated

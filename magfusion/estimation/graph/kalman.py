@@ -13,20 +13,20 @@ from magfusion.units import Array
 def partial_update(
     step: Array, cov: Array, prior_cov: Array, share: Array | None
 ) -> tuple[Array, Array]:
-    """Return step and covariance of an update that each parameter takes only a share of.
+    """Return step and covariance of an update of which each parameter takes a share.
 
-    A share of zero is Schmidt's filter: what is known well enough is considered, not estimated, but
-    what it may be wrong by stays in the covariance of all else (Brink, "Partial-update
+    A share of zero is Schmidt's filter: a parameter that is known well enough is considered, not
+    estimated, but its uncertainty stays in the covariance of all others (Brink, "Partial-update
     Schmidt-Kalman filter", J. Guid. Control Dyn. 40(9), 2017).
 
     Parameters
     ----------
     step : ndarray, shape (n,)
-        Of a whole update.
+        Of a full update.
     cov, prior_cov : ndarray, shape (n, n)
-        After a whole update, and before it.
+        After a full update, and before it.
     share : ndarray, shape (n,), optional
-        From zero to one; None where all of it is taken.
+        From zero to one; None for a full update.
     """
     if share is None:
         return step, cov
@@ -42,14 +42,14 @@ def considered_share(size: int, considered: int) -> Array | None:
 class PartialUpdateFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no types
     """Kalman filter of an error state, whose parameters may take a share of each update.
 
-    All is as in filterpy, by filterpy's `predict` and `update`, but for this:
+    As filterpy's, with its `predict` and `update`, except:
 
-    - ``x`` is the error of a nominal state, shape (n,), zero before an update; who owns the nominal
-      state moves it by ``x`` after the update and sets ``x`` to zero.  ``x_post`` keeps it.
-    - ``H`` and ``dim_z`` are those of the last update: each may have another number of rows.
+    - ``x`` is the error of a nominal state, shape (n,), zero before an update; the owner of the
+      nominal state moves it by ``x`` after the update and sets ``x`` to zero.  ``x_post`` keeps it.
+    - ``H`` and ``dim_z`` are those of the last update: the number of rows may change.
     - ``K`` is the gain that was applied, a share of the optimal one.
-    - ``log_likelihood`` is exact whatever ``S`` spans; filterpy's leaves out what varies by less
-      than 2e-10 of the largest variance.
+    - ``log_likelihood`` is exact whatever the range of ``S``; filterpy's omits directions with
+      less than 2e-10 of the largest variance.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class PartialUpdateFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterp
         hx_args: Any = (),
         residual: Any = np.subtract,
     ) -> None:
-        """Update as filterpy; of what it finds each parameter takes its share."""
+        """Update as filterpy; each parameter takes its share of the result."""
         prior = self.x, self.P
         super().update(z, HJacobian, Hx, R, args, hx_args, residual)
         if z is not None:
@@ -89,14 +89,14 @@ class PartialUpdateFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterp
         z : ndarray, shape (m,)
         H : ndarray, shape (m, n)
         R : ndarray, shape (m, m), optional
-            One where rows are whitened.
+            Identity where rows are whitened.
         """
         self.H, self.dim_z = H, len(z)
         self.R = np.eye(len(z)) if R is None else R
         self.update(z, HJacobian=lambda _: H, Hx=lambda x: H @ x)
 
     def update_from_far(self, z: Array, H: Array) -> None:
-        """Update by whitened rows as `update_linear`, by QR: here ``S`` spans too many digits.
+        """Update by whitened rows as `update_linear`, by QR for an ill-conditioned ``S``.
 
         Raises
         ------

@@ -1,6 +1,6 @@
-"""What a measurement is to an estimator: whitened rows with derivatives, and a robust loss.
+"""Interface of a measurement to an estimator: whitened rows with derivatives, and a robust loss.
 
-Batch graph, sliding window and filter know nothing more of a sensor.  To add one, write a frozen
+Batch graph, sliding window and filter use nothing else of a sensor.  To add one, write a frozen
 dataclass with these methods; nothing else changes.
 """
 
@@ -18,7 +18,7 @@ from magfusion.estimation.graph.state import MOTION, State, States, states_of
 from magfusion.model.parameters import Block, Calibration, dimension
 from magfusion.units import Array, BoolArray, IntArray
 
-# 95 % efficient on white noise of one dimension; the last is for what is no noise at all.
+# 95 % efficient on white noise of one dimension; the last is for residuals that are not noise.
 ROBUST_WIDTH = {"huber": 1.345, "cauchy": 2.385, "geman-mcclure": 2.385}
 
 
@@ -58,14 +58,14 @@ class Loss:
     ----------
     kind : {'huber', 'cauchy', 'geman-mcclure'}
     repeats : float or ndarray, shape (n, groups)
-        How many epochs count as one measurement: one that counts in part is an outlier no less.
+        How many epochs count as one measurement; fractions do not reduce outlier rejection.
     """
 
     kind: str
     repeats: Array | float = 1.0
 
     def weighed(self, square: Array, components: int) -> tuple[Array, Array]:
-        """Return weight and loss as `robust_weight`."""
+        """Return weight and loss as `robust_weight` does."""
         weight, rho = robust_weight(self.repeats * square, self.kind, components)
         return weight, rho / self.repeats
 
@@ -74,8 +74,8 @@ class Loss:
 class Rows:
     """Whitened measurement: ``error`` plus the derivatives times a step is unit noise.
 
-    Each epoch has groups of components; a robust loss takes or leaves a group as a whole.  A
-    derivative that is None is zero.
+    Each epoch has groups of components; a robust loss weights a group as a whole.  A derivative
+    that is None is zero.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ optional
     by_calibration: Array | None = None
 
     def weighed(self, loss: Loss | None) -> tuple["Rows", Array]:
-        """Return rows that a robust loss has weighed, and the loss of each group."""
+        """Return rows weighted by a robust loss, and the loss of each group."""
         square = (self.error**2).sum(axis=2)
         if loss is None:
             return self, square
@@ -116,14 +116,14 @@ optional
 
 @dataclass(frozen=True, eq=False)
 class Measurement(ABC):
-    """What was measured at some epochs.
+    """Measurements at some epochs.
 
-    Fields that are arrays have one row for each of ``epoch``; other fields hold for all of them,
-    and those that are not compared are no part of what was measured.
+    Fields that are arrays have one row for each of ``epoch``; other fields hold for all of them.
+    Fields that are not compared do not belong to the measurement itself.
 
     Parameters
     ----------
-    epoch : int ndarray, shape (n,)
+        State index of each row.
         Which state each row belongs to.
     """
 
@@ -144,7 +144,7 @@ class Measurement(ABC):
         """
 
     def error(self, states: States, calibration: Calibration) -> Array:
-        """Return the rows' error alone: to be overridden where that costs less."""
+        """Return the rows' error alone; override it where that costs less."""
         return self.linearize(states, calibration, ()).error
 
     @property
@@ -157,7 +157,7 @@ class Measurement(ABC):
         return None
 
     def at_states(self) -> Self:
-        """Return the measurement linearised where its states are, if an update has it elsewhere."""
+        """Return the measurement linearised at its states, if an update has it elsewhere."""
         return self
 
     def rows(self, kept: BoolArray | slice) -> Self:
@@ -167,17 +167,17 @@ class Measurement(ABC):
         )
 
     def at(self, epoch: int) -> Self:
-        """Return a measurement of one epoch as of another."""
+        """Return a measurement of one epoch with another epoch index."""
         return replace(self, epoch=np.full(len(self.epoch), epoch))
 
 
 def joined(parts: Iterable[Measurement], epochs: Iterable[int] | None = None) -> list[Measurement]:
-    """Return measurements of the same kind as one, so that a call serves them all.
+    """Return measurements of the same kind as one, evaluated in one call.
 
     Parameters
     ----------
     epochs : iterable of int, optional
-        Of each part, in place of its own.
+        Of each part, instead of its own.
     """
     kinds: dict[str, list[tuple[Measurement, IntArray]]] = {}
     for part, epoch in zip(parts, repeat(None) if epochs is None else epochs, strict=False):
@@ -197,7 +197,7 @@ _KINDS: WeakKeyDictionary[Measurement, str] = WeakKeyDictionary()
 
 
 def kind_of(part: Measurement) -> str:
-    """Return what is the same of all that are `joined`; a window asks it of each at every epoch."""
+    """Return a key that is equal for parts which are `joined`; cached for windows."""
     known = _KINDS.get(part)
     if known is None:
         values = ((name, getattr(part, name)) for name in _compared(type(part)))
@@ -235,7 +235,7 @@ def calibration_rows(shape: tuple[int, ...], blocks: tuple[Block, ...]) -> Array
 def measured_rows(
     measurements: Sequence[Measurement], state: State, blocks: tuple[Block, ...]
 ) -> tuple[Array, Array]:
-    """Return whitened error (m,) and Jacobian (m, 15 + calibration) of what one epoch measured."""
+    """Return whitened error (m,) and Jacobian (m, 15 + calibration) of the rows of one epoch."""
     size, errors, jacobians = len(state.cov), [np.zeros(0)], [np.zeros((0, len(state.cov)))]
     for measurement in measurements:
         rows = measurement.linearize(states_of([state]), state.calibration, blocks)

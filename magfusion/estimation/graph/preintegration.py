@@ -14,11 +14,11 @@ from magfusion.model.site import ImuModel
 from magfusion.model.trajectory import interpolated
 from magfusion.units import Array, BoolArray, IntArray
 
-# What may happen while the IMU is silent: the motion of a person or a vehicle.
+# Possible motion in a gap of the IMU: that of a person or a vehicle.
 BRIDGE_GYRO_NOISE = 1.0  # rad/s/sqrt(Hz)
 BRIDGE_ACCEL_NOISE = 3.0  # m/s^2/sqrt(Hz)
 RATE_SPAN = 0.08  # s; motion is slower, noise is not
-LEAST_HELD = 1e-4  # rad/s, and that per root s, about an axis that is held: none, but regular
+LEAST_HELD = 1e-4  # rad/s, and that per root s, about a fixed axis: no motion, but regular
 GAP_SAMPLES = 5.0  # a gap is this many times the usual sampling interval
 
 
@@ -55,17 +55,16 @@ def cut_at_epochs(
     time_offset : float
         Added to its stamps to bring them to the log's clock (s).
     epochs : ndarray, shape (n,)
-        (s); where they lie outside the stream its end values are extended.
+        (s); outside the stream its end values are extended.
     usual : float, optional
-        Sampling interval (s); the median where it is not given: of a stretch inside a gap there
-        is none.
+        Sampling interval (s); the median by default, which a part inside a gap does not have.
     """
     time = imu.time + time_offset
     known = float(np.median(np.diff(time))) if usual is None else usual
     edges, gap = _gaps(time, epochs, known)
     if len(epochs) == 2 and not gap.any() and (time[1:] > time[:-1]).all():
         return _one_interval(imu, time, epochs)
-    # One long step would tie the position to the velocity: its noise would be singular.
+        # One long step would tie the position to the velocity: its noise would be singular.
     stamps = _filled(time, edges, np.flatnonzero(gap), epochs, known)
     inside = (stamps > epochs[0]) & (stamps < epochs[-1])
     grid = np.sort(np.concatenate([stamps[inside], epochs]))
@@ -90,7 +89,7 @@ def cut_at_epochs(
 
 
 def _one_interval(imu: ImuSamples, time: Array, epochs: Array) -> Increments:
-    """Return the steps between two epochs, as online: the samples between them are used as is."""
+    """Return the steps between two epochs as online, without resampling."""
     rows = slice(time.searchsorted(epochs[0], side="right"), time.searchsorted(epochs[1]))
     both = np.concatenate([imu.gyro_body, imu.accel_body], axis=1)
     begin, end = interpolated(epochs, time, both)
@@ -107,19 +106,19 @@ def _one_interval(imu: ImuSamples, time: Array, epochs: Array) -> Increments:
 
 
 def _gaps(time: Array, reach: Array, usual: float) -> tuple[Array, BoolArray]:
-    """Return the stamps with the ends that are reached, and which steps between them are gaps."""
+    """Return the stamps with the ends of ``reach`` added, and which steps between them are gaps."""
     edges = np.concatenate([[min(time[0], reach[0])], time, [max(time[-1], reach[-1])]])
     return edges, edges[1:] - edges[:-1] > GAP_SAMPLES * usual
 
 
 def in_gap(time: Array, grid: Array, usual: float) -> BoolArray:
-    """Tell which steps of the grid lie in a gap of the stream, however short the step itself is."""
+    """Return which steps of the grid are in a gap of the stream, however short the step is."""
     edges, gap = _gaps(time, grid, usual)
     return np.asarray(gap[np.searchsorted(edges[1:-1], grid[:-1], side="right")])
 
 
 def _filled(time: Array, edges: Array, gaps: IntArray, epochs: Array, usual: float) -> Array:
-    """Return stamps with others that fill the gaps of a stream, as far as the epochs reach."""
+    """Return the stamps with others that fill gaps of the stream, within the epochs."""
     if not len(gaps):
         return time
     filled = [time]
@@ -131,7 +130,7 @@ def _filled(time: Array, edges: Array, gaps: IntArray, epochs: Array, usual: flo
 
 
 def across_held(cov: Array, imu: ImuModel) -> Array:
-    """Return the covariance of a gyro's bias, (3, 3), without any about the axis that is held."""
+    """Return the covariance of a gyro's bias, (3, 3), without that about the fixed axis."""
     if not isinstance(imu, HeldModel):
         return cov
     axis = np.array(imu.held_axis)
@@ -193,9 +192,9 @@ def preintegrate(
 
 
 def low_passed(imu: ImuSamples) -> ImuSamples:
-    """Return the stream averaged over `RATE_SPAN`: the rate that differentiates a measurement.
+    """Return the stream averaged over `RATE_SPAN`, to differentiate measurements by the rate.
 
-    White noise in a derivative would pass for information on the time offset.
+    White noise in a derivative would appear as information on the time offset.
     """
     size = 2 * low_pass_reach(_usual(imu)) + 1
     gyro, accel = (
@@ -206,7 +205,7 @@ def low_passed(imu: ImuSamples) -> ImuSamples:
 
 
 def low_passed_rate_at(imu: ImuSamples, time_offset: float, wanted: Array) -> Array:
-    """Return the rate of the stream of `low_passed` at some times, without the whole stream.
+    """Return the rate of `low_passed` at some times, without averaging the whole stream.
 
     Parameters
     ----------
@@ -232,7 +231,7 @@ def low_passed_rate_at(imu: ImuSamples, time_offset: float, wanted: Array) -> Ar
 
 
 def low_pass_reach(usual: float) -> int:
-    """Return over how many samples, ``usual`` apart (s), `low_passed` averages on either side."""
+    """Return the half width, in samples ``usual`` apart (s), of the average of `low_passed`."""
     return int(0.5 * RATE_SPAN / usual)
 
 

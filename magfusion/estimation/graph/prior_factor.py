@@ -1,4 +1,4 @@
-"""The prior of a calibration as a linear factor, and what moves its mean."""
+"""The prior of a calibration as a linear factor, and shifts of its mean."""
 
 from typing import NamedTuple
 
@@ -12,26 +12,26 @@ from magfusion.units import Array
 
 
 class PriorShift(NamedTuple):
-    """What is uncertain beside a calibration does to the mean of a prior that other logs made.
+    """Shift of the mean of a prior from other logs by uncertainties besides the calibration.
 
     Parameters
     ----------
     by_considered : ndarray, shape (dimension, considered)
-        What one sigma of each considered parameter does to it.
+        Shift by one sigma of each considered parameter.
     apart : ndarray, shape (dimension, k)
-        What a unit of each of ``k`` errors does to it that this log has no part in.
+        Shift by a unit of each of ``k`` errors that do not affect this log.
     """
 
     by_considered: Array
     apart: Array
 
     def beside(self, spread: Array) -> tuple[Array, Array]:
-        """Return a spread with columns for the errors apart, and the shift in the same columns.
+        """Return a spread with columns for the separate errors, and the shift in these columns.
 
         Parameters
         ----------
         spread : ndarray, shape (uncertain, n)
-            Of the considered parameters first.
+            Considered parameters first.
         """
         between = spread.shape[1] - self.by_considered.shape[1]
         wider = np.pad(spread, ((0, 0), (0, self.apart.shape[1])))
@@ -50,7 +50,7 @@ def prior_factor(
     Parameters
     ----------
     shift : ndarray, shape (dimension, n), optional
-        What a unit of each held parameter does to its mean.
+        Shift of its mean by a unit of each fixed parameter.
     """
     sqrt_information = prior_sqrt_information(declared.site, blocks)
     error = -sqrt_information @ difference(declared, calibration, blocks)

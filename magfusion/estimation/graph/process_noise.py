@@ -1,4 +1,4 @@
-"""What of a calibration does not stay as it is, and how fast it may go."""
+"""Process noise of calibration parameters."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,14 +19,14 @@ class ProcessNoise:
     Parameters
     ----------
     variance : ndarray, shape (dimension,)
-        Gained in a second.
+        Gain per second.
     """
 
     blocks: tuple[Block, ...]
     variance: Array
 
     def cov(self, calibration: Calibration, time: float, elapsed: float) -> Array:
-        """Return the covariance gained in a while, shape (dimension, dimension).
+        """Return the covariance gained over an interval, shape (dimension, dimension).
 
         Parameters
         ----------
@@ -52,7 +52,7 @@ class ProcessNoise:
 
     @cached_property
     def _walking(self) -> int:
-        """Of the first so many parameters any walks, or may be moved by another's walk."""
+        """Number of leading parameters that have a random walk or are moved by another's."""
         dragged = {block.owner for block in self._dragging}
         return max(
             block.columns.stop
@@ -62,7 +62,7 @@ class ProcessNoise:
 
     @cached_property
     def _dragging(self) -> list[Block]:
-        """The blocks that walk, and may move others by it: what stays drags nothing."""
+        """Blocks with a random walk that may move other parameters."""
         return [
             block
             for block in self.blocks
@@ -74,12 +74,12 @@ class ProcessNoise:
 def calibration_process_noise(
     site: Site, blocks: tuple[Block, ...], considered: int = 0
 ) -> ProcessNoise:
-    """Return how a calibration walks; what is screwed down stays.
+    """Return the random walk of a calibration; rigidly mounted parts have none.
 
     Parameters
     ----------
     considered : int
-        Parameters at the end that are only considered: they stay.
+        Number of parameters at the end that are only considered: they are constant.
     """
     parts = [
         np.full(len(b.sigma), b.parameter.walk_per_sqrt_hour(site) ** 2 / HOUR) for b in blocks

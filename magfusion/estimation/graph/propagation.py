@@ -1,4 +1,4 @@
-"""From one field epoch to the next by the inertial stream: mean, transition and noise."""
+"""Propagation from one field epoch to the next by the inertial stream: mean, transition, noise."""
 
 from dataclasses import dataclass, replace
 
@@ -27,12 +27,12 @@ _AFTER = np.r_[9:15, 15:18, 24:30]
 
 @dataclass(frozen=True, eq=False)
 class Propagated:
-    """Where the inertial stream leads.
+    """Result of a propagation by the inertial stream.
 
     Parameters
     ----------
     state : State
-        At the later time, its covariance carried on.
+        At the later time, with its propagated covariance.
     bridged : bool
         Whether the stream had a gap.
     transition, noise : ndarray, shape (15 + calibration, 15 + calibration)
@@ -58,7 +58,7 @@ def propagate(
     *,
     blind: bool = False,
 ) -> Propagated:
-    """Carry a state on to a later time.
+    """Propagate a state to a later time.
 
     Transition and noise are those of the graph's own inertial factor, so that a filter built on
     this and the graph agree to round-off.
@@ -80,7 +80,7 @@ def propagate(
     blocks : tuple of Block
         Calibration parameters in the state's tangent.
     blind : bool
-        Whether samples stand in for inertial ones: they have the noise of a gap.
+        Whether other samples replace inertial ones: they have the noise of a gap.
     """
     epochs = np.array([state.time, time])
     accel, gyro = state.accel_bias_body, state.gyro_bias_body
@@ -127,7 +127,7 @@ def propagate(
 
 
 def _linearized(link: Link, values: gtsam.Values, size: int) -> tuple[Array, Array]:
-    """Return transition and noise of a step of the motion, shape (size, size) each."""
+    """Return transition and noise of a motion step, shape (size, size) each."""
     rows, _ = inertial_factor(0, link.measurement).linearize(values).jacobian()
     root = np.linalg.inv(rows[:, _AFTER])
     transition, noise = np.eye(size), np.zeros((size, size))
@@ -139,7 +139,7 @@ def _linearized(link: Link, values: gtsam.Values, size: int) -> tuple[Array, Arr
 
 
 def _moved_cov(cov: Array, motion: Array) -> Array:
-    """Return a covariance after a step of the motion (15, size); the calibration stays."""
+    """Return a covariance after a motion step (15, size); the calibration is constant."""
     out, across = cov.copy(), motion @ cov
     out[:MOTION, :MOTION] = across @ motion.T
     out[:MOTION, MOTION:], out[MOTION:, :MOTION] = across[:, MOTION:], across[:, MOTION:].T

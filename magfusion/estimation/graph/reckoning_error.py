@@ -1,7 +1,7 @@
-"""How the error of dead reckoning grows: transition and noise of short steps, world axes.
+"""Error growth of dead reckoning: transition and noise of short steps, world axes.
 
-Rotation, position, velocity, accelerometer and gyro bias; the rotation turns on the left, about the
-world's axes.
+Rotation, position, velocity, accelerometer and gyro bias; the rotation error is a left
+perturbation, about the world's axes.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ LEAST_WALK = 1e-9  # of a bias: without any the ends of an interval would be tie
 
 
 def step_transitions(length: Array, rotation: Array, force_world: Array) -> Array:
-    """Return what steps do to an error, shape (..., 15, 15).
+    """Return the error transition of steps, shape (..., 15, 15).
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def step_transitions(length: Array, rotation: Array, force_world: Array) -> Arra
 
 
 def step_noise(length: Array, imu: ImuModel, bridged: BoolArray) -> Array:
-    """Return the covariance that steps add, shape (..., 15, 15).
+    """Return the covariance added by steps, shape (..., 15, 15).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""State of a running estimator, and the tangent space that its covariance lives in.
+"""State of a running estimator, and the tangent space of its covariance.
 
 Tangent: rotation and position (body axes, right perturbation of the pose, GTSAM's chart), velocity
 (world), accelerometer and gyro bias, then the calibration as `magfusion.model.parameters` has it.
@@ -51,7 +51,7 @@ class State(PoseAccess):
 
     @cached_property
     def pose(self) -> gtsam.Pose3:
-        """The pose as GTSAM has it."""
+        """Pose as a GTSAM object."""
         return gtsam.Pose3(gtsam.Rot3(self.world_from_body), self.position_world)
 
     @property
@@ -66,7 +66,7 @@ class State(PoseAccess):
 
 
 def values_of(states: list[State]) -> gtsam.Values:
-    """Return states as a graph takes them: pose X(i), velocity V(i) and bias B(i) of each."""
+    """Return states as values of a graph: pose X(i), velocity V(i) and bias B(i) of each."""
     biases = [np.concatenate([s.accel_bias_body, s.gyro_bias_body]) for s in states]
     poses = [state.pose for state in states]
     return values_from(poses, [state.velocity_world for state in states], biases)
@@ -75,7 +75,7 @@ def values_of(states: list[State]) -> gtsam.Values:
 def values_from(
     poses: Sequence[gtsam.Pose3], velocity_world: Sequence[Array], bias_body: Sequence[Array]
 ) -> gtsam.Values:
-    """Return poses X(i), velocities V(i) (m/s) and biases B(i) of some epochs for a graph.
+    """Return poses X(i), velocities V(i) (m/s) and biases B(i) of some epochs as graph values.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def values_from(
 
 @lru_cache(maxsize=32)
 def _at_rest(epochs: int) -> gtsam.Values:
-    """Return zero velocities and biases; to insert a bias takes ten times as long as to move it."""
+    """Return zero velocities and biases, since inserting a bias takes ten times an update."""
     values, zero = gtsam.Values(), gtsam.imuBias.ConstantBias(np.zeros(3), np.zeros(3))
     for i in range(epochs):
         values.insert(V(i), np.zeros(3))
@@ -109,7 +109,7 @@ def moved(state: State, blocks: tuple[Block, ...], step: Array) -> State:
 
 
 def moved_to(state: State, calibration: Calibration, step: Array) -> State:
-    """Return the state with its motion moved by a tangent vector (15,), and another calibration."""
+    """Return the state with its motion moved by a tangent vector (15,), and a new calibration."""
     pose = state.pose.retract(step[:6])
     return replace(
         state,
@@ -145,7 +145,7 @@ class States:
     position_world, velocity_world : ndarray, shape (n, 3)
         (m, m/s)
     read_bias : callable
-        Returns accelerometer, then gyro bias, shape (n, 6) (m/s^2, rad/s): few measurements ask.
+        Returns accelerometer, then gyro bias, shape (n, 6) (m/s^2, rad/s); few measurements use it.
     """
 
     world_from_body: Array
@@ -184,7 +184,7 @@ def states_in(values: gtsam.Values) -> States:
 
 
 def states_of(states: list[State]) -> States:
-    """Return states as a measurement takes them."""
+    """Return states as arrays for a measurement."""
     return States(
         world_from_body=np.array([s.world_from_body for s in states]),
         position_world=np.array([s.position_world for s in states]),

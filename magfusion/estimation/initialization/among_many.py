@@ -1,4 +1,4 @@
-"""A start that was made of the beacons that are heard, as one of the whole site."""
+"""Embedding of a start from the detected beacons into the whole site."""
 
 from dataclasses import replace
 
@@ -27,14 +27,14 @@ Key = tuple[Parameter, str]
 def among_all(
     state: State, known: tuple[Block, ...], site: Site, settings: EstimatorSettings
 ) -> State:
-    """Return a state in the tangent of a whole site; what was not heard is as declared.
+    """Return a state in the tangent of a whole site; undetected beacons are as declared.
 
     A start may be of some beacons, of some magnetometers, or of some of both.
 
     Parameters
     ----------
     known : tuple of Block
-        Of its tangent, one after the other.
+        Of its tangent, in order.
     """
     estimated, considered = settings.blocks(site)
     blocks = (*estimated, *placed(considered, dimension(estimated)))
@@ -55,12 +55,12 @@ def among_all(
 def score_among_all(
     score: Score, known: tuple[Block, ...], site: Site, settings: EstimatorSettings
 ) -> Score:
-    """Return the score of a start of some beacons as one whose calibration is of the whole site.
+    """Return the score of a start of some beacons, with the calibration of the whole site.
 
     Parameters
     ----------
     known : tuple of Block
-        Of its calibration that is estimated; what was not heard did not respond.
+        Estimated part of its calibration; undetected beacons have no response.
     """
     estimated, _ = settings.blocks(site)
     whole = np.zeros((dimension(estimated), score.by_calibration.shape[1]))
@@ -69,7 +69,7 @@ def score_among_all(
 
 
 def _key(block: Block, some: Site, site: Site) -> Key:
-    """Return what a block of some magnetometers is among all: the only one has no name."""
+    """Return the key in the whole site of a block; that of a single magnetometer has no name."""
     sensors = some.platform
     alone = isinstance(block.parameter, MagnetometerParameter) and not sensors.further
     if alone and site.platform.further:
@@ -78,14 +78,14 @@ def _key(block: Block, some: Site, site: Site) -> Key:
 
 
 def _columns(blocks: tuple[Block, ...], known: list[Key]) -> IntArray:
-    """Return where the columns of known blocks are among all."""
+    """Return the indices of known blocks' columns among all."""
     place = {block.key: block.columns for block in blocks}
     found = [np.arange(place[key].start, place[key].stop) for key in known]
     return np.concatenate([np.zeros(0, dtype=np.int64), *found])
 
 
 def _whole(state: State, site: Site) -> Calibration:
-    """Return the calibration with what was not heard as the site declares it."""
+    """Return the calibration with undetected beacons as the site declares them."""
     heard, part = _of_all_magnetometers(state.calibration, site), state.calibration.site
     every = initial_calibration(site, heard.reference_time, heard.imu_begin)
     names = {beacon.name: beacon for beacon in part.beacons}
@@ -101,13 +101,13 @@ def _whole(state: State, site: Site) -> Calibration:
 
 
 def _of_all_magnetometers(calibration: Calibration, site: Site) -> Calibration:
-    """Return the calibration with the magnetometers that it lacks as the site declares them."""
+    """Return the calibration with the missing magnetometers as the site declares them."""
     part, every = calibration.site, site.platform.magnetometers
     if len(part.platform.magnetometers) == len(every):
         return calibration
     known = {sensor.name: sensor for sensor in part.platform.magnetometers}
     sensors = tuple(known.get(sensor.name, sensor) for sensor in every)
-    first = part.of_sensor(0)  # drives are the same of every magnetometer
+    first = part.of_sensor(0)  # drives are the same for every magnetometer
     return replace(
         calibration,
         site=replace(part, platform=part.platform.carrying(sensors)),

@@ -1,7 +1,7 @@
-"""When a start is tried of a lone tracker whose side nobody told, before enough has come for any.
+"""Early start of a single tracker of unknown hemisphere, before a usual start has enough data.
 
-Its motion tells the side within a second or two, against which a mirrored start is hopeless. What
-is less clear waits as long as all other starts do.
+Its motion determines the hemisphere within a second or two, and clearly rejects a mirrored start.
+Less clear cases wait as long as all other starts do.
 """
 
 from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE, DECIDED
@@ -10,23 +10,23 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.receiver.slots import has_schedule
 
-TRIES = 3  # in the time that other starts take; after one second attitudes erred by three sigmas
+TRIES = 3  # in the time of other starts; after one second attitudes erred by three sigmas
 
 
 def first_try(site: Site, start_duration: float) -> float:
-    """Return after how much data a start is tried first (s)."""
+    """Return the duration of data before the first try of a start (s)."""
     if has_schedule(site) and _is_mirrored(site):
         return start_duration / TRIES
     return start_duration
 
 
 def next_try(tried: float, start_duration: float) -> float:
-    """Return after how much data it is tried again that failed early (s)."""
+    """Return the duration of data before the next try, after an early one failed (s)."""
     return min(tried + start_duration / TRIES, start_duration)
 
 
 def is_clear(start: OnlineStart | NoStart) -> bool:
-    """Return whether an early start is beyond doubt: its rival needed no other look."""
+    """Return whether an early start is unambiguous: its rival needed no further comparison."""
     return (
         isinstance(start, OnlineStart)
         and start.rival_chi_square is not None
@@ -36,10 +36,10 @@ def is_clear(start: OnlineStart | NoStart) -> bool:
 
 
 def open_start(start: OnlineStart) -> NoStart:
-    """Return why a start is not taken whose mirror explains the data nearly as well."""
+    """Return the reason to reject a start whose mirror explains the data nearly as well."""
     text = (
-        "The data so far leave open on which side of the source the receiver is."
-        " Turn and move it, or give a hemisphere or a region."
+        "Hemisphere ambiguous; more data needed. Turn and move the receiver, or declare a"
+        " hemisphere or a region."
     )
     said = Finding("ambiguous", text, Verdict.DOUBTFUL)
     return NoStart(text, Trust((said, *start.trust.reasons)))

@@ -1,4 +1,4 @@
-"""From the smoother of a log's beginning to an estimator that goes on from its last epoch."""
+"""Handover from the smoother of a log's beginning to an estimator from its last epoch on."""
 
 import gtsam
 import numpy as np
@@ -16,12 +16,12 @@ from magfusion.units import Array
 
 
 def last_state(result: Smoothed, considered: tuple[Block, ...] = ()) -> State:
-    """Return the smoothed state of the last epoch with its covariance, the calibration's included.
+    """Return the smoothed state of the last epoch with its covariance, including calibration.
 
     Parameters
     ----------
     considered : tuple of Block
-        Uncertain parameters that were not estimated, to be considered from here on.
+        Uncertain parameters that were not estimated, to be considered from then on.
 
     Returns
     -------
@@ -58,7 +58,7 @@ def last_state(result: Smoothed, considered: tuple[Block, ...] = ()) -> State:
 def _with_considered(
     cov: Array, result: Smoothed, estimate: Estimate, considered: tuple[Block, ...]
 ) -> Array:
-    """Return the joint covariance with parameters that the estimate took for known."""
+    """Return the joint covariance with parameters that the estimate assumed to be known."""
     uncertain = placed((*considered, *result.field_errors))
     if not uncertain:
         return cov

@@ -1,4 +1,4 @@
-"""The first state of an online estimator: the smoother over the data gathered so far."""
+"""The first state of an online estimator, smoothed from the data received so far."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -33,35 +33,35 @@ from magfusion.receiver.turn import on_clock, turn_of
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array
 
-START_RATE_HZ = 20.0  # of the cycles of a slotted tracker that a start is made of
+START_RATE_HZ = 20.0  # of the cycles of a slotted tracker that a start uses
 
 
 @dataclass(frozen=True, eq=False)
 class OnlineStart:
-    """Where an online estimator begins.
+    """Start of an online estimator.
 
     Parameters
     ----------
     waveform : Waveform, optional
-        By whose samples the receiver begins; None where phasors come.
+        Samples for the receiver's start; None where phasors are received.
     rival_chi_square : float, optional
-        By how much the data preferred this start to its rival.
+        Chi square of the rival above that of this start.
     trust : Trust
-        What the witnesses say of the smoothed beginning.
+        Test results of the smoothed beginning.
     score : Score, optional
-        Of what the smoothed beginning holds.
+        Of the estimates of the smoothed beginning.
     beside : LockinSettings, optional
-        How the receiver goes on where lines are to be fitted that the site does not declare.
+        Receiver settings where undeclared lines are to be fitted.
     lines : mapping
         The same of several magnetometers, by their names.
     excluded : tuple of str
-        Magnetometers that it was made without, as they contradict the others.
+        Magnetometers not used for the start, as they are inconsistent with the others.
     said : tuple of Finding
-        Of that, or that they contradict each other and none can be named.
+        Their findings, or that magnetometers are inconsistent and the cause is ambiguous.
     turn, shift : float
-        By how much more attitude (rad) and position (m) may be off for it, one sigma an axis.
+        Increase of the uncertainty of attitude (rad) and position (m), one sigma an axis.
     borrowed : mapping of str to ndarray
-        Variance that estimated parameters, by name, have of what was only considered.
+        Variance of estimated parameters, by name, due to considered ones.
     """
 
     state: State
@@ -86,14 +86,14 @@ class OnlineStart:
 
 @dataclass(frozen=True)
 class NoStart:
-    """Why the data lead to no state yet.
+    """Reason why the data give no state yet.
 
     Parameters
     ----------
     reason : str
-        A sentence.
+        One or more sentences.
     trust : Trust
-        What the witnesses say of the smoothed beginning, where that is why.
+        Test results of the smoothed beginning, where these are the reason.
     """
 
     reason: str = "Record longer."
@@ -111,20 +111,20 @@ def find_online_start(
     marks: Marks | None = None,
     waveforms: Mapping[str, Waveform] | None = None,
 ) -> OnlineStart | NoStart:
-    """Return the state at the last epoch before a time; or why the data lead to none.
+    """Return the state at the last epoch before a time; or the reason why there is none.
 
     Parameters
     ----------
     fields : list of FieldSamples
-        One epoch each; used where there are any.
+        One epoch each; used where present.
     steady : list of SteadyFields
-        Beside ``fields``.
+        Of the same epochs as ``fields``.
     until : float
         (s)
     marks : Marks, optional
-        When which coil was driven, where the site's slots are marked.
+        Times at which each coil was driven, where the site's slots are marked.
     waveforms : mapping, optional
-        The samples of several magnetometers until then, each by its own stamps.
+        The samples of several magnetometers until then, each on its own clock.
     """
     if not fields:
         receiver = receiver_of(site, settings.lockin)
@@ -150,7 +150,7 @@ def find_online_start(
     except (EstimationError, InputError) as error:
         return NoStart(f"{error}.")
     except (RuntimeError, np.linalg.LinAlgError):
-        return NoStart("The measurements leave a direction of the motion open.")
+        return NoStart("The measurements do not determine the motion in one direction.")
     if found.trust.verdict is Verdict.FAILED:
         return NoStart(found.trust.reasons[0].text, found.trust)
     return _start_of(found, log, site, settings.lockin)
@@ -162,11 +162,11 @@ class _Beginning(NamedTuple):
     Parameters
     ----------
     log, site : Log, Site
-        Without the magnetometers that were excluded.
+        Without the excluded magnetometers.
     result, honest : Smoothed
-        As the estimator has it, and with what its tests add to the sigmas.
+        Of the estimator, and with sigmas increased by the tests.
     excluded : tuple of Finding
-        Why magnetometers are left out.
+        Reasons of excluded magnetometers.
     """
 
     log: Log
@@ -180,8 +180,8 @@ class _Beginning(NamedTuple):
 
 
 def _smoothed(log: Log, site: Site, settings: EstimatorSettings) -> _Beginning:
-    """Smooth the beginning and judge it."""
-    if log.waveforms and are_many(site):  # by what is heard they are chosen
+    """Smooth the beginning and test it."""
+    if log.waveforms and are_many(site):  # selected by detection
         log = replace(log, fields=demodulated_several(log, site, settings.lockin).fields)
     if log.waveform is not None and has_schedule(site) and joins(site, log.waveform.marks):
         log = _of_cycles(log, log.waveform, site, settings)
@@ -198,14 +198,14 @@ def _smoothed(log: Log, site: Site, settings: EstimatorSettings) -> _Beginning:
 def _start_of(
     found: _Beginning, heard: Log, site: Site, given: LockinSettings | None
 ) -> OnlineStart:
-    """Return the start that a smoothed beginning gives.
+    """Return the start from a smoothed beginning.
 
     Parameters
     ----------
     heard : Log
-        The beginning as it was recorded, of all magnetometers.
+        The recorded beginning, of all magnetometers.
     given : LockinSettings, optional
-        How samples are asked to be demodulated.
+        Requested lock-in settings.
     """
     result = found.result
     kept = [sensor.name for sensor in found.site.platform.magnetometers]
@@ -229,7 +229,7 @@ def _start_of(
 def _agreed(
     result: Smoothed, log: Log, site: Site, settings: SmootherSettings
 ) -> tuple[Log, Site, Smoothed, tuple[Finding, ...]]:
-    """Return a start without a magnetometer that contradicts the others, as of a whole log."""
+    """Return a start without a magnetometer that is inconsistent with the others, as offline."""
     if not site.platform.further:
         return log, site, result, ()
     plain = replace(settings, tune=False)
@@ -246,7 +246,7 @@ def _agreed(
 def _among_all(
     state: State, score: Score | None, result: Smoothed, site: Site, settings: EstimatorSettings
 ) -> tuple[State, Score | None]:
-    """Return a state and its score among all beacons and magnetometers, heard or not."""
+    """Return a state and its score among all beacons and magnetometers, detected or not."""
     state = among_all(state, (*result.blocks, *result.considered), site, settings)
     if score is not None and result.calibration.site.unheard:
         score = score_among_all(score, result.blocks, site, settings)
@@ -254,7 +254,7 @@ def _among_all(
 
 
 def _lines_of_each(log: Log, site: Site, given: LockinSettings | None) -> dict[str, LockinSettings]:
-    """Return how the receivers of several magnetometers go on that have lines to be fitted."""
+    """Return the receiver settings of the magnetometers that have undeclared lines to be fitted."""
     lockin, found = same_windows(site, given), dict[str, LockinSettings]()
     for name, own, alone in each_alone(log, site):
         lined = beside_lines(own, alone, lockin)
@@ -264,10 +264,10 @@ def _lines_of_each(log: Log, site: Site, given: LockinSettings | None) -> dict[s
 
 
 def _of_cycles(log: Log, waveform: Waveform, site: Site, settings: EstimatorSettings) -> Log:
-    """Return the phasors of a slotted tracker, a cycle an epoch, and no more than a start needs."""
+    """Return the phasors of a slotted tracker, one epoch per cycle, limited to those of a start."""
     receiver = receiver_of(site, settings.lockin)
     _, found = receiver.whole(waveform, log.imu)
-    if site.platform.magnetometer.lacking:  # whose slots stay epochs of their own
+    if site.platform.magnetometer.lacking:  # its slots remain separate epochs
         cycle = cycle_of(found, site)
         every = _every(int(cycle[-1]) + 1, found.time)
         return replace(log, waveform=None, fields=found.rows((cycle[-1] - cycle) % every == 0))
@@ -279,14 +279,14 @@ def _of_cycles(log: Log, waveform: Waveform, site: Site, settings: EstimatorSett
 
 
 def _every(count: int, time: Array) -> int:
-    """Return which of so many cycles a start is made of."""
+    """Return the stride of the cycles that a start uses."""
     if count < 2:
         raise InputError("magnetometer: no two cycles of time slots are usable; record longer")
     return max(1, int(count / (START_RATE_HZ * float(np.ptp(time)) + 1.0)))
 
 
 def _wider(result: Smoothed, honest: Smoothed) -> tuple[float, float]:
-    """Return what the witnesses add to the last state's sigmas of rotation and position."""
+    """Return the tests' increase of the last state's sigmas of rotation and position."""
     assert result.states.pose_cov is not None
     assert honest.states.pose_cov is not None
     added = honest.states.pose_cov[-1] - result.states.pose_cov[-1]
@@ -296,7 +296,7 @@ def _wider(result: Smoothed, honest: Smoothed) -> tuple[float, float]:
 
 
 def _joined_steady(parts: list[SteadyFields], fields: list[FieldSamples]) -> SteadyFields | None:
-    """Return the steady fields of the epochs; None where one has none."""
+    """Return the steady fields of the epochs; None where an epoch has none."""
     known = {float(part.time[0]): part for part in parts}
     wanted = [known.get(float(s.time[0])) for s in fields]
     found = [part for part in wanted if part is not None]

@@ -1,1 +1,1 @@
-"""What the estimators iterate over: one file for each kind of measurement."""
+"""Measurements of the estimators: one file for each kind."""

@@ -1,12 +1,12 @@
-"""The Earth field as a measurement, and how much it counts.
+"""Earth field as a measurement, and its weight.
 
-Indoors the field's direction is disturbed, by iron that no model knows.  Three things keep that
-from the attitude.  The disturbance lasts as long as the platform is near the iron, so that all of
-`AMBIENT_TIME` counts as one measurement of `AMBIENT_SHARE`.  Where the field's size is not what is
-declared, its direction is not either: what it deviates by is added to the covariance.  And what the
-motion contradicts has no say: a loss that lets go (Geman and McClure), since a pull that falls only
-with the distance (Cauchy) bends the heading by a degree where the field is turned by fifteen; in
-the online estimators the same weight at the prediction.
+Indoors the field's direction is disturbed by unmodelled iron.  Three measures protect the attitude.
+The disturbance lasts as long as the platform is near the iron, so that all of `AMBIENT_TIME` counts
+as one measurement of `AMBIENT_SHARE`.  If the field's magnitude is not as declared, neither is its
+direction: the deviation is added to the covariance.  A field that contradicts the motion is
+rejected by a redescending loss (Geman and McClure).  A weight that only decreases with distance
+(Cauchy) would bend the heading by a degree where the field is rotated by fifteen.  The online
+estimators apply the same weight at the prediction.
 """
 
 from dataclasses import dataclass, replace
@@ -38,19 +38,19 @@ from magfusion.units import Array, BoolArray, IntArray
 EARTH_LOSS = "geman-mcclure"
 DISTURBED = 0.25  # weight below which the field is reported as disturbed
 GATE = 16.3  # chi square of three components, one in a thousand
-AMBIENT_TIME = 2.0  # s; over which it stays the same
-DEVIATION_SPAN = 5.0  # s; over which the deviation of the field's size is averaged
+AMBIENT_TIME = 2.0  # s; over which it is constant
+DEVIATION_SPAN = 5.0  # s; over which the deviation of the field's magnitude is averaged
 LEAST_HORIZONTAL = 1e-6  # T; less gives no heading
 ANYWHERE, ANY_ROTATION = 100.0, 10.0  # m, rad; of a platform that never detected a beacon
-SPEED_TIME = 2.0  # s; so long a speed counts once where no beacon is detected
+SPEED_TIME = 2.0  # s; in which the speed counts once if no beacon is detected
 
 
 @dataclass(frozen=True, eq=False)
 class EarthField(Measurement):
-    """The steady field in the magnetometer, one group of three.
+    """Steady field in the magnetometer, one group of three.
 
-    Windows are symmetric, and a ramp is fitted beside the constant: it knows no time offset but by
-    the turn of the states.
+    Windows are symmetric, and a ramp is fitted with the constant: the time offset has an effect
+    only by the rotation of the states.
 
     Parameters
     ----------
@@ -63,11 +63,11 @@ class EarthField(Measurement):
     rate_body : ndarray, shape (n, 3)
         Angular rate, for the time offset (rad/s).
     repeats : float
-        How many epochs in a row count as one measurement.
+        Number of consecutive epochs that count as one measurement.
     applied_offset : ndarray, shape (n,)
-        IMU time offset with which the inertial data were cut (s).
+        IMU time offset used to cut the inertial data (s).
     robust : bool
-        Whether what the motion contradicts has no say.
+        Whether a field that contradicts the motion is rejected.
     """
 
     time: Array
@@ -80,7 +80,7 @@ class EarthField(Measurement):
 
     @property
     def loss(self) -> Loss | None:
-        """Loss that lets go of a disturbed field."""
+        """Redescending loss that rejects a disturbed field."""
         return Loss(EARTH_LOSS, self.repeats) if self.robust else None
 
     def linearize(
@@ -119,15 +119,15 @@ def earth_measurement(
     Parameters
     ----------
     steady : SteadyFields
-        What is NaN is missing.
+        NaN where missing.
     epoch : int ndarray, shape (n,)
-        States that they belong to.
+        Indices of their states.
     rate_body : ndarray, shape (n, 3)
         Without the gyro's bias (rad/s).
     applied_offset : ndarray, shape (n,)
-        IMU time offset with which the inertial data were cut (s).
+        IMU time offset used to cut the inertial data (s).
     step : float
-        Between epochs (s).
+        Time between epochs (s).
     """
     repeats = max(1.0, AMBIENT_TIME / step)
     there = np.isfinite(steady.measured_sensor)
@@ -139,7 +139,7 @@ def earth_measurement(
 
 
 def check_earth(site: Site) -> None:
-    """Refuse a site that has no use of the Earth field.
+    """Reject a site that cannot use the Earth field.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def check_earth(site: Site) -> None:
     field, gravity = site.earth_field_world, site.gravity
     if site.platform.further:
         raise InputError(
-            "--earth measures by one magnetometer; leave it out, or give a site of the one"
+            "--earth uses a single magnetometer; leave it out, or give a site with one"
         )
     if field is None:
         raise InputError(
@@ -157,8 +157,8 @@ def check_earth(site: Site) -> None:
         )
     if np.hypot(field[0], field[1]) < LEAST_HORIZONTAL or not gravity > 0.0:
         raise InputError(
-            f"the site's Earth field has only {1e6 * np.hypot(field[0], field[1]):.2g} uT across"
-            " the vertical, too little to determine a heading; leave --earth out"
+            f"the site's Earth field has only {1e6 * np.hypot(field[0], field[1]):.2g} uT in the"
+            " horizontal plane, too little to determine a heading; leave --earth out"
         )
 
 
@@ -169,7 +169,7 @@ def earth_cov(site: Site, steady: SteadyFields) -> Array:
     size = float(np.linalg.norm(site.earth_field_world))
     field = (steady.measured_sensor - sensor.offset) @ np.linalg.inv(sensor.matrix).T
     deviation = (np.linalg.norm(field, axis=1) - size) ** 2
-    if len(sensor.axes) < 3:  # of a component the size tells nothing
+    if len(sensor.axes) < 3:  # the magnitude is unknown
         deviation = np.zeros(len(steady))
     ambient = (AMBIENT_SHARE * size) ** 2 + _moving_mean(steady.time, deviation)
     return steady.cov + ambient[:, None, None] * np.eye(3)
@@ -183,14 +183,14 @@ def _moving_mean(time: Array, value: Array) -> Array:
 
 
 def disturbed(residual: Array, repeats: float) -> BoolArray:
-    """Tell at which epochs the motion contradicts the Earth field.
+    """Return at which epochs the motion contradicts the Earth field.
 
     Parameters
     ----------
     residual : ndarray, shape (n, 3)
         Whitened.
     repeats : float
-        How many epochs count as one measurement.
+        Number of epochs that count as one measurement.
     """
     weight, _ = robust_weight(repeats * np.sum(residual**2, axis=1), EARTH_LOSS, components=3)
     return weight < DISTURBED
@@ -199,18 +199,18 @@ def disturbed(residual: Array, repeats: float) -> BoolArray:
 def unheld(
     states: Trajectory, epoch: IntArray, detected: BoolArray, step: float, motion: MotionModel
 ) -> list[Measurement]:
-    """Bound what no beacon determines: the speed, and if need be one position.
+    """Constrain what no beacon determines: the speed, and if necessary one position.
 
     Parameters
     ----------
     states : Trajectory
-        Where the platform is thought to be.
+        Approximate states.
     epoch : int ndarray, shape (n,)
         Of the fields.
     detected : bool ndarray, shape (n,)
-        Whether a beacon was detected then.
+        Whether a beacon was detected at each.
     step : float
-        Between epochs (s).
+        Time between epochs (s).
     """
     free = epoch[~detected]
     out: list[Measurement] = []
@@ -230,7 +230,7 @@ def speed_sigma(step: float, motion: MotionModel) -> float:
 
 
 class EarthWeight:
-    """How much the Earth field counts at a prediction, epoch by epoch.
+    """Weight of the Earth field at a prediction, epoch by epoch.
 
     Parameters
     ----------
@@ -245,13 +245,13 @@ class EarthWeight:
         self.refused_at = -np.inf  # s
 
     def weighed(self, measurement: EarthField, state: State) -> tuple[EarthField, bool]:
-        """Return an epoch's measurement as it counts, and whether the field is disturbed.
+        """Return the weighted measurement of an epoch, and whether the field is disturbed.
 
         Parameters
         ----------
         state : State
-            As predicted: the farther from it, the less the field counts, and at last nothing; nor
-            for a while after, since what lets go for an epoch would be followed where it leads.
+            Prediction.  The weight decreases to zero with the distance from it, and remains zero
+            for a while, as an accepted disturbance would pull the state.
         """
         whole = replace(
             measurement,

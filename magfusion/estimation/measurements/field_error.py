@@ -1,10 +1,10 @@
-"""What iron makes of a beacon's field: an error that is constant in place, considered.
+"""Field error by iron, constant in place, as considered parameters.
 
-A relative error of correlation exp(-d / length) is, over the places of a log, a sum of a few modes
-(Karhunen and Loeve), each with an amplitude of unit variance.  An estimate that weighs epochs by
-what is white of their errors keeps what they know of each other; what the amplitudes do to it is
-added to its covariance (a consider covariance), so that a hundred epochs at one place do not count
-as a hundred witnesses of where it is.
+A relative error of correlation exp(-d / length) is, over the positions of a log, a sum of a few
+modes (Karhunen and Loeve), each of unit variance in amplitude.  An estimate that weights epochs
+by the white part of their errors keeps their relative information.  The effect of the amplitudes is
+added to its covariance (a consider covariance), so that a hundred epochs at one position do not
+count as a hundred independent measurements of it.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, ComplexArray
 
-SHARE = 0.97  # of the variance, which the modes have; the rest is in the white part
+SHARE = 0.97  # of the variance, contained in the modes; the rest is in the white part
 COLUMNS = 288  # of all beacons
 MATRIX = 9  # elements
 AT_ONCE = 5e8  # bytes of their Jacobian, in a long log
@@ -28,17 +28,17 @@ SAME_TIME = 1e-6  # s
 class FieldError(BeaconParameter):
     """Amplitudes of the modes of one beacon's error: by mode, row and column of a matrix.
 
-    Iron answers to a field in proportion, so that what it adds is a matrix of the place times the
-    beacon's field, the same for all its tones and in phase with each.
+    Iron responds to a field linearly, so that it adds a position-dependent matrix times the
+    beacon's field, equal for all its tones and in phase with each.
 
     Parameters
     ----------
     time : ndarray, shape (n,)
-        Of the epochs that have it (s).
+        Of the epochs affected (s).
     modes : ndarray, shape (n, magnetometers, m)
-        With unit variance in all.
+        With unit variance in total.
     relative : ndarray, shape (n, magnetometers, tones)
-        Size of the error, as a share of the field.
+        Magnitude of the error, relative to the field.
     sensor_from_world : ndarray, shape (n, magnetometers, 3, 3)
     """
 
@@ -52,7 +52,7 @@ class FieldError(BeaconParameter):
 
     @property
     def columns(self) -> int:
-        """How many amplitudes there are."""
+        """Number of amplitudes."""
         return int(MATRIX * self._modes.shape[2])
 
     def own_jacobian(self, view: PhasorView) -> ComplexArray:
@@ -73,7 +73,7 @@ def field_errors(site: Site, time: Array, poses: Trajectory) -> tuple[Block, ...
     time : ndarray, shape (n,)
         Of the fields (s).
     poses : Trajectory
-        There.
+        Poses at these times.
     """
     length, channels = site.model_error_length, len(site.channels)
     if length <= 0.0 or not len(time):
@@ -100,7 +100,7 @@ def field_errors(site: Site, time: Array, poses: Trajectory) -> tuple[Block, ...
 
 
 def modes_in_place(position_world: Array, length: float, most: int) -> Array:
-    """Return the modes of an error of correlation exp(-d / length) at some places, shape (n, m).
+    """Return the modes of an error of correlation exp(-d / length) at positions, shape (n, m).
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def modes_in_place(position_world: Array, length: float, most: int) -> Array:
     length : float
         (m)
     most : int
-        Of them.
+        Maximum number of modes.
     """
     size, (owner, members, centre) = 1.0, cells(position_world, length)
     while len(centre) > MOST_CELLS:

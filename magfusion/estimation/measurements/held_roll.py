@@ -1,4 +1,4 @@
-"""The roll about a single coil, held where it is: nothing measures it, and any is as good."""
+"""Constraint that fixes the unobservable roll about a single coil to an arbitrary value."""
 
 from dataclasses import dataclass
 
@@ -14,12 +14,12 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
-SIGMA = 1e-3  # rad; what is told of a state opens the roll
+SIGMA = 1e-3  # rad; reported covariances include any roll
 
 
 @dataclass(frozen=True, eq=False)
 class HeldRoll(Measurement):
-    """The turn about an axis of the body from some attitudes is zero.
+    """Zero rotation about an axis of the body from given attitudes.
 
     Parameters
     ----------
@@ -37,28 +37,28 @@ class HeldRoll(Measurement):
         turn = np.swapaxes(self.world_from_body, 1, 2) @ states.world_from_body
         about = np.sum(Rotation.from_matrix(turn).as_rotvec() * self.axis_body, axis=1)
         by_pose = np.zeros((len(turn), 1, 1, 6))
-        # At a turn of which the rest is small.
+        # Linearised at the rotation about the axis, with the rest small.
         by_pose[..., :3] = self.axis_body[:, None, None] / SIGMA
         return Rows(error=about[:, None, None] / SIGMA, by_pose=by_pose)
 
 
 def held_roll(site: Site, states: Trajectory) -> HeldRoll:
-    """Return that the first state has the roll that it has."""
+    """Constrain the roll of the first state to its current value."""
     first = np.zeros(1, dtype=np.int64)
     axis_body = axis_of(site.platform.magnetometer)[None]
     return HeldRoll(first, axis_body, states.world_from_body[:1])
 
 
 def without_roll(states: Trajectory, site: Site, *, signed: bool = True) -> Trajectory:
-    """Return states whose attitudes do not turn about the coil from one to the next.
+    """Return states whose attitudes do not rotate about the coil from one to the next.
 
-    The coil is where it was, and points as it did; the first has the smallest turn that does.
+    The coil's position and direction are unchanged; the first state has the smallest rotation.
 
     Parameters
     ----------
     signed : bool
-        Whether it is known which way the coil points.  Amplitudes do not tell it: the first points
-        up, and none turns round from one state to the next.
+        Whether the sense of the coil is known.  Amplitudes do not determine it: the first points
+        up, and none reverses from one state to the next.
     """
     sensor = site.platform.magnetometer
     axis, lever = axis_of(sensor), coil_lever(sensor)
@@ -72,5 +72,5 @@ def without_roll(states: Trajectory, site: Site, *, signed: bool = True) -> Traj
     for k, step in enumerate(least_turn(towards[:-1], towards[1:])):
         turns[k + 1] = step @ turns[k]
     place = states.position_world + (states.world_from_body - turns) @ lever
-    whole = matrices(of_matrices(turns))  # rounding adds up over many
+    whole = matrices(of_matrices(turns))  # rounding accumulates over many
     return Trajectory(**vars(states) | {"world_from_body": whole, "position_world": place})

@@ -1,4 +1,4 @@
-"""Close tones as a measurement: what a short window tells of all of them together."""
+"""Close tones as a measurement: joint information of short windows on all of them."""
 
 from dataclasses import dataclass, replace
 
@@ -11,7 +11,7 @@ from magfusion.model.field import skew
 from magfusion.model.parameters import Block, Calibration
 from magfusion.units import Array, BoolArray
 
-NOTHING_LEFT = 1e-6  # of a channel's information, once others were left out
+NOTHING_LEFT = 1e-6  # of a channel's information, after exclusion of others
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,22 +23,22 @@ class JointPhasors(Measurement):
     time : ndarray, shape (n,)
         Centres of the windows (s).
     measured : ndarray, shape (n, 3 directions)
-        What the prediction leaves, with what it is at the nodes (T); axes of the centre.
+        Residual of the prediction plus its value at the nodes (T); axes of the centre.
     basis : ndarray, shape (n, directions, nodes, 2 channels)
-        By real and imaginary part of each channel's phasor; zero of those that are not felt.
+        By real and imaginary part of each channel's phasor; zero for channels not predicted.
     whitening : ndarray, shape (n, 3 directions, 3 directions)
     elapsed : ndarray, shape (n, nodes)
         Of the nodes, from the centre (s).
     shift_body : ndarray, shape (n, nodes, 3)
-        By how much the sensor moves there beyond a steady velocity, axes of the centre (m).
+        Displacement of the sensor beyond a steady velocity, axes of the centre (m).
     strength : ndarray, shape (n, nodes, channels)
-        Of each channel's field, as a share of that at the centre.
+        Of each channel's field, relative to that at the centre.
     rate_body : ndarray, shape (n, 3)
         As of `FieldPhasors`, as are the next two (rad/s).
     applied_offset : ndarray, shape (n,)
     moving : bool ndarray, shape (n,)
     felt : bool ndarray, shape (n, channels)
-        Those that are predicted.
+        Channels that are predicted.
     robust : {None, 'huber', 'cauchy'}
         Loss of each window.
     """
@@ -62,7 +62,7 @@ class JointPhasors(Measurement):
         return None if self.robust is None else Loss(self.robust)
 
     def alone(self) -> "JointPhasors":
-        """Return the measurement as its epochs are; no sample is in two of them."""
+        """Return the measurement unchanged, as no sample is in two epochs."""
         return self
 
     def linearize(
@@ -95,7 +95,7 @@ class JointPhasors(Measurement):
 
     @property
     def _phasors(self) -> FieldPhasors:
-        """The phasors at the nodes, of which the directions are made."""
+        """Phasors at the nodes, from which the directions are computed."""
         nothing = np.zeros((self.elapsed.size, self.felt.shape[1], 6))
         every = np.repeat(np.arange(len(self.time)), self.elapsed.shape[1])
         return FieldPhasors(
@@ -111,7 +111,7 @@ class JointPhasors(Measurement):
         )
 
     def _at_nodes(self, states: States) -> States:
-        """Return states with the attitude of the centre, where the sensor is at the nodes."""
+        """Return states with the attitude of the centre, and the sensor's position at the nodes."""
         every = np.repeat(np.arange(len(states)), self.elapsed.shape[1])
         turn, velocity = states.world_from_body[every], states.velocity_world[every]
         shift = (turn @ self.shift_body.reshape(-1, 3, 1))[..., 0]
@@ -123,13 +123,13 @@ class JointPhasors(Measurement):
         return (self.whitening @ off[..., None])[..., 0]
 
     def _directions(self, by: Array) -> Array:
-        """Return columns of phasors (n nodes, channels, 6, k) as those of the directions."""
+        """Transform columns of phasors (n nodes, channels, 6, k) to the directions."""
         return in_directions(self.basis, by)
 
-    # Channel by channel, as far as they are told apart
+    # Channel by channel, as far as they are separable
 
     def of_channels(self) -> Array:
-        """Return what a phasor's parts do to the whitened rows, (n, channels, rows, 6)."""
+        """Return the effect of a phasor's parts on the whitened rows, (n, channels, rows, 6)."""
         n, directions, nodes, _ = self.basis.shape
         parts = self.basis.reshape(n, directions, nodes, -1, 2)
         whole = np.einsum("nrkcp,nkc->ncrp", parts, self.strength)
@@ -139,9 +139,9 @@ class JointPhasors(Measurement):
     def distances(self, state: State, blocks: tuple[Block, ...], gate: float = np.inf) -> Array:
         """Return the squared distance of each channel's innovation of an epoch, (channels,).
 
-        By how much the whole would be less unexpected with any phasor of that channel.  Since
-        neighbours are told from each other in part only, the worst beyond a gate is left out
-        before the others are looked at, and so on.
+        Decrease of the total distance by an arbitrary phasor of that channel.  As neighbours are
+        only partly separable, the worst beyond a gate is excluded before the others are
+        evaluated, and so on.
         """
         found, out = self._distances(state, blocks), np.zeros(self.felt.shape[1], dtype=bool)
         worst = int(np.argmax(found))
@@ -171,7 +171,7 @@ class JointPhasors(Measurement):
         return np.where(felt, found, 0.0)
 
     def spanned(self, channels: BoolArray) -> Array:
-        """Return an orthonormal basis of the whitened rows that phasors of channels can explain.
+        """Return an orthonormal basis of the whitened rows spanned by phasors of channels.
 
         Parameters
         ----------
@@ -180,7 +180,7 @@ class JointPhasors(Measurement):
         Returns
         -------
         ndarray, shape (n, rows, k)
-            With columns of zero.
+            Padded with zero columns.
         """
         by = np.where(channels[..., None, None], self.of_channels(), 0.0)
         by = np.moveaxis(by, 1, 2).reshape(len(by), by.shape[2], -1)
@@ -189,7 +189,7 @@ class JointPhasors(Measurement):
         return np.where(told[:, None], basis, 0.0)
 
     def without(self, rejected: BoolArray) -> "JointPhasors":
-        """Return the measurement with any phasor allowed of some channels, shape (channels,)."""
+        """Return the measurement with arbitrary phasors for some channels, shape (channels,)."""
         return self.leaving_out(np.broadcast_to(rejected, self.felt.shape))
 
     def leaving_out(self, rejected: BoolArray) -> "JointPhasors":
@@ -204,13 +204,13 @@ class JointPhasors(Measurement):
 
 
 def at_nearest(time: Array, seen: BoolArray, wanted: Array) -> BoolArray:
-    """Return what is said of epochs at the times nearest to them, shape (m, channels)."""
+    """Return the flags of epochs at the times nearest to them, shape (m, channels)."""
     middle = 0.5 * (time[1:] + time[:-1])
     return np.asarray(seen[np.searchsorted(middle, wanted)])
 
 
 def in_directions(basis: Array, by: Array) -> Array:
-    """Return columns of phasors as those of directions.
+    """Transform columns of phasors to those of directions.
 
     Parameters
     ----------

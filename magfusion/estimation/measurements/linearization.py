@@ -1,4 +1,4 @@
-"""Iterated update: where to linearise an epoch's fields when its prediction is wide."""
+"""Iterated update: linearisation point of an epoch's fields for an uncertain prediction."""
 
 import numpy as np
 
@@ -7,16 +7,16 @@ from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.model.parameters import Block
 from magfusion.units import Array
 
-# A dipole's field at a displacement s from distance r departs from its tangent by up to
-# 6 (s / r)^2 of itself: at two sigma of a prediction this wide by .0024, about half of what its
-# model is usually wrong by.  A turn departs by half of its square.
+# A dipole's field at a displacement s from distance r deviates from its tangent by up to
+# 6 (s / r)^2 of itself: at two sigma of a prediction with this uncertainty by .0024, about half of
+# the usual model error.  A rotation deviates by half of its square.
 WIDE_OF_DISTANCE, WIDE_ROTATION = 0.01, 0.03  # of the nearest beacon's distance; rad
-SETTLED = 0.001  # a last step of so much of the distance, or rad: 6e-6 of a field is left
+SETTLED = 0.001  # last step, of the distance, or rad: the remaining error is 6e-6 of a field
 MAX_ITERATIONS = 10
 
 
 def is_curved(predicted: State) -> bool:
-    """Return whether fields are not linear over the spread of a prediction."""
+    """Return whether fields are nonlinear over the uncertainty of a prediction."""
     cov = predicted.cov
     if np.trace(cov[ROTATION, ROTATION]) > WIDE_ROTATION**2:
         return True
@@ -29,8 +29,8 @@ def relinearized(
     """Return an epoch's fields linearised at their own most probable pose, by Gauss-Newton steps.
 
     The update of an iterated extended Kalman filter (Bell and Cathey 1993,
-    doi 10.1109/9.250476): innovation and Jacobian are those of the last point, the prior stays the
-    prediction's.
+    doi 10.1109/9.250476): innovation and Jacobian are those of the last point, the prior is that
+    of the prediction.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def relinearized(
     Returns
     -------
     FieldPhasors or None
-        None where the steps do not settle.
+        None if the steps do not converge.
     """
     pose, distance = predicted.pose, _nearest(predicted)
     for _ in range(MAX_ITERATIONS):

@@ -1,14 +1,14 @@
-"""How many epochs have the same model error: those that lie closer than iron's field changes.
+"""Number of epochs that share a model error, within the correlation length of the iron's field.
 
-Iron is constant in place, so that its error does not average over epochs at one place, nor over
+Iron is constant in place, so that its error does not average over epochs at one position, nor over
 visits to it.  An error of correlation exp(-d / length) leaves N epochs the information of N / A
-independent ones, where A is the sum of an epoch's correlations with all; each is weighed so.
+independent ones, where A is the sum of an epoch's correlations with all; each is weighted so.
 
-Online that is no more than the estimator holds together.  With an IMU those are all; a motion
-prior forgets: at steady state an epoch has a gain of sqrt(2) w times its step, where
+Online only the epochs in the estimator's memory count.  With an IMU those are all.  With a motion
+prior, at steady state an epoch has a gain of sqrt(2) w times its step, where
 w^4 = q^2 / (R step), of white acceleration of density q and errors of variance R (P. R. Kalata,
-IEEE Transactions on Aerospace and Electronic Systems 20, 1984, for small steps); an error that A
-epochs share is what the covariance claims where errors of variance A R have a gain of 1 / A.
+IEEE Transactions on Aerospace and Electronic Systems 20, 1984, for small steps).  For an error
+shared by A epochs the covariance is correct if errors of variance A R have a gain of 1 / A.
 """
 
 import numpy as np
@@ -18,20 +18,20 @@ from magfusion.model.noise import model_error
 from magfusion.model.site import Site
 from magfusion.units import Array, IntArray
 
-LONGEST_REST = 20.0  # s; online, longer ones are held together no more: the state has moved on
-CELLS = 4.0  # a length, in which epochs are counted together
+LONGEST_REST = 20.0  # s; online, no more is shared: the state has moved on
+CELLS = 4.0  # per length, in which epochs are counted together
 CHUNK = 1_000_000  # pairs at a time
 
 
 def alike_in_batch(position_world: Array, length: float) -> Array:
-    """Return how many epochs of a log have the model error of each, shape (n,).
+    """Return how many epochs of a log share the model error of each, shape (n,).
 
     Parameters
     ----------
     position_world : ndarray, shape (n, 3)
         (m)
     length : float
-        Of correlation (m).
+        Correlation length (m).
     """
     count = len(position_world)
     if length <= 0.0:
@@ -45,14 +45,14 @@ def alike_in_batch(position_world: Array, length: float) -> Array:
 
 
 def cells(position_world: Array, length: float) -> tuple[IntArray, IntArray, Array]:
-    """Return which cell of space each place is in, how many are there, and their centres.
+    """Return the spatial cell of each position, the number in each, and their centres.
 
     Parameters
     ----------
     position_world : ndarray, shape (n, 3)
         (m)
     length : float
-        Of correlation (m).
+        Correlation length (m).
 
     Returns
     -------
@@ -68,7 +68,7 @@ def cells(position_world: Array, length: float) -> tuple[IntArray, IntArray, Arr
 
 
 def alike_online(speed: float, step: float, length: float) -> float:
-    """Return about how many epochs have the model error of one, at a steady pace.
+    """Return the approximate number of epochs that share a model error, at a steady speed.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def alike_online(speed: float, step: float, length: float) -> float:
     step : float
         Time between epochs (s).
     length : float
-        Of correlation (m).
+        Correlation length (m).
     """
     if length <= 0.0:
         return 1.0
@@ -86,7 +86,7 @@ def alike_online(speed: float, step: float, length: float) -> float:
 
 
 def alike_at(state: State, step: float) -> float:
-    """Return with how many epochs that are held together one has its model error.
+    """Return the number of epochs in the estimator's memory that share a model error.
 
     Parameters
     ----------
@@ -103,12 +103,12 @@ def alike_at(state: State, step: float) -> float:
 
 
 def held_by_prior(site: Site, position_world: Array, step: float) -> float:
-    """Return how many epochs a motion prior holds together, at least one.
+    """Return the number of epochs in the memory of a motion prior, at least one.
 
     Parameters
     ----------
     site : Site
-        Of `magfusion.model.without_imu.on_motion_prior`.
+        From `magfusion.model.without_imu.on_motion_prior`.
     position_world : ndarray, shape (3,)
         (m)
     step : float
@@ -116,7 +116,7 @@ def held_by_prior(site: Site, position_world: Array, step: float) -> float:
     """
     apart = np.array([beacon.position_world for beacon in site.beacons]) - position_world
     relative = float(np.max(model_error(site)))
-    # A share of the field turns it by as many radians at most, and shifts by that of the distance.
+    # A relative field error rotates it by at most as many radians, and shifts by that share.
     turn, shift = relative, relative * float(np.max(np.linalg.norm(apart, axis=1)))
     imu = site.platform.imu
     pairs = ((turn, imu.gyro_bias_walk), (shift, imu.accel_noise))

@@ -34,12 +34,12 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
-MANY_COLUMNS = 64  # of parameters, most of which are of one beacon
+MANY_COLUMNS = 64  # of parameters, most of which belong to one beacon
 
 
 @dataclass(frozen=True, eq=False)
 class FieldPhasors(Measurement):
-    """Phasors of all channels, a group each.
+    """Phasors of all channels, one group each.
 
     Parameters
     ----------
@@ -52,25 +52,25 @@ class FieldPhasors(Measurement):
     rate_body : ndarray, shape (n, 3)
         Angular rate, for the time offset (rad/s).
     by_time_offset : ndarray, shape (n, channels, 6)
-        What a change of it does to the lock-in at fixed states (T/s).
+        Effect of its change on the lock-in at fixed states (T/s).
     applied_offset : ndarray, shape (n,)
-        IMU time offset with which the inertial data were cut (s).
+        IMU time offset used to cut the inertial data (s).
     moving : bool ndarray, shape (n,)
-        Where the clocks have a bearing: a platform that stands is where it was a little earlier.
-        Noise in its rate and velocity would pass for information on them.
+        Where the clocks have an effect: not for a stationary platform, where noise of rate and
+        velocity would be taken for information on them.
     ahead : ndarray, shape (n, channels), optional
-        How much later the sensor was where each was measured (s), as of `FieldSamples`.
+        Time of the measurement after that of the row (s), as of `FieldSamples`.
     robust : {None, 'huber', 'cauchy'}
         Loss of each channel.
     excess : ndarray, shape (n, channels), optional
-        Variance with which it is weighed, since epochs close by have the same model error, in
-        units of that of an epoch alone.
+        Ratio of the variance used to that of an independent epoch, as epochs close by share a
+        model error.
     heard : bool ndarray, shape (n, channels), optional
-        Those that are predicted; None for all.
+        Channels that are predicted; None for all.
     world_from_body, position_world : ndarray, shape (n, 3, 3) and (n, 3), optional
-        Pose at which the fields are linearised, in place of the states': an iterated update's.
+        Pose at which the fields are linearised instead of the states': for an iterated update.
     predicted : Predictions
-        Shared by all that differ from this in their weights alone.
+        Shared by all measurements that differ in their weights alone.
     """
 
     time: Array
@@ -90,7 +90,7 @@ class FieldPhasors(Measurement):
 
     @property
     def loss(self) -> Loss | None:
-        """Robust loss of each channel: one that counts in part is an outlier no less."""
+        """Robust loss of each channel; a channel weighted in part is still an outlier."""
         if self.robust is None:
             return None
         return Loss(self.robust, 1.0 if self.excess is None else self.excess)
@@ -100,7 +100,7 @@ class FieldPhasors(Measurement):
         return self.heard
 
     def alone(self) -> "FieldPhasors":
-        """Return the measurement whitened as if no other epoch had the same model error."""
+        """Return the measurement whitened as if epochs shared no model error."""
         if self.excess is None:
             return self
         scale = np.sqrt(self.excess)[..., None, None]
@@ -143,7 +143,7 @@ class FieldPhasors(Measurement):
         )
 
     def at_states(self) -> "FieldPhasors":
-        """Return the measurement linearised where its states are."""
+        """Return the measurement linearised at its states."""
         if self.world_from_body is None:
             return self
         return replace(self, world_from_body=None, position_world=None)
@@ -156,7 +156,7 @@ class FieldPhasors(Measurement):
         )
 
     def _whitened(self, by_blocks: Array, site: Site, blocks: tuple[Block, ...]) -> Array:
-        """Return whitened columns of blocks; of many, those that each channel feels alone."""
+        """Return whitened columns of blocks; of many, only those that affect each channel."""
         if by_blocks.shape[-1] < MANY_COLUMNS:
             return np.asarray(self.sqrt_information @ by_blocks)
         out, root = np.zeros_like(by_blocks), self.sqrt_information
@@ -206,7 +206,7 @@ class FieldPhasors(Measurement):
         position_world: Array,
         twist_body: Array,
     ) -> tuple[Array, Array, Array, Array]:
-        """Return prediction and derivatives with the sensor where each channel was measured."""
+        """Return prediction and derivatives at the sensor's pose of each measurement."""
         count, channels = ahead.shape
         site = calibration.site
         levers = np.array([sensor.position_body for sensor in site.platform.magnetometers])
@@ -243,9 +243,9 @@ class FieldPhasors(Measurement):
         return replace(self, sqrt_information=kept)
 
     def _at_field(self, states: States, calibration: Calibration) -> tuple[Array, Array, Array]:
-        """Return lag, attitude and position where the field was taken.
+        """Return lag, attitude and position at the measurement of the field.
 
-        The states carry the IMU's clock: that was a little before or after.
+        The states use the IMU's clock: the measurement was a little before or after.
         """
         lag = np.where(self.moving, calibration.imu_offset(self.time) - self.applied_offset, 0.0)
         turn = matrices(of_vectors((-lag[:, None] * self.rate_body).T))
@@ -257,7 +257,7 @@ class FieldPhasors(Measurement):
 
 
 def _felt(blocks: tuple[Block, ...], names: set[str]) -> dict[str, list[tuple[int, int]]]:
-    """Return stretches of columns that the phasors of each beacon feel."""
+    """Return ranges of columns that affect the phasors of each beacon."""
     found: dict[str, list[tuple[int, int]]] = {name: [] for name in names}
     every = list(found.values())
     for parameter, owner, columns, _ in blocks:
@@ -269,9 +269,9 @@ def _felt(blocks: tuple[Block, ...], names: set[str]) -> dict[str, list[tuple[in
 
 
 class Predictions:
-    """The last predictions of a single epoch: gate, score, filter and subsets ask for two in turn.
+    """Cache of the last two predictions of a single epoch, for gate, score, filter and subsets.
 
-    All share them that differ in their weights alone, or ask for the first of the parameters.
+    Shared by measurements that differ in weights alone, or use a leading part of the parameters.
     """
 
     def __init__(self) -> None:
@@ -307,7 +307,7 @@ _Unwhitened = tuple[Array, Array, Array | None, Array]
 
 
 class _Prediction(NamedTuple):
-    """A prediction with the state, and with all else, that it is of."""
+    """A prediction with the state and other inputs that it depends on."""
 
     at: tuple[bytes, ...]
     of: tuple[object, ...]
@@ -328,26 +328,26 @@ def field_phasors(
     standing: BoolArray | None = None,
     beside: bool = True,
 ) -> FieldPhasors:
-    """Return phasors as a measurement, weighed at poses that are about right.
+    """Return phasors as a measurement, weighted at approximate poses.
 
     Parameters
     ----------
     epoch : int ndarray, shape (n,)
-        States that they belong to.
+        Indices of their states.
     poses : Trajectory
-        Of the same epochs.
+        At the same epochs.
     rate_body : ndarray, shape (n, 3)
         Angular rate without its bias (rad/s).
     applied_offset : ndarray, shape (n,)
-        IMU time offset with which the inertial data were cut (s).
+        IMU time offset used to cut the inertial data (s).
     repeats : float
-        How many epochs hold each sample of overlapping windows: that must not count twice.
+        Number of epochs that contain each sample of overlapping windows, to count it once.
     by_time_offset : complex ndarray, shape (n, channels, 3), optional
         As of `magfusion.estimation.demodulation.motion_compensation.WaveFields`.
     alike : ndarray, shape (n,), or float
-        How many epochs have the same model error; no fewer than windows hold a sample.
+        Number of epochs with the same model error; at least the number of windows of a sample.
     standing : bool ndarray, shape (n,), optional
-        Where the platform is known to stand.
+        Where the platform is known to be stationary.
     beside : bool
         As of `magfusion.model.noise.measurement_cov`.
     """
@@ -374,10 +374,10 @@ def field_phasors(
 
 
 def leaves_out(measurements: Sequence[Measurement]) -> bool:
-    """Return whether some channels are not predicted, their rows zero."""
+    """Return whether some channels are not predicted, with zero rows."""
     return any(isinstance(m, FieldPhasors) and m.heard is not None for m in measurements)
 
 
 def alone(measurement: Measurement) -> Measurement:
-    """Return a measurement whitened as its epochs are, not as they are weighed."""
+    """Return a measurement whitened as independent epochs, without shared weights."""
     return measurement.alone() if isinstance(measurement, FieldPhasors) else measurement

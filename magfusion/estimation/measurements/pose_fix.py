@@ -14,7 +14,7 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class PoseFix(Measurement):
-    """A pose that something else has found, one group of six.
+    """A pose from another estimator, one group of six.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def _log_jacobian(pose: gtsam.Pose3) -> Array:
 
 
 def pose_fixes(fixes: Trajectory, robust: str | None = None) -> PoseFix:
-    """Return fixes, one for each state, with their covariance."""
+    """Return fixes, one for each state, with their covariance, as a measurement."""
     assert fixes.pose_cov is not None
     return PoseFix(
         np.arange(len(fixes)),

@@ -1,9 +1,9 @@
-"""Amplitudes without sign as phasors: the sign, or phase, is that of a state that is about right.
+"""Unsigned amplitudes as phasors, with the sign or phase of an approximate state.
 
-What ``|z|`` changes by is what ``z`` changes by along its own phase, so an amplitude that is given
-the phase of its prediction counts as a phasor of which the one part along that phase was measured.
-Near zero the sign is open and ``|z|`` has a kink: what is predicted there is left out, by the
-prediction and not by what was measured, which would choose among errors.
+A change of ``|z|`` is the change of ``z`` along its own phase, so that an amplitude with the phase
+of its prediction counts as a phasor measured along that phase only.  Near zero the sign is open and
+``|z|`` has a kink: amplitudes predicted there are omitted.  The selection uses the prediction and
+not the measurement, which would bias it.
 """
 
 from dataclasses import replace
@@ -19,12 +19,12 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, ComplexArray
 
 NEAR_ZERO = 4.0  # sigmas of noise, model error and prediction, below which a sign is open
-UNSURE = 0.1  # of the whole field; by so much a first guess of a component may err
+UNSURE = 0.1  # of the whole field; error of a component at a first guess
 OPEN_SIGN = "amplitude near zero, whose sign is open"
 
 
 def along_axis(fields: FieldSamples, site: Site) -> FieldSamples:
-    """Return amplitudes along the one axis of a site's receiver; phasors as they are.
+    """Return amplitudes along the one axis of a site's receiver; phasors unchanged.
 
     Raises
     ------
@@ -36,7 +36,7 @@ def along_axis(fields: FieldSamples, site: Site) -> FieldSamples:
         return fields
     if len(own) != 1:
         raise InputError(
-            "fields: are amplitudes, which are of a receiver of one axis, and the site's has"
+            "fields: are amplitudes, which are of a receiver of one axis, but the site's has"
             f" {', '.join(own)}; declare platform.magnetometer.axes"
         )
     phasor = np.full_like(fields.phasor_sensor, np.nan)
@@ -52,18 +52,18 @@ def with_signs(
     first: bool = False,
     every: bool = False,
 ) -> FieldSamples:
-    """Return amplitudes with the phases that poses predict, without those whose sign is open.
+    """Return amplitudes with the phases predicted at poses, without those of open sign.
 
     Parameters
     ----------
     samples : FieldSamples
-        Whose `FieldSamples.signed` is False; whatever phases they have are not looked at.
+        With `FieldSamples.signed` False; their phases are ignored.
     poses : Trajectory
-        Of the same epochs; its covariance, where there is one, widens what is near zero.
+        At the same epochs; a covariance widens the range near zero.
     first : bool
         Whether the poses are a first guess.
     every : bool
-        Whether those near zero stay in, too: so that guesses are compared by the same amplitudes.
+        Whether those near zero are included, to compare guesses by the same amplitudes.
     """
     if samples.signed:
         return samples
@@ -90,7 +90,7 @@ def _near_zero(
     size: Array,
     guess: Array,
 ) -> BoolArray:
-    """Tell of which amplitudes the sign is open, shape (n, channels), by their phase and size."""
+    """Return which amplitudes have an open sign, shape (n, channels), by phase and size."""
     k, site = "xyz".index(samples.axes), calibration.site
     own = sensor_positions(site, poses)
     variance = measurement_cov(site, samples, sensor_world=own)[..., k, k] + guess**2
@@ -103,12 +103,12 @@ def _near_zero(
 
 
 def count_open(samples: FieldSamples, resolved: FieldSamples) -> int:
-    """Return how many amplitudes were left out."""
+    """Return how many amplitudes were omitted."""
     return 0 if samples.signed else int(np.sum(samples.valid & ~resolved.valid))
 
 
 def whitened_along(sqrt_information: Array, samples: FieldSamples) -> Array:
-    """Return a whitening (n, channels, 6, 6) of the part along each amplitude's phase alone."""
+    """Return a whitening (n, channels, 6, 6) of the part along each amplitude's phase only."""
     if samples.signed:
         return sqrt_information
     k = "xyz".index(samples.axes)

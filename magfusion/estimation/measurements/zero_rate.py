@@ -1,8 +1,8 @@
-"""Zero rate: in a whole rest the gyroscope shows nothing but its bias.
+"""Zero angular rate: in a stationary interval the gyroscope measures its bias.
 
-Between two epochs that are hours apart nothing else tells a bias from a turn.  The same noise is in
-the inertial stream between the states: what it claims of the turn within a rest is too much, never
-too little.
+Between two epochs hours apart nothing else separates a bias from a rotation.  The same noise is in
+the inertial stream between the states, so that the uncertainty of the rotation within the interval
+is overestimated, never underestimated.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ LONGEST_MEAN = 2.0  # s
 
 @dataclass(frozen=True, eq=False)
 class ZeroRate(Measurement):
-    """The gyroscope's bias is what it shows.
+    """The gyroscope's bias equals its reading.
 
     Parameters
     ----------
@@ -55,16 +55,16 @@ def zero_rate(
     time_offset: Array,
     noise: float,
 ) -> ZeroRate | None:
-    """Return what a gyroscope shows about some epochs of rests; None where it is silent.
+    """Return the gyroscope's mean around stationary epochs as a measurement; None in a gap.
 
     Parameters
     ----------
     time : ndarray, shape (n,)
         Of the epochs, increasing (s).
     within : tuple of ndarray, shape (n,)
-        Beginning and end of the rest that each lies in (s).
+        Begin and end of the stationary interval of each (s).
     time_offset : ndarray, shape (n,)
-        Of the IMU's stamps then (s).
+        Of the IMU's stamps at each (s).
     noise : float
         Density of the gyroscope's noise (rad/s/sqrt(Hz)).
     """
@@ -85,7 +85,7 @@ def zero_rate(
 
 
 def freed_of_bias(imu: ImuSamples, begin: Array, end: Array) -> ImuSamples:
-    """Return inertial samples whose mean rate is zero in each of some rests, and goes between.
+    """Remove the mean rate of stationary intervals from inertial samples, interpolated between.
 
     Parameters
     ----------

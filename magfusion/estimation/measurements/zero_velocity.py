@@ -1,4 +1,4 @@
-"""Zero velocity: when the platform may be said to stand, and what that measures."""
+"""Zero-velocity update: detection of a stationary platform, and its measurement."""
 
 from dataclasses import dataclass
 
@@ -46,12 +46,12 @@ class ZeroVelocity(Measurement):
 
 
 def zero_velocity(epoch: IntArray, sigma: float) -> ZeroVelocity:
-    """Return that the platform stands at some epochs, alike (m/s)."""
+    """Return zero velocity at some epochs, with one sigma (m/s)."""
     return ZeroVelocity(epoch, np.full(len(epoch), sigma))
 
 
 def quiet_before(imu: ImuSamples, stamps: Array, motion: MotionModel) -> BoolArray:
-    """Tell at which times the IMU has been quiet for the motion's span of rest, without a gap.
+    """Return at which times the IMU has been quiet for the rest span, without a gap.
 
     Parameters
     ----------
@@ -77,21 +77,21 @@ def quiet_before(imu: ImuSamples, stamps: Array, motion: MotionModel) -> BoolArr
 
 
 def may_stand(velocity_world: Array, cov: Array, motion: MotionModel) -> BoolArray:
-    """Tell where nothing that is known says that the platform moves.
+    """Return where the velocity estimate is consistent with rest.
 
-    A slow steady motion is as quiet as a rest: the velocity decides, and one that nobody knows
-    contradicts nothing, nor does it tell anything.
+    A slow steady motion is as quiet as a rest, so that the velocity decides.  An unknown velocity
+    is consistent with anything and gives no information.
 
     Parameters
     ----------
     velocity_world : ndarray, shape (..., 3)
         (m/s)
     cov : ndarray, shape (..., 3, 3)
-        Of it (m^2/s^2).
+        Of the velocity (m^2/s^2).
     """
     known = np.diagonal(cov, axis1=-2, axis2=-1).max(axis=-1) < motion.rest_known_speed**2
     slow = (velocity_world**2).sum(axis=-1) < REST_GATE * motion.rest_speed_sigma**2
-    if not known.any() or slow.all():  # a covariance makes the distance only smaller
+    if not known.any() or slow.all():  # a covariance only decreases the distance
         return np.asarray(known & slow)
     cov = cov + motion.rest_speed_sigma**2 * _EYE
     solved = np.linalg.solve(cov, velocity_world[..., None])[..., 0]

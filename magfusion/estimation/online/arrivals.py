@@ -1,4 +1,4 @@
-"""What holds the streams of a platform while they arrive, of one magnetometer or of several."""
+"""Input queue of a platform with one or several magnetometers."""
 
 from magfusion.estimation.online.input_queue import Arrivals
 from magfusion.estimation.online.several_arrivals import SeveralArrivals
@@ -8,7 +8,7 @@ from magfusion.receiver.windows import LockinSettings
 
 
 def arrivals_of(site: Site, lockin: LockinSettings | None) -> Arrivals:
-    """Return what holds the streams of a site's platform."""
+    """Return the input queue of a site's platform."""
     offset = site.platform.imu.time_offset
     if site.platform.further:
         return SeveralArrivals(site, lockin, offset)

@@ -1,4 +1,4 @@
-"""Corrections that enter smoothly: what the output is still away from the corrected estimate."""
+"""Correction smoothing: corrections of the estimate enter the output gradually."""
 
 from dataclasses import dataclass, replace
 
@@ -11,14 +11,14 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class Offset:
-    """A correction that has not entered altogether.
+    """A correction that has not fully entered the output.
 
     Parameters
     ----------
     time : float
-        When it came (s).
+        Of the correction (s).
     step : ndarray, shape (9,)
-        From the corrected state to what was told before, world axes: rotation (on the left),
+        From the corrected state to the previous output, world axes: rotation (on the left),
         position, velocity.
     """
 
@@ -27,7 +27,7 @@ class Offset:
 
 
 class Blend:
-    """Corrections, each of which enters within so long (s), at first and at last slowly."""
+    """Corrections that enter the output smoothly, each within a length of time (s)."""
 
     _offsets: list[Offset]
 
@@ -35,11 +35,11 @@ class Blend:
         self.length, self._offsets = length, []
 
     def forget(self) -> None:
-        """Let all that was told before be of no more account."""
+        """Discard all corrections."""
         self._offsets = []
 
     def take(self, told: State, corrected: State) -> None:
-        """Go on from what was told to a corrected state of the same time."""
+        """Add the correction from an output state to a corrected state of the same time."""
         turn = told.world_from_body @ corrected.world_from_body.T
         step = np.concatenate(
             [
@@ -57,11 +57,11 @@ class Blend:
         return one.step * (1.0 - share**2 * (3.0 - 2.0 * share))
 
     def remaining(self, time: float) -> Array:
-        """Return what is left at a time (s) of all corrections, shape (9,)."""
+        """Return the sum of all corrections that remain at a time (s), shape (9,)."""
         return sum((self._left(one, time) for one in self._offsets), np.zeros(9))
 
     def told(self, state: State) -> tuple[State, Array]:
-        """Return a corrected state as it is told, with a covariance for what is left; and that."""
+        """Return the output for a corrected state, its covariance enlarged; and the remainder."""
         step = self.remaining(state.time)
         if not np.any(step):
             return state, step

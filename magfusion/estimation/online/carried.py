@@ -1,7 +1,8 @@
-"""A state carried on by the inertial samples, one step of strapdown each, with its covariance.
+"""Propagation of a state by inertial samples, one strapdown step each, with its covariance.
 
-Each step goes on from the last: nothing is integrated again from the epoch.  Motion and covariance
-of several samples are made together, in closed form but for one product of matrices a sample.
+Each step continues from the last: nothing is integrated again from the epoch.  Motion and
+covariance of several samples are computed together, in closed form except one matrix product per
+sample.
 """
 
 from dataclasses import dataclass
@@ -23,12 +24,12 @@ from magfusion.units import Array, BoolArray
 
 @dataclass(frozen=True, eq=False)
 class Departure:
-    """The state of an epoch, and what carries it on.
+    """The state of an epoch, and all that its propagation needs.
 
     Parameters
     ----------
     state : State
-        As the estimator has it.
+        Of the estimator.
     site : Site
         Its gravity and the noise of its IMU.
     blocks : tuple of Block
@@ -51,7 +52,7 @@ class Departure:
 
 @dataclass(frozen=True, eq=False)
 class Passage:
-    """Where the platform passes at some times, and what of the epoch's errors gets there.
+    """Propagated states, and their transition and noise since the epoch.
 
     Parameters
     ----------
@@ -61,12 +62,12 @@ class Passage:
     position_world, velocity_world : ndarray, shape (n, 3)
         (m, m/s)
     gyro_body, accel_body : ndarray, shape (n, 3)
-        There, without bias (rad/s, m/s^2).
+        At these times, without bias (rad/s, m/s^2).
     transition : ndarray, shape (n, 15, 15 or 15 + calibration)
-        From the tangent of the epoch's state to errors as
-        `magfusion.estimation.graph.reckoning_error` has them.
+        From the tangent of the epoch's state to errors as defined by
+        `magfusion.estimation.graph.reckoning_error`.
     noise : ndarray, shape (n, 15, 15)
-        Of such errors, since the epoch.
+        Covariance of these errors that is added since the epoch.
     """
 
     time: Array
@@ -82,12 +83,12 @@ class Passage:
         return len(self.time)
 
     def rows(self, chosen: slice | BoolArray) -> "Passage":
-        """Return some of them."""
+        """Return a subset."""
         return Passage(**{name: part[chosen] for name, part in vars(self).items()})
 
 
 def departing(departure: Departure) -> Passage:
-    """Return where a state departs; rate and specific force there are not known yet."""
+    """Return the start of a propagation; its rate and specific force are not known yet."""
     state = departure.state
     width = len(state.cov) if inertial_blocks(departure.blocks) else MOTION
     transition = np.eye(MOTION, width)
@@ -108,18 +109,18 @@ def departing(departure: Departure) -> Passage:
 def carry(
     departure: Departure, last: Passage, imu: ImuSamples, wanted: Array, *, blind: bool = False
 ) -> tuple[Passage, Passage]:
-    """Carry a passage on to some times, and to the newest inertial sample.
+    """Propagate a passage to some times, and to the newest inertial sample.
 
     Parameters
     ----------
     last : Passage
-        Of one time: how far the state was carried before.
+        Of one time: the end of the previous propagation.
     imu : ImuSamples
-        With the one before that time.
+        Including the one before that time.
     wanted : ndarray, shape (n,)
-        Rising, not before the last time nor behind the newest sample (s).
+        Rising, not before the last time nor after the newest sample (s).
     blind : bool
-        Whether samples stand in for inertial ones: they have the noise of a gap.
+        Whether samples are substitutes for inertial ones: they have the noise of a gap.
 
     Returns
     -------
@@ -135,7 +136,7 @@ def carry(
 def _along(
     departure: Departure, last: Passage, imu: ImuSamples, grid: Array, *, blind: bool
 ) -> Passage:
-    """Return the passage at the times of a grid that begins where it was."""
+    """Return the passage at the times of a grid that starts at its time."""
     state, stamps = departure.state, imu.time + departure.time_offset
     samples = corrected_imu(state.calibration, departure.blocks, imu)
     bias = np.concatenate([state.gyro_bias_body, state.accel_bias_body])
@@ -167,7 +168,7 @@ def _along(
         step = steps[k]
         np.matmul(step, transition[k], out=transition[k + 1])
         if by_calibration is not None:
-            # What a parameter adds to a sample acts as its bias does, the other way.
+            # A parameter's effect on a sample is that of the bias with the opposite sign.
             own = by_calibration[k]
             transition[k + 1, :9, MOTION:] -= step[:9, 9:] @ own
         np.matmul(step @ noise[k], step.T, out=noise[k + 1])
@@ -199,7 +200,7 @@ def _by_calibration(departure: Departure, imu: ImuSamples, grid: Array) -> Array
 
 
 def ahead(passage: Passage, horizon: float, gravity: float, cov_body: Array) -> Passage:
-    """Return where a passage leads if rate, and specific force in world axes, stay as they are.
+    """Return a passage extrapolated with constant rate and constant specific force in world axes.
 
     Parameters
     ----------
@@ -208,7 +209,7 @@ def ahead(passage: Passage, horizon: float, gravity: float, cov_body: Array) -> 
     gravity : float
         (m/s^2)
     cov_body : ndarray, shape (9, 9)
-        Of rotation, position and velocity: what it costs that they do not stay.
+        Of rotation, position and velocity: the cost of that assumption.
     """
     count = len(passage)
     length = np.full(count, horizon)
@@ -235,7 +236,7 @@ def ahead(passage: Passage, horizon: float, gravity: float, cov_body: Array) -> 
 
 
 def in_tangent(passage: Passage) -> tuple[Array, Array]:
-    """Return transition and noise in the tangent of the states there."""
+    """Return transition and noise in the tangent of the propagated states."""
     turn = np.zeros((len(passage), MOTION, MOTION))
     turn[:] = np.eye(MOTION)
     for part in (ROTATION, POSITION):
@@ -244,7 +245,7 @@ def in_tangent(passage: Passage) -> tuple[Array, Array]:
 
 
 def carried_states(departure: Departure, passage: Passage) -> list[State]:
-    """Return the states along a passage, each with its covariance for all that the epoch's has."""
+    """Return the states of a passage, with covariances of all that the epoch's state has."""
     state, (transition, noise) = departure.state, in_tangent(passage)
     if len(passage) == 0:
         return []

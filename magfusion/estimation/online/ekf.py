@@ -1,4 +1,4 @@
-"""The light estimator: an error-state Kalman filter, with filterpy as its arithmetic."""
+"""The light estimator: an error-state Kalman filter on filterpy's equations."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,13 +14,13 @@ from magfusion.estimation.measurements.phasors import leaves_out
 from magfusion.model.parameters import Block
 from magfusion.units import Array
 
-FAR_ITERATIONS = 3  # where the prediction is too wide to linearise at
+FAR_ITERATIONS = 3  # where the prediction is too uncertain to linearise at
 
 
 def telling_rows(
     measurements: Sequence[Measurement], state: State, blocks: tuple[Block, ...]
 ) -> tuple[Array, Array]:
-    """Return `measured_rows` without those, of many beacons, of what was not heard."""
+    """Return `measured_rows` without the rows of undetected ones of many beacons."""
     error, jacobian = measured_rows(measurements, state, blocks)
     if not leaves_out(measurements):
         return error, jacobian
@@ -29,23 +29,23 @@ def telling_rows(
 
 
 class ErrorStateFilter(PartialUpdateFilter):
-    """State of now, updated epoch by epoch.
+    """Current state, updated epoch by epoch.
 
     A filterpy filter whose nominal state is ``state``: `absorb` predicts, updates, moves the
     nominal state by ``x`` and sets ``x`` to zero.  Its attributes are filterpy's:
 
     - ``F`` and ``Q`` are transition and noise of the last interval, in the tangent of the states;
-      the nominal state goes on by preintegration, not by ``F``.
+      the nominal state is propagated by preintegration, not by ``F``.
     - ``P`` is the covariance of ``state``.
     - Rows are whitened, so ``R`` is one; ``y`` is the innovation in units of its noise, and ``z``
       is measured minus predicted.  ``H``, ``K``, ``S``, ``log_likelihood`` and ``mahalanobis`` are
-      of the last update, ``x_post`` is what the state was moved by from its prediction.
-    - A robust loss has weighed the rows before.
+      of the last update, ``x_post`` is the correction of the predicted state.
+    - A robust loss has already weighted the rows.
 
     Parameters
     ----------
     state : State
-        The start.
+        Initial state.
     blocks : tuple of Block
         Calibration parameters in its tangent.
     considered : int
@@ -67,7 +67,7 @@ class ErrorStateFilter(PartialUpdateFilter):
         measurements: Sequence[Measurement],
         linearization_point: State | None = None,
     ) -> None:
-        """Take in what was measured at the end of an interval.
+        """Update with the measurements at the end of an interval.
 
         Parameters
         ----------
@@ -76,12 +76,12 @@ class ErrorStateFilter(PartialUpdateFilter):
         measurements : sequence of Measurement
             Of this epoch.
         linearization_point : State, optional
-            Where to linearise, if the prediction is too wide for it; then three times.
+            Where to linearise if the prediction is too uncertain; then three iterations.
 
         Raises
         ------
         EstimationError
-            Where the arithmetic fails; the state is then as it was.
+            If the arithmetic fails; the state is then unchanged.
         """
         self.F, self.Q = predicted.transition, predicted.noise
         self.predict()
@@ -95,17 +95,17 @@ class ErrorStateFilter(PartialUpdateFilter):
     def _update_nominal(
         self, prior: State, measurements: Sequence[Measurement], point: State | None
     ) -> State:
-        """Return the state moved by the update, its covariance aside."""
+        """Return the state moved by the update, with its covariance unchanged."""
         state, cov = prior if point is None else replace(point, cov=prior.cov), self.P
         for _ in range((1 if point is None else FAR_ITERATIONS) if measurements else 0):
             self.x, self.P = np.zeros(len(cov)), cov
             error, jacobian = telling_rows(measurements, state, self.blocks)
-            if state is not prior:  # from the prediction, which holds the prior
+            if state is not prior:  # from the prediction, which contains the prior
                 error = error - jacobian @ between(prior, state, self.blocks)
             update = self.update_linear if point is None else self.update_from_far
             try:
                 update(-error, jacobian)
-            except ValueError as failure:  # SciPy's of what is not finite, and LinAlgError
+            except ValueError as failure:  # SciPy's for non-finite values, and LinAlgError
                 raise EstimationError(f"the filter's update failed ({failure})") from failure
             if not np.all(np.isfinite(self.x)):
                 raise EstimationError("the filter's step is not finite")
@@ -113,6 +113,6 @@ class ErrorStateFilter(PartialUpdateFilter):
         return state
 
     def replace_state(self, state: State) -> None:
-        """Go on from another state."""
+        """Continue from another state."""
         self.state = self.lagged = state
         self.x, self.P = np.zeros(len(state.cov)), state.cov

@@ -1,4 +1,4 @@
-"""What one epoch does to a running estimate: gate, update, being lost, and what is said of it."""
+"""Update of a running estimate by one epoch: gate, update, loss and recovery, and judgement."""
 
 from dataclasses import replace
 
@@ -45,26 +45,26 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding
 from magfusion.units import Array, BoolArray
 
-WIDE_POSITION, WIDE_ROTATION = 0.3, 0.2  # m, rad; beyond, the prediction is no place to linearise
-LOST_POSITION = 10.0  # m; a prediction wider than this is worth nothing
-NOW = np.zeros(1, dtype=np.int64)  # the one epoch of a measurement
+WIDE_POSITION, WIDE_ROTATION = 0.3, 0.2  # m, rad; beyond, the prediction is no linearization point
+LOST_POSITION = 10.0  # m; a larger sigma means that the state is lost
+NOW = np.zeros(1, dtype=np.int64)  # the single epoch of a measurement
 AS_LIKELY = 20.0  # difference of chi square to the best hypothesis
-COMPARED_EVERY, COMPARED_EPOCHS = 30.0, 150  # s, epochs; between fixes that nothing asked for
+COMPARED_EVERY, COMPARED_EPOCHS = 30.0, 150  # s, epochs; between fixes without a request
 
 Estimator = SlidingWindow | ErrorStateFilter
 
 
 class EpochUpdate:
-    """Takes in epochs, one after the other.
+    """Processes epochs one by one.
 
     Parameters
     ----------
     estimated, blocks : tuple of Block
         Calibration parameters that are estimated, and all in the states' tangent.
     earth : bool
-        Whether the steady field is a measurement.
+        Whether the static field is a measurement.
     bank : SubsetBank, optional
-        Filters without each beacon; without it there are no protection levels.
+        Filters that exclude each beacon; without it there are no protection levels.
     """
 
     gate: Gate
@@ -114,12 +114,12 @@ class EpochUpdate:
         predicted: Propagated,
         samples: FieldSamples | None,
     ) -> Judgement:
-        """Go on to a prediction, take in what was measured there, and judge the state.
+        """Process the measurements at a prediction, and judge the state.
 
         Parameters
         ----------
         samples : FieldSamples, optional
-            Of this epoch; None where there may be a window of it.
+            Of this epoch; None where it may have a window.
         """
         before, state = estimator.state, predicted.state
         if predicted.bridged:
@@ -138,7 +138,7 @@ class EpochUpdate:
             self.gate.nothing_measured()
         else:
             passed = self._passed(estimator, predicted, found, lost=lost)
-            if isinstance(passed, Judgement):  # nothing of it is to be taken in
+            if isinstance(passed, Judgement):  # nothing of it is to be used
                 return passed
             found, point = passed
         if found is not None:
@@ -155,7 +155,7 @@ class EpochUpdate:
         return judged if found is None else replace(judged, heard=found.heard)
 
     def _without_the_last(self, estimator: Estimator, predicted: Propagated) -> Judgement:
-        """Go on with a prediction that holds nothing of what came while it was not noticed."""
+        """Continue with a prediction without the measurements of an interference's onset."""
         estimator.replace_state(self._reckoned.taken_back(predicted))
         self._reckoned.forget()
         self.score.end()
@@ -166,7 +166,7 @@ class EpochUpdate:
     def _weighed_phasors(
         self, found: Measured, explained: State, *, asked: bool
     ) -> FieldPhasors | JointPhasors:
-        """Weigh phasors by what is near; of those that the score asks of, all is predicted once."""
+        """Weight phasors for nearby metal; all predictions that the score needs are shared."""
         if isinstance(found.phasors, JointPhasors):  # of two beacons or more
             return found.phasors
         if asked:
@@ -190,7 +190,7 @@ class EpochUpdate:
         self.gate.counts["Earth field disturbed"] += disturbed
         return weighed
 
-    # What is said of it
+    # Judgement
 
     def _ask(
         self,
@@ -200,7 +200,7 @@ class EpochUpdate:
         measurements: list[Measurement],
         point: State | None,
     ) -> None:
-        """Let the score hear an epoch; a state that is linearised elsewhere ends it."""
+        """Pass an epoch to the score; end the score if the linearization point is elsewhere."""
         if point is not None:
             self.score.end()
             return
@@ -225,7 +225,7 @@ class EpochUpdate:
     def _separate(
         self, predicted: Propagated | None, measurements: list[Measurement], state: State
     ) -> None:
-        """Carry the filters without each beacon on; from None they begin anew."""
+        """Propagate the filters without each beacon; without a prediction they start again."""
         if self.bank is None:
             return
         if predicted is None:
@@ -246,7 +246,7 @@ class EpochUpdate:
         return said if self.bank is None else self.bank.heard(said, state)
 
     def _compare(self, samples: FieldSamples, state: State) -> None:
-        """See from time to time whether a fix finds the platform where the state says."""
+        """Compare the state with a fix from time to time."""
         if self.metal.near:
             return
         self._since_compared += 1
@@ -258,14 +258,14 @@ class EpochUpdate:
         fix = agreed_fix(samples, state.calibration)
         lacking = self.site.platform.magnetometer.lacking
         if fix is not None and lacking and not fix.fixes.determined[0, 0]:
-            return  # a roll that is open is as far from any state
+            return  # an undetermined roll is equally far from any state
         if fix is not None and explains(fix, samples, state.calibration):
             self.witness.compared(*_apart(state, fix))
 
-    # Being lost, and found again
+    # Loss and recovery
 
     def asks_for_each(self, state: State) -> bool:
-        """Return whether beacons that are told together do not do: each must be told alone."""
+        """Return whether jointly measured beacons do not suffice: each is needed separately."""
         return self._lost(state) or _wide(state)
 
     def _lost(self, state: State) -> bool:
@@ -274,9 +274,9 @@ class EpochUpdate:
     def _passed(
         self, estimator: Estimator, predicted: Propagated, found: Measured, *, lost: bool
     ) -> tuple[Measured, State | None] | Judgement:
-        """Return fields that pass the gate, and the fix where they are linearised, if one is.
+        """Return fields that pass the gate, and the fix where they are linearised, if any.
 
-        Where they begin the state anew, or the last epochs are undone, the judgement of that.
+        If they restart the state, or the last epochs are undone, return the judgement instead.
 
         Parameters
         ----------
@@ -304,7 +304,7 @@ class EpochUpdate:
         measurements: list[Measurement],
         point: State | None,
     ) -> bool:
-        """Take measurements in; where that fails the state stays as it was predicted."""
+        """Update with measurements; if that fails, the state stays as predicted."""
         try:
             estimator.absorb(predicted, measurements, point)
         except EstimationError:
@@ -319,10 +319,10 @@ class EpochUpdate:
     def _linearization_point(
         self, found: Measured, state: State
     ) -> tuple[Measured, State | None, BoolArray]:
-        """Return fields as they are linearised, the fix where if one is needed, what disagrees."""
+        """Return fields as linearised, the fix that this needs, if any, and rejected channels."""
         samples = found.samples
         nothing = np.zeros(len(samples.channels), dtype=bool)
-        # Of a state that is near enough, or its windows were not asked for.
+        # Of a state that is near enough, or whose windows were not requested.
         if not isinstance(found.phasors, FieldPhasors):
             return found, None, nothing
         if not _wide(state):
@@ -343,7 +343,7 @@ class EpochUpdate:
         return found, at_fix(state, fix), fix.refused
 
     def _found_again(self, estimator: Estimator, found: Measured, predicted: Propagated) -> bool:
-        """Give the pose up that explains nothing any more, and start from a fix."""
+        """Restart from a fix, if the pose explains no measurement any more."""
         state = predicted.state
         if not self._attempts.due(state.time):
             return False
@@ -377,14 +377,14 @@ class EpochUpdate:
 
 
 def _wide(state: State) -> bool:
-    """Return whether a state is no place to linearise."""
+    """Return whether a state is too uncertain to linearise at."""
     wide = (POSITION, WIDE_POSITION), (ROTATION, WIDE_ROTATION)
     return not all(_no_wider(state.cov[part, part], sigma) for part, sigma in wide)
 
 
 def _no_wider(cov: Array, sigma: float) -> bool:
-    """Tell whether no axis of a covariance (3, 3) has a larger sigma."""
-    # The trace is not below the variance of any axis, and costs less.
+    """Return whether no axis of a covariance (3, 3) has a larger sigma."""
+    # The trace bounds the variance of every axis, and costs less.
     return bool(cov.trace() <= sigma**2 or np.linalg.eigvalsh(cov)[-1] <= sigma**2)
 
 
@@ -396,9 +396,9 @@ def _of_place(site: Site, state: State) -> tuple[Finding, ...]:
 
 
 def _apart(state: State, fix: AgreedFix) -> tuple[float, float]:
-    """Return squared distance and offset (m) of a state from the likely hypothesis nearest to it.
+    """Return squared distance and offset (m) of a state from the nearest likely hypothesis.
 
-    A mirrored pose that explains the epoch as well is no contradiction.
+    A mirrored pose that explains the epoch equally well is no contradiction.
     """
     fixes, body_from_world = fix.fixes, state.world_from_body.T
     best = (np.inf, np.inf)

@@ -1,8 +1,8 @@
 """The fixed-lag smoother: a sliding window of the batch smoother's own factors.
 
-All of the window is linearised anew at each epoch, and what leaves it stays as a prior.  GTSAM's
-`IncrementalFixedLagSmoother` would take a callback for each field factor and relinearise when it
-sees fit; here the time of an update is that of the window, whatever happens.
+The whole window is linearised again at each epoch, and what leaves it becomes a prior.  GTSAM's
+`IncrementalFixedLagSmoother` would need a callback for each field factor and relinearise when it
+decides to; here the time of an update depends on the window only.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ from magfusion.estimation.solve.bordered import eliminate_partial
 from magfusion.model.parameters import Block, dimension, retract
 from magfusion.units import Array
 
-ITERATIONS_FAR = 4  # where the prediction is too wide to linearise at
+ITERATIONS_FAR = 4  # where the prediction is too uncertain to linearise at
 LAST = slice(MOTION, 2 * MOTION)  # of the first state, the last and the calibration
 
 
@@ -46,7 +46,7 @@ class Node:
     measurements : tuple of Measurement
         Of this epoch.
     link : Link, optional
-        From the node before; None for the first.
+        From the previous node; None for the first.
     """
 
     state: State
@@ -69,7 +69,7 @@ class SlidingWindow:
     Parameters
     ----------
     state : State
-        The start, with its covariance.
+        Initial state, with its covariance.
     blocks : tuple of Block
         Calibration parameters in its tangent.
     lag : float
@@ -107,10 +107,10 @@ class SlidingWindow:
         measurements: Sequence[Measurement],
         linearization_point: State | None = None,
     ) -> None:
-        """Take in what was measured at the end of an interval.
+        """Update with the measurements at the end of an interval.
 
-        Another code than `ErrorStateFilter.absorb`: it solves for all of the window by elimination,
-        that for one state by a gain.  They share rows, inertial factor, partial update and chart.
+        Unlike `ErrorStateFilter.absorb`, which solves for one state by a gain, it solves for the
+        whole window by elimination.  Both share rows, inertial factor, partial update and chart.
 
         Parameters
         ----------
@@ -119,12 +119,12 @@ class SlidingWindow:
         measurements : sequence of Measurement
             Of this epoch.
         linearization_point : State, optional
-            Where to start the iteration, if the prediction is too wide for it.
+            Where to start the iteration, if the prediction is too uncertain.
 
         Raises
         ------
         EstimationError
-            Where the window cannot be solved; it is then as it was.
+            If the window cannot be solved; it is then unchanged.
         """
         kept = (self.nodes, self.prior, self.state, self.lagged, self.left)
         nodes, passed = self.nodes or [Node(self.state, (), None)], self._has_passed(0)
@@ -142,14 +142,14 @@ class SlidingWindow:
             raise EstimationError(f"the window could not be solved ({reason})") from error
 
     def replace_state(self, state: State) -> None:
-        """Go on from another state, with its covariance for all that was known."""
+        """Continue from another state, with its covariance for all that was known."""
         untold = self.nodes[1:] if self._has_passed(0) else self.nodes
         self.left = [*self.left, *(n.state for n in untold if n.state.time < state.time)]
         self.nodes, self.prior = [], _prior_of(state)
         self.state = self.lagged = state
 
     def _has_passed(self, number: int) -> bool:
-        """Return whether a node is older than the lag: a first one is told, and leaves next."""
+        """Return whether a node is older than the lag: it is output, and then leaves."""
         nodes = self.nodes
         return len(nodes) > 1 and nodes[-1].state.time - nodes[number].state.time > self.lag
 
@@ -159,13 +159,13 @@ class SlidingWindow:
         Parameters
         ----------
         passed : bool
-            Whether the first node leaves, as it is linearised with all others.
+            Whether the first node leaves, linearised with all others.
         """
         graph, begin = self._linearized(self.nodes), 0
         if passed:
             graph, begin = self._without_first(graph), 1
         last = begin + len(self.nodes) - 1
-        # Both ends stay to the last, so that one elimination tells the covariance of either.
+        # Both ends are eliminated last, so that one elimination gives the covariance of either.
         solved, rest = eliminate_partial(graph, _keys(range(begin + 1, last), None))
         information, vector = rest.hessian(_keys([begin, last], self.calibration_key))
         oldest, newest = slice(0, MOTION), slice(MOTION, None)
@@ -227,14 +227,14 @@ class SlidingWindow:
         return factor
 
     def _tell_passed(self, cov: Array) -> None:
-        """Tell the states that are older than the lag; the last of them leaves with the next epoch.
+        """Output the states that are older than the lag; the last leaves with the next epoch.
 
-        Then the whole window is linearised where it is now, and none of it twice.
+        Then the whole window is linearised at its current states, and no node twice.
 
         Parameters
         ----------
         cov : ndarray
-            Of the first state, as the last step solved it: a step later it is the same.
+            Of the first state, from the last step; the same one step later.
         """
         while self._has_passed(0):
             self.lagged = replace(self.nodes[0].state, cov=cov)
@@ -246,14 +246,14 @@ class SlidingWindow:
             cov = self._cov_of_first()
 
     def _cov_of_first(self) -> Array:
-        """Return the covariance of the first state, the whole window and its past considered."""
+        """Return the covariance of the first state, given the whole window and its past."""
         later = range(len(self.nodes) - 1, 0, -1)
         _, rest = eliminate_partial(self._linearized(self.nodes), _keys(later, None))
         information, _ = rest.hessian(_keys([0], self.calibration_key))
         return _even(np.asarray(np.linalg.inv(information)))
 
     def _without_first(self, graph: gtsam.GaussianFactorGraph) -> gtsam.GaussianFactorGraph:
-        """Return a window's linear graph without its first node, whose information is a prior."""
+        """Return a window's linear graph with its first node marginalized to a prior."""
         own, others = gtsam.GaussianFactorGraph(), gtsam.GaussianFactorGraph()
         keys = {X(0), V(0), B(0)}
         for i in range(graph.size()):
@@ -264,7 +264,7 @@ class SlidingWindow:
         return others
 
     def _leave(self, graph: gtsam.GaussianFactorGraph) -> None:
-        """Let the first node go: what a linear graph says of it is a prior of the second."""
+        """Marginalize the first node: its information in a linear graph becomes a prior."""
         first, second = self.nodes[:2]
         _, rest = eliminate_partial(graph, _keys([0], None), orthogonal=True)
         sqrt_information, right = rest.jacobian(_keys([1], self.calibration_key))
@@ -275,7 +275,7 @@ class SlidingWindow:
         self.nodes = self.nodes[1:]
 
     def _carried(self, sqrt_information: Array, right: Array, noise: Array) -> tuple[Array, Array]:
-        """Return the prior of later: some of the calibration drifts, some is not to be learnt."""
+        """Return the prior with calibration drift added and considered parameters unlearnt."""
         triangular = np.asarray(np.linalg.qr(np.column_stack([sqrt_information, right])).R)
         size = sqrt_information.shape[1]
         sqrt_information, right = triangular[:size, :size], triangular[:size, size]
@@ -314,7 +314,7 @@ def _split(step: Array, node: int) -> list[tuple[int, Array]]:
 
 
 def _cov_without(information: Array, others: slice) -> Array:
-    """Return the covariance of all variables but some."""
+    """Return the covariance of all variables except some."""
     kept = np.delete(np.arange(len(information)), others)
     by_kept = information[others, kept]
     gained = by_kept.T @ np.linalg.solve(information[others, others], by_kept)

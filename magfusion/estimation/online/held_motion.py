@@ -1,6 +1,6 @@
-"""What it costs to hold rate and specific force for a while: the covariance of a look ahead.
+"""Constant-motion model: the covariance of predictions that keep rate and specific force constant.
 
-Measured along the inertial stream itself, as the same look ahead from its past samples erred.
+It is measured on the inertial stream itself, by the errors of such predictions in its past.
 """
 
 import numpy as np
@@ -9,23 +9,23 @@ from magfusion.model.samples import ImuSamples
 from magfusion.model.trajectory import interpolated
 from magfusion.units import Array, IntArray
 
-REFERENCE = 0.05  # s; the look ahead that is measured where none is asked for
-# Of a hand, before anything is measured: change of rate (rad/s^2) and of force (m/s^3) in a second.
+REFERENCE = 0.05  # s; the measured horizon where none is requested
+# Initially, of a hand: change of rate (rad/s^2) and of force (m/s^3) in a second.
 ANGULAR, JERK = 10.0, 30.0
-PRIOR = 1.0  # s of the stream; the weight of that
+PRIOR = 1.0  # s of the stream; the weight of these
 MEMORY, RECENT = 20.0, 1.0  # s
 PARTS = (slice(0, 3), slice(3, 9))  # rotation, then position and velocity
 
 
 class HeldMotion:
-    """Covariance of what a look ahead misses, body axes.
+    """Covariance of prediction errors, body axes.
 
-    It is that of the last `MEMORY` seconds, or of the most recent where that is more.
+    The average of the last `MEMORY` seconds, or of the most recent ones where that is larger.
 
     Parameters
     ----------
     horizon : float
-        How far ahead it is measured (s); others follow by powers of time that are not too small.
+        Of the measured predictions (s); others scale with powers of time, bounded below.
     """
 
     _mean: Array
@@ -42,7 +42,7 @@ class HeldMotion:
         self._recent, self._weight, self._heard = self._mean.copy(), PRIOR, -np.inf
 
     def hear(self, imu: ImuSamples) -> None:
-        """Take in what has come of the stream since this was last called."""
+        """Process the new samples of the stream."""
         if len(imu) < 3:
             return
         begin = max(self._heard, imu.time[0])
@@ -58,7 +58,7 @@ class HeldMotion:
         self._weight, self._heard = weight, float(imu.time[-1] - self.horizon)
 
     def cov(self, horizon: float) -> Array:
-        """Return the covariance of rotation, position and velocity after a look ahead (s)."""
+        """Return the covariance of rotation, position and velocity after a horizon (s)."""
         ratio = horizon / self.horizon
         grown = ratio ** np.where(ratio > 1.0, [2.0, 3.0, 2.0], [1.0, 2.0, 1.0])
         scale = np.repeat(grown, 3)
@@ -69,7 +69,7 @@ class HeldMotion:
 
 
 def _missed(imu: ImuSamples, at: IntArray, horizon: float) -> Array:
-    """Return what looks ahead from some samples missed, rotation, position, velocity, (n, 9)."""
+    """Return errors of predictions from some samples: rotation, position, velocity, (n, 9)."""
     time, count = imu.time, max(int(np.ceil(horizon / np.median(np.diff(imu.time)))), 2)
     dt = horizon / count
     turn, gained, moved = np.zeros((3, len(at), 3))
@@ -79,7 +79,7 @@ def _missed(imu: ImuSamples, at: IntArray, horizon: float) -> Array:
         since = (k + 0.5) * dt
         rate = interpolated(now + since, time, imu.gyro_body)
         later = interpolated(now + since, time, imu.accel_body)
-        # Held is the force in world axes: it turns against the body.
+        # The force is constant in world axes: it rotates with respect to the body.
         change = (later + since * np.cross(gyro, later) - force) * dt
         turn += (rate - gyro) * dt
         moved += gained * dt + 0.5 * change * dt

@@ -1,6 +1,6 @@
-"""What has arrived for a navigator and is not used up yet.
+"""Input queue of a navigator: samples that are not processed yet.
 
-How far all of it goes, and what of it was measured at an epoch.
+It knows until when all streams are complete, and what was measured at an epoch.
 """
 
 from collections import deque
@@ -42,19 +42,19 @@ from magfusion.receiver.lockin_receiver import LockinReceiver
 from magfusion.receiver.receiver import Receiver
 from magfusion.units import Array, IntArray
 
-LONGEST_WAIT = 5.0  # s; the fields go on without an IMU that is silent for longer
+LONGEST_WAIT = 5.0  # s; fields are processed without an IMU that is silent for longer
 OFFSET_STALE = 1e-4  # s; at a radian a second, six thousandths of a degree
 SHORTEST_STEP = 1e-6  # s; of epochs of one magnetometer
 MARGIN = 0.1  # s; of inertial samples about a window
 
 
 class Arrivals:
-    """Streams in order of time, each on its own clock.
+    """Streams, sorted by time, each on its own clock.
 
     Parameters
     ----------
     receiver : Receiver
-        Of the waveform; it begins with the first state, and not at all where phasors come.
+        Of the waveform; it begins with the first state, and never where phasors are given.
     applied_offset : float
         Added to the IMU's stamps (s).
 
@@ -65,23 +65,23 @@ class Arrivals:
     fields : list of FieldSamples
         One epoch each, the oldest first.
     steady : dict
-        By the time of the epoch (s), the steady fields with it.
+        By the time of the epoch (s), its static fields.
     others : list of (float, Measurement)
-        Anything else that was measured, and when (s).
+        Other measurements, with their times (s).
     windows : deque of int
-        Numbers of windows that were admitted and not demodulated yet.
+        Numbers of windows that are admitted and not demodulated yet.
     usual : float, optional
         Sampling interval of the IMU (s), once there is a state.
     last_epoch : float
-        When fields were last measured (s).
+        Time of the last fields (s).
     unseen : int
-        Windows in which the inertial stream is silent.
+        Windows without inertial samples.
     open_signs : int
-        Amplitudes that were left out because nothing tells their sign.
+        Amplitudes that are dropped because their sign is undetermined.
     frozen : int
-        Inertial samples that were left out because the IMU hung.
+        Inertial samples that are dropped because the IMU is frozen.
     stand_in : StandIn
-        What takes its place there.
+        Substitutes for missing inertial samples.
     short : ShortWindows, optional
         Of tones that are close.
     """
@@ -96,7 +96,7 @@ class Arrivals:
     others: list[tuple[float, Measurement]]
     windows: deque[int]
     usual: float | None
-    _heard_by: dict[str, float]  # when each of several magnetometers was last heard (s)
+    _heard_by: dict[str, float]  # time of the last samples of each of several magnetometers (s)
     last_epoch: float
     unseen: int
     open_signs: int
@@ -111,7 +111,7 @@ class Arrivals:
 
     def __init__(self, receiver: Receiver, applied_offset: float) -> None:
         self.receiver, self.short = receiver, None
-        # What stands in for them needs a state, which a whole log has only when it is smoothed.
+        # Substitutes need a state; a whole log has one only in the smoother.
         receiver.needs_turn = not isinstance(receiver, LockinReceiver)
         receiver.joined = True
         self.applied_offset = applied_offset
@@ -127,10 +127,10 @@ class Arrivals:
         self._noise, self._noise_unseen = [], False
         self._heard_by = {}
 
-    # What goes in
+    # Input
 
     def add_imu(self, time: Array, gyro_body: Array, accel_body: Array) -> None:
-        """Take inertial samples, as `Navigator.add_imu`."""
+        """Add inertial samples, as `Navigator.add_imu`."""
         stamps = np.atleast_1d(time)
         check_clock("imu", stamps, self._newest)
         rows = np.hstack([np.atleast_2d(gyro_body), np.atleast_2d(accel_body)])
@@ -144,28 +144,28 @@ class Arrivals:
     def add_magnetometer(
         self, time: Array, measured_sensor: Array, magnetometer: str | None = None
     ) -> None:
-        """Take raw samples of the magnetometer, as `Navigator.add_magnetometer`."""
+        """Add raw samples of the magnetometer, as `Navigator.add_magnetometer`."""
         magnetometer_number(self.receiver.site, magnetometer, "samples")
         stamps = np.atleast_1d(time)
         check_clock("magnetometer", stamps, self._newest)
         self.waveform.add(stamps, np.atleast_2d(measured_sensor))
 
     def add_marks(self, marks: Marks) -> None:
-        """Take bursts of coils, as `Navigator.add_marks`."""
+        """Add bursts of coils, as `Navigator.add_marks`."""
         check_clock("marks", marks.end, self._newest)
         self.receiver.hear_marks(marks)
 
     def add_slots(self, time: Array, slot: IntArray) -> None:
-        """Take slots beside samples, as `Navigator.add_slots`."""
+        """Add the slots of samples, as `Navigator.add_slots`."""
         check_clock("magnetometer", time, self._newest)
         self.receiver.hear_slots(time, slot)
 
     def add_fields(self, samples: FieldSamples, steady: SteadyFields | None, after: float) -> int:
-        """Take phasors, as `Navigator.add_fields`; return how many are not after a time (s)."""
+        """Add phasors, as `Navigator.add_fields`; return how many are not after a time (s)."""
         check_clock("fields", samples.time, self._newest)
         if self.fields and self.fields[-1].signed != samples.signed:
             raise InputError(
-                "fields: amplitudes without sign come among phasors; give one or other"
+                "fields: amplitudes without sign are mixed with phasors; use only one of them"
             )
         late = 0
         for i in range(len(samples)):
@@ -180,18 +180,18 @@ class Arrivals:
         return late
 
     def add_measurement(self, time: float, measurement: Measurement, after: float) -> bool:
-        """Take any other measurement; return whether it is after a time (s)."""
+        """Add any other measurement; return whether it is after a time (s)."""
         check_clock("measurement", np.array([time]), self._newest)
         if time > after:
             self.others.append((time, measurement.at(0)))
             self.others.sort(key=lambda other: other[0])
         return time > after
 
-    # How far it goes
+    # Times
 
     @property
     def next_field(self) -> float:
-        """When the next fields are measured (s), as far as is known."""
+        """Time of the next fields (s), as far as is known."""
         if self.fields:
             return float(self.fields[0].time[0])
         if self.receiver.grid is None:
@@ -201,7 +201,7 @@ class Arrivals:
 
     @property
     def next_other(self) -> float:
-        """When anything else was measured next (s)."""
+        """Time of the next other measurement (s)."""
         return self.others[0][0] if self.others else np.inf
 
     @property
@@ -230,32 +230,32 @@ class Arrivals:
 
     @property
     def hung_since(self) -> float | None:
-        """Stamp since which the IMU hangs (s), on the log's clock; None where it does not."""
+        """Stamp since which the IMU is frozen (s), on the log's clock; None where it is not."""
         since = [one.since for one in (self._gyro, self._accel) if one.found]
         return min(since) + self.applied_offset if since else None
 
     @property
     def reached(self) -> float:
-        """Until when everything has come (s)."""
+        """Time until which all streams have arrived (s)."""
         return min(self.inertial, self._newest_field)
 
     @property
     def awaited(self) -> float:
-        """Until when the inertial samples have come, or are not waited for any more (s)."""
+        """Time until which inertial samples have arrived, or are not awaited any more (s)."""
         return max(self.inertial, self._newest_field - LONGEST_WAIT)
 
     def due(self, inertial: float) -> bool:
-        """Return whether fields may be taken in that came, up to a time of the IMU (s)."""
+        """Return whether phasors are due for processing, up to a time of the IMU (s)."""
         return bool(self.fields) and bool(self.fields[0].time[0] <= inertial)
 
     @property
     def remarks(self) -> tuple[Finding, ...]:
-        """What is to be said of the streams; nothing of those of one magnetometer."""
+        """Findings on the streams; none on those of a single magnetometer."""
         return ()
 
     @property
     def losses(self) -> dict[str, int]:
-        """What was of no use, with the reason: windows, samples."""
+        """Numbers of unused windows and samples, by reason."""
         frozen = {"imu sample of a sensor that hung": self.frozen} if self.frozen else {}
         late = {f"{b.name} sample too late": b.late for b in (self.imu, self.waveform) if b.late}
         unseen = {"window without inertial samples": self.unseen} if self.unseen else {}
@@ -267,28 +267,28 @@ class Arrivals:
             **late,
         }
 
-    # How it goes on
+    # Processing
 
     def settle(self) -> None:
-        """Put what came last into its order, as a checkpoint holds it."""
+        """Sort the newest samples, as a checkpoint stores them."""
         self.imu.rows()
         self.waveform.rows()
 
     def gathered(self, delay: float, span: float) -> float | None:
-        """Return until when a first state is looked for (s); None as long as that is too early.
+        """Return until when to search for a first state (s); None as long as that is too early.
 
         Parameters
         ----------
         delay : float
             As of `receive` (s).
         span : float
-            Of the data that it takes (s).
+            Required duration of data (s).
         """
         reached = self.reached - delay
         return reached if reached - self.first >= span else None
 
     def first_state(self, until: float, settings: EstimatorSettings) -> OnlineStart | NoStart:
-        """Return the first state that what has come leads to, or why there is none."""
+        """Return the first state from the data so far, or why there is none."""
         steady = list(self.steady.values())
         return find_online_start(
             self.receiver.site,
@@ -302,7 +302,7 @@ class Arrivals:
         )
 
     def forget_before_start(self, kept: float) -> None:
-        """Keep no more than so long (s), whatever it is."""
+        """Keep only the last so many seconds of everything."""
         oldest = self.reached - kept
         for buffer in (self.imu, self.waveform):
             buffer.forget(oldest, oldest)
@@ -310,7 +310,7 @@ class Arrivals:
         self.receiver.forget_marks(oldest)
 
     def start(self, start: OnlineStart, delay: float) -> None:
-        """Go on from a first state, and drop what it has used; the delay as of `receive`."""
+        """Continue from a first state, and drop the data it used; the delay as of `receive`."""
         time = start.state.time
         self.applied_offset = float(start.state.calibration.imu_offset(np.array(time)))
         self.usual = float(np.median(np.diff(self.imu.rows()[0])))
@@ -329,7 +329,7 @@ class Arrivals:
         self.forget(time)
 
     def receive(self, state: State, delay: float) -> None:
-        """Judge the windows that are complete and not too late for a delay (s); demodulate slots.
+        """Check the windows that are complete and within a delay (s); demodulate slots.
 
         Windows wait for a prediction of the motion in them.
         """
@@ -352,14 +352,14 @@ class Arrivals:
             self.fields += found.rows(found.time > after).epochs()
 
     def next_window(self, state: State, *, lost: bool = False) -> float | None:
-        """Go on to the next window that was admitted: return its centre (s); None for none.
+        """Advance to the next admitted window; return its centre (s), None for none.
 
-        Of close tones to the next short one, as long as the state is near enough for it.
+        For close tones it is the next short window, as long as the state is certain enough.
 
         Parameters
         ----------
         lost : bool
-            Whether the tones must be told apart before anything else.
+            Whether the tones must first be separated.
         """
         if self.short is not None:
             while self.windows and self.receiver.centre_of(self.windows[0]) <= state.time:
@@ -374,16 +374,16 @@ class Arrivals:
 
     @property
     def window_to_come(self) -> bool:
-        """Whether the samples of a window are there that awaits its inertial ones."""
+        """Whether all samples of a window exist that awaits its inertial samples."""
         newest = self.waveform.newest
         short = self.short is not None and self.short.receiver.complete(newest)
         return short or self.receiver.complete(newest)
 
     def apply_offset_anew(self, state: State, blocks: tuple[Block, ...]) -> float:
-        """Cut the inertial stream by the time offset that has been learnt since; return the change.
+        """Apply the time offset learnt since to the inertial stream; return the change (s).
 
-        A state is the platform's where the IMU's stamp says; under another offset it is the same
-        state, a little earlier or later (s) on the log's clock.
+        A state belongs to its stamp on the IMU's clock; with another offset the same state is a
+        little earlier or later (s) on the log's clock.
         """
         lag = float(state.calibration.imu_offset(np.array(state.time))) - self.applied_offset
         if abs(lag) < OFFSET_STALE:
@@ -403,25 +403,25 @@ class Arrivals:
         return lag
 
     def forget(self, time: float) -> None:
-        """Keep the samples that are needed after a state (s)."""
+        """Keep only the samples that are needed after a state (s)."""
         reach = 2.0 + self.receiver.history
         self.imu.forget(time - reach, time - self.applied_offset - 1.0)
         self.stand_in.forget(time - reach)
         self.waveform.forget(time - reach, time - reach)
 
-    # What comes out
+    # Output
 
     def inertial_samples(self, begin: float = -np.inf, end: float = np.inf) -> ImuSamples:
-        """Return the inertial samples between two stamps of their own, and the next outside."""
+        """Return the inertial samples between two of their own stamps, with both neighbours."""
         time, rows = self.imu.between(begin, end)
         return ImuSamples(time, rows[:, :3], rows[:, 3:])
 
     def motion_samples(self, begin: float, end: float) -> ImuSamples:
-        """Return them with what stands in for those that did not come."""
+        """Return them, with substitutes for missing ones."""
         return self.stand_in.among(self.inertial_samples(begin, end), begin, end)
 
     def fill_silence(self, state: State, time: float) -> None:
-        """Learn of the fields how the platform moves from a state to a time (s), if need be."""
+        """Substitute missing inertial samples from a state to a time (s), from the fields."""
         receiver = self.receiver
         if self.fields or not isinstance(receiver, LockinReceiver) or receiver.admission is None:
             return
@@ -429,13 +429,13 @@ class Arrivals:
         self.stand_in.fill(state, until, *streams, self.applied_offset, receiver.admission)
 
     def others_at(self, time: float) -> list[Measurement]:
-        """Return anything else that was measured at a time (s), once."""
+        """Return the other measurements at a time (s), and remove them."""
         found = [measurement for when, measurement in self.others if when == time]
         self.others = [other for other in self.others if other[0] > time]
         return found
 
     def rests(self, state: State) -> bool:
-        """Return whether the platform is at rest, as far as is known."""
+        """Return whether the platform is stationary, as far as is known."""
         stamp = state.time - self.applied_offset
         motion = state.calibration.site.platform.motion
         if not may_stand(state.velocity_world, state.cov[VELOCITY, VELOCITY], motion):
@@ -454,20 +454,20 @@ class Arrivals:
         standing: bool,
         lost: bool = False,
     ) -> Measured | None:
-        """Return what was detected and measured at a prediction; None where nothing was.
+        """Return what was detected and measured at a prediction; None without a measurement.
 
         Parameters
         ----------
         before, predicted : State
-            At the epoch before and at this.
+            At the previous epoch and at this one.
         samples : FieldSamples, optional
-            Of this epoch; None where there may be a window of it.
+            Of this epoch; None where it may have a window.
         step : float
             Since fields were last measured (s).
         earth : bool
-            Whether a steady field is a measurement.
+            Whether a static field is a measurement.
         standing : bool
-            Whether the platform is known to stand.
+            Whether the platform is known to be stationary.
         """
         time = predicted.time
         by_offset, steady = None, self.steady.pop(time, None)
@@ -511,7 +511,7 @@ class Arrivals:
     def _measured_together(
         self, short: ShortWindows, before: State, predicted: State, *, standing: bool
     ) -> Measured:
-        """Return what a short window tells of tones together."""
+        """Return the joint measurement of a short window's tones."""
         half, time = 0.5 * short.length, predicted.time
         begin, end = min(before.time, time - half), time + half
         imu = self.motion_samples(begin - MARGIN, end + MARGIN)
@@ -528,7 +528,7 @@ class Arrivals:
         )
 
     def _own_step(self, samples: FieldSamples) -> float:
-        """Return since when the magnetometers of an epoch did not measure, the shortest (s)."""
+        """Return the shortest time since an epoch's magnetometers last measured (s)."""
         time, valid = float(samples.time[0]), samples.valid[0]
         named = zip(samples.magnetometers, valid.tolist(), strict=True)
         names = dict.fromkeys(name for name, there in named if there)

@@ -1,4 +1,4 @@
-"""What an epoch of a running estimate holds."""
+"""The measurements of one epoch of a running estimate."""
 
 from dataclasses import dataclass
 
@@ -10,21 +10,20 @@ from magfusion.model.samples import FieldSamples, SteadyFields
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """What an epoch holds.
+    """Measurements of one epoch.
 
     Parameters
     ----------
     samples : FieldSamples
-        Without the beacons that are not detected; where tones are told together alone, as they are
-        foreseen.
+        Without undetected beacons; as predicted where tones are only measured jointly.
     phasors : FieldPhasors or JointPhasors
         The phasors as a measurement.
     earth : EarthField, optional
-        The steady field as a measurement, where it is one.
+        The static field as a measurement, if it is one.
     steady : SteadyFields, optional
-        It as it was measured, where there is a waveform.
+        The measured static field, where there is a waveform.
     repeats : float
-        How many epochs hold each sample of overlapping windows.
+        Number of epochs that contain each sample of overlapping windows.
     """
 
     samples: FieldSamples
@@ -35,11 +34,11 @@ class Measured:
 
     @property
     def apart(self) -> bool:
-        """Whether each phasor was measured alone."""
+        """Whether each phasor was measured separately."""
         return isinstance(self.phasors, FieldPhasors)
 
     @property
     def heard(self) -> tuple[str, ...]:
-        """The beacons that are detected."""
+        """Detected beacons."""
         channels = zip(self.samples.channels, self.samples.valid[0], strict=True)
         return tuple(dict.fromkeys(name for (name, _), valid in channels if valid))

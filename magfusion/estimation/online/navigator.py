@@ -1,7 +1,7 @@
 """Navigation as the data arrive: one interface for the fixed-lag smoother and the filter.
 
-`Navigator` knows no files.  Samples go in as they come; a state comes out at every field epoch, and
-on request at any time since.
+`Navigator` reads no files.  It takes samples as they arrive; it returns a state at every field
+epoch, and on request at any later time.
 """
 
 from collections import Counter, deque
@@ -64,12 +64,12 @@ class Navigator:
     Raises
     ------
     TypeError
-        Where the first argument is no site.
+        If the first argument is no site.
     InputError
-        Where the Earth field is to be measured but the site has none.
+        If the Earth field is to be measured but the site declares none.
     """
 
-    # What a checkpoint holds, beside the estimator.
+    # Contents of a checkpoint, besides the estimator.
     _arrived: Arrivals
     _update: EpochUpdate
     _next_start: float
@@ -93,7 +93,7 @@ class Navigator:
         if site.platform.imu == NO_IMU:
             site = on_motion_prior(site)
         require_motion_prior(site)
-        # Readings of its own: those to come are no other navigator's.
+        # A copy of its own: no other navigator shares its future readings.
         known = site.temperatures
         self._degrees = Temperatures(None if known is None else known.readings)
         currents = None if site.drives is None else site.drives.readings
@@ -104,52 +104,52 @@ class Navigator:
         self.settings = NavigatorSettings() if settings is None else settings
         if self.settings.earth:
             check_earth(site)
-        # In the estimator's tangent what is estimated comes first, then what is only considered.
+        # In the estimator's tangent, estimated parameters precede considered ones.
         estimated, considered = self.settings.blocks(site)
         self.blocks = (*estimated, *placed(considered, dimension(estimated)))
         self._considered = dimension(considered)
         self._of_imu = self.blocks if inertial_blocks(self.blocks) else ()
         risk, bank = self.settings.risk, None
-        # Without its only beacon there is nothing to compare with.
+        # Without its only beacon nothing can be compared.
         if risk is not None and len(site.beacons) > 1:
             bank = SubsetBank(site, self.blocks, self._considered, risk)
         self._update = EpochUpdate(site, estimated, self.blocks, self.settings.earth, bank)
         self._process_noise = calibration_process_noise(site, self.blocks, self._considered)
         self._arrived = arrivals_of(site, self.settings.lockin)
-        if not self.settings.earth:  # of short windows there is no steady field
+        if not self.settings.earth:  # short windows contain no static field
             self._arrived.short = ShortWindows.of(site, self.settings.lockin)
         self._estimator: Estimator | None = None
         self._next_start = first_try(self.site, self.settings.start_duration)
         imu = site.platform.imu
-        self._white = [imu.gyro_noise, imu.accel_noise]  # what states are carried with
+        self._white = [imu.gyro_noise, imu.accel_noise]  # for the propagation
         self._judgement, self._made, self._told = Judgement(), [], deque()
         self._resets, self.summary = Resets(), Summary()
         self._now = StateOfNow(self.settings)
         self.why_no_start = NoStart()
         self.rival_chi_square = None
 
-    # What goes in
+    # Input
 
     def add_imu(self, time: Array, gyro_body: Array, accel_body: Array) -> None:
-        """Take inertial samples: times (k,), rates and specific forces (k, 3).
+        """Add inertial samples: times (k,), rates and specific forces (k, 3).
 
         Raises
         ------
         InputError
-            Where a number is not finite or the clock jumped, or the site describes no IMU.
+            If a number is not finite, the clock jumped, or the site describes no IMU.
         """
         self.hear_imu(time, gyro_body, accel_body)
         self.advance()
 
     def hear_imu(self, time: Array, gyro_body: Array, accel_body: Array) -> None:
-        """Take inertial samples as `add_imu`, and carry the state to them; leave all else.
+        """Add inertial samples as `add_imu`, and only propagate the state to them.
 
-        What takes longer is for `advance`, so that the state of now need not wait for it.
+        `advance` does what takes longer, so that the current state need not wait for it.
         """
         if not self.site.platform.inertial:
             raise InputError(
-                "imu: the site has a motion prior in its place; describe platform.imu, or leave the"
-                " inertial samples out"
+                "imu: the site declares a motion prior instead of an IMU; describe platform.imu, or"
+                " drop the inertial samples"
             )
         self._arrived.add_imu(time, gyro_body, accel_body)
         self._now.reach(self._arrived)
@@ -157,19 +157,19 @@ class Navigator:
     def add_magnetometer(
         self, time: Array, measured_sensor: Array, magnetometer: str | None = None
     ) -> None:
-        """Take raw samples of a magnetometer: times (k,), fields (k, 3) (T).
+        """Add raw samples of a magnetometer: times (k,), fields (k, 3) (T).
 
-        What stands in the columns of axes that the site does not declare is not looked at.
+        Columns of axes that the site does not declare are ignored.
 
         Parameters
         ----------
         magnetometer : str, optional
-            Which of several took them, by its own stamps.
+            Name of one of several, which stamps its own samples.
 
         Raises
         ------
         InputError
-            Where a number is not finite or the clock jumped, or the site has no such magnetometer.
+            If a number is not finite, the clock jumped, or the site has no such magnetometer.
         """
         samples = samples_heard(self.site, time, measured_sensor)
         self._arrived.add_magnetometer(time, samples, magnetometer)
@@ -177,7 +177,7 @@ class Navigator:
         self.advance()
 
     def add_drive(self, samples: DriveSamples) -> None:
-        """Take currents of coils, before the samples of the magnetometer that they go with.
+        """Add currents of coils, before the magnetometer samples of the same time.
 
         Raises
         ------
@@ -189,20 +189,20 @@ class Navigator:
         self._update.of_currents = tuple(drive_findings(self._currents, self.site))
 
     def add_marks(self, marks: Marks) -> None:
-        """Take bursts of coils whose slots are marked, with their samples or up to 0.5 s later.
+        """Add bursts of coils with marked slots, with their samples or up to 0.5 s later.
 
         Raises
         ------
         InputError
-            Where they do not follow those that came, a slot is of no coil, or the clock jumped.
+            If they do not follow the previous ones, a slot is of no coil, or the clock jumped.
         """
         self._arrived.add_marks(marks)
         self.advance()
 
     def add_slots(self, time: Array, slot: IntArray) -> None:
-        """Take the slot that is driven at each sample (k,), before the samples themselves.
+        """Add the driven slot of each sample (k,), before the samples themselves.
 
-        ``magfusion.model.marks.SILENT`` where none is, ``UNTOLD`` where nothing is said.
+        ``magfusion.model.marks.SILENT`` where none is driven, ``UNTOLD`` where it is unknown.
 
         Raises
         ------
@@ -212,16 +212,16 @@ class Navigator:
         self._arrived.add_slots(time, slot)
 
     def add_temperature(self, part: str, time: float, degc: float) -> None:
-        """Take the temperature of a beacon, or of the ``magnetometer``: of what comes after it."""
+        """Set the temperature of a beacon, or of the ``magnetometer``, for later samples."""
         self._degrees.hear(part, time, degc)
 
     def add_fields(self, samples: FieldSamples, steady: SteadyFields | None = None) -> None:
-        """Take demodulated phasors, channels in the site's order, and the steady fields with them.
+        """Add demodulated phasors, channels in the site's order, with their static fields.
 
         Raises
         ------
         InputError
-            Where the clock jumped.
+            If the clock jumped.
         """
         samples = fields_heard(self.site, samples)
         after = -np.inf if self._estimator is None else self._estimator.state.time
@@ -233,14 +233,14 @@ class Navigator:
         self.advance()
 
     def add_measurement(self, time: float, measurement: Measurement) -> None:
-        """Take in anything else that was measured, of one epoch: a state is made at its time (s).
+        """Add any other measurement of one epoch: a state is created at its time (s).
 
-        It passes no gate; a robust loss is its own.
+        It bypasses the gate; it may have a robust loss of its own.
 
         Raises
         ------
         InputError
-            Where the clock jumped.
+            If the clock jumped.
         """
         after = -np.inf if self._estimator is None else self._estimator.state.time
         if not self._arrived.add_measurement(time, measurement, after):
@@ -248,7 +248,7 @@ class Navigator:
         self.advance()
 
     def _stand_still(self, time: Array, *, raw: bool) -> None:
-        """Go on with a motion prior to where the fields have come (s), where it has no IMU."""
+        """Advance a motion prior to the newest fields (s), where the site has no IMU."""
         if self.site.platform.inertial:
             return
         made = self._still.stamps(time, raw=raw)
@@ -257,7 +257,7 @@ class Navigator:
             self._arrived.add_imu(made, nothing, nothing)
             self._now.reach(self._arrived)
 
-    # What comes out
+    # Output
 
     @property
     def started(self) -> bool:
@@ -266,24 +266,24 @@ class Navigator:
 
     @property
     def judgement(self) -> Judgement:
-        """What is said of the newest state."""
+        """Judgement of the newest state."""
         return self._judgement
 
     def take(self) -> list[JudgedState]:
-        """Return the states made since this was last asked.
+        """Return the states since the last call.
 
-        Of one that is lost the pose is a guess that nobody should use.
+        The pose of a lost state is a guess and must not be used.
         """
         made, self._made = self._made, []
         return made
 
     def take_carried(self) -> list[CarriedState]:
-        """Return the states carried on between epochs, at the rate that the settings ask for."""
+        """Return the propagated states between epochs, at the rate of the settings."""
         made, self._now.made = self._now.made, []
         return made
 
     def state(self, time: float | None = None) -> JudgedState:
-        """Return the state at a time, carried on by the inertial stream from the last epoch.
+        """Return the state at a time, propagated by the inertial stream from the last epoch.
 
         Parameters
         ----------
@@ -305,23 +305,23 @@ class Navigator:
 
     @property
     def of_currents(self) -> tuple[Finding, ...]:
-        """What is said of the currents of coils; every state says it, too."""
+        """Findings on the currents of coils; every state includes them."""
         return self._update.of_currents
 
     @property
     def distortion(self) -> dict[str, float]:
-        """By beacon, running mean of the squared innovation in units of its expectation."""
+        """By beacon, running mean of the squared innovation over its expectation."""
         return self._update.gate.distortion
 
     @property
     def lagged(self) -> State | None:
-        """State that left the smoother's window last; that of the filter is of now."""
+        """State that left the smoother's window last; for the filter, the current one."""
         return None if self._estimator is None else self._estimator.lagged
 
     def take_lagged(self) -> list[JudgedState]:
-        """Return the states that left the smoother's window since this was last asked.
+        """Return the states that left the smoother's window since the last call.
 
-        Each is judged as the state of now was at its time.  A filter has none.
+        Each has the judgement of its own time.  A filter has none.
         """
         if not isinstance(self._estimator, SlidingWindow):
             return []
@@ -330,32 +330,32 @@ class Navigator:
         return [judged_state(state, t.judgement, t.reset_counter) for state, t in told]
 
     def _told_at(self, time: float) -> Told:
-        """Return what was said of a time, and forget what was said before."""
+        """Return the judgement of a time, and discard earlier ones."""
         while len(self._told) > 1 and self._told[1].time <= time:
             self._told.popleft()
         return self._told[0] if self._told else Told(time, Judgement())
 
     @property
     def counts(self) -> Counter[str]:
-        """What was refused, lost and recovered, with the reason."""
+        """Numbers of rejections, losses and recoveries, by reason."""
         return self._update.gate.counts
 
     @property
     def losses(self) -> dict[str, int]:
-        """All that was refused, lost or recovered, with the reason: `counts`, windows, samples."""
+        """All rejections, losses and recoveries by reason: `counts`, windows, samples."""
         return {**self.counts, **self._arrived.losses}
 
     def checkpoint(self) -> dict[str, Any]:
-        """Return everything needed to go on as plain data: `restored` makes a navigator of it."""
+        """Return the complete state as plain data, from which `restored` makes a navigator."""
         rules = navigator_rules(self.site, self.blocks)
         self._arrived.settle()
         self._update.score.settle()
         return {"parts": to_plain(self, rules), "estimator": to_plain(self._estimator, rules)}
 
     def go_on_from(self, data: Any, rules: Rules) -> None:
-        """Take the state that a checkpoint holds; see `magfusion.estimation.online.restored`."""
+        """Load the state of a checkpoint; see `magfusion.estimation.online.restored`."""
         if not isinstance(data, dict) or data.keys() != {"parts", "estimator"}:
-            raise InputError("holds no state of a navigator; run without --resume")
+            raise InputError("contains no state of a navigator; run without --resume")
         resume(self, data["parts"], "navigator", rules)
         own = data["estimator"]
         if own is not None:
@@ -364,10 +364,10 @@ class Navigator:
             resume(self._estimator, own, "estimator", rules)
             self._depart()
 
-    # How it goes on
+    # Processing
 
     def advance(self) -> None:
-        """Take in all that has come, as far as it is complete; whatever is added does so itself."""
+        """Process all complete data; the methods that add data call it."""
         changed = self._estimator is None and self._begin()
         if self._estimator is None:
             return
@@ -377,7 +377,7 @@ class Navigator:
             self._depart()
 
     def _depart(self) -> None:
-        """Carry the newest estimate from now on."""
+        """Propagate the newest estimate from here on."""
         assert self._estimator is not None
         assert self._arrived.usual is not None
         departure = Departure(
@@ -392,7 +392,7 @@ class Navigator:
         self._now.depart(departure, said, self._arrived)
 
     def _begin(self) -> bool:
-        """Find the first state, once enough has come."""
+        """Find the first state, once enough data have arrived."""
         arrived = self._arrived
         until = arrived.gathered(self.settings.delay, self._next_start)
         if until is None:
@@ -431,7 +431,7 @@ class Navigator:
             )
 
     def _step(self) -> bool:
-        """Process the next epoch, if all that it needs has come."""
+        """Process the next epoch, if all its data have arrived."""
         assert self._estimator is not None
         state = self._estimator.state
         now = state.time
@@ -475,7 +475,7 @@ class Navigator:
         return True
 
     def _absorb(self, time: float, samples: FieldSamples | None) -> None:
-        """Go on to a time and take in what was measured there."""
+        """Propagate to a time and process its measurements."""
         assert self._estimator is not None
         if samples is None:
             self._arrived.fill_silence(self._estimator.state, time)
@@ -486,14 +486,14 @@ class Navigator:
         judgement = judgement.beside(*self._arrived.remarks)
         state, counts = self._estimator.state, self.counts
         restarts = counts["lost and found again"]
-        if self.site.platform.inertial:  # a motion prior may be wide, and a fix its rule
+        if self.site.platform.inertial:  # a motion prior may be uncertain, with regular fixes
             restarts += counts["found by a fix"]
         self._resets.hear(predicted.state, state, self._judgement, judgement, restarts)
         self._tell(state, judgement)
         lag = self._arrived.apply_offset_anew(state, self.blocks)
         if lag:
             self._estimator.replace_state(replace(state, time=state.time + lag))
-            self.counts["time offset applied anew"] += 1
+            self.counts["time offset updated"] += 1
         self._arrived.forget(self._estimator.state.time)
 
     def _tell(self, state: State, judgement: Judgement) -> None:

@@ -1,8 +1,8 @@
-"""A running navigator's parts as plain data, and back: what a checkpoint holds.
+"""Conversion of a running navigator to plain data and back: the contents of a checkpoint.
 
-A part's state is what its class annotates; the rest is made again of the site and the settings.
-Calibrations are kept as what differs from the declared one, GTSAM's preintegrated measurements as
-the inertial steps they were made of.
+The state of a part is its class's annotations; the rest is rebuilt from the site and the settings.
+Calibrations are stored as differences from the declared one, GTSAM's preintegrated measurements as
+their inertial steps.
 """
 
 from collections.abc import Mapping
@@ -46,18 +46,18 @@ ROUNDING = 1e-6  # of a rotation, and of a correlation's least eigenvalue
 
 
 def _made_again(data: Any) -> Predictions:
-    _check(data is None, "holds predictions, which are not kept")
+    _check(data is None, "contains predictions, which are not stored")
     return Predictions()
 
 
-# What is only kept to be shared is made again.
+# What is only cached for sharing is rebuilt.
 _FORGOTTEN = Rules({Predictions: lambda _: None}, {Predictions: _made_again})
 
 
 def navigator_rules(
     site: Site, blocks: tuple[Block, ...], measurements: tuple[type[Measurement], ...] = ()
 ) -> Rules:
-    """Return how the parts of a navigator become plain data, and what holds for them.
+    """Return how the parts of a navigator become plain data, and their validity checks.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def navigator_rules(
 
 def _levels(data: Any) -> Levels:
     right = isinstance(data, list) and len(data) == 2
-    _check(right and all(x is None or type(x) is float for x in data), "are no levels")
+    _check(right and all(x is None or type(x) is float for x in data), "is not a pair of levels")
     return Levels((data[0], data[1]))
 
 
@@ -132,9 +132,9 @@ def _check_state(state: State, size: int) -> None:
         if isinstance(value, np.ndarray):
             _check(value.shape == shapes.get(name, (3,)), f"has a {name} of another shape")
             _check(np.all(np.isfinite(value)), f"has a {name} that is not finite")
-    _check(np.isfinite(state.time), "is of no time")
+    _check(np.isfinite(state.time), "has a time that is not finite")
     turned = state.world_from_body @ state.world_from_body.T
-    _check(np.max(np.abs(turned - np.eye(3))) < ROUNDING, "has a rotation that is none")
+    _check(np.max(np.abs(turned - np.eye(3))) < ROUNDING, "has an invalid rotation")
     _check_cov(state.cov)
 
 
@@ -142,7 +142,7 @@ def _check_judgement(judgement: Judgement) -> None:
     levels = (judgement.protection_level_m, judgement.protection_level_deg)
     known = [level for level in levels if level is not None]
     values = (judgement.inflation, judgement.turn, judgement.shift, *known)
-    _check(np.all(np.isfinite(values)) and judgement.inflation >= 1.0, "is no judgement")
+    _check(np.all(np.isfinite(values)) and judgement.inflation >= 1.0, "is not a valid judgement")
 
 
 def _check_running(running: Running) -> None:
@@ -162,7 +162,7 @@ def _check_cov(cov: Array) -> None:
     sigma = np.sqrt(np.maximum(np.diagonal(cov), np.finfo(float).tiny))
     correlation = cov / sigma / sigma[:, None]
     _check(np.all(np.isfinite(correlation)), "has a covariance that is not finite")
-    _check(np.max(np.abs(correlation - correlation.T)) < ROUNDING, "has a skew covariance")
+    _check(np.max(np.abs(correlation - correlation.T)) < ROUNDING, "has an asymmetric covariance")
     least = np.linalg.eigvalsh(correlation)[0]
     _check(least > -ROUNDING, "has a covariance that is not positive definite")
 
@@ -171,14 +171,14 @@ def _check_node(node: Node, blocks: tuple[Block, ...]) -> None:
     state = states_of([node.state])
     for measurement in node.measurements:
         rows = measurement.linearize(state, node.state.calibration, blocks)
-        _check(len(measurement.epoch) == 1, "holds a measurement of several epochs")
-        _check(np.all(np.isfinite(rows.error)), "holds a measurement that is not finite")
+        _check(len(measurement.epoch) == 1, "contains a measurement of several epochs")
+        _check(np.all(np.isfinite(rows.error)), "contains a measurement that is not finite")
 
 
 def _check_prior(prior: Prior, size: int) -> None:
     matrix, right = prior.sqrt_information, prior.right
     _check(matrix.ndim == 2 and matrix.shape[1] == size, "has a matrix of another shape")
-    _check(right.shape == matrix.shape[:1], "has a right side of another shape")
+    _check(right.shape == matrix.shape[:1], "has a right-hand side of another shape")
     _check(np.all(np.isfinite(matrix)) and np.all(np.isfinite(right)), "is not finite")
 
 
@@ -186,11 +186,11 @@ def _check_buffer(buffer: Buffer) -> None:
     time, rows = buffer.rows()
     _check(time.ndim == 1 and rows.shape == (len(time), buffer.width), "has another shape")
     _check(np.all(np.isfinite(time)) and np.all(np.isfinite(rows)), "is not finite")
-    _check(np.all(np.diff(time) > 0.0), "is not in order of time")
+    _check(np.all(np.diff(time) > 0.0), "is not sorted by time")
 
 
 def _check_window(window: SlidingWindow) -> None:
-    _check(np.all(np.diff([n.state.time for n in window.nodes]) > 0.0), "is not in order of time")
+    _check(np.all(np.diff([n.state.time for n in window.nodes]) > 0.0), "is not sorted by time")
     _check(all(node.link for node in window.nodes[1:]), "has nodes that are not linked")
 
 
@@ -202,7 +202,7 @@ def _measurement_data(measurement: Measurement) -> dict[str, Any]:
 
 
 def _measurement(data: Any, kinds: Mapping[str, type[Measurement]]) -> Measurement:
-    _check(isinstance(data, dict) and str(data.get("kind")) in kinds, "is of no known kind")
+    _check(isinstance(data, dict) and str(data.get("kind")) in kinds, "is of an unknown kind")
     own = {name: value for name, value in data.items() if name != "kind"}
     return from_plain(kinds[str(data["kind"])], own, str(data["kind"]), _FORGOTTEN)
 

@@ -1,4 +1,4 @@
-"""What a user chooses of an online estimator."""
+"""User settings of an online estimator."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -12,7 +12,7 @@ from magfusion.units import Rate
 
 @dataclass(frozen=True)
 class NavigatorSettings(EstimatorSettings):
-    """How to navigate.
+    """Settings of a navigator.
 
     Parameters
     ----------
@@ -20,20 +20,20 @@ class NavigatorSettings(EstimatorSettings):
     lag : float
         Window of the smoother (s).
     delay : float
-        How late samples may come and still be used in their order (s); so much later are states.
+        Largest delay of samples that are still sorted in (s); states are delayed as much.
     start_duration : float
-        Data gathered before the first state (s); longer where they leave it ambiguous.
+        Data gathered before the first state (s); longer while they are ambiguous.
     longest_step : float
-        Without any field a state is made after so long (s).
+        Longest time between states without any field (s).
     risk : Risk, optional
-        What the protection levels promise; without it there are none, and an update costs less.
+        Integrity risk of the protection levels; without it there are none, and updates cost less.
     rate : 'field', 'imu' or float
-        Where states are made beside those of the epochs: nowhere, at every inertial sample, or so
-        many a second (Hz); they are carried there from the newest epoch.
+        Where states are output besides those of the epochs: nowhere, at every inertial sample, or
+        at a rate (Hz); they are propagated from the newest epoch.
     horizon : float
-        So far ahead of that they are told (s).
+        How far ahead they are predicted (s).
     blend : float
-        A correction enters them within so long (s); at once where it is zero.
+        Time in which a correction enters them (s); at once where it is zero.
     """
 
     __repr__ = short_repr

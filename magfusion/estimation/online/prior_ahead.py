@@ -1,4 +1,4 @@
-"""Where a motion prior leads without an IMU, in steps as the filter takes them, with its spread."""
+"""Prediction by a motion prior without an IMU, in the filter's steps, with its covariance."""
 
 import numpy as np
 
@@ -11,9 +11,9 @@ from magfusion.units import Array
 
 
 def ahead_by_prior(passage: Passage, horizon: float, imu: ImuModel) -> Passage:
-    """Return where a passage leads if nothing but white accelerations changes rate and velocity.
+    """Return a passage predicted with white accelerations of rate and velocity only.
 
-    There is no stream by which it could be measured what a look ahead costs: the prior says it.
+    Without a stream the error of a prediction cannot be measured: it follows from the prior.
 
     Parameters
     ----------
@@ -52,12 +52,12 @@ def ahead_by_prior(passage: Passage, horizon: float, imu: ImuModel) -> Passage:
 
 
 def _added(length: Array, rotation: Array, imu: ImuModel) -> Array:
-    """Return the covariance that a step adds, with what a rate that walks turns within it."""
+    """Return the covariance that a step adds, including the rotation by its random-walk rate."""
     noise = step_noise(length, imu, np.zeros(len(length), dtype=np.bool_))
     walk = imu.gyro_bias_walk**2
     axes = np.arange(3)
     noise[:, axes, axes] += (walk * length**3 / 3.0)[:, None]
-    # A rate is that of a bias reversed.
+    # An error of the rate acts as a bias of the opposite sign.
     both = -0.5 * walk * (length**2)[:, None, None] * rotation
     noise[:, :3, 12:] += both
     noise[:, 12:, :3] += np.swapaxes(both, 1, 2)

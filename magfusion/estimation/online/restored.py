@@ -1,4 +1,4 @@
-"""A navigator that goes on from a checkpoint."""
+"""Restoring a navigator from a checkpoint."""
 
 from typing import Any
 
@@ -25,19 +25,19 @@ def restored(
     site, settings
         Of the navigator that made it.
     checkpoint : dict
-        What `Navigator.checkpoint` returned.
+        As returned by `Navigator.checkpoint`.
     measurements : tuple of type
-        Kinds of measurements from outside the package that were given to it.
+        Kinds of measurements from outside the package that were added to it.
 
     Raises
     ------
     InputError
-        Where it is none, or does not fit the site.
+        If it is no checkpoint, or does not fit the site.
     """
     navigator = Navigator(site, settings)
     rules = navigator_rules(navigator.site, navigator.blocks, measurements)
     try:
         navigator.go_on_from(checkpoint, rules)
     except np.linalg.LinAlgError as error:
-        raise InputError(f"its covariance is none ({error}); run without --resume") from error
+        raise InputError(f"its covariance is invalid ({error}); run without --resume") from error
     return navigator

@@ -1,4 +1,4 @@
-"""The raw samples of one of several magnetometers as they arrive, and the windows made of them."""
+"""Raw samples of one of several magnetometers as they arrive, and their windows."""
 
 from collections import deque
 from dataclasses import replace
@@ -19,29 +19,29 @@ from magfusion.receiver.receivers import receiver_of
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array
 
-BEGINNING = 0.5  # s; of samples, by which a receiver begins that had none at the start
+BEGINNING = 0.5  # s; of samples, to start a receiver that had none at the first state
 
 
 class SensorStream:
-    """One magnetometer's samples by the log's clock, its receiver, and its windows that wait.
+    """One magnetometer's samples on the log's clock, its receiver, and its pending windows.
 
     Parameters
     ----------
     site : Site
-        With this magnetometer alone, its clock that of the log.
+        With this magnetometer only, on the log's clock.
     lockin : LockinSettings, optional
-        Of windows that are at the same times of all magnetometers.
+        Of windows at the same times for all magnetometers.
 
     Attributes
     ----------
     receiver : Receiver
     samples : Buffer
     windows : deque of int
-        Numbers of windows that were admitted and not demodulated yet.
+        Numbers of windows that are admitted and not demodulated yet.
     now : int, optional
         Of the window at the state that is to be predicted.
     late : int
-        Windows that came when the others had gone on.
+        Windows that arrived after the others were processed.
     """
 
     receiver: Receiver
@@ -61,12 +61,12 @@ class SensorStream:
 
     @property
     def waveform(self) -> Waveform:
-        """What is kept of the samples."""
+        """Stored samples."""
         return Waveform(*self.samples.rows())
 
     @property
     def next_centre(self) -> float:
-        """When its next window is (s), as far as is known."""
+        """Centre of its next window (s), as far as is known."""
         if self.receiver.grid is None:
             return np.inf
         number = self.windows[0] if self.windows else self.receiver.next_number
@@ -74,25 +74,25 @@ class SensorStream:
 
     @property
     def next_admitted(self) -> float:
-        """When the next window is that waits to be demodulated (s)."""
+        """Centre of the next window that is to be demodulated (s)."""
         return self.receiver.centre_of(self.windows[0]) if self.windows else np.inf
 
     @property
     def to_come(self) -> bool:
-        """Whether a window waits, or the samples of one are there."""
+        """Whether a window is pending, or its samples have arrived."""
         return bool(self.windows) or self.receiver.complete(self.samples.newest)
 
     def receive(
         self, imu: ImuSamples, until: float, after: float, state: State, offset: float
     ) -> FieldSamples | None:
-        """Judge the windows that are complete at a time (s); return the phasors of slots.
+        """Check the windows that are complete at a time (s); return the phasors of slots.
 
         Parameters
         ----------
         imu : ImuSamples
-            All that is kept.
+            All stored samples.
         after : float
-            What is not later than this is too late (s).
+            Windows up to this time are too late (s).
         state : State
             The newest.
         offset : float
@@ -121,7 +121,7 @@ class SensorStream:
     def demodulated(
         self, before: State, predicted: State, imu: ImuSamples, offset: float, *, lost: bool
     ) -> MotionCompensated:
-        """Return the window at a prediction, as the calibration of this magnetometer has it.
+        """Return the window at a prediction, by the calibration of this magnetometer.
 
         Parameters
         ----------

@@ -1,7 +1,7 @@
-"""What has arrived of several magnetometers: windows and fields of one time are one epoch.
+"""Input queue of several magnetometers: windows and fields of one time form one epoch.
 
-Each has a receiver and a clock of its own, and may be later than another.  An epoch waits for all
-of them, but for one that is silent; of that it is said, and the others go on.
+Each has its own receiver and clock, and may be later than another.  An epoch waits for all of
+them except a silent one, which is reported.
 """
 
 from collections import Counter
@@ -34,7 +34,7 @@ from magfusion.receiver.slots import is_marked
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, IntArray
 
-SILENCE = 1.0  # s; and a window: the others go on without one that is silent for longer
+SILENCE = 1.0  # s; plus a window: the others do not wait for one that is silent for longer
 
 
 class SeveralArrivals(Arrivals):
@@ -43,11 +43,11 @@ class SeveralArrivals(Arrivals):
     Attributes
     ----------
     streams : list of SensorStream
-        Of each magnetometer; without a sample where fields come.
+        Of each magnetometer; empty where fields are given.
     begun_at : float
-        Stamp of whatever came first of any (s).
+        First stamp of any of them (s).
     without : Counter
-        Magnetometer to number of epochs while it was silent.
+        Number of epochs without each magnetometer, while it was silent.
     """
 
     streams: list[SensorStream]
@@ -56,7 +56,7 @@ class SeveralArrivals(Arrivals):
     _fields_to: dict[str, float]  # stamp of the newest fields of each (s)
     _longest: float  # of their windows (s)
     _centre: float  # of the windows at the state that is to be predicted (s)
-    _looked: float  # until when a first state was looked for last (s)
+    _looked: float  # until when a first state was last searched (s)
 
     def __init__(self, site: Site, lockin: LockinSettings | None, applied_offset: float) -> None:
         refuse_warm(site)
@@ -72,17 +72,17 @@ class SeveralArrivals(Arrivals):
         self._centre = self._looked = -np.inf
         self._delay = 0.0
 
-    # What goes in
+    # Input
 
     def add_magnetometer(
         self, time: Array, measured_sensor: Array, magnetometer: str | None = None
     ) -> None:
-        """Take raw samples of a magnetometer by its own stamps."""
+        """Add raw samples of a magnetometer, stamped by itself."""
         which = magnetometer_number(self.site, magnetometer, "samples")
         if self._fields_to:
             raise InputError(
-                f"magnetometer: samples of {magnetometer} come beside fields; give the one or the"
-                " other of all magnetometers"
+                f"magnetometer: samples of {magnetometer} are mixed with fields; use only one of"
+                " them for all magnetometers"
             )
         stream, late = self.streams[which], self.site.platform.magnetometers[which].clock_offset
         stamps = np.atleast_1d(time) + late
@@ -91,15 +91,15 @@ class SeveralArrivals(Arrivals):
         self.begun_at = min(self.begun_at, float(np.min(stamps, initial=np.inf)))
 
     def add_marks(self, marks: Marks) -> None:
-        """Take bursts of coils, which every magnetometer hears."""
+        """Add bursts of coils, which every magnetometer receives."""
         check_clock("marks", marks.end, self._newest)
         for stream in self.streams:
             stream.receiver.hear_marks(marks)
 
     def add_slots(self, time: Array, slot: IntArray) -> None:  # noqa: ARG002
-        """Refuse slots beside samples: each magnetometer would tell its own."""
+        """Reject slots of samples: each magnetometer would have its own."""
         raise InputError(
-            "magnetometer: slot beside the samples of several is not taken; give records of marks"
+            "magnetometer: slots of the samples of several are not supported; use records of marks"
         )
 
     def add_fields(
@@ -108,11 +108,11 @@ class SeveralArrivals(Arrivals):
         steady: SteadyFields | None,  # noqa: ARG002
         after: float,
     ) -> int:
-        """Take phasors by the log's clock; those of one time are put together."""
+        """Add phasors on the log's clock; those of equal times are merged."""
         if any(np.isfinite(stream.samples.newest) for stream in self.streams):
             raise InputError(
-                "fields: they come beside samples of the magnetometers; give the one or the other"
-                " of all magnetometers"
+                "fields: they are mixed with samples of the magnetometers; use only one of them for"
+                " all magnetometers"
             )
         check_clock("fields", samples.time, self._newest)
         late = 0
@@ -134,7 +134,7 @@ class SeveralArrivals(Arrivals):
         self._longest = max(self._longest, float(one.window[0]))
 
     def _put(self, one: FieldSamples) -> None:
-        """Put an epoch to the others, or into the one of the same time."""
+        """Insert an epoch, or merge it with the one of the same time."""
         for k, known in enumerate(self.fields):
             apart = not np.any(known.valid & one.valid)
             if apart and abs(known.time[0] - one.time[0]) < SAME_TIME:
@@ -148,10 +148,10 @@ class SeveralArrivals(Arrivals):
                 return
         self.fields.append(one)
 
-    # How far it goes
+    # Times
 
     def _heard_to(self) -> dict[str, float]:
-        """Return until when each magnetometer was heard (s)."""
+        """Return the time until which each magnetometer has sent samples (s)."""
         return {
             stream.name: max(stream.samples.newest, self._fields_to.get(stream.name, self.begun_at))
             for stream in self.streams
@@ -159,7 +159,7 @@ class SeveralArrivals(Arrivals):
 
     @property
     def complete(self) -> float:
-        """Until when all were heard, or are not waited for any more (s)."""
+        """Time until which all have sent samples, or are not awaited any more (s)."""
         if not np.isfinite(self.begun_at):
             return -np.inf
         heard, silent = self._heard_to(), self._silent()
@@ -167,7 +167,7 @@ class SeveralArrivals(Arrivals):
         return max(waited, self.inertial - LONGEST_WAIT)
 
     def _silent(self) -> list[str]:
-        """Return which magnetometers are not waited for."""
+        """Return the magnetometers that are not awaited."""
         heard = self._heard_to()
         newest = max(heard.values())
         return [n for n, to in heard.items() if newest - to > SILENCE + self._longest]
@@ -183,14 +183,14 @@ class SeveralArrivals(Arrivals):
 
     @property
     def first(self) -> float:
-        """Oldest stamp of what is kept of the fields (s)."""
+        """Oldest stamp of the stored fields (s)."""
         known = [stream.waveform.time[:1] for stream in self.streams]
         known += [samples.time for samples in self.fields[:1]]
         return float(np.min(np.concatenate(known), initial=np.inf))
 
     @property
     def next_field(self) -> float:
-        """When the next fields are measured (s), as far as is known."""
+        """Time of the next fields (s), as far as is known."""
         silent = self._silent()
         live = [stream for stream in self.streams if stream.windows or stream.name not in silent]
         known = [float(samples.time[0]) for samples in self.fields[:1]]
@@ -198,17 +198,17 @@ class SeveralArrivals(Arrivals):
 
     @property
     def window_to_come(self) -> bool:
-        """Whether what is there of the fields waits for more."""
+        """Whether an incomplete epoch of fields awaits more."""
         return bool(self.fields) or any(stream.to_come for stream in self.streams)
 
     def due(self, inertial: float) -> bool:
-        """Return whether the oldest fields have all that there will be of their epoch."""
+        """Return whether the oldest epoch of fields is complete."""
         until = min(inertial, self.complete - self._delay) - self._slots_late
         return bool(self.fields) and bool(self.fields[0].time[0] <= until)
 
     @property
     def _slots_late(self) -> float:
-        """How much later than a slot its phasor comes, at most (s)."""
+        """Largest delay of a slot's phasor (s)."""
         grids = [
             s.receiver.grid for s in self.streams if not isinstance(s.receiver, LockinReceiver)
         ]
@@ -218,13 +218,13 @@ class SeveralArrivals(Arrivals):
 
     @property
     def remarks(self) -> tuple[Finding, ...]:
-        """What is to be said of magnetometers that fell silent."""
+        """Findings on silent magnetometers."""
         heard = self._heard_to()
         return tuple(
             Finding(
                 "magnetometer_silent",
-                f"Magnetometer {name} has sent nothing since {heard[name]:.3f} s: the others go on"
-                " without it. Check its supply, its cable and its channel.",
+                f"Magnetometer {name} has sent nothing since {heard[name]:.3f} s: the others are"
+                " used without it. Check its supply, its cable and its channel.",
                 Verdict.TRUSTWORTHY,
             )
             for name in self._silent()
@@ -232,7 +232,7 @@ class SeveralArrivals(Arrivals):
 
     @property
     def losses(self) -> dict[str, int]:
-        """What was of no use, with the magnetometer and the reason."""
+        """Numbers of unused windows and samples, by magnetometer and reason."""
         found = super().losses
         for stream in self.streams:
             name = stream.name
@@ -243,16 +243,16 @@ class SeveralArrivals(Arrivals):
             found |= {f"magnetometer {name}: {k}": v for k, v in counts.items() if v}
         return found
 
-    # How it goes on
+    # Processing
 
     def settle(self) -> None:
-        """Put what came last into its order."""
+        """Sort the newest samples."""
         super().settle()
         for stream in self.streams:
             stream.samples.rows()
 
     def gathered(self, delay: float, span: float) -> float | None:
-        """Return until when a first state is looked for (s), however large the pieces are."""
+        """Return until when to search for a first state (s), independent of the size of pieces."""
         until = self.first + span
         if not self.reached - delay >= until:
             return None
@@ -260,7 +260,7 @@ class SeveralArrivals(Arrivals):
         return until
 
     def first_state(self, until: float, settings: EstimatorSettings) -> OnlineStart | NoStart:
-        """Return the first state by what was measured up to a time (s)."""
+        """Return the first state from the measurements up to a time (s)."""
         late = {sensor.name: sensor.clock_offset for sensor in self.site.platform.magnetometers}
         waves = {}
         for stream in self.streams:
@@ -279,7 +279,7 @@ class SeveralArrivals(Arrivals):
         )
 
     def forget_before_start(self, kept: float) -> None:
-        """Keep no more than so long before what was looked at last (s)."""
+        """Keep only so much before the last search (s)."""
         oldest = self._looked - kept
         self.imu.forget(oldest, oldest)
         self.fields = [s for s in self.fields if s.time[0] >= oldest]
@@ -288,7 +288,7 @@ class SeveralArrivals(Arrivals):
             stream.receiver.forget_marks(oldest)
 
     def start(self, start: OnlineStart, delay: float) -> None:
-        """Go on from a first state, each receiver by its own samples."""
+        """Continue from a first state, each receiver by its own samples."""
         for stream in self.streams:
             if isinstance(stream.receiver, LockinReceiver):
                 stream.receiver.beside = start.lines.get(stream.name)
@@ -296,7 +296,7 @@ class SeveralArrivals(Arrivals):
         self.receive(start.state, delay)
 
     def receive(self, state: State, delay: float) -> None:
-        """Judge the windows of each that are complete and not too late for a delay (s)."""
+        """Check the windows of each that are complete and within a delay (s)."""
         self._delay = delay
         imu = self.inertial_samples()
         for k, stream in enumerate(self.streams):
@@ -309,12 +309,12 @@ class SeveralArrivals(Arrivals):
         self.fields.sort(key=lambda s: float(s.time[0]))
 
     def _beside(self, found: dict[int, FieldSamples]) -> FieldSamples:
-        """Return what some magnetometers measured as channels of all."""
+        """Return the fields of some magnetometers as channels of all."""
         none = FieldSamples.empty(self.streams[0].receiver.site.channels)
         return side_by_side([found.get(k, none) for k in range(len(self.streams))], self.site)
 
     def next_window(self, state: State, *, lost: bool = False) -> float | None:  # noqa: ARG002
-        """Go on to the next windows of all: return their centre (s); None where one may come."""
+        """Advance to the next windows of all; return their centre (s), None where one may come."""
         centre = min(stream.next_admitted for stream in self.streams)
         grids = [s.receiver for s in self.streams if s.receiver.grid is not None]
         if not np.isfinite(centre):
@@ -331,16 +331,16 @@ class SeveralArrivals(Arrivals):
         return centre
 
     def forget(self, time: float) -> None:
-        """Keep the samples that are needed after a state (s)."""
+        """Keep only the samples that are needed after a state (s)."""
         reach = 2.0 + max(stream.receiver.history for stream in self.streams)
         self.imu.forget(time - reach, time - self.applied_offset - 1.0)
         for stream in self.streams:
             stream.samples.forget(time - reach, time - reach)
 
     def fill_silence(self, state: State, time: float) -> None:
-        """Do without the IMU where it is silent: no one magnetometer's samples stand in for it."""
+        """Do nothing where the IMU is silent: no single magnetometer's samples replace it."""
 
-    # What comes out
+    # Output
 
     def measured(
         self,
@@ -353,7 +353,7 @@ class SeveralArrivals(Arrivals):
         standing: bool,
         lost: bool = False,
     ) -> Measured | None:
-        """Return what was measured at a prediction, as `Arrivals.measured`."""
+        """Return the measurements at a prediction, as `Arrivals.measured`."""
         self.without.update(self._silent())
         return super().measured(
             before, predicted, samples, step, earth=earth, standing=standing, lost=lost
@@ -362,7 +362,7 @@ class SeveralArrivals(Arrivals):
     def _demodulated(
         self, before: State, predicted: State, *, lost: bool
     ) -> MotionCompensated | None:
-        """Return the windows at a prediction, each by its own magnetometer; None for none."""
+        """Return the windows at a prediction, each of its own magnetometer; None for none."""
         if self._centre != predicted.time:
             return None
         half = 0.5 * max(s.receiver.grid.length for s in self.streams if s.receiver.grid)

@@ -1,4 +1,4 @@
-"""Short windows of close tones as they come: each takes an estimate on by its own length."""
+"""Short windows of close tones online: each advances an estimate by its own length."""
 
 from collections import deque
 
@@ -21,7 +21,7 @@ from magfusion.units import Array
 
 
 class ShortWindows:
-    """The short windows that were admitted, and the noise in those before.
+    """The admitted short windows, and the noise of earlier ones.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ class ShortWindows:
     Attributes
     ----------
     numbers : deque of int
-        Of windows that were not used yet.
+        Of windows that are not used yet.
     window : int, optional
         At the state that is to be predicted.
     """
@@ -47,19 +47,19 @@ class ShortWindows:
 
     @staticmethod
     def of(site: Site, asked: LockinSettings | None) -> "ShortWindows | None":
-        """Return those of a site whose tones are close; None of any other."""
+        """Return those of a site whose tones are close; None for any other."""
         settings = joint_settings(site, asked)
         return None if settings is None else ShortWindows(JointReceiver(site, settings))
 
     def receive(self, waveform: Waveform, imu: ImuSamples, until: float, after: float) -> None:
-        """Judge the windows that are complete at a time (s), and keep those after another (s)."""
+        """Check the windows that are complete at a time (s), and keep those after another (s)."""
         if self.receiver.complete(until):
             windows = self.receiver.admit(waveform, imu, until)
             later = windows.centre > after + 0.25 * self.receiver.settings.step
             self.numbers.extend(windows.number[later].tolist())
 
     def next_after(self, time: float) -> float | None:
-        """Return the centre of the next window after a time (s), which is then the one at hand."""
+        """Advance to the next window after a time (s), and return its centre."""
         self.window = None
         while self.numbers:
             number = self.numbers.popleft()
@@ -74,7 +74,7 @@ class ShortWindows:
         return self.receiver.settings.window
 
     def at(self, time: float) -> bool:
-        """Return whether the window at hand is at a time (s)."""
+        """Return whether the current window is at a time (s)."""
         return self.window is not None and self.receiver.centre_of(self.window) == time
 
     def measured(
@@ -88,7 +88,7 @@ class ShortWindows:
         *,
         standing: bool,
     ) -> Measured:
-        """Return what the window at hand tells at a prediction.
+        """Return the measurement of the current window at a prediction.
 
         Parameters
         ----------
@@ -135,7 +135,7 @@ class ShortWindows:
 
 
 def _foreseen(joint: JointPhasors, state: State, length: float) -> FieldSamples:
-    """Return the phasors that are expected in a window, those missing that nobody would hear."""
+    """Return the phasors expected in a window; undetectable ones are missing."""
     centre, site = as_trajectory([state]), state.calibration.site
     phasor = predict_channels(
         state.calibration, centre.time, centre.world_from_body, centre.position_world

@@ -1,4 +1,4 @@
-"""Inertial samples that take the place of those that never came, while the fields are heard."""
+"""IMU gap filler: inertial samples from the magnetic fields, while beacons are received."""
 
 import numpy as np
 
@@ -9,12 +9,12 @@ from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.receiver.admission import Admission, longest_step, silences
 from magfusion.units import Array
 
-LONGEST = 2.0  # s; that is followed from a known state
-REACH = 0.5  # s; of inertial samples about a stretch, to know whether one is missing
+LONGEST = 2.0  # s; that is filled from a known state
+REACH = 0.5  # s; of inertial samples about a stretch, to detect a gap
 
 
 class StandIn:
-    """What the magnetometer tells of the motion in the gaps of the inertial stream.
+    """Motion measured by the magnetometer in the gaps of the inertial stream.
 
     Attributes
     ----------
@@ -39,12 +39,12 @@ class StandIn:
         offset: float,
         admission: Admission,
     ) -> None:
-        """Follow the motion from a state on, where the inertial stream has a gap.
+        """Estimate the motion from a state on, where the inertial stream has a gap.
 
         Parameters
         ----------
         state : State
-            The last that is known.
+            The last known one.
         until : float
             (s)
         offset : float
@@ -52,7 +52,7 @@ class StandIn:
         """
         stamps, heard = imu.between(state.time - offset - REACH, until - offset + REACH)
         begin, end = silences(stamps + offset, admission.imu_step, admission.imu_margin)
-        # What is behind the newest sample is silent from it on.
+        # After the newest sample the stream is silent.
         begin[-1] -= admission.imu_margin
         meets = (begin < until - admission.imu_margin) & (end > state.time)
         if not np.any(meets) or state.calibration.site.platform.magnetometer.lacking:
@@ -75,12 +75,12 @@ class StandIn:
         own = np.hstack([found.gyro_body, found.accel_body])[silent]
         self.time = np.append(self.time, found.time[silent] - offset)
         self.rows = np.vstack([self.rows, own])
-        if silent[-1]:  # the last one's interval reaches to the end
+        if silent[-1]:  # the last interval extends to the end
             self.time = np.append(self.time, until - offset)
             self.rows = np.vstack([self.rows, own[-1:]])
 
     def among(self, imu: ImuSamples, begin: float, end: float) -> ImuSamples:
-        """Return inertial samples with those that stand in between two stamps."""
+        """Return inertial samples with the substitutes between two stamps."""
         if not self.covers(begin, end):
             return imu
         inside = (self.time >= begin) & (self.time <= end)
@@ -90,11 +90,11 @@ class StandIn:
         return ImuSamples(time, gyro, accel)
 
     def covers(self, begin: float, end: float) -> bool:
-        """Tell whether anything stands in between two stamps."""
+        """Return whether there are substitutes between two stamps."""
         return len(self.time) > 0 and bool(np.any((self.time > begin) & (self.time < end)))
 
     def forget(self, before: float) -> None:
-        """Drop what is older."""
+        """Drop older ones."""
         if not len(self.time):
             return
         kept = self.time >= before

@@ -1,4 +1,4 @@
-"""The state of now: the newest estimate carried on by every inertial sample, as it is told."""
+"""The current state: the newest estimate, propagated by every inertial sample, as output."""
 
 from dataclasses import dataclass, replace
 
@@ -33,12 +33,12 @@ from magfusion.units import DEGREE, Array
 
 @dataclass(frozen=True, eq=False)
 class CarriedState(JudgedState):
-    """A state that the inertial samples carried on.
+    """A state that is propagated by inertial samples.
 
     Parameters
     ----------
     epoch : float
-        The time of the state that was carried (s).
+        Time of the estimate that was propagated (s).
     """
 
     __repr__ = short_repr
@@ -48,12 +48,12 @@ class CarriedState(JudgedState):
 
 @dataclass(frozen=True, eq=False)
 class Said:
-    """What goes with every state that is carried from an epoch.
+    """Judgement and levels that all states propagated from one epoch share.
 
     Parameters
     ----------
     bank : SubsetBank, optional
-        The filters without each beacon, of that epoch.
+        The filters that exclude each beacon, of that epoch.
     """
 
     judgement: Judgement
@@ -62,17 +62,17 @@ class Said:
 
 
 class StateOfNow:
-    """Carries the newest estimate to the newest inertial sample, or ahead of it.
+    """Propagates the newest estimate to the newest inertial sample, or ahead of it.
 
     Attributes
     ----------
     made : list of CarriedState
-        At the rate that was asked for, in order of time.
+        At the requested rate, in order of time.
     """
 
     made: list[CarriedState]
-    _stamp: float  # of the newest sample, or instant, that a state was made at
-    _until: float  # states were made (s)
+    _stamp: float  # of the newest sample, or instant, with a state
+    _until: float  # time of the newest state (s)
     _blend: Blend
     _held: HeldMotion
 
@@ -86,13 +86,13 @@ class StateOfNow:
         self._told: State | None = None  # of the newest sample, before a correction
 
     def depart(self, departure: Departure, said: Said, arrived: Arrivals) -> None:
-        """Go on from another epoch's state, which a correction has changed."""
+        """Continue from the state of a new epoch, which may include a correction."""
         jumped = said.reset_counter != self._said.reset_counter
         before = self._told
         self._departure, self._said, self._last = departure, said, None
         if self.rate == "field":
             return
-        if self._stamp == -np.inf:  # states are made from the first on that comes now
+        if self._stamp == -np.inf:  # states start with the next sample
             self._stamp = self._reached(arrived)
         if self.horizon > 0.0:
             self._held.hear(arrived.inertial_samples())
@@ -106,7 +106,7 @@ class StateOfNow:
             self._blend.take(before, corrected)
 
     def reach(self, arrived: Arrivals) -> None:
-        """Carry the state to the inertial samples that have come."""
+        """Propagate the state to the inertial samples that have arrived."""
         if self.rate == "field" or self._departure is None:
             return
         wanted = self._wanted(arrived)
@@ -115,7 +115,7 @@ class StateOfNow:
         self._stamp = float(wanted[-1])
         if self.rate == "imu":
             wanted = wanted + arrived.applied_offset
-        # Another time offset may lead back.
+        # Another time offset may go back in time.
         wanted = wanted[wanted > max(self._departure.state.time, self._until)]
         if len(wanted) == 0:
             return
@@ -136,7 +136,7 @@ class StateOfNow:
         return arrived.imu.newest if self.rate == "imu" else arrived.inertial
 
     def _wanted(self, arrived: Arrivals) -> Array:
-        """Return stamps of samples, or instants, that a state is to be made at."""
+        """Return the stamps of samples, or instants, for new states."""
         if self.rate == "imu":
             stamps, _ = arrived.imu.rows()
             return stamps[np.searchsorted(stamps, self._stamp, side="right") :]
@@ -146,7 +146,7 @@ class StateOfNow:
         return np.arange(first, last + 1.0) / self.rate
 
     def _passage(self, arrived: Arrivals, wanted: Array) -> Passage:
-        """Return where the platform passes, going on from where it was carried to."""
+        """Return the passage at some times, continued from the last propagation."""
         departure, last = self._departure, self._last
         assert departure is not None
         if last is None or wanted[0] < last.time[0]:
@@ -188,7 +188,7 @@ class StateOfNow:
 
 
 def _wider(judgement: Judgement, grown: list[float], step: Array) -> Judgement:
-    """Return a judgement whose levels grew by factors, attitude first, and by an offset."""
+    """Return a judgement whose levels are scaled, attitude first, and shifted by an offset."""
     metres, degrees = judgement.protection_level_m, judgement.protection_level_deg
     if metres is None and degrees is None:
         return judgement

@@ -1,4 +1,4 @@
-"""Whom the online score asks: everything that is held, or of many beacons those that are heard."""
+"""Parameters of the online score test: all fixed ones; of many beacons, those of detected ones."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -19,16 +19,16 @@ from magfusion.units import Array, IntArray
 
 
 class Asked:
-    """What is held, and where it stands beside a state.
+    """The fixed parameters that are tested, and their columns next to a state.
 
     Parameters
     ----------
     site : Site
-        With those beacons that are asked.
+        With the tested beacons.
     estimated, considered : tuple of Block
         Calibration parameters in the state's tangent, of all beacons.
     steady : bool
-        Whether the steady field is measured.
+        Whether the static field is measured.
     """
 
     def __init__(
@@ -50,17 +50,17 @@ class Asked:
         self.asked, self.whole = (*estimated, *considered, *self.blocks), at
         among = [b for b in considered if _is_of(b, self.names)]
         self.spread = self._declared(tuple(among))
-        # Of a state's tangent, what is considered of them.
+        # Columns of a state's tangent with the considered parameters of these beacons.
         self.rest = _columns(among)
 
     @cached_property
     def suspects(self) -> tuple[Suspect, ...]:
-        """What one mistake would have wrong; only what is asked for is made."""
+        """Candidate faults of these parameters, created on demand."""
         return tuple(suspects(self.site, self.held))
 
     @cached_property
     def _alike(self) -> list[tuple[list[int], IntArray, Array]]:
-        """Suspects of one shape each: their numbers, rows of what is held, and how they combine."""
+        """Candidates by shape: their numbers, parameter rows, and combinations."""
         shapes: dict[tuple[int, ...], list[tuple[int, IntArray, Array]]] = {}
         for k, one in enumerate(self.suspects):
             rows = np.concatenate([np.arange(b.columns.start, b.columns.stop) for b in one.blocks])
@@ -73,7 +73,7 @@ class Asked:
         return found
 
     def gains(self, information: Array, gradient: Array) -> Array:
-        """Return what freeing each suspect would gain, shape (suspects,)."""
+        """Return the log-likelihood gain of estimating each candidate, shape (candidates,)."""
         found = np.zeros(len(self.suspects))
         for numbers, rows, combine in self._alike:
             own = information[rows[:, :, None], rows[:, None, :]]
@@ -81,7 +81,7 @@ class Asked:
         return found
 
     def among(self, other: "Asked") -> tuple[IntArray, IntArray]:
-        """Return the columns of what both hold, here and there."""
+        """Return the columns of the parameters in both, here and there."""
         there = {block.key: block.columns for block in other.held}
         both = [(b.columns, there[b.key]) for b in self.held if b.key in there]
         here, far = (
@@ -91,7 +91,7 @@ class Asked:
         return here, far
 
     def _declared(self, considered: tuple[Block, ...]) -> Array:
-        """Return a root of the covariance that the site declares of what is held."""
+        """Return a root of the declared covariance of the tested parameters."""
         if not considered:
             return np.zeros((len(self.unit), 0))
         start, own = 0, []
@@ -107,7 +107,7 @@ class Asked:
 
 
 def heard_in(measurements: Iterable[Measurement], site: Site) -> list[str]:
-    """Return the names of the beacons that some measurements tell of."""
+    """Return the names of the beacons that contribute to some measurements."""
     told = np.zeros(len(site.channels), dtype=bool)
     for one in measurements:
         if isinstance(one, FieldPhasors):
@@ -118,7 +118,7 @@ def heard_in(measurements: Iterable[Measurement], site: Site) -> list[str]:
 
 
 def of_beacons_named(site: Site, names: Iterable[str]) -> Site:
-    """Return a site with some of its beacons, in their order."""
+    """Return a site with the named beacons only, in their order."""
     wanted = set(names)
     return replace(site, beacons=tuple(b for b in site.beacons if b.name in wanted))
 

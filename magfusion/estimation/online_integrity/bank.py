@@ -1,11 +1,12 @@
-"""Filters without each beacon beside the running estimate: separation online, at constant cost.
+"""Filters without each beacon, run with the estimate: online solution separation at constant cost.
 
-Each is kept as its deviation from the estimate, linearised where that is, with the covariance of
-both: what a false beacon did is in the estimate's prior for long, but never was in the filter
-without it, so that a slow fault is seen too.
+Each is stored as its deviation from the estimate, linearised there, with the covariance of both.
+A false beacon influences the estimate's prior for long, but never that of the filter without it, so
+that slow faults are detected too.
 
-All are updated in the same calls, and no `PartialUpdateFilter` each (2.0 ms an epoch of four
-beacons, not 0.8): filterpy inverts ``S``, which fails for a filter that has drifted by kilometres.
+All are updated in the same calls and not as one `PartialUpdateFilter` each (0.8 instead of 2.0 ms
+an epoch of four beacons): filterpy inverts ``S``, which fails for a filter that has drifted by
+kilometres.
 """
 
 from collections.abc import Sequence
@@ -26,11 +27,11 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk, Verdict
 from magfusion.units import DEGREE, Array, IntArray
 
-MOST = 6  # filters; of more beacons some share one
-SLACK = 3.0  # sigma; a deviation below it is covered
-# Of what a filter without a beacon does not take over from a start that was made with all.
+MOST = 6  # filters; with more beacons some share one
+SLACK = 3.0  # sigma; smaller deviations are covered
+# Initial uncertainty of a filter without a beacon, as the first state was estimated with all.
 WIDE = np.repeat([0.2, 0.3, 0.5], 3)  # rad, m, m/s
-NOBODY, TOGETHER = -1, -2  # groups of rows that are of no beacon, or of all
+NOBODY, TOGETHER = -1, -2  # groups of rows that belong to no beacon, or to all
 OPEN_ROTATION, OPEN_POSITION = 0.3, 10.0  # rad, m; beyond, nothing else determines the pose
 
 
@@ -45,9 +46,9 @@ class SubsetBank:
         Parameters at the tangent's end that are considered, not estimated.
     """
 
-    _step: Array | None  # (groups, n); of each filter from the estimate
+    _step: Array | None  # (groups, n); deviation of each filter from the estimate
     _cov: Array | None  # (1 + groups, n, n); of the filter with all, then of those without
-    _joint: Array | None  # (groups, n, n); of the errors of each with those of the one with all
+    _joint: Array | None  # (groups, n, n); cross-covariance of each with the one with all
 
     def __init__(
         self, site: Site, blocks: tuple[Block, ...], considered: int, risk: Risk | None = None
@@ -65,12 +66,12 @@ class SubsetBank:
         self._owner = np.array([self.names.index(name) % self.groups for name in names])
 
     def check(self, size: int) -> None:
-        """See that the filters are of states of a size, as a checkpoint gave them.
+        """Check that the filters of a checkpoint fit states of a size.
 
         Raises
         ------
         ValueError
-            Where they are not.
+            If they do not.
         """
         parts = (self._step, self._cov, self._joint)
         if all(part is None for part in parts):
@@ -81,20 +82,20 @@ class SubsetBank:
                 raise ValueError("has filters of another shape, or not finite")
 
     def forget(self) -> None:
-        """Begin anew: the estimate has."""
+        """Discard all filters: the estimate has restarted."""
         self._step = self._cov = self._joint = None
 
     def absorb(
         self, predicted: Propagated, measurements: Sequence[Measurement], after: State
     ) -> None:
-        """Go on to where the estimate is now.
+        """Update the filters to the new estimate.
 
         Parameters
         ----------
         predicted : Propagated
-            From the estimate before.
+            From the previous estimate.
         measurements : sequence of Measurement
-            Of this epoch, as the estimate took them in.
+            Of this epoch, as the estimate used them.
         after : State
             The estimate.
         """
@@ -116,7 +117,7 @@ class SubsetBank:
         if leaves_out(measurements):
             kept = np.any(jacobian, axis=1)
             error, jacobian, taken = error[kept], jacobian[kept], taken[:, kept]
-        # What is considered has no gain: only rows and columns of all else are updated.
+        # Considered parameters have no gain: only rows and columns of all others are updated.
         count = cov.shape[1] - self.considered
         own, considered = slice(0, count), slice(count, None)
         crossed, back = taken @ cov, np.swapaxes(taken, 1, 2)
@@ -125,7 +126,7 @@ class SubsetBank:
         innovation = error + step @ jacobian.T
         step[:, own] -= (gain[1:] @ innovation[..., None])[..., 0]
         step[:, own] -= between(predicted.state, after, self._estimated)
-        # Joseph's form: what is considered is not updated as would be best.
+        # Joseph's form, as the gain is not optimal with considered parameters.
         half = cov[:, own] - gain @ crossed
         whole = half[:, :, own] + (gain - half @ back) @ turned
         cov[:, own, own] = 0.5 * (whole + np.swapaxes(whole, 1, 2))
@@ -148,7 +149,7 @@ class SubsetBank:
     def _rows(
         self, measurements: Sequence[Measurement], state: State
     ) -> tuple[Array, Array, IntArray]:
-        """Return error, Jacobian and group of each row; negative of what is no beacon's."""
+        """Return error, Jacobian and group of each row; negative for rows of no single beacon."""
         parts = [(measured_rows([], state, self.blocks), np.zeros(0, dtype=np.int64))]
         for measurement in measurements:
             rows = measured_rows([measurement], state, self.blocks)
@@ -163,15 +164,15 @@ class SubsetBank:
         return error, jacobian, np.concatenate([owner for _, owner in parts])
 
     def _taken(self, jacobian: Array, owner: IntArray) -> Array:
-        """Return the rows that every filter takes in, zero of what it leaves out."""
-        # The first filter leaves nobody out.
+        """Return the rows that each filter uses, zero for those it excludes."""
+        # The first filter excludes no beacon.
         kept = np.arange(-1, self.groups)[:, None] != np.where(owner < 0, self.groups, owner)
         return np.where(kept[:, :, None], jacobian, 0.0)
 
     def _leave_out_together(
         self, measurements: Sequence[Measurement], owner: IntArray, jacobian: Array, taken: Array
     ) -> None:
-        """Leave out of rows of tones that are told together what each group can explain."""
+        """Project each group out of the rows of jointly measured tones."""
         rows = np.flatnonzero(owner == TOGETHER)
         for measurement in measurements:
             if isinstance(measurement, JointPhasors):
@@ -185,13 +186,13 @@ class SubsetBank:
         return np.asarray(np.swapaxes(np.linalg.solve(innovation, crossed), 1, 2))
 
     def heard(self, judgement: Judgement, state: State) -> Judgement:
-        """Return what is said of a state with what the bank says of it, and its levels."""
+        """Return a judgement with the separation test, and with its protection levels."""
         found = self.separation(state)
         if found is None or judgement.verdict is Verdict.FAILED:
             return judgement
         excess = self._excess(found)
         if np.max(excess) <= 1.0:
-            # What the witnesses allow for is beyond what separation knows of.
+            # Inflation by other monitors is unknown to the separation.
             wide, more = float(np.sqrt(judgement.inflation)), SLACK * float(np.sqrt(3.0))
             beyond = (more * judgement.shift, more * judgement.turn / DEGREE)
             asked = Asked(found, SLACK, self.risk, self._prior, wide, beyond)
@@ -201,7 +202,7 @@ class SubsetBank:
         text = (
             f"The state with and without {self._called(worst)} differs by {1e3 * shift:.3g} mm,"
             f" {excess[worst]:.3g} times what noise and survey explain: the beacons contradict each"
-            " other. Check their drive, and iron or a screen near one."
+            " other. Check their drive, and iron or a shield near one."
         )
         return replace(
             judgement,
@@ -214,7 +215,7 @@ class SubsetBank:
         )
 
     def _excess(self, found: Separation) -> Array:
-        """Return the step of each filter, of its threshold; zeros where all are clearly below."""
+        """Return the ratio of each filter's step to its threshold; zeros if all are far below."""
         step = np.add.reduceat(found.step[0] ** 2, (0, 3), axis=1)
         own = np.add.reduceat(found.cov[0].diagonal(), (0, 3))
         if (step <= SLACK**2 * own).all():
@@ -226,11 +227,11 @@ class SubsetBank:
         return f"beacon {names[0]}" if len(names) == 1 else f"beacons {', '.join(names)}"
 
     def separation(self, state: State) -> Separation | None:
-        """Return how the filters deviate from an estimate; None where there are none yet."""
+        """Return the deviations of the filters from an estimate; None without filters."""
         if self._step is None or self._cov is None or self._joint is None:
             return None
         pose = np.s_[:, :6, :6]
-        # A copy: a state whose levels nobody has asked for yet must not keep the whole filters.
+        # A copy: a state whose levels are not yet computed must not reference the whole filters.
         subset, joint = self._cov[1:][pose].copy(), self._joint[pose]
         apart = subset + self._cov[:1][pose] - joint - np.swapaxes(joint, 1, 2)
         variance = np.einsum("gii->gi", subset)
@@ -249,17 +250,17 @@ class SubsetBank:
         )
 
     def grown(self, transition: Array, noise: Array) -> Array:
-        """Return factors by which levels are larger where the inertial stream has led to, (n, 2).
+        """Return factors by which levels grow along a propagation, (n, 2).
 
-        Attitude, then position.  No norm that a level is made of grows by more than that, neither
-        of the estimate nor of a filter without a beacon nor of their distance.
+        Attitude, then position.  They bound the growth of every norm in a level: of the estimate,
+        of a filter without a beacon, and of their distance.
 
         Parameters
         ----------
         transition : ndarray, shape (n, 15, 15 or 15 + calibration)
             From the state of the last epoch.
         noise : ndarray, shape (n, 15, 15)
-            Since then.
+            Added since then.
         """
         if self._cov is None or self._joint is None:
             return np.ones((len(transition), 2))
@@ -271,7 +272,7 @@ class SubsetBank:
         later = pose @ np.concatenate([cov, apart]) @ back
         later[:, : len(cov)] += noise[:, None, :6, :6]
         before, after = radii(np.concatenate([cov, apart])[:, :6, :6]), radii(later)
-        # What is known exactly, or separates nothing, has no share in a level.
+        # Parameters known exactly, or without separation, do not contribute to a level.
         shares = [
             after[i] / np.where(before[i] > LEAST, before[i], np.inf) for i in range(len(before))
         ]

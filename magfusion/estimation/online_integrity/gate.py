@@ -1,4 +1,4 @@
-"""Which channels of an epoch the prediction explains, and how well each beacon's field is."""
+"""Innovation gate: rejects channels that the prediction does not explain; tracks distortion."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -13,13 +13,13 @@ from magfusion.model.parameters import Block
 from magfusion.units import Array, BoolArray
 
 GATE = 38.3  # chi square of six components, one in a million
-LOST_EPOCHS = 5  # in a row, most of whose channels were refused: the state is wrong, not they
+LOST_EPOCHS = 5  # consecutive epochs with most channels rejected: the state is wrong, not they
 Phasors = FieldPhasors | JointPhasors
-MEMORY = 0.95  # of the running mean of the distortion, an epoch
+MEMORY = 0.95  # of the running mean of the distortion, per epoch
 
 
 class Gate:
-    """Refuses outliers, and notices when it is the state that is wrong.
+    """Rejects outliers, and detects a wrong state.
 
     Attributes
     ----------
@@ -28,10 +28,10 @@ class Gate:
     distortion : dict of str to float
         By beacon, running mean of the squared innovation in units of its expectation.
     refused_in_a_row : int
-        Epochs most of whose channels were refused, up to now.
+        Consecutive epochs with most channels rejected, up to now.
     taken, refused : dict of str to float
-        Of the last epoch, by beacon, the mean squared innovation of the channels that were taken
-        and of those that were refused, in the same units.
+        Of the last epoch, by beacon, the mean squared innovation of the accepted and of the
+        rejected channels, in the same units.
     """
 
     counts: Counter[str]
@@ -57,7 +57,7 @@ class Gate:
 
     @property
     def lost(self) -> bool:
-        """Whether the state is to be doubted rather than the measurements."""
+        """Whether the state is probably wrong rather than the measurements."""
         return self.refused_in_a_row >= LOST_EPOCHS
 
     def passed(
@@ -70,7 +70,7 @@ class Gate:
         measurements : FieldPhasors or JointPhasors
             Of one epoch.
         valid, refused : bool ndarray, shape (channels,)
-            What the epoch holds, and what was refused before.
+            Channels that the epoch contains, and those that are already rejected.
         """
         distance = measurements.alone().distances(state, self.blocks, GATE)
         false = self.watch.heard(distance > GATE, valid)
@@ -85,7 +85,7 @@ class Gate:
         return measurements.without(rejected) if np.any(rejected) else measurements
 
     def nothing_measured(self) -> None:
-        """Say that an epoch held no field."""
+        """Record an epoch without field."""
         self.taken, self.refused = {}, {}
 
     def _by_beacon(self, distance: Array, chosen: BoolArray) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""What is said of one state online, and the state with a covariance that it allows."""
+"""Judgement of one online state, and the state with the covariance that the judgement allows."""
 
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -15,22 +15,22 @@ from magfusion.units import Array
 
 @dataclass(frozen=True)
 class Judgement:
-    """What the witnesses say of a state.
+    """Combined result of the monitors of a state.
 
     Parameters
     ----------
     findings : tuple of Finding
         A failed one means that the platform is lost.
     excluded : tuple of str
-        Beacons that the gate refused there.
+        Beacons that the gate rejected at this epoch.
     inflation : float
         Of the whole covariance, at least one.
     turn, shift : float
-        What the attitude (rad) and the position (m) may be off by beyond that, one sigma an axis.
+        Additional error of attitude (rad) and position (m), one sigma per axis.
     levels : Levels, optional
         None where there are none.
     heard : tuple of str
-        Beacons that were told from noise there, the motion inside the window taken off.
+        Beacons that are detected there, with the motion inside the window compensated.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -43,12 +43,12 @@ class Judgement:
 
     @property
     def protection_level_m(self) -> float | None:
-        """Radius that the position stays within (m), if there is one."""
+        """Radius that bounds the position error (m), if there is one."""
         return None if self.levels is None else self.levels.found[0]
 
     @property
     def protection_level_deg(self) -> float | None:
-        """Angle that the attitude stays within (deg), if there is one."""
+        """Angle that bounds the attitude error (deg), if there is one."""
         return None if self.levels is None else self.levels.found[1]
 
     @property
@@ -63,15 +63,15 @@ class Judgement:
 
     @property
     def remarks(self) -> tuple[Finding, ...]:
-        """What is said without doubt: the estimator copes with it."""
+        """Findings that cast no doubt: the estimator handles them."""
         return Trust(self.findings).remarks
 
     def beside(self, *findings: Finding) -> "Judgement":
-        """Return it with more to be said."""
+        """Return the judgement with more findings."""
         return replace(self, findings=(*self.findings, *findings)) if findings else self
 
     def honest(self, cov: Array) -> Array:
-        """Return the covariance of a state as its witnesses allow it; the same where they agree."""
+        """Return the covariance of a state, enlarged as its judgement demands."""
         if self.inflation == 1.0 and self.turn == 0.0 and self.shift == 0.0:
             return cov
         wide = self.inflation * cov
@@ -91,7 +91,7 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Told:
-    """What was said of the state at a time (s)."""
+    """Judgement of the state at a time (s)."""
 
     time: float
     judgement: Judgement
@@ -100,14 +100,15 @@ class Told:
 
 @dataclass(frozen=True, eq=False)
 class JudgedState(State):
-    """A state and what is said of it; its covariance is as wide as that demands.
+    """A state with its judgement, and its covariance enlarged accordingly.
 
     Parameters
     ----------
     judgement : Judgement
     reset_counter : int
-        How often the pose has jumped up to here, as `magfusion.estimation.online_integrity.resets`
-        has it: who follows a pose by its changes begins anew where it rises.
+        Number of pose jumps up to here, as counted by
+        `magfusion.estimation.online_integrity.resets`; users of pose increments must restart where
+        it rises.
     """
 
     __repr__ = short_repr
@@ -117,17 +118,17 @@ class JudgedState(State):
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the state is to be believed."""
+        """Whether the state can be trusted."""
         return self.judgement.verdict
 
     @property
     def lost(self) -> bool:
-        """Whether the pose is a guess that nobody should use."""
+        """Whether the pose is a guess that must not be used."""
         return self.verdict is Verdict.FAILED
 
 
 def told_cov(state: State, judgement: Judgement) -> Array:
-    """Return the covariance of a state as it is told: with any roll that nothing tells."""
+    """Return the output covariance of a state: with any roll that is undetermined."""
     cov, site = judgement.honest(state.cov), state.calibration.site
     if not roll_is_open(site):
         return cov
@@ -136,14 +137,14 @@ def told_cov(state: State, judgement: Judgement) -> Array:
 
 
 def judged_state(state: State, judgement: Judgement, reset_counter: int = 0) -> JudgedState:
-    """Return a state of an estimator as it is told."""
+    """Return the output state for an estimator's state."""
     told = {"cov": told_cov(state, judgement), "judgement": judgement}
     own = {name: getattr(state, name) for name in _OF_STATE}
     return JudgedState(**own | told | {"reset_counter": reset_counter})
 
 
 def parts_of(state: JudgedState) -> dict[str, Any]:
-    """Return the fields of a state by their names, to make one of another kind with them."""
+    """Return the fields of a state by name, to construct another kind from them."""
     return {name: getattr(state, name) for name in _OF_JUDGED}
 
 

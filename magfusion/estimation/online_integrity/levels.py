@@ -1,6 +1,6 @@
-"""Protection levels that are found when somebody asks for them, those of many states at once.
+"""Protection levels computed on demand, for many states at once.
 
-To find one takes as long as a good part of an update does, and few who follow a state read it.
+Computing one takes a good part of the time of an update, and few users read it.
 """
 
 from collections.abc import Iterable
@@ -18,7 +18,7 @@ _PARTS = tuple(part.name for part in fields(Separation))
 
 
 class Asked(NamedTuple):
-    """What the levels of a state are found of.
+    """Arguments from which the levels of a state are computed.
 
     Parameters
     ----------
@@ -29,9 +29,9 @@ class Asked(NamedTuple):
     risk : Risk
     prior : ndarray, shape (1, beacons)
     factor : float
-        By which the levels are larger than separation knows of.
+        Inflation of the levels by other monitors.
     more : tuple of float
-        By which they are larger beside that (m, deg).
+        Additional margin (m, deg).
     """
 
     separation: Separation
@@ -48,9 +48,9 @@ class Levels:
     Parameters
     ----------
     found : tuple of float, optional
-        Position (m) and attitude (deg), None for one that there is not.
+        Position (m) and attitude (deg); None for a level that does not exist.
     asked : Asked, optional
-        Of those that are not found yet.
+        Arguments of levels that are not computed yet.
     """
 
     def __init__(self, found: Found | None = None, asked: Asked | None = None) -> None:
@@ -58,18 +58,18 @@ class Levels:
 
     @property
     def found(self) -> Found:
-        """Position (m) and attitude (deg); None where there is none."""
+        """Position (m) and attitude (deg); None where a level does not exist."""
         if self._found is None:
             find([self])
         return self._found or (None, None)
 
     @property
     def asked(self) -> Asked | None:
-        """What they are to be found of; None where they are found."""
+        """Arguments of the computation; None once it is done."""
         return self._asked
 
     def take(self, found: Found) -> None:
-        """Take what was found."""
+        """Store computed levels."""
         self._found, self._asked = found, None
 
     def __eq__(self, other: object) -> bool:
@@ -83,7 +83,7 @@ class Levels:
 
 
 def find(levels: Iterable[Levels]) -> None:
-    """Find levels that are not found yet; each is what it would be alone."""
+    """Compute missing levels together; each result is as computed separately."""
     waiting: dict[tuple[float, Risk, int], list[tuple[Levels, Asked]]] = {}
     for one in levels:
         asked = one.asked

@@ -1,4 +1,4 @@
-"""Several magnetometers online: one that the motion keeps refusing is named and left out."""
+"""Online exclusion of magnetometers whose phasors the motion contradicts repeatedly."""
 
 import numpy as np
 
@@ -6,22 +6,22 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding
 from magfusion.units import BoolArray
 
-MEMORY = 0.95  # of the running share of its phasors that were refused, an epoch of its own
-MOSTLY, SELDOM = 0.5, 0.2  # share of one that is false, and of another beside it that is right
-FEWEST = 20  # epochs of its own, before anything is said of one
+MEMORY = 0.95  # of the running share of rejected phasors, per epoch of its own
+MOSTLY, SELDOM = 0.5, 0.2  # shares of rejections: of a faulty one, and of another that is right
+FEWEST = 20  # epochs of its own, before one is assessed
 
 
 class MagnetometerWatch:
-    """Follows what share of each magnetometer's phasors the state does not explain.
+    """Tracks the share of each magnetometer's phasors that the state does not explain.
 
     Attributes
     ----------
     share : dict of str to float
         By magnetometer.
     epochs : dict of str to int
-        Of each, as many as hold any of its phasors.
+        Number of epochs with any of its phasors.
     excluded : list of str
-        Those that the first state was made without.
+        Those that the first state excludes.
     """
 
     share: dict[str, float]
@@ -38,24 +38,24 @@ class MagnetometerWatch:
         self.excluded, self._said = [], []
 
     def begin(self, excluded: tuple[str, ...], said: tuple[Finding, ...]) -> None:
-        """Leave out what the first state was made without, and keep what is said of that."""
+        """Exclude those that the first state excludes, and keep the findings on them."""
         self.excluded, self._said = list(excluded), list(said)
 
     @property
     def false(self) -> tuple[str, ...]:
-        """Those that are left out: refused mostly, where another seldom is."""
+        """Excluded ones: mostly rejected, while another seldom is."""
         asked = [name for name in self._names if self.epochs.get(name, 0) >= FEWEST]
         right = [name for name in asked if self.share[name] < SELDOM]
         late = [name for name in asked if right and self.share[name] > MOSTLY]
         return tuple(dict.fromkeys([*self.excluded, *late]))
 
     def heard(self, refused: BoolArray, valid: BoolArray) -> BoolArray:
-        """Take in which of an epoch's channels a state does not explain; return what is left out.
+        """Process the channels that a state does not explain; return the excluded ones.
 
         Returns
         -------
         bool ndarray, shape (channels,)
-            The channels of magnetometers that are false, whatever they hold now.
+            All channels of faulty magnetometers.
         """
         out = np.zeros(len(valid), dtype=bool)
         for k, name in enumerate(self._names):
@@ -70,14 +70,14 @@ class MagnetometerWatch:
         return out
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return what is to be said of those that are left out."""
+        """Return the findings on excluded magnetometers."""
         late = [name for name in self.false if name not in self.excluded]
         return *self._said, *(
             Finding(
                 "magnetometer_excluded",
                 f"Magnetometer {name} contradicts the others: {100.0 * self.share[name]:.0f} % of"
-                " its phasors are not what the motion allows, of another hardly any. It is left"
-                " out. Check its body_from_sensor, matrix, response and clock_offset_s.",
+                " its phasors are inconsistent with the motion, of another hardly any. It is not"
+                " used. Check its body_from_sensor, matrix, response and clock_offset_s.",
             )
             for name in late
         )

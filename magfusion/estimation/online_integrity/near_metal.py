@@ -1,10 +1,10 @@
-"""Metal that comes near a lone beacon: how much of its field it makes, and what that leaves.
+"""Metal near a single beacon: estimation of its share of the field, and weights accordingly.
 
-Of several beacons the one that is disturbed contradicts the others and is refused.  Of one there is
-nothing to compare with but the motion: its channels are refused one after the other, the rest moves
-the state, and a fix is as wrong as they are.  So the share of the field that the motion does not
-explain is estimated as it changes, and weighs as an error that epochs close by have in common:
-what passes is bridged by the inertial data, and the covariance says so.
+Of several beacons a disturbed one contradicts the others and is rejected.  A single one can only be
+compared with the motion: its channels are rejected one by one, the rest moves the state, and a fix
+is equally wrong.  The share of the field that the motion does not explain is therefore estimated
+over time, and weighted as an error shared by neighbouring epochs: the inertial data bridge a
+passing disturbance, and the covariance grows.
 """
 
 from dataclasses import replace
@@ -23,18 +23,18 @@ from magfusion.model.trust import Finding
 from magfusion.units import Array, BoolArray
 
 MEMORY = 0.15  # s; over which the share is averaged
-RELEASE = 1.0  # s; in which it is forgotten, as what passes comes back
-COMMON = 2.0  # s; for which epochs have the error of a hand-held thing in common
-QUIET = 1.0  # s; without it, before anything can have come
+RELEASE = 1.0  # s; time constant of its decay, as a passing object may return
+COMMON = 2.0  # s; correlation time of the error of a hand-held object
+QUIET = 1.0  # s; undisturbed time before an onset can be detected
 BEYOND = 2.0  # times the declared model error
 SURE = 5.0  # sigma
 
 
 class NearMetal:
-    """The share of a lone beacon's field that came with something near it."""
+    """The share of a single beacon's field that is caused by nearby metal."""
 
-    _heard: Running  # squared share, and its variance were there nothing
-    _kept: float  # squared share that is believed
+    _heard: Running  # squared share, and its variance without metal
+    _kept: float  # squared share that is used
     _time: float
     _quiet: float  # s
     _since: float | None
@@ -47,21 +47,21 @@ class NearMetal:
 
     @property
     def comes(self) -> bool:
-        """Whether it was noticed at the last epoch: those before have some of it."""
+        """Whether the last epoch is the onset: earlier epochs are partly disturbed."""
         return self._since == self._time
 
     @property
     def near(self) -> bool:
-        """Whether there is something."""
+        """Whether metal is near."""
         return self._since is not None
 
     def weighed(self, phasors: FieldPhasors, state: State, valid: BoolArray) -> FieldPhasors:
-        """Return the phasors of an epoch, weighed by what is near.
+        """Return the phasors of an epoch, weighted for nearby metal.
 
         Parameters
         ----------
         state : State
-            Predicted, as the prediction claims to know it.
+            The prediction, with its own covariance.
         valid : bool ndarray, shape (channels,)
         """
         if not self.lone or not np.any(valid):
@@ -111,14 +111,14 @@ class NearMetal:
             self._quiet, self._since = self._quiet + step, None
 
     def said(self) -> Judgement:
-        """Return what is to be said of a state."""
+        """Return the judgement on nearby metal."""
         if self._since is None:
             return Judgement()
         name, share = self.site.beacons[0].name, 100.0 * np.sqrt(self._kept)
         text = (
-            f"The field of beacon {name} departs by {share:.2g} % from what site and motion say,"
-            f" since {self._since:.1f} s: metal or iron has come near it or the sensor. Take it"
-            " away, or wait until it has gone; the sigmas hold for it."
+            f"The field of beacon {name} deviates by {share:.2g} % from the prediction by site and"
+            f" motion since {self._since:.1f} s: metal or iron is near it or the sensor. Remove it,"
+            " or wait until it is gone; the sigmas account for it."
         )
         return Judgement((Finding("metal_near", text, weight=share),))
 
@@ -134,7 +134,7 @@ def _in_phase(measured: Array) -> Array:
 def _with_share(
     phasors: FieldPhasors, valid: BoolArray, variance: Array, alike: float
 ) -> FieldPhasors:
-    """Return phasors whose components have an error more that so many epochs have in common.
+    """Return phasors with an additional error that a number of epochs share.
 
     Parameters
     ----------

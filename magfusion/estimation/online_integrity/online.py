@@ -1,8 +1,8 @@
-"""Witnesses of an online estimate: what is said of each state, at constant cost.
+"""Monitors of an online estimate: the judgement of each state, at constant cost.
 
-Fields that the prediction explains worse than it claims; biases and calibration beyond what was
-declared; gravity and the Earth's field, two compasses that know nothing of beacons; fixes that
-find the platform elsewhere.  None of them knows the truth.
+They test field innovations against their covariance; biases and calibration against their
+declaration; gravity and the Earth's field, which are independent of the beacons; and fixes against
+the state.  None of them knows the truth.
 """
 
 from collections.abc import Mapping
@@ -29,38 +29,38 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array, BoolArray
 
-MEMORY = 10.0  # s; of the innovations and of the compasses
-LEAST_SPAN = 1.0  # s; of inertial data, before gravity is judged
-FADES = 20.0  # s; what was said of the beginning and may have passed since
+MEMORY = 10.0  # s; of the innovations, gravity and static field
+LEAST_SPAN = 1.0  # s; of inertial data, before gravity is tested
+FADES = 20.0  # s; after which findings of the beginning that may have passed are dropped
 PASSING = {"not_converged", "diverged", "field_residuals", "geometry", "gap", "separation"}
 RESTARTS_MEMORY = 60.0  # s
-LEAST_EXCESS = 2.5  # mean square; the noise was tuned on the few seconds of the start
+LEAST_EXCESS = 2.5  # mean square; the noise is tuned on only a few seconds of the start
 SURE = 6.0
-BEYOND_HELP = 0.2  # rad; a bias that turns the vertical farther leaves no state to inflate
+BEYOND_HELP = 0.2  # rad; a bias that tilts the vertical more makes inflation useless
 TURNED = 1.0  # s; of a gyro bias, before the fields correct it
-LEAST_GAIN = 0.05  # of a prior variance; what is hardly determined does not move by itself
+LEAST_GAIN = 0.05  # of a prior variance; a barely determined parameter does not move by itself
 OFTEN_REFUSED = 0.5  # of a beacon's epochs
 MANY_RESTARTS = 3.0
 PRIOR_EVERY = 1.0  # s
 LARGEST_INFLATION = 1e8
-PROBATION = 2.0  # s, after the platform was found again or an update failed
+PROBATION = 2.0  # s; after a recovery or a failed update
 
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """What an epoch brought beside the state.
+    """Data of an epoch besides the state.
 
     Parameters
     ----------
     accel_world : ndarray, shape (3,), optional
-        Mean acceleration since the epoch before by the raw accelerometer, in world axes, as far as
-        gravity leaves one (m/s^2).
+        Mean acceleration since the previous epoch by the raw accelerometer, in world axes, the
+        residual of gravity (m/s^2).
     elapsed : float
         Since that epoch (s).
     steady : SteadyFields, optional
-        The steady field of the window.
+        The static field of the window.
     repeats : float
-        How many epochs hold each sample of overlapping windows.
+        Number of epochs that contain each sample of overlapping windows.
     """
 
     accel_world: Array | None = None
@@ -70,7 +70,7 @@ class Heard:
 
 
 class OnlineWitness:
-    """What is known of the trust in a running estimate.
+    """Monitors of a running estimate.
 
     Parameters
     ----------
@@ -106,21 +106,21 @@ class OnlineWitness:
         self._borrowed = {}
         self._borrowed_variance: Array | None = None
 
-    # What is heard
+    # Input
 
     def begin(self, time: float, said: Judgement, borrowed: Mapping[str, Array]) -> None:
-        """Begin with a first state (s), and what is said of the smoothed beginning.
+        """Start at a first state (s), with the judgement of the smoothed beginning.
 
         Parameters
         ----------
         borrowed : mapping of str to ndarray
-            Variance that estimated parameters have of what was only considered.
+            Variance of estimated parameters that is due to considered ones.
         """
         self._began, self._beginning, self._borrowed = time, said, dict(borrowed)
         self._borrowed_variance = None
 
     def hear(self, state: State, gate: Gate, heard: Heard) -> None:
-        """Take in an epoch: the state after it, and what its gate said."""
+        """Process an epoch: the state after it, and its gate."""
         time = state.time
         for name, level in gate.taken.items():
             before = self._level.get(name, nothing())
@@ -146,19 +146,19 @@ class OnlineWitness:
         self._earth = self._earth.with_sample(field_world - earth, state.time, MEMORY)
 
     def uncertain(self, code: str, time: float) -> None:
-        """Doubt the states for a while, for a reason that has passed."""
+        """Doubt the states for a while after a temporary problem."""
         self._uncertain_until[code] = time + PROBATION
         if code == "found_again":
             self._restarts = self._restarts.with_sample(np.ones(1), time, RESTARTS_MEMORY)
 
     def forget_motion(self) -> None:
-        """Forget what was heard of a pose that was given up."""
+        """Discard the history of a pose that was given up."""
         self._level, self._refused = {}, {}
         self._gravity, self._earth = nothing(3), nothing(3)
         self._elsewhere, self._elsewhere_times = None, 0
 
     def compared(self, distance: float, off: float) -> None:
-        """Take in how a fix compares: its squared distance and how far off it is (m).
+        """Process the comparison with a fix: squared distance and offset (m).
 
         Parameters
         ----------
@@ -172,15 +172,15 @@ class OnlineWitness:
 
     @property
     def asks_for_a_fix(self) -> bool:
-        """Whether a fix that disagreed should be followed by another at once."""
+        """Whether a fix that disagrees requests another at once."""
         return self._elsewhere is not None
 
-    # What is said
+    # Output
 
     def judgement(
         self, state: State, gate: Gate, lost_since: float | None, held: Judgement
     ) -> Judgement:
-        """Return what is to be said of a state, with what is said of all that it holds."""
+        """Return the judgement of a state, including that of its fixed parameters."""
         parts = [
             held,
             self._of_the_beginning(state.time),
@@ -202,7 +202,7 @@ class OnlineWitness:
         )
 
     def _of_the_beginning(self, time: float) -> Judgement:
-        """Return what was said of the beginning: what is of the site stays, what passes fades."""
+        """Return the judgement of the beginning; temporary findings are dropped with time."""
         said, findings = self._beginning, self._beginning.findings
         if time >= self._began + FADES:
             findings = tuple(f for f in findings if f.code not in PASSING)
@@ -211,7 +211,7 @@ class OnlineWitness:
     def _of_being_lost(self, gate: Gate, since: float | None) -> Judgement:
         if since is not None:
             text = (
-                f"Lost since {since:.1f} s: no fix explains the fields, nor does the state. Look at"
+                f"Lost since {since:.1f} s: neither a fix nor the state explains the fields. Check"
                 " the frequencies, phases and positions of the beacons in the site."
             )
             return Judgement((Finding("lost", text, Verdict.FAILED, 10.0),))
@@ -220,7 +220,7 @@ class OnlineWitness:
         levels = [*gate.refused.values(), *gate.taken.values()]
         excess = max(1.0, float(np.mean(levels)) if levels else 1.0)
         text = (
-            f"The fields of {_listed(gate.refused)} were refused together for"
+            f"The fields of {_listed(gate.refused)} were rejected together for"
             f" {gate.refused_in_a_row} epochs: a disturbance, or the state is wrong."
         )
         return Judgement((Finding("field_innovations", text, weight=excess),), inflation=excess)
@@ -235,16 +235,16 @@ class OnlineWitness:
                 inflation = max(inflation, self._repeats * mean)
                 text = (
                     f"The field of beacon {name} deviates from its prediction by"
-                    f" {np.sqrt(mean):.2g} times what is claimed over the last {MEMORY:g} s: iron"
-                    " nearby, a wrong survey of it, or motion that the IMU did not measure."
+                    f" {np.sqrt(mean):.2g} times its sigma over the last {MEMORY:g} s: iron nearby,"
+                    " a wrong survey of it, or motion that the IMU did not measure."
                 )
                 found.append(Finding("field_innovations", text, weight=mean / limit))
         for name, share in self._refused.items():
             often = float(share.mean[0])
             if often > OFTEN_REFUSED and share.count > 4.0:
                 text = (
-                    f"The field of beacon {name} was refused in {100 * often:.0f} % of the last"
-                    f" {MEMORY:g} s: it is moved, disturbed or not as the site says."
+                    f"The field of beacon {name} was rejected in {100 * often:.0f} % of the last"
+                    f" {MEMORY:g} s: it is moved, disturbed, or declared wrongly in the site."
                 )
                 found.append(Finding("beacon_excluded", text, weight=often / OFTEN_REFUSED))
         return Judgement(tuple(found), inflation=inflation)
@@ -293,10 +293,10 @@ class OnlineWitness:
         left = np.diagonal(state.cov)[MOTION : MOTION + len(change)]
         walk = self._walk * (state.time - self._began) / 3600.0
         prior = self._declared_variance + walk
-        if self._borrowed_variance is None:  # also where a checkpoint brought it
+        if self._borrowed_variance is None:  # also after a checkpoint
             own = (self._borrowed.get(b.name, np.zeros(len(b.sigma))) for b in self.estimated)
             self._borrowed_variance = np.concatenate(list(own))
-        # What was only considered moves the estimate, and its error with it: it is in both.
+        # Considered parameters shift estimate and error alike: their variance counts in both.
         both = 2.0 * np.minimum(self._borrowed_variance, left)
         gained = np.maximum(prior - left + both, LEAST_GAIN * prior)
         scores, usual = np.abs(change) / np.sqrt(gained), np.maximum(prior, gained)
@@ -307,15 +307,15 @@ class OnlineWitness:
             score = float(np.max(scores[block.columns]))
             if not block.parameter.of_log and score > DOUBT:
                 text = (
-                    f"{block.name} came out {score:.1f} times what its declared sigma allows: a"
-                    " wrong value in the site, or a sigma that is too small."
+                    f"{block.name} deviates from its declared value by {score:.1f} times what the"
+                    " declared sigma allows: the value is wrong, or the sigma is too small."
                 )
                 found.append(Finding("prior", text, weight=score / DOUBT))
                 inflation = max(inflation, score**2)
         if number and total > (limit := float(chdtri(number, 1e-5))):
             text = (
-                f"Together the {number} calibration parameters are {np.sqrt(total / number):.2g}"
-                " times as far from their declared values as their sigmas say."
+                f"Together the {number} calibration parameters deviate from their declared values"
+                f" by {np.sqrt(total / number):.2g} times their declared sigmas."
             )
             found.append(Finding("prior", text, weight=total / limit))
             inflation = max(inflation, total / number)
@@ -324,13 +324,13 @@ class OnlineWitness:
 
     @cached_property
     def _of_site(self) -> BoolArray:
-        """Which of the estimated parameters are no log's own."""
+        """Which of the estimated parameters belong to the site, not to a log."""
         own = [np.full(len(b.sigma), not b.parameter.of_log) for b in self.estimated]
         return np.concatenate(own)
 
     @cached_property
     def _walk(self) -> Array:
-        """Variance that each estimated parameter gains in an hour."""
+        """Random-walk variance of each estimated parameter in an hour."""
         own = (b.parameter.walk_per_sqrt_hour(self.site) ** 2 for b in self.estimated)
         return np.repeat(list(own), [len(b.sigma) for b in self.estimated])
 
@@ -339,8 +339,8 @@ class OnlineWitness:
         return np.asarray(prior_sigma(self.estimated) ** 2)
 
     def _of_gravity(self) -> Judgement:
-        """Judge what is left of the mean specific force: no platform falls for seconds."""
-        span = self._gravity.weight  # s that are heard, without the gaps of the IMU
+        """Test the residual of the mean specific force: no platform falls for seconds."""
+        span = self._gravity.weight  # s of data, without the gaps of the IMU
         if span < LEAST_SPAN or not self.site.platform.inertial:
             return Judgement()
         left = float(np.linalg.norm(self._gravity.mean))
@@ -352,7 +352,7 @@ class OnlineWitness:
         angle = left / self.site.gravity
         verdict = Verdict.FAILED if angle > 2.0 * BEYOND_HELP else Verdict.DOUBTFUL
         text = (
-            f"The mean specific force of the last {MEMORY:g} s leaves {left:.2g} m/s^2 beside"
+            f"The mean specific force of the last {MEMORY:g} s deviates by {left:.2g} m/s^2 from"
             " gravity at the estimated attitude: axes or signs of the IMU, its mounting to the"
             " magnetometer, or gravity removed from its data."
         )
@@ -377,7 +377,7 @@ class OnlineWitness:
         if kept > MANY_RESTARTS - 1.0:
             text = (
                 f"The platform was lost about {kept:.0f} times in the last minute: fields and"
-                " inertial data lead apart. Look at the axes, signs, units and stamps of the IMU."
+                " inertial data are inconsistent. Check axes, signs, units and stamps of the IMU."
             )
             verdict = Verdict.FAILED if kept > 2.0 * MANY_RESTARTS else Verdict.DOUBTFUL
             found.append(Finding("restarts", text, verdict, weight=kept / MANY_RESTARTS))
@@ -387,8 +387,8 @@ class OnlineWitness:
         if self._elsewhere is None:
             return Judgement()
         text = (
-            f"A fix of one epoch alone finds the platform {self._elsewhere:.2g} m away: the state"
-            " is in a mirrored place, or the survey of a beacon is wrong."
+            f"A fix of one epoch is {self._elsewhere:.2g} m from the state: the state is in a"
+            " mirrored place, or the survey of a beacon is wrong."
         )
         return Judgement(
             (Finding("fix_disagrees", text, weight=float(self._elsewhere_times)),),
@@ -397,8 +397,8 @@ class OnlineWitness:
 
 
 _PASSED = {
-    "found_again": "The platform was lost, and found again by a fix of one epoch.",
-    "update_failed": "An update of the estimator failed: the state was predicted alone.",
+    "found_again": "The platform was lost and has been recovered by a fix of one epoch.",
+    "update_failed": "An update of the estimator failed: the state is only predicted.",
 }
 
 

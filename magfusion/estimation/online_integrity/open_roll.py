@@ -1,4 +1,4 @@
-"""The roll about a single coil that neither field nor IMU tells: what is said, and compared."""
+"""Undetermined roll about a single coil without an IMU: its finding, covariance and comparison."""
 
 from dataclasses import replace
 
@@ -10,26 +10,26 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Verdict
 
 TEXT = (
-    "One axis tells nothing of the roll about it, and there is no IMU: a roll that does not turn is"
-    " taken, and its sigma is that of any. Place and direction of the coil are told; of errors"
-    " against a truth, these alone."
+    "One axis does not determine the roll about it, and there is no IMU. The estimate assumes a"
+    " constant roll with the sigma of an unknown angle. Position and direction of the coil are"
+    " determined; only their errors are compared with a truth."
 )
 
 
 def roll_findings(site: Site) -> tuple[Finding, ...]:
-    """Return that the roll is open, where it is."""
+    """Return the finding that the roll is undetermined, where it is."""
     return (Finding("roll_open", TEXT, Verdict.TRUSTWORTHY),) if roll_is_open(site) else ()
 
 
 def with_open_roll(states: Trajectory, site: Site) -> Trajectory:
-    """Return states of an estimate with covariances of any roll, where it is open."""
+    """Return states with covariances of any roll, where it is undetermined."""
     if not roll_is_open(site) or states.pose_cov is None:
         return states
     return replace(states, pose_cov=opened_poses(site, states.pose_cov))
 
 
 def comparable(log: Log, states: Trajectory, site: Site) -> Log:
-    """Return a log whose truth has the roll that was taken, where nothing tells it."""
+    """Return a log whose truth has the assumed roll, where the roll is undetermined."""
     if log.truth is None or not roll_is_open(site):
         return log
     signed = log.fields is None or log.fields.signed

@@ -1,7 +1,7 @@
-"""Where the inertial data alone lead from a little while ago: what was measured since, taken back.
+"""Undoing the corrections of the last epochs: the dead-reckoned state from a short time ago.
 
-A disturbance is noticed some epochs after it began, and those are in the state and in its
-covariance.  Beside the estimate runs what its corrections were, carried on as errors are.
+A disturbance is detected some epochs after its onset, and these are in the state and in its
+covariance.  The sum of their corrections is therefore propagated with the estimate.
 """
 
 from collections.abc import Sequence
@@ -14,19 +14,19 @@ from magfusion.estimation.graph.state import State, between, moved
 from magfusion.model.parameters import Block
 from magfusion.units import Array
 
-LATE = 0.5  # s; after which a disturbance is noticed, at most
+LATE = 0.5  # s; largest delay of the detection of a disturbance
 
 
 @dataclass(frozen=True, eq=False)
 class Since:
-    """What was taken in since a time.
+    """Corrections since a time.
 
     Parameters
     ----------
     time : float
         (s)
     correction : ndarray, shape (15 + calibration,)
-        Of the state, carried on.
+        Of the state, propagated.
     cov : ndarray, shape (15 + calibration, 15 + calibration)
         Of the state without it.
     """
@@ -37,7 +37,7 @@ class Since:
 
 
 class Reckoned:
-    """Takes back what was measured in the last half second to a second."""
+    """Undoes the measurements of the last half second to a second."""
 
     _older: Since | None
     _newer: Since | None
@@ -47,11 +47,11 @@ class Reckoned:
         self._older, self._newer = None, None
 
     def forget(self) -> None:
-        """Begin anew: the state has come from elsewhere."""
+        """Start again: the state was replaced."""
         self._older = self._newer = None
 
     def hear(self, before: State, predicted: Propagated, state: State) -> None:
-        """Take in an epoch: the states before it, predicted, and updated."""
+        """Process an epoch: the states before it, predicted, and updated."""
         step = between(predicted.state, state, self.blocks)
         if self._newer is None or before.time - self._newer.time >= LATE:
             self._older = self._newer
@@ -60,7 +60,7 @@ class Reckoned:
         self._newer = _carried(self._newer, predicted, step)
 
     def taken_back(self, predicted: Propagated) -> State:
-        """Return a prediction without what was measured before it."""
+        """Return a prediction without the measurements of these epochs."""
         since = self._older or self._newer
         if since is None:
             return predicted.state

@@ -1,6 +1,6 @@
-"""Where a fix finds the platform when the prediction is of no use: by the beacons that agree.
+"""Recovery of a lost platform by a fix from the beacons that agree.
 
-A fix that no choice of beacons makes agree is none to begin at again: it would be believed.
+A fix without any agreeing subset of beacons is not used for a restart: it would be trusted.
 """
 
 from dataclasses import replace
@@ -21,9 +21,9 @@ from magfusion.units import Array, BoolArray, ComplexArray
 
 MOST_REFUSED = 2  # beacons
 DOUBT = 1e-6  # probability of a worse agreement
-EXPLAINED = 0.25  # of the field; what leaves more is no explanation, whatever its covariance
-FIRST_WAIT, LONGEST_WAIT = 0.1, 2.0  # s; between attempts at a fix, doubled from one to the next
-BIAS_LIMIT = 6.0  # prior sigmas; a bias beyond is what a wrong pose has made of it
+EXPLAINED = 0.25  # of the field; a larger residual is no explanation, whatever its covariance
+FIRST_WAIT, LONGEST_WAIT = 0.1, 2.0  # s; between attempts at a fix, doubled each time
+BIAS_LIMIT = 6.0  # prior sigmas; a larger bias is the result of a wrong pose
 
 
 class AgreedFix(NamedTuple):
@@ -32,7 +32,7 @@ class AgreedFix(NamedTuple):
     Parameters
     ----------
     refused : bool ndarray, shape (channels,)
-        Of beacons that do not agree with the others.
+        Of beacons that disagree with the others.
     """
 
     fixes: Fixes
@@ -40,12 +40,12 @@ class AgreedFix(NamedTuple):
 
     @property
     def excess(self) -> float:
-        """Mean squared residual where that is above one."""
+        """Mean squared residual, at least one."""
         return max(1.0, float(self.fixes.residual_rms[0, 0]) ** 2)
 
 
 class Attempts:
-    """When to try a fix again: at once, then after waits that double up to `LONGEST_WAIT`.
+    """Times of attempts at a fix: at once, then after waits that double up to `LONGEST_WAIT`.
 
     Attributes
     ----------
@@ -62,13 +62,13 @@ class Attempts:
         self._next, self._wait = -np.inf, FIRST_WAIT
 
     def lost_at(self, time: float) -> float:
-        """Note that the platform is lost at a time (s); return since when it is."""
+        """Record that the platform is lost at a time (s); return since when it is."""
         if self.since is None:
             self.since, self._next, self._wait = time, time, FIRST_WAIT
         return self.since
 
     def due(self, time: float) -> bool:
-        """Note that the platform is lost at a time (s); return whether a fix should be tried."""
+        """Record that the platform is lost at a time (s); return whether to try a fix."""
         self.lost_at(time)
         if time < self._next:
             return False
@@ -76,12 +76,12 @@ class Attempts:
         return True
 
     def over(self) -> None:
-        """Note that it is found."""
+        """Record that the platform is recovered."""
         self.since = None
 
 
 def prior_of(state: State) -> Trajectory:
-    """Return the pose of a prediction, for a fix to hold to."""
+    """Return the pose of a prediction as the prior of a fix."""
     return Trajectory(
         time=np.array([state.time]),
         world_from_body=state.world_from_body[None],
@@ -91,7 +91,7 @@ def prior_of(state: State) -> Trajectory:
 
 
 def at_fix(state: State, fix: AgreedFix) -> State:
-    """Return a state at the pose of a fix, all else as it is: a place to linearise at."""
+    """Return a state at the pose of a fix, otherwise unchanged, as a linearization point."""
     best = fix.fixes.best()
     return replace(
         state, world_from_body=best.world_from_body[0], position_world=best.position_world[0]
@@ -99,9 +99,9 @@ def at_fix(state: State, fix: AgreedFix) -> State:
 
 
 def restarted(state: State, fix: AgreedFix) -> State:
-    """Return a state that knows its pose from a fix alone; the calibration is kept.
+    """Return a state with the pose of a fix alone; calibration is kept.
 
-    So are the biases, unless they are what no such instrument has.
+    So are the biases, unless they are implausible for the instrument.
     """
     best, site = fix.fixes.best(), state.calibration.site
     assert best.pose_cov is not None
@@ -125,7 +125,7 @@ def _begin_anew(cov: Array, columns: slice, sigma: float) -> None:
 
 
 def explains(fix: AgreedFix, samples: FieldSamples, calibration: Calibration) -> bool:
-    """Tell whether a fix explains the field: but for noise, or at least most of it."""
+    """Return whether a fix explains the field up to noise, or at least most of it."""
     if _agrees(fix, samples):
         return True
     best, kept = fix.fixes.best(), samples.valid[0] & ~fix.refused
@@ -140,9 +140,9 @@ def explains(fix: AgreedFix, samples: FieldSamples, calibration: Calibration) ->
 
 
 def corroborated(samples: FieldSamples) -> bool:
-    """Tell whether an epoch has more than one beacon to begin at again, where the site has more.
+    """Return whether an epoch has more than one beacon for a restart, if the site has more.
 
-    A state is lost because a beacon contradicts it: alone, that may be the Earth's field in a turn.
+    A contradicting beacon loses a state: alone, it may be the Earth's field in a rotation.
     """
     beacons = {name for name, _ in samples.channels}
     heard = {name for (name, _), on in zip(samples.channels, samples.valid[0], strict=True) if on}
@@ -152,16 +152,16 @@ def corroborated(samples: FieldSamples) -> bool:
 def agreed_fix(
     samples: FieldSamples, calibration: Calibration, prior: Trajectory | None = None
 ) -> AgreedFix | None:
-    """Fix an epoch without the fewest beacons that keep the others from agreeing.
+    """Fix an epoch without the smallest set of beacons that prevents agreement.
 
-    Where nothing agrees (a model that is wrong everywhere), all are taken.
+    If no subset agrees (a model that is wrong everywhere), all are used.
 
     Parameters
     ----------
     samples : FieldSamples
         One epoch.
     prior : Trajectory, optional
-        With it a single beacon is enough.
+        With it a single beacon suffices.
 
     Returns
     -------
@@ -189,7 +189,7 @@ def _fixed(
     prior: Trajectory | None,
     refused: list[BoolArray],
 ) -> list[AgreedFix | None]:
-    """Fix one epoch without each choice of channels, all of them at once."""
+    """Fix one epoch without each choice of channels, all at once."""
     count = len(refused)
     every = samples.rows(np.zeros(count, dtype=int))
     silenced: ComplexArray = np.where(np.array(refused)[:, :, None], np.nan, every.phasor_sensor)
@@ -204,9 +204,9 @@ def _fixed(
 
 
 def _repeated(prior: Trajectory, count: int) -> Trajectory:
-    """Return the one pose of a prediction so many times."""
+    """Return the pose of a prediction, repeated."""
     assert prior.pose_cov is not None
-    # Times must increase; of a pose to hold to they say nothing.
+    # Times must increase; they do not matter for a prior pose.
     apart = np.spacing(prior.time[0]) * np.arange(count)
     return Trajectory(
         time=prior.time[0] + apart,

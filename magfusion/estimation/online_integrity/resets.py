@@ -1,4 +1,4 @@
-"""Whether a running estimate went on or jumped, for those who follow it by its changes."""
+"""Discontinuity counter of a running estimate, for users of its pose increments."""
 
 import numpy as np
 from scipy.special import chdtri
@@ -7,14 +7,14 @@ from magfusion.estimation.graph.state import State
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.model.trust import Verdict
 
-UNEXPLAINED = float(chdtri(6, 1e-6))  # squared jump of a pose in units of what it was known to
+UNEXPLAINED = float(chdtri(6, 1e-6))  # squared jump of a pose over its covariance
 
 
 class Resets:
     """Counts the jumps of a running estimate.
 
-    It jumps where it was lost and is found again, where another hypothesis takes its place, and
-    where a correction is larger than the covariance of the state before it explains.
+    It jumps where a lost state is recovered, where another hypothesis replaces it, and where a
+    correction is larger than the prior covariance explains.
 
     Attributes
     ----------
@@ -32,16 +32,16 @@ class Resets:
     def hear(
         self, predicted: State, state: State, before: Judgement, now: Judgement, restarts: int
     ) -> bool:
-        """Take in an update; return whether the estimate jumped there.
+        """Process an update; return whether the estimate jumped.
 
         Parameters
         ----------
         predicted, state : State
-            Before and after it, at one time.
+            Before and after the update, at one time.
         before, now : Judgement
-            What was said of the last state, and of this.
+            Of the previous state, and of this one.
         restarts : int
-            How often a fix has taken the state's place, up to now.
+            Number of fixes that have replaced the state up to now.
         """
         anew, self._restarts = restarts > self._restarts, restarts
         was_lost, self._lost = self._lost, now.verdict is Verdict.FAILED
@@ -53,7 +53,7 @@ class Resets:
 
 
 def unexplained(predicted: State, state: State, before: Judgement) -> bool:
-    """Tell whether a pose moved by more than it was known to, at one time."""
+    """Return whether a pose moved by more than its covariance explains, at one time."""
     step = predicted.pose.localCoordinates(state.pose)
     cov = before.honest(predicted.cov[:6, :6])
     return bool(step @ np.linalg.solve(cov, step) > UNEXPLAINED)

@@ -1,7 +1,6 @@
-"""Epochs that the online score has not heard yet, and what all of them together tell it.
+"""Pending epochs of the online score test, processed in batches.
 
-What it makes of an epoch is asked for every few seconds only, and of several it costs little more
-than of one.
+Results are only requested every few seconds, and a batch costs little more than one epoch.
 """
 
 from collections.abc import Sequence
@@ -22,19 +21,19 @@ from magfusion.model.parameters import Calibration
 from magfusion.model.samples import ImuSamples
 from magfusion.units import Array
 
-MEMORY = 60.0  # s; older innovations count less, for what is wrong may have changed
+MEMORY = 60.0  # s; older innovations count less, as faults may change
 
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """Of the innovations up to now, in typical errors of what is held.
+    """Sums over the innovations up to now, in typical errors of the fixed parameters.
 
     Parameters
     ----------
     information : ndarray, shape (h, h)
     gradient : ndarray, shape (h,)
     response : ndarray, shape (15 + estimated, h)
-        What a unit of an error in them has done to the state.
+        Effect of a unit error of these on the state.
     time : float
         (s)
     """
@@ -46,7 +45,7 @@ class Sums:
 
 
 class Passed(NamedTuple):
-    """What led to an epoch.
+    """Propagation to an epoch.
 
     Parameters
     ----------
@@ -65,15 +64,15 @@ class Passed(NamedTuple):
 
 
 class Epoch(NamedTuple):
-    """An epoch that waits to be heard.
+    """A pending epoch.
 
     Parameters
     ----------
     predicted : State
     passed : Passed, optional
-        None where the state stayed.
+        None where the state was not propagated.
     measurements : tuple of Measurement
-        As the gate has left them.
+        After the gate.
     """
 
     predicted: State
@@ -82,7 +81,7 @@ class Epoch(NamedTuple):
 
 
 def passed(before: State, after: State, transition: Array, imu: ImuSamples) -> Passed:
-    """Return what led to a prediction, of the inertial samples of the interval."""
+    """Return the propagation to a prediction, from the inertial samples of the interval."""
     gyro = accel = np.zeros(3)
     if len(imu):
         share = np.full(len(imu), 1.0 / len(imu))
@@ -91,7 +90,7 @@ def passed(before: State, after: State, transition: Array, imu: ImuSamples) -> P
 
 
 def heard(sums: Sums, epochs: Sequence[Epoch], asked: Asked) -> Sums:
-    """Return the sums with the innovations of some epochs in a row."""
+    """Return the sums with the innovations of some consecutive epochs."""
     own, rest = slice(0, asked.size), asked.rest
     error, jacobian = _rows(epochs, asked)
     by_state, by_held = jacobian[..., : asked.whole], jacobian[..., asked.whole :] * asked.unit
@@ -128,7 +127,7 @@ def heard(sums: Sums, epochs: Sequence[Epoch], asked: Asked) -> Sums:
 
 
 def _pushed(epochs: Sequence[Epoch], asked: Asked) -> Array:
-    """Return what a unit of each error of the inertial sensors takes off, (epochs, 9, h)."""
+    """Return the effect of a unit error of the inertial sensors, to subtract, (epochs, 9, h)."""
     out = np.zeros((len(epochs), 9, len(asked.unit)))
     rows = [k for k, epoch in enumerate(epochs) if epoch.passed is not None]
     led = [epoch.passed for epoch in epochs if epoch.passed is not None]
@@ -149,9 +148,9 @@ def _pushed(epochs: Sequence[Epoch], asked: Asked) -> Array:
 
 
 def _rows(epochs: Sequence[Epoch], asked: Asked) -> tuple[Array, Array]:
-    """Return errors (epochs, m) and Jacobians (epochs, m, whole + h), zero where there are less.
+    """Return errors (epochs, m) and Jacobians (epochs, m, whole + h), padded with zeros.
 
-    Rows that say nothing of the state are zero.
+    Rows without information on the state are zero.
     """
     width, parts = asked.whole - MOTION + len(asked.unit), [list[_Row]() for _ in epochs]
     alike: dict[object, list[tuple[int, Measurement]]] = {}
@@ -185,12 +184,12 @@ class _Row(NamedTuple):
     jacobian: Array
 
 
-_OFFSET = (FieldPhasors, JointPhasors, EarthField)  # that know what offset the IMU was cut with
+_OFFSET = (FieldPhasors, JointPhasors, EarthField)  # that depend on the applied IMU time offset
 
 
 def _alike(measurement: Measurement, calibration: Calibration, alone: tuple[int, int]) -> object:
-    """Return what measurements have in common that can be linearised at once."""
-    if isinstance(measurement, ZeroVelocity):  # which no calibration changes
+    """Return a key of the measurements that can be linearised together."""
+    if isinstance(measurement, ZeroVelocity):  # independent of the calibration
         return kind_of(measurement)
     if not isinstance(measurement, _OFFSET):
         return alone
@@ -199,11 +198,11 @@ def _alike(measurement: Measurement, calibration: Calibration, alone: tuple[int,
 
 
 def _linearized(parts: list[Measurement], states: list[State], asked: Asked) -> Rows:
-    """Return the weighed rows of measurements of one kind, an epoch each."""
+    """Return the weighted rows of measurements of one kind, one epoch each."""
     calibration = states[0].calibration
     (whole,) = parts if len(parts) == 1 else joined(parts, range(len(parts)))
     if len(parts) > 1 and isinstance(whole, _OFFSET):
-        # What the time offset of each is more than that of the first.
+        # Excess of each time offset over that of the first.
         own = (s.calibration.imu_offset(t) for s, t in zip(states, whole.time, strict=True))
         more = calibration.imu_offset(whole.time) - np.array(list(own))
         whole = replace(whole, applied_offset=whole.applied_offset + more)

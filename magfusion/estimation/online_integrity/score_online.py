@@ -1,10 +1,10 @@
-"""The score test as the data arrive: what an online estimate holds is asked at every epoch.
+"""Online score test: tests the fixed parameters of a running estimate at every epoch.
 
-What a parameter that is held may be wrong by goes into the state through the gain, epoch after
-epoch, and shows in each innovation in a way of its own (the generalised likelihood ratio of Willsky
-and Jones 1976, doi 10.1109/TAC.1976.1101146).  With that response carried on beside the state, the
-innovations make the same information and gradient that `magfusion.estimation.integrity.score` has
-of a whole log, at the cost of one more product of matrices.  Epochs wait until they are asked of.
+An error of a fixed parameter enters the state through the gain, epoch after epoch, and has a
+signature of its own in the innovations (the generalised likelihood ratio of Willsky and Jones 1976,
+doi 10.1109/TAC.1976.1101146).  This response is propagated with the state; the innovations then
+yield the information and gradient that `magfusion.estimation.integrity.score` has of a whole log,
+for one more matrix product.  Epochs are pending until a result is requested.
 """
 
 from collections.abc import Iterable, Sequence
@@ -26,26 +26,26 @@ from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.units import Array
 
-ASKED_EVERY, ASKED_AFTER = 2.0, 20.0  # s; at the soonest, and at the latest
-ENOUGH = 5  # epochs to be asked of sooner
-MOST_WAITING = 10  # epochs; to hear more at once would make a late update
+ASKED_EVERY, ASKED_AFTER = 2.0, 20.0  # s; shortest and longest interval of results
+ENOUGH = 5  # epochs for the shortest interval
+MOST_WAITING = 10  # epochs; larger batches would delay an update
 
 
 class OnlineScore:
-    """Of everything that a running estimate holds; of many beacons, those that it has just heard.
+    """Score test of a running estimate's fixed parameters; of many beacons, of detected ones.
 
     Parameters
     ----------
     estimated, considered : tuple of Block
         Calibration parameters in the state's tangent.
     steady : bool
-        Whether the steady field is measured.
+        Whether the static field is measured.
     """
 
     _sums: Sums | None
     _heard_at: dict[str, float]
     _asked_at: float
-    _unasked: int  # epochs since then
+    _unasked: int  # epochs since the last result
     _said: Judgement
 
     def __init__(
@@ -66,7 +66,7 @@ class OnlineScore:
 
     @property
     def asked(self) -> Asked:
-        """What is asked at present."""
+        """Parameters that are tested at present."""
         if are_many(self.site) and self._made.names != tuple(self._heard_at):
             self._made = self._asked_of(self._heard_at)
         return self._made
@@ -77,7 +77,7 @@ class OnlineScore:
         return Asked(site, estimated, considered, steady=self._steady)
 
     def begin(self, score: Score | None, time: float) -> None:
-        """Go on from the score of the smoothed beginning, at its last state (s)."""
+        """Continue from the score of the smoothed beginning, at its last state (s)."""
         if score is None:
             return
         if are_many(self.site):
@@ -91,16 +91,16 @@ class OnlineScore:
         self._sums, self._waiting = Sums(score.information, score.gradient, response, time), []
 
     def end(self) -> None:
-        """Hear no more: the state has come from elsewhere, and its response is not known.
+        """Stop the test: the state was replaced, and its response is not known.
 
-        What was said of the site stays said.
+        The last result is kept.
         """
         self._sums, self._waiting = None, []
 
     def foresee(self, measurement: Measurement, predicted: State) -> None:
-        """Predict all that is asked: who asks for less of it finds it there.
+        """Predict all that the test needs, so that other users share the prediction.
 
-        Of few beacons whose calibration stays, epochs wait to be predicted together.
+        With few beacons and a constant calibration, pending epochs are predicted together.
         """
         if self._sums is None or not (self._each_alone or are_many(self.site)):
             return
@@ -112,12 +112,12 @@ class OnlineScore:
             measurement.linearize(*at)
 
     def _hear(self, measurements: Sequence[Measurement], time: float) -> None:
-        """Ask of those among many beacons that are heard, and no more of those long unheard."""
+        """Test the detected ones among many beacons, and drop those long undetected."""
         if self._sums is None or not are_many(self.site):
             return
         known = self._heard_at | dict.fromkeys(heard_in(measurements, self.site), time)
         kept = {name: known[name] for name in known if known[name] > time - MEMORY}
-        if kept.keys() <= self._heard_at.keys():  # nobody came: as cheap to go on asking
+        if kept.keys() <= self._heard_at.keys():  # no new beacon: keeping the others is as cheap
             self._heard_at = {name: known[name] for name in self._heard_at}
             return
         sums, before = self.settle(), self.asked
@@ -133,7 +133,7 @@ class OnlineScore:
         self._sums = Sums(information, gradient, response, sums.time)
 
     def predict(self, before: State, after: State, transition: Array, imu: ImuSamples) -> None:
-        """Carry the response on to a prediction.
+        """Propagate the response to a prediction.
 
         Parameters
         ----------
@@ -146,7 +146,7 @@ class OnlineScore:
             self._waiting.append(Epoch(after, passed(before, after, transition, imu)))
 
     def measured(self, measurements: Sequence[Measurement], predicted: State) -> None:
-        """Take in the innovations of an epoch, as the gate has left them."""
+        """Process the innovations of an epoch, after the gate."""
         self._hear(measurements, predicted.time)
         if self._sums is None or not measurements:
             return
@@ -159,7 +159,7 @@ class OnlineScore:
             self.settle()
 
     def settle(self) -> Sums | None:
-        """Hear the epochs that wait, and return the sums: what a checkpoint holds."""
+        """Process the pending epochs, and return the sums, which a checkpoint stores."""
         waiting, self._waiting = self._waiting, []
         if self._sums is not None and waiting:
             found = heard(self._sums, waiting, self.asked)
@@ -168,7 +168,7 @@ class OnlineScore:
         return self._sums
 
     def said_of(self, state: State) -> Judgement:
-        """Return what the score says of a state; asked now and then."""
+        """Return the judgement of a state by the test, updated now and then."""
         wait = ASKED_EVERY if self._unasked >= ENOUGH else ASKED_AFTER
         if state.time >= self._asked_at + wait and (sums := self.settle()) is not None:
             self._asked_at, self._unasked, self._said = state.time, 0, self._ask(sums, state)

@@ -1,4 +1,4 @@
-"""What is to be said of a run, from what was said of its states as they were made."""
+"""Summary of a run's judgements."""
 
 from dataclasses import dataclass, replace
 
@@ -10,7 +10,7 @@ from magfusion.model.trust import Finding, Trust, Unverified, Verdict
 
 @dataclass(frozen=True)
 class Noted:
-    """A finding as it spoke most strongly, and the states that it was said of.
+    """The strongest finding of a code, and the states that have it.
 
     Parameters
     ----------
@@ -26,14 +26,14 @@ class Noted:
 
 
 class Summary:
-    """Of all states up to now.
+    """Summary of all states up to now.
 
     Attributes
     ----------
     unverified : tuple of Unverified
-        What the beginning could not check.
+        Parameters that the beginning could not check.
     lost_states, lost_time, longest_loss : int, float, float
-        How many states were lost, how long in all, and how long at most until found again (s).
+        Number of lost states, their total and their longest duration until recovery (s).
     """
 
     unverified: tuple[Unverified, ...]
@@ -51,7 +51,7 @@ class Summary:
         self._noted, self._states, self._lost_since, self._last = {}, 0, None, -np.inf
 
     def note(self, time: float, judgement: Judgement) -> None:
-        """Take in what was said of a state (s)."""
+        """Add the judgement of a state (s)."""
         self._states += 1
         if self._lost_since is not None:
             self.lost_time += time - self._last
@@ -78,7 +78,7 @@ class Summary:
 
     @property
     def trust(self) -> Trust:
-        """The worst of all states; but a loss that was found again leaves a doubt alone."""
+        """The worst findings of all states; a loss that was recovered only leaves a doubt."""
         found = []
         for noted in self._noted.values():
             finding = noted.finding

@@ -1,10 +1,10 @@
-"""A filter of orientation: gravity, the Earth's field, rest, and a field that something disturbs.
+"""Orientation filter: gravity, the Earth's field, rest, and disturbances of the field.
 
-Gravity is what the specific force is on average: the velocity of what moves is held near zero, by
-the speed that it shows.  The field's deviation from the declared one is in the state, once in world
-axes, where it changes as the platform moves, and once with the platform.  Where neither explains
-what is measured something has changed: a magnet was attached, or iron is near.  Then both are free
-again, and the gyroscope holds the heading until the motion tells which of them it was.
+Gravity is the mean specific force: the velocity of a moving platform is kept near zero, within its
+usual speed.  The field's deviation from the declared one is in the state, once in world axes, where
+it changes as the platform moves, and once with the platform.  If neither explains the measured
+field, something has changed: a magnet was attached, or iron is near.  Then both are estimated
+again, and the gyroscope propagates the heading until the motion distinguishes them.
 """
 
 from dataclasses import dataclass, replace
@@ -37,28 +37,28 @@ from magfusion.units import Array
 
 GYRO_SCALE = 0.003  # usual error of a gyroscope's scale and axes
 AMBIENT = 0.02  # of the field's size: usual disturbance of each component, indoors
-SETTLED, MOVED = 10.0, 2.0  # s; over which it changes, at rest and in motion
-WAY = 0.5  # m; on which it becomes another, however soon that is
-MEMORY = 5.0  # s; over which its size is learnt, and that of the speed
+SETTLED, MOVED = 10.0, 2.0  # s; its correlation time, at rest and in motion
+WAY = 0.5  # m; distance after which it is independent, however short the time
+MEMORY = 5.0  # s; over which its size is estimated, and that of the speed
 NOISE_MEMORY, NOISE_FACTOR = 10.0, 20.0  # s; samples of the field are not independent
-SYNCHRONY = 0.003  # s; to which samples of field and rate belong together
-SPEED_TIME = 1.0  # s; so long a speed counts once
-LEAKAGE = 1.0  # s; over which a speed is thought to vanish, to learn its size
+SYNCHRONY = 0.003  # s; synchronisation error of field and rate samples
+SPEED_TIME = 1.0  # s; correlation time of the speed
+LEAKAGE = 1.0  # s; decay time of the speed for the estimate of its size
 LEAST_SPEED = 0.3  # m/s
 REST_RATE = np.deg2rad(0.03)  # rad/s, of one second
 GATE = 25.0  # chi square of three components
-LEAST_CHANGE, FREED = 3.0, 4.0  # uT; factor of the variance of what has changed
+LEAST_CHANGE, FREED = 3.0, 4.0  # uT; factor of the variance after a change
 TILT, HEADING = 0.05, 0.3  # rad; of the first attitude
-FAR_STRENGTH = 0.04  # of the field's size: what the declared one may be off by anywhere
+FAR_STRENGTH = 0.04  # of the field's size: error of the declared one everywhere
 OFFSET_WALK = 0.01  # uT per square root of second
-# What is carried turns with the arm that carries it: its speed goes with its attitude, over and
-# over, as a false bias would.  In motion the accelerometer's bias takes so much of it.
+# A carried platform rotates with the arm that carries it: its speed correlates with its attitude
+# periodically, as for a false bias.  In motion this is the share for the accelerometer's bias.
 SWUNG = 0.05  # of the speed: the accelerometer's bias
 
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """One stretch, as it was worked in: what a smoother needs of it.
+    """One processed segment, as needed by a smoother.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class Update:
     disturbance : float
         Usual deviation of the field then (uT).
     changed : bool
-        Whether the field was explained by nothing known, and was freed.
+        Whether the field was inconsistent with the model, and its disturbance was estimated again.
     """
 
     stretch: Stretch
@@ -86,7 +86,7 @@ class Update:
 class Row:
     """Measured minus predicted (3,), its derivative (3, 40), and its variance (3,).
 
-    ``share`` (40,) is what each parameter takes of it, one unless it is correlated with the motion.
+    ``share`` (40,) is the share of each parameter, one unless it is correlated with the motion.
     """
 
     by_state: Array
@@ -96,12 +96,12 @@ class Row:
 
 
 class OrientationFilter:
-    """A running estimate of orientation.
+    """Running estimate of orientation.
 
     Parameters
     ----------
     site : Site
-        Its beacons are left aside.
+        Its beacons are ignored.
 
     Raises
     ------
@@ -112,15 +112,15 @@ class OrientationFilter:
     def __init__(self, site: Site) -> None:
         if site.earth_field_world is None or not site.gravity > 0.0:
             raise InputError(
-                "a site without beacons needs the Earth's field and gravity; give earth_field_t or"
-                " a location in its world"
+                "a site without beacons needs the Earth's field and gravity; declare earth_field_t"
+                " or a location in its world"
             )
         self.site = site
         self.earth = site.earth_field_world / MICROTESLA
         if site.platform.imu == NO_IMU:
             raise InputError(
-                "platform.imu: is missing; without beacons and without an inertial sensor nothing"
-                " tells an orientation"
+                "platform.imu: is missing; orientation without beacons requires an inertial sensor;"
+                " declare it"
             )
         sensor = site.platform.magnetometer
         self.sensor = sensor
@@ -135,11 +135,11 @@ class OrientationFilter:
 
     @property
     def disturbance(self) -> float:
-        """Usual deviation of the field of late (uT)."""
+        """Present usual deviation of the field (uT)."""
         return float(np.sqrt(self._deviation))
 
     def take(self, stretch: Stretch) -> Update:
-        """Work in a stretch."""
+        """Process a segment."""
         if self.state is None or np.isnan(stretch.begin):
             self.state = self._started(stretch)
             self._before = None
@@ -159,7 +159,7 @@ class OrientationFilter:
         )
 
     def _started(self, stretch: Stretch) -> Orientation:
-        """Return the attitude by gravity and field; what is known of the instruments is kept."""
+        """Return the attitude by gravity and field, with the known errors of the instruments."""
         imu, sensor, size = self.site.platform.imu, self.sensor, float(np.linalg.norm(self.earth))
         time = float(stretch.time[0])
         old = self.state
@@ -221,7 +221,7 @@ class OrientationFilter:
         transition[TURN, GYRO_MATRIX] = begin @ turn.by_matrix
         by_turn = -skew(begin @ turn.push)
         transition[SPEED, TURN] = by_turn
-        for part in (GYRO_BIAS, GYRO_MATRIX):  # on average half of the turn tilts the force
+        for part in (GYRO_BIAS, GYRO_MATRIX):  # on average half of the rotation tilts the force
             transition[SPEED, part] = 0.5 * by_turn @ transition[TURN, part]
         transition[SPEED, ACCEL_BIAS] = -begin @ turn.by_force
         transition[OFFSET, OFFSET] = begin @ whole @ begin.T
@@ -263,7 +263,7 @@ class OrientationFilter:
         return Row(by_state, -state.velocity_world, np.full(3, variance), share)
 
     def _may_rest(self, state: Orientation, turn: Turned) -> bool:
-        """Tell a bias from a slow and even turn: no larger one is likely."""
+        """Return whether the rate may be a bias, and no slow and even turn: larger ones are not."""
         sigma = np.sqrt(np.diag(state.cov)[GYRO_BIAS]) + self.site.platform.imu.gyro_bias_walk
         return bool(np.all(np.abs(np.mean(turn.rate, axis=0)) < 4.0 * sigma + 3.0 * REST_RATE))
 
@@ -312,7 +312,7 @@ class OrientationFilter:
         return row, True, replace(state, cov=cov)
 
     def _field_variance(self, stretch: Stretch, turn: Turned) -> float:
-        """Return the variance of a component of the mean field, as it scatters (uT^2)."""
+        """Return the variance of a component of the mean field, from its scatter (uT^2)."""
         length = max(float(np.sum(stretch.steps)), 1e-3)
         now = turn.attitude[-1] @ (self.sensor.body_from_sensor @ np.mean(stretch.field, axis=0))
         if self._noise is None and len(stretch.field) > 3:  # of samples: more than of their mean
@@ -329,7 +329,7 @@ class OrientationFilter:
         return NOISE_FACTOR * max(declared, self._noise or 0.0) + skewed**2
 
     def _learn_deviation(self, off_world: Array, variance: float, stretch: Stretch) -> None:
-        """Learn how much the field is disturbed from what no heading changes: size and dip."""
+        """Estimate the field's disturbance from size and dip, which do not depend on heading."""
         if self._begun is None:
             self._begun = stretch.time[0]
         if stretch.rests and stretch.time[-1] - self._begun > 1.0:
@@ -343,9 +343,9 @@ class OrientationFilter:
 
 
 def updated(state: Orientation, rows: list[Row], measured_from_body: Array) -> Orientation:
-    """Return the state with what was measured; each parameter takes its share of it.
+    """Return the state after an update, of which each parameter takes its share.
 
-    filterpy's update costs 0.14 ms more a stretch than the bare formula (0.9 in place of 0.76 ms).
+    filterpy's update costs 0.14 ms more per segment than the bare formula (0.9 instead of 0.76 ms).
     """
     kalman = PartialUpdateFilter(SIZE)
     kalman.P = state.cov

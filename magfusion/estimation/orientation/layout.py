@@ -1,9 +1,9 @@
-"""What an orientation without beacons is estimated with, and the tangent of its covariance.
+"""State of an orientation without beacons, and the tangent of its covariance.
 
-Errors of attitude and offset are in world axes, that of the offset turned with the attitude (the
-two-frame group of Barrau and Bonnabel): what the data leave open, the heading at rest with an
-unknown offset, then lies in one direction whatever the estimate is, and nothing seems to be learnt
-of it where nothing is.  Fields are in microtesla, so that the covariance stays well conditioned.
+Errors of attitude and offset are in world axes, that of the offset rotated with the attitude (the
+two-frame group of Barrau and Bonnabel).  The unobservable direction, the heading at rest with an
+unknown offset, is then independent of the estimate, and the filter gains no false information on
+it.  Fields are in microtesla, so that the covariance stays well conditioned.
 """
 
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ SIZE = 40
 
 @dataclass(frozen=True, eq=False)
 class Orientation:
-    """Attitude and what was found with it, at one time.
+    """Attitude and other estimates, at one time.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class Orientation:
         (s)
     world_from_body : ndarray, shape (3, 3)
     velocity_world : ndarray, shape (3,)
-        Held near zero by what is usual of the motion, no more (m/s).
+        Kept near zero within the usual speed (m/s).
     gyro_bias, accel_bias : ndarray, shape (3,)
         Body axes (rad/s, m/s^2).
     gyro_matrix : ndarray, shape (3, 3)
@@ -42,10 +42,10 @@ class Orientation:
     matrix : ndarray, shape (3, 3)
         Of the magnetometer.
     near, far : ndarray, shape (3,)
-        What the field deviates from the declared one by, world axes (uT): here and now, and
+        Deviation of the field from the declared one, world axes (uT): local and present, and
         everywhere.
     lag : float
-        So much later than the inertial samples are those of the field (s).
+        Delay of the field samples relative to the inertial samples (s).
     cov : ndarray, shape (40, 40)
     """
 
@@ -63,7 +63,7 @@ class Orientation:
     cov: Array
 
     def moved(self, step: Array, measured_from_body: Array) -> "Orientation":
-        """Return it moved by a tangent vector; the covariance stays."""
+        """Return the state moved by a tangent vector; the covariance is constant."""
         attitude = Rotation.from_rotvec(step[TURN]).as_matrix() @ self.world_from_body
         return replace(
             self,
@@ -80,7 +80,7 @@ class Orientation:
         )
 
     def step_to(self, other: "Orientation", measured_from_body: Array) -> Array:
-        """Return the tangent vector that leads to another: the inverse of `moved`."""
+        """Return the tangent vector to another state: the inverse of `moved`."""
         turn = other.world_from_body @ self.world_from_body.T
         offset = np.linalg.solve(measured_from_body, other.offset - self.offset)
         return np.concatenate(

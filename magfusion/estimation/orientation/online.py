@@ -1,4 +1,4 @@
-"""Orientation as samples come: a state at every inertial sample, at once."""
+"""Online orientation: a state at every inertial sample, without delay."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,18 +22,18 @@ from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import MotionModel, Site
 from magfusion.units import Array
 
-WAIT = 0.3  # s; so long the inertial samples wait for those of the field
-ANYWHERE = 100.0  # m; one sigma of a position that nothing tells
-TIMING = 0.002  # s; by which the stamps of inertial samples may be late
+WAIT = 0.3  # s; maximum wait of inertial samples for those of the field
+ANYWHERE = 100.0  # m; one sigma of an undetermined position
+TIMING = 0.002  # s; possible delay of the stamps of inertial samples
 
 
 class OrientationNavigator:
-    """Takes samples as they come, and tells the orientation at each.
+    """Estimates the orientation at each sample as it arrives.
 
     Attributes
     ----------
     changed : list of float
-        When the field changed so that nothing known explained it (s).
+        Times of changes of the field that the model did not explain (s).
 
     Raises
     ------
@@ -63,7 +63,7 @@ class OrientationNavigator:
         return self.filter.state is not None
 
     def add_imu(self, time: Array, gyro_body: Array, accel_body: Array) -> None:
-        """Take inertial samples: times (k,), rates and specific forces (k, 3)."""
+        """Add inertial samples: times (k,), rates and specific forces (k, 3)."""
         stamps = time + self.site.platform.imu.time_offset
         rows = np.column_stack([stamps, gyro_body, accel_body])
         newest = self._newest_inertial
@@ -73,7 +73,7 @@ class OrientationNavigator:
         self._advance()
 
     def add_magnetometer(self, time: Array, measured_sensor: Array) -> None:
-        """Take raw samples of the magnetometer: times (k,), fields (k, 3) (T)."""
+        """Add raw samples of the magnetometer: times (k,), fields (k, 3) (T)."""
         _refuse_unsorted(time, self._heard, "samples of the magnetometer")
         rows = np.column_stack([time, measured_sensor])
         self._field = np.concatenate([self._field, rows])
@@ -81,7 +81,7 @@ class OrientationNavigator:
         self._advance()
 
     def take(self) -> list[JudgedState]:
-        """Return the states that were made since this was last called, one a sample."""
+        """Return the states made since the last call, one per sample."""
         made, self._made = self._made, []
         return made
 
@@ -163,12 +163,12 @@ class OrientationNavigator:
 
 
 def motion_cov(state: Orientation, attitude: Array, ahead: float, gyro_noise: float) -> Array:
-    """Return the covariance of a motion, shape (15, 15), as `State` has it.
+    """Return the covariance of a motion, shape (15, 15), in the layout of `State`.
 
     Parameters
     ----------
     attitude : ndarray, shape (3, 3)
-        world_from_body, carried so much (s) ahead of the state.
+        world_from_body, propagated by ``ahead`` (s) from the state.
     """
     cov = np.zeros((MOTION, MOTION))
     turn = state.cov[TURN, TURN] + gyro_noise**2 * max(ahead, 0.0) * np.eye(3)
@@ -181,7 +181,7 @@ def motion_cov(state: Orientation, attitude: Array, ahead: float, gyro_noise: fl
 
 
 def _rested(recent: Array, motion: MotionModel) -> bool:
-    """Tell whether the platform has stood still for the span that rest takes."""
+    """Return whether the platform has been still for the duration of a rest."""
     if len(recent) < 4 or recent[-1, 0] - recent[0, 0] < 0.9 * motion.rest_span:
         return False
     spread = np.var(recent[:, 1:], axis=0)

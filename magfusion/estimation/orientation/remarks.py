@@ -1,4 +1,4 @@
-"""What is to be said of an orientation: what disturbed the field, and what nothing tells."""
+"""Findings of an orientation: disturbances of the field, and undetermined quantities."""
 
 from itertools import pairwise
 
@@ -9,30 +9,30 @@ from magfusion.estimation.orientation.layout import LAG, OFFSET, Orientation
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import DEGREE, Array, BoolArray
 
-OPEN = 20.0 * DEGREE  # rad; sigma of a heading that is none
+OPEN = 20.0 * DEGREE  # rad; sigma above which a heading is undetermined
 DISTURBED = 0.05  # of the field's size
-TOLD = 2.0  # s; so long a change is told online
+TOLD = 2.0  # s; duration for which a change is reported online
 MOVED = 3.0  # sigma of an offset that has changed, all components: one in a hundred thousand
-LATE = 4.0  # sigma of a lag that is said
+LATE = 4.0  # sigma of a lag that is reported
 
 
 def position_open() -> Finding:
-    """Return that there is no position."""
+    """Return the finding that the position is undetermined."""
     text = (
-        "Position and velocity are undetermined: without beacons only the orientation is found."
-        " Positions are written as zero, with a sigma of 100 m."
+        "Position and velocity are undetermined: without beacons only the orientation is"
+        " estimated. Positions are written as zero, with a sigma of 100 m."
     )
     return Finding("geometry", text, Verdict.TRUSTWORTHY, weight=0.1)
 
 
 def doubts(cov_body: Array, world_from_body: Array) -> tuple[Finding, ...]:
-    """Return that a heading is none, where its sigma says so."""
+    """Return a finding if the heading is undetermined, according to its sigma."""
     sigma = float(np.sqrt(world_from_body[2] @ cov_body @ world_from_body[2]))
     if sigma < OPEN:
         return ()
     text = (
-        f"The heading is known to {sigma / DEGREE:.0f} degrees only: the Earth's field has been"
-        " disturbed or missing for too long. Move away from iron, and turn about all axes."
+        f"The heading has a sigma of {sigma / DEGREE:.0f} degrees: the Earth's field was disturbed"
+        " or missing for too long. Move away from iron, and turn about all axes."
     )
     return (Finding("few_data", text, weight=sigma / OPEN),)
 
@@ -40,7 +40,7 @@ def doubts(cov_body: Array, world_from_body: Array) -> tuple[Finding, ...]:
 def told_now(
     estimator: OrientationFilter, time: float, changed: float | None
 ) -> tuple[Finding, ...]:
-    """Return what an online state says of the field."""
+    """Return the findings of an online state on the field."""
     out = []
     if changed is not None and time - changed < TOLD:
         out.append(_change(np.array([changed])))
@@ -53,7 +53,7 @@ def told_now(
 def remarks(
     states: tuple[Orientation, ...], disturbance: Array, changed: Array, earth: Array
 ) -> tuple[Finding, ...]:
-    """Return what is to be said of a whole log.
+    """Return the findings of a whole log.
 
     Parameters
     ----------
@@ -78,14 +78,14 @@ def remarks(
         which = "magnetometer" if last.lag > 0.0 else "inertial sensor"
         text = (
             f"The {which} lags {1e3 * abs(last.lag):.1f} ms ({1e3 * sigma:.1f}) behind the other;"
-            " that is taken into account."
+            " this is compensated."
         )
         found.append(Finding("time_offset", text, Verdict.TRUSTWORTHY))
     return tuple(found)
 
 
 def _attached(states: tuple[Orientation, ...], changed: Array) -> list[Finding]:
-    """Return by what the magnetometer's offset moved where the field changed."""
+    """Return the findings of steps of the magnetometer's offset where the field changed."""
     found = []
     time = np.array([s.time for s in states])
     for first in _onsets(changed):
@@ -96,8 +96,8 @@ def _attached(states: tuple[Orientation, ...], changed: Array) -> list[Finding]:
         size = float(np.linalg.norm(step))
         if size > MOVED * float(np.sqrt(np.trace(cov))):
             text = (
-                f"At {first:.1f} s the magnetometer's offset moved by {size:.1f} uT: a magnet or"
-                " iron came to the body. It is estimated from there on."
+                f"At {first:.1f} s the magnetometer's offset changed by {size:.1f} uT: a magnet or"
+                " iron was attached to the body. It is estimated from then on."
             )
             found.append(Finding("body_iron", text, Verdict.TRUSTWORTHY, weight=2.0))
     return found
@@ -108,8 +108,8 @@ def _change(changed: Array) -> Finding:
     times = ", ".join(f"{t:.1f}" for t in onsets[:6])
     more = f" and {len(onsets) - 6} more" if len(onsets) > 6 else ""
     text = (
-        f"The field changed at {times} s{more} by what nothing known explains: a magnet or iron"
-        " near the path or on the body. The gyroscope held the heading."
+        f"The field changed at {times} s{more}, inconsistent with the model: a magnet or iron is"
+        " near the path or on the body. The gyroscope propagated the heading."
     )
     return Finding("earth_field", text, Verdict.TRUSTWORTHY, weight=1.5)
 
@@ -117,7 +117,7 @@ def _change(changed: Array) -> Finding:
 def _disturbed(deviation: float, size: float, when: str) -> Finding:
     text = (
         f"The field deviates from the Earth's by {deviation:.1f} uT"
-        f" ({100.0 * deviation / size:.0f} %){when}: it counts less there."
+        f" ({100.0 * deviation / size:.0f} %){when}: it is downweighted there."
     )
     return Finding("iron", text, Verdict.TRUSTWORTHY)
 

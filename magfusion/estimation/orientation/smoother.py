@@ -1,4 +1,4 @@
-"""Orientation by all that was measured, before and after: the filter, and back again."""
+"""Orientation smoother: the filter forward, and a backward pass over all measurements."""
 
 import copy
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ from magfusion.model.site import Site
 from magfusion.model.strapdown import resting
 from magfusion.units import Array
 
-PIECE = 1500  # stretches whose matrices are in memory at once
+PIECE = 1500  # segments whose matrices are in memory at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +31,11 @@ class Oriented:
     world_from_body : ndarray, shape (n, 3, 3)
         At each.
     states : tuple of Orientation
-        At the ends of the stretches.
+        At the ends of the segments.
     disturbance : ndarray, shape (stretches,)
         Usual deviation of the field then (uT).
     changed : ndarray, shape (m,)
-        When the field changed so that nothing known explained it (s).
+        Times of changes of the field that the model did not explain (s).
     """
 
     time: Array
@@ -51,21 +51,21 @@ class Oriented:
 
 
 def pieces(log: Log, site: Site) -> list[Stretch]:
-    """Return the stretches of a log, on its clock.
+    """Return the segments of a log, on its clock.
 
     Raises
     ------
     InputError
-        Where it has no samples of the magnetometer, or hardly any of the IMU.
+        Where it has no samples of the magnetometer, or too few of the IMU.
     """
     imu, wave = log.imu, log.waveform
     if wave is None or len(wave) == 0:
         raise InputError(
-            "holds only phasors, which know nothing of the Earth field; give the log with"
+            "has only phasors, which do not contain the Earth field; give the log with"
             " magnetometer.parquet"
         )
     if len(imu) < 3:
-        raise InputError(f"holds {len(imu)} inertial samples; orientation needs the gyroscope")
+        raise InputError(f"has {len(imu)} inertial samples; orientation needs the gyroscope")
     time = imu.time + site.platform.imu.time_offset
     rests = resting(time, imu.gyro_body, imu.accel_body, motion=site.platform.motion)
     streams = (time, imu.gyro_body, imu.accel_body, rests, wave.time, wave.measured_sensor)
@@ -73,12 +73,12 @@ def pieces(log: Log, site: Site) -> list[Stretch]:
 
 
 def oriented(log: Log, site: Site, *, back: bool = True, report: Report = quiet) -> Oriented:
-    """Find the orientation of a log at every inertial sample.
+    """Estimate the orientation of a log at every inertial sample.
 
     Parameters
     ----------
     back : bool
-        Whether later samples count too; otherwise it is as it was known online.
+        Whether to use later samples too; otherwise the estimate is that of the online filter.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def oriented(log: Log, site: Site, *, back: bool = True, report: Report = quiet)
 def _smoothed(
     cut: list[Stretch], snapshots: list[OrientationFilter], measured_from_body: Array
 ) -> Iterator[tuple[int, Orientation, Array]]:
-    """Yield the stretches from the last to the first: state at the end, attitudes at samples."""
+    """Yield the segments from the last to the first: state at the end, attitudes at samples."""
     after: Orientation | None = None
     later: Update | None = None
     for piece in reversed(range(len(snapshots))):
@@ -140,7 +140,7 @@ def _smoothed(
 def _one_back(
     state: Orientation, later: Update, after: Orientation, measured_from_body: Array
 ) -> Orientation:
-    """Return a state with what was measured after it (Rauch, Tung and Striebel)."""
+    """Return a state smoothed by later measurements (Rauch, Tung and Striebel)."""
     cross = later.transition @ state.cov
     gain = np.linalg.solve(later.predicted.cov, cross).T
     step = gain @ later.predicted.step_to(after, measured_from_body)
@@ -151,7 +151,7 @@ def _one_back(
 
 
 def _between(before: Orientation | None, update: Update, after: Orientation) -> Array:
-    """Return the attitudes at a stretch's samples, its turn fitted to its ends."""
+    """Return the attitudes at a segment's samples, its rotation fitted to its ends."""
     count = len(update.stretch.time)
     if before is None or np.isnan(update.stretch.begin):
         begin = after.world_from_body @ update.attitude[-1].T

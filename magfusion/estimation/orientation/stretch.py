@@ -1,4 +1,4 @@
-"""A tenth of a second of inertial samples, with the field samples that fell into it."""
+"""Segment of a tenth of a second of inertial samples, with the field samples in it."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,21 +11,21 @@ from magfusion.estimation.orientation.layout import MICROTESLA, Orientation
 from magfusion.model.field import skew
 from magfusion.units import Array, BoolArray
 
-STEP = 0.1  # s; of a stretch
-GAP = 0.5  # s; across a longer pause of the inertial samples nothing is carried
+STEP = 0.1  # s; of a segment
+GAP = 0.5  # s; a longer pause of the inertial samples interrupts propagation
 
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
     """Samples after one time, up to another.
 
-    A sample is taken for the mean over the step that ends at its stamp: an instrument that averages
-    gives it so, and one that filters is later still.
+    A sample is assumed to be the mean over the step that ends at its stamp, as for an instrument
+    that averages; one that filters has a larger delay.
 
     Parameters
     ----------
     begin : float
-        (s); NaN after a gap, and at first: nothing is carried into it.
+        (s); NaN after a gap, and at first: the state is not propagated into it.
     time : ndarray, shape (n,)
         Of the inertial samples (s).
     gyro_body, accel_body : ndarray, shape (n, 3)
@@ -35,7 +35,7 @@ class Stretch:
     field : ndarray, shape (m, 3)
         Measured axes (uT).
     rests : bool
-        Whether the platform stands still.
+        Whether the platform is at rest.
     """
 
     begin: float
@@ -55,14 +55,14 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class Turned:
-    """How a stretch turns and pushes the platform, by an estimate of the instruments' errors.
+    """Rotation and velocity change of a segment, given the instruments' errors.
 
     Parameters
     ----------
     attitude : ndarray, shape (n + 1, 3, 3)
         ``begin_from_then``: at the beginning, and at every sample.
     by_bias, by_matrix : ndarray, shape (3, 3), (3, 9)
-        Derivatives of the whole turn, axes of the beginning.
+        Derivatives of the whole rotation, axes of the beginning.
     push : ndarray, shape (3,)
         Integral of the specific force, axes of the beginning (m/s).
     by_force : ndarray, shape (3, 3)
@@ -80,7 +80,7 @@ class Turned:
 
 
 def turned(stretch: Stretch, state: Orientation) -> Turned:
-    """Integrate a stretch."""
+    """Integrate a segment."""
     dt = stretch.steps
     rate = stretch.gyro_body @ (np.eye(3) + state.gyro_matrix).T - state.gyro_bias
     steps = Rotation.from_rotvec(rate * dt[:, None]).as_matrix()
@@ -101,12 +101,12 @@ def turned(stretch: Stretch, state: Orientation) -> Turned:
 
 
 def body_from_end(stretch: Stretch, turn: Turned, lag: float) -> tuple[Array, Array]:
-    """Return how the axes of the field samples lie to those of the end, on average.
+    """Return the mean rotation from the axes of the end to those of the field samples.
 
     Parameters
     ----------
     lag : float
-        The samples show the platform as it was so much before their stamp (s).
+        Delay of the samples' stamps relative to the motion (s).
 
     Returns
     -------
@@ -131,7 +131,7 @@ def stretches(
     field_t: Array,
     begin: float,
 ) -> Iterator[Stretch]:
-    """Cut streams into stretches; what does not fill one at the end is a shorter one.
+    """Cut streams into segments; the last one may be shorter.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""What a solved graph gives beside its states: marginals, redundancy, noise."""
+"""Results of a solved graph besides its states: marginals, redundancy, noise."""

@@ -1,6 +1,6 @@
-"""What is left of parameters that are held when all states and the calibration are eliminated.
+"""Schur complement of fixed parameters after elimination of all states and the calibration.
 
-A stretch of the log at a time: the rows of all of it, with hundreds of columns, would be gigabytes.
+In segments of the log: the rows of all of it, with hundreds of columns, would be gigabytes.
 """
 
 import numpy as np
@@ -17,16 +17,15 @@ STRETCH = 128  # states that are eliminated at once
 
 
 def left_over(graph: Graph, estimate: Estimate, beside: Columns, native: NativeRows) -> Array:
-    """Return the normal equations of what is held, all that is estimated eliminated.
+    """Return the normal equations of fixed parameters after elimination of all estimates.
 
-    Of a log that has one calibration all along, whose prior is in the graph.
+    For a log with one calibration, whose prior is in the graph.
 
     Returns
     -------
     ndarray, shape (1 + columns, 1 + columns)
-        Products of what the estimate leaves of the residual and of each column, the latter with
-        the sign of a right side: the gradient of the columns downhill is minus their products with
-        the residual.
+        Products of the projected residual and columns, the latter with the sign of a right side:
+        the descent gradient of the columns is minus their products with the residual.
     """
     count, carried = 1 + beside.number, None
     states, whole = states_in(estimate.values), Normal.zeros(0, _size(graph), beside.number)
@@ -69,7 +68,7 @@ def _size(graph: Graph) -> int:
 
 def _add(normal: Normal, gram: Array, piece: Piece, begin: int) -> None:
     piece._replace(epoch=piece.epoch - begin).added_to(normal)
-    for channel in range(piece.right.shape[1]):  # most columns are felt by one beacon
+    for channel in range(piece.right.shape[1]):  # most columns affect one beacon
         _count(gram, piece.right[:, channel])
 
 
@@ -82,9 +81,9 @@ def _count(gram: Array, right: Array) -> None:
 
 
 def _eliminated(normal: Normal, gram: Array, number: int) -> tuple[Array, Array]:
-    """Eliminate the first states; take them from all products and return what is left of the next.
+    """Eliminate the first states from all products; return the Schur complement of the next.
 
-    That is its own information, and its right sides and border.
+    It consists of its information, and its right sides and border.
     """
     of_each = inverses(normal.diagonal[None, :number], normal.following[None])[0]
     sides = normal.sides

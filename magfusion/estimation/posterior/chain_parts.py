@@ -1,6 +1,6 @@
-"""What the rows of some channels add to normal equations, found once for all variants that have it.
+"""Contributions of channels to normal equations, computed once for all variants that have them.
 
-Most of what is considered is felt by one beacon alone, so that all parts together are hardly larger
+Most considered parameters affect one beacon alone, so that all parts together are hardly larger
 than their sum.
 """
 
@@ -17,16 +17,16 @@ from magfusion.units import Array, BoolArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """What the rows of some channels add.
+    """Contribution of the rows of some channels.
 
     Parameters
     ----------
     channels : bool ndarray, shape (channels,)
-        None of what every variant has.
+        All False for the part of every variant.
     sums : Normal
-        With those right sides alone that they have any of.
+        With only the nonzero right sides.
     columns : int ndarray
-        Which these are.
+        Their indices.
     """
 
     channels: BoolArray
@@ -34,7 +34,7 @@ class Part:
     columns: IntArray
 
     def added_to(self, normal: Normal) -> None:
-        """Add them to equations that have all right sides, but for the diagonal."""
+        """Add the part to equations with all right sides, except the diagonal."""
         own = self.sums
         normal.border[...] += own.border
         normal.corner += own.corner
@@ -56,7 +56,7 @@ class Parts:
     following : ndarray
         As of `Normal`.
     count : int
-        Of right sides.
+        Number of right sides.
     """
 
     parts: tuple[Part, ...]
@@ -76,7 +76,7 @@ class Parts:
         return found
 
     def forget_diagonals(self) -> None:
-        """Make room, once they were asked for."""
+        """Release the memory of the diagonals after their use."""
         for part in self.parts:
             part.sums.diagonal = part.sums.diagonal[:0].copy()
 
@@ -94,14 +94,14 @@ class Parts:
 
 
 def parts_of(rest: Normal, rows: FieldRows, pieces: Iterable[Piece], kept: BoolArray) -> Parts:
-    """Return a chain in parts, of which each variant has all or nothing.
+    """Return a chain in parts, each of which a variant has completely or not at all.
 
     Parameters
     ----------
     rest : Normal
-        What every variant has; it is left without right sides.
+        Common part of all variants; it is returned without right sides.
     rows : FieldRows
-        Of which the pieces are.
+        Source of the pieces.
     kept : bool ndarray, shape (variants, channels)
         Channels that a variant has.
     """
@@ -119,7 +119,7 @@ def parts_of(rest: Normal, rows: FieldRows, pieces: Iterable[Piece], kept: BoolA
 
 
 def _with_felt_alone(rest: Normal, channels: int) -> Part:
-    """Return equations as a part, without right sides of zeros."""
+    """Return equations as a part, with only the nonzero right sides."""
     felt = np.any(rest.right, axis=(0, 1)) | np.any(rest.right_border, axis=0)
     felt[0] = True
     columns = np.flatnonzero(felt)
@@ -129,7 +129,7 @@ def _with_felt_alone(rest: Normal, channels: int) -> Part:
 
 
 def _felt(rows: FieldRows, channels: BoolArray) -> IntArray:
-    """Return the right sides that some channels feel: the first, and of what acts on them."""
+    """Return the right sides of some channels: the first, and those that affect them."""
     every = rows.estimate.calibration.site.channels
     names = {every[k][0] for k in np.flatnonzero(channels).tolist()}
     acting = [

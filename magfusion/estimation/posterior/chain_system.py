@@ -1,7 +1,7 @@
 """The linear system of a solved graph as normal equations of a chain of states with a border.
 
-GTSAM's elimination serves any graph; here all states of a log are one chain, so that the covariance
-of every state, and what else is asked of all of them, come of one sweep (`solve.chain`).
+GTSAM's elimination serves any graph; here all states of a log are one chain, so that one sweep
+(`solve.chain`) gives the covariance of every state and other results for all of them.
 """
 
 from collections.abc import Iterator
@@ -20,21 +20,21 @@ from magfusion.model.parameters import Block, Calibration, difference, dimension
 from magfusion.model.prior import prior_sqrt_covariance, prior_sqrt_information
 from magfusion.units import Array, BoolArray, IntArray
 
-AT_ONCE = 2e8  # bytes; variants are solved in groups of so much
-SIDES = 6e7  # bytes of right sides at once; what is considered is taken in groups
+AT_ONCE = 2e8  # bytes; variants are solved in groups of this size
+SIDES = 6e7  # bytes of right sides at once; considered parameters are processed in groups
 
 
 @dataclass(eq=False)
 class Normal:
-    """Normal equations of a chain that grow by rows.
+    """Normal equations of a chain, accumulated by rows.
 
-    The right sides are the step, then what one sigma of each considered parameter does.
+    The right sides are the step, then the response to one sigma of each considered parameter.
 
     Parameters
     ----------
     diagonal : ndarray, shape (states, 15, 15)
     following : ndarray, shape (states - 1, 15, 15)
-        Of each state with the next.
+        Between each state and the next.
     sides : ndarray, shape (states, 15, 1 + considered + calibration)
         Right sides, then the border.
     corner : ndarray, shape (calibration, calibration)
@@ -49,7 +49,7 @@ class Normal:
 
     @classmethod
     def zeros(cls, states: int, calibration: int, considered: int) -> "Normal":
-        """Return equations without any rows."""
+        """Return empty equations."""
         return cls(
             np.zeros((states, MOTION, MOTION)),
             np.zeros((max(states - 1, 0), MOTION, MOTION)),
@@ -76,14 +76,14 @@ class Normal:
     def blank(
         count: int, states: int, calibration: int, right: int, following: Array
     ) -> tuple[Chain, list["Normal"]]:
-        """Return variants without any rows as one chain, and each of them to add to.
+        """Return empty variants as one chain, and each of them for accumulation.
 
         Parameters
         ----------
         right : int
             Number of right sides.
         following : ndarray, shape (states - 1, 15, 15)
-            The same of all.
+            Common to all.
         """
         made = {
             "diagonal": np.zeros((count, states, MOTION, MOTION)),
@@ -109,7 +109,7 @@ class Normal:
             By the state, and by the next.
         border : ndarray, shape (m, rows, calibration)
         right : ndarray, shape (m, rows, k)
-            The first k of 1 + considered; of the others there is nothing.
+            The first k of 1 + considered; the others are zero.
         """
         back, felt = np.swapaxes(own, 1, 2), right.shape[-1]
         self.diagonal[epoch] += back @ own
@@ -126,7 +126,7 @@ class Normal:
 
 
 class Piece(NamedTuple):
-    """Rows of some epochs, shape (m, groups, components, k), weighed as they were last."""
+    """Rows of some epochs, shape (m, groups, components, k), with their latest weights."""
 
     epoch: IntArray
     by_state: Array
@@ -146,14 +146,14 @@ class Piece(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FieldRows:
-    """The rows of a measurement, made piece by piece: those of a log of hours take much memory.
+    """The rows of a measurement in pieces, since those of a log of hours take much memory.
 
     Parameters
     ----------
     considered : tuple of Block
-        Those that the columns are of.
+        Parameters of the columns.
     spread : ndarray, shape (dimension, columns)
-        What makes a step of them out of unit noise.
+        Maps unit noise to a step of the parameters.
     """
 
     factors: Factors
@@ -190,7 +190,7 @@ def field_piece(
 
 
 def _spread_over(by_other: Array, spread: Array, out: Array) -> None:
-    """Write what a spread makes of the columns of parameters; most spreads are diagonal."""
+    """Write the product of parameters' columns and a spread; most spreads are diagonal."""
     if not spread.size or np.any(np.count_nonzero(spread, axis=0) > 1):
         np.matmul(by_other, spread, out=out)
         return
@@ -202,7 +202,7 @@ def _spread_over(by_other: Array, spread: Array, out: Array) -> None:
 
 
 def column_groups(considered: tuple[Block, ...], epochs: int) -> list[slice]:
-    """Return columns of what is considered, so many at once that their right sides fit memory."""
+    """Return groups of considered columns whose right sides fit memory."""
     most, out = int(SIDES / (8.0 * MOTION * epochs)), [slice(0, 0)]
     for block in considered:
         first, end = out[-1].start, block.columns.stop
@@ -221,19 +221,19 @@ def chain_system(
 ) -> tuple[Normal, FieldRows | None]:
     """Return the normal equations of all but the fields, and the rows of the fields.
 
-    Of a log that has one calibration all along, whose prior is in the graph.
+    For a log with one calibration, whose prior is in the graph.
 
     Parameters
     ----------
     columns : slice
-        Of what is considered, of which the right sides are.
+        Of the considered parameters, for the right sides.
     """
     assert graph.declared is not None
     spread, by_inertial = np.zeros((0, 0)), None
     if considered:
         spread = prior_sqrt_covariance(graph.declared.site, considered)[:, columns]
         by_others = graph.by_considered(spread)
-        if by_others is not None and np.any(by_others):  # else the fields alone tell of them
+        if by_others is not None and np.any(by_others):  # else they act on the fields only
             by_inertial = by_others.__getitem__
     beside = Columns(considered, spread, by_inertial)
     return system_beside(graph, estimate, beside, NativeRows(graph, estimate), columns)
@@ -246,12 +246,12 @@ def system_beside(
     native: NativeRows,
     columns: slice = slice(None),
 ) -> tuple[Normal, FieldRows | None]:
-    """Return the same, with columns of any parameters for right sides.
+    """Return the same, with columns of any parameters as right sides.
 
     Parameters
     ----------
     columns : slice
-        Of what else other logs say of the calibration.
+        Of errors in the calibration's prior from other logs.
     """
     size = dimension(graph.blocks)
     normal = Normal.zeros(graph.epochs, size, beside.number)
@@ -286,7 +286,7 @@ def add_prior(normal: Normal, graph: Graph, estimate: Estimate) -> None:
 
 
 def felt_blocks(beside: Columns) -> tuple[tuple[Block, ...], Array]:
-    """Return the parameters that any column is of, and what makes a step of them."""
+    """Return the parameters with a nonzero column, and the map from columns to their steps."""
     felt = [block for block in beside.blocks if np.any(beside.spread[block.columns])]
     if not felt:
         return (), beside.spread[:0]

@@ -1,9 +1,9 @@
-"""What a log says of a calibration that it shares with others, its states eliminated.
+"""Information of a log on a calibration that it shares with others, its states eliminated.
 
-The linear graph at an estimate is eliminated down to the calibration, without the prior of what is
-shared; what is the log's own (drive phases, the IMU's clock) is eliminated with its prior.  What is
-left is a quadratic in the shared parameters: added over logs, with the prior once, it makes the
-step of Gauss and Newton that one graph of all the logs would make.
+The linear graph at an estimate is eliminated down to the calibration, without the prior of shared
+parameters; the log's own (drive phases, the IMU's clock) are eliminated with their prior.  The
+result is a quadratic in the shared parameters: added over logs, with the prior once, it gives the
+Gauss-Newton step of one graph of all the logs.
 """
 
 from dataclasses import dataclass, replace
@@ -22,20 +22,20 @@ from magfusion.units import Array, BoolArray
 
 @dataclass(frozen=True, eq=False)
 class Condensed:
-    """A quadratic in what several logs share, at the calibration where it was taken.
+    """A quadratic in parameters that several logs share, at its linearisation point.
 
     Parameters
     ----------
     information : ndarray, shape (s, s)
         Of the log alone.
     gradient : ndarray, shape (s,)
-        Downhill: ``information @ step = gradient`` where the log alone would go.
+        Descent direction: ``information @ step = gradient`` gives the step of the log alone.
     by_common : ndarray, shape (s, c)
-        What one sigma of each parameter that is considered, and the same in every log, adds to it.
+        Change by one sigma of each considered parameter that is the same in every log.
     by_place : ndarray, shape (s, s)
-        Covariance of what errors of the fields that are constant in place add to it.
+        Covariance due to errors of the fields that are constant in place.
     by_log : ndarray, shape (s, s)
-        Covariance of what is considered of the log's own adds to it.
+        Covariance due to considered parameters of the log's own.
     """
 
     information: Array
@@ -46,12 +46,12 @@ class Condensed:
 
 
 def columns_of(blocks: tuple[Block, ...], *, own: bool) -> BoolArray:
-    """Return which columns are the log's own, or those that logs share, shape (dimension,)."""
+    """Return which columns are the log's own, or shared between logs, shape (dimension,)."""
     return np.array([b.parameter.each_log is own for b in blocks for _ in b.sigma], dtype=bool)
 
 
 def shared_blocks(blocks: tuple[Block, ...]) -> tuple[Block, ...]:
-    """Return the parameters that logs share, their columns following each other."""
+    """Return the parameters that logs share, with consecutive columns."""
     return placed(block for block in blocks if not block.parameter.each_log)
 
 
@@ -61,21 +61,21 @@ def condensed(
     considered: tuple[Block, ...],
     errors: tuple[Block, ...] = (),
 ) -> Condensed:
-    """Condense the graph of a log to what it shares.
+    """Marginalise the graph of a log to its shared parameters.
 
     Parameters
     ----------
     graph : Graph
-        Its prior is left out but for the log's own parameters.
+        Its prior is omitted except for the log's own parameters.
     considered : tuple of Block
-        What is uncertain and not estimated.
+        Uncertain parameters that are not estimated.
     errors : tuple of Block
         Errors of the beacons' fields that are constant in place.
 
     Raises
     ------
     RuntimeError
-        GTSAM's own, of states that the log leaves open.
+        From GTSAM, for states that the log does not determine.
     """
     assert graph.declared is not None
     site, size = graph.declared.site, dimension(graph.blocks)
@@ -132,7 +132,7 @@ def _without_own(
 
 
 def summed(parts: list[Condensed]) -> Condensed:
-    """Return what several logs say together, all taken at one calibration."""
+    """Return the sum over several logs with the same linearisation point."""
 
     def both(a: Condensed, b: Condensed) -> Condensed:
         return Condensed(**{k: v + getattr(b, k) for k, v in vars(a).items()})
@@ -143,6 +143,6 @@ def summed(parts: list[Condensed]) -> Condensed:
 def taken_at(
     part: Condensed, taken: Calibration, calibration: Calibration, shared: tuple[Block, ...]
 ) -> Condensed:
-    """Return a quadratic as it is at another calibration than that where it was taken."""
+    """Return a quadratic at another linearisation point."""
     step = difference(taken, calibration, shared)
     return replace(part, gradient=part.gradient - part.information @ step)

@@ -1,10 +1,10 @@
-"""Whether an estimator has ended where the cost is least, in units of what it claims."""
+"""Convergence of an estimator, in units of its own sigmas."""
 
 import numpy as np
 from gtsam.symbol_shorthand import X
 from scipy.spatial.transform import Rotation
 
-from magfusion.errors import EstimationError
+from magfusion.errors import UNOBSERVABLE, EstimationError
 from magfusion.estimation.graph.graph import Estimate, Graph
 from magfusion.estimation.solve.bordered import eliminate
 from magfusion.model.parameters import Calibration
@@ -13,13 +13,13 @@ from magfusion.units import Array
 
 OFFSET_CONVERGED = 2e-5  # s; change of the time offset at which the passes end
 POSITION_CONVERGED = 5e-5  # m; rms change of the positions at which the passes end
-OPEN_ROTATION = 0.3  # rad; beyond, no linearisation holds and the sigma itself means nothing
+OPEN_ROTATION = 0.3  # rad; beyond, linearisation fails and the sigma itself is not valid
 
 
 def last_move(
     before: Trajectory, after: Trajectory, unfinished: tuple[Graph, Estimate] | None = None
 ) -> float:
-    """Return what the last pass moved the poses by, in sigmas, and what its loop had yet to.
+    """Return the rms pose change of the last pass, in sigmas, including an unfinished step.
 
     The gauge of a survey is as uncertain as the survey: a step along it is small in these units.
 
@@ -28,7 +28,7 @@ def last_move(
     after : Trajectory
         With a covariance.
     unfinished : Graph and Estimate, optional
-        Where the loop of the last pass was given up.
+        State of an unconverged loop of the last pass.
     """
     cov, moves = after.pose_cov, [pose_steps(before, after)]
     assert cov is not None
@@ -36,7 +36,7 @@ def last_move(
         graph, estimate = unfinished
         try:
             step = eliminate(graph.linearized(estimate), graph.ordering).optimize()
-        except RuntimeError:  # GTSAM's own, of a singular system
+        except RuntimeError:  # from GTSAM, for a singular system
             return float("inf")
         moves.append(step.vector([X(i) for i in range(graph.epochs)]).reshape(-1, 6))
     squares = [np.einsum("ni,ni->", m, np.linalg.solve(cov, m[..., None])[..., 0]) for m in moves]
@@ -44,7 +44,7 @@ def last_move(
 
 
 def pose_steps(before: Trajectory, after: Trajectory) -> Array:
-    """Return what takes poses to others, shape (n, 6): rotation, then translation, body axes."""
+    """Return the steps between poses, shape (n, 6): rotation, then translation, body axes."""
     back = np.swapaxes(before.world_from_body, 1, 2)
     turn = Rotation.from_matrix(back @ after.world_from_body).as_rotvec()
     moved = back @ (after.position_world - before.position_world)[..., None]
@@ -52,17 +52,15 @@ def pose_steps(before: Trajectory, after: Trajectory) -> Array:
 
 
 def refuse_open(states: Trajectory) -> None:
-    """Refuse an attitude that nothing determines: rounding alone may have made it a result."""
+    """Raise an error for an unobservable attitude, whose estimate may be rounding alone."""
     assert states.pose_cov is not None
     widest = np.linalg.eigvalsh(states.pose_cov[:, :3, :3])[:, -1]
     if np.min(widest) > OPEN_ROTATION**2:
-        raise EstimationError(
-            "the measurements leave a direction of the motion open: add a beacon or a coil"
-        )
+        raise EstimationError(f"{UNOBSERVABLE}: add a beacon or a coil")
 
 
 def settled_at(before: Trajectory, after: Trajectory, old: Calibration, new: Calibration) -> bool:
-    """Tell whether a pass moved states and the IMU's stamps by next to nothing."""
+    """Return whether a pass changed states and the IMU's stamps by negligible amounts."""
     moved = np.sqrt(np.mean((after.position_world - before.position_world) ** 2))
     ends = after.time[[0, -1]]
     shifted = np.max(np.abs(new.imu_offset(ends) - old.imu_offset(ends)))

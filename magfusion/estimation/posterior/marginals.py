@@ -1,7 +1,7 @@
 """The posterior covariance of all poses of a log and of its calibration.
 
-GTSAM's Bayes tree is asked for one pose at a time, and for one considered parameter at a time.  The
-chain of states gives all of them in one sweep; the tree vouches for it at some poses.
+GTSAM's Bayes tree returns one pose at a time, and one considered parameter at a time.  The chain of
+states gives all of them in one sweep; it is checked against the tree at some poses.
 """
 
 from dataclasses import dataclass
@@ -22,22 +22,22 @@ from magfusion.model.parameters import Block, dimension
 from magfusion.units import Array
 
 POSE = 6
-VOUCHED = 5  # poses at which the tree is asked too
+VOUCHED = 5  # poses at which the tree is used too
 AGREED = 1e-6  # of a sigma; rounding of a well-posed log is far below
 
 
 @dataclass(frozen=True, eq=False)
 class _Marginals:
-    """What the chain gives.
+    """Covariances from the chain.
 
     Parameters
     ----------
     pose_cov : ndarray, shape (n, 6, 6)
-        Of what is estimated alone.
+        Of the estimated parameters alone.
     by_considered : ndarray, shape (n, 6, 6)
-        What considered parameters add to it.
+        Contribution of considered parameters.
     calibration_cov : ndarray, shape (dimension, dimension)
-        Of what is estimated alone.
+        Of the estimated parameters alone.
     response : ndarray, shape (dimension, considered)
     """
 
@@ -48,7 +48,7 @@ class _Marginals:
 
     @property
     def whole(self) -> tuple[Array, Array, Array]:
-        """As `marginals` returns it."""
+        """Results in the form of `marginals`."""
         poses = self.pose_cov + self.by_considered
         return poses, self.calibration_cov + self.response @ self.response.T, self.response
 
@@ -61,8 +61,8 @@ def marginals(
     Parameters
     ----------
     considered : tuple of Block
-        Uncertain parameters that were not estimated: what their errors do to the estimate is added
-        (a consider covariance).
+        Uncertain parameters that were not estimated: the effect of their errors on the estimate is
+        added (a consider covariance).
 
     Returns
     -------
@@ -70,7 +70,8 @@ def marginals(
         Calibration marginalised, its gauge included.
     calibration_cov : ndarray, shape (dimension, dimension)
     calibration_response : ndarray, shape (dimension, considered)
-        What one sigma of what is considered does to the calibration: its part of that covariance.
+        Change of the calibration by one sigma of each considered parameter, included in its
+        covariance.
     """
     linear, ordering = graph.linearized(estimate), graph.ordering
     tree = eliminate(linear, ordering)
@@ -78,7 +79,7 @@ def marginals(
         rows = np.unique(np.linspace(0, graph.epochs - 1, VOUCHED).astype(int)).tolist()
         vouched = {i: np.array(tree.marginalCovariance(X(i))) for i in rows}
         calibration = last_marginal(tree, linear, ordering) if graph.blocks else None
-        del tree, linear  # of a long log they are as much again as what follows
+        del tree, linear  # as large again as the arrays below
         give_back_memory()
         found = _of_chain(graph, estimate, considered)
         if _agrees(found, vouched, calibration):
@@ -104,7 +105,7 @@ def marginals(
 
 
 def is_chain(graph: Graph, considered: tuple[Block, ...]) -> bool:
-    """Tell whether one sweep gives all covariances: of one calibration, no log of many hours."""
+    """Return whether one sweep gives all covariances: one calibration, not many hours."""
     columns = [group.stop - group.start for group in column_groups(considered, graph.epochs)]
     most = 1 + max(columns) + dimension(graph.blocks)
     too_long = 8.0 * graph.epochs * MOTION * most > AT_ONCE
@@ -124,7 +125,7 @@ def _of_chain(graph: Graph, estimate: Estimate, considered: tuple[Block, ...]) -
                 piece.added_to(normal)
         known: Array | None = None if solved is None else solved.inverse
         found = solve_chain(normal.chain(), POSE, known, covariance=known is None)
-        del normal, fields  # before the next group: of a long log they are much
+        del normal, fields  # before the next group, to limit memory
         response = found.states[0, ..., 1:]
         added += response @ np.swapaxes(response, 1, 2)
         responses.append(found.border[0, :, 1:])
@@ -136,7 +137,7 @@ def _of_chain(graph: Graph, estimate: Estimate, considered: tuple[Block, ...]) -
 
 
 def _agrees(found: _Marginals, vouched: dict[int, Array], calibration: Array | None) -> bool:
-    """Tell whether the tree gives the same: rounding along a chain of bad condition may grow."""
+    """Return whether the tree agrees: rounding along an ill-conditioned chain may grow."""
     if not all(np.all(np.isfinite(part)) for part in vars(found).values()):
         return False
     pairs = [(found.pose_cov[i], cov) for i, cov in vouched.items()]

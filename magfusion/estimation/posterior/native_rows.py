@@ -1,4 +1,4 @@
-"""The rows of inertial factors and of priors of the motion, in arrays, with columns of others."""
+"""Rows of inertial factors and of motion priors as arrays, with columns of other parameters."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -21,16 +21,16 @@ NativePiece = tuple[IntArray, Array, Array | None, Array, Array]
 
 
 class Columns(NamedTuple):
-    """Parameters that are not estimated, and what they do.
+    """Columns of parameters that are not estimated.
 
     Parameters
     ----------
     blocks : tuple of Block
     spread : ndarray, shape (dimension, columns)
-        What makes a step of them out of each column.
+        Maps each column to a step of the parameters.
     inertial : callable, optional
-        Of some intervals (int ndarray): what the columns do to the whitened error of their inertial
-        factors, shape (m, 15, columns).
+        Returns for some intervals (int ndarray) the columns of the whitened error of their
+        inertial factors, shape (m, 15, columns).
     """
 
     blocks: tuple[Block, ...]
@@ -56,7 +56,7 @@ class _Kind:
 
 @dataclass(eq=False)
 class NativeRows:
-    """The rows at an estimate, linearised once whatever columns stand beside them.
+    """The rows at an estimate, linearised once for any columns.
 
     Parameters
     ----------
@@ -91,14 +91,14 @@ class NativeRows:
         ]
 
     def of(self, columns: Columns, begin: int = 0, end: int | None = None) -> Iterator[NativePiece]:
-        """Yield the rows of factors whose first state is one of some, as `Normal.add` takes them.
+        """Yield the rows of factors by their first states, in the form of `Normal.add`.
 
-        Those of which no column is felt have the first of the right sides alone.
+        Those without a nonzero column have only the first of the right sides.
 
         Parameters
         ----------
         begin, end : int
-            Of the states; all where nothing is said.
+            Of the states; all by default.
         """
         for _, rows in self.kinds_of(columns, begin, end):
             yield rows
@@ -106,7 +106,7 @@ class NativeRows:
     def kinds_of(
         self, columns: Columns, begin: int = 0, end: int | None = None
     ) -> Iterator[tuple[bool, NativePiece]]:
-        """Yield the same, and whether they are of inertial factors."""
+        """Yield the same rows, with whether they are of inertial factors."""
         for kind in self.kinds:
             inside = kind.epoch >= begin
             inside &= kind.epoch < (self.graph.epochs if end is None else end)
@@ -139,7 +139,7 @@ class NativeRows:
             yield epoch[once], own[once], ahead, border[once], right[once]
 
     def _by_blocks(self, epoch: IntArray) -> tuple[Array, Array]:
-        """Return what is estimated does to inertial factors, and by how much it has moved."""
+        """Return estimated parameters' columns of inertial factors, and their present steps."""
         blocks, by, moved = self.graph.blocks, [], []
         for link in (self.graph.links[k] for k in epoch.tolist()):
             assert link.by_calibration is not None
@@ -149,7 +149,7 @@ class NativeRows:
 
 
 def each_once(epoch: IntArray) -> Iterator[IntArray]:
-    """Yield rows in groups in which no state comes twice."""
+    """Yield rows in groups without repeated states."""
     left = np.arange(len(epoch))
     while len(left):
         _, first = np.unique(epoch[left], return_index=True)

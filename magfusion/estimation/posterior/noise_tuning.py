@@ -1,11 +1,11 @@
-"""Noise that tunes itself: what the residuals of a pass say of the noise that was declared.
+"""Noise tuning: estimation of the noise from the residuals of a pass.
 
 For each beacon its noise and its model error, and the densities of gyro and accelerometer, each
-with its declared value as a prior of a factor of two.  An estimate takes part of every error with
-it; how much is left in the residuals is found by drawing errors of the declared kind, and giving
-them to the same linear system that made the estimate (a variance component estimation by Monte
-Carlo, K.-R. Koch and J. Kusche, J. Geodesy 76, 2002).  Faults come first: a Student distribution of
-few degrees of freedom lets what is false a while say little of the noise of the rest.
+with its declared value as a prior of a factor of two.  An estimate absorbs part of every error; the
+part that remains in the residuals is determined by drawing errors of the declared kind and solving
+the estimate's linear system for them (variance component estimation by Monte Carlo, K.-R. Koch and
+J. Kusche, J. Geodesy 76, 2002).  Faults are covered first: a Student distribution of few degrees of
+freedom limits the effect of temporary faults on the noise of the rest.
 """
 
 from collections.abc import Sequence
@@ -23,23 +23,23 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray
 
-SETTLED = 0.05  # of a logarithm; a smaller change is none
+SETTLED = 0.05  # of a logarithm; a smaller change is negligible
 GYRO, ACCEL = slice(0, 3), slice(6, 9)  # rows of an inertial factor that each determines
-FAULT = 3.0  # of a declared model error; more is no error of that kind, and is not covered by it
+FAULT = 3.0  # times a declared model error; more is no error of that kind, and not covered by it
 OF_IMU = ("gyro_noise", "accel_noise")  # a beacon may be called "imu", too
-# Of a motion prior, by what of the IMU stands for it; the rate is that of the bias, in its rows.
+# Keys of a motion prior and of the IMU field they replace; the rate is in the rows of the bias.
 OF_MOTION = {"angular_accel_density": "gyro_bias_walk", "accel_density": "accel_noise"}
 WALK = slice(12, 15)
-PLAUSIBLE = 6.0  # by a factor of more, either way, white noise is a fault under another name
-LEFT = 1e-3  # of an error; of which less is left says nothing
-# Of a beacon's noise; where less is left no IMU holds the pose, the beacon alone does, and by its
-# own residuals, which it takes with it, it would seem better and better from pass to pass.
+PLAUSIBLE = 6.0  # by a larger factor, either way, white noise is a fault
+LEFT = 1e-3  # of an error; a smaller remainder is not informative
+# Of a beacon's noise; with a smaller remainder no IMU constrains the pose, but the beacon alone,
+# whose own residuals, which it absorbs, would seem to improve from pass to pass.
 SELF_MADE = 0.5
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """One standard deviation of the noise, as declared and as found.
+    """One standard deviation of the noise, declared and estimated.
 
     Parameters
     ----------
@@ -57,12 +57,12 @@ class Tuned:
 
     @property
     def factor(self) -> float:
-        """Found over declared."""
+        """Estimated over declared."""
         return self.found / self.declared
 
 
 def tuned_site(site: Site, tuned: Sequence[Tuned]) -> Site:
-    """Return a site with the noise that was found."""
+    """Return a site with the estimated noise."""
     of_imu: dict[str, Any] = {t.key: t.found for t in tuned if t.key in OF_IMU}
     of_imu |= {OF_MOTION[t.key]: t.found for t in tuned if t.key in OF_MOTION}
     platform = replace(site.platform, imu=replace(site.platform.imu, **of_imu))
@@ -75,23 +75,23 @@ def tuned_site(site: Site, tuned: Sequence[Tuned]) -> Site:
 
 
 def with_noise(calibration: Calibration, tuned: Sequence[Tuned]) -> Calibration:
-    """Return a calibration whose site has the noise that was found."""
+    """Return a calibration whose site has the estimated noise."""
     return replace(calibration, site=tuned_site(calibration.site, tuned))
 
 
 def plausible(tuned: Sequence[Tuned]) -> bool:
-    """Tell whether what was found is noise: a fault is none, and must not be hidden by it."""
+    """Return whether the estimates are plausible noise, and hide no fault."""
     white = [t.factor for t in tuned if t.key != "model_error" and t.key not in OF_MOTION]
     return all(1.0 / PLAUSIBLE < factor < PLAUSIBLE for factor in white)
 
 
 def as_declared(tuned: Sequence[Tuned]) -> tuple[Tuned, ...]:
-    """Return the noise as it was declared."""
+    """Return the noise with its declared values."""
     return tuple(replace(t, found=t.declared) for t in tuned)
 
 
 def settled(before: Sequence[Tuned], after: Sequence[Tuned]) -> bool:
-    """Tell whether two tunings differ by less than matters."""
+    """Return whether two tunings differ by a negligible amount."""
     old = {(t.owner, t.key): t.found for t in before}
     return all(
         abs(np.log(t.found / old.get((t.owner, t.key), t.declared))) < SETTLED for t in after
@@ -109,24 +109,24 @@ def tune(
     blind: BoolArray | None = None,
     considered: tuple[Block, ...] = (),
 ) -> tuple[Tuned, ...]:
-    """Return the noise that the residuals of a solved graph are likeliest with.
+    """Return the most probable noise for the residuals of a solved graph.
 
     Parameters
     ----------
     samples : FieldSamples
-        As they were measured in the graph.
+        As measured in the graph.
     poses : Trajectory
         At the samples.
     declared : Site
         Whose noise is the prior.
     windows : float
-        How many windows hold each sample.
+        Number of windows that contain each sample.
     alike : ndarray, shape (n,)
-        How many epochs have the same model error.
+        Number of epochs with the same model error.
     blind : bool ndarray, shape (n,), optional
-        Epochs whose noise is another: of a motion that was found without an IMU.
+        Epochs with other noise: of a motion estimated without an IMU.
     considered : tuple of Block
-        Parameters that are not estimated: what their errors do to residuals is no noise.
+        Parameters that are not estimated: the effect of their errors on residuals is no noise.
     """
     system = Leavings(graph, estimate, samples, poses, windows, considered)
     now = estimate.calibration.site
@@ -138,7 +138,7 @@ def tune(
     modelled = [part for part in parts.values() if part.model is not None]
     less, smooth = 1.0, 0.0
     if modelled:
-        # Rare large errors say little, which makes those of a whole log seem smaller than they are.
+        # Rare large errors have little weight, so that those of a whole log seem too small.
         less = float(np.exp(np.mean(np.log([part.taken for part in modelled]))))
         smooth = float(np.mean([part.smooth for part in modelled]))
     out: list[Tuned] = []
@@ -150,7 +150,7 @@ def tune(
         out.append(Tuned(name, "noise_factor", noise, white * noise))
         if part.model is not None:
             factor = min(part.model / min(less, 1.0), FAULT)  # faults come first
-            if alone:  # poses that nothing else ties follow a smooth error
+            if alone:  # poses without other constraints follow a smooth error
                 factor = max(factor, 1.0)
             out.append(Tuned(name, "model_error", usual, factor * usual))
     return (*out, *_tuned_imu(system, now, declared, smooth))
@@ -178,7 +178,7 @@ def _without(own: ChannelErrors, blind: BoolArray | None) -> ChannelErrors:
 
 
 def _left_of_noise(channels: list[ChannelErrors]) -> float:
-    """Return the share of a beacon's noise that its residuals still have."""
+    """Return the share of a beacon's noise that remains in its residuals."""
     left = sum(float(np.sum(own.left[0] ** 2)) for own in channels)
     given = sum(float(np.sum(own.variance[0])) * own.size[0] ** 2 for own in channels)
     return left / given if given > 0.0 else 1.0
@@ -209,9 +209,9 @@ def _tuned_imu(system: Leavings, now: Site, declared: Site, smooth: float) -> li
         count = int(np.sum(here))
         known = np.full((1, 1, count), every[2] * (before / usual) ** 2)
         fixed = np.full((1, count), every[0] + every[1])
-        # Neighbours in time share what is left of them.
+        # Successive residuals are correlated.
         weight = np.full((1, count), min(1.0, (every[2] + fixed[0, 0]) ** 2 / every[2]))
         log = likeliest(square[here][None], known, fixed, weight, 3)[0]
-        # What is declared below these holds scale and vibration too, which are not white.
+        # Declared values below these include scale and vibration too, which are not white.
         found.append(Tuned(owner, name, before, float(before * np.exp(max(log[0], 0.0)))))
     return found

@@ -1,4 +1,4 @@
-"""Passes that swing about their fixed point are led into it."""
+"""Acceleration of passes that oscillate about their fixed point."""
 
 from dataclasses import dataclass, replace
 
@@ -14,17 +14,17 @@ from magfusion.model.parameters import Block, Calibration, difference, retract
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
-LEAST = 0.2  # share of a step that is taken at least
+LEAST = 0.2  # minimum share of a step
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What a pass moved, and the share of it that was taken.
+    """Change by a pass, and the share of it that was applied.
 
     Parameters
     ----------
     moved : ndarray
-        In units of what is taken for converged.
+        In units of the convergence limits.
     """
 
     moved: Array
@@ -38,12 +38,11 @@ class Step:
         old: Calibration,
         new: Calibration,
     ) -> "Step":
-        """Return the step of a pass, shortened where it undoes the one before.
+        """Return the step of a pass, shortened where it reverses the one before.
 
-        What is demodulated about a trajectory depends on it in ways that no Jacobian of the pass
-        has.  Where that sends each pass back across the fixed point, the secant through the last
-        two steps says where it is (Aitken's relaxation; Küttler and Wall, Comput. Mech. 43, 2008,
-        Eq 44).
+        Demodulation about a trajectory depends on it in ways that no Jacobian of the pass contains.
+        Where each pass therefore overshoots the fixed point, the secant through the last two steps
+        locates it (Aitken's relaxation; Küttler and Wall, Comput. Mech. 43, 2008, Eq 44).
         """
         ends = after.time[[0, -1]]
         shifted = (new.imu_offset(ends) - old.imu_offset(ends)) / OFFSET_CONVERGED
@@ -64,7 +63,7 @@ def part_of_the_way(
     blocks: tuple[Block, ...],
     share: float,
 ) -> tuple[Trajectory, Calibration]:
-    """Return states and a calibration that are a share of the way between two."""
+    """Return states and a calibration at a share of the way between two."""
     if share == 1.0:
         return after, new
     step = share * pose_steps(before, after)

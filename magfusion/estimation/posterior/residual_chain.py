@@ -1,7 +1,7 @@
-"""What a log of one chain of states leaves of errors: all of them solved in one sweep.
+"""Residuals of errors after the estimate of a log of one chain of states, in one sweep.
 
-As `magfusion.estimation.posterior.residual_shares` has it of GTSAM's elimination, which serves any
-graph.
+Equivalent to `magfusion.estimation.posterior.residual_shares` with GTSAM's elimination, which
+serves any graph.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,7 +26,7 @@ from magfusion.model.parameters import Block, dimension
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.units import Array, IntArray
 
-LARGER = 1e-6  # share by which rounding may make a sum of squares larger
+LARGER = 1e-6  # relative increase of a sum of squares that is rounding
 
 
 class _Rows(NamedTuple):
@@ -47,16 +47,16 @@ def left_by_chain(
     fields: Sequence[Array],
     inertial: Sequence[Array],
 ) -> tuple[Array, Array] | None:
-    """Return what is left of the residuals, then of other errors; None where rounding is all.
+    """Return the residuals, then the remainders of other errors; None if dominated by rounding.
 
     Parameters
     ----------
     considered : tuple of Block
         Parameters that are estimated here with a prior of their own.
     fields : sequence of ndarray, shape (n, channels, 6)
-        Errors of the phasors, whitened, and weighed as they are.
+        Errors of the phasors, whitened and weighted.
     inertial : sequence of ndarray, shape (intervals, 15)
-        Errors of the inertial factors, whitened, beside them.
+        The corresponding errors of the inertial factors, whitened.
 
     Returns
     -------
@@ -92,7 +92,7 @@ def left_by_chain(
 def _explains(
     of_fields: Array, of_motion: Array, fields: Sequence[Array], inertial: Sequence[Array]
 ) -> bool:
-    """Tell whether no drawn error has become larger: least squares never make it so."""
+    """Return whether no drawn error has become larger, as least squares require."""
     left = np.sum(of_fields[..., 1:] ** 2, axis=(0, 1, 2)) + np.sum(of_motion[..., 1:] ** 2, (0, 1))
     given = [np.sum(one**2) + np.sum(two**2) for one, two in zip(fields, inertial, strict=True)]
     return bool(np.all(left <= (1.0 + LARGER) * np.array(given)))
@@ -104,13 +104,13 @@ def _beside(graph: Graph, considered: tuple[Block, ...]) -> Columns:
     assert graph.declared is not None
     spread = prior_sqrt_covariance(graph.declared.site, considered)
     by_inertial = graph.by_considered(spread)
-    if by_inertial is None or not np.any(by_inertial):  # the fields alone tell of them
+    if by_inertial is None or not np.any(by_inertial):  # they act on the fields only
         return Columns(considered, spread)
     return Columns(considered, spread, by_inertial.__getitem__)
 
 
 def _with_priors(graph: Graph, estimate: Estimate, considered: int, errors: int) -> Normal:
-    """Return the equations with the priors of the calibration and of what is considered."""
+    """Return the equations with the priors of the calibration and of considered parameters."""
     size = dimension(graph.blocks)
     normal, prior = Normal.zeros(graph.epochs, size + considered, errors), Normal.zeros(0, size, 0)
     add_prior(prior, graph, estimate)
@@ -150,7 +150,7 @@ def _field_rows(
 
 
 def _with_considered(border: Array, right: Array, count: int) -> Array:
-    """Return columns of the calibration, then of what is considered: of the right sides, turned."""
+    """Return the columns of the calibration, then those of considered parameters, negated."""
     if not count:
         return border
     out = np.zeros((*border.shape[:-1], border.shape[-1] + count))
@@ -161,6 +161,6 @@ def _with_considered(border: Array, right: Array, count: int) -> Array:
 
 
 def _left_of(piece: Piece, states: Array, calibration: Array) -> Array:
-    """Return what is left of the rows of a piece, shape (m, channels, 6, errors)."""
+    """Return the remainders of the rows of a piece, shape (m, channels, 6, errors)."""
     moved = piece.by_state @ states[piece.epoch][:, None]
     return np.asarray(moved + piece.by_calibration @ calibration - piece.right)

@@ -1,4 +1,4 @@
-"""What an estimate leaves of errors in the residuals: drawn errors, given to its linear system."""
+"""Share of errors that remains in the residuals, by solving for drawn errors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from magfusion.units import Array, BoolArray, IntArray
 
 WAVES = 64  # of a random model error
 FEWEST_CHANNELS = 3  # of an epoch; the pose of fewer explains too much
-LOOSE = 1e-9  # of what the fields know of a pose
+LOOSE = 1e-9  # of the fields' information on a pose
 ORDINARY = 3.0  # of usual sigmas; an interval with larger ones has a gap
 
 
@@ -38,12 +38,12 @@ class ChannelErrors:
     seen : ndarray, shape (m, 6)
         Residuals.
     left : tuple of ndarray, shape (m, 6)
-        What is left of drawn noise, of a rough and of a smooth drawn model error, and of drawn
+        Remainders of drawn noise, of a rough and of a smooth drawn model error, and of drawn
         inertial noise.
     variance : tuple of ndarray, shape (m,)
         Of noise and of model error of size one: the sum over the components.
     size : tuple of float
-        Of noise and model error, with which they were drawn.
+        Noise and model error of the drawn errors.
     """
 
     epoch: IntArray
@@ -54,19 +54,19 @@ class ChannelErrors:
 
 
 class Leavings:
-    """The linear system of a solved graph, and what it leaves of errors.
+    """The linear system of a solved graph, and the remainders of errors after its estimate.
 
     Parameters
     ----------
     samples : FieldSamples
-        As they were measured in the graph.
+        As measured in the graph.
     poses : Trajectory
         At the samples.
     windows : float
-        How many windows hold each sample.
+        Number of windows that contain each sample.
     considered : tuple of Block
-        Parameters that are uncertain without being estimated.  Here they are: what their errors do
-        is no noise.
+        Uncertain parameters that are not estimated elsewhere.  Here they are: the effect of their
+        errors is no noise.
     """
 
     ordinary: BoolArray  # inertial intervals without a gap
@@ -118,7 +118,7 @@ class Leavings:
 
     def _drawn(self, site: Site, sensor_world: Array, windows: float) -> list[tuple[Array, Array]]:
         """Return drawn errors of fields and inertial factors: noise, model errors, the IMU's."""
-        rng = np.random.default_rng(0)  # the same log, the same result
+        rng = np.random.default_rng(0)  # reproducible for the same log
         samples, root = self._samples, self._measured.sqrt_information[..., :3, :3]
         unit = model_error_cov(np.nan_to_num(samples.phasor_sensor), 1.0)
         self._variance = [_spread(root, c) for c in (samples.phasor_cov, unit)]
@@ -146,9 +146,9 @@ class Leavings:
         return [(drawn, still), (rough, still), (smooth, still), (nothing, imu)]
 
     def _without_pose(self, fields: Sequence[Array]) -> list[Array]:
-        """Return errors without what any other pose of their own epoch would explain.
+        """Return errors without the part that a pose of their own epoch would explain.
 
-        What inertial errors leave in the fields is that of a pose, and must not pass for noise.
+        Remainders of inertial errors in the fields have the form of a pose, and are no noise.
         """
         weight = np.repeat(self._weight[..., 0] ** 2, 6, axis=1)
         several = np.sum(self._samples.valid, axis=1) >= FEWEST_CHANNELS
@@ -163,7 +163,7 @@ class Leavings:
         return [left[..., k].reshape(field.shape) for k, field in enumerate(fields)]
 
     def channels_of(self, beacon: int) -> list[ChannelErrors]:
-        """Return the errors of the channels of a beacon, given by its number."""
+        """Return the errors of the channels of a beacon, given by its index."""
         out = []
         for channel in np.flatnonzero(self._owner == beacon).tolist():
             rows = np.flatnonzero(self._samples.valid[:, channel])
@@ -179,7 +179,7 @@ class Leavings:
         return out
 
     def inertial(self) -> list[Array]:
-        """Return inertial residuals, and what is left there of noise, model errors and IMU's own.
+        """Return inertial residuals, and remainders of noise, model errors and the IMU's own.
 
         Each of shape (intervals, 15): rotation, position, velocity, biases.
         """
@@ -207,7 +207,7 @@ def _spread(root: Array, cov: Array) -> Array:
 def _draw_noise(
     rng: np.random.Generator, samples: FieldSamples, windows: float, root: Array
 ) -> Array:
-    """Return whitened noise, shape (n, channels, 6), that windows which overlap share."""
+    """Return whitened noise, shape (n, channels, 6), shared by overlapping windows."""
     shared, (count, channels) = max(1, round(windows)), samples.valid.shape
     cells = rng.standard_normal((count + shared - 1, channels, 2, 3)) / np.sqrt(shared)
     drawn = np.sum([cells[k : k + count] for k in range(shared)], axis=0)

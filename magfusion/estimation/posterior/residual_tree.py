@@ -1,4 +1,4 @@
-"""What a log leaves of errors, by GTSAM's elimination: of any graph."""
+"""Remainders of errors after the estimate of a log, by GTSAM's elimination: for any graph."""
 
 from collections.abc import Sequence
 
@@ -40,7 +40,7 @@ def left_by_tree(
 
 
 class _System:
-    """The linear system of a solved graph, with right-hand sides of its own."""
+    """The linear system of a solved graph, with variable right-hand sides."""
 
     def __init__(self, graph: Graph, estimate: Estimate, considered: tuple[Block, ...]) -> None:
         self._linear, self._ordering, begin = _linear(graph, estimate, considered)
@@ -59,7 +59,7 @@ class _System:
         self._net = eliminate_in_sequence(self._linear, self._ordering)
 
     def put(self, fields: Array, inertial: Array) -> None:
-        """Take other right-hand sides: of fields (n, rows), and of inertial factors."""
+        """Set right-hand sides: of fields (n, rows), and of inertial factors."""
         for factor in self._every:
             factor.getb()[...] = 0.0
         for factor, own, told in zip(self._fields, fields, self._told, strict=True):
@@ -69,7 +69,7 @@ class _System:
             factor.getb()[: own.size] = own
 
     def left(self) -> tuple[Array, Array]:
-        """Return what the linear system leaves of its right-hand sides."""
+        """Return the remainders of the right-hand sides."""
         step = self._step()
         rows = np.zeros((len(self._fields), self._width))
         for row, factor, told in zip(rows, self._fields, self._told, strict=True):
@@ -78,10 +78,10 @@ class _System:
         return rows, np.array(own).reshape(-1, ROWS)
 
     def _step(self) -> gtsam.VectorValues:
-        """Return the solution of the linear system with the right-hand sides that it has now."""
+        """Return the solution of the linear system for the present right-hand sides."""
         if self._net is None:
             return eliminate(self._linear, self._ordering).optimize()
-        # One elimination serves them all: its triangle and its transpose are solved with each.
+        # One elimination serves all: its triangle and its transpose are solved with each.
         uphill = self._linear.gradientAtZero()
         step = self._net.backSubstitute(self._net.backSubstituteTranspose(uphill))
         return step.scale(-1.0)
@@ -90,7 +90,7 @@ class _System:
 def _linear(
     graph: Graph, estimate: Estimate, considered: tuple[Block, ...]
 ) -> tuple[gtsam.GaussianFactorGraph, gtsam.Ordering, int]:
-    """Return a linear graph that estimates what is considered too, and where its fields begin."""
+    """Return a linear graph that estimates considered parameters, and its first field factor."""
     ordering = graph.ordering
     if not considered or graph.declared is None:
         return graph.linearized(estimate), ordering, graph.native.size()

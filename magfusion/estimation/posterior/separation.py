@@ -1,12 +1,12 @@
 """Solution separation: the estimate without each beacon against the one with all.
 
 Multiple-hypothesis solution separation of advanced RAIM (J. Blanch et al., IEEE Trans. Aerospace
-and Electronic Systems 51(1), 2015).  Under the hypothesis that one beacon is false, by whatever
-amount, the estimate without it is right.  What the estimate with all deviates from it by more than
-a threshold is an alarm; what stays below the threshold bounds what the false beacon can do unseen.
+and Electronic Systems 51(1), 2015).  Under the hypothesis that one beacon is faulty, by any amount,
+the estimate without it is right.  If the estimate with all deviates from it by more than a
+threshold, this is an alarm; below the threshold it bounds the undetected effect of the fault.
 All is by epoch, and batched.
 
-Position and attitude each are judged by the norm of a Gaussian vector, whose tail has two bounds:
+Position and attitude are each tested by the norm of a Gaussian vector, whose tail has two bounds:
 that of a single number with all of the variance (G. J. Székely and N. K. Bakirov, Probability
 Theory and Related Fields 126, 2003), and that of three equal ones with the largest.
 """
@@ -26,9 +26,9 @@ from magfusion.units import DEGREE, Array, BoolArray, IntArray
 ROOT_2, ROOT_2_PI = float(np.sqrt(2.0)), float(np.sqrt(2.0 / np.pi))
 POSE = 6  # axes: rotation, then position
 PRECISE, MOST_STEPS = 1e-7, 60  # of a level
-MOST_DEG = 180.0  # an attitude level beyond it says nothing
+MOST_DEG = 180.0  # an attitude level beyond it is not informative
 SINGLE_HOLDS = 0.215  # probability of a tail below which a single number bounds it
-LEAST = 1e-30  # rad, m; a deviation below it is none
+LEAST = 1e-30  # rad, m; a deviation below it is zero
 PARTS = (slice(0, 3), slice(3, 6))  # rotation, position
 ROWS = np.arange(POSE).reshape(2, 3, 1)  # of the blocks of both, shape (2, 3, 3) with
 COLUMNS = np.arange(POSE).reshape(2, 1, 3)
@@ -50,16 +50,16 @@ class Radius(NamedTuple):
     largest: Array
 
     def tail(self, radius: Array) -> Array:
-        """Return a probability that is not less than that of a norm beyond a radius."""
+        """Return an upper bound of the probability that a norm exceeds a radius."""
         single = erfc(radius / (ROOT_2 * np.maximum(self.whole, LEAST)))
         share = np.minimum(np.maximum(radius / np.maximum(self.largest, LEAST), 0.0), 1e3)
         three = erfc(share / ROOT_2) + ROOT_2_PI * share * np.exp(-0.5 * share**2)
         return np.minimum(three, np.where(single < SINGLE_HOLDS, single, 1.0))
 
     def beyond(self, probability: Array | float) -> Array:
-        """Return a radius that a norm exceeds with no more than a probability."""
+        """Return a radius that a norm exceeds with at most a given probability."""
         single = -ndtri(0.5 * np.minimum(probability, 0.999 * SINGLE_HOLDS))
-        with np.errstate(invalid="ignore"):  # of what is known exactly
+        with np.errstate(invalid="ignore"):  # where the value is exactly known
             bounds = (
                 single * self.whole,
                 np.sqrt(2.0 * gammainccinv(1.5, probability)) * self.largest,
@@ -70,7 +70,7 @@ class Radius(NamedTuple):
 def radii(cov: Array) -> Radius:
     """Return the norms of rotation and position, shape (..., 2), of covariances (..., 6, 6)."""
     blocks = cov[..., ROWS, COLUMNS]
-    # What is known exactly may round below.
+    # Exactly known values may round below zero.
     trace = np.maximum(np.einsum("...ii->...", blocks), 0.0)
     largest = np.minimum(np.maximum(_largest_eigenvalue(blocks), 0.0), trace)
     return Radius(np.sqrt(trace), np.sqrt(largest))
@@ -89,7 +89,7 @@ def _largest_eigenvalue(matrix: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Separation:
-    """Estimates without each beacon, beside the one with all.
+    """Estimates without each beacon, relative to the one with all.
 
     Rotation, then position, in axes of any kind.
 
@@ -100,15 +100,15 @@ class Separation:
     cov : ndarray, shape (n, 6, 6)
         Of the estimate with all.
     subset_cov : ndarray, shape (n, beacons, 6, 6)
-        Without a beacon; of no meaning where it is not determined.
+        Without a beacon; not valid where the pose is not determined.
     separation_cov : ndarray, shape (n, beacons, 6, 6)
         Of the step.
     determined : bool ndarray, shape (n, beacons)
         Whether there is an estimate without a beacon.
     cost : ndarray, shape (n, beacons)
-        Squared residual that is left without a beacon.
+        Squared residual without a beacon.
     rows : ndarray, shape (n, beacons)
-        Residuals of each beacon; of one that is not in an epoch none, and it cannot be false.
+        Number of residuals of each beacon; zero where it is missing, and cannot be faulty.
     """
 
     step: Array
@@ -121,7 +121,7 @@ class Separation:
 
     @cached_property
     def _sigmas(self) -> Radius:
-        """All that follow, shape (n, 1 + 2 beacons, 2)."""
+        """All sigmas, shape (n, 1 + 2 beacons, 2), from which the others are taken."""
         return radii(np.concatenate([self.cov[:, None], self.subset_cov, self.separation_cov], 1))
 
     def _part(self, rows: slice | int) -> Radius:
@@ -148,38 +148,38 @@ class Separation:
         return np.stack([np.linalg.norm(self.step[..., part], axis=-1) for part in PARTS], axis=-1)
 
     def prior(self, risk: Risk) -> Array:
-        """Return the probability that each beacon is false, shape (n, beacons)."""
+        """Return the probability that each beacon is faulty, shape (n, beacons)."""
         return np.where(self.rows > 0, risk.fault, 0.0)
 
     def thresholds(self, risk: Risk, slack: float = 0.0) -> Array:
-        """Return how large a step may be, shape (n, beacons, 2) (rad, m).
+        """Return the largest step without an alarm, shape (n, beacons, 2) (rad, m).
 
         Parameters
         ----------
         slack : float
-            A step below so many sigma of the estimate with all is no alarm: it is covered.
+            A step below this number of sigmas of the estimate with all is no alarm: it is covered.
         """
         tests = len(PARTS) * self.step.shape[1]
         limit = self.separation_sigma.beyond(risk.false_alarm / tests)
         return np.maximum(limit, slack * self.sigma.whole[:, None])
 
     def excess(self, risk: Risk, slack: float = 0.0) -> Array:
-        """Return the step of each beacon, of its threshold, shape (n, beacons); above one: alarm.
+        """Return each beacon's step relative to its threshold, shape (n, beacons); above 1: alarm.
 
-        That of rotation or position, whichever is larger.
+        Of rotation or position, whichever is larger.
         """
         limit = self.thresholds(risk, slack)
         known = (self.determined & (self.rows > 0))[..., None]
         return np.max(np.where(known, self.shift / np.maximum(limit, LEAST), 0.0), axis=2)
 
     def likely(self, prior: Array) -> Array:
-        """Return the probability of each beacon, given that one is false, shape (n, beacons).
+        """Return the probability of each beacon, given that one is faulty, shape (n, beacons).
 
         Parameters
         ----------
         prior : ndarray, shape (n, beacons)
         """
-        # What leaves more out explains more; each number is worth two (Akaike).
+        # Omitting more rows explains more; each number is worth two (Akaike).
         cost = np.where(self.determined & (prior > 0.0), self.cost + 2.0 * self.rows, np.inf)
         least = np.min(cost, axis=1, keepdims=True)
         weight = prior * np.exp(-0.5 * (cost - np.where(np.isfinite(least), least, 0.0)))
@@ -190,18 +190,18 @@ class Separation:
 def linear_separation(
     jacobian: Array, error: Array, covariance: Array | None, owner: IntArray, beacons: int
 ) -> Separation:
-    """Separate the estimates of linear least squares with whitened rows, each epoch on its own.
+    """Separate the estimates of linear least squares with whitened rows, independently by epoch.
 
     Parameters
     ----------
     jacobian : ndarray, shape (n, rows, 6 + nuisances)
-        By the pose, then by what else is found.  Zero rows are missing ones.
+        By the pose, then by the nuisances.  Missing rows are zero.
     error : ndarray, shape (n, rows)
         Predicted minus measured.
     covariance : ndarray, shape (n, rows, rows), optional
-        What the rows' covariance really is where their whitening only stands in for it.
+        The rows' true covariance, where their whitening is an approximation.
     owner : int ndarray, shape (rows,)
-        Beacon of each row; negative of what is no beacon's.
+        Beacon of each row; negative for rows of no beacon.
     beacons : int
     """
     step, gain, _ = _estimate(jacobian, error)
@@ -227,7 +227,7 @@ def spread(gain: Array, covariance: Array | None) -> Array:
     ----------
     gain : ndarray, shape (n, k, rows)
     covariance : ndarray, shape (n, rows, rows), optional
-        The identity where there is none.
+        The identity by default.
     """
     carried = gain if covariance is None else gain @ covariance
     return carried @ np.swapaxes(gain, -1, -2)
@@ -242,7 +242,7 @@ def _estimate(jacobian: Array, error: Array) -> tuple[Array, Array, BoolArray]:
 
 
 def unmonitored(prior: Array) -> Array:
-    """Return the probability that more than one beacon is false, shape (n,).
+    """Return the probability that more than one beacon is faulty, shape (n,).
 
     Parameters
     ----------
@@ -256,17 +256,17 @@ def unmonitored(prior: Array) -> Array:
 def protection_levels(
     separation: Separation, risk: Risk, slack: float = 0.0, prior: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return the radii that position (m) and attitude (deg) stay within, each of shape (n,).
+    """Return the protection levels of position (m) and attitude (deg), each of shape (n,).
 
-    Each has half of the risk.  NaN where there is none: without some beacon that may be false
-    nothing determines the pose, or two may be false too often.
+    Each has half of the risk.  NaN where there is none: the pose is not determined without some
+    beacon that may be faulty, or two may be faulty too often.
 
     Parameters
     ----------
     slack : float
         As of `Separation.thresholds`.
     prior : ndarray, shape (n, beacons), optional
-        Probability that each beacon is false, where more is known than `Risk.fault`.
+        Probability that each beacon is faulty, where more is known than `Risk.fault`.
     """
     prior = separation.prior(risk) if prior is None else prior
     share = (1.0 - risk.mirrors) * risk.total - unmonitored(np.minimum(prior, risk.fault))
@@ -284,12 +284,13 @@ def protection_levels(
 
 
 def _levels(sigma: Radius, without: Radius, threshold: Array, prior: Array, risk: Array) -> Array:
-    """Return what is exceeded unseen with no more than a risk, shape (n, 2).
+    """Return the levels exceeded without an alarm with at most a given risk, shape (n, 2).
 
-    It solves ``P(error > L) + sum_j p_j P(error_j > L - T_j) = risk``, shapes (n, beacons, 2) of
+    They solve ``P(error > L) + sum_j p_j P(error_j > L - T_j) = risk``, shapes (n, beacons, 2) of
+    the faults j.
     the faults j.
     """
-    # The estimate with all is one more, of threshold zero, whose share is one.
+    # The estimate with all is one more, with threshold zero and share one.
     each = Radius(
         *(np.concatenate([a[:, None], b], axis=1) for a, b in zip(sigma, without, strict=True))
     )
@@ -301,7 +302,7 @@ def _levels(sigma: Radius, without: Radius, threshold: Array, prior: Array, risk
         total = (prior * each.tail(level[:, None] - threshold)).sum(axis=1)
         return np.asarray(np.log(np.maximum(total, LEAST)) - goal)
 
-    # One alone has all of the risk at the lower end, and none more than its part at the upper.
+    # A single one has all of the risk at the lower end, and at most its part at the upper.
     reach, part = threshold + each.beyond(np.minimum(own, 1.0)), own / prior.shape[1]
     low = np.max(np.where((prior > 0.0) & (own < SINGLE_HOLDS), reach, 0.0), axis=1)
     reach = threshold + each.beyond(np.minimum(part, 1.0))
@@ -312,19 +313,19 @@ def _levels(sigma: Radius, without: Radius, threshold: Array, prior: Array, risk
 def _crossing(falling: Callable[[Array], Array], low: Array, high: Array) -> Array:
     """Return where functions fall below zero between two ends, from above.
 
-    By chords between the ends; of an end that stays the value counts half from step to step, so
-    that the other moves, too (the Illinois algorithm).  One that is found stays, however long the
-    others take.
+    By chords between the ends; the value of an end that does not move is halved from step to step,
+    so that the other moves, too (the Illinois algorithm).  A converged one is kept, however long
+    the others take.
     """
     at_low, at_high, width = falling(low), np.minimum(falling(high), 0.0), PRECISE * high
     rose = np.full(high.shape, 2)
-    with np.errstate(invalid="ignore"):  # of what has no end
+    with np.errstate(invalid="ignore"):  # for infinite ends
         for _ in range(MOST_STEPS):
             wide = high - low > width
             if not wide.any():
                 break
             middle = low + (high - low) * (at_low / np.maximum(at_low - at_high, LEAST))
-            # Not nearer to an end than is asked for: a step beyond the crossing closes in on it.
+            # Not nearer to an end than requested: a step beyond the crossing closes in on it.
             middle = np.maximum(low + 0.4 * width, np.minimum(middle, high - 0.4 * width))
             found = falling(middle)
             rises = found > 0.0
@@ -340,7 +341,7 @@ def _crossing(falling: Callable[[Array], Array], low: Array, high: Array) -> Arr
 
 
 def with_rivals(level: Array, distance: Array, weight: Array, share: float) -> Array:
-    """Return levels that reach to every rival pose that is too likely to be passed over.
+    """Return levels extended to every rival pose that is too probable to be ignored.
 
     Parameters
     ----------
@@ -350,7 +351,7 @@ def with_rivals(level: Array, distance: Array, weight: Array, share: float) -> A
     weight : ndarray, shape (n, rivals)
         Posterior share, falling.
     share : float
-        Of the risk that the rivals may take together.
+        Maximum total share of the rivals in the risk.
     """
     rest = np.cumsum(weight[:, ::-1], axis=1)[:, ::-1]
     reach = np.where(rest > share, distance + level[:, None], level[:, None])

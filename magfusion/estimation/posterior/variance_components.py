@@ -1,7 +1,7 @@
-"""Variance components of a beacon's residuals: noise, and what the model of its field lacks.
+"""Variance components of a beacon's residuals: noise, and errors of its field model.
 
-An error that is constant in place goes with a beacon's field by a matrix, which changes with place.
-How smoothly it does nobody declares; so a rough and a smooth kind are told apart by how residuals
+An error that is constant in place multiplies a beacon's field by a matrix, which changes with
+place.  Its smoothness is not declared; so a rough and a smooth kind are separated by how residuals
 change from epoch to epoch, and both together have the declared size as their prior.
 """
 
@@ -17,32 +17,32 @@ from magfusion.estimation.solve.bounded import minimise_curved
 from magfusion.units import Array
 
 PRIOR = float(np.log(2.0))  # of the logarithm of a declared sigma
-LEAST, MOST = 0.1, 1e3  # of a factor; that a noise is smaller yet, no log tells for sure
-STUDENT = 4.0  # degrees of freedom: what is false says little
+LEAST, MOST = 0.1, 1e3  # of a factor; no log can determine a smaller noise
+STUDENT = 4.0  # degrees of freedom: faults have little weight
 # Gain, by components, with which that distribution finds the variance of normal residuals.
 NORMAL = {3: 1.322946, 6: 1.224631}
-SCALES = 8  # epochs in a row that are compared, so far apart that they share no sample
-WEIGHINGS = 5  # times that the epochs are weighed by what is found, at first as if noise were all
-NONE = 1e-4  # of a part that was not declared: as good as none
-# Parts of which one sigma was declared: noise, and a model error that is rough or smooth.
+SCALES = 8  # successive epochs that are compared, so far apart that they share no sample
+WEIGHINGS = 5  # iterations of the epochs' weights, at first as if all were noise
+NONE = 1e-4  # of a part that was not declared: negligible
+# Parts with one declared sigma: noise, and a model error that is rough or smooth.
 KINDS = (slice(0, 1), slice(1, 3))
 
 
 class BeaconParts(NamedTuple):
-    """What the residuals of one beacon are likeliest made of.
+    """Most probable components of one beacon's residuals.
 
     Parameters
     ----------
     sizes : tuple of float
         Noise factor and model error as declared.
     white : float
-        Factor of the declared noise, by all that is white.
+        Factor of the declared noise, by all white parts.
     model : float, optional
-        Factor of the declared model error; None where none was looked for.
+        Factor of the declared model error; None where it was not estimated.
     smooth : float
         Share of its variance that is smooth.
     taken : float
-        Factor found in errors that were drawn with those that were found, over theirs.
+        Ratio of the factor estimated from errors drawn with the estimated sizes to the true one.
     """
 
     sizes: tuple[float, float]
@@ -62,7 +62,7 @@ class BeaconErrors:
     sizes : tuple of float
         Noise factor and model error as declared.
     bent : bool
-        Whether a model error is looked for.
+        Whether a model error is estimated.
     """
 
     channels: list[ChannelErrors]
@@ -71,14 +71,14 @@ class BeaconErrors:
 
 
 def parts_of(beacons: Sequence[BeaconErrors], alike: Array, lag: int) -> list[BeaconParts | None]:
-    """Return what the residuals of each beacon are made of; None where there are too few.
+    """Return the components of each beacon's residuals; None where there are too few.
 
     Parameters
     ----------
     alike : ndarray, shape (n,)
-        How many epochs have the same model error.
+        Number of epochs with the same model error.
     lag : int
-        Epochs that share samples.
+        Number of epochs that share samples.
     """
     fitted = _fitted(beacons, alike, lag)
     bent = [k for k, (log, _) in enumerate(fitted) if len(log) and beacons[k].bent]
@@ -105,7 +105,7 @@ def _logarithm(log: Array) -> float:
 
 
 def _drawn(beacon: BeaconErrors, log: Array, white: float) -> BeaconErrors:
-    """Return errors that were drawn, of these sizes, in the place of those seen."""
+    """Return drawn errors of these sizes in place of the residuals."""
     of_noise, usual = white * beacon.sizes[0], beacon.sizes[1]
     of_rough, of_smooth = np.exp(log[1:3]) * usual
     drawn = []
@@ -118,7 +118,7 @@ def _drawn(beacon: BeaconErrors, log: Array, white: float) -> BeaconErrors:
 
 
 def _fitted(beacons: Sequence[BeaconErrors], alike: Array, lag: int) -> list[tuple[Array, float]]:
-    """Return logarithms of the factors of all parts, and the factor of all that is white."""
+    """Return logarithms of the factors of all parts, and the factor of all white parts."""
     scaled = [by_scale(beacon.channels, alike, lag) for beacon in beacons]
     found = [(np.zeros(0), 1.0)] * len(beacons)
     for bent in (False, True):
@@ -134,18 +134,18 @@ def _fitted(beacons: Sequence[BeaconErrors], alike: Array, lag: int) -> list[tup
 def _fitted_alike(
     scaled: list[tuple[Array, Array, Array]], sizes: Array, lag: int, bent: bool
 ) -> list[tuple[Array, float]]:
-    """Return what `_fitted` does, of beacons that have the same parts.
+    """Return the result of `_fitted` for beacons that have the same parts.
 
     Parameters
     ----------
     scaled : list of tuple
-        By `by_scale`, of each beacon.
+        From `by_scale`, one per beacon.
     sizes : ndarray, shape (k, 2)
     """
     most = max(len(square) for square, _, _ in scaled)
     square, near = np.zeros((len(scaled), most)), np.ones((len(scaled), most))
     expected, weighed = np.zeros((len(scaled), 5, most)), np.zeros((len(scaled), most))
-    expected[:, 4] = 1.0  # of rows that a beacon does not have, whose weight is none
+    expected[:, 4] = 1.0  # of missing rows, with zero weight
     for k, (seen, parts, close) in enumerate(scaled):
         rows = slice(0, len(seen))
         square[k, rows], expected[k, :, rows], near[k, rows] = seen, parts, close
@@ -164,10 +164,10 @@ def _fitted_alike(
         of_model = np.sum(parts[:, 1:3], axis=1) if bent else fixed
         of_model = of_model / (np.sum(parts, axis=1) + fixed)
         weight = (1.0 - of_model + of_model * near) * weighed
-    # What is white but goes with the field, as of a jitter among gradients, is noise all told.
+    # White errors proportional to the field, as of a jitter among gradients, count as noise.
     usual = np.sum(known[:, 0], axis=1)
     white = np.sum(parts[:, ::3], axis=(1, 2)) / usual
-    # Of a strong beacon less noise than declared is not to be told from a little model error.
+    # For a strong beacon less noise than declared cannot be distinguished from a small model error.
     unsure = LEAST**2 * np.sum(known[:, 3:], axis=(1, 2)) / usual
     assert log is not None
     white = np.sqrt(np.maximum(white, np.minimum(white + unsure, 1.0)))
@@ -177,9 +177,9 @@ def _fitted_alike(
 def by_scale(channels: list[ChannelErrors], alike: Array, lag: int) -> tuple[Array, Array, Array]:
     """Return squares of a beacon's residuals on several scales of time, and their expectation.
 
-    Noise is alike on all scales; an error that is constant in place is mostly in the longest.  How
-    much of it is in the shorter ones depends on how smooth it is, which nobody declares: what they
-    have is no measure of its size unless that is found, too.
+    Noise is equal on all scales; an error that is constant in place is mostly in the longest.  Its
+    share in the shorter ones depends on its smoothness, which is not declared: they measure its
+    size only if the smoothness is estimated, too.
 
     Returns
     -------
@@ -188,7 +188,7 @@ def by_scale(channels: list[ChannelErrors], alike: Array, lag: int) -> tuple[Arr
         Of a component, by noise, by a rough and by a smooth model error of size one, by a relative
         error of size one that is white, and by inertial noise.
     near : ndarray, shape (m,)
-        Share of it that is independent, where model error prevails.
+        Share that is independent, where model error prevails.
     """
     every, seen, left, given, near = _haar(SCALES), [], [], [], []
     for own in channels:
@@ -204,7 +204,7 @@ def by_scale(channels: list[ChannelErrors], alike: Array, lag: int) -> tuple[Arr
         close = np.mean(alike[own.epoch][:used].reshape(shape), axis=1).ravel()
         near.append(np.minimum(SCALES * lag / close, 1.0))
     drawn = np.concatenate(given, axis=1)
-    # Of a wrong motion too, a stronger field has more.
+    # The effect of a wrong motion increases with the field, too.
     drawn = np.stack([*drawn, drawn[1], drawn[1]])
     noise, model = channels[0].size
     total = np.array([noise, model, model, 1.0]) ** 2 * np.sum(drawn, axis=1)
@@ -235,9 +235,9 @@ def likeliest(
     kinds: Sequence[slice] = (slice(0, 1),),
     near: Array | None = None,
 ) -> Array:
-    """Return the logarithm of what each part's standard deviation is too small by.
+    """Return the logarithm of the factor of each part's standard deviation.
 
-    Of each of k beacons, or whatever else has residuals of its own.
+    For each of k beacons, or other sources of separate residuals.
 
     Parameters
     ----------
@@ -246,17 +246,16 @@ def likeliest(
     parts : ndarray, shape (k, kinds, m)
         Expected square of a component by each kind of noise, as declared.
     fixed : ndarray, shape (k, m)
-        And by all else.
+        Expected square of a component by all other noise.
     weight : ndarray, shape (k, m)
-        Of each: how much of it is independent.
+        Share of each that is independent.
     components : int
         Of each residual.
     kinds : sequence of slice
-        Parts of which one sigma was declared for all together.  Of the others nothing was: there
-        may be none of them.
+        Parts with one declared sigma in total.  The others have no declared sigma and may vanish.
     near : ndarray, shape (k, kinds), optional
-        What was found with other weights: the search begins there.  A part of next to nothing,
-        where the cost has no slope, begins as a little one, unless a little were less likely.
+        Estimate with other weights, where the search begins.  A negligible part, where the cost has
+        no slope, begins as a small one, unless that were less probable.
 
     Returns
     -------
@@ -306,7 +305,7 @@ def likeliest(
 
 
 def _of_kinds(count: int, kinds: Sequence[slice]) -> tuple[Array, Array, Array]:
-    """Return where each part begins, the least it may be, and which parts are of each kind."""
+    """Return start and lower bound of each part, and which parts are of each kind."""
     first, least = np.full(count, np.log(LEAST)), np.full(count, NONE)
     of_kind = np.zeros((count, len(kinds)))
     for k, kind in enumerate(kinds):

@@ -1,4 +1,4 @@
-"""Where a well is from another, by a magnet that turns as it passes a sensor at rest."""
+"""Relative position of two wells, from a rotating magnet that passes a sensor at rest."""
 
 from dataclasses import dataclass
 
@@ -19,22 +19,22 @@ from magfusion.model.site import Site
 from magfusion.units import Array, BoolArray, IntArray
 
 PASSES, PASSES_OF_BEST, FOLLOWED = 40, 60, 3
-THINNED = 24  # windows, about, that starts are tried on
-KEPT = 24  # starts that are followed
+THINNED = 24  # approximate number of windows for the comparison of starts
+KEPT = 24  # starts that are refined
 
 
 @dataclass(frozen=True, eq=False)
 class Ranged:
-    """The sensor's pose from the magnet, of the likeliest start and of its rivals.
+    """The sensor's pose relative to the magnet, of the most probable start and of its rivals.
 
     Parameters
     ----------
     world_from_body : ndarray, shape (3, 3)
         Attitude of the high side's frame in that of the rotor.
     position_world : ndarray, shape (3,)
-        Of the sensor when both are at the depths that the windows count from (m).
+        Of the sensor when both are at the windows' depth origins (m).
     names : tuple of str
-        Of what was estimated beside the pose.
+        Of the parameters estimated with the pose.
     values, prior_sigma : ndarray, shape (names,)
     cov : ndarray, shape (6 + names, 6 + names)
         Rotation and translation in the axes of the high side's frame (rad, m), then the names.
@@ -42,9 +42,9 @@ class Ranged:
         Without priors.
     freedom : int
     rival_chi_square : float
-        Of the next best minimum elsewhere; infinite where there is none.
+        Of the second-best separate minimum; infinite where there is none.
     conditioning : float
-        Smallest over largest singular value of the whitened Jacobian by pose, columns made equal.
+        Smallest over largest singular value of the whitened Jacobian by pose, with unit columns.
     converged : bool
     """
 
@@ -62,7 +62,7 @@ class Ranged:
 
 
 def _moved(state: Array, step: Array) -> Array:
-    """Return states moved along the screws of their steps, which a turn about the magnet is."""
+    """Return states moved along the screws of their steps, as in a rotation about the magnet."""
     turn, angle = step[:, :3], np.linalg.norm(step[:, :3], axis=1)[:, None, None]
     small = np.maximum(angle, 1e-4)
     cross = skew(turn)
@@ -74,7 +74,7 @@ def _moved(state: Array, step: Array) -> Array:
 
 
 def find_range(site: Site, windows: RangingWindows) -> Ranged:
-    """Return where the sensor is from the magnet.
+    """Return the pose of the sensor relative to the magnet.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def find_range(site: Site, windows: RangingWindows) -> Ranged:
     thin = RangingModel(site, windows.rows(slice(every // 2, None, every)))
     tried = _solved(thin, starts(thin)[:KEPT], PASSES)
     found = _solved(RangingModel(site, windows), tried.state[:FOLLOWED], PASSES_OF_BEST)
-    # Weighed about the likeliest: its rivals by the same weights, as a likelihood asks.
+    # Weighted at the most probable: its rivals by the same weights, as a likelihood requires.
     model = RangingModel(site, windows, about=found.state[0])
     found = _solved(model, found.state, PASSES_OF_BEST)
     best = found.state[:1]
@@ -109,7 +109,7 @@ def find_range(site: Site, windows: RangingWindows) -> Ranged:
 
 
 def _solved(model: RangingModel, starts: Array, passes: int) -> Solution:
-    """Return where starts lead to, the likeliest first."""
+    """Return the solutions of starts, the most probable first."""
 
     def normal(rows: IntArray, state: Array) -> Normal:
         del rows
@@ -123,7 +123,7 @@ def _solved(model: RangingModel, starts: Array, passes: int) -> Solution:
 
 
 def _elsewhere(model: RangingModel, states: Array, windows: RangingWindows) -> BoolArray:
-    """Return which states are not the first, as seen from the sensor."""
+    """Return which states differ from the first, as seen from the sensor."""
     rotation, place = states[:, :9].reshape(-1, 3, 3), states[:, 9:12]
     middle = float(np.median(windows.magnet))
     seen = np.einsum("kba,kb->ka", rotation, middle * model.axis - place)

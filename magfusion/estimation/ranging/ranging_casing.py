@@ -1,4 +1,4 @@
-"""What a casing about the sensor does to a field: gathers it, and lets a part of it through."""
+"""Effect of a casing about the sensor on a field: flux gathering and attenuation by its wall."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -27,7 +27,7 @@ PER_REACH, REACHES = (
 
 
 def casing_unknowns(casing: Casing) -> tuple[tuple[str, float], ...]:
-    """Return names and sigmas of what is estimated of a casing."""
+    """Return names and sigmas of a casing's estimated parameters."""
     found = list[tuple[str, float]]()
     for kind in ("gather", "across", "along"):
         found.append((f"log_{kind}", casing.log_gain_sigma))
@@ -37,7 +37,7 @@ def casing_unknowns(casing: Casing) -> tuple[tuple[str, float], ...]:
 
 
 class Gathered(NamedTuple):
-    """What a casing gathers: phasors (k, n, 1, tones, 3), and derivatives.
+    """Field gathered by a casing: phasors (k, n, 1, tones, 3), and derivatives.
 
     ``by_strength`` is that by the logarithm of the tube's strength, a complex number.
     """
@@ -63,7 +63,7 @@ class CasingModel:
         self._place = step * np.arange(-count, count + 1.0)
 
     def responses(self, extra: Mapping[str, Array], size: int) -> list[Response]:
-        """Return what the tube does at each tone, for states (k,)."""
+        """Return the response of the tube at each tone, for states (k,)."""
         zero = np.zeros(size)
         change = np.stack([extra.get(name, zero) for name in LOGS], axis=1)
         return [tube_response(self._casing, tone, change) for tone in self._tones_hz]
@@ -76,7 +76,7 @@ class CasingModel:
         extra: Mapping[str, Array],
         responses: list[Response],
     ) -> Gathered:
-        """Return what a casing's poles add along it, outside its wall.
+        """Return the field of a casing's poles along it, outside its wall.
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class CasingModel:
         return Gathered(whole, by_pose, by_ground if has_ground else None, by_strength)
 
     def column(self, name: str, bend: Gathered, responses: list[Response]) -> ComplexArray | None:
-        """Return the derivative of what is gathered (k, n, tones, 3) by a number of the casing."""
+        """Return the derivative of the gathered field (k, n, tones, 3) by a casing parameter."""
         by = bend.by_strength[:, :, 0]
         if name in {"log_gather", "phase_gather"}:
             return by if name == "log_gather" else 1j * by
@@ -123,7 +123,7 @@ class CasingModel:
         names: tuple[str, ...],
         responses: list[Response],
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Return what comes through the wall of phasors (k, n, tones, 3) outside it."""
+        """Return phasors inside the wall for phasors (k, n, tones, 3) outside it."""
         first = np.outer(FIRST, FIRST)
         tensors = self._part(np.eye(3) - first), self._part(first)
         parts = []
@@ -144,5 +144,5 @@ class CasingModel:
         return (through @ phasor[..., None])[..., 0], out
 
     def _part(self, tensor: Array) -> Array:
-        """Return a tensor of the body's axes in those of what the sensor measures."""
+        """Return a tensor in body axes converted to the sensor's measured axes."""
         return np.asarray(self._mounted @ tensor @ np.linalg.inv(self._mounted))

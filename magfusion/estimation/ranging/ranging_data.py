@@ -1,4 +1,4 @@
-"""What a sensor at rest measured of a magnet that turned and went by, in windows."""
+"""Windows of a sensor at rest while a rotating magnet passes."""
 
 from dataclasses import dataclass, replace
 
@@ -7,23 +7,23 @@ import numpy as np
 from magfusion.model.samples import FieldSamples
 from magfusion.units import Array
 
-# Gauss and Legendre's points of a window, over its length from its middle: it is moved through.
+# Gauss-Legendre points of a window, relative to its middle and length, for the motion within it.
 WITHIN, SHARE = np.sqrt(0.6) * np.array([-0.5, 0.0, 0.5]), np.array([5.0, 8.0, 5.0]) / 18.0
 FIRST = np.array([1.0, 0.0, 0.0])  # axis of the sensor's body, down its hole
 POSE = 6
-BESIDE = 1.0  # m; between places of the sensor that are one
+BESIDE = 1.0  # m; places of the sensor that are closer count as one
 
 
 @dataclass(frozen=True, eq=False)
 class RangingWindows:
-    """What was measured while a magnet went by.
+    """Measurements while a magnet passes.
 
     Parameters
     ----------
     fields : FieldSamples
         Of one rotor, by its angle.
     angle_known : bool
-        Whether that was measured; otherwise each window has a phase of its own.
+        Whether the angle was measured; otherwise each window has a phase of its own.
     magnet : ndarray, shape (n, 3)
         Depth of the magnet at the points `WITHIN` each window (m), from ``magnet_from``.
     sensor : ndarray, shape (n,)
@@ -31,7 +31,7 @@ class RangingWindows:
     roll : ndarray, shape (n,)
         Of the sensor about its hole, from its high side (rad).
     depth_sigma : float
-        Of a window's depth, each by itself (m).
+        Of a window's depth, independently (m).
     depth_scale_sigma : float
         Of all, relative.
     """
@@ -57,10 +57,10 @@ class RangingWindows:
         )
 
     def spread(self, length: float) -> "RangingWindows":
-        """Return the same of a magnet that is so long (m): it is where it goes, and beside.
+        """Return the same for a magnet of this length (m), distributed along its path.
 
-        What a window sees of a way and of a length along it is the mean over both, by the sum of
-        their second moments.
+        A window measures the mean over motion and length, approximated by the sum of their second
+        moments.
         """
         half = 0.5 * (self.magnet[:, 2] - self.magnet[:, 0])
         wider = np.hypot(half, WITHIN[2] * length) - np.abs(half)
@@ -75,9 +75,9 @@ class RangingWindows:
 
     @property
     def reach(self) -> Array:
-        """How far the magnet moves while it is heard at half its strength, shape (tones,) (m).
+        """Path of the magnet within half of the maximum strength, shape (tones,) (m).
 
-        In one pass; of a dipole that is about twice the distance.
+        In one pass; for a dipole that is about twice the distance.
         """
         size, out = self.seen, []
         for own in size.T:

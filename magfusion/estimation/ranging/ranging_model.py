@@ -1,11 +1,11 @@
-"""What a sensor at rest measures of a magnet that turns and goes by: predicted, with derivatives.
+"""Predicted windows of a sensor at rest while a rotating magnet passes, with derivatives.
 
-The well of the magnet is straight as far as it is heard, and so is the sensor's.  Seen from the
-magnet, whose frame is the world here, the sensor goes by: what it should measure is `observe`, and
-the pose of the sensor is what is sought, six numbers, with the moment, what comes through the
-casing, the scale of the depths and the ground.
+The wells of the magnet and of the sensor are straight over the detection range.  The world frame
+here is that of the magnet, which the sensor passes.  `observe` predicts its measurement; the
+unknowns are the six of the sensor's pose, with the moment, the response of the casing, the scale of
+the depths and the ground.
 
-The sensor's frame for this is that of its high side: x down the hole, z towards the high side.
+The sensor's frame here is that of its high side: x down the hole, z towards the high side.
 """
 
 from dataclasses import replace
@@ -22,7 +22,7 @@ from magfusion.model.receive_coils import Observation
 from magfusion.model.site import Beacon, Site
 from magfusion.units import Array, ComplexArray
 
-OPEN = 1.0  # rad; prior of a turn about the magnet's axis where its angle is not measured
+OPEN = 1.0  # rad; prior of a rotation about the magnet's axis where its angle is not measured
 _NONE = np.zeros((), dtype=np.complex128)
 
 _Sources = list[tuple[ComplexArray | float, Observation]]
@@ -34,12 +34,12 @@ class _Unknown(NamedTuple):
 
 
 class RangingModel:
-    """Residuals of windows and their derivatives; one problem a start.
+    """Residuals of windows and their derivatives; one problem per start.
 
     Parameters
     ----------
     about : ndarray, shape (12 + unknowns,), optional
-        State about which depths and the model's errors are weighed.
+        State at which errors of depths and of the model are weighted.
     """
 
     def __init__(self, site: Site, windows: RangingWindows, about: Array | None = None) -> None:
@@ -149,7 +149,7 @@ class RangingModel:
     def _of_steel(
         self, name: str, bend: Gathered | None, steel: list[Response]
     ) -> ComplexArray | None:
-        """Return the derivative by an unknown of the casing; None of any other."""
+        """Return the derivative by an unknown of the casing; None for any other."""
         if self.casing is None or bend is None:
             return None
         return self.casing.column(name, bend, steel)
@@ -162,7 +162,7 @@ class RangingModel:
         by = self._whitening @ np.where(self._kept[:, None], by, 0.0)
         if self.windows.angle_known:
             return self.white(phasor - self.seen), by
-        # Each window by itself: its whitening is the same whatever its phase is.
+        # Windows are independent: a window's whitening does not depend on its phase.
         phase = self.phase(phasor)[..., None, None] * self.orders[:, None]
         error = self.white(phasor - self.seen * np.exp(-1j * phase))
         free = self.white(1j * self.orders[:, None] * phasor)
@@ -180,7 +180,7 @@ class RangingModel:
         return np.asarray(parts @ self._whitening.T)
 
     def with_priors(self, state: Array) -> tuple[Array, Array]:
-        """Return the same with the rows of what is known before."""
+        """Return the same with the rows of the priors."""
         error, by = self.residuals(state)
         size, n = len(state), by.shape[-1]
         told = state[:, 12:] / self.prior
@@ -195,7 +195,7 @@ class RangingModel:
         return np.concatenate([error, told], 1), np.concatenate([by, rows], 1)
 
     def about_axis(self, state: Array) -> Array:
-        """Return the step of a turn about the magnet's axis, of length one, shape (k, 6)."""
+        """Return the unit step of a rotation about the magnet's axis, shape (k, 6)."""
         rotation, place = state[:, :9].reshape(-1, 3, 3), state[:, 9:12]
         turn = np.einsum("kba,b->ka", rotation, self.axis)
         shift = np.einsum("kba,kb->ka", rotation, np.cross(self.axis, place))
@@ -203,7 +203,7 @@ class RangingModel:
         return np.asarray(whole / np.linalg.norm(whole, axis=1, keepdims=True))
 
     def phase(self, phasor: ComplexArray) -> Array:
-        """Return the phase that brings each window's prediction to its measurement (k, n)."""
+        """Return the phase from each window's prediction to its measurement (k, n)."""
         first = self.weight[:, 0]
         seen = (first @ self.seen[:, 0, :, None])[..., 0]
         mine = (first @ phasor[:, :, 0, :, None])[..., 0]
@@ -213,7 +213,7 @@ class RangingModel:
 def _column(
     name: str, sources: _Sources, bend: Gathered | None, phasor: ComplexArray, share: Array
 ) -> ComplexArray:
-    """Return the derivative of phasors by one number, zero where that is the casing's."""
+    """Return the derivative of phasors by one parameter, zero for those of the casing."""
     if name == "log_moment":
         return phasor
     if name == "log_conductivity":
@@ -233,7 +233,7 @@ def _wide(part: ComplexArray | float) -> ComplexArray | float:
 
 
 def _counter(beacon: Beacon) -> Beacon:
-    """Return the same magnet turning the other way, harmonics left out: none of them is so."""
+    """Return the same magnet rotating the other way, without harmonics, which do not reverse."""
     cosine, sine = beacon.coils[:2]
     silent = tuple(replace(c, moment_beacon=0.0 * c.moment_beacon) for c in beacon.coils[2:])
     return replace(beacon, coils=(cosine, replace(sine, phase=-sine.phase), *silent))

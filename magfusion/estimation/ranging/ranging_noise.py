@@ -1,7 +1,7 @@
-"""How the windows of a range err together: noise, depths, and what the field's model leaves out.
+"""Joint covariance of the windows of a range: noise, depths, and errors of the field model.
 
-Errors of the model are alike where the magnet was alike: they are correlated along its way, which
-one covariance of all windows holds.  A depth that errs shifts a window along the field's slope.
+Errors of the model are correlated along the magnet's path, where neighbouring places have similar
+errors; one covariance covers all windows.  A depth error shifts a window along the field's slope.
 """
 
 from dataclasses import dataclass
@@ -13,20 +13,20 @@ from magfusion.estimation.ranging.ranging_data import RangingWindows
 from magfusion.model.site import Site
 from magfusion.units import Array, ComplexArray
 
-# Of what a casing gathers: joints, couplings and uneven steel make no tube without end.
+# Of the field gathered by a casing: joints, couplings and uneven steel make no infinite tube.
 GATHERED_ERROR = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """What windows should see, and how that changes as the magnet goes on.
+    """Predicted phasors of windows, and their slope along the magnet's path.
 
     Parameters
     ----------
     phasor, slope : complex ndarray, shape (n, tones, 3)
         (T) and (T/m).
     gathered : ndarray, shape (n, tones)
-        Share of the field that goes with the strength of a casing's poles.
+        Share of the field in proportion to the strength of a casing's poles.
     """
 
     phasor: ComplexArray
@@ -54,7 +54,7 @@ def whitening(site: Site, windows: RangingWindows, course: Course | None = None)
     Parameters
     ----------
     course : Course, optional
-        About which; without it the slope is bounded by what was measured, alike in all axes.
+        Linearisation point; by default the slope is bounded by the measurements, equal in all axes.
 
     Returns
     -------
@@ -85,7 +85,7 @@ def whitening(site: Site, windows: RangingWindows, course: Course | None = None)
             power = (windows.depth_sigma * slope) ** 2 / 3.0
             cov[at, t, :, at, t, :] += power[:, None, None] * np.eye(6)
     if course is not None and windows.angle_known:
-        shift = windows.depth_sigma * apart(course.slope)  # one depth moves all tones
+        shift = windows.depth_sigma * apart(course.slope)  # one depth affects all tones
         cov[at, :, :, at] += shift[:, :, :, None, None] * shift[:, None, None]
     silent = np.repeat(~valid.ravel(), 6)
     whole = cov.reshape(n * tones * 6, -1)
@@ -103,8 +103,8 @@ def _model_error(site: Site) -> float:
 def _alike(site: Site, windows: RangingWindows) -> Array:
     """Return the correlation of the model's errors between windows (n, n).
 
-    Windows whose phases are free are taken one by one: each errs by more, as if all over the length
-    said the same once.
+    Windows with unknown phases are independent, with a larger error each, equivalent to one
+    common error over the correlation length.
     """
     places = np.stack([windows.magnet[:, 1], windows.sensor], axis=1)
     distance = np.linalg.norm(places[:, None] - places, axis=-1)

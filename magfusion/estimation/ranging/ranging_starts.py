@@ -1,4 +1,4 @@
-"""Where a search for the range of one well from another begins."""
+"""Starts of the search for the relative position of two wells."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ DIRECTIONS, DISTANCES = 12, 10  # of starts: about the axis, and outwards
 
 
 def starts(model: RangingModel) -> Array:
-    """Return poses over all directions and distances, the likeliest first."""
+    """Return poses over all directions and distances, the most probable first."""
     windows, size = model.windows, np.linalg.norm(model.seen[:, 0], axis=-1)
     beside = windows.sensor == windows.sensor[np.argmax(size)]
     abreast = float(windows.magnet[np.argmax(np.where(beside, size, 0.0)), 1])
@@ -35,7 +35,7 @@ def starts(model: RangingModel) -> Array:
 
 
 def _scaled(model: RangingModel, states: Array) -> Array:
-    """Return residuals of states at the moment that suits each best."""
+    """Return residuals of states at the best-fitting moment of each."""
     phasor, _ = model.predicted(states)
     seen = np.broadcast_to(model.seen, phasor.shape)
     if not model.windows.angle_known:
@@ -46,13 +46,13 @@ def _scaled(model: RangingModel, states: Array) -> Array:
 
 
 def _weighed(model: RangingModel, phasor: ComplexArray) -> Array:
-    """Return whitened parts (k, d), each window by itself."""
+    """Return whitened parts (k, d), independent for each window."""
     whitened: ComplexArray = (model.weight @ phasor[..., None])[..., 0]
     return apart(whitened).reshape(len(phasor), -1)
 
 
 def _turned_to_phase(model: RangingModel, states: Array) -> Array:
-    """Return states turned about the magnet's axis until the phase is the measured one."""
+    """Return states rotated about the magnet's axis to match the measured phase."""
     if not model.windows.angle_known:
         return states
     phasor, _ = model.predicted(states)

@@ -1,4 +1,4 @@
-"""A log of a magnet that goes by, as windows: phasors by its angle, depths, and the high side."""
+"""Windows of a log of a passing magnet: phasors by its angle, depths, and the high side."""
 
 from dataclasses import dataclass, replace
 
@@ -15,12 +15,12 @@ from magfusion.units import Array
 SENSOR = "magnetometer"  # as a part of the table of depths
 UPRIGHT = 0.05  # of gravity across the hole; below, it has no high side
 LEAST_WINDOWS = 8
-PAUSE = 2.0  # s; without samples, after which the angle is followed anew
+PAUSE = 2.0  # s; without samples, after which angle tracking restarts
 
 
 @dataclass(frozen=True, eq=False)
 class DepthErrors:
-    """How well depths are known.
+    """Errors of depths.
 
     Parameters
     ----------
@@ -36,15 +36,15 @@ class DepthErrors:
 
 @dataclass(frozen=True, eq=False)
 class RangingLog:
-    """What a log says of the range.
+    """Ranging data of a log.
 
     Parameters
     ----------
     windows : RangingWindows
     speed_hz : ndarray, shape (n,)
-        At which the magnet turned in each window.
+        Rotation rate of the magnet in each window.
     high_side : bool
-        Whether gravity tells it; otherwise directions are from the sensor's own third axis.
+        Whether gravity determines it; otherwise directions are from the sensor's own third axis.
     inclination : float, optional
         Of the sensor's hole from the vertical, downwards (rad).
     dropped : int
@@ -59,15 +59,15 @@ class RangingLog:
 
 
 def the_rotor(site: Site) -> Beacon:
-    """Return the one beacon of a site for ranging.
+    """Return the only beacon of a site for ranging.
 
     Raises
     ------
     InputError
-        Where there is another beacon, or none is a magnet on a shaft.
+        Where there is another beacon, or the only one is no magnet on a shaft.
     """
     if len(site.beacons) != 1 or site.beacons[0].rotor is None:
-        raise InputError("beacons: ranging needs one beacon with rotor, and no other; describe it")
+        raise InputError("beacons: ranging needs exactly one beacon with rotor; declare it")
     return site.beacons[0]
 
 
@@ -84,11 +84,11 @@ def ranging_log(
     ------
     InputError
         Where it lacks the waveform or the depths of the magnet, an angle names another beacon, the
-        magnet is not told from noise, or too few windows can be demodulated.
+        magnet cannot be distinguished from noise, or too few windows can be demodulated.
     """
     beacon = the_rotor(site)
     if log.waveform is None:
-        raise InputError("holds no magnetometer.parquet; ranging needs the raw waveform")
+        raise InputError("has no magnetometer.parquet; ranging needs the raw waveform")
     known = None if log.depths is None else log.depths.readings.get(beacon.name)
     if log.depths is None or known is None:
         raise InputError(
@@ -104,8 +104,8 @@ def ranging_log(
     fields, speed = fields.rows(inside), found.speed_hz[inside]
     if len(fields) < LEAST_WINDOWS:
         raise InputError(
-            f"only {len(fields)} windows of {window:g} s hold samples, depths and a magnet that"
-            f" turns, of {LEAST_WINDOWS} that ranging needs; record a longer way, or give a shorter"
+            f"only {len(fields)} windows of {window:g} s have samples, depths and a rotating"
+            f" magnet, but ranging needs {LEAST_WINDOWS}; record a longer pass, or use a shorter"
             " --window"
         )
     at = fields.time[:, None] + window * WITHIN
@@ -143,7 +143,7 @@ def _angle(log: Log, beacon: Beacon) -> tuple[Array, bool]:
         return _followed(log, beacon), False
     if beacon.name not in rotation.angle:
         names = ", ".join(f"rotor_{name}" for name in rotation.angle)
-        raise InputError(f"{names}: the site's rotor is {beacon.name}; name the column after it")
+        raise InputError(f"{names}: the site's rotor is {beacon.name}; rename the column to match")
     whole = np.unwrap(rotation.angle[beacon.name])
     angle = np.interp(waveform.time, rotation.time, whole, np.nan, np.nan)
     step = float(np.median(np.diff(waveform.time)))

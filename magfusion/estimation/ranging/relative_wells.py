@@ -1,4 +1,4 @@
-"""Where two wells are from each other, in a driller's words, with the sigma of each."""
+"""Relative position of two wells in drilling terms, with the sigma of each."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ LATERAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])  # to the right and to t
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Where the magnet is from the sensor at some depths of both.
+    """Position of the magnet relative to the sensor at some depths of both.
 
     Parameters
     ----------
@@ -30,16 +30,16 @@ class Places:
 
 @dataclass(frozen=True)
 class Abreast:
-    """The two wells where the sensor is.
+    """The two wells at the depth of the sensor.
 
     Parameters
     ----------
     distance, distance_sigma : float
-        From the sensor to the line of the magnet's way, centre to centre (m).
+        From the sensor to the line of the magnet's path, centre to centre (m).
     direction, direction_sigma : float
         Of its nearest point from the high side, clockwise looking down the hole (rad).
     depth, depth_sigma : float
-        Measured depth of the magnet when it is nearest (m).
+        Measured depth of the magnet where it is nearest (m).
     """
 
     distance: float
@@ -52,7 +52,7 @@ class Abreast:
 
 @dataclass(frozen=True)
 class Divergence:
-    """Angles of the magnet's well against the sensor's, to the right and up, with sigma (rad)."""
+    """Angles of the magnet's well to the sensor's, to the right and up, with sigma (rad)."""
 
     right: float
     right_sigma: float
@@ -61,14 +61,14 @@ class Divergence:
 
 
 class Wells:
-    """What a range says of two wells.
+    """Relative position of two wells from a range.
 
     Parameters
     ----------
     axis : ndarray, shape (3,)
-        Of the magnet, along its way.
+        Of the magnet, along its path.
     excess : float
-        By which the covariance is too small.
+        Factor by which the covariance is too small.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Wells:
         return turned - (sensor - self._windows.sensor_from) * FIRST, by
 
     def places(self, magnet: Array, sensor: Array) -> Places:
-        """Return where the magnet is from the sensor at measured depths of both (n,) (m)."""
+        """Return the magnet relative to the sensor at measured depths of both (n,) (m)."""
         words = np.concatenate([FIRST[None], LATERAL])
         each = [self._side(float(m), float(s)) for m, s in zip(magnet, sensor, strict=True)]
         slopes = np.array([words @ by for _, by in each])
@@ -102,7 +102,7 @@ class Wells:
         )
 
     def abreast(self, sensor: float) -> Abreast:
-        """Return the wells where the sensor is at a depth."""
+        """Return the wells at a depth of the sensor."""
         start, _ = self._side(self._windows.magnet_from, sensor)
         travel = -float(start @ self._along)
         magnet = self._windows.magnet_from + travel / self._factor
@@ -113,7 +113,7 @@ class Wells:
         right, up = LATERAL @ place
         across = float(np.hypot(right, up))
         slope = (place / distance) @ by
-        # The nearest point moves along the line as that turns and shifts.
+        # The nearest point moves along the line as that rotates and shifts.
         along = self._along @ by + place @ turned
         moved = by - np.outer(self._along, along)
         turning = (np.array([up, -right]) @ LATERAL / across**2) @ moved
@@ -130,7 +130,7 @@ class Wells:
         )
 
     def divergence(self) -> Divergence:
-        """Return how the wells lead apart, down the magnet's."""
+        """Return the divergence of the wells, down the magnet's."""
         by = np.zeros((3, len(self._cov)))
         by[:, :3] = skew(self._along)
         forward = float(FIRST @ self._along)

@@ -1,1 +1,1 @@
-"""Integration over the rests of a platform that stands still for long."""
+"""Integration over the rests of a platform that does not move for a long time."""

@@ -1,4 +1,4 @@
-"""Whole rests as one epoch each: what hours of integration make of beacons far below the noise."""
+"""Integration of each rest to one epoch, for beacons far below the noise of the raw samples."""
 
 import itertools
 from collections import Counter
@@ -43,24 +43,24 @@ LEAST_RATE = 1e-3  # rad/s; a bias of the gyroscope may look like that
 
 @dataclass(frozen=True, eq=False)
 class AtRest:
-    """The rests of a log, an epoch each.
+    """The rests of a log, one epoch each.
 
     Parameters
     ----------
     fields : FieldSamples
-        Synchronised beacons are there whether or not they are heard; of others a phase that is not
-        heard is none.
+        Synchronised beacons are always included; other beacons that are not detected have a NaN
+        phasor.
     chance : ndarray, shape (n, channels)
-        Probability that noise alone is so loud, with all frequencies that were tried.
+        Probability that noise alone reaches this amplitude, over all frequencies tried.
     heard : bool ndarray, shape (n, channels)
-        Where that is less than was asked.
+        Where ``chance`` is below the requested false-alarm rate.
     dropped : mapping
         Reason to number of rests.
     findings : tuple of Finding
-        What is not heard, and how weak it must be.
+        Undetected beacons, with upper bounds of their fields.
     gain : ndarray, shape (n, channels), optional
-        How many times smaller the reference sensor made the sigma of a phasor; NaN where it has no
-        part in it.
+        Ratio by which the reference sensor reduces the sigma of a phasor; NaN where it is not
+        used.
     """
 
     fields: FieldSamples
@@ -71,20 +71,20 @@ class AtRest:
     gain: Array | None = None
 
     def log(self, log: Log) -> Log:
-        """Return a log with these epochs in place of its waveform."""
+        """Return the log with these epochs in place of its waveform."""
         noticed = (*log.noticed, *self.findings)
         return replace(
             log, waveform=None, fields=self.fields, drive=None, reference=None, noticed=noticed
         )
 
     def amplitude(self) -> Array:
-        """Return the sizes of phasors, freed of what noise adds to a square, (n, channels) (T)."""
+        """Return the amplitudes of phasors without the bias by noise, (n, channels) (T)."""
         size = np.sum(np.abs(self.fields.phasor_sensor) ** 2, axis=-1)
         noise = 2.0 * np.trace(self.fields.phasor_cov, axis1=-2, axis2=-1)
         return np.sqrt(np.maximum(size - noise, 0.0))
 
     def hearing(self, site: Site) -> Heard:
-        """Return how each beacon is heard, by its loudest tone."""
+        """Return the detection of each beacon by its strongest tone."""
         names = tuple(b.name for b in site.beacons)
         size = self.amplitude()
         sigma = np.sqrt(np.trace(self.fields.phasor_cov, axis1=-2, axis2=-1) / 3.0)
@@ -104,12 +104,12 @@ class AtRest:
 def _epochs_at_rest(
     log: Log, site: Site, usual: LockinSettings, lockin: LockinSettings | None, least: int
 ) -> tuple[list[tuple[tuple[float, float], float]], Counter[str]]:
-    """Return when each epoch begins and ends, with the length of its pieces; and what is dropped.
+    """Return the span and piece length of each epoch, and the counts of rejected rests.
 
     Parameters
     ----------
     usual : LockinSettings
-        By the tones of the site.
+        Chosen by the tones of the site.
     lockin, least
         As of `at_rest`.
     """
@@ -137,24 +137,24 @@ def at_rest(
     false_alarm: float = 1e-3,
     least: int = 1,
 ) -> AtRest:
-    """Return the rests of a log with a waveform, an epoch each.
+    """Return the rests of a log with a waveform, one epoch each.
 
     Parameters
     ----------
     lockin : LockinSettings, optional
-        Length of the pieces, and the mains; chosen by the tones where there is none.
+        Length of the pieces, and the mains; by default chosen by the tones.
     false_alarm : float
-        Probability that a rest without a beacon is taken for one with it.
+        Probability of detecting an absent beacon in a rest.
     least : int
-        So many epochs are made: where there are fewer rests, each is divided.
+        Minimum number of epochs: where there are fewer rests, each is divided.
 
     Raises
     ------
     InputError
-        Where there is no waveform, no long rest, or coils are driven in time slots.
+        Where there is no waveform or no long rest, or coils are driven in time slots.
     """
     if log.waveform is None:
-        raise InputError("holds no magnetometer.parquet to integrate at rest; give the raw log")
+        raise InputError("has no magnetometer.parquet to integrate at rest; give the raw log")
     check_tones(site)
     usual = default_settings(site)
     mains_hz = (usual if lockin is None else lockin).mains_hz
@@ -164,8 +164,8 @@ def at_rest(
         need = LEAST_LENGTHS * usual.window
         short = f" ({dropped[TOO_SHORT]} are shorter)" if dropped else ""
         raise InputError(
-            f"--at-rest: the log has no rest of {need:.3g} s{short}; leave the platform longer, or"
-            " declare platform.motion by how it vibrates"
+            f"--at-rest: the log has no rest of {need:.3g} s{short}; keep the platform still for"
+            " longer, or adapt platform.motion to its vibration"
         )
     fields = FieldSamples.joined([part.fields for part in parts])
     chance = np.stack([part.chance for part in parts])
@@ -183,25 +183,25 @@ def at_rest(
 
 
 def check_tones(site: Site) -> None:
-    """Refuse tones that whole rests are not integrated by.
+    """Raise an error for tones that cannot be integrated over whole rests.
 
     Raises
     ------
     InputError
     """
     if has_schedule(site):
-        raise InputError("--at-rest integrates tones, and a beacon has time slots; leave it out")
+        raise InputError("--at-rest integrates tones, but a beacon has time slots; omit --at-rest")
     if tones_of(site).reused:
         raise InputError(
-            "--at-rest integrates each tone for one beacon, and beacons share a frequency; leave it"
-            " out"
+            "--at-rest integrates one beacon per tone, but beacons share a frequency; omit"
+            " --at-rest"
         )
 
 
 def rests(log: Log, site: Site) -> list[tuple[float, float]]:
-    """Return beginning and end of each stretch in which the platform rests (s).
+    """Return beginning and end of each interval in which the platform rests (s).
 
-    Without inertial samples who asks for rest is believed: it is the whole log.
+    Without inertial samples the whole log is assumed to be one rest.
     """
     assert log.waveform is not None
     first, last = float(log.waveform.time[0]), float(log.waveform.time[-1])
@@ -215,10 +215,10 @@ def rests(log: Log, site: Site) -> list[tuple[float, float]]:
     slow = max(LEAST_RATE, 5.0 * site.platform.imu.gyro_bias_sigma)
     found = []
     for begin, end in edges.reshape(-1, 2):
-        # A turn that is even has a quiet gyroscope, too.
+        # An even turn has a quiet gyroscope, too.
         turns = np.linalg.norm(np.mean(gyro[begin:end], axis=0)) > slow
         span = max(float(stamps[begin]), first), min(float(stamps[end - 1]), last)
-        # What a half span before the first sample was quiet, too, is at rest.
+        # Half a span before the first quiet sample is at rest, too.
         ends = begin == np.argmax(still), end == len(still) - np.argmax(still[::-1])
         half = 0.5 * motion.rest_span
         span = (
@@ -236,17 +236,17 @@ def _beacon(site: Site, name: str) -> Beacon:
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """One rest, or as much of it as is one epoch.
+    """One rest, or the part of it that makes one epoch.
 
     Parameters
     ----------
     fields : FieldSamples
         Of one epoch.
     chance : ndarray, shape (channels,)
-        Probability that noise alone is so loud.
+        Probability that noise alone reaches this amplitude.
     tones : list of Judged
     known : Known, optional
-        For later parts of a stream, of which it was one.
+        For later parts of the same stream.
     """
 
     fields: FieldSamples
@@ -264,7 +264,7 @@ def rest_epoch(
     false_alarm: float,
     known: Known | None = None,
 ) -> Rest:
-    """Return the epoch of a rest.
+    """Return one rest as an epoch.
 
     Parameters
     ----------
@@ -273,7 +273,7 @@ def rest_epoch(
     length : float
         Of the pieces (s).
     known : Known, optional
-        What earlier parts of a stream tell of its reference.
+        Results of earlier parts of a stream for its reference.
     """
     assert log.waveform is not None
     rows = slice(*np.searchsorted(log.waveform.time, span))
@@ -317,7 +317,7 @@ def rest_epoch(
 
 
 def _searches(found: Pieces, site: Site, nominal_hz: Array) -> dict[str, Search]:
-    """Return how the frequency of each beacon without synchronisation was found."""
+    """Return the frequency search of each beacon without synchronisation."""
     searches = {}
     for beacon in site.beacons:
         if not beacon.synchronised:
@@ -327,7 +327,7 @@ def _searches(found: Pieces, site: Site, nominal_hz: Array) -> dict[str, Search]
 
 
 def _at_declared_drives(found: Pieces, site: Site, time: float) -> Pieces:
-    """Return pieces as they were at the currents of a rest's middle, where these were recorded."""
+    """Return pieces scaled to the drive currents at the middle of a rest, where recorded."""
     if site.drives is None:
         return found
     phasor = found.phasor.copy()
@@ -342,7 +342,7 @@ def _at_declared_drives(found: Pieces, site: Site, time: float) -> Pieces:
 def _wandered(
     one: Integrated, site: Site, frequency_hz: float, duration: float, name: str
 ) -> Array:
-    """Return the covariance of what the drive wanders within a rest, shape (3, 3) (T^2)."""
+    """Return the covariance by drive phase drift within a rest, shape (3, 3) (T^2)."""
     variance = walk(site, frequency_hz, duration)
     square = np.real(np.outer(one.phasor, np.conj(one.phasor)))
     if not _beacon(site, name).synchronised:
@@ -363,12 +363,12 @@ def _chances(single: list[Integrated], site: Site, searches: Mapping[str, Search
 
 
 def believed(log: Log) -> tuple[Finding, ...]:
-    """Return that nothing in the log says that the platform rests."""
+    """Return a warning where the log has no IMU to confirm that the platform rests."""
     if log.inertial:
         return ()
     text = (
-        "The log has no IMU: all of it is taken for one rest. If the platform moved, cut the log"
-        " (--start, --end), or record an IMU beside it."
+        "The log has no IMU: all of it is assumed to be one rest. If the platform moved, cut the"
+        " log (--start, --end), or record an IMU with it."
     )
     return (Finding("few_data", text, Verdict.TRUSTWORTHY),)
 
@@ -376,7 +376,7 @@ def believed(log: Log) -> tuple[Finding, ...]:
 def unheard_in(
     fields: FieldSamples, heard: BoolArray, site: Site, false_alarm: float
 ) -> tuple[Finding, ...]:
-    """Return what is said of the tones that are not told from noise, in no rest."""
+    """Return the finding of tones that are in no rest distinguished from noise."""
     below = []
     sigma = np.sqrt(np.trace(fields.phasor_cov, axis1=-2, axis2=-1) / 3.0)
     size = np.sqrt(np.sum(np.abs(fields.phasor_sensor) ** 2, axis=-1))
@@ -390,9 +390,9 @@ def unheard_in(
     none = not np.any(heard)
     text = (
         f"Below the noise, at a false-alarm rate of {false_alarm:g} a rest: {', '.join(below)}."
-        " Rest longer, come nearer, or send louder."
+        " Rest longer, reduce the distance, or increase the transmitted power."
     )
     if none:
-        text = f"no beacon is heard. {text}"
+        text = f"no beacon is detected. {text}"
     verdict = Verdict.FAILED if none else Verdict.TRUSTWORTHY
     return (Finding("low_signal", text, verdict, 1e3 if none else 1.0),)

@@ -1,4 +1,4 @@
-"""How long a piece of a rest may be, and how long a rest is one epoch."""
+"""Maximum lengths of the pieces of a rest, and of a rest that makes one epoch."""
 
 import numpy as np
 
@@ -32,7 +32,7 @@ def piece_length(
 
 
 def coherent(site: Site) -> float:
-    """Return how long a rest may be one epoch (s): as long as phases and clocks stay."""
+    """Return the longest rest that may be one epoch (s), by the stability of phases and clocks."""
     duration = 1000.0 * HOUR
     while walk(site, float(np.max(sent_frequencies_hz(site))), duration) > LARGEST_WALK**2:
         duration *= 0.9
@@ -40,9 +40,9 @@ def coherent(site: Site) -> float:
 
 
 def walk(site: Site, frequency_hz: float, duration: float) -> float:
-    """Return the variance of a phase's mean over a rest against that at its middle (rad^2).
+    """Return the variance of a phase's mean over a rest about its value in the middle (rad^2).
 
-    Of a random walk of phase, and of one of frequency.
+    Includes a random walk of phase and one of frequency.
     """
     clock = site.clock
     phase = clock.phase_walk**2 / HOUR * duration / 12.0

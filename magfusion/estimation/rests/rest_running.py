@@ -1,7 +1,7 @@
-"""A rest as far as it has come: the phasors of its stretches as one, in constant memory.
+"""Running combination of the segments of a rest to one set of phasors, in constant memory.
 
-Information adds up, so that nothing is kept of a stretch but its share.  Where phases and clocks
-may wander, what is older weighs less.
+Information is additive, so that only sums over the segments are stored.  Where phases and clocks
+may drift, older segments are weighted less.
 """
 
 from dataclasses import dataclass
@@ -16,30 +16,30 @@ from magfusion.receiver.integration import trace_chance
 from magfusion.receiver.windows import sent_frequencies_hz
 from magfusion.units import Array, ComplexArray
 
-LEAST_FREEDOM = 8.0  # of a covariance that is told by few readings
-LOOKS = 6.0 / np.pi**2  # of the false alarms, the first look may have; then a fourth, a ninth
+LEAST_FREEDOM = 8.0  # of a covariance that is estimated from few readings
+LOOKS = 6.0 / np.pi**2  # share of the first look in the false alarms; then a fourth, a ninth
 
 
 @dataclass(frozen=True, eq=False)
 class Running:
-    """What all stretches of a rest tell together.
+    """Sums over all segments of a rest.
 
     Parameters
     ----------
     begin, end : float
-        Of the rest, as far as it has come (s).
+        Of the rest so far (s).
     information : ndarray, shape (channels, 3, 3)
-        Of a phasor's real part, and of its imaginary part alike (1/T^2).
+        Of a phasor's real part, equal to that of its imaginary part (1/T^2).
     weighted : complex ndarray, shape (channels, 3)
-        The phasors by it (1/T).
+        Phasors multiplied by their information (1/T).
     squares : ndarray, shape (channels,)
-        Sum of the squares of the stretches' shares, by their traces.
+        Sum of the squares of the segments' shares, by their traces.
     freedom : ndarray, shape (channels,)
-        Readings behind the covariances.
+        Degrees of freedom of the covariances.
     least_chance : ndarray, shape (channels,)
-        Of all stretches, that noise alone is so loud; of beacons without synchronisation.
+        Least false-alarm probability of all segments, of beacons without synchronisation.
     looks : int
-        Stretches.
+        Number of segments.
     """
 
     begin: float
@@ -53,7 +53,7 @@ class Running:
 
     @staticmethod
     def begun(begin: float, channels: int) -> "Running":
-        """Return a rest of which nothing has come."""
+        """Return an empty rest."""
         return Running(
             begin,
             begin,
@@ -66,18 +66,18 @@ class Running:
 
     @property
     def duration(self) -> float:
-        """How long it has lasted (s)."""
+        """Duration so far (s)."""
         return self.end - self.begin
 
     def beside(self, rest: Rest, site: Site, end: float, longest: float, asked: float) -> "Running":
-        """Return it with one more stretch.
+        """Return the sums with one more segment.
 
         Parameters
         ----------
         longest : float
-            As long as phases stay (s): of a longer rest, what is older counts less.
+            Coherence time of the phases (s): in a longer rest older segments are weighted less.
         asked : float
-            False-alarm probability, with which a stretch tells the phase of a beacon without
+            False-alarm probability below which a segment determines the phase of a beacon without
             synchronisation.
         """
         window = float(rest.fields.window[0])
@@ -107,7 +107,7 @@ class Running:
         )
 
     def fields(self, site: Site, longest: float) -> FieldSamples:
-        """Return the epoch that the rest is so far; its time is that of its end."""
+        """Return the rest so far as one epoch, with the time of its end."""
         channels, sent_hz = len(site.channels), sent_frequencies_hz(site)
         phasor = np.full((channels, 3), np.nan, dtype=np.complex128)
         cov = np.tile(np.eye(3), (channels, 1, 1))
@@ -129,17 +129,17 @@ class Running:
         )
 
     def _widened(self, channel: int, cov: Array) -> Array:
-        """Return a covariance with what weights by estimated ones lose (as Meier, 1953)."""
+        """Return a covariance inflated for weights by estimated covariances (Meier, 1953)."""
         total = float(np.trace(self.information[channel]))
         spread = 1.0 - float(self.squares[channel]) / total**2
         each = max(float(self.freedom[channel]) / max(self.looks, 1) - 4.0, 4.0)
         return np.asarray(cov * (1.0 + 2.0 * spread / each))
 
     def chance(self, site: Site) -> Array:
-        """Return the probability that noise alone is so loud in any of so many looks, (channels,).
+        """Return the false-alarm probability of the amplitudes over all looks, (channels,).
 
-        Of the k-th look it is taken k^2 times, so that all looks together have one rate of false
-        alarms.
+        That of the k-th look is multiplied by k^2, which bounds the false-alarm rate of all looks
+        together.
         """
         out = np.ones(len(site.channels))
         for c, (name, _) in enumerate(site.channels):
@@ -162,6 +162,6 @@ def _synchronised(site: Site, name: str) -> bool:
 
 
 def _onto(known: ComplexArray, value: ComplexArray) -> complex:
-    """Return the turn of a phasor onto what is known of it; none where nothing is."""
+    """Return the rotation of a phasor's phase onto the known one; unity without a known one."""
     along = complex(np.vdot(value, known))
     return along / abs(along) if abs(along) > 0.0 else 1.0 + 0.0j

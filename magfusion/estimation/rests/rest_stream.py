@@ -1,8 +1,8 @@
-"""Whole rests as they last: an estimate of the pose that sharpens while the platform stands.
+"""Running estimate of the pose during a rest, which improves while the platform does not move.
 
-Every stretch of a rest is integrated as a whole rest is, with its reference and its mains, and what
-it tells is added to the stretches before.  Nothing else is kept: hours take as much memory as
-minutes.  From rest to rest nothing is carried.
+Each segment of a rest is integrated like a whole rest, with its reference and its mains, and its
+information is added to that of the segments before.  Only the sums are stored: hours take as much
+memory as minutes.  Nothing is propagated from one rest to the next.
 """
 
 from dataclasses import dataclass, replace
@@ -31,34 +31,34 @@ from magfusion.model.trust import Finding, Risk, Trust
 from magfusion.receiver.windows import LockinSettings, default_settings
 from magfusion.units import Array, BoolArray
 
-FIRST, LATER = 60.0, 120.0  # s; of the first stretch of a rest, and of those after it
-LOOK = 2.0  # s; so often it is looked whether the platform rests
-PATIENCE = 10.0  # s; a reference is waited for
-SAME_REST = 0.5  # of the span of rest: what is missing between two stretches of one rest
-MARGIN = 4.0  # s; of inertial samples that are kept before a stretch
+FIRST, LATER = 60.0, 120.0  # s; of the first segment of a rest, and of those after it
+LOOK = 2.0  # s; interval of the checks for rest
+PATIENCE = 10.0  # s; timeout of the reference
+SAME_REST = 0.5  # of the span of rest: maximum gap between two segments of one rest
+MARGIN = 4.0  # s; of inertial samples that are kept before a segment
 
 
 @dataclass(frozen=True, eq=False)
 class RestState:
-    """What is known of a rest so far.
+    """Estimate of a rest so far.
 
     Parameters
     ----------
     time : float
         (s)
     standing : bool
-        False once the platform has moved: then nothing else is told.
+        False once the platform has moved: then nothing else is reported.
     duration : float
-        Of the rest, as far as it was integrated (s).
+        Of the rest as far as it is integrated (s).
     samples : FieldSamples, optional
-        Its phasors, an epoch.
+        Its phasors, one epoch.
     heard : bool ndarray, shape (channels,)
     found : ExplainedFixes, optional
-        None while no beacon is heard.
+        None while no beacon is detected.
     trust : Trust
     gain : ndarray, shape (channels,)
-        How many times smaller the reference makes the sigmas of the newest stretch; NaN where it
-        has no part in it.
+        Ratio by which the reference reduces the sigmas of the newest segment; NaN where it is not
+        used.
     """
 
     time: float
@@ -72,21 +72,21 @@ class RestState:
 
 
 class RestNavigator:
-    """A running estimate of where a platform rests.
+    """Running estimate of the pose of a platform at rest.
 
     Parameters
     ----------
     lockin : LockinSettings, optional
-        Length of the pieces, and the mains; chosen by the tones where there is none.
+        Length of the pieces, and the mains; by default chosen by the tones.
     false_alarm : float
-        Probability, a rest and beacon, that noise is taken for it in any of its states.
+        Probability, per rest and beacon, of a false detection in any of its states.
     risk : Risk, optional
-        What the protection levels promise.
+        Integrity risk of the protection levels.
 
     Raises
     ------
     InputError
-        Where the site's tones are not integrated, or it has not one magnetometer of three axes.
+        Where tones cannot be integrated, or there is not exactly one magnetometer of three axes.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class RestNavigator:
     ) -> None:
         check_tones(site)
         if site.platform.further or site.platform.magnetometer.lacking:
-            raise InputError("--at-rest integrates one magnetometer of three axes; leave it out")
+            raise InputError("--at-rest requires one magnetometer of three axes; omit --at-rest")
         self.site, self._asked, self._risk = site, false_alarm, risk
         self._usual, self._lockin = default_settings(site), lockin
         self._longest = coherent(site)
@@ -110,21 +110,21 @@ class RestNavigator:
         self._made: list[RestState] = []
         self.too_short = 0
 
-    # What goes in
+    # Input
 
     def add_imu(self, time: Array, gyro_body: Array, accel_body: Array) -> None:
-        """Take inertial samples: times (k,), rates and specific forces (k, 3)."""
+        """Add inertial samples: times (k,), rates and specific forces (k, 3)."""
         check_clock("imu", time, self._newest)
         self._imu.add(time, np.hstack([gyro_body, accel_body]))
 
     def add_magnetometer(self, time: Array, measured_sensor: Array) -> None:
-        """Take raw samples: times (k,), fields (k, 3) (T); then go on as far as can be."""
+        """Add raw samples and process them: times (k,), fields (k, 3) (T)."""
         check_clock("magnetometer", time, self._newest)
         self._wave.add(time, measured_sensor)
         self.advance()
 
     def add_reference(self, time: Array, measured_sensor: Array) -> None:
-        """Take samples of a reference sensor, by its own clock: times (k,), fields (k, 3) (T)."""
+        """Add samples of a reference sensor, on its own clock: times (k,), fields (k, 3) (T)."""
         check_clock("reference", time, self._newest)
         self._reference.add(time, measured_sensor)
 
@@ -132,26 +132,26 @@ class RestNavigator:
     def _newest(self) -> float:
         return max(self._imu.newest, self._wave.newest, self._reference.newest)
 
-    # What comes out
+    # Output
 
     def take(self) -> list[RestState]:
-        """Return the states made since this was last asked."""
+        """Return the states made since the last call."""
         made, self._made = self._made, []
         return made
 
     @property
     def kept(self) -> int:
-        """How many samples are kept."""
+        """Number of buffered samples."""
         return len(self._imu) + len(self._wave) + len(self._reference)
 
-    # How it goes on
+    # Processing
 
     def end(self) -> None:
-        """Take in what is left at the end of a log."""
+        """Process the remaining samples at the end of a log."""
         self.advance(last=True)
 
     def advance(self, *, last: bool = False) -> None:
-        """Integrate every stretch that has come."""
+        """Integrate every complete segment."""
         inertial = self.site.platform.inertial
         newest = self._wave.newest
         if inertial:
@@ -177,7 +177,7 @@ class RestNavigator:
         self._forget(self._done - MARGIN - span)
 
     def _stand(self, log: Log, begin: float, until: float, *, over: bool) -> None:
-        """Integrate what has come of a rest."""
+        """Integrate the complete segments of a rest."""
         running, gap = self._running, SAME_REST * self.site.platform.motion.rest_span
         if running is None or begin > running.end + gap:
             running = self._running = Running.begun(begin, len(self.site.channels))
@@ -186,7 +186,7 @@ class RestNavigator:
             wanted = LATER if running.looks else FIRST
             if until - begin < wanted and not over:
                 break
-            # What would be left of a rest that is over is none for itself.
+            # A short remainder of a rest that is over makes no segment of its own.
             end = until if over and until - begin < wanted + 0.5 * LATER else begin + wanted
             running = self._stretch(log, running, (begin, end))
             begin = end
@@ -206,10 +206,10 @@ class RestNavigator:
         return running
 
     def _state(self, log: Log, running: Running, rest: Rest) -> RestState:
-        """Return what is known after a stretch."""
+        """Return the estimate after a segment."""
         samples = running.fields(self.site, self._longest)
         heard = running.chance(self.site) < self._asked
-        # A last moment of the rest has its gravity behind it.
+        # The gravity of a rest's last moment lies before it.
         shown = replace(samples, time=samples.time - self.site.platform.motion.rest_span)
         findings = (*believed(log), *unheard_in(samples, heard[None], self.site, self._asked))
         gain = np.array([tone.gain for tone in rest.tones])

@@ -1,4 +1,4 @@
-"""The pieces of a rest, freed of the noise that a reference sensor heard too."""
+"""Reference-noise cancellation: the pieces of a rest without the noise common to a reference."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -25,16 +25,16 @@ from magfusion.receiver.reference import (
 from magfusion.receiver.reference_clock import Clock, lag_in
 from magfusion.units import Array, BoolArray
 
-LEAST_COVERED = 0.8  # of the pieces of a rest, a reference has
+LEAST_COVERED = 0.8  # share of a rest's pieces that the reference must cover
 MOST_HIDDEN = 0.5  # sigmas of a phasor
-CONTRADICTED = 2.0  # times what the site says of a beacon at the reference, it hears
-SURE = 1e-6  # chance of noise, below which what is heard contradicts the site
-HIGHEST = 0.45  # of the sampling rate, up to which probes are
+CONTRADICTED = 2.0  # detected over predicted field of a beacon at the reference
+SURE = 1e-6  # false-alarm probability below which a detection contradicts the site
+HIGHEST = 0.45  # of the sampling rate; maximum frequency of the probes
 
 
 @dataclass(frozen=True, eq=False)
 class Witness:
-    """A reference at the samples of a rest.
+    """Samples of a reference sensor at the sample times of a rest.
 
     Parameters
     ----------
@@ -51,15 +51,15 @@ class Witness:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What earlier stretches of a stream tell of a reference.
+    """Results of earlier segments of a stream for a reference.
 
     Parameters
     ----------
     clock : Clock
     lag : Lag
-        By which the latest of them was read.
+        By which the newest of them was resampled.
     normals : tuple of Normal or None
-        Of each tone.
+        One per tone.
     """
 
     clock: Clock = field(default_factory=Clock)
@@ -67,7 +67,7 @@ class Known:
     normals: tuple[Normal | None, ...] = ()
 
     def at(self, lag: Lag, time: float, tones_hz: Array) -> tuple[Normal | None, ...]:
-        """Return the normal equations as they count about a time (s), read by another lag."""
+        """Return the normal equations propagated to a time (s), for another lag."""
         if not self.normals:
             return (None,) * len(tones_hz)
         late = float(lag.of(np.array(time)) - self.lag.of(np.array(time)))
@@ -84,16 +84,16 @@ def witness_of(
     hum: Hum | None,
     known: Known | None = None,
 ) -> Witness | None:
-    """Return a reference on the clock of a rest; None where it has too little of it.
+    """Return a reference on the clock of a rest; None where it covers too little of it.
 
     Parameters
     ----------
     known : Known, optional
-        From earlier parts of a stream; without it the rest is all that there is.
+        From earlier parts of a stream; by default the rest alone is used.
     """
     if reference is None:
         return None
-    margin = 10.0  # s; more than its clock may be off
+    margin = 10.0  # s; exceeds the offset of its clock
     rows = slice(*np.searchsorted(reference.time, wave.time[[0, -1]] + [-margin, margin]))
     own = Waveform(reference.time[rows], reference.measured_sensor[rows])
     if len(own) < len(tones_hz) + 2:
@@ -112,15 +112,15 @@ def witness_of(
 
 @dataclass(frozen=True, eq=False)
 class Freed:
-    """The pieces of a rest with and without what its reference tells.
+    """Pieces of a rest with and without cancellation of the reference's noise.
 
     Parameters
     ----------
     raw : Pieces
     freed, heard : Pieces, optional
-        Without the noise in common, and of the reference itself; those that have one.
+        With the common noise removed, and those of the reference; where the reference has samples.
     relations : tuple of Relation or None
-        Of each tone.
+        One per tone.
     """
 
     raw: Pieces
@@ -129,9 +129,9 @@ class Freed:
     relations: tuple[Relation | None, ...]
 
     def best(self) -> Pieces:
-        """Return pieces of which each tone is freed where its relation tells anything.
+        """Return the pieces, with noise cancelled at each tone of significant relation.
 
-        A piece without a reference is none of a tone that is freed: NaN.
+        Pieces without a reference are NaN at such tones.
         """
         if self.freed is None:
             return self.raw
@@ -153,7 +153,7 @@ def freed_pieces(
     witness: Witness | None,
     known: Known | None = None,
 ) -> Freed:
-    """Return the pieces of a rest, and what the reference makes of them.
+    """Return the pieces of a rest, with and without reference-noise cancellation.
 
     Parameters
     ----------
@@ -195,17 +195,17 @@ def freed_pieces(
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """One tone of a rest, by the pieces that tell most of it.
+    """One tone of a rest, by the most precise pieces.
 
     Parameters
     ----------
     gain : float
-        Of the reference: how many times smaller it makes the sigma; NaN where it is not used.
+        Ratio by which the reference reduces the sigma; NaN where it is not used.
     hears : bool
-        Whether the reference hears the beacon, and is not used for that.
+        Whether the reference detects the beacon, and is not used for this reason.
     hidden : float
-        What it may hear of the beacon unnoticed, in sigmas of the phasor; zero where its place is
-        declared.
+        Bound of the beacon's undetected part in the reference, in sigmas of the phasor; zero where
+        the reference's position is declared.
     """
 
     tone: Integrated
@@ -217,12 +217,12 @@ class Judged:
 def judged(
     freed: Freed, best: Pieces, tone: int, time: float, site: Site, false_alarm: float
 ) -> Judged:
-    """Return a tone of a rest, with the reference where that makes it better.
+    """Return a tone of a rest, with the reference where it reduces the sigma.
 
     Parameters
     ----------
     best : Pieces
-        As from `Freed.best`, at the currents of the rest's middle.
+        As from `Freed.best`, at the drive currents of the rest's middle.
     """
     one, found = integrated(best, tone, time), freed.relations[tone]
     if found is None or not found.tells:
@@ -237,7 +237,7 @@ def judged(
         hidden = taken * most / float(np.sqrt(np.trace(one.cov) / 3.0))
     else:
         one = replace(one, cov=one.cov + (taken * sent) ** 2 * np.eye(3))
-        # What is known to be small is in the covariance.
+        # A predicted part that is small is included in the covariance.
         small = 6.0 * (taken * sent) ** 2 < float(np.trace(one.cov))
         hears = not small or (other.chance < SURE and size > CONTRADICTED * sent)
     gain = float(np.sqrt(np.trace(raw.cov) / np.trace(one.cov)))
@@ -247,7 +247,7 @@ def judged(
 
 
 def _sent_there(tone: int, site: Site) -> float | None:
-    """Return how loud a beacon is at the reference (T), by the site; None where it has no place."""
+    """Return the predicted field of a beacon at the reference (T); None without its position."""
     if site.reference_world is None:
         return None
     name, own = site.channels[tone]
@@ -263,7 +263,7 @@ def _sent_there(tone: int, site: Site) -> float | None:
 
 
 def witnessed(rests: list[list[Judged]], site: Site) -> tuple[Finding, ...]:
-    """Return what is to be said of a reference: where it has no part, and what it may hide.
+    """Return the findings of a reference: tones it is not used for, and what it may hide.
 
     Parameters
     ----------
@@ -283,23 +283,23 @@ def witnessed(rests: list[list[Judged]], site: Site) -> tuple[Finding, ...]:
     )
     if hears:
         text = (
-            f"The reference sensor hears beacons, or is so near that it takes something off them:"
+            f"The reference sensor detects beacons, or is near enough to remove a part of them:"
             f" {hears}. It is not used for these. Place it farther from them."
         )
         out.append(Finding("reference_hears", text, Verdict.TRUSTWORTHY))
     if unused:
         text = (
-            f"The reference sensor tells nothing of the noise at the tones of {unused}, or has too"
-            " few samples there; it is not used for these. See that it runs, and stands where it"
-            " hears the same storms and mains."
+            f"The reference sensor does not measure the noise at the tones of {unused}, or has too"
+            " few samples there; it is not used for these. Check that it runs, and place it where"
+            " it receives the same storms and mains."
         )
         out.append(Finding("reference_unused", text, Verdict.TRUSTWORTHY))
     hidden = max(one.hidden for rest in rests for one in rest)
     if hidden > MOST_HIDDEN:
         text = (
-            "The site does not say where the reference sensor stands: that it is out of reach of"
-            " the beacons is assumed. What it may hear of them unnoticed would change phasors by"
-            f" up to {hidden:.2g} sigmas. Give its place: reference.position_m."
+            "The site does not declare the position of the reference sensor: it is assumed out of"
+            " reach of the beacons. What it may receive of them unnoticed would change phasors by"
+            f" up to {hidden:.2g} sigmas. Declare reference.position_m."
         )
         out.append(Finding("reference_hears", text, Verdict.DOUBTFUL, hidden))
     return tuple(out)

@@ -1,1 +1,1 @@
-"""From one epoch to a pose, without a prior guess."""
+"""Single-epoch pose estimation without an initial guess."""

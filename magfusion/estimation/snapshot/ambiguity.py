@@ -1,8 +1,8 @@
-"""Which symmetry of the dipole leads from the best pose of an epoch to its rivals.
+"""Symmetries of the dipole that relate the best pose of an epoch to its alternatives.
 
-The field of a dipole is even in the offset, ``B(-r) = B(r)``, and that of a rotating one repeats
-itself up to a rotation of the sensor in its plane's mirror and half a turn about its axis.  What
-other beacons, gravity and the drive phase leave of this group is reported here in words.
+The field of a dipole is even in the offset, ``B(-r) = B(r)``.  That of a rotating one is repeated,
+up to a rotation of the sensor, in the mirror image of its plane and half a turn about its axis.
+Symmetries not resolved by other beacons, gravity and the drive phase are reported here.
 """
 
 from dataclasses import dataclass
@@ -19,18 +19,18 @@ from magfusion.units import Array, BoolArray
 
 Words = NDArray[np.str_]
 
-OPEN = 9.0  # chi square, three sigma: a rival closer than this explains the epoch as well
-NEAR = 0.25  # of the way to a rival, how far it may lie from the exact image of the best pose
+OPEN = 9.0  # chi square, three sigma: an alternative closer than this explains the epoch as well
+NEAR = 0.25  # largest distance to the exact image of the best pose, relative to the offset
 SAME_PLACE = 0.05  # of the distance from the nearest beacon
-TURNED = 0.35  # rad, within which two attitudes are one; noise and survey move rivals apart
-FLAT, PARALLEL = 0.1, 0.1  # m, rad; within which beacons have a plane in common
+TURNED = 0.35  # rad, within which two attitudes are equal; noise and survey move alternatives
+FLAT, PARALLEL = 0.1, 0.1  # m, rad; tolerances for beacons in a common plane
 
 
 class Kind(StrEnum):
-    """How a rival follows from the best pose."""
+    """Symmetry from the best pose to an alternative."""
 
     BEST = "best"
-    NONE = ""  # there is no such hypothesis
+    NONE = ""  # no hypothesis
     MIRROR = "mirror"
     PLANE = "plane"
     HALF_TURN = "half_turn"
@@ -46,24 +46,24 @@ _POSE = {
     Kind.MIRROR: "the pose on the opposite side of {}",
     Kind.PLANE: "the pose mirrored in the plane of {}",
     Kind.HALF_TURN: "the pose half a turn about the axis of {}",
-    Kind.HEADING: "the opposite heading at the same place",
+    Kind.HEADING: "the opposite heading at the same position",
     Kind.POLARITY: "the pose mirrored in the plane of {} with the opposite heading",
     Kind.AZIMUTH: "any azimuth about {}",
     Kind.ELSEWHERE: "another pose",
 }
 _REMEDY = {
-    Kind.MIRROR: "another beacon in reach, or motion,",
+    Kind.MIRROR: "another beacon in range, or motion,",
     Kind.PLANE: "gravity at rest, or a beacon off that plane,",
-    Kind.HALF_TURN: "gravity at rest, or another beacon in reach,",
+    Kind.HALF_TURN: "gravity at rest, or another beacon in range,",
     Kind.HEADING: "a synchronised beacon, or motion,",
     Kind.POLARITY: "a synchronised beacon, or one off that plane,",
-    Kind.AZIMUTH: "another beacon in reach",
-    Kind.ELSEWHERE: "another beacon in reach, or motion,",
+    Kind.AZIMUTH: "another beacon in range",
+    Kind.ELSEWHERE: "another beacon in range, or motion,",
 }
 
 
 class _Image(NamedTuple):
-    """Where one symmetry takes the sensor."""
+    """Image of the sensor under one symmetry."""
 
     kind: Kind
     owner: str
@@ -72,20 +72,20 @@ class _Image(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Relations:
-    """How the hypotheses of every epoch follow from its best.
+    """Relation of the hypotheses of every epoch to its best.
 
     Parameters
     ----------
     kind : ndarray of str, shape (n, hypotheses)
         Values of `Kind`.
     owner : ndarray of str, shape (n, hypotheses)
-        The beacon whose symmetry it is; empty for the plane of several, and where it is nobody's.
+        The beacon of the symmetry; empty for the plane of several, and if there is none.
     is_open : bool ndarray, shape (n, hypotheses)
-        A rival that explains the epoch as well, within three sigma.
+        An alternative that explains the epoch as well, within three sigma.
     settled : ndarray of str, shape (n, hypotheses)
-        What ruled a rival out, in words; empty where none is or it is open.
+        Information that excluded an alternative, for messages; empty if none did or it is open.
     azimuth : ndarray of str, shape (n,)
-        The beacon about which the azimuth is open; empty where it is not.
+        The beacon about which the azimuth is open; empty if it is not.
     """
 
     kind: Words
@@ -101,7 +101,7 @@ class Relations:
 
 
 def _axis(beacon: Beacon) -> Array | None:
-    """Return the axis (world) about which a beacon's moments are alike; None of three axes."""
+    """Return the symmetry axis (world) of a beacon's moments; None for three axes."""
     drive = beacon.moments_beacon.T @ beacon.excitation
     left, size, _ = np.linalg.svd(np.concatenate([drive.real, drive.imag], axis=1))
     rank = int(np.sum(size > 1e-3 * size[0]))
@@ -111,7 +111,7 @@ def _axis(beacon: Beacon) -> Array | None:
 
 
 def _common_plane(site: Site) -> Array | None:
-    """Return the normal of the plane in which several parallel beacons stand; None without one."""
+    """Return the normal of the common plane of several parallel beacons; None without one."""
     axes = [_axis(beacon) for beacon in site.beacons]
     first = axes[0]
     if len(axes) < 2 or first is None:
@@ -142,7 +142,7 @@ def _images(site: Site, sensor_world: Array) -> list[_Image]:
 
 
 def _open_azimuth(fixes: Fixes, site: Site) -> Words:
-    """Return the beacon, by name, about which the best pose of each epoch may turn."""
+    """Return the name of the beacon about which the best pose of each epoch may rotate."""
     names = np.full(len(fixes), "", dtype=f"<U{max(len(b.name) for b in site.beacons)}")
     rotation, position = fixes.world_from_body[:, 0], fixes.position_world[:, 0]
     body_from_world = np.swapaxes(rotation, 1, 2)
@@ -162,7 +162,7 @@ def _open_azimuth(fixes: Fixes, site: Site) -> Words:
 
 
 def relations(fixes: Fixes, site: Site) -> Relations:
-    """Return how the hypotheses of each epoch follow from its best."""
+    """Return how the hypotheses of each epoch are related to its best."""
     lever = site.platform.magnetometer.position_body
     sensor = fixes.position_world + fixes.world_from_body @ lever
     images = _images(site, sensor[:, 0])
@@ -198,7 +198,7 @@ def _related(
     kind = np.array([str(i.kind) for i in images], dtype="<U16")[nearest]
     owner = np.array([i.owner for i in images])[nearest]
     turn = fixes.world_from_body[:, h] @ np.swapaxes(fixes.world_from_body[:, 0], 1, 2)
-    # The rotation sense of no drive is known: the field may be reversed, and the heading with it.
+    # The rotation sense of the drives is unknown: the field may be reversed, with the heading.
     normal = _common_plane(site)
     if normal is not None and not any(b.synchronised for b in site.beacons):
         reversed_heading = _is_half_turn(turn, normal)
@@ -219,7 +219,7 @@ def _is_half_turn(turn_world: Array, axis_world: Array) -> BoolArray:
 def _about_azimuth(
     kind: Words, owner: Words, azimuth: Words, site: Site, best: Array, rival: Array
 ) -> None:
-    """Distinguish rivals of epochs with an open azimuth by what no azimuth changes."""
+    """Distinguish alternatives of epochs with an open azimuth by azimuth-invariant quantities."""
     for beacon in site.beacons:
         rows, axis = azimuth == beacon.name, _axis(beacon)
         if axis is None or not np.any(rows):
@@ -249,12 +249,12 @@ def _pose(kind: Kind, owner: str) -> str:
 
 
 class Ambiguities(NamedTuple):
-    """What the symmetries left open in a log, and what ruled rivals out.
+    """Symmetries that a log leaves open, and alternatives that it excludes.
 
     Parameters
     ----------
     epochs : dict of Kind to int
-        How many epochs each symmetry left open; those that none are missing.
+        Number of epochs that each symmetry leaves open; only those with any.
     open, settled : list of str
         Sentences.
     """
@@ -265,7 +265,7 @@ class Ambiguities(NamedTuple):
 
 
 def ambiguities(related: Relations) -> Ambiguities:
-    """Return how many epochs each symmetry left open, and sentences for a reader."""
+    """Return how many epochs each symmetry leaves open, and messages."""
     count = len(related.azimuth)
     by_kind: dict[Kind, int] = {}
     sentences: list[str] = []
@@ -278,7 +278,7 @@ def ambiguities(related: Relations) -> Ambiguities:
         by_kind[kind] = epochs + by_kind.get(kind, 0)
         sentences.append(
             f"In {epochs} of {count} epochs {_pose(kind, owner)} explains the measurements as well;"
-            f" {_REMEDY[kind]} would decide."
+            f" {_REMEDY[kind]} would resolve this."
         )
     settled = []
     for decided in np.unique(related.settled[related.settled != ""]):

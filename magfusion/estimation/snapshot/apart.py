@@ -1,4 +1,4 @@
-"""What a fix predicts of channels that were measured one after the other, each in its own axes."""
+"""Predictions of a fix for channels measured in turn, each in its own axes."""
 
 import numpy as np
 
@@ -22,14 +22,14 @@ def predicted(problem: Problem, state: State) -> Array:
 
 
 def linearized(problem: Problem, state: State) -> tuple[Array, Array, Array]:
-    """Return the phasors of states, and their derivatives by poses and by nuisances.
+    """Return the phasors of states, and their derivatives by pose and nuisances.
 
     Returns
     -------
     value : ndarray, shape (m, channels, 6)
         (T)
     by_pose : ndarray, shape (m, channels, 6, 6)
-        By a turn and a shift in the body's axes.
+        By rotation and translation in the body's axes.
     by_nuisance : ndarray, shape (m, channels, 6, nuisances)
     """
     known, blocks, time = problem.at(state), problem.blocks, problem.time
@@ -42,7 +42,7 @@ def linearized(problem: Problem, state: State) -> tuple[Array, Array, Array]:
         )
         own = by_pose[:, k]
         if problem.turned is not None:
-            # A step in the body's axes of the epoch is another one in those of then.
+            # Convert the step from the body's axes of the epoch to those of the measurement.
             back = np.swapaxes(problem.turned[:, k], 1, 2)[:, None]
             own = (own.reshape(len(own), 6, 2, 3) @ back).reshape(own.shape)
         parts.append((value[:, k], own, by_nuisance[:, k]))
@@ -51,7 +51,7 @@ def linearized(problem: Problem, state: State) -> tuple[Array, Array, Array]:
 
 
 def by_motion(problem: Problem, state: State, by_pose: Array) -> Array:
-    """Return what one sigma of the motion does to the phasors, shape (m, channels, 6, 3).
+    """Return the effect of one sigma of the motion on the phasors, shape (m, channels, 6, 3).
 
     Parameters
     ----------
@@ -64,12 +64,12 @@ def by_motion(problem: Problem, state: State, by_pose: Array) -> Array:
 
 
 def _apart(problem: Problem) -> bool:
-    """Tell whether channels have poses of their own."""
+    """Return whether channels have separate poses."""
     return problem.turned is not None or problem.motion is not None
 
 
 def _pose(problem: Problem, state: State, channel: int) -> tuple[Array, Array]:
-    """Return attitudes and positions when a channel was measured."""
+    """Return attitudes and positions at the measurement of a channel."""
     rotation, position = state.rotation, state.position
     if problem.turned is not None:
         rotation = rotation @ problem.turned[:, channel]

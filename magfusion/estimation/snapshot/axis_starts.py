@@ -1,9 +1,9 @@
-"""Where the fix of a receiver may start that lacks components: one or two axes, or a gap of three.
+"""Initial states for the fix of a receiver with one or two axes, or with missing components.
 
-No Gram matrix of three components tells a range then.  What each axis ``s`` measures of a beacon is
-``s . B_j(p)``, so a grid of places about the beacons is asked in closed form, as for a coil alone
-(`magfusion.estimation.snapshot.coil_starts`); the axes that fit best there must then be as long,
-and lie to one another, as those of the receiver do.
+The Gram matrix of three components, which gives the range, is then not available.  An axis ``s``
+measures ``s . B_j(p)`` of a beacon, so that a grid of positions around the beacons is evaluated in
+closed form, as for a single coil (`magfusion.estimation.snapshot.coil_starts`).  The axes that fit
+best there must then have the lengths and angles of the receiver's axes.
 """
 
 from dataclasses import dataclass, field
@@ -27,14 +27,14 @@ from magfusion.model.one_axis import least_turn
 from magfusion.model.parameters import predict_channels
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
-KEPT = 24  # places of the grid that are refined roughly
-SHAPE = 0.2  # error of the axes that are found there, of their length
-LEAST_TURN = 1e-6  # weight of the world's axes: of all turns that are left open the smallest
+KEPT = 24  # positions of the grid that are refined roughly
+SHAPE = 0.2  # error of the axes fitted there, relative to their length
+LEAST_TURN = 1e-6  # weight of the world's axes, to select the smallest of the open rotations
 _TINY = 1e-300
 
 
 def starts_on_grid(problem: Problem) -> tuple[State, int]:
-    """Return the likeliest states of epochs that lack components, so many rows an epoch.
+    """Return the most probable states of epochs that lack components, so many rows an epoch.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def starts_on_grid(problem: Problem) -> tuple[State, int]:
     Raises
     ------
     EstimationError
-        Where no grid can be laid about the beacons.
+        Where no grid can be built around the beacons.
     """
     asked = _Asked.of(problem)
     found = [asked.starts(row) for row in range(len(problem.time))]
@@ -62,7 +62,7 @@ def starts_on_grid(problem: Problem) -> tuple[State, int]:
 
 
 def mirrored(problem: Problem, state: State) -> State:
-    """Return states on the other side of the plane that the beacons are nearest to."""
+    """Return states mirrored in the plane that the beacons are nearest to."""
     middle, turn = mirror(problem.calibration.site)
     lever = problem.calibration.site.platform.magnetometer.position_body
     place, rotation = state.position + state.rotation @ lever, turn @ state.rotation
@@ -71,14 +71,14 @@ def mirrored(problem: Problem, state: State) -> State:
 
 
 def with_least_roll(problem: Problem, state: State) -> State:
-    """Return states with the smallest turn where nothing tells the roll about the one axis heard.
+    """Return states with the smallest rotation if the roll about the received axis is open.
 
-    Equal epochs have equal poses then, wherever they began.
+    Equal epochs then have equal poses, whatever the start.
 
     Parameters
     ----------
     problem : Problem
-        Of the same rows.
+        For the same rows.
     """
     informed = problem.prior is not None and problem.prior.sqrt_information is not None
     heard = np.any(np.einsum("...ii->...i", problem.sqrt_information) > 0.0, axis=1)
@@ -97,7 +97,7 @@ def with_least_roll(problem: Problem, state: State) -> State:
 
 
 def phases_of(problem: Problem, state: State, free: BoolArray) -> Array:
-    """Return the drive phases with which states explain the phasors best, (m, channels)."""
+    """Return the drive phases that fit the phasors best at each state, (m, channels)."""
     seen = predict_channels(problem.at(state), problem.time, state.rotation, state.position)
     measured = problem.measured[..., :3] + 1j * problem.measured[..., 3:]
     there = np.einsum("...ii->...i", problem.sqrt_information) > 0.0
@@ -107,7 +107,7 @@ def phases_of(problem: Problem, state: State, free: BoolArray) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Asked:
-    """The grid, and what each axis measured at every epoch.
+    """Grid, and the measurements of each axis at every epoch.
 
     Parameters
     ----------
@@ -115,11 +115,11 @@ class _Asked:
         (T)
     there : bool ndarray, shape (n, channels, 3)
     sigma : ndarray, shape (n, channels, 3)
-        Of either part (T).
+        Of the real and of the imaginary part (T).
     axes_body : ndarray, shape (3, 3)
         The receiver's axes, row by row, each times its gain.
     free : bool ndarray, shape (channels,)
-        Whose drive phase is unknown: where one is, signs are left out of the grid.
+        Channels of unknown drive phase: with any, the grid ignores signs.
     """
 
     problem: Problem
@@ -133,7 +133,7 @@ class _Asked:
 
     @staticmethod
     def of(problem: Problem) -> "_Asked":
-        """Return the epochs of a problem."""
+        """Return the grid and measurements of a problem."""
         site, known = problem.calibration.site, at_point(problem.calibration)
         sensor = site.platform.magnetometer
         free = np.concatenate([np.full(len(b.tones), not b.synchronised) for b in site.beacons])
@@ -152,11 +152,11 @@ class _Asked:
 
     @property
     def signed(self) -> bool:
-        """Whether phases tell signs."""
+        """Whether phases determine signs."""
         return not np.any(self.free)
 
     def starts(self, row: int) -> tuple[Array, Array]:
-        """Return attitudes of the body and places of the receiver at an epoch, the likeliest."""
+        """Return the most probable attitudes of the body and receiver positions at an epoch."""
         own = np.flatnonzero(np.any(self.there[row], axis=0))
         cost = np.zeros(len(self.grid.places_world))
         for k in own:
@@ -176,14 +176,14 @@ class _Asked:
         return np.concatenate(turns), np.concatenate([place, place])
 
     def _rows(self, row: int, k: int) -> tuple[Array, BoolArray]:
-        """Return what an axis measured as rows of the grid's design, and which are there."""
+        """Return the measurements of an axis as rows of the grid's design, and which exist."""
         value, there = self.phasor[row, :, k], self.there[row, :, k]
         if not self.signed:
             return np.abs(value) ** 2, there
         return np.concatenate([value.real, value.imag]), np.concatenate([there, there])
 
     def _misfit(self, row: int, k: int) -> Array:
-        """Return what no axis explains at each place, shape (g,), in shares of the field there."""
+        """Return the relative residual of the best axis at each position, shape (g,)."""
         given, there = self._rows(row, k)
         scale, basis = self._basis(there)
         target = np.where(there, given, 0.0) * scale
@@ -192,17 +192,17 @@ class _Asked:
         return np.asarray(1.0 - np.sum(along**2, axis=1) / np.maximum(total, _TINY))
 
     def _basis(self, there: BoolArray) -> tuple[Array, Array]:
-        """Return the weights of rows at each place, and a basis of all that axes make of them."""
+        """Return the weights of rows at each position, and a basis of all predictions there."""
         if there.tobytes() not in self.bases:
             scale = np.where(there, self.grid.scale, 0.0)
             left, size, _ = np.linalg.svd(self.grid.design * scale[..., None], full_matrices=False)
             felt = (size > FLAT * size[:, :1])[:, None]
-            self.bases.clear()  # of the usual pattern alone
+            self.bases.clear()  # cache the latest pattern only
             self.bases[there.tobytes()] = scale, np.where(felt, left, 0.0)
         return self.bases[there.tobytes()]
 
     def _axes(self, row: int, k: int, best: IntArray) -> tuple[Array, Array]:
-        """Return the axis that fits best at places, shape (m, 3), and its chi square."""
+        """Return the axis that fits best at positions, shape (m, 3), and its chi square."""
         given, there = self._rows(row, k)
         size = np.abs(self.phasor[row, :, k]) * self.there[row, :, k]
         noise = np.where(self.there[row, :, k], self.sigma[row, :, k], 1.0)
@@ -216,7 +216,7 @@ class _Asked:
         return axes, np.sum(left**2, axis=1)
 
     def _one_sign(self, row: int, own: IntArray, axes: Array, places: IntArray) -> Array:
-        """Return axes whose signs agree with the first's: their phasors have the same phase."""
+        """Return axes with signs consistent with the first: their phasors have equal phase."""
         seen = np.einsum("gcx,gax->gac", self.grid.field[places], axes)
         measured = np.where(self.there[row], self.phasor[row], 0.0).T[own]
         ours = np.real(seen[:, :1] * np.conj(seen))
@@ -225,7 +225,7 @@ class _Asked:
         return np.asarray(sign[..., None] * axes)
 
     def _turns(self, row: int, own: IntArray, axes: Array) -> Array:
-        """Return the attitudes whose axes point as they were found, shape (m, 3, 3)."""
+        """Return the attitudes that align the body's axes with those fitted, shape (m, 3, 3)."""
         length = np.linalg.norm(axes, axis=-1, keepdims=True)
         body = self.axes_body[own]
         body = body / np.linalg.norm(body, axis=-1, keepdims=True)
@@ -237,7 +237,7 @@ class _Asked:
 
 
 def _misshapen(axes: Array, body: Array) -> Array:
-    """Return how far axes (m, k, 3) are from being turned ones of the body, as a chi square."""
+    """Return the chi square of axes (m, k, 3) against rotated axes of the body."""
     gain = np.linalg.norm(body, axis=-1)
     unit, own = axes / gain[:, None], body / gain[:, None]
     product = unit @ np.swapaxes(unit, 1, 2) - own @ own.T

@@ -1,8 +1,8 @@
-"""Where a fix may start: positions and attitudes that one epoch allows, without a prior guess.
+"""Initial positions and attitudes for a fix of one epoch, without a prior guess.
 
-Positions come from what does not depend on the attitude: the Gram matrix of a beacon's phasors
-gives its range exactly, and its direction up to the mirrors of the dipole.  Attitudes come from
-Wahba's problem over all phasors at each position.
+Positions come from attitude-independent quantities: the Gram matrix of a beacon's phasors gives its
+range exactly, and its direction up to the mirror images of the dipole.  Attitudes come from Wahba's
+problem over all phasors at each position.
 """
 
 from itertools import combinations, product
@@ -15,13 +15,13 @@ from magfusion.model.site import Beacon, Site
 from magfusion.units import MU0_OVER_4PI, Array, BoolArray, ComplexArray
 
 AROUND = 96  # directions of a beacon in conducting ground
-AZIMUTHS = 16  # of the cone that an unknown drive phase leaves
+AZIMUTHS = 16  # on the cone that an unknown drive phase leaves open
 ALTERNATIONS = 4  # between attitude and drive phases
 _TINY = 1e-300
 
 
 def beacon_directions(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Array]:
-    """Return directions and ranges from a beacon that its phasors allow at any attitude.
+    """Return directions and ranges from a beacon consistent with its phasors at any attitude.
 
     Parameters
     ----------
@@ -44,9 +44,9 @@ def beacon_directions(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Arra
 
 
 def _polarities(beacon: Beacon, phasor: ComplexArray) -> list[ComplexArray]:
-    """Return phasors with each tone's phase undone, once for every polarity against the first tone.
+    """Return phasors with each tone's phase removed, for every polarity against the first tone.
 
-    Where one coil alone drives a tone its phasor is a real vector but for the phase.
+    If a single coil drives a tone, its phasor is a real vector times a phase factor.
     """
     declared = np.angle(np.sum(beacon.excitation, axis=0))
     lag = 0.5 * np.angle(np.sum(phasor**2, axis=-1)) - declared
@@ -64,7 +64,7 @@ def _directions(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Array]:
     if rank == 1:
         direction = np.broadcast_to(sphere(48), (len(phasor), 48, 3))
     else:
-        # Columns: the field of a unit moment along each of the principal drive axes.
+        # Columns: field of a unit moment along each of the principal drive axes.
         unit = np.swapaxes(measured, 1, 2) @ right[:rank].T / size[:rank]
         gram = np.swapaxes(unit, 1, 2) @ unit
         power, axes = np.linalg.eigh(gram)
@@ -80,9 +80,10 @@ def _directions(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Array]:
 
 
 def _directions_in_ground(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Array]:
-    """Return directions all around, each at the range whose field is as strong as the phasors.
+    """Return directions all around, each with the range that matches the phasors' amplitude.
 
-    What lags is no Gram matrix of real fields; but along any direction it grows weaker with range.
+    With a phase lag there is no Gram matrix of real fields; but along any direction the field
+    decreases with range.
     """
     direction = sphere(AROUND)
     distance = range_of_strength(beacon, phasor, direction)
@@ -90,7 +91,7 @@ def _directions_in_ground(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, 
 
 
 def _planar_directions(beacon: Beacon, power: Array, axes: Array, left: Array) -> Array:
-    """Return the directions that a two-axis beacon's Gram matrix leaves.
+    """Return the directions consistent with a two-axis beacon's Gram matrix.
 
     Its eigenvalues are ``(K/r^3)^2 {1, 1 + 3 s^2}``, s the sine of the angle from the normal.
     """
@@ -109,7 +110,7 @@ def _planar_directions(beacon: Beacon, power: Array, axes: Array, left: Array) -
 
 
 def positions(calibration: Calibration, phasor: ComplexArray, weight: Array, keep: int) -> Array:
-    """Return the sensor positions that agree best in what does not depend on attitude.
+    """Return the sensor positions that agree best in attitude-independent quantities.
 
     Parameters
     ----------
@@ -146,7 +147,7 @@ def positions(calibration: Calibration, phasor: ComplexArray, weight: Array, kee
 
 
 def _invariants(phasor: ComplexArray) -> Array:
-    """Squared axes of a phasor's ellipse as half their sum and half their difference."""
+    """Return half the sum and half the difference of a phasor ellipse's squared axes."""
     power = np.sum(np.abs(phasor) ** 2, axis=-1)
     return np.stack([power, np.abs(np.sum(phasor**2, axis=-1))], axis=-1) / 2.0
 
@@ -164,10 +165,10 @@ def _invariant_cost(
 
 
 def _predicted_at(calibration: Calibration, sensor_world: Array) -> ComplexArray:
-    """Phasors in world axes at sensor positions (n, c, 3), drive phase zero."""
+    """Return phasors in world axes at sensor positions (n, c, 3), drive phase zero."""
     site = calibration.site
     sensor = site.platform.magnetometer
-    # A body whose sensor axes are the world's; the matrix is undone.
+    # A body whose sensor axes are the world's; the matrix is inverted.
     world_from_body = np.broadcast_to(sensor.body_from_sensor.T, (*sensor_world.shape, 3))
     body = sensor_world - sensor.body_from_sensor.T @ sensor.position_body
     still = initial_calibration(site, 0.0)
@@ -212,7 +213,7 @@ def attitudes(
     -------
     world_from_sensor : ndarray, shape (n, c, 3, 3)
     phase : ndarray, shape (n, c, channels)
-        (rad); zero where it is not free.
+        (rad); zero where it is known.
     """
     world = _predicted_at(calibration, sensor_world)
     measured, share = phasor[:, None], weight[:, None]
@@ -246,7 +247,7 @@ def _normal(phasor: ComplexArray) -> Array:
 
 
 def _between_tones(site: Site, world: ComplexArray, measured: ComplexArray, power: Array) -> Array:
-    """Correlate the planes of tones of one coil each, which do not depend on the phases either."""
+    """Correlate the planes of single-coil tones, which do not depend on the phases either."""
     one_coil = np.concatenate([np.count_nonzero(b.excitation, axis=0) == 1 for b in site.beacons])
     out = np.zeros((*world.shape[:2], 3, 3))
     for pair in combinations(np.flatnonzero(one_coil & np.any(power > 0, axis=(0, 1))), 2):
@@ -264,7 +265,7 @@ def _long_axis(phasor: ComplexArray) -> Array:
 
 
 def _plane(axes: Array) -> Array:
-    """Return the normal of two axes (..., 2, 3), whatever their signs; short where unsure."""
+    """Return the normal of two axes (..., 2, 3), independent of their signs; short if uncertain."""
     a, b = axes[..., 0, :], axes[..., 1, :]
     return np.cross(a, b) * np.sum(a * b, axis=-1, keepdims=True)
 

@@ -1,7 +1,7 @@
-"""The fix of a receiver of one axis: where its coil is, and where that points.
+"""Fix of a receiver of one axis: position and direction of its coil.
 
-The likeliest places of a grid are refined together with the axis on the one measurement model.  The
-roll about the coil bears on nothing.
+The most probable positions of a grid are refined together with the axis on the measurement model.
+The roll about the coil has no effect.
 """
 
 from dataclasses import dataclass, replace
@@ -31,25 +31,25 @@ from magfusion.model.parameters import Calibration, linearize_channels, predict_
 from magfusion.model.site import Magnetometer, Site
 from magfusion.units import Array, BoolArray, IntArray
 
-ALIKE = 1e-3  # of the distance; hypotheses nearer to one another are one
-RIVAL = 25.0  # chi square above the best, from which a place is none
-SOFT_EDGE = 0.02  # of the distance; nobody declares a plane more sharply
-LEAST_GAIN_SIGMA = 1e-4  # nobody knows it better
-UNKNOWNS = 6  # of place, direction and gain
+ALIKE = 1e-3  # of the distance; hypotheses closer to one another are one
+RIVAL = 25.0  # chi square above the best, from which a hypothesis is dropped
+SOFT_EDGE = 0.02  # of the distance; uncertainty of a declared plane
+LEAST_GAIN_SIGMA = 1e-4  # lower bound of a declared sigma
+UNKNOWNS = 6  # of position, direction and gain
 CHUNK = 200  # epochs refined at once
-REFINED, MIRRORED = 12, 3  # rough starts that go on, and ends whose mirrors are asked
+REFINED, MIRRORED = 12, 3  # rough starts that are refined, and results whose mirrors are tried
 ROUGH_PASSES = 20
-ROUGH = 1e-4  # relative fall of the cost below which a start is good enough
+ROUGH = 1e-4  # relative decrease of the cost below which a start has converged
 
 
 class Gain(NamedTuple):
-    """What is known of a coil's gain.
+    """Prior of a coil's gain.
 
     Parameters
     ----------
     nominal : float
     sigma : float
-        Standard deviation of its logarithm; infinite where nothing is known of it.
+        Standard deviation of its logarithm; infinite if it is unknown.
     """
 
     nominal: float = 1.0
@@ -57,7 +57,7 @@ class Gain(NamedTuple):
 
     @staticmethod
     def of(sensor: Magnetometer, *, free: bool) -> "Gain":
-        """Return that of the one axis of a magnetometer, as declared or free."""
+        """Return the gain of the one axis of a magnetometer, as declared or unknown."""
         row = "xyz".index(sensor.axes)
         nominal = float(np.linalg.norm(sensor.matrix[row]))
         sigma = float(sensor.sigma.matrix[row, row]) / nominal
@@ -66,21 +66,21 @@ class Gain(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CoilFixes:
-    """Hypotheses of a coil at each epoch, the likeliest first.
+    """Hypotheses of a coil at each epoch, the most probable first.
 
     Parameters
     ----------
     position_world : ndarray, shape (n, hypotheses, 3)
         Of the coil (m).
     axis_world : ndarray, shape (n, hypotheses, 3)
-        Its axis times its gain; of unknown sign where the amplitudes have none.
+        Its axis times its gain; of unknown sign if the amplitudes have none.
     cov : ndarray, shape (n, hypotheses, 6, 6)
-        Of both.
+        Of position and axis.
     cost : ndarray, shape (n, hypotheses)
         Minus twice the logarithm of their likelihood, the first of each epoch its chi square;
-        infinite where an epoch has fewer.
+        infinite if an epoch has fewer.
     determined : bool ndarray, shape (n, hypotheses)
-        False where place, direction or gain is open.
+        False where position, direction or gain is open.
     freedom : ndarray, shape (n,)
         Degrees of freedom of the chi square.
     """
@@ -94,19 +94,19 @@ class CoilFixes:
 
 
 def fix_coil(epochs: CoilEpochs, calibration: Calibration, gain: Gain) -> CoilFixes:
-    """Return where the coil is at each epoch, and where it points.
+    """Return position and direction of the coil at each epoch.
 
     Parameters
     ----------
     epochs : CoilEpochs
-        One at least.
+        At least one.
     gain : Gain
         Of the coil.
 
     Raises
     ------
     EstimationError
-        Where the declared region holds no place that could be asked.
+        Where the declared region contains no position to test.
     """
     known = at_point(calibration)
     places = grid_about(known.site)
@@ -120,7 +120,7 @@ def fix_coil(epochs: CoilEpochs, calibration: Calibration, gain: Gain) -> CoilFi
 
 
 class _Refined(NamedTuple):
-    """Where the starts of epochs ended."""
+    """Refined states of the starts of epochs."""
 
     state: Array  # (n, starts, 6)
     cov: Array  # (n, starts, 6, 6)
@@ -130,7 +130,7 @@ class _Refined(NamedTuple):
     freedom: Array  # (n,)
 
     def beside(self, other: "_Refined") -> "_Refined":
-        """Return these ends and others of the same epochs."""
+        """Return these results and others of the same epochs."""
         return _Refined(
             np.concatenate([self.state, other.state], axis=1),
             np.concatenate([self.cov, other.cov], axis=1),
@@ -149,8 +149,8 @@ def _refined(epochs: CoilEpochs, known: Calibration, gain: Gain, grid: Grid) -> 
     problem, points = _Problem(epochs, known, gain), _Problem(epochs, _of_points(known), gain)
     start = np.concatenate([place, axis], axis=2).reshape(-1, 6)
     owner = np.repeat(np.arange(len(epochs)), count)
-    # A place of the grid is only nearly right: at full weight some end in the next valley, and
-    # there dipoles are as good as coils of true size.
+    # Grid positions are approximate: with full weights some converge to the wrong minimum, and
+    # there dipoles are as good as coils of finite size.
     soft = points.of(owner, softened(epochs)[owner])
     rough = minimise(soft, start, relative=ROUGH, passes=ROUGH_PASSES)
     order = np.argsort(rough.cost.reshape(-1, count), axis=1, kind="stable")[:, :REFINED]
@@ -158,7 +158,7 @@ def _refined(epochs: CoilEpochs, known: Calibration, gain: Gain, grid: Grid) -> 
     found = _solved(problem, best)
     order = np.argsort(found.cost, axis=1, kind="stable")[:, :MIRRORED]
     best = np.take_along_axis(found.state, order[..., None], axis=1)
-    # An amplitude whose sign was taken wrongly holds it in a false minimum, which is shallow.
+    # An amplitude with a wrong sign keeps it in a false minimum, which is shallow.
     owner = np.repeat(np.arange(len(epochs)), best.shape[1])
     soft = problem.of(owner, softened(epochs)[owner])
     eased = minimise(soft, best.reshape(-1, 6), relative=ROUGH, passes=ROUGH_PASSES)
@@ -168,24 +168,24 @@ def _refined(epochs: CoilEpochs, known: Calibration, gain: Gain, grid: Grid) -> 
 
 
 def _solved(problem: "_Problem", start: Array) -> _Refined:
-    """Return where starts end, shape (n, starts, 6), at the weights of these."""
+    """Refine starts, shape (n, starts, 6), with their weights."""
     epochs, site, count = problem.epochs, problem.calibration.site, start.shape[1]
     start = start.reshape(-1, 6)
     owner = np.repeat(np.arange(len(epochs)), count)
     sigma = problem.sigma(owner, start)
     solved = minimise(problem.of(owner, sigma), start)
     state, chi_square = solved.state.reshape(-1, count, 6), solved.cost.reshape(-1, count)
-    # The weights are those of each place: where they are small, that it explains all is no wonder.
+    # Weights differ by position: where they are small, a small residual is no evidence.
     share = np.sum(np.log(sigma / problem.sigma(owner, None)), axis=1).reshape(-1, count)
     cost = chi_square + share * (4.0 if epochs.signed else 2.0)
-    # In units of the gain, which may be any: what is open is then told by its direction alone.
+    # In units of the gain, which may have any value: openness then depends on direction alone.
     unit = np.ones((len(solved.state), 6))
     unit[:, 3:] = np.linalg.norm(solved.state[:, 3:], axis=1, keepdims=True)
     square = unit[:, :, None] * unit[:, None, :]
     inverse, determined = open_inverse(solved.information * square)
     cov = (inverse * square).reshape(-1, count, 6, 6)
     cost = cost + _outside(site, state[..., :3], cov[..., :3, :3])
-    if not epochs.signed:  # of both signs the one that points up
+    if not epochs.signed:  # of both signs, the one that points up
         sign = np.ones_like(state)
         sign[..., 3:] = np.where(state[..., 5:] < 0.0, -1.0, 1.0)
         state, cov = sign * state, sign[..., :, None] * cov * sign[..., None, :]
@@ -195,7 +195,7 @@ def _solved(problem: "_Problem", start: Array) -> _Refined:
 
 
 def _mirrored(state: Array, site: Site) -> Array:
-    """Return states on the other side of the plane to which the beacons are nearest."""
+    """Return states mirrored in the plane to which the beacons are nearest."""
     middle, turn = mirror(site)
     return np.concatenate([middle - (state[..., :3] - middle) @ turn, state[..., 3:] @ turn], -1)
 
@@ -206,7 +206,7 @@ def _of_points(calibration: Calibration) -> Calibration:
 
 
 def _outside(site: Site, place: Array, cov: Array) -> Array:
-    """Return what being outside of the region costs hypotheses, shape (n, hypotheses)."""
+    """Return the cost of hypotheses outside of the region, shape (n, hypotheses)."""
     if site.bounds is None:
         return np.zeros(place.shape[:-1])
     margin, normal = site.bounds.margin(place), site.bounds.normal_world
@@ -223,7 +223,7 @@ def _distances(site: Site, place: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Place and axis of the coil at every epoch."""
+    """Position and axis of the coil at every epoch."""
 
     epochs: CoilEpochs
     calibration: Calibration
@@ -238,7 +238,7 @@ class _Problem:
         return model
 
     def sigma(self, epoch: IntArray, state: Array | None) -> Array:
-        """Return the errors of channels at states, or of noise alone, shape (k, channels) (T)."""
+        """Return the errors of channels at states, or noise alone, shape (k, channels) (T)."""
         there = np.isfinite(self.epochs.measured[epoch])
         noise = np.where(there, self.epochs.sigma[epoch], 1.0)
         if state is None:
@@ -248,7 +248,7 @@ class _Problem:
         field = predict_channels(self.calibration, self.epochs.time[epoch], attitude, place)
         size = np.linalg.norm(field, axis=2) * np.linalg.norm(axis, axis=1, keepdims=True)
         error = self._error(place) * size / np.sqrt(3.0)
-        if self.epochs.swing is not None:  # which way nobody knows: the roll is open
+        if self.epochs.swing is not None:  # in an unknown direction, as the roll is open
             error = np.hypot(error, self.epochs.swing[epoch] * size / np.sqrt(2.0))
         if self.epochs.shift is not None:  # a dipole's field falls with the third power
             away = _distances(self.calibration.site, place)[:, self.calibration.site.owner]
@@ -256,7 +256,7 @@ class _Problem:
         return np.asarray(np.where(there, np.hypot(noise, error), 1.0))
 
     def normal(self, epoch: IntArray, state: Array, sigma: Array) -> Normal:
-        """Return the normal equations at states of place and axis, shape (k, 6)."""
+        """Return the normal equations at states of position and axis, shape (k, 6)."""
         place, axis, count = state[:, :3], state[:, 3:], len(state)
         attitude = np.broadcast_to(np.eye(3), (count, 3, 3))
         value, by_pose, _ = linearize_channels(
@@ -290,14 +290,14 @@ class _Problem:
         return normal_equations(residual, rows)
 
     def _error(self, place: Array) -> Array:
-        """Return the relative error of each channel that model and survey leave, (k, channels)."""
+        """Return the relative model and survey error of each channel, (k, channels)."""
         site = self.calibration.site
         survey = calibration_error(site, _distances(site, place))[:, site.owner]
         return np.hypot(model_error(site, place[:, None]), survey)
 
 
 def _ranked(found: _Refined, middle: Array) -> CoilFixes:
-    """Return the hypotheses that differ, and of which none is much less likely than the best."""
+    """Return the distinct hypotheses that are not much less probable than the best."""
     kept: list[list[int]] = []
     for row, costs in zip(found.state, found.cost, strict=True):
         own: list[int] = []

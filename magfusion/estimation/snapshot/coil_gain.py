@@ -1,4 +1,4 @@
-"""The gain of a coil that nobody measured, from single epochs: where a smoother begins."""
+"""Initial estimate of an unknown coil gain for a smoother, from single epochs."""
 
 from dataclasses import replace
 
@@ -13,14 +13,14 @@ from magfusion.model.site import Site
 
 ASKED = 60  # epochs, spread over a log
 LEAST = 5  # of them, that determine a gain
-LEAST_SIGMA = 0.01  # of the logarithm; model errors are alike in all epochs
+LEAST_SIGMA = 0.01  # of the logarithm; model errors are common to all epochs
 TO_SIGMA = 1.4826  # of the median deviation
 
 
 def with_found_gain(fields: FieldSamples, site: Site) -> Site:
-    """Return a site whose one axis has the gain that its epochs tell, with how they scatter.
+    """Return a site whose one axis has the gain estimated from its epochs, with their scatter.
 
-    What is declared of it has no part; the smoother estimates it further, from that prior.
+    Its declared value is not used; the smoother estimates it further, from that prior.
 
     Parameters
     ----------
@@ -46,8 +46,9 @@ def with_found_gain(fields: FieldSamples, site: Site) -> Site:
         log_gain = np.log(size[found.determined[:, 0]])
     if len(log_gain) < LEAST:
         raise EstimationError(
-            f"{len(log_gain)} epochs determine the gain of the coil beside its place and direction,"
-            f" and {LEAST} are needed: add beacons, or declare the gain as magnetometer.matrix"
+            f"{len(log_gain)} epochs determine the gain of the coil together with its position and"
+            f" direction; {LEAST} are needed: add beacons, or declare the gain as"
+            " magnetometer.matrix"
         )
     middle = float(np.median(log_gain))
     scatter = TO_SIGMA * float(np.median(np.abs(log_gain - middle)))

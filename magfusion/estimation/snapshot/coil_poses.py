@@ -1,4 +1,4 @@
-"""The poses of a platform whose receiver has one axis, and what is to be said of them."""
+"""Poses of a platform whose receiver has one axis, and their findings."""
 
 from dataclasses import dataclass, replace
 
@@ -16,23 +16,23 @@ from magfusion.model.trajectory import Trajectory, interpolate
 from magfusion.model.trust import Finding, StateTrust, Trust, Verdict
 from magfusion.units import Array, BoolArray
 
-AMBIGUOUS = 0.05  # posterior share of a rival that is said
-FEW = 0.1  # share of the epochs; more of them cast doubt
+AMBIGUOUS = 0.05  # posterior share from which an alternative is reported
+FEW = 0.1  # share of the epochs; a larger one casts doubt
 LONGEST_STEP = 0.1  # s; of a truth that is interpolated
 
 
 def poses_of(found: CoilFixes, time: Array, site: Site, *, signed: bool) -> Fixes:
-    """Return the poses that a coil's places and directions leave, the roll chosen and open.
+    """Return the poses for a coil's positions and directions, with an arbitrary, open roll.
 
-    Of all turns that point the axis as it was found the smallest is taken, so that equal epochs
-    have equal poses.
+    The smallest rotation that aligns the axis is selected, so that equal epochs have equal
+    poses.
 
     Parameters
     ----------
     time : ndarray, shape (n,)
         (s)
     signed : bool
-        Whether it is known which way the axis points.
+        Whether the sense of the axis is known.
     """
     sensor = site.platform.magnetometer
     lever_body, sigma = coil_lever(sensor), sensor.sigma
@@ -41,7 +41,7 @@ def poses_of(found: CoilFixes, time: Array, site: Site, *, signed: bool) -> Fixe
     rotation = least_turn(axis_of(sensor), towards)
     back = np.swapaxes(rotation, -1, -2)
     lever = rotation @ lever_body
-    # By the turn (world axes) and the place of the coil: the body moves about the coil.
+    # By rotation (world axes) and position of the coil: the body moves about the coil.
     by_axis = np.zeros((*gain.shape, 6, 6))
     by_axis[..., :3, 3:] = skew(towards) / gain[..., None, None]
     by_axis[..., 3:, :3] = np.eye(3)
@@ -50,7 +50,7 @@ def poses_of(found: CoilFixes, time: Array, site: Site, *, signed: bool) -> Fixe
     cov += ANY_ROLL**2 * _outer(np.concatenate([towards, np.cross(lever, towards)], axis=-1))
     along = np.sum(lever * towards, axis=-1, keepdims=True) * towards
     cov[..., 3:, 3:] += CIRCLE * _outer(lever - along)  # about the coil on a circle, not a tangent
-    if not signed:  # twice as far in half of the cases
+    if not signed:  # at twice the distance in half of the cases
         cov[..., 3:, 3:] += 2.0 * _outer(along)
     body = np.zeros_like(cov)
     body[..., :3, :3] = body[..., 3:, 3:] = back
@@ -68,7 +68,7 @@ def poses_of(found: CoilFixes, time: Array, site: Site, *, signed: bool) -> Fixe
         cost=found.cost,
         residual_rms=np.sqrt(found.cost / freedom),
         phase=np.zeros(shape),
-        determined=np.zeros(gain.shape, dtype=bool),  # the roll never is
+        determined=np.zeros(gain.shape, dtype=bool),  # the roll is never determined
         log_gain=np.broadcast_to(np.log(gain)[..., None], shape).copy(),
         gravity_cost=np.zeros(gain.shape),
         prior_cost=np.zeros(gain.shape),
@@ -80,7 +80,7 @@ def _outer(vector: Array) -> Array:
 
 
 def axis_sigma(found: CoilFixes) -> Array:
-    """Return the standard deviation of the axis across itself, shape (n, hypotheses) (rad)."""
+    """Return the standard deviation of the axis' direction, shape (n, hypotheses) (rad)."""
     gain = np.linalg.norm(found.axis_world, axis=-1)
     across = skew(found.axis_world / gain[..., None]) / gain[..., None, None]
     square = across @ found.cov[..., 3:, 3:] @ np.swapaxes(across, -1, -2)
@@ -88,9 +88,9 @@ def axis_sigma(found: CoilFixes) -> Array:
 
 
 def nearest_truth(truth: Trajectory, poses: Trajectory, site: Site, *, signed: bool) -> Trajectory:
-    """Return the true poses, turned about the coil to the roll (and sign) that a fix chose.
+    """Return the true poses, rotated about the coil to the roll (and sign) selected by a fix.
 
-    An error against them is one of place and direction: of five degrees of freedom.
+    An error against them is one of position and direction: of five degrees of freedom.
     """
     true, there = interpolate(truth, poses.time, LONGEST_STEP)
     if not len(true):
@@ -106,7 +106,7 @@ def nearest_truth(truth: Trajectory, poses: Trajectory, site: Site, *, signed: b
 
 
 def nearest_told(fixes: Fixes, truth: Trajectory, site: Site) -> tuple[Trajectory, BoolArray]:
-    """Return of every epoch the place told that is nearest to the truth, and where it is not first.
+    """Return the hypothesis nearest to the truth at each epoch, and where it is not the first.
 
     Parameters
     ----------
@@ -134,12 +134,12 @@ def nearest_told(fixes: Fixes, truth: Trajectory, site: Site) -> tuple[Trajector
 
 @dataclass(frozen=True, eq=False)
 class JudgedPoses:
-    """Poses whose covariances cover rivals and residuals, and what is to be said of them.
+    """Poses whose covariances cover alternatives and residuals, with findings.
 
     Parameters
     ----------
     alone : Fixes
-        Of whose covariances each is that of its own hypothesis.
+        Each with the covariance of its own hypothesis.
     """
 
     fixes: Fixes
@@ -154,7 +154,7 @@ def judged_poses(fixes: Fixes, found: CoilFixes, left_out: int, *, signed: bool)
     Parameters
     ----------
     left_out : int
-        Epochs of too few channels.
+        Epochs with too few channels.
     """
     count = len(fixes)
     log_p = log_p_chi_square(found.cost[:, 0], np.maximum(found.freedom, 1.0))
@@ -162,12 +162,12 @@ def judged_poses(fixes: Fixes, found: CoilFixes, left_out: int, *, signed: bool)
     share, open_ = fixes.probability, ~found.determined[:, 0]
     rival = share[:, 1] > AMBIGUOUS if share.shape[1] > 1 else np.zeros(count, dtype=bool)
     roll = (
-        "One axis tells nothing of the roll about it: a roll is chosen, and its sigma is that of"
-        " any. Place and direction are told; of errors against a truth, these alone."
+        "A receiver of one axis does not determine the roll about it: an arbitrary roll is given,"
+        " with the sigma of an unknown one. Only errors of position and direction are meaningful."
     )
     turned = "" if signed else " Amplitudes have no sign: the axis may point the other way."
     median = float(np.median(found.cost[:, 0])), float(np.median(found.freedom))
-    remedy = "Check the beacons; where the common gain is not as declared, --free gain."
+    remedy = "Check the beacons, or if the common gain is not as declared, use --free gain."
     whole = unexplained("the median epoch", *median, remedy)
     excess = np.where(odd, found.cost[:, 0] / np.maximum(found.freedom, 1.0), 1.0)
     enlarged = fixes.pose_cov * np.maximum(excess, whole.excess)[:, None, None, None]
@@ -179,24 +179,25 @@ def judged_poses(fixes: Fixes, found: CoilFixes, left_out: int, *, signed: bool)
         (
             "ambiguous",
             rival,
-            "are ambiguous: fixes.parquet holds every place that explains them; declare a"
+            "are ambiguous: fixes.parquet has every position that explains them. Declare a"
             " hemisphere or region, or add a beacon that is off the plane of the others.",
         ),
         (
             "geometry",
             open_,
-            "leave place or direction of the coil open; add beacons that stand or point otherwise.",
+            "do not determine position or direction of the coil. Add beacons elsewhere or with"
+            " other directions.",
         ),
         (
             "field_residuals",
             odd & ~bool(whole.findings),
-            "have residuals that noise and model error do not explain; their covariance has been"
-            " enlarged. Look for iron, and for a beacon that is not as declared.",
+            "have residuals larger than noise and model error; their covariance has been"
+            " inflated. Look for iron, and for a beacon that is not as declared.",
         ),
     ):
         findings += _share(code, rows, what)
     if left_out:
-        text = f"{left_out} epochs hold too few beacons for place, direction and gain; left out."
+        text = f"Omitted {left_out} epochs: too few beacons for position, direction and gain."
         findings.append(Finding("few_data", text, Verdict.TRUSTWORTHY))
     none, doubt = np.full(count, np.nan), rival | odd | open_ | bool(whole.findings)
     verdicts = tuple(Verdict.DOUBTFUL if d else Verdict.TRUSTWORTHY for d in doubt.tolist())

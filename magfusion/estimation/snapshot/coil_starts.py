@@ -1,8 +1,8 @@
-"""What a receiver of one axis measured, and from where its coil is sought.
+"""Measurements of a receiver of one axis, and a grid search for its coil's position.
 
-What it measures of each beacon is one number, ``u . B_j(p)`` with u the coil's axis times its gain:
-linear in u where the place is given, and its square linear in ``u u^T`` where its sign is not
-known.  So a grid of places about the beacons is asked in closed form.
+The measurement of a beacon is one number, ``u . B_j(p)`` with u the coil's axis times its gain:
+linear in u at a given position, and its square linear in ``u u^T`` if its sign is unknown.  A grid
+of positions around the beacons is therefore evaluated in closed form.
 """
 
 from dataclasses import dataclass, replace
@@ -17,18 +17,18 @@ from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Beacon, Magnetometer, MagnetometerSigma, Site
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
-DIRECTIONS, RADII = 400, 28  # of the grid about the beacons
+DIRECTIONS, RADII = 400, 28  # of the grid around the beacons
 NEAREST, FARTHEST = 0.15, 8.0  # of their extent
-LIKELY, KEPT = 400, 40  # places of the grid that are looked at again, and that are refined
-SOFT, FLOOR = 0.1, 0.01  # error at a place of the grid: of an amplitude, of the largest
-FLAT = 1e-9  # of the largest singular value; a combination of channels that says nothing
+LIKELY, KEPT = 400, 40  # grid positions that are evaluated again, and that are refined
+SOFT, FLOOR = 0.1, 0.01  # error at a grid position: of an amplitude, of the largest
+FLAT = 1e-9  # of the largest singular value; smaller combinations of channels are unobservable
 _TINY = 1e-300
 _PAIRS = np.triu_indices(3)
 
 
 @dataclass(frozen=True, eq=False)
 class CoilEpochs:
-    """What a coil measured.
+    """Measurements of a coil.
 
     Parameters
     ----------
@@ -37,14 +37,14 @@ class CoilEpochs:
     measured : complex ndarray, shape (n, channels)
         Phasors, or amplitudes (T); NaN where missing.
     sigma : ndarray, shape (n, channels)
-        Of either part (T).
+        Of the real and of the imaginary part (T).
     signed : bool
-        Whether the phase tells the sign.
+        Whether the phase determines the sign.
     parts : ndarray, shape (channels,), optional
-        How many numbers each tells: two where its field turns and phases are known, else one.
+        Real values of each: two if its field rotates and phases are known, else one.
     swing, shift : ndarray, shape (n, channels), optional
-        How far the coil had turned since, or would (rad), and one sigma of how far it had moved
-        (m), where channels are measured in turn.
+        Rotation of the coil since the measurement, or its limit (rad), and one sigma of its
+        displacement (m), if channels are measured in turn.
     """
 
     time: Array
@@ -60,7 +60,7 @@ class CoilEpochs:
 
     @staticmethod
     def of(fields: FieldSamples, site: Site) -> "CoilEpochs":
-        """Return what the one axis measured; without a sign where some drive's phase is unknown."""
+        """Return the measurements of the one axis; unsigned if a drive's phase is unknown."""
         k = "xyz".index(fields.axes)
         measured, sigma = fields.phasor_sensor[..., k], np.sqrt(fields.phasor_cov[..., k, k].real)
         signed = fields.signed and all(beacon.synchronised for beacon in site.beacons)
@@ -74,25 +74,25 @@ class CoilEpochs:
         return CoilEpochs(*own, _swing(fields, site.platform.magnetometer), shift)
 
     def rows(self, kept: BoolArray | slice) -> "CoilEpochs":
-        """Return some epochs."""
+        """Return a subset of the epochs."""
         own = self.time[kept], self.measured[kept], self.sigma[kept]
         motion = (None if part is None else part[kept] for part in (self.swing, self.shift))
         return CoilEpochs(*own, self.signed, self.parts, *motion)
 
     @property
     def heard(self) -> IntArray:
-        """How many channels each row holds, shape (n,)."""
+        """Number of channels in each row, shape (n,)."""
         return np.asarray(np.sum(np.isfinite(self.measured), axis=1))
 
     @property
     def told(self) -> IntArray:
-        """How many numbers each row tells, shape (n,)."""
+        """Number of real values in each row, shape (n,)."""
         parts = 1 if self.parts is None else self.parts
         return np.asarray(np.sum(np.isfinite(self.measured) * parts, axis=1))
 
 
 def _swing(fields: FieldSamples, sensor: Magnetometer) -> Array | None:
-    """Return by how much the one axis swings to where it is at the time of the epoch."""
+    """Return the rotation of the one axis until the time of the epoch."""
     if fields.turned is None:
         return None
     axis = axis_of(sensor)
@@ -100,14 +100,14 @@ def _swing(fields: FieldSamples, sensor: Magnetometer) -> Array | None:
 
 
 def _turning(beacon: Beacon) -> IntArray:
-    """Return two for each tone whose field turns, and one for each that keeps its line."""
+    """Return two for each tone with a rotating field, and one for each with a fixed direction."""
     drive = beacon.moments_beacon.T @ beacon.excitation  # (3, tones)
     square = np.abs(np.sum(drive**2, axis=0))
     return np.where(square < (1.0 - 1e-9) * np.sum(np.abs(drive) ** 2, axis=0), 2, 1)
 
 
 def middle_of(beacons: tuple[Beacon, ...]) -> tuple[Array, float]:
-    """Return the middle of some beacons, shape (3,) (m), and how far they extend about it (m)."""
+    """Return the centre of some beacons, shape (3,) (m), and their extent about it (m)."""
     centres = np.array(
         [b.position_world + b.world_from_beacon @ b.centres_beacon.mean(axis=0) for b in beacons]
     )
@@ -118,7 +118,7 @@ def middle_of(beacons: tuple[Beacon, ...]) -> tuple[Array, float]:
 def mirror(site: Site) -> tuple[Array, Array]:
     """Return a point of the plane that beacons are nearest to, and half a turn about its normal.
 
-    Coils along the normal, or in the plane, look alike from both of its sides.
+    Coils along the normal, or in the plane, have equal fields on both sides.
     """
     middle, _ = middle_of(site.beacons)
     centres = np.array([beacon.position_world for beacon in site.beacons])
@@ -137,9 +137,9 @@ def at_point(calibration: Calibration) -> Calibration:
 
 
 def grid_about(site: Site) -> Array:
-    """Return places to ask, shape (g, 3) (m): on spheres about the beacons.
+    """Return positions to evaluate, shape (g, 3) (m): on spheres around the beacons.
 
-    Those outside of the region too: on the way some end on the other side, and are mirrored back.
+    Those outside of the region are included, as some converge to the other side and are mirrored.
 
     Raises
     ------
@@ -156,14 +156,14 @@ def grid_about(site: Site) -> Array:
     inside = site.bounds is None or bool(np.any(np.all(site.bounds.margin(places) > 0.0, axis=1)))
     if not inside or not extent > 0.0:
         raise EstimationError(
-            "no place within the declared region is near enough to beacons that stand apart: a"
-            " receiver of one axis is located by several of them"
+            "no position within the declared region is near enough to separate beacons: a"
+            " receiver of one axis needs several of them"
         )
     return places
 
 
 class Grid(NamedTuple):
-    """Places, and what a coil at each would measure of every axis, or pair of axes.
+    """Positions, and the response of a coil at each to every axis, or pair of axes.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ class Grid(NamedTuple):
     design : ndarray, shape (g, rows, unknowns)
         Of the axis, or of its products.
     scale : ndarray, shape (g, rows)
-        What the rows are weighed by: a share of the field counts alike everywhere.
+        Weights of the rows: relative to the field, equal everywhere.
     """
 
     places_world: Array
@@ -184,7 +184,7 @@ class Grid(NamedTuple):
 
     @staticmethod
     def of(calibration: Calibration, time: float, places_world: Array, *, signed: bool) -> "Grid":
-        """Return the places of a receiver whose axes are the world's."""
+        """Return the grid of a receiver whose axes are the world's."""
         attitude = np.broadcast_to(np.eye(3), (len(places_world), 3, 3))
         at = np.full(len(places_world), time)
         field = predict_channels(calibration, at, attitude, places_world)
@@ -198,7 +198,7 @@ class Grid(NamedTuple):
         return Grid(places_world, field, square[:, :, *_PAIRS] * twice, scale**2)
 
     def starts(self, epochs: CoilEpochs) -> tuple[Array, Array]:
-        """Return the likeliest places of each epoch, and their axes, shapes (n, kept, 3)."""
+        """Return the most probable positions of each epoch, and axes, shapes (n, kept, 3)."""
         if epochs.signed:
             given = np.concatenate([epochs.measured.real, epochs.measured.imag], axis=1)
         else:
@@ -229,7 +229,7 @@ class Grid(NamedTuple):
     def _misfit(
         self, places: IntArray, axes: Array, epochs: CoilEpochs, row: int, sigma: Array
     ) -> tuple[Array, Array]:
-        """Return the chi square of an epoch at places and axes, these scaled to make it least."""
+        """Return the chi square of an epoch at positions and axes, these optimally scaled."""
         seen = np.einsum("gcx,gx->gc", self.field[places], axes)
         if not epochs.signed:
             seen = np.abs(seen).astype(np.complex128)
@@ -243,7 +243,7 @@ class Grid(NamedTuple):
 
 
 def softened(epochs: CoilEpochs) -> Array:
-    """Return the errors of amplitudes with those of a place that is only nearly right (T)."""
+    """Return the errors of amplitudes including that of an approximate position (T)."""
     size = np.abs(np.nan_to_num(epochs.measured))
     largest = np.max(size, axis=1, keepdims=True)
     sigma = np.where(np.isfinite(epochs.measured), epochs.sigma, 1.0)
@@ -251,7 +251,7 @@ def softened(epochs: CoilEpochs) -> Array:
 
 
 def roots(pairs: Array) -> Array:
-    """Return the vectors whose products come nearest to some symmetric matrices."""
+    """Return the vectors whose outer products are nearest to symmetric matrices."""
     matrix = np.empty((len(pairs), 3, 3))
     matrix[:, *_PAIRS] = pairs
     matrix[:, _PAIRS[1], _PAIRS[0]] = pairs

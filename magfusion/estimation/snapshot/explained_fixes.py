@@ -1,8 +1,8 @@
-"""Fixes of a log in which as little is free as explains its fields.
+"""Fixes of a log with the fewest estimated parameters that explain its fields.
 
-A beacon whose gain errs from place to place, and one that stands elsewhere than declared, both
-leave residuals.  The fewest errors that explain all of them are told: none, one false beacon, and
-only then gains of every beacon.
+A beacon whose gain error varies with position, and one at another position than declared, both
+cause residuals.  The hypotheses are tried in order: no error, one faulty beacon, and only then a
+gain of every beacon.
 """
 
 from dataclasses import dataclass
@@ -22,23 +22,23 @@ from magfusion.model.samples import FieldSamples
 from magfusion.model.trust import Risk, StateTrust, Trust, Verdict
 from magfusion.units import IntArray
 
-OF_FIELDS = ("field_residuals", "separation")  # codes of what the fields say against the site
+OF_FIELDS = ("field_residuals", "separation")  # codes of inconsistent fields
 
 
 @dataclass(frozen=True, eq=False)
 class ExplainedFixes:
-    """Fixes with what is to be said of them.
+    """Fixes with their findings.
 
     Parameters
     ----------
     fixes : Fixes
-        With covariances that cover what was found.
+        With covariances that cover the findings.
     states : StateTrust
         Of each epoch.
     trust : Trust
         Of the whole.
     gain_spread : float
-        Standard deviation of the log-gains that were found beside the poses; zero where held.
+        Standard deviation of the log-gains estimated with the poses; zero if they are fixed.
     """
 
     fixes: Fixes
@@ -57,11 +57,11 @@ def explained_fixes(
     risk: Risk | None = None,
     report: Report = quiet,
 ) -> ExplainedFixes:
-    """Fix every epoch on its own, without false beacons, gains free where nothing less explains it.
+    """Fix every epoch independently, without faulty beacons, with estimated gains if necessary.
 
-    A spread of gains is asked for where the fixes that hold them, without the one beacon that is
-    false, still contradict the fields; it is taken where with it nothing does.  Where most epochs
-    hear one beacon it is not: its gain is its range, and whatever errs would pass for a place.
+    A spread of gains is estimated if the fixes with fixed gains, without the one faulty beacon,
+    still contradict the fields; it is used if it removes the contradiction.  If most epochs receive
+    one beacon it is not: its gain and range are not separable, and any error would change position.
 
     Parameters
     ----------
@@ -69,9 +69,9 @@ def explained_fixes(
         Channels in the site's order.
     gravity, survey_error, free
         As in `magfusion.estimation.snapshot.likelihood.fix_epochs`; with ``gain`` the spread is
-        asked for, and taken, in any case.
+        always estimated and used.
     risk : Risk, optional
-        What the protection levels promise.
+        Requirements for the protection levels.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def explained_fixes(
 
 @dataclass(frozen=True)
 class _How:
-    """Of what fixes are made and by what they are judged."""
+    """Inputs and risk of fixes."""
 
     samples: FieldSamples
     calibration: Calibration
@@ -123,7 +123,7 @@ class _How:
         )
 
     def judged(self, fixes: Fixes, free: tuple[str, ...], spread: float) -> ExplainedFixes:
-        """Return them without what is false, and what is to be said of them."""
+        """Exclude faulty beacons, and return the fixes with their findings."""
         separated = separate_fixes(
             self.samples,
             self.calibration,
@@ -144,14 +144,14 @@ class _How:
 
 
 def _beacons_heard(samples: FieldSamples, calibration: Calibration) -> IntArray:
-    """Return how many beacons each epoch holds, shape (n,)."""
+    """Return how many beacons each epoch has, shape (n,)."""
     site = calibration.site
     each = [np.any(samples.valid[:, site.owner == k], axis=1) for k in range(len(site.beacons))]
     return np.sum(each, axis=0)
 
 
 def _said(trust: Trust) -> list[str]:
-    """Return the codes of all that the fields say against the site."""
+    """Return the codes of all findings of inconsistent fields."""
     return [
         finding.code
         for finding in trust.findings
@@ -161,5 +161,5 @@ def _said(trust: Trust) -> list[str]:
 
 
 def _explained(trust: Trust) -> bool:
-    """Tell whether one false beacon, or none, explains all fields."""
+    """Return whether one faulty beacon, or none, explains all fields."""
     return _said(trust) in ([], ["beacon_excluded"])

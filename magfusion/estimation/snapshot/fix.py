@@ -1,4 +1,4 @@
-"""What a fix is: for each epoch the poses that explain it, best first; and what may help it."""
+"""Fix results: for each epoch the poses that explain it, best first; and the gravity input."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -11,21 +11,21 @@ from magfusion.units import Array, BoolArray, IntArray
 
 
 class Gravity(NamedTuple):
-    """Direction of the specific force, where the platform is at rest or nearly so.
+    """Direction of the specific force, if the platform is at rest or nearly so.
 
     Parameters
     ----------
     up_body : ndarray, shape (n, 3)
         Unit vectors.
     sigma : ndarray, shape (n,)
-        (rad); infinite where it says nothing.
+        (rad); infinite if it is not available.
     """
 
     up_body: Array
     sigma: Array
 
     def rows(self, chosen: IntArray | BoolArray | slice) -> "Gravity":
-        """Return it at some epochs, or at epochs repeated."""
+        """Return it at selected epochs, possibly repeated."""
         return Gravity(self.up_body[chosen], self.sigma[chosen])
 
 
@@ -48,13 +48,13 @@ class Fixes:
     residual_rms : ndarray, shape (n, hypotheses)
         Root mean square of the whitened residual; about one where noise and model are as declared.
     phase : ndarray, shape (n, hypotheses, channels)
-        Drive phase (rad); zero where it was not sought.
+        Drive phase (rad); zero if it was not estimated.
     determined : bool ndarray, shape (n, hypotheses)
-        False where the epoch leaves a direction of the pose open.
+        False if the epoch does not determine a direction of the pose.
     log_gain : ndarray, shape (n, hypotheses, channels)
-        Logarithm of each channel's gain; zero where it was not sought.
+        Logarithm of each channel's gain; zero if it was not estimated.
     gravity_cost, prior_cost : ndarray, shape (n, hypotheses)
-        What gravity and the prior pose have of the cost; zero where nothing is known of them.
+        Contributions of gravity and the prior pose to the cost; zero without them.
     """
 
     __repr__ = short_repr
@@ -81,7 +81,7 @@ class Fixes:
         return relative / np.sum(relative, axis=1, keepdims=True)
 
     def padded(self, count: int) -> "Fixes":
-        """Return so many hypotheses of each epoch: the best again, of infinite cost, at the end."""
+        """Pad the hypotheses of each epoch to a count, by the best with infinite cost."""
         own = self.cost.shape[1]
         if own >= count:
             return self

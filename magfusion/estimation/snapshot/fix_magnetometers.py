@@ -1,7 +1,7 @@
-"""Several magnetometers in single epochs: where each alone finds the platform elsewhere.
+"""Consistency test of several magnetometers in single epochs.
 
-What each says of the pose is compared by pairs.  Errors of the site are alike at all epochs, so
-that many prove no more than one: the median of the squared distances is judged as one of them.
+The fixes of each magnetometer alone are compared by pairs.  Errors of the site are common to all
+epochs, so that many prove no more than one: the median of the squared distances is tested as one.
 """
 
 from itertools import combinations
@@ -21,15 +21,15 @@ from magfusion.model.trust import Finding
 from magfusion.units import Array
 
 AS_LIKELY = 20.0  # difference of chi square to the best hypothesis
-FEWEST = 5  # epochs that two share, before anything is said of them
+FEWEST = 5  # common epochs needed to test a pair
 
 
 def contradicting_magnetometers(
     samples: FieldSamples, calibration: Calibration
 ) -> tuple[Finding, ...]:
-    """Return what is to be said of magnetometers that contradict each other about the pose.
+    """Return findings for magnetometers that contradict each other about the pose.
 
-    Of three or more, one that contradicts all others while these agree is named.
+    Of three or more, one that contradicts all others while these agree is identified.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def _apart(one: Fixes | None, other: Fixes | None) -> Array:
 
 
 def _least(one: Fixes, i: int, other: Fixes, j: int) -> float:
-    """Return the least squared distance of any two likely hypotheses."""
+    """Return the least squared distance of any two probable hypotheses."""
     least = np.inf
     for a in np.flatnonzero(one.cost[i] < one.cost[i, 0] + AS_LIKELY):
         for b in np.flatnonzero(other.cost[j] < other.cost[j, 0] + AS_LIKELY):
@@ -92,18 +92,17 @@ def _least(one: Fixes, i: int, other: Fixes, j: int) -> float:
 
 def _named(name: str, names: str, worst: float) -> Finding:
     text = (
-        f"Magnetometer {name} contradicts the others, which agree: of single epochs it finds the"
-        f" platform elsewhere, by {worst:.3g} times what noise and survey explain. Check its"
-        f" body_from_sensor, matrix, response and clock_offset_s (of {names}), or leave it out."
+        f"Magnetometer {name} contradicts the others, which agree: its fixes of single epochs are"
+        f" off by {worst:.3g} times what noise and survey explain. Check its body_from_sensor,"
+        f" matrix, response and clock_offset_s (of {names}), or leave it out."
     )
     return Finding("magnetometers_contradict", text, weight=worst)
 
 
 def _open(names: str, worst: float) -> Finding:
     text = (
-        f"The magnetometers {names} contradict each other: of single epochs each alone finds the"
-        f" platform elsewhere, by {worst:.3g} times what noise and survey explain. Check"
-        " body_from_sensor, matrix, response and clock_offset_s of each; smooth, by the motion, may"
-        " tell which it is."
+        f"The magnetometers {names} contradict each other: their fixes of single epochs differ by"
+        f" {worst:.3g} times what noise and survey explain. Check body_from_sensor, matrix,"
+        " response and clock_offset_s of each. The smoother may identify the faulty one."
     )
     return Finding("magnetometers_contradict", text, weight=worst)

@@ -1,4 +1,4 @@
-"""Fixes without each beacon: alarm, exclusion of a false one, and protection levels by epoch."""
+"""Solution separation of fixes: alarm, exclusion of a faulty beacon, and protection levels."""
 
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -24,22 +24,22 @@ from magfusion.model.samples import FieldSamples
 from magfusion.model.trust import Finding, Risk, StateTrust, Trust, Verdict
 from magfusion.units import DEGREE, Array, BoolArray, IntArray
 
-SURE = 0.9  # probability that it is this beacon, for it to be left out
-MISFIT = 1e-6  # probability of a larger residual, where what was false has been left out
-LEAST_HEARD = 3  # beacons; of two that contradict each other either may be false
+SURE = 0.9  # probability of the fault hypothesis for which a beacon is excluded
+MISFIT = 1e-6  # probability of a larger residual, after the faulty beacon has been excluded
+LEAST_HEARD = 3  # beacons; of two that contradict each other either may be faulty
 
 
 class SeparatedFixes(NamedTuple):
-    """Fixes after the false beacons were left out.
+    """Fixes after the exclusion of faulty beacons.
 
     Parameters
     ----------
     fixes : Fixes
-        Where an alarm could not be told to a beacon, with a covariance that covers it.
+        With a covariance that covers an alarm not attributed to a beacon.
     states : StateTrust
         Doubtful where there is an alarm that no exclusion explains.
     excess : ndarray, shape (n, beacons)
-        How far the fix without each beacon is from the fix with all, of its threshold.
+        Distance of the fix without each beacon from the fix with all, relative to its threshold.
     shift_m : ndarray, shape (n, beacons)
         The same in metres.
     """
@@ -52,7 +52,7 @@ class SeparatedFixes(NamedTuple):
 
 @dataclass(frozen=True)
 class _How:
-    """How fixes are made, and what of."""
+    """Inputs and options of fixes."""
 
     samples: FieldSamples
     calibration: Calibration
@@ -63,11 +63,11 @@ class _How:
 
     @property
     def names(self) -> list[str]:
-        """Of the beacons."""
+        """Names of the beacons."""
         return [beacon.name for beacon in self.calibration.site.beacons]
 
     def without(self, rows: IntArray, excluded: BoolArray) -> "_How":
-        """Return some epochs without some beacons, shape (rows, beacons)."""
+        """Return selected epochs without some beacons, shape (rows, beacons)."""
         owner = [self.names.index(name) for name, _ in self.samples.channels]
         part = self.samples.rows(rows)
         phasor = np.where(excluded[:, owner, None], np.nan, part.phasor_sensor)
@@ -89,14 +89,14 @@ class _How:
         )
 
     def fits(self, fixes: Fixes) -> BoolArray:
-        """Tell whether the residuals are not too large for what is declared."""
+        """Return whether the residuals are consistent with the declared noise."""
         rows = np.sum(self.samples.numbers, axis=1) + 3 * (self.gravity is not None)
         return np.asarray(fixes.cost[:, 0] < chdtri(rows, MISFIT))
 
 
 @dataclass(eq=False)
 class _Result:
-    """What is known of all epochs up to now; changed in place."""
+    """Current results of all epochs; modified in place."""
 
     fixes: Fixes
     level_m: Array
@@ -105,7 +105,7 @@ class _Result:
     bad: BoolArray  # an alarm that no exclusion explains
 
     def take(self, rows: IntArray, chosen: IntArray, fixes: Fixes, levels: "_Levels") -> None:
-        """Take fixes without one beacon each, where they have no alarm."""
+        """Replace the fixes without one beacon each, where they have no alarm."""
         good = np.flatnonzero(~levels.bad)
         kept = rows[good]
         some = Fixes(**{name: value[good] for name, value in vars(fixes).items()})
@@ -132,14 +132,14 @@ def separate_fixes(
     gain_sigma: float = GAIN_SIGMA,
     risk: Risk | None = None,
 ) -> SeparatedFixes:
-    """Compare every fix with those without each beacon; leave out the one that is false.
+    """Compare every fix with those without each beacon; exclude the faulty one.
 
     Parameters
     ----------
     samples : FieldSamples
         Of the fixes.
     gravity, survey_error, free, gain_sigma
-        With which they were made, as in `magfusion.estimation.snapshot.likelihood.fix_epochs`.
+        Those of the fixes, as in `magfusion.estimation.snapshot.likelihood.fix_epochs`.
     """
     risk = Risk() if risk is None else risk
     how = _How(samples, calibration, gravity, survey_error, free, gain_sigma)
@@ -160,7 +160,7 @@ def _separated(how: _How, fixes: Fixes, risk: Risk) -> SeparatedFixes:
         _leave_out(how, result, rows, found.likely(prior)[rows], prior[rows], risk)
     rows = np.flatnonzero(tried & result.bad)
     if len(rows):
-        # So far off that no linearisation tells who is false.
+        # Too large a deviation for a linearisation to identify the faulty beacon.
         likely = _likely_by_fixes(how, rows, prior[rows])
         _leave_out(how, result, rows, likely, prior[rows], risk)
     result.level_m[result.bad] = result.level_deg[result.bad] = np.nan
@@ -179,7 +179,7 @@ def _separated(how: _How, fixes: Fixes, risk: Risk) -> SeparatedFixes:
 
 
 def _among_many(how: _How, fixes: Fixes, risk: Risk) -> SeparatedFixes:
-    """Compare the fixes of each stretch with those without each beacon that it hears."""
+    """Compare the fixes of each stretch with those without each beacon that it detects."""
     site, parts, found = how.calibration.site, [], []
     for rows, beacons, some, known, up in parts_heard(how.samples, how.calibration, how.gravity):
         channels = channels_of(site, beacons)
@@ -205,7 +205,7 @@ def _among_many(how: _How, fixes: Fixes, risk: Risk) -> SeparatedFixes:
 def _leave_out(
     how: _How, result: _Result, rows: IntArray, likely: Array, prior: Array, risk: Risk
 ) -> None:
-    """Fix epochs again without the beacon that is likely false, where that is sure."""
+    """Fix epochs again without the probably faulty beacon, if that is certain."""
     chosen = np.argmax(likely, axis=1)
     each = np.arange(len(rows))
     sure = likely[each, chosen] >= SURE
@@ -215,7 +215,7 @@ def _leave_out(
     excluded = chosen[:, None] == np.arange(likely.shape[1])
     part = how.without(rows, excluded)
     again = part.fixed()
-    # What remains may be false as an unknown beacon may, or because the wrong one was left out.
+    # The remaining beacons may be faulty, or the wrong one was excluded.
     known = np.where((prior > 0.0) & ~excluded, np.maximum(prior, likely), 0.0)
     found = _separation(part, again)
     levels = _levels(found, again, risk, known)
@@ -224,7 +224,7 @@ def _leave_out(
 
 
 def _likely_by_fixes(how: _How, rows: IntArray, prior: Array) -> Array:
-    """Return the probability of each beacon to be the false one, by the fixes without it."""
+    """Return the probability that each beacon is the faulty one, from the fixes without it."""
     cost = np.full(prior.shape, np.inf)
     own = np.bincount(how.calibration.site.owner, minlength=prior.shape[1])
     for beacon in range(prior.shape[1]):
@@ -271,7 +271,7 @@ def _separation(how: _How, fixes: Fixes) -> Separation:
 
 
 def _levels(found: Separation, fixes: Fixes, risk: Risk, prior: Array) -> _Levels:
-    """Return the levels of position (m) and attitude (deg), rival poses in them."""
+    """Return the levels of position (m) and attitude (deg), including alternative poses."""
     position, degrees = protection_levels(found, risk, prior=prior)
     weight = fixes.probability[:, 1:]
     way = np.linalg.norm(fixes.position_world[:, 1:] - fixes.position_world[:, :1], axis=2)
@@ -286,7 +286,7 @@ def _levels(found: Separation, fixes: Fixes, risk: Risk, prior: Array) -> _Level
 
 
 def _replaced(fixes: Fixes, rows: IntArray, new: Fixes) -> Fixes:
-    """Return fixes with some epochs replaced, as many hypotheses as there were."""
+    """Replace some epochs of fixes, keeping the number of hypotheses."""
     count, found = fixes.cost.shape[1], new.cost.shape[1]
     chosen = np.minimum(np.arange(count), found - 1)
     changed = {}
@@ -299,7 +299,7 @@ def _replaced(fixes: Fixes, rows: IntArray, new: Fixes) -> Fixes:
 
 
 def _covering(fixes: Fixes, how: _How, alarmed: BoolArray) -> Fixes:
-    """Return fixes whose covariance covers those without each beacon, where there is an alarm."""
+    """Inflate covariances to cover the fixes without each beacon, where there is an alarm."""
     rows = np.flatnonzero(alarmed)
     some = Fixes(**{name: value[rows] for name, value in vars(fixes).items()})
     nothing = np.zeros((len(rows), len(how.names)), dtype=bool)
@@ -314,7 +314,7 @@ def _covering(fixes: Fixes, how: _How, alarmed: BoolArray) -> Fixes:
 
 
 def separation_trust(separated: SeparatedFixes, names: tuple[str, ...], risk: Risk) -> Trust:
-    """Return what is to be said of a whole log of fixes."""
+    """Return the findings for a whole log of fixes."""
     states, n = separated.states, len(separated.fixes)
     by_chance = risk.false_alarm * n
     most = by_chance + 3.0 * np.sqrt(by_chance) + 1.0
@@ -329,7 +329,7 @@ def separation_trust(separated: SeparatedFixes, names: tuple[str, ...], risk: Ri
                 "beacon_excluded",
                 f"In {len(rows)} of {n} epochs the fixes without beacon {name} contradict it: by up"
                 f" to {1e3 * shift:.3g} mm, {excess:.3g} times what noise and survey explain. It"
-                " was left out there. Check its drive current, and iron or a screen near it.",
+                " was excluded there. Check its drive current, and iron or a screen near it.",
                 Verdict.TRUSTWORTHY,
                 float(excess),
             )
@@ -341,7 +341,7 @@ def separation_trust(separated: SeparatedFixes, names: tuple[str, ...], risk: Ri
             Finding(
                 "separation",
                 f"In {int(np.sum(doubtful))} of {n} epochs the beacons contradict each other, and"
-                f" which is wrong cannot be told: leaving one out moves the fix by up to"
+                f" the faulty one cannot be identified: excluding one moves the fix by up to"
                 f" {1e3 * shift:.3g} mm, {excess:.3g} times what noise and survey explain. Check"
                 " positions and moments of the beacons in the site, and iron in the room.",
                 weight=float(excess),
@@ -353,7 +353,7 @@ def separation_trust(separated: SeparatedFixes, names: tuple[str, ...], risk: Ri
             Finding(
                 "no_redundancy",
                 f"{int(np.sum(without))} of {n} epochs have no protection level: without one of the"
-                " beacons nothing determines the pose, so that a false one would not be noticed."
+                " beacons the pose is not determined, so that a fault of it is not detectable."
                 " Add a beacon.",
                 Verdict.TRUSTWORTHY,
                 0.0,

@@ -1,4 +1,4 @@
-"""What fixes say of themselves, each and all: rivals, open directions, residuals."""
+"""Tests of fixes, per epoch and over all: alternatives, open directions, residuals."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -20,16 +20,16 @@ UNKNOWNS = 6
 def judged_fixes(
     fixes: Fixes, states: StateTrust, numbers: IntArray
 ) -> tuple[Fixes, StateTrust, Trust]:
-    """Return fixes with covariances that cover rivals and residuals, and what is to be said.
+    """Inflate covariances for alternatives and residuals, and return the findings.
 
-    The covariance of an epoch with a rival is that of both poses with their posterior
-    probabilities, about the first.  Errors of the survey are common to all epochs, so that the
-    residuals of all are evidence as those of one: the median's.
+    The covariance of an epoch with an alternative is that of both poses with their posterior
+    probabilities, about the first.  Errors of the survey are common to all epochs, so that all
+    residuals are tested as one: the median's.
 
     Parameters
     ----------
     numbers : ndarray, shape (n,)
-        Real numbers that each epoch measured.
+        Number of real values measured at each epoch.
     """
     rival = _rival(fixes)
     open_pose = ~fixes.determined[:, 0]
@@ -43,7 +43,7 @@ def judged_fixes(
         "the median epoch",
         float(np.median(chi_square)),
         float(np.median(freedom)),
-        "Check the survey of the beacons: where they are, how they are turned and driven.",
+        "Check positions, attitudes and drives of the beacons in the site.",
     )
     factor = np.maximum(np.where(odd, excess, 1.0), whole.excess)
     cov = fixes.pose_cov.copy()
@@ -74,7 +74,7 @@ def _chi_square(fixes: Fixes, numbers: IntArray) -> tuple[Array, Array]:
 
 
 def rival_spread(fixes: Fixes, rival: BoolArray) -> Array:
-    """Return what the rivals add to the covariance of the best pose, shape (n, 6, 6)."""
+    """Return the contribution of alternatives to the best pose's covariance, shape (n, 6, 6)."""
     weight = np.where(rival[:, None], fixes.probability, 0.0)[:, 1:]
     best = np.swapaxes(fixes.world_from_body[:, :1], 2, 3)
     turn = Rotation.from_matrix((best @ fixes.world_from_body[:, 1:]).reshape(-1, 3, 3))
@@ -85,25 +85,25 @@ def rival_spread(fixes: Fixes, rival: BoolArray) -> Array:
 
 
 def _of_epochs(rival: BoolArray, open_pose: BoolArray, odd: BoolArray) -> Iterator[Finding]:
-    """Yield what is said of the epochs, as doubt where they are more than few."""
+    """Yield findings for the epochs, doubtful if they are more than few."""
     for code, rows, what in (
         (
             "ambiguous",
             rival,
-            "are ambiguous: fixes.parquet holds every pose that explains them; add a beacon,"
-            " declare a hemisphere or region, or smooth, so that the motion decides.",
+            "are ambiguous: fixes.parquet has every pose that explains them. Add a beacon,"
+            " declare a hemisphere or region, or use smooth, which uses the motion.",
         ),
         (
             "geometry",
             open_pose,
-            "leave a direction of the pose open (undetermined in fixes.parquet); add a beacon or a"
-            " coil.",
+            "do not determine a direction of the pose (undetermined in fixes.parquet). Add a beacon"
+            " or a coil.",
         ),
         (
             "field_residuals",
             odd,
-            "have residuals that noise and survey do not explain; there the covariance has been"
-            " enlarged. Look for iron that passes, or a beacon that fails for a while.",
+            "have residuals larger than noise and survey explain; there the covariance has been"
+            " inflated. Look for passing iron, or a beacon with a temporary fault.",
         ),
     ):
         count, epochs = int(np.sum(rows)), len(rows)

@@ -1,8 +1,8 @@
-"""How far the gains of beacons scatter from epoch to epoch, as the epochs themselves say.
+"""Maximum-likelihood spread of the beacon gains over the epochs.
 
-A field that is stronger here and weaker there than the model has it is a gain of a beacon in each
-epoch.  Free gains cost the range that an amplitude tells of; gains that are held where they err
-cost more.  The evidence weighs the two.
+A field-model error that varies with position is a gain of a beacon in each epoch.  Estimated gains
+lose the range information of the amplitudes; fixed gains that are wrong cause a larger error.  The
+evidence decides between the two.
 """
 
 import numpy as np
@@ -18,9 +18,9 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
 LEAST, MOST = 0.003, 1.0  # of a log-gain; less is no spread, and more no beacon
-ENOUGH = 200  # epochs, spread over a log, that are asked
+ENOUGH = 200  # epochs used, spread over a log
 TOLERANCE = 0.1  # of the logarithm of a spread
-FEWEST = 10  # epochs, below which nothing is told of a spread
+FEWEST = 10  # epochs needed to estimate a spread
 
 
 def gain_spread(
@@ -32,27 +32,27 @@ def gain_spread(
     survey_error: bool = True,
     free: tuple[str, ...] = (),
 ) -> float:
-    """Return the standard deviation of the log-gains that makes the epochs most likely.
+    """Return the standard deviation of the log-gains that maximises the evidence.
 
     The evidence of an epoch is its likelihood with pose and gains integrated out by Laplace's
-    method, the prior of a pose flat.  A spread is told where it beats none by more than Schwarz's
-    criterion asks for one more parameter.
+    method, with a flat prior of the pose.  A spread is accepted if it improves the evidence by
+    more than Schwarz's criterion requires for one more parameter.
 
     Parameters
     ----------
     samples : FieldSamples
         Channels in the site's order.
     fixes : Fixes
-        Of these epochs, gains held.
+        Of these epochs, with fixed gains.
     gravity, survey_error
         As in `magfusion.estimation.snapshot.likelihood.fix_epochs`.
     free : tuple of str
-        What else is found beside the pose.
+        Other parameters estimated with the pose.
 
     Returns
     -------
     float
-        Zero where no spread is told; `GAIN_SIGMA` where too few epochs could tell of one.
+        Zero if no spread is accepted; `GAIN_SIGMA` if there are too few epochs.
     """
     rows = np.flatnonzero(fixes.determined[:, 0])
     if len(rows) < FEWEST:
@@ -76,7 +76,7 @@ def gain_spread(
 
 
 class _Asked:
-    """Epochs, and what each beacon's gain is known by where the pose is."""
+    """Epochs, and the information on each beacon's gain at the poses."""
 
     def __init__(
         self,

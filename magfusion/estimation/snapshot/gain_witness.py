@@ -1,4 +1,4 @@
-"""What gains that were found epoch by epoch say of the moments that are declared."""
+"""Test of the declared moments against gains estimated epoch by epoch."""
 
 from collections.abc import Iterator
 
@@ -9,12 +9,12 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 
 BEYOND = 3.0  # declared sigmas
-STEADY = 2.0  # times its own scatter, a gain that is off everywhere alike
-MAD = 1.4826  # of a normal distribution, its standard deviation over this
+STEADY = 2.0  # times its own scatter, for a gain error that is equal everywhere
+MAD = 1.4826  # ratio of standard deviation and median absolute deviation, normal distribution
 
 
 def gains_of(fixes: Fixes, site: Site, spread: float) -> Iterator[Finding]:
-    """Yield that gains are free, and which moments are another everywhere.
+    """Yield a finding for estimated gains, and one for each wrong moment.
 
     Parameters
     ----------
@@ -25,10 +25,10 @@ def gains_of(fixes: Fixes, site: Site, spread: float) -> Iterator[Finding]:
     """
     yield Finding(
         "gain_spread",
-        f"The fields differ from those of the site by a factor of each beacon that scatters by"
-        f" {100.0 * spread:.2g} % from place to place: it is found in each epoch beside the pose."
-        " Iron near coils or path, or drives that vary: a map of the field (magfusion calibrate"
-        " fieldmap) gives smaller errors.",
+        f"The fields differ from those of the site by a factor of each beacon that varies by"
+        f" {100.0 * spread:.2g} % with position; it is estimated with the pose at each epoch."
+        " Causes are iron near coils or path, or varying drives. A map of the field (magfusion"
+        " calibrate fieldmap) gives smaller errors.",
         Verdict.TRUSTWORTHY,
     )
     owner = np.array([name for name, _ in site.channels])
@@ -42,8 +42,8 @@ def gains_of(fixes: Fixes, site: Site, spread: float) -> Iterator[Finding]:
         if abs(middle) > max(BEYOND * declared, STEADY * scatter):
             yield Finding(
                 "moments",
-                f"The field of beacon {beacon.name} is {np.exp(middle):.3g} times what its moments"
-                " make of it, wherever it is heard. Check its current and turns.",
+                f"The field of beacon {beacon.name} is {np.exp(middle):.3g} times that of its"
+                " declared moments, wherever it is detected. Check its current and turns.",
                 Verdict.DOUBTFUL,
                 abs(middle) / max(declared, 1e-3),
             )

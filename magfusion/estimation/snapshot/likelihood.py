@@ -1,7 +1,7 @@
-"""Maximum-likelihood fix of one epoch: pose with covariance, every hypothesis that survives.
+"""Maximum-likelihood fix of one epoch: pose with covariance, and all probable hypotheses.
 
-Started without a prior guess from `candidates`, refined on the one measurement model by `refine`,
-all epochs and hypotheses at once.
+Started without a prior guess from `candidates`, refined on the measurement model by `refine`, all
+epochs and hypotheses at once.
 """
 
 from dataclasses import replace
@@ -29,9 +29,9 @@ from magfusion.units import Array, BoolArray, IntArray
 
 CANDIDATES = 10  # positions that get an attitude
 REFINED = 6  # of these, how many are refined
-REFINED_OF_AXES = 8  # where components are missing; and as many mirrors of them
+REFINED_OF_AXES = 8  # if components are missing; and as many mirrors of them
 HYPOTHESES = 4  # of these, how many are returned
-SOFT = 0.03  # relative error of a phasor, in the first refinement beside coils of true size
+SOFT = 0.03  # relative error of a phasor, in the first refinement near coils of finite size
 SAME_POSITION = 0.02  # m; two solutions closer than this and SAME_ROTATION are one
 SAME_ROTATION = 0.02  # rad
 
@@ -55,10 +55,10 @@ def fix_epochs(
     prior : Trajectory, optional
         With ``pose_cov``, at the same times: one more candidate, and a term of the posterior.
     survey_error : bool
-        Weigh by the site's calibration sigmas too.
+        Include the site's calibration sigmas in the weights.
     free : tuple of str
-        What is found beside the pose: ``phase``, the drive phase of synchronised beacons too;
-        ``gain``, one of each beacon.
+        Parameters estimated with the pose: ``phase``, including the drive phase of synchronised
+        beacons; ``gain``, one of each beacon.
     gain_sigma : float
         Prior of the logarithm of a gain.
 
@@ -111,7 +111,7 @@ def fix_epochs(
 
 
 def _in_motion(parts: list[Epochs], fixes: Fixes) -> Fixes:
-    """Return fixes of coils driven in turn again, with the platform where it was at each."""
+    """Repeat fixes of coils driven in turn, with the platform's position at each measurement."""
     turned = parts[0].samples.turned is not None
     velocity, sigma = velocities(fixes, parts[0].problem.calibration.site, turned=turned)
     found, first = [], 0
@@ -133,7 +133,7 @@ def _solve(epochs: Epochs) -> Fixes:
 
 
 def _lacking(samples: FieldSamples) -> BoolArray:
-    """Tell which epochs hold more channels without some component than whole ones."""
+    """Return which epochs have more channels that lack a component than complete ones."""
     partial = np.sum(samples.partial, axis=1)
     return np.asarray(partial > np.sum(samples.valid, axis=1) - partial)
 
@@ -146,7 +146,7 @@ def _solved(epochs: Epochs) -> Fixes:
         start, count = _starts(problem)
     epoch = np.repeat(np.arange(len(problem.time)), count)
     if any(is_sized(beacon) for beacon in problem.calibration.site.beacons):
-        # Candidates are those of dipoles: at full weight some end short of the minimum.
+        # Candidates are those of dipoles: with full weights some stop short of the minimum.
         start = solved_from(_softened(problem).rows(epoch), start).state
     solved = solved_from(problem.rows(epoch), start)
     best = np.argmin(solved.cost.reshape(-1, count), axis=1) + count * np.arange(len(problem.time))
@@ -185,7 +185,7 @@ def _starts_of_axes(epochs: Epochs) -> tuple[State, int]:
 
 
 def _lone_starts(problem: Problem) -> tuple[State, int]:
-    """Return the states that differ of those that a lone source leaves open."""
+    """Return the distinct states consistent with a single source."""
     start, count = starts_about_one(problem)
     n = len(problem.time)
     rough = solved_from(_softened(problem).rows(np.repeat(np.arange(n), count)), start)
@@ -197,7 +197,7 @@ def _lone_starts(problem: Problem) -> tuple[State, int]:
 
 
 def _softened(problem: Problem) -> Problem:
-    """Return the problem with an error of `SOFT` in each phasor, relative to its size."""
+    """Return the problem with an error of `SOFT` in each phasor, relative to its magnitude."""
     parts = np.stack([problem.measured[..., :3], problem.measured[..., 3:]], axis=-1)
     square = np.sum((problem.sqrt_information @ parts) ** 2, axis=(-1, -2))[..., None, None]
     share = 1.0 / np.sqrt(1.0 + SOFT**2 / 6.0 * square)
@@ -205,7 +205,7 @@ def _softened(problem: Problem) -> Problem:
 
 
 def _starts(problem: Problem) -> tuple[State, int]:
-    """Return the most likely candidates, so many rows an epoch: by any of the magnetometers."""
+    """Return the most probable candidates of any magnetometer, so many rows an epoch."""
     site = problem.calibration.site
     found = [_candidates(problem, k) for k in range(len(site.platform.magnetometers))]
     rotation, position, phase = (
@@ -227,7 +227,7 @@ def _starts(problem: Problem) -> tuple[State, int]:
 
 
 def _candidates(problem: Problem, which: int) -> tuple[Array, Array, Array]:
-    """Return poses (n, candidates) and drive phases that what one magnetometer measures allows."""
+    """Return poses (n, candidates) and drive phases consistent with one magnetometer."""
     calibration, mine = (
         seen_by(problem.calibration, which),
         problem.calibration.site.of_sensor(which),
@@ -253,7 +253,7 @@ def _candidates(problem: Problem, which: int) -> tuple[Array, Array, Array]:
 
 
 def _ranked(rotation: Array, position: Array, cost: Array) -> tuple[IntArray, Array]:
-    """Return the hypotheses to keep, best first, and their cost, infinite where one repeats."""
+    """Return the hypotheses to keep, best first, and their cost, infinite for duplicates."""
     order = np.argsort(cost, axis=1)
     rotation = np.take_along_axis(rotation, order[..., None, None], axis=1)
     position = np.take_along_axis(position, order[..., None], axis=1)
@@ -264,7 +264,7 @@ def _ranked(rotation: Array, position: Array, cost: Array) -> tuple[IntArray, Ar
 
 
 def _repeated(rotation: Array, position: Array) -> BoolArray:
-    """Which hypotheses, sorted by cost, repeat an earlier one."""
+    """Return which hypotheses, sorted by cost, duplicate an earlier one."""
     repeated = np.zeros(rotation.shape[:2], dtype=bool)
     for j in range(1, rotation.shape[1]):
         for i in range(j):

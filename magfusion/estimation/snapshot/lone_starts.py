@@ -1,9 +1,9 @@
-"""Where the fix of a receiver of two axes may start about a lone source of three coils.
+"""Initial states for the fix of a receiver of two axes about a single source of three coils.
 
-The field matrix of coils at one place is ``c/r^3 (3 n n^T - 1) K``, with K the moments.  Freed of K
-and of the receiver's own skew, what two axes s_1, s_2 measure is ``A = c/r^3 (3 n n^T - 1) S`` with
-S orthonormal, and ``A^T A - 3/4 (A^T n)(A^T n)^T = (c/r^3)^2``.  So the smaller eigenvalue of
-``A^T A`` tells the range and the larger, with its vector, ``A^T n``: two numbers of the direction n
+The field matrix of concentric coils is ``c/r^3 (3 n n^T - 1) K``, with K the moments.  With K and
+the receiver's own skew removed, two axes s_1, s_2 measure ``A = c/r^3 (3 n n^T - 1) S`` with S
+orthonormal, and ``A^T A - 3/4 (A^T n)(A^T n)^T = (c/r^3)^2``.  The smaller eigenvalue of ``A^T A``
+therefore gives the range and the larger, with its vector, ``A^T n``: two numbers of the direction n
 of three, and its length.  Four poses explain an epoch: of both signs, either with its mirror in the
 plane of the columns of A.
 """
@@ -22,12 +22,12 @@ from magfusion.units import Array, BoolArray, ComplexArray
 
 FLAT = 1e-6  # of the largest singular value; coils of which one adds no direction
 POSES = 4
-REFERENCE = 1.0  # m; from which the source is first looked at
+REFERENCE = 1.0  # m; distance at which the source is first evaluated
 _TINY = 1e-300
 
 
 def stands_alone(site: Site) -> bool:
-    """Tell whether all beacons of a site are at one place."""
+    """Return whether all beacons of a site are at one position."""
     return not middle_of(site.beacons)[1] > 0.0
 
 
@@ -47,14 +47,14 @@ def starts_about_one(problem: Problem) -> tuple[State, int]:
     site = problem.calibration.site
     if len(site.platform.magnetometer.axes) == 1:
         raise EstimationError(
-            "a receiver of one axis measures three numbers of a lone source of three coils, and"
-            " place and direction are five: add sources that stand apart, or a second axis"
+            "a receiver of one axis measures three numbers of a single source of three coils, but"
+            " position and direction are five: add separate sources, or a second axis"
         )
     there = np.einsum("...ii->...i", problem.sqrt_information) > 0.0
     measured = problem.measured[..., :3] + 1j * problem.measured[..., 3:]
     free = np.concatenate([np.full(len(b.tones), not b.synchronised) for b in site.beacons])
     distance = REFERENCE
-    for _ in range(2):  # coils near by are no dipoles: looked at from where they are heard
+    for _ in range(2):  # near coils are not dipoles: evaluate them at the measured distance
         source = _source(problem, distance)
         turn, offset = _poses(problem, measured, there, free, source)
         distance = float(np.median(np.linalg.norm(offset, axis=-1)))
@@ -72,7 +72,7 @@ def starts_about_one(problem: Problem) -> tuple[State, int]:
 
 
 def _source(problem: Problem, distance: float) -> ComplexArray:
-    """Return the moment of each coil as half its field ahead at 1 m, (channels, 3) (T)."""
+    """Return the moment of each coil as half its axial field at 1 m, (channels, 3) (T)."""
     middle, ahead = middle_of(problem.calibration.site.beacons)[0], np.array([1.0, 0.0, 0.0])
     where = (middle + distance * ahead)[None]
     time = np.array([float(np.mean(problem.time))])
@@ -81,8 +81,8 @@ def _source(problem: Problem, distance: float) -> ComplexArray:
     size = np.linalg.svd(np.concatenate([moments.real, moments.imag]), compute_uv=False)
     if size[-1] < FLAT * size[0]:
         raise EstimationError(
-            "a lone source whose coils lie in one plane leaves the pose of a receiver of two axes"
-            " open; give it a third coil, or add sources that stand apart"
+            "a single source whose coils are in one plane does not determine the pose of a"
+            " receiver of two axes; give it a third coil, or add separate sources"
         )
     return np.asarray(moments)
 
@@ -94,7 +94,7 @@ def _poses(
     free: BoolArray,
     source: ComplexArray,
 ) -> tuple[Array, Array]:
-    """Return attitudes (n, k, 3, 3) of the body and places (n, k, 3) from the source (m)."""
+    """Return attitudes (n, k, 3, 3) of the body and positions (n, k, 3) from the source (m)."""
     sensor = problem.calibration.site.platform.magnetometer
     body = sensor.matrix @ sensor.body_from_sensor.T
     turns, offsets = [], []
@@ -120,9 +120,9 @@ def _poses(
 def _signed(
     value: ComplexArray, own: BoolArray, free: BoolArray, source: ComplexArray
 ) -> list[tuple[Array, Array]]:
-    """Return what was measured, and the moments, as real rows; NaN where missing.
+    """Return measurements and moments as real rows; NaN where missing.
 
-    Of coils whose phase is free, once with each choice of their signs.
+    For coils of unknown phase, once with each choice of their signs.
     """
     known = np.where(own, value, 0.0)
     if not np.any(free):
@@ -151,7 +151,7 @@ def _directions(flat: Array) -> list[tuple[Array, float]]:
 
 
 def _attitude(flat: Array, direction: Array, square: Array) -> Array:
-    """Return the attitude whose two axes measure so of a source in a direction."""
+    """Return the attitude for the measurements of two axes and the direction of the source."""
     world = (1.5 * np.outer(direction, direction) - np.eye(3)) @ flat
     left, _, right = np.linalg.svd(world, full_matrices=False)
     axes = left @ right

@@ -1,4 +1,4 @@
-"""Fixes among many beacons: each stretch of epochs with those alone that it hears."""
+"""Fixes among many beacons: each stretch of epochs with its detected beacons only."""
 
 from collections.abc import Callable
 
@@ -16,7 +16,7 @@ Part = tuple[slice, IntArray, FieldSamples, Calibration, Gravity | None]
 def parts_heard(
     samples: FieldSamples, calibration: Calibration, gravity: Gravity | None
 ) -> list[Part]:
-    """Return stretches of epochs: rows, beacons, and what is left of the arguments."""
+    """Return stretches of epochs: rows, beacons, and the arguments restricted to them."""
     site, out = calibration.site, []
     for rows, heard in stretches(site, samples.valid):
         beacons = heard if len(heard) else np.zeros(1, dtype=np.int64)
@@ -42,7 +42,7 @@ def fix_parts(
 
 
 def whole_fixes(fixes: Fixes, calibration: Calibration, channels: IntArray) -> Fixes:
-    """Return fixes of some channels as those of all: others are as declared."""
+    """Expand fixes of some channels to all channels; the others are as declared."""
     values = dict(vars(fixes))
     for name in ("phase", "log_gain"):
         every = np.zeros((*fixes.cost.shape, len(calibration.site.channels)))
@@ -52,7 +52,7 @@ def whole_fixes(fixes: Fixes, calibration: Calibration, channels: IntArray) -> F
 
 
 def some_fixes(fixes: Fixes, rows: slice, channels: IntArray) -> Fixes:
-    """Return the fixes of a stretch, of some channels."""
+    """Return the fixes of a stretch, restricted to some channels."""
     values = dict(vars(fixes.rows(rows)))
     for name in ("phase", "log_gain"):
         values[name] = values[name][..., channels]
@@ -60,7 +60,7 @@ def some_fixes(fixes: Fixes, rows: slice, channels: IntArray) -> Fixes:
 
 
 def by_beacon(found: list[tuple[Array, IntArray]], beacons: int) -> Array:
-    """Return what is of some beacons at each stretch as of all, zero of others, (n, beacons)."""
+    """Expand values of some beacons at each stretch to all, zero for others, (n, beacons)."""
     out = []
     for own, numbers in found:
         every = np.zeros((len(own), beacons))
@@ -70,7 +70,7 @@ def by_beacon(found: list[tuple[Array, IntArray]], beacons: int) -> Array:
 
 
 def _with_hypotheses(fixes: Fixes, count: int) -> Fixes:
-    """Return fixes with more hypotheses, the last repeated at no chance."""
+    """Return fixes with more hypotheses, the last repeated with zero probability."""
     known = fixes.cost.shape[1]
     if known == count:
         return fixes

@@ -1,4 +1,4 @@
-"""What a declared region, or the hemisphere of a beacon, makes of the hypotheses of a fix."""
+"""Weighting of a fix's hypotheses by a declared region, or the hemisphere of a beacon."""
 
 import numpy as np
 from scipy.special import log_ndtr
@@ -9,16 +9,16 @@ from magfusion.estimation.solve.batched import open_inverse
 from magfusion.model.site import Site
 from magfusion.units import Array
 
-SOFT_EDGE = 0.02  # of the distance from the nearest beacon; nobody declares a plane more sharply
-DROPPED = 25.0  # chi square of being where the magnetometer is not, from which a pose is none
+SOFT_EDGE = 0.02  # of the distance from the nearest beacon; uncertainty of a declared plane
+DROPPED = 25.0  # chi square of a position outside, from which a pose is excluded
 
 
 def outside(problem: Problem, solved: Solved, count: int) -> Array:
-    """Return what being outside costs each hypothesis, shape (epochs, count).
+    """Return the cost of each hypothesis for being outside, shape (epochs, count).
 
     Minus twice the logarithm of its probability to be inside, by its own covariance; infinite
-    beyond `DROPPED`. Of an epoch all of whose poses are outside the nearest to the inside keeps its
-    own cost: that the declaration is wrong is then to be said of it, rather than to have no pose.
+    beyond `DROPPED`. If all poses of an epoch are outside, the one nearest to the inside keeps its
+    own cost, so that the wrong declaration is reported instead of an epoch without a pose.
     """
     site = problem.calibration.site
     if site.bounds is None:
@@ -34,7 +34,7 @@ def outside(problem: Problem, solved: Solved, count: int) -> Array:
 def margins(
     site: Site, world_from_body: Array, position_world: Array, position_cov: Array
 ) -> tuple[Array, Array]:
-    """Return how far the magnetometer is inside of each plane, and the standard deviation of that.
+    """Return the distance of the magnetometer inside of each plane, and its standard deviation.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def margins(
     Returns
     -------
     margin, sigma : ndarray, shape (n, planes)
-        (m); that of how sharply a plane is declared is in it.
+        (m); includes the uncertainty of a declared plane.
     """
     assert site.bounds is not None
     sensor = position_world + world_from_body @ site.platform.magnetometer.position_body

@@ -1,4 +1,4 @@
-"""A calibration against what the site declared: of each parameter, and of all together.
+"""Tests of a calibration against the declared values of the site, singly and jointly.
 
 A change ``d`` from the declared values has the covariance ``C = P0 - P`` where the declared values
 are part of the fit (prior ``P0``, posterior ``P``), and ``C = P0 + P`` where they are not.  Then
@@ -17,19 +17,19 @@ from magfusion.estimation.data_checks.statistics import FALSE_ALARMS, SURE, holm
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.units import Array
 
-MOVED = 0.01  # of the prior's variance, below which the data said nothing along a direction
+MOVED = 0.01  # of the prior's variance; below, the data do not determine a direction
 NAMED = 3  # parameters in a sentence
 
 
 class Contradiction(NamedTuple):
-    """What a calibration says against the declared values.
+    """Result of a test of a calibration against the declared values.
 
     Parameters
     ----------
     findings : tuple of Finding
         None, or one.
     excess : float
-        By which variances are too small, one where nothing is contradicted.
+        Factor by which variances are too small, one if nothing is contradicted.
     """
 
     findings: tuple[Finding, ...]
@@ -44,17 +44,17 @@ def contradiction(
     remedy: str,
     of: str = "The calibration",
 ) -> Contradiction:
-    """Return whether parameters moved farther from their declared values than was declared.
+    """Test whether parameters deviate from their declared values by more than declared.
 
     Parameters
     ----------
     names : sequence of str
         As the report has them.
     change : ndarray, shape (n,)
-        Found less declared.
+        Estimated less declared.
     change_cov, prior_cov : ndarray, shape (n, n)
-        Of the change, were the declared sigmas right, and of the declared values; parameters whose
-        prior variance is zero are left out.
+        Of the change, if the declared sigmas are right, and of the declared values; parameters
+        with zero prior variance are ignored.
     remedy : str
         Sentence that ends the reason.
     """
@@ -79,7 +79,7 @@ def contradiction(
     order = np.argsort(single)[: max(1, min(NAMED, int(np.sum(speaks[:-1]))))]
     most = ", ".join(f"{names[kept[i]]} by {deviation[i]:.1f}" for i in order)
     text = (
-        f"{of} contradicts the site: most changed {most} sigmas; all together a chi square of"
+        f"{of} contradicts the site: largest deviations {most} sigmas; joint chi square"
         f" {square:.3g} where {freedom} is expected. {remedy}"
     )
     verdict = Verdict.FAILED if least < np.log(2.0 * SURE) else Verdict.DOUBTFUL
@@ -88,23 +88,23 @@ def contradiction(
     return Contradiction((found,), max(1.0, square / freedom, float(np.max(deviation)) ** 2))
 
 
-TOLERATED = 1.5  # root mean square of whitened residuals, below which sigmas are right enough
-NOTHING_EXPLAINED = 10.0  # and from which the model is not that of what was measured
+TOLERATED = 1.5  # root mean square of whitened residuals, up to which sigmas are acceptable
+NOTHING_EXPLAINED = 10.0  # from which the model does not describe the measurements
 
 
 def unexplained(
     what: str, chi_square: float, freedom: float, remedy: str, limit: float = FALSE_ALARMS
 ) -> Contradiction:
-    """Return whether residuals are larger than was declared, and more than chance.
+    """Test whether residuals are significantly larger than declared.
 
     Parameters
     ----------
     what : str
-        Of which the residuals are: "beacon A".
+        Source of the residuals: "beacon A".
     chi_square : float
         Sum of the squared whitened residuals.
     freedom : float
-        Numbers that are independent, less what was fitted.
+        Independent values, less fitted parameters.
     limit : float
         Share of the false alarms of this test.
     """
@@ -123,6 +123,6 @@ def unexplained(
 
 
 def trust_of(*parts: Contradiction) -> tuple[Trust, float]:
-    """Return what several tests say, and by what a covariance is too small after all of them."""
+    """Return the findings of several tests, and the joint factor on a covariance."""
     findings = tuple(finding for part in parts for finding in part.findings)
     return Trust(findings), max((part.excess for part in parts), default=1.0)

@@ -1,4 +1,4 @@
-"""What a fix is sought from: the phasors of many epochs, weighed, and what else is known."""
+"""Input of a fix: the weighted phasors of many epochs, and other information."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -15,33 +15,33 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
-FREE = ("phase", "gain")  # what may be found beside the pose, whatever the site says of it
+FREE = ("phase", "gain")  # parameters that may be estimated with the pose, whatever the site
 GAIN_SIGMA = 0.2  # of a log-gain; smooth errors of real installations (paper 004, Table 1)
 CHUNK = 1000  # epochs solved at once: they fit into the cache
 Chosen = IntArray | BoolArray | slice
 
 
 class Prior(NamedTuple):
-    """Where the body is thought to be."""
+    """Prior of the body's pose."""
 
     rotation: Array  # (m, 3, 3) world_from_body
     position: Array  # (m, 3)
-    sqrt_information: Array | None  # (m, 6, 6) whitening; None where it is a candidate and no more
+    sqrt_information: Array | None  # (m, 6, 6) whitening; None if it is only a candidate
 
     def rows(self, chosen: Chosen) -> "Prior":
-        """Return some rows, or rows repeated."""
+        """Return selected rows, possibly repeated."""
         sqrt_information = None if self.sqrt_information is None else self.sqrt_information[chosen]
         return Prior(self.rotation[chosen], self.position[chosen], sqrt_information)
 
 
 class Motion(NamedTuple):
-    """What a platform moves by until each channel of a cycle is measured."""
+    """Displacement of a platform until each channel of a cycle is measured."""
 
     shift_world: Array  # (m, channels, 3) (m)
-    spread: Array  # (m, channels); one sigma of it along each axis, one and the same cause (m)
+    spread: Array  # (m, channels); one sigma of it along each axis, fully correlated (m)
 
     def rows(self, chosen: Chosen) -> "Motion":
-        """Return some rows, or rows repeated."""
+        """Return selected rows, possibly repeated."""
         return Motion(self.shift_world[chosen], self.spread[chosen])
 
 
@@ -52,7 +52,7 @@ def _prior(prior: Trajectory) -> Prior:
 
 
 class State(NamedTuple):
-    """What is found in each row."""
+    """Estimated quantities of each row."""
 
     rotation: Array  # (m, 3, 3) world_from_body
     position: Array  # (m, 3)
@@ -60,13 +60,13 @@ class State(NamedTuple):
     log_gain: Array  # (m, channels), beyond the calibration's
 
     def rows(self, chosen: IntArray | BoolArray) -> "State":
-        """Return some rows."""
+        """Return a subset of the rows."""
         return State(*(part[chosen] for part in self))
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Phasors with their weights, and what else is known; a row for each pose sought.
+    """Phasors with their weights, and other information; a row for each pose to estimate.
 
     Parameters
     ----------
@@ -76,15 +76,15 @@ class Problem:
     sqrt_information : ndarray, shape (m, channels, 3, 3)
         Whitening (1/T); zero where a channel is missing.
     noise : ndarray, shape (m, channels, 3, 3), optional
-        Covariance of the whitened noise, where the whitening covers more than noise.
+        Covariance of the whitened noise, if the whitening includes more than noise.
     blocks : tuple of Block
-        Nuisances found beside the pose.
+        Nuisances estimated with the pose.
     prior : optional
         Poses with their whitening.
     turned : ndarray, shape (m, channels, 3, 3), optional
         As of `magfusion.model.samples.FieldSamples`.
     motion : Motion, optional
-        Where channels are measured one after the other by a platform that moves.
+        If channels are measured in turn by a moving platform.
     """
 
     calibration: Calibration
@@ -99,7 +99,7 @@ class Problem:
     motion: Motion | None = None
 
     def rows(self, chosen: Chosen) -> "Problem":
-        """Return some rows, or rows repeated."""
+        """Return selected rows, possibly repeated."""
         return replace(
             self,
             time=self.time[chosen],
@@ -138,21 +138,21 @@ class Problem:
 
 
 class Epochs(NamedTuple):
-    """A row for each epoch, and what its weights come from."""
+    """A row for each epoch, and the inputs of its weights."""
 
     problem: Problem
     samples: FieldSamples
     survey_error: bool
 
     def rows(self, chosen: Chosen) -> "Epochs":
-        """Return some of the epochs."""
+        """Return a subset of the epochs."""
         return Epochs(self.problem.rows(chosen), self.samples.rows(chosen), self.survey_error)
 
     def reweighed(self, rotation: Array, position: Array) -> Problem | None:
-        """Return the problem as weighed at poses (n, ...); None where these make no difference.
+        """Return the problem weighted at poses (n, ...); None if weights do not depend on them.
 
-        A field map is not equally well known everywhere, and how large the field is of which only
-        some components were measured is known by the place.
+        The uncertainty of a field map depends on position, as does the magnitude of a field of
+        which only some components were measured.
         """
         site = self.problem.calibration.site
         mapped = any(beacon.field_map is not None for beacon in site.beacons)
@@ -164,14 +164,14 @@ class Epochs(NamedTuple):
 
 
 def nuisance_blocks(site: Site, gain_sigma: float | None = None) -> tuple[Block, ...]:
-    """Return the columns of what is found beside the pose.
+    """Return the columns of the nuisances estimated with the pose.
 
     Parameters
     ----------
     site : Site
         The drive phases of its beacons that are not synchronised come first.
     gain_sigma : float, optional
-        Prior of a log-gain of each beacon; None where gains are known.
+        Prior of a log-gain of each beacon; None if gains are known.
     """
     blocks = [
         Block(PHASE, beacon.name, slice(0), np.full(len(beacon.tones), np.inf))
@@ -194,7 +194,7 @@ def epochs_of(
     free: tuple[str, ...],
     gain_sigma: float,
 ) -> Iterator[Epochs]:
-    """Yield the epochs of a log in chunks, weighed.
+    """Yield the weighted epochs of a log in chunks.
 
     Raises
     ------
@@ -205,7 +205,7 @@ def epochs_of(
         raise EstimationError("no epoch to fix: every window was dropped")
     if not set(free) <= set(FREE):
         raise ValueError(f"free must be among {FREE}; got {sorted(set(free) - set(FREE))}")
-    if "phase" in free or not samples.signed:  # any phase is as good as any sign
+    if "phase" in free or not samples.signed:  # an unknown sign is an unknown phase
         site = calibration.site
         loose = tuple(replace(b, synchronised=False) for b in site.beacons)
         calibration = replace(calibration, site=replace(site, beacons=loose))
@@ -232,7 +232,7 @@ def epochs_of(
 def _weights(
     site: Site, samples: FieldSamples, survey_error: bool, sensor_world: Array | None
 ) -> tuple[Array, Array | None]:
-    """Return the whitening, and the covariance of the whitened noise where the two differ."""
+    """Return the whitening, and the covariance of the whitened noise if the two differ."""
     there = samples.there
     known = measurement_cov(site, samples, sensor_world=sensor_world)
     if not survey_error:

@@ -1,4 +1,4 @@
-"""Refinement of given poses on the one measurement model, all epochs and hypotheses at once."""
+"""Refinement of given poses on the measurement model, all epochs and hypotheses at once."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -28,7 +28,7 @@ Columns = tuple[Array, Array]  # Jacobian (m, rows, 6 + nuisances) and residual 
 
 
 class Solved(NamedTuple):
-    """Where the rows ended."""
+    """Converged rows."""
 
     state: State
     cost: Array  # (m,)
@@ -46,9 +46,9 @@ def refine(
     free: tuple[str, ...] = (),
     gain_sigma: float = GAIN_SIGMA,
 ) -> Fixes:
-    """Refine the pose at every epoch from where it is thought to be.
+    """Refine the pose at every epoch from an initial guess.
 
-    It ends in the minimum next to the start; mirrored poses are not looked for.
+    It converges to the minimum next to the start; mirrored poses are not searched.
 
     Parameters
     ----------
@@ -91,14 +91,14 @@ def refine(
 
 
 def joined(parts: list[Fixes]) -> Fixes:
-    """Return the fixes of chunks as one."""
+    """Concatenate the fixes of chunks."""
     return Fixes(
         *(np.concatenate([getattr(p, f) for p in parts]) for f in Fixes.__dataclass_fields__)
     )
 
 
 def as_fixes(problem: Problem, solved: Solved, count: int) -> Fixes:
-    """Return rows as fixes of so many hypotheses each, in the order in which they are.
+    """Return rows as fixes of so many hypotheses each, in the given order.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def _prior_pose(problem: Problem, state: State) -> Columns | None:
 
 
 def _known(problem: Problem, state: State) -> Iterator[Columns]:
-    """Yield Jacobian and residual of what is no field."""
+    """Yield Jacobian and residual of gravity and prior."""
     for known in (_gravity(problem, state), _prior_pose(problem, state)):
         if known is not None:
             yield known
@@ -175,7 +175,7 @@ def _known(problem: Problem, state: State) -> Iterator[Columns]:
 
 
 def _pose_difference(rotation0: Array, position0: Array, rotation: Array, position: Array) -> Array:
-    """Perturbation from the first pose to the second, small-angle in its translation."""
+    """Return the perturbation from the first pose to the second, for a small translation."""
     inverse = np.swapaxes(rotation0, -1, -2)
     turn = Rotation.from_matrix(inverse @ rotation).as_rotvec()
     shift = (inverse @ (position - position0)[..., None])[..., 0]
@@ -201,14 +201,14 @@ def _normal(problem: Problem, state: State) -> Normal:
 
 
 def rows_at(problem: Problem, state: State) -> tuple[Array, Array, Array | None]:
-    """Return every whitened row at a state, six of each channel first, then what is no field.
+    """Return every whitened row at a state, six of each channel, then gravity and prior.
 
     Returns
     -------
     jacobian : ndarray, shape (m, rows, 6 + nuisances)
     error : ndarray, shape (m, rows)
     covariance : ndarray, shape (m, rows, rows), optional
-        Of the error, the survey's in it, where the whitening only stands in for it.
+        Of the error, including the survey's, if the whitening only approximates it.
     """
     parts = [_columns(problem, state)]
     parts += [np.concatenate([by, e[..., None]], axis=-1) for by, e in _known(problem, state)]
@@ -224,7 +224,7 @@ def rows_at(problem: Problem, state: State) -> tuple[Array, Array, Array | None]
 
 
 def _spread(problem: Problem, kind: Parameter) -> Array:
-    """Return which channels a nuisance's column moves, shape (nuisances, channels)."""
+    """Return the channels affected by a nuisance's column, shape (nuisances, channels)."""
     names = np.array([name for name, _ in problem.calibration.site.channels])
     out = np.zeros((dimension(problem.blocks), len(names)))
     for block in problem.blocks:
@@ -249,7 +249,7 @@ def solved_from(problem: Problem, start: State) -> Solved:
 
     def model(rows: IntArray, flat: Array) -> Normal:
         nonlocal kept, narrowed
-        if len(rows) < len(kept):  # rows only ever end
+        if len(rows) < len(kept):  # rows only ever converge
             narrowed, kept = narrowed.rows(np.isin(kept, rows)), rows
         return _normal(narrowed, _state(flat, count))
 
@@ -270,7 +270,7 @@ def _state(flat: Array, channels: int) -> State:
 
 
 def _moved(state: State, step: Array, by_phase: Array, by_gain: Array) -> State:
-    """Return the state moved by a step, shortened to a radian at most."""
+    """Return the state moved by a step, limited to one radian."""
     angle = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
     step = step * np.minimum(1.0, 1.0 / np.maximum(angle, 1e-12))
     return State(
@@ -286,7 +286,7 @@ def posterior(problem: Problem, solved: Solved) -> tuple[Array, BoolArray]:
     inverse, determined = open_inverse(solved.information)
     if problem.noise is not None:
         carried = _with_survey(problem, solved, inverse)
-        # Where a direction is open there is nothing for the survey to make worse.
+        # The survey error has no effect on an open direction.
         inverse = np.where(determined[..., None, None], carried, inverse)
     if problem.motion is not None:
         moved = _by_motion(problem, solved)
@@ -295,7 +295,7 @@ def posterior(problem: Problem, solved: Solved) -> tuple[Array, BoolArray]:
 
 
 def _by_motion(problem: Problem, solved: Solved) -> Array:
-    """Return the covariance of what the motion within the cycle leaves open, (m, found, found)."""
+    """Return the covariance due to motion within the cycle, (m, found, found)."""
     _, by_pose, by_nuisance = linearized(problem, solved.state)
     by_found = np.concatenate([by_pose, by_nuisance], axis=-1)
     by_shift = by_motion(problem, solved.state, by_pose)
@@ -306,7 +306,7 @@ def _by_motion(problem: Problem, solved: Solved) -> Array:
 
 
 def _with_survey(problem: Problem, solved: Solved, inverse: Array) -> Array:
-    """Covariance with the error of the survey carried through, rather than taken for noise."""
+    """Return the covariance with the survey error propagated, rather than treated as noise."""
     assert problem.noise is not None
     by_found, by_survey = _survey(problem, solved.state)
     noise = block_diagonal(np.repeat(problem.noise, 2, axis=1))

@@ -1,4 +1,4 @@
-"""What the error of the survey does to a fix, which takes the site as declared."""
+"""Effect of survey errors on a fix, which uses the declared site."""
 
 import numpy as np
 
@@ -29,14 +29,14 @@ def survey_jacobians(
     position_world: Array,
     sqrt_information: Array,
 ) -> tuple[Array, Array]:
-    """Return the whitened Jacobians of what a fix finds, and of the survey it takes for granted.
+    """Return the whitened Jacobians of the estimated and of the survey parameters of a fix.
 
     Parameters
     ----------
     calibration : Calibration
         Its ``phase`` and ``log_gain`` may have one row for each pose.
     nuisances : tuple of Block
-        What is found beside the pose.
+        Estimated with the pose.
     time : ndarray, shape (m,)
     world_from_body : ndarray, shape (m, 3, 3)
     position_world : ndarray, shape (m, 3)
@@ -46,10 +46,10 @@ def survey_jacobians(
     Returns
     -------
     by_found : ndarray, shape (m, rows, 6 + nuisances)
-        By the pose and by the nuisances.
+        With respect to the pose and the nuisances.
     by_survey : ndarray, shape (m, rows, parameters)
-        By each column of the spread of the survey's prior: one sigma of each parameter, where
-        these are independent.
+        With respect to each column of the survey prior's square root: one sigma of each parameter,
+        if these are independent.
     """
     site, found = calibration.site, dimension(nuisances)
     clocks = choose_blocks(site, (CLOCK_OFFSET.group,), parameters=(CLOCK_OFFSET,))
@@ -83,7 +83,7 @@ def whitened(sqrt_information: Array, columns: Array) -> Array:
 def honest_covariance(
     by_found: Array, by_survey: Array, noise: Array, inverse: Array, information: Array
 ) -> Array:
-    """Return the covariance of an estimate whose weights only stand in for the survey's error.
+    """Return the covariance of an estimate whose weights only approximate the survey error.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def honest_covariance(
     noise : ndarray, shape (m, rows, rows)
         Covariance of the whitened noise.
     inverse, information : ndarray, shape (m, found, found)
-        Of the normal matrix, which may hold more than the field (gravity, a prior).
+        Of the normal matrix, which may include gravity or a prior.
 
     Returns
     -------
@@ -106,9 +106,9 @@ def honest_covariance(
 
 
 def survey_response(declared: Calibration, samples: FieldSamples, states: Trajectory) -> Array:
-    """Return what the survey's error does to every fix alike, shape (n, 6, parameters).
+    """Return the common effect of the survey error on every fix, shape (n, 6, parameters).
 
-    The graph takes the fixes' errors for independent, but no number of fixes averages it out.
+    The graph treats the errors of fixes as independent, but this part does not average out.
     Columns are of one sigma each.
     """
     cov = measurement_cov(

@@ -1,7 +1,7 @@
-"""Where a platform was when each coil of a cycle was driven, as the fixes about it tell.
+"""Platform position at the time of each coil of a cycle, from neighbouring fixes.
 
-Coils driven in turn are measured at places that differ by what the platform moves in between; the
-gyroscope tells turns, and nothing at all a shift.  The fixes of the cycles before and after do.
+Coils driven in turn are measured at different positions of a moving platform.  The gyroscope
+measures the rotation, but not the translation, which is taken from the neighbouring cycles' fixes.
 """
 
 from dataclasses import replace
@@ -15,12 +15,12 @@ from magfusion.estimation.snapshot.refine import as_fixes, solved_from
 from magfusion.model.site import Site
 from magfusion.units import Array, BoolArray
 
-FEWEST = 3  # epochs, below which none has neighbours on both sides
-LONGEST = 1.0  # s; a fix that is farther off says nothing
+FEWEST = 3  # epochs needed for neighbours on both sides
+LONGEST = 1.0  # s; more distant fixes are not used
 
 
 def fixed_in_motion(epochs: Epochs, fixes: Fixes, velocity: Array, sigma: Array) -> Fixes:
-    """Return fixes again, each channel predicted where the platform was when it was measured.
+    """Repeat fixes with each channel predicted at the platform's position of its measurement.
 
     Parameters
     ----------
@@ -55,20 +55,20 @@ def fixed_in_motion(epochs: Epochs, fixes: Fixes, velocity: Array, sigma: Array)
 
 
 def velocities(fixes: Fixes, site: Site, *, turned: bool) -> tuple[Array, Array]:
-    """Return the velocity of each hypothesis by the nearest ones of the epochs beside it.
+    """Return the velocity of each hypothesis from the nearest ones of neighbouring epochs.
 
     Parameters
     ----------
     turned : bool
-        Whether phasors are in the axes of their own times: then that of the body, else that of its
-        magnetometer, whose lever swings.
+        Whether phasors are in the axes of their own times: then the velocity is that of the body,
+        else that of its magnetometer with its lever arm.
 
     Returns
     -------
     velocity : ndarray, shape (n, hypotheses, 3)
         World axes (m/s).
     sigma : ndarray, shape (n, hypotheses)
-        Standard deviation of each component (m/s); with the usual speed for a prior.
+        Standard deviation of each component (m/s); with the usual speed as a prior.
     """
     sensor, motion = site.platform.magnetometer, site.platform.motion
     lever = np.zeros(3) if turned else sensor.position_body
@@ -101,7 +101,7 @@ def velocities(fixes: Fixes, site: Site, *, turned: bool) -> tuple[Array, Array]
 
 
 def _nearest(place: Array, variance: Array, there: BoolArray, beside: Array) -> tuple[Array, Array]:
-    """Return another epoch's hypothesis nearest to each, and its variance; infinite of none."""
+    """Return the nearest hypothesis of another epoch, and its variance; infinite if none."""
     away = np.linalg.norm(place[beside][:, None] - place[:, :, None], axis=3)
     away = np.where(there[beside][:, None], away, np.inf)
     best = np.argmin(away, axis=2)

@@ -1,7 +1,7 @@
 """Nonlinear least squares of many small problems at once (Levenberg-Marquardt).
 
-The first axis of every array is the problem.  Each is solved as if it were alone, with its own
-damping; one that has converged costs nothing more.
+The first axis of every array is the problem.  Each is solved independently, with its own damping;
+a converged problem costs nothing more.
 """
 
 from collections.abc import Callable
@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from magfusion.units import Array, BoolArray, IntArray
 
 PASSES = 100  # a bound; the few that creep along a valley need more than 25
-SETTLED = 1e-11  # relative fall of the cost below which a problem is solved
-ROUNDING = 1e-13  # relative rise of the cost that is no rise
+SETTLED = 1e-11  # relative decrease of the cost below which a problem is solved
+ROUNDING = 1e-13  # relative increase of the cost that is rounding
 DAMPING_START, DAMPING_LEAST, DAMPING_STOP = 1e-3, 1e-12, 1e9
 EASED, TIGHTENED = 0.2, 10.0  # factors of the damping after a good step and after a bad one
-UNFELT = 1e-15  # of the largest column of a Jacobian: no residual feels this direction
+UNFELT = 1e-15  # of the largest column of a Jacobian: no residual depends on this direction
 # Smallest over largest singular value of a Jacobian of unit columns.  Rounding makes 1e-16 of a
 # zero, whatever the processor; noise of a thousandth makes 1e-3 of it.
 SINGULAR = 1e-7
@@ -26,8 +26,8 @@ SINGULAR = 1e-7
 class Normal(NamedTuple):
     """Normal equations at some states; priors are residuals like any other.
 
-    A method with better curvature than Gauss-Newton's puts it into ``information``, which must not
-    be negative in any direction.
+    A method with better curvature than Gauss-Newton's returns it as ``information``, which must be
+    positive semidefinite.
     """
 
     cost: Array  # (k,) sum of squares
@@ -36,7 +36,7 @@ class Normal(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Where the problems ended."""
+    """Solutions of the problems."""
 
     state: Array  # (problems, ...) as the start
     cost: Array  # (problems,) sum of squares
@@ -71,17 +71,17 @@ def minimise(
     Parameters
     ----------
     model : callable
-        Takes the numbers of the problems asked for, shape (k,), and their states, shape (k, ...);
+        Takes the numbers of the requested problems, shape (k,), and their states, shape (k, ...);
         returns the normal equations there.
     start : ndarray, shape (problems, ...)
-        Of any type, objects too: only ``model`` and ``move`` look into it.
+        Of any type, also objects: only ``model`` and ``move`` use it.
     move : callable
-        Takes states (k, ...) and steps (k, n) and returns the states moved; addition by default.
+        Takes states (k, ...) and steps (k, n) and returns the moved states; addition by default.
     passes : int
-        At most.
+        Maximum number.
     relative, absolute : float
-        A step that lowers the cost by less than this share of it, or by less than this, is the
-        last.
+        A step that decreases the cost by less than this share, or by less than this amount, is
+        the last.
     """
     state = start.copy()
     rows = np.arange(len(state))
@@ -96,7 +96,7 @@ def minimise(
         trial = move(state[rows], _step(normal, damping))
         new = model(rows, trial)
         fall = normal.cost - new.cost
-        better = fall > 0.0  # false of a cost that is not finite
+        better = fall > 0.0  # False for a cost that is not finite
         settled = fall <= relative * new.cost + absolute
         settled &= fall >= -ROUNDING * normal.cost
         state[rows[better]] = trial[better]
@@ -109,7 +109,7 @@ def minimise(
         damping = np.maximum(damping * np.where(better, EASED, TIGHTENED), DAMPING_LEAST)
         ended = settled | (damping > DAMPING_STOP)
         if np.any(ended):
-            # Where no step lowers the cost, however short, it is least to rounding.
+            # Where no step decreases the cost, however short, it is minimal to rounding.
             solved = settled | np.isfinite(normal.cost)
             _keep(found, rows[ended], Normal(*(part[ended] for part in normal)), solved[ended])
             rows, damping = rows[~ended], damping[~ended]
@@ -127,7 +127,7 @@ def _step(normal: Normal, damping: Array) -> Array:
     """Return the damped step of each problem, shape (k, n), whatever the units of its unknowns."""
     scale = _scale(np.sqrt(np.einsum("kii->ki", normal.information)))
     scaled = normal.information / (scale[:, :, None] * scale[:, None, :])
-    # A direction that no residual feels stays where it is.
+    # A direction on which no residual depends does not move.
     np.einsum("kii->ki", scaled)[...] += damping[:, None]
     return -np.linalg.solve(scaled, (normal.gradient / scale)[..., None])[..., 0] / scale
 
@@ -146,7 +146,7 @@ def moved_poses(pose: Array, step: Array) -> Array:
 
 
 def conditioning(jacobian: Array) -> Array:
-    """Return the smallest over the largest singular value of Jacobians, their columns made equal.
+    """Return the smallest over the largest singular value of Jacobians with unit columns.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def conditioning(jacobian: Array) -> Array:
     Returns
     -------
     ndarray, shape (...)
-        From 0 to 1: below `SINGULAR` the residuals leave a direction open.
+        From 0 to 1: below `SINGULAR` the residuals do not determine a direction.
     """
     if jacobian.shape[-2] < jacobian.shape[-1]:
         return np.zeros(jacobian.shape[:-2])
@@ -184,9 +184,9 @@ def by_differences(
 
 
 def open_inverse(information: Array) -> tuple[Array, BoolArray]:
-    """Return the inverse of information matrices, and whether these determine the pose.
+    """Return the inverse of information matrices, and whether they determine the pose.
 
-    Flat directions are wide, not infinite.
+    Unobservable directions get a large variance, not an infinite one.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def open_inverse(information: Array) -> tuple[Array, BoolArray]:
     """
     value, vector = np.linalg.eigh(information)
     largest = value[..., -1:]
-    # The phase of a channel that is missing is open too, but is no direction of the pose.
+    # The phase of a missing channel is unobservable too, but is no direction of the pose.
     in_pose = np.sum(vector[..., :6, :] ** 2, axis=-2) > 1e-6
     open_direction = (value <= 1e-10 * largest) & in_pose
     safe = np.maximum(value, 1e-10 * largest + 1e-300)

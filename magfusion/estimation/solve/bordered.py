@@ -1,7 +1,7 @@
 """The optimisation loop of sparse poses with a dense calibration, over GTSAM's linear layer.
 
-Whatever problem it is: the problem linearises itself in batched calls, GTSAM eliminates.  Here is
-the only fallback from Cholesky to QR.
+Independent of the problem, which linearises itself in batched calls; GTSAM eliminates.  The only
+fallback from Cholesky to QR is here.
 """
 
 from collections.abc import Callable, Iterable
@@ -17,16 +17,16 @@ from magfusion.units import Array
 S = TypeVar("S")
 
 DAMPING_START, DAMPING_STOP = 1e-2, 1e10
-STALLED = 1e-9  # relative rise of the cost that is rounding
-UNDETERMINED = 1e12  # variance of a variable that a graph determines too badly to invert
+STALLED = 1e-9  # relative increase of the cost that is rounding
+UNDETERMINED = 1e12  # variance of a variable that is too badly determined to invert
 
 
 class Problem(Protocol[S]):
-    """A sum of squares of some estimate ``S``."""
+    """A sum of squares as a function of an estimate ``S``."""
 
     @property
     def ordering(self) -> gtsam.Ordering:
-        """Of elimination: the calibration last."""
+        """Elimination order: the calibration last."""
         ...
 
     def cost(self, estimate: S) -> float:
@@ -42,13 +42,13 @@ class Problem(Protocol[S]):
         ...
 
     def damping_scales(self) -> Iterable[tuple[int, Array]]:
-        """Return, for each key, the step that a damping of one holds back."""
+        """Return, for each key, the step that a unit damping allows."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Optimised(Generic[S]):
-    """Where the loop ended.
+    """Result of the loop.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def eliminate(
     Raises
     ------
     RuntimeError
-        GTSAM's own, of a singular system.
+        From GTSAM, for a singular system.
     """
     try:
         return graph.eliminateMultifrontal(ordering)
@@ -83,7 +83,7 @@ def eliminate_in_sequence(
 ) -> gtsam.GaussianBayesNet | None:
     """Return the conditionals of a linear graph, to be solved with other right-hand sides.
 
-    None where Cholesky fails: of QR's triangle alone such solutions have half the digits.
+    None where Cholesky fails: with QR's triangle alone such solutions have half the digits.
     """
     try:
         return graph.eliminateSequential(ordering)
@@ -94,17 +94,17 @@ def eliminate_in_sequence(
 def eliminate_partial(
     graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, *, orthogonal: bool = False
 ) -> tuple[gtsam.GaussianBayesNet, gtsam.GaussianFactorGraph]:
-    """Return the conditionals of some variables, and what is left of the others.
+    """Return the conditionals of some variables, and the Schur complement of the others.
 
     Parameters
     ----------
     orthogonal : bool
-        By QR at once: what is left is then a square root.
+        Use QR directly: the Schur complement is then a square root.
 
     Raises
     ------
     RuntimeError
-        GTSAM's own, of a singular system.
+        From GTSAM, for a singular system.
     """
     if not orthogonal:
         try:
@@ -115,10 +115,10 @@ def eliminate_partial(
 
 
 def marginal(tree: gtsam.GaussianBayesTree, key: int, size: int) -> Array:
-    """Return the covariance of a variable; `UNDETERMINED` where the tree cannot invert for it."""
+    """Return the covariance of a variable; `UNDETERMINED` where the tree cannot be inverted."""
     try:
         return np.array(tree.marginalCovariance(key))
-    except RuntimeError:  # a tree takes Cholesky only
+    except RuntimeError:  # a tree supports Cholesky only
         return UNDETERMINED * np.eye(size)
 
 
@@ -136,7 +136,7 @@ def last_marginal(
     kept.push_back(ordering.at(ordering.size() - 1))
     try:
         return np.array(tree.marginalCovariance(kept.at(0)))
-    except RuntimeError:  # a tree takes Cholesky only
+    except RuntimeError:  # a tree supports Cholesky only
         for i in range(ordering.size() - 1):
             others.push_back(ordering.at(i))
         _, rest = eliminate_partial(graph, others, orthogonal=True)
@@ -156,7 +156,7 @@ def optimise(
     Parameters
     ----------
     estimate : object
-        The start.
+        Initial estimate.
     tolerance : float
         Relative decrease of the cost that ends the loop.
     report : callable, optional
@@ -165,11 +165,11 @@ def optimise(
     Raises
     ------
     EstimationError
-        Where the start itself has no finite cost or the graph cannot be solved.
+        Where the initial cost is not finite, or the graph cannot be solved.
     """
     cost = problem.cost(estimate)
     if not np.isfinite(cost):
-        raise EstimationError("the start of the smoother has no finite cost")
+        raise EstimationError("the smoother's initial estimate has no finite cost")
     damping, done = 0.0, 0
     while done < iterations:
         graph = problem.linearized(estimate)
@@ -197,7 +197,7 @@ def optimise(
 def _tried(
     problem: Problem[S], estimate: S, system: gtsam.GaussianFactorGraph
 ) -> tuple[S, float, gtsam.VectorValues | None]:
-    """Return where a linear system leads, the cost there, and the step; at worst infinite."""
+    """Return the estimate after a linear solve, its cost and the step; infinite on failure."""
     try:
         step = eliminate(system, problem.ordering).optimize()
         trial = problem.moved(estimate, step)
@@ -207,7 +207,7 @@ def _tried(
 
 
 def _promised(graph: gtsam.GaussianFactorGraph, step: gtsam.VectorValues) -> float:
-    """Return by how much a step lowers the cost of the linear graph."""
+    """Return the decrease of the linear graph's cost by a step."""
     return float(graph.error(gtsam.VectorValues.Zero(step)) - graph.error(step))
 
 

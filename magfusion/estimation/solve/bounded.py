@@ -1,4 +1,4 @@
-"""The minimum of a cost that is no sum of squares, of few unknowns between limits."""
+"""Minimisation of costs that are no sums of squares, of few bounded unknowns."""
 
 from collections.abc import Callable
 
@@ -7,15 +7,15 @@ from scipy.optimize import minimize, minimize_scalar
 
 from magfusion.units import Array, BoolArray
 
-DECREASE = 1e-6  # of the cost; the step that lowers it by less is the last
-DECREASE_CURVED = 1e-9  # relative; the step of Newton that lowers a cost by less is the last
+DECREASE = 1e-6  # of the cost; a step that decreases it by less is the last
+DECREASE_CURVED = 1e-9  # relative; a Newton step that decreases a cost by less is the last
 MOST_STEPS = 100
-LONGEST = 2.0  # of the steps of `minimise_curved`: beyond, a curvature says nothing
-SUFFICIENT = 1e-4  # share of the decrease that the slope promises
+LONGEST = 2.0  # of the steps of `minimise_curved`: beyond, a curvature is not valid
+SUFFICIENT = 1e-4  # share of the decrease that the slope predicts
 FLATTEST = 1e-10  # of the largest curvature
-LINEAR = 0.05  # share of a slope by which a curvature may differ from that by a mere variance
-FOUND = 1e-2  # of a logarithm; a smaller step is near the end
-SHORTEST = 1e-9  # of a step; where that goes not down, rounding is all
+LINEAR = 0.05  # share of a slope by which a curvature may differ from that of a pure variance
+FOUND = 1e-2  # of a logarithm; a smaller step is near the minimum
+SHORTEST = 1e-9  # of a step; if that does not decrease the cost, the rest is rounding
 DIFFERENCE = 1e-3  # of an unknown: rounding of a cost that solves large systems is far below it
 
 
@@ -26,10 +26,10 @@ def minimise_bounded(
     steps: int = 200,
     decrease: float = DECREASE,
 ) -> Array:
-    """Return where a cost is least, by a quasi-Newton method (SciPy's L-BFGS-B).
+    """Return the minimum of a cost by a quasi-Newton method (SciPy's L-BFGS-B).
 
-    Its slopes are of central differences, as far apart as rounding asks: by SciPy's own, a hundred
-    thousand times closer, it ended where the processor's rounding let no step go down.
+    Slopes are central differences with a step suited to rounding.  With SciPy's own step, a hundred
+    thousand times smaller, the search ended where rounding let no step decrease the cost.
 
     Parameters
     ----------
@@ -37,11 +37,11 @@ def minimise_bounded(
         Takes an ndarray of shape (n,); smooth over `DIFFERENCE` of each unknown.
     start : ndarray, shape (n,)
     limits : ndarray, shape (n, 2)
-        Least and greatest value of each unknown.
+        Lower and upper bound of each unknown.
     steps : int
-        At most.
+        Maximum number.
     decrease : float
-        Of the cost, relative; the step that lowers it by less is the last.
+        Of the cost, relative; a step that decreases it by less is the last.
     """
     aside = DIFFERENCE * np.eye(len(start))
 
@@ -60,12 +60,12 @@ def minimise_curved(
     start: Array,
     limits: Array,
 ) -> Array:
-    """Return where costs of logarithms of sigmas are least, by a projected Newton method.
+    """Return the minima of costs of logarithms of sigmas by a projected Newton method.
 
-    Bertsekas, SIAM J. Control Optim. 20, 1982, with the absolute eigenvalues of the curvature, so
-    that saddles are left.  For searches of a few unknowns by the hundred, of which SciPy's own
-    bookkeeping takes several times what the costs do, and ours as much as they; so searches that
-    know nothing of each other go side by side.
+    Bertsekas, SIAM J. Control Optim. 20, 1982, with the absolute eigenvalues of the curvature, to
+    leave saddles.  For hundreds of searches of a few unknowns: SciPy's bookkeeping would take
+    several times as long as the costs, and ours as long as they, so independent searches run in
+    one batch.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def minimise_curved(
         Returns gradients, shape (k, n), and curvatures, shape (k, n, n).
     start : ndarray, shape (k, n)
     limits : ndarray, shape (n, 2)
-        Least and greatest value of each unknown.
+        Lower and upper bound of each unknown.
     """
     low, high = limits.T
     at = np.minimum(np.maximum(start, low), high)
@@ -90,8 +90,8 @@ def minimise_curved(
         step *= LONGEST / np.maximum(np.abs(step).max(axis=1, keepdims=True), LONGEST)
         promised = -0.5 * (slope * step).sum(axis=1)
         last = promised < DECREASE_CURVED * np.maximum(np.abs(here), 1.0)
-        # By the logarithm of a variance that comes to nothing a step is a half, again and again.
-        # Before the others are found it may yet be wanted, and does not come back from there.
+        # In the logarithm of a vanishing variance every step is a half, again and again.
+        # Before the others converge it may yet be needed, and cannot return from there.
         falling = free & (slope > 0.0)
         diagonal = curvature.reshape(len(at), -1)[:, :: at.shape[1] + 1]
         falling &= np.abs(diagonal - 2.0 * slope) < LINEAR * slope
@@ -115,7 +115,7 @@ def _gone(
     high: Array,
     going: BoolArray,
 ) -> tuple[Array, Array, BoolArray]:
-    """Return where searches are after so much of a step as goes down, the cost, and which went."""
+    """Return searches after the longest decreasing part of a step, the cost, and which moved."""
     left, gone = going.copy(), np.zeros(len(at), dtype=bool)
     while True:
         left &= (np.abs(step) > SHORTEST).any(axis=1)
@@ -142,7 +142,7 @@ def _downhill(slope: Array, curvature: Array) -> Array:
 def minimise_between(
     cost: Callable[[float], float], low: float, high: float, tolerance: float
 ) -> tuple[float, float]:
-    """Return where a cost of one unknown is least between two values, and that cost (Brent's).
+    """Return the minimum of a cost of one bounded unknown, and that cost (Brent's method).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Linear least squares of a chain of states with a border, many variants of it at once.
+"""Linear least squares of a chain of states with a border, for many variants of it at once.
 
 GTSAM eliminates one system at a time; here the same system without each of some measurements is
 solved in one sweep, with the covariance of every state.  Block elimination along the chain, the
@@ -28,7 +28,7 @@ class Chain(NamedTuple):
     right : ndarray, shape (h, n, s, r)
     right_border : ndarray, shape (h, c, r)
     sides : ndarray, shape (h, n, s, r + c), optional
-        Of which right sides and border are the parts: solving the chain overwrites it.
+        Array whose parts are right sides and border: solving the chain overwrites it.
     """
 
     diagonal: Array
@@ -43,7 +43,7 @@ class Chain(NamedTuple):
     def of_sides(
         diagonal: Array, following: Array, sides: Array, corner: Array, right_border: Array
     ) -> "Chain":
-        """Return a chain whose right sides and border are parts of one array."""
+        """Return a chain whose right sides and border are views of one array."""
         right, border = np.split(sides, [right_border.shape[-1]], axis=-1)
         return Chain(diagonal, following, border, corner, right, right_border, sides)
 
@@ -56,27 +56,27 @@ class ChainSolution(NamedTuple):
     cov: Array  # (h, n, k, k) of the same
     border_cov: Array  # (h, c, c)
     explained: Array  # (h,) of the sum of squares, by the solution for the first right side
-    inverse: Array  # (h, n, s, s) of what is left of each state: other right sides need no more
+    inverse: Array  # (h, n, s, s) of each state's Schur complement: reused for other right sides
 
 
 @np.errstate(all="ignore")
 def solve_chain(
     chain: Chain, kept: int, known: Array | None = None, *, covariance: bool = True
 ) -> ChainSolution:
-    """Solve every variant.  What one leaves open comes out as not finite, or absurdly wide.
+    """Solve every variant; an undetermined one has infinite, NaN or very large results.
 
     Parameters
     ----------
     kept : int
-        Of each state: how many of its first numbers' covariance is asked for.
+        Number of leading components of each state whose covariance is returned.
     known : ndarray, shape (h, n, s, s), optional
         As `inverses` of the chain, or `ChainSolution.inverse` of it with other right sides.
     covariance : bool
-        Whether that of the states is asked for; else there are none of it.
+        Whether to compute that of the states.
     """
     n, size = chain.diagonal.shape[1:3]
-    # What is swept takes the place of the right sides, and what is found that of what is swept: of
-    # a log of hours they are the largest of all.
+    # The sweep overwrites the right sides, and the solution overwrites the sweep: in a log of
+    # hours they are the largest arrays.
     first, outer = chain.right[..., 0].copy(), chain.border.copy()
     solved = chain.sides
     if solved is None:
@@ -101,7 +101,7 @@ def solve_chain(
     if not chain.corner.shape[1]:
         states = alone[:, :, :kept]
         return ChainSolution(states, chain.right_border, own, chain.corner, explained, inverse)
-    # What the states leave of the border.
+    # Schur complement of the border.
     left = np.swapaxes(outer.reshape(len(outer), n * size, -1), 1, 2)
     taken = left @ solved.reshape(len(outer), n * size, -1)
     corner = _inverse(chain.corner - taken[..., count:])
@@ -109,7 +109,7 @@ def solve_chain(
     border = corner @ rest
     part = by_border[..., :kept, :]
     states = alone[:, :, :kept] - part @ border[:, None]
-    # The border explains what the states leave of it.
+    # Back substitution of the border.
     explained += np.einsum("hc,hc->h", rest[..., 0], border[..., 0])
     if covariance:
         own += part @ corner[:, None] @ np.swapaxes(part, -1, -2)
@@ -118,7 +118,7 @@ def solve_chain(
 
 @np.errstate(all="ignore")
 def inverses(diagonal: Array, following: Array) -> Array:
-    """Return the inverse of what those before leave of each state, shape (h, n, s, s).
+    """Return the inverse of the Schur complement of each state, shape (h, n, s, s).
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def inverses(diagonal: Array, following: Array) -> Array:
         As of `Chain`.
     """
     out, count, taken = np.empty_like(diagonal), diagonal.shape[1], np.zeros(1)
-    # In units in which all numbers of a state are about one.
+    # In units in which all components of a state are about one.
     size = np.sqrt(np.maximum(np.einsum("hnii->hni", diagonal), np.finfo(np.float64).tiny))
     for begin in range(0, count, STRETCH):
         here = slice(begin, min(begin + STRETCH, count))
@@ -145,7 +145,7 @@ def inverses(diagonal: Array, following: Array) -> Array:
 
 
 def _inverted(matrix: Array) -> Array:
-    """Return inverses of symmetric positive matrices of like units, (h, k, k)."""
+    """Return inverses of symmetric positive matrices of similar units, (h, k, k)."""
     try:
         inverse = np.linalg.inv(matrix)
     except np.linalg.LinAlgError:
@@ -154,7 +154,7 @@ def _inverted(matrix: Array) -> Array:
 
 
 def _covariances(inverse: Array, gain: Array, kept: int) -> Array:
-    """Return the covariance of the first numbers of each state, shape (h, n, kept, kept)."""
+    """Return the covariance of the leading components of each state, shape (h, n, kept, kept)."""
     own = np.empty((*inverse.shape[:2], kept, kept))
     cov = inverse[:, -1]
     own[:, -1] = cov[:, :kept, :kept]

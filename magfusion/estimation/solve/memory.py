@@ -1,22 +1,22 @@
-"""Memory that was freed: kept for what comes next, or given back to the system."""
+"""Released memory: kept for later arrays, or returned to the system."""
 
 import ctypes
 import os
 from collections.abc import Callable
 from pathlib import Path
 
-RESIDENT = 512e6  # bytes; what a smaller program has freed nobody misses
-KEPT_ARRAY = 2**25  # bytes; larger ones glibc always maps anew
+RESIDENT = 512e6  # bytes; a smaller program keeps its released memory
+KEPT_ARRAY = 2**25  # bytes; larger ones glibc always maps again
 KEPT_TOP = 2**27  # bytes
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 PAGES = Path("/proc/self/statm")
 
 
 def keep_memory() -> None:
-    """Keep the memory of arrays that are freed for those that come next.
+    """Keep the memory of released arrays for later ones.
 
-    Otherwise glibc gives each of more than some hundred kilobytes back at once, and every page of
-    the next is made anew: a tenth of what smoothing takes.
+    Otherwise glibc returns each array above some hundred kilobytes to the system at once, and maps
+    every page of the next again: a tenth of the time of smoothing.
     """
     change = _of_glibc("mallopt")
     if change is not None:
@@ -25,9 +25,9 @@ def keep_memory() -> None:
 
 
 def give_back_memory() -> None:
-    """Give what was freed back to the system, of a program that is large.
+    """Return released memory of a large program to the system.
 
-    Factors are in small pieces, which glibc keeps.
+    Factors are small allocations, which glibc keeps.
     """
     trim = _of_glibc("malloc_trim")
     if trim is not None and _resident() > RESIDENT:
@@ -43,7 +43,7 @@ def _of_glibc(name: str) -> Callable[..., int] | None:
 
 
 def _resident() -> float:
-    """Return what is in memory (bytes); infinite where the system does not tell."""
+    """Return the resident memory (bytes); infinite where the system does not report it."""
     try:
         return float(PAGES.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, OSError, ValueError, IndexError):

@@ -9,7 +9,7 @@ from gtsam.symbol_shorthand import B, V, X
 def nested_dissection(
     epochs: int, last: int | None, segments: Sequence[tuple[int, int]] = ()
 ) -> gtsam.Ordering:
-    """Return halves before what parts them, calibration last.
+    """Return an elimination order of halves before their separators, the calibration last.
 
     GTSAM's own orderings, and plain time order, are quadratic in the number of epochs once a
     calibration variable touches all of them.
@@ -19,8 +19,8 @@ def nested_dissection(
     last : int, optional
         Key of the calibration.
     segments : sequence of (int, int)
-        First epoch and key of stretches that have a variable of their own; it comes after them,
-        but where it is the last.
+        First epoch and key of segments that have their own variable; it comes after them, except
+        where it is the last.
     """
     ordering = gtsam.Ordering()
     begins = [begin for begin, _ in segments] or [0]

@@ -1,7 +1,7 @@
-"""Calibration parameters: one object a kind of them, and the tangent vector that they make up.
+"""Calibration parameters: one object per kind, and the tangent vector that they form.
 
-`PARAMETERS` is the one list of them; the fix, the smoother, the filter, reports and files iterate
-over it or over the blocks chosen of it.
+`PARAMETERS` lists all of them; fix, smoother, filter, reports and files iterate over it or over
+blocks selected from it.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -71,7 +71,7 @@ GROUPS = tuple(dict.fromkeys(parameter.group for parameter in PARAMETERS))
 
 
 def of_phasors(parameters: Iterable[Parameter]) -> tuple[Parameter, ...]:
-    """Return the parameters that are not of the steady field alone."""
+    """Return the parameters that affect more than the steady field."""
     return tuple(parameter for parameter in parameters if not parameter.steady_only)
 
 
@@ -81,14 +81,14 @@ PHASOR_PARAMETERS = of_phasors(PARAMETERS)
 def initial_calibration(
     site: Site, reference_time: float, imu_begin: float | None = None
 ) -> Calibration:
-    """Return the calibration that the site declares.
+    """Return the declared calibration of a site.
 
     Parameters
     ----------
     reference_time : float
-        Where phases hold (s).
+        Reference of the phases (s).
     imu_begin : float, optional
-        Where the IMU's time offset holds (s); the reference time where there is no IMU.
+        Reference of the IMU's time offset (s); the reference time without an IMU.
     """
     return Calibration(
         site=site,
@@ -103,7 +103,7 @@ def initial_calibration(
 
 
 def seen_by(calibration: Calibration, sensor: int) -> Calibration:
-    """Return the calibration of what one of the platform's magnetometers measures."""
+    """Return the calibration for the measurements of one of the platform's magnetometers."""
     site = calibration.site
     if not site.platform.further:
         return calibration
@@ -121,7 +121,7 @@ def seen_by(calibration: Calibration, sensor: int) -> Calibration:
 def without_response(
     phasor: ComplexArray, calibration: Calibration
 ) -> tuple[ComplexArray, Calibration]:
-    """Return phasors (..., channels, 3) as one that answers alike to all would, and that one."""
+    """Return phasors (..., channels, 3) with the response removed, and a calibration without."""
     site = calibration.site
     answer, factors = responded(site), axis_factors(site)
     if answer is None and factors is None:
@@ -136,7 +136,7 @@ def without_response(
 def candidates(
     site: Site, parameters: Iterable[Parameter] = PARAMETERS
 ) -> Iterator[tuple[Parameter, str]]:
-    """Yield every parameter with its owner: beacon by beacon, then the platform, then the room."""
+    """Yield every parameter with its owner: the beacons, then the platform, then the room."""
     kinds = tuple(parameters)
     of_beacon = [kind for kind in kinds if isinstance(kind, BeaconParameter)]
     yield from ((kind, beacon.name) for beacon in site.beacons for kind in of_beacon)
@@ -155,12 +155,12 @@ def choose_blocks(
     Parameters
     ----------
     site : Site
-        Its sigmas are the priors; a parameter whose sigma is zero is known and never chosen.
+        Its sigmas are the priors; a parameter with zero sigma is known and never selected.
     groups : iterable of str, optional
-        Any of `GROUPS`, or of the given kinds' own.  None takes every parameter whose sigma is not
-        negligible.
+        Any of `GROUPS`, or of the given kinds' own.  None selects every parameter whose sigma is
+        not negligible.
     parameters : iterable of Parameter
-        The kinds that the measurements tell of; those of the Earth field are not among them unless
+        The kinds that the measurements depend on; those of the Earth field are included only if
         it is measured.
 
     Returns
@@ -192,7 +192,7 @@ def considered_blocks(
 
 
 def placed(blocks: Iterable[Block], start: int = 0) -> tuple[Block, ...]:
-    """Return blocks whose columns follow each other."""
+    """Assign successive columns to blocks."""
     out = []
     for block in blocks:
         out.append(block._replace(columns=slice(start, start + len(block.sigma))))
@@ -210,7 +210,7 @@ def _blocks(
         sigma = parameter.sigma(site, owner)
         largest = float(np.max(sigma))
         if largest > 0.0 and chosen(parameter, largest):
-            # One known axis in an unknown block.
+            # A known axis within an unknown block.
             sigma = np.maximum(sigma, 1e-6 * largest)
             blocks.append(Block(parameter, owner, slice(0), sigma))
     return placed(blocks)
@@ -226,7 +226,7 @@ def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) ->
     if not step.any():
         return calibration
     own = np.array(step)  # GTSAM's vectors are read-only
-    last = int(own.nonzero()[0][-1])  # what is only considered does not move
+    last = int(own.nonzero()[0][-1])  # considered parameters do not move
     numbers = own.tolist()
     steps: dict[Parameter, dict[str, Array]] = {}
     for block in blocks:
@@ -240,9 +240,9 @@ def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) ->
 
 
 def difference(reference: Calibration, moved: Calibration, blocks: tuple[Block, ...]) -> Array:
-    """Return the tangent vector that takes ``reference`` to ``moved``: the inverse of `retract`."""
+    """Return the tangent vector from ``reference`` to ``moved``: the inverse of `retract`."""
     step = np.zeros(dimension(blocks))
-    if moved is reference:  # as of a filter that estimates none
+    if moved is reference:  # as in a filter that estimates none
         return step
     of_kind: dict[Parameter, list[Block]] = {}
     for block in blocks:
@@ -257,7 +257,7 @@ def difference(reference: Calibration, moved: Calibration, blocks: tuple[Block, 
 def corrected_imu(
     calibration: Calibration, blocks: tuple[Block, ...], imu: ImuSamples
 ) -> ImuSamples:
-    """Return the inertial samples without what the calibration says is wrong with them."""
+    """Return the inertial samples, corrected by the calibration."""
     for block in inertial_blocks(blocks):
         imu = block.parameter.corrected_imu(calibration, block.owner, imu)
     return imu

@@ -1,4 +1,4 @@
-"""Parameters of a beacon: where it is, how strong, and how its drive runs."""
+"""Parameters of a beacon: pose, moment, and drive."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -27,7 +27,7 @@ PHASE_SIGMA = 1e2  # rad; wide enough to be no information
 
 
 class BeaconParameter(Parameter):
-    """A parameter that every beacon has; its owners are the beacons' names."""
+    """A parameter of every beacon; its owners are the beacons' names."""
 
     def part(self, site: Site, owner: str) -> Beacon:
         """Return the beacon."""
@@ -40,7 +40,7 @@ class BeaconParameter(Parameter):
         )
 
     def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray | None:
-        """Return the columns of the owner's phasors; it has no bearing on the others'."""
+        """Return the columns of the owner's phasors; it does not affect the others'."""
         return self.own_jacobian(view) if view.beacon.name == owner else None
 
     def own_jacobian(self, view: PhasorView) -> ComplexArray:
@@ -117,17 +117,17 @@ class _LogMoment(BeaconParameter, SiteParameter):
 
 
 class _OfDrive(BeaconParameter):
-    """A parameter of the log's own: some entries of an array that the calibration holds."""
+    """A parameter of the log: some entries of an array of the calibration."""
 
     of_log = each_log = factor_of_phasor = True
     attribute: ClassVar[str]
 
     def names(self, site: Site) -> tuple[str, ...]:
-        """Return whose each entry is; here one a channel."""
+        """Return the owner of each entry; here one per channel."""
         return tuple([name for name, _ in site.channels])
 
     def copies(self, site: Site) -> int:
-        """Return how often the array has it: the channels of every magnetometer do."""
+        """Return how often the array repeats it: once per magnetometer for channels."""
         return len(site.platform.magnetometers)
 
     def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
@@ -189,14 +189,14 @@ class _Drift(_OfDrive):
     def drags(
         self, calibration: Calibration, owner: str, time: float
     ) -> tuple[Parameter, Array] | None:
-        # A frequency that changes now has not turned the phase of all the time before: the phase
-        # at the reference time goes back by what the new frequency would have made.
+        # A change of frequency now does not change the phase accumulated so far: the phase at the
+        # reference time is reduced by what the new frequency would have added.
         tones = self.part(calibration.site, owner).tone_frequencies_hz
         return PHASE, -2.0 * np.pi * tones[:, None] * (time - calibration.reference_time)
 
 
 class _Gain(_OfDrive):
-    """What every phasor of a beacon is larger by; found beside a pose, never part of a site."""
+    """Factor of all phasors of a beacon; estimated with a pose, never part of a site."""
 
     group, kind, attribute = "gain", "gain", "log_gain"
 
@@ -211,7 +211,7 @@ class _Gain(_OfDrive):
 
 @lru_cache(maxsize=1024)
 def _named(names: tuple[str, ...], owner: str) -> BoolArray:
-    """Tell which names are the owner's; sites that differ in numbers alone have the same names."""
+    """Return which names are the owner's; sites that differ in numbers only share names."""
     mine = np.array([name == owner for name in names], dtype=bool)
     mine.flags.writeable = False
     return mine

@@ -1,6 +1,6 @@
 """The phasors of every channel of a site, with their Jacobian by pose and calibration.
 
-Beacons of one form are evaluated side by side: of a single epoch that costs what one costs.
+Beacons of one form are evaluated together: for one epoch that costs as much as one beacon.
 """
 
 from collections.abc import Iterator
@@ -22,19 +22,19 @@ from magfusion.units import Array, BoolArray, ComplexArray
 
 
 class _Group(NamedTuple):
-    """Beacons that are evaluated at once: what that returns has an axis of them in front."""
+    """Beacons that are evaluated together; results have a leading axis of them."""
 
     source: Sources
     beacons: tuple[Beacon, ...]
-    tones: tuple[slice, ...]  # of the channels, of each
+    tones: tuple[slice, ...]  # channels of each
 
     def of(self, by_channel: Array) -> Array:
-        """Return what is of their channels, shape (..., channels), to evaluate them with."""
+        """Select their channels, shape (..., channels), in the form for the evaluation."""
         own = [by_channel[..., tones] for tones in self.tones]
         return np.stack(own) if len(own) > 1 else own[0]
 
     def each(self, evaluated: Observation) -> Iterator[Observation]:
-        """Return what is of each beacon."""
+        """Yield the observation of each beacon."""
         if len(self.beacons) == 1:
             yield evaluated
             return
@@ -45,7 +45,7 @@ class _Group(NamedTuple):
             yield Observation(**own)
 
     def parted(self, evaluated: ComplexArray) -> ComplexArray:
-        """Return the same with an axis of the beacons in front, if there is but one, too."""
+        """Return the result with a leading axis of beacons, also for a single one."""
         return evaluated if len(self.beacons) > 1 else evaluated[None]
 
 
@@ -60,7 +60,7 @@ def _each_alone(site: Site) -> list[_Group]:
 
 
 def _groups(site: Site, *, beside: bool = True) -> list[_Group]:
-    """Return the beacons of a site in as few groups as their forms allow, or each alone."""
+    """Return the beacons of a site in as few groups as their forms allow, or one per group."""
     end = np.cumsum([len(beacon.tones) for beacon in site.beacons]).tolist()
     tones = [slice(*ends) for ends in pairwise([0, *end])]
     sources = (
@@ -118,7 +118,7 @@ def linearize_channels(
     twist_body : ndarray, shape (n, 6), optional
         Needed where the time offset is among the blocks.
     heard : bool ndarray, shape (n, channels), optional
-        What is asked for: beacons of which nothing is, at epochs close by, are zero.
+        Requested channels: a beacon without any is zero, if the epochs are close to each other.
 
     Returns
     -------
@@ -173,7 +173,7 @@ def linearize_channels(
 
 
 def _acting(blocks: tuple[Block, ...], site: Site) -> dict[str, list[Block]]:
-    """Return the blocks that have a bearing on each beacon's phasors, by its name."""
+    """Return the blocks that affect each beacon's phasors, by its name."""
     found: dict[str, list[Block]] = {beacon.name: [] for beacon in site.beacons}
     for block in blocks:
         if not isinstance(block.parameter, BeaconParameter):
@@ -185,7 +185,7 @@ def _acting(blocks: tuple[Block, ...], site: Site) -> dict[str, list[Block]]:
 
 
 def _answered(stacked: Array, factors: ComplexArray) -> Array:
-    """Return stacked columns (n, channels, 6, k) with what each axis makes of them."""
+    """Apply the response of each axis to stacked columns (n, channels, 6, k)."""
     real, imaginary = stacked[..., :3, :], stacked[..., 3:, :]
     a, b = factors.real[:, :, None], factors.imag[:, :, None]
     return np.concatenate([a * real - b * imaginary, b * real + a * imaginary], axis=-2)
@@ -200,7 +200,7 @@ def _linearize_heard(
     twist_body: Array | None,
     heard: BoolArray,
 ) -> tuple[Array, Array, Array]:
-    """Predict the channels of the beacons that are heard, as `linearize_channels`."""
+    """Predict the channels of the detected beacons, as `linearize_channels`."""
     site, n, channels = calibration.site, len(time), len(calibration.site.channels)
     value, by_pose = np.zeros((n, channels, 6)), np.zeros((n, channels, 6, 6))
     by_calibration = np.zeros((n, channels, 6, dimension(blocks)))
@@ -226,7 +226,7 @@ def _linearize_heard(
 
 
 def _own_blocks(blocks: tuple[Block, ...], site: Site) -> tuple[tuple[Block, ...], list[int]]:
-    """Return the blocks that have a bearing on the beacons of a site, and their columns."""
+    """Return the blocks that affect the beacons of a site, and their columns."""
     names = {beacon.name for beacon in site.beacons}
     own: list[Block] = []
     columns: list[int] = []

@@ -1,4 +1,4 @@
-"""The parameter of the ground or water that all is in."""
+"""Parameter of the surrounding ground or water."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from magfusion.units import Array, ComplexArray
 
 
 class _Conductivity(Parameter):
-    """The logarithm of the conductivity: a sum to the estimators, a factor to the ground."""
+    """Logarithm of the conductivity: additive for the estimators, a factor for the ground."""
 
     group, owner, kind = "ground", "ground", "conductivity"
     spoken = PERCENT

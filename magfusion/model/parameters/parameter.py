@@ -1,4 +1,4 @@
-"""What a calibration parameter is: all that is particular to one kind of it, in one object."""
+"""Definition of a calibration parameter: all properties of one kind, in one object."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -37,18 +37,18 @@ class Calibration:
     drift : ndarray, shape (beacons,)
         Relative error of each beacon's clock.
     time_offset : float
-        The IMU's sample stamped t was taken at t + time_offset (s), that of ``imu_begin``.
+        An IMU sample stamped t was taken at t + time_offset (s), at ``imu_begin``.
     reference_time : float
-        Where ``phase`` holds (s).
+        Reference of ``phase`` (s).
     log_gain : ndarray, shape (channels,)
-        Logarithm of what each channel's phasor is larger by than the site says.
+        Logarithm of the ratio of each channel's phasor to that of the site.
     others : mapping
-        Values of parameters that have no field here, by ``owner.kind``; absent means zero.
+        Values of parameters without a field here, by ``owner.kind``; absent means zero.
 
     clock_rate : float
-        By how much more than a second of the log's clock passes in one of the IMU's.
+        Seconds of the log's clock per second of the IMU's, less one.
     imu_begin : float
-        Stamp of the IMU's at which its time offset holds (s): its first.
+        IMU stamp at which its time offset is defined (s): the first.
 
     ``phase`` and ``log_gain`` may have one row for each pose.
     """
@@ -67,7 +67,7 @@ class Calibration:
 
     @property
     def clock_offsets(self) -> Array:
-        """What was to be added to each magnetometer's stamps beyond what the site declares (s)."""
+        """Offset of each magnetometer's stamps in addition to the declared one (s)."""
         if not self.others:
             return np.zeros(len(self.site.platform.magnetometers))
         platform = self.site.platform
@@ -75,20 +75,20 @@ class Calibration:
         return np.array([np.sum(self.others.get(f"{name}.{CLOCK}", 0.0)) for name in names])
 
     def imu_offset(self, time: Array) -> Array:
-        """Return what was to be added to the IMU's stamps at some times, shape of them (s)."""
+        """Return the offset of the IMU's stamps at some times, same shape (s)."""
         return self.time_offset + self.clock_rate * (np.asarray(time) - self.imu_begin)
 
     def on_log_rate(self, imu: ImuSamples) -> ImuSamples:
-        """Return the IMU's samples with stamps that lack no more than the time offset."""
+        """Return the IMU samples with stamps corrected for all but the constant time offset."""
         if not self.clock_rate:
             return imu
         return replace(imu, time=imu.time + self.clock_rate * (imu.time - self.imu_begin))
 
     def gain_at(self, time: Array) -> Array:
-        """Return what phasors are larger by than those of the site, shape (..., channels).
+        """Return the gain of phasors relative to those of the site, shape (..., channels).
 
-        With what temperature does to the moments, what was recorded of the currents, and how the
-        magnetometer responds.
+        Includes temperature effects on the moments, recorded currents and the magnetometer's
+        response.
         """
         warmth, current = warmed(self.site, time), driven(self.site, time)
         response = responded(self.site)
@@ -99,7 +99,7 @@ class Calibration:
     def drive_phase(self, time: Array) -> Array:
         """Return the phase of every channel at the given times, shape (..., channels) (rad).
 
-        As measured: with what was recorded of the currents, and the magnetometer's response.
+        As measured: with recorded currents and the magnetometer's response.
         """
         frequencies = of_all_sensors(self.site, self.site.tone_frequencies_hz)
         rate = 2.0 * np.pi * frequencies * self.drift[self.site.owner]
@@ -113,7 +113,7 @@ class Calibration:
 
 
 class Unit(NamedTuple):
-    """A unit's name, and its size in that of the tangent vector."""
+    """Name of a unit, and its size in the unit of the tangent vector."""
 
     text: str
     size: float
@@ -125,24 +125,24 @@ CENTIMETRE, MILLISECOND = Unit("cm", 1e-2), Unit("ms", 1e-3)
 
 
 class PhasorView(NamedTuple):
-    """What the Jacobian of one beacon's phasors is made of."""
+    """Inputs of the Jacobian of one beacon's phasors."""
 
     calibration: Calibration
     beacon: Beacon
     elapsed: Array  # (n,) since the reference time (s)
     phasor: ComplexArray  # (n, tones, 3)
-    observation: Observation | None  # None where all that is asked for is a factor of the phasor
-    sensor: int = 0  # which of the platform's magnetometers measures them
+    observation: Observation | None  # None if only factors of the phasor are needed
+    sensor: int = 0  # index of the magnetometer that measures them
 
     @property
     def whole(self) -> Observation:
-        """The observation of a parameter that is no factor of the phasor."""
+        """Observation, for a parameter that is no factor of the phasor."""
         assert self.observation is not None
         return self.observation
 
 
 class SteadyView(NamedTuple):
-    """What the Jacobian of the steady field is made of."""
+    """Inputs of the Jacobian of the steady field."""
 
     calibration: Calibration
     observation: EarthObservation
@@ -153,37 +153,37 @@ class SteadyView(NamedTuple):
 class Parameter:
     """One kind of calibration parameter.
 
-    A new one is a subclass, added to the kinds in use: estimators, reports and files know of it
-    what it says here.  What is not overridden makes it a value in `Calibration.others` that starts
-    at zero, adds up, and has no bearing on any measurement.  The tangent vector's unit is ``si``.
+    Add a new one as a subclass in the list of kinds: estimators, reports and files use only what
+    it defines here.  By default it is a value in `Calibration.others` that starts at zero, is
+    additive, and affects no measurement.  The tangent vector's unit is ``si``.
     """
 
-    group: ClassVar[str]  # under which it is chosen, with others
-    owner: ClassVar[str]  # what it belongs to, and what it is of that: its name
+    group: ClassVar[str]  # under which it is selected, with others
+    owner: ClassVar[str]  # the object it belongs to; ``kind`` is its name there
     kind: ClassVar[str]
-    components: ClassVar[Sequence[str]] = ()  # names of its numbers; otherwise they are counted
-    unit: ClassVar[Unit] = NO_UNIT  # of figures under its name
-    spoken: ClassVar[Unit] = NO_UNIT  # of sentences
-    words: ClassVar[str | Sequence[str]] = "{owner}.{kind} {i}"  # of sentences: for all or for each
-    si: ClassVar[float] = 1.0  # numbers of all sizes in one covariance cost its digits
-    # A survey this good is kept at its declared values; what it may still be wrong by is considered
-    # in the covariance of the result.
+    components: ClassVar[Sequence[str]] = ()  # names of its numbers; otherwise their indices
+    unit: ClassVar[Unit] = NO_UNIT  # in figures
+    spoken: ClassVar[Unit] = NO_UNIT  # in messages
+    words: ClassVar[str | Sequence[str]] = "{owner}.{kind} {i}"  # in messages: for all or for each
+    si: ClassVar[float] = 1.0  # scale, as numbers of all sizes in one covariance lose digits
+    # A parameter surveyed this well is fixed at its declared value; its remaining error is
+    # considered in the covariance of the result.
     negligible: ClassVar[float] = 0.0
     declared: ClassVar[bool] = False  # whether the site's file has its value and its sigma
-    of_log: ClassVar[bool] = False  # whether it is the log's own, only recorded with the site
-    each_log: ClassVar[bool] = False  # whether every log has a value of its own, declared or not
+    of_log: ClassVar[bool] = False  # whether it belongs to the log and is only recorded in the site
+    each_log: ClassVar[bool] = False  # whether every log has its own value, declared or not
     steady_only: ClassVar[bool] = False  # whether only the steady field determines it
-    factor_of_phasor: ClassVar[bool] = False  # its Jacobian is the phasor but for a factor
+    factor_of_phasor: ClassVar[bool] = False  # whether its Jacobian is proportional to the phasor
     inertial: ClassVar[bool] = False  # whether it corrects the inertial stream
-    # Its mean variance, times this and by this power of the distance, is relative variance of a
-    # beacon's field.
+    # Its mean variance, times this and this power of the inverse distance, is the relative
+    # variance of a beacon's field.
     field_error: ClassVar[float] = 0.0
     falls: ClassVar[int] = 0
-    by_turning: ClassVar[str] = ""  # what it is called where turning would determine it
-    walk: ClassVar[str] = ""  # where the site says what standard deviation it gains in an hour (SI)
+    by_turning: ClassVar[str] = ""  # its name in advice to determine it by rotation
+    walk: ClassVar[str] = ""  # site attribute of its standard deviation gained in an hour (SI)
 
     def kept_to(self, site: Site) -> float:
-        """Return the largest sigma with which it is kept at its declared value."""
+        """Return the largest sigma with which it is fixed at its declared value."""
         return self.negligible
 
     def __eq__(self, other: object) -> bool:
@@ -193,11 +193,11 @@ class Parameter:
         return hash(type(self))
 
     def __repr__(self) -> str:
-        # Of the same settings the same in every process: checkpoints are recognised by it.
+        # Equal in every process for equal settings: checkpoints are identified by it.
         return f"{type(self).__qualname__}()"
 
     def owners(self, site: Site) -> tuple[str, ...]:
-        """Return whom a site has one of: but for beacons and magnetometers there is one."""
+        """Return its owners in a site: one, except for beacons and magnetometers."""
         return (self.owner,)
 
     def sigma(self, site: Site, owner: str) -> Array:
@@ -217,34 +217,34 @@ class Parameter:
         return calibration
 
     def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
-        """Return the step that takes one calibration to another: the inverse of `moved`."""
+        """Return the step from one calibration to another: the inverse of `moved`."""
         name, zero = f"{owner}.{self.kind}", np.zeros(1)
         return new.others.get(name, zero) - old.others.get(name, zero)
 
     def all_differences(
         self, old: Calibration, new: Calibration, owners: Sequence[str]
     ) -> list[Array]:
-        """Return the steps of several owners that take one calibration to another."""
+        """Return the steps of several owners from one calibration to another."""
         return [self.difference(old, new, owner) for owner in owners]
 
     def value(self, calibration: Calibration, owner: str) -> Array | None:
-        """Return what it is, flat, in the unit of a step; None where only changes are numbers."""
+        """Return its value, flat, in the unit of a step; None if only changes are numbers."""
         return None
 
     def refined(self, site: Site, calibration: Calibration, owner: str, sigma: Array) -> Site:
-        """Return the site of a fitted calibration with its value and posterior sigma."""
+        """Return the site with the value and posterior sigma of a fitted calibration."""
         return site
 
     def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray | None:
-        """Return its columns, shape (n, tones, 3, columns); None where it has no bearing."""
+        """Return its columns, shape (n, tones, 3, columns); None without an effect."""
         return None
 
     def steady_jacobian(self, view: SteadyView) -> Array | None:
-        """Return its columns, shape (n, 3, columns); None where it has no bearing."""
+        """Return its columns, shape (n, 3, columns); None without an effect."""
         return None
 
     def corrected_imu(self, calibration: Calibration, owner: str, imu: ImuSamples) -> ImuSamples:
-        """Return the inertial samples without what this parameter does to them."""
+        """Return the inertial samples corrected for this parameter."""
         return imu
 
     def walk_per_sqrt_hour(self, site: Site) -> float:
@@ -254,11 +254,11 @@ class Parameter:
     def drags(
         self, calibration: Calibration, owner: str, time: float
     ) -> "tuple[Parameter, Array] | None":
-        """Return what else a step of it moves that happens at a time, shape (columns, own)."""
+        """Return the effect of a step at a time on another parameter, shape (columns, own)."""
         return None
 
     def called(self, site: Site, owner: str, i: int) -> str:
-        """Return what one of its numbers is called in a sentence."""
+        """Return the name of one of its numbers in messages."""
         words = self.words if isinstance(self.words, str) else self.words[i]
         return words.format(owner=owner, kind=self.kind, i=i, axis=AXES[i % 3])
 
@@ -280,7 +280,7 @@ class SiteParameter(Parameter):
         raise NotImplementedError
 
     def sigma(self, site: Site, owner: str) -> Array:
-        """Return what the survey declares."""
+        """Return the declared standard deviations."""
         return getattr(self.part(site, owner).sigma, self.sigma_attribute).ravel() / self.si
 
     def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
@@ -304,14 +304,14 @@ class SiteParameter(Parameter):
         return ((b - a) / self.si).ravel()
 
     def value(self, calibration: Calibration, owner: str) -> Array | None:
-        """Return the attribute; a rotation is no list of numbers."""
+        """Return the attribute; None for a rotation."""
         if self.is_rotation or not hasattr(self, "attribute"):
             return None
         found = getattr(self.part(calibration.site, owner), self.attribute)
         return np.asarray(found / self.si).ravel()
 
     def refined(self, site: Site, calibration: Calibration, owner: str, sigma: Array) -> Site:
-        """Return the site with the posterior sigma; the value is in it."""
+        """Return the site with the posterior sigma; it already has the value."""
         part = self.part(site, owner)
         shape = getattr(part.sigma, self.sigma_attribute).shape
         changed = {self.sigma_attribute: self.si * sigma.reshape(shape)}
@@ -328,12 +328,12 @@ class Block(NamedTuple):
 
     @property
     def group(self) -> str:
-        """Name under which it is chosen."""
+        """Name under which it is selected."""
         return self.parameter.group
 
     @property
     def kind(self) -> str:
-        """What it is of its owner."""
+        """Name of the parameter within its owner."""
         return self.parameter.kind
 
     @property
@@ -343,7 +343,7 @@ class Block(NamedTuple):
 
     @property
     def key(self) -> tuple[Parameter, str]:
-        """What distinguishes it from all others; a beacon may be called sensor, so not its name."""
+        """Unique key; the name is ambiguous, as a beacon may be called sensor."""
         return self.parameter, self.owner
 
 

@@ -1,4 +1,4 @@
-"""Parameters of the platform's instruments, and of the Earth field about it."""
+"""Parameters of the platform's instruments, and of the surrounding Earth field."""
 
 from dataclasses import replace
 from typing import ClassVar
@@ -29,10 +29,10 @@ MICROTESLA = 1e-6  # T
 
 
 class MagnetometerParameter(SiteParameter):
-    """A parameter that every magnetometer has; where there are several, their names are owners."""
+    """A parameter of every magnetometer; where there are several, their names are owners."""
 
     def owners(self, site: Site) -> tuple[str, ...]:
-        """Return the names of magnetometers, or of the only one what it is called everywhere."""
+        """Return the names of the magnetometers, or the common name of a single one."""
         several = site.platform.further
         return tuple(m.name for m in site.platform.magnetometers) if several else (self.owner,)
 
@@ -41,7 +41,7 @@ class MagnetometerParameter(SiteParameter):
         return site.platform.magnetometers[self.sensor(site, owner)]
 
     def sensor(self, site: Site, owner: str) -> int:
-        """Return which of the platform's it is."""
+        """Return the index of the magnetometer."""
         return self.owners(site).index(owner)
 
     def with_part(self, site: Site, part: Magnetometer) -> Site:
@@ -53,14 +53,14 @@ class MagnetometerParameter(SiteParameter):
         return replace(site, platform=platform.carrying(every))
 
     def kept_to(self, site: Site) -> float:
-        """Return the largest sigma with which it is kept at its declared value.
+        """Return the largest sigma with which it is fixed at its declared value.
 
-        Of several magnetometers none is kept: what is between two of them turns the platform.
+        With several magnetometers none is fixed: a difference between two rotates the platform.
         """
         return 0.0 if site.platform.further else self.negligible
 
     def called(self, site: Site, owner: str, i: int) -> str:
-        """Return what one of its numbers is called, with the name where there are several."""
+        """Return the name of one of its numbers in messages, with that of the magnetometer."""
         words = super().called(site, owner, i)
         if not site.platform.further:
             return words
@@ -68,7 +68,7 @@ class MagnetometerParameter(SiteParameter):
         return named if named != words else f"{words} of magnetometer {owner}"
 
     def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray | None:
-        """Return the columns of its own phasors; it has no bearing on the others'."""
+        """Return the columns of its own phasors; it does not affect the others'."""
         site = view.calibration.site
         if site.platform.further and self.sensor(site, owner) != view.sensor:
             return None
@@ -146,9 +146,9 @@ class _Position(MagnetometerParameter):
 
 
 class _ClockOffset(MagnetometerParameter):
-    """What was to be added to a magnetometer's stamps beyond what is declared.
+    """Offset of a magnetometer's stamps in addition to the declared one.
 
-    A stamp that is too early reads a phase that is ahead, and the place of a little later.
+    A stamp that is too early gets a phase that leads, and a position of a later time.
     """
 
     group, owner, kind = "time-offset", "magnetometer", CLOCK
@@ -179,7 +179,7 @@ class _ClockOffset(MagnetometerParameter):
     def own_jacobian(self, view: PhasorView) -> ComplexArray | None:
         turns = 2j * np.pi * view.beacon.tone_frequencies_hz[:, None]
         by_phase = turns * view.phasor
-        # No twist where the pose alone is sought: a fix is of a platform that hardly moves in it.
+        # No twist where only the pose is estimated: a fix assumes a nearly stationary platform.
         moved = view.whole.time_offset
         return (by_phase if moved is None else by_phase - moved)[..., None]
 
@@ -218,7 +218,7 @@ class _TimeOffset(Parameter):
 
 
 class _ClockRate(Parameter):
-    """What the time offset changes by in each second, from the IMU's first sample on."""
+    """Change of the time offset per second, from the IMU's first sample on."""
 
     group, owner, kind = "time-offset", "imu", "clock_rate"
     unit = spoken = PPM
@@ -228,7 +228,7 @@ class _ClockRate(Parameter):
 
     def sigma(self, site: Site, owner: str) -> Array:
         imu = site.platform.imu
-        # Stamps that are known exactly are of one clock.
+        # Stamps with a known offset are of one clock.
         return np.array([imu.clock_rate_sigma if imu.time_offset_sigma else 0.0])
 
     def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
@@ -255,7 +255,7 @@ class _ClockRate(Parameter):
 
 
 def _running(calibration: Calibration, time: Array) -> Array:
-    """Return how long the IMU's clock has run (s)."""
+    """Return the running time of the IMU's clock (s)."""
     return time - calibration.imu_begin
 
 
@@ -286,7 +286,7 @@ class _EarthParameter(Parameter):
         return change[self.coordinates] / self.si
 
     def refined(self, site: Site, calibration: Calibration, owner: str, sigma: Array) -> Site:
-        return replace(site, location=None)  # the estimate takes the place of the location's
+        return replace(site, location=None)  # the estimate replaces the location's field
 
     def steady_jacobian(self, view: SteadyView) -> Array | None:
         azimuth, level, _ = _cylindrical(view.calibration)

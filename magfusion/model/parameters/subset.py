@@ -1,4 +1,4 @@
-"""A calibration of some of a site's beacons: what many others are need not be calculated."""
+"""Calibration of a subset of a site's beacons, to avoid computing the many others."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,17 +14,17 @@ TOGETHER = 32  # epochs whose beacons are evaluated at once
 
 
 def channels_of(site: Site, beacons: IntArray) -> IntArray:
-    """Return the channels of some beacons, by their numbers in the site."""
+    """Return the channels of beacons, given by index in the site."""
     return np.flatnonzero(np.isin(site.owner, beacons))
 
 
 def beacons_of(site: Site, channels: BoolArray) -> IntArray:
-    """Return the beacons of which some channel is heard, shape (channels,)."""
+    """Return the beacons with any of the detected channels, shape (channels,)."""
     return np.unique(site.owner[channels])
 
 
 def of_beacons(calibration: Calibration, beacons: IntArray) -> Calibration:
-    """Return the calibration of some beacons alone, in the order of the site."""
+    """Return the calibration of a subset of the beacons, in the order of the site."""
     site, channels = calibration.site, channels_of(calibration.site, beacons)
     return replace(
         calibration,
@@ -36,9 +36,9 @@ def of_beacons(calibration: Calibration, beacons: IntArray) -> Calibration:
 
 
 def with_unheard(calibration: Calibration) -> Calibration:
-    """Return the calibration with the beacons that are not heard, as the site declares them.
+    """Return the calibration including the undetected beacons, as the site declares them.
 
-    Of one magnetometer.
+    For one magnetometer.
     """
     site = calibration.site
     if not site.unheard:
@@ -59,7 +59,7 @@ def with_unheard(calibration: Calibration) -> Calibration:
 
 
 def samples_of(samples: FieldSamples, channels: IntArray) -> FieldSamples:
-    """Return the phasors of some channels."""
+    """Return the phasors of a subset of the channels."""
     return replace(
         samples,
         channels=tuple(samples.channels[k] for k in channels.tolist()),
@@ -71,7 +71,7 @@ def samples_of(samples: FieldSamples, channels: IntArray) -> FieldSamples:
 
 
 def stretches(site: Site, heard: BoolArray) -> Iterator[tuple[slice, IntArray]]:
-    """Yield epochs that follow each other, with the beacons that are heard at any of them.
+    """Yield successive epochs, with the beacons detected at any of them.
 
     Parameters
     ----------

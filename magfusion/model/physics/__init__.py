@@ -1,1 +1,1 @@
-"""The ground: pure functions of physics on arrays, batched."""
+"""Physics as pure, batched functions on arrays."""

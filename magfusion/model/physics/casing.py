@@ -1,6 +1,6 @@
-"""What a steel tube about a sensor lets through of fields that alternate, and gathers.
+"""Transmission of alternating fields through a steel tube around a sensor, and flux it collects.
 
-What comes through is after H. Kaden, Wirbelstroeme und Schirmung in der Nachrichtentechnik, 2nd ed.
+The transmission is after H. Kaden, Wirbelstroeme und Schirmung in der Nachrichtentechnik, 2nd ed.
 (1959), of a long tube whose wall is thin against its radius, in a field that is uniform about it;
 in English e.g. in S. Celozzi, R. Araneo and G. Lovat, Electromagnetic Shielding (2008).
 """
@@ -15,18 +15,18 @@ from scipy.special import k0
 from magfusion.units import MU0_OVER_4PI, Array, ComplexArray
 
 STEEL = ("wall", "permeability", "conductivity")
-MOST = 2.0  # by which a logarithm may be wrong; beyond, a search is lost
-WAVES = 128  # wave numbers that the response along a tube is summed over
+MOST = 2.0  # largest error of a logarithm; beyond, a search diverges
+WAVES = 128  # wave numbers in the sum of the response along a tube
 
 
 @dataclass(frozen=True)
 class Casing:
-    """A long steel tube about the magnetometer, along the body's first axis.
+    """A long steel tube around the magnetometer, along the body's first axis.
 
     Parameters
     ----------
     radius : float
-        Of the middle of its wall (m).
+        Mean radius of its wall (m).
     wall : float
         Thickness (m).
     permeability : float
@@ -34,8 +34,8 @@ class Casing:
     conductivity : float
         (S/m)
     log_gain_sigma, phase_sigma : float
-        Of what comes through, about what follows from these: of the logarithm of its size, and
-        of its phase (rad); across and along alike.
+        Of the transmission about the value that follows from these: of the logarithm of its
+        magnitude, and of its phase (rad); equal across and along.
     """
 
     radius: float
@@ -50,23 +50,23 @@ class Casing:
 
     @property
     def steel_sigma(self) -> Array:
-        """Of the logarithms of `STEEL`, shape (3,)."""
+        """Standard deviations of the logarithms of `STEEL`, shape (3,)."""
         return np.array([self.wall_sigma, self.permeability_sigma, self.conductivity_sigma])
 
 
 class Transmission(NamedTuple):
-    """Field inside over field outside, a complex number by the phasor's exp(+j w t)."""
+    """Ratio of the field inside to that outside, a complex number for exp(+j w t)."""
 
     across: complex
     along: complex
 
 
 class Response(NamedTuple):
-    """What tubes do, each with its own change of the steel.
+    """Response of tubes, each with its own change of the steel.
 
-    ``strength`` is the cross section of the wall times its permeability as the field enters it
-    from both sides, less one, over 2 pi (m^2).  ``by_steel`` has the derivatives of the logarithms
-    of across, along and strength by those of `STEEL`.
+    ``strength`` is the cross section of the wall times its permeability for a field entering from
+    both sides, less one, over 2 pi (m^2).  ``by_steel`` has the derivatives of the logarithms of
+    across, along and strength by those of `STEEL`.
     """
 
     across: ComplexArray  # (k,)
@@ -76,7 +76,7 @@ class Response(NamedTuple):
 
 
 def tube_response(casing: Casing, frequency_hz: float, change: Array) -> Response:
-    """Return what a tube lets through and gathers.
+    """Return the transmission and flux collection of a tube.
 
     With ``g = (1 + j) / skin depth`` and ``K = g radius / permeability``: along
     ``1 / (cosh g d + K sinh(g d) / 2)``, across ``1 / (cosh g d + (K + 1 / K) sinh(g d) / 2)``,
@@ -120,7 +120,7 @@ def tube_response(casing: Casing, frequency_hz: float, change: Array) -> Respons
 
 
 def tube_transmission(casing: Casing, frequency_hz: float) -> Transmission:
-    """Return what comes through a tube's wall, of its steel as it is declared."""
+    """Return the transmission through a tube's wall, for its declared steel."""
     whole = tube_response(casing, frequency_hz, np.zeros((1, 3)))
     return Transmission(complex(whole.across[0]), complex(whole.along[0]))
 
@@ -128,20 +128,20 @@ def tube_transmission(casing: Casing, frequency_hz: float) -> Transmission:
 def gathering_weights(
     strength: ComplexArray, radius: float, place: Array
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Return what a long tube adds along its axis, as a sum over the field outside it.
+    """Return the field a long tube adds along its axis, as weights of the field outside it.
 
-    A wall that is magnetised along has poles where that changes, whose field magnetises it again.
-    Of a wave of number q along the tube a ring of poles answers ``-N / (1 + N)``, with
-    ``N = strength q^2 K0(q radius)``: to all orders, for a tube has no place that is not like
-    another.  Places must be closer than the field changes: a dipole's at a distance d has no waves
-    shorter than about d.
+    An axially magnetised wall has poles where its magnetisation changes, and their field magnetises
+    it again.  To a wave of number q along the tube the response of a ring of poles is
+    ``-N / (1 + N)``, with ``N = strength q^2 K0(q radius)``, to all orders, as the tube is
+    translation invariant.  Positions must be closer than the field changes: a dipole's at a
+    distance d has no waves shorter than about d.
 
     Parameters
     ----------
     strength : complex ndarray, shape (k,)
         Of `Response` (m^2).
     place : ndarray, shape (m,)
-        Evenly along the tube, from where the field is seen (m).
+        Positions at equal steps along the tube, relative to the sensor (m).
 
     Returns
     -------

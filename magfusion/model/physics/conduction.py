@@ -1,12 +1,12 @@
-"""What conducting ground or water adds to the field of a dipole that oscillates in it.
+"""Contribution of conducting ground or water to the field of an oscillating dipole.
 
 In a full space of one conductivity, with ``exp(+j w t)``, ``x = (1 + j) R / skin depth`` and n the
 direction of the offset, the field of a dipole is (J. R. Wait, Geoelectromagnetism, 1982)::
 
     B = (mu0/4pi R^3) exp(-x) [ (3 n (n . m) - m) (1 + x) + x^2 (n (n . m) - m) ]
 
-Here is the difference from the field without conduction, which so keeps whatever form it has.
-Displacement currents are left out: below 1 MHz they are no part of what any ground conducts.
+Computed is the difference from the field without conduction, whatever form that has.  Displacement
+currents are neglected: below 1 MHz they are small in any ground.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ MU0 = 4.0 * np.pi * MU0_OVER_4PI  # T m / A
 
 
 def skin_depth(frequency_hz: Array | float, conductivity: float) -> Array:
-    """Return the distance over which a wave falls by e (m); infinite without conduction.
+    """Return the distance over which a wave decays by e (m); infinite without conduction.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def decay(frequency_hz: Array, conductivity: float) -> ComplexArray:
 
 
 def conducted_field(offset: Array, moment: Array, decay: ComplexArray) -> ComplexArray:
-    """Return what conduction adds to the phasor of a dipole.
+    """Return the contribution of conduction to the phasor of a dipole.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def by_log_conductivity(offset: Array, moment: Array, decay: ComplexArray) -> Co
 def _terms(
     offset: Array, moment: Array, decay: ComplexArray
 ) -> tuple[Array, Array, ComplexArray, ComplexArray]:
-    """Return R^2, r . m, and what conduction adds to the near and to the far part, (..., 1)."""
+    """Return R^2, r . m, and the conduction terms of the near and the far part, (..., 1)."""
     square = np.einsum("...i,...i", offset, offset)[..., None]
     along = np.einsum("...i,...i", offset, moment)[..., None]
     x = decay[..., None] * np.sqrt(square)

@@ -29,7 +29,7 @@ def dipole_field(offset: Array, moment: Array) -> Array:
 
 
 def dipole_field_and_gradient(offset: Array, moment: Array) -> tuple[Array, Array]:
-    """Return the dipole field with its gradient: ``[i, j] = d field_i / d offset_j``.
+    """Return the dipole field and its gradient: ``[i, j] = d field_i / d offset_j``.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def dipole_field_and_gradient(offset: Array, moment: Array) -> tuple[Array, Arra
     field : ndarray, shape (..., 3)
         (T)
     gradient : ndarray, shape (..., 3, 3)
-        (T/m); symmetric and without trace, as the field has neither curl nor divergence.
+        (T/m); symmetric and trace-free, as the field has neither curl nor divergence.
     """
     square = np.einsum("...i,...i", offset, offset)[..., None]
     along = np.einsum("...i,...i", offset, moment)[..., None]
@@ -56,7 +56,7 @@ def dipole_field_and_gradient(offset: Array, moment: Array) -> tuple[Array, Arra
 
 
 def dipole_field_along(offset: Array, moment: Array, along: Array) -> Array:
-    """Return the derivative of the dipole field along displacements, without its whole gradient.
+    """Return the derivative of the dipole field along displacements, without its full gradient.
 
     Parameters
     ----------

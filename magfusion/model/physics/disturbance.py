@@ -1,15 +1,15 @@
-"""What iron and metal make of an alternating field: the moment that it induces in a sphere.
+"""Disturbance of an alternating field by iron and metal: the moment induced in a sphere.
 
 Paper 004 models a disturbing body as a ring of N turns, area S and resistance R (Eq 24):
-``M = N S / R dB/dt S``, for ``B sin(w t)`` equal to ``N w B S^2 cos(w t) / R``.  Three things are
-not right with it:
+``M = N S / R dB/dt S``, for ``B sin(w t)`` equal to ``N w B S^2 cos(w t) / R``.  Three points are
+incorrect:
 
 - the sign: the induced current opposes the change of the field (Lenz), so that the moment is
   ``-N^2 S^2 / R dB/dt`` -- with the square of N, since each turn adds to the voltage as well;
-- the ring has no inductance: its moment grows with the frequency without bound, where that of a
-  real body saturates and turns from quadrature to opposition;
+- the ring has no inductance: its moment grows without bound with frequency, where that of a real
+  body saturates and changes from quadrature to opposition;
 - a permeable body is magnetised in phase with the field at any frequency.  For steel furniture at
-  tens of hertz this is the larger part, and no lower frequency takes it away.
+  tens of hertz this is the larger part, and a lower frequency does not remove it.
 
 The sphere has all three and a closed solution.  Its weak-field, low-frequency limit without
 permeability is the sum of such rings, ``-(2 pi / 15) conductivity a^5 dB/dt``.
@@ -35,7 +35,7 @@ def sphere_polarizability(
 
     With ``x = a sqrt(-i w mu sigma)`` and ``q = x j0(x) / j1(x) - 1`` (spherical Bessel functions)
     it is ``(4 pi a^3 / mu0) (2 mu_r - q) / (2 (mu_r + q))``: ``(4 pi a^3 / mu0) (mu_r - 1) /
-    (mu_r + 2)`` at rest, where q is 2, and ``-2 pi a^3 / mu0`` where the skin is thin.
+    (mu_r + 2)`` in a static field, where q is 2, and ``-2 pi a^3 / mu0`` for a thin skin.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def _bessel_ratio(square: ComplexArray) -> ComplexArray:
     """Return ``x j0(x) / j1(x) = x^2 / (1 - x cot x)``, given the square of x."""
     small = np.abs(square) < _SMALL**2
     safe = np.where(small, -1j, square)
-    x = np.sqrt(safe)  # of negative imaginary part: what follows never overflows
+    x = np.sqrt(safe)  # with negative imaginary part: the following never overflows
     turn = np.exp(-2j * x)
     cotangent = 1j * (1.0 + turn) / (1.0 - turn)
     series = 3.0 - square / 5.0 - square**2 / 175.0
@@ -77,8 +77,8 @@ def induced_field(
     """Return the field of induced dipoles, in the axes of the arguments.
 
     Each body is a dipole in the primary field at its centre: exact for a sphere in a uniform
-    field; the gradient of the primary over the body, and what bodies induce in each other, are
-    left out.
+    field.  The gradient of the primary over the body, and mutual induction of bodies, are
+    neglected.
 
     Parameters
     ----------

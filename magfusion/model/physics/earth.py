@@ -1,4 +1,4 @@
-"""The Earth's magnetic field and gravity at a place."""
+"""Earth's magnetic field and gravity at a location."""
 
 import datetime
 
@@ -10,7 +10,7 @@ from magfusion.units import DEGREE, NANOTESLA, Array
 
 IGRF_FIRST = datetime.date(1900, 1, 1)
 IGRF_LAST = datetime.date(2030, 1, 1)
-AMBIENT_SHARE = 0.005  # of the field's size: usual disturbance of each component, one sigma
+AMBIENT_SHARE = 0.005  # of the field's magnitude: usual disturbance per component, one sigma
 
 # WGS84 (NIMA TR8350.2, tables 3.1 to 3.4): semi-major axis, flattening, first eccentricity
 # squared, normal gravity at the equator, Somigliana's constant, and omega^2 a^2 b / GM.
@@ -54,8 +54,8 @@ def earth_field_world(
     day = datetime.date(date.year, date.month, date.day)
     if not IGRF_FIRST <= day <= IGRF_LAST:
         raise InputError(
-            f"location.date: found {day}; the IGRF holds from {IGRF_FIRST} to {IGRF_LAST}: give a "
-            "date in it, or earth_field_t instead of the location"
+            f"location.date: found {day}; the IGRF is valid from {IGRF_FIRST} to {IGRF_LAST}: give"
+            " a date in it, or earth_field_t instead of the location"
         )
     midnight = datetime.datetime(day.year, day.month, day.day)
     east_north_up = ppigrf.igrf(longitude_deg, latitude_deg, height_m / 1e3, midnight)

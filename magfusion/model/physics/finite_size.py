@@ -1,8 +1,8 @@
-"""The coupling of two coils of true size: dipoles, and the first term of their size.
+"""Coupling of two coils of finite size: dipoles, and the first-order term of their size.
 
-The flux through a small flat coil is the mean over its disc of a harmonic field, and that mean is
-``1 - kappa d^2/dn^2`` of the field at its centre, n the coil's axis; a transmitting coil is the
-same by reciprocity.  This one term makes the dipole model good to 0.03 degrees at five coil sizes.
+The flux through a small flat coil is the mean over its disc of a harmonic field,
+``1 - kappa d^2/dn^2`` of the field at its centre, n the coil's axis; by reciprocity the same holds
+for a transmitting coil.  With this term the dipole model has 0.03 degrees error at five coil sizes.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class _Term(NamedTuple):
 
 
 def _terms(of_a: int, of_b: int) -> tuple[_Term, ...]:
-    """Return the derivative of 1/r, so many times along one unit vector and along another.
+    """Return derivatives of 1/r of given orders along two unit vectors.
 
     Taylor coefficients of ``(q + w)^(-1/2)``, ``w = 2 x a + 2 y b + x^2 + 2 x y c + y^2``, with a
     and b the offset along the two vectors, c their product and q the square of the distance.
@@ -62,19 +62,19 @@ def square_kappa(side: float) -> float:
 def coil_kappa(radius: float | None, length: float | None) -> float:
     """Return the constant of a coil's shape, ``radius^2 / 8 - length^2 / 24`` (m^2).
 
-    Its moments are spread over a disc and along a line; at a length of ``sqrt(3)`` radii they
+    Its moments are spread over a disc and along a line; at a length of ``sqrt(3)`` radii the two
     cancel.
     """
     return disc_kappa(radius or 0.0) - (length or 0.0) ** 2 / 24.0
 
 
 def coil_shape(kappa: float, length: float | None = None) -> tuple[float | None, float | None]:
-    """Return radius and length (m) of a coil of such a constant; None for none.
+    """Return radius and length (m) of a coil with a constant; None for none.
 
     Parameters
     ----------
     length : float, optional
-        That is known; another one only where no radius would do with it.
+        Known length; changed only if no radius fits it.
     """
     square = 8.0 * kappa + (length or 0.0) ** 2 / 3.0
     if square >= 0.0:
@@ -84,7 +84,7 @@ def coil_shape(kappa: float, length: float | None = None) -> tuple[float | None,
 
 @dataclass(frozen=True, eq=False)
 class CoilCoupling:
-    """Flux density that a coil senses of another, and its derivatives.
+    """Flux density that a coil receives from another, with its derivatives.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def coil_coupling(
     kappa_moment: Array | None = None,
     kappa_sensitivity: Array | None = None,
 ) -> CoilCoupling:
-    """Return what a receiving coil senses of a transmitting one, all in the same axes.
+    """Return the coupling from a transmitting to a receiving coil, all in the same axes.
 
     ``s . (1 - kappa_s (n_s . grad)^2) (1 - kappa_m (n_m . grad)^2) G(offset) m``, with G the field
     of a unit dipole.
@@ -123,7 +123,7 @@ def coil_coupling(
         Along the coils' axes (A m^2; without unit).  Must not be zero.
     kappa_moment, kappa_sensitivity : ndarray, shape (...), optional
         `disc_kappa` or `square_kappa` of the coils (m^2); with neither both are points, and the
-        derivatives by them are left zero.
+        derivatives by them are zero.
     """
     size_s, size_m = (np.linalg.norm(v, axis=-1) for v in (sensitivity, moment))
     along_s, along_m = sensitivity / size_s[..., None], moment / size_m[..., None]
@@ -160,7 +160,7 @@ def coil_coupling(
 
 
 def _by_vector(value: Array, by_unit: Array, unit: Array, size: Array) -> Array:
-    """Chain rule from length and direction to the vector itself."""
+    """Apply the chain rule from length and direction to the vector."""
     radial = np.einsum("...i,...i", by_unit, unit)[..., None]
     return (value * unit + by_unit - radial * unit) / size[..., None]
 

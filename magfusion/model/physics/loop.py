@@ -1,8 +1,8 @@
-"""The field of a thin circular loop and its gradient, in closed form, near and far.
+"""Field of a thin circular loop and its gradient, in closed form, near and far.
 
 The textbook formula by complete elliptic integrals (Smythe, *Static and Dynamic Electricity*,
-section 7.10) loses all its digits near the axis and far away, where the loop is all but a dipole.
-Here the dipole's formula stays, and each of its terms has a factor that is one at the dipole: with
+section 7.10) loses all its digits near the axis and far away, where the loop is nearly a dipole.
+Here each term of the dipole's formula has a factor that is one for the dipole: with
 z along the axis, s the square of the distance from it, ``c = r^2 + a^2`` and ``x = 4 a^2 s / c^2``,
 
     B = (mu0/4pi) m (P n + Q rho),  P = 2 f0 / c^1.5 - 3 s f1 / c^2.5,  Q = 3 z f1 / c^2.5,
@@ -10,9 +10,9 @@ z along the axis, s the square of the distance from it, ``c = r^2 + a^2`` and ``
     f0 = F(3/4, 5/4; 1; x),  f1 = F(5/4, 7/4; 2; x),  and  g = F(5/4, 7/4; 1; x)  in the gradient,
 
 hypergeometric functions of positive terms, since ``(1 - t cos)^(-nu)`` has the mean
-``F(nu/2, (nu+1)/2; 1; t^2)``.  On the axis and far away x goes to nothing.  A quadratic
-transformation (DLMF 15.8.18) and contiguous relations (DLMF 15.5(ii)) make of them the complete
-integrals B and D (Bulirsch's, DLMF 19.2.11) by sums of positive terms; these come from the
+``F(nu/2, (nu+1)/2; 1; t^2)``.  On the axis and far away x tends to zero.  A quadratic
+transformation (DLMF 15.8.18) and contiguous relations (DLMF 15.5(ii)) express them by the complete
+integrals B and D (Bulirsch's, DLMF 19.2.11) in sums of positive terms; these are computed by the
 arithmetic-geometric mean (DLMF 19.8(i)).  A loop without radius is the dipole.
 """
 
@@ -22,13 +22,13 @@ import numpy as np
 
 from magfusion.units import MU0_OVER_4PI, Array
 
-_MOST_MEANS = 10  # each doubles the digits; at the wire it takes so many
-_WIRE = 1e-6  # of the radius, about; half its thickness, so that the field stays finite
+_MOST_MEANS = 10  # iterations, each of which doubles the digits; needed at the wire
+_WIRE = 1e-6  # of the radius, about; half the wire's thickness, so that the field stays finite
 _TINY = 1e-300
 
 
 class _Loop(NamedTuple):
-    """What field and gradient have in common, shape (..., 1) and (..., 3)."""
+    """Quantities shared by field and gradient, shape (..., 1) and (..., 3)."""
 
     axis: Array
     strength: Array  # mu0/4pi times the size of the moment
@@ -48,8 +48,8 @@ def loop_field(offset: Array, moment: Array, radius: Array | float) -> Array:
     Parameters
     ----------
     offset : ndarray, shape (..., 3)
-        From the loop's centre (m).  Must not be zero where the radius is; on the wire, which has a
-        millionth of the radius, the field stays finite.
+        From the loop's centre (m).  Must not be zero where the radius is.  The wire has a
+        thickness of a millionth of the radius, so that the field is finite.
     moment : ndarray, shape (..., 3)
         Along the loop's axis (A m^2).  Must not be zero.
     radius : ndarray or float, shape (...)
@@ -66,7 +66,7 @@ def loop_field(offset: Array, moment: Array, radius: Array | float) -> Array:
 def loop_field_and_gradient(
     offset: Array, moment: Array, radius: Array | float
 ) -> tuple[Array, Array]:
-    """Return the field of thin circular loops with its gradient, in one evaluation.
+    """Return the field of thin circular loops and its gradient, in one evaluation.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def loop_field_and_gradient(
     field : ndarray, shape (..., 3)
         (T)
     gradient : ndarray, shape (..., 3, 3)
-        ``[i, j] = d field_i / d offset_j`` (T/m); symmetric and without trace, as the field has
+        ``[i, j] = d field_i / d offset_j`` (T/m); symmetric and trace-free, as the field has
         neither curl nor divergence.
     """
     seen = _loop(offset, moment, np.asarray(radius, dtype=np.float64))
@@ -87,7 +87,7 @@ def loop_field_and_gradient(
     shear = 3.0 * (seen.first - z * z * fall)
     axis, across = seen.axis, seen.across
     mixed = axis[..., :, None] * across[..., None, :]
-    # Where the distance from the axis is lost in rounding, so is what it is divided from.
+    # Where rounding loses the distance from the axis, the numerators vanish with it.
     outward = (by_axial + 2.0 * seen.radial) / np.maximum(s, _TINY)
     gradient = (by_axial - seen.radial)[..., None] * axis[..., :, None] * axis[..., None, :]
     gradient += shear[..., None] * (mixed + np.swapaxes(mixed, -1, -2))
@@ -109,7 +109,7 @@ def _loop(offset: Array, moment: Array, radius: Array) -> _Loop:
     rho = np.sqrt(s)
     c = s + z * z + a * a
     x = (2.0 * a * rho / c) ** 2
-    # By the nearest and the farthest point of the wire, sqrt(1 - x); within the wire it ends.
+    # sqrt(1 - x) from the nearest and the farthest point of the wire, bounded within the wire.
     y = np.maximum(np.sqrt(((rho - a) ** 2 + z * z) * ((rho + a) ** 2 + z * z)) / c, _WIRE)
     w, q = x / (1.0 + y) ** 2, 0.5 * (1.0 + y)
     first, second = _integrals(w, np.sqrt(y / q))
@@ -145,10 +145,10 @@ def _integrals(parameter: Array, complement: Array) -> tuple[Array, Array]:
     parameter : ndarray
         The square of the modulus, from 0 to 1.
     complement : ndarray
-        ``sqrt(1 - parameter)``, which the caller knows better.
+        ``sqrt(1 - parameter)``, more accurate from the caller.
     """
     mean, other = 0.5 * (1.0 + complement), np.sqrt(complement)
-    apart = 0.5 * parameter / (1.0 + complement)  # half the difference of the means before
+    apart = 0.5 * parameter / (1.0 + complement)  # half the difference of the previous means
     added = 0.5 * apart / (1.0 + complement)  # its square over the parameter
     total, weight = added, 1.0
     for _ in range(_MOST_MEANS):

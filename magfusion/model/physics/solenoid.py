@@ -1,6 +1,6 @@
-"""The field of coils of true size by Biot and Savart's law: what the simulator measures.
+"""Field of coils of finite size by the Biot-Savart law, for the simulator.
 
-The estimators have a closed form (`magfusion.model.physics.loop`), which this knows nothing of.
+Independent of the closed form of the estimators (`magfusion.model.physics.loop`).
 """
 
 import numpy as np
@@ -55,9 +55,9 @@ def solenoid_field(
 def loop_field(offset: Array, moment: Array, radius: float) -> Array:
     """Return the flux density of a thin circular current loop, in the axes of its arguments.
 
-    The sum over elements of the wire, which on a circle converges as a geometric series; so many
-    that the nearest point has eleven digits, unless it is nearer to the wire than a hundredth of
-    the radius.
+    The sum over wire elements converges as a geometric series on a circle.  Their number gives
+    eleven digits at the nearest point, unless it is closer to the wire than a hundredth of the
+    radius.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def loop_field(offset: Array, moment: Array, radius: float) -> Array:
 
 
 def _azimuths(offset: Array, axis: Array, radius: float) -> int:
-    """Return how many elements of the wire the nearest of the points needs."""
+    """Return the number of wire elements that the nearest of the points needs."""
     square = np.einsum("ni,ni->n", offset, offset)
     rho = np.sqrt(np.maximum(square - (offset @ axis) ** 2, 0.0))
     rate = np.arccosh(np.maximum((square + radius**2) / (2.0 * radius * rho + 1e-300), 1.0))

@@ -1,12 +1,12 @@
-"""Layers and rows of turns, and the coil that stands for them: moment, radius, length.
+"""Windings of layers and rows of turns, and the equivalent coil: moment, radius, length.
 
 Far away turns of radius R at the height z are dipoles of ``I pi R^2``, whose next term has
-``R^2 / 8 - z^2 / 2`` of their own axis (`magfusion.model.physics.finite_size`).  The coil of
+``R^2 / 8 - z^2 / 2`` along their own axis (`magfusion.model.physics.finite_size`).  The coil of
 
     M = I pi sum R^2,  radius^2 = sum R^4 / sum R^2,  length^2 = 12 sum R^2 z^2 / sum R^2
 
-has the same two terms, and a field of its own near by (`magfusion.model.coil_field`): it differs
-from that of all the turns by the fourth power of their spread over the distance.
+has the same two terms (`magfusion.model.coil_field`).  Its near field differs from that of all
+turns by the fourth power of their spread over the distance.
 """
 
 from dataclasses import dataclass
@@ -26,13 +26,13 @@ class Winding:
     current : float
         Peak, of one turn (A).
     layers, rows : int
-        Layers, one about the other, and the turns of each, one beside the other.
+        Concentric layers, and adjacent turns of each.
     inner_radius : float
-        Of the former on which the first layer lies (m).
+        Radius of the former below the first layer (m).
     wire : float
-        Diameter with its insulation (m), by which each layer lies farther out than the last.
+        Diameter with insulation (m); the radial distance of successive layers.
     pitch : float
-        From turn to turn along the axis (m); the wire's where it is wound closely.
+        From turn to turn along the axis (m); the wire's diameter if closely wound.
     """
 
     current: float
@@ -44,17 +44,17 @@ class Winding:
 
     @property
     def radii(self) -> Array:
-        """To the middle of the wire of each layer (m), shape (layers,)."""
+        """Mean radius of each layer (m), shape (layers,)."""
         return np.asarray(self.inner_radius + self.wire * (0.5 + np.arange(float(self.layers))))
 
     @property
     def heights(self) -> Array:
-        """Of the turns of a layer from the middle of the coil (m), shape (rows,)."""
+        """Axial positions of the turns of a layer from the coil's middle (m), shape (rows,)."""
         return np.asarray(self.pitch * (np.arange(float(self.rows)) - 0.5 * (self.rows - 1)))
 
 
 class WoundCoil(NamedTuple):
-    """The coil that stands for windings: moment (A m^2), radius and length (m), None for none."""
+    """Coil equivalent to windings: moment (A m^2), radius and length (m), None for none."""
 
     moment: float
     radius: float
@@ -62,7 +62,7 @@ class WoundCoil(NamedTuple):
 
     @property
     def kappa(self) -> float:
-        """The constant of its shape (m^2), that of `magfusion.model.physics.finite_size`."""
+        """Shape constant (m^2), that of `magfusion.model.physics.finite_size`."""
         return self.radius**2 / 8.0 - (self.length or 0.0) ** 2 / 24.0
 
 

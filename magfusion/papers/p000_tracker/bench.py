@@ -2,7 +2,7 @@
 
 Each coil is driven alone; the probe goes to points at one distance from the antenna's mechanical
 centre, two on either of the axes across the coil, and (which the paper lacks) two on its own axis.
-The four see a coil's offset across its axis but never the one along it.  A receiving antenna is
+The four measure a coil's offset across its axis, but not along it.  A receiving antenna is
 measured as a small transmitting one.
 """
 
@@ -32,7 +32,7 @@ def bench_points(distance: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class BenchEstimate:
-    """What the bench measures of one antenna.
+    """An antenna measured on the bench.
 
     Parameters
     ----------
@@ -47,11 +47,11 @@ class BenchEstimate:
 
 
 def measure(field: Array, distance: float, *, on_axis: bool) -> BenchEstimate:
-    """Find moments and centres of an antenna's coils from readings at `bench_points`.
+    """Estimate moments and centres of an antenna's coils from readings at `bench_points`.
 
-    The moments by least squares over all points: a centre's offset is odd in the side and cancels.
-    An offset d along axis a changes the strength at the two points of that axis by the factors
-    ``1 +- 3 d / distance``, of the component along the coil's axis, which is what the paper's
+    The moments are estimated by least squares over all points: a centre's offset is odd in the side
+    and cancels.  An offset d along axis a scales the field at the two points of that axis by
+    ``1 +- 3 d / distance``, in the component along the coil's axis, which is what the paper's
     single-axis probe reads.
 
     Parameters
@@ -77,7 +77,7 @@ def measure(field: Array, distance: float, *, on_axis: bool) -> BenchEstimate:
 
 
 def helmert(moments: Array) -> Array:
-    """Return the small rotation (..., 3) (rad) that Eq 18 at scale one finds for coils (..., 3, 3).
+    """Return the small rotation (..., 3) (rad) of Eq 18 at scale one for coils (..., 3, 3).
 
     Least squares over the coils' axes.  Gains, and every change of the angles between the coils,
     are symmetric and remain: no rotation removes them.
@@ -90,10 +90,10 @@ def helmert(moments: Array) -> Array:
 def rigid_antenna(
     nominal: Antenna, transmitter: BenchEstimate, receiver: BenchEstimate, *, printed: bool
 ) -> Antenna:
-    """Return the nominal antenna turned and shifted as a whole: the paper's calibration.
+    """Return the nominal antenna rotated and shifted as a whole: the paper's calibration.
 
-    As printed it takes the sum of the offsets (Eq 15-17) and ``1 + [w]x`` (Eq 18), else their mean
-    and the rotation itself.
+    As printed it uses the sum of the offsets (Eq 15-17) and ``1 + [w]x`` (Eq 18), otherwise their
+    mean and the rotation itself.
     """
     parts: list[Array] = []
     for coils, bench in (
@@ -112,7 +112,7 @@ def rigid_antenna(
 def general_antenna(
     transmitter: BenchEstimate, receiver: BenchEstimate, *, coil_centres: bool
 ) -> Antenna:
-    """Return the antenna of general T and Q, with one centre a coil or their common mean."""
+    """Return the antenna of general T and Q, with one centre per coil or their common mean."""
     parts: list[Array] = []
     for bench in (transmitter, receiver):
         common = np.broadcast_to(mean_shift(bench.centres)[..., None, :], bench.centres.shape)

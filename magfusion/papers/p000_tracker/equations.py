@@ -43,7 +43,7 @@ def eq_05_coupling(
     """Return ``Y = -(K / R^3) H M X + A``, as measured.
 
     Misprint: it is called the coupling after A was removed.  Right as measured, with one vector in
-    all columns of A, which the silent slot has and `magfusion.receiver.ambient` takes off.
+    all columns of A, measured in the silent slot and removed by `magfusion.receiver.ambient`.
     """
     return eq_01_coupling(gain, attitude, position_beacon, drive) + ambient
 
@@ -81,7 +81,7 @@ class Correction:
 
 
 def eq_09_whitened(coupling: Array, receiver: Array, transmitter: Array) -> Array:
-    """Return couplings freed of their antennas, ``T Y (Q X)^-1``.
+    """Return the couplings with both antennas removed, ``T Y (Q X)^-1``.
 
     Corrected: T on the left, where it mixes receiving coils, and Q the map of moments.
 
@@ -102,7 +102,7 @@ def eq_10_coupling_as_printed(
 ) -> Array:
     """Return ``Y = [-(K / R^3) H M (X - C) Q + A] T^-1 + B``, which is Eq 9 solved for Y.
 
-    False: T mixes transmitting coils, as Q does already; B and C are lengths, beside voltages;
+    False: T mixes transmitting coils, as Q does already; B and C are lengths, added to voltages;
     Q and T of Eq 20 are the inverses of what is needed.
     """
     driven = correction.driven(drive)
@@ -119,7 +119,7 @@ def eq_11_attitude_as_printed(
 ) -> Array:
     """Return ``H = [-(R^3 / K) (Y - B) T - A] Q^-1 (X - C)^-1 M^-1``, in general no rotation.
 
-    False: it does not even invert Eq 10, as A is added to what the factor multiplies.
+    False: it does not even invert Eq 10, as A is added to the term that the factor multiplies.
     """
     scale = np.linalg.norm(position_beacon, axis=-1)[..., None, None] ** 3 / gain
     bracket = -scale * correction.received(coupling) - correction.ambient

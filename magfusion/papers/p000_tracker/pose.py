@@ -1,4 +1,4 @@
-"""Pose from one three-axis beacon in closed form, exactly: what paper 000 lacks.
+"""Exact pose from one three-axis beacon in closed form, which paper 000 lacks.
 
 Frames: the paper's transmitter is the beacon, its receiver the sensor, its H sensor_from_beacon.
 One singular value decomposition gives range, bearing and attitude at once.  The dipole is even, so
@@ -30,12 +30,12 @@ class TrackerFix:
     sensor_from_beacon : ndarray, shape (..., 3, 3)
         The paper's H.
     position_beacon : ndarray, shape (..., 2, 3)
-        The two positions that fit, opposite each other (m); the order means nothing until
-        `nearest` has put the wanted hemisphere first.
+        The two positions that fit, opposite each other (m), in arbitrary order until `nearest`
+        puts the wanted hemisphere first.
     distance : ndarray, shape (...)
         (m)
     residual : ndarray, shape (...)
-        What no pose explains, relative to the coupling: singular values that are not 2 : 1 : 1.
+        Unmodelled part relative to the coupling: singular values that are not 2 : 1 : 1.
     """
 
     sensor_from_beacon: Array
@@ -46,8 +46,8 @@ class TrackerFix:
     def nearest(self, guess_beacon: Array) -> "TrackerFix":
         """Return the fix with the position on the side of a guess (..., 3) first.
 
-        A prior or the last position tells the hemisphere; the coils' centres do so only where the
-        antenna is known far better than the noise.
+        The hemisphere is known from a prior or the last position; the coils' centres determine it
+        only where the antenna is known far more accurately than the noise.
         """
         towards = np.einsum("...hi,...i", self.position_beacon, guess_beacon)
         swap = (towards[..., 1] > towards[..., 0])[..., None, None]
@@ -60,8 +60,8 @@ def unit_coupling(
 ) -> Array:
     """Return the field of unit moments along the beacon's axes, in sensor axes.
 
-    The paper's ``T Y (Q X)^-1``: whitened of drive, moments and sensitivities, and real once the
-    drive phase is undone.
+    The paper's ``T Y (Q X)^-1``: drive, moments and sensitivities removed, and real after removal
+    of the drive phase.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def unit_coupling(
     matrix : ndarray, shape (3, 3)
         The magnetometer's.
     phase : ndarray, shape (..., tones), optional
-        Drive phase beyond what the coils declare (rad).
+        Drive phase in addition to the coils' own (rad).
 
     Returns
     -------
@@ -90,7 +90,7 @@ def unit_coupling(
     if size[-1] < 1e-3 * size[0]:
         raise InputError(
             f"beacon {beacon.name}: its moments lie in one plane; the closed form of a tracker"
-            " needs three axes, `magfusion fix` does with fewer"
+            " requires three axes; `magfusion fix` works with fewer"
         )
     undone = phasor_sensor if phase is None else phasor_sensor * np.exp(-1j * phase)[..., None]
     measured = np.concatenate([undone.real, undone.imag], axis=-2)  # (..., 2 tones, 3)
@@ -99,16 +99,16 @@ def unit_coupling(
 
 
 def locate_by_svd(unit: Array) -> TrackerFix:
-    """Find range, bearing and attitude from one singular value decomposition.
+    """Compute range, bearing and attitude from one singular value decomposition.
 
     `unit_coupling` (..., 3, 3), ``U = (K/R^3) H (3 u u^T - 1)``, has singular values 2 : 1 : 1, the
-    first along the bearing, and H is what remains of it: the solution of Wahba's problem and the
-    polar factor of Eq 11 as well.
+    first along the bearing, and H is the remaining factor: the solution of Wahba's problem and also
+    the polar factor of Eq 11.
 
     Raises
     ------
     EstimationError
-        Where a determinant is not positive, as no pose of a right-handed tracker makes it.
+        Where a determinant is not positive, which no pose of a right-handed tracker gives.
     """
     _refuse_mirrored(unit)
     left, size, right = np.linalg.svd(unit)
@@ -127,14 +127,14 @@ def locate_by_svd(unit: Array) -> TrackerFix:
 def _refuse_mirrored(unit: Array) -> None:
     finite = np.isfinite(unit).all(axis=(-2, -1))
     if not finite.all():
-        raise EstimationError(f"coupling {np.argmin(finite.ravel())} holds no numbers to solve for")
+        raise EstimationError(f"coupling {np.argmin(finite.ravel())} is not finite")
     size = np.linalg.svd(unit, compute_uv=False)
     flat = size[..., 2] < 1e-6 * size[..., 0]
     if flat.any():
         raise EstimationError(
             f"coupling {np.argmax(flat.ravel())} is singular: a coil is silent or its wire broken"
         )
-    # det U = 2 (K/R^3)^3; noise does not turn its sign before it is as large as the signal.
+    # det U = 2 (K/R^3)^3; noise changes its sign only if it is as large as the signal.
     wrong = np.linalg.det(unit) < 0.0
     if wrong.any():
         raise EstimationError(
@@ -145,7 +145,7 @@ def _refuse_mirrored(unit: Array) -> None:
 
 
 def world_poses(site: Site, beacon: Beacon, fix: TrackerFix) -> tuple[Array, Array]:
-    """Return world_from_body (..., 2, 3, 3) and the body's position (..., 2, 3) of a fix (m).
+    """Return world_from_body (..., 2, 3, 3) and the body's position (..., 2, 3) (m) of a fix.
 
     One hypothesis for each hemisphere: a start for `magfusion.estimation.snapshot.likelihood` or a
     smoother.
@@ -168,8 +168,8 @@ def refine_poses(
 ) -> tuple[Array, Array]:
     """Return the poses of maximum likelihood in white noise.
 
-    The closed form knows no centres and weighs all directions alike; this takes its pose to the
-    optimum of the whole model.
+    The closed form neglects the coils' centres and weights all directions equally; this refines its
+    pose to the optimum of the full model.
 
     Couplings (..., 3, 3) (T) and the start's beacon_from_sensor (..., 3, 3) and position (..., 3)
     (m) broadcast against the leading axes of the antenna; returned as the start is given.
@@ -177,7 +177,7 @@ def refine_poses(
     Raises
     ------
     EstimationError
-        Where a pose does not settle.
+        Where a pose does not converge.
     """
     lead = coupling.shape[:-2]
     vector = np.broadcast_to(antenna.vector(), (*lead, antenna.vector().shape[-1]))
@@ -196,5 +196,5 @@ def refine_poses(
     )
     found = minimise(model, start, moved_poses, passes=passes, absolute=1e-18)
     if not np.all(found.converged):
-        raise EstimationError("a tracker's pose does not converge: antenna and couplings disagree")
+        raise EstimationError("a tracker's pose does not converge: inconsistent couplings")
     return found.state[:, :9].reshape(*lead, 3, 3), found.state[:, 9:].reshape(*lead, 3)

@@ -16,8 +16,8 @@ from magfusion.units import Array, IntArray
 NOT_FUNCTIONS: dict[int, str] = {}
 
 _N, _E, _D = np.eye(3)
-# Along what the sensor's x, y and z axis point.  1 to 4 are what Eq 4-15 of the paper tell; its
-# table 1 is lost, so that 5 to 12 are the cyclic permutations of them.
+# World direction of the sensor's x, y and z axis.  1 to 4 follow from Eq 4-15 of the paper; its
+# table 1 is lost, so that 5 to 12 are their cyclic permutations.
 _POINTING = (
     ((_N, _E, _D), (-_N, -_E, _D), (_N, -_E, -_D), (-_N, _E, -_D)),
     ((_E, _D, _N), (-_E, _D, -_N), (-_E, -_D, _N), (_E, -_D, -_N)),
@@ -45,7 +45,7 @@ eq_02_voltage_y = partial(_voltage, 1)
 def eq_02_voltage_y_as_printed(
     field: Array, bias: Array, scale: Array, misalignment: Array
 ) -> Array:
-    """Return Vy.  Misprint: ``ezy By`` for ``ezy Bz``, of which Eq 16 would find nothing."""
+    """Return Vy.  Misprint: ``ezy By`` for ``ezy Bz``, which would cancel in Eq 16."""
     return eq_02_voltage_y(field[..., [0, 1, 1]], bias, scale, misalignment)
 
 
@@ -115,18 +115,18 @@ def eq_16_misalignment(readings: Array, down_field: float, scale: Array) -> Arra
 
 
 def eq_17_nearest(field_body: Array, entries_body: Array) -> IntArray:
-    """Return the entry that is nearest in y and z, where the body turns about x alone.
+    """Return the nearest entry in y and z, for rotation about x alone.
 
-    Unclear: the picture is lost, and this read as the least of Eq 19.
+    Unclear: the picture is lost; read as the minimum of Eq 19.
     """
     return np.argmin(eq_19_distance(field_body[..., None, :], entries_body), axis=-1)
 
 
 def eq_18_nearest(field_body: Array, entries_body: Array) -> IntArray:
-    """Return the entry that is nearest, where the body turns about all axes.
+    """Return the nearest entry, for rotation about all axes.
 
-    Unclear: the picture is lost, and this read as the least of Eq 20.  False: that one vector
-    tells three angles; a turn about the field leaves it as it was.
+    Unclear: the picture is lost; read as the minimum of Eq 20.  False: that one vector determines
+    three angles; it is invariant to rotation about the field.
     """
     return np.argmin(eq_20_distance(field_body[..., None, :], entries_body), axis=-1)
 

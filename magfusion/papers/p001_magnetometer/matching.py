@@ -1,14 +1,15 @@
 """Attitude from the vector of one uniform field, the Earth's, in closed form.
 
-A vector tells two angles of three: any turn about the field leaves it as it was.  Paper 001 calls
-the point on its sphere of vectors one attitude (section 2); it is a circle of them.  So roll is
-found where pitch and yaw are given, roll and pitch where yaw is given, and all three only with a
-second vector.  Even then pitch has two solutions, which meet in a fold where neither is determined.
+A vector determines two angles of three: it is invariant to rotation about the field.  Paper 001
+treats a point on its sphere of vectors as one attitude (section 2); it is a circle of them.  So
+roll follows from given pitch and yaw, roll and pitch from given yaw, and all three only from a
+second vector.  Even then pitch has two solutions, which coincide in a fold where neither is
+determined.
 
 Angles (rad) are those of ``world_from_body = Rz(yaw) Ry(pitch) Rx(roll)``, z up: a positive pitch
 lowers the x axis.  Throughout, ``field_body`` is the measured field (..., 3) (T), ``field_world``
-the known one (3,) (T) and ``sigma`` the noise of each component of the former (T).  Matching with
-a database is in `magfusion.papers.p001_magnetometer.matching_database`.
+the known one (3,) (T) and ``sigma`` the noise of each component of the former (T).  Database
+matching is in `magfusion.papers.p001_magnetometer.matching_database`.
 """
 
 from dataclasses import dataclass
@@ -25,25 +26,25 @@ LEAST_SHARE = 0.05  # of the field across an axis; below it an error of the fiel
 RESTING = 0.05  # of gravity; a specific force that differs by more is not that of a body at rest
 
 THREE_ANGLES = (
-    "one field vector determines two of three angles; give the yaw and ask for roll and pitch, or"
-    " add a second vector: gravity by the accelerometer, or the phasors of beacons"
+    "one field vector determines two of three angles; give the yaw to estimate roll and pitch, or"
+    " add a second vector: gravity from the accelerometer, or the phasors of beacons"
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Attitudes that a field vector allows, the usual one first.
+    """Attitudes consistent with a field vector, the usual one first.
 
     Parameters
     ----------
     rpy : ndarray, shape (..., hypotheses, 3)
         Roll, pitch, yaw (rad); NaN where there is no second solution of the pitch.
     sigma : ndarray, shape (..., hypotheses, 3)
-        (rad); zero for an angle that was given, NaN or infinite where one is not determined.
+        (rad); zero for a given angle, NaN or infinite where one is not determined.
     residual : ndarray, shape (..., hypotheses)
         Distance of the measured field from the matched one (T).
     determined : bool ndarray, shape (..., hypotheses)
-        False at the fold, or where the measured field is none that the database knows.
+        False at the fold, or where the measured field is outside the database.
     """
 
     rpy: Array
@@ -70,7 +71,7 @@ def wrap(angle: Array) -> Array:
 
 
 def usual_side(field_world: Array) -> int:
-    """Return the side of the fold on which a level body lies; see `fold_side`."""
+    """Return the side of the fold of a level body; see `fold_side`."""
     return 1 if field_world[2] >= 0.0 else -1
 
 
@@ -78,7 +79,7 @@ def fold_side(pitch: Array, yaw: Array | float, field_world: Array) -> Array:
     """Return the field along the pitched z axis as a share of the whole: its sign gives the side.
 
     It is the sine of the angle between the field and the axes of roll and pitch; where it is zero,
-    a turn about the field is a turn of these two, and neither is determined.
+    a rotation about the field is a combination of these two, and neither is determined.
     """
     along, _, down = _in_heading(yaw, field_world)
     return (along * np.sin(pitch) + down * np.cos(pitch)) / np.linalg.norm(field_world)
@@ -87,7 +88,7 @@ def fold_side(pitch: Array, yaw: Array | float, field_world: Array) -> Array:
 def match_roll(
     field_body: Array, pitch: float, yaw: float, field_world: Array, sigma: float
 ) -> Matches:
-    """Return the roll of maximum likelihood where pitch and yaw are given (atan2).
+    """Return the maximum-likelihood roll for given pitch and yaw (atan2).
 
     Raises
     ------
@@ -106,26 +107,26 @@ def match_roll(
 def match_roll_pitch(
     field_body: Array, yaw: Array | float, field_world: Array, sigma: float, side: int | None = None
 ) -> Matches:
-    """Return roll and pitch of maximum likelihood where yaw is given, both solutions.
+    """Return the maximum-likelihood roll and pitch for given yaw, both solutions.
 
-    First comes that on a side of the fold (`fold_side`), by default that of a level body.  Yaws
-    (...) give the family of attitudes of which each has its own.
+    The first is on the given side of the fold (`fold_side`), by default that of a level body.  Yaws
+    (...) give a family of attitudes.
 
     Raises
     ------
     InputError
-        Where the field has no part in the plane of pitch.
+        Where the field has no component in the plane of pitch.
     """
     along, _, down = _in_heading(yaw, field_world)
     size = float(np.linalg.norm(field_world))
     in_plane, turned = np.hypot(along, down), np.arctan2(down, along)
     if np.any(in_plane < LEAST_SHARE * size):
         raise InputError(
-            "the field lies along the axis of pitch, which it therefore cannot determine; choose"
-            " another heading, or add gravity by the accelerometer"
+            "the field lies along the axis of pitch and cannot determine it; choose another"
+            " heading, or add gravity from the accelerometer"
         )
     first = usual_side(field_world) if side is None else side
-    # Noise moves the measured vector off the sphere and beyond the fold: the nearest point counts.
+    # Noise moves the measured vector off the sphere and beyond the fold: use the nearest point.
     share = field_body[..., 0] * size / (np.linalg.norm(field_body, axis=-1) * in_plane)
     opening = np.arccos(np.clip(share, -1.0, 1.0))
     pitch = wrap(first * opening - turned)
@@ -137,9 +138,9 @@ def match_roll_pitch(
 def with_other_pitch(
     rpy: Array, field_body: Array, field_world: Array, sigma: float | Array, known: BoolArray
 ) -> Matches:
-    """Add to attitudes (..., 3) the other pitch that the same field has; say what is determined.
+    """Add to attitudes (..., 3) the other pitch with the same field, and flag determined ones.
 
-    ``known`` (...) says where the attitude explains the field at all.
+    ``known`` (...) is whether the attitude matches the field.
     """
     yaw = rpy[..., 2]
     along, _, down = _in_heading(yaw, field_world)
@@ -149,7 +150,7 @@ def with_other_pitch(
     roll = roll_about(field_body, other, yaw, field_world)
     both = np.stack([rpy, np.stack([roll, other, np.where(np.isnan(other), np.nan, yaw)], -1)], -2)
     spread = roll_pitch_sigma(both, field_world, np.asarray(sigma)[..., None])
-    # Distance of the pitch from the fold, where the two solutions are one.
+    # Distance of the pitch from the fold, where the two solutions coincide.
     to_fold = np.abs(np.arcsin(np.clip(np.sin(rpy[..., 1] + np.arctan2(down, along)), -1.0, 1.0)))
     apart = to_fold[..., None] > 3.0 * spread[..., 1]
     determined = known[..., None] & apart & (np.max(spread, axis=-1) < UNDETERMINED)
@@ -160,7 +161,7 @@ def with_other_pitch(
 
 
 def roll_about(field_body: Array, pitch: Array, yaw: Array | float, field_world: Array) -> Array:
-    """Return the roll (rad) that turns the pitched field towards the measured one."""
+    """Return the roll (rad) that rotates the pitched field onto the measured one."""
     along, across, down = _in_heading(yaw, field_world)
     up = along * np.sin(pitch) + down * np.cos(pitch)
     measured = field_body[..., 2] + 1j * field_body[..., 1]
@@ -168,7 +169,7 @@ def roll_about(field_body: Array, pitch: Array, yaw: Array | float, field_world:
 
 
 def check_roll_axis(pitch: float, yaw: float, field_world: Array) -> None:
-    """Refuse an axis of roll that lies along the field.
+    """Raise an error if the axis of roll lies along the field.
 
     Raises
     ------
@@ -177,8 +178,8 @@ def check_roll_axis(pitch: float, yaw: float, field_world: Array) -> None:
     still = predict_field(np.array([0.0, pitch, yaw]), field_world)
     if np.hypot(still[1], still[2]) < LEAST_SHARE * np.linalg.norm(field_world):
         raise InputError(
-            "the field lies along the axis of roll, which it therefore cannot determine; choose"
-            " another pitch or heading, or add gravity by the accelerometer"
+            "the field lies along the axis of roll and cannot determine it; choose another pitch or"
+            " heading, or add gravity from the accelerometer"
         )
 
 
@@ -207,19 +208,19 @@ def attitude_with_gravity(
 ) -> Array:
     """Return world_from_body (..., 3, 3) from the field and, at rest, gravity: maximum likelihood.
 
-    The solution of Wahba's problem; the specific force (..., 3) is upwards, and the shares are the
+    The solution of Wahba's problem; the specific force (..., 3) is upwards, and the weights are the
     noise of each component relative to the length of the vector.
 
     Raises
     ------
     InputError
-        Where the field is vertical: then both are one direction.
+        Where the field is vertical: then both are parallel.
     """
     direction = field_world / np.linalg.norm(field_world)
     if np.hypot(direction[0], direction[1]) < LEAST_SHARE:
         raise InputError(
-            "the field is vertical, as gravity is, so that the two leave the yaw open; give the"
-            " yaw, or add beacons"
+            "the field is vertical, parallel to gravity, so that the yaw is not determined; give"
+            " the yaw, or add beacons"
         )
     unit_field = field_body / np.linalg.norm(field_body, axis=-1, keepdims=True)
     unit_force = force_body / np.linalg.norm(force_body, axis=-1, keepdims=True)
@@ -238,7 +239,7 @@ def match_with_gravity(
 ) -> Matches:
     """Return all three angles from the field and the specific force of a body at rest.
 
-    A force (n, 3) (m/s^2) whose length is not that of gravity leaves the attitude undetermined.
+    A force (n, 3) (m/s^2) whose magnitude is not that of gravity leaves the attitude undetermined.
 
     Raises
     ------
@@ -250,7 +251,7 @@ def match_with_gravity(
     pitch = -np.arcsin(np.clip(turn[:, 2, 0], -1.0, 1.0))
     roll = np.arctan2(turn[:, 2, 1], turn[:, 2, 2])
     rpy = np.stack([roll, pitch, np.arctan2(turn[:, 1, 0], turn[:, 0, 0])], axis=-1)
-    # Each direction tells the two turns across it.
+    # Each direction determines the two rotations across it.
     known = np.stack([field_world / np.linalg.norm(field_world), [0.0, 0.0, 1.0]]) @ turn
     across = np.eye(3) - known[..., :, None] * known[..., None, :]
     cov_body = np.linalg.inv(np.einsum("nkij,k->nij", across, 1.0 / np.square(shares)))

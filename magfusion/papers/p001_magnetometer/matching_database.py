@@ -1,8 +1,8 @@
 """Attitude from a database of field vectors: paper 001, section 2, with and without interpolation.
 
 The matched entry is that of Eq 17 and 18, `magfusion.papers.p001_magnetometer.equations`.  Where
-the field is known, `magfusion.papers.p001_magnetometer.matching` does as well or better without a
-database: it pays where the platform distorts the field in a way that no model tells.
+the field is known, `magfusion.papers.p001_magnetometer.matching` is at least as accurate without a
+database; a database is useful where the platform distorts the field in an unmodelled way.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ from magfusion.units import DEGREE, Array, IntArray
 
 FIXED = 2.0 * DEGREE  # rad; a yaw that is free by this much costs up to 4 of the paper's 5 degrees
 NEIGHBOURS = {"roll": 3, "roll-pitch": 9}
-# Of the neighbours' extent: directions in which they extend less have no slope.
+# Relative to the neighbours' extent: directions in which they extend less have no slope.
 _FLAT = 0.05
 _CHUNK = 50_000  # fields at once
 _OUTSIDE = 3.0  # spacings of the database
@@ -35,18 +35,18 @@ _OUTSIDE = 3.0  # spacings of the database
 
 @dataclass(frozen=True, eq=False)
 class Index:
-    """A database ready to be asked.
+    """A database ready for queries.
 
     Parameters
     ----------
     tree : KDTree
-        Over the components that are compared (T).
+        Over the compared components (T).
     field_world : ndarray, shape (3,)
-        The uniform field that explains the entries best (T).
+        The uniform field that best fits the entries (T).
     sigma : float
-        What it leaves unexplained, of each component (T).
+        Its residual, per component (T).
     spacing : float
-        Distance of an entry's nearest neighbour (T), that 95 % do not exceed.
+        Nearest-neighbour distance of an entry (T), 95th percentile.
     side : int
         Of the fold on which all entries lie.
     """
@@ -61,7 +61,7 @@ class Index:
 
 @dataclass(frozen=True, eq=False)
 class Built:
-    """A database, and how many measurements did not enter it.
+    """A database, and the number of excluded measurements.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def build_database(
     angles: str | None = None,
     step: float = 1.0 * DEGREE,
 ) -> Built:
-    """Return the database of measurements whose attitude is known.
+    """Return a database of measurements with known attitude.
 
     Parameters
     ----------
@@ -89,16 +89,16 @@ def build_database(
     world_from_body : ndarray, shape (n, 3, 3)
         Of the reference.
     source : str
-        Log that they come from.
+        Log of the measurements.
     angles : {"roll", "roll-pitch"}, optional
-        What the database shall tell; default: what varies.
+        Angles to estimate; default: those that vary.
     step : float
         Measurements within one cell of this size in each angle are averaged (rad).
 
     Raises
     ------
     InputError
-        Where an angle that must be fixed varies, the field does not determine one that is asked, or
+        Where an angle that must be fixed varies, the field does not determine a requested angle, or
         too few attitudes remain.
     """
     chosen, rpy = _angles_of(world_from_body, angles)
@@ -114,25 +114,25 @@ def build_database(
     if len(thinned[0]) < LEAST_ENTRIES:
         raise InputError(
             f"holds {len(thinned[0])} attitudes that differ by {step / DEGREE:g} degrees and do not"
-            f" lie beyond the fold, of which a database needs {LEAST_ENTRIES}; turn the platform"
-            " through all that it shall know"
+            f" lie beyond the fold; a database requires {LEAST_ENTRIES}; rotate the platform"
+            " through all attitudes to be estimated"
         )
     return Built(AttitudeDatabase(*thinned, chosen, source), int(np.sum(beyond)))
 
 
 def prepare(database: AttitudeDatabase) -> Index:
-    """Return a database ready to be asked.
+    """Return a database ready for queries.
 
     Raises
     ------
     InputError
-        Where what it holds at one value varies, or its entries lie on both sides of the fold.
+        Where a fixed angle varies, or the entries lie on both sides of the fold.
     """
     fixed = (1, 2) if database.angles == "roll" else (2,)
     for axis in fixed:
         name = ("roll", "pitch", "yaw")[axis]
         if np.ptp(wrap(database.rpy[:, axis] - database.rpy[0, axis])) > 1e-6:
-            raise InputError(f"its {name} varies, which must be fixed; {THREE_ANGLES}")
+            raise InputError(f"its {name} varies and must be fixed; {THREE_ANGLES}")
     turned = np.stack([predict_field(database.rpy, axis) for axis in np.eye(3)], axis=-1)
     field_world = np.einsum("nij,ni->j", turned, database.field_body) / len(database)
     left = database.field_body - predict_field(database.rpy, field_world)
@@ -155,14 +155,14 @@ def prepare(database: AttitudeDatabase) -> Index:
 
 
 def nearest_entries(index: Index, field_body: Array, count: int = 1) -> tuple[Array, IntArray]:
-    """Return distance (T) and row of the entries nearest to each field, each (n, count)."""
+    """Return distance (T) and row of the entries nearest to each field, shape (n, count)."""
     asked = _compared(index.database.angles, field_body)
     distance, row = index.tree.query(asked, k=np.arange(1, count + 1))
     return distance, row
 
 
 def match_nearest(index: Index, field_body: Array, sigma: float) -> Matches:
-    """Return the attitude of the entry nearest to each field (n, 3) (T), as the paper does."""
+    """Return the attitude of the entry nearest to each field (n, 3) (T), as in the paper."""
     distance, row = nearest_entries(index, field_body)
     return _matches(index, field_body, index.database.rpy[row[:, 0]], distance[:, 0], sigma)
 
@@ -178,13 +178,13 @@ def match_interpolated(index: Index, field_body: Array, sigma: float) -> Matches
 
 
 def _interpolated(index: Index, field_body: Array) -> tuple[Array, Array, Array]:
-    """Return angles, distance of the nearest entry (T), and what the map leaves of the angles."""
+    """Return angles, distance of the nearest entry (T), and the map's residuals in the angles."""
     kind = index.database.angles
     distance, row = nearest_entries(index, field_body, NEIGHBOURS[kind])
     near = _unit(_compared(kind, index.database.field_body[row]))
     asked = _unit(_compared(kind, field_body))
     centre = np.mean(near, axis=1)
-    # Only directions count; the length is noise.  So the fit lives in the plane across the centre.
+    # Only directions count; the length is noise.  The fit is in the plane across the centre.
     across = np.eye(near.shape[-1]) - _unit(centre)[:, :, None] * _unit(centre)[:, None, :]
     spread = (near - centre[:, None]) @ across
     known = index.database.rpy[row]
@@ -193,7 +193,7 @@ def _interpolated(index: Index, field_body: Array) -> tuple[Array, Array, Array]
     slope = np.linalg.pinv(spread, rcond=_FLAT) @ (turned - mean[:, None])
     rpy = known[:, 0] + mean + ((asked - centre)[:, None] @ across @ slope)[:, 0]
     rpy[:, 0] = wrap(rpy[:, 0])
-    # What an affine map leaves of the neighbours, it leaves of the angles between them too.
+    # The residuals of an affine map at the neighbours are those between them too.
     left = turned - mean[:, None] - spread @ slope
     free = left.shape[1] - (2 if kind == "roll" else 3)
     return rpy, distance[:, 0], np.sqrt(np.sum(left**2, axis=1) / free)
@@ -209,7 +209,7 @@ def _matches(
     interpolated: bool = False,
 ) -> Matches:
     within = distance <= _OUTSIDE * index.spacing + 5.0 * np.hypot(sigma, index.sigma)
-    # The nearest entry is off by up to half a spacing, evenly.
+    # The nearest entry is off by up to half a spacing, uniformly.
     step = 0.0 if interpolated else index.spacing / np.sqrt(12.0)
     total = float(np.sqrt(sigma**2 + index.sigma**2 + step**2))
     if index.database.angles == "roll-pitch":
@@ -221,7 +221,7 @@ def _matches(
 
 
 def _compared(angles: Angles, field_body: Array) -> Array:
-    """Return the components that determine the attitude: a turn about x leaves its own as it is."""
+    """Return the components that determine the attitude: a rotation about x keeps its own."""
     return field_body[..., 1:] if angles == "roll" else field_body
 
 
@@ -230,18 +230,19 @@ def _unit(vector: Array) -> Array:
 
 
 def _angles_of(world_from_body: Array, angles: str | None) -> tuple[Angles, Array]:
-    """Return what varies, and the angles with the others fixed at their mean."""
+    """Return the varying angles, and the angles with the others fixed at their mean."""
     axis = world_from_body[:, :, 0]
     mean = _unit(np.mean(axis, axis=0))
     turning = np.arccos(np.clip(axis @ mean, -1.0, 1.0))
     if angles == "roll" or (angles is None and np.max(turning) <= FIXED):
         if np.max(turning) > FIXED:
             raise InputError(
-                f"the axis of roll turns by {np.max(turning) / DEGREE:.3g} degrees from its mean,"
-                f" and may by {FIXED / DEGREE:g}; hold pitch and yaw, or ask for roll and pitch"
+                f"the axis of roll rotates by {np.max(turning) / DEGREE:.3g} degrees from its mean;"
+                f" at most {FIXED / DEGREE:g} are allowed; keep pitch and yaw fixed, or select roll"
+                " and pitch"
             )
         level = float(np.hypot(mean[0], mean[1]))
-        # On a vertical axis yaw and roll are one: roll then counts from world x.
+        # On a vertical axis yaw and roll coincide: roll then counts from world x.
         yaw = float(np.arctan2(mean[1], mean[0])) if level > np.sin(FIXED) else 0.0
         return "roll", angles_about(world_from_body, yaw, -float(np.arctan2(mean[2], level)))
     heading = np.arctan2(axis[:, 1], axis[:, 0])
@@ -249,8 +250,8 @@ def _angles_of(world_from_body: Array, angles: str | None) -> tuple[Angles, Arra
     turning = np.abs(wrap(heading - yaw))
     if angles not in (None, "roll-pitch") or np.max(turning) > FIXED:
         raise InputError(
-            f"the yaw turns by {np.max(turning) / DEGREE:.3g} degrees from its mean, and may by"
-            f" {FIXED / DEGREE:g}; {THREE_ANGLES}"
+            f"the yaw rotates by {np.max(turning) / DEGREE:.3g} degrees from its mean; at most"
+            f" {FIXED / DEGREE:g} are allowed; {THREE_ANGLES}"
         )
     return "roll-pitch", angles_about(world_from_body, yaw)
 
@@ -258,7 +259,7 @@ def _angles_of(world_from_body: Array, angles: str | None) -> tuple[Angles, Arra
 def angles_about(world_from_body: Array, yaw: Array | float, pitch: float | None = None) -> Array:
     """Return roll, pitch, yaw (n, 3) (rad) of attitudes (n, 3, 3), fixed at the values given (rad).
 
-    Defined at a vertical x axis too, where roll and yaw are one.
+    Defined at a vertical x axis too, where roll and yaw coincide.
     """
     n = len(world_from_body)
     if pitch is None:
@@ -274,7 +275,7 @@ def angles_about(world_from_body: Array, yaw: Array | float, pitch: float | None
 
 
 def _thin(field_body: Array, rpy: Array, step: float) -> tuple[Array, Array]:
-    """Average what lies in one cell of roll and pitch."""
+    """Average the measurements in one cell of roll and pitch."""
     cells = np.floor(rpy[:, :2] / step).astype(np.int64)
     _, cell = np.unique(cells, axis=0, return_inverse=True)
     cell = cell.ravel()

@@ -10,18 +10,18 @@ _VERTICAL = (2, 1, 0)  # the axis that is vertical in each group of four
 
 
 def positions(heading: float) -> Array:
-    """Return sensor_from_ned (12, 3, 3) of a table turned by a heading, north over east (rad)."""
+    """Return sensor_from_ned (12, 3, 3) of a table rotated by a heading, north over east (rad)."""
     c, s = np.cos(heading), np.sin(heading)
     table_from_ned = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     return SENSOR_FROM_NED @ table_from_ned
 
 
 def closed_form(measured: Array, down_field: float, sigma: float | None = None) -> MagnetometerFit:
-    """Solve the paper's formulas (Eq 9, 11 and 16, and their like for the other groups).
+    """Solve the paper's formulas (Eq 9, 11 and 16, and their equivalents for the other groups).
 
     In each group the four readings, added with the signs of the vertical axis, give one column of
-    the matrix at once: ``K_a e_ba = (V_1 + V_2 - V_3 - V_4) / 4 B_D``.  The horizontal field and
-    the heading cancel; only the size of ``down_field`` and the level of the table matter.
+    the matrix directly: ``K_a e_ba = (V_1 + V_2 - V_3 - V_4) / 4 B_D``.  The horizontal field and
+    the heading cancel; only the magnitude of ``down_field`` and the level of the table matter.
 
     Parameters
     ----------
@@ -30,14 +30,14 @@ def closed_form(measured: Array, down_field: float, sigma: float | None = None) 
     down_field : float
         Downward component of the Earth's field (T).
     sigma : float, optional
-        Of each component of a reading (T); where it is not given it follows from the three
-        groups' offsets, which differ by the noise alone.
+        Of each component of a reading (T); by default from the three groups' offsets, which differ
+        by noise only.
 
     Returns
     -------
     MagnetometerFit
         The offset is the mean of all readings: each group's four positions cancel the field, and
-        three groups carry less noise than the one that the paper takes for each axis.
+        three groups have less noise than the one that the paper uses for each axis.
     """
     group = measured.reshape(*measured.shape[:-2], 3, 4, 3)
     readings = np.swapaxes(group, -1, -2)
@@ -56,7 +56,7 @@ def closed_form(measured: Array, down_field: float, sigma: float | None = None) 
 def least_squares(
     measured: Array, field_sensor: Array, sigma: float | None = None
 ) -> MagnetometerFit:
-    """Fit matrix and offset to readings of a field that is known in each.
+    """Fit matrix and offset to readings of known fields.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def least_squares(
     field_sensor : ndarray, shape (n, 3)
         True field (T), n at least 5; on a turntable ``positions(heading) @ field_ned``.
     sigma : float, optional
-        Of each component of a reading (T); from the residuals where it is not given.
+        Of each component of a reading (T); by default from the residuals.
     """
     size = float(np.max(np.abs(field_sensor)))
     n = len(field_sensor)

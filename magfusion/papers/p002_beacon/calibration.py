@@ -1,11 +1,11 @@
-"""Calibration of a rotating beacon as paper 002 prints it, to compare with.
+"""Calibration of a rotating beacon as printed in paper 002, for comparison.
 
-The paper turns the normals of the field's plane into directions (Eq 4), finds the distances from
-the angles between them (Eq 9-11), the centre from the distances (Eq 12), and the attitude from
-directions seen and directions known (Eq 18-21).  That is right only where the normals are given in
-the axes of the beacon, which is what the calibration is to find, and each direction in its
-hemisphere; the paper's argument that the centre does not depend on the attitude (Eq 13-17) is
-false.  Given normals in the magnetometers' axes, one degree of tilt moves the centre by 0.2 m.
+The paper converts the normals of the field's plane to directions (Eq 4), computes the distances
+from the angles between them (Eq 9-11), the centre from the distances (Eq 12), and the attitude from
+measured and known directions (Eq 18-21).  That is right only where the normals are given in beacon
+axes, which the calibration is to estimate, and each direction in its hemisphere; the paper's
+argument that the centre does not depend on the attitude (Eq 13-17) is false.  Given normals in the
+magnetometers' axes, one degree of tilt moves the centre by 0.2 m.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ from magfusion.units import MU0_OVER_4PI, Array, ComplexArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class PrintedCalibration:
-    """What the paper's equations give, run by run.
+    """Results of the paper's equations, per run.
 
     Parameters
     ----------
@@ -43,9 +43,9 @@ class PrintedCalibration:
     angles : ndarray, shape (runs, 3)
         psi, gamma, lambda of Eq 21 (rad).
     distance : ndarray, shape (runs, magnetometers)
-        From the centre (m); one below zero shows that the directions fit no beacon.
+        From the centre (m); a negative one shows that the directions fit no beacon.
     alarm : ndarray, shape (runs,)
-        What the law of cosines leaves (m^2), root of the mean square; zero for three magnetometers.
+        RMS residual of the law of cosines (m^2); zero for three magnetometers.
     """
 
     centre_world: Array
@@ -58,10 +58,10 @@ class PrintedCalibration:
 def distances_from_angles(
     direction: Array, position_world: Array, start: Array
 ) -> tuple[Array, Array]:
-    """Return distances (runs, m) (m) and what Eq 11 leaves (runs, pairs) (m^2), by least squares.
+    """Return distances (runs, m) (m) and residuals of Eq 11 (runs, pairs) (m^2), by least squares.
 
     Directions (runs, m, 3) from the beacon in any axes, magnetometers (m, 3) (m); the start
-    (runs, m) chooses among up to four solutions that fit three magnetometers.
+    (runs, m) selects among up to four solutions that fit three magnetometers.
     """
     first, second = pairs(len(position_world))
     cosine, length = eq_09_cosines(direction), eq_10_lengths(position_world)
@@ -79,10 +79,10 @@ def distances_from_angles(
 
 
 def centre_by_rays(direction: Array, distance: Array, position_world: Array) -> Array:
-    """Return the centres (runs, 3) (m) of rays that are moved rigidly onto their known ends.
+    """Return the centres (runs, 3) (m) of rays aligned rigidly with their known ends.
 
-    Unlike the distances (runs, m) alone, the directions (runs, m, 3), beacon axes, tell on which
-    side of the magnetometers' plane (m, 3) the beacon is.
+    Unlike the distances (runs, m) alone, the directions (runs, m, 3), beacon axes, determine on
+    which side of the magnetometers' plane (m, 3) the beacon is.
     """
     rays = distance[..., None] * direction
     mean_ray, mean_place = rays.mean(axis=1), position_world.mean(axis=0)
@@ -103,15 +103,15 @@ def calibrate_as_printed(
     Parameters
     ----------
     phasor : complex ndarray, shape (runs, magnetometers, 3)
-        (T).  In beacon axes the equations are right; in world axes, which is what magnetometers
-        that are aligned with the world measure, they are the paper's.
+        (T).  In beacon axes the equations are right; in world axes, as measured by magnetometers
+        aligned with the world, they are the paper's.
     position_world : ndarray, shape (magnetometers, 3)
         Three at least, not on a line (m).
     moment : float
         Of both coils (A m^2); only the start of the distances depends on it.
     hemisphere : ndarray, shape (magnetometers,), optional
-        The sign of each direction's third component, which the normal does not tell; positive, as
-        the paper has it, where it is not given.
+        The sign of each direction's third component, which the normal does not determine; by
+        default positive, as in the paper.
     """
     direction = eq_04_direction(plane_normal(phasor))
     if hemisphere is not None:
@@ -136,9 +136,9 @@ def consistent_centres(
 ) -> list[tuple[tuple[int, ...], Array]]:
     """Return every centre that fits directions (m, 3) of unknown hemisphere, with its signs.
 
-    The normals leave each direction's sign open (one of them is the choice of the beacon's own
-    z axis), and the law of cosines, which may leave the tolerance (m^2), has up to four roots for
-    three magnetometers.
+    The normals do not determine each direction's sign (one of them is the choice of the beacon's
+    own z axis), and the law of cosines, with a residual up to the tolerance (m^2), has up to four
+    roots for three magnetometers.
     """
     count = len(position_world)
     size = float(np.max(np.linalg.norm(position_world[:, None] - position_world, axis=-1)))

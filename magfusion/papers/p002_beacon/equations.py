@@ -1,7 +1,7 @@
-"""Paper 002, equation by equation: centre and attitude of a rotating beacon by magnetometers.
+"""Paper 002, equation by equation: centre and attitude of a rotating beacon from magnetometers.
 
-In the source every equation is a picture: what is here follows from the text beside it, from its
-references by number, and from paper 004 of the same authors.  Directions (..., magnetometers, 3)
+In the source every equation is a picture: this module follows the surrounding text, its references
+by number, and paper 004 of the same authors.  Directions (..., magnetometers, 3)
 point from the beacon to the magnetometers, angles (..., 3) are psi, gamma, lambda (rad).
 """
 
@@ -18,7 +18,7 @@ from magfusion.units import Array, IntArray
 NOT_FUNCTIONS = {
     5: "defines the offset of the centre from where the beacon's shape has it; Right",
     6: "defines the attitude: axes of the field = C_0^m axes of the shape; Right",
-    14: "says that C_0^m is orthogonal; Right, of the C of Eq 7 and not of that of Eq 19",
+    14: "states that C_0^m is orthogonal; Right, of the C of Eq 7 and not of that of Eq 19",
     15: "step to Eq 17: the products of pseudo-directions by Eq 13",
     16: "step to Eq 17: the angles between them are those of the directions; False as Eq 13",
     17: "concludes that the centre does not depend on the attitude; False: 0.2 m for each degree",
@@ -26,7 +26,7 @@ NOT_FUNCTIONS = {
     22: "assumes pseudo-directions with errors of mean zero; Right to first order in the noise",
     23: "step to Eq 26: the error of the matrix of Eq 19, of that of the directions",
     24: "step to Eq 26: its mean",
-    25: "step to Eq 26; False: T is made of the estimated centre, hence not free of the errors",
+    25: "step to Eq 26; False: T is made of the estimated centre, hence it contains the errors",
     26: "concludes that Eq 19 has no bias; False beyond first order: 7 mm of the centre at 5 %",
     27: "step to Eq 30: the sine of a small error is the error; Right",
     28: "step to Eq 30: element (3, 1) of the matrix as a function of psi and its error",
@@ -37,10 +37,10 @@ eq_01_field = dipole_field
 """Right."""
 
 eq_02_field = solenoid_field
-"""Unclear: a coil that stands for rows and columns of turns; here that of Biot and Savart."""
+"""Unclear: a coil in place of rows and columns of turns; here that of Biot and Savart."""
 
 eq_03_equivalent_coil = wound_coil
-"""Unclear; here the coil that has the dipole of all rows and columns, and the next term."""
+"""Unclear; here the coil with the dipole of all rows and columns, and the next term."""
 
 
 eq_04_direction = p004.eq_07_direction
@@ -72,7 +72,7 @@ def eq_10_lengths(position_world: Array) -> Array:
 
 
 def eq_11_misfit(distance: Array, cosine: Array, length: Array) -> Array:
-    """Return what the law of cosines leaves (m^2), shape (..., pairs).
+    """Return the residual of the law of cosines (m^2), shape (..., pairs).
 
     Right; up to four sets of distances (..., magnetometers) (m) fit three magnetometers.
     """
@@ -82,7 +82,7 @@ def eq_11_misfit(distance: Array, cosine: Array, length: Array) -> Array:
 
 
 eq_12_misfit = p004.eq_17_misfit
-"""Right, of centre, magnetometers and distances; in one plane they leave two mirror centres."""
+"""Right, of centre, magnetometers and distances; in one plane there are two mirror centres."""
 
 eq_13_pseudo_direction_as_printed = p004.eq_18_pseudo_direction_as_printed
 """False as Eq 18 of paper 004."""
@@ -94,7 +94,7 @@ def eq_18_direction(centre_world: Array, position_world: Array) -> Array:
 
 
 eq_19_attitude_as_printed = p004.eq_21_attitude_as_printed
-"""False as Eq 21 of paper 004: in general no rotation, and blind to a turn about the axis."""
+"""False as Eq 21 of paper 004: in general no rotation, and blind to rotation about the axis."""
 
 eq_21_angles = p004.eq_23_angles
 """Corrected: Eq 30-32 imply arcsine and arccosines, which lose the signs."""
@@ -127,6 +127,6 @@ def _upright(world_from_beacon: Array) -> Array:
 def eq_33_geometric_centre(corner_world: Array) -> Array:
     """Return the mean of the corners (8, 3) of the beacon's box (m).
 
-    Right of the shape; the field's centre and axes are what it leaves open.
+    Right for the shape; it does not determine the field's centre and axes.
     """
     return corner_world.mean(axis=0)

@@ -1,10 +1,10 @@
 """The three algorithms of paper 004, from a survey and the fields of an epoch to its pose.
 
-They are what this package is compared with.  Positions are those of
-`magfusion.papers.p004_fingerprints.rssi` and `magfusion.papers.p004_fingerprints.fingerprint`; the
-attitude is that of Eq 18-19 by the nearest rotation, which holds for a level platform among beacons
-that turn about the vertical, and for no other: one degree of tilt at half a metre above the beacons
-makes two to three degrees of error (`scenarios/tilted_attitude.py`).
+They serve for comparison.  Positions are those of `magfusion.papers.p004_fingerprints.rssi` and
+`magfusion.papers.p004_fingerprints.fingerprint`; the attitude is that of Eq 18-19 by the nearest
+rotation, which is valid only for a level platform among beacons that rotate about the vertical: one
+degree of tilt at half a metre above the beacons gives two to three degrees of error
+(`scenarios/tilted_attitude.py`).
 """
 
 from collections.abc import Mapping
@@ -40,22 +40,22 @@ Method = Literal["paper-lines", "paper-knn", "paper-knn-nt", "paper-fingerprint"
 LEAST_BEACONS = 3  # a position has three coordinates
 BLOCK_PASSES = 3  # between position and the block that it lies in
 
-TOO_FEW_BEACONS = "fewer than three beacons heard"
-TOO_FEW_POINTS = "too few fingerprints of the beacons heard"
+TOO_FEW_BEACONS = "fewer than three beacons detected"
+TOO_FEW_POINTS = "too few fingerprints of the detected beacons"
 
 
 @dataclass(frozen=True, eq=False)
 class RotatingFields:
-    """What the published algorithms take from each epoch.
+    """Inputs of the published algorithms for each epoch.
 
     Parameters
     ----------
     axis_world : ndarray, shape (beacons, 3)
-        Unit vectors about which the beacons' moments turn by the right-hand rule.
+        Unit vectors about which the beacons' moments rotate by the right-hand rule.
     amplitude : ndarray, shape (n, beacons)
         Root mean square over time (T); NaN where a beacon was not detected.
     normal_body : ndarray, shape (n, beacons, 3)
-        Normal of the plane in which the field turns, of any length, body axes.
+        Normal of the plane in which the field rotates, of any length, body axes.
     """
 
     axis_world: Array
@@ -65,12 +65,12 @@ class RotatingFields:
 
 @dataclass(frozen=True, eq=False)
 class PublishedFixes:
-    """Poses of the epochs that could be located.
+    """Poses of the located epochs.
 
     Parameters
     ----------
     epoch : ndarray of int, shape (m,)
-        Which of the epochs they are.
+        Their indices.
     position_world : ndarray, shape (m, 3)
         Of the sensor (m).
     world_from_body : ndarray, shape (m, 3, 3)
@@ -90,7 +90,7 @@ def fix_as_published(
     method: Method,
     block: float | None = None,
 ) -> PublishedFixes:
-    """Locate each epoch by one of the published algorithms, from the beacons that it detects.
+    """Locate each epoch by one of the published algorithms, from the detected beacons.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def fix_as_published(
     method : {"paper-lines", "paper-knn", "paper-knn-nt", "paper-fingerprint"}
         Algorithm 1; 2, in logarithms or as printed in nT; 3.
     block : float, optional
-        Size of the blocks of algorithm 1 (m); one line for all where it is not given.
+        Size of the blocks of algorithm 1 (m); by default one line for all.
 
     Raises
     ------
@@ -147,8 +147,8 @@ def locate_by_lines(
 ) -> Array:
     """Return the positions (n, 3) of the sensor (m) by algorithm 1: ranges, then trilateration.
 
-    Started where the fingerprints are most alike, which also gives the side of the beacons' plane
-    and the first block.
+    The start is the most similar fingerprints, which also give the side of the beacons' plane and
+    the first block.
     """
     _, point = nearest(known, amplitude, NEIGHBOURS)
     position = np.mean(known.position_world[point], axis=1)
@@ -164,12 +164,12 @@ def attitude_as_published(
 ) -> Array:
     """Return world_from_body (n, 3, 3), the rotation nearest to Eq 18.
 
-    Eq 7 takes the normal in the body's axes, NaN where a beacon was not detected, for one in the
-    beacon's and returns a direction in the half-space of its axis; the position of the sensor tells
-    when it is the other.  Arguments as in `RotatingFields`.
+    Eq 7 treats the normal in body axes, NaN where a beacon was not detected, as one in beacon axes
+    and returns a direction in the half-space of its axis; the position of the sensor determines
+    where the opposite applies.  Arguments as in `RotatingFields`.
     """
     direction = eq_19_direction(position_world, beacons_world)
-    # About its axis a rotating beacon looks the same: any axes across it do.
+    # A rotating beacon is symmetric about its axis: any axes across it do.
     across = np.linalg.svd(axis_world[:, None])[2][:, 1:]
     beacon_from_world = np.concatenate([across, axis_world[:, None]], axis=1)
     normal_beacon = np.einsum("bij,nbj->nbi", beacon_from_world, normal_body)

@@ -1,4 +1,4 @@
-"""Direction to, and attitude among, rotating beacons, exactly: what paper 004 lacks.
+"""Exact direction to, and attitude among, rotating beacons, which paper 004 lacks.
 
 Where the attitude is unknown, `magfusion.estimation.snapshot.candidates.beacon_directions` gives
 range and four directions from the Gram matrix of the phasors.  Where it is known,
@@ -29,10 +29,10 @@ _BASIS = np.array(
 def attitude_from_vectors(
     vector_sensor: Array | ComplexArray, vector_world: Array | ComplexArray
 ) -> Array:
-    """Return the rotation that fits vectors in two axes best (Wahba's problem).
+    """Return the rotation that best fits vectors in two frames (Wahba's problem).
 
-    Of phasors, which both must have the same drive phase, it is the maximum of the likelihood in
-    white noise and exact at any attitude; two coils of a single beacon suffice.  Of the directions
+    For phasors, which both must have the same drive phase, it is the maximum of the likelihood in
+    white noise and exact at any attitude; two coils of a single beacon suffice.  For the directions
     of paper 004, Eq 18-19, it is only the rotation nearest to a wrong equation.
 
     Parameters
@@ -60,8 +60,8 @@ class TensorFix:
     distance : ndarray, shape (...)
         (m)
     residual : ndarray, shape (...)
-        Norm of what no dipole field explains (T): a test of attitude and drive that is free of
-        the position.  Of a beacon of two coils it is ``Bc_y / mc - Bs_x / ms`` but for a factor.
+        Norm of the residual of any dipole field (T): a position-independent test of attitude and
+        drive.  For a beacon of two coils it is ``Bc_y / mc - Bs_x / ms`` up to a factor.
     """
 
     direction_beacon: Array
@@ -72,15 +72,15 @@ class TensorFix:
 def locate_by_tensor(beacon: Beacon, phasor_beacon: ComplexArray) -> TensorFix:
     """Locate a sensor of known attitude by completing the tensor of the dipole field.
 
-    The field of a moment m is ``A m``, with ``A = K (3 n n^T - 1) / r^3`` symmetric and without
-    trace: two coils determine all of it.  The largest eigenvalue is ``2 K / r^3``, along n.  Unlike
-    paper 004, Eq 7, this stays exact near the beacon's plane (at 80 degrees from the axis the
-    mean square error is 85 times less).
+    The field of a moment m is ``A m``, with ``A = K (3 n n^T - 1) / r^3`` symmetric and traceless:
+    two coils determine all of it.  The largest eigenvalue is ``2 K / r^3``, along n.  Unlike paper
+    004, Eq 7, this stays exact near the beacon's plane (at 80 degrees from the axis the mean square
+    error is 85 times less).
 
     Parameters
     ----------
     beacon : Beacon
-        With moments along two axes at least, and its declared drive phase.
+        With moments along at least two axes, and its declared drive phase.
     phasor_beacon : complex ndarray, shape (..., tones, 3)
         (T), beacon axes.
 

@@ -15,7 +15,7 @@ from magfusion.receiver.ellipse import plane_normal, rms_amplitude
 from magfusion.units import MU0_OVER_4PI, Array, ComplexArray
 
 NOT_FUNCTIONS = {
-    10: "says that Eq 8 gives one normal from all pairs; Right of pairs a quarter period apart",
+    10: "states that Eq 8 gives one normal from all pairs; Right of pairs a quarter period apart",
     22: "names the matrices of Eq 21, whose columns are the directions of Eq 19",
 }
 
@@ -42,9 +42,9 @@ def eq_02_direction(polar: Array, azimuth: Array) -> Array:
 
 
 def eq_03_currents(amplitude: Array, phase: Array) -> tuple[Array, Array]:
-    """Return both coils' currents, or whatever is proportional to them, of amplitudes (2,).
+    """Return both coils' currents, or proportional quantities, of amplitudes (2,).
 
-    Corrected: cosine and sine, as Eq 1 has it.
+    Corrected: cosine and sine, as in Eq 1.
     """
     return amplitude[0] * np.cos(phase), amplitude[1] * np.sin(phase)
 
@@ -60,7 +60,7 @@ def eq_04_field(offset: Array, moments: Array, phase: Array) -> Array:
 
 
 def eq_05_normal(direction_beacon: Array) -> Array:
-    """Return the normal ``3 e n - 2 z`` of the field's plane seen in direction n = (u, v, e).
+    """Return the normal ``3 e n - 2 z`` of the field's plane in direction n = (u, v, e).
 
     Corrected: without its factor.  The normal of the phasors is ``mc ms K^2 / r^6`` times it, for
     any two moments in the plane of the coils; its square is ``4 - 3 e^2``, hence never zero.
@@ -72,7 +72,7 @@ def eq_05_normal(direction_beacon: Array) -> Array:
 def eq_05_normal_as_printed(offset: Array, moments: Array, phase: Array) -> Array:
     """Return ``Bc(t) x Bs(t)`` (T^2).
 
-    False: it is called invariant, but changes its sign each quarter period and has no mean.
+    False: it is called invariant, but changes its sign each quarter period and has zero mean.
     """
     return np.cross(*eq_01_coil_fields(offset, moments, phase))
 
@@ -99,7 +99,7 @@ def eq_07_direction(normal_beacon: Array) -> Array:
 
     Corrected: with the angle of `eq_06_polar_of_normal` both branches are one formula, and atan2
     keeps the quadrant of the azimuth.  The opposite direction has the same normal.  In a sensor's
-    axes the normal means nothing unless the sensor is turned about z alone: see Eq 18.
+    axes the normal is meaningless unless the sensor is rotated about z alone: see Eq 18.
     """
     polar_of_normal = eq_06_polar_of_normal(normal_beacon)
     polar = 0.5 * (polar_of_normal - np.arcsin(np.sin(polar_of_normal) / 3.0))
@@ -131,9 +131,9 @@ eq_11_normal = plane_normal
 
 
 def eq_11_mean_as_printed(samples: Array) -> Array:
-    """Return the constant (..., 3) that fits samples (..., n, 3) best.
+    """Return the constant (..., 3) that best fits samples (..., n, 3).
 
-    Right of the normals of Eq 8.  False of the field: its mean over a period is zero.
+    Right for the normals of Eq 8.  False for the field: its mean over a period is zero.
     """
     return np.mean(samples, axis=-2)
 
@@ -141,7 +141,7 @@ def eq_11_mean_as_printed(samples: Array) -> Array:
 # 2.2 Ranges and attitude ------------------------------------------------------------------------
 
 eq_12_field = dipole_field
-"""Right.  The moment turns, so that its size is constant only where both coils' are equal."""
+"""Right.  The moment rotates, so that its magnitude is constant only for equal coils."""
 
 
 def eq_13_log_field(offset: Array, moment: Array) -> Array:
@@ -161,9 +161,9 @@ def eq_14_angular_term(direction_beacon: Array, moment: Array) -> Array:
 
 
 def eq_15_log_amplitude(distance: Array, slope: Array | float, intercept: Array) -> Array:
-    """Return the logarithm of the amplitude (T) by a line in that of the distance (m).
+    """Return the logarithm of the amplitude (T), linear in that of the distance (m).
 
-    Right of the minor semi-axis alone, which is ``K m / r^3`` in all directions.
+    Right for the minor semi-axis alone, which is ``K m / r^3`` in all directions.
     """
     return slope * np.log(distance) + intercept
 
@@ -192,10 +192,10 @@ def eq_17_misfit(position_world: Array, beacons_world: Array, ranges: Array) -> 
 
 
 def eq_18_pseudo_direction_as_printed(sensor_from_world: Array, direction_world: Array) -> Array:
-    """Return what Eq 7 is said to make of a normal in sensor axes: the direction in sensor axes.
+    """Return the result of Eq 7, according to the paper, for a normal in sensor axes: a direction.
 
-    False: Eq 7 knows the beacon's z axis and commutes with turns about it alone.  Among the points
-    of Table 1 one degree of tilt makes two to three degrees of attitude error.
+    False: Eq 7 depends on the beacon's z axis and commutes with rotations about it alone.  Among
+    the points of Table 1 one degree of tilt gives two to three degrees of attitude error.
     """
     return (sensor_from_world @ direction_world[..., None])[..., 0]
 
@@ -203,7 +203,7 @@ def eq_18_pseudo_direction_as_printed(sensor_from_world: Array, direction_world:
 def eq_19_direction(position_world: Array, beacons_world: Array) -> Array:
     """Return the directions (..., beacons, 3) from beacons to positions (..., 3).
 
-    Right.  Its second line, of the measured angles, is `eq_02_direction`.
+    Right.  Its second line, for the measured angles, is `eq_02_direction`.
     """
     offset = position_world[..., None, :] - beacons_world
     return offset / np.linalg.norm(offset, axis=-1, keepdims=True)
@@ -216,13 +216,13 @@ def eq_20_attitude(angles: Array) -> Array:
 
 
 eq_21_attitude = attitude_from_vectors
-"""Corrected: the nearest rotation; exact of phasors, but no remedy for Eq 18 of directions."""
+"""Corrected: the nearest rotation; exact for phasors, but no remedy for Eq 18."""
 
 
 def eq_21_attitude_as_printed(direction_sensor: Array, direction_world: Array) -> Array:
     """Return sensor_from_world (..., 3, 3) by least squares from directions (..., beacons, 3).
 
-    False: in general no rotation, and of three beacons it averages nothing.
+    False: in general no rotation, and for three beacons it averages nothing.
 
     Raises
     ------
@@ -276,21 +276,21 @@ def eq_24_ring_moment_as_printed(
 def eq_25_fingerprint(phasor: ComplexArray) -> Array:
     """Return the amplitude (...) of one beacon from the phasors of its tones (..., tones, 3).
 
-    Unclear: the paper does not say which amplitude; this is the root of the mean square.
+    Unclear: the paper does not specify which amplitude; this is the root of the mean square.
     """
     return np.linalg.norm(rms_amplitude(phasor), axis=-1)
 
 
 eq_26_fingerprint_of_survey = eq_25_fingerprint
-"""Unclear as Eq 25, of the points of the survey."""
+"""Unclear as Eq 25, for the points of the survey."""
 
 
 def eq_27_position(difference: Array, position_world: Array) -> Array:
     """Return the mean of points (n, k, 3) weighted by the inverse of their differences (n, k).
 
-    Corrected: the point itself where one is met exactly, for which it is 0 / 0.  The differences
+    Corrected: the point itself where one matches exactly, for which it is 0 / 0.  The differences
     must be of logarithms: in nT, as printed, the nearest beacon outweighs all others and the
-    position errs four times as much.
+    position error is four times as large.
     """
     met = difference == 0.0
     share = np.where(met.any(axis=1, keepdims=True), met, 1.0 / np.where(met, 1.0, difference))
@@ -301,7 +301,7 @@ def eq_27_position(difference: Array, position_world: Array) -> Array:
 def eq_28_range(reach: Array, amplitude: Array, fingerprint: Array, slope: Array) -> Array:
     """Return the range to a beacon from its amplitude at a point at a known distance (m).
 
-    Corrected: the intercept cancels, what is left is a ratio of ranges, the right way up.
+    Corrected: the intercept cancels and leaves a ratio of ranges, the right way up.
     """
     return reach * np.exp((np.log(amplitude) - np.log(fingerprint)) / slope)
 
@@ -338,8 +338,8 @@ def eq_30_mean_position_error(true_world: Array, found_world: Array) -> float:
 
 
 def eq_31_mean_angle_error(error: Array) -> Array:
-    """Return the mean of the sizes of three angles' errors (..., 3) (rad).
+    """Return the mean of the magnitudes of three angles' errors (..., 3) (rad).
 
-    Right of the sizes; about half the angle of the rotation between the two attitudes.
+    Right for the magnitudes; about half the angle of the rotation between the two attitudes.
     """
     return np.mean(np.abs(error), axis=-1)

@@ -1,8 +1,8 @@
 """Position from a fingerprint survey: paper 004, algorithms 2 and 3, corrected.
 
-A survey is cut into what the algorithms compare: the amplitude of each beacon at each point, root
-mean square over time.  None of them knows the field's model, so that what the model does not know
-(coil size, steel) troubles them only between the points of the survey.
+A survey is reduced to what the algorithms compare: the amplitude of each beacon at each point, root
+mean square over time.  They do not use the field's model, so that unmodelled effects (coil size,
+steel) affect them only between the points of the survey.
 """
 
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class FingerprintDatabase:
         return len(self.position_world)
 
     def detecting(self, columns: IntArray) -> "FingerprintDatabase":
-        """Return the points where all of some beacons were detected, with no others."""
+        """Return the points where all given beacons were detected, with these beacons alone."""
         amplitude = self.amplitude[:, columns]
         complete = np.isfinite(amplitude).all(axis=1)
         return FingerprintDatabase(
@@ -61,22 +61,22 @@ class FingerprintDatabase:
 
 
 def fingerprint_database(survey: Survey, site: Site) -> FingerprintDatabase:
-    """Return the fingerprints of a survey, of the site's beacons that it names.
+    """Return the fingerprints of a survey, for the site's beacons in it.
 
     The survey's poses are of the body; fingerprints belong to the sensor.
 
     Raises
     ------
     InputError
-        Where the survey names a beacon or a tone that the site does not know.
+        Where the survey has a beacon or a tone that is not in the site.
     """
     unknown = [channel for channel in survey.channels if channel not in site.channels]
     if unknown:
         beacon, tone = unknown[0]
         known = ", ".join(b.name for b in site.beacons)
         raise InputError(
-            f"the survey holds beacon {beacon} tone {tone}, which the site does not know (it knows"
-            f" {known}); give the site in which it was made."
+            f"the survey has beacon {beacon} tone {tone}, which is not in the site (which has"
+            f" {known}); give the site of the survey."
         )
     sensor = site.platform.magnetometer
     detected = [b for b in site.beacons if any(name == b.name for name, _ in survey.channels)]
@@ -98,16 +98,16 @@ def _of_beacon(survey: Survey, site: Site, name: str) -> Array:
 
 
 def calibrated(phasor_sensor: ComplexArray, site: Site) -> ComplexArray:
-    """Return measured phasors (..., 3) with the magnetometer's matrix undone (T)."""
+    """Return measured phasors (..., 3) with the magnetometer's matrix inverted (T)."""
     return phasor_sensor @ np.linalg.inv(site.platform.magnetometer.matrix).T
 
 
 def nearest(
     database: FingerprintDatabase, amplitude: Array, neighbours: int, *, logarithmic: bool = True
 ) -> tuple[Array, IntArray]:
-    """Return differences and numbers (n, k) of the points most like amplitudes (n, beacons).
+    """Return differences and indices (n, k) of the points most similar to amplitudes (n, beacons).
 
-    Euclidean, of logarithms or else in nT, where the nearest beacon outweighs all others; least
+    Euclidean, of logarithms or else in nT, where the nearest beacon outweighs all others; smallest
     first.  The database must be complete (`FingerprintDatabase.detecting`).
     """
     ours, theirs = (
@@ -126,7 +126,7 @@ def locate_by_neighbours(
 ) -> Array:
     """Return the positions (n, 3) of the sensor (m) by algorithm 2; arguments as in `nearest`.
 
-    The paper prints it with amplitudes in nT (``logarithmic=False``).
+    The paper uses amplitudes in nT (``logarithmic=False``).
     """
     difference, point = nearest(database, amplitude, neighbours, logarithmic=logarithmic)
     return eq_27_position(difference, database.position_world[point])
@@ -140,13 +140,13 @@ def locate_by_differential_range(
 ) -> Array:
     """Return the positions (n, 3) of the sensor (m) by algorithm 3, with Eq 28 and 29 corrected.
 
-    Ranges by the nearest fingerprints, each by itself::
+    Ranges from each of the nearest fingerprints::
 
         r_i(j) = |P_j - M_i| exp((ln F_t,i - ln F_j,i) / k_i)
         min_P  sum_i (|P - M_i| - mean_j r_i(j))^2
 
-    The slopes k (beacons,) are those of all fingerprints where they are not given; other arguments
-    as in `nearest`.
+    The slopes k (beacons,) are by default those of all fingerprints; other arguments as in
+    `nearest`.
     """
     _, point = nearest(database, amplitude, neighbours)
     reach = distances(database.position_world, database.beacons_world)

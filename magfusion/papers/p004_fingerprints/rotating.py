@@ -1,4 +1,4 @@
-"""What the algorithms of paper 004 take, of the beacons and phasors of a site and a log."""
+"""Inputs of the algorithms of paper 004, from the beacons and phasors of a site and a log."""
 
 import numpy as np
 
@@ -24,13 +24,14 @@ ROUND = 1e-3  # least ratio of a rotating moment's axes
 def rotating_beacons(
     database: FingerprintDatabase, site: Site
 ) -> tuple[FingerprintDatabase, Array]:
-    """Return the fingerprints of rotating beacons alone, and the axes about which these turn."""
+    """Return the fingerprints of rotating beacons alone, and the axes about which these rotate."""
     axis = np.array([rotation_axis_world(b) for b in _beacons(site, database)])
     columns = np.flatnonzero(np.isfinite(axis).all(axis=1))
     if len(columns) < LEAST_BEACONS:
         raise InputError(
-            f"the algorithms of paper 004 need {LEAST_BEACONS} rotating beacons, two coils on one"
-            f" tone; site and survey share {len(columns)}; take --method likelihood, or add beacons"
+            f"the algorithms of paper 004 require {LEAST_BEACONS} rotating beacons, two coils on"
+            f" one tone; site and survey share {len(columns)}; use --method likelihood, or add"
+            " beacons"
         )
     kept = FingerprintDatabase(
         tuple(database.beacons[c] for c in columns),
@@ -41,7 +42,7 @@ def rotating_beacons(
     useful = int(np.sum(_enough(kept.amplitude)))
     if useful < NEIGHBOURS:
         raise InputError(
-            f"holds {useful} points that hear {LEAST_BEACONS} rotating beacons, and {NEIGHBOURS}"
+            f"has {useful} points that detect {LEAST_BEACONS} rotating beacons; {NEIGHBOURS}"
             " are needed; survey more places"
         )
     return kept, axis[columns]
@@ -56,7 +57,7 @@ def _enough(amplitude: Array) -> BoolArray:
 
 
 def rotation_axis_world(beacon: Beacon) -> Array:
-    """Return the unit vector about which a beacon's moment turns; NaN where it does not."""
+    """Return the unit vector about which a beacon's moment rotates; NaN where it does not."""
     if len(beacon.tones) != 1:
         return np.full(3, np.nan)
     drive = (beacon.moments_beacon.T @ beacon.excitation)[:, 0]

@@ -1,8 +1,8 @@
-"""Position from field amplitudes alone: lines in the logarithms, then trilateration.
+"""Position from field amplitudes alone: linear in the logarithms, then trilateration.
 
-Paper 004, algorithm 1, and the ranges that two other algorithms start from.  A line says that the
-amplitude depends on the distance alone (Eq 14), which no amplitude of a dipole does but the minor
-semi-axis of a rotating one: see `ranges_from_minor_axis`.
+Paper 004, algorithm 1, and the initial ranges of two other algorithms.  A line means that the
+amplitude depends on the distance alone (Eq 14), which is true of no amplitude of a dipole except
+the minor semi-axis of a rotating one: see `ranges_from_minor_axis`.
 """
 
 from dataclasses import dataclass
@@ -53,7 +53,7 @@ class BlockLines:
     Parameters
     ----------
     size : float
-        Of a block (m); the paper takes 2 m.
+        Edge of a block (m); the paper uses 2 m.
     overall : RssiLines
         Where there is no block, slope and intercept of shape (beacons,).
     block : ndarray of int, shape (blocks, 2)
@@ -68,7 +68,7 @@ class BlockLines:
     lines: RssiLines
 
     def at(self, position_world: Array) -> RssiLines:
-        """Return the lines that hold at positions (..., 3) (m), shape (..., beacons)."""
+        """Return the lines valid at positions (..., 3) (m), shape (..., beacons)."""
         own = _block(position_world, self.size)
         slope = np.broadcast_to(self.overall.slope, (*own.shape[:-1], len(self.overall.slope)))
         slope, intercept = slope.copy(), np.broadcast_to(self.overall.intercept, slope.shape).copy()
@@ -115,7 +115,7 @@ def fit_block_lines(
 
 
 def _block(position_world: Array, size: float) -> IntArray:
-    # A point on the edge, as of a regular survey, must not fall to either side by rounding.
+    # Rounding must not move a point on the edge, as of a regular survey, to either side.
     return np.floor(position_world[..., :2] / size + 1e-9)
 
 
@@ -134,11 +134,11 @@ def ranges_from_minor_axis(minor_axis: Array, moment: Array) -> Array:
 
 
 def trilaterate(ranges: Array, beacons_world: Array, start_world: Array) -> Array:
-    """Return the positions (..., 3) (m) of least misfit (Eq 17) to ranges (..., beacons) (m).
+    """Return the positions (..., 3) (m) of minimum misfit (Eq 17) to ranges (..., beacons) (m).
 
-    Beacons in one plane leave two mirror positions that fit equally well; the side of the start,
+    Beacons in one plane give two mirror positions that fit equally well; the side of the start,
     (3,) or (..., 3) (m), decides between them.  Newton's method on all epochs at once, with the
-    curvature made positive: where the ranges are too short to meet, Gauss-Newton creeps.
+    curvature made positive: Gauss-Newton converges slowly where the ranges are too short to meet.
 
     Raises
     ------
@@ -146,13 +146,13 @@ def trilaterate(ranges: Array, beacons_world: Array, start_world: Array) -> Arra
         Where a range is not finite, or an iteration does not converge.
     """
     if not np.all(np.isfinite(ranges)):
-        raise EstimationError("trilateration needs the range to every beacon")
+        raise EstimationError("trilateration requires the range to every beacon")
     shape = (*ranges.shape[:-1], 3)
     start = np.broadcast_to(start_world, shape).reshape(-1, 3)
     position = _converged(start, beacons_world, ranges.reshape(-1, ranges.shape[-1]))
     centre, normal, flat = _plane(beacons_world)
     if flat:
-        # A step may cross the plane, behind which everything is the same.
+        # A step may cross the plane, which is a plane of symmetry.
         crossed = ((position - centre) @ normal) * ((start - centre) @ normal) < 0.0
         position = np.where(crossed[:, None], _mirrored(position, centre, normal), position)
     return position.reshape(shape)
@@ -161,8 +161,8 @@ def trilaterate(ranges: Array, beacons_world: Array, start_world: Array) -> Arra
 def trilaterate_from_both_sides(ranges: Array, beacons_world: Array, start_world: Array) -> Array:
     """Return the better of `trilaterate` from the start and from its mirror image.
 
-    The mirror is the plane that fits the beacons best.  Where both fit alike, as they do when all
-    beacons lie in that plane, the start's side is kept.
+    The mirror is the best-fit plane of the beacons.  Where both fit equally well, as they do when
+    all beacons lie in that plane, the start's side is kept.
     """
     centre, normal, flat = _plane(beacons_world)
     here = trilaterate(ranges, beacons_world, start_world)
@@ -203,5 +203,5 @@ def _converged(start: Array, beacons: Array, ranges: Array) -> Array:
     found = minimise(model, start.astype(np.float64), passes=ITERATIONS, absolute=CONVERGED**2)
     if not np.all(found.converged):
         first = start[np.argmin(found.converged)]
-        raise EstimationError(f"trilateration did not converge from {first}")
+        raise EstimationError(f"trilateration does not converge from {first}")
     return found.state

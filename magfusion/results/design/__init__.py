@@ -1,1 +1,1 @@
-"""Where to put beacons, and where to hold the sensor: choices by the bound that coverage draws."""
+"""Placement of beacons and of calibration stops, by the Cramér-Rao bound."""

@@ -1,12 +1,12 @@
-"""Which candidates to take: exchange of one beacon at a time, from several random layouts.
+"""Selection of candidates: exchange of one beacon at a time, from several random layouts.
 
 V. V. Fedorov, Theory of Optimal Experiments (1972); H. P. Wynn, J. R. Statist. Soc. B 34 (1972):
 each beacon in turn is exchanged for the candidate that lowers the objective most, until no
-exchange does.  That is a local optimum, so it is sought from several starts.
+exchange does.  That is a local optimum, so the search has several starts.
 
-For the worst protection level a candidate is out as soon as one point is worse than what is
-reached: candidates are compared at the worst points first.  The points themselves are few at
-first; where a layout is worse elsewhere, the points there are added, until there are none.
+For the worst protection level a candidate is rejected as soon as one point is worse than the best
+value so far: candidates are compared at the worst points first.  The initial points are few; where
+a layout is worse elsewhere, the points there are added, until there are none.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,13 +40,13 @@ TRIES = 2000  # random layouts in a row that do not keep their distance
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Beacons that may be taken.
+    """Candidate beacons.
 
     Parameters
     ----------
     beacons : tuple of Beacon
     apart : float
-        Least distance of two beacons (m).
+        Minimum distance of two beacons (m).
     """
 
     beacons: tuple[Beacon, ...]
@@ -54,11 +54,11 @@ class Candidates:
 
     @property
     def places(self) -> Array:
-        """Where they are, shape (candidates, 3) (m)."""
+        """Their positions, shape (candidates, 3) (m)."""
         return np.array([beacon.position_world for beacon in self.beacons])
 
     def beside(self, taken: Sequence[int]) -> BoolArray:
-        """Tell which keep their distance from those that are taken."""
+        """Return which candidates keep the distance from the selected ones."""
         places = self.places
         free = np.ones(len(places), dtype=bool)
         for other in taken:
@@ -68,16 +68,16 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Found:
-    """A layout that no exchange betters.
+    """A layout that no exchange improves.
 
     Parameters
     ----------
     chosen : tuple of int
-        Of the candidates.
+        Indices of the candidates.
     value : float
         Of the objective, at all points.
     complete : bool
-        Whether the search came to its end before its time was over.
+        Whether the search ended before its time limit.
     """
 
     chosen: tuple[int, ...]
@@ -87,7 +87,7 @@ class Found:
 
 @dataclass(eq=False)
 class Search:
-    """Candidates at the points at which they are compared; points are added to it.
+    """Candidates and the points at which they are compared, to which points can be added.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ class Search:
         Worst protection level (m); mean of the logarithm of the determinant of the position's
         covariance; mean of its trace (m^2).
     in_time : callable
-        Whether there is time left.
+        Whether the time limit is not reached.
     """
 
     information: LayoutInformation
@@ -109,13 +109,13 @@ class Search:
     standing: Array = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))
 
     def __post_init__(self) -> None:
-        """Take the first points: spread evenly over all, or enough for a mean."""
+        """Select the first points: distributed evenly over all, or enough for a mean."""
         most = FIRST_POINTS if self.objective == "worst" else 2 * FIRST_POINTS
         count = len(self.information.points)
         self.add(np.unique(np.linspace(0, count - 1, min(most, count)).astype(int)))
 
     def add(self, points: IntArray) -> None:
-        """Compare candidates at more points, too."""
+        """Add points at which candidates are compared."""
         part = self.information.at(self.information.points[points])
         roots = np.stack([part.root(beacon) for beacon in self.candidates.beacons])
         first = not len(self.active)
@@ -125,7 +125,7 @@ class Search:
         self.active = np.concatenate([self.active, points])
 
     def value(self, chosen: Sequence[int]) -> float:
-        """Return the objective of a layout at the points that are compared."""
+        """Return the objective of a layout at the compared points."""
         return of_points(self._each(chosen), self.objective)
 
     def _each(self, chosen: Sequence[int]) -> Array:
@@ -133,12 +133,12 @@ class Search:
         return at_each_point(self.information, new, self.standing, self.objective)
 
     def value_everywhere(self, chosen: Sequence[int]) -> tuple[float, Array]:
-        """Return the objective of a layout at all points, and what each point has of it."""
+        """Return the objective of a layout at all points, and its value per point."""
         beacons = [self.candidates.beacons[c] for c in chosen]
         return value_of(self.information, beacons, self.objective)
 
     def best_in_place_of(self, chosen: Sequence[int], slot: int, value: float) -> tuple[int, float]:
-        """Return the candidate that is best in the place of one, and the objective with it."""
+        """Return the best candidate in place of a beacon, and the objective with it."""
         others = [c for k, c in enumerate(chosen) if k != slot]
         rows = np.flatnonzero(self.candidates.beside(others))
         new = added(self.roots[others])
@@ -169,7 +169,7 @@ class Search:
         return int(rows[best]), float(worst[best])
 
     def _compared(self, rows: IntArray, base: Array, alone: Array, points: IntArray) -> Array:
-        """Return what points have of the objective with each candidate, (rows, points)."""
+        """Return the objective per point with each candidate, (rows, points)."""
         size, parts = base.shape[-1], base.shape[1]
         step = max(AT_ONCE // (len(points) * parts), 1)
         found = np.empty((len(rows), len(points)))
@@ -191,7 +191,7 @@ class Search:
 def value_of(
     information: LayoutInformation, beacons: Sequence[Beacon], objective: Objective
 ) -> tuple[float, Array]:
-    """Return the objective of beacons beside those that stay, and what each point has of it."""
+    """Return the objective of beacons with those that stay, and its value per point."""
     new = np.stack([added(information.root(beacon)) for beacon in beacons])
     each = at_each_point(information, new, information.standing, objective)
     return of_points(each, objective), each
@@ -200,7 +200,7 @@ def value_of(
 def at_each_point(
     information: LayoutInformation, new: Array, standing: Array, objective: Objective
 ) -> Array:
-    """Return what each point has of the objective, shape (n,).
+    """Return the objective per point, shape (n,).
 
     Parameters
     ----------
@@ -225,14 +225,14 @@ def _of_covariance(cov: Array, objective: Objective) -> Array:
 
 
 def of_points(each: Array, objective: Objective) -> float:
-    """Return the objective of what each point has of it."""
+    """Return the objective from its values per point."""
     return float(np.max(each) if objective == "worst" else np.mean(each))
 
 
 def random_layout(
     candidates: Candidates, count: int, rng: np.random.Generator
 ) -> tuple[int, ...] | None:
-    """Return candidates drawn evenly that keep their distance; None where none are found."""
+    """Return random candidates that keep their distance; None where none are found."""
     for _ in range(TRIES):
         drawn: list[int] = rng.choice(len(candidates.beacons), count, replace=False).tolist()
         if all(candidates.beside(drawn[:k])[c] for k, c in enumerate(drawn)):
@@ -241,7 +241,7 @@ def random_layout(
 
 
 def exchanged(search: Search, chosen: tuple[int, ...]) -> tuple[int, ...]:
-    """Exchange one beacon after another, until nothing is gained at the points compared."""
+    """Exchange one beacon after another, until there is no gain at the compared points."""
     value, unchanged, layout = search.value(chosen), 0, list(chosen)
     for turn in range(SWEEPS * len(layout)):
         if unchanged == len(layout) or not search.in_time():
@@ -269,7 +269,7 @@ def best_layout(
     Parameters
     ----------
     first : tuple of int, optional
-        A layout to start from, before random ones.
+        An initial layout, before random ones.
     """
     best: Found | None = None
     for start in range(starts):
@@ -301,7 +301,7 @@ def _start(search: Search, count: int, rng: np.random.Generator) -> tuple[int, .
 
 
 def _settled(search: Search, layout: tuple[int, ...]) -> Found:
-    """Exchange, and add the points where the layout is worse than where it was compared."""
+    """Exchange, and add the points where the layout is worse than at the compared points."""
     best: Found | None = None
     for _ in range(ROUNDS):
         layout = exchanged(search, layout)
@@ -318,7 +318,7 @@ def _settled(search: Search, layout: tuple[int, ...]) -> Found:
 
 
 def _worst_apart(search: Search, each: Array) -> IntArray:
-    """Return the worst points that are not compared yet, none beside another."""
+    """Return the worst points that are not compared yet, none close to another."""
     points = search.information.points
     near = 0.1 * float(np.linalg.norm(np.ptp(points, axis=0)))
     taken: list[int] = []

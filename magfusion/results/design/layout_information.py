@@ -1,8 +1,8 @@
-"""The information of layouts as a sum over beacons, for a search that tries many thousands.
+"""Information of layouts as a sum over beacons, for a search with many thousands of layouts.
 
-Coverage marginalises everything at once.  Here what belongs to a beacon alone is marginalised
-beacon by beacon, once, and what all share (the magnetometer, its place on the platform, the
-ground) stays beside the pose until the beacons are chosen: the same bound, to rounding.
+Coverage marginalises all parameters at once.  Here the parameters of a beacon alone are
+marginalised once per beacon, and the shared ones (the magnetometer, its position on the platform,
+the ground) remain with the pose until the beacons are chosen: the same bound, up to rounding.
 """
 
 from dataclasses import dataclass, replace
@@ -39,20 +39,20 @@ FLOOR = 1e-14  # of each number's own information: keeps what is open finite, an
 
 @dataclass(frozen=True, eq=False)
 class LayoutInformation:
-    """What beacons at places tell of the pose at points.
+    """Information of beacons at places on the pose at points.
 
     Parameters
     ----------
     site : Site
         With the beacons that stay.
     template : Beacon
-        A copy of which is to be added.
+        Beacon of which copies are added.
     points : ndarray, shape (n, 3)
-        Where the platform is (m), level and along the world's axes.
+        Positions of the platform (m), level and along the world's axes.
     window : float
-        Over which the tones are averaged (s).
+        Averaging time of the tones (s).
     risk : Risk
-        What protection levels promise.
+        Specification of the protection levels.
     """
 
     site: Site
@@ -79,7 +79,7 @@ class LayoutInformation:
 
     @cached_property
     def standing(self) -> Array:
-        """Information of what is known and of the beacons that stay, (1 + stay, n, size, size).
+        """Information of the prior and of the beacons that stay, (1 + stay, n, size, size).
 
         With all of these, then without each.
         """
@@ -129,12 +129,12 @@ def added(roots: Array) -> Array:
 
 
 def _shared(blocks: tuple[Block, ...]) -> int:
-    """Return how many nuisances are of no beacon; they are the last."""
+    """Return the number of nuisances of no beacon; they are the last."""
     return sum(len(b.sigma) for b in blocks if not isinstance(b.parameter, BeaconParameter))
 
 
 def pose_covariance(information: Array) -> Array:
-    """Return the pose's covariance, what all beacons share marginalised, shape (..., 6, 6)."""
+    """Return the pose's covariance, shared parameters marginalised, shape (..., 6, 6)."""
     size = np.diagonal(information, axis1=-2, axis2=-1)
     scale = 1.0 / np.sqrt(np.maximum(size, NOTHING))
     alike = information * scale[..., :, None] * scale[..., None, :]

@@ -1,12 +1,12 @@
-"""Where to hold the sensor next, for a calibration: stops chosen one by one by what they determine.
+"""Stops of the sensor for a calibration, selected one by one by their information.
 
-A stop is a pose held for some time.  What it tells of the calibration is what its fields leave when
-the pose itself is marginalised, of which only gravity is known; or all of it, where poses are
-measured.  What an IMU tells of the way between stops is left out: a log determines more, not less.
-Where fields err, they err alike at places close by: of these only one is chosen.
+A stop is a pose kept for some time.  Its information on the calibration is that of its fields with
+the pose marginalised, of which only gravity is known; or all of it, for measured poses.  IMU data
+between stops are neglected: a log determines more, not less.  Field errors are correlated between
+places close to each other: of these only one is selected.
 
-A parameter counts by how far one sigma of it moves the fields where it is to be navigated, in
-units of their noise: so metres, radians and shares can be compared.
+The weight of a parameter is the change of the fields for one sigma of it, where the platform is to
+navigate, in units of their noise: so metres, radians and shares can be compared.
 """
 
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ AT_ONCE = 200
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """What is to be calibrated, number by number.
+    """The parameters to calibrate.
 
     Parameters
     ----------
@@ -61,11 +61,11 @@ class Parameters:
     sigma : ndarray, shape (k,)
         Declared by the site, as tangent vector.
     weight : ndarray, shape (k,)
-        By how many sigmas of their noise the fields move, for one sigma.
+        Change of the fields for one sigma, in sigmas of their noise.
     limit : ndarray, shape (k,)
-        Of the declared sigma, that is left after all stops that there are.
-    asked : bool ndarray, shape (k,)
-        Whether stops can determine it, and it is of the site rather than of one log.
+        Relative to the declared sigma, after all possible stops.
+    `asked` : bool ndarray, shape (k,)
+        Whether stops can determine it, and it belongs to the site rather than to one log.
     """
 
     names: list[tuple[str, str, float]]
@@ -75,36 +75,36 @@ class Parameters:
     asked: BoolArray
 
     def worst(self, ratio: Array) -> int:
-        """Return the one of which most can still be had: what moves the fields most.
+        """Return the parameter with the largest possible gain in the fields.
 
         Parameters
         ----------
         ratio : ndarray, shape (k,)
-            Of each sigma to the declared one.
+            Each sigma relative to the declared one.
         """
         return int(np.argmax(np.where(self.asked, self.excess(ratio), -1.0)))
 
     def excess(self, ratio: Array) -> Array:
-        """Return how far what stops could still determine moves the fields, in sigmas of noise."""
+        """Return the possible change of the fields from further stops, in sigmas of noise."""
         left = np.maximum(ratio**2 - self.limit**2, 0.0)
         return np.asarray(self.weight * np.sqrt(left))
 
     def sized(self, index: int, ratio: float) -> str:
-        """Return a sigma with its unit, given as a share of the declared one."""
+        """Return a sigma with its unit, from its ratio to the declared one."""
         _, unit, size = self.names[index]
         return f"{ratio * self.sigma[index] / size:.2g} {unit}".strip()
 
 
 @dataclass(frozen=True, eq=False)
 class Stop:
-    """A pose to hold, and what that does.
+    """A pose to keep, and its effect.
 
     Parameters
     ----------
     worst : int
-        The parameter that it is for.
+        The parameter for which it is selected.
     before, after : float
-        Its sigma, of the declared one.
+        Its sigma, relative to the declared one.
     """
 
     position_world: Array
@@ -116,12 +116,12 @@ class Stop:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Stops in their order, and what they leave.
+    """Stops in their order, and the remaining sigmas.
 
     Parameters
     ----------
     ratio : ndarray, shape (k,)
-        Sigma of each parameter after all stops, of the declared one.
+        Sigma of each parameter after all stops, relative to the declared one.
     """
 
     stops: tuple[Stop, ...]
@@ -131,14 +131,14 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Candidates for stops, and what each tells.
+    """Candidate stops, and their information.
 
     Parameters
     ----------
     position_world : ndarray, shape (n, 3)
         (m)
     attitude : int ndarray, shape (n,)
-        Of `ATTITUDES_DEG`.
+        Index of `ATTITUDES_DEG`.
     root : ndarray, shape (n, rows, k)
         Of the information on the calibration, in units of the declared sigmas.
     """
@@ -149,14 +149,14 @@ class Poses:
 
 
 def next_motion(site: Site, places: Array, count: int, stop: float, *, known: bool) -> Motion:
-    """Choose stops one after another, each for the parameter that is worst then.
+    """Select stops one after another, each for the parameter that is then the worst.
 
     Parameters
     ----------
     places : ndarray, shape (m, 3)
-        Where the platform may be held (m); evenly thinned where they are many.
+        Possible positions of the platform (m); thinned evenly if many.
     stop : float
-        How long (s).
+        Duration (s).
     known : bool
         Whether the poses are measured, as those of a survey.
     """
@@ -193,7 +193,7 @@ def next_motion(site: Site, places: Array, count: int, stop: float, *, known: bo
 
 
 def prior_information(site: Site, blocks: tuple[Block, ...]) -> Array:
-    """Return what the site knows of the calibration, in units of its sigmas, shape (k, k)."""
+    """Return the site's prior information on the calibration, in units of its sigmas, (k, k)."""
     free = is_free(blocks)
     root = (prior_sqrt_information(site, blocks) * prior_sigma(blocks))[~free]
     return np.asarray(root.T @ root + UNKNOWN * np.diag(free.astype(float)))
@@ -202,7 +202,7 @@ def prior_information(site: Site, blocks: tuple[Block, ...]) -> Array:
 def candidate_poses(
     site: Site, blocks: tuple[Block, ...], places: Array, stop: float, *, known: bool
 ) -> Poses:
-    """Return every place in every attitude, with what a stop there tells."""
+    """Return every place in every attitude, with the information of a stop there."""
     places = places[np.unique(np.linspace(0, len(places) - 1, MOST_PLACES).astype(int))]
     centres = np.array([b.position_world for b in site.beacons])
     apart = np.linalg.norm(places[:, None] - centres, axis=2).min(axis=1)
@@ -237,7 +237,7 @@ def candidate_poses(
 
 
 def _weight(site: Site, blocks: tuple[Block, ...], places: Array, stop: float) -> Array:
-    """Return by how many sigmas of noise one of each parameter moves the fields, rms."""
+    """Return the change of the fields per unit parameter, in sigmas of noise, rms."""
     level = places[: len(places) // len(ATTITUDES_DEG)]
     calibration = initial_calibration(site, 0.0)
     seen = whitened(calibration, blocks, phasor_variance(site, stop), np.eye(3), level)
@@ -250,7 +250,7 @@ def _ratio(information: Array) -> Array:
 
 
 def _errs_alike(site: Site, poses: Poses, chosen: int) -> BoolArray:
-    """Return where the model error is that of a stop: a second one there would not be as good."""
+    """Return where the model error is correlated with a stop's: a second one there adds less."""
     if site.model_error == 0.0:
         return np.zeros(len(poses.root), dtype=bool)
     apart = np.linalg.norm(poses.position_world - poses.position_world[chosen], axis=1)
@@ -258,7 +258,7 @@ def _errs_alike(site: Site, poses: Poses, chosen: int) -> BoolArray:
 
 
 def _best(information: Array, poses: Poses, worst: int, among: IntArray) -> tuple[int, float]:
-    """Return which of some candidates leaves the least sigma of a parameter, and that sigma."""
+    """Return the candidate that minimises the sigma of a parameter, and that sigma."""
     found = []
     for start in range(0, len(among), AT_ONCE):
         root = poses.root[among[start : start + AT_ONCE]]

@@ -1,4 +1,4 @@
-"""Beacons made after one that the site has: turned, placed, tuned and of another strength."""
+"""Beacons copied from one of the site: rotated, placed, tuned and scaled."""
 
 from dataclasses import dataclass, replace
 from itertools import product
@@ -17,16 +17,16 @@ AXES_OFFERED = (3, 7, 13)
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """Where tones may be, and how far apart.
+    """Frequency band of tones, and their spacing.
 
     Parameters
     ----------
     low, high : float
         (Hz)
     window : float
-        Over which tones must be told apart (s): two of its periods lie between any two.
+        Time over which tones must be separated (s): any two are two of its periods apart.
     mains_hz : float
-        Its harmonics are kept away from; 0 for none.
+        Mains frequency whose harmonics are avoided; 0 for none.
     """
 
     low: float
@@ -36,11 +36,11 @@ class Band:
 
     @property
     def spacing(self) -> float:
-        """Least distance of tones from each other, from zero and from the mains (Hz)."""
+        """Minimum distance of tones from each other, from zero and from the mains (Hz)."""
         return max(2.0 / self.window, CLOSEST_TONES_HZ)
 
     def free(self, taken: Array) -> Array:
-        """Return tones that may stand beside those that are taken, and beside each other (Hz)."""
+        """Return tones separable from the used ones and from each other (Hz)."""
         step = self.spacing / 5.0
         wanted = np.arange(self.low, self.high * (1.0 + 1e-9), step)
         found: list[float] = []
@@ -55,9 +55,9 @@ class Band:
 
 
 def pattern_axis(beacon: Beacon) -> Array | None:
-    """Return the axis that says how a beacon is turned, beacon axes; None where no turn matters.
+    """Return the axis that specifies a beacon's direction, beacon axes; None where it has none.
 
-    Of coils in one plane its normal, about which their field turns; of one coil its own axis; of
+    Of coils in one plane its normal, about which their field rotates; of one coil its own axis; of
     coils in all three directions none.
     """
     _, size, axes = np.linalg.svd(np.vstack([beacon.moments_beacon, np.zeros((3, 3))]))
@@ -66,7 +66,7 @@ def pattern_axis(beacon: Beacon) -> Array | None:
 
 
 def turned(beacon: Beacon, axis_world: Array) -> Beacon:
-    """Return a beacon whose axis points along a unit vector, turned no farther than it must be."""
+    """Return a beacon whose axis points along a unit vector, by the smallest rotation."""
     axis = pattern_axis(beacon)
     if axis is None:
         return beacon
@@ -82,7 +82,7 @@ def turned(beacon: Beacon, axis_world: Array) -> Beacon:
 
 
 def axes_offered(beacon: Beacon, count: int) -> Array:
-    """Return the directions among which that of a beacon is chosen, shape (axes, 3), world.
+    """Return the candidate directions of a beacon, shape (axes, 3), world.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def axes_offered(beacon: Beacon, count: int) -> Array:
 
 
 def stronger(beacon: Beacon, factor: float) -> Beacon:
-    """Return a beacon whose moments are so many times as large, its currents with them."""
+    """Return a beacon with its moments, and currents, scaled by a factor."""
     coils = tuple(
         replace(
             coil,
@@ -132,7 +132,7 @@ def peak_moment(beacon: Beacon) -> float:
 
 
 def template_of(site: Site, name: str | None) -> Beacon:
-    """Return the beacon of which copies are made, without what belongs to its own place.
+    """Return the beacon to copy, without the properties of its own place.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def template_of(site: Site, name: str | None) -> Beacon:
 def frequencies_for(
     template: Beacon, count: int, band: Band, kept: tuple[Beacon, ...]
 ) -> tuple[Array, Array]:
-    """Return the frequencies of each new beacon, shape (count, tones), and what is still free.
+    """Return the frequencies of each new beacon, shape (count, tones), and the free ones.
 
     Raises
     ------
@@ -162,7 +162,7 @@ def frequencies_for(
     free, tones = band.free(taken), len(template.tones)
     if len(free) < count * tones:
         raise InputError(
-            f"--band {band.low:g},{band.high:g} has room for {len(free)} tones {band.spacing:g} Hz"
-            f" apart, and {count * tones} are needed; widen it, or give a longer --window"
+            f"--band {band.low:g},{band.high:g} has {len(free)} tones {band.spacing:g} Hz apart,"
+            f" and {count * tones} are needed; widen it, or give a longer --window"
         )
     return free[: count * tones].reshape(count, tones), free[count * tones :]

@@ -39,26 +39,26 @@ MOST_CANDIDATES = 6000
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is to be designed.
+    """A design task.
 
     Parameters
     ----------
     site : Site
         With the beacons that stay.
     template : Beacon
-        Of which copies are placed, with the moment that each may have.
+        Beacon of which copies are placed, with the moment of each.
     count : int
         Of the copies.
     places : ndarray, shape (m, 3)
-        Where they may be mounted (m).
+        Possible mounting places (m).
     points : ndarray, shape (n, 3)
-        Where it is to be navigated (m).
+        Points of use (m).
     axes : int
-        Directions in which each may point.
+        Number of candidate directions of each.
     apart, clearance : float
-        Least distance of two beacons, and of a beacon from points of use (m).
+        Minimum distance of two beacons, and of a beacon from points of use (m).
     budgeted : bool
-        Whether the moments may be divided otherwise than evenly.
+        Whether the moments may be distributed unevenly.
     """
 
     site: Site
@@ -77,7 +77,7 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """What was chosen.
+    """A finished design.
 
     Parameters
     ----------
@@ -85,9 +85,9 @@ class Design:
         With the beacons that stayed and the new ones.
     new : tuple of Beacon
     candidates : int
-        Among which they were chosen.
+        Number of candidates.
     complete : bool
-        Whether the search came to its end in time.
+        Whether the search ended before its time limit.
     random_worst_m : ndarray, shape (layouts,)
         Worst protection level of random layouts of the same candidates (m).
     median_random : Site, optional
@@ -112,21 +112,21 @@ def designed(
     in_time: Callable[[], bool] = lambda: True,
     report: Report = quiet,
 ) -> Design:
-    """Choose places, axes, moments and frequencies.
+    """Select places, axes, moments and frequencies.
 
     Parameters
     ----------
     starts : int
         Of the search.
     layouts : int
-        Random ones to compare with.
+        Number of random ones to compare with.
     first : Site, optional
-        Whose beacons, as many as are to be placed, are the first start.
+        Site whose beacons, of the same number, are the first start.
 
     Raises
     ------
     InputError
-        Where nothing may be mounted, or not so many so far apart.
+        Where there are no mounting places, or too few at this distance.
     """
     tones, free = np.zeros((0, 0)), np.zeros(0)
     if is_in_turn(task.template):
@@ -149,9 +149,8 @@ def designed(
     found = best_layout(search, task.count, starts, search_rng, first=given, report=report)
     if found is None or any(layout is None for layout in drawn):
         raise InputError(
-            f"{task.count} beacons at least --apart {task.apart:g} m from each other do not find"
-            f" room on {len(np.unique(candidates.places, axis=0))} mounting places; lower --apart"
-            " or --grid"
+            f"{task.count} beacons at a distance of at least --apart {task.apart:g} m do not fit on"
+            f" {len(np.unique(candidates.places, axis=0))} mounting places; lower --apart or --grid"
         )
     new = _finished(
         task, information, [candidates.beacons[c] for c in found.chosen], tones, free, in_time
@@ -177,7 +176,7 @@ def designed(
 
 
 def candidates_of(task: Task, beacon: Beacon) -> Candidates:
-    """Return copies of a beacon at every place where one may be, in every direction.
+    """Return copies of a beacon at every allowed place, in every direction.
 
     Raises
     ------
@@ -193,9 +192,9 @@ def candidates_of(task: Task, beacon: Beacon) -> Candidates:
     axes = axes_offered(beacon, task.axes)
     if len(places) < task.count:
         raise InputError(
-            f"{len(places)} mounting places are left, and {task.count} are needed: all others are"
-            f" forbidden, nearer than --clearance {task.clearance:g} m to where it is to be"
-            f" navigated, or nearer than --apart {task.apart:g} m to a beacon that stays"
+            f"{len(places)} mounting places remain, and {task.count} are needed: all others are"
+            f" forbidden, closer than --clearance {task.clearance:g} m to the points of use, or"
+            f" closer than --apart {task.apart:g} m to a beacon that stays"
         )
     if len(places) * len(axes) > MOST_CANDIDATES:
         raise InputError(
@@ -209,7 +208,7 @@ def candidates_of(task: Task, beacon: Beacon) -> Candidates:
 
 
 def with_beacons(site: Site, new: tuple[Beacon, ...]) -> Site:
-    """Return the site with new beacons behind those that it has."""
+    """Return the site with new beacons after the existing ones."""
     return replace(site, beacons=(*site.beacons, *new))
 
 
@@ -219,7 +218,7 @@ def with_moment(beacon: Beacon, moment: float) -> Beacon:
 
 
 def _apart(task: Task, chosen: list[Beacon], tones: Array) -> tuple[Beacon, ...]:
-    """Return beacons with what tells them apart: tones, or time slots, of their own."""
+    """Return beacons with separate tones or time slots."""
     if is_in_turn(task.template):
         return all_in_turn(task.template, chosen)
     return tuple(tuned(b, t) for b, t in zip(chosen, tones, strict=True))
@@ -233,7 +232,7 @@ def _finished(
     free: Array,
     in_time: Callable[[], bool],
 ) -> tuple[Beacon, ...]:
-    """Return the beacons chosen with their own frequencies, moments and names."""
+    """Return the selected beacons with their own frequencies, moments and names."""
     beacons = _apart(task, chosen, tones)
     response = task.site.platform.magnetometer.response
     if is_in_turn(task.template):
@@ -252,13 +251,13 @@ def _named(beacons: list[Beacon], site: Site) -> tuple[Beacon, ...]:
 
 
 def _nearest(candidates: Candidates, first: Site, task: Task) -> tuple[int, ...]:
-    """Return the candidates that are most like the beacons of an earlier design."""
+    """Return the candidates closest to the beacons of an earlier design."""
     kept = {beacon.name for beacon in task.site.beacons}
     new = [beacon for beacon in first.beacons if beacon.name not in kept]
     if len(new) != task.count:
         raise InputError(
-            f"--continue: the earlier design places {len(new)} beacons beside those that stay, and"
-            f" --beacons asks for {task.count}"
+            f"--continue: the earlier design has {len(new)} beacons apart from those that stay, but"
+            f" --beacons is {task.count}"
         )
     chosen: list[int] = []
     for beacon in new:

@@ -1,4 +1,4 @@
-"""How a budget of moment is divided among beacons that are placed, and who has which frequency."""
+"""Distribution of a moment budget, and of frequencies, among placed beacons."""
 
 from collections.abc import Callable
 from itertools import permutations
@@ -21,19 +21,19 @@ def divided(
     objective: Objective,
     in_time: Callable[[], bool],
 ) -> tuple[tuple[Beacon, ...], Array]:
-    """Give moment from one beacon to another as long as that betters the objective.
+    """Move moment from one beacon to another as long as the objective improves.
 
     Parameters
     ----------
     beacons : tuple of Beacon
-        Each with an even share.
+        Each with an equal share.
 
     Returns
     -------
     beacons : tuple of Beacon
-        Whose moments have the same sum.
+        With the same sum of moments.
     share : ndarray, shape (beacons,)
-        Of what each had.
+        Relative to the initial moments.
     """
     share = np.ones(len(beacons))
 
@@ -66,14 +66,14 @@ def assigned(
     objective: Objective,
     in_time: Callable[[], bool],
 ) -> tuple[Beacon, ...]:
-    """Exchange frequencies between beacons, and for free ones, as long as that is better.
+    """Exchange frequencies between beacons, and for free ones, as long as the objective improves.
 
-    It is only where the ground conducts or the magnetometer does not answer alike to all.
+    It improves only where the ground conducts or the magnetometer's response is not flat.
 
     Parameters
     ----------
     free_hz : ndarray, shape (k,)
-        That nobody has.
+        Unused frequencies.
     """
     tones = [b.tone_frequencies_hz for b in beacons]
     free = free_hz[: len(free_hz) // len(tones[0]) * len(tones[0])].reshape(-1, len(tones[0]))

@@ -1,4 +1,4 @@
-"""Beacons whose coils are driven in turn: each new one has slots of its own in a longer cycle."""
+"""Beacons whose coils are driven in turn: each new one has its own slots in a longer cycle."""
 
 from dataclasses import replace
 
@@ -6,21 +6,21 @@ from magfusion.model.site import Beacon, Slots
 
 
 def is_in_turn(beacon: Beacon) -> bool:
-    """Tell whether a beacon's coils are driven in time slots."""
+    """Return whether a beacon's coils are driven in time slots."""
     return any(slot is not None for _, slot in beacon.tones)
 
 
 def in_turn(template: Beacon, number: int, count: int) -> Beacon:
-    """Return one of so many copies of a beacon, in its own slots of the cycle of all.
+    """Return one of several copies of a beacon, in its own slots of the common cycle.
 
-    Slots that are silent come first, so that no share of a window is thought longer than it is.
+    Silent slots come first, so that no share of a window is overestimated.
 
     Parameters
     ----------
     number : int
-        Of the copy, from zero.
+        Index of the copy, from zero.
     count : int
-        Of copies.
+        Number of copies.
     """
     own = sorted({coil.slot for coil in template.coils if coil.slot is not None})
     slots = template.slots
@@ -36,7 +36,7 @@ def in_turn(template: Beacon, number: int, count: int) -> Beacon:
 
 
 def all_in_turn(template: Beacon, placed: list[Beacon]) -> tuple[Beacon, ...]:
-    """Return copies where some beacons are, each in its own slots."""
+    """Return copies at the positions of some beacons, each in its own slots."""
     return tuple(
         replace(
             in_turn(template, number, len(placed)),
@@ -48,6 +48,6 @@ def all_in_turn(template: Beacon, placed: list[Beacon]) -> tuple[Beacon, ...]:
 
 
 def cycle_of(template: Beacon, count: int) -> float | None:
-    """Return how long a cycle of so many copies is (s); None where a host decides."""
+    """Return the length (s) of a cycle of several copies; None where a host decides."""
     slots = in_turn(template, 0, count).slots
     return slots.cycle if isinstance(slots, Slots) else None

@@ -1,1 +1,1 @@
-"""Pictures of results: the only room that imports matplotlib."""
+"""Pictures of results: the only subpackage that imports matplotlib."""

@@ -1,4 +1,4 @@
-"""Allan deviations of the instruments as a picture, with what they are made of."""
+"""Allan deviations of the instruments as a picture, with their noise components."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +15,7 @@ Plotted = tuple[str, str, AllanVariance, tuple[AllanFit | None, ...]]
 
 
 def write_allan_plot(path: Path, instruments: Sequence[Plotted]) -> None:
-    """Write a PNG of the Allan deviation of each axis with its fit, an instrument a panel."""
+    """Write a PNG of the Allan deviation of each axis with its fit, one panel per instrument."""
     figure = Figure(figsize=(5.5 * len(instruments), 5.5))
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, len(instruments), squeeze=False)[0]

@@ -12,7 +12,7 @@ _BEFORE, _AFTER = "tab:orange", "tab:blue"
 
 
 def write_antenna_plot(path: Path, before: PoseErrors, after: PoseErrors) -> None:
-    """Write a PNG of the errors of every pose, sorted by none but the survey's order."""
+    """Write a PNG of the errors of every pose, in the survey's order."""
     figure = Figure(figsize=(10.0, 6.5), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(2, 1, sharex=True)
@@ -22,13 +22,13 @@ def write_antenna_plot(path: Path, before: PoseErrors, after: PoseErrors) -> Non
     ):
         for errors, colour, name in ((before, _BEFORE, "before"), (after, _AFTER, "after")):
             own, survey = errors.rms[kind] / unit, errors.survey[kind] / unit
-            label = f"{name}: {own:.3g} RMS without the survey's own {survey:.3g}"
+            label = f"{name}: {own:.3g} RMS excl. the survey's own {survey:.3g}"
             axes.plot(errors.difference[:, kind] / unit, "o", ms=4, c=colour, label=label)
             axes.axhline(own, c=colour, lw=0.8)
         axes.set(yscale="log", ylabel=axis)
         axes.legend()
     panels[1].set_xlabel("pose of the survey")
     figure.suptitle(
-        "Difference of tracked and surveyed poses; after: by an antenna fitted without the pose"
+        "Difference of tracked and surveyed poses; after: antenna fitted without the pose"
     )
     figure.savefig(path, dpi=110, metadata={"Software": None})

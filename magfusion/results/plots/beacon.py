@@ -1,4 +1,4 @@
-"""Calibrated beacons as a picture: the centre that was found beside the surveyed, and residuals."""
+"""Calibrated beacons as a picture: estimated and surveyed centres, and residuals."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +21,9 @@ class BeaconPanel:
     Parameters
     ----------
     centre_cov : ndarray, shape (3, 3)
-        Of the centre that was found, world axes (m^2).
+        Of the estimated centre, world axes (m^2).
     point : ndarray, shape (n,)
-        Number of each point of the survey.
+        Index of each point of the survey.
     residual : ndarray, shape (n,)
         Whitened, root of the mean square at each point.
     """

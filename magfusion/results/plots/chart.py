@@ -1,4 +1,4 @@
-"""Line charts as SVG for pages: a few milliseconds each, their words are text, and no library."""
+"""Line charts as SVG for pages: a few milliseconds each, with real text, without a library."""
 
 import math
 from collections.abc import Iterable
@@ -26,7 +26,7 @@ class Line(NamedTuple):
 
 
 class Band(NamedTuple):
-    """What lies between two lines (n,)."""
+    """The area between two lines (n,)."""
 
     x: Array
     low: Array
@@ -35,7 +35,7 @@ class Band(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """A place with its name."""
+    """A named point."""
 
     x: float
     y: float
@@ -45,16 +45,16 @@ class Mark(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """What is drawn.
+    """Content of a chart.
 
     Parameters
     ----------
     equal : bool
-        Whether both axes have one scale, as those of a plan do.
+        Whether both axes have one scale, as in a plan.
     log : bool
         Whether the upright axis is logarithmic.
     y_limits : (float, float), optional
-        Ends of the upright axis; what lies beyond is drawn at the edge.
+        Limits of the upright axis; values beyond are drawn at the edge.
     """
 
     title: str
@@ -71,7 +71,7 @@ class Chart:
 
 
 class _Axes(NamedTuple):
-    """Where values are drawn: limits, and pixels a unit."""
+    """The area of values: limits, and pixels per unit."""
 
     low: tuple[float, float]
     high: tuple[float, float]
@@ -87,7 +87,7 @@ class _Axes(NamedTuple):
 
 
 def svg(chart: Chart) -> str:
-    """Return a chart as an element of HTML; all words in it are escaped."""
+    """Return a chart as an HTML element; all its text is escaped."""
     if chart.log:
         chart = _logarithmic(chart)
     axes = _axes(chart)
@@ -121,7 +121,7 @@ def ticks(low: float, high: float, most: int = 6) -> list[float]:
 
 
 def thinned(y: Array) -> IntArray:
-    """Return the rows of a line to draw: of each stretch those of its least and greatest value."""
+    """Return the rows of a line to draw: the minimum and maximum of each stretch."""
     n = len(y)
     if n <= MOST_POINTS:
         return np.arange(n)

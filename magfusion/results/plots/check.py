@@ -1,4 +1,4 @@
-"""A first look at a log as a picture: spectrum, signal to noise, and the two free compasses."""
+"""A quick check of a log as a picture: spectrum, signal to noise, gravity and static field."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from magfusion.estimation.integrity.first_look import Look
 
 
 def write_check_plot(path: Path, look: Look) -> None:
-    """Write a PNG of the spectrum, each beacon's signal to noise, gravity and steady field."""
+    """Write a PNG of the spectrum, each beacon's signal to noise, gravity and static field."""
     figure = Figure(figsize=(11.0, 9.0), layout="constrained")
     FigureCanvasAgg(figure)
     top, middle, bottom = figure.subplots(3, 1)
@@ -34,7 +34,7 @@ def write_check_plot(path: Path, look: Look) -> None:
         field = bottom.twinx()
         size = 1e6 * np.linalg.norm(means.field_body, axis=1)
         field.plot(means.time, size, ".-", c="tab:blue")
-        field.set_ylabel("steady field (uT)", color="tab:blue")
+        field.set_ylabel("static field (uT)", color="tab:blue")
     bottom.set(xlabel="time (s)")
     bottom.set_ylabel("mean specific force (m/s^2)", color="tab:red")
     for one_gap in look.timings:

@@ -23,7 +23,7 @@ def write_plot(path: Path, site: Site, found: Coverage, extra: Beacon | None) ->
     found : Coverage
         On a regular grid.
     extra : Beacon, optional
-        Where one more beacon adds most; it is marked.
+        Best position of one more beacon; it is marked.
     """
     heights = np.unique(found.position_world[:, 2])
     drawn = heights[np.unique(np.linspace(0, len(heights) - 1, SLICES).astype(int))]
@@ -48,9 +48,9 @@ def write_plot(path: Path, site: Site, found: Coverage, extra: Beacon | None) ->
     bar.ax.set_yticklabels([length(level) for level in levels])
     bar.set_label("position sigma, three axes together")
     figure.suptitle(
-        "Best position that one window allows (Cramér-Rao bound); grey: not determined;\n"
+        "Cramér-Rao bound of the position from one window; grey: not determined;\n"
         "beacons with their heights"
-        + ("; star: where one more adds most" if extra is not None else "")
+        + ("; star: best position of one more" if extra is not None else "")
     )
     figure.savefig(path, dpi=110, metadata={"Software": None})
 

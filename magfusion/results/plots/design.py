@@ -22,7 +22,7 @@ SLICES = 2  # heights that are drawn where there are more
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One layout with its map, which has protection levels."""
+    """One layout with its map, which includes protection levels."""
 
     words: str
     site: Site
@@ -36,7 +36,7 @@ class Panel:
 
 
 def write_plot(path: Path, hall: Hall, panels: list[Panel]) -> None:
-    """Write a PNG of the protection levels of layouts, one a row, in the same colours.
+    """Write a PNG of the protection levels of layouts, one per row, in the same colours.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def write_plot(path: Path, hall: Hall, panels: list[Panel]) -> None:
     bar.ax.set_yticklabels([length(level) for level in levels])
     bar.set_label("protection level of the position")
     figure.suptitle(
-        "How far a fix may err, one beacon false unnoticed; grey: no protection level\n"
+        "Bound of a fix's error with one undetected beacon fault; grey: no protection level\n"
         "triangles: beacons with height, line: their axis (none: vertical); cross: worst here",
         fontsize=10,
     )
@@ -126,7 +126,7 @@ def _place(axes: Axes, beacon: Beacon, reach: float) -> None:
 
 
 def _label(axes: Axes, site: Site, near: float) -> None:
-    """Write names and heights, those of beacons above each other or close by under each other."""
+    """Write names and heights; those of beacons close to each other are stacked."""
     groups: list[list[Beacon]] = []
     for beacon in site.beacons:
         place = beacon.position_world[:2]

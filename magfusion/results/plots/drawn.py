@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from magfusion.results.plots.chart import Chart
 
-# The colours that the style sheet of pages gives these names.
+# The colours of these names in the style sheet of pages.
 COLOURS = {
     "estimate": "#1f5fbf",
     "truth": "#111111",

@@ -73,7 +73,7 @@ def _draw_error(
 def write_stability(path: Path, courses: list[Course]) -> None:
     """Write figures 9 and 10 of paper 004 as a PNG: lengths of the errors, and their hourly means.
 
-    The paper shows a place at rest; here the platform walks once an hour.
+    The paper shows a stationary place; here the platform walks once an hour.
     """
     figure = Figure(figsize=(1.0 + 6.5 * len(courses), 6.0), layout="constrained")
     FigureCanvasAgg(figure)
@@ -103,12 +103,12 @@ def _draw_length(axes: Axes, course: Course, quantity: Quantity) -> None:
 
 
 def _draw_consistency(axes: Axes, course: Course) -> None:
-    """Draw hourly means of squared errors and innovations in units of what they should be."""
+    """Draw hourly means of squared errors and innovations relative to their expectation."""
     hours, levels = course.hourly()
     for name, level in levels.items():
         axes.plot(hours, level, ".-", markersize=3, linewidth=0.8, label=name)
     axes.axhline(1.0, color="0.5", linewidth=0.8)
-    axes.set(xlabel="time (h)", ylabel="squared, of expected", yscale="log")
+    axes.set(xlabel="time (h)", ylabel="squared, over expected", yscale="log")
     axes.legend(fontsize=7, ncols=3)
 
 

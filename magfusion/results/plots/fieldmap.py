@@ -1,4 +1,4 @@
-"""A field map as a picture: gain and turn of each beacon's field, and where it is known."""
+"""A field map as a picture: gain and rotation of each beacon's field, and where it is known."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +15,7 @@ _GRID = 60
 
 
 def write_plot(path: Path, fit: MapFit) -> None:
-    """Write a PNG: a column for each beacon; gain above, turn below, at the survey's height."""
+    """Write a PNG: a column for each beacon; gain above, rotation below, at the survey's height."""
     beacons = fit.site.beacons
     figure = Figure(figsize=(1.5 + 4.2 * len(beacons), 8.5), layout="constrained")
     FigureCanvasAgg(figure)
@@ -38,19 +38,19 @@ def write_plot(path: Path, fit: MapFit) -> None:
             axes.plot(*beacon.position_world[:2], "^", color="black", markersize=9)
             axes.set(aspect="equal")
             if column == len(beacons) - 1:
-                label = "stronger than modelled by (%)" if axes is upper else "turned by (deg)"
+                label = "stronger than modelled by (%)" if axes is upper else "rotated by (deg)"
                 figure.colorbar(mesh, ax=axes, label=label)
         lower.set_xlabel("x (m)")
         without, left = (100.0 * e[beacon.name] for e in (fit.error_without, fit.error_with))
         upper.set_title(
-            f"beacon {beacon.name}\nmodel wrong by {without:.2g} %, with the map {left:.2g} %"
+            f"beacon {beacon.name}\nmodel error {without:.2g} %, with the map {left:.2g} %"
         )
     for axes in panels[:, 0]:
         axes.set_ylabel("y (m)")
     figure.suptitle(
-        f"What the field is, relative to its model, at a height of {sheets[0].height:.2f} m\n"
-        "dots: where it was learnt (any height); triangle: the beacon; hatched: not known, sigma"
-        " above the size it has at the dots; errors: rms at points left out"
+        f"Field relative to its model, at a height of {sheets[0].height:.2f} m\n"
+        "dots: survey points (any height); triangle: the beacon; hatched: unknown, sigma"
+        " above the deviation at the dots; errors: rms at left-out points"
     )
     figure.savefig(path, dpi=100, metadata={"Software": None})
 

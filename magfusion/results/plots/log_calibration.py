@@ -1,4 +1,4 @@
-"""What a log made of the survey's sigmas, as a picture: prior against posterior."""
+"""Effect of a log on the survey's sigmas, as a picture: prior against posterior."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ def write_log_calibration_plot(
     estimates : list of Estimate
         Every parameter.
     ratio_but_for_gauge : ndarray, shape (parameters,)
-        The same without what no log can determine; NaN where nothing is left.
+        The same without gauges; NaN where nothing remains.
     direction_ratio : ndarray, shape (parameters,)
         Ascending.
     """
@@ -35,7 +35,7 @@ def write_log_calibration_plot(
     ratio = np.array([e.sigma / e.prior_sigma for e in estimates])
     left.barh(rows, np.ones(len(estimates)), color=_PRIOR, label="survey")
     left.barh(rows, ratio, color=_POSTERIOR, height=0.55, label="after the log")
-    left.plot(ratio_but_for_gauge, rows, "o", ms=4, c=_REST, label="beside the gauge")
+    left.plot(ratio_but_for_gauge, rows, "o", ms=4, c=_REST, label="without the gauge")
     labels = [f"{e.key}   {e.prior_sigma:.2g} → {e.sigma:.2g}" for e in estimates]
     left.set_yticks(rows, labels, fontsize=7)
     left.set(xscale="log", xlabel="sigma over the survey's", ylim=(len(estimates) - 0.5, -0.5))
@@ -43,5 +43,5 @@ def write_log_calibration_plot(
     right.axvline(0.5, c="0.5", lw=0.8)
     right.set(xscale="log", xlabel="sigma over the survey's", ylabel="direction, best first")
     figure.legend(loc="outside lower center", ncols=3, fontsize=8)
-    figure.suptitle("What the log determined of the calibration")
+    figure.suptitle("Observability of the calibration from the log")
     figure.savefig(path, dpi=110, metadata={"Software": None})

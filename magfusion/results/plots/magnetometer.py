@@ -1,4 +1,4 @@
-"""Readings of a turned magnetometer before and after its calibration: an ellipse and a circle."""
+"""Readings of a rotated magnetometer before and after calibration: an ellipse and a circle."""
 
 from pathlib import Path
 
@@ -19,16 +19,16 @@ MICROTESLA = 1e-6
 def write_magnetometer_plot(
     path: Path, time: Array, before_sensor: Array, after_sensor: Array, field_size: float
 ) -> None:
-    """Write a PNG: the readings in three planes, and the size of their field over time.
+    """Write a PNG: the readings in three planes, and the magnitude of their field over time.
 
     Parameters
     ----------
     time : ndarray, shape (n,)
         (s)
     before_sensor, after_sensor : ndarray, shape (n, 3)
-        Field by the declared and by the found calibration (T).
+        Field with the declared and with the estimated calibration (T).
     field_size : float
-        What the size should be (T).
+        Nominal magnitude (T).
     """
     figure = Figure(figsize=(13.0, 8.5), layout="constrained")
     FigureCanvasAgg(figure)
@@ -49,11 +49,11 @@ def write_magnetometer_plot(
             time, size / NANOTESLA, ".-", ms=3, lw=0.6, c=colour, label=f"{label}: {spread:.2g}"
         )
     axes.axhline(field_size / NANOTESLA, c="0.5", lw=0.8)
-    axes.set(xlabel="time (s)", ylabel="size of the field (nT)")
+    axes.set(xlabel="time (s)", ylabel="magnitude of the field (nT)")
     axes.legend(title="standard deviation over mean")
     figure.suptitle(
-        "Readings turned into fields by the declared and by the found calibration;"
-        f" deviations from the circle drawn {magnified:.0f} times"
+        "Fields of the readings with the declared and with the estimated calibration;"
+        f" deviations from the circle magnified {magnified:.0f} times"
     )
     figure.savefig(path, dpi=110, metadata={"Software": None})
 
@@ -72,7 +72,7 @@ def _plane(
     for field, colour in ((before_sensor, _BEFORE), (after_sensor, _AFTER)):
         size = np.linalg.norm(field, axis=1, keepdims=True)
         drawn = field / size * (field_size + magnified * (size - field_size)) / MICROTESLA
-        # What points out of the plane would fill the disc.
+        # Points out of the plane would fill the disc.
         near = np.linalg.norm(field[:, plane] / size, axis=1) > np.cos(np.pi / 6.0)
         flat = drawn[:, plane] / np.linalg.norm(field[:, plane] / size, axis=1, keepdims=True)
         axes.plot(*flat[near].T, ".", ms=4, c=colour)

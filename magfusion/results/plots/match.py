@@ -1,4 +1,4 @@
-"""Attitudes found from the field as a picture, and the database they were found in."""
+"""Attitudes estimated from the field as a picture, and the database used for them."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ _NAMES = ("roll", "pitch", "yaw")
 def write_match_plot(
     path: Path, time: Array, matches: Matches, found: tuple[int, ...], true_rpy: Array | None
 ) -> None:
-    """Write a PNG of the angles found over time, and of their errors where a truth is known.
+    """Write a PNG of the estimated angles over time, and of their errors where a truth is known.
 
     Parameters
     ----------
@@ -25,9 +25,9 @@ def write_match_plot(
     matches : Matches
         Shapes (n, hypotheses, ...).
     found : tuple of int
-        Which of roll, pitch and yaw were found and not given.
+        Which of roll, pitch and yaw are estimated, not given.
     true_rpy : ndarray, shape (n, 3), optional
-        (rad); NaN where it is not known.
+        (rad); NaN where unknown.
     """
     columns = 1 if true_rpy is None else 2
     figure = Figure(figsize=(6.5 * columns, 1.0 + 2.5 * len(found)), layout="constrained")
@@ -56,7 +56,7 @@ def write_match_plot(
 
 
 def write_database_plot(path: Path, database: AttitudeDatabase, residual: Array) -> None:
-    """Write a PNG of the attitudes that a database holds, and of what no uniform field explains.
+    """Write a PNG of the attitudes in a database, and of the residuals of a uniform field.
 
     Parameters
     ----------

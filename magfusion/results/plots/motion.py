@@ -1,4 +1,4 @@
-"""Where to hold the sensor next, as a picture: the stops in plan, and what they leave."""
+"""Next stops of the sensor, as a picture: the stops in plan, and the remaining sigmas."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ def write_motion_plot(path: Path, site: Site, hall: Hall, found: Motion) -> None
     plan, bars = figure.subplots(1, 2, width_ratios=(1.2, 1.0))
     _draw_plan(plan, site, hall, found)
     _draw_sigmas(bars, found)
-    figure.suptitle("Where to hold the platform next, and what that determines")
+    figure.suptitle("Next stops of the platform, and the parameters they determine")
     figure.savefig(path, dpi=100, metadata={"Software": None})
 
 
@@ -102,12 +102,12 @@ def _draw_sigmas(axes: Axes, found: Motion) -> None:
     axes.barh(rows, np.ones(len(order)), color="0.8", label="before")
     axes.barh(rows, found.ratio[order], height=0.55, color="tab:blue", label="after these stops")
     limit = parameters.limit[order]
-    axes.plot(limit, rows, "|", color="tab:orange", markersize=9, label="after all stops there are")
+    axes.plot(limit, rows, "|", color="tab:orange", markersize=9, label="after all possible stops")
     labels = [
         f"{parameters.names[k][0]}   {parameters.sized(k, 1.0)} → {parameters.sized(k, r)}"
         for k, r in zip(order.tolist(), found.ratio[order].tolist(), strict=True)
     ]
     axes.set_yticks(rows, labels, fontsize=7)
     axes.set(xlabel="sigma over the site's", xlim=(0.0, 1.05), ylim=(len(order) - 0.5, -0.5))
-    axes.set_title("what moves the fields most, first", fontsize=9)
+    axes.set_title("largest effect on the fields first", fontsize=9)
     axes.legend(loc="lower right", fontsize=8)

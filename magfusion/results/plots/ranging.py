@@ -1,4 +1,4 @@
-"""What a driller looks at: where the magnet's well is, down the hole and by depth."""
+"""A driller's view of ranging: position of the magnet's well, down the hole and by depth."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +16,7 @@ _TURN: Array = np.linspace(0.0, 2.0 * np.pi, 90)
 
 
 class RangePicture(NamedTuple):
-    """Where the magnet was in each window (n,), from the sensor.
+    """Position of the magnet in each window (n,), relative to the sensor.
 
     Parameters
     ----------
@@ -35,12 +35,12 @@ class RangePicture(NamedTuple):
 
 
 def write_range_plot(path: Path, told: RangePicture, *, high_side: bool) -> None:
-    """Write a PNG with a cross section and three curves by depth, one colour a place of the sensor.
+    """Write a PNG with a cross section and three curves by depth, one colour per sensor place.
 
     Parameters
     ----------
     high_side : bool
-        Whether directions are from it, not from the sensor's own third axis.
+        Whether directions are from it, or from the sensor's third axis.
     """
     figure = Figure(figsize=(12.0, 8.6), layout="constrained")
     FigureCanvasAgg(figure)
@@ -61,7 +61,7 @@ def write_range_plot(path: Path, told: RangePicture, *, high_side: bool) -> None
         _banded(along, x, beyond, np.sqrt(cov[:, 0, 0]), colour, name)
         for value, style, what in (
             (distance_sigma, "-", "distance"),
-            (aside_sigma, "--", "aside, by direction"),
+            (aside_sigma, "--", "lateral, by direction"),
             (np.sqrt(cov[:, 0, 0]), ":", "along the hole"),
         ):
             sigmas.plot(x, value, style, c=colour, label=what if k == 0 else None)
@@ -69,7 +69,7 @@ def write_range_plot(path: Path, told: RangePicture, *, high_side: bool) -> None
     section.scatter(0.0, 0.0, s=80, marker="+", c="black", zorder=3)
     section.annotate("sensor", (0.0, 0.0), (-10, -16), textcoords="offset points")
     section.set(
-        title=f"Looking down the hole (ellipse: {BAND:g} sigma, abreast)",
+        title=f"Looking down the hole (ellipse: {BAND:g} sigma, closest approach)",
         xlabel="to the right (m)",
         ylabel=f"to the {up} (m)" if high_side else f"along the {up} (m)",
     )
@@ -77,8 +77,8 @@ def write_range_plot(path: Path, told: RangePicture, *, high_side: bool) -> None
     section.margins(0.15)
     band = f"band: {BAND:g} sigma"
     across.set(title=f"Across the hole, centre to centre ({band})", ylabel="distance (m)")
-    along.set(title=f"Along the hole, farther ahead than depths say ({band})", ylabel="offset (m)")
-    sigmas.set(title="How well each is known", ylabel="1 sigma (m)", ylim=(0.0, None))
+    along.set(title=f"Along the hole, relative to the depths ({band})", ylabel="offset (m)")
+    sigmas.set(title="Sigmas", ylabel="1 sigma (m)", ylim=(0.0, None))
     for axes in (across, along, sigmas):
         axes.set_xlabel("measured depth of the magnet (m)")
     for axes in (section, across, along, sigmas):
@@ -93,7 +93,7 @@ def _spread(direction: Array, cov: Array) -> Array:
 
 
 def _section(axes: Axes, place: Array, cov: Array, colour: str, name: str) -> None:
-    """Draw the way of the magnet, and its ellipse where it is abreast."""
+    """Draw the path of the magnet, and its ellipse at the closest approach."""
     axes.plot(place[:, 1], place[:, 2], c=colour, lw=1.0, alpha=0.6)
     axes.scatter(place[-1, 1], place[-1, 2], s=30, marker="v", c=colour, alpha=0.6)
     near = int(np.argmin(np.abs(place[:, 0])))

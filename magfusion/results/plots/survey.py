@@ -49,7 +49,7 @@ def write_survey_plot(path: Path, site: Site, survey: Survey) -> None:
         axes.set(title=beacon.name, xlabel="x (m)", ylabel="y (m)", aspect="equal")
         axes.margins(0.1)
         figure.colorbar(dots, ax=axes, shrink=0.8, label="RMS amplitude (nT)")
-    figure.suptitle(f"{len(survey)} points; triangle: the beacon; crosses: points that miss it")
+    figure.suptitle(f"{len(survey)} points; triangle: the beacon; crosses: points without it")
     figure.savefig(path, dpi=110, metadata={"Software": None})
 
 
