@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from magfusion.errors import EstimationError as EstimationError
     from magfusion.errors import InputError as InputError
     from magfusion.estimation.batch.settings import SmootherSettings as SmootherSettings
-    from magfusion.estimation.integrity.judge import judged as judged
+    from magfusion.estimation.integrity.judge import judge_result as judge_result
     from magfusion.estimation.online.navigator import Navigator as Navigator
     from magfusion.estimation.online.navigator_settings import (
         NavigatorSettings as NavigatorSettings,
@@ -81,7 +81,7 @@ _HOMES = {
     "dipole_field": "model.physics.dipole",
     "fix_epochs": "estimation.snapshot.likelihood",
     "initial_calibration": "model.parameters",
-    "judged": "estimation.integrity.judge",
+    "judge_result": "estimation.integrity.judge",
     "load_site": "files.site",
     "observe": "model.field",
     "open_log": "files.open",
@@ -97,13 +97,13 @@ def __getattr__(name: str) -> Any:
     if name == "__version__":
         from importlib.metadata import version
 
-        found = version("magfusion")
+        result = version("magfusion")
     elif name in _HOMES:
-        found = getattr(import_module(f"magfusion.{_HOMES[name]}"), name)
+        result = getattr(import_module(f"magfusion.{_HOMES[name]}"), name)
     else:
         raise AttributeError(f"module 'magfusion' has no attribute {name!r}")
-    globals()[name] = found
-    return found
+    globals()[name] = result
+    return result
 
 
 def __dir__() -> list[str]:

@@ -74,12 +74,12 @@ def main(arguments: list[str] | None = None) -> None:
     except Exception as error:
         if debug:
             traceback.print_exc()
-        status, sentence = _said(error)
+        status, sentence = _error_report(error)
         _fail(status, sentence, isinstance(error, InputErrors))
     raise SystemExit(status)
 
 
-def _said(error: Exception) -> tuple[int, str]:
+def _error_report(error: Exception) -> tuple[int, str]:
     """Return exit code and message of a command's exception."""
     if isinstance(error, typer.TyperException):
         context = getattr(error, "ctx", None)
@@ -211,13 +211,13 @@ def _options(
 def _callback(path: str, command: Command) -> Callable[..., None]:
     """Return the function of a command, with parameters from which typer generates its options."""
     wanted = inspect.signature(command.run).parameters
-    asked = {field.name: option for field, option in options(command.settings)}
+    requested = {field.name: option for field, option in options(command.settings)}
 
     def run(context: typer.Context, **values: Any) -> None:
         output, as_json = values.pop("output", None), values.pop("as_json", False)
         if as_json:
             binary_output()
-        own = {field: _value(asked[field], value) for field, value in values.items()}
+        own = {field: _value(requested[field], value) for field, value in values.items()}
         settings = command.settings(**own)
         if output is None and "output" in wanted and not command.output_optional:
             # A log's name as given by the user, also for ".".
@@ -257,7 +257,7 @@ def _callback(path: str, command: Command) -> Callable[..., None]:
 
 def _parameters(command: Command, writes: bool) -> list[inspect.Parameter]:
     hints = get_type_hints(command.settings)
-    found = [_parameter(f, option, hints[f.name]) for f, option in options(command.settings)]
+    result = [_parameter(f, option, hints[f.name]) for f, option in options(command.settings)]
     if writes:
         note = "" if command.output or command.output_required else _NAMED_BY_LOG
         note = _NOT_WRITTEN if command.output_optional else note
@@ -267,11 +267,11 @@ def _parameters(command: Command, writes: bool) -> list[inspect.Parameter]:
             default = inspect.Parameter.empty
         hint: Any = Path | None if default is None else Path
         output = _keyword("output", Annotated[hint, info], default)
-        found.insert(0, output)
+        result.insert(0, output)
     if command.reports:
         flag = typer.Option("--json", help="Print the report as a line of JSON, and nothing else.")
-        found.append(_keyword("as_json", Annotated[bool, flag], False))
-    return found
+        result.append(_keyword("as_json", Annotated[bool, flag], False))
+    return result
 
 
 def _parameter(field: Field[Any], option: Option, hint: Any) -> inspect.Parameter:

@@ -25,5 +25,6 @@ class InputErrors(InputError):
     def __init__(self, *lines: str) -> None:
         super().__init__("\n".join(lines))
 
+
 # The reason of a failed estimate that jobs recognise.
 UNOBSERVABLE = "the measurements do not determine the motion in one direction"

@@ -16,7 +16,7 @@ level, as it was in the paper.
 4. Does the attitude matter to the likelihood?  No: the same errors at any tilt.
 
 Our methods are held against algorithm 3, the paper's own, by a rule that was settled before any run
-(`beside_algorithm_3`).
+(`compared_with_algorithm_3`).
 
 The lines of algorithm 1 carry `World.line_bias`, a change since they were fitted.  It cancels in
 algorithm 3, which takes from its lines the slope alone.
@@ -26,13 +26,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from algorithms_figures import beside_algorithm_3, bounds, draw, report, summary, worst_ratio
+from algorithms_figures import bounds, compared_with_algorithm_3, draw, report, summary, worst_ratio
 from algorithms_tried import (
     LEVEL,
     MAPPED,
     METHODS,
     OURS,
-    Outcome,
+    AlgorithmOutcome,
     Task,
     angle_deg,
     fixed,
@@ -63,7 +63,7 @@ class Config:
 
 def run(
     config: Config, scale: Scale | None = None, methods: Sequence[str] = tuple(METHODS)
-) -> dict[str, list[Outcome]]:
+) -> dict[str, list[AlgorithmOutcome]]:
     """Return what came out in every room of each scenario."""
     kinds = {name: SCENARIOS[name] for name in config.scenarios}
     if config.gain_length is not None:
@@ -73,9 +73,9 @@ def run(
         for name in config.scenarios
         for _ in range(config.worlds)
     ]
-    found = run_many(try_world, tasks, seed=config.seed, **(scale or {}))
+    result = run_many(try_world, tasks, seed=config.seed, **(scale or {}))
     return {
-        name: found[i * config.worlds : (i + 1) * config.worlds]
+        name: result[i * config.worlds : (i + 1) * config.worlds]
         for i, name in enumerate(config.scenarios)
     }
 
@@ -94,9 +94,9 @@ def likelihood_at_tilts(config: Config) -> dict[float, float]:
     errors = {}
     for tilt_deg in TILTS_DEG:
         true = Rotation.from_rotvec(tilt_deg * DEGREE * axis).as_matrix()
-        turned = replace(level, phasor_sensor=level.phasor_sensor @ true)
-        found = fixed(turned, world.site).world_from_body
-        errors[tilt_deg] = float(np.mean(angle_deg(np.swapaxes(true, -1, -2) @ found)))
+        rotated = replace(level, phasor_sensor=level.phasor_sensor @ true)
+        result = fixed(rotated, world.site).world_from_body
+        errors[tilt_deg] = float(np.mean(angle_deg(np.swapaxes(true, -1, -2) @ result)))
     return errors
 
 
@@ -118,23 +118,23 @@ def main() -> None:
         scenarios=tuple(given.rooms or small.scenarios),
         gain_length=given.gain_length,
     )
-    found, tilts = run(config, chosen_scale(given)), likelihood_at_tilts(config)
+    result, tilts = run(config, chosen_scale(given)), likelihood_at_tilts(config)
     if given.output is not None:
-        draw(given.output, found)
-    bound_m, bound_deg = bounds(next(iter(found.values())))
+        draw(given.output, result)
+    bound_m, bound_deg = bounds(next(iter(result.values())))
     figures = {
         "worlds": config.worlds,
         "seed": config.seed,
-        "scenarios": {name: summary(outcomes) for name, outcomes in found.items()},
+        "scenarios": {name: summary(outcomes) for name, outcomes in result.items()},
         "bound_rms_m": bound_m,
         "bound_rms_deg": bound_deg,
         "over_algorithm_3": {
-            n: {m: beside_algorithm_3(o, m) for m in OURS} for n, o in found.items()
+            n: {m: compared_with_algorithm_3(o, m) for m in OURS} for n, o in result.items()
         },
-        "map_over_best_published": {n: worst_ratio(o, MAPPED) for n, o in found.items()},
+        "map_over_best_published": {n: worst_ratio(o, MAPPED) for n, o in result.items()},
         "ml_attitude_by_tilt_deg": tilts,
     }
-    conclude(report(found, tilts), figures)
+    conclude(report(result, tilts), figures)
 
 
 if __name__ == "__main__":

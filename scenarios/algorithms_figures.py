@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from algorithms_tried import MAPPED, METHODS, ML, OURS, PUBLISHED, Outcome
+from algorithms_tried import MAPPED, METHODS, ML, OURS, PUBLISHED, AlgorithmOutcome
 from harness import blank_figure, rms, save_picture
 from scipy.stats import t as student
 
@@ -16,14 +16,14 @@ PAPER_ATTITUDE_DEG = dict(zip(PUBLISHED, (5.62, 3.91, 2.37), strict=True))
 CHANCE = 0.0027 / (len(OURS) * len(SCENARIOS))  # of each verdict
 
 
-def means(outcomes: Sequence[Outcome], quantity: str, method: str) -> Array:
+def means(outcomes: Sequence[AlgorithmOutcome], quantity: str, method: str) -> Array:
     """Return the mean error of a method in each room, shape (worlds,)."""
     return np.array([np.mean(getattr(o, quantity)[method]) for o in outcomes])
 
 
-def summary(outcomes: Sequence[Outcome]) -> dict[str, dict[str, float]]:
+def summary(outcomes: Sequence[AlgorithmOutcome]) -> dict[str, dict[str, float]]:
     """Return mean errors of each method in one scenario, with standard errors over the rooms."""
-    found = {}
+    result = {}
     for method in outcomes[0].position:
         row = {}
         for key, quantity in (
@@ -36,8 +36,8 @@ def summary(outcomes: Sequence[Outcome]) -> dict[str, dict[str, float]]:
             row[key + "_se"] = standard_error(value)
         every = np.concatenate([o.position[method] for o in outcomes])
         row["position_rms_m"] = rms(every)
-        found[method] = row
-    return found
+        result[method] = row
+    return result
 
 
 def standard_error(value: Array) -> float:
@@ -45,7 +45,7 @@ def standard_error(value: Array) -> float:
     return float(np.std(value, ddof=1) / np.sqrt(len(value)))
 
 
-def bounds(outcomes: Sequence[Outcome]) -> tuple[float, float]:
+def bounds(outcomes: Sequence[AlgorithmOutcome]) -> tuple[float, float]:
     """Return the root mean square bound of position (m) and attitude (deg) over all targets."""
     return (
         rms(np.concatenate([o.position_bound for o in outcomes])),
@@ -53,7 +53,7 @@ def bounds(outcomes: Sequence[Outcome]) -> tuple[float, float]:
     )
 
 
-def worst_ratio(outcomes: Sequence[Outcome], method: str) -> tuple[float, float]:
+def worst_ratio(outcomes: Sequence[AlgorithmOutcome], method: str) -> tuple[float, float]:
     """Return a method's mean error relative to the best published one: overall, worst room."""
     ours = means(outcomes, "position", method)
     published = np.array([means(outcomes, "position", name) for name in PUBLISHED])
@@ -61,30 +61,32 @@ def worst_ratio(outcomes: Sequence[Outcome], method: str) -> tuple[float, float]
     return overall, float(np.max(ours / published.min(axis=0)))
 
 
-def beside_algorithm_3(outcomes: Sequence[Outcome], method: str) -> tuple[float, str]:
+def compared_with_algorithm_3(
+    outcomes: Sequence[AlgorithmOutcome], method: str
+) -> tuple[float, str]:
     """Return a method's mean error over algorithm 3's, and the verdict over the rooms.
 
     Better or WORSE where the mean of the differences in the same room is farther from none than
     chance has it in 0.27 % of such tables, by Student's t.
     """
-    ours, theirs = (means(outcomes, "position", name) for name in (method, PUBLISHED[2]))
-    off = ours - theirs
+    ours, others = (means(outcomes, "position", name) for name in (method, PUBLISHED[2]))
+    off = ours - others
     beyond = student.isf(0.5 * CHANCE, len(off) - 1) * standard_error(off)
     verdict = "undecided" if abs(np.mean(off)) <= beyond else "better"
     if verdict == "better" and np.mean(off) > 0.0:
         verdict = "WORSE"
-    return float(np.mean(ours) / np.mean(theirs)), verdict
+    return float(np.mean(ours) / np.mean(others)), verdict
 
 
-def report(found: Mapping[str, Sequence[Outcome]], tilts: Mapping[float, float]) -> str:
+def report(result: Mapping[str, Sequence[AlgorithmOutcome]], tilts: Mapping[float, float]) -> str:
     """Return the tables that a reader sees."""
-    sums = {name: summary(outcomes) for name, outcomes in found.items()}
+    sums = {name: summary(outcomes) for name, outcomes in result.items()}
     lines = _table("position, mean (m)", sums, "position_m", PAPER_POSITION, 4)
     lines += _table("attitude, mean |Euler| (deg)", sums, "euler_deg", PAPER_ATTITUDE_DEG, 3)
     lines += _table("attitude, whole angle (deg)", sums, "geodesic_deg", {}, 3)
     lines.append("")
-    if "S0" in found:
-        position, attitude = bounds(found["S0"])
+    if "S0" in result:
+        position, attitude = bounds(result["S0"])
         rms = sums["S0"][ML]["position_rms_m"]
         lines.append(
             f"S0: Cramér-Rao bound {position:.5f} m, {attitude:.4f} deg rms;"
@@ -92,17 +94,17 @@ def report(found: Mapping[str, Sequence[Outcome]], tilts: Mapping[float, float])
         )
     lines.append("position error over algorithm 3's in the same rooms, and the verdict")
     lines.append(f"  {'':8}" + "".join(f"{name:>22}" for name in OURS))
-    for name, outcomes in found.items():
+    for name, outcomes in result.items():
         cells = ""
         for method in OURS:
-            ratio, verdict = beside_algorithm_3(outcomes, method)
+            ratio, verdict = compared_with_algorithm_3(outcomes, method)
             cells += f"{f'{ratio:.2f} {verdict}':>22}"
         lines.append(f"  {name:8}{cells}")
     lines.append(
         f"{MAPPED} over the best of A1, A2, A3 in the same room, mean and worst room: "
         + ", ".join(
             f"{name} {mean:.2f} {worst:.2f}"
-            for name, (mean, worst) in ((n, worst_ratio(o, MAPPED)) for n, o in found.items())
+            for name, (mean, worst) in ((n, worst_ratio(o, MAPPED)) for n, o in result.items())
         )
     )
     lines.append(
@@ -132,9 +134,9 @@ def _table(
     return lines
 
 
-def draw(directory: Path, found: Mapping[str, Sequence[Outcome]]) -> None:
+def draw(directory: Path, result: Mapping[str, Sequence[AlgorithmOutcome]]) -> None:
     """Write the paper's figures 7 and 8 as PNGs, and bars of all rooms."""
-    shown = "F1" if "F1" in found else next(iter(found))
+    shown = "F1" if "F1" in result else next(iter(result))
     colours = {name: f"C{i}" for i, name in enumerate(METHODS)}
     for number, quantity, paper, label in (
         (7, "position", PAPER_POSITION, "position error (m)"),
@@ -143,7 +145,7 @@ def draw(directory: Path, found: Mapping[str, Sequence[Outcome]]) -> None:
         figure = blank_figure(7.0, 5.0)
         axes = figure.subplots()
         for name, colour in colours.items():
-            every = np.concatenate([getattr(o, quantity)[name] for o in found[shown]])
+            every = np.concatenate([getattr(o, quantity)[name] for o in result[shown]])
             share = np.arange(1, len(every) + 1) / len(every)
             axes.step(np.sort(every), share, where="post", c=colour, label=name)
         for name, value in paper.items():
@@ -153,11 +155,11 @@ def draw(directory: Path, found: Mapping[str, Sequence[Outcome]]) -> None:
         axes.grid(visible=True, alpha=0.3)
         axes.legend(fontsize=8)
         save_picture(figure, directory / f"figure_{number}.png")
-    _draw_bars(directory / "rooms.png", found, colours)
+    _draw_bars(directory / "rooms.png", result, colours)
 
 
 def _draw_bars(
-    path: Path, found: Mapping[str, Sequence[Outcome]], colours: Mapping[str, str]
+    path: Path, result: Mapping[str, Sequence[AlgorithmOutcome]], colours: Mapping[str, str]
 ) -> None:
     figure = blank_figure(12.0, 7.0)
     axes = figure.subplots(2, 1, sharex=True)
@@ -165,14 +167,14 @@ def _draw_bars(
     labels = ("mean position error (m)", "mean attitude error, |Euler| (deg)")
     for axis, quantity, label in zip(axes, ("position", "euler"), labels, strict=True):
         for i, (name, colour) in enumerate(colours.items()):
-            per_world = [means(outcomes, quantity, name) for outcomes in found.values()]
-            place = np.arange(len(found)) + (i - 0.5 * (len(colours) - 1)) * width
+            per_world = [means(outcomes, quantity, name) for outcomes in result.values()]
+            place = np.arange(len(result)) + (i - 0.5 * (len(colours) - 1)) * width
             error = [standard_error(v) for v in per_world]
             height = [float(np.mean(v)) for v in per_world]
             axis.bar(place, height, width, color=colour, yerr=error, label=name)
         axis.set(yscale="log", ylabel=label)
         axis.grid(visible=True, axis="y", alpha=0.3)
-    axes[1].set_xticks(np.arange(len(found)), list(found))
+    axes[1].set_xticks(np.arange(len(result)), list(result))
     handles, names = axes[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper center", ncols=len(colours), fontsize=8)
     save_picture(figure, path)

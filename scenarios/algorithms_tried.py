@@ -24,7 +24,7 @@ from magfusion.papers.p004_fingerprints.fingerprint import (
 from magfusion.papers.p004_fingerprints.rssi import RssiLines, fit_lines
 from magfusion.receiver.ellipse import plane_normal
 from magfusion.results.coverage import coverage
-from magfusion.simulation.worlds import Layout, Scenario, World, draw_world
+from magfusion.simulation.worlds import Scenario, SceneLayout, SimulatedWorld, draw_world
 from magfusion.units import DEGREE, Array
 
 MODEL_ERROR = 0.02  # relative; half a per cent to five give nearly the same
@@ -39,7 +39,7 @@ OURS = (ML, "MLrel", "MLrel + gain", FIX, MAPPED)
 class Trial:
     """What a method is given: a survey of a room, and the fields at its targets, sensor level."""
 
-    world: World
+    world: SimulatedWorld
     survey: Survey
     samples: FieldSamples
 
@@ -71,12 +71,12 @@ class Task:
 
     scenario: Scenario
     targets: int
-    layout: Layout
+    layout: SceneLayout
     methods: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class AlgorithmOutcome:
     """Errors in one room.
 
     Parameters
@@ -110,8 +110,8 @@ def by_neighbours(trial: Trial) -> Poses:
 
 def by_neighbours_nt(trial: Trial) -> Poses:
     """Algorithm 2 as printed."""
-    found = locate_by_neighbours(trial.database, trial.amplitude, logarithmic=False)
-    return _with_attitude(trial, found)
+    result = locate_by_neighbours(trial.database, trial.amplitude, logarithmic=False)
+    return _with_attitude(trial, result)
 
 
 def by_differential_range(trial: Trial) -> Poses:
@@ -137,8 +137,8 @@ def by_free_gain(trial: Trial) -> Poses:
 def by_default(trial: Trial) -> Poses:
     """Fix as `magfusion fix` does: beacons left out, or gains free, where the fields ask for it."""
     calibration = initial_calibration(trial.world.site, 0.0)
-    found = explained_fixes(trial.samples, calibration, survey_error=False).fixes.best()
-    return Poses(found.position_world, found.world_from_body)
+    result = explained_fixes(trial.samples, calibration, survey_error=False).fixes.best()
+    return Poses(result.position_world, result.world_from_body)
 
 
 def by_map(trial: Trial) -> Poses:
@@ -174,37 +174,44 @@ def _with_attitude(trial: Trial, position_world: Array) -> Poses:
 
 
 def fixed(
-    samples: FieldSamples, site: Site, free: tuple[str, ...] = (), gain_sigma: float = GAIN_SIGMA
+    samples: FieldSamples,
+    site: Site,
+    free_parameters: tuple[str, ...] = (),
+    gain_sigma: float = GAIN_SIGMA,
 ) -> Poses:
     """Return the most likely poses."""
     calibration = initial_calibration(site, 0.0)
     fixes = fix_epochs(
-        samples, calibration, survey_error=False, free=free, gain_sigma=gain_sigma
+        samples,
+        calibration,
+        survey_error=False,
+        free_parameters=free_parameters,
+        gain_sigma=gain_sigma,
     ).best()
     return Poses(fixes.position_world, fixes.world_from_body)
 
 
-def try_world(task: Task, rng: np.random.Generator) -> Outcome:
+def try_world(task: Task, rng: np.random.Generator) -> AlgorithmOutcome:
     """Draw one room and try the methods in it."""
     world = draw_world(task.scenario, rng, task.layout, model_error=MODEL_ERROR)
     targets = task.layout.draw_targets(rng, task.targets)
     trial = Trial(world, world.survey(rng), world.measure(targets, LEVEL, rng))
-    found = {name: METHODS[name](trial) for name in task.methods}
+    result = {name: METHODS[name](trial) for name in task.methods}
     angles = {
         name: eq_23_angles(np.swapaxes(poses.world_from_body, -1, -2))
-        for name, poses in found.items()
+        for name, poses in result.items()
     }
     position_bound, attitude_bound = bound(world, targets)
-    return Outcome(
-        position={n: size(poses.position_world - targets) for n, poses in found.items()},
+    return AlgorithmOutcome(
+        position={n: size(poses.position_world - targets) for n, poses in result.items()},
         euler={n: np.mean(np.abs(a), axis=1) / DEGREE for n, a in angles.items()},
-        geodesic={n: angle_deg(poses.world_from_body) for n, poses in found.items()},
+        geodesic={n: angle_deg(poses.world_from_body) for n, poses in result.items()},
         position_bound=position_bound,
         attitude_bound=attitude_bound,
     )
 
 
-def bound(world: World, position_world: Array) -> tuple[Array, Array]:
+def bound(world: SimulatedWorld, position_world: Array) -> tuple[Array, Array]:
     """Return the Cramér-Rao bounds of position (m) and attitude (deg) in noise alone."""
     receiver, platform = world.receiver, world.site.platform
     window = receiver.samples / receiver.rate_hz

@@ -89,13 +89,13 @@ class Coils:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class BenchOutcome:
     """What was reported and what was found (deg, m)."""
 
     seed: int
     before: tuple[float, float]
     reported: tuple[float, float]
-    found: tuple[float, float]
+    estimate: tuple[float, float]
 
 
 def drawn(config: Config, rng: np.random.Generator) -> Coils:
@@ -211,11 +211,11 @@ class World:
         turn, place = self.poses(self.config.poses)
         phasor = self.phasors(turn, place)
         off = self.config.pose_deg * DEGREE * self.rng.standard_normal(place.shape)
-        told = (turn * Rotation.from_rotvec(off)).as_quat(scalar_first=True)
+        reported = (turn * Rotation.from_rotvec(off)).as_quat(scalar_first=True)
         moved = place + self.config.pose_m * self.rng.standard_normal(place.shape)
         listed = {"point": np.arange(len(place))} | dict(zip(POSITION, moved.T, strict=True))
         read = {"point": np.repeat(np.arange(len(place)), 3)} | self._columns(phasor)
-        return read, listed | dict(zip(QUATERNION, told.T, strict=True))
+        return read, listed | dict(zip(QUATERNION, reported.T, strict=True))
 
     def _columns(self, phasor: Array) -> Table:
         flat = phasor.reshape(-1, 3)
@@ -262,7 +262,7 @@ def write_bench(config: Config, directory: Path) -> None:
     world.write_log(directory / "others")
 
 
-def run_seed(config: Config) -> Outcome:
+def run_seed(config: Config) -> BenchOutcome:
     """Calibrate one tracker by its bench, and fix a log with the site that was written."""
     with tempfile.TemporaryDirectory() as name:
         path = Path(name)
@@ -280,42 +280,42 @@ def run_seed(config: Config) -> Outcome:
             boresight="boresight" in config.options,
         )
         run_calibrate_antenna(settings, path / "antenna")
-        told = json.loads((path / "antenna" / "report.json").read_text())
+        reported = json.loads((path / "antenna" / "report.json").read_text())
         run(FixSettings(log=path / "others", site=path / "antenna" / "site.yaml"), path / "fixes")
         fixed = json.loads((path / "fixes" / "report.json").read_text())
         before, after = (
-            (told[f"attitude_deg_{when}"], told[f"position_m_{when}"])
+            (reported[f"attitude_deg_{when}"], reported[f"position_m_{when}"])
             for when in ("before", "after")
         )
-        found = fixed["attitude_rmse_deg"], fixed["ate_m"]
-        return Outcome(config.seed, before, after, found)
+        result = fixed["attitude_rmse_deg"], fixed["ate_m"]
+        return BenchOutcome(config.seed, before, after, result)
 
 
-def ratios(outcomes: list[Outcome]) -> Array:
+def ratios(outcomes: list[BenchOutcome]) -> Array:
     """Return reported over found, of all seeds together, of attitude and position."""
-    told, found = ([getattr(o, name) for o in outcomes] for name in ("reported", "found"))
-    return np.array([rms(np.array(told)[:, k]) / rms(np.array(found)[:, k]) for k in range(2)])
+    reported, result = ([getattr(o, name) for o in outcomes] for name in ("reported", "found"))
+    return np.array([rms(np.array(reported)[:, k]) / rms(np.array(result)[:, k]) for k in range(2)])
 
 
-def holds(outcomes: list[Outcome]) -> bool:
+def passes_check(outcomes: list[BenchOutcome]) -> bool:
     """Tell whether the rule is kept."""
-    each = np.array([np.divide(o.reported, o.found) for o in outcomes])
+    each = np.array([np.divide(o.reported, o.estimate) for o in outcomes])
     whole = np.abs(np.log(ratios(outcomes))) < np.log1p(WITHIN)
     return bool(np.all(whole) and np.all(np.abs(np.log(each)) < np.log1p(SEED_WITHIN)))
 
 
-def report(name: str, outcomes: list[Outcome]) -> str:
+def report(name: str, outcomes: list[BenchOutcome]) -> str:
     """Return the table that a reader sees."""
     lines = [
         f"{name}: the drawing's site -> reported after / found by fix elsewhere",
         *(
-            f"seed {o.seed}: {o.before[0]:.3f} -> {o.reported[0]:.4f} / {o.found[0]:.4f} deg,"
-            f" {1e3 * o.before[1]:.2f} -> {1e3 * o.reported[1]:.3f} / {1e3 * o.found[1]:.3f} mm"
+            f"seed {o.seed}: {o.before[0]:.3f} -> {o.reported[0]:.4f} / {o.estimate[0]:.4f} deg,"
+            f" {1e3 * o.before[1]:.2f} -> {1e3 * o.reported[1]:.3f} / {1e3 * o.estimate[1]:.3f} mm"
             for o in outcomes
         ),
     ]
     attitude, position = ratios(outcomes)
-    verdict = "holds" if holds(outcomes) else "does NOT hold"
+    verdict = "holds" if passes_check(outcomes) else "does NOT hold"
     return "\n".join(
         [*lines, f"reported / found: {attitude:.3f} and {position:.3f}; the rule {verdict}"]
     )
@@ -337,13 +337,13 @@ def main() -> None:
     parser = scenario_parser(__doc__, Config.seed, "one tracker of each kind", output=None)
     parser.add_argument("--seeds", type=int, default=6)
     given = parser.parse_args()
-    found = {}
+    result = {}
     for name, config in KINDS.items():
         count = 1 if given.quick else given.seeds
         seeds = range(given.seed, given.seed + count)
-        found[name] = [run_seed(Config(**vars(config) | {"seed": k})) for k in seeds]
-    text = "\n".join(report(name, outcomes) for name, outcomes in found.items())
-    conclude(text, {name: list(ratios(outcomes)) for name, outcomes in found.items()})
+        result[name] = [run_seed(Config(**vars(config) | {"seed": k})) for k in seeds]
+    text = "\n".join(report(name, outcomes) for name, outcomes in result.items())
+    conclude(text, {name: list(ratios(outcomes)) for name, outcomes in result.items()})
 
 
 if __name__ == "__main__":

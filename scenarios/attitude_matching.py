@@ -136,12 +136,12 @@ def database(config: Config, step_deg: float, rng: np.random.Generator) -> Index
 def found_by_all(index: Index, measured: Array, sigma: float) -> dict[str, Array]:
     """Return the first attitude of each method (rad)."""
     yaw = float(index.database.rpy[0, 2])
-    found = (
+    result = (
         match_nearest(index, measured, sigma),
         match_interpolated(index, measured, sigma),
         match_roll_pitch(measured, yaw, FIELD_WORLD, sigma),
     )
-    return {name: m.rpy[:, 0] for name, m in zip(METHODS, found, strict=True)}
+    return {name: m.rpy[:, 0] for name, m in zip(METHODS, result, strict=True)}
 
 
 def by_step(config: Config, step_deg: float) -> Step:
@@ -152,9 +152,9 @@ def by_step(config: Config, step_deg: float) -> Step:
         true = random_attitudes(config.attitudes, 0.0, rng)
         left_over = calibrated_error(Instruments(), rng)
         measured = measure(true, left_over, config.noise_mg, rng)
-        found = found_by_all(index, measured, config.noise_mg * MILLIGAUSS)
+        result = found_by_all(index, measured, config.noise_mg * MILLIGAUSS)
         for name in METHODS:
-            errors[name].append(np.abs(wrap(found[name] - true)[:, :2]) / DEGREE)
+            errors[name].append(np.abs(wrap(result[name] - true)[:, :2]) / DEGREE)
     return Step(
         step_deg=step_deg,
         entries=len(index.database),
@@ -183,22 +183,22 @@ def among_all_attitudes(config: Config) -> tuple[float, float, float]:
         true.apply(direction, inverse=True)
     )
     error = (true.inv() * entries[row]).magnitude() / DEGREE
-    apart = 2.0 * np.arcsin(0.5 * distance) / DEGREE
-    return float(np.median(error)), float(np.mean(error <= PAPER_DEG)), float(np.median(apart))
+    separate = 2.0 * np.arcsin(0.5 * distance) / DEGREE
+    return float(np.median(error)), float(np.mean(error <= PAPER_DEG)), float(np.median(separate))
 
 
 def at_fold(pitch_ned_deg: float) -> Fold:
     """Return both pitches that explain an exact vector, heading north."""
     true = from_ned(np.array([20.0, pitch_ned_deg, 0.0]))
-    found = match_roll_pitch(predict_field(true, FIELD_WORLD), true[2], FIELD_WORLD, MILLIGAUSS)
-    pitch_deg = -found.rpy[:, 1] / DEGREE
+    result = match_roll_pitch(predict_field(true, FIELD_WORLD), true[2], FIELD_WORLD, MILLIGAUSS)
+    pitch_deg = -result.rpy[:, 1] / DEGREE
     nearest = int(np.nanargmin(np.abs(pitch_deg - pitch_ned_deg)))
     return Fold(
         pitch_deg=pitch_ned_deg,
         found_deg=tuple(None if np.isnan(p) else float(p) for p in pitch_deg),
-        roll_sigma_deg=float(found.sigma[nearest, 0] / DEGREE),
-        pitch_sigma_deg=float(found.sigma[nearest, 1] / DEGREE),
-        determined=bool(found.determined[nearest]),
+        roll_sigma_deg=float(result.sigma[nearest, 0] / DEGREE),
+        pitch_sigma_deg=float(result.sigma[nearest, 1] / DEGREE),
+        determined=bool(result.determined[nearest]),
     )
 
 
@@ -211,8 +211,8 @@ def with_gravity(config: Config) -> float:
     force = predict_field(true, np.array([0.0, 0.0, 1.0]))
     force += rng.normal(0.0, force_noise, force.shape)
     share = config.noise_mg * MILLIGAUSS / float(np.linalg.norm(FIELD_WORLD))
-    found = attitude_with_gravity(measured, force, FIELD_WORLD, share, force_noise)
-    turn = Rotation.from_matrix(found).inv() * Rotation.from_euler("xyz", true)
+    result = attitude_with_gravity(measured, force, FIELD_WORLD, share, force_noise)
+    turn = Rotation.from_matrix(result).inv() * Rotation.from_euler("xyz", true)
     return rms(turn.magnitude()) / DEGREE
 
 
@@ -269,9 +269,9 @@ def draw(config: Config, path: Path) -> None:
     for yaw_deg, color in ((0.0, "tab:blue"), (5.0, "tab:orange")):
         rpy = from_ned(np.stack([roll_deg, swing, np.full_like(time, yaw_deg)], axis=1))
         measured = measure(rpy, ideal(), config.noise_mg, rng)
-        found = match_interpolated(index, measured, config.noise_mg * MILLIGAUSS).rpy[:, 0]
+        result = match_interpolated(index, measured, config.noise_mg * MILLIGAUSS).rpy[:, 0]
         for k, (name, sign) in enumerate((("roll", 1.0), ("pitch", -1.0))):
-            error = sign * wrap(found[:, k] - rpy[:, k]) / DEGREE
+            error = sign * wrap(result[:, k] - rpy[:, k]) / DEGREE
             panels[k + 1].plot(time, error, color=color, lw=0.8, label=f"yaw {yaw_deg:g} deg")
             panels[k + 1].set(ylabel=f"error of {name} (deg)")
     panels[0].plot(time, roll_deg, ".", ms=2, label="roll")

@@ -163,8 +163,8 @@ def noisy(block: Block, exact: ComplexArray, rng: np.random.Generator) -> tuple[
     else:
         sigma = length / (1.0 if block.noise == "axis" else np.sqrt(3.0))
         error = draws * sigma[..., None]
-    found = parts + block.level * error
-    return found[..., 0, :] + 1j * found[..., 1, :], block.level * sigma
+    result = parts + block.level * error
+    return result[..., 0, :] + 1j * result[..., 1, :], block.level * sigma
 
 
 def run_block(block: Block, rng: np.random.Generator) -> tuple[Array, Array, Array]:
@@ -176,10 +176,10 @@ def run_block(block: Block, rng: np.random.Generator) -> tuple[Array, Array, Arr
     printed = calibrate_as_printed(phasor_beacon, places, MOMENT, hemisphere)
     measured = measurements(phasor_beacon @ rotation.T, sigma)
     nine = calibrate_beacon(measured)
-    turned, _ = attitudes(measured.beacon, nine.moments_world)
-    centre, known, cov = fit_known_moments(measured, nine.centre_world, turned)
+    rotated, _ = attitudes(measured.beacon, nine.moments_world)
+    centre, known, cov = fit_known_moments(measured, nine.centre_world, rotated)
     places_found = np.stack([printed.centre_world, nine.centre_world, centre])
-    angles = np.stack([printed.angles, eq_21_angles(turned), eq_21_angles(known)])
+    angles = np.stack([printed.angles, eq_21_angles(rotated), eq_21_angles(known)])
     square = np.stack([nine.cov[:, :3, :3], cov[:, 3:, 3:]])
     bound = np.sqrt(np.trace(square, axis1=2, axis2=3))
     return (
@@ -195,10 +195,10 @@ def run(config: Config, **scale: Any) -> dict[tuple[str, int], Errors]:
     sizes += [config.runs % config.block] if config.runs % config.block else []
     cases = [(noise, count) for noise in config.noises for count in PAPER]
     blocks = [Block(n, count, noise, config.level) for noise, count in cases for n in sizes]
-    found = run_many(run_block, blocks, seed=config.seed, **scale)
+    result = run_many(run_block, blocks, seed=config.seed, **scale)
     out = {}
     for i, case in enumerate(cases):
-        own = found[i * len(sizes) : (i + 1) * len(sizes)]
+        own = result[i * len(sizes) : (i + 1) * len(sizes)]
         out[case] = Errors(*(np.concatenate(parts, axis=1) for parts in zip(*own, strict=True)))
     return out
 
@@ -235,11 +235,11 @@ def printed_from(rotation: Array, world_from_axes: Array) -> list[Printed]:
     for count in PAPER:
         places = PLACES_WORLD[:count]
         phasor = phasors_world(beacon(rotation=rotation), places)[None, :, 0] @ world_from_axes
-        found = calibrate_as_printed(phasor, places, MOMENT)
-        turned = Rotation.from_matrix(wahba(found.world_from_beacon[0])).magnitude() / DEGREE
-        error = float(np.linalg.norm(found.centre_world))
-        possible = bool(np.all(found.distance > 0.0))
-        out.append(Printed(error if possible else None, float(found.alarm[0]), float(turned)))
+        result = calibrate_as_printed(phasor, places, MOMENT)
+        rotated = Rotation.from_matrix(wahba(result.world_from_beacon[0])).magnitude() / DEGREE
+        error = float(np.linalg.norm(result.centre_world))
+        possible = bool(np.all(result.distance > 0.0))
+        out.append(Printed(error if possible else None, float(result.alarm[0]), float(rotated)))
     return out
 
 
@@ -247,16 +247,16 @@ def false_centres() -> list[float]:
     """Return how far off the centres are (m) that fit three exact normals as well as the truth."""
     rotation, places = paper_rotation(), PLACES_WORLD[:3]
     exact = phasors_world(beacon(rotation=rotation), places)[:, 0] @ rotation
-    found = consistent_centres(eq_04_direction(plane_normal(exact)), places, 1e-6)
-    return sorted(float(np.linalg.norm(centre)) for _, centre in found)
+    result = consistent_centres(eq_04_direction(plane_normal(exact)), places, 1e-6)
+    return sorted(float(np.linalg.norm(centre)) for _, centre in result)
 
 
 def anywhere(config: Config) -> float:
     """Return the share of beacons at any attitude within a metre that the exact fit finds."""
     rng = np.random.default_rng(config.seed)
-    turned = Rotation.random(config.anywhere, random_state=rng).as_matrix()
+    rotated = Rotation.random(config.anywhere, random_state=rng).as_matrix()
     centres = rng.uniform(-1.0, 1.0, (config.anywhere, 3)) * [1.0, 1.0, 0.5] - [0.0, 0.0, 0.25]
-    true = [beacon(place, turn) for place, turn in zip(centres, turned, strict=True)]
+    true = [beacon(place, turn) for place, turn in zip(centres, rotated, strict=True)]
     exact = np.stack([phasors_world(one, PLACES_WORLD[:3])[:, 0] for one in true])
     sigma = config.level * np.sqrt(np.mean(np.abs(exact) ** 2) / 2.0)
     noise = rng.normal(0.0, sigma, (2, *exact.shape))
@@ -274,8 +274,8 @@ def uneven_coils() -> tuple[float, float]:
     exact = phasors_world(replace(plain, coils=(plain.coils[0], second)), PLACES_WORLD[:3])[:, 0]
     measured = measurements(exact[None], np.full((3, 2), 1e-9))
     nine = calibrate_beacon(measured)
-    turned, _ = attitudes(measured.beacon, nine.moments_world)
-    six, _, _ = fit_known_moments(measured, nine.centre_world, turned)
+    rotated, _ = attitudes(measured.beacon, nine.moments_world)
+    six, _, _ = fit_known_moments(measured, nine.centre_world, rotated)
     return float(np.linalg.norm(nine.centre_world)), float(np.linalg.norm(six))
 
 
@@ -285,8 +285,8 @@ def report(errors: dict[tuple[str, int], Errors]) -> str:
         f"{'noise':<10}{'sensors':>8} {'method':<15}{'position m':>11}{'angle deg':>10}"
         f"{'rms angle':>10}{'rms/bound':>10}"
     ]
-    for (noise, count), found in errors.items():
-        own = found.summary()
+    for (noise, count), result in errors.items():
+        own = result.summary()
         for i, method in enumerate(METHODS):
             ratio = "" if i == 0 else own["position_rms_m"][i] / own["bound_rms_m"][i - 1]
             lines.append(
@@ -319,22 +319,22 @@ def failures() -> tuple[str, dict[str, Any]]:
 def draw(errors: dict[tuple[str, int], Errors], directory: Path) -> Path:
     """Draw the cumulative distributions of figures 5 and 6; return the picture's path."""
     figure = blank_figure(11.0, 4.5)
-    left, right = figure.subplots(1, 2)
+    remaining, right = figure.subplots(1, 2)
     shown = [(noise, 0, f"C{i}") for i, noise in enumerate(dict.fromkeys(n for n, _ in errors))]
     shown.append((shown[0][0], 1, "0.2"))
     for count, style in zip(PAPER, ("-", "--"), strict=True):
         for noise, i, colour in shown:
-            found = errors[noise, count]
-            share = (np.arange(found.position.shape[1]) + 1.0) / found.position.shape[1]
+            result = errors[noise, count]
+            share = (np.arange(result.position.shape[1]) + 1.0) / result.position.shape[1]
             label = f"{METHODS[i]}, noise by {noise}, {count} magnetometers"
-            left.plot(np.sort(found.position[i]), share, style, color=colour, label=label)
-            angle = np.mean(np.abs(found.angles[i]), axis=-1) / DEGREE
+            remaining.plot(np.sort(result.position[i]), share, style, color=colour, label=label)
+            angle = np.mean(np.abs(result.angles[i]), axis=-1) / DEGREE
             right.plot(np.sort(angle), share, style, color=colour)
-        left.axvline(PAPER[count][0], color="0.5", linestyle=style, linewidth=0.8)
+        remaining.axvline(PAPER[count][0], color="0.5", linestyle=style, linewidth=0.8)
         right.axvline(PAPER[count][1], color="0.5", linestyle=style, linewidth=0.8)
-    left.set(xlabel="error of the centre (m)", ylabel="share of the runs", title="figure 5")
+    remaining.set(xlabel="error of the centre (m)", ylabel="share of the runs", title="figure 5")
     right.set(xlabel="mean error of the three angles (deg)", title="figure 6")
-    left.legend(fontsize=6)
+    remaining.legend(fontsize=6)
     figure.suptitle("Calibration of a beacon, 1 % noise; grey: mean that paper 002 reports")
     path = directory / "beacon_calibration.png"
     save_picture(figure, path)
@@ -349,13 +349,13 @@ def main() -> None:
     config = Config(runs=options.runs, seed=options.seed)
     errors = run(config, **chosen_scale(options))
     text, naive = failures()
-    found, (nine, six) = anywhere(config), uneven_coils()
+    result, (nine, six) = anywhere(config), uneven_coils()
     read = readings({case: (one.position[0], one.angles[0]) for case, one in errors.items()})
     lines = [
         report(errors),
         report_readings(read),
         text,
-        f"\nbeacons anywhere within a metre, any attitude: {100.0 * found:.0f} % found",
+        f"\nbeacons anywhere within a metre, any attitude: {100.0 * result:.0f} % found",
         f"coils off by 3 % and 2 deg: {nine:.1e} m with nine unknowns, {six:.4f} m with six",
     ]
     if options.output is not None:
@@ -364,7 +364,7 @@ def main() -> None:
     rest = {
         "readings": read,
         "naive": naive,
-        "found_anywhere": found,
+        "found_anywhere": result,
         "uneven_coils_m": [nine, six],
     }
     conclude("\n".join(lines), {"methods": METHODS, "errors": figures} | rest)

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from algorithms_figures import means, standard_error
-from algorithms_tried import MAPPED, Outcome, Task, try_world
+from algorithms_tried import MAPPED, AlgorithmOutcome, Task, try_world
 from harness import Scale, blank_figure, chosen_scale, conclude, save_picture, scenario_parser
 
 from magfusion.simulation.monte_carlo import run_many
@@ -42,7 +42,7 @@ class Config:
 
 def run(
     config: Config, scale: Scale | None = None, methods: Sequence[str] = METHODS
-) -> dict[int, list[Outcome]]:
+) -> dict[int, list[AlgorithmOutcome]]:
     """Return what came out in every room with each number of beacons."""
     scenario = replace(F1, line_bias_rms=0.0)
     tasks = [
@@ -50,39 +50,39 @@ def run(
         for count in COUNTS
         for _ in range(config.worlds)
     ]
-    found = run_many(try_world, tasks, seed=config.seed, **(scale or {}))
+    result = run_many(try_world, tasks, seed=config.seed, **(scale or {}))
     return {
-        count: found[i * config.worlds : (i + 1) * config.worlds] for i, count in enumerate(COUNTS)
+        count: result[i * config.worlds : (i + 1) * config.worlds] for i, count in enumerate(COUNTS)
     }
 
 
-def errors(found: Mapping[int, Sequence[Outcome]], method: str) -> Array:
+def errors(result: Mapping[int, Sequence[AlgorithmOutcome]], method: str) -> Array:
     """Return mean errors in each room (m), shape (counts, worlds)."""
-    return np.array([means(outcomes, "position", method) for outcomes in found.values()])
+    return np.array([means(outcomes, "position", method) for outcomes in result.values()])
 
 
-def bounds(found: Mapping[int, Sequence[Outcome]]) -> Array:
+def bounds(result: Mapping[int, Sequence[AlgorithmOutcome]]) -> Array:
     """Return the root mean square bound of position (m), shape (counts,)."""
     return np.array(
         [
             np.sqrt(np.mean(np.concatenate([o.position_bound for o in outcomes]) ** 2))
-            for outcomes in found.values()
+            for outcomes in result.values()
         ]
     )
 
 
-def report(found: Mapping[int, Sequence[Outcome]]) -> str:
+def report(result: Mapping[int, Sequence[AlgorithmOutcome]]) -> str:
     """Return the table that a reader sees."""
     lines = [
         "mean position error (m), its standard error over rooms, and relative to three beacons",
-        f"  {'beacons':18}" + "".join(f"{count:>26}" for count in found),
+        f"  {'beacons':18}" + "".join(f"{count:>26}" for count in result),
         _row("paper", PAPER),
     ]
     for method in METHODS:
-        error = errors(found, method)
+        error = errors(result, method)
         spread = [standard_error(rooms) for rooms in error]
         lines.append(_row(method, error.mean(axis=1), spread))
-    lines.append(_row(BOUND, bounds(found)))
+    lines.append(_row(BOUND, bounds(result)))
     return "\n".join(lines)
 
 
@@ -94,16 +94,16 @@ def _row(name: str, value: Sequence[float] | Array, spread: Sequence[float] | No
     return f"  {name:18}{cells}"
 
 
-def draw(path: Path, found: Mapping[int, Sequence[Outcome]]) -> None:
+def draw(path: Path, result: Mapping[int, Sequence[AlgorithmOutcome]]) -> None:
     """Write the paper's figure 11 as a PNG."""
     figure = blank_figure(8.0, 5.0)
     axis = figure.subplots()
     axis.plot(COUNTS, PAPER, "k--o", label="paper")
     for method in METHODS:
-        error = errors(found, method)
+        error = errors(result, method)
         spread = [standard_error(rooms) for rooms in error]
         axis.errorbar(COUNTS, error.mean(axis=1), spread, marker="o", capsize=3, label=method)
-    axis.plot(COUNTS, bounds(found), ":o", label=f"{BOUND}, noise alone")
+    axis.plot(COUNTS, bounds(result), ":o", label=f"{BOUND}, noise alone")
     axis.set(yscale="log", xticks=COUNTS, xlabel="beacons", ylabel="mean position error (m)")
     axis.grid(visible=True, which="both", alpha=0.3)
     axis.legend()
@@ -116,18 +116,18 @@ def main() -> None:
     given = scenario_parser(__doc__, Config.seed, quick, parallel=True).parse_args()
     small = Config(worlds=2, targets=50) if given.quick else Config()
     config = replace(small, seed=given.seed)
-    found = run(config, chosen_scale(given))
+    result = run(config, chosen_scale(given))
     if given.output is not None:
-        draw(given.output / "figure_11.png", found)
+        draw(given.output / "figure_11.png", result)
     figures = {
         "beacons": COUNTS,
         "paper_m": PAPER,
-        "position_m": {m: errors(found, m).mean(axis=1).tolist() for m in METHODS},
-        "bound_rms_m": bounds(found).tolist(),
+        "position_m": {m: errors(result, m).mean(axis=1).tolist() for m in METHODS},
+        "bound_rms_m": bounds(result).tolist(),
         "worlds": config.worlds,
         "seed": config.seed,
     }
-    conclude(report(found), figures)
+    conclude(report(result), figures)
 
 
 if __name__ == "__main__":

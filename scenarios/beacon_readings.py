@@ -41,29 +41,29 @@ def readings(errors: Mapping[tuple[str, int], tuple[Array, Array]]) -> list[Read
             place, turn = [], []
             for count, (printed_m, printed_deg) in PAPER.items():
                 position, angles = errors[noise, count]
-                place.append(_beside(position[:, None], 1, printed_m, 5e-4))
-                turn.append(_beside(angles / DEGREE, power, printed_deg, 5e-3))
+                place.append(_neighbour(position[:, None], 1, printed_m, 5e-4))
+                turn.append(_neighbour(angles / DEGREE, power, printed_deg, 5e-3))
             ratios, agree = zip(*place, *turn, strict=True)
             out.append(Reading(noise, angle, ratios, all(agree)))
     return out
 
 
-def _beside(error: Array, power: int, printed: float, half_digit: float) -> tuple[float, bool]:
+def _neighbour(error: Array, power: int, printed: float, half_digit: float) -> tuple[float, bool]:
     """Return a mean of errors (runs, k) over what is printed, and whether it can be that."""
     each = np.mean(np.abs(error) ** power, axis=1)
-    found = float(np.mean(each)) ** (1.0 / power)
+    result = float(np.mean(each)) ** (1.0 / power)
     spread = float(np.std(each, ddof=1) / np.sqrt(len(each)))
-    spread *= found ** (1 - power) / power  # of the root
-    return found / printed, bool(abs(found - printed) <= half_digit + 3.0 * spread)
+    spread *= result ** (1 - power) / power  # of the root
+    return result / printed, bool(abs(result - printed) <= half_digit + 3.0 * spread)
 
 
-def report_readings(found: list[Reading]) -> str:
+def report_readings(result: list[Reading]) -> str:
     """Return the table of readings with the verdicts."""
     lines = [
         "",
         "printed method, found / printed: position of three, four; angle of three, four",
     ]
-    for one in found:
+    for one in result:
         cells = "".join(f"{ratio:8.2f}" for ratio in one.ratios)
         verdict = "can be the paper's" if one.is_the_papers else "is not the paper's"
         lines.append(f"{one.noise:<10}{one.angle:<6}{cells}  {verdict}")

@@ -8,7 +8,7 @@ from harness import rms
 
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.graph.state import as_trajectory
-from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.integrity.judge import judge_result
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.jobs.replay import Replay, feed
@@ -32,7 +32,7 @@ class Row:
 
 def smoothed(log: Log, site: Site) -> tuple[Trajectory, str]:
     """Smooth a log; return its states and the verdict."""
-    result, trust = judged(smooth(log, site, SmootherSettings()), log)
+    result, trust = judge_result(smooth(log, site, SmootherSettings()), log)
     return result.states, str(trust.verdict)
 
 
@@ -51,9 +51,9 @@ def rows_of(case: str, log: Log, site: Site) -> Iterator[Row]:
     assert log.truth is not None
     for estimator, estimate in (("smooth", smoothed), ("navigate (ekf)", filtered)):
         states, verdict = estimate(log, site)
-        found = trajectory_errors(states, log.truth)
-        size = rms(np.linalg.norm(found.position_world, axis=1))
-        yield Row(case, estimator, 1e3 * size, rms(found.attitude) / DEGREE, verdict)
+        result = trajectory_errors(states, log.truth)
+        size = rms(np.linalg.norm(result.position_world, axis=1))
+        yield Row(case, estimator, 1e3 * size, rms(result.attitude) / DEGREE, verdict)
 
 
 def table(title: str, rows: list[Row]) -> str:

@@ -113,8 +113,8 @@ def run_world(config: Config, rng: np.random.Generator) -> Array:
     site = declared_site(config)
     true_site = perturb_site(site, rng)
     position = rng.uniform(LOW, HIGH, (config.targets, 3))
-    turned = Rotation.random(config.targets, random_state=rng).as_matrix()
-    poses = Trajectory(np.arange(float(config.targets)), turned, position)
+    rotated = Rotation.random(config.targets, random_state=rng).as_matrix()
+    poses = Trajectory(np.arange(float(config.targets)), rotated, position)
     samples = simulate_fields(true_site, poses, config.noise, rng)
     gain = np.exp(config.amplitude_error * rng.standard_normal(samples.phasor_sensor.shape[:2]))
     samples = replace(samples, phasor_sensor=samples.phasor_sensor * gain[..., None])
@@ -128,25 +128,28 @@ def _errors(site: Site, config: Config, samples: FieldSamples, poses: Trajectory
     weighed = replace(site, model_error=max(site.model_error, config.amplitude_error))
     surveyed = any(np.any(b.sigma.position_world > 0.0) for b in site.beacons)
     fixes = fix_epochs(samples, initial_calibration(weighed, 0.0), survey_error=surveyed)
-    found = (trilaterated(site, samples), (fixes.position_world[:, 0], fixes.world_from_body[:, 0]))
+    result = (
+        trilaterated(site, samples),
+        (fixes.position_world[:, 0], fixes.world_from_body[:, 0]),
+    )
     return np.stack(
         [
             np.stack(
                 [
                     np.linalg.norm(position - poses.position_world, axis=-1),
-                    between_deg(turned, poses.world_from_body),
+                    between_deg(rotated, poses.world_from_body),
                 ],
                 axis=-1,
             )
-            for position, turned in found
+            for position, rotated in result
         ]
     )
 
 
 def run(config: Config, **scale: Any) -> Array:
     """Return the errors of all worlds, shape (worlds, sites, methods, targets, 2) (m, deg)."""
-    found = run_many(run_world, [config] * config.worlds, seed=config.seed, **scale)
-    return np.stack(found)
+    result = run_many(run_world, [config] * config.worlds, seed=config.seed, **scale)
+    return np.stack(result)
 
 
 def means(errors: Array) -> dict[str, dict[str, list[float]]]:

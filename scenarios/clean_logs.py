@@ -126,20 +126,20 @@ def draw(config: Config, rng: np.random.Generator) -> Drawn:
 
 def _places(size: Array, count: int, rng: np.random.Generator) -> Array:
     """Return places near the walls of a room, as far apart as chance allows."""
-    found: list[Array] = []
-    while len(found) < count:
+    result: list[Array] = []
+    while len(result) < count:
         tried = rng.uniform(0.0, 1.0, (20, 3))
         wall = rng.integers(0, 3, 20)
         tried[np.arange(20), wall] = rng.integers(0, 2, 20)
         place = tried * size
-        apart = [min((float(np.linalg.norm(p - q)) for q in found), default=1.0) for p in place]
-        found.append(place[int(np.argmax(apart))])
-    return np.array(found)
+        separate = [min((float(np.linalg.norm(p - q)) for q in result), default=1.0) for p in place]
+        result.append(place[int(np.argmax(separate))])
+    return np.array(result)
 
 
-def bound(drawn: Drawn, made: SimulatedLog) -> float:
+def bound(drawn: Drawn, simulation: SimulatedLog) -> float:
     """Return what nine of ten single epochs determine the position to, at least (m)."""
-    truth = made.log.truth
+    truth = simulation.log.truth
     assert truth is not None
     path = truth.position_world[:: max(1, len(truth.time) // 50)]
     sigma = coverage(drawn.site, path, WINDOW).position_sigma
@@ -149,18 +149,18 @@ def bound(drawn: Drawn, made: SimulatedLog) -> float:
 def judge(config: Config, rng: np.random.Generator) -> Row:
     """Simulate a log, smooth it and return what was said."""
     drawn = draw(config, rng)
-    made = simulate_log(drawn.site, drawn.config, rng)
-    code, said = 0, ""
+    built = simulate_log(drawn.site, drawn.config, rng)
+    code, findings = 0, ""
     with tempfile.TemporaryDirectory(prefix="clean_") as name:
         log, output = Path(name) / "log", Path(name) / "out"
-        write_log(made.log, log)
+        write_log(built.log, log)
         save_site(drawn.site, log / "site.yaml")
         try:
             smooth.run(smooth.SmoothSettings(log=log), output)
         except InputError as error:
-            code, said = 2, str(error)
+            code, findings = 2, str(error)
         except EstimationError as error:
-            code, said = 1, str(error)
+            code, findings = 1, str(error)
         place = output / "report.json"
         report = json.loads(place.read_text()) if place.is_file() else {}
     reasons = report.get("reasons", [])
@@ -170,11 +170,11 @@ def judge(config: Config, rng: np.random.Generator) -> Row:
         motion=drawn.config.motion,
         speed=drawn.config.speed,
         room_m=float(np.ptp(drawn.config.box_world[:, 0]) * 2.0),
-        bound_m=bound(drawn, made),
+        bound_m=bound(drawn, built),
         exit=code,
         verdict=report.get("verdict", "failed" if code else "trustworthy"),
         codes=tuple(reason["code"] for reason in reasons),
-        text=reasons[0]["text"] if reasons else said,
+        text=reasons[0]["text"] if reasons else findings,
         error_m=report.get("ate_m"),
         error_deg=report.get("attitude_rmse_deg"),
         nees=report.get("nees_mean"),
@@ -229,15 +229,15 @@ def table(rows: Sequence[Row]) -> str:
             f"{_number(row.error_m, 100.0):>9}{_number(row.error_deg):>7}{_number(row.nees):>7}"
             f"  {row.text[:120]}"
         )
-    found = figures(rows)
+    result = figures(rows)
     return "\n".join(
         (
             *lines,
-            f"{found.logs} logs, {found.determined} of them with a pose that the bound determines:",
-            f"  doubtful {found.doubtful}, failed {found.failed}; median of the mean NEES"
-            f" {found.nees_median:.2g} (6 is due)",
-            f"  trusted with a mean NEES above {SILENT_NEES:g}, of all: {found.silent}",
-            f"  trusted although the bound of single epochs is open: {found.trusted_elsewhere}",
+            f"{result.logs} logs, {result.determined} of them with a pose that the bound determines:",
+            f"  doubtful {result.doubtful}, failed {result.failed}; median of the mean NEES"
+            f" {result.nees_median:.2g} (6 is due)",
+            f"  trusted with a mean NEES above {SILENT_NEES:g}, of all: {result.silent}",
+            f"  trusted although the bound of single epochs is open: {result.trusted_elsewhere}",
         )
     )
 

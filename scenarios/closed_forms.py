@@ -86,9 +86,9 @@ def exactness(config: Config) -> dict[str, float]:
         "rms": np.sqrt((2.0 + 3.0 * sine_square) / 2.0),
     }
     axes = semi_axes(phasor)
-    found = {"minor": axes[..., 0], "major": axes[..., 1], "rms": rms_amplitude(phasor)}
+    result = {"minor": axes[..., 0], "major": axes[..., 1], "rms": rms_amplitude(phasor)}
     errors = {
-        f"{k}_axis_error": float(np.max(np.abs(found[k] / scale / expected[k] - 1.0)))
+        f"{k}_axis_error": float(np.max(np.abs(result[k] / scale / expected[k] - 1.0)))
         for k in expected
     }
     return {
@@ -120,8 +120,8 @@ def solutions(config: Config, beacons: int, *, attitude: bool, synchronised: boo
         cov = np.diag([1e-6] * 3 + [1e4] * 3)
         prior = replace(truth, pose_cov=np.broadcast_to(cov, (config.epochs, 6, 6)).copy())
     fixes = fix_epochs(samples, initial_calibration(site, 0.0), prior=prior, survey_error=False)
-    left = fixes.cost - fixes.cost[:, :1] < AS_LIKELY
-    return float(np.mean(np.sum(left, axis=1)))
+    remaining = fixes.cost - fixes.cost[:, :1] < AS_LIKELY
+    return float(np.mean(np.sum(remaining, axis=1)))
 
 
 def coefficients(config: Config, polar_deg: float = 80.0) -> dict[str, float]:
@@ -140,8 +140,8 @@ def coefficients(config: Config, polar_deg: float = 80.0) -> dict[str, float]:
     by_tensor = locate_by_tensor(beacon, noisy[:, None]).direction_beacon
     by_normal = eq_07_direction(plane_normal(noisy))
     squares = {
-        name: np.sum((found - direction) ** 2, axis=1)
-        for name, found in (("tensor", by_tensor), ("eq_7", by_normal))
+        name: np.sum((result - direction) ** 2, axis=1)
+        for name, result in (("tensor", by_tensor), ("eq_7", by_normal))
     }
     return {f"coefficient_{name}": float(np.mean(s) / unit**2) for name, s in squares.items()}
 

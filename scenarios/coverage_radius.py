@@ -92,7 +92,7 @@ class Raw:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RadiusOutcome:
     """Everything that is printed."""
 
     curves: tuple[Curve, ...]
@@ -128,13 +128,13 @@ def from_samples(
     design = np.column_stack([np.cos(turns), -np.sin(turns), np.ones(samples)])
     solve = np.linalg.pinv(design)
     clean = np.real(phasor * np.exp(1j * turns)[:, None])
-    found = np.empty((config.raw_runs, 3), dtype=np.complex128)
+    result = np.empty((config.raw_runs, 3), dtype=np.complex128)
     step = config.quantisation_nt * NANOTESLA
-    for run in found:
+    for run in result:
         wave = clean + rng.normal(0.0, config.sample_sigma_nt * NANOTESLA, clean.shape)
         cosine, sine, _ = solve @ (step * np.round(wave / step))
         run[:] = cosine + 1j * sine
-    return found
+    return result
 
 
 def square_angles(source: Beacon, phasor: ComplexArray, true: Array) -> tuple[Array, Array]:
@@ -146,10 +146,10 @@ def square_angles(source: Beacon, phasor: ComplexArray, true: Array) -> tuple[Ar
     )
 
 
-def between_deg(found: Array, true: Array) -> Array:
+def between_deg(result: Array, true: Array) -> Array:
     """Return the angle between unit vectors (deg)."""
-    across = np.linalg.norm(np.cross(found, true), axis=-1)
-    return np.asarray(np.arctan2(across, found @ true) / DEGREE)
+    across = np.linalg.norm(np.cross(result, true), axis=-1)
+    return np.asarray(np.arctan2(across, result @ true) / DEGREE)
 
 
 def coefficients(polar_deg: float) -> tuple[float, float]:
@@ -161,11 +161,11 @@ def coefficients(polar_deg: float) -> tuple[float, float]:
     step = 1e-6
     steps = step * np.concatenate([np.eye(3), 1j * np.eye(3)])
     phasor = phasors_world(source, true[None])[0, 0] + np.concatenate([steps, -steps])
-    found = (
+    result = (
         eq_07_direction(plane_normal(phasor)),
         locate_by_tensor(source, phasor[:, None]).direction_beacon,
     )
-    slopes = [(f[:6] - f[6:]) / (2.0 * step) for f in found]
+    slopes = [(f[:6] - f[6:]) / (2.0 * step) for f in result]
     first, second = (float(np.sum(slope**2)) for slope in slopes)
     return first, second
 
@@ -217,12 +217,12 @@ def raw(config: Config, rng: np.random.Generator) -> Raw:
     """Simulate acceptance figure R1 twice: sample by sample, and by the law of the noise."""
     source, true = beacon(115.0, config.frequency_hz), direction(config.polar_deg)
     clean = phasors_world(source, PAPER_RADIUS * true[None])[0, 0]
-    found = (
+    result = (
         square_angles(source, from_samples(clean, 12_000, config, rng), true),
         square_angles(source, noisy(clean, config.sigma(12_000), config.runs, rng), true),
     )
-    means = np.array([[np.mean(s) for s in pair] for pair in found])
-    errors = np.array([[np.std(s) / np.sqrt(len(s)) for s in pair] for pair in found])
+    means = np.array([[np.mean(s) for s in pair] for pair in result])
+    errors = np.array([[np.std(s) / np.sqrt(len(s)) for s in pair] for pair in result])
     spread = np.linalg.norm(errors / means, axis=0)
     return Raw(
         samples=(float(means[0, 0]), float(means[0, 1])),
@@ -231,28 +231,28 @@ def raw(config: Config, rng: np.random.Generator) -> Raw:
     )
 
 
-def run(config: Config) -> Outcome:
+def run(config: Config) -> RadiusOutcome:
     """Simulate all curves."""
     curve_rng, polar_rng, raw_rng = np.random.default_rng(config.seed).spawn(3)
-    return Outcome(
+    return RadiusOutcome(
         curves=tuple(curve(config, m, n, curve_rng) for m, n in ANALYSED),
         at_twenty=tuple(at_twenty(config, p, polar_rng) for p in (5.0, 35.3, 45.0, 75.0, 80.0)),
         raw=raw(config, raw_rng),
     )
 
 
-def report(outcome: Outcome) -> str:
+def report(outcomes: RadiusOutcome) -> str:
     """Return the tables that a reader sees."""
     lines = ["Mean square of the direction's error (deg^2), 45 deg from the beacon's axis, 3 nT"]
     lines.append(f"{'range (m)':>32}" + "".join(f"{r:9g}" for r in RANGES) + f"{'1 deg at':>11}")
-    for found in outcome.curves:
-        name = f"{found.moment:g} A m^2, {found.samples}"
-        analysed = ANALYSED[found.moment, found.samples]
+    for result in outcomes.curves:
+        name = f"{result.moment:g} A m^2, {result.samples}"
+        analysed = ANALYSED[result.moment, result.samples]
         for label, row, end in (
-            ("Eq 7", found.eq7, f"{found.radius_eq7:9.1f} m"),
+            ("Eq 7", result.eq7, f"{result.radius_eq7:9.1f} m"),
             ("(analysed)", analysed, ""),
-            ("law", found.law_eq7, ""),
-            ("tensor", found.tensor, f"{found.radius_tensor:9.1f} m"),
+            ("law", result.law_eq7, ""),
+            ("tensor", result.tensor, f"{result.radius_tensor:9.1f} m"),
         ):
             cells = "".join(f"{value:9.3g}" for value in row)
             lines.append(f" {name:>20}{label:>11}{cells}{end}")
@@ -260,17 +260,17 @@ def report(outcome: Outcome) -> str:
     lines.append(
         "Samples for one degree rms by Eq 7 at 20 m (the paper's radius) and 14 m (it used)"
     )
-    for moment, found in {c.moment: c for c in outcome.curves}.items():
-        wanted = f"{found.samples_at_20m:8.0f} and {found.samples_at_14m:6.0f}"
+    for moment, result in {c.moment: c for c in outcomes.curves}.items():
+        wanted = f"{result.samples_at_20m:8.0f} and {result.samples_at_14m:6.0f}"
         lines.append(f" {moment:g} A m^2: {wanted}")
     lines.append("20 m, 115 A m^2, 12000 samples (deg^2; and coefficient of the law)")
     lines.append(f"{'from the axis (deg)':>22}{'Eq 7':>18}{'tensor':>18}{'ratio':>8}")
-    for row in outcome.at_twenty:
+    for row in outcomes.at_twenty:
         pairs = f"{row.eq7:9.3g} ({row.coefficient_eq7:6.3g})"
         pairs += f"{row.tensor:9.3g} ({row.coefficient_tensor:6.3g})"
         ratio = row.coefficient_eq7 / row.coefficient_tensor
         lines.append(f"{row.polar_deg:22g}{pairs}{ratio:8.1f}")
-    both = outcome.raw
+    both = outcomes.raw
     lines.append(
         f"Simulated samples {both.samples[0]:.3f} and {both.samples[1]:.3f}, phasors"
         f" {both.phasors[0]:.3f} and {both.phasors[1]:.3f}: within"
@@ -280,16 +280,16 @@ def report(outcome: Outcome) -> str:
     return "\n".join(lines)
 
 
-def draw(path: Path, outcome: Outcome) -> None:
+def draw(path: Path, outcomes: RadiusOutcome) -> None:
     """Write a PNG of the curves beside the paper's radii."""
     figure = blank_figure(8.0, 5.5)
     axes = figure.subplots()
-    for colour, found in zip(("tab:red", "tab:blue", "tab:green"), outcome.curves, strict=True):
-        name = f"{found.moment:g} A m², {found.samples} samples"
-        axes.plot(RANGES, found.eq7, "o-", color=colour, label=f"{name}: Eq 7")
-        axes.plot(RANGES, found.tensor, "s--", color=colour, label=f"{name}: tensor")
-        axes.plot(RANGES, found.law_eq7, ":", color=colour, linewidth=1.0)
-        analysed = ANALYSED[found.moment, found.samples]
+    for colour, result in zip(("tab:red", "tab:blue", "tab:green"), outcomes.curves, strict=True):
+        name = f"{result.moment:g} A m², {result.samples} samples"
+        axes.plot(RANGES, result.eq7, "o-", color=colour, label=f"{name}: Eq 7")
+        axes.plot(RANGES, result.tensor, "s--", color=colour, label=f"{name}: tensor")
+        axes.plot(RANGES, result.law_eq7, ":", color=colour, linewidth=1.0)
+        analysed = ANALYSED[result.moment, result.samples]
         axes.plot(RANGES, analysed, "x", color="black", markersize=8)
     axes.axhline(1.0, color="0.4", linewidth=0.8)
     axes.text(40.0, 1.15, "one degree rms", color="0.3", fontsize=8, ha="right")
@@ -315,10 +315,10 @@ def main() -> None:
     given = scenario_parser(__doc__, Config.seed, "a tenth of the runs").parse_args()
     share = 10 if given.quick else 1
     runs, raw_runs = Config.runs // share, Config.raw_runs // share
-    outcome = run(Config(seed=given.seed, runs=runs, raw_runs=raw_runs))
+    outcomes = run(Config(seed=given.seed, runs=runs, raw_runs=raw_runs))
     if given.output is not None:
-        draw(given.output / "coverage_radius.png", outcome)
-    conclude(report(outcome), {"ranges": RANGES, **vars(outcome)})
+        draw(given.output / "coverage_radius.png", outcomes)
+    conclude(report(outcomes), {"ranges": RANGES, **vars(outcomes)})
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from magfusion.model.site import Beacon, Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Risk
 from magfusion.results.coverage import Coverage, coverage, phasor_variance
-from magfusion.results.design.pattern import Band
+from magfusion.results.design.pattern import ToneBand
 from magfusion.results.design.planning import Task, designed
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.log import simulate_fields
@@ -52,7 +52,7 @@ class Config:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class DesignOutcome:
     """Worst protection levels (m) and times (s)."""
 
     candidates: int
@@ -86,22 +86,22 @@ def task_of(config: Config) -> Task:
         count=config.beacons,
         places=mounting_places(hall(), config.grid),
         points=points_of_use(hall(), config.spacing),
-        band=Band(10.0, 100.0, 0.4, 50.0),
+        band=ToneBand(10.0, 100.0, 0.4, 50.0),
         risk=Risk(),
     )
 
 
-def run(config: Config) -> Outcome:
+def run(config: Config) -> DesignOutcome:
     """Design, and compare."""
-    task, seconds, found = task_of(config), [], []
+    task, seconds, result = task_of(config), [], []
     for search in range(config.searches):
         begin = time.monotonic()
         rng = np.random.default_rng([config.seed, search])
         layouts = config.layouts if search == 0 else 0
-        found.append(designed(task, starts=config.starts, layouts=layouts, rng=rng))
+        result.append(designed(task, starts=config.starts, layouts=layouts, rng=rng))
         seconds.append(time.monotonic() - begin)
-    first = found[0]
-    levels = tuple(_worst(one.site, task) for one in found)
+    first = result[0]
+    levels = tuple(_worst(one.site, task) for one in result)
     fine = replace(task, points=points_of_use(hall(), 0.5 * config.spacing))
     assert first.median_random is not None
     by_a = designed(
@@ -114,7 +114,7 @@ def run(config: Config) -> Outcome:
     sigma = tuple(float(np.max(_map(site, task).position_sigma)) for site in sites)
     low, middle, high = _fixes_over_predicted(first.site, task, config.seed)
     median, best = (float(f(first.random_worst_m)) for f in (np.median, np.min))
-    return Outcome(
+    return DesignOutcome(
         candidates=first.candidates,
         points=len(task.points),
         random_median=median,
@@ -155,8 +155,8 @@ def _fixes_over_predicted(site: Site, task: Task, seed: int) -> tuple[float, flo
     still = Trajectory(task.band.window * np.arange(count), attitude, task.points)
     samples = simulate_fields(dipoles, still, noise, np.random.default_rng(seed))
     fixes = fix_epochs(samples, calibration)
-    found = separate_fixes(samples, calibration, fixes, risk=task.risk).states
-    ratio = found.protection_level_m / _levels(dipoles, task)
+    result = separate_fixes(samples, calibration, fixes, risk=task.risk).states
+    ratio = result.protection_level_m / _levels(dipoles, task)
     low, middle, high = np.nanquantile(ratio, [0.05, 0.5, 0.95])
     return float(low), float(middle), float(high)
 
@@ -165,26 +165,26 @@ def _as_dipoles(beacon: Beacon) -> Beacon:
     return replace(beacon, coils=tuple(replace(c, radius=None) for c in beacon.coils))
 
 
-def report(found: Outcome) -> str:
+def report(result: DesignOutcome) -> str:
     """Return the table that a reader sees."""
-    searches = ", ".join(f"{level:.3f} m" for level in found.designed)
-    took = ", ".join(f"{s:.0f} s" for s in found.seconds)
+    searches = ", ".join(f"{level:.3f} m" for level in result.designed)
+    took = ", ".join(f"{s:.0f} s" for s in result.seconds)
     return "\n".join(
         [
-            f"worst protection level; {found.candidates} candidates, {found.points} points of use",
-            f"  random layouts, median   {found.random_median:8.3f} m",
-            f"  random layouts, best     {found.random_best:8.3f} m",
-            f"  designed                 {found.designed[0]:8.3f} m:"
-            f" {100 * found.gain_over_median:.0f} % below the median,"
-            f" {100 * found.gain_over_best:.0f} % below the best",
+            f"worst protection level; {result.candidates} candidates, {result.points} points of use",
+            f"  random layouts, median   {result.random_median:8.3f} m",
+            f"  random layouts, best     {result.random_best:8.3f} m",
+            f"  designed                 {result.designed[0]:8.3f} m:"
+            f" {100 * result.gain_over_median:.0f} % below the median,"
+            f" {100 * result.gain_over_best:.0f} % below the best",
             f"  searches                 {searches}, in {took} (the first with the random ones)",
-            f"  at points half as far    {found.fine_designed:8.3f} m, random median"
-            f" {found.fine_random_median:.3f} m",
+            f"  at points half as far    {result.fine_designed:8.3f} m, random median"
+            f" {result.fine_random_median:.3f} m",
             "  levels of fixes over predicted, 5, 50, 95 % of the points: "
-            + ", ".join(f"{r:.3f}" for r in found.fix_over_predicted),
+            + ", ".join(f"{r:.3f}" for r in result.fix_over_predicted),
             "  worst position sigma     designed {:.3f} m, random median {:.3f} m, designed by A"
-            " {:.3f} m".format(*found.worst_sigma),
-            f"  worst level by A         {found.level_by_a:8.3f} m",
+            " {:.3f} m".format(*result.worst_sigma),
+            f"  worst level by A         {result.level_by_a:8.3f} m",
         ]
     )
 
@@ -195,8 +195,8 @@ def main() -> None:
         __doc__, Config.seed, "coarse, one search of two starts, forty layouts", output=None
     ).parse_args()
     small = Config(spacing=2.5, grid=3.0, starts=2, layouts=40, searches=1)
-    found = run(replace(small if given.quick else Config(), seed=given.seed))
-    conclude(report(found), found)
+    result = run(replace(small if given.quick else Config(), seed=given.seed))
+    conclude(report(result), result)
 
 
 if __name__ == "__main__":

@@ -61,13 +61,13 @@ def run_case(
     return run_drift(settings, place / case, show_progress)
 
 
-def report(config: Config, found: dict[str, Figures]) -> str:
+def report(config: Config, result: dict[str, Figures]) -> str:
     """Return the table that a reader sees."""
     lines = [
         f"{config.hours:g} h, {config.worlds} world(s); slope a day +- standard error, verdict",
         f"{'':18}" + "".join(f"{f'{q.name} ({q.unit})':>34}" for q in QUANTITIES),
     ]
-    for case, figures in found.items():
+    for case, figures in result.items():
         for estimator in ESTIMATORS:
             cells = []
             for quantity in QUANTITIES:
@@ -79,7 +79,7 @@ def report(config: Config, found: dict[str, Figures]) -> str:
             lines.append(f" {case:7}{estimator:10}" + "".join(f"{cell:>34}" for cell in cells))
     lines += ["", f"{'':18}   rms: position   attitude     NEES / dof   an update   bare   memory"]
     lines.append(f"{'':18}           (mm)      (deg)  pose   biases     p50 (ms)  loops    (MiB)")
-    for case, figures in found.items():
+    for case, figures in result.items():
         for estimator in ESTIMATORS:
             own = {k.removeprefix(f"{estimator}_"): v for k, v in figures.items()}
             lines.append(
@@ -117,13 +117,13 @@ def main() -> None:
     config = Config(hours=hours, worlds=given.worlds, cases=cases, seed=given.seed)
     with tempfile.TemporaryDirectory() as scratch:
         place = Path(scratch) if given.output is None else given.output
-        found = {
+        result = {
             case: run_case(config, case, place, given.cluster, given.workers, given.resume)
             for case in cases
         }
-    shown = {case: {k: v for k, v in own.items() if k != "notes"} for case, own in found.items()}
+    shown = {case: {k: v for k, v in own.items() if k != "notes"} for case, own in result.items()}
     conclude(
-        report(config, found), {"hours": config.hours, "worlds": config.worlds, "cases": shown}
+        report(config, result), {"hours": config.hours, "worlds": config.worlds, "cases": shown}
     )
 
 

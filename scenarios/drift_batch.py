@@ -50,18 +50,18 @@ class Row:
 def whole_log(config: Config, world: int) -> tuple[Log, Site]:
     """Return the log of a world with its truth, and the site that is declared."""
     task = WorldTask(world, "ekf", config.hours, config.seed, phase_known=config.phase_known)
-    drawn, made = draw_task(task), []
+    drawn, built = draw_task(task), []
     before = drawn.start()
     for stretch in range(task.stretches):
         part = drawn.stretch(stretch * STRETCH, STRETCH, before)
         before = part.after
-        made.append(part)
+        built.append(part)
     imu = ImuSamples(
-        np.concatenate([part.imu.time for part in made]),
-        np.concatenate([part.imu.gyro_body for part in made]),
-        np.concatenate([part.imu.accel_body for part in made]),
+        np.concatenate([part.imu.time for part in built]),
+        np.concatenate([part.imu.gyro_body for part in built]),
+        np.concatenate([part.imu.accel_body for part in built]),
     )
-    fields = FieldSamples.joined([part.fields for part in made])
+    fields = FieldSamples.joined([part.fields for part in built])
     truth = drawn.motion.trajectory(fields.time)
     return Log(f"world {world}", 0, "drift", imu, None, fields, truth), drawn.site
 
@@ -71,15 +71,15 @@ def run_world(config: Config, world: int) -> Row:
     log, site = whole_log(config, world)
     result = smooth(log, site)
     assert log.truth is not None
-    found = trajectory_errors(result.states, log.truth)
-    assert found.nees is not None
-    part = np.minimum((PARTS * found.time / found.time[-1]).astype(int), PARTS - 1)
+    estimate = trajectory_errors(result.states, log.truth)
+    assert estimate.nees is not None
+    part = np.minimum((PARTS * estimate.time / estimate.time[-1]).astype(int), PARTS - 1)
     return Row(
         world,
-        float(np.mean(found.nees)),
-        tuple(float(np.mean(found.nees[part == k])) for k in range(PARTS)),
-        found.ate,
-        found.attitude_rmse_deg,
+        float(np.mean(estimate.nees)),
+        tuple(float(np.mean(estimate.nees[part == k])) for k in range(PARTS)),
+        estimate.ate,
+        estimate.attitude_rmse_deg,
         result.converged,
     )
 

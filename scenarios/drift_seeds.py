@@ -62,14 +62,14 @@ def judge(task: Task, _rng: np.random.Generator) -> Row:
         workers=1,
     )
     with tempfile.TemporaryDirectory(prefix="drift_") as name:
-        found = run_drift(settings, Path(name) / "drift")
-    notes = found["notes"]
+        result = run_drift(settings, Path(name) / "drift")
+    notes = result["notes"]
     assert isinstance(notes, list)
     return Row(
         seed=task.seed,
         trap=task.trap,
-        stability=str(found["stability"]),
-        by_quantity={q.name: str(found[f"{q.name}_stability"]) for q in QUANTITIES},
+        stability=str(result["stability"]),
+        by_quantity={q.name: str(result[f"{q.name}_stability"]) for q in QUANTITIES},
         blamed=tuple(str(note) for note in notes if str(note).startswith("FAIL")),
     )
 

@@ -84,8 +84,8 @@ def wandering_log(config: Config, *, steady: bool) -> Log:
 
 def _current(beacon: Beacon, time: Array, phase: float, drift: float) -> Array:
     """Return the current through the first coil at its declared amplitude (A)."""
-    turned = 2.0 * np.pi * beacon.frequency_hz * (1.0 + drift) * time
-    return CURRENT * np.cos(turned + phase + beacon.coils[0].phase)
+    rotated = 2.0 * np.pi * beacon.frequency_hz * (1.0 + drift) * time
+    return CURRENT * np.cos(rotated + phase + beacon.coils[0].phase)
 
 
 def run(config: Config) -> list[Row]:

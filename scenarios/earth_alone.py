@@ -55,10 +55,10 @@ def errors(time: Array, attitude: Array, truth: Trajectory) -> tuple[float, floa
     return rms(head) / DEGREE, float(np.std(head)) / DEGREE, rms(tilt) / DEGREE
 
 
-def heading_nees(found: Oriented, truth: Trajectory) -> float:
+def heading_nees(result: Oriented, truth: Trajectory) -> float:
     """Return the mean squared error of the heading by its claimed variance, at the states."""
-    known, exists = interpolate(truth, found.ends, 0.1)
-    states = [s for s, there in zip(found.states, exists, strict=True) if there]
+    known, exists = interpolate(truth, result.ends, 0.1)
+    states = [s for s, there in zip(result.states, exists, strict=True) if there]
     attitude = np.stack([s.world_from_body for s in states])
     off = Rotation.from_matrix(attitude @ np.swapaxes(known.world_from_body, 1, 2)).as_rotvec()
     return float(np.mean(off[:, 2] ** 2 / np.array([s.cov[2, 2] for s in states])))
@@ -84,9 +84,9 @@ def rows_of(log: Log, site: Site) -> Iterator[Row]:
     """Yield the errors of both, online and offline."""
     assert log.truth is not None
     for way, back in (("online", False), ("offline", True)):
-        found = oriented(log, site, back=back)
-        own = errors(found.time, found.world_from_body, log.truth)
-        yield Row(log.name, way, *own, heading_nees(found, log.truth))
+        result = oriented(log, site, back=back)
+        own = errors(result.time, result.world_from_body, log.truth)
+        yield Row(log.name, way, *own, heading_nees(result, log.truth))
         yield Row(
             log.name, f"VQF {way}", *errors(log.imu.time, vqf(log, site, back=back), log.truth)
         )

@@ -44,7 +44,7 @@ from magfusion.units import Array
 
 REAL = Path(__file__).parents[2] / "shared" / "logs" / "turn_miscalibrated"
 PUBLISHED_DEG = (2.9, 5.0)
-SETTLED = 15.0  # s; the filter is judged from then on
+CONVERGED_STEP = 15.0  # s; the filter is judged from then on
 PIECE = 0.5  # s of data given to the filter at once
 ALL = ("magnetometer", "extrinsics", "time-offset", "earth")
 NONE = ("time-offset",)
@@ -107,8 +107,8 @@ def alone(log: Log, site: Site) -> Log:
 def calibrated(log: Log, site: Site) -> Site:
     """Return the site with the magnetometer that the log's own turning calibrates."""
     assert log.waveform is not None
-    found = calibrate_log(log.waveform, log.imu, site)
-    return replace(site, platform=replace(site.platform, magnetometer=found.magnetometer))
+    result = calibrate_log(log.waveform, log.imu, site)
+    return replace(site, platform=replace(site.platform, magnetometer=result.magnetometer))
 
 
 def navigated(log: Log, site: Site, estimate: tuple[str, ...]) -> Trajectory:
@@ -127,7 +127,7 @@ def navigated(log: Log, site: Site, estimate: tuple[str, ...]) -> Trajectory:
         navigator.add_fields(log.fields.rows(part), log.steady.rows(part))
         detected = stop
     states = as_trajectory(navigator.take())
-    return _rows(states, states.time > log.imu.time[0] + SETTLED)
+    return _rows(states, states.time > log.imu.time[0] + CONVERGED_STEP)
 
 
 def _rows(states: Trajectory, kept: Array) -> Trajectory:
@@ -143,8 +143,8 @@ def _rows(states: Trajectory, kept: Array) -> Trajectory:
 def row(name: str, magnetometer: str, estimator: str, states: Trajectory, truth: Trajectory) -> Row:
     """Compare the attitudes of a run with the truth."""
     errors = trajectory_errors(states, truth)
-    turned = Rotation.from_matrix(errors.world_from_body).apply(errors.attitude_body)
-    square = np.rad2deg(turned) ** 2
+    rotated = Rotation.from_matrix(errors.world_from_body).apply(errors.attitude_body)
+    square = np.rad2deg(rotated) ** 2
     assert errors.pose_cov is not None
     variance = np.trace(errors.pose_cov[:, :3, :3], axis1=1, axis2=2)
     return Row(

@@ -205,11 +205,11 @@ def _motion(kind: Kind, rng: np.random.Generator, time: Array) -> tuple[Rotation
         truth = turns[0] * Rotation.from_rotvec(kind.wobble * angle * 2.0 * np.pi * kind.hertz)
     push = _wave(rng, time, kind.hertz) / (2.0 * np.pi * kind.hertz) ** 2
     lever = 0.1 * rng.normal(size=3)
-    carried = kind.shaking * push * active
+    propagated = kind.shaking * push * active
     # A hand swings about an elbow or a shoulder: what is carried to a side turns with it.
     arm = rng.uniform(0.4, 0.8) * _some_way(rng)
-    truth = Rotation.from_rotvec(np.cross(arm, carried) / (arm @ arm)) * truth
-    place = carried + truth.apply(lever)
+    truth = Rotation.from_rotvec(np.cross(arm, propagated) / (arm @ arm)) * truth
+    place = propagated + truth.apply(lever)
     if kind.lifted:
         up = np.clip((time - kind.rest + 2.0) / 2.0, 0.0, 1.0)
         place[:, 2] += LIFTED * up**3 * (10.0 - 15.0 * up + 6.0 * up**2)
@@ -245,15 +245,15 @@ def _magnet_near(rng: np.random.Generator, place: Array) -> Array:
     centre = away + rng.uniform(0.1, 0.2) * _some_way(rng)
     if np.linalg.norm(centre) < np.linalg.norm(away):  # it begins far from it
         centre = 2.0 * away - centre
-    found = _dipole(place - centre, _some_way(rng))
-    return np.asarray(found * rng.uniform(1e-5, 4e-5) / np.max(np.linalg.norm(found, axis=1)))
+    result = _dipole(place - centre, _some_way(rng))
+    return np.asarray(result * rng.uniform(1e-5, 4e-5) / np.max(np.linalg.norm(result, axis=1)))
 
 
 def _table(rng: np.random.Generator, place: Array) -> Array:
     """Return what iron in a table adds: microteslas on it, little above it."""
     below = np.array([*rng.uniform(-0.15, 0.15, size=2), -rng.uniform(0.15, 0.35)])
-    found = _dipole(place - below, _some_way(rng))
-    return np.asarray(found * rng.uniform(1e-6, 3e-6) / np.linalg.norm(found[0]))
+    result = _dipole(place - below, _some_way(rng))
+    return np.asarray(result * rng.uniform(1e-6, 3e-6) / np.linalg.norm(result[0]))
 
 
 def _inertial(
@@ -283,11 +283,11 @@ def _field(
     world: Array,
     body: Array,
     share: float,
-    latest: float,
+    newest: float,
 ) -> Waveform:
     matrix = np.eye(3) + 0.02 * share * rng.normal(size=(3, 3))
     field = truth.inv().apply(world) @ matrix.T + body
-    late = rng.uniform(0.0, latest)
+    late = rng.uniform(0.0, newest)
     field = np.stack([np.interp(time - late, time, c) for c in field.T], axis=1)
     field += 4e-7 * rng.normal(size=field.shape)
     shown = np.arange(len(time))

@@ -44,7 +44,7 @@ from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.units import Array
 
-HELD = ("phase", "time-offset")  # what no survey gives
+HELD_CASES = ("phase", "time-offset")  # what no survey gives
 PIECE = 0.1  # s, fed at once
 FIRST = 8.0  # s; first instant of the batch up to now
 ONLINE: dict[Literal["smoother", "ekf"], str] = {"smoother": "fixed lag", "ekf": "filter"}
@@ -93,16 +93,16 @@ def pieces(log: Log) -> Iterator[tuple[ImuSamples, Waveform]]:
 def online(log: Log, site: Site, settings: NavigatorSettings) -> tuple[Trajectory, Trajectory]:
     """Return the states as they were when they were made, and those that left the window."""
     navigator = Navigator(site, settings)
-    made: list[State] = []
-    left: list[State] = []
+    built: list[State] = []
+    remaining: list[State] = []
     for imu, waveform in pieces(log):
         if len(imu):
             navigator.add_imu(imu.time, imu.gyro_body, imu.accel_body)
         if len(waveform):
             navigator.add_magnetometer(waveform.time, waveform.measured_sensor)
-        made += navigator.take()
-        left += navigator.take_lagged()
-    return as_trajectory(made), as_trajectory(left)
+        built += navigator.take()
+        remaining += navigator.take_lagged()
+    return as_trajectory(built), as_trajectory(remaining)
 
 
 def part_of(log: Log, begin: float, end: float) -> Log:
@@ -132,20 +132,20 @@ def batch_up_to_now(log: Log, site: Site, instants: Array) -> Trajectory:
     )
 
 
-def at(found: Trajectory, time: Array) -> Trajectory:
+def at(result: Trajectory, time: Array) -> Trajectory:
     """Return the states nearest to some times."""
-    rows = np.array([np.argmin(np.abs(found.time - t)) for t in time])
-    cov = None if found.pose_cov is None else found.pose_cov[rows]
+    rows = np.array([np.argmin(np.abs(result.time - t)) for t in time])
+    cov = None if result.pose_cov is None else result.pose_cov[rows]
     return Trajectory(
-        found.time[rows], found.world_from_body[rows], found.position_world[rows], pose_cov=cov
+        result.time[rows], result.world_from_body[rows], result.position_world[rows], pose_cov=cov
     )
 
 
-def row(log: Log, estimator: str, found: Trajectory) -> Row:
+def row(log: Log, estimator: str, result: Trajectory) -> Row:
     """Return the errors of a trajectory against the log's truth."""
     assert log.truth is not None
-    errors = trajectory_errors(found, log.truth)
-    middle = 0.5 * (found.time[0] + found.time[-1])
+    errors = trajectory_errors(result, log.truth)
+    middle = 0.5 * (result.time[0] + result.time[-1])
     return Row(
         log=log.name,
         estimator=estimator,
@@ -153,14 +153,16 @@ def row(log: Log, estimator: str, found: Trajectory) -> Row:
         attitude_deg=errors.attitude_rmse_deg,
         aligned_position_cm=100.0 * errors.aligned_ate,
         aligned_attitude_deg=errors.aligned_attitude_rmse_deg,
-        settled_position_cm=100.0 * _of_part(found, log, found.time >= middle).aligned_ate,
+        settled_position_cm=100.0 * _of_part(result, log, result.time >= middle).aligned_ate,
         nees=None if errors.nees is None else float(np.mean(errors.nees)),
     )
 
 
-def _of_part(found: Trajectory, log: Log, part: Array) -> TrajectoryErrors:
+def _of_part(result: Trajectory, log: Log, part: Array) -> TrajectoryErrors:
     assert log.truth is not None
-    chosen = Trajectory(found.time[part], found.world_from_body[part], found.position_world[part])
+    chosen = Trajectory(
+        result.time[part], result.world_from_body[part], result.position_world[part]
+    )
     return trajectory_errors(chosen, log.truth)
 
 
@@ -170,20 +172,20 @@ def compare(log: Log, site: Site, config: Config) -> Iterator[Row]:
     calibration = initial_calibration(site, float(np.mean(samples.time)))
     yield row(log, "fixes", first_fixes(samples, log, calibration).best())
     for coupling in ("tight", "loose"):
-        found = smooth(log, site, SmootherSettings(coupling=coupling))
-        yield row(log, f"batch, {coupling}", found.states)
-    held = smooth(log, site, SmootherSettings(estimate=HELD))
-    yield row(log, "batch, survey held", held.states)
+        result = smooth(log, site, SmootherSettings(coupling=coupling))
+        yield row(log, f"batch, {coupling}", result.states)
+    fixed = smooth(log, site, SmootherSettings(estimate=HELD_CASES))
+    yield row(log, "batch, survey held", fixed.states)
     instants = np.linspace(log.imu.time[0] + FIRST, log.imu.time[-1] - 1.0, config.instants)
     best = batch_up_to_now(log, site, instants)
     yield row(log, "batch up to now", best)
     for estimator, label in ONLINE.items():
-        for estimate, name in ((None, ""), (HELD, ", survey held")):
+        for estimate, name in ((None, ""), (HELD_CASES, ", survey held")):
             settings = NavigatorSettings(estimator=estimator, lag=config.lag, estimate=estimate)
-            now, left = online(log, site, settings)
+            now, remaining = online(log, site, settings)
             yield row(log, label + name, now)
-            if len(left):
-                yield row(log, f"{label}, lagged{name}", left)
+            if len(remaining):
+                yield row(log, f"{label}, lagged{name}", remaining)
             if estimate is None:
                 yield row(log, f"{label}, then", at(now, best.time))
     yield from calibrated(log, site, config)
@@ -197,10 +199,10 @@ def calibrated(log: Log, site: Site, config: Config) -> Iterator[Row]:
     rest = part_of(log, middle, np.inf)
     yield row(rest, "batch, calibrated", smooth(rest, known).states)
     for estimator, label in ONLINE.items():
-        now, left = online(rest, known, NavigatorSettings(estimator=estimator, lag=config.lag))
+        now, remaining = online(rest, known, NavigatorSettings(estimator=estimator, lag=config.lag))
         yield row(rest, f"{label}, calibrated", now)
-        if len(left):
-            yield row(rest, f"{label}, lagged, calibrated", left)
+        if len(remaining):
+            yield row(rest, f"{label}, lagged, calibrated", remaining)
 
 
 def inputs(config: Config) -> Iterator[tuple[Log, Site]]:

@@ -18,7 +18,7 @@ from harness import conclude, rms, scenario_parser
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.demodulation.demodulation import first_fixes
-from magfusion.estimation.rests.at_rest import AtRest, at_rest
+from magfusion.estimation.rests.stationary_integration import IntegratedRests, integrate_rests
 from magfusion.model.ground import in_ground
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import Log
@@ -95,7 +95,7 @@ def far_site(
     )
 
 
-def noise_log(site: Site, duration: float, seed: int, *, heard: bool = False) -> Log:
+def noise_log(site: Site, duration: float, seed: int, *, detected: bool = False) -> Log:
     """Return a log of a receiver at rest: of noise alone, or with the beacons.
 
     Parameters
@@ -112,15 +112,15 @@ def noise_log(site: Site, duration: float, seed: int, *, heard: bool = False) ->
         replace(b, coils=tuple(replace(c, moment_beacon=SILENT * c.moment_beacon) for c in b.coils))
         for b in site.beacons
     )
-    sending = site if heard else replace(site, beacons=silent)
+    active_beacons = site if detected else replace(site, beacons=silent)
     drives = draw_drives(site, rng)
     imu = simulate_imu(motion, site.platform.imu, site.gravity, IMU_RATE_HZ, duration, rng)
-    waveform = simulate_waveform(motion, sending, drives, RATE_HZ, duration, rng)
+    waveform = simulate_waveform(motion, active_beacons, drives, RATE_HZ, duration, rng)
     truth = motion.trajectory(imu.samples.time)
     return Log("far_and_weak", EPOCH_NS, "simulation", imu.samples, waveform, truth=truth)
 
 
-def witnessed_log(
+def monitored_log(
     site: Site,
     duration: float,
     seed: int,
@@ -140,7 +140,7 @@ def witnessed_log(
     late, rate : float
         Of its clock (s).
     """
-    turned = Rotation.random(random_state=seed).as_matrix()
+    rotated = Rotation.random(random_state=seed).as_matrix()
     config = SimulationConfig(
         box_world=np.array([[-20.0, -20.0, -10.0], [20.0, 20.0, 10.0]]),
         duration=duration,
@@ -149,25 +149,27 @@ def witnessed_log(
         magnetometer_rate_hz=RATE_HZ,
         perturb=False,
         ambient=Ambient(atmosphere=Atmosphere(storms, seed, duration, 0.5 * RATE_HZ)),
-        reference=Reference(place_world, turned, late, rate),
+        reference=Reference(place_world, rotated, late, rate),
     )
     known = replace(site, reference_world=place_world)
     return simulate_log(known, config, np.random.default_rng(seed))
 
 
-def true_phasors(rested: AtRest, made: SimulatedLog) -> ComplexArray:
+def true_phasors(rested: IntegratedRests, simulation: SimulatedLog) -> ComplexArray:
     """Return what was there at the middle of each rest, shape (n, channels, 3) (T)."""
-    truth, time = made.log.truth, rested.fields.time
+    truth, time = simulation.log.truth, rested.fields.time
     assert truth is not None
     pose = np.repeat(truth.world_from_body[:1], len(time), 0), truth.position_world[:1]
     there = Trajectory(time, pose[0], np.repeat(pose[1], len(time), 0))
     none = np.random.default_rng(0)
-    return simulate_fields(made.true_site, there, NOTHING, none, made.drives).phasor_sensor
+    return simulate_fields(
+        simulation.true_site, there, NOTHING, none, simulation.drives
+    ).phasor_sensor
 
 
-def errors_in_sigmas(rested: AtRest, made: SimulatedLog) -> Array:
+def errors_in_sigmas(rested: IntegratedRests, simulation: SimulatedLog) -> Array:
     """Return the square of each phasor's error in its sigmas, shape (n, channels); six are due."""
-    error = rested.fields.phasor_sensor - true_phasors(rested, made)
+    error = rested.fields.phasor_sensor - true_phasors(rested, simulation)
     solved = np.linalg.solve(rested.fields.phasor_cov, error[..., None])[..., 0]
     return np.asarray(np.real(np.sum(np.conj(error) * solved, axis=-1)))
 
@@ -190,7 +192,7 @@ class Hour:
 
     name: str
     below_noise_db: float  # a tone's mean power over that of a sample's noise, all axes
-    heard: float  # share of the tones
+    detected: float  # share of the tones
     times_bound: float  # rms error of a phasor
     nees: float  # of phasors; six are due
     position_m: float
@@ -202,7 +204,7 @@ class Silence:
     """How often noise is taken for a beacon."""
 
     name: str
-    asked: float
+    requested: float
     alarms: int
     tried: int
 
@@ -216,22 +218,22 @@ class Storm:
     best_gain: float  # that two instruments of the same noise allow
     error_gain: float  # of the rms error
     nees: float
-    said: str
+    findings: str
 
 
 def run_hour(name: str, density: float, config: Config, *, synchronised: bool) -> Hour:
     """Measure hours at rest."""
     site, square, nees = far_site(noise_density=density, synchronised=synchronised), [], []
-    heard, places, pose_nees, power = [], [], [], []
+    detected, places, pose_nees, power = [], [], [], []
     for seed in range(config.seed, config.seed + config.runs):
-        made = witnessed_log(site, config.hour, seed, FAR_AWAY, 0.0)
-        log = replace(made.log, reference=None)
-        rested = at_rest(log, site)
-        heard.append(rested.heard)
-        error = rested.fields.phasor_sensor - true_phasors(rested, made)
+        built = monitored_log(site, config.hour, seed, FAR_AWAY, 0.0)
+        log = replace(built.log, reference=None)
+        rested = integrate_rests(log, site)
+        detected.append(rested.detected)
+        error = rested.fields.phasor_sensor - true_phasors(rested, built)
         square.append(np.abs(error) ** 2 / 2.0)
-        nees.append(errors_in_sigmas(rested, made))
-        power.append(np.sum(np.abs(true_phasors(rested, made)) ** 2, axis=-1) / 2.0)
+        nees.append(errors_in_sigmas(rested, built))
+        power.append(np.sum(np.abs(true_phasors(rested, built)) ** 2, axis=-1) / 2.0)
         off, ratio = pose_error(rested, log, site)
         places.append(off)
         pose_nees.append(ratio)
@@ -240,7 +242,7 @@ def run_hour(name: str, density: float, config: Config, *, synchronised: bool) -
     return Hour(
         name,
         float(10.0 * np.log10(np.mean(power) / (3.0 * sigma**2))),
-        float(np.mean(heard)),
+        float(np.mean(detected)),
         float(np.sqrt(np.nanmean(square)) / bound),
         float(np.nanmean(nees)),
         rms(np.array(places)),
@@ -248,7 +250,7 @@ def run_hour(name: str, density: float, config: Config, *, synchronised: bool) -
     )
 
 
-def pose_error(rested: AtRest, log: Log, site: Site) -> tuple[float, float]:
+def pose_error(rested: IntegratedRests, log: Log, site: Site) -> tuple[float, float]:
     """Return the error of the position (m), and the NEES of the pose."""
     truth, time = log.truth, float(rested.fields.time[0])
     assert truth is not None
@@ -263,36 +265,38 @@ def pose_error(rested: AtRest, log: Log, site: Site) -> tuple[float, float]:
 
 def run_silence(config: Config, *, synchronised: bool) -> Silence:
     """Count false alarms in noise alone."""
-    site, asked, alarms, tried = far_site(synchronised=synchronised), 0.01, 0, 0
+    site, requested, alarms, tried = far_site(synchronised=synchronised), 0.01, 0, 0
     for seed in range(config.silent_runs):
-        rested = at_rest(noise_log(site, config.silence, seed), site, false_alarm=asked)
-        alarms, tried = alarms + int(np.sum(rested.heard)), tried + rested.heard.size
+        rested = integrate_rests(noise_log(site, config.silence, seed), site, false_alarm=requested)
+        alarms, tried = alarms + int(np.sum(rested.detected)), tried + rested.detected.size
     name = "on the log's clock" if synchronised else "clocks of their own"
-    return Silence(name, asked, alarms, tried)
+    return Silence(name, requested, alarms, tried)
 
 
 def run_storm(name: str, place_world: Array, config: Config, *, other: bool = False) -> Storm:
     """Measure what a second magnetometer takes off."""
-    site, gains, nees, square, said = far_site(), [], [], [], set[str]()
+    site, gains, nees, square, findings = far_site(), [], [], [], set[str]()
     for seed in range(config.seed, config.seed + config.runs):
         storm = (config.storm, seed, place_world, STORMS, LATE, RATE)
-        made = witnessed_log(site, *storm)
-        log = made.log
+        built = monitored_log(site, *storm)
+        log = built.log
         if other:
-            strange = witnessed_log(site, config.storm, seed + 1000, place_world, STORMS)
+            strange = monitored_log(site, config.storm, seed + 1000, place_world, STORMS)
             log = replace(log, reference=strange.log.reference)
-        found = at_rest(log, made.true_site)
-        alone = at_rest(replace(log, reference=None), made.true_site)
-        true = true_phasors(found, made)
-        square.append([np.mean(np.abs(r.fields.phasor_sensor - true) ** 2) for r in (alone, found)])
-        assert found.gain is not None
-        gains.append(np.where(np.isnan(found.gain), 1.0, found.gain))
-        nees.append(errors_in_sigmas(found, made))
-        said |= {finding.code for finding in found.findings}
+        result = integrate_rests(log, built.true_site)
+        alone = integrate_rests(replace(log, reference=None), built.true_site)
+        true = true_phasors(result, built)
+        square.append(
+            [np.mean(np.abs(r.fields.phasor_sensor - true) ** 2) for r in (alone, result)]
+        )
+        assert result.gain is not None
+        gains.append(np.where(np.isnan(result.gain), 1.0, result.gain))
+        nees.append(errors_in_sigmas(result, built))
+        findings |= {finding.code for finding in result.findings}
     density = np.hypot(STORMS / np.sqrt(np.array(FREQUENCIES_HZ)), NOISE_DENSITY)
     best = float(np.median(density / (np.sqrt(2.0) * NOISE_DENSITY)))
     total = np.sqrt(np.mean(square, axis=0))
-    codes = ", ".join(sorted(said))
+    codes = ", ".join(sorted(findings))
     gain = float(np.median(gains))
     return Storm(name, gain, best, float(total[0] / total[1]), float(np.mean(nees)), codes)
 
@@ -303,16 +307,18 @@ def report(hours: list[Hour], silences: list[Silence], storms: list[Storm]) -> s
         "an hour                  tone/noise  heard  error/bound  NEES (6)  position  NEES (6)"
     ]
     for one in hours:
-        heard = f"{one.below_noise_db:8.1f} dB{100.0 * one.heard:6.0f} %{one.times_bound:13.3f}"
+        detected = (
+            f"{one.below_noise_db:8.1f} dB{100.0 * one.detected:6.0f} %{one.times_bound:13.3f}"
+        )
         pose = f"{one.nees:10.2f}{one.position_m:8.2f} m{one.pose_nees:10.2f}"
-        lines.append(f"{one.name:24}{heard}{pose}")
+        lines.append(f"{one.name:24}{detected}{pose}")
     for alone in silences:
         share = f"{alone.alarms} of {alone.tried}"
-        lines.append(f"noise alone, {alone.name}: {share} heard, {alone.asked:g} asked")
+        lines.append(f"noise alone, {alone.name}: {share} heard, {alone.requested:g} asked")
     lines.append("second magnetometer      gain of sigma  at best  gain of error  NEES (6)")
     for storm in storms:
         gain = f"{storm.gain:13.2f}{storm.best_gain:9.2f}{storm.error_gain:15.2f}"
-        lines.append(f"{storm.name:25}{gain}{storm.nees:10.2f}  {storm.said}")
+        lines.append(f"{storm.name:25}{gain}{storm.nees:10.2f}  {storm.findings}")
     return "\n".join(lines)
 
 
@@ -328,14 +334,14 @@ def main() -> None:
         run_hour("30 pT/rtHz, own clocks", 3e-11, config, synchronised=False),
     ]
     silences = [run_silence(config, synchronised=one) for one in (True, False)]
-    beside = far_site().beacons[0].position_world + np.array([60.0, 0.0, 0.0])
+    others = far_site().beacons[0].position_world + np.array([60.0, 0.0, 0.0])
     storms = [
         run_storm("5 km away", FAR_AWAY, config),
         run_storm("hears other storms", FAR_AWAY, config, other=True),
-        run_storm("60 m from beacon A", beside, config),
+        run_storm("60 m from beacon A", others, config),
     ]
-    found = {"hours": hours, "silences": silences, "storms": storms}
-    conclude(report(hours, silences, storms), found)
+    result = {"hours": hours, "silences": silences, "storms": storms}
+    conclude(report(hours, silences, storms), result)
 
 
 if __name__ == "__main__":

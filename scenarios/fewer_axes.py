@@ -21,7 +21,7 @@ from harness import conclude, rms, scenario_parser
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.demodulation.demodulation import demodulated
 from magfusion.estimation.graph.state import as_trajectory
-from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.integrity.judge import judge_result
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.jobs.fix_coil import find_coil
@@ -37,7 +37,7 @@ from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.units import DEGREE
 
 SETS = ("xyz", "xy", "z")
-EXPECTED, MOST = {"fix": 5.0}, 1.5  # numbers of a pose, six but of a coil alone; times these
+EXPECTED, MAX_COUNT = {"fix": 5.0}, 1.5  # numbers of a pose, six but of a coil alone; times these
 INSIDE = 0.9
 ROLL = 5.0  # deg
 
@@ -81,7 +81,7 @@ def with_axes(log: Log, site: Site, axes: str) -> tuple[Log, Site]:
 
 def smoothed(log: Log, site: Site) -> tuple[Trajectory, Trust]:
     """Smooth a log."""
-    result, trust = judged(smooth(log, site, SmootherSettings()), log)
+    result, trust = judge_result(smooth(log, site, SmootherSettings()), log)
     return result.states, trust
 
 
@@ -99,18 +99,18 @@ def row_of(
     seed: int, axes: str, estimator: str, states: Trajectory, trust: Trust, truth: Trajectory
 ) -> Row:
     """Compare states with the truth."""
-    found = trajectory_errors(states, truth)
-    assert found.nees is not None
+    result = trajectory_errors(states, truth)
+    assert result.nees is not None
     assert states.pose_cov is not None
     widest = np.sqrt(np.linalg.eigvalsh(states.pose_cov[:, :3, :3])[:, -1])
     return Row(
         seed,
         axes,
         estimator,
-        1e3 * rms(np.linalg.norm(found.position_world, axis=1)),
-        rms(found.attitude) / DEGREE,
-        float(np.mean(found.nees)),
-        float(found.inside_3_sigma or 0.0),
+        1e3 * rms(np.linalg.norm(result.position_world, axis=1)),
+        rms(result.attitude) / DEGREE,
+        float(np.mean(result.nees)),
+        float(result.inside_3_sigma or 0.0),
         float(np.median(widest)) / DEGREE,
         str(trust.verdict),
         tuple(finding.code for finding in trust.findings),
@@ -145,7 +145,7 @@ def faults_of(rows: list[Row]) -> list[str]:
         nees, inside = (float(np.mean([getattr(r, k) for r in own])) for k in ("nees", "inside"))
         where = f"{axes} by {estimator}"
         expected = EXPECTED.get(estimator, 6.0)
-        if nees > MOST * expected:
+        if nees > MAX_COUNT * expected:
             faults.append(f"{where}: mean NEES {nees:.2f} of {expected:g}")
         if inside < INSIDE:
             faults.append(f"{where}: {inside:.0%} within three sigma")

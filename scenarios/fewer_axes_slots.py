@@ -12,7 +12,7 @@ at most 9 where 6 are expected, nine in ten epochs are within three sigma, and n
 from dataclasses import dataclass, replace
 
 import numpy as np
-from fewer_axes import INSIDE, MOST, Row, filtered, row_of, smoothed, with_axes
+from fewer_axes import INSIDE, MAX_COUNT, Row, filtered, row_of, smoothed, with_axes
 from harness import conclude, scenario_parser
 from scipy.spatial.transform import Rotation
 
@@ -31,7 +31,7 @@ from magfusion.units import DEGREE
 CARRIER_HZ, RATE_HZ = 1000.0, 5000.0
 SLOT = 4e-3  # s
 NO_STATE = "no state"
-LONE_BOX_WORLD = np.array([[0.35, -0.25, -0.25], [0.75, 0.25, 0.25]])
+SINGLE_BOX_WORLD = np.array([[0.35, -0.25, -0.25], [0.75, 0.25, 0.25]])
 ROOM = {"A": (0.0, 0.0, 0.5), "B": (6.0, 0.5, 1.5), "C": (2.5, 5.0, 1.0)}
 SETS = {"lone": ("xyz", "xy"), "room": ("xyz", "xy", "z")}
 
@@ -50,7 +50,7 @@ def world(name: str) -> tuple[Site, np.ndarray]:
     if name == "lone":
         beacons = (source("T", (0.0, 0.0, 0.0), 0.5, 0),)
         box, region = (
-            LONE_BOX_WORLD,
+            SINGLE_BOX_WORLD,
             Region(half_space=HalfSpace(np.array([1.0, 0.0, 0.0]), np.zeros(3))),
         )
     else:
@@ -108,7 +108,7 @@ def faults_of(rows: list[SlotRow]) -> list[str]:
         own = [row for row in rows if (row.world, row.axes, row.estimator) == key]
         nees, inside = (float(np.mean([getattr(r, k) for r in own])) for k in ("nees", "inside"))
         where = " ".join(key)
-        if nees > 6.0 * MOST:
+        if nees > 6.0 * MAX_COUNT:
             faults.append(f"{where}: mean NEES {nees:.2f} of 6")
         if inside < INSIDE:
             faults.append(f"{where}: {inside:.0%} within three sigma")
@@ -135,8 +135,8 @@ def main() -> None:
     ]
     for row in rows:
         errors = f"{row.position_mm:9.2f} mm{row.attitude_deg:8.3f} deg{row.nees:8.2f}"
-        told = f"{row.verdict} {','.join(row.codes)}"
-        lines.append(f"{row.world:6}{row.axes:5}{row.seed:5} {row.estimator:9}{errors}  {told}")
+        reported = f"{row.verdict} {','.join(row.codes)}"
+        lines.append(f"{row.world:6}{row.axes:5}{row.seed:5} {row.estimator:9}{errors}  {reported}")
     conclude("\n".join([*lines, *faults, "FAIL" if faults else "pass"]), rows)
     if faults:
         raise SystemExit(1)

@@ -94,8 +94,8 @@ def rms(value: Array) -> float:
     return float(np.sqrt(np.mean(np.square(value))))
 
 
-def between_deg(found: Array, true: Array) -> Array:
+def between_deg(result: Array, true: Array) -> Array:
     """Return the angle of the rotation between matrices (..., 3, 3) (deg)."""
-    turn = np.swapaxes(true, -1, -2) @ found
+    turn = np.swapaxes(true, -1, -2) @ result
     angle = Rotation.from_matrix(turn.reshape(-1, 3, 3)).magnitude() / DEGREE
     return angle.reshape(turn.shape[:-2])

@@ -78,7 +78,7 @@ class Epochs:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class CaseOutcome:
     """What came of some epochs, each of shape (n,).
 
     Parameters
@@ -142,7 +142,7 @@ def draw(config: Config, count: int, rng: np.random.Generator) -> Epochs:
     return Epochs(known, truth, share)
 
 
-def solve(config: Config, epochs: Epochs) -> Outcome:
+def solve(config: Config, epochs: Epochs) -> CaseOutcome:
     """Solve epochs in closed form, at their true poses."""
     site, risk, truth = room(config), Risk(), epochs.truth
     parts = []
@@ -152,7 +152,7 @@ def solve(config: Config, epochs: Epochs) -> Outcome:
         gravity=None,
         prior=None,
         survey_error=False,
-        free=(),
+        free_parameters=(),
         gain_sigma=GAIN_SIGMA,
     )
     names = [beacon.name for beacon in site.beacons]
@@ -163,72 +163,72 @@ def solve(config: Config, epochs: Epochs) -> Outcome:
         first = rows.stop
         state = chunk.problem.start(truth.world_from_body[rows], truth.position_world[rows])
         jacobian, error, covariance = rows_at(chunk.problem, state)
-        found = linear_separation(jacobian, error, covariance, owner, len(names))
+        result = linear_separation(jacobian, error, covariance, owner, len(names))
         back = np.swapaxes(jacobian, 1, 2)
         inverse, _ = open_inverse(back @ jacobian)
         step = (inverse @ (back @ error[..., None]))[..., 0]
-        position_m, degrees = protection_levels(found, risk)
+        position_m, degrees = protection_levels(result, risk)
         wrong_m = np.linalg.norm(step[:, 3:6], axis=1)
-        turned = np.linalg.norm(step[:, :3], axis=1) / DEGREE
+        rotated = np.linalg.norm(step[:, :3], axis=1) / DEGREE
         parts.append(
-            Outcome(
+            CaseOutcome(
                 faulted=epochs.share[rows] != 0.0,
-                alarm=np.any(found.excess(risk) > 1.0, axis=1),
-                beyond=(wrong_m > position_m) | (turned > degrees),
-                ratio=position_m / (3.0 * found.sigma.whole[:, 1]),
+                alarm=np.any(result.excess(risk) > 1.0, axis=1),
+                beyond=(wrong_m > position_m) | (rotated > degrees),
+                ratio=position_m / (3.0 * result.sigma.whole[:, 1]),
                 error_m=wrong_m,
             )
         )
     return joined(parts)
 
 
-def fix(config: Config, epochs: Epochs) -> Outcome:
+def fix(config: Config, epochs: Epochs) -> CaseOutcome:
     """Fix epochs as ``magfusion fix`` does, without a false beacon where one is found."""
     site, truth = room(config), epochs.truth
     calibration = initial_calibration(site, 0.0)
     fixes = fix_epochs(epochs.samples, calibration, survey_error=False)
     sigma = np.sqrt(np.trace(fixes.pose_cov[:, 0, 3:, 3:], axis1=1, axis2=2))
-    found = separate_fixes(epochs.samples, calibration, fixes, survey_error=False)
-    best, level = found.fixes.best(), found.states.protection_level_m
+    result = separate_fixes(epochs.samples, calibration, fixes, survey_error=False)
+    best, level = result.fixes.best(), result.states.protection_level_m
     wrong_m = np.linalg.norm(best.position_world - truth.position_world, axis=1)
     turn = np.swapaxes(truth.world_from_body, 1, 2) @ best.world_from_body
-    turned = Rotation.from_matrix(turn).magnitude() / DEGREE
-    return Outcome(
+    rotated = Rotation.from_matrix(turn).magnitude() / DEGREE
+    return CaseOutcome(
         faulted=epochs.share != 0.0,
-        alarm=np.any(found.excess > 1.0, axis=1),
-        beyond=(wrong_m > level) | (turned > found.states.protection_level_deg),
-        ratio=np.where(np.any(found.excess > 1.0, axis=1), np.nan, level / (3.0 * sigma)),
+        alarm=np.any(result.excess > 1.0, axis=1),
+        beyond=(wrong_m > level) | (rotated > result.states.protection_level_deg),
+        ratio=np.where(np.any(result.excess > 1.0, axis=1), np.nan, level / (3.0 * sigma)),
         error_m=wrong_m,
     )
 
 
-def joined(parts: Sequence[Outcome]) -> Outcome:
+def joined(parts: Sequence[CaseOutcome]) -> CaseOutcome:
     """Return outcomes as one."""
-    return Outcome(
-        *(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Outcome))
+    return CaseOutcome(
+        *(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(CaseOutcome))
     )
 
 
-def try_block(config: Config, rng: np.random.Generator) -> Outcome:
+def try_block(config: Config, rng: np.random.Generator) -> CaseOutcome:
     """Return what came of a block of epochs."""
     epochs = draw(config, min(config.epochs, BLOCK), rng)
     return fix(config, epochs) if config.full else solve(config, epochs)
 
 
-def run(config: Config, scale: Scale | None = None) -> Outcome:
+def run(config: Config, scale: Scale | None = None) -> CaseOutcome:
     """Return what came of all epochs."""
     blocks = max(1, config.epochs // BLOCK)
     return joined(run_many(try_block, [config] * blocks, seed=config.seed, **(scale or {})))
 
 
-def figures(outcome: Outcome, config: Config, risk: Risk | None = None) -> Figures:
+def figures(outcomes: CaseOutcome, config: Config, risk: Risk | None = None) -> Figures:
     """Return what is asked of all epochs."""
     risk = Risk() if risk is None else risk
-    faulted, clean = outcome.faulted, ~outcome.faulted
-    unseen = int(np.sum(outcome.beyond & ~outcome.alarm & faulted))
-    alarms = int(np.sum(outcome.alarm & clean))
+    faulted, clean = outcomes.faulted, ~outcomes.faulted
+    unseen = int(np.sum(outcomes.beyond & ~outcomes.alarm & faulted))
+    alarms = int(np.sum(outcomes.alarm & clean))
     limit = upper_limit(unseen, int(np.sum(faulted)))
-    known = np.isfinite(outcome.ratio)
+    known = np.isfinite(outcomes.ratio)
     return Figures(
         epochs=len(faulted),
         faulted=int(np.sum(faulted)),
@@ -237,8 +237,8 @@ def figures(outcome: Outcome, config: Config, risk: Risk | None = None) -> Figur
         hazard_limit=limit * config.beacons * risk.fault,
         false_alarm_rate=alarms / int(np.sum(clean)),
         false_alarm_limit=upper_limit(alarms, int(np.sum(clean))),
-        detected=float(np.mean(outcome.alarm[faulted])),
-        median_ratio=float(np.median(outcome.ratio[known & clean])),
+        detected=float(np.mean(outcomes.alarm[faulted])),
+        median_ratio=float(np.median(outcomes.ratio[known & clean])),
         finite=float(np.mean(known[clean])),
     )
 
@@ -248,18 +248,18 @@ def upper_limit(count: int, of: int) -> float:
     return float(beta.ppf(CONFIDENCE, count + 1, of - count)) if count < of else 1.0
 
 
-def report(found: Figures) -> str:
+def report(result: Figures) -> str:
     """Return what a reader sees."""
     return "\n".join(
         (
-            f"{found.epochs} epochs, {found.faulted} of them with a false beacon;"
-            f" {found.detected:.1%} of these are noticed",
-            f"  beyond the level, unseen       {found.unseen}: at most {found.unseen_limit:.2g} of"
-            f" the faulty, {found.hazard_limit:.2g} an epoch",
-            f"  alarms without a fault         {found.false_alarm_rate:.2g} of the epochs, at most"
-            f" {found.false_alarm_limit:.2g}",
-            f"  level over the 3-sigma radius  {found.median_ratio:.2f} (median), finite in"
-            f" {found.finite:.2%}",
+            f"{result.epochs} epochs, {result.faulted} of them with a false beacon;"
+            f" {result.detected:.1%} of these are noticed",
+            f"  beyond the level, unseen       {result.unseen}: at most {result.unseen_limit:.2g} of"
+            f" the faulty, {result.hazard_limit:.2g} an epoch",
+            f"  alarms without a fault         {result.false_alarm_rate:.2g} of the epochs, at most"
+            f" {result.false_alarm_limit:.2g}",
+            f"  level over the 3-sigma radius  {result.median_ratio:.2f} (median), finite in"
+            f" {result.finite:.2%}",
         )
     )
 
@@ -273,8 +273,8 @@ def main() -> None:
     given = parser.parse_args()
     count = 20_000 if given.quick else Config.epochs
     config = Config(epochs=count // 10 if given.full else count, full=given.full, seed=given.seed)
-    found = figures(run(config, chosen_scale(given)), config)
-    conclude(report(found), found._asdict())
+    result = figures(run(config, chosen_scale(given)), config)
+    conclude(report(result), result._asdict())
 
 
 if __name__ == "__main__":

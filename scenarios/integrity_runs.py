@@ -32,15 +32,15 @@ from magfusion.simulation.demo_site import DEMO_BOX_WORLD
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.log import EPOCH_NS, simulate_fields
 from magfusion.simulation.monte_carlo import run_many
-from magfusion.simulation.motion import Motion, random_walk_motion
+from magfusion.simulation.motion import SimulatedMotion, random_walk_motion
 from magfusion.units import DEGREE, Array, ComplexArray
 
 IMU_RATE_HZ = 100.0
 STEP = 0.2  # s between epochs
-EARLIEST, LATEST = 10.0, 20.0  # s, of a fault's begin
+EARLIEST, MAX_DELAY_S = 10.0, 20.0  # s, of a fault's begin
 LONGEST_RAMP = 10.0  # s
 IN_TIME = 2.0  # s, of an alarm after the level is left
-SETTLED = 1.0  # s after the first state, before which there is no level yet
+CONVERGED_STEP = 1.0  # s after the first state, before which there is no level yet
 MODES = 20  # of the field's error in space
 WAVELENGTH = 1.0  # m, of the shortest of them
 
@@ -57,7 +57,7 @@ class Config:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class OnlineOutcome:
     """What came of one run.
 
     Parameters
@@ -120,7 +120,9 @@ def error_in_space(
     return sigma * np.sqrt(2.0 / MODES) * np.sum(np.cos(turn), axis=2)
 
 
-def simulated(config: Config, rng: np.random.Generator) -> tuple[Log, Motion, float, float, float]:
+def simulated(
+    config: Config, rng: np.random.Generator
+) -> tuple[Log, SimulatedMotion, float, float, float]:
     """Return a log, its motion, and when, by how much and how slowly a beacon becomes false."""
     of_room = Room()
     site = room(of_room)
@@ -136,7 +138,7 @@ def simulated(config: Config, rng: np.random.Generator) -> tuple[Log, Motion, fl
     wrong = error_in_space(truth.position_world, 6 * channels, of_room.model_error, rng)
     parts = wrong.reshape(len(truth.time), channels, 3, 2)
     phasor = phasor + size * (parts[..., 0] + 1j * parts[..., 1])
-    began = rng.uniform(EARLIEST, LATEST)
+    began = rng.uniform(EARLIEST, MAX_DELAY_S)
     ramp = 0.0 if rng.random() < 0.5 else rng.uniform(0.0, LONGEST_RAMP)
     share = rng.uniform(-config.largest, config.largest)
     name = site.beacons[int(rng.integers(0, len(site.beacons)))].name
@@ -160,14 +162,14 @@ def navigated(config: Config, log: Log) -> list[JudgedState]:
     settings = NavigatorSettings(estimator=config.estimator, risk=Risk())
     navigator = Navigator(room(Room()), settings)
     replay = Replay(log)
-    made = []
+    built = []
     for k in range(len(replay)):
         feed(navigator, replay.piece(k))
-        made += navigator.take()
-    return made
+        built += navigator.take()
+    return built
 
 
-def try_run(config: Config, rng: np.random.Generator) -> Outcome:
+def try_run(config: Config, rng: np.random.Generator) -> OnlineOutcome:
     """Return what came of one run."""
     log, motion, began, share, ramp = simulated(config, rng)
     states = navigated(config, log)
@@ -179,7 +181,7 @@ def try_run(config: Config, rng: np.random.Generator) -> Outcome:
             for state, place in zip(states, true.position_world, strict=True)
         ]
     )
-    turned = np.array(
+    rotated = np.array(
         [
             np.arccos(np.clip((np.trace(state.world_from_body.T @ pose) - 1.0) / 2.0, -1.0, 1.0))
             for state, pose in zip(states, true.world_from_body, strict=True)
@@ -190,9 +192,9 @@ def try_run(config: Config, rng: np.random.Generator) -> Outcome:
     level_m = np.array([np.inf if m is None else m for m, _ in levels])
     level_deg = np.array([np.inf if d is None else d for _, d in levels])
     alarm = np.array([state.verdict is not Verdict.TRUSTWORTHY for state in states])
-    lost = np.array([state.lost for state in states])
-    beyond = (error_m > level_m) | (turned / DEGREE > level_deg)
-    before = (time < began) & (time > time[0] + SETTLED)
+    lost_epochs = np.array([state.is_lost for state in states])
+    beyond = (error_m > level_m) | (rotated / DEGREE > level_deg)
+    before = (time < began) & (time > time[0] + CONVERGED_STEP)
     unseen = 0
     for t in time[beyond & (time >= began)]:
         unseen += not np.any(alarm[(time >= t) & (time <= t + IN_TIME)])
@@ -200,7 +202,7 @@ def try_run(config: Config, rng: np.random.Generator) -> Outcome:
     radius = np.array([3.0 * np.sqrt(np.trace(s.cov[POSITION, POSITION])) for s in states])
     onsets = int(np.sum(np.diff(alarm[before].astype(int), prepend=0) == 1))
     usual = before & known
-    return Outcome(
+    return OnlineOutcome(
         share=share,
         ramp=ramp,
         clean=int(np.sum(before)),
@@ -209,41 +211,41 @@ def try_run(config: Config, rng: np.random.Generator) -> Outcome:
         detected=float(first[0] - began) if len(first) else None,
         ratio=float(np.median(level_m[usual] / radius[usual])) if np.any(usual) else np.nan,
         known=int(np.sum(usual)),
-        error_m=float(np.max(error_m[(time >= began) & ~lost], initial=0.0)),
+        error_m=float(np.max(error_m[(time >= began) & ~lost_epochs], initial=0.0)),
         error_before_m=float(np.max(error_m[before], initial=0.0)),
     )
 
 
-def run(config: Config, scale: Scale | None = None) -> list[Outcome]:
+def run(config: Config, scale: Scale | None = None) -> list[OnlineOutcome]:
     """Return what came of all runs."""
     return run_many(try_run, [config] * config.runs, seed=config.seed, **(scale or {}))
 
 
-def figures(found: Sequence[Outcome], risk: Risk | None = None) -> Figures:
+def figures(result: Sequence[OnlineOutcome], risk: Risk | None = None) -> Figures:
     """Return what is asked of all runs."""
     risk = Risk() if risk is None else risk
-    missed = sum(one.unseen > 0 for one in found)
-    clean, onsets = sum(one.clean for one in found), sum(one.onsets for one in found)
-    limit = upper_limit(missed, len(found))
+    missed = sum(one.unseen > 0 for one in result)
+    clean, onsets = sum(one.clean for one in result), sum(one.onsets for one in result)
+    limit = upper_limit(missed, len(result))
     return Figures(
-        runs=len(found),
+        runs=len(result),
         unseen_runs=missed,
         unseen_limit=limit,
         hazard_limit=limit * Room().beacons * risk.fault,
         clean_epochs=clean,
         false_alarms=onsets,
         false_alarm_limit=upper_limit(onsets, clean),
-        detected=float(np.mean([one.detected is not None for one in found])),
-        median_ratio=float(np.nanmedian([one.ratio for one in found])),
-        finite=sum(one.known for one in found) / clean,
+        detected=float(np.mean([one.detected is not None for one in result])),
+        median_ratio=float(np.nanmedian([one.ratio for one in result])),
+        finite=sum(one.known for one in result) / clean,
     )
 
 
-def report(found: Sequence[Outcome]) -> str:
+def report(result: Sequence[OnlineOutcome]) -> str:
     """Return what a reader sees."""
-    sums = figures(found)
-    worst = max(found, key=lambda one: one.unseen)
-    delays = [one.detected for one in found if one.detected is not None]
+    sums = figures(result)
+    worst = max(result, key=lambda one: one.unseen)
+    delays = [one.detected for one in result if one.detected is not None]
     lines = [
         f"{sums.runs} runs with a false beacon; {sums.detected:.0%} noticed, after"
         f" {np.median(delays) if delays else np.nan:.1f} s (median)",
@@ -253,8 +255,8 @@ def report(found: Sequence[Outcome]) -> str:
         f" most {sums.false_alarm_limit:.2g}",
         f"  level over the 3-sigma radius  {sums.median_ratio:.2f} (median), known in"
         f" {sums.finite:.2%}",
-        f"  largest error not lost         {1e3 * max(one.error_m for one in found):.3g} mm with a"
-        f" fault, {1e3 * max(one.error_before_m for one in found):.3g} mm without",
+        f"  largest error not lost         {1e3 * max(one.error_m for one in result):.3g} mm with a"
+        f" fault, {1e3 * max(one.error_before_m for one in result):.3g} mm without",
     ]
     if worst.unseen:
         lines.append(
@@ -277,8 +279,8 @@ def main() -> None:
         estimator=given.estimator,
         seed=given.seed,
     )
-    found = run(config, chosen_scale(given))
-    conclude(report(found), figures(found)._asdict())
+    result = run(config, chosen_scale(given))
+    conclude(report(result), figures(result)._asdict())
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ class Config:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SmoothOutcome:
     """What came of one walk.
 
     Parameters
@@ -83,7 +83,7 @@ class Figures(NamedTuple):
     doubtful_without_fault: int
 
 
-def try_walk(config: Config, rng: np.random.Generator) -> Outcome:
+def try_walk(config: Config, rng: np.random.Generator) -> SmoothOutcome:
     """Return what came of one walk."""
     walk, state = Walk(largest=config.largest), rng.bit_generator.state
     log, motion, _, share, ramp = simulated(walk, rng)
@@ -94,7 +94,7 @@ def try_walk(config: Config, rng: np.random.Generator) -> Outcome:
     faulty, verdict = _smoothed(log, truth)
     clean, clean_verdict = _smoothed(good, truth)
     plain = smooth(good, room(Room()), SmootherSettings(loss=None))
-    return Outcome(
+    return SmoothOutcome(
         share=share,
         ramp=ramp,
         error_m=np.nan if faulty is None else faulty.ate,
@@ -115,33 +115,33 @@ def _smoothed(log: Log, truth: Trajectory) -> tuple[TrajectoryErrors | None, str
     return trajectory_errors(done.result.states, truth), str(done.trust.verdict)
 
 
-def run(config: Config, scale: Scale | None = None) -> list[Outcome]:
+def run(config: Config, scale: Scale | None = None) -> list[SmoothOutcome]:
     """Return what came of all walks."""
     return run_many(try_walk, [config] * config.runs, seed=config.seed, **(scale or {}))
 
 
-def figures(found: Sequence[Outcome]) -> Figures:
+def figures(result: Sequence[SmoothOutcome]) -> Figures:
     """Return what is asked of all walks."""
-    trusted = [one for one in found if one.verdict == Verdict.TRUSTWORTHY]
+    trusted = [one for one in result if one.verdict == Verdict.TRUSTWORTHY]
     ratios = [one.ratio for one in trusted]
     return Figures(
-        runs=len(found),
+        runs=len(result),
         ratio_trusted=float(np.median(ratios)) if ratios else np.nan,
         ratio_worst_trusted=max(ratios, default=np.nan),
         beyond_trusted=sum(ratio > 1.5 for ratio in ratios),
         silent=sum(one.nees > 20.0 for one in trusted),
-        cost_of_robustness=_rms(found, "fault_free_m") / _rms(found, "plain_m") - 1.0,
-        doubtful_without_fault=sum(o.fault_free_verdict != Verdict.TRUSTWORTHY for o in found),
+        cost_of_robustness=_rms(result, "fault_free_m") / _rms(result, "plain_m") - 1.0,
+        doubtful_without_fault=sum(o.fault_free_verdict != Verdict.TRUSTWORTHY for o in result),
     )
 
 
-def _rms(found: Sequence[Outcome], name: str) -> float:
-    return float(np.sqrt(np.nanmean([getattr(one, name) ** 2 for one in found])))
+def _rms(result: Sequence[SmoothOutcome], name: str) -> float:
+    return float(np.sqrt(np.nanmean([getattr(one, name) ** 2 for one in result])))
 
 
-def report(found: Sequence[Outcome]) -> str:
+def report(result: Sequence[SmoothOutcome]) -> str:
     """Return what a reader sees."""
-    sums = figures(found)
+    sums = figures(result)
     lines = [
         f"{'false by':>9}{'ramp s':>8}{'error mm':>10}{'without':>9}{'plain':>8}{'NEES':>7}"
         "  verdict"
@@ -149,9 +149,9 @@ def report(found: Sequence[Outcome]) -> str:
     lines += [
         f"{one.share:9.1%}{one.ramp:8.1f}{1e3 * one.error_m:10.2f}{1e3 * one.fault_free_m:9.2f}"
         f"{1e3 * one.plain_m:8.2f}{one.nees:7.1f}  {one.verdict}"
-        for one in found
+        for one in result
     ]
-    trusted = sum(one.verdict == Verdict.TRUSTWORTHY for one in found)
+    trusted = sum(one.verdict == Verdict.TRUSTWORTHY for one in result)
     return "\n".join(
         (
             *lines,
@@ -171,8 +171,8 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=Config.runs)
     given = parser.parse_args()
     config = Config(runs=4 if given.quick else given.runs, seed=given.seed)
-    found = run(config, chosen_scale(given))
-    conclude(report(found), figures(found)._asdict())
+    result = run(config, chosen_scale(given))
+    conclude(report(result), figures(result)._asdict())
 
 
 if __name__ == "__main__":

@@ -22,7 +22,11 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.ellipsoid import fit_ellipsoid, fit_ellipsoid_gravity
 from magfusion.calibration.magnetometer import MagnetometerFit, field_from_measured, from_paper
-from magfusion.calibration.magnetometer_graph import Epochs, Prior, fit_graph
+from magfusion.calibration.magnetometer_graph import (
+    MagnetometerEpochs,
+    MagnetometerPrior,
+    fit_graph,
+)
 from magfusion.papers.p001_magnetometer.twelve_positions import (
     closed_form,
     least_squares,
@@ -88,9 +92,9 @@ def angle_deg(sensors: Sensors, fit: MagnetometerFit) -> float:
     """Return the RMS angle (deg) between true and calibrated field, over sphere and sensors."""
     true = sphere()
     measured = true @ np.swapaxes(sensors.matrix, 1, 2) + sensors.offset[:, None]
-    found = field_from_measured(measured, fit.matrix, fit.offset)
-    sine = np.linalg.norm(np.cross(found, true), axis=-1)
-    angle = np.arctan2(sine, np.sum(found * true, axis=-1))
+    result = field_from_measured(measured, fit.matrix, fit.offset)
+    sine = np.linalg.norm(np.cross(result, true), axis=-1)
+    angle = np.arctan2(sine, np.sum(result * true, axis=-1))
     return float(np.sqrt(np.mean(angle**2)) / DEGREE)
 
 
@@ -119,20 +123,22 @@ def on_table(
     ``down_error`` (T) and ``heading_deg`` are what the user of the formulas does not know.
     """
     tilted = tilts(tilt_deg, (len(sensors.matrix), 12), rng, (1.0, 1.0, 0.0))
-    turned = positions(heading_deg * DEGREE) @ tilted @ FIELD_NED
-    measured = read(sensors, turned, noise, rng)
-    believed = FIELD_NED + np.array([0.0, 0.0, down_error])
+    rotated = positions(heading_deg * DEGREE) @ tilted @ FIELD_NED
+    measured = read(sensors, rotated, noise, rng)
+    assumed = FIELD_NED + np.array([0.0, 0.0, down_error])
     return {
-        "paper": angle_deg(sensors, closed_form(measured, float(believed[2]))),
-        "least_squares": angle_deg(sensors, least_squares(measured, positions(0.0) @ believed)),
+        "paper": angle_deg(sensors, closed_form(measured, float(assumed[2]))),
+        "least_squares": angle_deg(sensors, least_squares(measured, positions(0.0) @ assumed)),
     }
 
 
 def graphs(
-    sensors: Sensors, epochs: list[Epochs], dip_sigma: float
+    sensors: Sensors, epochs: list[MagnetometerEpochs], dip_sigma: float
 ) -> tuple[MagnetometerFit, float]:
     """Return the fits of one graph a sensor, and the mean NEES of their twelve numbers."""
-    prior = Prior(np.eye(3), np.eye(3), np.zeros(3), PRIOR_COV, FIELD_LEVEL, dip_sigma, GRAVITY)
+    prior = MagnetometerPrior(
+        np.eye(3), np.eye(3), np.zeros(3), PRIOR_COV, FIELD_LEVEL, dip_sigma, GRAVITY
+    )
     fits = [fit_graph(own, prior).fit for own in epochs]
     fit = MagnetometerFit(*(np.array([getattr(f, k) for f in fits]) for k in vars(fits[0])))
     error = np.concatenate(
@@ -156,7 +162,7 @@ def on_table_graph(sensors: Sensors, rng: np.random.Generator, tilt_deg: float) 
     accel_sigma = np.full(12, GRAVITY * ACCEL_NOISE)
     for name, forces in (("graph", [None] * count), ("graph_accel", list(force))):
         epochs = [
-            Epochs(
+            MagnetometerEpochs(
                 measured_sensor=own,
                 field_sigma=HAND_NOISE,
                 accel_body=own_force,
@@ -181,7 +187,7 @@ def by_hand(sensors: Sensors, rng: np.random.Generator, readings: int) -> dict[s
     noisy = up + ACCEL_NOISE * rng.standard_normal(up.shape)
     accel_sigma = np.full(readings, GRAVITY * ACCEL_NOISE)
     epochs = [
-        Epochs(own, HAND_NOISE, GRAVITY * own_up, accel_sigma)
+        MagnetometerEpochs(own, HAND_NOISE, GRAVITY * own_up, accel_sigma)
         for own, own_up in zip(measured, noisy, strict=True)
     ]
     fit, nees = graphs(sensors, epochs, 0.3)

@@ -23,7 +23,7 @@ from harness import conclude, scenario_parser
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.data_checks.mending import mended
+from magfusion.estimation.data_checks.data_cleaning import clean_log
 from magfusion.jobs.calibrate_magnetometer import calibrated, estimates_of
 from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.samples import ImuSamples, Log, Waveform
@@ -88,7 +88,7 @@ class Row:
     sigma_ut: float | None
     determined: int
     wrong: bool
-    said: str
+    findings: str
 
 
 def joint_angles(case: Case, time: Array, rng: np.random.Generator) -> Array:
@@ -107,24 +107,24 @@ def joint_angles(case: Case, time: Array, rng: np.random.Generator) -> Array:
     return angles
 
 
-def stamps(taken: Array, host: Host, rng: np.random.Generator) -> Array:
+def stamps(selected: Array, host: Host, rng: np.random.Generator) -> Array:
     """Return when a host says that samples arrived (s); equal ones where a bus hands over many."""
-    step = float(np.median(np.diff(taken)))
+    step = float(np.median(np.diff(selected)))
     if host == "bursts":
         poll = 0.02 + 0.02 * rng.random()
         begun = poll * rng.random()
-        arrived = begun + poll * np.ceil((taken - begun) / poll)
+        arrived = begun + poll * np.ceil((selected - begun) / poll)
         within = np.concatenate([[0.0], np.diff(arrived)]) == 0.0
-        place = np.arange(len(taken)) - np.maximum.accumulate(
-            np.where(within, 0, np.arange(len(taken)))
+        place = np.arange(len(selected)) - np.maximum.accumulate(
+            np.where(within, 0, np.arange(len(selected)))
         )
-        arrived = arrived + 2e-4 * rng.random(len(taken))[0] + 1e-4 * place
+        arrived = arrived + 2e-4 * rng.random(len(selected))[0] + 1e-4 * place
         return np.asarray(arrived)
-    late = rng.uniform(0.0, 0.75, len(taken)) * step
-    held = rng.random(len(taken)) < 0.01
-    late[held] += 2.5 * step
+    late = rng.uniform(0.0, 0.75, len(selected)) * step
+    fixed = rng.random(len(selected)) < 0.01
+    late[fixed] += 2.5 * step
     # No sample overtakes another: those behind one that was held up arrive with it.
-    return np.maximum.accumulate(taken + late)
+    return np.maximum.accumulate(selected + late)
 
 
 def recorded(case: Case) -> tuple[Log, Site, Array]:
@@ -203,22 +203,22 @@ def _as_logged(arrived: Array, values: Array) -> tuple[Array, Array]:
     return arrived[fresh], values[fresh]
 
 
-def judged(case: Case) -> Row:
+def judge_run(case: Case) -> Row:
     """Return what the job makes of a case."""
     recording, declared, true = recorded(case)
     log, site = logged(recording, declared)
     try:
-        log = mended(log, site)
-        found, trust = calibrated(log, site)
+        log = clean_log(log, site)
+        result, trust = calibrated(log, site)
     except (InputError, EstimationError) as error:
         kind = "refused" if isinstance(error, InputError) else "failed"
         return Row(case, kind, None, None, 0, False, str(error))
-    said = trust.ordered[0].text if trust.ordered else ""
+    findings = trust.ordered[0].text if trust.ordered else ""
     if trust.verdict is Verdict.FAILED:
-        return Row(case, "failed", None, None, 0, False, said)
-    sensor = found.magnetometer
+        return Row(case, "failed", None, None, 0, False, findings)
+    sensor = result.magnetometer
     error, sigma = np.abs(sensor.offset - true), sensor.sigma.offset
-    numbers = estimates_of(found, declared.platform.magnetometer)[9:]
+    numbers = estimates_of(result, declared.platform.magnetometer)[9:]
     named = np.array([number.determined for number in numbers])
     wrong = bool(np.any(named & (error > LIMIT)) or np.any(error > SIGMAS * sigma))
     return Row(
@@ -228,15 +228,15 @@ def judged(case: Case) -> Row:
         sigma_ut=1e6 * float(np.max(sigma)),
         determined=int(np.sum(named)),
         wrong=wrong,
-        said=said,
+        findings=findings,
     )
 
 
 def cases(seeds: int, *, imu: bool = True) -> Iterator[Case]:
     """Yield all cases."""
     for seed in range(1, seeds + 1):
-        for told in product(TURNS_DEG, AXES, HOSTS, FIELDS, OFFSET_SIGMA):
-            yield Case(*told, imu=imu, seed=seed)
+        for reported in product(TURNS_DEG, AXES, HOSTS, FIELDS, OFFSET_SIGMA):
+            yield Case(*reported, imu=imu, seed=seed)
 
 
 def line(row: Row) -> str:
@@ -244,10 +244,10 @@ def line(row: Row) -> str:
     case = row.case
     name = f"{case.turn_deg:4.0f} deg {case.axes} {case.host:7} {case.field:14} {case.declared:14}"
     if row.error_ut is None or row.sigma_ut is None:
-        return f"{name} {row.verdict:12} {'':>17}  {row.said[:90]}"
-    told = f"{row.error_ut:7.2f} ({row.sigma_ut:6.2f})"
+        return f"{name} {row.verdict:12} {'':>17}  {row.findings[:90]}"
+    reported = f"{row.error_ut:7.2f} ({row.sigma_ut:6.2f})"
     bad = "WRONG" if row.wrong else f"{row.determined} of 3"
-    return f"{name} {row.verdict:12} {told} {bad:7} {row.said[:70]}"
+    return f"{name} {row.verdict:12} {reported} {bad:7} {row.findings[:70]}"
 
 
 def main() -> None:
@@ -260,7 +260,7 @@ def main() -> None:
     for case in cases(1 if given.quick else given.seeds, imu=not given.without_imu):
         if given.quick and case.host != "jitter":
             continue
-        rows.append(judged(case))
+        rows.append(judge_run(case))
         print(line(rows[-1]), flush=True)
     accepted = [row for row in rows if row.error_ut is not None]
     within = [row for row in accepted if row.error_ut is not None and row.error_ut < 1e6 * LIMIT]

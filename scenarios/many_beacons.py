@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.estimation.batch.batch import smooth
 from magfusion.estimation.online.navigator import Navigator
 from magfusion.estimation.online.navigator_settings import NavigatorSettings
-from magfusion.model.audibility import largest_fields, phasor_sigma
+from magfusion.model.detection_range import largest_fields, phasor_sigma
 from magfusion.model.samples import Log
 from magfusion.model.site import Beacon, BeaconSigma, Coil, Site
 from magfusion.receiver.windows import default_settings
@@ -43,7 +43,7 @@ MOMENT = 10.0  # A m^2
 CELL = (8, 5)  # beacons along and across, after which the frequencies come again
 MAINS_HZ = 50.0
 PIECE = 0.1  # s; that a stream brings at once
-SETTLED = 10.0  # s; after which states of an estimator that runs are compared
+CONVERGED_STEP = 10.0  # s; after which states of an estimator that runs are compared
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Run:
 
     Parameters
     ----------
-    beacons, heard : int
+    beacons, detected : int
         Declared, and above the noise somewhere on the way.
     rms_m, online_rms_m : float
         Of the position, smoothed and as it came.
@@ -63,7 +63,7 @@ class Run:
     """
 
     beacons: int
-    heard: int
+    detected: int
     rms_m: float
     online_rms_m: float
     nees: float
@@ -123,7 +123,7 @@ def spaced_hz(spacing: float) -> Callable[[int, int], float]:
     return frequency
 
 
-def heard_alone(site: Site, log: Log) -> Site:
+def detected_alone(site: Site, log: Log) -> Site:
     """Return the beacons that are above the noise somewhere on the true path."""
     assert log.truth is not None
     largest = np.max(largest_fields(site, log.truth.position_world[::20]), axis=0)
@@ -161,10 +161,10 @@ def tried(site: Site, log: Log) -> Run:
     began = time.process_time()
     at, place = _navigated(site, log)
     online = time.process_time() - began
-    late = at > (at[0] if len(at) else 0.0) + SETTLED
+    late = at > (at[0] if len(at) else 0.0) + CONVERGED_STEP
     return Run(
         beacons=len(site.beacons),
-        heard=len(heard_alone(site, log).beacons),
+        detected=len(detected_alone(site, log).beacons),
         rms_m=rms(np.linalg.norm(error, axis=1)),
         online_rms_m=rms(np.linalg.norm(_errors(log, at[late], place[late]), axis=1)),
         nees=float(np.mean(nees)),
@@ -176,15 +176,15 @@ def tried(site: Site, log: Log) -> Run:
 def _navigated(site: Site, log: Log) -> tuple[Array, Array]:
     navigator, imu, wave = Navigator(site, NavigatorSettings()), log.imu, log.waveform
     assert wave is not None
-    made = []
+    built = []
     for begin in np.arange(0.0, imu.time[-1], PIECE):
         a, b = np.searchsorted(imu.time, [begin, begin + PIECE])
         navigator.add_imu(imu.time[a:b], imu.gyro_body[a:b], imu.accel_body[a:b])
         a, b = np.searchsorted(wave.time, [begin, begin + PIECE])
         navigator.add_magnetometer(wave.time[a:b], wave.measured_sensor[a:b])
-        made += navigator.take()
-    time = np.array([state.time for state in made])
-    return time, np.array([state.position_world for state in made]).reshape(-1, 3)
+        built += navigator.take()
+    time = np.array([state.time for state in built])
+    return time, np.array([state.position_world for state in built]).reshape(-1, 3)
 
 
 def _errors(log: Log, at: Array, position_world: Array) -> Array:
@@ -194,11 +194,11 @@ def _errors(log: Log, at: Array, position_world: Array) -> Array:
     return position_world - np.stack(true, axis=1)
 
 
-def compared_hearing(minutes: float, seed: int) -> dict[str, Run]:
+def compared_detection(minutes: float, seed: int) -> dict[str, Run]:
     """Return what 200 beacons come to, and those alone that are heard."""
     whole = building(np.random.default_rng(seed), 20, 10, reused_hz)
     log = walked(whole, minutes, WING_WORLD, 600.0, seed + 1)
-    alone = heard_alone(whole, log)
+    alone = detected_alone(whole, log)
     return {
         "heard alone": tried(alone, walked(alone, minutes, WING_WORLD, 600.0, seed + 1)),
         "all": tried(whole, log),
@@ -214,19 +214,19 @@ def compared_spacing(minutes: float, seed: int) -> dict[str, Run]:
     return out
 
 
-def report(found: dict[str, Run]) -> str:
+def report(result: dict[str, Run]) -> str:
     """Return the table that a reader sees."""
     lines = [
         f"  {'':14}{'beacons':>9}{'heard':>7}{'smooth':>11}{'NEES (3)':>10}{'processor':>11}"
         f"{'navigate':>11}{'processor':>11}"
     ]
-    for name, run in found.items():
+    for name, run in result.items():
         lines.append(
-            f"  {name:14}{run.beacons:9}{run.heard:7}{1e3 * run.rms_m:8.2f} mm{run.nees:10.2f}"
+            f"  {name:14}{run.beacons:9}{run.detected:7}{1e3 * run.rms_m:8.2f} mm{run.nees:10.2f}"
             f"{run.processor_s:9.0f} s{1e3 * run.online_rms_m:8.2f} mm"
             f"{run.online_processor_s:9.0f} s"
         )
-    first, last = found.values()
+    first, last = result.values()
     lines.append(
         f"  {'ratio':14}{'':16}{last.rms_m / first.rms_m:11.3f}{'':10}"
         f"{last.processor_s / first.processor_s:11.2f}"
@@ -243,8 +243,8 @@ def main() -> None:
     parser.add_argument("--spacing", action="store_true", help="60 beacons, 0.5 or 5 Hz apart")
     given = parser.parse_args()
     minutes = 0.5 if given.quick else given.minutes
-    found = (compared_spacing if given.spacing else compared_hearing)(minutes, given.seed)
-    conclude(report(found), found)
+    result = (compared_spacing if given.spacing else compared_detection)(minutes, given.seed)
+    conclude(report(result), result)
 
 
 if __name__ == "__main__":

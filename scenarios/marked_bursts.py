@@ -40,8 +40,8 @@ BUSY, LONG_PAUSE = 0.01, (0.01, 0.06)  # share of the pauses in which the host d
 RISE, SETTLING = 0.05e-3, 0.2e-3  # s
 SILENT = -1
 LENGTH, BEGUN = 12.5, 6.5  # s
-Told = Literal["column", "marks"]
-Ways = tuple[Told, ...]
+Declared = Literal["column", "marks"]
+Ways = tuple[Declared, ...]
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Bursts:
         """Return start, end and slot as the host would write them, when the current has settled."""
         return self.begin + SETTLING, self.end, self.slot
 
-    def beside(self, time: Array) -> IntArray:
+    def between(self, time: Array) -> IntArray:
         """Return the slot of each sample, -2 where nothing is said."""
         start, end, slot = self.marked()
         row = np.searchsorted(start, time, side="right") - 1
@@ -79,8 +79,8 @@ class Bursts:
             if slot == SILENT:
                 continue
             rows = slice(*np.searchsorted(time, [begin, end + SETTLING]))
-            since = time[rows] - begin
-            rising = 1.0 - np.exp(-since / RISE)
+            start_time = time[rows] - begin
+            rising = 1.0 - np.exp(-start_time / RISE)
             falling = np.exp(-(time[rows] - end) / RISE)
             out[rows, slot] += np.where(time[rows] < end, rising, falling)
         return out
@@ -116,7 +116,7 @@ class Recording:
         line = next(line for line in text.splitlines() if "slots: {" in line)
         return text.replace(line, "    slots: marked")
 
-    def write(self, path: Path, told: Told) -> None:
+    def write(self, path: Path, reported: Declared) -> None:
         """Write it as a log, whose site is beside it."""
         time, field = self.wave
         at = self.imu[0]
@@ -127,20 +127,20 @@ class Recording:
         (path / "site.yaml").write_text(self.site_text())
         if self.bursts is None:
             return
-        if told == "marks":
+        if reported == "marks":
             start, end, slot = self.bursts.marked()
             stamps = {"time_ns": _stamps(start), "end_ns": _stamps(end), "slot": slot}
             pa.parquet.write_table(pa.table(stamps), path / "marks.parquet")
             return
         table = pa.parquet.read_table(path / "magnetometer.parquet")
-        own = self.bursts.beside(time)
+        own = self.bursts.between(time)
         column = pa.array(own, pa.int64(), mask=own == -2)
         pa.parquet.write_table(table.append_column("slot", column), path / "magnetometer.parquet")
 
-    def records(self, told: Told) -> bytes:
+    def records(self, reported: Declared) -> bytes:
         """Return the streams as the lines of a driver, every hundredth of a second."""
         time, field = self.wave
-        beside = None if self.bursts is None else self.bursts.beside(time)
+        others = None if self.bursts is None else self.bursts.between(time)
         edges = PIECE * np.arange(round(self.config.duration / PIECE) + 1)
         lines = []
         for begin, end in pairwise((edges - 1e-9).tolist()):
@@ -152,8 +152,8 @@ class Recording:
                 "imu": dict(zip(("time", "gyro", "accel"), parts, strict=True)),
                 "magnetometer": wave,
             }
-            if beside is not None and told == "column":
-                wave["slot"] = [None if one == -2 else one for one in beside[rows].tolist()]
+            if others is not None and reported == "column":
+                wave["slot"] = [None if one == -2 else one for one in others[rows].tolist()]
             elif self.bursts is not None:
                 start, until, slot = self.bursts.marked()
                 new = slice(*np.searchsorted(until, [begin, end]))
@@ -181,37 +181,37 @@ def record(config: Config, *, uneven: bool) -> Recording:
     return Recording(config, head, wave, head.imu(config, rng), own)
 
 
-def errors(found: Trajectory, head: Head) -> Errors:
+def errors(result: Trajectory, head: Head) -> Errors:
     """Return the errors of poses while the head turns."""
-    kept = found.time >= TURNING
-    time = found.time[kept]
-    place = found.position_world[kept] - head.place(time)
-    own = Rotation.from_matrix(found.world_from_body[kept])
+    kept = result.time >= TURNING
+    time = result.time[kept]
+    place = result.position_world[kept] - head.place(time)
+    own = Rotation.from_matrix(result.world_from_body[kept])
     turn = (head.turn(time).inv() * own).magnitude() / DEGREE
     return Errors(1e3 * rms(np.linalg.norm(place, axis=1)), rms(turn), len(time))
 
 
-def of_job(job: str, made: Recording, told: Told) -> Errors:
+def of_job(job: str, simulation: Recording, reported: Declared) -> Errors:
     """Return the errors of a job of the command line."""
     with tempfile.TemporaryDirectory() as directory:
         log, result = Path(directory) / "log", Path(directory) / "result"
-        made.write(log, told)
+        simulation.write(log, reported)
         command = [sys.executable, "-m", "magfusion", job, str(log), "-o", str(result)]
         subprocess.run(command, check=True, capture_output=True)
-        return errors(read_trajectory(result / "trajectory.parquet", 0), made.head)
+        return errors(read_trajectory(result / "trajectory.parquet", 0), simulation.head)
 
 
-def of_pipe(made: Recording, told: Told) -> Errors:
+def of_pipe(simulation: Recording, reported: Declared) -> Errors:
     """Return the errors of the states of the pipe."""
     with tempfile.TemporaryDirectory() as directory:
         site = Path(directory) / "site.yaml"
-        site.write_text(made.site_text())
-        states, _ = piped(site, made.records(told))
+        site.write_text(simulation.site_text())
+        states, _ = piped(site, simulation.records(reported))
     known = [s for s in states if not s["lost"]]
     time = np.array([s["time"] for s in known])
     turn = Rotation.from_quat([s["quaternion"] for s in known], scalar_first=True)
     place = np.array([s["position"] for s in known])
-    return errors(Trajectory(time, turn.as_matrix(), place), made.head)
+    return errors(Trajectory(time, turn.as_matrix(), place), simulation.head)
 
 
 def main() -> None:
@@ -226,18 +226,18 @@ def main() -> None:
         "pulses, uneven": (record(pulsed, uneven=True), ("column", "marks")),
     }
     jobs = ("fix",) if given.quick else ("fix", "smooth")
-    found: dict[str, Errors] = {}
-    for name, (made, ways) in worlds.items():
-        for told in ways:
-            label = name if made.bursts is None else f"{name}, {told}"
+    result: dict[str, Errors] = {}
+    for name, (built, ways) in worlds.items():
+        for reported in ways:
+            label = name if built.bursts is None else f"{name}, {reported}"
             for job in jobs:
-                found[f"{label}, {job}"] = of_job(job, made, told)
-            found[f"{label}, pipe"] = of_pipe(made, told)
+                result[f"{label}, {job}"] = of_job(job, built, reported)
+            result[f"{label}, pipe"] = of_pipe(built, reported)
     lines = [f"{'turning at 100 deg/s':<34}{'mm':>8}{'deg':>8}{'a second':>10}"]
-    for label, one in found.items():
+    for label, one in result.items():
         rate = one.count / (LENGTH - TURNING)
         lines.append(f"{label:<34}{one.mm:8.3f}{one.deg:8.3f}{rate:10.1f}")
-    conclude("\n".join(lines), found)
+    conclude("\n".join(lines), result)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import numpy as np
 from far_and_weak import far_site
 from harness import conclude, scenario_parser
 
-from magfusion.estimation.rests.at_rest import at_rest
+from magfusion.estimation.rests.stationary_integration import integrate_rests
 from magfusion.model.ground import in_ground
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.site import Site
@@ -140,13 +140,13 @@ def run_kind(kind: Interference, config: Config) -> Row:
     for k in range(config.runs):
         log, site, phasor = mine_log(kind, config, config.seed + k)
         assert log.waveform is not None
-        found, _ = received(log.waveform, log.imu, site)
+        result, _ = received(log.waveform, log.imu, site)
         # Every other window: those between share their samples.
-        weight = np.linalg.inv(found.phasor_cov[::2])
+        weight = np.linalg.inv(result.phasor_cov[::2])
         cov = np.linalg.inv(np.sum(weight, axis=0))
-        total = np.einsum("nckl,ncl->ck", weight, found.phasor_sensor[::2])
+        total = np.einsum("nckl,ncl->ck", weight, result.phasor_sensor[::2])
         mean = np.einsum("ckl,cl->ck", cov, total)
-        rested = at_rest(log, site).fields
+        rested = integrate_rests(log, site).fields
         ways = ((mean, cov), (rested.phasor_sensor[0], rested.phasor_cov[0]))
         for way, (value, own) in enumerate(ways):
             error = value - phasor

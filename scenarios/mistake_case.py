@@ -131,8 +131,8 @@ def again(case: Case, world: Site | None = None, **changes: object) -> Case:
         Of the `SimulationConfig`.
     """
     config = replace(case.config, **changes)  # type: ignore[arg-type]
-    made = simulated(case.site if world is None else world, config, case.seed)
-    return replace(made, site=case.site)
+    built = simulated(case.site if world is None else world, config, case.seed)
+    return replace(built, site=case.site)
 
 
 def _roughly_surveyed(site: Site) -> Site:

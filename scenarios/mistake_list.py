@@ -1,6 +1,6 @@
 """All mistakes of `mistakes` by name, and the case without one."""
 
-import mistakes_midway
+import mistakes_changing
 import mistakes_of_data
 import mistakes_of_instruments
 import mistakes_of_site
@@ -14,7 +14,7 @@ MISTAKES = {
         mistakes_of_site,
         mistakes_of_data,
         mistakes_of_world,
-        mistakes_midway,
+        mistakes_changing,
         mistakes_of_instruments,
     )
     for mistake in part.MISTAKES

@@ -76,8 +76,8 @@ class Row:
     def silent(self) -> bool:
         """Whether a wrong result passes as a right one, and nothing is said."""
         wrong = self.nees is not None and self.nees > SILENT_NEES
-        told = self.listed or self.known.unknowable
-        return self.verdict == "trustworthy" and wrong and not told
+        reported = self.listed or self.known.unknowable
+        return self.verdict == "trustworthy" and wrong and not reported
 
     @property
     def diagnosable(self) -> bool:
@@ -112,8 +112,8 @@ def run(config: Config, scale: Scale | None = None) -> list[Row]:
     """Return the rows of the table, those of the good log first."""
     names = ("good", *(name for name in config.mistakes if name != "good"))
     tasks = [Task(n, log, config.estimators, config.seed) for log in config.logs for n in names]
-    found = run_many(judge, tasks, seed=config.seed, **(scale or {}))
-    return [row for rows in found for row in rows]
+    result = run_many(judge, tasks, seed=config.seed, **(scale or {}))
+    return [row for rows in result for row in rows]
 
 
 def judge(task: Task, _rng: np.random.Generator) -> list[Row]:
@@ -137,19 +137,19 @@ def judge(task: Task, _rng: np.random.Generator) -> list[Row]:
 
 
 def _estimated(task: Task, estimator: str, log: Path, output: Path) -> Row:
-    began, code, said = time.process_time(), 0, ""
+    began, code, findings = time.process_time(), 0, ""
     try:
         _run_job(estimator, log, output)
     except InputError as error:
-        code, said = 2, str(error)
+        code, findings = 2, str(error)
     except EstimationError as error:
-        code, said = 1, str(error)
+        code, findings = 1, str(error)
     except Exception:
-        code, said = 3, traceback.format_exc()
+        code, findings = 3, traceback.format_exc()
     spent = time.process_time() - began
     place = output / "report.json"
     report = json.loads(place.read_text()) if place.is_file() else {}
-    return _row(task, estimator, code, report, said, spent)
+    return _row(task, estimator, code, report, findings, spent)
 
 
 def _run_job(estimator: str, log: Path, output: Path) -> None:
@@ -165,7 +165,7 @@ def _run_job(estimator: str, log: Path, output: Path) -> None:
     run_navigate(settings, output)
 
 
-def _row(task: Task, estimator: str, code: int, report: dict, said: str, seconds: float) -> Row:
+def _row(task: Task, estimator: str, code: int, report: dict, findings: str, seconds: float) -> Row:
     reasons = report.get("reasons", [])
     # Exit 1 and 2 give no result, whatever else there is.
     usual = {0: "trustworthy", 1: "failed", 2: "refused", 3: "traceback"}[code]
@@ -176,7 +176,7 @@ def _row(task: Task, estimator: str, code: int, report: dict, said: str, seconds
         code,
         report.get("verdict", usual) if code < 2 else usual,
         tuple(reason["code"] for reason in reasons),
-        reasons[0]["text"] if reasons else said,
+        reasons[0]["text"] if reasons else findings,
         tuple(one["parameter"] for one in report.get("unverified", [])),
         report.get("ate_m"),
         report.get("attitude_rmse_deg"),
@@ -204,20 +204,22 @@ class Summary:
 def summed(rows: Sequence[Row]) -> Summary:
     """Return the summary of a table."""
     wrong = [row for row in rows if row.mistake != "good"]
-    asked = [row for row in wrong if row.diagnosable]
-    right = sum(row.right for row in asked)
+    requested = [row for row in wrong if row.diagnosable]
+    right = sum(row.right for row in requested)
     ratio = slowness(rows)
     return Summary(
         rows=len(wrong),
         silent=tuple(_named(row) for row in wrong if row.silent),
-        diagnosable=len(asked),
-        right_first=right / max(len(asked), 1),
+        diagnosable=len(requested),
+        right_first=right / max(len(requested), 1),
         tracebacks=tuple(_named(row) for row in rows if row.exit == 3),
         slow=tuple(_named(row) for row, r in zip(rows, ratio, strict=True) if r > SLOW),
         false_alarms=tuple(
             _named(r) for r in rows if r.mistake == "good" and r.verdict != "trustworthy"
         ),
-        wrong_cause=tuple(f"{_named(r)}: {', '.join(r.codes[:1])}" for r in asked if not r.right),
+        wrong_cause=tuple(
+            f"{_named(r)}: {', '.join(r.codes[:1])}" for r in requested if not r.right
+        ),
     )
 
 
@@ -256,13 +258,13 @@ def table(rows: Sequence[Row], texts: bool = False) -> str:
         )
         if texts and row.text:
             lines.append(f"    {row.text}")
-    found = summed(rows)
+    result = summed(rows)
     lines += [
-        f"{found.rows} rows with a mistake; silent: {len(found.silent)}",
-        f"right cause first in {100 * found.right_first:.0f} % of {found.diagnosable} diagnosable",
+        f"{result.rows} rows with a mistake; silent: {len(result.silent)}",
+        f"right cause first in {100 * result.right_first:.0f} % of {result.diagnosable} diagnosable",
     ]
     for name in ("silent", "tracebacks", "slow", "false_alarms"):
-        listed = getattr(found, name)
+        listed = getattr(result, name)
         lines.append(f"{name}: {len(listed)}" + "".join(f"\n    {one}" for one in listed))
     return "\n".join(lines)
 

@@ -34,7 +34,7 @@ def _signs(*signs: float) -> Samples:
     return lambda values: values * np.array(signs)
 
 
-def _turned(rotvec_deg: tuple[float, float, float]) -> Samples:
+def _rotated(rotvec_deg: tuple[float, float, float]) -> Samples:
     turn = Rotation.from_rotvec(rotvec_deg, degrees=True).as_matrix()
     return lambda values: values @ turn.T
 
@@ -53,11 +53,11 @@ def _frozen(axis: int | slice, begin: float, end: float) -> Change:
     """Return both triads held at the last value, from one time to another (s)."""
 
     def changed(_: Case, time: Array, rate: Array, force: Array) -> tuple[Array, Array, Array]:
-        held = (time >= begin) & (time < end)
-        first = int(np.argmax(held))
+        fixed = (time >= begin) & (time < end)
+        first = int(np.argmax(fixed))
         rate, force = rate.copy(), force.copy()
         for values in (rate, force):
-            values[held, axis] = values[first, axis]
+            values[fixed, axis] = values[first, axis]
         return time, rate, force
 
     return of_imu(changed)
@@ -84,7 +84,7 @@ def _spikes(case: Case, time: Array, rate: Array, force: Array) -> tuple[Array, 
     )
 
 
-def _held(every: int) -> Samples:
+def _repeated_samples(every: int) -> Samples:
     return lambda values: values[np.arange(len(values)) // every * every]
 
 
@@ -124,7 +124,7 @@ def _magnetometer_clock(rate: float) -> Change:
     return of_waveform(lambda _, time, measured: (time * (1.0 + rate), measured))
 
 
-def _lost(case: Case, time: Array, measured: Array) -> tuple[Array, Array]:
+def _is_lost(case: Case, time: Array, measured: Array) -> tuple[Array, Array]:
     kept = case.rng.random(len(time)) > 0.05
     return time[kept], measured[kept]
 
@@ -153,15 +153,15 @@ MISTAKES = (
     Mistake("accel_in_mg", "data", _imu(accel=lambda a: a / 9.81e-3), ("accel_units",)),
     Mistake("accel_scale_3pct", "data", _imu(accel=lambda a: 1.03 * a), ("accel_scale", "gravity")),
     Mistake("gravity_removed", "data", of_imu(_without_gravity), ("gravity_missing",)),
-    Mistake("imu_z90", "data", _both(_turned((0.0, 0.0, 90.0))), _AXES, REST),
-    Mistake("imu_z180", "data", _both(_turned((0.0, 0.0, 180.0))), _AXES, REST),
-    Mistake("imu_upside_down", "data", _both(_turned((180.0, 0.0, 0.0))), _AXES),
-    Mistake("imu_y-90", "data", _both(_turned((0.0, -90.0, 0.0))), _AXES),
+    Mistake("imu_z90", "data", _both(_rotated((0.0, 0.0, 90.0))), _AXES, REST),
+    Mistake("imu_z180", "data", _both(_rotated((0.0, 0.0, 180.0))), _AXES, REST),
+    Mistake("imu_upside_down", "data", _both(_rotated((180.0, 0.0, 0.0))), _AXES),
+    Mistake("imu_y-90", "data", _both(_rotated((0.0, -90.0, 0.0))), _AXES),
     Mistake("imu_permuted", "data", _both(lambda v: v[:, [1, 2, 0]]), _AXES),
     Mistake("imu_xy_swapped", "data", _both(lambda v: v[:, [1, 0, 2]]), _AXES, REST),
     Mistake("imu_ned", "data", _both(_signs(1, -1, -1)), _AXES),
     Mistake("gyro_only_permuted", "data", _imu(gyro=lambda g: g[:, [1, 2, 0]]), _AXES, REST),
-    Mistake("accel_only_z90", "data", _imu(accel=_turned((0.0, 0.0, 90.0))), _AXES),
+    Mistake("accel_only_z90", "data", _imu(accel=_rotated((0.0, 0.0, 90.0))), _AXES),
     Mistake(
         "gyro_x_stuck",
         "data",
@@ -178,7 +178,7 @@ MISTAKES = (
         "imu_frozen_10s", "data", _frozen(slice(None), 15.0, 25.0), ("frozen_imu", "stuck_axis")
     ),
     Mistake("imu_spikes", "data", of_imu(_spikes), ("imu_spikes",)),
-    Mistake("imu_held_4", "data", _both(_held(4)), ("repeated_samples",)),
+    Mistake("imu_held_4", "data", _both(_repeated_samples(4)), ("repeated_samples",)),
     Mistake("imu_1s_late", "data", _imu_time(lambda t: t + 1.0), _TIME, REST),
     Mistake("imu_100ms_late", "data", _imu_time(lambda t: t + 0.1), _TIME, REST),
     Mistake("imu_clock_1pct", "data", _imu_time(lambda t: 1.01 * t), ("imu_clock",), REST),
@@ -203,8 +203,8 @@ MISTAKES = (
     Mistake("magnetometer_in_nt", "data", _wave(lambda m: 1e9 * m), ("field_units",)),
     Mistake("magnetometer_in_gauss", "data", _wave(lambda m: 1e4 * m), ("field_units",)),
     Mistake("magnetometer_saturated", "data", _wave(_saturated), ("saturated",)),
-    Mistake("magnetometer_held_2", "data", _wave(_held(2)), ("repeated_samples",)),
-    Mistake("samples_lost_5pct", "data", of_waveform(_lost), harmless=True),
+    Mistake("magnetometer_held_2", "data", _wave(_repeated_samples(2)), ("repeated_samples",)),
+    Mistake("samples_lost_5pct", "data", of_waveform(_is_lost), harmless=True),
     Mistake("body_iron", "data", _wave(_body_iron), ("magnetometer_matrix", "magnetometer_offset")),
     Mistake(
         "magnet_on_body",

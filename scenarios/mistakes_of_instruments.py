@@ -159,8 +159,8 @@ def _beacon_at_mains(case: Case) -> Case:
     )
     site = replace(case.site, beacons=beacons)
     direction = Rotation.from_rotvec([0.3, 0.5, 0.0]).apply([0.0, 0.0, 1.0])
-    made = again(case, site, mains=Mains(2e-8, 49.98, (), direction))
-    return replace(made, site=site)
+    built = again(case, site, mains=Mains(2e-8, 49.98, (), direction))
+    return replace(built, site=site)
 
 
 def _names_swapped(case: Case) -> Case:

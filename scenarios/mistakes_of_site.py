@@ -50,7 +50,7 @@ def _axes_swapped(beacon: Beacon) -> Beacon:
     return replace(beacon, coils=coils)
 
 
-def _turned(rotvec_deg: tuple[float, float, float]) -> Callable[[Beacon], Beacon]:
+def _rotated(rotvec_deg: tuple[float, float, float]) -> Callable[[Beacon], Beacon]:
     turn = Rotation.from_rotvec(rotvec_deg, degrees=True).as_matrix()
     return lambda b: replace(b, world_from_beacon=b.world_from_beacon @ turn)
 
@@ -68,8 +68,8 @@ def _angles(change: Callable[[Array], Array]) -> Callable[[Beacon], Beacon]:
 
     def changed(beacon: Beacon) -> Beacon:
         rpy = Rotation.from_matrix(beacon.world_from_beacon).as_euler("xyz", degrees=True)
-        turned = Rotation.from_euler("xyz", change(rpy), degrees=True).as_matrix()
-        return replace(beacon, world_from_beacon=turned)
+        rotated = Rotation.from_euler("xyz", change(rpy), degrees=True).as_matrix()
+        return replace(beacon, world_from_beacon=rotated)
 
     return changed
 
@@ -80,8 +80,8 @@ def _exchanged(*fields: str) -> Change:
     def changed(case: Case) -> Case:
         first, second, *rest = case.site.beacons
         mine = {name: getattr(first, name) for name in fields}
-        theirs = {name: getattr(second, name) for name in fields}
-        beacons = (replace(first, **theirs), replace(second, **mine), *rest)
+        others = {name: getattr(second, name) for name in fields}
+        beacons = (replace(first, **others), replace(second, **mine), *rest)
         return declared(case, replace(case.site, beacons=beacons))
 
     return changed
@@ -166,8 +166,8 @@ def _overconfident(case: Case) -> Case:
     beacons = []
     for beacon in case.site.beacons:
         wrong = beacon.position_world + rng.normal(0.0, 0.05, 3)
-        sure = with_sigma(beacon, position=0.01, rotation=0.4 * DEGREE, log_moment=0.006)
-        beacons.append(replace(sure, position_world=wrong))
+        certain = with_sigma(beacon, position=0.01, rotation=0.4 * DEGREE, log_moment=0.006)
+        beacons.append(replace(certain, position_world=wrong))
     return declared(case, replace(case.site, beacons=tuple(beacons)))
 
 
@@ -239,8 +239,8 @@ MISTAKES = (
     Mistake("one_coil_10pct", "site", of_beacons(_moments(1.1, 1), "D"), ("moments",)),
     Mistake("moved_5cm", "site", of_beacons(_moved((0.03, -0.04, 0.0)), "A"), _PLACE),
     Mistake("moved_50cm", "site", of_beacons(_moved((0.3, 0.4, 0.0)), "C"), _PLACE),
-    Mistake("beacon_turned_10deg", "site", of_beacons(_turned((6.0, 6.0, 5.0)), "B"), _PLACE),
-    Mistake("beacon_turned_90deg", "site", of_beacons(_turned((90.0, 0.0, 0.0)), "D"), _PLACE),
+    Mistake("beacon_turned_10deg", "site", of_beacons(_rotated((6.0, 6.0, 5.0)), "B"), _PLACE),
+    Mistake("beacon_turned_90deg", "site", of_beacons(_rotated((90.0, 0.0, 0.0)), "D"), _PLACE),
     Mistake("beacon_inverse", "site", of_beacons(_inverse), ("angle_convention",)),
     Mistake(
         "beacon_rpy_radians",

@@ -58,7 +58,7 @@ def _line(frequency_hz: float, amplitude: float) -> Change:
     return lambda case: again(case, mains=mains)
 
 
-def _magnet_passes(_: Case, time: Array, measured: Array) -> tuple[Array, Array]:
+def _magnet_transits(_: Case, time: Array, measured: Array) -> tuple[Array, Array]:
     """Return the steady field of a lift or a car that comes and goes."""
     pulse = 1e-5 * np.exp(-0.5 * ((time - 20.0) / 3.0) ** 2)
     return time, measured + pulse[:, None] * np.array([0.6, -0.5, 0.6])
@@ -142,5 +142,5 @@ MISTAKES = (
     Mistake("beside_a_coil", "world", _at_a_coil, ("near_field", "field_residuals", "coil_size")),
     Mistake("drives_free_running", "world", _free_running, ("beacon_clock",)),
     Mistake("earth_drifts", "world", _earth_drifts, harmless=True),
-    Mistake("magnet_passes", "world", of_waveform(_magnet_passes), harmless=True),
+    Mistake("magnet_passes", "world", of_waveform(_magnet_transits), harmless=True),
 )

@@ -22,7 +22,7 @@ from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
-from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.integrity.judge import judge_result
 from magfusion.jobs.calibrate_log import against_site, grown
 from magfusion.model.parameters import (
     Block,
@@ -47,7 +47,7 @@ from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.disturbance import Ambient, draw_bending
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.log import EPOCH_NS, draw_drives, perturb_site
-from magfusion.simulation.motion import Motion, Rests, progress_rate
+from magfusion.simulation.motion import Rests, SimulatedMotion, progress_rate
 from magfusion.simulation.waveform import simulate_waveform
 from magfusion.units import Array
 
@@ -141,11 +141,11 @@ def loose_site(model_error: float) -> Site:
 def planned(site: Site, config: Config) -> tuple[dict[str, Planned], Array]:
     """Return both motions, and which parameters stops can determine."""
     blocks = choose_blocks(site, SURVEY_GROUPS)
-    found = next_motion(site, PLACES, config.stops, config.stop, known=False)
+    result = next_motion(site, PLACES, config.stops, config.stop, known=False)
     proposed = Planned(
-        np.array([stop.position_world for stop in found.stops]),
-        np.array([stop.rpy_deg for stop in found.stops]),
-        found.ratio,
+        np.array([stop.position_world for stop in result.stops]),
+        np.array([stop.rpy_deg for stop in result.stops]),
+        result.ratio,
     )
     poses = candidate_poses(site, blocks, PLACES, config.stop, known=False)
     away = np.linalg.norm(poses.position_world - np.mean(DEMO_BOX_WORLD, axis=0), axis=1)
@@ -156,7 +156,7 @@ def planned(site: Site, config: Config) -> tuple[dict[str, Planned], Array]:
         np.array([ATTITUDES_DEG[k] for k in poses.attitude[near]]),
         left_by(site, blocks, poses, near),
     )
-    return {"proposed": proposed, "poor": poor}, found.parameters.asked
+    return {"proposed": proposed, "poor": poor}, result.parameters.requested
 
 
 def left_by(site: Site, blocks: tuple[Block, ...], poses: Poses, chosen: Array) -> Array:
@@ -166,7 +166,7 @@ def left_by(site: Site, blocks: tuple[Block, ...], poses: Poses, chosen: Array) 
     return np.sqrt(np.diagonal(np.linalg.inv(whole)))
 
 
-def through(plan: Planned, config: Config) -> Motion:
+def through(plan: Planned, config: Config) -> SimulatedMotion:
     """Return a motion that rests at each stop, and goes straight from one to the next."""
     rests = Rests(start=config.stop, move=config.move, pause=config.stop)
     rate = progress_rate(config.duration, rests)
@@ -175,10 +175,10 @@ def through(plan: Planned, config: Config) -> Motion:
     # All rests at the corners of the path, so that it need not be smooth there.
     knots = np.concatenate([at[:1], at, at[-1:]])
     turns = Rotation.from_euler("xyz", plan.rpy_deg, degrees=True)
-    return Motion(BSpline(knots, plan.position_world, 1), RotationSpline(at, turns), rate)
+    return SimulatedMotion(BSpline(knots, plan.position_world, 1), RotationSpline(at, turns), rate)
 
 
-def recorded(site: Site, motion: Motion, config: Config, seed: int) -> tuple[Log, Site]:
+def recorded(site: Site, motion: SimulatedMotion, config: Config, seed: int) -> tuple[Log, Site]:
     """Return a log of a motion, and the true site."""
     site_rng, field_rng, imu_rng, wave_rng = np.random.default_rng(seed).spawn(4)
     true = perturb_site(site, site_rng)
@@ -199,7 +199,7 @@ def recorded(site: Site, motion: Motion, config: Config, seed: int) -> tuple[Log
 def calibrated(log: Log, site: Site, true: Site) -> tuple[Array, Array, Verdict]:
     """Return error and found sigma of the survey's parameters, as `calibrate log` tells them."""
     result = smooth(log, site, SmootherSettings())
-    honest, trust = judged(result, log)
+    honest, trust = judge_result(result, log)
     result, moved = against_site(honest, grown(result, honest))
     reference = result.calibration.reference_time
     error = difference(initial_calibration(true, reference), result.calibration, result.blocks)
@@ -214,8 +214,8 @@ def run(config: Config) -> Result:
     """Measure both motions."""
     site = loose_site(config.model_error)
     blocks = choose_blocks(site, SURVEY_GROUPS)
-    plans, asked = planned(site, config)
-    asked = asked & ~is_free(blocks)
+    plans, requested = planned(site, config)
+    requested = requested & ~is_free(blocks)
     declared, kept = prior_sigma(blocks), []
     kinds = np.array([f"{b.group}: {b.kind}" for b in blocks for _ in b.sigma])
     doubted, failed = dict.fromkeys(plans, 0), dict.fromkeys(plans, 0)
@@ -227,11 +227,11 @@ def run(config: Config) -> Result:
             failed[name] += verdict is Verdict.FAILED
             errors.append(error)
             sigmas.append(sigma)
-        found, error = np.array(sigmas), np.array(errors)
+        result, error = np.array(sigmas), np.array(errors)
         predicted = plan.predicted * declared
-        for kind in [*dict.fromkeys(kinds[asked].tolist()), "all"]:
-            own = asked & ((kinds == kind) | (kind == "all"))
-            ratio = predicted[own] / found[:, own]
+        for kind in [*dict.fromkeys(kinds[requested].tolist()), "all"]:
+            own = requested & ((kinds == kind) | (kind == "all"))
+            ratio = predicted[own] / result[:, own]
             kept.append(
                 Kept(
                     name,
@@ -241,13 +241,15 @@ def run(config: Config) -> Result:
                     float(np.median(ratio)),
                     float(np.min(np.median(ratio, axis=0))),
                     rms(error[:, own] / predicted[own]),
-                    rms(error[:, own] / found[:, own]),
+                    rms(error[:, own] / result[:, own]),
                 )
             )
     return Result(kept, doubted, failed)
 
 
-def logged(site: Site, motion: Motion, config: Config, seed: int) -> tuple[Log, Site, Site]:
+def logged(
+    site: Site, motion: SimulatedMotion, config: Config, seed: int
+) -> tuple[Log, Site, Site]:
     """Return a log with the declared and the true site."""
     log, true = recorded(site, motion, config, seed)
     return log, site, true
@@ -283,8 +285,8 @@ def main() -> None:
     config = Config(
         stops=given.stops, runs=given.runs, seed=given.seed, model_error=given.model_error
     )
-    found = run(config)
-    conclude(report(found), found)
+    result = run(config)
+    conclude(report(result), result)
 
 
 if __name__ == "__main__":

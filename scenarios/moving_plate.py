@@ -67,17 +67,17 @@ class Plate:
         skin = np.sqrt(2.0 / (turning * MU_0 * self.conductivity))
         resistance = 1.0 / (self.conductivity * min(self.thickness, skin))
         number = self.cells**2
-        apart = self.centres[:, None] - self.centres
+        separate = self.centres[:, None] - self.centres
         # A current that flows in a strip a cell wide has the flux of a wire so far from it.
         fine = np.array([-1.0, 1.0]) * (0.5 - STRIP)
         x, z = np.meshgrid(fine * self.cell, fine * self.cell, indexing="ij")
         mutual = np.zeros((number, number))
         for dx, dz in zip(x.ravel(), z.ravel(), strict=True):
-            seen = self.loop_field((apart + np.array([dx, 0.0, dz])).reshape(-1, 3))[:, 1]
+            seen = self.loop_field((separate + np.array([dx, 0.0, dz])).reshape(-1, 3))[:, 1]
             mutual += seen.reshape(number, number) * self.cell**2 / x.size
-        beside = np.abs(np.linalg.norm(apart, axis=2) / self.cell - 1.0) < 1e-6
+        others = np.abs(np.linalg.norm(separate, axis=2) / self.cell - 1.0) < 1e-6
         # Of a strip along the edge of the plate there is only the inner half.
-        shared = np.diag(8.0 - np.sum(beside, axis=1)) - beside
+        shared = np.diag(8.0 - np.sum(others, axis=1)) - others
         impedance = resistance * shared + 1j * turning * mutual
         return np.asarray(-1j * turning * np.linalg.inv(impedance))
 
@@ -97,7 +97,7 @@ class Plate:
         at = (centre[:, None] + self.centres).reshape(-1, 3)
         flux = coil(at)[:, 1].reshape(len(centre), -1) * self.cell**2
         current = flux @ response.T
-        found = np.zeros((len(centre), 3), dtype=np.complex128)
+        result = np.zeros((len(centre), 3), dtype=np.complex128)
         for k, own in enumerate(self.centres):
-            found += current[:, k, None] * self.loop_field(place - centre - own)
-        return found
+            result += current[:, k, None] * self.loop_field(place - centre - own)
+        return result

@@ -35,7 +35,7 @@ HZ, LEVER = 20.0, (0.05, -0.02, 0.03)  # m
 MOST_NEES, INSIDE, LEAST_ROLL = 7.5, 0.9, 1.5
 
 
-def free() -> Site:
+def run_free() -> Site:
     """Return the site, of a platform without an IMU that a hand moves."""
     site = floor()
     sensor = replace(site.platform.magnetometer, position_body=np.array(LEVER))
@@ -58,7 +58,7 @@ def moved(site: Site, seed: int, duration: float) -> Log:
     return Log("free", 0, "scenario", ImuSamples.empty(), fields=own, truth=truth)
 
 
-def told(log: Log, site: Site, estimator: str) -> tuple[Trajectory, Trust]:
+def reported(log: Log, site: Site, estimator: str) -> tuple[Trajectory, Trust]:
     """Return what an estimator tells of a log."""
     if estimator == "ekf":
         return filtered(log, site)
@@ -68,10 +68,10 @@ def told(log: Log, site: Site, estimator: str) -> tuple[Trajectory, Trust]:
 
 def rows_of(seed: int, duration: float) -> tuple[list[Row], list[str]]:
     """Return the rows of one log, and where its roll is called known."""
-    site, rows, faults = free(), [], []
+    site, rows, faults = run_free(), [], []
     log, axis = moved(site, seed, duration), axis_of(site.platform.magnetometer)
     for estimator in ("smooth", "ekf"):
-        states, trust = told(log, site, estimator)
+        states, trust = reported(log, site, estimator)
         truth = comparable(log, states, site).truth
         assert truth is not None
         assert states.pose_cov is not None

@@ -40,7 +40,7 @@ FEW = 0.1  # share of epochs that a hemisphere may leave a second place
 
 
 @dataclass(frozen=True)
-class Found:
+class ReceiverResult:
     """What one seed gave.
 
     Parameters
@@ -142,14 +142,14 @@ def write_log(directory: Path, amplitude: Array) -> None:
 
 def hypotheses(log: Path, output: Path, where: Where) -> tuple[dict[str, Array], dict[str, Any]]:
     """Fix a log; return its hypotheses as columns, and the report."""
-    run_fix(Job(log, None, output, where=where), free=("gain",))
+    run_fix(Job(log, None, output, where=where), free_parameters=("gain",))
     names = "time_ns hypothesis position_x position_y position_z axis_x axis_y axis_z"
     table = pq.read_table(output / "fixes.parquet", columns=names.split())
     report: dict[str, Any] = json.loads((output / "report.json").read_text())
     return {name: table[name].to_numpy() for name in table.column_names}, report
 
 
-def run(seed: int, epochs: int = 100) -> Found:
+def run(seed: int, epochs: int = 100) -> ReceiverResult:
     """Simulate receivers at random over the coils, and fix them."""
     rng = np.random.default_rng(seed)
     half = 0.5 * PITCH * (ACROSS - 1)
@@ -168,11 +168,11 @@ def run(seed: int, epochs: int = 100) -> Found:
     errors = np.empty((2, 2, epochs))  # without and with; place, axis
     for run_, table in enumerate((anywhere, front)):
         epoch = np.rint(table["time_ns"] / 1e8).astype(int)
-        found = np.stack([table[f"position_{c}"] for c in "xyz"], axis=1)
+        result = np.stack([table[f"position_{c}"] for c in "xyz"], axis=1)
         towards = np.stack([table[f"axis_{c}"] for c in "xyz"], axis=1)
         across = np.linalg.norm(np.cross(towards, axis[epoch]), axis=1)
-        away = np.linalg.norm(found - place[epoch], axis=1)
-        mirror = np.linalg.norm(found - place[epoch] * [1.0, 1.0, -1.0], axis=1)
+        away = np.linalg.norm(result - place[epoch], axis=1)
+        mirror = np.linalg.norm(result - place[epoch] * [1.0, 1.0, -1.0], axis=1)
         for k in range(epochs):
             own = np.flatnonzero(epoch == k)
             nearer = own[0] if run_ else own[np.argmin(away[own])]
@@ -192,7 +192,7 @@ def run(seed: int, epochs: int = 100) -> Found:
         and 1.5 <= nees <= 6.0
         and "roll_open" in codes
     )
-    return Found(
+    return ReceiverResult(
         seed,
         100.0 * rms(errors[:, 0]),
         100.0 * float(worst[0]),
@@ -227,17 +227,17 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3, help="how many, from --seed")
     options = parser.parse_args()
     seeds = range(options.seed, options.seed + options.seeds)
-    found = [run(seed, 20 if options.quick else 100) for seed in seeds]
+    result = [run(seed, 20 if options.quick else 100) for seed in seeds]
     lines = [
         f"seed {one.seed}: place {one.place_percent:.2f} % of the range (largest"
         f" {one.largest_place_percent:.2f} %), axis {one.axis_rad:.4f} rad (largest"
         f" {one.largest_axis_rad:.4f}), NEES {one.nees:.2f} of 3, both mirrors"
         f" {one.mirrored:.0%}, one place with a hemisphere {one.alone:.0%}:"
         f" {'pass' if one.passed else 'FAIL'}"
-        for one in found
+        for one in result
     ]
-    conclude("\n".join(lines), found)
-    if not all(one.passed for one in found):
+    conclude("\n".join(lines), result)
+    if not all(one.passed for one in result):
         raise SystemExit(1)
 
 

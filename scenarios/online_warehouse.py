@@ -23,7 +23,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.log import simulate_fields
-from magfusion.simulation.motion import Motion, random_walk_motion
+from magfusion.simulation.motion import SimulatedMotion, random_walk_motion
 from magfusion.units import Array
 
 Estimator = Literal["smoother", "ekf"]
@@ -60,7 +60,7 @@ class World:
     """The data, and what they were made of."""
 
     site: Site
-    motion: Motion
+    motion: SimulatedMotion
     imu: ImuSamples
     fields: FieldSamples
 
@@ -93,7 +93,7 @@ def draw(config: Config) -> World:
     ).samples
     epochs = motion.trajectory(np.arange(STEP, config.duration - STEP, STEP))
     fields = simulate_fields(site, epochs, config.field_sigma, rng, window=0.4)
-    return World(site, motion, _silenced(imu), _spoilt(fields, config, rng))
+    return World(site, motion, _silenced(imu), _corrupted(fields, config, rng))
 
 
 def _silenced(imu: ImuSamples) -> ImuSamples:
@@ -102,7 +102,7 @@ def _silenced(imu: ImuSamples) -> ImuSamples:
     return ImuSamples(imu.time[there], imu.gyro_body[there], imu.accel_body[there])
 
 
-def _spoilt(fields: FieldSamples, config: Config, rng: np.random.Generator) -> FieldSamples:
+def _corrupted(fields: FieldSamples, config: Config, rng: np.random.Generator) -> FieldSamples:
     phasor = fields.phasor_sensor.copy()
     after = fields.time >= PHASES["outliers"][0]
     hit = (rng.random(phasor.shape[:2]) < config.outlier_share) & after[:, None]
@@ -123,7 +123,7 @@ def navigate(world: World, estimator: Estimator, config: Config) -> tuple[list[S
     late = np.where((time >= late_from) & (time < late_to), 0.4, 0.0)
     arrives = np.searchsorted(np.sort(time + late), time + late)
     order = np.argsort(arrives, kind="stable")
-    made: list[State] = []
+    built: list[State] = []
     fed = 0
     for k in order:
         rows = slice(fed, int(np.searchsorted(world.imu.time, time[k] + late[k])))
@@ -133,21 +133,21 @@ def navigate(world: World, estimator: Estimator, config: Config) -> tuple[list[S
                 world.imu.time[rows], world.imu.gyro_body[rows], world.imu.accel_body[rows]
             )
         navigator.add_fields(world.fields.rows(slice(int(k), int(k) + 1)))
-        made += navigator.take()
-    return made, navigator
+        built += navigator.take()
+    return built, navigator
 
 
-def errors(world: World, found: Trajectory) -> Array:
+def errors(world: World, result: Trajectory) -> Array:
     """Return the distance from the true position at each state (m)."""
-    true = world.motion.trajectory(found.time)
-    return np.asarray(np.linalg.norm(found.position_world - true.position_world, axis=1))
+    true = world.motion.trajectory(result.time)
+    return np.asarray(np.linalg.norm(result.position_world - true.position_world, axis=1))
 
 
-def recovery(found: Trajectory, error: Array) -> int:
+def recovery(result: Trajectory, error: Array) -> int:
     """Return how many epochs after the IMU came back the error stays within three times usual."""
     begin, end = PHASES["undisturbed"]
-    usual = float(np.sqrt(np.mean(error[(found.time >= begin) & (found.time < end)] ** 2)))
-    after = np.flatnonzero(found.time > PHASES["IMU silent"][1])
+    usual = float(np.sqrt(np.mean(error[(result.time >= begin) & (result.time < end)] ** 2)))
+    after = np.flatnonzero(result.time > PHASES["IMU silent"][1])
     beyond = np.flatnonzero(error[after][:40] > 3.0 * usual)
     return int(beyond[-1] + 1) if len(beyond) else 0
 
@@ -159,14 +159,14 @@ def run(config: Config, output: Path | None = None) -> dict[str, object]:
     drawn = {}
     for estimator in ESTIMATORS:
         states, navigator = navigate(world, estimator, config)
-        found = as_trajectory(states)
-        error = errors(world, found)
-        drawn[estimator] = (found, error)
+        result = as_trajectory(states)
+        error = errors(world, result)
+        drawn[estimator] = (result, error)
         for name, (begin, end) in PHASES.items():
-            part = (found.time >= begin) & (found.time < end)
+            part = (result.time >= begin) & (result.time < end)
             rms = float(np.sqrt(np.mean(error[part] ** 2))) if np.any(part) else None
             figures[f"{estimator}, {name}"] = None if rms is None else round(100.0 * rms, 3)
-        figures[f"{estimator}, epochs to recover"] = recovery(found, error)
+        figures[f"{estimator}, epochs to recover"] = recovery(result, error)
         figures[f"{estimator}, counts"] = dict(navigator.counts)
     if output is not None:
         write_picture(drawn, output)
@@ -186,9 +186,9 @@ def write_picture(drawn: dict[Estimator, tuple[Trajectory, Array]], output: Path
     """Write the way through the hall, and the errors over time."""
     figure = blank_figure(13.0, 5.0)
     plan, over_time = figure.subplots(1, 2)
-    for estimator, (found, error) in drawn.items():
-        plan.plot(*found.position_world[:, :2].T, linewidth=0.8, label=estimator)
-        over_time.semilogy(found.time, 100.0 * error, linewidth=0.8, label=estimator)
+    for estimator, (result, error) in drawn.items():
+        plan.plot(*result.position_world[:, :2].T, linewidth=0.8, label=estimator)
+        over_time.semilogy(result.time, 100.0 * error, linewidth=0.8, label=estimator)
     plan.plot(*np.array(PLACES, dtype=float).T, "k^", label="beacons")
     plan.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title="the way")
     plan.legend(loc="upper right")

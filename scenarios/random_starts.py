@@ -27,7 +27,7 @@ from magfusion.errors import EstimationError
 from magfusion.estimation.batch.batch import smooth
 from magfusion.estimation.batch.offline import OfflineStart, begin
 from magfusion.estimation.demodulation.demodulation import phasors
-from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.integrity.judge import judge_result
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
@@ -48,17 +48,17 @@ class Case:
     """A simulated log and its phasors."""
 
     site: Site
-    made: SimulatedLog
+    simulated: SimulatedLog
     samples: FieldSamples
 
     def starts(self) -> list[OfflineStart]:
         """Return the starts that are offered."""
         calibration = initial_calibration(self.site, float(np.mean(self.samples.time)))
-        return begin(self.samples, None, self.made.log, calibration)
+        return begin(self.samples, None, self.simulated.log, calibration)
 
     def wrong(self, states: Trajectory) -> float:
         """Return the share of epochs that are at another hypothesis than the truth's."""
-        truth = self.made.motion.trajectory(states.time)
+        truth = self.simulated.motion.trajectory(states.time)
         away = np.linalg.norm(states.position_world - truth.position_world, axis=1)
         between = np.swapaxes(truth.world_from_body, 1, 2) @ states.world_from_body
         angle = Rotation.from_matrix(between).magnitude()
@@ -79,7 +79,7 @@ class Row:
     nees: float | None = None
 
     @property
-    def found(self) -> bool:
+    def success(self) -> bool:
         """Whether some start is right."""
         return self.wrong < MOST_WRONG
 
@@ -95,12 +95,12 @@ def recorded(site: Site, seed: int, duration: float, speed: float = 0.5) -> Case
     config = SimulationConfig(
         DEMO_BOX_WORLD, duration, speed=speed, rests=Rests(start=3.0, move=20.0, pause=3.0)
     )
-    made = simulate_log(site, config, np.random.default_rng([7, seed]))
-    samples, _ = phasors(made.log, site)
-    return Case(site, made, samples)
+    built = simulate_log(site, config, np.random.default_rng([7, seed]))
+    samples, _ = phasors(built.log, site)
+    return Case(site, built, samples)
 
 
-def lone(
+def single(
     seed: int,
     duration: float,
     *,
@@ -138,16 +138,16 @@ def drawn(seed: int, duration: float) -> Case:
 
 def run_one(seed: int, *, alone: bool) -> Row:
     """Simulate a log and look for its starts; smooth it where that decides something."""
-    case = lone(seed, 30.0) if alone else drawn(seed, 15.0)
+    case = single(seed, 30.0) if alone else drawn(seed, 15.0)
     beacons = case.site.beacons
     row = Row(seed, len(beacons), beacons[0].synchronised, _least_wrong(case))
-    if row.found and not alone:
+    if row.success and not alone:
         return row
     try:
-        result, trust = judged(smooth(case.made.log, case.site), case.made.log)
+        result, trust = judge_result(smooth(case.simulated.log, case.site), case.simulated.log)
     except EstimationError:
         return replace(row, verdict=str(Verdict.FAILED))
-    truth = case.made.log.truth
+    truth = case.simulated.log.truth
     assert truth is not None
     errors = trajectory_errors(result.states, truth)
     return replace(
@@ -177,8 +177,8 @@ def report(rows: Sequence[Row]) -> str:
                 f"{row.seed:4d} {row.beacons:7d} {100 * row.wrong:4.0f} % {smoothed:>9} {nees:>6}"
                 f"  {row.verdict} {', '.join(row.codes)}"
             )
-    found, silent = sum(row.found for row in rows), [row.seed for row in rows if row.silent]
-    lines.append(f"a right start in {found} of {len(rows)} ({100 * found / len(rows):.1f} %)")
+    result, silent = sum(row.success for row in rows), [row.seed for row in rows if row.silent]
+    lines.append(f"a right start in {result} of {len(rows)} ({100 * result / len(rows):.1f} %)")
     trusted = [row.nees for row in rows if row.verdict == "trustworthy" and row.nees is not None]
     if trusted:
         above, due = sum(one > LARGE_NEES for one in trusted), float(chi2.sf(LARGE_NEES, 6))

@@ -26,13 +26,13 @@ class LeftOut:
 
 def left_out(case: Case) -> LeftOut:
     """Return it over draws of seeds that are ranged nowhere."""
-    power, alike, step = 0.0, np.zeros(LEFT_OUT_PLACES), 0.0
+    power, shared, step = 0.0, np.zeros(LEFT_OUT_PLACES), 0.0
     for seed in range(LEFT_OUT_SEED, LEFT_OUT_SEED + LEFT_OUT_DRAWS):
         own = draw_world(case, Config(), np.random.default_rng([seed, 19]))
         assert own.around.steel is not None
         casing = replace(own.around.steel, pipes=own.around.steel.pipes[:1])
         plain = replace(own.around, steel=casing, layers=None)
-        for one in own.passes:
+        for one in own.transits:
             depth = np.linspace(*one.depth, LEFT_OUT_PLACES)
             whole = passing_phasor(own.site, own.shaft, one, own.around, depth)
             known = passing_phasor(own.site, own.shaft, one, plain, depth)
@@ -40,10 +40,10 @@ def left_out(case: Case) -> LeftOut:
             power += float(np.mean(np.sum(np.abs(error) ** 2, axis=1)))
             for lag in range(LEFT_OUT_PLACES):
                 product = np.sum(error[: len(depth) - lag] * error[lag:].conj(), axis=1)
-                alike[lag] += float(np.mean(product.real))
+                shared[lag] += float(np.mean(product.real))
             step = float(depth[1] - depth[0])
-    apart = int(np.argmax(alike < alike[0] / np.e))
-    return LeftOut(case.name, float(np.sqrt(power / (2 * LEFT_OUT_DRAWS))), apart * step)
+    separate = int(np.argmax(shared < shared[0] / np.e))
+    return LeftOut(case.name, float(np.sqrt(power / (2 * LEFT_OUT_DRAWS))), separate * step)
 
 
 def main() -> None:

@@ -20,17 +20,17 @@ from far_and_weak import (
     STORMS,
     errors_in_sigmas,
     far_site,
+    monitored_log,
     pose_error,
     true_phasors,
-    witnessed_log,
 )
 from harness import conclude, rms, scenario_parser
 from mine_noise import KINDS, RATE_HZ, SIGMA, Interference, mine_log
 from mine_noise import Config as MineConfig
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.rests.at_rest import AtRest, at_rest
 from magfusion.estimation.rests.rest_stream import RestNavigator, RestState
+from magfusion.estimation.rests.stationary_integration import IntegratedRests, integrate_rests
 from magfusion.jobs.navigate_rests import replayed
 from magfusion.model.samples import FieldSamples, Log, Waveform
 from magfusion.model.site import Site
@@ -54,7 +54,7 @@ class Sharpened:
     """What is known after so long."""
 
     after_s: float
-    heard: float  # share of the tones
+    detected: float  # share of the tones
     position_m: float
     sigma_m: float
     pose_nees: float
@@ -63,14 +63,14 @@ class Sharpened:
 
 
 @dataclass(frozen=True)
-class Witnessed:
+class MonitoredRest:
     """What a reference in the stream takes off."""
 
     name: str
     gain: float  # of the rms error of a phasor, without one
     gain_at_once: float  # of the whole rest at once
     nees: float
-    said: str
+    reported: str
 
 
 @dataclass(frozen=True)
@@ -90,16 +90,16 @@ def states_of(log: Log, site: Site) -> tuple[list[RestState], int]:
     return [one for one in replayed(log, navigator) if one.standing], navigator.kept
 
 
-def as_rest(samples: FieldSamples) -> AtRest:
+def as_rest(samples: FieldSamples) -> IntegratedRests:
     """Return a state's phasors as those of a rest."""
     none = np.zeros((1, len(samples.channels)))
-    return AtRest(samples, none, none == 0.0, {})
+    return IntegratedRests(samples, none, none == 0.0, {})
 
 
 def pose_of(state: RestState, truth: Trajectory) -> tuple[float, float, float]:
     """Return error and sigma of the position (m), and the NEES of the pose."""
-    assert state.found is not None
-    fixes = state.found.fixes
+    assert state.fixes is not None
+    fixes = state.fixes.fixes
     rotation, cov = fixes.world_from_body[0, 0], fixes.pose_cov[0, 0]
     turn = Rotation.from_matrix(truth.world_from_body[0].T @ rotation).as_rotvec()
     offset = fixes.position_world[0, 0] - truth.position_world[0]
@@ -112,9 +112,9 @@ def run_sharpening(config: Config) -> tuple[list[Sharpened], float, list[int]]:
     """Measure rests without storms; return what the whole rest at once errs by, too (m)."""
     site, rows, whole, kept = far_site(), [], [], []
     for seed in range(config.seed, config.seed + config.runs):
-        made = witnessed_log(site, config.rest, seed, FAR_AWAY, 0.0)
-        log = replace(made.log, reference=None)
-        at_once = at_rest(log, site)
+        built = monitored_log(site, config.rest, seed, FAR_AWAY, 0.0)
+        log = replace(built.log, reference=None)
+        at_once = integrate_rests(log, site)
         whole.append(pose_error(at_once, log, site)[0])
         states, count = states_of(log, site)
         kept.append(count)
@@ -122,12 +122,12 @@ def run_sharpening(config: Config) -> tuple[list[Sharpened], float, list[int]]:
         for state in states:
             assert state.samples is not None
             own = as_rest(state.samples)
-            square = float(np.mean(errors_in_sigmas(own, made)))
+            square = float(np.mean(errors_in_sigmas(own, built)))
             ratio = float(np.median(_sigma(state.samples) / sigma))
             assert log.truth is not None
-            pose = (np.nan,) * 3 if state.found is None else pose_of(state, log.truth)
-            heard = float(np.mean(state.heard))
-            rows.append((round(state.duration, -1), heard, *pose, square, ratio))
+            pose = (np.nan,) * 3 if state.fixes is None else pose_of(state, log.truth)
+            detected = float(np.mean(state.detected))
+            rows.append((round(state.duration, -1), detected, *pose, square, ratio))
     table, out = np.array(rows), []
     for after in np.unique(table[:, 0]):
         own = table[table[:, 0] == after]
@@ -142,32 +142,32 @@ def _sigma(samples: FieldSamples) -> Array:
     return np.asarray(np.sqrt(np.trace(samples.phasor_cov[0], axis1=1, axis2=2)))
 
 
-def run_reference(name: str, config: Config, until: float = np.inf) -> Witnessed:
+def run_reference(name: str, config: Config, until: float = np.inf) -> MonitoredRest:
     """Measure what a reference takes off, in the stream and at once."""
-    site, square, nees, said = far_site(), [], [], set[str]()
+    site, square, nees, findings = far_site(), [], [], set[str]()
     for seed in range(config.seed, config.seed + config.runs):
-        made = witnessed_log(site, config.storm, seed, FAR_AWAY, STORMS, LATE, RATE)
-        reference = made.log.reference
+        built = monitored_log(site, config.storm, seed, FAR_AWAY, STORMS, LATE, RATE)
+        reference = built.log.reference
         assert reference is not None
         there = reference.time < until
         cut = Waveform(reference.time[there], reference.measured_sensor[there])
-        log, known = replace(made.log, reference=cut), made.true_site
+        log, known = replace(built.log, reference=cut), built.true_site
         states, _ = states_of(log, known)
         last = states[-1].samples
         assert last is not None
-        alone = at_rest(replace(log, reference=None), known)
-        ways = (alone.fields, last, at_rest(log, known).fields)
-        true = true_phasors(alone, made)
+        alone = integrate_rests(replace(log, reference=None), known)
+        ways = (alone.fields, last, integrate_rests(log, known).fields)
+        true = true_phasors(alone, built)
         square.append([np.mean(np.abs(way.phasor_sensor - true) ** 2) for way in ways])
-        nees.append(np.mean(errors_in_sigmas(as_rest(last), made)))
-        said |= {finding.code for state in states for finding in state.trust.findings}
+        nees.append(np.mean(errors_in_sigmas(as_rest(last), built)))
+        findings |= {finding.code for state in states for finding in state.trust.findings}
     total = np.sqrt(np.mean(square, axis=0))
-    codes = ", ".join(sorted(said))
+    codes = ", ".join(sorted(findings))
     gain = total[0] / total[1:]
-    return Witnessed(name, float(gain[0]), float(gain[1]), float(np.mean(nees)), codes)
+    return MonitoredRest(name, float(gain[0]), float(gain[1]), float(np.mean(nees)), codes)
 
 
-def run_mine(kind: Interference, config: Config) -> Mine:
+def run_in_mine(kind: Interference, config: Config) -> Mine:
     """Measure one kind of interference."""
     square, nees = np.zeros((2, config.runs)), np.zeros((2, config.runs))
     mine = MineConfig(duration=config.mine)
@@ -176,7 +176,7 @@ def run_mine(kind: Interference, config: Config) -> Mine:
         states, _ = states_of(log, site)
         last = states[-1].samples
         assert last is not None
-        for way, fields in enumerate((last, at_rest(log, site).fields)):
+        for way, fields in enumerate((last, integrate_rests(log, site).fields)):
             error = fields.phasor_sensor[0] - phasor
             solved = np.linalg.solve(fields.phasor_cov[0], error[..., None])[..., 0]
             square[way, k] = np.mean(np.abs(error) ** 2) / 2.0
@@ -188,19 +188,19 @@ def run_mine(kind: Interference, config: Config) -> Mine:
 
 
 def report(
-    sharpened: list[Sharpened], whole: float, witnessed: list[Witnessed], mines: list[Mine]
+    sharpened: list[Sharpened], whole: float, monitored: list[MonitoredRest], mines: list[Mine]
 ) -> str:
     """Return the tables."""
     lines = ["at rest  heard  position  its sigma  NEES (6)  of phasors  sigma by all at once"]
     for one in sharpened:
-        heard = f"{one.after_s:5.0f} s{100.0 * one.heard:6.0f} %{one.position_m:8.2f} m"
-        sure = f"{one.sigma_m:9.2f} m{one.pose_nees:10.2f}{one.phasor_nees:12.2f}"
-        lines.append(f"{heard}{sure}{one.times_whole:12.2f}")
+        detected = f"{one.after_s:5.0f} s{100.0 * one.detected:6.0f} %{one.position_m:8.2f} m"
+        certain = f"{one.sigma_m:9.2f} m{one.pose_nees:10.2f}{one.phasor_nees:12.2f}"
+        lines.append(f"{detected}{certain}{one.times_whole:12.2f}")
     lines.append(f"all at once: {whole:.2f} m")
     lines.append("reference            gain of error  at once  NEES (6)")
-    for found in witnessed:
-        gain = f"{found.gain:14.2f}{found.gain_at_once:9.2f}{found.nees:10.2f}"
-        lines.append(f"{found.name:20}{gain}  {found.said}")
+    for result in monitored:
+        gain = f"{result.gain:14.2f}{result.gain_at_once:9.2f}{result.nees:10.2f}"
+        lines.append(f"{result.name:20}{gain}  {result.reported}")
     lines.append("mine               times the bound  NEES (6)   at once, times the bound  NEES")
     for mine in mines:
         own = f"{mine.times_bound:15.2f}{mine.nees:10.2f}"
@@ -217,15 +217,15 @@ def main() -> None:
     given = parser.parse_args()
     config = Config(runs=given.runs, seed=given.seed)
     sharpened, whole, kept = run_sharpening(config)
-    witnessed = [
+    monitored = [
         run_reference("5 km away", config),
         run_reference("ends halfway", config, 0.5 * config.storm),
     ]
-    mines = [run_mine(kind, config) for kind in KINDS]
-    found = {"sharpened": sharpened, "whole_m": whole, "kept": max(kept)}
-    text = report(sharpened, whole, witnessed, mines)
+    mines = [run_in_mine(kind, config) for kind in KINDS]
+    result = {"sharpened": sharpened, "whole_m": whole, "kept": max(kept)}
+    text = report(sharpened, whole, monitored, mines)
     text += f"\nsamples kept at the end of a rest: at most {max(kept)}"
-    conclude(text, found | {"witnessed": witnessed, "mines": mines})
+    conclude(text, result | {"witnessed": monitored, "mines": mines})
 
 
 if __name__ == "__main__":

@@ -24,9 +24,9 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.demodulation.demodulation import first_fixes
-from magfusion.estimation.integrity.judge import judged
-from magfusion.estimation.rests.at_rest import at_rest
+from magfusion.estimation.integrity.judge import judge_result
 from magfusion.estimation.rests.rest_stream import RestNavigator
+from magfusion.estimation.rests.stationary_integration import integrate_rests
 from magfusion.jobs.navigate_rests import replayed
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import Log
@@ -57,19 +57,19 @@ class Config:
 
 
 @dataclass(frozen=True)
-class Found:
+class RestsResult:
     """What a method finds of all rests of all logs.
 
     Parameters
     ----------
-    told : int
+    findings : int
         Rests with a pose.
     failed, doubted : int
         Logs.
     """
 
     method: str
-    told: int
+    findings: int
     failed: int
     doubted: int
     position_m: float
@@ -96,7 +96,7 @@ Poses = tuple[Trajectory, Trust]
 
 def fixed(log: Log, site: Site) -> Poses:
     """Return the poses of rests, each for itself."""
-    rested = at_rest(log, site)
+    rested = integrate_rests(log, site)
     best = first_fixes(rested.fields, log, initial_calibration(site, 0.0)).best()
     return best, Trust(rested.findings)
 
@@ -108,12 +108,12 @@ def navigated(log: Log, site: Site) -> Poses:
         if not state.standing and newest is not None:
             last.append(newest)
             newest = None
-        elif state.found is not None:
+        elif state.fixes is not None:
             newest = state
     last += [] if newest is None else [newest]
     if not last:
         raise EstimationError("no rest is told of")
-    fixes = [state.found.fixes.best() for state in last if state.found is not None]
+    fixes = [state.fixes.fixes.best() for state in last if state.fixes is not None]
     trust = Trust()
     for state in last:
         trust |= state.trust
@@ -129,9 +129,9 @@ def navigated(log: Log, site: Site) -> Poses:
 
 def smoothed(log: Log, site: Site) -> Poses:
     """Return the poses of rests in one solution, with the covariance that the job tells."""
-    rested = at_rest(log, site, least=2)
+    rested = integrate_rests(log, site, least=2)
     own = rested.log(log)
-    honest, trust = judged(smooth(own, site, SmootherSettings()), own)
+    honest, trust = judge_result(smooth(own, site, SmootherSettings()), own)
     states = honest.states
     assert states.pose_cov is not None
     near = np.abs(states.time - rested.fields.time[:, None]).argmin(axis=1)
@@ -164,7 +164,7 @@ def errors(poses: Trajectory, truth: Trajectory) -> tuple[Array, Array]:
     return error, np.asarray(np.sum(error * solved, axis=1))
 
 
-def run(config: Config) -> list[Found]:
+def run(config: Config) -> list[RestsResult]:
     """Measure all methods on the same logs."""
     site = far_site()
     logs = [resting(site, config, config.seed + k) for k in range(config.runs)]
@@ -187,7 +187,7 @@ def run(config: Config) -> list[Found]:
             nees.append(own)
         error = np.concatenate([np.zeros((0, 6)), *parts])
         out.append(
-            Found(
+            RestsResult(
                 name,
                 len(error),
                 failed,
@@ -201,15 +201,15 @@ def run(config: Config) -> list[Found]:
     return out
 
 
-def report(found: list[Found]) -> str:
+def report(result: list[RestsResult]) -> str:
     """Return the table."""
     lines = [
         f"{'':20}rests told  logs failed, doubted   position  attitude  NEES (6)   of the logs"
     ]
-    for one in found:
+    for one in result:
         spread = f"{min(one.nees_each):.1f} to {max(one.nees_each):.1f}" if one.nees_each else "-"
         lines.append(
-            f"{one.method:20}{one.told:10}{one.failed:13}{one.doubted:9}{one.position_m:9.2f} m"
+            f"{one.method:20}{one.findings:10}{one.failed:13}{one.doubted:9}{one.position_m:9.2f} m"
             f"{one.attitude_deg:6.2f} deg{one.nees:10.2f}   {spread}"
         )
     return "\n".join(lines)
@@ -221,8 +221,8 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=Config.runs, help="logs, a seed each")
     parser.add_argument("--rest", type=float, default=Config.rest, help="length of a rest (s)")
     given = parser.parse_args()
-    found = run(Config(rest=given.rest, runs=given.runs, seed=given.seed))
-    conclude(report(found), found)
+    result = run(Config(rest=given.rest, runs=given.runs, seed=given.seed))
+    conclude(report(result), result)
 
 
 if __name__ == "__main__":

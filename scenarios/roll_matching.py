@@ -90,9 +90,9 @@ def calibrated_error(config: Config, rng: np.random.Generator) -> tuple[Array, A
     tilt = Rotation.from_rotvec(rng.normal(0.0, config.position_tilt_deg * DEGREE, (12, 3)))
     reading = tilt.apply(declared) @ true_matrix.T + true_offset
     reading += rng.normal(0.0, config.position_noise_mg * MILLIGAUSS, (12, 3))
-    found = least_squares(reading, declared)
-    inverse = np.linalg.inv(found.matrix)
-    return inverse @ true_matrix, inverse @ (true_offset - found.offset)
+    result = least_squares(reading, declared)
+    inverse = np.linalg.inv(result.matrix)
+    return inverse @ true_matrix, inverse @ (true_offset - result.offset)
 
 
 def measure(
@@ -126,14 +126,14 @@ def once(
     true = on_axis(rng.uniform(-np.pi, np.pi, config.rolls), axis)
     measured = measure(true, left_over, noise_mg, rng)
     sigma = noise_mg * MILLIGAUSS
-    found: tuple[Matches, ...] = (
+    result: tuple[Matches, ...] = (
         match_nearest(index, measured, sigma),
         match_interpolated(index, measured, sigma),
         match_roll(measured, true[0, 1], true[0, 2], FIELD_WORLD, sigma),
     )
     return {
         name: wrap(matches.rpy[:, 0, 0] - true[:, 0]) / DEGREE
-        for name, matches in zip(METHODS, found, strict=True)
+        for name, matches in zip(METHODS, result, strict=True)
     }
 
 
@@ -145,7 +145,7 @@ def run(config: Config) -> tuple[Row, ...]:
 def _row(config: Config, axis: str, step_deg: float, noise_mg: float) -> Row:
     generators = np.random.default_rng(config.seed).spawn(config.seeds)
     runs = [once(config, axis, step_deg, noise_mg, rng) for rng in generators]
-    error = {name: np.abs([found[name] for found in runs]) for name in METHODS}
+    error = {name: np.abs([result[name] for result in runs]) for name in METHODS}
     return Row(
         axis=axis,
         step_deg=step_deg,
@@ -183,9 +183,9 @@ def draw(config: Config, path: Path) -> None:
         fields.plot(true_deg, measured[:, k] / MILLIGAUSS, label=f"field {name}")
     fields.set(ylabel="mG", title="A calibrated magnetometer, 3 mG, on a vertical axis")
     for match, name in ((match_nearest, "nearest"), (match_interpolated, "interpolated")):
-        found = match(index, measured, 3.0 * MILLIGAUSS).rpy[:, 0, 0]
-        rolls.plot(true_deg, found / DEGREE, ".", ms=2, label=name)
-        errors.plot(true_deg, wrap(found - true_deg * DEGREE) / DEGREE, lw=0.7, label=name)
+        result = match(index, measured, 3.0 * MILLIGAUSS).rpy[:, 0, 0]
+        rolls.plot(true_deg, result / DEGREE, ".", ms=2, label=name)
+        errors.plot(true_deg, wrap(result - true_deg * DEGREE) / DEGREE, lw=0.7, label=name)
     for limit in (-PAPER_DEG, PAPER_DEG):
         errors.axhline(limit, color="red", ls="--", lw=0.8)
     rolls.set(ylabel="roll found (deg)")

@@ -40,7 +40,7 @@ from magfusion.model.site import Beacon, BeaconSigma, Site, rotor_coils
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.layers import Layers
 from magfusion.simulation.pipe import Pipe, Steel
-from magfusion.simulation.rotor import Pass, Surroundings, simulate_passes
+from magfusion.simulation.rotor import Pass, Surroundings, simulate_transits
 from magfusion.simulation.shaft import Shaft
 from magfusion.simulation.wells import TwoWells, drawn_steel
 from magfusion.units import Array
@@ -75,7 +75,7 @@ class Case:
     ----------
     distance : float
         About (m).
-    apart : float
+    well_distance : float
         Of the sensor's two places along its well (m).
     reach : float
         Of the magnet's way on either side of the sensor (m).
@@ -93,7 +93,7 @@ class Case:
 
     name: str
     distance: float
-    apart: float
+    well_distance: float
     reach: float
     converge: float
     speed: float
@@ -158,7 +158,7 @@ class World:
     site: Site
     shaft: Shaft
     wells: TwoWells
-    passes: tuple[Pass, ...]
+    transits: tuple[Pass, ...]
     around: Surroundings
 
 
@@ -168,7 +168,7 @@ class Scene:
 
     log: Log
     wells: TwoWells
-    passes: tuple[Pass, ...]
+    transits: tuple[Pass, ...]
     stretch: float
 
 
@@ -186,9 +186,9 @@ def draw_world(case: Case, config: Config, rng: np.random.Generator) -> World:
     distance = case.distance * rng.uniform(0.9, 1.1)
     right, up = rng.normal(0.0, case.converge, 2)
     turn, ahead = rng.uniform(-np.pi, np.pi), rng.uniform(-2.0, 2.0)
-    way = case.apart, case.reach, case.speed
+    way = case.well_distance, case.reach, case.speed
     wells = TwoWells(distance, angle, dip, (right, up), turn, ahead, *way)
-    passes = wells.passes(rng.uniform(-np.pi, np.pi, 2))
+    max_iterations = wells.transits_of(rng.uniform(-np.pi, np.pi, 2))
     # An error of the angle twice a turn makes an ellipse of half its size.
     first, second = 2.0 * ELLIPSE * rng.standard_normal(2)
     shaft = Shaft(
@@ -204,27 +204,27 @@ def draw_world(case: Case, config: Config, rng: np.random.Generator) -> World:
         STRETCH * rng.standard_normal(),
         READING,
     )
-    return World(site, shaft, wells, passes, around)
+    return World(site, shaft, wells, max_iterations, around)
 
 
 def draw(case: Case, config: Config, seed: int) -> Scene:
     """Draw two wells, and what the sensor records in two passes."""
     rng = np.random.default_rng([seed, 19])
     own = draw_world(case, config, rng)
-    log = simulate_passes(
-        own.site, own.shaft, own.passes, own.around, RATE_HZ, rng, encoder=config.encoder
+    log = simulate_transits(
+        own.site, own.shaft, own.transits, own.around, RATE_HZ, rng, encoder=config.encoder
     )
-    return Scene(log, own.wells, own.passes, own.around.depth_scale)
+    return Scene(log, own.wells, own.transits, own.around.depth_scale)
 
 
 def _steel(case: Case, wells: TwoWells, rng: np.random.Generator) -> Steel:
     """Return the casing about the sensor, not quite as declared, and rails off the magnet's way."""
     true = drawn_steel(CASING, rng)
     steel = true.wall, true.permeability, true.conductivity
-    half = 0.5 * case.apart + case.reach + case.distance
+    half = 0.5 * case.well_distance + case.reach + case.distance
     casing = wells.casing(half, RADIUS, steel, case.segment)
     rails = []
-    for place in (-0.5 * case.apart, 0.5 * case.apart):
+    for place in (-0.5 * case.well_distance, 0.5 * case.well_distance):
         away = wells.direction + rng.uniform(0.5 * np.pi, 1.5 * np.pi)
         across = rng.uniform(RAIL_FROM, RAIL_TO) * np.array([0.0, -np.sin(away), np.cos(away)])
         ends = [
@@ -268,20 +268,20 @@ class Judgement:
 
 
 def pose_error(
-    scene: Scene, windows: RangingWindows, found: Ranged, *, measured: bool = True
+    scene: Scene, windows: RangingWindows, result: Ranged, *, measured: bool = True
 ) -> Array:
     """Return the error of the pose in the axes of the true high side (6,), rotation first.
 
     Where the angle is not measured, zero of the magnet's turn is anywhere: the truth is turned to
     the estimate about the magnet's axis, for a covariance holds near by and not half a turn away.
     """
-    own = scene.passes[0]
+    own = scene.transits[0]
     rotor_world = own.world_from_rotor
     depth = windows.magnet_from / (1.0 + scene.stretch)
     magnet = own.start_world + (depth - own.depth[0]) * rotor_world[:, 0]
     place = rotor_world.T @ (own.sensor_world - magnet)
     true = gtsam.Pose3(gtsam.Rot3(rotor_world.T @ scene.wells.side_world), place)
-    estimated = gtsam.Pose3(gtsam.Rot3(found.world_from_body), found.position_world)
+    estimated = gtsam.Pose3(gtsam.Rot3(result.world_from_body), result.position_world)
     if not measured:
         between = estimated.rotation().matrix() @ true.rotation().matrix().T
         turn = np.arctan2(between[2, 1] - between[1, 2], between[1, 1] + between[2, 2])
@@ -289,13 +289,13 @@ def pose_error(
     return np.asarray(gtsam.Pose3.Logmap(true.between(estimated)))
 
 
-def nees(error: Array, found: Ranged, *, measured: bool) -> float:
+def nees(error: Array, result: Ranged, *, measured: bool) -> float:
     """Return the NEES of a pose; where the angle is not measured without the turn that is open."""
-    weight = np.linalg.inv(found.cov[:6, :6])
+    weight = np.linalg.inv(result.cov[:6, :6])
     if not measured:
         axis = np.array([1.0, 0.0, 0.0])
-        turn = np.concatenate([axis, np.cross(axis, found.position_world)]).reshape(2, 3)
-        way = (turn @ found.world_from_body).ravel()
+        turn = np.concatenate([axis, np.cross(axis, result.position_world)]).reshape(2, 3)
+        way = (turn @ result.world_from_body).ravel()
         weight = weight - np.outer(weight @ way, way @ weight) / (way @ weight @ way)
     return float(error @ weight @ error)
 
@@ -308,15 +308,15 @@ def run_one(case: Case, config: Config, seed: int) -> Row:
         model_error=case.model_error,
         model_error_length=case.model_error_length,
     )
-    told = ranging_log(scene.log, site, case.window, errors=DepthErrors(WINDOW_DEPTH, STRETCH))
-    found = find_range(site, told.windows)
-    wells = Wells(found, told.windows, np.array([1.0, 0.0, 0.0]))
+    reported = ranging_log(scene.log, site, case.window, errors=DepthErrors(WINDOW_DEPTH, STRETCH))
+    result = find_range(site, reported.windows)
+    wells = Wells(result, reported.windows, np.array([1.0, 0.0, 0.0]))
     errors, distances, sigmas = [], [], []
-    for own in scene.passes:
-        distance, direction, depth = scene.wells.abreast(own)
-        one = wells.abreast(own.sensor_depth)
-        turned = np.angle(np.exp(1j * (one.direction - direction)))
-        errors.append([one.distance - distance, np.rad2deg(turned), one.depth - depth])
+    for own in scene.transits:
+        distance, direction, depth = scene.wells.truth_of(own)
+        one = wells.wells_at(own.sensor_depth)
+        rotated = np.angle(np.exp(1j * (one.direction - direction)))
+        errors.append([one.distance - distance, np.rad2deg(rotated), one.depth - depth])
         distances.append(distance)
         sigmas.append(one.distance_sigma)
     error = np.mean(errors, axis=0)
@@ -330,16 +330,16 @@ def run_one(case: Case, config: Config, seed: int) -> Row:
         direction_error_deg=float(error[1]),
         depth_error_m=float(error[2]),
         nees=nees(
-            pose_error(scene, told.windows, found, measured=config.encoder),
-            found,
+            pose_error(scene, reported.windows, result, measured=config.encoder),
+            result,
             measured=config.encoder,
         ),
-        residual_rms=float(np.sqrt(found.chi_square / found.freedom)),
-        converged=found.converged,
+        residual_rms=float(np.sqrt(result.chi_square / result.freedom)),
+        converged=result.converged,
     )
 
 
-def judged(rows: list[Row]) -> Judgement:
+def judge_ranging(rows: list[Row]) -> Judgement:
     """Judge the draws of a case."""
     share = np.array([row.error_m / row.distance_m for row in rows])
     mean = float(np.mean([row.nees for row in rows]))
@@ -359,7 +359,7 @@ def judged(rows: list[Row]) -> Judgement:
     )
 
 
-def report(rows: list[Row], found: list[Judgement]) -> str:
+def report(rows: list[Row], result: list[Judgement]) -> str:
     """Return the table of the draws, and the verdict."""
     lines = [
         f"{'case':10}{'angle':10}{'seed':>5}{'distance':>10}{'error':>10}{'sigma':>10}"
@@ -372,7 +372,7 @@ def report(rows: list[Row], found: list[Judgement]) -> str:
             f"{row.direction_error_deg:7.2f} deg{100 * row.depth_error_m:6.1f} cm{row.nees:8.2f}"
             f"{row.residual_rms:10.3f}{'' if row.converged else '  not converged'}"
         )
-    for one in found:
+    for one in result:
         word = {True: "fulfilled: ", False: "NOT fulfilled: ", None: ""}[one.fulfilled]
         lines.append(
             f"{one.case}, angle {one.angle}, {one.runs} draws: {word}distance"
@@ -389,15 +389,15 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=Config.runs, help="of each case of the rule")
     parser.add_argument("--others", type=int, default=Config.others, help="with a followed angle")
     given = parser.parse_args()
-    rows, found = list[Row](), list[Judgement]()
+    rows, result = list[Row](), list[Judgement]()
     for case in (CROSSING, PAIR):
         for encoder in (True, False):
             config = Config(seed=given.seed, encoder=encoder)
             runs = given.runs if encoder else given.others
             own = [run_one(case, config, given.seed + k) for k in range(runs)]
             rows += own
-            found += [judged(own)] if own else []
-    conclude(report(rows, found), {"rows": rows, "judgements": found})
+            result += [judge_ranging(own)] if own else []
+    conclude(report(rows, result), {"rows": rows, "judgements": result})
 
 
 if __name__ == "__main__":

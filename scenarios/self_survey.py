@@ -71,10 +71,10 @@ def declared_site(config: Config, index: int) -> Site:
     return replace(site, beacons=tuple(beacons))
 
 
-def turn_deg(found: Beacon, true: Beacon) -> float:
+def turn_deg(result: Beacon, true: Beacon) -> float:
     """Return how far a beacon is turned; of its own axis alone where its phase is unknown."""
-    between = found.world_from_beacon.T @ true.world_from_beacon
-    if found.synchronised:
+    between = result.world_from_beacon.T @ true.world_from_beacon
+    if result.synchronised:
         return float(np.degrees(Rotation.from_matrix(between).magnitude()))
     return float(np.degrees(np.arctan2(np.hypot(between[0, 2], between[1, 2]), between[2, 2])))
 
@@ -82,21 +82,21 @@ def turn_deg(found: Beacon, true: Beacon) -> float:
 def run_walk(config: Config, rng: np.random.Generator) -> list[Row]:
     """Simulate one walk and find each beacon in turn by it."""
     site = demo_site(config.coil_radius, config.synchronised)
-    made = simulate_log(site, SimulationConfig(DEMO_BOX_WORLD, duration=config.duration), rng)
+    built = simulate_log(site, SimulationConfig(DEMO_BOX_WORLD, duration=config.duration), rng)
     rows = []
-    for index, true in enumerate(made.true_site.beacons):
+    for index, true in enumerate(built.true_site.beacons):
         declared = declared_site(config, index)
-        result, placed = smooth_and_place(made.log, declared, SmootherSettings(), quiet)
-        found = result.calibration.site.beacons[index]
-        assert made.log.truth is not None
+        result, placed = smooth_and_place(built.log, declared, SmootherSettings(), quiet)
+        estimate = result.calibration.site.beacons[index]
+        assert built.log.truth is not None
         rows.append(
             Row(
                 beacon=true.name,
-                position_m=float(np.linalg.norm(found.position_world - true.position_world)),
-                rotation_deg=turn_deg(found, true),
+                position_m=float(np.linalg.norm(estimate.position_world - true.position_world)),
+                rotation_deg=turn_deg(estimate, true),
                 claimed_sigma_m=_claimed(result.calibration_cov, result.blocks, true.name),
                 places=len(placed[0].hypotheses),
-                aligned_ate_m=trajectory_errors(result.states, made.log.truth).aligned_ate,
+                aligned_ate_m=trajectory_errors(result.states, built.log.truth).aligned_ate,
             )
         )
     return rows
@@ -154,8 +154,8 @@ def main() -> None:
     if options.quick:
         config = replace(config, walks=1, duration=30.0)
     walks = [config] * config.walks
-    found = run_many(run_walk, walks, seed=config.seed, **chosen_scale(options))
-    rows = [row for walk in found for row in walk]
+    result = run_many(run_walk, walks, seed=config.seed, **chosen_scale(options))
+    rows = [row for walk in result for row in walk]
     if options.output is not None:
         draw(rows, options.output / "self_survey.png")
     figures = vars(config) | {

@@ -78,7 +78,7 @@ def declared() -> Site:
         falling = gain ** np.arange(3.0)
         return FrequencyResponse(frequency_hz, falling, -lag * np.arange(3.0))
 
-    left = replace(known, name="left", position_body=np.array([0.125, 0.0, 0.0]))
+    remaining = replace(known, name="left", position_body=np.array([0.125, 0.0, 0.0]))
     right = replace(
         known,
         name="right",
@@ -89,24 +89,24 @@ def declared() -> Site:
         clock_offset=CLOCK,
         sigma=replace(known.sigma, clock_offset=CLOCK_SIGMA),
     )
-    return replace(site, platform=site.platform.carrying((left, right)))
+    return replace(site, platform=site.platform.with_magnetometers((remaining, right)))
 
 
 def only(site: Site, kept: list[int]) -> Site:
     """Return the site of some of its magnetometers."""
     sensors = tuple(site.platform.magnetometers[k] for k in kept)
-    return replace(site, platform=site.platform.carrying(sensors))
+    return replace(site, platform=site.platform.with_magnetometers(sensors))
 
 
 def recorded(walk: SimulatedLog, bending: Bending, which: int, at: Trajectory) -> FieldSamples:
     """Return the phasors of one magnetometer as it stamps and refers them."""
     own = only(walk.true_site, [which])
     rng = np.random.default_rng(which)
-    found = simulate_fields(own, at, NOISE, rng, walk.drives, WINDOW, bending=bending)
+    result = simulate_fields(own, at, NOISE, rng, walk.drives, WINDOW, bending=bending)
     late = own.platform.magnetometer.clock_offset
     tones = np.concatenate([beacon.tone_frequencies_hz for beacon in own.beacons])
     turn = np.exp(2j * np.pi * tones * late)[:, None]
-    return replace(found, time=found.time - late, phasor_sensor=found.phasor_sensor * turn)
+    return replace(result, time=result.time - late, phasor_sensor=result.phasor_sensor * turn)
 
 
 def walked(site: Site, duration: float, seed: int) -> tuple[Log, SimulatedLog, Bending]:
@@ -117,8 +117,8 @@ def walked(site: Site, duration: float, seed: int) -> tuple[Log, SimulatedLog, B
     parts = []
     for which, rate in enumerate(RATES):
         at = np.arange(EDGE + 0.03 * which, duration - EDGE, 1.0 / rate)
-        found = recorded(walk, bending, which, walk.motion.trajectory(at))
-        parts.append(on_log_clock(found, only(site, [which])))
+        result = recorded(walk, bending, which, walk.motion.trajectory(at))
+        parts.append(on_log_clock(result, only(site, [which])))
     fields = side_by_side(parts, site)
     return replace(walk.log, waveforms={}, fields=fields), walk, bending
 
@@ -132,7 +132,7 @@ def fixed(site: Site, walk: SimulatedLog, bending: Bending, kept: list[int]) -> 
         replace(s, clock_offset=0.0, sigma=replace(s.sigma, clock_offset=0.0))
         for s in some.platform.magnetometers
     )
-    some = replace(some, platform=some.platform.carrying(known))
+    some = replace(some, platform=some.platform.with_magnetometers(known))
     samples = side_by_side(parts, some) if len(kept) > 1 else parts[0]
     return fix_epochs(samples, initial_calibration(some, 0.0)).best()
 
@@ -150,7 +150,7 @@ def filtered(log: Log, site: Site) -> Trajectory:
 def run(walks: int, duration: float, seed: int) -> list[Row]:
     """Return the rows of all estimators."""
     site = declared()
-    found: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
+    result: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
     for k in range(walks):
         log, walk, bending = walked(site, duration, seed + k)
         assert log.fields is not None
@@ -167,9 +167,9 @@ def run(walks: int, duration: float, seed: int) -> list[Row]:
                 errors = trajectory_errors(states, walk.motion.trajectory(states.time))
                 assert errors.nees is not None
                 own = errors.ate, errors.attitude_rmse_deg, float(np.mean(errors.nees))
-                found.setdefault((estimator, name), []).append(own)
+                result.setdefault((estimator, name), []).append(own)
     rows = []
-    for (estimator, name), values in found.items():
+    for (estimator, name), values in result.items():
         position, attitude, nees = np.array(values).T
         rows.append(Row(estimator, name, 1e3 * rms(position), rms(attitude), float(np.mean(nees))))
     return sorted(rows, key=lambda row: row.estimator)
@@ -177,34 +177,34 @@ def run(walks: int, duration: float, seed: int) -> list[Row]:
 
 def run_raw(walks: int, duration: float, seed: int) -> tuple[list[Row], float]:
     """Return the rows of raw samples, and how far pipe and log are apart at most (m)."""
-    site, apart = declared(), 0.0
-    found: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
+    site, separate = declared(), 0.0
+    result: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
     for k in range(walks):
         errors, far = raw_errors(walked_raw(site, BOX, duration, seed + k), site)
-        apart = max(apart, far)
+        separate = max(separate, far)
         for key, one in errors.items():
-            found.setdefault(key, []).append((one.position_mm, one.attitude_deg, one.nees))
+            result.setdefault(key, []).append((one.position_mm, one.attitude_deg, one.nees))
     rows = []
-    for (estimator, name), values in found.items():
+    for (estimator, name), values in result.items():
         position, attitude, nees = np.array(values).T
         rows.append(Row(estimator, name, rms(position), rms(attitude), float(np.mean(nees))))
-    return rows, apart
+    return rows, separate
 
 
 def named(duration: float, seed: int) -> list[str]:
     """Return what is said where the second is not mounted as the site says."""
     site = declared()
     log, _, _ = walked(site, duration, seed)
-    left, right = site.platform.magnetometers
+    remaining, right = site.platform.magnetometers
     turn = Rotation.from_euler("x", MISTAKE, degrees=True).as_matrix()
     wrong = replace(right, body_from_sensor=right.body_from_sensor @ turn)
-    site = replace(site, platform=site.platform.carrying((left, wrong)))
+    site = replace(site, platform=site.platform.with_magnetometers((remaining, wrong)))
 
     def solve(log: Log, site: Site) -> Smoothed:
         return smooth(log, site, SmootherSettings(tune=False))
 
-    found = agreed(smooth(log, site), log, site, solve, solve)
-    return [finding.text for finding in found.findings]
+    result = agreed(smooth(log, site), log, site, solve, solve)
+    return [finding.text for finding in result.findings]
 
 
 def main() -> None:
@@ -212,7 +212,7 @@ def main() -> None:
     parser = scenario_parser(__doc__, 1, "one short walk", None)
     options = parser.parse_args()
     walks, duration = (1, 12.0) if options.quick else (3, 20.0)
-    raw, apart = run_raw(walks, duration, options.seed)
+    raw, separate = run_raw(walks, duration, options.seed)
     rows = [*run(walks, duration, options.seed), *raw]
     lines = [f"{'':30}{'':14}{'position':>12}{'attitude':>12}{'mean NEES':>12}"]
     lines += [
@@ -220,9 +220,9 @@ def main() -> None:
         f"{r.nees:12.1f}"
         for r in rows
     ]
-    lines.append(f"The states of the pipe are those of the log within {apart:.1e} m.")
-    said = named(duration, options.seed)
-    conclude("\n".join([*lines, *said]), {"rows": rows, "said": said, "apart_m": apart})
+    lines.append(f"The states of the pipe are those of the log within {separate:.1e} m.")
+    findings = named(duration, options.seed)
+    conclude("\n".join([*lines, *findings]), {"rows": rows, "said": findings, "apart_m": separate})
 
 
 if __name__ == "__main__":

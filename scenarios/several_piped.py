@@ -15,7 +15,7 @@ import numpy as np
 
 from magfusion.estimation.batch.batch import smooth
 from magfusion.estimation.data_checks.magnetometers import without_magnetometer
-from magfusion.estimation.demodulation.demodulated_apart import demodulated_apart
+from magfusion.estimation.demodulation.separate_demodulation import demodulated_apart
 from magfusion.estimation.graph.state import as_trajectory
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.fields import by_own_clocks
@@ -56,7 +56,7 @@ def navigated(log: Log, site: Site) -> Trajectory:
     return as_trajectory(states)
 
 
-def apart(log: Log, site: Site, states: Trajectory) -> float:
+def run_separately(log: Log, site: Site, states: Trajectory) -> float:
     """Return by how much the states of the pipe differ from those of the log, at most (m)."""
     source, sink = io.BytesIO(), io.BytesIO()
     run_replay(log, source, "json", realtime=False)
@@ -65,18 +65,18 @@ def apart(log: Log, site: Site, states: Trajectory) -> float:
         place = Path(directory) / "site.yaml"
         save_site(site, place)
         run_stream(place, StreamSettings(EKF), source, sink, io.StringIO())
-    told = [json.loads(line) for line in sink.getvalue().splitlines()]
-    found = np.array([state["position"] for state in told if state["started"]])
-    if found.shape != states.position_world.shape:
+    reported = [json.loads(line) for line in sink.getvalue().splitlines()]
+    result = np.array([state["position"] for state in reported if state["started"]])
+    if result.shape != states.position_world.shape:
         return np.inf
-    return float(np.max(np.abs(found - states.position_world)))
+    return float(np.max(np.abs(result - states.position_world)))
 
 
 def errors_of(states: Trajectory, walk: SimulatedLog) -> Errors:
     """Return the errors of states against the truth."""
-    found = trajectory_errors(states, walk.motion.trajectory(states.time))
-    assert found.nees is not None
-    return Errors(1e3 * found.ate, found.attitude_rmse_deg, float(np.mean(found.nees)))
+    result = trajectory_errors(states, walk.motion.trajectory(states.time))
+    assert result.nees is not None
+    return Errors(1e3 * result.ate, result.attitude_rmse_deg, float(np.mean(result.nees)))
 
 
 def raw_errors(walk: SimulatedLog, site: Site) -> tuple[dict[tuple[str, str], Errors], float]:
@@ -93,14 +93,14 @@ def raw_errors(walk: SimulatedLog, site: Site) -> tuple[dict[tuple[str, str], Er
         "smooth, raw": lambda log, site: smooth(log, site).states,
         "filter, raw": navigated,
     }
-    found = {
+    result = {
         (name, which): errors_of(run(*one), walk)
         for name, run in estimators.items()
         for which, one in logs.items()
     }
-    found["smooth, turns alone taken off", "both"] = errors_of(smooth(fields, site).states, walk)
+    result["smooth, turns alone taken off", "both"] = errors_of(smooth(fields, site).states, walk)
     by_fields = navigated(fields, site)
-    found["filter, turns alone taken off", "both"] = errors_of(by_fields, walk)
+    result["filter, turns alone taken off", "both"] = errors_of(by_fields, walk)
     by_samples = navigated(walk.log, site)
-    far = max(apart(walk.log, site, by_samples), apart(stamped, site, by_fields))
-    return found, far
+    far = max(run_separately(walk.log, site, by_samples), run_separately(stamped, site, by_fields))
+    return result, far

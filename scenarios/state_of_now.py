@@ -21,7 +21,7 @@ from harness import conclude, scenario_parser
 
 from magfusion.estimation.graph.state import as_trajectory
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.online.state_of_now import CarriedState
+from magfusion.estimation.online.state_of_now import PropagatedState
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site, save_site
 from magfusion.files.stream import json_line
@@ -78,18 +78,18 @@ def simulated(config: Config) -> tuple[str, Log, Site]:
     return "simulated", simulate_log(site, plan, np.random.default_rng(config.seed)).log, site
 
 
-def errors_at(states: list[CarriedState], truth: Trajectory) -> dict[str, float]:
+def errors_at(states: list[PropagatedState], truth: Trajectory) -> dict[str, float]:
     """Return errors of states (mm, deg) and their NEES."""
-    found = trajectory_errors(as_trajectory(list(states)), truth)
-    assert found.nees is not None
+    result = trajectory_errors(as_trajectory(list(states)), truth)
+    assert result.nees is not None
     return {
-        "position_mm": 1e3 * found.ate,
-        "attitude_deg": found.attitude_rmse_deg,
-        "nees": float(np.mean(found.nees)),
+        "position_mm": 1e3 * result.ate,
+        "attitude_deg": result.attitude_rmse_deg,
+        "nees": float(np.mean(result.nees)),
     }
 
 
-def held_errors(states: list[CarriedState], truth: Trajectory) -> dict[str, float]:
+def held_errors(states: list[PropagatedState], truth: Trajectory) -> dict[str, float]:
     """Return by how much the truth moved since the epoch (mm, deg), as a held state would err."""
     at = np.array([s.time for s in states])
     inside = (at > truth.time[0]) & (at < truth.time[-1])
@@ -101,8 +101,8 @@ def held_errors(states: list[CarriedState], truth: Trajectory) -> dict[str, floa
     rows = [
         np.clip(np.searchsorted(truth.time, t), 0, len(truth) - 1) for t in (at[inside], before)
     ]
-    turned = np.einsum("nij,nkj->nik", *(truth.world_from_body[r] for r in rows))
-    angle = np.arccos(np.clip(0.5 * (np.trace(turned, axis1=1, axis2=2) - 1.0), -1.0, 1.0))
+    rotated = np.einsum("nij,nkj->nik", *(truth.world_from_body[r] for r in rows))
+    angle = np.arccos(np.clip(0.5 * (np.trace(rotated, axis1=1, axis2=2) - 1.0), -1.0, 1.0))
     moved = np.sum((now - then) ** 2, axis=0)
     return {
         "held_position_mm": 1e3 * float(np.sqrt(np.mean(moved))),
@@ -110,9 +110,9 @@ def held_errors(states: list[CarriedState], truth: Trajectory) -> dict[str, floa
     }
 
 
-def carried(
+def propagated(
     log: Log, site: Site, estimator: str, *, levels: bool
-) -> tuple[list[CarriedState], float]:
+) -> tuple[list[PropagatedState], float]:
     """Return the states of now along a log, and the processor time that they took (s)."""
     settings = NavigatorSettings(
         "ekf" if estimator == "ekf" else "smoother", rate="imu", risk=Risk() if levels else None
@@ -124,8 +124,8 @@ def carried(
         imu = piece.imu
         began = time.process_time()
         if len(imu):
-            navigator.hear_imu(imu.time, imu.gyro_body, imu.accel_body)
-        states += navigator.take_carried()
+            navigator.propagate_imu(imu.time, imu.gyro_body, imu.accel_body)
+        states += navigator.take_propagated()
         spent += time.process_time() - began
         navigator.advance()
         if piece.waveform is not None:
@@ -134,7 +134,7 @@ def carried(
             navigator.add_fields(samples)
         navigator.take()
         navigator.take_lagged()
-    return [s for s in states if not s.lost], spent
+    return [s for s in states if not s.is_lost], spent
 
 
 def pipe_ages(log: Log, site: Path, seconds: float) -> Array:
@@ -192,7 +192,7 @@ def run(config: Config) -> dict[str, object]:
     for name, log, site in logs or [simulated(config)]:
         assert log.truth is not None
         for estimator in ESTIMATORS:
-            states, spent = carried(log, site, estimator, levels=False)
+            states, spent = propagated(log, site, estimator, levels=False)
             aged = [s for s in states if AGE[0] <= s.time - s.epoch <= AGE[1]]
             own = errors_at(aged, log.truth) | held_errors(aged, log.truth)
             own["nees"] = errors_at(states, log.truth)["nees"]

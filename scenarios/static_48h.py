@@ -40,20 +40,20 @@ from magfusion.papers.p004_fingerprints.algorithms import RotatingFields, fix_as
 from magfusion.papers.p004_fingerprints.equations import eq_25_fingerprint
 from magfusion.papers.p004_fingerprints.fingerprint import fingerprint_database
 from magfusion.receiver.ellipse import plane_normal
-from magfusion.results.drift import FEWEST_COMMON, THREE_SIGMA, common_slope
+from magfusion.results.drift import MIN_COMMON, THREE_SIGMA, common_slope
 from magfusion.simulation.disturbance import DayNight
 from magfusion.simulation.drift import (
     COPPER_PER_KELVIN,
-    Clock,
     DailySwing,
     Drift,
+    DriveClock,
     Wander,
     WarmUp,
     draw_drift,
 )
 from magfusion.simulation.monte_carlo import run_many
 from magfusion.simulation.waveform import Mains
-from magfusion.simulation.worlds import F1, Receiver, World, draw_world
+from magfusion.simulation.worlds import F1, SimulatedReceiver, SimulatedWorld, draw_world
 from magfusion.units import DEGREE, NANOTESLA, Array, ComplexArray
 
 HOUR = 3600.0  # s
@@ -62,14 +62,14 @@ CURRENT = Drift(
     coils=WarmUp(rise=20.0, time_constant=90.0 * 60.0),
     fading_per_kelvin=1e-4,
     gain=Wander(rms=0.003, time_constant=4.0 * HOUR),
-    clock=Clock(walk=1e-9),
+    clock=DriveClock(walk=1e-9),
     sensor=DailySwing(amplitude=4.0, warmest_time=DAYTIME),
     scale_per_kelvin=5e-5,
 )
 CASES = {
     "current drive": CURRENT,
     "voltage drive": replace(CURRENT, fading_per_kelvin=COPPER_PER_KELVIN),
-    "0.01 ppm clock": replace(CURRENT, clock=Clock(rate=1e-8, walk=1e-9)),
+    "0.01 ppm clock": replace(CURRENT, clock=DriveClock(rate=1e-8, walk=1e-9)),
 }
 METHODS: dict[str, tuple[str, ...] | None] = {  # and what is found beside the pose
     "A3": None,
@@ -97,7 +97,7 @@ class Config:
     interval: float = 60.0  # s between fixes
     settled_hours: float = 12.0  # before which slopes do not count
     place_world: Array = field(default_factory=lambda: np.array([2.85, 2.25, 0.5]))  # mid-room, m
-    receiver: Receiver = field(default_factory=Receiver)
+    receiver: SimulatedReceiver = field(default_factory=SimulatedReceiver)
     # One-sided density: 2 nT rms at night to 4 nT by day at 200 Hz (paper: 3 nT).
     night_density: float = 0.2 * NANOTESLA  # T / sqrt(Hz)
     day_density: float = 0.4 * NANOTESLA
@@ -193,7 +193,9 @@ class Surroundings:
     added: ComplexArray  # (n, beacons, 3), T
     sigma: Array  # (n,), T; of each component
 
-    def measure(self, world: World, drift: Drift, config: Config, seed: int) -> FieldSamples:
+    def measure(
+        self, world: SimulatedWorld, drift: Drift, config: Config, seed: int
+    ) -> FieldSamples:
         """Return what a level sensor at rest measures while so much drifts."""
         beacons, time = len(world.true_beacons), config.time
         drawn = draw_drift(drift, time, beacons, np.random.default_rng(seed))
@@ -211,7 +213,9 @@ class Surroundings:
         )
 
 
-def draw_surroundings(world: World, config: Config, rng: np.random.Generator) -> Surroundings:
+def draw_surroundings(
+    world: SimulatedWorld, config: Config, rng: np.random.Generator
+) -> Surroundings:
     """Draw noise, hum and the fresh part of the world's gains."""
     shape = (len(config.time), len(world.true_beacons), 3)
     receiver = config.receiver
@@ -235,7 +239,7 @@ def mapped(site: Site, survey: Survey) -> Site:
 
 
 def locate(
-    world: World, survey: Survey, site: Site, samples: FieldSamples
+    world: SimulatedWorld, survey: Survey, site: Site, samples: FieldSamples
 ) -> dict[str, Trajectory]:
     """Return the fixes of each method."""
     fields = RotatingFields(
@@ -250,9 +254,11 @@ def locate(
     # A free phase leaves the mirrored pose possible: the survey tells on which side they are.
     return {
         method: a3
-        if free is None
-        else refine(samples, calibration, a3, survey_error=False, free=free).best()
-        for method, free in METHODS.items()
+        if free_parameters is None
+        else refine(
+            samples, calibration, a3, survey_error=False, free_parameters=free_parameters
+        ).best()
+        for method, free_parameters in METHODS.items()
     }
 
 
@@ -264,13 +270,13 @@ def run_world(config: Config, rng: np.random.Generator) -> dict[tuple[str, str],
     site = mapped(world.site, survey)
     surroundings = draw_surroundings(world, config, noise_rng)
     seed = int(drift_rng.integers(2**63))
-    found = {}
+    result = {}
     for case, drift in CASES.items():
         samples = surroundings.measure(world, drift, config, seed)
         for method, fixes in locate(world, survey, site, samples).items():
             turn = Rotation.from_matrix(fixes.world_from_body).as_rotvec() / DEGREE
-            found[case, method] = Errors(fixes.position_world - config.place_world, turn)
-    return found
+            result[case, method] = Errors(fixes.position_world - config.place_world, turn)
+    return result
 
 
 def slopes(config: Config, error: Array) -> Array:
@@ -279,25 +285,25 @@ def slopes(config: Config, error: Array) -> Array:
     In one day and a half the daily swing of the noise leaves a slope of up to 0.2 of the swing of
     the error: two thousandths of a degree, which the gains' wander hides unless gains are free.
     """
-    settled = config.time > config.settled_hours * HOUR
-    days = config.time[settled] / (24.0 * HOUR)
-    return np.asarray(np.polyfit(days, error[:, settled].T, 1)[0])
+    converged = config.time > config.settled_hours * HOUR
+    days = config.time[converged] / (24.0 * HOUR)
+    return np.asarray(np.polyfit(days, error[:, converged].T, 1)[0])
 
 
 def components(config: Config, errors: list[Array]) -> Components | None:
     """Return the slopes of the components of each world's errors (n, 3) after settling."""
-    if len(errors) < FEWEST_COMMON:
+    if len(errors) < MIN_COMMON:
         return None
-    settled = config.time > config.settled_hours * HOUR
-    found = common_slope([config.time[settled]] * len(errors), [e[settled] for e in errors])
+    converged = config.time > config.settled_hours * HOUR
+    result = common_slope([config.time[converged]] * len(errors), [e[converged] for e in errors])
     return Components(
-        tuple(found.per_day.tolist()), tuple(found.standard_error.tolist()), found.probability
+        tuple(result.per_day.tolist()), tuple(result.standard_error.tolist()), result.probability
     )
 
 
 def summarise(config: Config, worlds: list[dict[tuple[str, str], Errors]]) -> tuple[Row, ...]:
     """Return a row for each case and method."""
-    settled = config.time > config.settled_hours * HOUR
+    converged = config.time > config.settled_hours * HOUR
     rows = []
     for case, method in worlds[0]:
         position = np.stack([world[case, method].position for world in worlds])
@@ -308,8 +314,8 @@ def summarise(config: Config, worlds: list[dict[tuple[str, str], Errors]]) -> tu
             Row(
                 case=case,
                 method=method,
-                position_mean=float(np.mean(position[:, settled])),
-                attitude_mean=float(np.mean(attitude[:, settled])),
+                position_mean=float(np.mean(position[:, converged])),
+                attitude_mean=float(np.mean(attitude[:, converged])),
                 position_slope=float(np.mean(by_position)),
                 position_slope_se=float(share * np.std(by_position, ddof=1)),
                 attitude_slope=float(np.mean(by_attitude)),
@@ -358,7 +364,7 @@ def by_components(rows: tuple[Row, ...]) -> list[str]:
     for row in rows:
         place, turn = row.position_components, row.attitude_components
         if place is None or turn is None:
-            return [*lines, f" takes {FEWEST_COMMON} worlds: no verdict"]
+            return [*lines, f" takes {MIN_COMMON} worlds: no verdict"]
         cells = "".join(
             f"{scale * slope:+{digits}} +-{scale * error:<{width}} "
             for part, scale, digits, width in (

@@ -184,8 +184,8 @@ def run(config: Config) -> Result:
     )
 
 
-def _mean_distance(found: Array, true: Array) -> float:
-    return float(np.linalg.norm(found - true, axis=1).mean())
+def _mean_distance(result: Array, true: Array) -> float:
+    return float(np.linalg.norm(result - true, axis=1).mean())
 
 
 def report(result: Result) -> str:

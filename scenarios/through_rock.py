@@ -19,7 +19,7 @@ from harness import conclude, rms, scenario_parser
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.integrity.judge import judge_result
 from magfusion.model.ground import conductivity_of, in_ground
 from magfusion.model.parameters import CONDUCTIVITY
 from magfusion.model.samples import Log
@@ -162,14 +162,14 @@ def position_errors(result: Smoothed, log: Log) -> tuple[float, float]:
 
 def smoothed(log: Log, site: Site, place: Place, seed: int, declared: str) -> Row:
     """Smooth a log by a site."""
-    result, trust = judged(smooth(log, site, SmootherSettings()), log)
+    result, trust = judge_result(smooth(log, site, SmootherSettings()), log)
     error, nees = position_errors(result, log)
-    found, off = conductivity_of(result.calibration.site), None
+    estimate, off = conductivity_of(result.calibration.site), None
     for block in result.blocks:
         if block.parameter == CONDUCTIVITY:
             variance = float(result.calibration_cov[block.columns, block.columns][0, 0])
-            off = float(np.log(found / place.conductivity)) / variance**0.5
-    return Row(place.name, seed, declared, error, nees, found, off, str(trust.verdict))
+            off = float(np.log(estimate / place.conductivity)) / variance**0.5
+    return Row(place.name, seed, declared, error, nees, estimate, off, str(trust.verdict))
 
 
 def run_place(place: Place, config: Config) -> list[Row]:
@@ -191,19 +191,19 @@ def judgement(place: Place, rows: list[Row], config: Config) -> Judgement:
     nees = float(np.mean([row.nees for row in own]))
     bound = 2.0 * place.bound if config.surface else place.bound
     # A half space has no conductivity of a full one: what is found is what stands in for it.
-    sure = config.surface or (off <= 3.0 and nees >= LEAST_NEES)
-    good = worst <= bound and sure and nees <= MOST_NEES
+    certain = config.surface or (off <= 3.0 and nees >= LEAST_NEES)
+    good = worst <= bound and certain and nees <= MOST_NEES
     return Judgement(place.name, worst, bound, off, nees, good)
 
 
-def report(rows: list[Row], found: list[Judgement]) -> str:
+def report(rows: list[Row], result: list[Judgement]) -> str:
     """Return the table of the errors, and the verdict."""
     lines = [f"{'place':24}{'conductivity':24}{'position':>11}{'NEES':>8}{'S/m':>10}{'sigmas':>8}"]
     for row in rows:
         off = "" if row.off_in_sigmas is None else f"{row.off_in_sigmas:8.2f}"
         figures = f"{100.0 * row.position_m:8.2f} cm{row.nees:8.2f}{row.conductivity_s_m:10.4g}"
         lines.append(f"{row.place:24}{row.declared:24}{figures}{off:8}  {row.verdict}")
-    for one in found:
+    for one in result:
         lines.append(
             f"{one.place}: {'fulfilled' if one.fulfilled else 'NOT fulfilled'}: at most"
             f" {100.0 * one.worst_m:.2f} cm of {100.0 * one.bound_m:g}, {one.worst_in_sigmas:.2f}"
@@ -221,8 +221,8 @@ def main() -> None:
     config, rows = Config(seed=given.seed, logs=given.logs, surface=given.surface), list[Row]()
     for place in PLACES:
         rows += run_place(place, config)
-    found = [judgement(place, rows, config) for place in PLACES]
-    conclude(report(rows, found), {"rows": rows, "judgements": found})
+    result = [judgement(place, rows, config) for place in PLACES]
+    conclude(report(rows, result), {"rows": rows, "judgements": result})
 
 
 if __name__ == "__main__":

@@ -122,8 +122,8 @@ def by_likelihood(site: Site, config: Config, tilt_deg: float) -> float:
     sigma = config.sample_sigma_nt * NANOTESLA * np.sqrt(2.0 / config.samples)
     samples = observe(site, position_world, true, float(sigma), config.seed + 1)
     fixes = fix_epochs(samples, initial_calibration(site, 0.0), survey_error=False)
-    found = np.swapaxes(fixes.world_from_body[:, 0], -1, -2)
-    return float(np.mean(between_deg(found, true)))
+    result = np.swapaxes(fixes.world_from_body[:, 0], -1, -2)
+    return float(np.mean(between_deg(result, true)))
 
 
 def run(config: Config) -> tuple[Row, ...]:

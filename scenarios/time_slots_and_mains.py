@@ -52,7 +52,7 @@ from magfusion.units import DEGREE, MU0_OVER_4PI, Array, ComplexArray
 DISTANCE = 0.5  # m
 UNIT = MU0_OVER_4PI / DISTANCE**3  # T; K/R^3 of one A m^2
 COIL_RADIUS = 0.02  # m
-SIZE_PASSES = 3  # each leaves a hundredth of what the one before did
+SIZE_ITERATIONS = 3  # each leaves a hundredth of what the one before did
 SILENCE = 1e-16  # T/sqrt(Hz); of an instrument without noise
 REMOVALS: tuple[Removal, ...] = ("none", "subtract", "interpolate", "state")
 PRINTED_DEG = {  # attitude RMS of the independent analysis: none, subtract, interpolate
@@ -179,7 +179,7 @@ def recorded(
     return waveform, ImuSamples(stamps, np.zeros_like(force), force)
 
 
-def located(site: Site, seen: ComplexArray, passes: int = SIZE_PASSES) -> TrackerFix:
+def located(site: Site, seen: ComplexArray, max_iterations: int = SIZE_ITERATIONS) -> TrackerFix:
     """Return the closed form for coils of their true size.
 
     It is one of dipoles: the model's difference between coils and dipoles, at the pose found, is
@@ -191,13 +191,13 @@ def located(site: Site, seen: ComplexArray, passes: int = SIZE_PASSES) -> Tracke
         With one beacon at the origin.
     seen : ndarray, shape (n, tones, 3)
         Phasors (T), sensor axes.
-    passes : int
+    max_iterations : int
         None for a closed form that takes the coils for dipoles.
     """
     beacon, sensor = site.beacons[0], site.platform.magnetometer
     point = as_points(beacon)
     fix = locate_by_svd(unit_coupling(beacon, seen, np.eye(3)))
-    for _ in range(passes):
+    for _ in range(max_iterations):
         world_from_sensor = np.swapaxes(fix.sensor_from_beacon, -1, -2)
         at = fix.position_beacon[:, 0]  # coils and dipoles are alike on both sides
         sized, dipole = (observe_from(b, sensor, world_from_sensor, at)[0] for b in (beacon, point))
@@ -221,8 +221,8 @@ def errors(
     """
     wrong: ComplexArray = (samples.phasor_sensor - true) * np.exp(-1j * drive_phase)
     residual = np.linalg.norm(wrong.real, axis=-1) / UNIT
-    found = located(site, samples.phasor_sensor).sensor_from_beacon
-    turn = Rotation.from_matrix(found @ room.rotation.as_matrix())
+    result = located(site, samples.phasor_sensor).sensor_from_beacon
+    turn = Rotation.from_matrix(result @ room.rotation.as_matrix())
     return residual, np.asarray(turn.magnitude() / DEGREE)
 
 
@@ -245,20 +245,20 @@ def pulsed(
 ) -> dict[Removal, tuple[float, float]]:
     """Return residual and attitude error (deg) of each removal, RMS over all rooms."""
     site = tracker(0.0, Slots(duration, 4), density)
-    found: dict[Removal, list[tuple[Array, Array]]] = {removal: [] for removal in REMOVALS}
+    result: dict[Removal, list[tuple[Array, Array]]] = {removal: [] for removal in REMOVALS}
     for room in rooms(config):
         mains = None if mains_hz is None else _mains(config, room, mains_hz)
         length = 4 * duration * config.cycles
         waveform, imu = recorded(site, room, config.pulsed_rate_hz, length, mains)
         true = true_phasors(site, room)
-        for removal, parts in found.items():
+        for removal, parts in result.items():
             settings = SlotSettings(removal, "rectangular")
             slots, _ = received(waveform, imu, site, settings)
             samples = whole_cycles(slots, imu, site)
             inner = slice(1, -1)  # the first cycle has no silent slot before it
             residual, attitude = errors(site, room, true, samples)
             parts.append((residual[inner], attitude[inner]))
-    return {k: (rms([p[0] for p in v]), rms([p[1] for p in v])) for k, v in found.items()}
+    return {k: (rms([p[0] for p in v]), rms([p[1] for p in v])) for k, v in result.items()}
 
 
 def pulsed_rows(config: Config) -> Iterator[Row]:
@@ -321,8 +321,8 @@ def carrier_rows(config: Config) -> Iterator[CarrierRow]:
 def noise_deg(config: Config, snr_db: float = 60.0, duration: float = 2.5e-3) -> dict[str, float]:
     """Return the attitude error (deg) of each removal in white noise and no hum."""
     sigma = 10.0 ** (-snr_db / 20.0) * UNIT  # of the mean over a slot
-    found = pulsed(config, duration, None, sigma * np.sqrt(2.0 * duration))
-    return {removal: attitude for removal, (_, attitude) in found.items()}
+    result = pulsed(config, duration, None, sigma * np.sqrt(2.0 * duration))
+    return {removal: attitude for removal, (_, attitude) in result.items()}
 
 
 def taken_for_dipoles_deg(config: Config) -> dict[str, float]:
@@ -332,11 +332,11 @@ def taken_for_dipoles_deg(config: Config) -> dict[str, float]:
     turn = Rotation.concatenate([room.rotation for room in every])
     place = np.stack([room.position for room in every])
     seen = phasors_world(site.beacons[0], place) @ turn.as_matrix()
-    found = {}
-    for name, passes in (("dipoles", 0), ("coils", SIZE_PASSES)):
-        wrong = Rotation.from_matrix(located(site, seen, passes).sensor_from_beacon) * turn
-        found[name] = rms([wrong.magnitude() / DEGREE])
-    return found
+    result = {}
+    for name, max_iterations in (("dipoles", 0), ("coils", SIZE_ITERATIONS)):
+        wrong = Rotation.from_matrix(located(site, seen, max_iterations).sensor_from_beacon) * turn
+        result[name] = rms([wrong.magnitude() / DEGREE])
+    return result
 
 
 def report(
@@ -386,15 +386,17 @@ def report(
 def draw(path: Path, config: Config, rows: list[Row]) -> None:
     """Write a PNG of the formula over the slot's length, and of the simulated attitude errors."""
     figure = blank_figure(9.0, 4.0)
-    left, right = figure.subplots(1, 2)
+    remaining, right = figure.subplots(1, 2)
     length = np.linspace(0.1e-3, 22e-3, 600)
     for k in range(3):
         gain = [decibel(subtraction_gain(50.0, tau, 3 - k)) for tau in length]
-        left.plot(1e3 * length, np.maximum(gain, -40.0), label=f"slot {k + 1}, minus slot 4")
+        remaining.plot(1e3 * length, np.maximum(gain, -40.0), label=f"slot {k + 1}, minus slot 4")
     none = [decibel(abs(np.sinc(50.0 * tau))) for tau in length]
-    left.plot(1e3 * length, np.maximum(none, -40.0), "k--", label="nothing subtracted")
-    left.set(xlabel="slot (ms)", ylabel="what is left of 50 Hz, worst phase (dB)", ylim=(-40, 8))
-    left.legend(fontsize="small")
+    remaining.plot(1e3 * length, np.maximum(none, -40.0), "k--", label="nothing subtracted")
+    remaining.set(
+        xlabel="slot (ms)", ylabel="what is left of 50 Hz, worst phase (dB)", ylim=(-40, 8)
+    )
+    remaining.legend(fontsize="small")
     for removal in REMOVALS:
         own = [r for r in rows if r.removal == removal and r.mains_hz == config.mains_hz[-1]]
         error = [max(r.attitude_deg, 1e-4) for r in own]

@@ -98,7 +98,7 @@ def wires(coil: Array, centre: Array, diameter: float) -> tuple[Array, Array]:
     return centre[..., None, :] + 0.5 * diameter * outward, step * along
 
 
-def turned(angle: Array) -> Array:
+def rotated(angle: Array) -> Array:
     """Return rotation matrices (..., 3, 3) of rotation vectors (..., 3) (rad)."""
     matrix = Rotation.from_rotvec(angle.reshape(-1, 3)).as_matrix()
     return np.asarray(matrix.reshape(*angle.shape, 3))
@@ -112,7 +112,7 @@ def draw_antennas(errors: Errors, number: int, rng: np.random.Generator) -> Ante
         across = errors.tilt_deg * DEGREE * rng.standard_normal((number, 3, 3)) * (1 - np.eye(3))
         axis = np.eye(3) + across
         axis = axis / np.linalg.norm(axis, axis=-1, keepdims=True)
-        mount = turned(errors.mount_deg * DEGREE * rng.standard_normal((number, 3)))
+        mount = rotated(errors.mount_deg * DEGREE * rng.standard_normal((number, 3)))
         common = errors.common_centre * rng.standard_normal((number, 1, 3))
         centre = common + errors.centre * rng.standard_normal((number, 3, 3))
         back = np.swapaxes(mount, -1, -2)
@@ -136,9 +136,9 @@ def couplings(
     for i, j in np.ndindex(3, 3):
         there, there_along = seen[0][..., i, :, :], seen[1][..., i, :, :]
         here, here_along = sent[0][..., j, :, :], sent[1][..., j, :, :]
-        apart = np.linalg.norm(there[..., :, None, :] - here[..., None, :, :], axis=-1)
+        separate = np.linalg.norm(there[..., :, None, :] - here[..., None, :, :], axis=-1)
         both = np.einsum("...ax,...bx->...ab", there_along, here_along)
-        out[..., i, j] = MU0_OVER_4PI * np.sum(both / apart, axis=(-1, -2))
+        out[..., i, j] = MU0_OVER_4PI * np.sum(both / separate, axis=(-1, -2))
     return out
 
 
@@ -165,13 +165,13 @@ def bench_readings(
     place = points + config.bench_position * rng.standard_normal(shape)
     if diameter:
         wire, along = (part[:, :, None, None] for part in wires(coils, centres, diameter))
-        apart = place[..., None, :] - wire
-        cubed = np.linalg.norm(apart, axis=-1, keepdims=True) ** 3
-        field = MU0_OVER_4PI * np.sum(np.cross(along, apart) / cubed, axis=-2)
+        separate = place[..., None, :] - wire
+        cubed = np.linalg.norm(separate, axis=-1, keepdims=True) ** 3
+        field = MU0_OVER_4PI * np.sum(np.cross(along, separate) / cubed, axis=-2)
     else:
         offset = place - centres[:, :, None, None, :]
         field = dipole_field(offset, coils[:, :, None, None, :])
-    tilt = turned(config.bench_tilt_deg * DEGREE * rng.standard_normal(shape))
+    tilt = rotated(config.bench_tilt_deg * DEGREE * rng.standard_normal(shape))
     sigma = noise_sigma(config.snr_db, np.array(config.bench_distance))
     return np.asarray((tilt @ field[..., None])[..., 0] + sigma * rng.standard_normal(shape))
 
@@ -193,7 +193,7 @@ def draw_survey(antenna: Antenna, config: Config, rng: np.random.Generator) -> A
     sigma = noise_sigma(config.snr_db, np.linalg.norm(position, axis=-1))
     seen = couplings(antenna.at(np.s_[:, None]), attitude, position, config)
     noise = sigma[..., None, None] * rng.standard_normal(seen.shape)
-    off = turned(config.pose_deg * DEGREE * rng.standard_normal((*shape, 3)))
+    off = rotated(config.pose_deg * DEGREE * rng.standard_normal((*shape, 3)))
     moved = position + config.pose_m * rng.standard_normal((*shape, 3))
     return AntennaSurvey(attitude @ off, moved, seen + noise, sigma)
 
@@ -213,7 +213,7 @@ def locate(antenna: Antenna, seen: Array, guess_beacon: Array) -> tuple[Array, A
     """Return poses by closed form and maximum likelihood with an antenna (n,), couplings (n, m)."""
     wide = antenna.at(np.s_[:, None])
     transmitter = np.swapaxes(wide.moments_beacon, -1, -2)
-    free = eq_09_whitened(seen, np.linalg.inv(wide.sensitivities_sensor), transmitter)
-    start = locate_by_svd(free).nearest(guess_beacon)
+    free_parameters = eq_09_whitened(seen, np.linalg.inv(wide.sensitivities_sensor), transmitter)
+    start = locate_by_svd(free_parameters).nearest(guess_beacon)
     attitude = np.swapaxes(start.sensor_from_beacon, -1, -2)
     return refine_poses(wide, seen, attitude, start.position_beacon[..., 0, :])

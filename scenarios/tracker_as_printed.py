@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from harness import between_deg, conclude, rms, scenario_parser
 from scipy.spatial.transform import Rotation
-from tracker_antennas import turned
+from tracker_antennas import rotated
 
 from magfusion.model.physics.dipole import dipole_field
 from magfusion.papers.p000_tracker.equations import (
@@ -59,28 +59,28 @@ def run(config: Config) -> Result:
     position *= (distance / np.linalg.norm(position, axis=1))[:, None]
     ideal = attitude @ np.swapaxes(dipole_field(position[:, None], np.eye(3)), 1, 2)
     error = config.error_deg * DEGREE * rng.standard_normal((2, config.poses, 3))
-    sent, seen = turned(error)
+    sent, seen = rotated(error)
     measured = np.swapaxes(seen, 1, 2) @ ideal @ sent
     sent_matrix, seen_matrix = bursa_wolf_matrix(error)
     known = Correction(np.linalg.inv(sent_matrix), NONE, np.linalg.inv(seen_matrix), NONE, NONE)
     printed = eq_11_attitude_as_printed(measured, position, MU0_OVER_4PI, np.eye(3), known)
     right = eq_11_attitude(measured, position, seen_matrix, sent_matrix, NONE)
-    found = (locate_by_svd(measured).sensor_from_beacon, _rotation(printed), right)
-    return Result(*(rms(between_deg(one, attitude)) for one in found))
+    result = (locate_by_svd(measured).sensor_from_beacon, _rotation(printed), right)
+    return Result(*(rms(between_deg(one, attitude)) for one in result))
 
 
 def _rotation(matrix: Array) -> Array:
     """Return the orthogonal matrix next to each: what Eq 11 gives as printed is none."""
-    left, _, right = np.linalg.svd(matrix)
-    return np.asarray(left @ right)
+    remaining, _, right = np.linalg.svd(matrix)
+    return np.asarray(remaining @ right)
 
 
-def report(found: Result) -> str:
+def report(result: Result) -> str:
     """Return the table of the run."""
     rows = {
-        "not corrected": found.not_corrected,
-        "as printed (Eq 9-11, Q and T of Eq 20)": found.as_printed,
-        "put right": found.put_right,
+        "not corrected": result.not_corrected,
+        "as printed (Eq 9-11, Q and T of Eq 20)": result.as_printed,
+        "put right": result.put_right,
     }
     lines = ["attitude error (deg, rms), both antennas turned by known errors"]
     return "\n".join([*lines, *(f" {name:40}{value:8.3f}" for name, value in rows.items())])
@@ -89,8 +89,8 @@ def report(found: Result) -> str:
 def main() -> None:
     """Print the table and one JSON line."""
     given = scenario_parser(__doc__, Config.seed, "200 poses", output=None).parse_args()
-    found = run(Config(poses=200 if given.quick else Config.poses, seed=given.seed))
-    conclude(report(found), found)
+    result = run(Config(poses=200 if given.quick else Config.poses, seed=given.seed))
+    conclude(report(result), result)
 
 
 if __name__ == "__main__":

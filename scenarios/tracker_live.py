@@ -67,8 +67,8 @@ class PlateFigures:
     """What a plate did to a run of the pipe: positions in mm, mean squared errors in variances."""
 
     largest_share: float  # of the fields
-    said_after_s: float  # it made a hundredth of them
-    wrongly_said: int  # states before
+    detected_after_s: float  # it made a hundredth of them
+    false_detections: int  # states before
     poses: float  # share of the states that have one while it is there
     nees: float  # of the poses from when it made a hundredth of the fields until it is gone
     error_mm: float
@@ -77,7 +77,7 @@ class PlateFigures:
     after_nees: float
 
 
-def run_beside_plate(config: Config) -> PlateFigures:
+def run_near_plate(config: Config) -> PlateFigures:
     """Simulate a head beside which a plate is moved, and navigate it through the pipe."""
     given, head = records(config), Head(config)
     with tempfile.TemporaryDirectory() as directory:
@@ -86,19 +86,19 @@ def run_beside_plate(config: Config) -> PlateFigures:
         states, _ = piped(site, given)
     time = np.arange(0.0, config.duration, 0.02)
     share = plate_fields(head, time)[1]
-    near, gone = time[share > PLATE_NEAR][[0, -1]]
-    said = [s["time"] for s in states if any(r["code"] == "metal_near" for r in s["reasons"])]
-    there = [s for s in states if near <= s["time"] < gone]
+    near, elapsed = time[share > PLATE_NEAR][[0, -1]]
+    findings = [s["time"] for s in states if any(r["code"] == "metal_near" for r in s["reasons"])]
+    there = [s for s in states if near <= s["time"] < elapsed]
     posed = [s for s in there if not s["lost"]]
-    after = [s for s in states if s["time"] >= gone + 2.0 and not s["lost"]]
+    after = [s for s in states if s["time"] >= elapsed + 2.0 and not s["lost"]]
     return PlateFigures(
         float(np.max(share)),
-        next((t for t in said if t >= near), np.inf) - near,
-        sum(t < PLATE_COMES for t in said),
+        next((t for t in findings if t >= near), np.inf) - near,
+        sum(t < PLATE_COMES for t in findings),
         len(posed) / len(there),
         nees(posed, head),
-        *errors(posed, head, near, gone),
-        errors(after, head, gone, config.duration)[0],
+        *errors(posed, head, near, elapsed),
+        errors(after, head, elapsed, config.duration)[0],
         nees(after, head),
     )
 
@@ -110,15 +110,15 @@ def run_without_hemisphere(config: Config) -> SideFigures:
         site = Path(directory) / "site.yaml"
         site.write_text(site_text(replace(config, hemisphere=False)))
         states, _ = piped(site, given)
-    sure = [s for s in states if not s["ambiguous"] and not s["lost"]]
-    place = np.array([s["position"] for s in sure]).reshape(-1, 3)
-    off = np.linalg.norm(place - head.place(np.array([s["time"] for s in sure])), axis=1)
-    wrong, found = int(np.sum(off > WRONG_SIDE)), off[off <= WRONG_SIDE]
+    certain = [s for s in states if not s["ambiguous"] and not s["lost"]]
+    place = np.array([s["position"] for s in certain]).reshape(-1, 3)
+    off = np.linalg.norm(place - head.place(np.array([s["time"] for s in certain])), axis=1)
+    wrong, result = int(np.sum(off > WRONG_SIDE)), off[off <= WRONG_SIDE]
     return SideFigures(
         states[0]["time"],
         sum(bool(s["ambiguous"]) for s in states) / len(states),
         wrong / len(states),
-        1e3 * rms(found) if len(found) else np.inf,
+        1e3 * rms(result) if len(result) else np.inf,
     )
 
 
@@ -142,53 +142,53 @@ def run(config: Config) -> Figures:
         states, seconds = piped(site, given)
         speed = 0.5 * (speed + python_ms())
         rate = f"{config.rate_hz:g}"
-        carried, _ = piped(site, given, "--rate", rate, "--horizon", str(config.ahead))
+        propagated, _ = piped(site, given, "--rate", rate, "--horizon", str(config.ahead))
     end = config.duration
-    turned = np.linalg.norm(head.rate_body(np.arange(TURNING, end, 0.01)), axis=1)
-    told = [s for s in states if s["time"] >= BEGUN and not s["lost"]]
-    resting = [s for s in told if s["time"] < TURNING - CHANGE]
-    moving = [s for s in told if s["time"] >= TURNING]
+    rotated = np.linalg.norm(head.rate_body(np.arange(TURNING, end, 0.01)), axis=1)
+    reported = [s for s in states if s["time"] >= BEGUN and not s["lost"]]
+    resting = [s for s in reported if s["time"] < TURNING - CHANGE]
+    moving = [s for s in reported if s["time"] >= TURNING]
     return Figures(
-        len(told) / (end - BEGUN),
+        len(reported) / (end - BEGUN),
         *errors(states, head, BEGUN, TURNING - CHANGE),
         *errors(states, head, TURNING, end),
-        *errors(carried, head, TURNING, end),
+        *errors(propagated, head, TURNING, end),
         nees(resting, head),
         nees(moving, head),
-        rms(turned) / DEGREE,
+        rms(rotated) / DEGREE,
         (seconds - startup) / (end - BEGUN),
         speed,
     )
 
 
-def report(found: Figures) -> str:
+def report(result: Figures) -> str:
     """Return the table that a reader sees."""
     return "\n".join(
         [
             "three wound coils, 0.3 to 0.6 m away",
-            f"{'states a second':<32}{found.states_per_s:8.1f}",
-            f"{'at rest':<32}{found.rest_mm:8.3f} mm {found.rest_deg:7.3f} deg,"
-            f" NEES {found.rest_nees:.2f}",
-            f"{'turning, ' + format(found.turned_deg_s, '.0f') + ' deg/s':<32}"
-            f"{found.turning_mm:8.3f} mm {found.turning_deg:7.3f} deg,"
-            f" NEES {found.turning_nees:.2f}",
-            f"{'predicted to the display':<32}{found.ahead_mm:8.3f} mm {found.ahead_deg:7.3f} deg",
-            f"{'processor for a second':<32}{found.processor_share:8.2f} s"
-            f" (a million empty turns: {found.python_ms:.0f} ms)",
+            f"{'states a second':<32}{result.states_per_s:8.1f}",
+            f"{'at rest':<32}{result.rest_mm:8.3f} mm {result.rest_deg:7.3f} deg,"
+            f" NEES {result.rest_nees:.2f}",
+            f"{'turning, ' + format(result.turned_deg_s, '.0f') + ' deg/s':<32}"
+            f"{result.turning_mm:8.3f} mm {result.turning_deg:7.3f} deg,"
+            f" NEES {result.turning_nees:.2f}",
+            f"{'predicted to the display':<32}{result.ahead_mm:8.3f} mm {result.ahead_deg:7.3f} deg",
+            f"{'processor for a second':<32}{result.processor_share:8.2f} s"
+            f" (a million empty turns: {result.python_ms:.0f} ms)",
         ]
     )
 
 
-def report_of_plate(found: PlateFigures) -> str:
+def report_of_plate(result: PlateFigures) -> str:
     """Return what a reader sees of the run beside a plate."""
     return "\n".join(
         [
-            f"a plate of aluminium makes up to {100 * found.largest_share:.1f} % of the fields",
-            f"said {found.said_after_s:.2f} s after it made {100 * PLATE_NEAR:g} %;"
-            f" before it came, {found.wrongly_said} states said so",
-            f"{'while it is there':<32}{found.error_mm:8.3f} mm {found.error_deg:7.3f} deg,"
-            f" NEES {found.nees:.1f}, poses in {100 * found.poses:.0f} %",
-            f"{'after it':<32}{found.after_mm:8.3f} mm, NEES {found.after_nees:.1f}",
+            f"a plate of aluminium makes up to {100 * result.largest_share:.1f} % of the fields",
+            f"said {result.detected_after_s:.2f} s after it made {100 * PLATE_NEAR:g} %;"
+            f" before it came, {result.false_detections} states said so",
+            f"{'while it is there':<32}{result.error_mm:8.3f} mm {result.error_deg:7.3f} deg,"
+            f" NEES {result.nees:.1f}, poses in {100 * result.poses:.0f} %",
+            f"{'after it':<32}{result.after_mm:8.3f} mm, NEES {result.after_nees:.1f}",
         ]
     )
 
@@ -207,16 +207,16 @@ def main() -> None:
     config = Config(seed=given.seed, rate_deg_s=given.rate, rate_hz=cycles)
     if given.no_hemisphere:
         side = run_without_hemisphere(replace(config, duration=TURNING + 2.0))
-        told_of_side = (
+        hemisphere_reported = (
             f"first state {side.first_s:.1f} s after the data begin; {100 * side.ambiguous:.0f} %"
             f" say ambiguous, {100 * side.wrong:.1f} % are wrong and do not; the others err by"
             f" {side.mm:.2f} mm"
         )
-        conclude(told_of_side, side)
+        conclude(hemisphere_reported, side)
         return
     if given.plate:
-        beside = run_beside_plate(replace(config, duration=PLATE_RUN, plate=True))
-        conclude(report_of_plate(beside), beside)
+        others = run_near_plate(replace(config, duration=PLATE_RUN, plate=True))
+        conclude(report_of_plate(others), others)
         return
     if given.quick:
         config = replace(config, duration=TURNING + 4.0)
@@ -225,8 +225,8 @@ def main() -> None:
         conclude(report(alone), alone)
         return
     known, searched = run(config), run(replace(config, source_ppm=SOURCE_PPM))
-    told = [report(known), "a clock of its own, slots found in the stream:", report(searched)]
-    conclude("\n".join(told), {"known": known, "searched": searched})
+    reported = [report(known), "a clock of its own, slots found in the stream:", report(searched)]
+    conclude("\n".join(reported), {"known": known, "searched": searched})
 
 
 if __name__ == "__main__":

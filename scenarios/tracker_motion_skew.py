@@ -31,7 +31,7 @@ from magfusion.papers.p000_tracker.pose import world_poses
 from magfusion.receiver.receivers import received
 from magfusion.simulation.field import phasors_world, synchronised_drives
 from magfusion.simulation.inertial import simulate_imu
-from magfusion.simulation.motion import ATTITUDE_KNOT, Motion, Rests, turning_motion
+from magfusion.simulation.motion import ATTITUDE_KNOT, Rests, SimulatedMotion, turning_motion
 from magfusion.simulation.waveform import Mains, simulate_waveform
 from magfusion.units import DEGREE, Array
 
@@ -113,8 +113,8 @@ def skew(config: Config, slot_ms: float) -> Skew:
     fix = located(site, seen.astype(np.complex128))
     together = np.swapaxes(fix.sensor_from_beacon, 1, 2)
     start = fix.nearest(position).position_beacon[:, 0]
-    apart = slots_apart(site, seen, turns, together, start)
-    return Skew(slot_ms, *(rms(_between_deg(found, middle)) for found in (together, apart)))
+    separate = slots_apart(site, seen, turns, together, start)
+    return Skew(slot_ms, *(rms(_between_deg(result, middle)) for result in (together, separate)))
 
 
 def slots_apart(
@@ -143,15 +143,15 @@ def slots_apart(
             jacobian = by_pose[:, k].real
             rows.append(np.concatenate([jacobian[..., :3] @ back, jacobian[..., 3:] @ back], -1))
             rest.append(seen[:, k] - value[:, k].real)
-        design, left = np.concatenate(rows, axis=1), np.concatenate(rest, axis=1)
+        design, remaining = np.concatenate(rows, axis=1), np.concatenate(rest, axis=1)
         size = np.linalg.norm(design, axis=1, keepdims=True)
-        move = (np.linalg.pinv(design / size) @ left[..., None])[..., 0] / size[:, 0]
+        move = (np.linalg.pinv(design / size) @ remaining[..., None])[..., 0] / size[:, 0]
         position = position + (rotation @ move[:, 3:, None])[..., 0]
         rotation = rotation @ Rotation.from_rotvec(move[:, :3]).as_matrix()
     return rotation
 
 
-def head_motion(config: Config) -> Motion:
+def head_motion(config: Config) -> SimulatedMotion:
     """Return a head in a volume of half a metre: two seconds of rest, then turns without pause.
 
     Every second it turns by the rate about an axis of its own, so that it never turns much slower.
@@ -200,23 +200,23 @@ def fuse(config: Config, imu_rate_hz: float) -> Fused:
     snapshot = snapshots(site, slots, motion)
     # Where all three are, and the head turns.
     begin = max(filtered.time[0], 3.0)
-    errors = [_errors(found, motion, begin) for found in (snapshot, smoothed, filtered)]
+    errors = [_errors(result, motion, begin) for result in (snapshot, smoothed, filtered)]
     time = snapshot.time[snapshot.time >= begin]
     rate = np.linalg.norm(motion.rate_body(time), axis=1) / DEGREE
     return Fused(imu_rate_hz, rms(rate), *(e[0] for e in errors), *(e[1] for e in errors))
 
 
-def snapshots(site: Site, slots: FieldSamples, motion: Motion) -> Trajectory:
+def snapshots(site: Site, slots: FieldSamples, motion: SimulatedMotion) -> Trajectory:
     """Return the closed form of each cycle, its three slots taken for one, at their mean time."""
     beacon = site.beacons[0]
     assert beacon.slots is not None
     order = beacon.slots.running(slots.time) // beacon.slots.count
-    _, cycle, held = np.unique(order, return_inverse=True, return_counts=True)
-    time = (np.bincount(cycle, slots.time) / held)[held == 3]
+    _, cycle, fixed = np.unique(order, return_inverse=True, return_counts=True)
+    time = (np.bincount(cycle, slots.time) / fixed)[fixed == 3]
     row, channel = np.nonzero(slots.valid)
-    phasor = np.full((len(held), *slots.phasor_sensor.shape[1:]), np.nan, dtype=np.complex128)
+    phasor = np.full((len(fixed), *slots.phasor_sensor.shape[1:]), np.nan, dtype=np.complex128)
     phasor[cycle[row], channel] = slots.phasor_sensor[row, channel]
-    fix = located(site, phasor[held == 3])
+    fix = located(site, phasor[fixed == 3])
     guess = (motion.position_world(time) - beacon.position_world) @ beacon.world_from_beacon
     attitude, position = world_poses(site, beacon, fix.nearest(guess))
     return Trajectory(time, attitude[:, 0], position[:, 0])
@@ -243,16 +243,16 @@ def navigate(site: Site, imu: ImuSamples, slots: FieldSamples) -> Trajectory:
     return as_trajectory(filter_.take())
 
 
-def _errors(found: Trajectory, motion: Motion, begin: float) -> tuple[float, float]:
-    used = found.time >= begin
-    time = found.time[used]
-    attitude = _between_deg(found.world_from_body[used], motion.world_from_body(time))
-    position = found.position_world[used] - motion.position_world(time)
+def _errors(result: Trajectory, motion: SimulatedMotion, begin: float) -> tuple[float, float]:
+    used = result.time >= begin
+    time = result.time[used]
+    attitude = _between_deg(result.world_from_body[used], motion.world_from_body(time))
+    position = result.position_world[used] - motion.position_world(time)
     return rms(attitude), 1e3 * rms(np.linalg.norm(position, axis=1))
 
 
-def _between_deg(found: Array, true: Rotation) -> Array:
-    turn = true.inv() * Rotation.from_matrix(found)
+def _between_deg(result: Array, true: Rotation) -> Array:
+    turn = true.inv() * Rotation.from_matrix(result)
     return np.asarray(turn.magnitude() / DEGREE)
 
 
@@ -261,9 +261,9 @@ def report(skews: list[Skew], fused: list[Fused]) -> str:
     lines = ["100 deg/s, no noise: attitude RMS (deg)   together [analysis]    apart"]
     for one in skews:
         printed = PRINTED_SKEW_DEG.get(one.slot_ms)
-        told = "" if printed is None else f"[{printed:g}]"
+        reported = "" if printed is None else f"[{printed:g}]"
         lines.append(
-            f"{'slots of':>24}{one.slot_ms:4g} ms {one.together_deg:16.3f} {told:<10}"
+            f"{'slots of':>24}{one.slot_ms:4g} ms {one.together_deg:16.3f} {reported:<10}"
             f"{one.apart_deg:11.1e}"
         )
     lines.append("head tracker, 100 cycles a second, 60 dB: RMS of attitude (deg), position (mm)")

@@ -106,8 +106,8 @@ def exact_couplings(
         there, there_along = place + seen @ turn.T, seen_along @ turn.T
         for i in range(3):
             for j in range(3):
-                apart = np.linalg.norm(there[i][:, None] - sent[j][None], axis=-1)
-                out[n, i, j] = np.sum(there_along[i] @ sent_along[j].T / apart)
+                separate = np.linalg.norm(there[i][:, None] - sent[j][None], axis=-1)
+                out[n, i, j] = np.sum(there_along[i] @ sent_along[j].T / separate)
     areas = AREA[shape] * SIZE**2 * AREA[shape] * (receiver * SIZE) ** 2
     return np.asarray(MU0_OVER_4PI * out / areas)
 
@@ -132,12 +132,12 @@ def run_row(config: Config, shape: str, receiver: float, ratio: float) -> Row:
     attitude, position = random_poses(config, ratio)
     seen = exact_couplings(shape, receiver, attitude, position)
     start = locate_by_svd(seen).nearest(position)
-    found = np.swapaxes(start.sensor_from_beacon, -1, -2)
-    error = between_deg(found, attitude)
+    result = np.swapaxes(start.sensor_from_beacon, -1, -2)
+    error = between_deg(result, attitude)
     sized = None
     if ratio >= 3.0:
         antenna = ideal(shape, receiver)
-        refined, _ = refine_poses(antenna, seen, found, start.position_beacon[:, 0])
+        refined, _ = refine_poses(antenna, seen, result, start.position_beacon[:, 0])
         sized = rms(between_deg(refined, attitude))
     return Row(
         shape=shape,
@@ -176,8 +176,8 @@ def learn_sizes(config: Config, ratio: float = 5.0, receiver: float = 0.4) -> tu
     eye, zero = np.eye(3), np.zeros((3, 3))
     start = Antenna(eye, zero, eye, zero, np.zeros(3), np.zeros(()))
     survey = AntennaSurvey(attitude, position, seen, sigma)
-    found = fit_at_known_poses(survey, start, prior_sigma(start, gain=0.005, kappa=1e-3)).antenna
-    share = found.vector()[KAPPAS] / truth.vector()[KAPPAS]
+    result = fit_at_known_poses(survey, start, prior_sigma(start, gain=0.005, kappa=1e-3)).antenna
+    share = result.vector()[KAPPAS] / truth.vector()[KAPPAS]
     return float(np.mean(share[:3])), float(share[3])
 
 

@@ -16,10 +16,10 @@ PLATE_COMES, PLATE_HELD, PLATE_MOVES = 9.5, 4.0, 1.0  # s
 def plate_centre(time: Array) -> Array:
     """Return where the plate is (n, 3) (m)."""
     leaves = PLATE_COMES + PLATE_MOVES + PLATE_HELD
-    come, gone = (
+    come, elapsed = (
         np.clip((time - begin) / PLATE_MOVES, 0.0, 1.0) for begin in (PLATE_COMES, leaves)
     )
-    away = 1.0 - come**2 * (3.0 - 2.0 * come) + gone**2 * (3.0 - 2.0 * gone)
+    away = 1.0 - come**2 * (3.0 - 2.0 * come) + elapsed**2 * (3.0 - 2.0 * elapsed)
     return np.asarray(PLATE_CENTRE + away[:, None] * [0.0, PLATE_FAR, 0.0])
 
 

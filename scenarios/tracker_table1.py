@@ -139,7 +139,7 @@ def calibrated(
     survey = draw_survey(truth, config, rng)
     prior = usual_prior(config.errors, sized=config.is_sized)
     joint = fit_at_known_poses(survey, nominal(sized=config.is_sized), prior)
-    found = {
+    result = {
         "U": ideal,
         "P1": rigid_antenna(ideal, four[0], four[1], printed=True),
         "P2": rigid_antenna(ideal, four[0], four[1], printed=False),
@@ -148,12 +148,12 @@ def calibrated(
         "P6": general_antenna(six[0], six[1], coil_centres=True),
         "J": joint.antenna,
     }
-    return found | ({"G": stacked_antennas(fit_graphs(survey, config))} if graph else {})
+    return result | ({"G": stacked_antennas(fit_graphs(survey, config))} if graph else {})
 
 
-def euler_errors_deg(found: Array, target_deg: Array) -> Array:
+def euler_errors_deg(result: Array, target_deg: Array) -> Array:
     """Return errors of yaw, pitch and roll of attitudes beacon_from_sensor (..., n, 3, 3) (deg)."""
-    difference = euler_angles(np.swapaxes(found, -1, -2)) - target_deg * DEGREE
+    difference = euler_angles(np.swapaxes(result, -1, -2)) - target_deg * DEGREE
     return np.asarray(np.angle(np.exp(1j * difference)) / DEGREE)
 
 
@@ -201,13 +201,13 @@ def run_levels(config: Config, *, graph: bool = True) -> tuple[Row, ...]:
     rows: list[Row] = []
     before = np.ones(config.antennas)
     for level, antenna in calibrated(truth, config, rng, graph=graph).items():
-        found, place = locate(antenna, seen, POSITION_BEACON)
-        turn = between_deg(found, attitude)
+        result, place = locate(antenna, seen, POSITION_BEACON)
+        turn = between_deg(result, attitude)
         each = np.sqrt(np.mean(turn**2, axis=1))
         before = before if rows else each
         low, high = np.quantile(before / each, [0.05, 0.95])
         away = np.arange(len(TABLE)) != ROW_AT_THE_POLE
-        euler = euler_errors_deg(found, TABLE[:, 0])[:, away]
+        euler = euler_errors_deg(result, TABLE[:, 0])[:, away]
         rows.append(
             Row(
                 level=level,
@@ -287,8 +287,8 @@ def _errors(
     seen = couplings(truth.at(np.s_[:, None]), *poses, config)
     sigma = noise_sigma(config.snr_db, np.linalg.norm(poses[1], axis=-1))
     seen = seen + sigma[..., None, None] * rng.standard_normal(seen.shape)
-    found, place = locate(antenna, seen, poses[1])
-    return rms(between_deg(found, poses[0])), 1e3 * rms(np.linalg.norm(place - poses[1], axis=-1))
+    result, place = locate(antenna, seen, poses[1])
+    return rms(between_deg(result, poses[0])), 1e3 * rms(np.linalg.norm(place - poses[1], axis=-1))
 
 
 def report_levels(title: str, rows: tuple[Row, ...]) -> str:
@@ -334,18 +334,18 @@ def report_printed() -> str:
     return "\n".join(lines)
 
 
-def report_uncertain(found: Uncertain, config: Config) -> str:
+def report_uncertain(result: Uncertain, config: Config) -> str:
     """Return what uncertain poses do."""
     return (
         f"E: turntable errs by {config.pose_deg:g} deg and {1e3 * config.pose_m:g} mm,"
         f" {config.snr_db:g} dB; new poses (deg)\n"
-        f" not calibrated {found.uncalibrated_deg:.3f}, poses taken as exact"
-        f" {found.exact_poses_deg:.3f}, graph {found.graph_deg:.3f} (antenna known:"
-        f" {found.known_antenna_deg:.3f})\n"
-        f" graph / exact {found.graph_to_exact:.2f}, improvement x{found.improvement:.1f},"
-        f" chi2/dof {found.chi2_per_dof:.2f}, NEES {found.nees:.2f} per parameter\n"
-        f" within half a metre: {found.volume_position_mm:.2f} mm,"
-        f" {found.volume_attitude_deg:.3f} deg (another tracker's hardware, Anser EMT:"
+        f" not calibrated {result.uncalibrated_deg:.3f}, poses taken as exact"
+        f" {result.exact_poses_deg:.3f}, graph {result.graph_deg:.3f} (antenna known:"
+        f" {result.known_antenna_deg:.3f})\n"
+        f" graph / exact {result.graph_to_exact:.2f}, improvement x{result.improvement:.1f},"
+        f" chi2/dof {result.chi2_per_dof:.2f}, NEES {result.nees:.2f} per parameter\n"
+        f" within half a metre: {result.volume_position_mm:.2f} mm,"
+        f" {result.volume_attitude_deg:.3f} deg (another tracker's hardware, Anser EMT:"
         " 1.1 mm, 0.15 deg)"
     )
 
@@ -380,16 +380,16 @@ def main() -> None:
     tables = {title: run_levels(config) for title, config in titles.items()}
     others = {k: run_levels(replace(c, **change), graph=False) for k, c in OTHERS.items()}
     uncertain = [replace(SCENARIO_E, snr_db=db, **change) for db in (60.0, 65.0)]
-    found = [run_uncertain(config) for config in uncertain]
+    result = [run_uncertain(config) for config in uncertain]
     if given.output is not None:
         draw(given.output / "tracker_table1.png", tables)
     figures: dict[str, object] = {"printed": printed_ratios()}
     for name, rows in zip(("A", "F2", "common"), tables.values(), strict=True):
         figures[name] = {row.level: row for row in rows}
-    figures |= {"E": found, "others": {k: {r.level: r for r in v} for k, v in others.items()}}
+    figures |= {"E": result, "others": {k: {r.level: r for r in v} for k, v in others.items()}}
     parts = [report_printed(), *(report_levels(title, rows) for title, rows in tables.items())]
     parts += [report_others(others)]
-    parts += [report_uncertain(one, config) for one, config in zip(found, uncertain, strict=True)]
+    parts += [report_uncertain(one, config) for one, config in zip(result, uncertain, strict=True)]
     conclude("\n".join(parts), figures)
 
 

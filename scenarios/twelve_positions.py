@@ -42,7 +42,7 @@ from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.field import synchronised_drives
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.log import EPOCH_NS
-from magfusion.simulation.motion import Motion
+from magfusion.simulation.motion import SimulatedMotion
 from magfusion.simulation.waveform import simulate_waveform
 from magfusion.units import DEGREE, Array
 
@@ -85,18 +85,18 @@ def exactness(rng: np.random.Generator, count: int = 200) -> list[float]:
 
 def misprint(ezy: float = 0.02) -> tuple[float, float]:
     """Return what Eq 16 finds for ``ezy`` in readings by Eq 2 as printed, and as mended."""
-    found = []
+    result = []
     for column in (1, 2):  # of the field: y as printed, z as meant
         misalignment = np.zeros((3, 3))
         misalignment[1, column] = ezy
         matrix, offset = from_paper(np.zeros(3), np.ones(3), misalignment)
         measured = positions(0.0) @ FIELD_NED @ matrix.T + offset
         fit = closed_form(measured, float(FIELD_NED[2]))
-        found.append(float(to_paper(fit.matrix, fit.offset)[2][1, 2]))
-    return found[0], found[1]
+        result.append(float(to_paper(fit.matrix, fit.offset)[2][1, 2]))
+    return result[0], result[1]
 
 
-def stop_motion(world_from_body: Array, stop: float, move: float) -> tuple[Motion, float]:
+def stop_motion(world_from_body: Array, stop: float, move: float) -> tuple[SimulatedMotion, float]:
     """Return a motion that rests in each attitude (n, 3, 3), and its duration (s)."""
     times, rates = [0.0], [0.0]
     for _ in range(len(world_from_body) - 1):
@@ -110,7 +110,7 @@ def stop_motion(world_from_body: Array, stop: float, move: float) -> tuple[Motio
     attitude = RotationSpline(knots, Rotation.from_matrix(world_from_body))
     middle = np.mean(DEMO_BOX_WORLD, axis=0)
     place = BSpline(np.array([0.0, 1.0]), middle[None], 0)
-    return Motion(place, attitude, progress), times[-1]
+    return SimulatedMotion(place, attitude, progress), times[-1]
 
 
 def record(config: Config, attitude_count: int, rng: np.random.Generator) -> Session:
@@ -139,27 +139,27 @@ def calibrated(session: Session) -> dict[str, float]:
     """Return the errors (deg) of formulas and graph from the stops found in a session."""
     log = session.log
     assert log.waveform is not None
-    found = calibrate_log(log.waveform, log.imu, session.site, at_stops=True)
-    formulas = closed_form(found.readings.measured_sensor, float(FIELD_NED[2]))
+    result = calibrate_log(log.waveform, log.imu, session.site, at_stops=True)
+    formulas = closed_form(result.readings.measured_sensor, float(FIELD_NED[2]))
     nothing = MagnetometerFit(np.eye(3), np.zeros(3), np.zeros((12, 12)))
     error = np.concatenate(
         [
-            (found.graph.fit.matrix - session.true.matrix[0]).ravel(),
-            found.graph.fit.offset - session.true.offset[0],
+            (result.graph.fit.matrix - session.true.matrix[0]).ravel(),
+            result.graph.fit.offset - session.true.offset[0],
         ]
     )
     return {
         "uncalibrated": angle_deg(session.true, nothing),
         "formulas": angle_deg(session.true, formulas),
-        "graph": angle_deg(session.true, found.graph.fit),
-        "graph_nees": float(error @ np.linalg.solve(found.graph.fit.cov, error)),
+        "graph": angle_deg(session.true, result.graph.fit),
+        "graph_nees": float(error @ np.linalg.solve(result.graph.fit.cov, error)),
     }
 
 
 def run(config: Config) -> dict[str, object]:
     """Return all figures; errors of the sessions as RMS over them, the NEES as a mean."""
     rng = np.random.default_rng(config.seed)
-    printed, mended = misprint()
+    printed, cleaned = misprint()
     sessions = [calibrated(record(config, 12, rng)) for _ in range(config.sessions)]
     errors = {
         name: float(np.sqrt(np.mean([s[name] ** 2 for s in sessions])))
@@ -168,7 +168,7 @@ def run(config: Config) -> dict[str, object]:
     return {
         "exactness": exactness(rng),
         "ezy_by_printed_eq_2": printed,
-        "ezy_by_mended_eq_2": mended,
+        "ezy_by_mended_eq_2": cleaned,
         "session_deg": errors,
         "session_graph_nees": float(np.mean([s["graph_nees"] for s in sessions])),
     }
@@ -198,21 +198,21 @@ def draw(path: Path, seed: int) -> None:
     save_picture(figure, path)
 
 
-def report(found: dict[str, object], config: Config) -> str:
+def report(result: dict[str, object], config: Config) -> str:
     """Return the table that a reader sees."""
-    exact, errors = found["exactness"], found["session_deg"]
+    exact, errors = result["exactness"], result["session_deg"]
     assert isinstance(exact, list)
     assert isinstance(errors, dict)
     lines = ["largest relative error of the formulas without noise (analysis: 1e-14)"]
     lines += [f"  heading {h:5g} deg  {e:.0e}" for h, e in zip(HEADINGS_DEG, exact, strict=True)]
     lines.append("ezy of 0.02 as Eq 16 finds it")
-    lines.append(f"  readings by Eq 2 as printed  {found['ezy_by_printed_eq_2']:.4f}")
-    lines.append(f"  readings by Eq 2 with Bz     {found['ezy_by_mended_eq_2']:.4f}")
+    lines.append(f"  readings by Eq 2 as printed  {result['ezy_by_printed_eq_2']:.4f}")
+    lines.append(f"  readings by Eq 2 with Bz     {result['ezy_by_mended_eq_2']:.4f}")
     lines.append(
         f"twelve stops in a stream, set {config.hand_deg:g} deg off: RMS angle of the field"
     )
     lines += [f"  {name:14} {value:8.3f} deg" for name, value in errors.items()]
-    lines.append(f"  NEES of the graph's twelve numbers {found['session_graph_nees']:.1f} (12)")
+    lines.append(f"  NEES of the graph's twelve numbers {result['session_graph_nees']:.1f} (12)")
     return "\n".join(lines)
 
 
@@ -220,10 +220,10 @@ def main() -> None:
     """Print the table and one JSON line."""
     given = scenario_parser(__doc__, Config.seed, quick="two sessions").parse_args()
     config = Config(seed=given.seed, sessions=2 if given.quick else Config.sessions)
-    found = run(config)
+    result = run(config)
     if given.output is not None:
         draw(given.output / "twelve_positions.png", config.seed)
-    conclude(report(found, config), {"config": asdict(config), **found})
+    conclude(report(result, config), {"config": asdict(config), **result})
 
 
 if __name__ == "__main__":

@@ -69,26 +69,26 @@ def floor() -> Site:
 def walk(seed: int, duration: float) -> Walk:
     """Simulate a walk with an IMU, and what the coil measures on it."""
     config = SimulationConfig(BOX, duration=duration, perturb=False)
-    made = simulate_log(demo_site(), config, np.random.default_rng(seed))
+    built = simulate_log(demo_site(), config, np.random.default_rng(seed))
     site, time = floor(), np.arange(0.5, duration - 0.5, 1.0 / HZ)
     rng = np.random.default_rng([seed, 1])
-    fields = simulate_fields(site, made.motion.trajectory(time), SIGMA, rng)
+    fields = simulate_fields(site, built.motion.trajectory(time), SIGMA, rng)
     phasor = np.full_like(fields.phasor_sensor, np.nan)
     phasor[..., 2] = fields.phasor_sensor[..., 2]
     window = np.full(len(time), 1.0 / HZ)
     phasors = replace(fields, phasor_sensor=phasor, axes="z", window=window)
-    return Walk(site, replace(made.log, waveform=None), phasors)
+    return Walk(site, replace(built.log, waveform=None), phasors)
 
 
 def rows_of(seed: int, duration: float) -> list[Row]:
     """Return the rows of one walk."""
-    made, rows = walk(seed, duration), []
-    assert made.log.truth is not None
-    for name, fields in (("phasors", made.phasors), ("amplitudes", made.amplitudes)):
-        own = replace(made.log, fields=fields)
+    built, rows = walk(seed, duration), []
+    assert built.log.truth is not None
+    for name, fields in (("phasors", built.phasors), ("amplitudes", built.amplitudes)):
+        own = replace(built.log, fields=fields)
         for estimator, estimate in (("smooth", smoothed), ("ekf", filtered)):
-            states, trust = estimate(own, made.site)
-            rows.append(row_of(seed, name, estimator, states, trust, made.log.truth))
+            states, trust = estimate(own, built.site)
+            rows.append(row_of(seed, name, estimator, states, trust, built.log.truth))
     return rows
 
 

@@ -35,12 +35,12 @@ def run_command(*arguments: object) -> None:
 @pytest.fixture(scope="session")
 def worked(tmp_path_factory: pytest.TempPathFactory) -> Worked:
     root = tmp_path_factory.mktemp("worked")
-    made = Worked(root / "log", root / "smoothed", root / "fixes", root / "phasors")
-    run_command("simulate", "-o", made.log, "--duration", 12, "--seed", 1)
-    run_command("smooth", made.log, "-o", made.smoothed)
-    run_command("fix", made.log, "-o", made.fixes)
-    run_command("demodulate", made.log, "-o", made.phasors)
-    return made
+    built = Worked(root / "log", root / "smoothed", root / "fixes", root / "phasors")
+    run_command("simulate", "-o", built.log, "--duration", 12, "--seed", 1)
+    run_command("smooth", built.log, "-o", built.smoothed)
+    run_command("fix", built.log, "-o", built.fixes)
+    run_command("demodulate", built.log, "-o", built.phasors)
+    return built
 
 
 def change_table(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
@@ -51,11 +51,11 @@ def change_table(path: Path, change: Callable[[dict[str, Any]], object]) -> None
 
 
 def _listing(root: Path) -> dict[str, tuple[int, int]]:
-    found = {}
+    result = {}
     for path in root.rglob("*"):  # hidden names too
         stat = path.lstat()
-        found[str(path.relative_to(root))] = (stat.st_size, stat.st_mtime_ns)
-    return found
+        result[str(path.relative_to(root))] = (stat.st_size, stat.st_mtime_ns)
+    return result
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-PATIENCE = 60.0  # s
+MAX_WAIT = 60.0  # s
 
 
 def plain(value: Any) -> Any:
@@ -28,15 +28,17 @@ def plain(value: Any) -> Any:
 
 def main(domain: int, name: str) -> None:
     """Print the first message of the topic, or nothing."""
-    participant, end = DomainParticipant(domain), time.monotonic() + PATIENCE
+    participant, end = DomainParticipant(domain), time.monotonic() + MAX_WAIT
     publications = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
     reader = None
     while time.monotonic() < end:
-        for found in publications.take(10):
-            if reader is None and found.topic_name == name:
-                datatype, _ = get_types_for_typeid(participant, found.type_id, duration(seconds=10))
-                reader = DataReader(participant, Topic(participant, name, datatype, qos=found.qos))
-                kind = found.type_name
+        for result in publications.take(10):
+            if reader is None and result.topic_name == name:
+                datatype, _ = get_types_for_typeid(
+                    participant, result.type_id, duration(seconds=10)
+                )
+                reader = DataReader(participant, Topic(participant, name, datatype, qos=result.qos))
+                kind = result.type_name
         for message in reader.take(1) if reader is not None else ():
             sys.stdout.write(json.dumps({"type": kind, "message": plain(message)}) + "\n")
             return

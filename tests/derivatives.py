@@ -16,7 +16,7 @@ def central_difference(
     return np.stack(columns, axis=-1)
 
 
-def relative_to_group(found: np.ndarray, expected: np.ndarray) -> float:
+def relative_to_group(result: np.ndarray, expected: np.ndarray) -> float:
     """Return the largest error of a group of columns in units of the group's largest entry."""
-    assert found.shape == expected.shape
-    return float(np.max(np.abs(found - expected)) / np.max(np.abs(expected)))
+    assert result.shape == expected.shape
+    return float(np.max(np.abs(result - expected)) / np.max(np.abs(expected)))

@@ -23,7 +23,7 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.simulation.demo_site import demo_site
 
 EPOCH_NS = 1_700_000_000_000_000_000
-LOST = Judgement((Finding("lost", "The platform is lost.", Verdict.FAILED),))
+MAX_FINAL_STEP_SIGMAS = Judgement((Finding("lost", "The platform is lost.", Verdict.FAILED),))
 DOUBTFUL = Judgement((Finding("diverged", "It diverged."),), levels=Levels((1.0, None)))
 
 
@@ -44,10 +44,10 @@ def example_state(seed: int, judgement: Judgement | None = None) -> JudgedState:
     )
 
 
-def told_of(state: JudgedState) -> dict[str, Any]:
+def release_gain(state: JudgedState) -> dict[str, Any]:
     """Return as much of what a pipe tells of a state as those need who listen."""
     verdict = str(state.verdict)
-    return {"time": state.time, "lost": state.lost, "verdict": verdict}
+    return {"time": state.time, "lost": state.is_lost, "verdict": verdict}
 
 
 def write_walk(path: Path) -> Path:
@@ -62,8 +62,8 @@ def piped(log: Path, live: LiveSettings) -> tuple[list[Any], str]:
     """Return the states of a pipe, and what it said, while others are told."""
     from magfusion.files.log import read_log
 
-    records, sink, said = io.BytesIO(), io.BytesIO(), io.StringIO()
+    records, sink, findings = io.BytesIO(), io.BytesIO(), io.StringIO()
     run_replay(read_log(log), records, "json", realtime=False)
     settings = StreamSettings(NavigatorSettings("ekf"), live=live)
-    run_stream(log / "site.yaml", settings, io.BytesIO(records.getvalue()), sink, said)
-    return [json.loads(line) for line in sink.getvalue().splitlines()], said.getvalue()
+    run_stream(log / "site.yaml", settings, io.BytesIO(records.getvalue()), sink, findings)
+    return [json.loads(line) for line in sink.getvalue().splitlines()], findings.getvalue()

@@ -14,7 +14,7 @@ from magfusion.results.errors import TrajectoryErrors, trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.log import simulate_fields
-from magfusion.simulation.motion import Motion, Rests, random_walk_motion
+from magfusion.simulation.motion import Rests, SimulatedMotion, random_walk_motion
 
 SIGMA = 1e-9  # T
 WINDOW = 0.4  # s
@@ -43,7 +43,7 @@ class OnlineLog:
     site: Site
     imu: ImuSamples
     fields: FieldSamples
-    motion: Motion
+    motion: SimulatedMotion
 
     def errors(self, states: list[State]) -> TrajectoryErrors:
         truth = self.motion.trajectory(np.array([s.time for s in states]))

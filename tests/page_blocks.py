@@ -32,8 +32,8 @@ def run_blocks(page: str, directory: Path) -> None:
         elif language == "python":
             _run([sys.executable, "-c", block], directory)
         else:
-            told = differences(block, shown)
-            assert not told, "\n".join(told)
+            reported = differences(block, shown)
+            assert not reported, "\n".join(reported)
 
 
 def _commands(block: str) -> list[str]:
@@ -56,22 +56,22 @@ def _run(command: str | list[str], directory: Path) -> str:
     return done.stdout
 
 
-def differences(told: str, shown: str) -> list[str]:
+def differences(reported: str, shown: str) -> list[str]:
     """Return what is told otherwise than it is shown: other words, or numbers beyond tolerance."""
-    lines, seen = told.splitlines(), shown.splitlines()
-    found = [] if len(lines) == len(seen) else [f"{len(lines)} lines, {len(seen)} shown"]
+    lines, seen = reported.splitlines(), shown.splitlines()
+    result = [] if len(lines) == len(seen) else [f"{len(lines)} lines, {len(seen)} shown"]
     for one, other in zip(lines, seen, strict=False):
         same = NUMBER.sub("#", one).split() == NUMBER.sub("#", other).split()
         numbers = zip(NUMBER.findall(one), NUMBER.findall(other), strict=False)
         if one.split()[:1] not in [[word] for word in OF_THE_MACHINE]:
             same = same and all(agree(*pair) for pair in numbers)
-        found += [] if same else [f"told  {one}", f"shown {other}"]
-    return found
+        result += [] if same else [f"told  {one}", f"shown {other}"]
+    return result
 
 
-def agree(told: str, shown: str) -> bool:
+def agree(reported: str, shown: str) -> bool:
     """Tell whether a number is what is told of it."""
-    mantissa, _, power = told.partition("e")
+    mantissa, _, power = reported.partition("e")
     digit = 10.0 ** (int(power or 0) - len(mantissa.partition(".")[2]))
-    apart = abs(float(told) - float(shown))
-    return apart <= max(RELATIVE * abs(float(shown)), DIGITS * digit)
+    separate = abs(float(reported) - float(shown))
+    return separate <= max(RELATIVE * abs(float(shown)), DIGITS * digit)

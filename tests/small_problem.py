@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate
+from magfusion.estimation.graph.graph import Graph, GraphEstimate, initial_estimate
 from magfusion.estimation.graph.inertial import inertial_graph
 from magfusion.estimation.graph.preintegration import cut_at_epochs, preintegrate
 from magfusion.estimation.measurements.phasors import FieldPhasors
@@ -61,7 +61,7 @@ def small_problem(
     blocks: tuple[Block, ...],
     start: Trajectory | None = None,
     loss: str | None = None,
-) -> tuple[Graph, Estimate]:
+) -> tuple[Graph, GraphEstimate]:
     """Return the problem and a start: the truth where no other is given."""
     site, fields = small.site, small.fields
     time, n = fields.time, len(fields)

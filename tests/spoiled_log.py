@@ -182,7 +182,7 @@ def limited(share: float) -> Callable[[Array], Array]:
     return lambda v: np.clip(v, -share * np.abs(v).max(), share * np.abs(v).max())
 
 
-def held(every: int) -> Callable[[Array], Array]:
+def fixed(every: int) -> Callable[[Array], Array]:
     """Return an instrument that is read more often than it measures."""
     return lambda v: v[np.arange(len(v)) // every * every]
 

@@ -9,16 +9,23 @@ import algorithms_compared
 import numpy as np
 import pytest
 from algorithms_compared import Config, likelihood_at_tilts, run
-from algorithms_figures import beside_algorithm_3, bounds, means, report, summary, worst_ratio
-from algorithms_tried import FIX, MAPPED, METHODS, ML, PUBLISHED, Outcome
+from algorithms_figures import (
+    bounds,
+    compared_with_algorithm_3,
+    means,
+    report,
+    summary,
+    worst_ratio,
+)
+from algorithms_tried import FIX, MAPPED, METHODS, ML, PUBLISHED, AlgorithmOutcome
 
 DISTURBED = ("S1", "F1", "F2", "P0", "P1", "P2", "N1", "N2")
 A1, A2, A3 = PUBLISHED
 UNMAPPED = tuple(name for name in METHODS if name != MAPPED)
-Found = Mapping[str, Sequence[Outcome]]
+Trajectories = Mapping[str, Sequence[AlgorithmOutcome]]
 
 
-def position(outcomes: Sequence[Outcome], method: str) -> float:
+def position(outcomes: Sequence[AlgorithmOutcome], method: str) -> float:
     return float(np.mean(means(outcomes, "position", method)))
 
 
@@ -26,13 +33,13 @@ def position(outcomes: Sequence[Outcome], method: str) -> float:
 
 
 @pytest.fixture(scope="module")
-def quiet() -> list[Outcome]:
+def quiet() -> list[AlgorithmOutcome]:
     """Noise alone, the methods that need no map."""
     config = Config(worlds=2, targets=800, scenarios=("S0",))
     return run(config, {"workers": 1}, (*PUBLISHED, "A2 kNN nT", ML, "MLrel"))["S0"]
 
 
-def test_in_noise_alone_likelihood_meets_the_bound(quiet: list[Outcome]) -> None:
+def test_in_noise_alone_likelihood_meets_the_bound(quiet: list[AlgorithmOutcome]) -> None:
     bound_m, bound_deg = bounds(quiet)
     sums = summary(quiet)
     assert sums[ML]["position_rms_m"] / bound_m == pytest.approx(1.0, rel=0.05)
@@ -48,7 +55,7 @@ def test_in_noise_alone_likelihood_meets_the_bound(quiet: list[Outcome]) -> None
     [(A1, 0.040), (A2, 0.0865), ("A2 kNN nT", 0.48), (A3, 0.0084), ("MLrel", 0.0014)],
 )
 def test_in_noise_alone_each_method_errs_by_the_known_size(
-    quiet: list[Outcome], method: str, expected_m: float
+    quiet: list[AlgorithmOutcome], method: str, expected_m: float
 ) -> None:
     """Lines and matches by the grid; the independent analysis has 0.023 and 0.109 m on its own."""
     assert position(quiet, method) == pytest.approx(expected_m, rel=0.1)
@@ -76,10 +83,10 @@ def test_the_report_tells_where_plain_likelihood_is_worse_and_draws_both_figures
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     one = run(Config(worlds=1, targets=100, scenarios=("P0",)), {"workers": 1})["P0"]
-    found = {"P0": [*one, *one]}  # a map takes seconds to learn
+    result = {"P0": [*one, *one]}  # a map takes seconds to learn
     plain, mapped, paper = (position(one, name) for name in (ML, MAPPED, A3))
     assert mapped < 0.5 * paper < paper < plain
-    monkeypatch.setattr(algorithms_compared, "run", lambda *_: found)
+    monkeypatch.setattr(algorithms_compared, "run", lambda *_: result)
     monkeypatch.setattr(algorithms_compared, "likelihood_at_tilts", lambda _: {0.0: 0.04})
     monkeypatch.setattr(sys, "argv", ["algorithms_compared.py", "--quick", "-o", str(tmp_path)])
     algorithms_compared.main()
@@ -96,15 +103,15 @@ def test_a_verdict_is_of_the_differences_in_the_same_room() -> None:
     """Rooms differ by far more than the methods do in each."""
     rng = np.random.default_rng(6)
 
-    def room(level: float, off: float) -> Outcome:
+    def room(level: float, off: float) -> AlgorithmOutcome:
         error = {A3: np.full(5, level), "better": np.full(5, level - off)}
         error |= {"WORSE": np.full(5, level + off), "undecided": rng.uniform(0.5, 1.5, 5) * level}
-        return Outcome(error, error, error, np.zeros(5), np.zeros(5))
+        return AlgorithmOutcome(error, error, error, np.zeros(5), np.zeros(5))
 
     rooms = [room(level, 1e-3 * rng.uniform(0.9, 1.1)) for level in rng.uniform(0.01, 0.1, 10)]
     for verdict in ("better", "WORSE", "undecided"):
-        assert beside_algorithm_3(rooms, verdict)[1] == verdict
-    assert beside_algorithm_3(rooms[:2], "better")[1] == "undecided"
+        assert compared_with_algorithm_3(rooms, verdict)[1] == verdict
+    assert compared_with_algorithm_3(rooms[:2], "better")[1] == "undecided"
 
 
 def test_one_world_has_no_standard_error_and_is_refused(
@@ -121,30 +128,32 @@ def test_one_world_has_no_standard_error_and_is_refused(
 
 
 @pytest.fixture(scope="module")
-def full() -> dict[str, list[Outcome]]:
+def full() -> dict[str, list[AlgorithmOutcome]]:
     return run(Config(), methods=UNMAPPED)
 
 
 @pytest.fixture(scope="module")
-def mapped() -> dict[str, list[Outcome]]:
+def mapped() -> dict[str, list[AlgorithmOutcome]]:
     """Two rooms of each kind: a map takes five times as long to learn as all else."""
     return run(Config(worlds=2, scenarios=DISTURBED))
 
 
 @pytest.mark.slow
-def test_in_the_fitted_rooms_two_of_three_algorithms_err_as_the_paper_prints(full: Found) -> None:
+def test_in_the_fitted_rooms_two_of_three_algorithms_err_as_the_paper_prints(
+    full: Trajectories,
+) -> None:
     """Algorithm 2 errs by its grid, which the paper gives a spacing and no edges."""
-    found = [position(full["F1"], name) for name in PUBLISHED]
-    assert found[0] == pytest.approx(0.336, rel=0.30)
-    assert found[1] == pytest.approx(0.088, rel=0.12)  # printed 0.114
-    assert found[2] == pytest.approx(0.069, rel=0.25)
-    assert found[2] < found[1] < found[0]
+    result = [position(full["F1"], name) for name in PUBLISHED]
+    assert result[0] == pytest.approx(0.336, rel=0.30)
+    assert result[1] == pytest.approx(0.088, rel=0.12)  # printed 0.114
+    assert result[2] == pytest.approx(0.069, rel=0.25)
+    assert result[2] < result[1] < result[0]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", DISTURBED)
 def test_a_map_and_relative_weights_halve_the_best_published_error(
-    mapped: Found, scenario: str
+    mapped: Trajectories, scenario: str
 ) -> None:
     overall, worst = worst_ratio(mapped[scenario], MAPPED)
     assert overall <= 0.5
@@ -152,7 +161,7 @@ def test_a_map_and_relative_weights_halve_the_best_published_error(
 
 
 @pytest.mark.slow
-def test_likelihood_meets_the_bound_over_all_quiet_rooms(full: Found) -> None:
+def test_likelihood_meets_the_bound_over_all_quiet_rooms(full: Trajectories) -> None:
     assert summary(full["S0"])[ML]["position_rms_m"] / bounds(full["S0"])[0] == pytest.approx(
         1.0, rel=0.05
     )
@@ -162,16 +171,16 @@ def test_likelihood_meets_the_bound_over_all_quiet_rooms(full: Found) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("scenario", "expected_m"), [("S1", 0.152), ("F1", 0.087), ("P0", 0.028)])
 def test_plain_likelihood_loses_to_algorithm_3_where_the_model_is_wrong(
-    full: Found, mapped: Found, scenario: str, expected_m: float
+    full: Trajectories, mapped: Trajectories, scenario: str, expected_m: float
 ) -> None:
     assert position(full[scenario], ML) == pytest.approx(expected_m, rel=0.35)
     assert position(full[scenario], ML) > position(full[scenario], A3)
-    assert beside_algorithm_3(full[scenario], ML)[1] != "better"
-    told = report({scenario: mapped[scenario]}, {}).splitlines()
-    assert any(line.split()[:1] == [scenario] for line in told)
+    assert compared_with_algorithm_3(full[scenario], ML)[1] != "better"
+    reported = report({scenario: mapped[scenario]}, {}).splitlines()
+    assert any(line.split()[:1] == [scenario] for line in reported)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["S0", "S1", "F1", "F2", "P0", "P1", "P2"])
-def test_fix_beats_algorithm_3_without_its_survey(full: Found, scenario: str) -> None:
-    assert beside_algorithm_3(full[scenario], FIX)[1] == "better"
+def test_fix_beats_algorithm_3_without_its_survey(full: Trajectories, scenario: str) -> None:
+    assert compared_with_algorithm_3(full[scenario], FIX)[1] == "better"

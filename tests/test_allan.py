@@ -22,7 +22,7 @@ from magfusion.files.log import write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.files.table import Span, write_table
 from magfusion.files.table_stream import pieces, table_pieces
-from magfusion.jobs.allan_noise import Measured, measured
+from magfusion.jobs.allan_noise import MeasuredNoise, measured
 from magfusion.jobs.inputs import Job
 from magfusion.model.progress import quiet
 from magfusion.model.samples import ImuSamples, Log, Waveform
@@ -45,25 +45,25 @@ def _rest(
 ) -> Path:
     """Write a log at rest with known noise."""
     rng, count = np.random.default_rng(11), int(seconds * RATE)
-    made = {
+    built = {
         "time": np.arange(count) / RATE,
         "gyro": 2e-3 * np.array([1.0, -0.5, 0.2]) + _noise(rng, count, *GYRO),
         "accel": np.array([0.05, 0.02, 9.80665]) + _noise(rng, count, *ACCEL),
         "field": np.array([2e-5, 0.0, -4e-5]) + _noise(rng, count, FIELD / np.sqrt(2.0), 1e-12),
     }
     if spoil is not None:
-        spoil(made)
-    imu = ImuSamples(made["time"], made["gyro"], made["accel"])
-    write_log(Log("rest", 0, "test", imu, Waveform(made["time"], made["field"])), path)
+        spoil(built)
+    imu = ImuSamples(built["time"], built["gyro"], built["accel"])
+    write_log(Log("rest", 0, "test", imu, Waveform(built["time"], built["field"])), path)
     return path
 
 
-def _found(log: Path, end: float | None = None) -> Measured:
+def _result(log: Path, end: float | None = None) -> MeasuredNoise:
     return measured(Job(log, None, log, None, end), None, quiet)
 
 
-def _codes(found: Measured) -> set[str]:
-    return {reason.code for reason in found.trust.reasons}
+def _codes(result: MeasuredNoise) -> set[str]:
+    return {reason.code for reason in result.trust.reasons}
 
 
 # The sums -------------------------------------------------------------------------------------
@@ -76,14 +76,14 @@ def test_the_variance_is_that_of_allantools() -> None:
     stream = AllanStream(1)
     for part in np.split(data, [100, 101, 9_000, 20_003]):
         stream.add(part[:, None])
-    found = stream.result(1.0 / RATE)
-    own = found.tau < 20.0
-    tau, theirs, _, _ = allantools.oadev(data, rate=RATE, data_type="freq", taus=found.tau[own])
-    np.testing.assert_allclose(tau, found.tau[own], rtol=1e-12)
-    ours = np.sqrt(found.variance[own, 0])
-    np.testing.assert_allclose(ours[:7], theirs[:7], rtol=1e-9)
+    result = stream.result(1.0 / RATE)
+    own = result.tau < 20.0
+    tau, others, _, _ = allantools.oadev(data, rate=RATE, data_type="freq", taus=result.tau[own])
+    np.testing.assert_allclose(tau, result.tau[own], rtol=1e-12)
+    ours = np.sqrt(result.variance[own, 0])
+    np.testing.assert_allclose(ours[:7], others[:7], rtol=1e-9)
     # A quarter of a cluster from one to the next: their number is still large.
-    np.testing.assert_allclose(ours, theirs, rtol=0.02)
+    np.testing.assert_allclose(ours, others, rtol=0.02)
 
 
 def test_samples_in_any_pieces_give_the_same_variance() -> None:
@@ -105,9 +105,9 @@ def test_missing_samples_do_not_count() -> None:
     data[20_000:25_000] = np.nan
     stream = AllanStream(1)
     stream.add(data)
-    found = stream.result(1.0)
-    few = found.clusters > 500.0
-    np.testing.assert_allclose(found.variance[few, 0] * found.tau[few], 1.0, rtol=0.15)
+    result = stream.result(1.0)
+    few = result.clusters > 500.0
+    np.testing.assert_allclose(result.variance[few, 0] * result.tau[few], 1.0, rtol=0.15)
     assert stream.missing == np.sum(np.isnan(data))
 
 
@@ -135,8 +135,8 @@ def test_intervals_hold_what_was_simulated(walk: float) -> None:
     stream = AllanStream(axes)
     steps = walk / np.sqrt(RATE) * rng.normal(size=(count, axes))
     stream.add(1e-3 * np.sqrt(RATE) * rng.normal(size=(count, axes)) + np.cumsum(steps, axis=0))
-    found = stream.result(1.0 / RATE)
-    fits = [fit for axis in range(axes) if (fit := fit_allan(found, axis)) is not None]
+    result = stream.result(1.0 / RATE)
+    fits = [fit for axis in range(axes) if (fit := fit_allan(result, axis)) is not None]
     white = [fit.white.low <= 1e-3 <= fit.white.high for fit in fits]
     walks = [fit.walk.low <= walk <= fit.walk.high for fit in fits]
     assert sum(white) >= 27
@@ -196,27 +196,27 @@ def test_a_log_at_rest_gives_the_keys_of_a_site(
     assert "imu.accel_bias across gravity" in {u["parameter"] for u in report["unverified"]}
 
 
-def _knock(made: Arrays) -> None:
-    made["gyro"][20_000:20_300] += 0.5
+def _knock(simulation: Arrays) -> None:
+    simulation["gyro"][20_000:20_300] += 0.5
 
 
-def _gap(made: Arrays) -> None:
-    for name, values in made.items():
-        made[name] = np.delete(values, np.arange(15_000, 16_000), axis=0)
+def _gap(simulation: Arrays) -> None:
+    for name, values in simulation.items():
+        simulation[name] = np.delete(values, np.arange(15_000, 16_000), axis=0)
 
 
-def _freeze(made: Arrays) -> None:
-    made["gyro"][15_000:18_000] = made["gyro"][15_000]
-    made["accel"][15_000:18_000] = made["accel"][15_000]
+def _freeze(simulation: Arrays) -> None:
+    simulation["gyro"][15_000:18_000] = simulation["gyro"][15_000]
+    simulation["accel"][15_000:18_000] = simulation["accel"][15_000]
 
 
-def _coarse(made: Arrays) -> None:
-    made["accel"] = np.round(made["accel"] / 0.1) * 0.1
+def _coarse(simulation: Arrays) -> None:
+    simulation["accel"] = np.round(simulation["accel"] / 0.1) * 0.1
 
 
-def _carry(made: Arrays) -> None:
-    time = made["time"]
-    made["gyro"] += 0.4 * np.sin(time)[:, None]
+def _propagate(simulation: Arrays) -> None:
+    time = simulation["time"]
+    simulation["gyro"] += 0.4 * np.sin(time)[:, None]
 
 
 @pytest.mark.parametrize(
@@ -231,16 +231,16 @@ def _carry(made: Arrays) -> None:
 def test_what_spoils_a_log_is_said_and_left_out(
     spoil: Callable[[Arrays], None], code: str, white_holds: bool, tmp_path: Path
 ) -> None:
-    found = _found(_rest(tmp_path / "log", 400.0, spoil))
-    assert found.trust.verdict is Verdict.DOUBTFUL
-    assert code in _codes(found)
-    assert found.keys["gyro_noise"] == pytest.approx(GYRO[0], rel=0.05)
-    held = found.keys["accel_noise"] == pytest.approx(ACCEL[0], rel=0.05)
-    assert held is white_holds
+    result = _result(_rest(tmp_path / "log", 400.0, spoil))
+    assert result.trust.verdict is Verdict.DOUBTFUL
+    assert code in _codes(result)
+    assert result.keys["gyro_noise"] == pytest.approx(GYRO[0], rel=0.05)
+    fixed = result.keys["accel_noise"] == pytest.approx(ACCEL[0], rel=0.05)
+    assert fixed is white_holds
 
 
 def test_a_log_in_motion_fails(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    log = _rest(tmp_path / "log", 120.0, _carry)
+    log = _rest(tmp_path / "log", 120.0, _propagate)
     with pytest.raises(SystemExit) as ended:
         main(["allan", str(log), "-o", str(tmp_path / "out")])
     assert ended.value.code == 1
@@ -249,17 +249,19 @@ def test_a_log_in_motion_fails(tmp_path: Path, capfd: pytest.CaptureFixture[str]
 
 
 def test_a_short_log_does_not_know_the_walk_of_a_bias(resting: Path) -> None:
-    found = _found(resting, 60.0)
-    assert found.trust.verdict is Verdict.DOUBTFUL
-    assert _codes(found) == {"few_data"}
-    low, high = found.intervals["gyro_noise"]
+    result = _result(resting, 60.0)
+    assert result.trust.verdict is Verdict.DOUBTFUL
+    assert _codes(result) == {"few_data"}
+    low, high = result.intervals["gyro_noise"]
     assert low < GYRO[0] < high
-    assert found.keys["gyro_bias_walk"] > GYRO[1]
+    assert result.keys["gyro_bias_walk"] > GYRO[1]
 
 
 def test_too_few_samples_are_refused(resting: Path, tmp_path: Path, refuse: Refuse) -> None:
-    said = refuse("allan", resting, "--end", "1", "-o", tmp_path / "out")
-    assert "has 100 samples in the selected part; record at rest for at least some minutes" in said
+    findings = refuse("allan", resting, "--end", "1", "-o", tmp_path / "out")
+    assert (
+        "has 100 samples in the selected part; record at rest for at least some minutes" in findings
+    )
     assert "there is no such file" in refuse("allan", tmp_path / "nowhere")
 
 

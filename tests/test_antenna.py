@@ -28,7 +28,7 @@ from magfusion.calibration.antenna import (
     with_receiver_gain,
 )
 from magfusion.calibration.antenna_graph import fit_at_uncertain_poses
-from magfusion.calibration.antenna_observability import Observability, observability
+from magfusion.calibration.antenna_observability import AntennaObservability, observability
 from magfusion.errors import EstimationError, InputError
 from magfusion.model.antenna import (
     KAPPAS,
@@ -72,8 +72,8 @@ def test_it_is_the_one_measurement_model() -> None:
     seen = observe_antenna(antenna_of(beacon, sensor), *in_beacon(site, attitude, place))
     turned_back = np.exp(-0.3j * np.arange(3))[:, None]  # of the coils' own phases
     whole = observe(beacon, sensor, attitude, place)
-    for found in (whole.phasor_sensor, predict(beacon, sensor, attitude, place)):
-        coupling = np.swapaxes(found * turned_back, 1, 2)
+    for result in (whole.phasor_sensor, predict(beacon, sensor, attitude, place)):
+        coupling = np.swapaxes(result * turned_back, 1, 2)
         atol = 1e-13 * np.max(seen.value)
         np.testing.assert_allclose(coupling, seen.value, rtol=0, atol=atol)
     # Of the sensor's pose, as observe has it of the mounting; its coils' centres turn with it.
@@ -96,10 +96,10 @@ def test_derivatives_of_the_antennas(antenna: Antenna) -> None:
         return observe_antenna(antenna, turn, position + rotation @ step[3:]).value
 
     groups = [(seen.antenna, by_antenna, 1e-5), (seen.pose, by_pose, 1e-5)]
-    for found, function, step in groups:
-        expected = central_difference(function, found.shape[-1], step)
+    for result, function, step in groups:
+        expected = central_difference(function, result.shape[-1], step)
         scale = np.max(np.abs(expected), axis=(0, 1, 2))
-        np.testing.assert_allclose(found / scale, expected / scale, rtol=0, atol=3e-7)
+        np.testing.assert_allclose(result / scale, expected / scale, rtol=0, atol=3e-7)
 
 
 def test_many_antennas_at_once() -> None:
@@ -108,8 +108,8 @@ def test_many_antennas_at_once() -> None:
     together = observe_antenna(antennas.at(np.s_[:, None]), rotation, position)
     for k in range(4):
         alone = observe_antenna(antennas.at(k), rotation[k], position[k])
-        for found, expected in zip(together, alone, strict=True):
-            np.testing.assert_allclose(found[k], expected, rtol=1e-12, atol=1e-22)
+        for result, expected in zip(together, alone, strict=True):
+            np.testing.assert_allclose(result[k], expected, rtol=1e-12, atol=1e-22)
 
 
 def test_a_beacon_of_two_coils_is_no_tracker() -> None:
@@ -141,13 +141,13 @@ def test_a_receiving_coil_measures_its_mean_flux(
     sensor = replace(site.platform.magnetometer, coil_kappa=kappa, coil_centres_sensor=None)
     point = replace(sensor, coil_kappa=0.0)
     attitude, place = body_poses(site, 4, rng)
-    found = predict(beacon, sensor, attitude, place)
+    result = predict(beacon, sensor, attitude, place)
     nodes, weights = np.polynomial.legendre.leggauss(6)
     turn = np.arange(8) * np.pi / 4.0
     for i, axis in enumerate(sensor.matrix / np.linalg.norm(sensor.matrix, axis=1)[:, None]):
         across = np.linalg.svd(axis[None])[2][1:]
         circle = np.cos(turn)[:, None] * across[0] + np.sin(turn)[:, None] * across[1]
-        mean = np.zeros(found.shape[:-1], dtype=complex)
+        mean = np.zeros(result.shape[:-1], dtype=complex)
         for z, share in zip(nodes, weights, strict=True):
             for s, part in zip(nodes, weights, strict=True):
                 ring = (radius or 0.0) * np.sqrt(0.5 * (s + 1.0)) * circle
@@ -156,12 +156,12 @@ def test_a_receiving_coil_measures_its_mean_flux(
                     at = replace(point, position_body=arm)
                     mean += share * part / 32.0 * predict(beacon, at, attitude, place)[..., i]
         plain = predict(beacon, point, attitude, place)[..., i]
-        assert np.max(np.abs(found[..., i] - mean)) < 0.1 * np.max(np.abs(plain - mean))
+        assert np.max(np.abs(result[..., i] - mean)) < 0.1 * np.max(np.abs(plain - mean))
     seen = observe_antenna(antenna_of(beacon, sensor), *in_beacon(site, attitude, place))
     turned_back = np.exp(-0.3j * np.arange(3))[:, None]
-    apart = np.swapaxes(found * turned_back, 1, 2) - seen.value
+    separate = np.swapaxes(result * turned_back, 1, 2) - seen.value
     far = np.swapaxes(predict(beacon, point, attitude, place) * turned_back, 1, 2) - seen.value
-    assert np.max(np.abs(apart)) < 0.1 * np.max(np.abs(far))
+    assert np.max(np.abs(separate)) < 0.1 * np.max(np.abs(far))
 
 
 def test_shape_and_constant_of_a_coil() -> None:
@@ -174,12 +174,12 @@ def test_shape_and_constant_of_a_coil() -> None:
 def test_coils_at_one_place_change_nothing() -> None:
     sensor = tracker_site(np.random.default_rng(5), centre=0.0).platform.magnetometer
     plain, _, _ = _observe(sensor)
-    apart, _, _ = _observe(replace(sensor, coil_centres_sensor=np.zeros((3, 3))))
+    separate, _, _ = _observe(replace(sensor, coil_centres_sensor=np.zeros((3, 3))))
     for name, value in vars(plain).items():
         if value is None:
-            assert getattr(apart, name) is None
+            assert getattr(separate, name) is None
             continue
-        np.testing.assert_allclose(getattr(apart, name), value, rtol=1e-12, atol=1e-22)
+        np.testing.assert_allclose(getattr(separate, name), value, rtol=1e-12, atol=1e-22)
     # All three moved alike are a lever arm.
     shift = np.array([0.01, -0.02, 0.03])
     arm = sensor.position_body + sensor.body_from_sensor @ shift
@@ -229,16 +229,16 @@ def test_derivatives_with_coils_apart(kappa: float) -> None:
         )
         return predict(replace(beacon, coils=coils), sensor, attitude, place)
 
-    for found, function in (
+    for result, function in (
         (seen.platform_pose, platform),
         (seen.body_from_sensor, mounting),
         (seen.beacon_pose, source),
         (seen.matrix, matrix),
         (seen.log_moments, moments),
     ):
-        expected = central_difference(function, found.shape[-1], 1e-6)
+        expected = central_difference(function, result.shape[-1], 1e-6)
         atol = 1e-8 * np.max(np.abs(expected))
-        np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
+        np.testing.assert_allclose(result, expected, rtol=0, atol=atol)
     np.testing.assert_array_equal(observe_from(beacon, sensor, attitude, place)[0].shape, (4, 3, 3))
     np.testing.assert_allclose(
         observe_from(beacon, sensor, attitude, place)[1], seen.platform_pose, rtol=1e-12
@@ -300,18 +300,18 @@ def _varied(number: int = 30) -> AntennaSurvey:
     return _survey(*random_poses((number,), np.random.default_rng(6)))
 
 
-def _nullity(found: Observability) -> int:
-    return found.parameters - found.rank
+def _nullity(result: AntennaObservability) -> int:
+    return result.parameters - result.rank
 
 
 GAIN = "the share of moments and sensitivities in their product"
 
 
 def test_known_poses_leave_one_gain() -> None:
-    found = observability(_varied(), tracker())
-    assert (found.rank, found.null_space) == (35, (GAIN,))
-    assert found.fewest_poses == 4
-    assert found.singular[35] < 1e-13 < 1e-3 < found.singular[34]
+    result = observability(_varied(), tracker())
+    assert (result.rank, result.null_space) == (35, (GAIN,))
+    assert result.min_poses == 4
+    assert result.singular[35] < 1e-13 < 1e-3 < result.singular[34]
     with_sizes = observability(_varied(), sized(tracker()))
     assert (with_sizes.parameters, with_sizes.rank) == (40, 39)
 
@@ -322,13 +322,13 @@ def test_one_position_leaves_two_and_one_attitude_four() -> None:
     assert observability(one_position, tracker()).rank == 34
     attitudes = np.swapaxes(attitude_from_angles(TABLE[:, 0] * DEGREE), 1, 2)
     table = _survey(attitudes, np.tile(POSITION_BEACON, (13, 1)))
-    found = observability(table, tracker())
-    assert found.rank == 34
-    assert 1e-5 < found.singular[33] < 1e-2  # barely seen
+    result = observability(table, tracker())
+    assert result.rank == 34
+    assert 1e-5 < result.singular[33] < 1e-2  # barely seen
     one_attitude = _survey(np.tile(rotation[0], (30, 1, 1)), position)
-    found = observability(one_attitude, tracker())
-    assert found.rank == 32
-    assert found.null_space == (GAIN, "shift of both antennas' centres together (3)")
+    result = observability(one_attitude, tracker())
+    assert result.rank == 32
+    assert result.null_space == (GAIN, "shift of both antennas' centres together (3)")
 
 
 def test_unknown_poses_leave_frames_and_scale() -> None:
@@ -339,7 +339,7 @@ def test_unknown_poses_leave_frames_and_scale() -> None:
     no_position = observability(survey, antenna, positions_known=False)
     assert _nullity(no_position) == 8
     nothing = observability(survey, antenna, attitudes_known=False, positions_known=False)
-    assert (_nullity(nothing), nothing.rank, nothing.fewest_poses) == (14, 22, 8)
+    assert (_nullity(nothing), nothing.rank, nothing.min_poses) == (14, 22, 8)
     assert len(nothing.null_space) == 6
     assert "the scale of all lengths" in nothing.null_space
 
@@ -355,9 +355,9 @@ def test_centred_antennas() -> None:
 
 def test_what_has_no_name_is_told_by_its_parts() -> None:
     rotation, _ = random_poses((30,), np.random.default_rng(6))
-    found = observability(_survey(rotation, np.tile(POSITION_BEACON, (30, 1))), tracker())
-    assert found.null_space[0] == GAIN
-    assert found.null_space[1].startswith("1 more, in moments")
+    result = observability(_survey(rotation, np.tile(POSITION_BEACON, (30, 1))), tracker())
+    assert result.null_space[0] == GAIN
+    assert result.null_space[1].startswith("1 more, in moments")
 
 
 # Fits
@@ -374,11 +374,11 @@ def test_the_fit_is_exact_without_noise() -> None:
     truth = draw_antennas(config.errors, 3, rng)
     survey = draw_survey(truth, config, rng)
     fit = fit_at_known_poses(survey, nominal(), usual_prior(config.errors))
-    found, true = fit.antenna, truth
-    np.testing.assert_allclose(found.centres_beacon, true.centres_beacon, rtol=0, atol=1e-7)
-    np.testing.assert_allclose(found.centres_sensor, true.centres_sensor, rtol=0, atol=1e-7)
+    result, true = fit.antenna, truth
+    np.testing.assert_allclose(result.centres_beacon, true.centres_beacon, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(result.centres_sensor, true.centres_sensor, rtol=0, atol=1e-7)
     for k in range(3):
-        product = np.kron(found.moments_beacon[k], found.sensitivities_sensor[k])
+        product = np.kron(result.moments_beacon[k], result.sensitivities_sensor[k])
         expected = np.kron(true.moments_beacon[k], true.sensitivities_sensor[k])
         np.testing.assert_allclose(product, expected, rtol=0, atol=1e-6)
 
@@ -406,20 +406,20 @@ def test_a_held_gain_leaves_only_errors_of_couplings() -> None:
     normalised = []
     for k in range(config.antennas):
         fit = fit_at_known_poses(one_of(survey, k), nominal(), prior)
-        held = with_receiver_gain(fit, nominal())
-        size = np.linalg.norm(held.antenna.sensitivities_sensor, axis=1)
+        fixed = with_receiver_gain(fit, nominal())
+        size = np.linalg.norm(fixed.antenna.sensitivities_sensor, axis=1)
         assert np.prod(size) == pytest.approx(1.0, rel=1e-12)
-        before, after = (observe_antenna(f.antenna, rotation, position) for f in (fit, held))
+        before, after = (observe_antenna(f.antenna, rotation, position) for f in (fit, fixed))
         np.testing.assert_allclose(after.value, before.value, rtol=0, atol=1e-12 * 1e-5)
         # What the couplings' covariance was it still is; that of the gains is now small.
         old, new = (
             s.antenna[0, 0, 0] @ f.cov @ s.antenna[0, 0, 0]
-            for s, f in ((before, fit), (after, held))
+            for s, f in ((before, fit), (after, fixed))
         )
         assert new == pytest.approx(old, rel=1e-4)
         true = with_receiver_gain(replace(fit, antenna=truth.at(k)), nominal()).antenna
-        off = held.antenna.vector() - true.vector()
-        sigma = np.sqrt(np.diagonal(held.cov))
+        off = fixed.antenna.vector() - true.vector()
+        sigma = np.sqrt(np.diagonal(fixed.cov))
         assert np.max(sigma[:9]) < 1e-3 < 5e-3 < np.max(np.sqrt(np.diagonal(fit.cov))[:9])
         normalised.append(off / sigma)
     assert np.mean(np.square(normalised)) == pytest.approx(1.0, abs=0.12)
@@ -432,8 +432,8 @@ def test_the_graph_with_sure_poses_is_least_squares() -> None:
     survey, prior = draw_survey(truth, config, rng), usual_prior(config.errors)
     exact = fit_at_known_poses(survey, nominal(), prior)
     graph = fit_at_uncertain_poses(one_of(survey, 0), nominal(), prior, 1e-8, 1e-9)
-    apart = (graph.antenna.vector() - exact.antenna.vector()[0]) / prior
-    assert np.max(np.abs(apart)) < 1e-4
+    separate = (graph.antenna.vector() - exact.antenna.vector()[0]) / prior
+    assert np.max(np.abs(separate)) < 1e-4
     np.testing.assert_allclose(np.diagonal(graph.cov), np.diagonal(exact.cov[0]), rtol=1e-3)
     assert graph.chi2 == pytest.approx(exact.chi2[0], rel=1e-4)
 
@@ -451,11 +451,11 @@ def test_self_calibration_finds_shapes_and_mends_the_poses() -> None:
         unit = coils / np.linalg.norm(coils, axis=-1, keepdims=True)
         return np.asarray((unit @ unit.T)[np.triu_indices(3, 1)])
 
-    for found, true in (
+    for result, true in (
         (fit.antenna.moments_beacon, truth.moments_beacon[0]),
         (fit.antenna.sensitivities_sensor, truth.sensitivities_sensor[0]),
     ):
-        error = np.sqrt(np.mean((angles(found) - angles(true)) ** 2)) / DEGREE
+        error = np.sqrt(np.mean((angles(result) - angles(true)) ** 2)) / DEGREE
         assert error < 0.06 < np.sqrt(np.mean(angles(true) ** 2)) / DEGREE
     assert np.mean(fit.chi2) / fit.dof == pytest.approx(1.0, abs=0.35)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from antenna_bench import KINDS, Config, Table, holds, run_seed, write_csv
+from antenna_bench import KINDS, Config, Table, passes_check, run_seed, write_csv
 from conftest import Refuse
 from scipy.spatial.transform import Rotation
 from test_antenna_job import make_survey, nominal
@@ -79,8 +79,8 @@ def calibrated(
         sizes=sizes,
     )
     run_calibrate_antenna(settings, bench / "out")
-    told = json.loads((bench / "out" / "report.json").read_text())
-    return load_site(bench / "out" / "site.yaml"), told
+    reported = json.loads((bench / "out" / "report.json").read_text())
+    return load_site(bench / "out" / "site.yaml"), reported
 
 
 def test_six_points_of_one_axis_after_the_other_find_all_of_a_source(
@@ -89,15 +89,15 @@ def test_six_points_of_one_axis_after_the_other_find_all_of_a_source(
     beacon = true_site.beacons[0]
     table = probe_table(beacon.moments_beacon, beacon.centres_beacon, on_axis=True, three=True)
     write_csv(bench / "probe.csv", table)
-    site, told = calibrated(bench, "probe.csv")
-    found = site.beacons[0]
-    np.testing.assert_allclose(found.moments_beacon, beacon.moments_beacon, atol=1e-5)
-    np.testing.assert_allclose(found.centres_beacon, beacon.centres_beacon, atol=2e-6)
-    assert float(str(told["transmitter_field_error_before"])) > 0.005
-    assert float(str(told["transmitter_field_error_after"])) < 1e-4
-    assert told["verdict"] == "trustworthy"
-    assert "few_data" in str(told["remarks"])  # no pose was tried
-    undetermined = told["undetermined"]
+    site, reported = calibrated(bench, "probe.csv")
+    result = site.beacons[0]
+    np.testing.assert_allclose(result.moments_beacon, beacon.moments_beacon, atol=1e-5)
+    np.testing.assert_allclose(result.centres_beacon, beacon.centres_beacon, atol=2e-6)
+    assert float(str(reported["transmitter_field_error_before"])) > 0.005
+    assert float(str(reported["transmitter_field_error_after"])) < 1e-4
+    assert reported["verdict"] == "trustworthy"
+    assert "few_data" in str(reported["remarks"])  # no pose was tried
+    undetermined = reported["undetermined"]
     assert isinstance(undetermined, list)
     assert not any(name.startswith("transmitter") for name in undetermined)
 
@@ -109,14 +109,14 @@ def test_four_points_along_the_coils_axis_do_not_tell_what_they_do_not_see(
     beacon = true_site.beacons[0]
     table = probe_table(beacon.moments_beacon, beacon.centres_beacon, on_axis=False, three=False)
     write_csv(bench / "probe.csv", table)
-    site, told = calibrated(bench, "probe.csv")
-    undetermined = told["undetermined"]
+    site, reported = calibrated(bench, "probe.csv")
+    undetermined = reported["undetermined"]
     assert isinstance(undetermined, list)
     own = {name for name in undetermined if name.startswith("transmitter")}
     axial = {f"transmitter.centre_{c}{c}" for c in "xyz"}
     tilts = {f"transmitter.moment_{c}{a}" for c in "xyz" for a in "xyz" if a != c}
     assert own == axial | tilts
-    assert "transmitter.centre_xx" in str(told["remarks"])
+    assert "transmitter.centre_xx" in str(reported["remarks"])
     for coil, true in zip(site.beacons[0].coils, beacon.coils, strict=True):
         across = np.abs(true.moment_beacon) < 0.5
         assert np.max(np.abs(coil.centre_beacon - true.centre_beacon)[across]) < 1e-4
@@ -132,11 +132,11 @@ def test_a_receiver_is_driven_with_whatever_current(bench: Path, true_site: Site
         driven, sensor.coil_centres_sensor, on_axis=True, three=True, side="receiver"
     )
     write_csv(bench / "probe.csv", table)
-    found = calibrated(bench, "probe.csv")[0].platform.magnetometer
+    result = calibrated(bench, "probe.csv")[0].platform.magnetometer
     gain = np.exp(np.mean(np.log(np.linalg.norm(sensor.matrix, axis=1))))
-    np.testing.assert_allclose(found.matrix, sensor.matrix / gain, atol=1e-4)
-    assert found.coil_centres_sensor is not None
-    np.testing.assert_allclose(found.coil_centres_sensor, sensor.coil_centres_sensor, atol=1e-5)
+    np.testing.assert_allclose(result.matrix, sensor.matrix / gain, atol=1e-4)
+    assert result.coil_centres_sensor is not None
+    np.testing.assert_allclose(result.coil_centres_sensor, sensor.coil_centres_sensor, atol=1e-5)
 
 
 def test_windings_of_different_size_are_found_by_six_points(bench: Path) -> None:
@@ -155,8 +155,8 @@ def test_windings_of_different_size_are_found_by_six_points(bench: Path) -> None
             rows["coil"].append(coil)
             rows["sigma"].append(1e-12)
     write_csv(bench / "probe.csv", rows)
-    found = calibrated(bench, "probe.csv", sizes=True)[0].beacons[0]
-    for coil, radius in zip(found.coils, radii, strict=True):
+    result = calibrated(bench, "probe.csv", sizes=True)[0].beacons[0]
+    for coil, radius in zip(result.coils, radii, strict=True):
         assert coil.radius == pytest.approx(radius, rel=0.02)
 
 
@@ -173,9 +173,9 @@ def test_a_list_of_angles_is_the_same_as_quaternions_in_every_row(
 ) -> None:
     survey = make_survey(true_site, 12, 3)
     _split(survey, bench)
-    found = read_survey(bench / "readings.csv", bench / "turntable.csv")
-    np.testing.assert_allclose(found.world_from_body, survey.world_from_body, atol=1e-12)
-    np.testing.assert_allclose(found.position_world, survey.position_world, atol=1e-15)
+    result = read_survey(bench / "readings.csv", bench / "turntable.csv")
+    np.testing.assert_allclose(result.world_from_body, survey.world_from_body, atol=1e-12)
+    np.testing.assert_allclose(result.position_world, survey.position_world, atol=1e-15)
 
 
 def test_the_boresight_is_found_whatever_the_site_says_of_it(bench: Path, true_site: Site) -> None:
@@ -187,19 +187,21 @@ def test_the_boresight_is_found_whatever_the_site_says_of_it(bench: Path, true_s
         bench / "site.yaml",
     )
     write_survey(make_survey(true_site, 25, 4, exact=True), bench / "survey.parquet")
-    site, told = calibrated(bench, survey=True, boresight=True)
-    true, found = true_site.platform.magnetometer, site.platform.magnetometer
-    turn = Rotation.from_matrix(true.body_from_sensor.T @ found.body_from_sensor).magnitude()
+    site, reported = calibrated(bench, survey=True, boresight=True)
+    true, result = true_site.platform.magnetometer, site.platform.magnetometer
+    turn = Rotation.from_matrix(true.body_from_sensor.T @ result.body_from_sensor).magnitude()
     # What of three coils is a turn and what a shape is told by the matrix that was declared.
-    left, _, right = np.linalg.svd(true.matrix.T)
-    convention = Rotation.from_matrix(left @ right).magnitude()
+    remaining, _, right = np.linalg.svd(true.matrix.T)
+    convention = Rotation.from_matrix(remaining @ right).magnitude()
     assert turn < convention + 0.1 * DEGREE
     assert turn < 1.0 * DEGREE
     assert true.coil_centres_sensor is not None
     middle = true.position_body + true.body_from_sensor @ np.mean(true.coil_centres_sensor, axis=0)
-    assert np.linalg.norm(found.position_body - middle) < 5e-4
-    assert float(str(told["attitude_deg_after"])) < 0.02 * float(str(told["attitude_deg_before"]))
-    sensed = found.matrix @ found.body_from_sensor.T
+    assert np.linalg.norm(result.position_body - middle) < 5e-4
+    assert float(str(reported["attitude_deg_after"])) < 0.02 * float(
+        str(reported["attitude_deg_before"])
+    )
+    sensed = result.matrix @ result.body_from_sensor.T
     expected = true.matrix @ true.body_from_sensor.T
     gain = np.linalg.norm(sensed) / np.linalg.norm(expected)
     np.testing.assert_allclose(sensed, gain * expected, atol=2e-3)
@@ -215,10 +217,10 @@ def test_poses_turned_alike_are_said_not_to_tell_of_others(bench: Path, true_sit
     phasor = phasor + sigma[..., None] * (noise[0] + 1j * noise[1])
     survey = Survey(np.arange(20), place, attitude, true_site.channels, sigma, phasor)
     write_survey(survey, bench / "survey.parquet")
-    _, told = calibrated(bench, survey=True)
-    expected, after = (float(str(told[f"position_m_{n}"])) for n in ("any_attitude", "after"))
+    _, reported = calibrated(bench, survey=True)
+    expected, after = (float(str(reported[f"position_m_{n}"])) for n in ("any_attitude", "after"))
     assert expected > 2.0 * after
-    assert "transfer" in str(told["reasons"])
+    assert "transfer" in str(reported["reasons"])
 
 
 @pytest.mark.parametrize(
@@ -260,8 +262,10 @@ def test_a_point_without_a_pose_is_refused(bench: Path, true_site: Site, refuse:
     lines = (bench / "turntable.csv").read_text().splitlines()
     (bench / "turntable.csv").write_text("\n".join(lines[:-1]) + "\n")
     given = [bench / "readings.csv", "--poses", bench / "turntable.csv"]
-    told = refuse("calibrate", "antenna", *given, "--site", bench / "site.yaml", "-o", bench / "o")
-    assert "readings.csv: column point, row 15: found 5; write a point that" in told
+    reported = refuse(
+        "calibrate", "antenna", *given, "--site", bench / "site.yaml", "-o", bench / "o"
+    )
+    assert "readings.csv: column point, row 15: found 5; write a point that" in reported
     assert "give a survey of known poses" in refuse(
         "calibrate", "antenna", "--site", bench / "site.yaml", "-o", bench / "o"
     )
@@ -273,4 +277,4 @@ def test_what_is_reported_is_what_fixes_err_by_elsewhere(name: str) -> None:
     """The rule of the scenario, on two trackers of each kind."""
     kind = vars(KINDS[name])
     outcomes = [run_seed(Config(**kind | {"seed": seed})) for seed in range(2)]
-    assert holds(outcomes), outcomes
+    assert passes_check(outcomes), outcomes

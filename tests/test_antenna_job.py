@@ -96,12 +96,12 @@ def test_the_refined_site_tracks_better(
     assert isinstance(after, float)
     assert after < before / 3.0  # the turntable's own error is in both
     # And where no turntable tells: the phasors of the true antennas at new poses.
-    found = load_site(tmp_path / "out" / "site.yaml")
+    result = load_site(tmp_path / "out" / "site.yaml")
     rng = np.random.default_rng(2)
     poses = body_poses(true_site, 30, rng)
     errors = []
     truth = predict(true_site.beacons[0], true_site.platform.magnetometer, *poses)
-    for site in (nominal(true_site), found):
+    for site in (nominal(true_site), result):
         seen = predict(site.beacons[0], site.platform.magnetometer, *poses)
         errors.append(np.linalg.norm(seen - truth) / np.linalg.norm(truth))
     assert errors[1] < errors[0] / 8.0
@@ -148,13 +148,13 @@ def test_sizes_are_written_for_every_estimator(
     poses = body_poses(true_site, 20, np.random.default_rng(8))
     truth = predict(sized.beacons[0], sized.platform.magnetometer, *poses)
     run([*arguments, "--sizes"])
-    found = load_site(tmp_path / "out" / "site.yaml")
-    seen = predict(found.beacons[0], found.platform.magnetometer, *poses)
-    points = replace(found.platform.magnetometer, coil_kappa=0.0)
-    without = predict(as_points(found.beacons[0]), points, *poses)
+    result = load_site(tmp_path / "out" / "site.yaml")
+    seen = predict(result.beacons[0], result.platform.magnetometer, *poses)
+    points = replace(result.platform.magnetometer, coil_kappa=0.0)
+    without = predict(as_points(result.beacons[0]), points, *poses)
     errors = [np.linalg.norm(phasor - truth) for phasor in (without, seen)]
-    assert found.beacons[0].coils[0].radius == pytest.approx(0.04, rel=0.1)
-    assert found.platform.magnetometer.coil_kappa == pytest.approx(1e-4, rel=0.3)
+    assert result.beacons[0].coils[0].radius == pytest.approx(0.04, rel=0.1)
+    assert result.platform.magnetometer.coil_kappa == pytest.approx(1e-4, rel=0.3)
     assert errors[1] < 0.3 * errors[0]
 
 

@@ -31,8 +31,10 @@ BOX = np.array([[-1.5, -1.5, 0.5], [1.5, 1.5, 1.5]])
 @pytest.fixture(scope="module")
 def simulated() -> tuple[mf.Log, mf.Site]:
     site = demo_site()
-    found = mf.simulate_log(site, mf.SimulationConfig(BOX, duration=10.0), np.random.default_rng(1))
-    return replace(found.log, epoch_ns=EPOCH_NS), site
+    result = mf.simulate_log(
+        site, mf.SimulationConfig(BOX, duration=10.0), np.random.default_rng(1)
+    )
+    return replace(result.log, epoch_ns=EPOCH_NS), site
 
 
 @pytest.fixture(scope="module")
@@ -102,8 +104,8 @@ def test_what_is_saved_as_a_table_is_read_back(
         assert trajectory.cov is not None
         np.testing.assert_allclose(read.time, trajectory.time, rtol=0.0, atol=1e-9)
         np.testing.assert_allclose(read.position, trajectory.position, rtol=0.0, atol=1e-15)
-        turned = (trajectory.rotation.inv() * read.rotation).magnitude()
-        assert np.max(turned) < 1e-12
+        rotated = (trajectory.rotation.inv() * read.rotation).magnitude()
+        assert np.max(rotated) < 1e-12
         np.testing.assert_allclose(read.pose_cov, trajectory.cov, rtol=1e-12, atol=1e-18)
 
 
@@ -128,14 +130,14 @@ def test_what_is_saved_as_a_bag_has_the_log_s_stamps(
 ) -> None:
     trajectory.save(tmp_path / f"t.{form}")
     with AnyReader([tmp_path / f"t.{form}"]) as reader:
-        found = [
+        result = [
             (stamp, reader.deserialize(raw, one.msgtype).pose.pose.position)
             for one, stamp, raw in reader.messages()
             if one.topic == "/magfusion/odometry"
         ]
-    stamps = np.array([stamp - EPOCH_NS for stamp, _ in found])
+    stamps = np.array([stamp - EPOCH_NS for stamp, _ in result])
     np.testing.assert_allclose(1e-9 * stamps, trajectory.time, rtol=0.0, atol=1e-9)
-    places = np.array([[p.x, p.y, p.z] for _, p in found])
+    places = np.array([[p.x, p.y, p.z] for _, p in result])
     np.testing.assert_allclose(places, trajectory.position, rtol=0.0, atol=1e-15)
 
 
@@ -194,16 +196,16 @@ def test_the_states_of_a_navigator_are_a_trajectory(
     navigator: mf.Navigator, simulated: tuple[mf.Log, mf.Site]
 ) -> None:
     states = navigator.take()
-    found = mf.collect_states(states, EPOCH_NS)
+    result = mf.collect_states(states, EPOCH_NS)
     last = states[-1]
-    assert found.epoch_ns == EPOCH_NS
-    assert np.array_equal(found.position[-1], last.position)
-    np.testing.assert_allclose(found.euler[-1], last.euler, rtol=0.0, atol=1e-12)
-    assert found.cov is not None
-    assert np.array_equal(found.cov[-1], last.cov[:6, :6])
+    assert result.epoch_ns == EPOCH_NS
+    assert np.array_equal(result.position[-1], last.position)
+    np.testing.assert_allclose(result.euler[-1], last.euler, rtol=0.0, atol=1e-12)
+    assert result.cov is not None
+    assert np.array_equal(result.cov[-1], last.cov[:6, :6])
     truth = simulated[0].truth
     assert truth is not None
-    assert mf.trajectory_errors(found, truth).ate < 0.1
+    assert mf.trajectory_errors(result, truth).ate < 0.1
     with pytest.raises(mf.InputError, match="no state to collect"):
         mf.collect_states([])
 
@@ -212,12 +214,12 @@ def test_whatever_is_public_is_shown_in_one_line(
     result: mf.SmoothedLog, simulated: tuple[mf.Log, mf.Site], navigator: mf.Navigator
 ) -> None:
     log, site = simulated
-    judged, trust = mf.judged(result, log)
+    verdicts, trust = mf.judge_result(result, log)
     assert log.truth is not None
     shown = [
         *(log, log.imu, log.waveform, log.truth),
         *(site, site.platform, site.platform.magnetometer, *site.beacons),
-        *(result, judged, trust, result.trajectory, result.states, result.fields),
+        *(result, verdicts, trust, result.trajectory, result.states, result.fields),
         *(result.calibration, result.graph, result.estimate, result.start),
         mf.fix_epochs(result.fields, mf.initial_calibration(site, 0.0)),
         mf.trajectory_errors(result.states, log.truth),
@@ -234,11 +236,11 @@ def test_whatever_is_public_is_shown_in_one_line(
 def test_a_result_says_whether_it_was_judged(
     result: mf.SmoothedLog, simulated: tuple[mf.Log, mf.Site]
 ) -> None:
-    judged, trust = mf.judged(result, simulated[0])
-    assert isinstance(judged, mf.SmoothedLog)
-    assert judged.trust is trust
+    verdicts, trust = mf.judge_result(result, simulated[0])
+    assert isinstance(verdicts, mf.SmoothedLog)
+    assert verdicts.trust is trust
     assert "not judged" in repr(result)
-    assert str(trust.verdict) in repr(judged)
+    assert str(trust.verdict) in repr(verdicts)
 
 
 def test_settings_are_shown_as_far_as_they_were_chosen() -> None:
@@ -251,8 +253,8 @@ def test_a_notebook_shows_the_head_of_the_page(
 ) -> None:
     """With the verdict and what led to it; what it is styled by stays within it."""
     assert "No verdict yet" in result._repr_html_()
-    judged, trust = mf.judged(replace(result, log_name="<b>log"), simulated[0])
-    page = judged._repr_html_()
+    verdicts, trust = mf.judge_result(replace(result, log_name="<b>log"), simulated[0])
+    page = verdicts._repr_html_()
     assert str(trust.verdict).upper() in page
     assert "Main figures" in page
     assert "<b>log" not in page
@@ -277,7 +279,7 @@ SWAPPED = "the arguments are swapped; give them in this order"
 CONFIG, RNG = mf.SimulationConfig(BOX), np.random.default_rng(1)
 REFUSED: list[tuple[Callable[[Given], object], str]] = [
     (lambda g: mf.smooth(g.site, g.log), f"smooth(log, site): {SWAPPED}"),
-    (lambda g: mf.judged(g.log, g.result), f"judged(result, log): {SWAPPED}"),
+    (lambda g: mf.judge_result(g.log, g.result), f"judged(result, log): {SWAPPED}"),
     (
         lambda g: mf.fix_epochs(g.result.calibration, g.result.fields),
         f"fix_epochs(samples, calibration): {SWAPPED}",
@@ -287,7 +289,7 @@ REFUSED: list[tuple[Callable[[Given], object], str]] = [
         f"simulate_log(site, config, rng): {SWAPPED}",
     ),
     (lambda g: mf.smooth(g.log, "site.yaml"), "site must be a Site; got a str"),
-    (lambda g: mf.judged(g.result, g.site), "log must be a Log; got a Site"),
+    (lambda g: mf.judge_result(g.result, g.site), "log must be a Log; got a Site"),
     (lambda g: mf.Navigator(g.log), "site must be a Site; got a Log"),
     (lambda g: mf.save_site("site.yaml", g.site), "site must be a Site; got a str"),
     (
@@ -353,11 +355,11 @@ def test_a_program_is_warned_once_of_threads_that_nobody_asked_for(
         text=True,
         check=True,
     )
-    said, lines = done.stdout.splitlines()
-    assert int(said.split()[0]) == count
+    findings, lines = done.stdout.splitlines()
+    assert int(findings.split()[0]) == count
     if count:
-        assert "BLAS uses 2 threads" in said
-        assert "OPENBLAS_NUM_THREADS=1" in said
+        assert "BLAS uses 2 threads" in findings
+        assert "OPENBLAS_NUM_THREADS=1" in findings
         assert int(lines) == 1 + script.splitlines().index(
             "        called_by_a_user(); called_by_a_user()"
         )

@@ -97,22 +97,22 @@ STREAMS = {
 @pytest.mark.parametrize("mistake", STREAMS)
 def test_a_stream_that_is_none_is_refused_by_its_place(mistake: str, worked: Worked) -> None:
     form, given, pattern = STREAMS[mistake]
-    status, said = _navigate(worked, given, form)
+    status, findings = _navigate(worked, given, form)
     assert status == 2
-    assert said.count("\n") == 1
-    assert re.search(pattern, said), said
+    assert findings.count("\n") == 1
+    assert re.search(pattern, findings), findings
 
 
 def test_a_record_that_is_too_large_is_passed_over_where_that_is_asked(worked: Worked) -> None:
     given = b"0" * (LARGEST_RECORD + 10) + b"\n" + json.dumps(_IMU).encode() + b"\n"
-    status, said = _navigate(worked, given, "json", "--keep-going")
+    status, findings = _navigate(worked, given, "json", "--keep-going")
     assert status == 0
-    assert "line 1: is larger than" in said
-    assert "1 records were skipped" in said
+    assert "line 1: is larger than" in findings
+    assert "1 records were skipped" in findings
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "findings"),
     [
         ("replay LOG >&-", "standard output: is closed"),
         ("navigate - --site LOG/site.yaml <&-", "standard input: is closed"),
@@ -121,17 +121,17 @@ def test_a_record_that_is_too_large_is_passed_over_where_that_is_asked(worked: W
     ],
 )
 def test_a_standard_stream_that_is_closed_or_full_is_told(
-    line: str, said: str, worked: Worked
+    line: str, findings: str, worked: Worked
 ) -> None:
     shell = f"exec {sys.executable} -m magfusion {line.replace('LOG', str(worked.log))}"
     done = subprocess.run(["sh", "-c", shell], capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert said in done.stderr
+    assert findings in done.stderr
     assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "findings"),
     [
         ("fix LOG -o OUT --start 1e300", "holds no row from 1e.300 s"),
         ("fix LOG -o OUT --mains-hz 0.01", "--mains-hz must be 0 for none, or at least 10 Hz"),
@@ -140,12 +140,12 @@ def test_a_standard_stream_that_is_closed_or_full_is_told(
     ],
 )
 def test_an_option_beyond_what_is_is_told(
-    line: str, said: str, worked: Worked, tmp_path: Path, refuse: Refuse
+    line: str, findings: str, worked: Worked, tmp_path: Path, refuse: Refuse
 ) -> None:
     names = {"LOG": str(worked.log), "OUT": str(tmp_path / "run")}
     for name, path in names.items():
         line = line.replace(name, path)
-    assert re.search(said, refuse(*line.split()))
+    assert re.search(findings, refuse(*line.split()))
 
 
 # Files ----------------------------------------------------------------------------------------
@@ -179,18 +179,18 @@ def test_what_a_killed_run_left_is_removed_and_what_it_moved_away_given_back(
 ) -> None:
     child = os.fork()
     if not child:  # a run that is killed at the worst moments
-        with whole_directory(tmp_path / "run", lambda _: True) as made:
-            (made / "part").write_text("unfinished")
-            (made.with_name(made.name.replace("unfinished", "former"))).mkdir()
+        with whole_directory(tmp_path / "run", lambda _: True) as built:
+            (built / "part").write_text("unfinished")
+            (built.with_name(built.name.replace("unfinished", "former"))).mkdir()
             with whole_file(tmp_path / "state") as unfinished:
                 unfinished.write_text("unfinished")
                 os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(child, 0)
     (tmp_path / ".run.2024").write_text("a user's")
     assert len(list(tmp_path.iterdir())) == 4
-    with whole_directory(tmp_path / "run", lambda _: True) as made:
+    with whole_directory(tmp_path / "run", lambda _: True) as built:
         assert (tmp_path / "run").is_dir()  # given back
-        (made / "whole").write_text("")
+        (built / "whole").write_text("")
     with whole_file(tmp_path / "state") as unfinished:
         unfinished.write_text("whole")
     assert {p.name for p in tmp_path.iterdir()} == {"run", "state", ".run.2024"}
@@ -238,9 +238,9 @@ def test_sigterm_ends_as_an_interrupt_does(worked: Worked) -> None:
         run.stdin.flush()
         assert run.stdout.readline().startswith(b'{"time": 0.0')  # it is at work
         run.send_signal(signal.SIGTERM)
-        _, said = run.communicate()
+        _, findings = run.communicate()
     assert run.returncode == 130
-    assert said == b""
+    assert findings == b""
 
 
 def test_a_refused_drift_leaves_nothing(tmp_path: Path, refuse: Refuse) -> None:

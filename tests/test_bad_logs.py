@@ -50,13 +50,13 @@ def _twice(row: int) -> Callable[[dict[str, Any]], object]:
     return change
 
 
-def _most(column: str, row: int, value: object) -> Callable[[dict[str, Any]], object]:
+def _upper_percentile(column: str, row: int, value: object) -> Callable[[dict[str, Any]], object]:
     """Write a value, or that of the row, into most rows from there on."""
 
     def change(columns: dict[str, Any]) -> None:
         count = 4 * (len(columns[column]) - row) // 5
-        found = columns[column][row] if value is None else value
-        columns[column][row : row + count] = [found] * count
+        result = columns[column][row] if value is None else value
+        columns[column][row : row + count] = [result] * count
 
     return change
 
@@ -82,12 +82,16 @@ BAD_TABLES = [
     ("imu", lambda c: c.pop("time_ns"), "column time_ns is missing"),
     ("imu", lambda c: c.update(gyro_x=["a"] * 400), "column gyro_x holds string; write numbers"),
     ("imu", lambda c: c.update(time_ns=[t * 1e-9 for t in c["time_ns"]]), "time_ns holds double"),
-    ("imu", _most("accel_z", 17, float("nan")), r"column accel_z, row 17 .*: found nan"),
+    (
+        "imu",
+        _upper_percentile("accel_z", 17, float("nan")),
+        r"column accel_z, row 17 .*: found nan",
+    ),
     ("imu", _set("gyro_x", 399, float("inf")), r"column gyro_x, row 399 .*: found inf"),
     ("imu", _set("time_ns", 3, None), r"column time_ns, row 3 .*: found no value"),
     ("imu", _set("time_ns", 40, EPOCH_NS), r"column time_ns, row 40 .*sort the rows"),
     ("imu", _set("time_ns", 399, 2**63 - 1), r"column time_ns, row 399 .*write nanoseconds"),
-    ("imu", _most("time_ns", 8, None), r"column time_ns, row 9 .*remove one"),
+    ("imu", _upper_percentile("time_ns", 8, None), r"column time_ns, row 9 .*remove one"),
     ("imu", _hours_later(40), r"column time_ns, row 40 .*the clock jumped"),
     ("imu", lambda c: [v.clear() for v in c.values()], "holds no rows"),
     ("imu", _scale(_axes("accel"), 1 / 9.80665), "probably in g"),
@@ -100,7 +104,7 @@ BAD_TABLES = [
     ),
     ("magnetometer", _scale(_axes("field"), 1e9), "divide nanotesla by 1e9"),
     ("magnetometer", _scale(_axes("field"), 1e4), "gauss by 1e4"),
-    ("magnetometer", _most("time_ns", 0, None), r"column time_ns, row 1 .*remove one"),
+    ("magnetometer", _upper_percentile("time_ns", 0, None), r"column time_ns, row 1 .*remove one"),
     ("fields", lambda c: c.pop("sigma"), "column sigma is missing"),
     ("fields", lambda c: c.pop("cov_yz"), "column cov_yz is missing"),
     ("fields", lambda c: c.update(beacon=[1] * len(c["tone"])), "beacon holds int64; write text"),
@@ -272,13 +276,13 @@ def test_any_damage_to_a_table_is_noticed(tmp_path: Path) -> None:
         damaged[place] ^= 1 << int(rng.integers(8))
         path.write_bytes(damaged)
         try:
-            found = read_log(tmp_path / "walk").imu
+            result = read_log(tmp_path / "walk").imu
         except InputError:
             refused += 1
         else:
-            np.testing.assert_array_equal(found.time, expected.time)
-            np.testing.assert_array_equal(found.gyro_body, expected.gyro_body)
-            np.testing.assert_array_equal(found.accel_body, expected.accel_body)
+            np.testing.assert_array_equal(result.time, expected.time)
+            np.testing.assert_array_equal(result.gyro_body, expected.gyro_body)
+            np.testing.assert_array_equal(result.accel_body, expected.accel_body)
     assert refused > 30
 
 
@@ -296,14 +300,14 @@ def test_samples_without_a_number_or_a_time_of_their_own_are_left_out_and_counte
     column = "gyro_x" if stem == "imu" else "field_z"
     _rewrite(walk / f"{stem}.parquet", _set(column, 9, absent))
     _rewrite(walk / f"{stem}.parquet", _twice(7))
-    found = read_log(walk)
+    result = read_log(walk)
     before, after = (
         (log.imu.time if stem == "imu" else log.waveform.time)  # type: ignore[union-attr]
-        for log in (whole, found)
+        for log in (whole, result)
     )
     assert np.array_equal(after, np.delete(before, 9))
-    assert [finding.code for finding in found.noticed] == ["repeated_stamps", "missing_samples"]
-    assert all("1 samples" in finding.text for finding in found.noticed)
+    assert [finding.code for finding in result.noticed] == ["repeated_stamps", "missing_samples"]
+    assert all("1 samples" in finding.text for finding in result.noticed)
 
 
 def _imu(gyro_body: Array, accel_body: Array) -> ImuSamples:

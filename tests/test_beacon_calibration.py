@@ -43,9 +43,9 @@ def mean(errors: Errors, name: str) -> list[float]:
 def test_the_figures_of_the_paper_need_the_axes_of_the_beacon(
     errors: dict[tuple[str, int], Errors], count: int, position: float, angle: float
 ) -> None:
-    found = errors["component", count]
-    assert mean(found, "position_m")[0] == pytest.approx(position, rel=0.08)
-    assert mean(found, "attitude_rms_deg")[0] == pytest.approx(angle, rel=0.08)
+    result = errors["component", count]
+    assert mean(result, "position_m")[0] == pytest.approx(position, rel=0.08)
+    assert mean(result, "attitude_rms_deg")[0] == pytest.approx(angle, rel=0.08)
 
 
 # C2: the same with white noise, and the fit of six unknowns.
@@ -61,15 +61,15 @@ def test_in_white_noise_the_exact_fit_is_three_times_as_good(
 @pytest.mark.slow
 def test_many_runs_reach_the_figures_closely_and_the_bound() -> None:
     """C1 and C2 within 4 %, C3 within 5 %."""
-    found = beacon_calibration.run(
+    result = beacon_calibration.run(
         Config(runs=6000, noises=("component", "axis"), seed=5), workers=1
     )
     for count, position, angle in ((3, 0.0107, 0.152), (4, 0.0080, 0.119)):
-        printed = found["component", count]
+        printed = result["component", count]
         assert mean(printed, "position_m")[0] == pytest.approx(position, rel=0.04)
         assert mean(printed, "attitude_rms_deg")[0] == pytest.approx(angle, rel=0.04)
     for count, printed_m, exact_m in ((3, 0.0268, 0.0089), (4, 0.0195, 0.0072)):
-        white = found["axis", count]
+        white = result["axis", count]
         assert mean(white, "position_m")[0] == pytest.approx(printed_m, rel=0.04)
         assert mean(white, "position_m")[2] == pytest.approx(exact_m, rel=0.04)
         rms, bound = (np.array(mean(white, n)) for n in ("position_rms_m", "bound_rms_m"))
@@ -78,8 +78,8 @@ def test_many_runs_reach_the_figures_closely_and_the_bound() -> None:
 
 # C4
 def test_the_grid_finds_the_right_minimum(errors: dict[tuple[str, int], Errors]) -> None:
-    for found in errors.values():
-        assert np.mean(found.position[1] < 10.0 * np.median(found.bound[1])) >= 0.98
+    for result in errors.values():
+        assert np.mean(result.position[1] < 10.0 * np.median(result.bound[1])) >= 0.98
     assert beacon_calibration.anywhere(Config()) >= 0.98
 
 
@@ -89,25 +89,25 @@ def test_the_grid_finds_the_right_minimum(errors: dict[tuple[str, int], Errors])
 )
 def test_a_tilt_moves_the_printed_centre(tilt_deg: float, three: float, four: float) -> None:
     tilt = Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix()
-    found = beacon_calibration.printed_from(tilt, np.eye(3))
-    assert [one.error_m for one in found] == pytest.approx([three, four], abs=0.02)
-    assert found[0].alarm_m2 < 1e-9  # three angles always fit
-    assert found[1].alarm_m2 == pytest.approx(0.09 * tilt_deg**2, rel=0.1)
+    result = beacon_calibration.printed_from(tilt, np.eye(3))
+    assert [one.error_m for one in result] == pytest.approx([three, four], abs=0.02)
+    assert result[0].alarm_m2 < 1e-9  # three angles always fit
+    assert result[1].alarm_m2 == pytest.approx(0.09 * tilt_deg**2, rel=0.1)
 
 
 def test_the_printed_method_does_not_see_a_turn_about_the_axis() -> None:
     turn = Rotation.from_euler("z", 30.0, degrees=True).as_matrix()
-    for found in beacon_calibration.printed_from(turn, np.eye(3)):
-        assert found.error_m == pytest.approx(0.0, abs=1e-9)
-        assert found.turn_deg == pytest.approx(0.0, abs=1e-6)
+    for result in beacon_calibration.printed_from(turn, np.eye(3)):
+        assert result.error_m == pytest.approx(0.0, abs=1e-9)
+        assert result.turn_deg == pytest.approx(0.0, abs=1e-6)
 
 
 def test_the_papers_own_attitude_gives_nothing_usable() -> None:
     rotation = beacon_calibration.paper_rotation()
     for axes in (np.eye(3), rotation):  # measured axes; beacon axes with all directions upward
-        found = beacon_calibration.printed_from(rotation, axes)
-        assert found[0].error_m is None
-        assert found[1].error_m is None or found[1].alarm_m2 > 1.0
+        result = beacon_calibration.printed_from(rotation, axes)
+        assert result[0].error_m is None
+        assert result[1].error_m is None or result[1].alarm_m2 > 1.0
 
 
 def test_another_centre_fits_the_normals_of_three_magnetometers() -> None:
@@ -146,9 +146,9 @@ def test_the_printed_method_is_exact_without_noise_in_beacon_axes() -> None:
     true = beacon_calibration.beacon(place, rotation)
     phasor = phasors_world(true, PLACES_WORLD)[None, :, 0] @ rotation
     hemisphere = np.sign(((PLACES_WORLD - place) @ rotation)[:, 2])
-    found = calibrate_as_printed(phasor, PLACES_WORLD, MOMENT, hemisphere)
-    np.testing.assert_allclose(found.centre_world[0], place, rtol=0.0, atol=1e-8)
-    np.testing.assert_allclose(found.world_from_beacon[0], rotation, rtol=0.0, atol=1e-8)
+    result = calibrate_as_printed(phasor, PLACES_WORLD, MOMENT, hemisphere)
+    np.testing.assert_allclose(result.centre_world[0], place, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(result.world_from_beacon[0], rotation, rtol=0.0, atol=1e-8)
 
 
 def test_the_geometric_centre_is_that_of_the_box() -> None:
@@ -198,8 +198,8 @@ def measured_of(declared: Beacon, true: Beacon, runs: int, sigma: float) -> Beac
     sensor = beacon_calibration.bare_magnetometer()
     sensor = replace(sensor, position_body=np.array([0.05, 0.0, -0.02]), matrix=1.02 * np.eye(3))
     phase = np.zeros(len(true.tones)) if true.synchronised else rng.uniform(-3, 3, len(true.tones))
-    turned = np.broadcast_to(phase, (len(POINTS), len(phase)))
-    exact = predict(true, sensor, TURNS, POINTS, turned)
+    rotated = np.broadcast_to(phase, (len(POINTS), len(phase)))
+    exact = predict(true, sensor, TURNS, POINTS, rotated)
     noise = rng.normal(0.0, sigma, (2, runs, *exact.shape))
     phasor = exact + noise[0] + 1j * noise[1]
     return BeaconMeasurements(
@@ -251,8 +251,8 @@ def test_coils_of_true_size_are_fitted_as_such(kind: str) -> None:
     assert np.linalg.norm(plain.centre_world[0] - true.position_world) > 1e-3
 
 
-def misalignment(found: Array, true: Array) -> Array:
-    return np.asarray(Rotation.from_matrix(np.swapaxes(found, -1, -2) @ true).as_rotvec())
+def misalignment(result: Array, true: Array) -> Array:
+    return np.asarray(Rotation.from_matrix(np.swapaxes(result, -1, -2) @ true).as_rotvec())
 
 
 @pytest.mark.parametrize("kind", ["rotating", "one coil"])
@@ -261,11 +261,13 @@ def test_the_sigmas_of_attitude_and_moments_are_those_of_the_errors(kind: str) -
     true = truth_of(declared)
     measured = measured_of(declared, true, 500, 1e-9)
     fits = calibrate_beacon(measured)
-    turned, _ = attitudes(declared, fits.moments_world)
+    rotated, _ = attitudes(declared, fits.moments_world)
     sigma = refine(measured, fits).beacon.sigma
-    error = np.std(misalignment(turned, turned[0]), axis=0)
-    free = open_axes(declared)
-    known = np.ones(3, dtype=bool) if len(free) == 0 else np.abs(free[0]) < 0.5
+    error = np.std(misalignment(rotated, rotated[0]), axis=0)
+    free_parameters = open_axes(declared)
+    known = (
+        np.ones(3, dtype=bool) if len(free_parameters) == 0 else np.abs(free_parameters[0]) < 0.5
+    )
     np.testing.assert_allclose(error[known], sigma.rotation_beacon[known], rtol=0.12, atol=0.0)
     size = np.linalg.norm(np.abs(fits.moments_world), axis=-1)
     if kind == "one coil":
@@ -285,9 +287,9 @@ def test_the_sigmas_of_attitude_and_moments_are_those_of_the_errors(kind: str) -
 def test_turns_that_the_field_does_not_tell_are_known(
     kind: str, synchronised: bool, axes: Array
 ) -> None:
-    found = open_axes(any_beacon(kind, synchronised=synchronised))
-    assert len(found) == len(axes)
-    np.testing.assert_allclose(np.abs(found), axes, rtol=0.0, atol=1e-12)
+    result = open_axes(any_beacon(kind, synchronised=synchronised))
+    assert len(result) == len(axes)
+    np.testing.assert_allclose(np.abs(result), axes, rtol=0.0, atol=1e-12)
 
 
 def test_the_refined_beacon_predicts_what_was_fitted() -> None:
@@ -322,8 +324,8 @@ def test_a_missing_phasor_counts_for_nothing() -> None:
 
 def test_coils_of_one_tone_at_two_places_are_refused() -> None:
     declared = any_beacon("rotating", synchronised=True)
-    apart = replace(declared.coils[1], centre_beacon=np.array([0.0, 0.0, 0.1]))
-    declared = replace(declared, coils=(declared.coils[0], apart))
+    separate = replace(declared.coils[1], centre_beacon=np.array([0.0, 0.0, 0.1]))
+    declared = replace(declared, coils=(declared.coils[0], separate))
     with pytest.raises(InputError, match="separate centres"):
         calibrate_beacon(measured_of(declared, declared, 1, 1e-9))
 
@@ -355,13 +357,13 @@ def test_the_scenario_draws_and_ends_with_one_json_line(
     options = ["--runs", "20", "--workers", "1", "-o", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", ["beacon_calibration.py", *options])
     beacon_calibration.main()
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert len(told["errors"]) == 6
+    reported = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert len(reported["errors"]) == 6
     assert (tmp_path / "beacon_calibration.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_scenario_gives_the_same_numbers_on_two_processes() -> None:
     config = Config(runs=8, block=4)
     here, there = (beacon_calibration.run(config, workers=n) for n in (1, 2))
-    for case, found in here.items():
-        np.testing.assert_allclose(found.position, there[case].position, rtol=1e-9, atol=0.0)
+    for case, result in here.items():
+        np.testing.assert_allclose(result.position, there[case].position, rtol=1e-9, atol=0.0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import beacon_count
 import numpy as np
 import pytest
-from algorithms_tried import MAPPED, Outcome
+from algorithms_tried import MAPPED, AlgorithmOutcome
 from beacon_count import Config, bounds, errors, run
 
 from magfusion.units import Array
@@ -21,12 +21,12 @@ def shares(error: Array) -> Array:
 
 
 @pytest.fixture(scope="module")
-def many() -> Mapping[int, Sequence[Outcome]]:
+def many() -> Mapping[int, Sequence[AlgorithmOutcome]]:
     """Enough rooms to tell a step of ten per cent, without the map."""
     return run(Config(worlds=60, targets=100), {"workers": 1}, (A3,))
 
 
-def test_more_beacons_help_algorithm_3(many: Mapping[int, Sequence[Outcome]]) -> None:
+def test_more_beacons_help_algorithm_3(many: Mapping[int, Sequence[AlgorithmOutcome]]) -> None:
     error = errors(many, A3).mean(axis=1)
     assert np.all(shares(error) < 0.9)
     assert shares(error)[-1] <= 0.75
@@ -34,25 +34,29 @@ def test_more_beacons_help_algorithm_3(many: Mapping[int, Sequence[Outcome]]) ->
 
 
 def test_the_bound_falls_as_the_independent_analysis_found(
-    many: Mapping[int, Sequence[Outcome]],
+    many: Mapping[int, Sequence[AlgorithmOutcome]],
 ) -> None:
     np.testing.assert_allclose(shares(bounds(many)), [0.82, 0.73, 0.66], atol=0.01)
 
 
 @pytest.fixture(scope="module")
-def full() -> Mapping[int, Sequence[Outcome]]:
+def full() -> Mapping[int, Sequence[AlgorithmOutcome]]:
     return run(Config())
 
 
 @pytest.mark.slow
-def test_the_figure_has_its_ratios_in_twelve_rooms(full: Mapping[int, Sequence[Outcome]]) -> None:
+def test_the_figure_has_its_ratios_in_twelve_rooms(
+    full: Mapping[int, Sequence[AlgorithmOutcome]],
+) -> None:
     error = errors(full, A3).mean(axis=1)
     assert np.all(shares(error) < 0.9)
     assert shares(error)[-1] <= 0.75
 
 
 @pytest.mark.slow
-def test_a_map_is_worth_more_than_three_beacons(full: Mapping[int, Sequence[Outcome]]) -> None:
+def test_a_map_is_worth_more_than_three_beacons(
+    full: Mapping[int, Sequence[AlgorithmOutcome]],
+) -> None:
     mapped, published = errors(full, MAPPED).mean(axis=1), errors(full, A3).mean(axis=1)
     np.testing.assert_allclose(mapped, [0.0082, 0.0071, 0.0063, 0.0057], rtol=0.25)
     assert np.all(np.diff(mapped) < 0.0)
@@ -61,7 +65,7 @@ def test_a_map_is_worth_more_than_three_beacons(full: Mapping[int, Sequence[Outc
 
 @pytest.mark.slow
 def test_the_scenario_draws_prints_and_ends_with_one_json_line(
-    full: Mapping[int, Sequence[Outcome]],
+    full: Mapping[int, Sequence[AlgorithmOutcome]],
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,

@@ -12,7 +12,7 @@ def test_six_minutes_lead_to_states_in_bounded_memory() -> None:
     done = subprocess.run(
         [sys.executable, str(TOOL), "--hours", "0.1"], check=True, capture_output=True, text=True
     )
-    found = json.loads(done.stdout.splitlines()[-1])
-    assert 300 < found["states"] < 400  # one a second, but for those of the start
-    assert found["largest_mib"] < 1024.0
-    assert found["error_mm"] < 10.0
+    result = json.loads(done.stdout.splitlines()[-1])
+    assert 300 < result["states"] < 400  # one a second, but for those of the start
+    assert result["largest_mib"] < 1024.0
+    assert result["error_mm"] < 10.0

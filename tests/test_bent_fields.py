@@ -7,8 +7,8 @@ import pytest
 
 from magfusion.estimation.batch.batch import smooth
 from magfusion.estimation.measurements.field_error import FieldError
-from magfusion.estimation.measurements.model_error import alike_in_batch
-from magfusion.estimation.posterior.residual_shares import ChannelErrors, _matrices
+from magfusion.estimation.measurements.model_error import epochs_sharing_error
+from magfusion.estimation.posterior.residual_redundancy import ChannelErrors, _matrices
 from magfusion.estimation.posterior.variance_components import BeaconErrors, parts_of
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.parameters.parameter import PhasorView
@@ -39,26 +39,26 @@ def errors(rng: np.random.Generator, place: Array, *, smooth: bool) -> Array:
 @pytest.mark.parametrize("true", [0.5, 1.0, 2.0])
 def test_its_size_is_found_whether_it_is_rough_or_smooth(smooth: bool, true: float) -> None:
     """Were a smooth one taken for a rough one, it would seem two to four times smaller."""
-    rng, found, shares = np.random.default_rng(6), [], []
+    rng, result, shares = np.random.default_rng(6), [], []
     for _ in range(6):
         place = walk(rng, 400)
         noise = NOISE * rng.standard_normal((400, 6))
         seen = true * errors(rng, place, smooth=smooth) + noise
-        left = (
+        remaining = (
             NOISE * rng.standard_normal((400, 6)),
             errors(rng, place, smooth=False),
             errors(rng, place, smooth=True),
             np.zeros((400, 6)),
         )
         variance = np.full(400, 6 * NOISE**2), np.full(400, 6.0 / DECLARED**2)
-        own = ChannelErrors(np.arange(400), seen, left, variance, (1.0, DECLARED))
+        own = ChannelErrors(np.arange(400), seen, remaining, variance, (1.0, DECLARED))
         given = BeaconErrors([own], (1.0, DECLARED), bent=True)
-        parts = parts_of([given], alike_in_batch(place, LENGTH), 1)[0]
+        parts = parts_of([given], epochs_sharing_error(place, LENGTH), 1)[0]
         assert parts is not None
         assert parts.model is not None
-        found.append(parts.model / min(parts.taken, 1.0))
+        result.append(parts.model / min(parts.accepted_factor, 1.0))
         shares.append(parts.smooth)
-    assert np.exp(np.mean(np.log(found))) == pytest.approx(true, rel=0.2)
+    assert np.exp(np.mean(np.log(result))) == pytest.approx(true, rel=0.2)
     assert (np.mean(shares) > 0.5) == smooth
 
 

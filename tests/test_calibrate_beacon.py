@@ -69,8 +69,8 @@ def without_sensor_error(site: Site) -> Site:
     return replace(site, platform=replace(site.platform, magnetometer=known))
 
 
-def turn_deg(found: Beacon, true: Beacon) -> Array:
-    between = Rotation.from_matrix(true.world_from_beacon.T @ found.world_from_beacon)
+def turn_deg(result: Beacon, true: Beacon) -> Array:
+    between = Rotation.from_matrix(true.world_from_beacon.T @ result.world_from_beacon)
     return np.asarray(between.as_rotvec() / DEGREE)
 
 
@@ -82,16 +82,18 @@ def test_the_command_finds_what_the_survey_of_the_site_missed(tmp_path: Path) ->
     assert (tmp_path / "out" / "beacon.png").read_bytes().startswith(b"\x89PNG")
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     refined = load_site(tmp_path / "out" / "site.yaml")
-    for declared, found, true in zip(site.beacons, refined.beacons, true_site.beacons, strict=True):
+    for declared, result, true in zip(
+        site.beacons, refined.beacons, true_site.beacons, strict=True
+    ):
         before = np.linalg.norm(declared.position_world - true.position_world)
-        error = found.position_world - true.position_world
+        error = result.position_world - true.position_world
         assert np.linalg.norm(error) < 0.1 * before
-        assert np.all(np.abs(error) < 4.0 * found.sigma.position_world)
-        assert np.all(np.abs(turn_deg(found, true)) < 4.0 * found.sigma.rotation_beacon / DEGREE)
-        size = [np.linalg.norm(b.moments_beacon, axis=1) for b in (found, true)]
-        assert np.all(np.abs(np.log(size[0] / size[1])) < 4.0 * found.sigma.log_moment)
-        assert report[f"residual_rms_{found.name}"] == pytest.approx(1.0, abs=0.5)
-        assert report[f"other_places_{found.name}"] == 0
+        assert np.all(np.abs(error) < 4.0 * result.sigma.position_world)
+        assert np.all(np.abs(turn_deg(result, true)) < 4.0 * result.sigma.rotation_beacon / DEGREE)
+        size = [np.linalg.norm(b.moments_beacon, axis=1) for b in (result, true)]
+        assert np.all(np.abs(np.log(size[0] / size[1])) < 4.0 * result.sigma.log_moment)
+        assert report[f"residual_rms_{result.name}"] == pytest.approx(1.0, abs=0.5)
+        assert report[f"other_places_{result.name}"] == 0
     assert report["undetermined"] == []
     assert refined.calibration is not None
     assert refined.calibration["determined"] == report["determined"]
@@ -105,25 +107,25 @@ def test_an_unknown_drive_phase_leaves_the_turn_about_the_axis(tmp_path: Path) -
     )  # fmt: skip
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     refined = load_site(tmp_path / "out" / "site.yaml")
-    found, true, declared = (s.beacons[0] for s in (refined, true_site, site))
-    assert np.linalg.norm(found.position_world - true.position_world) < 0.01
+    result, true, declared = (s.beacons[0] for s in (refined, true_site, site))
+    assert np.linalg.norm(result.position_world - true.position_world) < 0.01
     assert report["undetermined"] == ["A.rotation_z_deg"]
-    assert found.sigma.rotation_beacon[2] == pytest.approx(5.0 * DEGREE, rel=1e-6)
-    assert abs(turn_deg(found, declared)[2]) < 0.5  # deg; it keeps what the site declares
-    error = turn_deg(found, true)[:2]
-    assert np.all(np.abs(error) < 4.0 * found.sigma.rotation_beacon[:2] / DEGREE + 0.1)
+    assert result.sigma.rotation_beacon[2] == pytest.approx(5.0 * DEGREE, rel=1e-6)
+    assert abs(turn_deg(result, declared)[2]) < 0.5  # deg; it keeps what the site declares
+    error = turn_deg(result, true)[:2]
+    assert np.all(np.abs(error) < 4.0 * result.sigma.rotation_beacon[:2] / DEGREE + 0.1)
     # The other beacon was not asked for.
     np.testing.assert_allclose(
         refined.beacons[1].position_world, site.beacons[1].position_world, rtol=0.0, atol=0.0
     )
 
 
-def spoilt(root: Path, survey: Survey) -> tuple[object, ...]:
+def corrupted(root: Path, survey: Survey) -> tuple[object, ...]:
     write_survey(survey, root / "survey.parquet")
     return ("calibrate", "beacon", root / "survey.parquet", "--site", root / "site.yaml")
 
 
-def taken(survey: Survey, points: list[int]) -> Survey:
+def selected(survey: Survey, points: list[int]) -> Survey:
     assert survey.phasor_sensor is not None
     return Survey(
         survey.point[points],
@@ -140,28 +142,28 @@ def test_what_a_survey_cannot_tell_is_refused(tmp_path: Path, refuse: Refuse) ->
     survey = survey_of(site, true_site, ROUND)
     assert survey.phasor_sensor is not None
     out = ("-o", tmp_path / "out")
-    one = refuse(*spoilt(tmp_path, taken(survey, [0])), *out)
+    one = refuse(*corrupted(tmp_path, selected(survey, [0])), *out)
     assert "survey.parquet: beacon A was measured at 1 point;" in one
     amplitude = replace(
         survey, phasor_sensor=None, amplitude=np.linalg.norm(survey.phasor_sensor, axis=2)
     )
-    assert "contains amplitudes" in refuse(*spoilt(tmp_path, amplitude), *out)
-    same = replace(taken(survey, [0, 0, 0]), point=np.arange(3))
-    assert "do not determine" in refuse(*spoilt(tmp_path, same), *out)
+    assert "contains amplitudes" in refuse(*corrupted(tmp_path, amplitude), *out)
+    same = replace(selected(survey, [0, 0, 0]), point=np.arange(3))
+    assert "do not determine" in refuse(*corrupted(tmp_path, same), *out)
     far = survey_of(site, true_site, ROUND + np.array([60.0, 0.0, 0.0]))
-    assert "to it" in refuse(*spoilt(tmp_path, far), *out)
+    assert "to it" in refuse(*corrupted(tmp_path, far), *out)
     strange = replace(survey, channels=(("A", 0), ("Z", 0)))
-    assert "beacon Z is not in the site" in refuse(*spoilt(tmp_path, strange), *out)
-    assert "was not surveyed" in refuse(*spoilt(tmp_path, strange), *out, "--beacon", "B")
-    assert "--beacon Q" in refuse(*spoilt(tmp_path, survey), *out, "--beacon", "Q")
+    assert "beacon Z is not in the site" in refuse(*corrupted(tmp_path, strange), *out)
+    assert "was not surveyed" in refuse(*corrupted(tmp_path, strange), *out, "--beacon", "B")
+    assert "--beacon Q" in refuse(*corrupted(tmp_path, survey), *out, "--beacon", "Q")
     tones = replace(survey, channels=(("A", 0), ("A", 1)))
-    assert "beacon A has no tone 1" in refuse(*spoilt(tmp_path, tones), *out)
+    assert "beacon A has no tone 1" in refuse(*corrupted(tmp_path, tones), *out)
 
 
 def test_two_magnetometers_suffice(tmp_path: Path) -> None:
     site, true_site = written(tmp_path)
-    survey = taken(survey_of(site, true_site, ROUND), [0, 1])
-    run_command(*spoilt(tmp_path, survey), "-o", tmp_path / "out", "--beacon", "A")
+    survey = selected(survey_of(site, true_site, ROUND), [0, 1])
+    run_command(*corrupted(tmp_path, survey), "-o", tmp_path / "out", "--beacon", "A")
     refined = load_site(tmp_path / "out" / "site.yaml")
     error = refined.beacons[0].position_world - true_site.beacons[0].position_world
     assert np.all(np.abs(error) < 4.0 * refined.beacons[0].sigma.position_world)

@@ -21,7 +21,7 @@ from magfusion.model.site import Site
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.disturbance import Ambient, Spheres, draw_spheres
 from magfusion.simulation.log import SimulationConfig, simulate_log
-from magfusion.simulation.worlds import ROOM, S1, World, draw_world
+from magfusion.simulation.worlds import ROOM, S1, SimulatedWorld, draw_world
 from magfusion.units import Array
 
 SEED = 5
@@ -29,7 +29,7 @@ NAMES = ("M1", "M2", "M3")
 SURVEYED = replace(ROOM, spacing=0.75)
 
 
-def _world() -> World:
+def _world() -> SimulatedWorld:
     return draw_world(S1, np.random.default_rng(SEED), SURVEYED)
 
 
@@ -41,17 +41,17 @@ def _points(survey: Survey) -> MapPoints:
 
 
 @pytest.fixture(scope="module")
-def world() -> World:
+def world() -> SimulatedWorld:
     return _world()
 
 
 @pytest.fixture(scope="module")
-def survey(world: World) -> Survey:
+def survey(world: SimulatedWorld) -> Survey:
     return world.survey(np.random.default_rng(6))
 
 
 @pytest.fixture(scope="module")
-def fit(world: World, survey: Survey) -> MapFit:
+def fit(world: SimulatedWorld, survey: Survey) -> MapFit:
     return learn_field_map(world.site, _points(survey))
 
 
@@ -72,7 +72,7 @@ def test_the_cross_validated_error_falls_fivefold(fit: MapFit) -> None:
 
 @pytest.mark.slow
 def test_the_error_without_the_map_is_that_of_the_world(
-    world: World, survey: Survey, fit: MapFit
+    world: SimulatedWorld, survey: Survey, fit: MapFit
 ) -> None:
     gain = world.log_gain(survey.position_world)
     for c, name in enumerate(NAMES):
@@ -82,7 +82,7 @@ def test_the_error_without_the_map_is_that_of_the_world(
 
 @pytest.mark.slow
 def test_the_map_is_the_gain_of_the_world_and_claims_its_own_error(
-    world: World, fit: MapFit, targets: Array
+    world: SimulatedWorld, fit: MapFit, targets: Array
 ) -> None:
     truth = world.log_gain(targets)
     for c, beacon in enumerate(fit.site.beacons):
@@ -95,7 +95,7 @@ def test_the_map_is_the_gain_of_the_world_and_claims_its_own_error(
         assert 0.1 < np.mean(error**2 / claimed) < 4.0
 
 
-def _position_error(site: Site, world: World, targets: Array) -> Array:
+def _position_error(site: Site, world: SimulatedWorld, targets: Array) -> Array:
     turn = Rotation.random(len(targets), random_state=8).as_matrix()
     samples = world.measure(targets, turn, np.random.default_rng(9))
     best = fix_epochs(samples, initial_calibration(site, 0.0)).best()
@@ -104,17 +104,17 @@ def _position_error(site: Site, world: World, targets: Array) -> Array:
 
 @pytest.mark.slow
 def test_a_fix_with_the_map_is_better_than_without(
-    world: World, fit: MapFit, targets: Array
+    world: SimulatedWorld, fit: MapFit, targets: Array
 ) -> None:
     """At places and in attitudes that the survey did not have."""
     without = np.sqrt(np.mean(_position_error(world.site, world, targets) ** 2))
-    left = np.sqrt(np.mean(_position_error(fit.site, world, targets) ** 2))
-    assert left < without / 3.0
+    remaining = np.sqrt(np.mean(_position_error(fit.site, world, targets) ** 2))
+    assert remaining < without / 3.0
 
 
 @pytest.mark.slow
 def test_attitudes_and_unknown_phases_of_the_survey_make_no_difference(
-    world: World, survey: Survey, targets: Array
+    world: SimulatedWorld, survey: Survey, targets: Array
 ) -> None:
     """The map belongs to the place; a phase is no gain and no turn."""
     points = _points(survey)
@@ -127,15 +127,15 @@ def test_attitudes_and_unknown_phases_of_the_survey_make_no_difference(
         replace(world.site, beacons=loose),
         replace(points, world_from_body=turn, phasor_sensor=late),
     ).site
-    for found, wanted in zip(other.beacons, plain.beacons, strict=True):
-        assert found.field_map is not None
+    for result, wanted in zip(other.beacons, plain.beacons, strict=True):
+        assert result.field_map is not None
         assert wanted.field_map is not None
         gain = wanted.field_map.mean(targets)[0][:, 0]
-        apart = found.field_map.mean(targets)[0][:, 0] - gain
-        assert np.sqrt(np.mean(apart**2)) < 0.05 * np.sqrt(np.mean(gain**2))
+        separate = result.field_map.mean(targets)[0][:, 0] - gain
+        assert np.sqrt(np.mean(separate**2)) < 0.05 * np.sqrt(np.mean(gain**2))
 
 
-def test_a_beacon_that_was_hardly_heard_is_named(world: World, survey: Survey) -> None:
+def test_a_beacon_that_was_hardly_heard_is_named(world: SimulatedWorld, survey: Survey) -> None:
     points = _points(survey)
     phasor = points.phasor_sensor.copy()
     phasor[7:, 1] = np.nan
@@ -145,7 +145,9 @@ def test_a_beacon_that_was_hardly_heard_is_named(world: World, survey: Survey) -
         learn_field_map(world.site, replace(points, phasor_sensor=phasor))
 
 
-def test_thinning_keeps_the_quietest_point_of_each_cube(world: World, survey: Survey) -> None:
+def test_thinning_keeps_the_quietest_point_of_each_cube(
+    world: SimulatedWorld, survey: Survey
+) -> None:
     points = _points(survey)
     rng = np.random.default_rng(12)
     doubled = points.rows(np.repeat(np.arange(len(points)), 2))
@@ -162,7 +164,7 @@ def test_thinning_keeps_the_quietest_point_of_each_cube(world: World, survey: Su
 
 
 @pytest.fixture
-def surveyed(world: World, survey: Survey, tmp_path: Path) -> Path:
+def surveyed(world: SimulatedWorld, survey: Survey, tmp_path: Path) -> Path:
     """Return a directory with a survey and its site, as a user has them."""
     directory = tmp_path / "survey"
     directory.mkdir()
@@ -178,7 +180,7 @@ def _figures(directory: Path) -> dict[str, Any]:
 
 @pytest.mark.slow
 def test_a_survey_becomes_a_site_with_its_map(
-    world: World, fit: MapFit, surveyed: Path, targets: Array, tmp_path: Path
+    world: SimulatedWorld, fit: MapFit, surveyed: Path, targets: Array, tmp_path: Path
 ) -> None:
     output = tmp_path / "mapped"
     run_command("calibrate", "fieldmap", surveyed, "-o", output)
@@ -256,16 +258,16 @@ def test_a_survey_of_amplitudes_is_refused(
     amplitude = np.linalg.norm(survey.phasor_sensor, axis=-1) / np.sqrt(2.0)
     path = surveyed / "survey.parquet"
     write_survey(replace(survey, phasor_sensor=None, amplitude=amplitude), path)
-    said = refuse("calibrate", "fieldmap", path, "-o", tmp_path / "out")
-    assert f"{path}: has amplitudes, but a field map requires phasors" in said
+    findings = refuse("calibrate", "fieldmap", path, "-o", tmp_path / "out")
+    assert f"{path}: has amplitudes, but a field map requires phasors" in findings
 
 
 def test_a_beacon_that_the_site_does_not_have_is_refused(
-    world: World, surveyed: Path, refuse: Refuse, tmp_path: Path
+    world: SimulatedWorld, surveyed: Path, refuse: Refuse, tmp_path: Path
 ) -> None:
     save_site(replace(world.site, beacons=world.site.beacons[:2]), surveyed / "site.yaml")
-    said = refuse("calibrate", "fieldmap", surveyed, "-o", tmp_path / "out")
-    assert "tone 0 of beacon M3 is not in the site (it has M1, M2)" in said
+    findings = refuse("calibrate", "fieldmap", surveyed, "-o", tmp_path / "out")
+    assert "tone 0 of beacon M3 is not in the site (it has M1, M2)" in findings
 
 
 def test_too_few_points_are_refused(
@@ -281,29 +283,29 @@ def test_too_few_points_are_refused(
         survey.phasor_sensor[:7],
     )
     write_survey(few, surveyed / "survey.parquet")
-    said = refuse("calibrate", "fieldmap", surveyed, "-o", tmp_path / "out")
-    assert f"{surveyed}: beacon M1 was detected at 7 points; a map requires 8" in said
+    findings = refuse("calibrate", "fieldmap", surveyed, "-o", tmp_path / "out")
+    assert f"{surveyed}: beacon M1 was detected at 7 points; a map requires 8" in findings
 
 
 def test_a_survey_has_no_use_for_a_trajectory(
     worked: Worked, surveyed: Path, refuse: Refuse, tmp_path: Path
 ) -> None:
     options = ("--trajectory", worked.smoothed, "-o", tmp_path / "out")
-    said = refuse("calibrate", "fieldmap", surveyed, *options)
-    assert "a survey has its own poses; omit --trajectory" in said
+    findings = refuse("calibrate", "fieldmap", surveyed, *options)
+    assert "a survey has its own poses; omit --trajectory" in findings
 
 
 def test_a_survey_without_a_site_is_refused(surveyed: Path, refuse: Refuse, tmp_path: Path) -> None:
     (surveyed / "site.yaml").unlink()
-    said = refuse("calibrate", "fieldmap", surveyed, "-o", tmp_path / "out")
-    assert "has no site.yaml next to it; give it with --site SITE.yaml" in said
+    findings = refuse("calibrate", "fieldmap", surveyed, "-o", tmp_path / "out")
+    assert "has no site.yaml next to it; give it with --site SITE.yaml" in findings
 
 
 def test_a_log_without_poses_is_refused(log: Path, refuse: Refuse, tmp_path: Path) -> None:
     (log / "truth.parquet").unlink()
-    said = refuse("calibrate", "fieldmap", log, "-o", tmp_path / "out")
-    assert f"{log}: has no truth" in said
-    assert "--trajectory" in said
+    findings = refuse("calibrate", "fieldmap", log, "-o", tmp_path / "out")
+    assert f"{log}: has no truth" in findings
+    assert "--trajectory" in findings
 
 
 @pytest.mark.parametrize("spacing", [0.0, -1.0, "nan"])
@@ -319,5 +321,5 @@ def test_more_points_than_a_map_takes_are_refused(
 ) -> None:
     dense = draw_world(S1, np.random.default_rng(SEED), replace(ROOM, spacing=0.15))
     write_survey(dense.survey(np.random.default_rng(6)), surveyed / "survey.parquet")
-    said = refuse("calibrate", "fieldmap", surveyed, "-o", tmp_path / "out")
-    assert "points; a map has at most 600" in said
+    findings = refuse("calibrate", "fieldmap", surveyed, "-o", tmp_path / "out")
+    assert "points; a map has at most 600" in findings

@@ -32,11 +32,11 @@ def badly_surveyed(scale: float = 1.0) -> Site:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SimulatedLog]:
     """Return the directory of a walk without a stop, and what was true."""
     config = SimulationConfig(DEMO_BOX_WORLD, duration=32.0, rests=RESTLESS)
-    made = simulate_log(badly_surveyed(), config, np.random.default_rng(3))
+    built = simulate_log(badly_surveyed(), config, np.random.default_rng(3))
     directory = tmp_path_factory.mktemp("calibrate_log") / "log"
-    write_log(made.log, directory)
+    write_log(built.log, directory)
     save_site(badly_surveyed(), directory / "site.yaml")
-    return directory, made
+    return directory, built
 
 
 @pytest.fixture(scope="module")
@@ -150,8 +150,8 @@ def test_a_site_without_sigmas_has_nothing_to_calibrate(
     known = badly_surveyed(scale=0.0)
     imu = replace(known.platform.imu, time_offset_sigma=0.0)
     save_site(replace(known, platform=replace(known.platform, imu=imu)), tmp_path / "site.yaml")
-    said = refuse(
+    findings = refuse(
         *("calibrate", "log", recorded[0], "--site", tmp_path / "site.yaml"),
         *("-o", tmp_path / "out", "--end", 8),
     )
-    assert "no parameter can be calibrated" in said
+    assert "no parameter can be calibrated" in findings

@@ -52,7 +52,7 @@ def write(log: Log, site: Site, place: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def turned(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedLog, Path]:
+def rotated(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedLog, Path]:
     config = SimulationConfig(
         DEMO_BOX_WORLD, DURATION, "turn", rests=Rests(2.0, 60.0, 0.0), time_offset=0.0
     )
@@ -62,16 +62,16 @@ def turned(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedLog, Path
 
 
 @pytest.fixture(scope="module")
-def result(turned: tuple[SimulatedLog, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result(rotated: tuple[SimulatedLog, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("calibrated") / "result"
     for _ in range(2):  # an earlier result is replaced
-        run_command("calibrate", "magnetometer", turned[1], "-o", output)
+        run_command("calibrate", "magnetometer", rotated[1], "-o", output)
     return output
 
 
 def report_of(place: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((place / "report.json").read_text())
-    return found
+    result: dict[str, Any] = json.loads((place / "report.json").read_text())
+    return result
 
 
 def spread_of(log: Log, site: Site, sensor: Magnetometer) -> float:
@@ -92,13 +92,13 @@ def test_the_command_writes_site_picture_and_report(result: Path) -> None:
 
 
 def test_sensor_and_mounting_together_are_found_within_their_sigmas(
-    turned: tuple[SimulatedLog, Path], result: Path
+    rotated: tuple[SimulatedLog, Path], result: Path
 ) -> None:
-    true = turned[0].true_site.platform.magnetometer
-    found = load_site(result / "site.yaml").platform.magnetometer
+    true = rotated[0].true_site.platform.magnetometer
+    estimate = load_site(result / "site.yaml").platform.magnetometer
     declared = miscalibrated().platform.magnetometer
     np.testing.assert_allclose(
-        found.body_from_sensor, declared.body_from_sensor, rtol=0.0, atol=1e-12
+        estimate.body_from_sensor, declared.body_from_sensor, rtol=0.0, atol=1e-12
     )
     # The mounting is held, so that the matrix holds its error.
     product = true.matrix @ true.body_from_sensor.T @ declared.body_from_sensor
@@ -106,16 +106,16 @@ def test_sensor_and_mounting_together_are_found_within_their_sigmas(
     assert np.max(off) > 0.02
     report = report_of(result)
     sigma = [[report[f"magnetometer.matrix_{r}{c}_sigma"] for c in "xyz"] for r in "xyz"]
-    assert np.max(np.abs(found.matrix - product) / sigma) < 3.5
+    assert np.max(np.abs(estimate.matrix - product) / sigma) < 3.5
     assert np.max(sigma) < 3e-3
-    assert np.max(np.abs(found.offset - true.offset) / found.sigma.offset) < 3.5
-    assert np.max(found.sigma.offset) < 5e-9
+    assert np.max(np.abs(estimate.offset - true.offset) / estimate.sigma.offset) < 3.5
+    assert np.max(estimate.sigma.offset) < 5e-9
 
 
 def test_the_refined_site_fed_back_in_changes_no_more(
-    turned: tuple[SimulatedLog, Path], result: Path, tmp_path: Path
+    rotated: tuple[SimulatedLog, Path], result: Path, tmp_path: Path
 ) -> None:
-    job = Job(turned[1], result / "site.yaml", tmp_path / "again")
+    job = Job(rotated[1], result / "site.yaml", tmp_path / "again")
     report = run_calibrate_magnetometer(job)
     for name in ("matrix_xx", "matrix_yz", "offset_nt_x"):
         change = report[f"magnetometer.{name}"]
@@ -127,30 +127,30 @@ def test_the_refined_site_fed_back_in_changes_no_more(
 
 
 def test_without_an_earth_field_the_scale_stays_and_the_report_says_so(
-    turned: tuple[SimulatedLog, Path], result: Path, tmp_path: Path
+    rotated: tuple[SimulatedLog, Path], result: Path, tmp_path: Path
 ) -> None:
     bare = replace(miscalibrated(), earth_field_world=None)
     save_site(bare, tmp_path / "bare.yaml")
-    report = run_calibrate_magnetometer(Job(turned[1], tmp_path / "bare.yaml", tmp_path / "out"))
+    report = run_calibrate_magnetometer(Job(rotated[1], tmp_path / "bare.yaml", tmp_path / "out"))
     assert report["scale_from"] == "the declared matrix"
     notes = report["notes"]
     assert isinstance(notes, list)
     assert any("scale" in note for note in notes)
     scaled = load_site(result / "site.yaml").platform.magnetometer.matrix
-    found = load_site(tmp_path / "out" / "site.yaml").platform.magnetometer
-    ratio = found.matrix / scaled
+    estimate = load_site(tmp_path / "out" / "site.yaml").platform.magnetometer
+    ratio = estimate.matrix / scaled
     assert np.ptp(np.diagonal(ratio)) < 1e-3
     # What only the declared matrix tells is as uncertain as that.
-    assert np.min(np.diagonal(found.sigma.matrix)) > 0.01
+    assert np.min(np.diagonal(estimate.sigma.matrix)) > 0.01
 
 
 def test_a_site_that_declares_no_sigma_gets_a_wide_prior(
-    turned: tuple[SimulatedLog, Path], result: Path, tmp_path: Path
+    rotated: tuple[SimulatedLog, Path], result: Path, tmp_path: Path
 ) -> None:
-    site = yaml.safe_load((turned[1] / "site.yaml").read_text())
+    site = yaml.safe_load((rotated[1] / "site.yaml").read_text())
     del site["platform"]["magnetometer"]["sigma"]
     (tmp_path / "site.yaml").write_text(yaml.safe_dump(site))
-    run_calibrate_magnetometer(Job(turned[1], tmp_path / "site.yaml", tmp_path / "out"))
+    run_calibrate_magnetometer(Job(rotated[1], tmp_path / "site.yaml", tmp_path / "out"))
     wide = load_site(tmp_path / "out" / "site.yaml").platform.magnetometer
     usual = load_site(result / "site.yaml").platform.magnetometer
     np.testing.assert_allclose(wide.matrix, usual.matrix, rtol=0.0, atol=2e-3)
@@ -161,14 +161,14 @@ HARD_IRON = 9e-5 * np.array([0.6, 0.64, 0.48])  # T; twice the Earth's field
 
 
 def with_hard_iron(
-    turned: tuple[SimulatedLog, Path],
+    rotated: tuple[SimulatedLog, Path],
     place: Path,
     sigma: float,
     end: float,
     field_world: bool = True,
 ) -> Path:
     """Write the turned log with a large hard iron, declared with a sigma (T)."""
-    log, site = turned[0].log, miscalibrated()
+    log, site = rotated[0].log, miscalibrated()
     assert log.waveform is not None
     kept = log.waveform.time < end
     waveform = Waveform(log.waveform.time[kept], log.waveform.measured_sensor[kept] + HARD_IRON)
@@ -182,14 +182,14 @@ def with_hard_iron(
 
 @pytest.mark.parametrize("field_world", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_a_large_hard_iron_is_found_where_its_sigma_allows_it(
-    field_world: bool, turned: tuple[SimulatedLog, Path], tmp_path: Path
+    field_world: bool, rotated: tuple[SimulatedLog, Path], tmp_path: Path
 ) -> None:
-    log = with_hard_iron(turned, tmp_path / "log", 3e-5, 30.0, field_world)
+    log = with_hard_iron(rotated, tmp_path / "log", 3e-5, 30.0, field_world)
     report = run_calibrate_magnetometer(Job(log, None, tmp_path / "out"))
-    found = load_site(tmp_path / "out" / "site.yaml").platform.magnetometer
-    true = turned[0].true_site.platform.magnetometer.offset + HARD_IRON
-    assert np.max(np.abs(found.offset - true) / found.sigma.offset) < 3.5
-    assert np.max(found.sigma.offset) < 5e-7
+    result = load_site(tmp_path / "out" / "site.yaml").platform.magnetometer
+    true = rotated[0].true_site.platform.magnetometer.offset + HARD_IRON
+    assert np.max(np.abs(result.offset - true) / result.sigma.offset) < 3.5
+    assert np.max(result.sigma.offset) < 5e-7
     assert report["verdict"] != "failed"
 
 
@@ -202,18 +202,18 @@ def test_a_large_hard_iron_is_found_where_its_sigma_allows_it(
     ],
 )
 def test_a_hard_iron_beyond_its_sigma_is_never_called_determined(
-    end: float, field_world: bool, turned: tuple[SimulatedLog, Path], tmp_path: Path
+    end: float, field_world: bool, rotated: tuple[SimulatedLog, Path], tmp_path: Path
 ) -> None:
-    log = with_hard_iron(turned, tmp_path / "log", 5e-7, end, field_world)
+    log = with_hard_iron(rotated, tmp_path / "log", 5e-7, end, field_world)
     with pytest.raises(EstimationError):
         run_calibrate_magnetometer(Job(log, None, tmp_path / "out"))
     assert not (tmp_path / "out" / "site.yaml").exists()
 
 
 def test_what_is_kept_keeps_the_sigma_that_it_had(
-    turned: tuple[SimulatedLog, Path],
+    rotated: tuple[SimulatedLog, Path],
 ) -> None:
-    simulated = turned[0]
+    simulated = rotated[0]
     log = simulated.log
     assert log.waveform is not None
     true = simulated.true_site.platform.magnetometer
@@ -223,20 +223,20 @@ def test_what_is_kept_keeps_the_sigma_that_it_had(
     site = replace(site, platform=replace(site.platform, magnetometer=known))
     kept = log.waveform.time < 14.0  # in which one half tells little of the other
     waveform = Waveform(log.waveform.time[kept], log.waveform.measured_sensor[kept])
-    found = calibrate_log(waveform, log.imu, site)
-    assert found.shape_kept
-    np.testing.assert_allclose(found.magnetometer.offset, known.offset, rtol=0.0, atol=0.0)
-    np.testing.assert_allclose(found.magnetometer.sigma.offset, sigma.offset, rtol=1e-6)
-    size = np.linalg.norm(found.magnetometer.matrix, axis=0) / np.linalg.norm(known.matrix, axis=0)
+    result = calibrate_log(waveform, log.imu, site)
+    assert result.shape_kept
+    np.testing.assert_allclose(result.magnetometer.offset, known.offset, rtol=0.0, atol=0.0)
+    np.testing.assert_allclose(result.magnetometer.sigma.offset, sigma.offset, rtol=1e-6)
+    size = np.linalg.norm(result.magnetometer.matrix, axis=0) / np.linalg.norm(known.matrix, axis=0)
     np.testing.assert_allclose(size, 1.0, rtol=0.0, atol=0.02)
-    assert np.all(np.diagonal(found.magnetometer.sigma.matrix) > 0.9 * 0.003)
+    assert np.all(np.diagonal(result.magnetometer.sigma.matrix) > 0.9 * 0.003)
 
 
 def test_the_size_of_the_field_speaks_against_a_small_spread(
-    turned: tuple[SimulatedLog, Path],
+    rotated: tuple[SimulatedLog, Path],
 ) -> None:
     """Twelve seconds: the declared offset of zero leaves little spread, of a field too large."""
-    log, site = turned[0].log, miscalibrated()
+    log, site = rotated[0].log, miscalibrated()
     assert log.waveform is not None
     sensor = site.platform.magnetometer
     zero = np.zeros(3)
@@ -244,9 +244,9 @@ def test_the_size_of_the_field_speaks_against_a_small_spread(
     site = replace(site, platform=replace(site.platform, magnetometer=replace(sensor, sigma=none)))
     kept = log.waveform.time < 12.0
     waveform = Waveform(log.waveform.time[kept], log.waveform.measured_sensor[kept])
-    found = calibrate_log(waveform, log.imu, site).magnetometer
-    true = turned[0].true_site.platform.magnetometer
-    assert np.max(np.abs(found.offset - true.offset) / found.sigma.offset) < 3.5
+    result = calibrate_log(waveform, log.imu, site).magnetometer
+    true = rotated[0].true_site.platform.magnetometer
+    assert np.max(np.abs(result.offset - true.offset) / result.sigma.offset) < 3.5
 
 
 def test_twelve_stops_are_found_in_the_stream(tmp_path: Path) -> None:
@@ -255,24 +255,24 @@ def test_twelve_stops_are_found_in_the_stream(tmp_path: Path) -> None:
     log = write(session.log, session.site, tmp_path / "log")
     run_command("calibrate", "magnetometer", log, "--positions", "-o", tmp_path / "out")
     assert report_of(tmp_path / "out")["readings"] == 12
-    found = load_site(tmp_path / "out" / "site.yaml").platform.magnetometer
-    np.testing.assert_allclose(found.matrix, session.true.matrix[0], rtol=0.0, atol=2e-3)
-    np.testing.assert_allclose(found.offset, session.true.offset[0], rtol=0.0, atol=2e-8)
+    result = load_site(tmp_path / "out" / "site.yaml").platform.magnetometer
+    np.testing.assert_allclose(result.matrix, session.true.matrix[0], rtol=0.0, atol=2e-3)
+    np.testing.assert_allclose(result.offset, session.true.offset[0], rtol=0.0, atol=2e-8)
 
 
 def test_too_few_stops_are_counted(tmp_path: Path, refuse: Refuse) -> None:
     session = twelve_positions.record(twelve_positions.Config(), 7, np.random.default_rng(2))
     log = write(session.log, session.site, tmp_path / "log")
-    told = refuse("calibrate", "magnetometer", log, "--positions", "-o", tmp_path / "out")
-    assert "7 stops" in told
+    reported = refuse("calibrate", "magnetometer", log, "--positions", "-o", tmp_path / "out")
+    assert "7 stops" in reported
 
 
 def test_turning_without_a_rest_is_no_set_of_positions(
-    turned: tuple[SimulatedLog, Path], tmp_path: Path, refuse: Refuse
+    rotated: tuple[SimulatedLog, Path], tmp_path: Path, refuse: Refuse
 ) -> None:
     given = ("--positions", "--start", 4, "--end", 55)
-    told = refuse("calibrate", "magnetometer", turned[1], *given, "-o", tmp_path / "out")
-    assert "no stationary interval" in told
+    reported = refuse("calibrate", "magnetometer", rotated[1], *given, "-o", tmp_path / "out")
+    assert "no stationary interval" in reported
 
 
 def test_a_level_walk_is_told_what_it_lacks(worked: Worked, tmp_path: Path) -> None:
@@ -284,9 +284,9 @@ def test_a_level_walk_is_told_what_it_lacks(worked: Worked, tmp_path: Path) -> N
 
 def test_a_sensor_that_was_not_turned_is_refused_in_words(tmp_path: Path, refuse: Refuse) -> None:
     run_command("simulate", "-o", tmp_path / "log", "--motion", "static", "--duration", 20)
-    told = refuse("calibrate", "magnetometer", tmp_path / "log", "-o", tmp_path / "out")
-    assert "too few orientations" in told
-    assert "the sensor's x axis never pointed up" in told
+    reported = refuse("calibrate", "magnetometer", tmp_path / "log", "-o", tmp_path / "out")
+    assert "too few orientations" in reported
+    assert "the sensor's x axis never pointed up" in reported
 
 
 def test_a_short_log_is_refused(worked: Worked, tmp_path: Path, refuse: Refuse) -> None:
@@ -295,19 +295,19 @@ def test_a_short_log_is_refused(worked: Worked, tmp_path: Path, refuse: Refuse) 
 
 
 def test_phasors_alone_are_refused(worked: Worked, tmp_path: Path, refuse: Refuse) -> None:
-    told = refuse("calibrate", "magnetometer", worked.phasors, "-o", tmp_path / "out")
-    assert "waveform" in told
+    reported = refuse("calibrate", "magnetometer", worked.phasors, "-o", tmp_path / "out")
+    assert "waveform" in reported
 
 
-@pytest.mark.parametrize(("factor", "told"), [(1e9, "nanotesla"), (np.nan, "field_x")])
+@pytest.mark.parametrize(("factor", "reported"), [(1e9, "nanotesla"), (np.nan, "field_x")])
 def test_nanotesla_and_nan_are_refused(
-    factor: float, told: str, log: Path, tmp_path: Path, refuse: Refuse
+    factor: float, reported: str, log: Path, tmp_path: Path, refuse: Refuse
 ) -> None:
     def spoil(columns: dict[str, Any]) -> None:
         columns["field_x"] = [factor * value for value in columns["field_x"]]
 
     change_table(log / "magnetometer.parquet", spoil)
-    assert told in refuse("calibrate", "magnetometer", log, "-o", tmp_path / "out")
+    assert reported in refuse("calibrate", "magnetometer", log, "-o", tmp_path / "out")
 
 
 @pytest.mark.parametrize("date", ["1899-12-31", "2030-06-01"])
@@ -319,12 +319,12 @@ def test_a_date_beyond_the_reference_field_is_refused(
     place = {"latitude_deg": 41.8, "longitude_deg": 123.4, "height_m": 50.0, "date": date}
     site["world"]["location"] = place
     (log / "site.yaml").write_text(yaml.safe_dump(site))
-    told = refuse("calibrate", "magnetometer", log, "-o", tmp_path / "out")
-    assert "1900-01-01 to 2030-01-01" in told
+    reported = refuse("calibrate", "magnetometer", log, "-o", tmp_path / "out")
+    assert "1900-01-01 to 2030-01-01" in reported
 
 
-def test_tones_average_out_of_the_steady_field(turned: tuple[SimulatedLog, Path]) -> None:
-    simulated = turned[0]
+def test_tones_average_out_of_the_steady_field(rotated: tuple[SimulatedLog, Path]) -> None:
+    simulated = rotated[0]
     log, site = simulated.log, simulated.true_site
     assert log.waveform is not None
     readings = steady_field(log.waveform, log.imu, site)
@@ -333,18 +333,18 @@ def test_tones_average_out_of_the_steady_field(turned: tuple[SimulatedLog, Path]
     sensor = site.platform.magnetometer
     clean = attitude.inv().apply(site.earth_field_world) @ sensor.body_from_sensor
     expected = clean @ sensor.matrix.T + sensor.offset
-    left = readings.measured_sensor - expected
+    remaining = readings.measured_sensor - expected
     raw = np.ptp(log.waveform.measured_sensor[: int(0.05 * 400)], axis=0)
     assert np.max(raw) > 1e-7  # T; what the tones do to a sample
-    assert np.sqrt(np.mean(left**2)) < 2e-9
+    assert np.sqrt(np.mean(remaining**2)) < 2e-9
     resting = readings.time < 1.7
     up = attitude[resting].inv().apply([0.0, 0.0, site.gravity])
     bias = 3.0 * np.sqrt(3.0) * site.platform.imu.accel_bias_sigma
     assert np.max(np.linalg.norm(readings.accel_body[resting] - up, axis=1)) < bias
 
 
-def test_windows_with_a_gap_are_left_out(turned: tuple[SimulatedLog, Path]) -> None:
-    log, site = turned[0].log, turned[0].true_site
+def test_windows_with_a_gap_are_left_out(rotated: tuple[SimulatedLog, Path]) -> None:
+    log, site = rotated[0].log, rotated[0].true_site
     assert log.waveform is not None
     whole = steady_field(log.waveform, log.imu, site)
     for stream in ("waveform", "imu"):
@@ -358,9 +358,9 @@ def test_windows_with_a_gap_are_left_out(turned: tuple[SimulatedLog, Path]) -> N
         cut = steady_field(waveform, imu, site)
         assert not np.any((cut.time > 20.0) & (cut.time < 23.0))
         assert len(whole) - 10 <= len(cut) <= len(whole) - 7
-        beside = np.isin(np.round(whole.time, 6), np.round(cut.time, 6))
+        others = np.isin(np.round(whole.time, 6), np.round(cut.time, 6))
         np.testing.assert_allclose(
-            cut.measured_sensor, whole.measured_sensor[beside], rtol=0.0, atol=1e-12
+            cut.measured_sensor, whole.measured_sensor[others], rtol=0.0, atol=1e-12
         )
 
 
@@ -385,10 +385,10 @@ def test_real_motion_calibrates_one_half_and_the_other_profits(
     site = load_site(LOGS / name / "site.yaml")
     output = tmp_path / "out"
     run_calibrate_magnetometer(Job(LOGS / name, None, output, start=own[0], end=own[1]))
-    found = load_site(output / "site.yaml").platform.magnetometer
+    result = load_site(output / "site.yaml").platform.magnetometer
     for part in (own, other):
         log = open_log(LOGS / name, *part)
         before = spread_of(log, site, site.platform.magnetometer)
-        after = spread_of(log, site, found)
+        after = spread_of(log, site, result)
         # A rotation of the sensor changes the averaging within a window, by next to nothing.
         assert after * gain <= before * (1.0 + 1e-4), (before, after)

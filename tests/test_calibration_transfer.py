@@ -15,13 +15,13 @@ from magfusion.model.site import Site
 from magfusion.results.errors import TrajectoryErrors, trajectory_errors
 from magfusion.results.observability import gauge_basis, observability
 from magfusion.results.refinement import result_site
-from magfusion.results.transfer import Agreement, Estimated, agreement
+from magfusion.results.transfer import CalibrationAgreement, Estimated, agreement
 
 LOGS = Path(__file__).parents[1].parent / "shared" / "logs"
 NAMES = ("turn_miscalibrated", "walk_unsynchronised")
 HALF = 90.0  # s since the log's epoch
 CALIBRATING = SmootherSettings(loss=None, tune=False)
-HELD = SmootherSettings(estimate=("phase", "time-offset"), loss=None, tune=False)
+HELD_CASES = SmootherSettings(estimate=("phase", "time-offset"), loss=None, tune=False)
 # Ten seconds for a half of a log, eight of them: the job itself is tested on a simulated log.
 pytestmark = [
     pytest.mark.skipif(not LOGS.is_dir(), reason="the shared logs are not beside the repository"),
@@ -51,25 +51,25 @@ def estimated(result: Smoothed) -> Estimated:
     return Estimated(result.declared, result.calibration, result.blocks, result.calibration_cov)
 
 
-def compared(halves: Halves) -> Agreement:
+def compared(halves: Halves) -> CalibrationAgreement:
     return agreement(*(estimated(result) for result in halves.results))
 
 
 def test_the_halves_agree_within_3_sigma(halves: Halves) -> None:
-    found = compared(halves)
-    assert len(found.by_direction) >= 30  # directions that both determined
-    assert np.max(np.abs(found.by_direction)) < 3.0
-    assert np.max(np.abs(found.by_parameter)) < 3.0
+    result = compared(halves)
+    assert len(result.by_direction) >= 30  # directions that both determined
+    assert np.max(np.abs(result.by_direction)) < 3.0
+    assert np.max(np.abs(result.by_parameter)) < 3.0
     # Were the sigmas far too large they would agree just as well.
-    assert np.sqrt(np.mean(found.by_direction**2)) > 0.3
+    assert np.sqrt(np.mean(result.by_direction**2)) > 0.3
 
 
 def test_nothing_but_the_survey_speaks_along_the_gauge(halves: Halves) -> None:
     """No log can tell, so that both halves stay where the survey was: agreement without proof."""
     for result in halves.results:
-        told = observability(result.calibration, result.blocks, result.calibration_cov)
-        assert len(told.gauge) >= 8
-        assert min(one.ratio for one in told.gauge) > 0.9
+        reported = observability(result.calibration, result.blocks, result.calibration_cov)
+        assert len(reported.gauge) >= 8
+        assert min(one.ratio for one in reported.gauge) > 0.9
         # The frame is that of the calibration found, a few degrees from that of the survey.
         basis = gauge_basis(result.declared, result.blocks)[:, :4]
         step = difference(result.declared, result.calibration, result.blocks)
@@ -79,7 +79,7 @@ def test_nothing_but_the_survey_speaks_along_the_gauge(halves: Halves) -> None:
 
 def scored(log: Log, site: Site) -> TrajectoryErrors:
     assert log.truth is not None
-    return trajectory_errors(smooth(log, site, HELD).states, log.truth)
+    return trajectory_errors(smooth(log, site, HELD_CASES).states, log.truth)
 
 
 def refined(result: Smoothed, log: Log) -> Site:

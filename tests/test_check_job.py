@@ -97,8 +97,8 @@ def test_without_a_site_the_recording_alone_is_judged(
     assert "heard_A" not in report
     lines = report["lines"]
     assert isinstance(lines, list)
-    found = sorted(float(line.split()[0]) for line in lines[:4])
-    assert found == pytest.approx([20.0, 25.0, 30.0, 35.0], abs=0.1)
+    result = sorted(float(line.split()[0]) for line in lines[:4])
+    assert result == pytest.approx([20.0, 25.0, 30.0, 35.0], abs=0.1)
 
     def dead(columns: dict[str, list[float]]) -> None:
         columns["accel_y"] = [0.0] * len(columns["accel_y"])

@@ -114,11 +114,11 @@ def _rest(log: OnlineLog, navigator, begin: float) -> list[State]:  # type: igno
 def phasors(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a log that takes some seconds to navigate."""
     path = tmp_path_factory.mktemp("phasors") / "log"
-    made = online_log(3, 120.0)
-    truth = made.motion.trajectory(made.imu.time)
+    built = online_log(3, 120.0)
+    truth = built.motion.trajectory(built.imu.time)
     epoch_ns = 1_700_000_000_000_000_000
-    write_log(Log("phasors", epoch_ns, "test", made.imu, None, made.fields, truth), path)
-    save_site(made.site, path / "site.yaml")
+    write_log(Log("phasors", epoch_ns, "test", built.imu, None, built.fields, truth), path)
+    save_site(built.site, path / "site.yaml")
     return path
 
 
@@ -196,10 +196,10 @@ def test_killed_before_the_first_checkpoint_it_begins_again(
     begun.close()
     with whole_file(output / "checkpoint.bin") as unfinished:  # and the first checkpoint
         unfinished.write_bytes(b"\0")
-        left = unfinished.read_bytes()
+        remaining = unfinished.read_bytes()
         name = unfinished.name.replace(f"-{os.getpid()}.", "-4194305.")  # no process has it
     (output / "checkpoint.bin").unlink()
-    (output / name).write_bytes(left)
+    (output / name).write_bytes(remaining)
     run_command("navigate", phasors, "-o", output, "--resume")
     assert (output / "trajectory.tum").read_bytes() == (
         uninterrupted / "trajectory.tum"
@@ -219,8 +219,8 @@ def test_the_checkpoint_of_another_run_is_refused(
 ) -> None:
     write_checkpoint(Checkpoint("ab" * 32, 5, {}), tmp_path / "checkpoint.bin")
     command = ("navigate", worked.log, "-o", tmp_path / "run", "--resume", "--checkpoint")
-    told = refuse(*command, tmp_path / "checkpoint.bin")
-    assert "is the checkpoint of another log, site or setting" in told
+    reported = refuse(*command, tmp_path / "checkpoint.bin")
+    assert "is the checkpoint of another log, site or setting" in reported
     (tmp_path / "checkpoint.bin").write_bytes(b"nonsense")
     assert "is no checkpoint of magfusion" in refuse(*command, tmp_path / "checkpoint.bin")
 
@@ -262,9 +262,9 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_former(
     monkeypatch.setattr("magfusion.files.checkpoint.os.fsync", full)
     with pytest.raises(OSError, match="No space left"):
         write_checkpoint(Checkpoint(KEY, 2, {"state": "second"}), path)
-    found = read_checkpoint(path, KEY)
-    assert found is not None
-    assert found.content == {"state": "first"}
+    result = read_checkpoint(path, KEY)
+    assert result is not None
+    assert result.content == {"state": "first"}
     assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.bin"]
 
 
@@ -275,10 +275,10 @@ def test_a_stream_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     whole, _ = answered(site, b"".join(lines))
     settings = StreamSettings(EKF.navigator, checkpoint=place, every=1.0)
     answered(site, b"".join(lines[:230]), settings)
-    found = read_checkpoint(place)
-    assert found is not None
-    assert 200 < found.position <= 230
+    result = read_checkpoint(place)
+    assert result is not None
+    assert 200 < result.position <= 230
     resumed = StreamSettings(EKF.navigator, checkpoint=place, every=1.0, resume=True)
-    later, _ = answered(site, b"".join(lines[found.position :]), resumed)
+    later, _ = answered(site, b"".join(lines[result.position :]), resumed)
     assert later[-1] == whole[-1]
     assert later == whole[len(whole) - len(later) :]

@@ -14,8 +14,8 @@ def test_every_kind_of_log_is_drawn() -> None:
     assert {one.config.motion for one in drawn} == {"walk", "turn"}
     for one in drawn:
         places = np.array([b.position_world for b in one.site.beacons])
-        apart = np.linalg.norm(places[:, None] - places, axis=2) + 10.0 * np.eye(len(places))
-        assert np.min(apart) > 0.3  # m; none lies in another
+        separate = np.linalg.norm(places[:, None] - places, axis=2) + 10.0 * np.eye(len(places))
+        assert np.min(separate) > 0.3  # m; none lies in another
         assert np.all(one.config.box_world[1] > one.config.box_world[0])
 
 
@@ -29,17 +29,17 @@ def test_what_is_asked_is_counted() -> None:
         replace(row, nees=50.0),
         replace(row, bound_m=np.inf, beacons=1),
     ]
-    found = clean_logs.figures(rows)
-    assert (found.logs, found.determined, found.doubtful, found.failed) == (4, 3, 1, 0)
-    assert found.silent == 1
-    assert found.trusted_elsewhere == 1
+    result = clean_logs.figures(rows)
+    assert (result.logs, result.determined, result.doubtful, result.failed) == (4, 3, 1, 0)
+    assert result.silent == 1
+    assert result.trusted_elsewhere == 1
     assert "why" in clean_logs.table(rows)
 
 
 @pytest.mark.slow
 def test_some_clean_logs_are_believed() -> None:
     rows = clean_logs.run(clean_logs.Config(logs=6, seed=3))
-    found = clean_logs.figures(rows)
-    assert found.silent == 0
-    assert found.failed == 0
-    assert found.doubtful <= 1
+    result = clean_logs.figures(rows)
+    assert result.silent == 0
+    assert result.failed == 0
+    assert result.doubtful <= 1

@@ -139,9 +139,9 @@ def test_the_screen_tells_the_errors_first_and_the_calibration_as_a_table(
 
 def test_evaluate_tells_what_smooth_told(worked: Worked, capfd: pytest.CaptureFixture[str]) -> None:
     run_command("evaluate", worked.smoothed, worked.log, "--json")
-    told = _errors_of(json.loads(capfd.readouterr().out.splitlines()[-1]))
+    reported = _errors_of(json.loads(capfd.readouterr().out.splitlines()[-1]))
     expected = _errors_of(_report(worked.smoothed))
-    assert told == pytest.approx(expected, rel=1e-5)  # stamps are written to the nanosecond
+    assert reported == pytest.approx(expected, rel=1e-5)  # stamps are written to the nanosecond
 
 
 def test_evaluate_reads_tum_tables_and_directories_alike(
@@ -185,9 +185,9 @@ def test_phasors_smooth_nearly_as_well_as_the_waveform(worked: Worked, tmp_path:
 
 def test_evo_reads_the_trajectory(worked: Worked) -> None:
     read = file_interface.read_tum_trajectory_file(worked.smoothed / "trajectory.tum")
-    found = read_estimate(worked.smoothed)
-    assert np.max(np.abs(read.positions_xyz - found.position_world)) < 1e-8  # m; nine digits
-    assert np.max(np.abs(read.timestamps - found.time)) < 1e-6  # s; a double at today's date
+    result = read_estimate(worked.smoothed)
+    assert np.max(np.abs(read.positions_xyz - result.position_world)) < 1e-8  # m; nine digits
+    assert np.max(np.abs(read.timestamps - result.time)) < 1e-6  # s; a double at today's date
 
 
 def test_the_recording_can_be_read_back(worked: Worked) -> None:
@@ -256,8 +256,8 @@ def test_the_same_seed_gives_the_same_log(tmp_path: Path) -> None:
 
 
 def test_topics_are_given_by_their_role() -> None:
-    found = topics_option("imu=/imu/data, truth=/odom")
-    assert found == Topics(imu="/imu/data", magnetometer=None, truth="/odom")
+    result = topics_option("imu=/imu/data, truth=/odom")
+    assert result == Topics(imu="/imu/data", magnetometer=None, truth="/odom")
 
 
 def test_view_opens_the_recording(worked: Worked, monkeypatch: pytest.MonkeyPatch) -> None:

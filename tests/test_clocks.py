@@ -26,8 +26,8 @@ def _recorded() -> tuple[Clocks, np.ndarray]:
     explained = []
     for shift in range(-count, count + 1):
         inner = slice(count, len(time) - count)
-        taken = clocks.rate[count - shift : len(time) - count - shift]
-        rest = clocks.change[inner] + np.cross(taken, field[inner])
+        selected = clocks.rate[count - shift : len(time) - count - shift]
+        rest = clocks.change[inner] + np.cross(selected, field[inner])
         explained.append(1.0 - np.sum(rest**2) / np.sum(clocks.change[inner] ** 2))
     return clocks, np.array(explained)
 

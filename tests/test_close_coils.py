@@ -40,8 +40,8 @@ def poses_about(site: Site, radius: float) -> Trajectory:
 def squares(fixes: Fixes, truth: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance from the truth (m), and the square of the error in sigmas."""
     error = pose_errors(fixes.world_from_body[:, 0], fixes.position_world[:, 0], truth)
-    apart = np.linalg.norm(fixes.position_world[:, 0] - truth.position_world, axis=1)
-    return apart, np.einsum("ni,nij,nj->n", error, np.linalg.inv(fixes.pose_cov[:, 0]), error)
+    separate = np.linalg.norm(fixes.position_world[:, 0] - truth.position_world, axis=1)
+    return separate, np.einsum("ni,nij,nj->n", error, np.linalg.inv(fixes.pose_cov[:, 0]), error)
 
 
 @pytest.mark.parametrize("radius", [0.1, 0.2, 0.3])
@@ -50,8 +50,8 @@ def test_fixes_without_a_guess_are_as_good_as_they_claim(radius: float) -> None:
     truth = poses_about(site, radius)
     samples = simulate_fields(site, truth, SIGMA, np.random.default_rng(5))
     known = initial_calibration(site, 0.0)
-    apart, nees = squares(fix_epochs(samples, known, survey_error=False), truth)
-    assert np.max(apart) < 0.01
+    separate, nees = squares(fix_epochs(samples, known, survey_error=False), truth)
+    assert np.max(separate) < 0.01
     low, high = average_nees_bounds(6, POSES, 0.999)
     assert low < np.mean(nees) < high
     # The dipoles that stand for the coils are not, even started from the truth.

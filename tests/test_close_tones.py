@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.estimation.batch.batch import Smoothed, smooth
 from magfusion.estimation.demodulation.close_tones import _of_channels
 from magfusion.estimation.graph.state import MOTION, State, States, states_in
-from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.integrity.judge import judge_result
 from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
@@ -53,8 +53,8 @@ def smoothed(log: Log) -> Smoothed:
 
 
 def joint_of(result: Smoothed) -> JointPhasors:
-    (found,) = [m for m in result.graph.measurements if isinstance(m, JointPhasors)]
-    return found
+    (estimate,) = [m for m in result.graph.measurements if isinstance(m, JointPhasors)]
+    return estimate
 
 
 def one(result: Smoothed, row: int) -> tuple[JointPhasors, States]:
@@ -74,7 +74,7 @@ def test_only_close_tones_are_told_together() -> None:
 
 def test_why_close_tones_are_not_told_together_is_said() -> None:
     site = room()
-    two = site.platform.carrying(
+    two = site.platform.with_magnetometers(
         (site.platform.magnetometer, replace(site.platform.magnetometer, name="second"))
     )
     one = replace(site.platform, magnetometer=replace(site.platform.magnetometer, axes="z"))
@@ -94,8 +94,8 @@ def test_the_directions_of_a_window_are_those_of_its_phasors() -> None:
     elapsed = np.arange(-0.5 * settings.window, 0.5 * settings.window, 1.0 / RATE_HZ) + 1e-4
     design, centre = JointDesign.of(elapsed, frequencies, settings, None), 17.3
     assert design.across.shape[1] < 2 * len(frequencies) + 2
-    felt = np.ones((1, len(frequencies)), dtype=bool)
-    basis = _of_channels(design.tones[None], np.array([centre]), site, felt)[0]
+    affected = np.ones((1, len(frequencies)), dtype=bool)
+    basis = _of_channels(design.tones[None], np.array([centre]), site, affected)[0]
     # A field that changes as a parabola, under the mains and a drift of the steady field.
     phasor = rng.normal(size=(3, len(frequencies))) + 1j * rng.normal(size=(3, len(frequencies)))
     grown = np.polynomial.polynomial.polyval(elapsed, phasor)
@@ -107,7 +107,7 @@ def test_the_directions_of_a_window_are_those_of_its_phasors() -> None:
     parts = np.stack([at_nodes.real, at_nodes.imag], axis=-1).reshape(len(nodes), -1)
     expected = np.einsum("rkc,kc->r", basis, parts)
     assert design.across.T @ samples == pytest.approx(expected, abs=1e-9 * np.max(np.abs(expected)))
-    assert np.max(np.abs(design.beside.T @ design.across)) < 1e-9
+    assert np.max(np.abs(design.extra_design.T @ design.across)) < 1e-9
 
 
 def test_short_windows_have_the_say_and_leave_what_noise_does(smoothed: Smoothed) -> None:
@@ -116,9 +116,9 @@ def test_short_windows_have_the_say_and_leave_what_noise_does(smoothed: Smoothed
     assert long.excess is not None
     assert np.min(long.excess) > 1e5
     assert len(joint.time) > 10 * len(long.time)
-    left = smoothed.graph.residual(joint, smoothed.estimate)
+    remaining = smoothed.graph.residual(joint, smoothed.estimate)
     # Of model error there is none in the samples, though the site declares some.
-    assert 0.4 < float(np.mean(left**2)) < 1.1
+    assert 0.4 < float(np.mean(remaining**2)) < 1.1
 
 
 def test_derivatives_are_those_of_differences(smoothed: Smoothed) -> None:
@@ -131,7 +131,7 @@ def test_derivatives_are_those_of_differences(smoothed: Smoothed) -> None:
         moved = States(turn, at.position_world + shift, at.velocity_world + step[6:], at.read_bias)
         return joint.error(moved, smoothed.calibration)[0, 0]
 
-    found = central_difference(error, 9, 1e-5)
+    result = central_difference(error, 9, 1e-5)
     assert rows.by_pose is not None
     assert rows.by_velocity is not None
     assert rows.error[0, 0] == pytest.approx(error(np.zeros(9)), abs=1e-9)
@@ -140,23 +140,23 @@ def test_derivatives_are_those_of_differences(smoothed: Smoothed) -> None:
         (rows.by_pose[0, 0, :, 3:], slice(3, 6)),
         (rows.by_velocity[0, 0], slice(6, 9)),
     ):
-        assert relative_to_group(part, found[:, columns]) < 1e-4
+        assert relative_to_group(part, result[:, columns]) < 1e-4
 
 
 def test_what_is_left_out_says_nothing_and_what_is_false_is_named(smoothed: Smoothed) -> None:
     joint, at = one(smoothed, 9)
     channel = 2
-    assert joint.felt[0, channel]
-    spoilt = np.zeros((1, joint.felt.shape[1], 2))
-    spoilt[0, channel] = 5e-8  # T
+    assert joint.is_predicted[0, channel]
+    corrupted = np.zeros((1, joint.is_predicted.shape[1], 2))
+    corrupted[0, channel] = 5e-8  # T
     whole = np.einsum(
         "nrkcp,nkc,ncp->nr",
         joint.basis.reshape(*joint.basis.shape[:3], -1, 2),
         joint.strength,
-        spoilt,
+        corrupted,
     )
     false = replace(joint, measured=joint.measured + np.repeat(whole, 3, axis=1))
-    own = np.arange(joint.felt.shape[1]) == channel
+    own = np.arange(joint.is_predicted.shape[1]) == channel
     before = joint.without(own).error(at, smoothed.calibration)
     after = false.without(own).error(at, smoothed.calibration)
     assert np.max(np.abs(after - before)) < 1e-6 * np.max(
@@ -187,8 +187,8 @@ def test_a_beacon_that_is_silent_is_not_believed() -> None:
     site = room()
     some = replace(site, beacons=site.beacons[:-1])
     quiet = many_beacons.walked(some, 0.15, BOX_WORLD, RATE_HZ, 3)
-    _, alone = judged(smooth(quiet, some), quiet)
-    _, both = judged(smooth(quiet, site), quiet)
+    _, alone = judge_result(smooth(quiet, some), quiet)
+    _, both = judge_result(smooth(quiet, site), quiet)
     assert alone.verdict is Verdict.TRUSTWORTHY
     assert both.verdict is not Verdict.TRUSTWORTHY
 
@@ -198,13 +198,13 @@ def test_positions_that_are_believed_are_consistent() -> None:
     site, nees = room(), []
     for seed in range(6):
         walk = many_beacons.walked(site, 0.15, BOX_WORLD, RATE_HZ, 20 + seed)
-        found, trust = judged(smooth(walk, site), walk)
+        result, trust = judge_result(smooth(walk, site), walk)
         if trust.verdict is Verdict.FAILED:  # of three long windows not every start is right
             continue
-        error = many_beacons._errors(walk, found.states.time, found.states.position_world)
-        body = np.einsum("nji,nj->ni", found.states.world_from_body, error)
-        assert found.states.pose_cov is not None
-        solved = np.linalg.solve(found.states.pose_cov[:, 3:, 3:], body[..., None])[..., 0]
+        error = many_beacons._errors(walk, result.states.time, result.states.position_world)
+        body = np.einsum("nji,nj->ni", result.states.world_from_body, error)
+        assert result.states.pose_cov is not None
+        solved = np.linalg.solve(result.states.pose_cov[:, 3:, 3:], body[..., None])[..., 0]
         nees.append(float(np.mean(np.sum(body * solved, axis=1))))
     assert len(nees) >= 4
     # Three are due; declared model error that the samples do not have takes most of it.

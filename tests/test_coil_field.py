@@ -34,10 +34,10 @@ def around(distance: float, count: int = 60) -> Array:
     return np.asarray(distance * direction / np.linalg.norm(direction, axis=1)[:, None])
 
 
-def relative(found: Array, expected: Array) -> float:
-    axes = tuple(range(1, found.ndim))
+def relative(result: Array, expected: Array) -> float:
+    axes = tuple(range(1, result.ndim))
     size = np.sqrt(np.sum(expected**2, axis=axes))
-    return float(np.max(np.sqrt(np.sum((found - expected) ** 2, axis=axes)) / size))
+    return float(np.max(np.sqrt(np.sum((result - expected) ** 2, axis=axes)) / size))
 
 
 def test_dipoles_are_dipoles_to_the_last_bit() -> None:
@@ -59,8 +59,8 @@ def test_the_simulator_which_sums_over_the_wire_agrees(
     shape: tuple[float | None, float | None], distance: float
 ) -> None:
     coil = Coil(MOMENT, 0.0, np.zeros(3), *shape)
-    found = coil_fields(alone(beacon_of(coil)), around(distance))[:, 0]
-    assert relative(found, solenoid_field(around(distance), MOMENT, *shape)) < 1e-6
+    result = coil_fields(alone(beacon_of(coil)), around(distance))[:, 0]
+    assert relative(result, solenoid_field(around(distance), MOMENT, *shape)) < 1e-6
 
 
 def test_a_sheet_is_the_magnet_of_an_independent_library() -> None:

@@ -80,13 +80,13 @@ def test_every_field_of_a_jobs_settings_is_an_option_with_its_help() -> None:
     for name, command in _commands().items():
         for field in dataclasses.fields(command.settings):
             assert "option" in field.metadata, f"{name}: {field.name}"
-        for field, asked in options(command.settings):
-            assert asked.sentence[0].isupper(), f"{name}: {field.name}"
-            assert asked.sentence.endswith("."), f"{name}: {field.name}"
+        for field, requested in options(command.settings):
+            assert requested.sentence[0].isupper(), f"{name}: {field.name}"
+            assert requested.sentence.endswith("."), f"{name}: {field.name}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Asked(Settings):
+class _Query(Settings):
     place: Path = argument("Where")
     length: float = option(2.0, "Length", unit="m", least=1.0, most=3.0, note="of the rod")
     width: float | None = option(None, "Width", unit="m", above=0.0)
@@ -97,7 +97,7 @@ class _Asked(Settings):
 
 
 def test_help_tells_unit_bounds_and_note() -> None:
-    sentences = {field.name: asked.sentence for field, asked in options(_Asked)}
+    sentences = {field.name: requested.sentence for field, requested in options(_Query)}
     assert sentences["length"] == "Length, 1 to 3 m; of the rod."
     assert sentences["width"] == "Width, m."
     assert sentences["mode"] == "How."
@@ -115,9 +115,9 @@ def test_help_tells_unit_bounds_and_note() -> None:
     ],
 )
 def test_a_number_out_of_its_bounds_is_refused(change: dict[str, Any], sentence: str) -> None:
-    _Asked(place=Path(), name="A")
+    _Query(place=Path(), name="A")
     with pytest.raises(InputError) as refused:
-        _Asked(place=Path(), name="A", **change)
+        _Query(place=Path(), name="A", **change)
     assert str(refused.value) == sentence
 
 
@@ -230,7 +230,7 @@ def test_blas_has_one_thread_unless_more_are_asked_for(
         monkeypatch.delenv(name, raising=False)
     for name, number in given.items():
         monkeypatch.setenv(name, number)
-    told = f"""
+    reported = f"""
 import os, sys
 import magfusion.cli
 assert "numpy" not in sys.modules
@@ -241,12 +241,12 @@ except SystemExit:
     pass
 assert os.environ.get("OPENBLAS_NUM_THREADS") == {threads!r}
 """
-    done = _child("-c", told)
+    done = _child("-c", reported)
     assert done.returncode == 0, done.stderr
 
 
 def test_who_imports_statistics_while_a_filter_is_made_has_all_of_them() -> None:
-    told = """
+    reported = """
 import threading
 found = []
 def statistics():
@@ -260,12 +260,12 @@ import scipy.stats
 assert found == [scipy.stats]
 assert scipy.stats.chi2.cdf(0.0, 1) == 0.0
 """
-    done = _child("-c", told)
+    done = _child("-c", reported)
     assert done.returncode == 0, done.stderr
 
 
 def test_a_command_looks_for_garbage_but_not_among_what_it_imported(tmp_path: Path) -> None:
-    told = """
+    reported = """
 import gc, sys
 from magfusion.jobs import smooth
 from magfusion.cli import main
@@ -276,6 +276,6 @@ sys.argv = ["magfusion", "smooth", "."]
 main()
 """
     done = subprocess.run(
-        [sys.executable, "-c", told], check=False, capture_output=True, text=True, cwd=tmp_path
+        [sys.executable, "-c", reported], check=False, capture_output=True, text=True, cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr

@@ -22,14 +22,14 @@ def _parsed(line: str) -> list[str]:
     for part in line.split(" | "):
         program, *words = shlex.split(part)
         assert program == "magfusion"
-        found, path = get_command(application()), []
-        context = found.make_context("magfusion", words)
-        while hasattr(found, "resolve_command"):
-            name, found, rest = found.resolve_command(
+        result, path = get_command(application()), []
+        context = result.make_context("magfusion", words)
+        while hasattr(result, "resolve_command"):
+            name, result, rest = result.resolve_command(
                 context, [*context._protected_args, *context.args]
             )
             path.append(name)
-            context = found.make_context(name, rest, parent=context)
+            context = result.make_context(name, rest, parent=context)
         named.append(" ".join(path))
     return named
 

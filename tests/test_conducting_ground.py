@@ -17,8 +17,8 @@ from through_rock import (
 )
 
 from magfusion.errors import InputError
+from magfusion.estimation.demodulation.burial_depth import depths_of
 from magfusion.estimation.demodulation.demodulation import phasors
-from magfusion.estimation.demodulation.skin_depths import depths_of
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.files.site import load_site, save_site
 from magfusion.model.coil_field import alone, coil_fields
@@ -75,8 +75,8 @@ EMPYMOD = np.array(
 def test_the_full_space_is_that_of_empymod_and_of_the_simulator() -> None:
     lag = decay(np.full(len(OFFSETS), 1000.0), 0.01)
     moments = np.broadcast_to(MOMENT, OFFSETS.shape)
-    found = dipole_field(OFFSETS, moments) + conducted_field(OFFSETS, moments, lag)
-    for field, expected in zip(found, EMPYMOD, strict=True):
+    result = dipole_field(OFFSETS, moments) + conducted_field(OFFSETS, moments, lag)
+    for field, expected in zip(result, EMPYMOD, strict=True):
         assert relative_to_group(field, expected) < 1e-7
     simulated = dipole_in_ground(OFFSETS, MOMENT, 1000.0, 0.01)
     for field, expected in zip(simulated, EMPYMOD, strict=True):
@@ -108,8 +108,8 @@ def test_the_full_space_is_that_of_empymod_installed(depths: float) -> None:
     to_tesla = 2j * np.pi * frequency * (4e-7 * np.pi) ** 2 * np.linalg.norm(MOMENT)
     expected = to_tesla * np.squeeze(seen)
     lag = decay(np.array(frequency), conductivity)
-    found = dipole_field(offset, MOMENT) + conducted_field(offset, MOMENT, lag)
-    assert relative_to_group(found, expected) < 1e-6
+    result = dipole_field(offset, MOMENT) + conducted_field(offset, MOMENT, lag)
+    assert relative_to_group(result, expected) < 1e-6
 
 
 def test_the_field_lags_behind_the_current() -> None:
@@ -148,9 +148,9 @@ def test_samples_are_phasors_times_what_turns_with_them() -> None:
     carrier = np.exp(2j * np.pi * beacon.frequency_hz * time)[:, None]
     place = np.tile([3.0, 2.0, 1.0], (len(time), 1))
     current = carrier * np.ones((1, 1)) @ beacon.excitation.T
-    found = driven_field(beacon, place, current).field
+    result = driven_field(beacon, place, current).field
     expected = np.real(phasors_world(beacon, place)[:, 0] * carrier)
-    assert relative_to_group(found, expected) < 1e-12
+    assert relative_to_group(result, expected) < 1e-12
     assert conductivity_of(site) == 800.0
 
 
@@ -255,12 +255,12 @@ def test_beyond_five_skin_depths_a_log_is_refused() -> None:
 def test_what_the_conductivity_may_be_off_by_is_in_the_bound() -> None:
     """Four beacons know the ground by their ranges; a lone one takes ground for distance."""
     points = np.array([[0.0, 0.0, 0.0], [5.0, -3.0, 1.0]])
-    for beacons, least, most in ((4, 1.003, 1.1), (1, 10.0, 1e4)):
+    for beacons, least, maximum in ((4, 1.003, 1.1), (1, 10.0, 1e4)):
         site = replace(site_at(ROCK), beacons=site_at(ROCK).beacons[:beacons])
         loose = replace(site, log_conductivity_sigma=float(np.log(3.0)))
         known, unknown = (coverage(s, points, 0.5).position_sigma for s in (site, loose))
         assert np.all(unknown > least * known)
-        assert np.all(unknown < most * known)
+        assert np.all(unknown < maximum * known)
 
 
 def test_a_log_through_rock_is_smoothed_and_its_ground_is_found() -> None:

@@ -37,11 +37,11 @@ CONFIDENCE = 0.99
 ALL_GROUPS = ("beacons", "moments", "magnetometer", "extrinsics", "time-offset")
 # Noise that tunes itself would take a wrong declaration back.
 AS_DECLARED = SmootherSettings(loss=None, tune=False)
-APART = LockinSettings(window=0.4, step=0.4)  # windows that share no sample
+DISTINCT = LockinSettings(window=0.4, step=0.4)  # windows that share no sample
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class RunOutcome:
     """Normalised errors of one run: of five poses, and of the calibration."""
 
     nees: np.ndarray
@@ -83,14 +83,14 @@ def recorded(site: Site, rng: np.random.Generator, imu_noise: float = 1.0) -> Si
     return simulate_log(site, config, rng)
 
 
-def outcome(made: SimulatedLog, site: Site, settings: SmootherSettings) -> Outcome:
-    result = smooth(made.log, site, settings)
+def outcomes(simulation: SimulatedLog, site: Site, settings: SmootherSettings) -> RunOutcome:
+    result = smooth(simulation.log, site, settings)
     assert result.converged
-    assert made.log.truth is not None
-    nees = trajectory_errors(result.states, made.log.truth).nees
+    assert simulation.log.truth is not None
+    nees = trajectory_errors(result.states, simulation.log.truth).nees
     assert nees is not None
-    true = initial_calibration(made.true_site, 0.0)
-    true = replace(true, phase=made.drives.phase, drift=made.drives.drift)
+    true = initial_calibration(simulation.true_site, 0.0)
+    true = replace(true, phase=simulation.drives.phase, drift=simulation.drives.drift)
     reference = result.calibration.reference_time
     phase = true.drive_phase(np.array(reference))
     true = replace(true, phase=phase, reference_time=reference)
@@ -98,38 +98,38 @@ def outcome(made: SimulatedLog, site: Site, settings: SmootherSettings) -> Outco
     for block in result.blocks:
         if block.kind == "phase":
             error[block.columns] = np.angle(np.exp(1j * error[block.columns]))
-    told = parameter_estimates(
+    reported = parameter_estimates(
         result.declared, result.calibration, result.blocks, result.calibration_cov
     )
-    return Outcome(
+    return RunOutcome(
         nees[np.linspace(3, len(nees) - 4, INSTANTS).astype(int)],
         error / np.sqrt(np.diagonal(result.calibration_cov)),
-        np.array([found.determined for found in told]),
+        np.array([result.determined for result in reported]),
     )
 
 
-def from_waveform(seed: int, site: Site, settings: SmootherSettings) -> Outcome:
-    return outcome(recorded(site, np.random.default_rng(seed)), site, settings)
+def from_waveform(seed: int, site: Site, settings: SmootherSettings) -> RunOutcome:
+    return outcomes(recorded(site, np.random.default_rng(seed)), site, settings)
 
 
-def from_phasors(seed: int, *, field_noise: float = 1.0, imu_noise: float = 1.0) -> Outcome:
+def from_phasors(seed: int, *, field_noise: float = 1.0, imu_noise: float = 1.0) -> RunOutcome:
     """Smooth a log of phasors whose noise is what was declared, times a factor."""
     rng = np.random.default_rng(seed)
     site = surveyed(0.0)
-    made = recorded(site, rng, imu_noise)
-    epochs = made.motion.trajectory(np.arange(0.5, DURATION - 0.4, 0.5))
+    built = recorded(site, rng, imu_noise)
+    epochs = built.motion.trajectory(np.arange(0.5, DURATION - 0.4, 0.5))
     sigma = 1e-9  # T
-    fields = simulate_fields(made.true_site, epochs, field_noise * sigma, rng)
+    fields = simulate_fields(built.true_site, epochs, field_noise * sigma, rng)
     fields = replace(fields, phasor_cov=fields.phasor_cov / field_noise**2)
-    bare = replace(made.log, waveform=None, fields=fields)
-    return outcome(replace(made, log=bare), site, AS_DECLARED)
+    bare = replace(built.log, waveform=None, fields=fields)
+    return outcomes(replace(built, log=bare), site, AS_DECLARED)
 
 
-def over_runs(one: Callable[[int], Outcome]) -> list[Outcome]:
+def over_runs(one: Callable[[int], RunOutcome]) -> list[RunOutcome]:
     return [one(seed) for seed in range(RUNS)]
 
 
-def pose_nees(outcomes: list[Outcome]) -> np.ndarray:
+def pose_nees(outcomes: list[RunOutcome]) -> np.ndarray:
     return np.array([o.nees for o in outcomes])
 
 
@@ -144,7 +144,7 @@ def honest(nees: np.ndarray, independent: int) -> bool:
     return bool(low < np.mean(nees) < high)
 
 
-def calibration_is_honest(outcomes: list[Outcome]) -> bool:
+def calibration_is_honest(outcomes: list[RunOutcome]) -> bool:
     """Tell whether the parameters that the data determined err as their sigmas say."""
     z = np.concatenate([o.z[o.determined] for o in outcomes])
     # One clock's offset and rate are drawn once a run: their scatter is known no better than that.
@@ -177,7 +177,7 @@ def test_sigmas_are_honest_where_the_survey_is_uncertain(
 
 
 def test_sigmas_are_honest_where_only_noise_is_left() -> None:
-    settings = replace(AS_DECLARED, lockin=APART)
+    settings = replace(AS_DECLARED, lockin=DISTINCT)
     site = surveyed(0.0)
     outcomes = over_runs(lambda seed: from_waveform(seed, site, settings))
     nees = pose_nees(outcomes)
@@ -220,9 +220,9 @@ def test_white_noise_that_the_receiver_measures_need_not_be_declared() -> None:
     quiet = replace(magnetometer, noise_density=magnetometer.noise_density / 3.0)
     declared = replace(site, platform=replace(site.platform, magnetometer=quiet))
 
-    def one(seed: int) -> Outcome:
-        made = recorded(site, np.random.default_rng(seed))
-        return outcome(made, declared, replace(AS_DECLARED, lockin=APART))
+    def one(seed: int) -> RunOutcome:
+        built = recorded(site, np.random.default_rng(seed))
+        return outcomes(built, declared, replace(AS_DECLARED, lockin=DISTINCT))
 
     nees = pose_nees(over_runs(one))
     assert honest(nees, RUNS * INSTANTS), np.mean(nees)

@@ -47,10 +47,10 @@ def test_its_measurement_has_the_derivative_that_it_says() -> None:
     measured = names["Range"](np.arange(3), np.full(3, 2.0), np.full(3, 0.1), (4.0, 1.0, 2.0))
 
     def rows(step: Array) -> Rows:
-        turned = attitude @ Rotation.from_rotvec(step[:3]).as_matrix()
-        states = States(turned, place + attitude @ step[3:], np.zeros((3, 3)), lambda: np.zeros(6))
-        found: Rows = measured.linearize(states, None, ())
-        return found
+        rotated = attitude @ Rotation.from_rotvec(step[:3]).as_matrix()
+        states = States(rotated, place + attitude @ step[3:], np.zeros((3, 3)), lambda: np.zeros(6))
+        result: Rows = measured.linearize(states, None, ())
+        return result
 
     by_pose = rows(np.zeros(6)).by_pose
     assert by_pose is not None

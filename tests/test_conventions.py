@@ -19,10 +19,10 @@ def _random_pose(rng: np.random.Generator) -> gtsam.Pose3:
 
 def test_pose3_perturbs_rotation_then_translation_in_body_axes() -> None:
     pose = _random_pose(np.random.default_rng(1))
-    turned = pose.retract(np.array([0.01, -0.02, 0.03, 0.0, 0.0, 0.0]))
-    relative = Rotation.from_matrix(pose.rotation().matrix().T @ turned.rotation().matrix())
+    rotated = pose.retract(np.array([0.01, -0.02, 0.03, 0.0, 0.0, 0.0]))
+    relative = Rotation.from_matrix(pose.rotation().matrix().T @ rotated.rotation().matrix())
     np.testing.assert_allclose(relative.as_rotvec(), [0.01, -0.02, 0.03], rtol=1e-10)
-    np.testing.assert_allclose(turned.translation(), pose.translation(), rtol=1e-12)
+    np.testing.assert_allclose(rotated.translation(), pose.translation(), rtol=1e-12)
     moved = pose.retract(np.array([0.0, 0.0, 0.0, 0.4, 0.5, -0.6]))
     shift_body = pose.rotation().matrix().T @ (moved.translation() - pose.translation())
     np.testing.assert_allclose(shift_body, [0.4, 0.5, -0.6], rtol=1e-10)

@@ -78,8 +78,8 @@ def some_cov(site: Site, seed: int = 3) -> tuple[tuple, np.ndarray]:
 def refined(site: Site) -> tuple[Site, tuple, np.ndarray]:
     declared = initial_calibration(site, 0.0)
     blocks, cov = some_cov(site)
-    told = parameter_estimates(declared, declared, blocks, cov)
-    return refined_site(declared, blocks, cov, told, "a log"), blocks, cov
+    reported = parameter_estimates(declared, declared, blocks, cov)
+    return refined_site(declared, blocks, cov, reported, "a log"), blocks, cov
 
 
 def test_a_refined_site_remembers_the_whole_covariance(tmp_path: Path) -> None:
@@ -89,8 +89,8 @@ def test_a_refined_site_remembers_the_whole_covariance(tmp_path: Path) -> None:
     rows = [p.group != "phase" for p in parameters_of(blocks)]
     spread = prior_sqrt_covariance(again, choose_blocks(again, GROUPS))[rows]
     sigma = np.sqrt(np.diagonal(cov))[rows]
-    found, expected = (spread @ spread.T) / sigma / sigma[:, None], cov[np.ix_(rows, rows)]
-    np.testing.assert_allclose(found, expected / sigma / sigma[:, None], rtol=0.0, atol=1e-9)
+    result, expected = (spread @ spread.T) / sigma / sigma[:, None], cov[np.ix_(rows, rows)]
+    np.testing.assert_allclose(result, expected / sigma / sigma[:, None], rtol=0.0, atol=1e-9)
 
 
 def test_the_root_whitens_what_the_spread_draws() -> None:
@@ -119,9 +119,9 @@ def test_a_sigma_changed_by_hand_is_independent_from_then_on(tmp_path: Path) -> 
     content["beacons"][0]["sigma"]["position_m"] = [0.5, 0.5, 0.5]
     del content["beacons"][3]
     path.write_text(yaml.safe_dump(content))
-    left = load_site(path).correlation
-    assert left is not None
-    owners = {(p.owner, p.kind) for p in left.parameters}
+    remaining = load_site(path).correlation
+    assert remaining is not None
+    owners = {(p.owner, p.kind) for p in remaining.parameters}
     names = [b.name for b in site.beacons]
     assert (names[0], "position") not in owners
     assert (names[0], "rotation") in owners
@@ -146,7 +146,7 @@ def _changed(path: Path, change: dict[tuple[int, int], float]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("spoil", "findings"),
     [
         (Path.unlink, "there is no such correlation"),
         (_cut, "is no correlation"),
@@ -156,11 +156,11 @@ def _changed(path: Path, change: dict[tuple[int, int], float]) -> None:
         (lambda path: _changed(path, {(0, 1): 2.0, (1, 0): 2.0}), "what no correlation is"),
     ],
 )
-def test_a_spoilt_file_is_refused_with_its_name_and_a_remedy(tmp_path, spoil, said) -> None:
+def test_a_spoilt_file_is_refused_with_its_name_and_a_remedy(tmp_path, spoil, findings) -> None:
     site, _, _ = refined(mixed_site())
     save_site(site, tmp_path / "site.yaml")
     spoil(tmp_path / FILE)
-    with pytest.raises(InputError, match=said) as refusal:
+    with pytest.raises(InputError, match=findings) as refusal:
         load_site(tmp_path / "site.yaml")
     assert FILE in str(refusal.value)
     assert "take the correlation out of it" in str(refusal.value)
@@ -193,13 +193,13 @@ def test_the_simulator_draws_together_what_goes_together() -> None:
     )
     middle = moved.mean(axis=1)
     assert np.std(middle) == pytest.approx(np.hypot(COMMON, OWN / 2.0), rel=0.05)
-    apart = np.sqrt(np.mean((moved - middle[:, None]) ** 2) * 4.0 / 3.0)
-    assert apart == pytest.approx(OWN, rel=0.05)
+    separate = np.sqrt(np.mean((moved - middle[:, None]) ** 2) * 4.0 / 3.0)
+    assert separate == pytest.approx(OWN, rel=0.05)
 
 
-def nees_of_fixes(drawn: Site, told: Site) -> float:
+def nees_of_fixes(drawn: Site, reported: Site) -> float:
     """Return the mean NEES of one fix in each of many worlds."""
-    found = []
+    result = []
     for seed in range(RUNS):
         rng = np.random.default_rng(seed)
         motion = random_walk_motion(rng, 20.0, DEMO_BOX_WORLD)
@@ -207,11 +207,11 @@ def nees_of_fixes(drawn: Site, told: Site) -> float:
         samples = simulate_fields(
             perturb_site(drawn, rng), truth, 1e-9, rng, draw_drives(drawn, rng)
         )
-        fixes = fix_epochs(samples, initial_calibration(told, 0.0), survey_error=True)
+        fixes = fix_epochs(samples, initial_calibration(reported, 0.0), survey_error=True)
         nees = trajectory_errors(fixes.best(), truth, max_gap=10.0).nees
         assert nees is not None
-        found.append(nees[1])
-    return float(np.mean(found))
+        result.append(nees[1])
+    return float(np.mean(result))
 
 
 @pytest.mark.slow
@@ -230,12 +230,14 @@ def test_the_smoother_is_as_unsure_of_the_world_as_its_beacons_are_together() ->
     config = SimulationConfig(DEMO_BOX_WORLD, duration=12.0)
     log = simulate_log(site, config, np.random.default_rng(1)).log
     for estimate in (None, ("time-offset",)):  # estimated, and considered
-        for told, sigma in ((site, COMMON), (replace(site, correlation=None), 0.5 * COMMON)):
-            result = smooth(log, told, SmootherSettings(estimate=estimate, loss=None, tune=False))
+        for reported, sigma in ((site, COMMON), (replace(site, correlation=None), 0.5 * COMMON)):
+            result = smooth(
+                log, reported, SmootherSettings(estimate=estimate, loss=None, tune=False)
+            )
             assert result.states.pose_cov is not None
             middle = result.states.pose_cov[len(result.states) // 2]
             horizontal = np.sqrt(0.5 * np.trace(middle[3:5, 3:5]))
-            if estimate is None or told is site:
+            if estimate is None or reported is site:
                 assert horizontal == pytest.approx(sigma, rel=0.15)
 
 
@@ -283,14 +285,14 @@ def test_the_second_log_is_as_honest_as_the_first() -> None:
         first = simulate_log(site, config, rng)
         second = simulate_log(exactly(first.true_site), config, rng)
         calibrated = again(smooth(first.log, site))
-        for name, told in (
+        for name, reported in (
             ("whole", calibrated),
             ("sigmas", replace(calibrated, correlation=None)),
         ):
             assert second.log.truth is not None
-            found = trajectory_errors(smooth(second.log, told).states, second.log.truth).nees
-            assert found is not None
-            nees[name].append(float(found[len(found) // 2]))
+            result = trajectory_errors(smooth(second.log, reported).states, second.log.truth).nees
+            assert result is not None
+            nees[name].append(float(result[len(result) // 2]))
     low, high = average_nees_bounds(6, CHAINS, 0.999)
     assert low < np.mean(nees["whole"]) < high
     assert np.mean(nees["sigmas"]) > high

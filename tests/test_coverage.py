@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from magfusion.estimation.snapshot.fix_separation import separate_fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
-from magfusion.model.audibility import tones_of
+from magfusion.model.detection_range import tones_of
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -39,8 +39,8 @@ def room(count: int = 4, synchronised: bool = True, model_error: float = 0.0) ->
 
 def with_noise(site: Site, factor: float) -> Site:
     sensor = site.platform.magnetometer
-    louder = replace(sensor, noise_density=factor * sensor.noise_density)
-    return replace(site, platform=replace(site.platform, magnetometer=louder))
+    stronger = replace(sensor, noise_density=factor * sensor.noise_density)
+    return replace(site, platform=replace(site.platform, magnetometer=stronger))
 
 
 def with_moment(site: Site, factor: float) -> Site:
@@ -131,8 +131,8 @@ def test_the_noise_of_a_tone_is_what_least_squares_leave_of_a_window() -> None:
 def test_coils_driven_in_turn_share_the_window() -> None:
     site = room(1)
     coils = tuple(replace(c, slot=k) for k, c in enumerate(site.beacons[0].coils))
-    turned = replace(site, beacons=(replace(site.beacons[0], coils=coils),))
-    ratio = phasor_variance(turned, WINDOW) / phasor_variance(site, WINDOW)
+    rotated = replace(site, beacons=(replace(site.beacons[0], coils=coils),))
+    ratio = phasor_variance(rotated, WINDOW) / phasor_variance(site, WINDOW)
     assert np.allclose(ratio, [2.0, 2.0], rtol=1e-12, atol=0)
 
 
@@ -157,10 +157,10 @@ def test_the_bound_grows_with_the_fourth_power_of_the_distance() -> None:
 @pytest.mark.parametrize("survey", [True, False])
 def test_the_position_hardly_depends_on_the_attitude(survey: bool) -> None:
     site = room(model_error=0.005)
-    turned = coverage(
+    rotated = coverage(
         site, POINTS, WINDOW, survey=survey, world_from_body=Rotation.random(rng=3).as_matrix()
     )
-    ratio = turned.position_sigma / sigma(site, survey=survey)
+    ratio = rotated.position_sigma / sigma(site, survey=survey)
     assert np.all(np.abs(ratio - 1.0) < 0.05)  # a lever arm of 6 cm in metres of distance
 
 
@@ -179,8 +179,8 @@ def test_an_attitude_known_from_elsewhere_has_no_error() -> None:
 
 
 def test_the_survey_is_a_floor_that_less_noise_does_not_break() -> None:
-    loud, quiet = room(), with_noise(room(), 1e-3)
-    assert np.all(sigma(quiet) < 2e-3 * sigma(loud))
+    strong, quiet = room(), with_noise(room(), 1e-3)
+    assert np.all(sigma(quiet) < 2e-3 * sigma(strong))
     millimetre = 1e-3  # m, how well the demo's beacons are surveyed
     assert np.all(sigma(quiet, survey=True) > 0.3 * millimetre)
 
@@ -232,10 +232,10 @@ def test_the_bound_holds_for_every_kind_of_beacon() -> None:
 def test_the_noise_factor_of_a_beacon_is_its_noise() -> None:
     site = room()
     factors = tuple(replace(b, noise_factor=3.0) for b in site.beacons)
-    loud = sigma(replace(site, beacons=factors))
-    assert np.allclose(loud, sigma(with_noise(site, 3.0)), rtol=1e-9, atol=0)
+    strong = sigma(replace(site, beacons=factors))
+    assert np.allclose(strong, sigma(with_noise(site, 3.0)), rtol=1e-9, atol=0)
     one = replace(site, beacons=(*factors[:1], *site.beacons[1:]))
-    assert np.all((sigma(one) > sigma(site)) & (sigma(one) < loud))
+    assert np.all((sigma(one) > sigma(site)) & (sigma(one) < strong))
 
 
 def test_a_planned_beacon_shares_its_frequency_with_none() -> None:
@@ -248,9 +248,9 @@ def test_a_planned_beacon_shares_its_frequency_with_none() -> None:
     np.testing.assert_array_equal(tones_of(planned).of_channel, [0, 1, 2])
     # What it tells is what it would tell at another frequency, which hardly weakens it.
     tuned = replace(first, frequency_hz=first.frequency_hz + 1e-6)
-    apart = sigma(replace(site, beacons=(*site.beacons, tuned)))
-    assert np.allclose(sigma(planned), apart, rtol=1e-6, atol=0)
-    assert np.any(sigma(both) > 1.5 * apart)
+    separate = sigma(replace(site, beacons=(*site.beacons, tuned)))
+    assert np.allclose(sigma(planned), separate, rtol=1e-6, atol=0)
+    assert np.any(sigma(both) > 1.5 * separate)
 
 
 def test_one_more_beacon_helps_most_where_it_is_put() -> None:
@@ -259,13 +259,13 @@ def test_one_more_beacon_helps_most_where_it_is_put() -> None:
     def bound(extended: Site, points: Array):
         return coverage(extended, points, WINDOW, survey=False)
 
-    found = best_extra_beacon(site, DEMO_BOX_WORLD, bound, POINTS)
-    assert found.after < found.before
-    assert found.before == bound(site, POINTS).position_quantile(0.5)
+    result = best_extra_beacon(site, DEMO_BOX_WORLD, bound, POINTS)
+    assert result.after < result.before
+    assert result.before == bound(site, POINTS).position_quantile(0.5)
     for place in boundary_places(DEMO_BOX_WORLD):
         other = replace(site.beacons[0], name="other", position_world=place, planned=True)
         extended = replace(site, beacons=(*site.beacons, other))
-        assert found.after <= bound(extended, POINTS).position_quantile(0.5)
+        assert result.after <= bound(extended, POINTS).position_quantile(0.5)
 
 
 def test_the_volume_spans_its_box() -> None:

@@ -45,7 +45,7 @@ def _mean_sigma_by_colour(
 ) -> list[tuple[float, tuple[int, ...]]]:
     """Return mean sigma and colour of the recording's points, by growing sigma."""
     where = np.stack([table[f"position_{axis}"] for axis in "xyz"], axis=1)
-    found = []
+    result = []
     for chunk in RrdReader(place / "run.rrd").stream().to_chunks():
         batch = chunk.to_record_batch()
         drawn = chunk.entity_path.startswith("/world/position_sigma/")
@@ -56,8 +56,8 @@ def _mean_sigma_by_colour(
             sigma = [table["position_sigma"][row] for row in rows]
             if sigma and np.all(np.isfinite(sigma)):
                 colour = tuple(packed >> shift & 255 for shift in (24, 16, 8))
-                found.append((float(np.mean(sigma)), colour))
-    return sorted(found)
+                result.append((float(np.mean(sigma)), colour))
+    return sorted(result)
 
 
 def test_a_volume_that_is_nowhere_determined_is_reported_as_such(
@@ -74,7 +74,7 @@ def test_a_volume_that_is_nowhere_determined_is_reported_as_such(
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "reported"),
     [
         (("--spacing", "0"), "--spacing"),
         (("--spacing", "nan"), "--spacing"),
@@ -87,10 +87,10 @@ def test_a_volume_that_is_nowhere_determined_is_reported_as_such(
     ],
 )
 def test_an_option_that_cannot_be_is_refused(
-    options: tuple[str, ...], told: str, worked: Worked, tmp_path: Path, refuse: Refuse
+    options: tuple[str, ...], reported: str, worked: Worked, tmp_path: Path, refuse: Refuse
 ) -> None:
     site = worked.log / "site.yaml"
-    assert told in refuse("coverage", site, "-o", tmp_path / "plan", *options)
+    assert reported in refuse("coverage", site, "-o", tmp_path / "plan", *options)
 
 
 def test_a_site_that_is_not_there_is_refused_by_name(tmp_path: Path, refuse: Refuse) -> None:

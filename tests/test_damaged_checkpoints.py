@@ -122,9 +122,9 @@ def leaves(data: Any) -> list[tuple[Any, Any]]:
 def spoiled(whole: bytes, rng: np.random.Generator, scratch: Path) -> bytes:
     """Return one whose digest is right and whose content is of another type or shape."""
     scratch.write_bytes(whole)
-    found = read_checkpoint(scratch)
-    assert found is not None
-    places = leaves(found.content["navigator"])
+    result = read_checkpoint(scratch)
+    assert result is not None
+    places = leaves(result.content["navigator"])
     holder, key = places[rng.integers(len(places))]
     value = holder[key]
     if isinstance(value, np.ndarray) and rng.random() < 0.5:
@@ -132,7 +132,7 @@ def spoiled(whole: bytes, rng: np.random.Generator, scratch: Path) -> bytes:
     else:
         wrong: list[Any] = [{"a": 1}, {"__reduce__": "os.system"}, np.zeros((2, 0, 7), bool)]
         holder[key] = wrong[rng.integers(len(wrong))]
-    write_checkpoint(found, scratch)
+    write_checkpoint(result, scratch)
     return scratch.read_bytes()
 
 
@@ -164,20 +164,20 @@ def damaged(whole: bytes, k: int, tmp_path: Path) -> bytes:
     return ways[k % len(ways)]()
 
 
-def refused(left: Interrupted, file: Path, content: bytes, tmp_path: Path) -> str:
+def refused(residual: Interrupted, file: Path, content: bytes, tmp_path: Path) -> str:
     """Go on with a damaged file; return the refusal, having seen that nothing came of it."""
     former = file.read_bytes()
     file.write_bytes(content)
     before = _listing(tmp_path)
     try:
-        with pytest.raises(InputError) as told:
-            left.go_on()
+        with pytest.raises(InputError) as reported:
+            residual.go_on()
         assert _listing(tmp_path) == before
         assert file.read_bytes() == content
     finally:
         file.write_bytes(former)
     assert not (tmp_path / "sentinel").exists()
-    sentence = str(told.value)
+    sentence = str(reported.value)
     assert "\n" not in sentence
     assert str(file) in sentence or "not as its checkpoint says" in sentence
     assert len(sentence) < 400 + len(str(file))
@@ -203,10 +203,10 @@ def stream(tmp_path: Path) -> Interrupted:
 def test_damaged_checkpoints_of_a_pipe_are_refused(stream: Interrupted, tmp_path: Path) -> None:
     whole = stream.place.read_bytes()
     stream.go_on()
-    told = [
+    reported = [
         refused(stream, stream.place, damaged(whole, k, tmp_path), tmp_path) for k in range(400)
     ]
-    assert all("--resume" in sentence or "another path" in sentence for sentence in told)
+    assert all("--resume" in sentence or "another path" in sentence for sentence in reported)
     stream.go_on()
 
 
@@ -243,9 +243,9 @@ def test_damaged_state_of_a_log_is_refused(log: Interrupted, tmp_path: Path) -> 
     for k in range(40):
         refused(log, place, damaged(whole, k, tmp_path), tmp_path)
     whole = rows.read_bytes()
-    made = read_checkpoint(place)
-    assert made is not None
-    size = made.content["beside"]["rows"]["size"]
+    built = read_checkpoint(place)
+    assert built is not None
+    size = built.content["beside"]["rows"]["size"]
     for k in range(30):
         rng = np.random.default_rng(k)
         content = (
@@ -257,15 +257,15 @@ def test_damaged_state_of_a_log_is_refused(log: Interrupted, tmp_path: Path) -> 
 def test_damaged_state_of_a_world_is_refused(tmp_path: Path) -> None:
     task = WorldTask(0, "ekf", 0.1, 1, place=str(tmp_path / "unfinished"))
     run_world(task)
-    left = Interrupted(task.progress, lambda: run_world(task))
+    remaining = Interrupted(task.progress, lambda: run_world(task))
     whole = task.progress.read_bytes()
     for k in range(24):
-        refused(left, task.progress, damaged(whole, k, tmp_path), tmp_path)
+        refused(remaining, task.progress, damaged(whole, k, tmp_path), tmp_path)
     for name in ("errors.rows", "pace.rows"):
         rows = task.progress.with_name(name)
         whole = rows.read_bytes()
         for k in range(3):
-            refused(left, rows, flipped(whole, np.random.default_rng(k)), tmp_path)
+            refused(remaining, rows, flipped(whole, np.random.default_rng(k)), tmp_path)
 
 
 @pytest.mark.parametrize("option", [["--resume"], []])
@@ -281,8 +281,10 @@ def test_a_file_that_is_not_ours_is_kept(
     else:
         hostile_one = pickle.dumps(Hostile(tmp_path / "sentinel"))
         place.write_bytes(hostile_one if kind == "pickle" else b"the only copy of my thesis")
-    told = refuse("navigate", worked.log, "-o", tmp_path / "run", "--checkpoint", place, *option)
-    assert str(place) in told
+    reported = refuse(
+        "navigate", worked.log, "-o", tmp_path / "run", "--checkpoint", place, *option
+    )
+    assert str(place) in reported
 
 
 @dataclass(frozen=True)

@@ -18,15 +18,21 @@ from magfusion.model.prior import parameters_of
 from magfusion.model.site import Site
 from magfusion.model.trust import Risk
 from magfusion.results.coverage import coverage, volume
-from magfusion.results.design.exchange import Candidates, Objective, Search, best_layout, value_of
+from magfusion.results.design.exchange import (
+    Candidates,
+    LayoutSearch,
+    Objective,
+    best_layout,
+    value_of,
+)
 from magfusion.results.design.layout_information import LayoutInformation
 from magfusion.results.design.pattern import (
-    Band,
+    ToneBand,
     axes_offered,
     frequencies_for,
     pattern_axis,
+    rotated_to,
     tuned,
-    turned,
 )
 from magfusion.results.design.planning import Task, candidates_of, designed
 from magfusion.results.design.tuning import assigned, divided
@@ -36,7 +42,7 @@ from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 WINDOW = 0.4  # s
 POINTS = volume(DEMO_BOX_WORLD, 1.3)
 ROOM = np.array([[0.0, 0.0, 0.0], [6.0, 5.0, 2.5]])
-BAND = Band(10.0, 100.0, WINDOW, 50.0)
+BAND = ToneBand(10.0, 100.0, WINDOW, 50.0)
 L_SHAPE = np.array([[0, 0], [6, 0], [6, 2], [3, 2], [3, 5], [0, 5]], dtype=float)
 
 
@@ -83,14 +89,14 @@ def site_in_the_sea() -> Site:
 )
 def test_design_and_coverage_agree_on_a_layout_to_rounding(site: Site, kept: int) -> None:
     """One marginalises beacon by beacon and adds up, the other everything at once."""
-    found = coverage(site, POINTS, WINDOW, risk=Risk())
+    result = coverage(site, POINTS, WINDOW, risk=Risk())
     info, new = information(site, kept), site.beacons[kept:]
-    assert np.all(np.isfinite(found.protection_level_m))
+    assert np.all(np.isfinite(result.protection_level_m))
     worst, each = value_of(info, new, "worst")
-    assert np.allclose(each, found.protection_level_m, rtol=1e-10, atol=0)
+    assert np.allclose(each, result.protection_level_m, rtol=1e-10, atol=0)
     assert worst == np.max(each)
     _, trace = value_of(info, new, "A")
-    assert np.allclose(np.sqrt(trace), found.position_sigma, rtol=1e-11, atol=0)
+    assert np.allclose(np.sqrt(trace), result.position_sigma, rtol=1e-11, atol=0)
 
 
 @pytest.mark.parametrize("objective", ["worst", "A", "D"])
@@ -101,24 +107,26 @@ def test_the_exchange_finds_the_best_of_all_pairs(objective: Objective) -> None:
     allowed = [
         pair
         for pair in itertools.combinations(range(len(candidates.beacons)), 2)
-        if candidates.beside(pair[:1])[pair[1]]
+        if candidates.far_from(pair[:1])[pair[1]]
     ]
     assert len(allowed) > 60
     every = [
         value_of(info, [candidates.beacons[c] for c in pair], objective)[0] for pair in allowed
     ]
-    search = Search(info, candidates, objective)
-    found = best_layout(search, 2, 4, np.random.default_rng(1))
-    assert found is not None
-    assert found.value == pytest.approx(min(every), rel=1e-3)
-    assert found.value < np.median(every)
+    search = LayoutSearch(info, candidates, objective)
+    result = best_layout(search, 2, 4, np.random.default_rng(1))
+    assert result is not None
+    assert result.value == pytest.approx(min(every), rel=1e-3)
+    assert result.value < np.median(every)
 
 
 def test_a_search_without_time_still_gives_a_layout() -> None:
     what = task()
-    found = designed(what, starts=3, layouts=0, rng=np.random.default_rng(1), in_time=lambda: False)
-    assert not found.complete
-    assert len(found.new) == 2
+    result = designed(
+        what, starts=3, layouts=0, rng=np.random.default_rng(1), in_time=lambda: False
+    )
+    assert not result.complete
+    assert len(result.new) == 2
 
 
 def test_an_earlier_design_is_where_the_search_goes_on() -> None:
@@ -131,19 +139,21 @@ def test_an_earlier_design_is_where_the_search_goes_on() -> None:
 
 def test_what_is_asked_of_a_layout_is_kept() -> None:
     site = demo_site(coil_radius=None)
-    what = task(3, 7, site=replace(site, beacons=site.beacons[1:2]), apart=2.5, clearance=1.3)
-    found = designed(what, starts=1, layouts=4, rng=np.random.default_rng(2))
-    assert found.site.beacons[0] is site.beacons[1]
-    for layout in (found.site, found.median_random):
+    what = task(
+        3, 7, site=replace(site, beacons=site.beacons[1:2]), min_distance=2.5, clearance=1.3
+    )
+    result = designed(what, starts=1, layouts=4, rng=np.random.default_rng(2))
+    assert result.site.beacons[0] is site.beacons[1]
+    for layout in (result.site, result.median_random):
         assert layout is not None
         places = np.array([b.position_world for b in layout.beacons])
         assert all(np.linalg.norm(a - b) >= 2.5 for a, b in itertools.combinations(places, 2))
         assert all(np.min(np.linalg.norm(POINTS - p, axis=1)) >= 1.3 for p in places[1:])
         tones = np.concatenate([b.tone_frequencies_hz for b in layout.beacons])
-        apart = np.abs(tones[:, None] - tones) + 1e3 * np.eye(len(tones))
-        assert np.min(apart) >= BAND.spacing - 1e-9
+        separate = np.abs(tones[:, None] - tones) + 1e3 * np.eye(len(tones))
+        assert np.min(separate) >= BAND.spacing - 1e-9
         assert np.min(np.abs(tones - 50.0)) >= BAND.spacing - 1e-9
-    assert len({b.name for b in found.site.beacons}) == 4
+    assert len({b.name for b in result.site.beacons}) == 4
 
 
 def test_a_budget_divided_is_spent_and_serves_better() -> None:
@@ -193,7 +203,7 @@ def test_a_beacon_is_turned_to_its_axis(index: int) -> None:
     else:
         assert np.allclose(beacon.moments_beacon @ axis, 0.0, rtol=0, atol=1e-9)
     for wanted in axes_offered(beacon, 13):
-        new = turned(beacon, wanted)
+        new = rotated_to(beacon, wanted)
         assert abs(wanted @ new.world_from_beacon @ axis) == pytest.approx(1.0, abs=1e-12)
         assert np.linalg.norm(new.world_from_beacon @ new.world_from_beacon.T - np.eye(3)) < 1e-12
 
@@ -220,7 +230,7 @@ hall: {polygon_m: [[0, 0], [6, 0], [6, 5], [0, 5]], height_m: [0, 3]}
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         (HALL + "walls: [1]", "walls: is not a known key"),
         (HALL + "mount: {walls: [4]}", r"mount.walls\[0\]: found 4; the hall has walls 0 to 3"),
@@ -232,17 +242,17 @@ hall: {polygon_m: [[0, 0], [6, 0], [6, 5], [0, 5]], height_m: [0, 3]}
         (HALL.replace("hall: 1", "hall: 2"), "magfusion_hall: .*write 1"),
     ],
 )
-def test_a_hall_that_cannot_be_is_refused(text: str, told: str, tmp_path: Path) -> None:
+def test_a_hall_that_cannot_be_is_refused(text: str, reported: str, tmp_path: Path) -> None:
     path = tmp_path / "hall.yaml"
     path.write_text(text)
-    with pytest.raises(InputError, match=told) as refused:
+    with pytest.raises(InputError, match=reported) as refused:
         load_hall(path)
     assert str(path) in str(refused.value)
 
 
 def test_beacons_that_find_no_room_are_refused() -> None:
     with pytest.raises(InputError, match="--apart 9 m"):
-        designed(task(apart=9.0), starts=1, layouts=0, rng=np.random.default_rng(1))
+        designed(task(min_distance=9.0), starts=1, layouts=0, rng=np.random.default_rng(1))
     with pytest.raises(InputError, match="mounting places remain"):
         candidates_of(task(clearance=9.0), task().template)
     assert isinstance(candidates_of(task(), task().template), Candidates)

@@ -6,13 +6,13 @@ from design_hall import Config, report, run
 
 @pytest.mark.slow
 def test_a_design_beats_the_median_of_random_layouts_and_the_best_of_them() -> None:
-    found = run(Config(spacing=2.0, grid=2.0, starts=3, searches=1))
-    assert found.gain_over_median > 0.3
-    assert found.gain_over_best > 0.05
+    result = run(Config(spacing=2.0, grid=2.0, starts=3, searches=1))
+    assert result.gain_over_median > 0.3
+    assert result.gain_over_best > 0.05
     # At points it was not designed for, too.
-    assert found.fine_designed < 0.7 * found.fine_random_median
-    low, middle, high = found.fix_over_predicted
+    assert result.fine_designed < 0.7 * result.fine_random_median
+    low, middle, high = result.fix_over_predicted
     assert 0.9 < low < middle < high < 1.1
     assert 0.98 < middle < 1.02
-    assert found.worst_sigma[2] < found.worst_sigma[0]  # for accuracy alone A is better
-    assert "below the median" in report(found)
+    assert result.worst_sigma[2] < result.worst_sigma[0]  # for accuracy alone A is better
+    assert "below the median" in report(result)

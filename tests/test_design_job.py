@@ -27,16 +27,16 @@ def test_the_command_writes_a_site_that_has_what_the_report_says(
     run_command("design", site, "-o", place, *QUICK, *keep, "--continue", place / "site.yaml")
     assert {path.name for path in place.iterdir()} == FILES
     report = json.loads((place / "report.json").read_text())
-    made = load_site(place / "site.yaml")
-    assert [b.name for b in made.beacons] == ["A", "B1", "B2"]
-    for beacon in made.beacons[1:]:
+    built = load_site(place / "site.yaml")
+    assert [b.name for b in built.beacons] == ["A", "B1", "B2"]
+    for beacon in built.beacons[1:]:
         where = [report[f"{beacon.name}.position_{axis}_m"] for axis in "xyz"]
         assert np.allclose(where, beacon.position_world, rtol=0, atol=1e-12)
     table = pyarrow.parquet.read_table(place / "coverage.parquet").to_pydict()
     points = np.stack([table[f"position_{axis}"] for axis in "xyz"], axis=1)
-    found = coverage(made, points, report["window_s"], risk=Risk())
-    assert found.protection_level_m is not None
-    assert report["protection_level_m_worst"] == pytest.approx(np.max(found.protection_level_m))
+    result = coverage(built, points, report["window_s"], risk=Risk())
+    assert result.protection_level_m is not None
+    assert report["protection_level_m_worst"] == pytest.approx(np.max(result.protection_level_m))
     assert report["random_layouts"] == 5
     assert report["protection_level_m_worst"] < report["random_worst_level_m_median"]
     assert report["search_complete"]
@@ -67,12 +67,14 @@ def test_a_site_that_is_known_exactly_has_nothing_to_calibrate(
     for part in (*site["beacons"], site["platform"]["magnetometer"]):
         del part["sigma"]
     (tmp_path / "exact.yaml").write_text(yaml.safe_dump(site))
-    told = refuse("design", tmp_path / "exact.yaml", "-o", tmp_path / "m", "--motion", 2, *QUICK)
-    assert "all sigmas are zero" in told
+    reported = refuse(
+        "design", tmp_path / "exact.yaml", "-o", tmp_path / "m", "--motion", 2, *QUICK
+    )
+    assert "all sigmas are zero" in reported
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "reported"),
     [
         (("--keep", "A,Z"), "no beacon 'Z'"),
         (("--template", "Z"), "--template Z"),
@@ -87,9 +89,9 @@ def test_a_site_that_is_known_exactly_has_nothing_to_calibrate(
     ],
 )
 def test_an_option_that_cannot_be_is_refused(
-    options: tuple[object, ...], told: str, worked: Worked, tmp_path: Path, refuse: Refuse
+    options: tuple[object, ...], reported: str, worked: Worked, tmp_path: Path, refuse: Refuse
 ) -> None:
     quick = () if "--hall" in options else QUICK
-    assert told in refuse(
+    assert reported in refuse(
         "design", worked.log / "site.yaml", "-o", tmp_path / "d", *quick, *options
     )

@@ -53,9 +53,9 @@ def test_a_stop_at_a_known_pose_tells_what_its_phasors_do() -> None:
     noise = site.platform.magnetometer.noise_density / np.sqrt(STOP)  # T
     sigma = np.concatenate([b.sigma for b in blocks])
     expected = (by[0].reshape(-1, len(sigma)) * sigma) / noise
-    found = poses.root[0]
+    result = poses.root[0]
     assert ATTITUDES_DEG[poses.attitude[0]] == (0.0, 0.0, 0.0)
-    assert np.allclose(found.T @ found, expected.T @ expected, rtol=1e-9, atol=1e-6)
+    assert np.allclose(result.T @ result, expected.T @ expected, rtol=1e-9, atol=1e-6)
 
 
 def test_an_open_pose_tells_less_than_a_known_one_and_nothing_of_the_lever_arm() -> None:
@@ -71,7 +71,7 @@ def test_an_open_pose_tells_less_than_a_known_one_and_nothing_of_the_lever_arm()
     assert np.all(whole[False][lever.columns] > 0.99)
     assert np.all(whole[True][lever.columns] < 0.5)
     assert not np.any(
-        next_motion(site, PLACES, 1, STOP, known=False).parameters.asked[lever.columns]
+        next_motion(site, PLACES, 1, STOP, known=False).parameters.requested[lever.columns]
     )
 
 
@@ -79,19 +79,19 @@ def test_an_open_pose_tells_less_than_a_known_one_and_nothing_of_the_lever_arm()
 def test_each_stop_is_the_best_of_all_for_what_is_worst(known: bool) -> None:
     site = loose()
     blocks = choose_blocks(site, SURVEY_GROUPS)
-    found = next_motion(site, PLACES, 3, STOP, known=known)
+    result = next_motion(site, PLACES, 3, STOP, known=known)
     poses = candidate_poses(site, blocks, PLACES, STOP, known=known)
     information = prior_information(site, blocks)
-    for stop in found.stops:
+    for stop in result.stops:
         now = ratio(information)
         assert stop.before == pytest.approx(now[stop.worst], rel=1e-9)
-        assert stop.worst == found.parameters.worst(now)
+        assert stop.worst == result.parameters.worst(now)
         after = [ratio(information + root.T @ root)[stop.worst] for root in poses.root]
         assert stop.after == pytest.approx(min(after), rel=1e-9)
         assert stop.after < stop.before
         best = poses.root[int(np.argmin(after))]
         information = information + best.T @ best
-    assert np.allclose(found.ratio, ratio(information), rtol=1e-9, atol=0)
+    assert np.allclose(result.ratio, ratio(information), rtol=1e-9, atol=0)
 
 
 def test_where_everything_is_known_there_is_no_stop() -> None:
@@ -109,9 +109,9 @@ def test_where_everything_is_known_there_is_no_stop() -> None:
 
 def test_no_stop_is_where_the_fields_err_as_at_another_while_there_is_room() -> None:
     site = replace(loose(), model_error=0.005, model_error_length=0.5)
-    found = next_motion(site, PLACES, 6, STOP, known=False)
-    places = np.array([stop.position_world for stop in found.stops])
-    apart = np.linalg.norm(places[:, None] - places, axis=2) + 10.0 * np.eye(len(places))
-    assert np.min(apart) > site.model_error_length
+    result = next_motion(site, PLACES, 6, STOP, known=False)
+    places = np.array([stop.position_world for stop in result.stops])
+    separate = np.linalg.norm(places[:, None] - places, axis=2) + 10.0 * np.eye(len(places))
+    assert np.min(separate) > site.model_error_length
     few = next_motion(site, PLACES[:2], 5, STOP, known=False)
     assert len(few.stops) == 5

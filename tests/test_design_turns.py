@@ -11,7 +11,7 @@ from magfusion.files.site import load_site, save_site
 from magfusion.model.site import Beacon, MarkedSlots, Slots
 from magfusion.model.trust import Risk
 from magfusion.results.coverage import coverage, phasor_variance, volume
-from magfusion.results.design.pattern import Band
+from magfusion.results.design.pattern import ToneBand
 from magfusion.results.design.planning import Task, designed
 from magfusion.results.design.turns import all_in_turn, cycle_of, in_turn
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -48,21 +48,21 @@ def test_what_the_search_minimises_is_what_coverage_says_of_the_site() -> None:
         count=3,
         places=places,
         points=POINTS,
-        band=Band(10.0, 100.0, WINDOW, 50.0),
+        band=ToneBand(10.0, 100.0, WINDOW, 50.0),
         risk=Risk(),
         axes=3,
     )
-    found = designed(task, starts=1, layouts=6, rng=np.random.default_rng(0))
-    level = coverage(found.site, POINTS, WINDOW, risk=Risk()).protection_level_m
+    result = designed(task, starts=1, layouts=6, rng=np.random.default_rng(0))
+    level = coverage(result.site, POINTS, WINDOW, risk=Risk()).protection_level_m
     assert level is not None
-    assert found.median_random is not None
-    median = coverage(found.median_random, POINTS, WINDOW, risk=Risk()).protection_level_m
+    assert result.median_random is not None
+    median = coverage(result.median_random, POINTS, WINDOW, risk=Risk()).protection_level_m
     assert median is not None
     assert np.max(level) < np.max(median)
-    assert np.max(median) == pytest.approx(np.sort(found.random_worst_m)[2], rel=1e-6)
+    assert np.max(median) == pytest.approx(np.sort(result.random_worst_m)[2], rel=1e-6)
     # Of a cycle of seven slots each coil has one.
     density = site.platform.magnetometer.noise_density
-    np.testing.assert_allclose(phasor_variance(found.site, WINDOW), 7.0 * density**2 / WINDOW)
+    np.testing.assert_allclose(phasor_variance(result.site, WINDOW), 7.0 * density**2 / WINDOW)
 
 
 def test_slots_go_through_the_job_and_what_cannot_be_is_refused(
@@ -73,9 +73,9 @@ def test_slots_go_through_the_job_and_what_cannot_be_is_refused(
     here = (tmp_path / "site.yaml", "--beacons", 2, "--box", "0,6,0,5,0,3", "--spacing", 2.5)
     few = ("--starts", 1, "--axes", 3, "--apart", 0.5)
     run_command("design", *here, *few, "-o", tmp_path / "design")
-    found = load_site(tmp_path / "design" / "site.yaml")
-    assert sorted(c.slot or 0 for b in found.beacons for c in b.coils) == [1, 2, 3, 4]
-    said = refuse("design", *here, "--window", 0.05, "-o", tmp_path / "x")
-    assert "give --window 0.1 or more" in said
-    said = refuse("design", *here, "--keep", "all", "-o", tmp_path / "x")
-    assert "can only be designed as a whole" in said
+    result = load_site(tmp_path / "design" / "site.yaml")
+    assert sorted(c.slot or 0 for b in result.beacons for c in b.coils) == [1, 2, 3, 4]
+    findings = refuse("design", *here, "--window", 0.05, "-o", tmp_path / "x")
+    assert "give --window 0.1 or more" in findings
+    findings = refuse("design", *here, "--keep", "all", "-o", tmp_path / "x")
+    assert "can only be designed as a whole" in findings

@@ -9,7 +9,7 @@ import pytest
 from mistake_case import Case, good_case, simulated
 from mistake_list import MISTAKES
 
-from magfusion.estimation.data_checks.recording import recorded
+from magfusion.estimation.data_checks.data_quality import recorded
 from magfusion.estimation.demodulation.demodulation import demodulated
 from magfusion.estimation.integrity.diagnosis import diagnosed, seen_in_streams, with_cause
 from magfusion.estimation.integrity.explanation import Explanation, clearly_best
@@ -97,9 +97,9 @@ def test_every_mistake_names_itself(name: str) -> None:
 
 def _names_itself(name: str, code: str) -> None:
     case = MISTAKES[name].change(_short())
-    found = cause_of(case.log, case.site)
-    assert found is not None
-    explanation, text = found
+    result = cause_of(case.log, case.site)
+    assert result is not None
+    explanation, text = result
     assert explanation.code == code
     assert code in CODES
     assert "chi square" in text
@@ -125,10 +125,10 @@ def test_nothing_is_tried_of_what_is_trustworthy_or_explains_itself() -> None:
     frozen = Finding("frozen_imu", "The IMU stands still.")
     assert diagnosed(case.log, case.site, Trust((frozen,))) is None
     doubt = Trust((Finding("not_converged", "It did not converge."),))
-    found = diagnosed(case.log, case.site, doubt)
-    assert found is not None
-    assert found.verdict is Verdict.DOUBTFUL
-    assert (doubt | Trust((found,))).ordered[0].code == "gyro_sign"
+    result = diagnosed(case.log, case.site, doubt)
+    assert result is not None
+    assert result.verdict is Verdict.DOUBTFUL
+    assert (doubt | Trust((result,))).ordered[0].code == "gyro_sign"
 
 
 def test_of_two_causes_that_explain_alike_none_is_named() -> None:
@@ -177,8 +177,8 @@ def test_errors_of_a_rough_survey_are_no_contradiction_of_the_inertial_sensor() 
     assert known.explained(np.eye(3), np.eye(3))[0] < known.freedom
     assert taken_for_sure.explained(np.eye(3), np.eye(3))[0] > 2.0 * known.freedom
     # Its stamps are late by what is declared to be possible.
-    told = timing_causes(every, case.log.imu, site, 1e6, known.freedom)
-    assert "time_offset" not in {one.code for one in told}
+    reported = timing_causes(every, case.log.imu, site, 1e6, known.freedom)
+    assert "time_offset" not in {one.code for one in reported}
 
 
 @pytest.mark.parametrize("name", ["lever_20cm", "survey_overconfident"])
@@ -187,9 +187,9 @@ def test_a_mistake_names_itself_in_a_rough_survey(name: str) -> None:
         box_world=DEMO_BOX_WORLD, duration=SECONDS, motion="turn", time_offset=0.004
     )
     case = MISTAKES[name].change(simulated(good_case("rough", 3).site, config, seed=3))
-    found = cause_of(case.log, case.site)
-    assert found is not None
-    assert found[0].code in MISTAKES[name].codes
+    result = cause_of(case.log, case.site)
+    assert result is not None
+    assert result[0].code in MISTAKES[name].codes
 
 
 @pytest.mark.slow
@@ -198,22 +198,22 @@ def test_most_mistakes_in_motion_are_named_rightly_and_few_wrongly(
 ) -> None:
     monkeypatch.setattr(mistake_case, "DURATION", 30.0)
     good_case.cache_clear()
-    right, wrong, asked = 0, [], 0
+    right, wrong, requested = 0, [], 0
     for name, mistake in list(MISTAKES.items())[::2]:  # each takes seconds
         if not mistake.codes or name not in NAMED:
             continue
         case = mistake.change(good_case("rough", 3))
         if seen_in_streams(Trust(recorded(case.log, case.site))):
             continue
-        found = cause_of(case.log, case.site)
-        asked += 1
-        if found is None:
+        result = cause_of(case.log, case.site)
+        requested += 1
+        if result is None:
             continue
-        if found[0].code in mistake.codes:
+        if result[0].code in mistake.codes:
             right += 1
         else:
-            wrong.append((name, found[0].code))
+            wrong.append((name, result[0].code))
     good_case.cache_clear()
-    assert right >= 0.6 * asked
+    assert right >= 0.6 * requested
     # Next of kin: coil and phase, units and scale, lever arm and place.
-    assert len(wrong) <= 0.2 * asked, wrong
+    assert len(wrong) <= 0.2 * requested, wrong

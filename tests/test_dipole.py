@@ -27,10 +27,10 @@ def offsets_and_moments(seed=1, count=300):
     return directions[0] * distance, directions[1] * size
 
 
-def relative(found, expected):
+def relative(result, expected):
     """Return the largest error of a row in units of the size of that row."""
-    error = np.linalg.norm((found - expected).reshape(len(found), -1), axis=1)
-    return np.max(error / np.linalg.norm(np.reshape(expected, (len(found), -1)), axis=1))
+    error = np.linalg.norm((result - expected).reshape(len(result), -1), axis=1)
+    return np.max(error / np.linalg.norm(np.reshape(expected, (len(result), -1)), axis=1))
 
 
 def test_on_the_axis_the_field_is_twice_the_moment_over_the_cube_and_along_it():
@@ -38,21 +38,21 @@ def test_on_the_axis_the_field_is_twice_the_moment_over_the_cube_and_along_it():
     distance = np.linalg.norm(offset, axis=1, keepdims=True)
     along = moment / np.linalg.norm(moment, axis=1, keepdims=True)
     for side in (1.0, -1.0):
-        found = dipole_field(side * distance * along, moment)
-        assert relative(found, 2.0 * MU0_OVER_4PI * moment / distance**3) < EXACT
+        result = dipole_field(side * distance * along, moment)
+        assert relative(result, 2.0 * MU0_OVER_4PI * moment / distance**3) < EXACT
 
 
 def test_on_the_equator_the_field_is_the_moment_over_the_cube_and_against_it():
     offset, moment = offsets_and_moments()
     across = np.cross(offset, moment)
     distance = np.linalg.norm(across, axis=1, keepdims=True)
-    found = dipole_field(across, moment)
-    assert relative(found, -MU0_OVER_4PI * moment / distance**3) < EXACT
+    result = dipole_field(across, moment)
+    assert relative(result, -MU0_OVER_4PI * moment / distance**3) < EXACT
 
 
 def test_one_ampere_square_metre_makes_200_nanotesla_a_metre_up_its_axis():
-    found = dipole_field(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0]))
-    np.testing.assert_allclose(found, [0.0, 0.0, 2e-7], rtol=1e-15)
+    result = dipole_field(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(result, [0.0, 0.0, 2e-7], rtol=1e-15)
 
 
 def test_the_field_is_the_same_on_opposite_sides():

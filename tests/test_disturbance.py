@@ -32,7 +32,7 @@ from magfusion.simulation.disturbance import (
 )
 from magfusion.simulation.field import synchronised_drives
 from magfusion.simulation.log import SimulationConfig, simulate_fields, simulate_log
-from magfusion.simulation.motion import Motion, static_motion
+from magfusion.simulation.motion import SimulatedMotion, static_motion
 from magfusion.simulation.waveform import simulate_waveform
 from magfusion.units import NANOTESLA, Array
 
@@ -70,8 +70,8 @@ def test_a_poor_conductor_is_the_sum_of_rings_and_opposes_the_change() -> None:
         return (np.pi * distance**2) ** 2 * conductivity * height / (TWO_PI * distance)
 
     expected = -1j * omega * quad(ring, 0.0, radius)[0]
-    found = sphere_polarizability(radius, 1.0, conductivity, omega)
-    assert found == pytest.approx(expected, rel=3e-3)  # the rings induce in each other
+    result = sphere_polarizability(radius, 1.0, conductivity, omega)
+    assert result == pytest.approx(expected, rel=3e-3)  # the rings induce in each other
     assert expected.imag == pytest.approx(-omega * TWO_PI / 15.0 * conductivity * radius**5)
 
 
@@ -96,8 +96,8 @@ def test_the_moment_is_that_of_the_diffusion_equation_solved_step_by_step(
     # Outside it is B r / 2 + D / r^2; A is continuous, and so is (r A)' / (mu r).
     ratio = (potential + radius * by_r) / potential / permeability
     dipole = radius**3 * (1.0 - ratio / 2.0) / (1.0 + ratio)
-    found = sphere_polarizability(radius, permeability, conductivity, TWO_PI * frequency_hz)
-    assert found == pytest.approx(VOLUME * dipole, rel=1e-7)
+    result = sphere_polarizability(radius, permeability, conductivity, TWO_PI * frequency_hz)
+    assert result == pytest.approx(VOLUME * dipole, rel=1e-7)
 
 
 def test_the_moment_is_that_of_scipys_bessel_functions_at_any_skin_depth() -> None:
@@ -106,8 +106,8 @@ def test_the_moment_is_that_of_scipys_bessel_functions_at_any_skin_depth() -> No
     x = size * np.sqrt(-1j)
     q = x * spherical_jn(0, x) / spherical_jn(1, x) - 1.0
     conductivity = size**2 / (MU0 * 7.0)
-    found = sphere_polarizability(1.0, 7.0, conductivity, 1.0)
-    np.testing.assert_allclose(found, VOLUME * (14.0 - q) / (2.0 * (7.0 + q)), rtol=1e-9)
+    result = sphere_polarizability(1.0, 7.0, conductivity, 1.0)
+    np.testing.assert_allclose(result, VOLUME * (14.0 - q) / (2.0 * (7.0 + q)), rtol=1e-9)
     finite = sphere_polarizability(1.0, np.array([1.0, 1e4]), 1e8, 1e12)
     assert np.isfinite(finite).all()
 
@@ -133,10 +133,10 @@ def test_the_static_moment_satisfies_the_boundary_with_magpylibs_sphere() -> Non
     strength = applied / MU0 + sphere.getH(inside)
     np.testing.assert_allclose(flux, permeability * MU0 * strength, rtol=1e-7)
     outside = np.array([[0.3, 0.2, -0.1], [-0.1, 0.16, 0.4]])
-    found = induced_field(
+    result = induced_field(
         outside, np.zeros((1, 3)), np.array([[moment[0] / applied[0]]]), applied[None, None]
     )
-    np.testing.assert_allclose(found[:, 0].real, sphere.getB(outside), rtol=1e-9)
+    np.testing.assert_allclose(result[:, 0].real, sphere.getB(outside), rtol=1e-9)
 
 
 def test_what_one_coil_induces_at_another_is_what_that_induces_at_the_first() -> None:
@@ -164,7 +164,7 @@ def plain_site() -> Site:
     return replace(site, platform=replace(site.platform, magnetometer=magnetometer))
 
 
-def still() -> Motion:
+def still() -> SimulatedMotion:
     return static_motion(np.array([3.0, 2.5, 1.0]), Rotation.from_rotvec((0.1, -0.2, 0.7)))
 
 
@@ -176,11 +176,13 @@ def some_spheres() -> Spheres:
 def test_the_waveform_has_what_the_phasors_say_of_steel() -> None:
     site, spheres = plain_site(), some_spheres()
     pose = still().trajectory(np.array([0.5]))
-    free, with_iron = (
+    free_parameters, with_iron = (
         simulate_fields(site, pose, 0.0, np.random.default_rng(1), spheres=s).phasor_sensor[0]
         for s in (None, spheres)
     )
-    change = np.linalg.norm(with_iron - free, axis=-1) / np.linalg.norm(free, axis=-1)
+    change = np.linalg.norm(with_iron - free_parameters, axis=-1) / np.linalg.norm(
+        free_parameters, axis=-1
+    )
     assert np.all((change > 1e-3) & (change < 0.1))
     wave = simulate_waveform(
         still(),
@@ -201,11 +203,11 @@ def test_a_sphere_without_iron_or_conduction_is_not_there() -> None:
     site, spheres = plain_site(), some_spheres()
     air = replace(spheres, permeability=np.ones(8), conductivity=np.zeros(8))
     pose = still().trajectory(np.zeros(1))
-    free, with_air = (
+    free_parameters, with_air = (
         simulate_fields(site, pose, 0.0, np.random.default_rng(1), spheres=s).phasor_sensor
         for s in (None, air)
     )
-    np.testing.assert_array_equal(free, with_air)
+    np.testing.assert_array_equal(free_parameters, with_air)
 
 
 def test_drawn_spheres_keep_clear_of_the_way_the_beacons_and_each_other() -> None:
@@ -237,19 +239,19 @@ def test_a_way_through_iron_is_refused() -> None:
 
 def test_iron_leaves_motion_and_instruments_as_they_were() -> None:
     config = SimulationConfig(DEMO_BOX_WORLD, duration=3.0)
-    free, with_iron, again = (
+    free_parameters, with_iron, again = (
         simulate_log(demo_site(), replace(config, iron=iron), np.random.default_rng(1))
         for iron in (0, 5, 5)
     )
-    assert free.ambient is None
+    assert free_parameters.ambient is None
     assert with_iron.ambient is not None
     assert with_iron.ambient.spheres is not None
     assert len(with_iron.ambient.spheres) == 5
-    assert free.log.waveform is not None
+    assert free_parameters.log.waveform is not None
     assert with_iron.log.waveform is not None
     assert again.log.waveform is not None
-    np.testing.assert_array_equal(free.log.imu.gyro_body, with_iron.log.imu.gyro_body)
-    change = with_iron.log.waveform.measured_sensor - free.log.waveform.measured_sensor
+    np.testing.assert_array_equal(free_parameters.log.imu.gyro_body, with_iron.log.imu.gyro_body)
+    change = with_iron.log.waveform.measured_sensor - free_parameters.log.waveform.measured_sensor
     assert 1.0 < np.std(change) / NANOTESLA < 1e3
     np.testing.assert_array_equal(
         with_iron.log.waveform.measured_sensor, again.log.waveform.measured_sensor
@@ -266,13 +268,13 @@ def test_simulate_draws_iron_and_counts_it(
         written = json.loads((tmp_path / name / "report.json").read_text())
         assert written["iron_spheres"] == figures["iron_spheres"]
     waves = [read_log(tmp_path / name).waveform for name in ("free", "iron", "again")]
-    free, with_iron, again = (w.measured_sensor for w in waves if w is not None)
-    assert np.std(with_iron - free) > NANOTESLA
+    free_parameters, with_iron, again = (w.measured_sensor for w in waves if w is not None)
+    assert np.std(with_iron - free_parameters) > NANOTESLA
     np.testing.assert_array_equal(with_iron, again)
 
 
 @pytest.mark.parametrize(
-    ("iron", "told"),
+    ("iron", "reported"),
     [
         ("-1", "--iron must lie between 0 and 200"),
         ("2.5", "--iron.*integer"),
@@ -282,10 +284,10 @@ def test_simulate_draws_iron_and_counts_it(
     ],
 )
 def test_iron_that_cannot_be_is_refused(
-    iron: str, told: str, tmp_path: Path, refuse: Refuse
+    iron: str, reported: str, tmp_path: Path, refuse: Refuse
 ) -> None:
     sentence = refuse("simulate", "-o", tmp_path / "out", "--duration", 2, "--iron", iron)
-    assert re.search(told, sentence), sentence
+    assert re.search(reported, sentence), sentence
 
 
 def test_more_iron_than_there_is_room_for_is_refused() -> None:
@@ -335,7 +337,7 @@ def background(ambient: Ambient, time: Array, seed: int = 1) -> Array:
 
 
 def test_noise_is_loud_by_day_and_quiet_at_night() -> None:
-    room = Ambient(day_night=DayNight(1e-10, 4e-10, loudest_time=0.25 * DAY))
+    room = Ambient(day_night=DayNight(1e-10, 4e-10, noisiest_time=0.25 * DAY))
     time = np.arange(0.0, DAY, 1.0)
     value = background(room, time)  # at 2 Hz, so that a sample's variance is the squared density
     for hour, density in ((6, 4e-10), (18, 1e-10), (0, 2.5e-10), (12, 2.5e-10)):
@@ -380,23 +382,23 @@ def test_a_bent_field_is_off_by_its_share_and_alike_nearby() -> None:
             kept.append(bending.bent_world(1, phasor, place) - phasor)
     size = np.linalg.norm(np.array(error[0])) / np.linalg.norm(phasor) / np.sqrt(6.0)
     assert size == pytest.approx(0.04, rel=0.1)
-    alike = np.vdot(error[0], error[1]).real / np.vdot(error[0], error[0]).real
-    assert alike == pytest.approx(np.exp(-0.5), abs=0.05)  # a correlation length apart
+    shared = np.vdot(error[0], error[1]).real / np.vdot(error[0], error[0]).real
+    assert shared == pytest.approx(np.exp(-0.5), abs=0.05)  # a correlation length apart
     other = draw_bending(np.random.default_rng(0), 0.04, 0.5, 2).bent_world(0, phasor, start)
     between = np.vdot(error[0][0], other - phasor) / np.linalg.norm(error[0][0]) ** 2
     assert abs(between) < 0.2
 
 
 def test_simulate_disturbs_what_it_is_asked_to_and_nothing_else(tmp_path: Path) -> None:
-    asked = {
+    requested = {
         "free": [],
         "noisy": ["--ambient", "day-night"],
         "drifting": ["--drift", "1e-7"],
         "bent": ["--random-field", "0.1"],
     }
-    for name, options in asked.items():
+    for name, options in requested.items():
         run_command("simulate", "-o", tmp_path / name, "--duration", 4, "--no-perturb", *options)
-    logs = {name: read_log(tmp_path / name) for name in asked}
+    logs = {name: read_log(tmp_path / name) for name in requested}
     waves = {name: log.waveform.measured_sensor for name, log in logs.items() if log.waveform}
     for log in logs.values():
         np.testing.assert_array_equal(log.imu.gyro_body, logs["free"].imu.gyro_body)
@@ -406,7 +408,7 @@ def test_simulate_disturbs_what_it_is_asked_to_and_nothing_else(tmp_path: Path) 
         spectrum > 0.1 * spectrum.max()
     ]
     assert np.all((tones > 15.0) & (tones < 50.0))
-    loud = np.diff(waves["noisy"] - waves["free"], axis=0)
-    assert np.std(loud) / np.sqrt(2.0) > 2e-10 * np.sqrt(200.0)
+    strong = np.diff(waves["noisy"] - waves["free"], axis=0)
+    assert np.std(strong) / np.sqrt(2.0) > 2e-10 * np.sqrt(200.0)
     slow = np.linalg.norm(np.mean(waves["drifting"] - waves["free"], axis=0))
     assert 1e-9 < slow < 5e-7

@@ -63,8 +63,10 @@ def test_a_line_through_a_walk_is_no_drift():
 
     assert outside(80, walk, 0.999) <= 0.03
     blocks = np.stack([np.mean(walk().reshape(12, 15), axis=1) for _ in range(60)], axis=1)
-    line, left, *_ = np.polyfit(np.arange(12.0), blocks, 1, full=True)
-    standard_error = np.sqrt(left / 10.0 / 143.0)  # the sum of the squared distances of 12 blocks
+    line, remaining, *_ = np.polyfit(np.arange(12.0), blocks, 1, full=True)
+    standard_error = np.sqrt(
+        remaining / 10.0 / 143.0
+    )  # the sum of the squared distances of 12 blocks
     assert np.mean(np.abs(line[0]) > 2.23 * standard_error) > 0.4
 
 
@@ -77,12 +79,12 @@ def test_a_line_through_errors_that_forget_soon_is_found_at_once():
 
 def test_the_interval_of_eight_worlds_holds_the_slope_as_often_as_it_says():
     rng = np.random.default_rng(5)
-    held = []
+    fixed = []
     for _ in range(400):
         values = [0.3 * MINUTES / DAY + correlated(rng, 4.0 * 3600.0) for _ in range(8)]
         slope = slope_over_worlds([MINUTES] * 8, values)
-        held.append(abs(slope.per_day - 0.3) < slope.margin)
-    assert abs(np.mean(held) - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / 400)
+        fixed.append(abs(slope.per_day - 0.3) < slope.margin)
+    assert abs(np.mean(fixed) - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / 400)
 
 
 @pytest.mark.parametrize(
@@ -107,13 +109,13 @@ def test_chance_alone_goes_beyond_three_standard_errors_as_rarely_as_it_says():
     rng = np.random.default_rng(9)
     correlations = np.array([[1.0, 0.0, 0.0], [0.9, 0.3, 0.0], [0.0, 0.5, 2.0]])
     draws = 3000
-    found = [
+    result = [
         common_slope([HOURS] * 8, list(rng.standard_normal((8, 48, 3)) @ correlations)).probability
         for _ in range(draws)
     ]
     for level in (0.05, THREE_SIGMA):
         spread = np.sqrt(level * (1.0 - level) / draws)
-        assert abs(np.mean(np.array(found) < level) - level) < 3.5 * spread
+        assert abs(np.mean(np.array(result) < level) - level) < 3.5 * spread
 
 
 def test_what_goes_one_way_is_found_although_no_error_becomes_longer():

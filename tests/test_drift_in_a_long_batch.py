@@ -77,12 +77,12 @@ def test_each_segment_follows_the_drift(smoothed: tuple[Site, Log, Smoothed]) ->
     assert count == int(np.ceil(3600.0 * HOURS / SEGMENT))
     assert all(block.parameter == LOG_MOMENT for block in result.blocks)
     centre = (np.arange(count) + 0.5) * 3600.0 * HOURS / count
-    found = np.array(
+    estimate = np.array(
         [difference(result.declared, c, result.blocks) for c in result.estimate.segments]
     )
     sigma = np.sqrt(np.diag(result.calibration_cov))
     assert np.all(sigma < 0.1 * DRIFT)
-    np.testing.assert_allclose(found, np.tile(drift_at(centre)[:, None], 2), atol=0.1 * DRIFT)
+    np.testing.assert_allclose(estimate, np.tile(drift_at(centre)[:, None], 2), atol=0.1 * DRIFT)
     main = result.estimate.segments[result.graph.segments.main]
     assert np.all(difference(result.calibration, main, result.blocks) == 0.0)
 
@@ -96,8 +96,8 @@ def test_the_drift_does_not_move_the_platform(
     rigid = smooth(log, site)
     assert len(rigid.graph.segments) == 1
 
-    def worst(found: Smoothed) -> float:
-        error = found.states.position_world - POSITION_WORLD
+    def worst(result: Smoothed) -> float:
+        error = result.states.position_world - POSITION_WORLD
         ends = np.r_[: len(error) // 8, -(len(error) // 8) : 0]
         return float(np.linalg.norm(np.mean(np.abs(error[ends]), axis=0)))
 

@@ -12,7 +12,13 @@ from magfusion.errors import InputError
 from magfusion.files.checkpoint import Checkpoint, write_checkpoint
 from magfusion.jobs import drift, drift_world
 from magfusion.jobs.drift import DriftSettings, overall, run_drift, summarise
-from magfusion.jobs.drift_figures import drift_of, judged, nees_limits, settled, verdict_of_one
+from magfusion.jobs.drift_figures import (
+    after_settling,
+    drift_of,
+    judge_runs,
+    nees_limits,
+    verdict_of_one,
+)
 from magfusion.jobs.drift_world import WorldRun, WorldTask, run_world
 from magfusion.results.drift import QUANTITIES, ErrorSeries
 
@@ -66,7 +72,7 @@ def a_run(
 
 
 def verdicts(**changes):
-    _, findings = judged("ekf", [a_run(world, **changes) for world in range(8)])
+    _, findings = judge_runs("ekf", [a_run(world, **changes) for world in range(8)])
     return {f.name.removeprefix("ekf_"): f.verdict for f in findings}
 
 
@@ -95,18 +101,18 @@ def test_each_fault_fails_its_own_verdict(changes, failing):
 @pytest.mark.parametrize(("slope_deg", "verdict"), [(3.0, "fail"), (0.1, "undecided")])
 def test_one_world_alone_drifts_only_by_more_than_it_claims(slope_deg, verdict):
     """Biases walk: a line through one walk is no drift."""
-    _, findings = judged("ekf", [a_run(0, slope=np.deg2rad(slope_deg))])
-    found = {f.name: f.verdict for f in findings}
-    assert found["ekf_attitude_drift"] == verdict
+    _, findings = judge_runs("ekf", [a_run(0, slope=np.deg2rad(slope_deg))])
+    result = {f.name: f.verdict for f in findings}
+    assert result["ekf_attitude_drift"] == verdict
 
 
 @pytest.mark.parametrize(("worlds", "verdict"), [(1, "pass"), (4, "fail")])
 def test_sigmas_too_large_need_several_worlds_to_be_told_from_luck(worlds, verdict):
     """One survey may happen to err little; not all of them."""
-    _, findings = judged("ekf", [a_run(world, sigma_error=0.5) for world in range(worlds)])
-    found = next(f for f in findings if f.name == "ekf_pose_consistency")
-    assert found.verdict == verdict
-    assert ("too large" in found.sentence) == (verdict == "fail")
+    _, findings = judge_runs("ekf", [a_run(world, sigma_error=0.5) for world in range(worlds)])
+    result = next(f for f in findings if f.name == "ekf_pose_consistency")
+    assert result.verdict == verdict
+    assert ("too large" in result.sentence) == (verdict == "fail")
 
 
 def test_the_limits_of_the_nees_follow_from_the_number_of_worlds():
@@ -123,7 +129,7 @@ def test_the_machine_growing_slower_is_not_the_estimator_growing_slower():
     run = a_run(0, slower=2.0)
     slowed = np.array(run.pace)
     slowed[:, 5] *= 1.0 + 2.0 * PIECES / PIECES[-1]
-    _, findings = judged("ekf", [replace(run, pace=slowed)])
+    _, findings = judge_runs("ekf", [replace(run, pace=slowed)])
     assert {f.name: f.verdict for f in findings}["ekf_latency"] == "pass"
 
 
@@ -131,11 +137,11 @@ def test_the_figures_tell_the_slope():
     runs = [a_run(world, slope=np.deg2rad(3.0)) for world in range(8)]
     slope = drift_of(QUANTITIES[1], runs)
     assert abs(slope.per_day - 3.0) < 5.0 * slope.standard_error + 0.1
-    figures, findings = judged("ekf", runs)
+    figures, findings = judge_runs("ekf", runs)
     assert figures["ekf_attitude_slope_deg_per_day"] == slope.per_day
-    told = next(f.sentence for f in findings if f.name == "ekf_attitude_drift")
-    assert "drifts" in told
-    assert "limit 0.05" in told
+    reported = next(f.sentence for f in findings if f.name == "ekf_attitude_drift")
+    assert "drifts" in reported
+    assert "limit 0.05" in reported
 
 
 def test_the_worst_verdict_is_the_whole():
@@ -272,7 +278,7 @@ def test_what_is_no_checkpoint_is_refused_and_kept(tmp_path):
 
 
 def test_progress_is_told_while_the_runs_write(tmp_path, monkeypatch):
-    told = []
+    reported = []
     monkeypatch.setattr(drift, "LOOK", 0.01)
 
     def run_many(_task, tasks, **_others):
@@ -285,9 +291,9 @@ def test_progress_is_told_while_the_runs_write(tmp_path, monkeypatch):
     monkeypatch.setattr("magfusion.jobs.drift.run_many", run_many)
     settings = DriftSettings(hours=1.0, worlds=2)
     with pytest.raises(KeyboardInterrupt):
-        run_drift(settings, tmp_path / "drift", lambda *given: told.append(given))
-    assert {given[2] for given in told} == {4 * 6}
-    assert {1, 2} <= {given[1] for given in told}
+        run_drift(settings, tmp_path / "drift", lambda *given: reported.append(given))
+    assert {given[2] for given in reported} == {4 * 6}
+    assert {1, 2} <= {given[1] for given in reported}
     assert (tmp_path / "drift" / "unfinished" / "world_0_ekf" / "progress.bin").is_file()
 
 
@@ -306,9 +312,9 @@ def test_settings_that_cannot_be_are_refused(changes, tmp_path):
 def test_hours_leave_memory_as_it_was(estimator):
     """The time of an update is judged by the job, whose machine is not busy with other tests."""
     run = run_world(WorldTask(0, estimator, 2.0, 1))
-    figures, findings = judged(estimator, [run])
-    told = {f.name.removeprefix(f"{estimator}_"): f.verdict for f in findings}
-    assert told["memory"] == told["lost"] == "pass"
+    figures, findings = judge_runs(estimator, [run])
+    reported = {f.name.removeprefix(f"{estimator}_"): f.verdict for f in findings}
+    assert reported["memory"] == reported["lost"] == "pass"
     assert figures[f"{estimator}_memory_growth_mib"] < 5.0
 
 
@@ -347,5 +353,5 @@ def test_a_bias_that_walks_as_declared_does_not_drift():
         )
         own = replace(run, task=replace(run.task, hours=4.0), errors=series)
         slopes, bias = drift_of(QUANTITIES[3], [own]), QUANTITIES[3]
-        failed += verdict_of_one(bias, slopes, settled(own)) == "fail"
+        failed += verdict_of_one(bias, slopes, after_settling(own)) == "fail"
     assert failed <= 2

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from magfusion.simulation.disturbance import DAY
 from magfusion.simulation.drift import (
     COPPER_PER_KELVIN,
-    Clock,
     DailySwing,
     Drift,
+    DriveClock,
     Wander,
     WarmUp,
     draw_drift,
@@ -50,10 +50,10 @@ def test_the_day_repeats_and_is_warmest_when_said() -> None:
 def test_wander_is_stationary_with_an_exponential_correlation() -> None:
     time = np.array([0.0, 10.0, 700.0, 3600.0, 4000.0, 50_000.0])  # s, uneven
     path = Wander(0.003, 3600.0).draw(time, PATHS, _rng())
-    found = path @ path.T / PATHS
+    result = path @ path.T / PATHS
     expected = 0.003**2 * np.exp(-np.abs(time[:, None] - time) / 3600.0)
     # Of the mean of 4000 products of two Gaussians: at most sqrt(2 / 4000) = 2.2 %.
-    np.testing.assert_allclose(found, expected, rtol=0, atol=4 * 0.0224 * 0.003**2)
+    np.testing.assert_allclose(result, expected, rtol=0, atol=4 * 0.0224 * 0.003**2)
 
 
 def test_wander_is_the_same_process_at_any_spacing() -> None:
@@ -65,8 +65,10 @@ def test_wander_is_the_same_process_at_any_spacing() -> None:
 
 
 def test_a_fast_clock_leads_in_proportion_and_a_walking_one_by_the_root_of_time() -> None:
-    np.testing.assert_allclose(Clock(rate=1e-8).lead(MINUTES, _rng()), 1e-8 * MINUTES, rtol=1e-12)
-    rng, walking = _rng(), Clock(walk=1e-9)
+    np.testing.assert_allclose(
+        DriveClock(rate=1e-8).lead(MINUTES, _rng()), 1e-8 * MINUTES, rtol=1e-12
+    )
+    rng, walking = _rng(), DriveClock(walk=1e-9)
     leads = np.array([walking.lead(MINUTES, rng) for _ in range(PATHS)])
     spread = np.sqrt(np.mean(leads**2, axis=0))
     np.testing.assert_allclose(spread, 1e-9 * np.sqrt(MINUTES), rtol=0.06)  # 5 sigma of 1.1 %
@@ -76,7 +78,7 @@ def test_a_fast_clock_leads_in_proportion_and_a_walking_one_by_the_root_of_time(
 
 def test_a_clock_refuses_times_before_the_epoch() -> None:
     with pytest.raises(ValueError, match="epoch"):
-        Clock().lead(np.array([-1.0, 2.0]), _rng())
+        DriveClock().lead(np.array([-1.0, 2.0]), _rng())
 
 
 def test_the_phase_of_a_fast_clock_is_that_of_the_simulated_waveform() -> None:
@@ -86,7 +88,7 @@ def test_the_phase_of_a_fast_clock_is_that_of_the_simulated_waveform() -> None:
     place, drives = np.array([2.0, 1.0, 0.5]), Drives(np.zeros(3), np.full(3, rate))
     motion = static_motion(place, Rotation.identity())
     wave = simulate_waveform(motion, quiet, drives, 200.0, 20.0, _rng())
-    phase = draw_drift(Drift(clock=Clock(rate=rate)), wave.time, 3, _rng()).phase(TONES_HZ)
+    phase = draw_drift(Drift(clock=DriveClock(rate=rate)), wave.time, 3, _rng()).phase(TONES_HZ)
     carrier = np.exp(1j * (2.0 * np.pi * TONES_HZ * wave.time[:, None] + phase))
     fields = np.concatenate([phasors_world(b, place[None])[0] for b in site.beacons])
     earth = 0.0 if site.earth_field_world is None else site.earth_field_world
@@ -119,8 +121,8 @@ def test_what_is_not_named_does_not_drift() -> None:
 
 def test_draws_repeat_and_a_clock_leaves_the_gains_alone() -> None:
     gain = Wander(0.003, 14_400.0)
-    one = draw_drift(Drift(gain=gain, clock=Clock(1e-8, 1e-9)), MINUTES, 3, _rng())
-    again = draw_drift(Drift(gain=gain, clock=Clock(1e-8, 1e-9)), MINUTES, 3, _rng())
+    one = draw_drift(Drift(gain=gain, clock=DriveClock(1e-8, 1e-9)), MINUTES, 3, _rng())
+    again = draw_drift(Drift(gain=gain, clock=DriveClock(1e-8, 1e-9)), MINUTES, 3, _rng())
     without = draw_drift(Drift(gain=gain), MINUTES, 3, _rng())
     np.testing.assert_array_equal(one.log_gain, again.log_gain)
     np.testing.assert_array_equal(one.lead, again.lead)

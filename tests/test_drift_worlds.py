@@ -21,9 +21,9 @@ def test_poses_and_biases_of_fresh_worlds_are_consistent_in_either_half(
     command += ["--estimator", estimator, "--seed", "101", "-o", str(tmp_path / "drift")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    found = json.loads((tmp_path / "drift" / "report.json").read_text())
+    result = json.loads((tmp_path / "drift" / "report.json").read_text())
     low, high = nees_limits(worlds)
     for part in ("pose", "bias"):
-        assert found[f"{estimator}_{part}_consistency_verdict"] == "pass"
+        assert result[f"{estimator}_{part}_consistency_verdict"] == "pass"
         for half in ("first", "last"):
-            assert low < found[f"{estimator}_{part}_nees_{half}_half"] < high
+            assert low < result[f"{estimator}_{part}_nees_{half}_half"] < high

@@ -37,7 +37,7 @@ def wandering() -> Log:
 
 def test_a_share_is_a_factor_of_the_phasor() -> None:
     shares = DriveShares()
-    shares.hear("B", 0, np.array([1.0, 3.0]), np.array([0.9, 0.7]) * np.exp([0.2j, 0.6j]))
+    shares.add_readings("B", 0, np.array([1.0, 3.0]), np.array([0.9, 0.7]) * np.exp([0.2j, 0.6j]))
     site = demo_site()
     pose = np.array([2.0]), np.eye(3)[None], np.array([[3.0, 2.0, 1.0]])
     steady, driven = (
@@ -55,10 +55,10 @@ def test_a_share_is_a_factor_of_the_phasor() -> None:
 def test_angles_have_no_jumps_and_go_on_for_one_interval() -> None:
     shares, time = DriveShares(), np.arange(6.0)
     for part in (slice(0, 3), slice(3, 6)):
-        shares.hear("A", 0, time[part], np.exp(2.5j * time[part]))
-    found = shares.at("A", 0, np.array([4.5, 6.0, 9.0]))
-    assert found is not None
-    np.testing.assert_allclose(found[1], 2.5 * np.array([4.5, 6.0, 6.0]), rtol=1e-12)
+        shares.add_readings("A", 0, time[part], np.exp(2.5j * time[part]))
+    result = shares.at("A", 0, np.array([4.5, 6.0, 9.0]))
+    assert result is not None
+    np.testing.assert_allclose(result[1], 2.5 * np.array([4.5, 6.0, 6.0]), rtol=1e-12)
 
 
 def test_windows_do_not_depend_on_the_pieces(wandering: Log) -> None:
@@ -77,12 +77,12 @@ def test_phasors_are_those_of_steady_currents(wandering: Log) -> None:
     steady = wandering_log(Config(DURATION), steady=True)
     log, site = with_drives(wandering, SITE)
     fields = phasors(log, site)[0]
-    found, expected = referred(fields, site), phasors(steady, SITE)[0]
+    result, expected = referred(fields, site), phasors(steady, SITE)[0]
     sigma = np.sqrt(np.einsum("nkii->nk", expected.phasor_cov))
-    for left, worst in ((fields, 20.0), (found, 3.0)):
-        error = np.linalg.norm(left.phasor_sensor - expected.phasor_sensor, axis=2) / sigma
-        assert (np.median(error) < worst) == (left is found)
-        assert np.median(error) < 3.0 or left is fields
+    for remaining, worst in ((fields, 20.0), (result, 3.0)):
+        error = np.linalg.norm(remaining.phasor_sensor - expected.phasor_sensor, axis=2) / sigma
+        assert (np.median(error) < worst) == (remaining is result)
+        assert np.median(error) < 3.0 or remaining is fields
 
 
 def test_pulses_of_direct_current_have_a_share() -> None:
@@ -97,9 +97,9 @@ def test_pulses_of_direct_current_have_a_share() -> None:
     receiver = DriveReceiver(site, DriveShares())
     receiver.push(DriveSamples(time, {"": current}))
     for tone, share in enumerate((0.8, -1.1)):
-        found = receiver.shares.at(pulsed.name, tone, np.array([2.0]))
-        assert found is not None
-        assert np.exp(found[0] + 1j * found[1])[0] == pytest.approx(share, rel=1e-9)
+        result = receiver.shares.at(pulsed.name, tone, np.array([2.0]))
+        assert result is not None
+        assert np.exp(result[0] + 1j * result[1])[0] == pytest.approx(share, rel=1e-9)
 
 
 def test_log_and_site_keep_currents(wandering: Log, tmp_path: Path) -> None:
@@ -127,9 +127,9 @@ def test_a_column_in_milliamperes_is_said(wandering: Log) -> None:
     assert wandering.drive is not None
     wrong = {name: 1e3 * values for name, values in wandering.drive.current.items()}
     log, _ = with_drives(replace(wandering, drive=replace(wandering.drive, current=wrong)), SITE)
-    found = [f for f in log.noticed if f.code == "drive_current"]
-    assert len(found) == 4
-    assert "times that of its declared moments" in found[0].text
+    result = [f for f in log.noticed if f.code == "drive_current"]
+    assert len(result) == 4
+    assert "times that of its declared moments" in result[0].text
     log, _ = with_drives(wandering, SITE)
     assert not [f for f in log.noticed if f.code == "drive_current"]
 
@@ -138,10 +138,12 @@ def test_a_column_in_milliamperes_is_said(wandering: Log) -> None:
 def test_the_pipe_hears_the_currents(wandering: Log, tmp_path: Path) -> None:
     save_site(SITE, tmp_path / "site.yaml")
     write_log(wandering, tmp_path / "log")
-    given, told, sink = io.BytesIO(), io.StringIO(), io.BytesIO()
+    given, reported, sink = io.BytesIO(), io.StringIO(), io.BytesIO()
     run_replay(read_log(tmp_path / "log"), given, "json", realtime=False)
     given.seek(0)
-    run_stream(tmp_path / "site.yaml", StreamSettings(NavigatorSettings("ekf")), given, sink, told)
+    run_stream(
+        tmp_path / "site.yaml", StreamSettings(NavigatorSettings("ekf")), given, sink, reported
+    )
     last = json.loads(sink.getvalue().splitlines()[-1])
     truth = wandering.truth
     assert truth is not None
@@ -157,9 +159,9 @@ def test_online_a_column_in_milliamperes_is_said_as_offline(wandering: Log) -> N
     currents = replace(wandering.drive, current=wrong).rows(slice(0, 1000))
     navigator, offline = Navigator(SITE), replace(wandering, drive=currents)
     navigator.add_drive(currents)
-    said = [finding.text for finding in navigator.of_currents]
-    assert len(said) == 4
-    assert said == [f.text for f in with_drives(offline, SITE)[0].noticed]
+    findings = [finding.text for finding in navigator.of_currents]
+    assert len(findings) == 4
+    assert findings == [f.text for f in with_drives(offline, SITE)[0].noticed]
 
 
 def test_a_run_goes_on_with_its_currents(wandering: Log) -> None:
@@ -170,6 +172,6 @@ def test_a_run_goes_on_with_its_currents(wandering: Log) -> None:
     for navigator in (first, second):
         navigator.add_drive(wandering.drive.rows(slice(1000, 2000)))
     time = np.linspace(0.5, 4.5, 9)
-    found, expected = (driven(navigator.site, time) for navigator in (second, first))
+    result, expected = (driven(navigator.site, time) for navigator in (second, first))
     assert expected is not None
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(result, expected)

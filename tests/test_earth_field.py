@@ -51,15 +51,15 @@ def a_sensor(rng):
     )
 
 
-def turned(rotation, step):
+def rotated(rotation, step):
     return rotation @ Rotation.from_rotvec(step).as_matrix()
 
 
 MOVES = {
-    "platform_rotation": lambda s, r, e, d: (s, turned(r, d), e),
+    "platform_rotation": lambda s, r, e, d: (s, rotated(r, d), e),
     "matrix": lambda s, r, e, d: (replace(s, matrix=s.matrix + d.reshape(3, 3)), r, e),
     "sensor_rotation": lambda s, r, e, d: (
-        replace(s, body_from_sensor=turned(s.body_from_sensor, d)),
+        replace(s, body_from_sensor=rotated(s.body_from_sensor, d)),
         r,
         e,
     ),
@@ -82,9 +82,9 @@ def test_every_block_of_the_earth_field_is_its_derivative(block):
             observe_earth(*MOVES[block](sensor, rotation, earth, sign * step)).measured_sensor
             for sign in (1.0, -1.0)
         )
-        found = (ahead - behind) / (2e-6 * scale)
+        result = (ahead - behind) / (2e-6 * scale)
         np.testing.assert_allclose(
-            found, jacobian[..., k], rtol=0, atol=1e-8 * np.max(np.abs(jacobian))
+            result, jacobian[..., k], rtol=0, atol=1e-8 * np.max(np.abs(jacobian))
         )
 
 
@@ -109,8 +109,8 @@ def test_a_step_of_the_earth_field_is_found_again():
     declared = initial_calibration(site, 0.0)
     sigma = np.concatenate([b.sigma for b in blocks])
     step = 3.0 * sigma * np.random.default_rng(1).normal(size=len(sigma))
-    found = difference(declared, retract(declared, blocks, step), blocks)
-    np.testing.assert_allclose(found / sigma, step / sigma, rtol=0, atol=1e-9)
+    result = difference(declared, retract(declared, blocks, step), blocks)
+    np.testing.assert_allclose(result / sigma, step / sigma, rtol=0, atol=1e-9)
 
 
 def test_a_field_of_the_wrong_size_counts_less():
@@ -179,13 +179,13 @@ def turning(seed, duration, begin, end, gyro_noise=3e-3):
         motion="turn",
         rests=Rests(start=2.0, move=12.0, pause=2.0),
     )
-    heard_all, unheard = (
+    heard_all, undetected = (
         simulate_log(s, plan, np.random.default_rng(seed)) for s in (site, silent(site))
     )
-    np.testing.assert_array_equal(heard_all.log.imu.gyro_body, unheard.log.imu.gyro_body)
+    np.testing.assert_array_equal(heard_all.log.imu.gyro_body, undetected.log.imu.gyro_body)
     time = heard_all.log.waveform.time
     off = ((time >= begin) & (time < end))[:, None]
-    waveform = [s.log.waveform.measured_sensor for s in (unheard, heard_all)]
+    waveform = [s.log.waveform.measured_sensor for s in (undetected, heard_all)]
     log = replace(heard_all.log, waveform=Waveform(time, np.where(off, *waveform)))
     return site, heard_all, log
 
@@ -229,8 +229,8 @@ def test_the_steady_field_of_a_turning_window_is_that_of_its_centre(gap):
 def test_where_no_beacon_is_heard_the_smoother_goes_on_by_the_earth_field(gap):
     site, _, log = gap
     result = smooth(log, site, SmootherSettings(earth=True))
-    unheard = ~np.isfinite(result.residual).any(axis=(1, 2))
-    times = result.states.time[unheard]
+    undetected = ~np.isfinite(result.residual).any(axis=(1, 2))
+    times = result.states.time[undetected]
     assert 7.5 < times[0] < 8.2
     assert 17.8 < times[-1] < 18.6
     heading, total = attitude_errors(result.states, log.truth, 8.0, 18.0)
@@ -278,15 +278,15 @@ def navigated(log, site, *, earth, without=(np.inf, np.inf)):
 
 @pytest.mark.slow
 def test_a_minute_without_beacons_costs_less_heading_with_the_earth_field():
-    held, drifted = [], []
+    fixed, drifted = [], []
     for seed in (2, 3):
         site, simulated, log = turning(seed, 82.0, 15.0, 75.0, gyro_noise=6e-3)
         with_field, _ = navigated(log, site, earth=True)
         inertial, _ = navigated(simulated.log, site, earth=False, without=(15.0, 75.0))
-        held.append(attitude_errors(with_field, log.truth, 45.0, 75.0)[0])
+        fixed.append(attitude_errors(with_field, log.truth, 45.0, 75.0)[0])
         drifted.append(attitude_errors(inertial, log.truth, 45.0, 75.0)[0])
-    assert np.sqrt(np.mean(np.square(held))) < 1.2
-    assert np.sqrt(np.mean(np.square(held))) < 0.5 * np.sqrt(np.mean(np.square(drifted)))
+    assert np.sqrt(np.mean(np.square(fixed))) < 1.2
+    assert np.sqrt(np.mean(np.square(fixed))) < 0.5 * np.sqrt(np.mean(np.square(drifted)))
 
 
 @pytest.mark.slow
@@ -316,13 +316,13 @@ def test_the_filter_lets_a_disturbed_field_go_and_takes_it_up_again(seed):
 def test_a_disturbed_field_changes_nothing_where_beacons_hold_the_attitude():
     site, simulated, log = turning(3, 20.0, 30.0, 30.0)
     bent = disturbed(simulated, log, 6.0, 14.0)
-    found = [
+    result = [
         attitude_errors(
             smooth(one, site, SmootherSettings(earth=earth)).states, log.truth, 0.0, 20.0
         )[1]
         for one, earth in ((log, False), (bent, True))
     ]
-    assert found[1] < 1.2 * found[0]
+    assert result[1] < 1.2 * result[0]
 
 
 @pytest.mark.slow
@@ -343,9 +343,9 @@ def test_the_commands_refuse_phasors_with_the_earth_field(gap, tmp_path, capsys,
     write_log(replace(simulated.log, waveform=None, fields=phasors), tmp_path / "log")
     save_site(site, tmp_path / "site.yaml")
     given = [command, str(tmp_path / "log"), "--site", str(tmp_path / "site.yaml"), "--earth"]
-    with pytest.raises(SystemExit) as left:
+    with pytest.raises(SystemExit) as remaining:
         main([*given, "-o", str(tmp_path / "out")])
-    assert left.value.code == 2
+    assert remaining.value.code == 2
     assert "only phasors" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out").exists()
 

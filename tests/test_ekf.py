@@ -138,9 +138,9 @@ def test_one_update_of_the_filter_is_one_gauss_newton_step_of_the_graph(
     window = SlidingWindow(start, blocks, 10.0, still)
     window.absorb(predicted, measurements)
     sigma = np.sqrt(np.diag(light.state.cov))
-    apart = between(light.state, window.state, blocks) / sigma
+    separate = between(light.state, window.state, blocks) / sigma
     went = between(predicted.state, light.state, blocks) / sigma
-    assert np.max(np.abs(apart)) < 1e-9 * max(1.0, np.max(np.abs(went)))
+    assert np.max(np.abs(separate)) < 1e-9 * max(1.0, np.max(np.abs(went)))
     scaled = (window.state.cov - light.state.cov) / np.outer(sigma, sigma)
     assert np.max(np.abs(scaled)) < 1e-9
 
@@ -173,9 +173,9 @@ def test_the_rows_of_an_epoch_are_its_derivative(earth):
         ahead, behind = (
             measured_rows(epoch, moved(state, blocks, sign * step), blocks)[0] for sign in (1, -1)
         )
-        found = (ahead - behind) / (2.0 * scale[k])
+        result = (ahead - behind) / (2.0 * scale[k])
         size = np.max(np.abs(jacobian[:, k]))
-        assert np.max(np.abs(found - jacobian[:, k])) < 1e-5 * size
+        assert np.max(np.abs(result - jacobian[:, k])) < 1e-5 * size
 
 
 def test_the_calibration_gains_variance_only_where_things_drift():
@@ -208,9 +208,9 @@ def test_the_covariance_carried_on_is_that_of_many_runs():
             quiet.accel_body + spread[1] * rng.normal(size=quiet.accel_body.shape),
         )
         steps.append(between(mean, propagate(start, noisy, later, site, 0.0).state, blocks))
-    found = np.std(np.array(steps)[:, :9], axis=0)
+    result = np.std(np.array(steps)[:, :9], axis=0)
     # Means of neighbouring samples carry a little less noise at the interval's ends.
-    ratio = found / np.sqrt(np.diag(mean.cov)[:9])
+    ratio = result / np.sqrt(np.diag(mean.cov)[:9])
     assert np.all((ratio > 0.85) & (ratio < 1.15))
 
 
@@ -309,10 +309,10 @@ def test_an_update_is_that_of_a_graph_in_which_the_clocks_walk():
         for columns, sigma in zip(own, gained, strict=True):
             np.fill_diagonal(walked[columns, columns], sigma)
         # The phase does not jump as the frequency steps.
-        since = (
+        start_time = (
             2.0 * np.pi * beacon.tone_frequencies_hz * (later - start.calibration.reference_time)
         )
-        walked[own[0], own[1]] = -since * gained[1]
+        walked[own[0], own[1]] = -start_time * gained[1]
     mean, cov = as_a_graph(start, blocks, predicted, epoch, walked)
     sigma = np.sqrt(np.diag(cov))
     went = between(predicted.state, light.state, blocks)

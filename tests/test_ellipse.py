@@ -72,14 +72,14 @@ def test_the_axes_are_the_extremes_of_the_amplitude_over_a_period() -> None:
 @pytest.mark.parametrize("phase", [np.pi, 0.3, -2.0])
 def test_no_feature_sees_the_drive_phase(phase: float) -> None:
     phasor = any_phasors()
-    turned = phasor * np.exp(1j * phase)
+    rotated = phasor * np.exp(1j * phase)
     for feature, size in (
         (plane_normal, 1e16),
         (semi_axes, 1e8),
         (rms_amplitude, 1e8),
     ):
         np.testing.assert_allclose(
-            size * feature(turned), size * feature(phasor), rtol=1e-11, atol=1e-13
+            size * feature(rotated), size * feature(phasor), rtol=1e-11, atol=1e-13
         )
 
 

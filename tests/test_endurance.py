@@ -37,7 +37,7 @@ def stretches(world, count, blocks):
     return out
 
 
-def columns(made):
+def columns(simulation):
     """Return all samples of several stretches."""
     parts = [
         (
@@ -50,7 +50,7 @@ def columns(made):
             s.fields.phasor_sensor,
             s.fields.phasor_cov,
         )
-        for s in made
+        for s in simulation
     ]
     return [np.concatenate(column) for column in zip(*parts, strict=True)]
 
@@ -73,8 +73,8 @@ def test_the_seed_is_the_world():
 
 
 def test_fields_come_each_minute_at_rest_and_each_second_about_a_walk():
-    made = stretches(a_world(), 10, 70)
-    time = np.concatenate([s.fields.time for s in made])
+    built = stretches(a_world(), 10, 70)
+    time = np.concatenate([s.fields.time for s in built])
     walking = (time >= 40.0) & (time <= 220.0)
     assert np.sum(walking) == 181
     assert np.all(np.isin(np.arange(0.0, 70 * BLOCK, BLOCK), time))
@@ -94,8 +94,8 @@ def test_the_platform_rests_between_walks_and_stays_where_it_is():
 def test_the_noise_is_what_it_is_said_to_be():
     """Phasors of one rest, moments and clocks still: scatter against the declared sigma."""
     world = a_world(drift=Drift(), site=demo_site(synchronised=True))
-    made = stretches(world, 10, 60)
-    fields = [s.fields for s in made[1:]]
+    built = stretches(world, 10, 60)
+    fields = [s.fields for s in built[1:]]
     phasor = np.concatenate([f.phasor_sensor for f in fields])
     sigma = np.sqrt(np.concatenate([f.phasor_cov for f in fields])[:, 0, 0, 0])
     scaled = (phasor - phasor.mean(axis=0)) / sigma[:, None, None]
@@ -106,12 +106,12 @@ def test_the_noise_is_what_it_is_said_to_be():
 
 def test_rest_is_gravity_and_bias_and_white_noise():
     world = a_world()
-    made = stretches(world, 1, 8)[-1]
+    built = stretches(world, 1, 8)[-1]
     site = world.true_site
     imu = site.platform.imu
-    left = made.imu.gyro_body - made.gyro_bias_body
-    assert abs(np.std(left) / (imu.gyro_noise * 10.0) - 1.0) < 0.03
-    force = made.imu.accel_body - made.accel_bias_body
+    remaining = built.imu.gyro_body - built.gyro_bias_body
+    assert abs(np.std(remaining) / (imu.gyro_noise * 10.0) - 1.0) < 0.03
+    force = built.imu.accel_body - built.accel_bias_body
     size = np.linalg.norm(force.mean(axis=0))
     assert abs(size - site.gravity) < 6.0 * imu.accel_noise / np.sqrt(BLOCK)
 
@@ -122,8 +122,8 @@ def test_biases_walk_as_declared_across_the_blocks():
     steps = []
     for seed in range(30):
         world = draw_endurance(site, config, (seed,))
-        made = stretches(world, 5, 10)
-        first, last = made[0].gyro_bias_body[0], made[-1].gyro_bias_body[-1]
+        built = stretches(world, 5, 10)
+        first, last = built[0].gyro_bias_body[0], built[-1].gyro_bias_body[-1]
         steps.append(last - first)
     expected = site.platform.imu.gyro_bias_walk * np.sqrt(10 * BLOCK)
     ratio = np.std(steps) / expected
@@ -131,10 +131,10 @@ def test_biases_walk_as_declared_across_the_blocks():
 
 
 def test_biases_go_on_where_they_were():
-    made = columns(stretches(a_world(), 1, 6))
-    steps = np.abs(np.diff(made[3], axis=0))
+    built = columns(stretches(a_world(), 1, 6))
+    steps = np.abs(np.diff(built[3], axis=0))
     edges = np.arange(5999, len(steps), 6000)
-    assert steps[edges].max() < 6.0 * np.std(np.diff(made[3], axis=0))
+    assert steps[edges].max() < 6.0 * np.std(np.diff(built[3], axis=0))
 
 
 @pytest.mark.parametrize(
@@ -148,10 +148,10 @@ def test_heat_takes_from_the_moments_what_the_drive_lets_it(drive, loss):
 
 
 def test_free_clocks_part_each_at_its_own_rate_and_a_common_one_for_all():
-    free = a_world(hours=6.0)
-    rates = free.phase[-1] - free.phase[0]
+    free_parameters = a_world(hours=6.0)
+    rates = free_parameters.phase[-1] - free_parameters.phase[0]
     assert np.all(np.abs(rates) > 1.0)
-    tones = np.array([b.frequency_hz for b in free.site.beacons])
+    tones = np.array([b.frequency_hz for b in free_parameters.site.beacons])
     assert np.ptp(rates / tones) > 1e-3
     common = a_world(
         hours=6.0, site=demo_site(synchronised=True), drift=usual_drift("current", 1e-8)
@@ -165,9 +165,9 @@ def test_its_fields_lead_a_fix_to_the_truth():
     site = demo_site(synchronised=True)
     world = a_world(site=site)
     fields = stretches(world, 2, 2)[0].fields
-    found = fix_epochs(fields, initial_calibration(site, 0.0)).best()
+    result = fix_epochs(fields, initial_calibration(site, 0.0)).best()
     truth = world.motion.trajectory(fields.time)
-    off = np.linalg.norm(found.position_world - truth.position_world, axis=1)
+    off = np.linalg.norm(result.position_world - truth.position_world, axis=1)
     assert np.median(off) < 0.01
 
 
@@ -177,8 +177,8 @@ def test_two_days_are_made_fast():
     biases = world.start()
     began = time.process_time()
     for first in range(0, 120, 10):
-        made = world.stretch(first, 10, biases)
-        biases = made.after
+        built = world.stretch(first, 10, biases)
+        biases = built.after
     assert 24.0 * (time.process_time() - began) < 60.0
 
 

@@ -61,8 +61,8 @@ def test_aligned_position_errors_are_those_of_evo(seed: int) -> None:
     aligned.align(_evo(truth))
     errors = trajectory_errors(estimate, truth)
     expected = _ape(aligned, _evo(truth), PoseRelation.translation_part)
-    found = np.linalg.norm(errors.aligned_position_world, axis=1)
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    result = np.linalg.norm(errors.aligned_position_world, axis=1)
+    np.testing.assert_allclose(result, expected, rtol=1e-9)
     assert errors.aligned_ate < 0.5 * errors.ate
 
 
@@ -70,13 +70,13 @@ def test_aligned_position_errors_are_those_of_evo(seed: int) -> None:
 def test_relative_errors_are_those_of_evo(delta: int) -> None:
     estimate, truth = _pair(4)
     relative = trajectory_errors(estimate, truth, delta_frames=delta).relative
-    for relation, found in (
+    for relation, result in (
         (PoseRelation.translation_part, relative.translation),
         (PoseRelation.rotation_angle_rad, relative.rotation),
     ):
         metric = RPE(relation, delta=delta, delta_unit=Unit.frames)
         metric.process_data((_evo(truth), _evo(estimate)))
-        np.testing.assert_allclose(found, metric.error, rtol=1e-9)
+        np.testing.assert_allclose(result, metric.error, rtol=1e-9)
 
 
 def test_pairs_in_seconds_are_chained_and_no_shorter_than_asked() -> None:
@@ -86,14 +86,14 @@ def test_pairs_in_seconds_are_chained_and_no_shorter_than_asked() -> None:
     assert lengths.min() >= 0.5
     assert lengths.max() < 0.5 + 0.09  # s, one step
     assert np.array_equal(pairs[1:, 0], pairs[:-1, 1])
-    found = relative_errors(estimate.world_from_body, estimate.position_world, truth, pairs)
+    result = relative_errors(estimate.world_from_body, estimate.position_world, truth, pairs)
     metric = RPE(PoseRelation.translation_part, delta=1, delta_unit=Unit.frames)
     ids = np.append(pairs[:, 0], pairs[-1, 1])
     paths = _evo(truth), _evo(estimate)
     for path in paths:
         path.reduce_to_ids(ids)
     metric.process_data(paths)
-    np.testing.assert_allclose(found.translation, metric.error, rtol=1e-9)
+    np.testing.assert_allclose(result.translation, metric.error, rtol=1e-9)
 
 
 def test_a_constant_world_rotation_is_no_aligned_attitude_error() -> None:
@@ -172,10 +172,10 @@ def test_position_sigma_is_turned_from_body_to_world() -> None:
     estimate, truth = _pair(10)
     cov = np.tile(np.diag([1e-4, 4e-4, 9e-4, 0.01, 0.04, 0.09]), (POSES, 1, 1))
     quarter = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
-    turned = Trajectory(
+    rotated = Trajectory(
         estimate.time, np.tile(quarter, (POSES, 1, 1)), estimate.position_world, pose_cov=cov
     )
-    errors = trajectory_errors(turned, truth)
+    errors = trajectory_errors(rotated, truth)
     assert errors.position_sigma_world is not None
     assert errors.attitude_sigma_body is not None
     np.testing.assert_allclose(errors.position_sigma_world[7], [0.2, 0.1, 0.3], rtol=1e-9)  # m

@@ -30,12 +30,16 @@ def room() -> tuple[Site, FieldSamples, np.ndarray]:
     return world.site, world.measure(targets, np.eye(3), rng), targets
 
 
-def explained(site: Site, samples: FieldSamples, free: tuple[str, ...] = ()) -> ExplainedFixes:
-    return explained_fixes(samples, initial_calibration(site, 0.0), survey_error=False, free=free)
+def explained(
+    site: Site, samples: FieldSamples, free_parameters: tuple[str, ...] = ()
+) -> ExplainedFixes:
+    return explained_fixes(
+        samples, initial_calibration(site, 0.0), survey_error=False, free_parameters=free_parameters
+    )
 
 
-def codes(found: ExplainedFixes) -> list[str]:
-    return [finding.code for finding in found.trust.findings]
+def codes(result: ExplainedFixes) -> list[str]:
+    return [finding.code for finding in result.trust.findings]
 
 
 def moved(site: Site, count: int, step: float = 0.5) -> Site:
@@ -57,23 +61,23 @@ def test_where_nothing_errs_the_fixes_are_those_with_gains_held_bit_for_bit(
     room: tuple[Site, FieldSamples, np.ndarray],
 ) -> None:
     site, samples, _ = room
-    found = explained(site, samples)
-    held = fix_epochs(samples, initial_calibration(site, 0.0), survey_error=False)
-    assert found.gain_spread == 0.0
-    assert found.trust.verdict is Verdict.TRUSTWORTHY
+    result = explained(site, samples)
+    fixed = fix_epochs(samples, initial_calibration(site, 0.0), survey_error=False)
+    assert result.gain_spread == 0.0
+    assert result.trust.verdict is Verdict.TRUSTWORTHY
     for name in ("position_world", "world_from_body", "pose_cov", "log_gain"):
-        np.testing.assert_array_equal(getattr(found.fixes, name), getattr(held, name))
+        np.testing.assert_array_equal(getattr(result.fixes, name), getattr(fixed, name))
 
 
 def test_a_beacon_that_stands_elsewhere_is_left_out_and_gains_are_held(
     room: tuple[Site, FieldSamples, np.ndarray],
 ) -> None:
     site, samples, targets = room
-    found = explained(moved(site, 1), samples)
-    assert codes(found) == ["beacon_excluded"]
-    assert f"beacon {site.beacons[0].name} " in found.trust.findings[0].text
-    assert found.gain_spread == 0.0
-    assert error(found.fixes, targets) < 2.0 * error(explained(site, samples).fixes, targets)
+    result = explained(moved(site, 1), samples)
+    assert codes(result) == ["beacon_excluded"]
+    assert f"beacon {site.beacons[0].name} " in result.trust.findings[0].text
+    assert result.gain_spread == 0.0
+    assert error(result.fixes, targets) < 2.0 * error(explained(site, samples).fixes, targets)
     # Who asks for gains gets them, and a fix that is worse.
     assert explained(moved(site, 1), samples, ("gain",)).gain_spread > 0.0
 
@@ -83,14 +87,14 @@ def test_gains_that_err_from_place_to_place_are_freed_unasked(
 ) -> None:
     site, samples, targets = room
     samples = scattered(samples)
-    found = explained(site, samples)
-    assert codes(found) == ["gain_spread"]
-    assert found.trust.verdict is Verdict.TRUSTWORTHY
-    assert found.gain_spread == pytest.approx(0.15, rel=0.3)
-    held = fix_epochs(samples, initial_calibration(site, 0.0), survey_error=False)
-    assert error(found.fixes, targets) < 0.2 * error(held, targets)
-    off = np.linalg.norm(found.fixes.position_world[:, 0] - targets, axis=1)
-    sigma = np.sqrt(np.trace(found.fixes.pose_cov[:, 0, 3:, 3:], axis1=1, axis2=2))
+    result = explained(site, samples)
+    assert codes(result) == ["gain_spread"]
+    assert result.trust.verdict is Verdict.TRUSTWORTHY
+    assert result.gain_spread == pytest.approx(0.15, rel=0.3)
+    fixed = fix_epochs(samples, initial_calibration(site, 0.0), survey_error=False)
+    assert error(result.fixes, targets) < 0.2 * error(fixed, targets)
+    off = np.linalg.norm(result.fixes.position_world[:, 0] - targets, axis=1)
+    sigma = np.sqrt(np.trace(result.fixes.pose_cov[:, 0, 3:, 3:], axis1=1, axis2=2))
     assert np.mean(off < 3.0 * sigma) > 0.95
 
 
@@ -98,10 +102,10 @@ def test_a_survey_that_gains_do_not_explain_stays_in_doubt_without_them(
     room: tuple[Site, FieldSamples, np.ndarray],
 ) -> None:
     site, samples, _ = room
-    found = explained(moved(site, 3), samples.rows(slice(0, 15)))
-    assert found.gain_spread == 0.0
-    assert found.trust.verdict is not Verdict.TRUSTWORTHY
-    assert "gain_spread" not in codes(found)
+    result = explained(moved(site, 3), samples.rows(slice(0, 15)))
+    assert result.gain_spread == 0.0
+    assert result.trust.verdict is not Verdict.TRUSTWORTHY
+    assert "gain_spread" not in codes(result)
 
 
 def test_too_few_epochs_free_nothing(room: tuple[Site, FieldSamples, np.ndarray]) -> None:
@@ -116,9 +120,9 @@ def test_the_gain_of_a_lone_beacon_is_its_range_and_stays_held() -> None:
     samples = simulate_fields(site, Trajectory(np.arange(float(TARGETS)), turn, place), 1e-12, rng)
     coupling = 0.03 * np.abs(samples.phasor_sensor).max(axis=(1, 2), keepdims=True)
     false = samples.phasor_sensor + coupling * rng.standard_normal(samples.phasor_sensor.shape)
-    found = explained(site, replace(samples, phasor_sensor=false))
-    assert "field_residuals" in codes(found)
-    assert found.gain_spread == 0.0
-    away = np.linalg.norm(found.fixes.position_world - place[:, None], axis=2)
+    result = explained(site, replace(samples, phasor_sensor=false))
+    assert "field_residuals" in codes(result)
+    assert result.gain_spread == 0.0
+    away = np.linalg.norm(result.fixes.position_world - place[:, None], axis=2)
     # Of the mirrors the nearer: a lone beacon has both.
     assert np.sqrt(np.mean(np.min(away, axis=1) ** 2)) < 0.02

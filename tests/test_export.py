@@ -50,18 +50,18 @@ def result(tmp_path: Path) -> Path:
     place = tmp_path / "run"
     place.mkdir()
     write_trajectory(STATES, place / "trajectory.parquet", EPOCH_NS, trust)
-    told = {"job": "navigate", "verdict": "doubtful", "lost_epochs": 3}
-    (place / "report.json").write_text(json.dumps(told))
+    reported = {"job": "navigate", "verdict": "doubtful", "lost_epochs": 3}
+    (place / "report.json").write_text(json.dumps(reported))
     return place
 
 
 def _read(path: Path) -> dict[str, list[tuple[int, Any]]]:
-    found: dict[str, list[tuple[int, Any]]] = {}
+    result: dict[str, list[tuple[int, Any]]] = {}
     with AnyReader([path]) as reader:  # with the types that the file itself tells
         for topic, stamp, raw in reader.messages():
             message = reader.deserialize(raw, topic.msgtype)
-            found.setdefault(topic.topic, []).append((stamp, message))
-    return found
+            result.setdefault(topic.topic, []).append((stamp, message))
+    return result
 
 
 def _xyz(value: Any) -> list[float]:
@@ -83,9 +83,9 @@ def test_a_bag_has_odometry_and_pose_of_every_state(
             assert header.stamp.sec * 10**9 + header.stamp.nanosec == stamp
             assert header.frame_id == "map"
             assert _xyz(pose.position) == list(STATES.position_world[k])
-            turned = Rotation.from_quat([*_xyz(pose.orientation), pose.orientation.w])
+            rotated = Rotation.from_quat([*_xyz(pose.orientation), pose.orientation.w])
             np.testing.assert_allclose(
-                turned.as_matrix(), STATES.world_from_body[k], rtol=0, atol=1e-14
+                rotated.as_matrix(), STATES.world_from_body[k], rtol=0, atol=1e-14
             )
     for k, (_, odometry) in zip(KEPT, topics["/magfusion/odometry"], strict=True):
         assert odometry.child_frame_id == "imu"
@@ -113,10 +113,10 @@ def test_covariances_are_those_of_ros(result: Path, tmp_path: Path) -> None:
         steps = small * np.eye(6)
         by_step = np.array([(_moved(k, s) - _moved(k, -s)) / (2.0 * small) for s in steps]).T
         expected = by_step @ STATES.pose_cov[k] @ by_step.T
-        found = message.pose.covariance.reshape(6, 6)
+        estimate = message.pose.covariance.reshape(6, 6)
         scale = np.sqrt(np.outer(expected.diagonal(), expected.diagonal()))
-        np.testing.assert_allclose(found / scale, expected / scale, rtol=0, atol=1e-7)
-        assert np.array_equal(found, found.T)
+        np.testing.assert_allclose(estimate / scale, expected / scale, rtol=0, atol=1e-7)
+        assert np.array_equal(estimate, estimate.T)
 
 
 def test_what_is_not_known_has_no_small_variance(tmp_path: Path) -> None:
@@ -134,8 +134,8 @@ def test_evo_reads_tum_and_kitti(result: Path, tmp_path: Path) -> None:
     run_command("export", result, "-o", tmp_path / "run.txt", "--format", "kitti")
     tum = file_interface.read_tum_trajectory_file(str(tmp_path / "run.tum"))
     np.testing.assert_allclose(tum.timestamps, np.array(STAMPS) * 1e-9, rtol=0, atol=1e-6)
-    for found in (tum, file_interface.read_kitti_poses_file(str(tmp_path / "run.txt"))):
-        poses = np.array(found.poses_se3)
+    for estimate in (tum, file_interface.read_kitti_poses_file(str(tmp_path / "run.txt"))):
+        poses = np.array(estimate.poses_se3)
         np.testing.assert_allclose(poses[:, :3, 3], STATES.position_world[KEPT], rtol=0, atol=1e-8)
         np.testing.assert_allclose(
             poses[:, :3, :3], STATES.world_from_body[KEPT], rtol=0, atol=1e-8
@@ -145,13 +145,13 @@ def test_evo_reads_tum_and_kitti(result: Path, tmp_path: Path) -> None:
 def test_pandas_reads_csv_and_so_do_we(result: Path, tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     run_command("export", result, "-o", path)
-    found = pandas.read_csv(path)
-    assert found["time_ns"].tolist() == STAMPS
-    assert found["verdict"].tolist() == ["doubtful"] * len(KEPT)
-    assert found["excluded"][0] == "A B.2"
+    estimate = pandas.read_csv(path)
+    assert estimate["time_ns"].tolist() == STAMPS
+    assert estimate["verdict"].tolist() == ["doubtful"] * len(KEPT)
+    assert estimate["excluded"][0] == "A B.2"
     assert STATES.pose_cov is not None
-    assert found["cov_35"].tolist() == STATES.pose_cov[KEPT, 3, 5].tolist()
-    assert found["protection_level_m"].isna().all()
+    assert estimate["cov_35"].tolist() == STATES.pose_cov[KEPT, 3, 5].tolist()
+    assert estimate["protection_level_m"].isna().all()
     again = read_estimate(path, EPOCH_NS)
     np.testing.assert_allclose(again.time, STATES.time[KEPT], rtol=0, atol=1e-12)
     np.testing.assert_allclose(again.pose_cov, STATES.pose_cov[KEPT], rtol=1e-15)
@@ -161,9 +161,13 @@ def test_what_is_left_out_is_counted(
     result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run_command("export", result, "-o", tmp_path / "run.csv", "--json")
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert (told["states"], told["states_failed"], told["lost_epochs"]) == (len(KEPT), 1, 3)
-    assert told["result_verdict"] == "doubtful"
+    reported = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (reported["states"], reported["states_failed"], reported["lost_epochs"]) == (
+        len(KEPT),
+        1,
+        3,
+    )
+    assert reported["result_verdict"] == "doubtful"
 
 
 def test_an_export_that_cannot_be_is_refused(result: Path, tmp_path: Path, refuse: Refuse) -> None:
@@ -176,9 +180,11 @@ def test_an_export_that_cannot_be_is_refused(result: Path, tmp_path: Path, refus
     assert "has no trajectory.parquet" in refuse("export", result, "-o", out)
     (result / "report.json").write_text('{"verdict": "failed"}')
     assert "its verdict is failed" in refuse("export", result, "-o", out)
-    lost = StateTrust((Verdict.FAILED,) * N, np.full(N, np.nan), np.full(N, np.nan), ((),) * N)
+    lost_epochs = StateTrust(
+        (Verdict.FAILED,) * N, np.full(N, np.nan), np.full(N, np.nan), ((),) * N
+    )
     table = tmp_path / "lost.parquet"
-    write_trajectory(STATES, table, EPOCH_NS, lost)
+    write_trajectory(STATES, table, EPOCH_NS, lost_epochs)
     assert "none has a pose" in refuse("export", table, "-o", out)
     write_trajectory(STATES, table, -(10**10))
     assert "1970 to 2038" in refuse("export", table, "-o", out)

@@ -18,11 +18,11 @@ from magfusion.model.parameters import PHASOR_PARAMETERS, choose_blocks, dimensi
 
 def nonlinear_solution(residual, scale):
     """Return the step of least squares (n,), by SciPy from zero, and its covariance there."""
-    found = least_squares(
+    result = least_squares(
         lambda unit: residual(scale * unit), np.zeros(len(scale)), jac="3-point", method="lm"
     )
-    root = scale[:, None] * np.linalg.inv(np.linalg.qr(found.jac).R)
-    return scale * found.x, root @ root.T
+    root = scale[:, None] * np.linalg.inv(np.linalg.qr(result.jac).R)
+    return scale * result.x, root @ root.T
 
 
 def a_wide_prediction():
@@ -49,9 +49,9 @@ def a_fix_beside(best, blocks):
 def check_same(light, best, cov, blocks):
     sigma = np.sqrt(np.diag(cov))
     off = between(best, light.state, blocks) / sigma
-    unlike = (light.state.cov - cov) / np.outer(sigma, sigma)
+    differing = (light.state.cov - cov) / np.outer(sigma, sigma)
     assert np.max(np.abs(off)) < 0.1
-    assert np.max(np.abs(unlike)) < 0.1
+    assert np.max(np.abs(differing)) < 0.1
 
 
 def test_an_update_of_the_filter_from_a_fix_is_the_nonlinear_least_squares_solution():

@@ -51,8 +51,8 @@ def seen(site: Site, truth: Trajectory, sigma: float = SIGMA) -> FieldSamples:
     return simulate_fields(site, truth, sigma, np.random.default_rng(1))
 
 
-def angles(found: np.ndarray, true: np.ndarray) -> np.ndarray:
-    turn = np.swapaxes(found, 1, 2) @ true
+def angles(result: np.ndarray, true: np.ndarray) -> np.ndarray:
+    turn = np.swapaxes(result, 1, 2) @ true
     return np.asarray(Rotation.from_matrix(turn).magnitude())
 
 
@@ -62,8 +62,8 @@ def test_the_whitening_is_that_of_the_components_that_are_there() -> None:
     cov = np.broadcast_to(root @ root.T, (3, 3, 3)).copy()
     there = np.array([[True, False, True], [True, True, True], [False, False, False]])
     cov[0, 1], cov[0, :, 1] = 1e9, 1e9
-    found = whitening(cov, there)
-    information = np.swapaxes(found, 1, 2) @ found
+    result = whitening(cov, there)
+    information = np.swapaxes(result, 1, 2) @ result
     own = np.ix_([0, 2], [0, 2])
     np.testing.assert_allclose(information[0][own], np.linalg.inv((root @ root.T)[own]))
     assert not information[0][1].any()
@@ -103,8 +103,8 @@ def test_one_axis_gives_the_place_of_its_coil_and_its_direction_and_leaves_the_r
     rows = np.arange(len(true))
     np.testing.assert_allclose(coil[rows, nearest], true, atol=2e-3)
     axis = sensor.body_from_sensor[:, 2]
-    found = fixes.world_from_body[rows, nearest] @ axis
-    np.testing.assert_allclose(found, truth.world_from_body @ axis, atol=5e-3)
+    result = fixes.world_from_body[rows, nearest] @ axis
+    np.testing.assert_allclose(result, truth.world_from_body @ axis, atol=5e-3)
     np.testing.assert_allclose(
         fixes.world_from_body[-1, 0], fixes.world_from_body[-2, 0], atol=1e-3
     )
@@ -149,15 +149,15 @@ def test_raw_samples_of_fewer_axes_become_phasors_of_these(
     assert log.waveform is not None
     assert log.waveform.axes == axes
     _, whole = receiver_of(site).whole(log.waveform, log.imu)
-    _, found = receiver_of(with_axes(site, axes)).whole(log.waveform, log.imu)
-    assert found.axes == axes
-    assert np.isnan(found.phasor_sensor[..., 1]).all()
-    sensor, truth = site.platform.magnetometer, simulated.motion.trajectory(found.time)
-    assert len(whole) == len(found)
+    _, result = receiver_of(with_axes(site, axes)).whole(log.waveform, log.imu)
+    assert result.axes == axes
+    assert np.isnan(result.phasor_sensor[..., 1]).all()
+    sensor, truth = site.platform.magnetometer, simulated.motion.trajectory(result.time)
+    assert len(whole) == len(result)
     true = simulate_fields(site, truth, 0.0, np.random.default_rng(0)).phasor_sensor
     own = [0, 2]
-    error = np.abs(found.phasor_sensor - true)[..., own]
-    sigma = np.sqrt(found.phasor_cov[..., own, own])
+    error = np.abs(result.phasor_sensor - true)[..., own]
+    sigma = np.sqrt(result.phasor_cov[..., own, own])
     assert sensor.lacking == ()
     assert np.mean(error**2 / sigma**2) < 4.0  # two parts, each of variance one at most
 
@@ -176,12 +176,12 @@ def test_what_does_not_fit_the_declared_axes_is_refused(
     log = tmp_path / "log"
     write_log(lacking(simulated.log, "xz"), log)
     save_site(demo_site(), log / "site.yaml")
-    said = refuse("smooth", log, "-o", tmp_path / "run")
-    assert "the magnetometer of" in said
-    assert "have x, z; declare the axes of the receiver" in said
+    findings = refuse("smooth", log, "-o", tmp_path / "run")
+    assert "the magnetometer of" in findings
+    assert "have x, z; declare the axes of the receiver" in findings
     save_site(with_axes(demo_site(), "xz"), log / "site.yaml")
-    said = refuse("survey", log, "--poses", log / "site.yaml", "-o", tmp_path / "run")
-    assert said
+    findings = refuse("survey", log, "--poses", log / "site.yaml", "-o", tmp_path / "run")
+    assert findings
 
 
 def test_half_a_component_is_refused(tmp_path: Path, refuse: Refuse) -> None:
@@ -201,8 +201,8 @@ def test_half_a_component_is_refused(tmp_path: Path, refuse: Refuse) -> None:
 def test_the_gain_of_a_coil_is_found_where_it_is_not_declared() -> None:
     site, truth = with_axes(demo_site(), "z"), poses(7)
     platform = site.platform
-    louder = replace(platform.magnetometer, matrix=2.7 * np.eye(3))
-    samples = seen(replace(site, platform=replace(platform, magnetometer=louder)), truth)
+    stronger = replace(platform.magnetometer, matrix=2.7 * np.eye(3))
+    samples = seen(replace(site, platform=replace(platform, magnetometer=stronger)), truth)
     sensor = with_found_gain(samples, site).platform.magnetometer
     assert abs(sensor.matrix[2, 2] - 2.7) < 4.0 * sensor.sigma.matrix[2, 2]
     assert sensor.sigma.matrix[2, 2] < 0.3
@@ -218,15 +218,15 @@ def test_what_one_axis_cannot_do_is_refused(
     site = with_axes(demo_site(), "z")
     prior = MotionPrior(2.0, 3.0)
     save_site(replace(site, platform=replace(site.platform, motion_prior=prior)), log / "site.yaml")
-    said = refuse("coverage", log / "site.yaml", "-o", tmp_path / "run")
-    assert "is [z], but this job requires all three axes" in said
+    findings = refuse("coverage", log / "site.yaml", "-o", tmp_path / "run")
+    assert "is [z], but this job requires all three axes" in findings
     save_site(demo_site(), tmp_path / "whole.yaml")
     write_log(simulated.log, tmp_path / "whole")
-    said = refuse(
+    findings = refuse(
         *("smooth", tmp_path / "whole", "--site", tmp_path / "whole.yaml"),
         *("--free", "gain", "-o", tmp_path / "run"),
     )
-    assert "is the common gain of a receiver of one axis" in said
+    assert "is the common gain of a receiver of one axis" in findings
     assert "smooth estimates gain only" in refuse("smooth", log, "--free", "phase", "-o", log)
 
 

@@ -30,8 +30,8 @@ def test_modes_have_the_correlation_of_iron() -> None:
     rng = np.random.default_rng(3)
     walk = np.cumsum(0.03 * rng.standard_normal((400, 3)), axis=0)
     modes = modes_in_place(walk, LENGTH, 10_000)
-    apart = np.linalg.norm(walk[:, None] - walk, axis=2)
-    error = modes @ modes.T - np.exp(-apart / LENGTH)
+    separate = np.linalg.norm(walk[:, None] - walk, axis=2)
+    error = modes @ modes.T - np.exp(-separate / LENGTH)
     assert np.sqrt(np.mean(error**2)) < 0.05
     # All of a cell have the same: its diagonal is as long as sqrt(3) / 4 lengths.
     assert np.max(np.abs(error)) < 1.0 - np.exp(-np.sqrt(3.0) / 4.0) + 0.03
@@ -48,9 +48,9 @@ def test_fewer_modes_are_those_with_most_variance() -> None:
 def test_a_mode_moves_the_estimate_as_its_response_says() -> None:
     """An amplitude added to what was measured, and solved again, against the linear response."""
     config = SimulationConfig(DEMO_BOX_WORLD, duration=12.0, motion="walk", perturb=False)
-    made = simulate_log(demo_site(), config, np.random.default_rng(5))
+    built = simulate_log(demo_site(), config, np.random.default_rng(5))
     settings = SmootherSettings(tune=False, loss=None)
-    result = smooth(made.log, replace(demo_site(), model_error=0.005), settings)
+    result = smooth(built.log, replace(demo_site(), model_error=0.005), settings)
     block = result.field_errors[0]
     site, fields = result.calibration.site, result.fields
     poses = result.states

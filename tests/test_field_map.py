@@ -16,7 +16,7 @@ LENGTH, GAIN, TURN, RESIDUAL = 0.9, 0.2, 0.15, 0.01
 PRIOR = np.diag([GAIN, TURN, TURN, TURN]) ** 2
 RNG = np.random.default_rng(3)
 POINTS = RNG.uniform(0.0, 3.0, (9, 3))
-ASKED = RNG.uniform(0.0, 3.0, (40, 3))
+MAX_EPOCHS = RNG.uniform(0.0, 3.0, (40, 3))
 FAR = np.array([[100.0, -50.0, 30.0]])
 DATA = RNG.normal(0.0, 0.1, (9, 4))
 _ROOT = RNG.normal(0.0, 20.0, (9, 4, 4))
@@ -46,36 +46,36 @@ def learnt(information=INFORMATION, points=POINTS, data=DATA):
     return FieldMap(points, weights.reshape(data.shape), information, LENGTH, GAIN, TURN, RESIDUAL)
 
 
-def textbook_variance(asked, information=INFORMATION, points=POINTS):
+def textbook_variance(requested, information=INFORMATION, points=POINTS):
     """Return the variance of gain and, mean of the axes, of rotation, shape (n, 2)."""
-    reach = covariance(asked, points)
+    reach = covariance(requested, points)
     known = np.linalg.solve(covariance(points, points) + noise(information), reach.T)
-    left = np.diag(covariance(asked, asked) - reach @ known).reshape(-1, 4)
-    return np.stack([left[:, 0], left[:, 1:].mean(axis=1)], axis=1)
+    remaining = np.diag(covariance(requested, requested) - reach @ known).reshape(-1, 4)
+    return np.stack([remaining[:, 0], remaining[:, 1:].mean(axis=1)], axis=1)
 
 
 def test_the_mean_goes_through_data_without_noise():
-    found, _ = learnt(np.tile(1e10 * np.eye(4), (9, 1, 1))).mean(POINTS)
-    np.testing.assert_allclose(found, DATA, rtol=0.0, atol=1e-6)
+    result, _ = learnt(np.tile(1e10 * np.eye(4), (9, 1, 1))).mean(POINTS)
+    np.testing.assert_allclose(result, DATA, rtol=0.0, atol=1e-6)
 
 
 def test_the_mean_is_that_of_the_posterior():
     weights = np.linalg.solve(covariance(POINTS, POINTS) + noise(INFORMATION), DATA.ravel())
-    expected = (covariance(ASKED, POINTS) @ weights).reshape(-1, 4)
-    np.testing.assert_allclose(learnt().mean(ASKED)[0], expected, rtol=0.0, atol=1e-12)
+    expected = (covariance(MAX_EPOCHS, POINTS) @ weights).reshape(-1, 4)
+    np.testing.assert_allclose(learnt().mean(MAX_EPOCHS)[0], expected, rtol=0.0, atol=1e-12)
 
 
 def test_the_mean_takes_any_shape_of_positions_and_many_of_them():
     field_map = learnt()
-    value, gradient = field_map.mean(np.tile(ASKED[:2].reshape(2, 1, 3), (1, 5000, 1)))
+    value, gradient = field_map.mean(np.tile(MAX_EPOCHS[:2].reshape(2, 1, 3), (1, 5000, 1)))
     assert value.shape == (2, 5000, 4)
     assert gradient.shape == (2, 5000, 4, 3)
-    alone = field_map.mean(ASKED[1])
+    alone = field_map.mean(MAX_EPOCHS[1])
     np.testing.assert_allclose(value[1, -1], alone[0], rtol=1e-12)
     np.testing.assert_allclose(gradient[1, -1], alone[1], rtol=1e-12)
 
 
-@pytest.mark.parametrize("place", [*ASKED[:3], POINTS[0]])
+@pytest.mark.parametrize("place", [*MAX_EPOCHS[:3], POINTS[0]])
 def test_the_gradient_is_that_of_the_mean(place):
     field_map = learnt()
     expected = central_difference(lambda step: field_map.mean(place + step)[0], 3, 1e-5)
@@ -83,7 +83,7 @@ def test_the_gradient_is_that_of_the_mean(place):
 
 
 def test_the_variance_is_that_of_the_posterior():
-    everywhere = np.concatenate([ASKED, POINTS])
+    everywhere = np.concatenate([MAX_EPOCHS, POINTS])
     np.testing.assert_allclose(
         learnt().variance(everywhere), textbook_variance(everywhere), rtol=1e-9, atol=1e-14
     )
@@ -91,9 +91,9 @@ def test_the_variance_is_that_of_the_posterior():
 
 def test_points_that_tell_nothing_leave_the_prior():
     nothing = FieldMap(POINTS, np.zeros((9, 4)), np.zeros((9, 4, 4)), LENGTH, GAIN, TURN, RESIDUAL)
-    expected = np.tile([GAIN**2, TURN**2], (len(ASKED), 1))
-    np.testing.assert_allclose(nothing.variance(ASKED), expected, rtol=1e-12)
-    assert np.all(nothing.mean(ASKED)[0] == 0.0)
+    expected = np.tile([GAIN**2, TURN**2], (len(MAX_EPOCHS), 1))
+    np.testing.assert_allclose(nothing.variance(MAX_EPOCHS), expected, rtol=1e-12)
+    assert np.all(nothing.mean(MAX_EPOCHS)[0] == 0.0)
 
 
 def test_far_from_the_survey_the_map_is_the_prior_again():
@@ -104,7 +104,7 @@ def test_far_from_the_survey_the_map_is_the_prior_again():
 
 def test_a_point_more_makes_no_place_worse_known_and_its_own_better():
     before = learnt(INFORMATION[:-1], POINTS[:-1], DATA[:-1])
-    gained = before.variance(ASKED) - learnt().variance(ASKED)
+    gained = before.variance(MAX_EPOCHS) - learnt().variance(MAX_EPOCHS)
     assert np.all(gained > -1e-12)
     there = POINTS[-1:]
     assert np.all(learnt().variance(there) < 0.7 * before.variance(there))
@@ -122,14 +122,14 @@ def test_a_direction_that_no_point_tells_stays_as_it_was():
 def test_the_relative_variance_is_what_gain_and_turn_do_to_a_field():
     """Against random draws of both, on fields of any direction."""
     field_map, rng = learnt(), np.random.default_rng(4)
-    gain, turn = field_map.variance(ASKED[:1])[0]
+    gain, turn = field_map.variance(MAX_EPOCHS[:1])[0]
     field = rng.normal(size=(400_000, 3))
     field /= np.linalg.norm(field, axis=1, keepdims=True)
     moved = rng.normal(0.0, np.sqrt(gain), (len(field), 1)) * field
     moved += np.cross(rng.normal(0.0, np.sqrt(turn), field.shape), field)
     moved += rng.normal(0.0, RESIDUAL / np.sqrt(3.0), field.shape)
     expected = np.mean(np.sum(moved**2, axis=1))
-    assert field_map.relative_variance(ASKED[:1])[0] == pytest.approx(expected, rel=0.01)
+    assert field_map.relative_variance(MAX_EPOCHS[:1])[0] == pytest.approx(expected, rel=0.01)
 
 
 def test_where_the_place_is_unknown_that_of_a_typical_point_is_meant():

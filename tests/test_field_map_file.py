@@ -19,7 +19,7 @@ from magfusion.model.field_map import FieldMap
 from magfusion.model.site import Site
 from magfusion.simulation.demo_site import demo_site
 
-ASKED = np.array([[1.0, 2.0, 0.5], [3.0, 1.0, 1.5]])
+MAX_EPOCHS = np.array([[1.0, 2.0, 0.5], [3.0, 1.0, 1.5]])
 
 
 def _map(seed: int, count: int) -> FieldMap:
@@ -44,12 +44,12 @@ def _mapped_site() -> Site:
     return replace(site, beacons=beacons)
 
 
-def _assert_same(found: FieldMap | None, wanted: FieldMap | None) -> None:
-    assert found is not None
+def _assert_same(result: FieldMap | None, wanted: FieldMap | None) -> None:
+    assert result is not None
     assert wanted is not None
     for name in FieldMap.__dataclass_fields__:
-        np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name), err_msg=name)
-    np.testing.assert_array_equal(found.variance(ASKED), wanted.variance(ASKED))
+        np.testing.assert_array_equal(getattr(result, name), getattr(wanted, name), err_msg=name)
+    np.testing.assert_array_equal(result.variance(MAX_EPOCHS), wanted.variance(MAX_EPOCHS))
 
 
 @pytest.fixture
@@ -60,10 +60,10 @@ def path(tmp_path: Path) -> Path:
 
 
 def test_maps_come_back_to_the_last_bit(path: Path) -> None:
-    found = read_field_maps(path)
-    assert list(found) == ["A", "B"]
-    _assert_same(found["A"], _map(1, 5))
-    _assert_same(found["B"], _map(2, 7))
+    result = read_field_maps(path)
+    assert list(result) == ["A", "B"]
+    _assert_same(result["A"], _map(1, 5))
+    _assert_same(result["B"], _map(2, 7))
 
 
 # Refusals --------------------------------------------------------------------------------------
@@ -72,15 +72,15 @@ def test_maps_come_back_to_the_last_bit(path: Path) -> None:
 def _refusal(path: Path) -> str:
     with pytest.raises(InputError) as caught:
         read_field_maps(path)
-    said = str(caught.value)
-    assert said.startswith(f"{path}: ")
-    assert "\n" not in said
-    return said
+    findings = str(caught.value)
+    assert findings.startswith(f"{path}: ")
+    assert "\n" not in findings
+    return findings
 
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    said = _refusal(tmp_path / "none.parquet")
-    assert "there is no such field map; learn it by calibrate fieldmap" in said
+    findings = _refusal(tmp_path / "none.parquet")
+    assert "there is no such field map; learn it by calibrate fieldmap" in findings
 
 
 def test_a_file_that_is_no_table_is_refused(tmp_path: Path) -> None:
@@ -134,8 +134,8 @@ def test_a_site_carries_its_maps_on_beside_it(tmp_path: Path) -> None:
     assert (tmp_path / "refined_field_map.parquet").is_file()
     content = yaml.safe_load((tmp_path / "refined.yaml").read_text())
     assert content["world"]["field_map"] == "refined_field_map.parquet"
-    found = load_site(tmp_path / "refined.yaml")
-    for again, beacon in zip(found.beacons, site.beacons, strict=True):
+    result = load_site(tmp_path / "refined.yaml")
+    for again, beacon in zip(result.beacons, site.beacons, strict=True):
         if beacon.field_map is None:
             assert again.field_map is None
         else:
@@ -160,6 +160,6 @@ def test_a_map_of_a_beacon_that_the_site_does_not_have_is_refused(tmp_path: Path
     write_field_maps(maps | {"Z": _map(3, 4)}, tmp_path / "site_field_map.parquet")
     with pytest.raises(InputError) as caught:
         load_site(tmp_path / "site.yaml")
-    said = str(caught.value)
-    assert said.startswith(f"{tmp_path / 'site_field_map.parquet'}: maps beacon Z, which ")
-    assert "does not have (it has " in said
+    findings = str(caught.value)
+    assert findings.startswith(f"{tmp_path / 'site_field_map.parquet'}: maps beacon Z, which ")
+    assert "does not have (it has " in findings

@@ -12,7 +12,14 @@ from rich.console import Console
 from magfusion.files.log import write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.model.site import BeaconSigma, Site
-from magfusion.results.figures import Column, Estimate, Figure, Figures, Section, heading
+from magfusion.results.figures import (
+    ErrorColumn,
+    Figure,
+    Figures,
+    ParameterEstimate,
+    Section,
+    heading,
+)
 from magfusion.results.screen import notes, show
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
@@ -32,7 +39,7 @@ def test_keys_of_ordinary_beacons_are_their_names() -> None:
     figures = Figures(
         Figure("epochs", 3),
         Figure("residual_rms_{beacon}", 1.0, "", "B.2"),
-        Estimate("{beacon}.position_x_m", 0.1, "m", "B.2", sigma=0.01, prior_sigma=0.05),
+        ParameterEstimate("{beacon}.position_x_m", 0.1, "m", "B.2", sigma=0.01, prior_sigma=0.05),
     )
     assert dict(figures) == {
         "epochs": 3,
@@ -46,8 +53,8 @@ def test_keys_of_ordinary_beacons_are_their_names() -> None:
 @pytest.mark.parametrize("name", ["sensor", "magnetometer", "imu", "earth"])
 def test_a_beacon_with_the_name_of_another_owner_has_keys_of_its_own(name: str) -> None:
     figures = Figures(
-        Estimate(f"{name}.rotation_x_deg", 1.0, "deg"),
-        Estimate("{beacon}.rotation_x_deg", 2.0, "deg", name),
+        ParameterEstimate(f"{name}.rotation_x_deg", 1.0, "deg"),
+        ParameterEstimate("{beacon}.rotation_x_deg", 2.0, "deg", name),
     )
     assert figures[f"{name}.rotation_x_deg"] == 1.0
     assert figures[f"beacon:{name}.rotation_x_deg"] == 2.0
@@ -75,7 +82,7 @@ def test_the_screen_has_the_units_and_hides_what_only_the_report_needs() -> None
     figures = heading("smooth", "walk") | Figures(
         Figure("window_s", 0.4, "s"),
         Figure("cost", 1.0, section=Section.REPORT),
-        Figure("ate_m", 0.0123, "m", None, Section.ERRORS, "position", Column.RMS),
+        Figure("ate_m", 0.0123, "m", None, Section.ERRORS, "position", ErrorColumn.RMS),
         Figure("share", 1.0, note="Look here."),
         Figure("residual_rms_{beacon}", 0.5, "", "A", label="residual"),
         Figure("residual_rms_{beacon}", 0.7, "", "B", label="residual"),

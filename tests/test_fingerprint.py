@@ -52,18 +52,18 @@ def test_where_the_line_holds_two_algorithms_are_exact_anywhere() -> None:
     rng = np.random.default_rng(1)
     points = rng.uniform([0.6, 0.6, 0.2], [5.1, 3.9, 1.0], (100, 3))  # above and below the survey
     lines = RssiLines(np.full(3, -3.0), np.log([1e-5, 2e-5, 3e-5]))
-    for found in (
+    for result in (
         locate_by_differential_range(_cubic(), _amplitude(points)),
         locate_by_lines(_cubic(), _amplitude(points), lines),
     ):
-        np.testing.assert_allclose(found, points, rtol=0, atol=1e-6)  # m
+        np.testing.assert_allclose(result, points, rtol=0, atol=1e-6)  # m
 
 
 @pytest.mark.parametrize("logarithmic", [True, False])
 def test_on_a_fingerprint_matching_returns_its_position(logarithmic: bool) -> None:
     known = _cubic()
-    found = locate_by_neighbours(known, known.amplitude, logarithmic=logarithmic)
-    np.testing.assert_allclose(found, known.position_world, rtol=1e-12)
+    result = locate_by_neighbours(known, known.amplitude, logarithmic=logarithmic)
+    np.testing.assert_allclose(result, known.position_world, rtol=1e-12)
 
 
 # The quiet room -------------------------------------------------------------------------------
@@ -77,7 +77,7 @@ def _fields(samples: FieldSamples, site: Site) -> RotatingFields:
 @pytest.fixture(scope="module")
 def errors() -> dict[Method, tuple[float, float]]:
     """Mean errors (m, deg) over ten worlds of 200 targets."""
-    found: dict[Method, list[tuple[float, float]]] = {method: [] for method in METHODS}
+    result: dict[Method, list[tuple[float, float]]] = {method: [] for method in METHODS}
     for seed in range(10):
         rng = np.random.default_rng(seed)
         world = draw_world(S0, rng)
@@ -88,8 +88,8 @@ def errors() -> dict[Method, tuple[float, float]]:
             fixes = fix_as_published(known, fields, method)
             position = np.linalg.norm(fixes.position_world - target, axis=1).mean()
             turn = Rotation.from_matrix(fixes.world_from_body).magnitude().mean() / DEGREE
-            found[method].append((position, turn))
-    means = {method: np.mean(pairs, axis=0) for method, pairs in found.items()}
+            result[method].append((position, turn))
+    means = {method: np.mean(pairs, axis=0) for method, pairs in result.items()}
     return {method: (float(mean[0]), float(mean[1])) for method, mean in means.items()}
 
 
@@ -143,8 +143,8 @@ def test_the_attitude_is_exact_for_a_body_in_world_axes_however_the_beacons_lie(
     site = _rolled_site(rng)
     position = rng.uniform([0.6, 0.6, -2.0], [5.1, 3.9, 2.0], (50, 3))
     axis = np.array([rotation_axis_world(b) for b in site.beacons])
-    found = attitude_as_published(_normals(site, position, np.eye(3)), position, BEACONS, axis)
-    np.testing.assert_allclose(found, np.broadcast_to(np.eye(3), found.shape), atol=1e-9)
+    result = attitude_as_published(_normals(site, position, np.eye(3)), position, BEACONS, axis)
+    np.testing.assert_allclose(result, np.broadcast_to(np.eye(3), result.shape), atol=1e-9)
 
 
 def test_the_attitude_is_exact_about_the_beacons_axis_and_far_off_at_ten_degrees_of_tilt() -> None:
@@ -155,8 +155,8 @@ def test_the_attitude_is_exact_about_the_beacons_axis_and_far_off_at_ten_degrees
     for name in "zx":
         true = Rotation.from_euler(name, -10.0, degrees=True)
         normal = _normals(site, position, true.as_matrix())
-        found = Rotation.from_matrix(attitude_as_published(normal, position, BEACONS, axis))
-        error[name] = (true.inv() * found).magnitude().mean() / DEGREE
+        result = Rotation.from_matrix(attitude_as_published(normal, position, BEACONS, axis))
+        error[name] = (true.inv() * result).magnitude().mean() / DEGREE
     assert error["z"] < 1e-9  # deg
     assert error["x"] == pytest.approx(29.5, abs=0.5)  # deg, from the independent analysis
 
@@ -194,14 +194,14 @@ def test_fingerprints_belong_to_the_sensor_and_are_free_of_its_matrix() -> None:
         world.site.platform.magnetometer, position_body=np.array([0.1, 0, 0]), matrix=matrix
     )
     site = replace(world.site, platform=replace(world.site.platform, magnetometer=sensor))
-    turned = replace(
+    rotated = replace(
         survey,
         world_from_body=np.tile(turn, (len(survey), 1, 1)),
         phasor_sensor=survey.phasor_sensor @ turn @ matrix.T,
     )
-    plain, found = fingerprint_database(survey, world.site), fingerprint_database(turned, site)
-    np.testing.assert_allclose(found.amplitude, plain.amplitude, rtol=1e-12)
-    shift = found.position_world - plain.position_world
+    plain, result = fingerprint_database(survey, world.site), fingerprint_database(rotated, site)
+    np.testing.assert_allclose(result.amplitude, plain.amplitude, rtol=1e-12)
+    shift = result.position_world - plain.position_world
     np.testing.assert_allclose(shift, np.tile([0.0, 0.1, 0.0], (len(survey), 1)), atol=1e-12)
 
 

@@ -65,8 +65,8 @@ def deviations(fixes, truth, hypothesis=0):
     """Return the truth's right perturbation of a hypothesis, rotation then position, (n, 6)."""
     body_from_world = np.swapaxes(fixes.world_from_body[:, hypothesis], 1, 2)
     turn = Rotation.from_matrix(body_from_world @ truth.world_from_body).as_rotvec()
-    apart = truth.position_world - fixes.position_world[:, hypothesis]
-    return np.concatenate([turn, (body_from_world @ apart[..., None])[..., 0]], axis=1)
+    separate = truth.position_world - fixes.position_world[:, hypothesis]
+    return np.concatenate([turn, (body_from_world @ separate[..., None])[..., 0]], axis=1)
 
 
 def is_exact(fixes, truth, hypothesis=0):
@@ -88,8 +88,10 @@ def gravity_of(truth, sigma=0.01):
 
 def drives_of(site, seed=3):
     """Return random phases for the beacons without synchronisation."""
-    free = np.concatenate([[not b.synchronised] * len(b.tones) for b in site.beacons])
-    phase = np.random.default_rng(seed).uniform(-np.pi, np.pi, len(free)) * free
+    free_parameters = np.concatenate([[not b.synchronised] * len(b.tones) for b in site.beacons])
+    phase = (
+        np.random.default_rng(seed).uniform(-np.pi, np.pi, len(free_parameters)) * free_parameters
+    )
     return Drives(phase, np.zeros(len(site.beacons)))
 
 
@@ -155,14 +157,14 @@ def test_one_beacon_leaves_four_positions_of_which_no_field_tells_the_true_one()
     assert np.all(holds_truth(fixes, truth))
     # Positions of the sensor from the beacon: the group {1, Rz(pi), Mz, -1}.
     lever = site.platform.magnetometer.position_body
-    found = fixes.position_world + fixes.world_from_body @ lever
+    result = fixes.position_world + fixes.world_from_body @ lever
     true = truth.position_world + truth.world_from_body @ lever
     images = true[:, None] * np.array([[1, 1, 1], [-1, -1, 1], [1, 1, -1], [-1, -1, -1]])
-    apart = np.linalg.norm(found[:, :, None] - images[:, None], axis=-1)
-    assert np.all(np.sum(apart < EXACT, axis=1) == 1)
-    assert np.all(np.sum(apart < EXACT, axis=2) == 1)
+    separate = np.linalg.norm(result[:, :, None] - images[:, None], axis=-1)
+    assert np.all(np.sum(separate < EXACT, axis=1) == 1)
+    assert np.all(np.sum(separate < EXACT, axis=2) == 1)
     # -1 keeps the attitude.
-    opposite = np.argmin(apart[:, :, 3], axis=1)
+    opposite = np.argmin(separate[:, :, 3], axis=1)
     kept = fixes.world_from_body[np.arange(200), opposite]
     assert np.max(np.abs(kept - truth.world_from_body)) < EXACT
     np.testing.assert_allclose(fixes.probability, np.full((200, 4), 0.25), atol=1e-3)
@@ -283,11 +285,11 @@ def test_a_prior_decides_between_mirrors():
 def test_a_prior_counts_by_its_covariance():
     site, truth = room(4), poses(50, seed=12)
     samples, prior = seen(site, truth, SIGMA), shifted(truth, 0.01)
-    free = fixed(site, samples)
+    free_parameters = fixed(site, samples)
     firm = fixed(site, samples, prior=with_cov(prior, 1e-8))
     loose = fixed(site, samples, prior=with_cov(prior, 1e3))
     np.testing.assert_allclose(firm.position_world[:, 0], prior.position_world, atol=1e-6)
-    assert np.max(np.abs(loose.position_world[:, 0] - free.position_world[:, 0])) < 1e-6
+    assert np.max(np.abs(loose.position_world[:, 0] - free_parameters.position_world[:, 0])) < 1e-6
     at_truth = fixed(site, seen(site, truth), prior=with_cov(truth, 1e-4))
     bare = fixed(site, seen(site, truth))
     added = np.linalg.inv(at_truth.pose_cov[:, 0]) - np.linalg.inv(bare.pose_cov[:, 0])
@@ -297,18 +299,22 @@ def test_a_prior_counts_by_its_covariance():
 def test_a_prior_without_covariance_is_a_candidate_and_nothing_more():
     site, truth = room(4), poses(50, seed=13)
     samples = seen(site, truth, SIGMA)
-    found, expected = fixed(site, samples, prior=shifted(truth, 0.3)), fixed(site, samples)
-    np.testing.assert_allclose(found.position_world[:, 0], expected.position_world[:, 0], atol=1e-6)
-    np.testing.assert_allclose(found.cost[:, 0], expected.cost[:, 0], rtol=1e-4)
+    result, expected = fixed(site, samples, prior=shifted(truth, 0.3)), fixed(site, samples)
+    np.testing.assert_allclose(
+        result.position_world[:, 0], expected.position_world[:, 0], atol=1e-6
+    )
+    np.testing.assert_allclose(result.cost[:, 0], expected.cost[:, 0], rtol=1e-4)
 
 
 def test_gravity_of_infinite_sigma_says_nothing():
     site, truth = room(3), poses(50, seed=14)
     samples = seen(site, truth, SIGMA)
     wrong = Gravity(np.broadcast_to([0.0, 0.0, 1.0], (50, 3)), np.full(50, np.inf))
-    found, expected = fixed(site, samples, gravity=wrong), fixed(site, samples)
-    np.testing.assert_allclose(found.position_world[:, 0], expected.position_world[:, 0], atol=1e-9)
-    np.testing.assert_allclose(found.pose_cov[:, 0], expected.pose_cov[:, 0], rtol=1e-6)
+    result, expected = fixed(site, samples, gravity=wrong), fixed(site, samples)
+    np.testing.assert_allclose(
+        result.position_world[:, 0], expected.position_world[:, 0], atol=1e-9
+    )
+    np.testing.assert_allclose(result.pose_cov[:, 0], expected.pose_cov[:, 0], rtol=1e-6)
 
 
 def without(samples, epochs, channel):
@@ -341,9 +347,11 @@ def test_a_missing_beacon_is_as_one_that_is_not_there():
         phasor_sensor=samples.phasor_sensor[:, :3],
         phasor_cov=samples.phasor_cov[:, :3],
     )
-    found, expected = fixed(room(4), without(samples, slice(None), 3)), fixed(room(3), three)
-    np.testing.assert_allclose(found.position_world[:, 0], expected.position_world[:, 0], atol=1e-7)
-    np.testing.assert_allclose(found.pose_cov[:, 0], expected.pose_cov[:, 0], rtol=1e-4)
+    result, expected = fixed(room(4), without(samples, slice(None), 3)), fixed(room(3), three)
+    np.testing.assert_allclose(
+        result.position_world[:, 0], expected.position_world[:, 0], atol=1e-7
+    )
+    np.testing.assert_allclose(result.pose_cov[:, 0], expected.pose_cov[:, 0], rtol=1e-4)
 
 
 def test_a_pose_is_determined_though_a_missing_beacons_phase_is_not():
@@ -385,11 +393,11 @@ def test_epochs_do_not_know_of_each_other():
         phasor_cov=samples.phasor_cov[late],
     )
     gravity = gravity_of(truth)
-    apart = fixed(site, rows, gravity=Gravity(gravity.up_body[late], gravity.sigma[late]))
+    separate = fixed(site, rows, gravity=Gravity(gravity.up_body[late], gravity.sigma[late]))
     np.testing.assert_allclose(
-        together.position_world[late, 0], apart.position_world[:, 0], atol=1e-9
+        together.position_world[late, 0], separate.position_world[:, 0], atol=1e-9
     )
-    assert together.best().time[late] == pytest.approx(apart.time)
+    assert together.best().time[late] == pytest.approx(separate.time)
 
 
 @pytest.mark.parametrize("survey_error", [False, True])

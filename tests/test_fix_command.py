@@ -12,15 +12,15 @@ from magfusion.files.site import load_site, save_site
 
 
 def report_of(run: Path) -> dict[str, object]:
-    found: dict[str, object] = json.loads((run / "report.json").read_text())
-    return found
+    result: dict[str, object] = json.loads((run / "report.json").read_text())
+    return result
 
 
 def test_free_phases_and_gains_make_a_fix_less_sure(worked: Worked, tmp_path: Path) -> None:
     run_command("fix", worked.log, "-o", tmp_path / "free", "--free", "phase,gain")
-    held, free = (report_of(run) for run in (worked.fixes, tmp_path / "free"))
-    assert free["epochs"] == held["epochs"]
-    assert float(str(free["ate_m"])) > float(str(held["ate_m"]))
+    fixed, free_parameters = (report_of(run) for run in (worked.fixes, tmp_path / "free"))
+    assert free_parameters["epochs"] == fixed["epochs"]
+    assert float(str(free_parameters["ate_m"])) > float(str(fixed["ate_m"]))
     cov = [
         pq.read_table(run / "trajectory.parquet", columns=["cov_33"]).column(0).to_numpy()
         for run in (worked.fixes, tmp_path / "free")
@@ -29,7 +29,7 @@ def test_free_phases_and_gains_make_a_fix_less_sure(worked: Worked, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("options", "found"),
+    ("options", "result"),
     [
         (("--free", "phase,matrix"), "matrix"),
         (("--free", ""), "nothing"),
@@ -37,9 +37,9 @@ def test_free_phases_and_gains_make_a_fix_less_sure(worked: Worked, tmp_path: Pa
     ],
 )
 def test_what_cannot_be_free_is_refused(
-    options: tuple[str, ...], found: str, worked: Worked, tmp_path: Path, refuse: Refuse
+    options: tuple[str, ...], result: str, worked: Worked, tmp_path: Path, refuse: Refuse
 ) -> None:
-    assert found in refuse("fix", worked.log, "-o", tmp_path / "run", *options)
+    assert result in refuse("fix", worked.log, "-o", tmp_path / "run", *options)
 
 
 def test_rivals_are_told_in_the_report_the_table_and_on_the_screen(

@@ -19,16 +19,16 @@ TURN = Rotation.from_euler("x", 8.0, degrees=True).as_matrix()
 @pytest.fixture(scope="module")
 def three() -> Site:
     site = two_magnetometers(demo_site(coil_radius=None))
-    left, right = site.platform.magnetometers
+    remaining, right = site.platform.magnetometers
     sigma = MagnetometerSigma(
         matrix=np.full((3, 3), 0.003),
         offset=np.zeros(3),
         rotation_sensor=np.full(3, np.deg2rad(0.5)),
         position_body=np.full(3, 0.002),
     )
-    above = replace(left, name="above", position_body=np.array([0.0, 0.02, 0.2]))
-    sensors = tuple(replace(s, sigma=sigma) for s in (left, right, above))
-    return replace(site, platform=site.platform.carrying(sensors))
+    above = replace(remaining, name="above", position_body=np.array([0.0, 0.02, 0.2]))
+    sensors = tuple(replace(s, sigma=sigma) for s in (remaining, right, above))
+    return replace(site, platform=site.platform.with_magnetometers(sensors))
 
 
 def mounted(site: Site, false: int | None, count: int) -> Site:
@@ -37,11 +37,11 @@ def mounted(site: Site, false: int | None, count: int) -> Site:
     if false is not None:
         wrong = sensors[false].body_from_sensor @ TURN
         sensors[false] = replace(sensors[false], body_from_sensor=wrong)
-    return replace(site, platform=site.platform.carrying(tuple(sensors)))
+    return replace(site, platform=site.platform.with_magnetometers(tuple(sensors)))
 
 
 @pytest.mark.parametrize(
-    ("count", "false", "said"),
+    ("count", "false", "findings"),
     [
         (2, None, None),
         (2, 1, "The magnetometers left, right contradict each other"),
@@ -51,11 +51,11 @@ def mounted(site: Site, false: int | None, count: int) -> Site:
     ],
 )
 def test_who_contradicts_whom_is_said(
-    three: Site, count: int, false: int | None, said: str | None
+    three: Site, count: int, false: int | None, findings: str | None
 ) -> None:
     true, declared = mounted(three, None, count), mounted(three, false, count)
     at = poses(8)
     samples = simulate_fields(true, at, 2e-10, np.random.default_rng(count))
-    found = contradicting_magnetometers(samples, initial_calibration(declared, 0.0))
-    assert [f.text.startswith(said) for f in found if said] == ([True] if said else [])
-    assert bool(found) == bool(said)
+    result = contradicting_magnetometers(samples, initial_calibration(declared, 0.0))
+    assert [f.text.startswith(findings) for f in result if findings] == ([True] if findings else [])
+    assert bool(result) == bool(findings)

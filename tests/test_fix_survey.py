@@ -29,7 +29,7 @@ def surveyed(beacons: int, *, synchronised: bool) -> Site:
 
 def mean_nees(site: Site, *, survey_error: bool) -> float:
     """Return the mean over runs, each with its own survey error, of one epoch's NEES."""
-    found = []
+    result = []
     for seed in range(RUNS):
         rng = np.random.default_rng(seed)
         motion = random_walk_motion(rng, 20.0, DEMO_BOX_WORLD)
@@ -40,8 +40,8 @@ def mean_nees(site: Site, *, survey_error: bool) -> float:
         fixes = fix_epochs(samples, initial_calibration(site, 0.0), survey_error=survey_error)
         errors = trajectory_errors(fixes.best(), truth, max_gap=10.0)
         assert errors.nees is not None
-        found.append(errors.nees[1])
-    return float(np.mean(found))
+        result.append(errors.nees[1])
+    return float(np.mean(result))
 
 
 @pytest.mark.parametrize(("beacons", "synchronised"), [(2, True), (4, True), (4, False)])

@@ -8,9 +8,9 @@ from small_problem import small_log
 
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.graph.state import pose_steps, states_in
-from magfusion.estimation.integrity.held import held
+from magfusion.estimation.integrity.fixed_parameter_test import check_fixed_parameters
 from magfusion.estimation.integrity.score import moved_estimate, scores_of
-from magfusion.estimation.integrity.testimony import Case
+from magfusion.estimation.integrity.test_result import Case
 from magfusion.model.parameters import GROUPS, difference, prior_sigma
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
@@ -32,13 +32,13 @@ def test_a_declared_sigma_allows_the_step_that_estimating_finds() -> None:
     assert {b.name for b in estimated.blocks} == {b.name for b in fixed.considered}
     scores = scores_of(fixed, small.log.imu)
     assert scores is not None
-    score = scores.held
+    score = scores.fixed
     allowed = moved_estimate(fixed, score, score.allowed(np.zeros(len(score.gradient))))
     blocks = estimated.blocks
-    found = difference(fixed.calibration, estimated.calibration, blocks) / prior_sigma(blocks)
+    result = difference(fixed.calibration, estimated.calibration, blocks) / prior_sigma(blocks)
     stepped = difference(fixed.calibration, allowed.calibration, blocks) / prior_sigma(blocks)
-    assert np.max(np.abs(found)) > 1.5  # declared sigmas; there is something to find
-    np.testing.assert_allclose(stepped, found, atol=0.2)
+    assert np.max(np.abs(result)) > 1.5  # declared sigmas; there is something to find
+    np.testing.assert_allclose(stepped, result, atol=0.2)
     # The poses follow: what is left is that a step is linear.
     assert estimated.states.pose_cov is not None
     sigma = np.sqrt(np.diagonal(estimated.states.pose_cov, axis1=1, axis2=2))
@@ -86,5 +86,5 @@ def test_a_moved_beacon_is_named_where_it_doubles_the_nees(
     scores, cov = scores_of(result, log.imu), result.states.pose_cov
     assert scores is not None
     assert cov is not None
-    findings = held(Case(result, log, scores.held, cov)).findings
+    findings = check_fixed_parameters(Case(result, log, scores.fixed, cov)).findings
     assert [f.code for f in findings] == (["beacon_pose"] if named else [])

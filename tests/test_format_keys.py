@@ -37,24 +37,24 @@ KEYS = list(_keys(SiteEntry, set()))
 
 def test_all_parts_of_a_site_are_found() -> None:
     parts = {model.__name__ for model, _ in KEYS}
-    assert {"WindingEntry", "RegionEntry", "MotionPriorEntry", "WarmingEntry"} <= parts
+    assert {"WindingEntry", "RegionEntry", "MotionPriorEntry", "MomentTemperatureEntry"} <= parts
 
 
 def test_every_key_is_documented() -> None:
-    told = " ".join(re.findall(r"`[^`]+`", PAGE)) + " ".join(re.findall(r"^### .*", PAGE, re.M))
+    reported = " ".join(re.findall(r"`[^`]+`", PAGE)) + " ".join(re.findall(r"^### .*", PAGE, re.M))
     missing = [
         f"{model.__name__}.{name}"
         for model, name in KEYS
-        if name != VERSION and not re.search(rf"\b{name}\b", told)
+        if name != VERSION and not re.search(rf"\b{name}\b", reported)
     ]
     assert not missing
 
 
 def test_no_key_takes_anything() -> None:
-    taken = [
+    selected = [
         f"{model.__name__}.{name}" for model, name in KEYS if not _refuses(model, name, object())
     ]
-    assert not taken
+    assert not selected
 
 
 def _refuses(model: type[StrictModel], name: str, value: object) -> bool:

@@ -29,9 +29,9 @@ def test_what_breaks_is_found(
     case: Case = {"kind": "site", "changes": [], "command": "navigate - --site SITE"}
     assert run_case(case, inputs, tmp_path / "good") is None
     monkeypatch.setattr("magfusion.jobs.stream.run_stream", broken)
-    found = run_case(case, inputs, tmp_path / "bad")
-    assert found is not None
-    assert "ZeroDivisionError: a fault" in found
+    result = run_case(case, inputs, tmp_path / "bad")
+    assert result is not None
+    assert "ZeroDivisionError: a fault" in result
 
 
 @pytest.mark.parametrize("path", KEPT, ids=lambda path: path.stem)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.estimation.snapshot.gain_consistency import gains_of
 from magfusion.estimation.snapshot.gain_spread import gain_spread
-from magfusion.estimation.snapshot.gain_witness import gains_of
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.estimation.snapshot.problem import GAIN_SIGMA
 from magfusion.model.parameters import initial_calibration
@@ -42,12 +42,14 @@ def scaled(samples: FieldSamples, log_gain: np.ndarray) -> FieldSamples:
 def fixed(site: Site, samples: FieldSamples) -> tuple[float, Fixes, Fixes]:
     """Return the spread, and the fixes with gains held and with gains that free."""
     calibration = initial_calibration(site, 0.0)
-    held = fix_epochs(samples, calibration, survey_error=False)
-    spread = gain_spread(samples, calibration, held, survey_error=False)
+    fixed = fix_epochs(samples, calibration, survey_error=False)
+    spread = gain_spread(samples, calibration, fixed, survey_error=False)
     if not spread:
-        return spread, held, held
-    free = fix_epochs(samples, calibration, survey_error=False, free=("gain",), gain_sigma=spread)
-    return spread, held, free
+        return spread, fixed, fixed
+    free_parameters = fix_epochs(
+        samples, calibration, survey_error=False, free_parameters=("gain",), gain_sigma=spread
+    )
+    return spread, fixed, free_parameters
 
 
 def error(fixes: Fixes, targets: np.ndarray) -> float:
@@ -63,12 +65,12 @@ def test_where_gains_do_not_err_none_are_found() -> None:
 def test_a_spread_of_gains_is_found_and_the_fixes_are_better_for_it(true: float) -> None:
     site, samples, targets = room()
     gains = np.random.default_rng(6).normal(0.0, true, (TARGETS, len(site.beacons)))
-    spread, held, free = fixed(site, scaled(samples, gains))
+    spread, constant, free_parameters = fixed(site, scaled(samples, gains))
     # Three gains at sixty targets scatter by 5 %; some of each is taken for a position.
     assert spread == pytest.approx(true, rel=0.3)
-    assert error(free, targets) < 0.3 * error(held, targets)
-    found = free.log_gain[:, 0, :: len(samples.channels) // len(site.beacons)]
-    assert np.std(found - gains) < 0.5 * true
+    assert error(free_parameters, targets) < 0.3 * error(constant, targets)
+    result = free_parameters.log_gain[:, 0, :: len(samples.channels) // len(site.beacons)]
+    assert np.std(result - gains) < 0.5 * true
 
 
 def test_too_few_epochs_tell_of_no_spread() -> None:
@@ -86,24 +88,24 @@ def test_a_moment_that_is_wrong_everywhere_is_named() -> None:
     site = replace(site, beacons=beacons)
     gains = np.random.default_rng(7).normal(0.0, 0.05, (TARGETS, len(site.beacons)))
     gains[:, 1] += 0.3
-    spread, _, free = fixed(site, scaled(samples, gains))
-    said = list(gains_of(free, site, spread))
-    assert said[0].code == "gain_spread"
-    assert [f.code for f in said if f.verdict is Verdict.DOUBTFUL] == ["moments"]
-    assert f"beacon {site.beacons[1].name} is 1.3" in said[1].text
+    spread, _, free_parameters = fixed(site, scaled(samples, gains))
+    findings = list(gains_of(free_parameters, site, spread))
+    assert findings[0].code == "gain_spread"
+    assert [f.code for f in findings if f.verdict is Verdict.DOUBTFUL] == ["moments"]
+    assert f"beacon {site.beacons[1].name} is 1.3" in findings[1].text
 
 
 def test_where_no_epoch_tells_a_pose_none_tells_of_a_spread() -> None:
     site, samples, _ = room()
     alone = replace(site, beacons=site.beacons[:1])
     tones = len(alone.beacons[0].tones)
-    heard = FieldSamples(
+    detected = FieldSamples(
         samples.time,
         samples.window,
         samples.channels[:tones],
         samples.phasor_sensor[:, :tones],
         samples.phasor_cov[:, :tones],
     )
-    held = fix_epochs(heard, initial_calibration(alone, 0.0), survey_error=False)
-    none = replace(held, determined=np.zeros_like(held.determined))
-    assert gain_spread(heard, initial_calibration(alone, 0.0), none) == GAIN_SIGMA
+    fixed = fix_epochs(detected, initial_calibration(alone, 0.0), survey_error=False)
+    none = replace(fixed, determined=np.zeros_like(fixed.determined))
+    assert gain_spread(detected, initial_calibration(alone, 0.0), none) == GAIN_SIGMA

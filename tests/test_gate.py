@@ -72,7 +72,7 @@ def test_innovations_have_the_covariance_of_prediction_and_noise_together() -> N
     predicted, gate = a_state(SITE, sigma), a_gate()
     every = np.ones(len(SITE.channels), dtype=bool)
     exact = replace(predicted, cov=1e-24 * np.eye(MOTION))
-    now, found, by_noise = np.zeros(1, dtype=np.int64), [], []
+    now, result, by_noise = np.zeros(1, dtype=np.int64), [], []
     for _ in range(250):
         true = moved(predicted, (), sigma * rng.normal(size=MOTION))
         pose = Trajectory(
@@ -82,10 +82,10 @@ def test_innovations_have_the_covariance_of_prediction_and_noise_together() -> N
         zero = np.zeros((1, 3))
         fields = field_phasors(SITE, samples, now, pose, zero, np.zeros(1), 1.0)
         gate.passed(fields, predicted, every, ~every)
-        found.append(list(gate.taken.values()))
+        result.append(list(gate.accepted.values()))
         by_noise.append(fields.distances(exact, ()) / COMPONENTS)
     # 1,000 channels, of which those of an epoch share the pose's error.
-    assert np.mean(found) == pytest.approx(1.0, abs=0.12)
+    assert np.mean(result) == pytest.approx(1.0, abs=0.12)
     assert np.mean(by_noise) > 2.0  # alone, it is not what the innovations are
 
 

@@ -25,10 +25,10 @@ def test_the_vertical_of_many_rests_is_off_by_the_claimed_sigma(noise: float, bi
     force += rng.normal(0.0, noise * np.sqrt(RATE_HZ), force.shape)
     time = np.arange(len(force)) / RATE_HZ
     middle = REST * (np.arange(count) + 0.5)
-    found = gravity_at_rest(ImuSamples(time, np.zeros_like(force), force), site, middle)
-    assert found is not None
-    assert np.all(np.isfinite(found.sigma))
-    across = found.up_body - np.sum(found.up_body * up, axis=1, keepdims=True) * up
+    result = gravity_at_rest(ImuSamples(time, np.zeros_like(force), force), site, middle)
+    assert result is not None
+    assert np.all(np.isfinite(result.sigma))
+    across = result.up_body - np.sum(result.up_body * up, axis=1, keepdims=True) * up
     # Two axes of 500 rests: a sigma is known to 2.2 %.
-    ratio = np.sqrt(np.mean(np.sum(across**2, axis=1) / found.sigma**2) / 2.0)
+    ratio = np.sqrt(np.mean(np.sum(across**2, axis=1) / result.sigma**2) / 2.0)
     assert ratio == pytest.approx(1.0, abs=0.09)

@@ -123,8 +123,8 @@ def test_a_file_of_maps_says_the_same(tables: dict[str, Path], tmp_path: Path) -
     (tmp_path / "map.yaml").write_text("\n".join(lines))
     log, _ = imported(tmp_path / "log", map_file=tmp_path / "map.yaml")
     assert_same(log)
-    turned = "imu.gyro=-gx,gy,gz[deg/s]"  # what is typed has the last word
-    log, _ = imported(tmp_path / "log", map_file=tmp_path / "map.yaml", maps=(turned,))
+    rotated = "imu.gyro=-gx,gy,gz[deg/s]"  # what is typed has the last word
+    log, _ = imported(tmp_path / "log", map_file=tmp_path / "map.yaml", maps=(rotated,))
     np.testing.assert_allclose(log.imu.gyro_body, GYRO * [-1, 1, 1], rtol=1e-12, atol=1e-15)
 
 
@@ -222,7 +222,7 @@ def test_names_that_say_their_unit_need_no_map(tmp_path: Path) -> None:
 
 def _transforms(k: int) -> object:
     types = STORE.types
-    made = []
+    built = []
     for parent, child, position in (("map", "imu", POSITION[k]), ("imu", "mag", np.zeros(3))):
         stamped = types["geometry_msgs/msg/TransformStamped"](
             types["std_msgs/msg/Header"](header(int(STAMPS[k])).stamp, parent),
@@ -231,8 +231,8 @@ def _transforms(k: int) -> object:
                 xyz("Vector3", position), xyz("Quaternion", ROTATION[k].as_quat())
             ),
         )
-        made.append(stamped)
-    return types["tf2_msgs/msg/TFMessage"](made)
+        built.append(stamped)
+    return types["tf2_msgs/msg/TFMessage"](built)
 
 
 @pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])

@@ -34,23 +34,23 @@ def _in_names(names: tuple[str, ...], values: np.ndarray) -> dict[str, np.ndarra
 @pytest.mark.slow
 def test_a_strangers_recording_leads_to_a_trusted_trajectory(tmp_path: Path) -> None:
     """Of 200 Hz and 1 kHz, in ms since its epoch, deg/s, g and nT."""
-    made = tmp_path / "made"
+    built = tmp_path / "made"
     config = SimulationConfig(DEMO_BOX_WORLD, duration=30.0, magnetometer_rate_hz=1000.0)
-    run_simulate(demo_site(), config, made, seed=4)
+    run_simulate(demo_site(), config, built, seed=4)
     stamps = {
-        stream: pa.parquet.read_table(made / f"{stream}.parquet")["time_ns"].to_numpy()
+        stream: pa.parquet.read_table(built / f"{stream}.parquet")["time_ns"].to_numpy()
         for stream in ("imu", "magnetometer", "truth")
     }
-    epoch = read_log(made).epoch_ns
+    epoch = read_log(built).epoch_ns
     _write(
         tmp_path / "imu.csv",
         {"t": (stamps["imu"] - epoch) / 1e6}
-        | _in_names(("GyrX", "GyrY", "GyrZ"), _columns(made / "imu.parquet", "gyro", DEGREE))
+        | _in_names(("GyrX", "GyrY", "GyrZ"), _columns(built / "imu.parquet", "gyro", DEGREE))
         | _in_names(
-            ("AccX", "AccY", "AccZ"), _columns(made / "imu.parquet", "accel", STANDARD_GRAVITY)
+            ("AccX", "AccY", "AccZ"), _columns(built / "imu.parquet", "accel", STANDARD_GRAVITY)
         ),
     )
-    field = _columns(made / "magnetometer.parquet", "field", 1e-9)
+    field = _columns(built / "magnetometer.parquet", "field", 1e-9)
     _write(
         tmp_path / "mag.csv",
         {"time [ms]": (stamps["magnetometer"] - epoch) / 1e6}
@@ -59,14 +59,14 @@ def test_a_strangers_recording_leads_to_a_trusted_trajectory(tmp_path: Path) -> 
     run_command(
         *("import", "--imu", tmp_path / "imu.csv", tmp_path / "mag.csv", "-o", tmp_path / "log"),
         *("--map", "imu.time=t[ms]", "--map", "imu.gyro=GyrX,GyrY,GyrZ[deg/s]"),
-        *("--map", "imu.accel=AccX,AccY,AccZ[g]", "--site", made / "site.yaml"),
+        *("--map", "imu.accel=AccX,AccY,AccZ[g]", "--site", built / "site.yaml"),
     )
     assert json.loads((tmp_path / "log" / "report.json").read_text())["verdict"] == "trustworthy"
-    site = made / "site.yaml"
+    site = built / "site.yaml"
     run_command("smooth", tmp_path / "log", "--site", site, "-o", tmp_path / "run")
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["verdict"] == "trustworthy"
-    truth = pa.parquet.read_table(made / "truth.parquet")
+    truth = pa.parquet.read_table(built / "truth.parquet")
     estimate = read_estimate(tmp_path / "run")
     error = [
         estimate.position_world[:, k]

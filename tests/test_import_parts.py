@@ -95,15 +95,15 @@ def test_halves_of_the_same_times_are_taken_as_they_are(tmp_path: Path) -> None:
 
 def test_where_a_half_is_silent_samples_are_missing_and_not_invented(tmp_path: Path) -> None:
     time = np.arange(400) / 200.0
-    heard = time[(time < 0.8) | (time > 1.2)]
+    detected = time[(time < 0.8) | (time > 1.2)]
     one = table(tmp_path / "gyro.csv", "t (s),wx (rad/s),wy (rad/s),wz (rad/s)", time, gyro(time))
     two = table(
-        tmp_path / "accel.csv", "t (s),ax (m/s^2),ay (m/s^2),az (m/s^2)", heard, accel(heard)
+        tmp_path / "accel.csv", "t (s),ax (m/s^2),ay (m/s^2),az (m/s^2)", detected, accel(detected)
     )
     log, figures = imported(tmp_path / "log", one, two, magnetometer(tmp_path / "mag.csv"))
-    missing = len(time) - len(heard)
+    missing = len(time) - len(detected)
     assert figures["imu_missing"] == missing
-    assert len(log.imu.time) == len(heard)  # the reader leaves missing samples out
+    assert len(log.imu.time) == len(detected)  # the reader leaves missing samples out
 
 
 def test_halves_without_a_moment_in_common_and_a_half_alone_are_refused(tmp_path: Path) -> None:

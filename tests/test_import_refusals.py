@@ -41,7 +41,7 @@ def tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def told(capfd: pytest.CaptureFixture[str], line: str) -> str:
+def reported(capfd: pytest.CaptureFixture[str], line: str) -> str:
     """Return what an import that is refused says; it must leave nothing behind."""
     before = sorted(Path().rglob("*"))
     with pytest.raises(SystemExit) as ended:
@@ -100,7 +100,7 @@ def test_a_slip_is_told_by_its_cause(
     line: str, pattern: str, tables: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     assert tables.is_dir()
-    assert re.search(pattern, told(capfd, line), re.S)
+    assert re.search(pattern, reported(capfd, line), re.S)
 
 
 # What is in the file --------------------------------------------------------------------------
@@ -143,7 +143,7 @@ def test_a_spoiled_table_is_refused_by_column_row_and_cause(
     rows = rows_of(TIME, FIELDS)
     change(rows)
     write(tables / "mag.csv", FIELD_HEAD, rows)
-    sentence = told(capfd, BOTH)
+    sentence = reported(capfd, BOTH)
     assert "mag.csv" in sentence
     assert re.search(pattern, sentence)
     assert sentence.count("\n") == 1
@@ -153,7 +153,7 @@ def test_a_column_that_is_there_twice_is_named_by_its_place(
     tables: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     write(tables / "mag.csv", "t_ms,B,B,B", rows_of(TIME, FIELDS))
-    sentence = told(capfd, f"imu.csv --magnetometer mag.csv --map '{_field('B,B,B')}'")
+    sentence = reported(capfd, f"imu.csv --magnetometer mag.csv --map '{_field('B,B,B')}'")
     assert "column B is there 3 times" in sentence
     assert "one of #1, #2, #3" in sentence
     line = f"import imu.csv --magnetometer mag.csv --map '{_field('#1,#2,#3')}' -o log"
@@ -171,9 +171,9 @@ def test_all_problems_are_told_at_once_with_what_would_decide_them(
 ) -> None:
     write(tables / "imu.csv", "time,wx,wy,wz,ax,ay,az", rows_of(TIME, RATES, FORCES))
     write(tables / "mag.csv", "time,Bx,By,Bz", rows_of(1e3 * TIME, FIELDS))
-    said = told(capfd, BOTH)
-    assert "for 5 problems" in said
-    proposed = [line.strip(" \\") for line in said.splitlines() if line.startswith("  --map")]
+    findings = reported(capfd, BOTH)
+    assert "for 5 problems" in findings
+    proposed = [line.strip(" \\") for line in findings.splitlines() if line.startswith("  --map")]
     assert proposed == [
         "--map 'imu.time=time[ms]'",
         "--map 'imu.gyro=wx,wy,wz[deg/s]'",
@@ -189,14 +189,14 @@ def test_all_problems_are_told_at_once_with_what_would_decide_them(
 def test_what_is_in_the_way_is_kept(tables: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (tables / "log").mkdir()
     (tables / "log" / "notes.txt").write_text("mine")
-    assert "holds other files" in told(capfd, BOTH)
+    assert "holds other files" in reported(capfd, BOTH)
     (tables / "log" / "notes.txt").unlink()
     for _ in range(2):  # its own log is replaced
         with pytest.raises(SystemExit) as ended:
             main(["import", "imu.csv", "mag.csv", "-o", "log"])
         assert not ended.value.code
     capfd.readouterr()
-    assert "is a log of magfusion already" in told(capfd, "log")
+    assert "is a log of magfusion already" in reported(capfd, "log")
 
 
 def test_lengths_that_differ_and_a_missing_package(
@@ -205,10 +205,12 @@ def test_lengths_that_differ_and_a_missing_package(
     with h5py.File(tables / "all.h5", "w") as file:
         file["t"], file["B"] = TIME, FIELDS[:-1]
     maps = "--map 'magnetometer.time=t[ms]' --map 'magnetometer.field=B[nT]'"
-    sentence = told(capfd, f"imu.csv --magnetometer all.h5 {maps}")
+    sentence = reported(capfd, f"imu.csv --magnetometer all.h5 {maps}")
     assert re.search("t has 400 rows, B:. has 399 rows", sentence)
     monkeypatch.setitem(sys.modules, "h5py", None)
-    assert "pip install 'magfusion[import]'" in told(capfd, f"imu.csv --magnetometer all.h5 {maps}")
+    assert "pip install 'magfusion[import]'" in reported(
+        capfd, f"imu.csv --magnetometer all.h5 {maps}"
+    )
 
 
 @pytest.mark.parametrize(
@@ -232,7 +234,7 @@ def test_a_bag_of_which_something_is_open(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_bag(tmp_path / "run", SENSORS | {"/mag2": (FIELD, field_message)})
-    assert re.search(pattern, told(capfd, f"run {maps}"), re.S)
+    assert re.search(pattern, reported(capfd, f"run {maps}"), re.S)
 
 
 def test_a_single_problem_is_one_sentence(tables: Path, refuse: Refuse) -> None:

@@ -12,13 +12,13 @@ from magfusion.files.foreign.convert import write_stream
 from magfusion.files.foreign.dialect import find_dialect
 from magfusion.files.foreign.guess import named_columns, streams_of
 from magfusion.files.foreign.plan import Findings, plan_stream
-from magfusion.files.foreign.source import Column
+from magfusion.files.foreign.source import SourceColumn
 from magfusion.files.foreign.text import TORN, text_source
 from magfusion.files.foreign.units import (
     NO_STAMP,
     UNITS,
     Dimension,
-    Unit,
+    SourceUnit,
     accepted,
     parse_unit,
     to_nanoseconds,
@@ -68,7 +68,7 @@ def test_a_unit_is_read_as_people_write_it(text: str, dimension: Dimension, si: 
 def test_every_unit_that_is_offered_is_taken(dimension: Dimension) -> None:
     for name in UNITS[dimension]:
         assert name in accepted(dimension)
-        assert parse_unit(name, dimension) == Unit(name, dimension)
+        assert parse_unit(name, dimension) == SourceUnit(name, dimension)
     for wrong in ("parsec", "0*", "nan*1"):
         assert parse_unit(wrong, dimension) is None
 
@@ -155,9 +155,9 @@ def test_what_is_no_stamp_is_told(text: str, unit: str) -> None:
     ],
 )
 def test_a_name_says_what_it_is(name: str, stream: str, target: str, unit: str | None) -> None:
-    found = {t: named for t, named in named_columns([Column(name)], stream).items() if named}
-    assert list(found) == [target]
-    (one,) = found[target]
+    result = {t: named for t, named in named_columns([SourceColumn(name)], stream).items() if named}
+    assert list(result) == [target]
+    (one,) = result[target]
     assert one.unit == (None if unit is None else parse_unit(unit, STREAMS[stream][target]))
 
 
@@ -169,7 +169,7 @@ def test_a_name_says_what_it_is(name: str, stream: str, target: str, unit: str |
     ],
 )
 def test_what_another_thing_is_called_is_not_taken(name: str, stream: str) -> None:
-    assert not any(named_columns([Column(name)], stream).values())
+    assert not any(named_columns([SourceColumn(name)], stream).values())
 
 
 def test_one_table_with_two_clocks_gives_each_stream_its_own() -> None:
@@ -183,7 +183,7 @@ def test_one_table_with_two_clocks_gives_each_stream_its_own() -> None:
         "gt_x",
         "gt_qw",
     ]
-    columns = [Column(name) for name in names]
+    columns = [SourceColumn(name) for name in names]
     assert streams_of(columns, "all") == {"imu", "magnetometer"}
     for stream, place in (("imu", 0), ("magnetometer", 3), ("truth", 5)):
         assert [n.place for n in named_columns(columns, stream)["time"]] == [place]
@@ -249,7 +249,11 @@ def test_a_table_is_read_in_whatever_way_it_is_written(name: str, tmp_path: Path
 def test_units_of_a_second_row_are_those_of_the_columns(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("t;Bx;By\n[ms];[nT];-\n1;2;3\n")
-    assert find_dialect(path).columns == (Column("t", "ms"), Column("Bx", "nT"), Column("By", "-"))
+    assert find_dialect(path).columns == (
+        SourceColumn("t", "ms"),
+        SourceColumn("Bx", "nT"),
+        SourceColumn("By", "-"),
+    )
 
 
 @pytest.mark.parametrize(
@@ -277,10 +281,10 @@ def test_rows_are_sorted_and_what_is_left_out_is_counted(tmp_path: Path) -> None
     rows[5][2] = np.nan
     text = "\n".join(",".join(map(str, row)) for row in rows)
     (tmp_path / "m.csv").write_text(f"t_ms,Bx_nT,By_nT,Bz_nT\n{text}\n,1,2,3\n7\n")
-    told = Findings()
-    plan = plan_stream("magnetometer", text_source(tmp_path / "m.csv"), (), None, told)
+    reported = Findings()
+    plan = plan_stream("magnetometer", text_source(tmp_path / "m.csv"), (), None, reported)
     assert plan is not None
-    assert not told.problems
+    assert not reported.problems
     counts = write_stream(plan, tmp_path / "m.parquet")
     assert (counts.read, counts.written, counts.missing, counts.unsorted) == (52, 50, 1, 1)
     assert counts.left_out == {
@@ -333,9 +337,9 @@ def test_columns_of_unknown_names_are_proposed_by_unit_place_and_size(
     rows = zip(*(values[kind] for kind in columns), strict=True)
     lines = [";".join(row) for row in rows]
     (tmp_path / "i.csv").write_text("\n".join(filter(None, [names, *lines])))
-    told = Findings()
-    assert plan_stream("imu", text_source(tmp_path / "i.csv"), (), None, told) is None
-    assert told.proposals[: len(maps)] == maps
+    reported = Findings()
+    assert plan_stream("imu", text_source(tmp_path / "i.csv"), (), None, reported) is None
+    assert reported.proposals[: len(maps)] == maps
 
 
 def test_truth_leaves_out_what_holds_no_pose(tmp_path: Path) -> None:

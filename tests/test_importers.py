@@ -333,10 +333,10 @@ def test_a_bag_that_no_instrument_gives_is_refused(
 
 
 def test_samples_that_were_not_taken_are_left_out_of_a_bag_and_said(tmp_path: Path) -> None:
-    lost = _changed(imu_message, _spoil("linear_acceleration", "y", float("nan")))
+    lost_epochs = _changed(imu_message, _spoil("linear_acceleration", "y", float("nan")))
     again = _changed(field_message, lambda m: _stamped(m, 20), row=21)
     unseen = _changed(pose_message, _spoil("pose", "position", xyz("Point", np.full(3, np.nan))))
-    topics = {"/imu": (IMU, lost), "/mag": (FIELD, again), "/mocap": (POSE, unseen)}
+    topics = {"/imu": (IMU, lost_epochs), "/mag": (FIELD, again), "/mocap": (POSE, unseen)}
     bag = write_bag(tmp_path / "run", topics)
     log = open_log(bag)
     assert log.waveform is not None

@@ -18,7 +18,7 @@ from magfusion.model.samples import ImuSamples
 from magfusion.model.site import ImuModel
 from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.inertial import simulate_imu
-from magfusion.simulation.motion import Motion, Rests, turning_motion
+from magfusion.simulation.motion import Rests, SimulatedMotion, turning_motion
 
 GRAVITY = 9.81
 DURATION = 40.0  # s
@@ -29,13 +29,13 @@ GYRO_BIAS = np.array([0.01, -0.02, 0.03])
 ACCEL_BIAS = np.array([0.1, 0.2, -0.3])
 
 
-def moving(seed: int, rate_rms: float = 1.5) -> Motion:
+def moving(seed: int, rate_rms: float = 1.5) -> SimulatedMotion:
     rests = Rests(start=0.0, move=DURATION, pause=0.0)
     rng = np.random.default_rng(seed)
     return turning_motion(rng, DURATION, BOX_WORLD, rate_rms=rate_rms, rests=rests)
 
 
-def recorded(motion: Motion, time_offset: float = 0.0) -> ImuSamples:
+def recorded(motion: SimulatedMotion, time_offset: float = 0.0) -> ImuSamples:
     rng = np.random.default_rng(0)
     return simulate_imu(motion, SILENT, GRAVITY, 200.0, DURATION, rng, time_offset).samples
 
@@ -54,7 +54,7 @@ def with_biases(states: Trajectory, gyro: np.ndarray, accel: np.ndarray) -> Traj
 
 
 def prediction_errors(
-    motion: Motion, imu: ImuSamples, time_offset: float, epochs: np.ndarray
+    motion: SimulatedMotion, imu: ImuSamples, time_offset: float, epochs: np.ndarray
 ) -> np.ndarray:
     """Largest error of attitude (rad), position (m) and velocity (m/s) over the intervals."""
     increments = cut_at_epochs(imu, time_offset, epochs)
@@ -70,13 +70,13 @@ def prediction_errors(
     for i, measurement in enumerate(measured):
         turn = gtsam.Rot3(true.world_from_body[i])
         state = gtsam.NavState(turn, true.position_world[i], true.velocity_world[i])
-        found = measurement.predict(state, constant)
-        turned = found.attitude().matrix().T @ true.world_from_body[i + 1]
+        result = measurement.predict(state, constant)
+        rotated = result.attitude().matrix().T @ true.world_from_body[i + 1]
         errors.append(
             [
-                Rotation.from_matrix(turned).magnitude(),
-                np.linalg.norm(found.position() - true.position_world[i + 1]),
-                np.linalg.norm(found.velocity() - true.velocity_world[i + 1]),
+                Rotation.from_matrix(rotated).magnitude(),
+                np.linalg.norm(result.position() - true.position_world[i + 1]),
+                np.linalg.norm(result.velocity() - true.velocity_world[i + 1]),
             ]
         )
     return np.max(errors, axis=0)
@@ -102,8 +102,8 @@ def test_preintegration_follows_the_exact_motion(
 def test_preintegration_survives_more_than_one_turn() -> None:
     motion = moving(2)
     epochs = np.array([3.0, 33.0])
-    turned = np.trapezoid(np.linalg.norm(motion.rate_body(np.arange(3.0, 33.0, 0.01)), axis=1))
-    assert 0.01 * turned > 4.0 * np.pi  # rad; two turns
+    rotated = np.trapezoid(np.linalg.norm(motion.rate_body(np.arange(3.0, 33.0, 0.01)), axis=1))
+    assert 0.01 * rotated > 4.0 * np.pi  # rad; two turns
     attitude = prediction_errors(motion, biased(recorded(motion)), 0.0, epochs)[0]
     assert attitude < 5e-4  # rad
 
@@ -127,7 +127,7 @@ def test_steps_never_straddle_an_epoch_and_fill_every_interval() -> None:
     assert np.allclose(edges[increments.first], epochs, rtol=0.0, atol=1e-9)  # s
     assert np.all(increments.dt > 0.0)
     assert np.max(increments.dt) < 0.005 + 1e-9  # s; the sampling interval
-    assert not np.any(increments.bridged)
+    assert not np.any(increments.gap_bridged)
 
 
 @pytest.mark.parametrize("ends", [(5.0011, 9.9993), (5.0, 10.0), (-0.4, 2.0), (38.0, 40.3)])
@@ -141,7 +141,7 @@ def test_one_interval_is_cut_as_one_among_several(ends: tuple[float, float]) -> 
     np.testing.assert_array_equal(alone.gyro_body, among.gyro_body)
     np.testing.assert_array_equal(alone.accel_body, among.accel_body)
     assert alone.first[-1] == among.first[-1]
-    assert alone.bridged[0] == among.bridged.any()
+    assert alone.gap_bridged[0] == among.gap_bridged.any()
 
 
 def without(imu: ImuSamples, start: float, end: float) -> ImuSamples:
@@ -156,7 +156,7 @@ def test_intervals_that_touch_a_gap_are_bridged_with_a_wide_covariance(end: floa
     imu = without(recorded(moving(5)), 10.19, end)
     increments = cut_at_epochs(imu, 0.0, epochs)
     touched = (epochs[1:] > 10.19 + 1e-6) & (epochs[:-1] < end - 1e-6)
-    assert np.array_equal(increments.bridged, touched)
+    assert np.array_equal(increments.gap_bridged, touched)
     zero = np.zeros((len(epochs), 3))
     measured = preintegrate(increments, MEMS, GRAVITY, zero, zero)
     sigma = np.sqrt([np.diagonal(m.preintMeasCov())[:9] for m in measured])
@@ -168,10 +168,10 @@ def test_intervals_that_touch_a_gap_are_bridged_with_a_wide_covariance(end: floa
 def test_epochs_beyond_the_stream_are_bridged() -> None:
     imu = without(without(recorded(moving(5)), -1.0, 10.0), 12.0, 50.0)
     increments = cut_at_epochs(imu, 0.0, np.arange(9.5, 12.6, 0.2))
-    assert np.array_equal(np.flatnonzero(increments.bridged), [0, 1, 2, 12, 13, 14])
+    assert np.array_equal(np.flatnonzero(increments.gap_bridged), [0, 1, 2, 12, 13, 14])
 
 
-def states_of(motion: Motion, step: float = 0.2) -> Trajectory:
+def states_of(motion: SimulatedMotion, step: float = 0.2) -> Trajectory:
     return with_biases(motion.trajectory(np.arange(2.0, 38.0, step)), GYRO_BIAS, ACCEL_BIAS)
 
 
@@ -187,23 +187,23 @@ def test_the_motion_passes_exactly_through_the_states() -> None:
         position_world=states.position_world + rng.normal(0.0, 0.01, (len(states), 3)),
         velocity_world=states.velocity_world + rng.normal(0.0, 0.01, (len(states), 3)),
     )
-    found = motion_at(states, biased(recorded(motion)), 0.0, GRAVITY, states.time)
-    assert found.velocity_world is not None
-    assert np.allclose(found.position_world, states.position_world, rtol=0.0, atol=1e-9)  # m
-    assert np.allclose(found.velocity_world, states.velocity_world, rtol=0.0, atol=1e-9)  # m/s
-    assert np.allclose(found.world_from_body, states.world_from_body, rtol=0.0, atol=1e-9)
+    result = motion_at(states, biased(recorded(motion)), 0.0, GRAVITY, states.time)
+    assert result.velocity_world is not None
+    assert np.allclose(result.position_world, states.position_world, rtol=0.0, atol=1e-9)  # m
+    assert np.allclose(result.velocity_world, states.velocity_world, rtol=0.0, atol=1e-9)  # m/s
+    assert np.allclose(result.world_from_body, states.world_from_body, rtol=0.0, atol=1e-9)
 
 
-def motion_errors(found: Trajectory, motion: Motion) -> np.ndarray:
-    true = motion.trajectory(found.time)
-    assert found.velocity_world is not None
+def motion_errors(result: Trajectory, motion: SimulatedMotion) -> np.ndarray:
+    true = motion.trajectory(result.time)
+    assert result.velocity_world is not None
     assert true.velocity_world is not None
-    turn = np.swapaxes(found.world_from_body, 1, 2) @ true.world_from_body
+    turn = np.swapaxes(result.world_from_body, 1, 2) @ true.world_from_body
     return np.array(
         [
             np.max(Rotation.from_matrix(turn).magnitude()),
-            np.max(np.linalg.norm(found.position_world - true.position_world, axis=1)),
-            np.max(np.linalg.norm(found.velocity_world - true.velocity_world, axis=1)),
+            np.max(np.linalg.norm(result.position_world - true.position_world, axis=1)),
+            np.max(np.linalg.norm(result.velocity_world - true.velocity_world, axis=1)),
         ]
     )
 
@@ -213,8 +213,8 @@ def test_between_the_states_the_motion_is_the_true_one(step: float, allowed: flo
     motion = moving(7)
     wanted = np.arange(2.0, 36.9, 0.00123)
     imu = biased(recorded(motion, time_offset=0.004))
-    found = motion_at(states_of(motion, step), imu, 0.004, GRAVITY, wanted)
-    errors = motion_errors(found, motion)
+    result = motion_at(states_of(motion, step), imu, 0.004, GRAVITY, wanted)
+    errors = motion_errors(result, motion)
     assert np.all(errors < allowed * np.array([5e-5, 3e-5, 5e-4])), errors  # rad, m, m/s
     shifted = motion_at(states_of(motion, step), imu, -0.004, GRAVITY, wanted)
     # At 1.4 rad/s and up, eight milliseconds show.
@@ -224,8 +224,10 @@ def test_between_the_states_the_motion_is_the_true_one(step: float, allowed: flo
 def test_a_wrong_bias_bends_the_motion_little_between_the_states() -> None:
     motion = moving(8)
     states = with_biases(motion.trajectory(np.arange(2.0, 38.0, 0.2)), np.zeros(3), np.zeros(3))
-    found = motion_at(states, biased(recorded(motion)), 0.0, GRAVITY, np.arange(2.0, 37.7, 0.00123))
-    errors = motion_errors(found, motion)
+    result = motion_at(
+        states, biased(recorded(motion)), 0.0, GRAVITY, np.arange(2.0, 37.7, 0.00123)
+    )
+    errors = motion_errors(result, motion)
     assert errors[0] < 1e-3  # rad
     assert errors[1] < 1e-3  # m
 
@@ -236,8 +238,8 @@ def test_beyond_the_states_the_imu_carries_the_motion_on() -> None:
     imu = biased(recorded(motion))
     before = motion_at(states, imu, 0.0, GRAVITY, np.arange(9.5, 10.0, 0.01))
     after = motion_at(states, imu, 0.0, GRAVITY, np.arange(11.85, 12.3, 0.01))
-    for found in (before, after):
-        assert np.all(motion_errors(found, motion) < [1e-3, 2e-3, 5e-3])  # rad, m, m/s
+    for result in (before, after):
+        assert np.all(motion_errors(result, motion) < [1e-3, 2e-3, 5e-3])  # rad, m, m/s
 
 
 def test_states_without_biases_are_refused() -> None:
@@ -257,5 +259,5 @@ def test_the_low_passed_rate_at_some_times_is_that_of_the_whole_stream(offset: f
     wanted = np.sort(np.concatenate([ends, rng.uniform(0.0, DURATION, 500), imu.time[::97]]))
     slow = low_passed(imu)
     expected = [np.interp(wanted, slow.time + offset, axis) for axis in slow.gyro_body.T]
-    found = low_passed_rate_at(imu, offset, wanted)
-    assert np.allclose(found, np.stack(expected, axis=1), rtol=0.0, atol=1e-10)
+    result = low_passed_rate_at(imu, offset, wanted)
+    assert np.allclose(result, np.stack(expected, axis=1), rtol=0.0, atol=1e-10)

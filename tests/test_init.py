@@ -49,8 +49,8 @@ def test_the_file_holds_what_was_said(tmp_path: Path) -> None:
     site = load_site(path, unknown=True)
     first, second, third = site.beacons
     np.testing.assert_array_equal(first.position_world, [0.5, -1.0, 2.0])
-    turned = Rotation.from_euler("xyz", [10.0, -20.0, 30.0], degrees=True).as_matrix()
-    np.testing.assert_allclose(first.world_from_beacon, turned, rtol=0, atol=1e-15)
+    rotated = Rotation.from_euler("xyz", [10.0, -20.0, 30.0], degrees=True).as_matrix()
+    np.testing.assert_allclose(first.world_from_beacon, rotated, rtol=0, atol=1e-15)
     np.testing.assert_array_equal(first.moments_beacon, [[220.0, 0.0, 0.0], [0.0, 220.0, 0.0]])
     assert [coil.phase for coil in first.coils] == pytest.approx([0.0, -np.pi / 2])
     assert [coil.radius for coil in first.coils] == [0.2, 0.2]
@@ -169,14 +169,14 @@ def _recording() -> Log:
 
 
 def test_tones_are_told_with_their_coils_and_without_mains() -> None:
-    found = transmitted(_recording(), None)
-    assert found is not None
-    assert [tone.meant_hz for tone in found.tones] == [25.0, 31.3]
-    assert [tone.rotating for tone in found.tones] == [True, False]
-    for tone, true in zip(found.tones, (25.0, 31.3), strict=True):
+    result = transmitted(_recording(), None)
+    assert result is not None
+    assert [tone.meant_hz for tone in result.tones] == [25.0, 31.3]
+    assert [tone.rotating for tone in result.tones] == [True, False]
+    for tone, true in zip(result.tones, (25.0, 31.3), strict=True):
         assert abs(tone.frequency_hz - true) < 4.0 * tone.sigma_hz + 1e-6
         assert tone.sigma_hz < 2e-3
-    assert any("mains of 50 Hz" in other for other in found.others)
+    assert any("mains of 50 Hz" in other for other in result.others)
 
 
 @pytest.fixture(scope="module")
@@ -203,9 +203,9 @@ def test_what_is_said_is_held_against_the_recording(recorded: Path, tmp_path: Pa
     settings = InitSettings(beacon=("A frequency_hz=28.3", "B frequency_hz=25"), log=recorded)
     figures = run_init(settings, tmp_path / "site.yaml")
     assert figures is not None
-    said = {one["code"]: str(one["text"]) for one in figures["reasons"]}  # type: ignore[union-attr,index]
-    assert said["silent_beacon"].startswith("beacon A is not detected at 28.3 Hz")
-    assert said["undeclared_line"].startswith("31.3 Hz")
+    findings = {one["code"]: str(one["text"]) for one in figures["reasons"]}  # type: ignore[union-attr,index]
+    assert findings["silent_beacon"].startswith("beacon A is not detected at 28.3 Hz")
+    assert findings["undeclared_line"].startswith("31.3 Hz")
 
 
 def test_a_frequency_that_is_wanting_is_found_where_it_can_only_be_one(
@@ -239,9 +239,9 @@ def test_questions_are_asked_again_until_the_answer_can_be_read(
         " synchronised=yes",
     )
     assert settings.imu == "BMI088"
-    said = capsys.readouterr().err
-    assert "it is required here" in said
-    assert "did you mean BMI055" in said
+    findings = capsys.readouterr().err
+    assert "it is required here" in findings
+    assert "did you mean BMI055" in findings
     run_init(settings, tmp_path / "site.yaml")
     assert load_site(tmp_path / "site.yaml").beacons[0].synchronised
     assert next(answers, None) is None
@@ -251,7 +251,7 @@ def test_questions_are_asked_again_until_the_answer_can_be_read(
 
 
 @pytest.mark.parametrize(
-    ("said", "sentence"),
+    ("findings", "sentence"),
     [
         ("", "begin with the beacon's name"),
         ("position_m=0,0,1", "begin with the beacon's name"),
@@ -267,9 +267,11 @@ def test_questions_are_asked_again_until_the_answer_can_be_read(
         ("A frequency_hz=20 synchronised=maybe", "write yes or no"),
     ],
 )
-def test_a_beacon_that_cannot_be_read_is_refused_in_one_sentence(said: str, sentence: str) -> None:
+def test_a_beacon_that_cannot_be_read_is_refused_in_one_sentence(
+    findings: str, sentence: str
+) -> None:
     with pytest.raises(InputError) as refused:
-        beacon_draft(said)
+        beacon_draft(findings)
     assert sentence in str(refused.value)
     assert "\n" not in str(refused.value)
 

@@ -33,21 +33,21 @@ def test_a_fault_is_in_one_beacon_and_not_before_its_begin() -> None:
 
 
 def test_what_is_asked_is_counted() -> None:
-    good = integrity_runs.Outcome(0.1, 0.0, 50, 0, 0, 1.0, 1.5, 50, 1e-3, 1e-3)
-    bad = integrity_runs.Outcome(0.1, 0.0, 50, 1, 3, None, 1.5, 40, 0.1, 1e-3)
-    found = integrity_runs.figures([good, bad], Risk())
-    assert found.unseen_runs == 1
-    assert found.false_alarms == 1
-    assert found.finite == pytest.approx(0.9)
-    assert found.detected == pytest.approx(0.5)
+    good = integrity_runs.OnlineOutcome(0.1, 0.0, 50, 0, 0, 1.0, 1.5, 50, 1e-3, 1e-3)
+    bad = integrity_runs.OnlineOutcome(0.1, 0.0, 50, 1, 3, None, 1.5, 40, 0.1, 1e-3)
+    result = integrity_runs.figures([good, bad], Risk())
+    assert result.unseen_runs == 1
+    assert result.false_alarms == 1
+    assert result.finite == pytest.approx(0.9)
+    assert result.detected == pytest.approx(0.5)
     assert "3 epochs unseen" in integrity_runs.report([good, bad])
 
 
 @pytest.mark.slow
 def test_the_promise_is_kept_in_some_runs() -> None:
-    found = integrity_runs.figures(integrity_runs.run(integrity_runs.Config(runs=12, seed=5)))
-    assert found.unseen_runs == 0
-    assert found.false_alarms <= 2
-    assert found.median_ratio <= 4.0
-    assert found.finite >= 0.99
-    assert found.detected > 0.5
+    result = integrity_runs.figures(integrity_runs.run(integrity_runs.Config(runs=12, seed=5)))
+    assert result.unseen_runs == 0
+    assert result.false_alarms <= 2
+    assert result.median_ratio <= 4.0
+    assert result.finite >= 0.99
+    assert result.detected > 0.5

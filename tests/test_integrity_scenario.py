@@ -26,23 +26,23 @@ def test_the_closed_form_tells_of_an_epoch_what_the_fix_does() -> None:
 
 def test_the_promise_is_kept_in_a_few_epochs() -> None:
     config = integrity.Config(epochs=6_000, largest=0.03)
-    found = integrity.figures(integrity.run(config, {"workers": 1}), config)
-    assert found.hazard_limit <= PROMISE.total
-    assert found.false_alarm_rate <= 2.0 * PROMISE.false_alarm
-    assert found.median_ratio <= 4.0
-    assert found.finite >= 0.99
-    assert 0.3 < found.detected < 1.0  # so small a fault is often not seen, nor does it matter
+    result = integrity.figures(integrity.run(config, {"workers": 1}), config)
+    assert result.hazard_limit <= PROMISE.total
+    assert result.false_alarm_rate <= 2.0 * PROMISE.false_alarm
+    assert result.median_ratio <= 4.0
+    assert result.finite >= 0.99
+    assert 0.3 < result.detected < 1.0  # so small a fault is often not seen, nor does it matter
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("largest", [0.02, 0.2])
 def test_the_promise_is_kept(largest: float) -> None:
     config = integrity.Config(epochs=300_000, largest=largest)
-    found = integrity.figures(integrity.run(config), config)
-    assert found.hazard_limit <= PROMISE.total
-    assert found.false_alarm_limit <= 1e-3
-    assert found.median_ratio <= 4.0
-    assert found.finite >= 0.99
+    result = integrity.figures(integrity.run(config), config)
+    assert result.hazard_limit <= PROMISE.total
+    assert result.false_alarm_limit <= 1e-3
+    assert result.median_ratio <= 4.0
+    assert result.finite >= 0.99
 
 
 def test_the_scenario_prints_a_table_and_a_line(
@@ -57,5 +57,5 @@ def test_the_scenario_prints_a_table_and_a_line(
     assert '"hazard_limit"' in out
 
 
-def _few(config: integrity.Config) -> integrity.Outcome:
+def _few(config: integrity.Config) -> integrity.CaseOutcome:
     return integrity.try_block(config, np.random.default_rng(2))

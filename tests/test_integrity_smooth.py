@@ -8,7 +8,7 @@ import pytest
 
 
 def test_what_is_trusted_and_far_off_is_counted() -> None:
-    good = integrity_smooth.Outcome(
+    good = integrity_smooth.SmoothOutcome(
         share=0.1,
         ramp=0.0,
         error_m=1.1e-3,
@@ -19,13 +19,13 @@ def test_what_is_trusted_and_far_off_is_counted() -> None:
         fault_free_verdict="trustworthy",
     )
     off = replace(good, error_m=2e-3, nees=30.0)
-    said = replace(off, verdict="doubtful", fault_free_verdict="doubtful")
-    found = integrity_smooth.figures([good, off, said])
-    assert (found.beyond_trusted, found.silent, found.doubtful_without_fault) == (1, 1, 1)
-    assert found.ratio_worst_trusted == pytest.approx(2.0)
-    assert found.cost_of_robustness == pytest.approx(0.0)
-    dear = integrity_smooth.figures([replace(good, fault_free_m=1.05e-3)])
-    assert dear.cost_of_robustness == pytest.approx(0.05)
+    findings = replace(off, verdict="doubtful", fault_free_verdict="doubtful")
+    result = integrity_smooth.figures([good, off, findings])
+    assert (result.beyond_trusted, result.silent, result.doubtful_without_fault) == (1, 1, 1)
+    assert result.ratio_worst_trusted == pytest.approx(2.0)
+    assert result.cost_of_robustness == pytest.approx(0.0)
+    expensive = integrity_smooth.figures([replace(good, fault_free_m=1.05e-3)])
+    assert expensive.cost_of_robustness == pytest.approx(0.05)
 
 
 @pytest.mark.slow

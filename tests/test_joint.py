@@ -9,7 +9,13 @@ import pytest
 from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.batch.joint import Known, Said, Shared, apart_in_sigmas, known_by
+from magfusion.estimation.batch.joint import (
+    LogReport,
+    Shared,
+    SharedCalibration,
+    apart_in_sigmas,
+    known_by,
+)
 from magfusion.estimation.batch.joint_log import (
     OfLog,
     Round,
@@ -19,9 +25,9 @@ from magfusion.estimation.batch.joint_log import (
     solve_round,
 )
 from magfusion.estimation.graph.factors import CALIBRATION_KEY
-from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate
+from magfusion.estimation.graph.graph import Graph, GraphEstimate, initial_estimate
 from magfusion.estimation.integrity.logs_agree import agreement
-from magfusion.estimation.posterior.condensed import columns_of, condensed
+from magfusion.estimation.posterior.marginalized_log import columns_of, marginalize
 from magfusion.jobs.joint_tasks import shared_of, together_settings
 from magfusion.model.parameters import Calibration, difference, dimension, placed
 from magfusion.model.prior import prior_sqrt_information
@@ -57,12 +63,12 @@ def log_of(true: Site, which: int, duration: float = 2.4) -> Log:
     config = SimulationConfig(
         DEMO_BOX_WORLD, duration=duration, perturb=False, rests=RESTLESS, magnetometer_rate_hz=100.0
     )
-    made = simulate_log(true, config, rng)
+    built = simulate_log(true, config, rng)
     time = np.arange(0.3, duration - 0.3, 0.2)
     fields = simulate_fields(
-        made.true_site, made.motion.trajectory(time), NOISE, rng, made.drives, window=0.2
+        built.true_site, built.motion.trajectory(time), NOISE, rng, built.drives, window=0.2
     )
-    return replace(made.log, name=f"log{which}", waveform=None, fields=fields)
+    return replace(built.log, name=f"log{which}", waveform=None, fields=fields)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,20 +80,20 @@ class Together:
     logs: list[Log]
     alone: list[Smoothed]
     shared: Shared
-    known: Known
+    known: SharedCalibration
     kept: list[OfLog]
     rounds: list[Round]
 
 
-def others(kept: list[OfLog], which: int) -> list[Said]:
-    return [log.said for i, log in enumerate(kept) if i != which]
+def others(kept: list[OfLog], which: int) -> list[LogReport]:
+    return [log.report for i, log in enumerate(kept) if i != which]
 
 
 def refined(site: Site, true: Site, logs: list[Log], rounds: int = ROUNDS) -> Together:
     alone = [smooth(log, site, SETTINGS) for log in logs]
     shared = shared_of(site, SETTINGS)
     kept = [of_smoothed(result, shared) for result in alone]
-    known = known_by(shared, [log.said for log in kept], kept[0].said.step)
+    known = known_by(shared, [log.report for log in kept], kept[0].report.step)
     solved: list[Round] = []
     for _ in range(rounds):
         solved = [
@@ -97,7 +103,7 @@ def refined(site: Site, true: Site, logs: list[Log], rounds: int = ROUNDS) -> To
             for i, (log, own) in enumerate(zip(logs, kept, strict=True))
         ]
         kept = [after_round(own, done, shared) for own, done in zip(kept, solved, strict=True)]
-        known = known_by(shared, [log.said for log in kept], known.step)
+        known = known_by(shared, [log.report for log in kept], known.step)
     return Together(site, true, logs, alone, shared, known, kept, solved)
 
 
@@ -125,7 +131,7 @@ class AllLogs:
         self.declared = [graph.declared for graph in graphs]
         self.own = [columns_of(graph.blocks, own=True) for graph in graphs]
 
-    def rows(self, estimates: list[Estimate]) -> Iterator[tuple[int, Array, Array, Array]]:
+    def rows(self, estimates: list[GraphEstimate]) -> Iterator[tuple[int, Array, Array, Array]]:
         """Yield, for each log, Jacobian by its own variables, by what is shared, and error."""
         for k, (graph, estimate) in enumerate(zip(self.graphs, estimates, strict=True)):
             matrix, right = graph.linearized(estimate).jacobian(graph.ordering)
@@ -140,7 +146,7 @@ class AllLogs:
             matrix, right = np.vstack([matrix, prior]), np.append(right, -whitening @ moved)
             yield k, matrix[:, own], matrix[:, ~own], right
 
-    def step(self, estimates: list[Estimate]) -> tuple[list[Estimate], float]:
+    def step(self, estimates: list[GraphEstimate]) -> tuple[list[GraphEstimate], float]:
         parts = list(self.rows(estimates))
         width, size = [own.shape[1] for _, own, _, _ in parts], len(self.prior)
         columns = sum(width)
@@ -167,7 +173,7 @@ class AllLogs:
             column += width[k]
         return out, float(np.max(np.abs(r[columns:, columns:] @ step[columns:])))
 
-    def moved(self, k: int, estimate: Estimate, own: Array, common: Array) -> Estimate:
+    def moved(self, k: int, estimate: GraphEstimate, own: Array, common: Array) -> GraphEstimate:
         graph, change, column = self.graphs[k], gtsam.VectorValues(), 0
         keys = graph.ordering
         for i in range(keys.size() - 1):
@@ -203,10 +209,10 @@ def test_the_joint_solution_is_that_of_one_graph_of_all_logs(together: Together)
         done, blocks = together.rounds[which], together.alone[which].blocks
         cov = joint_posterior(together.kept[which], done, blocks).states.pose_cov
         assert cov is not None
-        ends = done.found.estimate.values
+        ends = done.solution.estimate.values
         for i in range(done.graph.epochs):
-            apart = ends.atPose3(X(i)).localCoordinates(estimate.values.atPose3(X(i)))
-            assert np.max(np.abs(apart) / np.sqrt(np.diagonal(cov[i]))) < 1e-6
+            separate = ends.atPose3(X(i)).localCoordinates(estimate.values.atPose3(X(i)))
+            assert np.max(np.abs(separate) / np.sqrt(np.diagonal(cov[i]))) < 1e-6
             faster = ends.atVector(V(i)) - estimate.values.atVector(V(i))
             assert np.max(np.abs(faster)) < 1e-9  # m/s
             bias = (
@@ -217,7 +223,7 @@ def test_the_joint_solution_is_that_of_one_graph_of_all_logs(together: Together)
 
 def test_a_log_alone_condensed_says_what_its_own_posterior_says(together: Together) -> None:
     result, shared = together.alone[0], together.shared
-    own = of_smoothed(result, shared).said
+    own = of_smoothed(result, shared).report
     known = known_by(shared, [own], own.step)
     rows = ~columns_of(result.blocks, own=True)
     np.testing.assert_allclose(
@@ -226,7 +232,7 @@ def test_a_log_alone_condensed_says_what_its_own_posterior_says(together: Togeth
         rtol=1e-6,
     )
     assert apart_in_sigmas(known.step, own.step, known.cov) < 1e-2  # where its loop had ended
-    without = condensed(result.graph, result.estimate, ())
+    without = marginalize(result.graph, result.estimate, ())
     assert np.all(np.linalg.eigvalsh(without.information) > -1e-6 * np.max(without.information))
 
 
@@ -235,7 +241,7 @@ def test_together_logs_know_more_and_each_knows_it(together: Together) -> None:
     for own, done, result in zip(together.kept, together.rounds, together.alone, strict=True):
         rows = ~columns_of(result.blocks, own=True)
         alone = known_by(
-            together.shared, [of_smoothed(result, together.shared).said], own.said.step
+            together.shared, [of_smoothed(result, together.shared).report], own.report.step
         )
         less = alone.cov - together.known.cov
         scale = np.sqrt(np.diagonal(alone.cov))
@@ -249,27 +255,27 @@ def test_together_logs_know_more_and_each_knows_it(together: Together) -> None:
 
 
 def test_logs_of_one_site_agree(together: Together) -> None:
-    alone = [of_smoothed(result, together.shared).said for result in together.alone]
-    for said in (alone, [log.said for log in together.kept]):
-        known = known_by(together.shared, said, together.known.step)
-        found = agreement(together.shared, said, ["a", "b"], known)
-        assert found.of_log == ((), ())
-        assert found.excess == 1.0
-        assert np.max(found.sigmas) < 4.0
+    alone = [of_smoothed(result, together.shared).report for result in together.alone]
+    for findings in (alone, [log.report for log in together.kept]):
+        known = known_by(together.shared, findings, together.known.step)
+        result = agreement(together.shared, findings, ["a", "b"], known)
+        assert result.of_log == ((), ())
+        assert result.excess == 1.0
+        assert np.max(result.sigmas) < 4.0
 
 
 def test_a_log_that_says_otherwise_is_named_with_its_beacon(together: Together) -> None:
     """What two logs say thrice, and once with beacon C elsewhere."""
-    said = [log.said for log in together.kept]
+    findings = [log.report for log in together.kept]
     (place,) = (b for b in together.shared.blocks if b.name == "C.position")
-    moved = said[0].step.copy()
+    moved = findings[0].step.copy()
     moved[place.columns.start] += 0.05  # m
-    liar = Said(moved, said[0].part)
-    known = known_by(together.shared, [*said, liar], together.known.step)
-    found = agreement(together.shared, [*said, liar], ["a", "b", "c"], known)
-    assert found.of_log[:2] == ((), ())
-    (finding,) = found.of_log[2]
+    liar = LogReport(moved, findings[0].part)
+    known = known_by(together.shared, [*findings, liar], together.known.step)
+    result = agreement(together.shared, [*findings, liar], ["a", "b", "c"], known)
+    assert result.of_log[:2] == ((), ())
+    (finding,) = result.of_log[2]
     assert finding.code == "logs_disagree"
     assert "Log c contradicts the other logs: it takes C." in finding.text
     assert "beacon C was moved" in finding.text
-    assert found.excess > 2.0
+    assert result.excess > 2.0

@@ -13,7 +13,7 @@ from conftest import Refuse, run_command
 from test_joint import log_of, surveyed
 
 from magfusion.cli import main
-from magfusion.estimation.integrity.logs_agree import Agreement
+from magfusion.estimation.integrity.logs_agree import LogAgreement
 from magfusion.files.kept import digest_of_files
 from magfusion.files.log import write_log
 from magfusion.files.site import load_site, save_site
@@ -60,11 +60,11 @@ def test_two_logs_make_one_site_and_one_table(calibrated: Path) -> None:
     assert report["logs_used"] == 2
     with (calibrated / "logs.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    for row, told in zip(rows, report["logs"], strict=True):
-        assert {key: "" if value is None else str(value) for key, value in told.items()} == row
-        assert told["position_sigma_m"] > 0.0
-        assert told["verdict"] in ("trustworthy", "doubtful")
-        assert (told["reason"] == "") == (told["verdict"] == "trustworthy")
+    for row, reported in zip(rows, report["logs"], strict=True):
+        assert {key: "" if value is None else str(value) for key, value in reported.items()} == row
+        assert reported["position_sigma_m"] > 0.0
+        assert reported["verdict"] in ("trustworthy", "doubtful")
+        assert (reported["reason"] == "") == (reported["verdict"] == "trustworthy")
     assert "log1" in (calibrated / "report.html").read_text()
     before, after = surveyed(), load_site(calibrated / "site.yaml")
     assert after.calibration is not None
@@ -154,19 +154,19 @@ def row(name: str, **facts: str) -> dict[str, Any]:
 
 
 def test_nothing_is_left_out_in_silence() -> None:
-    agreed = Agreement(((), ()), 1.0, np.zeros(2))
+    agreed = LogAgreement(((), ()), 1.0, np.zeros(2))
     good = [row("a"), row("b")]
     assert trust_of_all(good, agreed, [], 0.0).findings == ()
     failed = row("c", used="no", verdict="failed", code="no_solution", reason="No start.")
-    found = trust_of_all([*good, failed], agreed, [], 0.0)
-    assert [(f.code, f.verdict) for f in found.findings] == [("log_left_out", "doubtful")]
-    assert "Log c is not used, as it failed alone: No start." in found.findings[0].text
-    (unheard,) = trust_of_all(good, agreed, ["D"], 0.0).findings
-    assert unheard.code == "silent_beacon"
-    assert "Beacon D is not detected in any log" in unheard.text
+    result = trust_of_all([*good, failed], agreed, [], 0.0)
+    assert [(f.code, f.verdict) for f in result.findings] == [("log_left_out", "doubtful")]
+    assert "Log c is not used, as it failed alone: No start." in result.findings[0].text
+    (undetected,) = trust_of_all(good, agreed, ["D"], 0.0).findings
+    assert undetected.code == "silent_beacon"
+    assert "Beacon D is not detected in any log" in undetected.text
     (unsettled,) = trust_of_all(good, agreed, [], 0.2).findings
     assert unsettled.code == "not_converged"
-    said = Finding("logs_disagree", "Log a contradicts log b: it takes all elsewhere.")
-    doubtful = [row("a", verdict="doubtful", code=said.code, reason=said.text), row("b")]
-    once = trust_of_all(doubtful, Agreement(((said,), ()), 3.0, np.zeros(2)), [], 0.0)
-    assert once.findings == (said,)
+    findings = Finding("logs_disagree", "Log a contradicts log b: it takes all elsewhere.")
+    doubtful = [row("a", verdict="doubtful", code=findings.code, reason=findings.text), row("b")]
+    once = trust_of_all(doubtful, LogAgreement(((findings,), ()), 3.0, np.zeros(2)), [], 0.0)
+    assert once.findings == (findings,)

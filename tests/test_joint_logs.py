@@ -39,12 +39,12 @@ def part_of_room(true: Site, world: int, which: int, duration: float = 6.0) -> L
     config = SimulationConfig(
         box, duration=duration, perturb=False, rests=RESTLESS, magnetometer_rate_hz=100.0
     )
-    made = simulate_log(true, config, rng)
+    built = simulate_log(true, config, rng)
     time = np.arange(0.3, duration - 0.3, 0.2)
     fields = simulate_fields(
-        made.true_site, made.motion.trajectory(time), NOISE, rng, made.drives, window=0.2
+        built.true_site, built.motion.trajectory(time), NOISE, rng, built.drives, window=0.2
     )
-    return replace(made.log, name=f"log{which}", waveform=None, fields=fields)
+    return replace(built.log, name=f"log{which}", waveform=None, fields=fields)
 
 
 @pytest.mark.slow
@@ -54,17 +54,19 @@ def test_three_logs_are_honest_together_and_better_than_each_alone() -> None:
         site = surveyed()
         true = perturb_site(site, np.random.default_rng([world, 9]))
         logs = [part_of_room(true, world, which) for which in range(LOGS)]
-        found = refined(site, true, logs, rounds=5)
-        truth = step_to(found.shared, initial_calibration(true, 0.0))
-        of_site.append(apart_in_sigmas(found.known.step, truth, found.known.honest) ** 2)
+        estimate = refined(site, true, logs, rounds=5)
+        truth = step_to(estimate.shared, initial_calibration(true, 0.0))
+        of_site.append(apart_in_sigmas(estimate.known.step, truth, estimate.known.honest) ** 2)
         # What no log can know, the common place and heading, is the same in all.
-        gauge = gauge_basis(initial_calibration(true, 0.0), found.shared.blocks)
-        left = np.eye(len(truth)) - gauge @ gauge.T
-        steps = [found.known.step]
-        steps += [step_to(found.shared, result.calibration) for result in found.alone]
-        unit = prior_sigma(found.shared.blocks)
-        errors.append([np.sqrt(np.mean((left @ ((s - truth) / unit)) ** 2)) for s in steps])
-        for log, own, done, alone in zip(logs, found.kept, found.rounds, found.alone, strict=True):
+        gauge = gauge_basis(initial_calibration(true, 0.0), estimate.shared.blocks)
+        remaining = np.eye(len(truth)) - gauge @ gauge.T
+        steps = [estimate.known.step]
+        steps += [step_to(estimate.shared, result.calibration) for result in estimate.alone]
+        unit = prior_sigma(estimate.shared.blocks)
+        errors.append([np.sqrt(np.mean((remaining @ ((s - truth) / unit)) ** 2)) for s in steps])
+        for log, own, done, alone in zip(
+            logs, estimate.kept, estimate.rounds, estimate.alone, strict=True
+        ):
             joint = joint_posterior(own, done, alone.blocks)
             assert log.truth is not None
             of_log = trajectory_errors(joint.states, log.truth).nees

@@ -42,7 +42,7 @@ def a_filter(cov: Array, share: Array | None = None) -> PartialUpdateFilter:
     return kalman
 
 
-def apart(one: Array, other: Array, cov: Array) -> float:
+def separate(one: Array, other: Array, cov: Array) -> float:
     """Return the largest difference of steps (n,) or covariances (n, n), in sigmas of another."""
     sigma = np.sqrt(np.diag(cov))
     scale = sigma if np.ndim(one) == 1 else np.outer(sigma, sigma)
@@ -62,7 +62,7 @@ def test_attributes_after_an_update_are_those_of_the_textbook() -> None:
     K = P @ H.T @ np.linalg.inv(S)
     posterior = (np.eye(len(P)) - K @ H) @ P
     assert isinstance(kalman, ExtendedKalmanFilter)
-    for found, expected in (
+    for result, expected in (
         (kalman.F, predicted.transition),
         (kalman.Q, predicted.noise),
         (kalman.H, H),
@@ -70,15 +70,15 @@ def test_attributes_after_an_update_are_those_of_the_textbook() -> None:
         (kalman.y, -error),
         (kalman.R, np.eye(len(error))),
     ):
-        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(result, expected)
     np.testing.assert_allclose(kalman.S, S, rtol=1e-9)
     np.testing.assert_allclose(kalman.SI @ S, np.eye(len(S)), atol=1e-9)
     assert kalman.dim_z == len(error)
-    assert apart(kalman.P_prior, P, P) < 1e-12
-    assert apart(kalman.P_prior, predicted.state.cov, P) < 1e-12
-    assert apart(kalman.K @ error, K @ error, posterior) < 1e-8
-    assert apart(kalman.x_post, -K @ error, posterior) < 1e-8
-    assert apart(kalman.P, posterior, posterior) < 1e-8
+    assert separate(kalman.P_prior, P, P) < 1e-12
+    assert separate(kalman.P_prior, predicted.state.cov, P) < 1e-12
+    assert separate(kalman.K @ error, K @ error, posterior) < 1e-8
+    assert separate(kalman.x_post, -K @ error, posterior) < 1e-8
+    assert separate(kalman.P, posterior, posterior) < 1e-8
     np.testing.assert_array_equal(kalman.P, kalman.state.cov)
 
 
@@ -90,9 +90,9 @@ def test_the_error_is_zero_but_for_the_update_and_moves_the_nominal_state() -> N
     assert not np.any(kalman.x)
     assert not np.any(kalman.x_prior)
     went = between(predicted.state, kalman.state, blocks)
-    assert apart(went, kalman.x_post, kalman.P) < 1e-9
+    assert separate(went, kalman.x_post, kalman.P) < 1e-9
     kalman.absorb(replace(predicted, state=replace(predicted.state, time=9.0)), [])
-    assert apart(between(predicted.state, kalman.state, blocks), 0.0 * went, kalman.P) < 1e-12
+    assert separate(between(predicted.state, kalman.state, blocks), 0.0 * went, kalman.P) < 1e-12
 
 
 def test_a_failed_update_leaves_the_filter_as_it_was() -> None:
@@ -147,17 +147,17 @@ def test_the_likelihood_is_exact_whatever_the_innovation_spans(far: bool) -> Non
 
 def test_all_is_as_in_filterpy() -> None:
     cov, z, H = a_problem()
-    kalman, theirs = a_filter(cov), ExtendedKalmanFilter(SIZE, ROWS)
-    theirs.x, theirs.P, R = np.zeros(SIZE), cov, np.diag(np.arange(1.0, 1.0 + ROWS))
-    for filter_ in (kalman, theirs):
+    kalman, others = a_filter(cov), ExtendedKalmanFilter(SIZE, ROWS)
+    others.x, others.P, R = np.zeros(SIZE), cov, np.diag(np.arange(1.0, 1.0 + ROWS))
+    for filter_ in (kalman, others):
         filter_.F, filter_.Q = np.eye(SIZE) + 0.1 * np.eye(SIZE, k=1), 0.2 * np.eye(SIZE)
         filter_.predict()
     kalman.update_linear(z, H, R)
-    theirs.update(z, lambda _: H, lambda x: H @ x, R)
+    others.update(z, lambda _: H, lambda x: H @ x, R)
     for name in ("x", "P", "K", "S", "SI", "y", "z", "x_post", "P_post", "x_prior", "P_prior"):
-        np.testing.assert_array_equal(getattr(kalman, name), getattr(theirs, name), name)
+        np.testing.assert_array_equal(getattr(kalman, name), getattr(others, name), name)
     for name in ("log_likelihood", "mahalanobis", "likelihood"):
-        assert getattr(kalman, name) == pytest.approx(getattr(theirs, name), rel=1e-12)
+        assert getattr(kalman, name) == pytest.approx(getattr(others, name), rel=1e-12)
     before = kalman.P
     kalman.update(None, None, None)
     np.testing.assert_array_equal(kalman.P, before)
@@ -177,14 +177,14 @@ def test_a_share_is_an_update_whose_gain_has_that_share(share: str, far: bool) -
     if share == "partial":
         part = np.linspace(0.0, 1.0, SIZE)
     K = part[:, None] * (cov @ H.T @ np.linalg.inv(H @ cov @ H.T + np.eye(ROWS)))
-    left = np.eye(SIZE) - K @ H
-    expected = left @ cov @ left.T + K @ K.T
+    remaining = np.eye(SIZE) - K @ H
+    expected = remaining @ cov @ remaining.T + K @ K.T
     kalman = a_filter(cov, part)
     kalman.x = np.arange(SIZE) / SIZE
     step = K @ (z - H @ kalman.x)
     (kalman.update_from_far if far else kalman.update_linear)(z, H)
-    assert apart(kalman.x, np.arange(SIZE) / SIZE + step, cov) < 1e-12
-    assert apart(kalman.P, expected, cov) < 1e-12
+    assert separate(kalman.x, np.arange(SIZE) / SIZE + step, cov) < 1e-12
+    assert separate(kalman.P, expected, cov) < 1e-12
     np.testing.assert_allclose(kalman.K, K, atol=1e-12)
     np.testing.assert_array_equal(kalman.x_post, kalman.x)
     np.testing.assert_array_equal(kalman.P_post, kalman.P)
@@ -202,10 +202,10 @@ def test_considered_parameters_of_a_state_are_those_whose_gain_is_zero() -> None
     P = predicted.state.cov
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.eye(len(error)))
     K[-considered:] = 0.0
-    left = np.eye(len(P)) - K @ H
-    expected = left @ P @ left.T + K @ K.T
-    assert apart(between(predicted.state, kalman.state, blocks), -K @ error, expected) < 1e-7
-    assert apart(kalman.state.cov, expected, expected) < 1e-7
+    remaining = np.eye(len(P)) - K @ H
+    expected = remaining @ P @ remaining.T + K @ K.T
+    assert separate(between(predicted.state, kalman.state, blocks), -K @ error, expected) < 1e-7
+    assert separate(kalman.state.cov, expected, expected) < 1e-7
 
 
 @pytest.mark.parametrize("share", [None, considered_share(SIZE, 2)])
@@ -228,8 +228,8 @@ def test_from_far_a_state_is_updated_as_from_near_where_rows_are_linear() -> Non
     near, far = ErrorStateFilter(start, blocks), ErrorStateFilter(start, blocks)
     near.absorb(predicted, rest)
     far.absorb(predicted, rest, predicted.state)
-    assert apart(between(near.state, far.state, blocks), np.zeros(len(near.P)), near.P) < 1e-9
-    assert apart(near.P, far.P, near.P) < 1e-9
+    assert separate(between(near.state, far.state, blocks), np.zeros(len(near.P)), near.P) < 1e-9
+    assert separate(near.P, far.P, near.P) < 1e-9
 
 
 def test_from_far_the_state_is_the_most_probable_one() -> None:
@@ -254,11 +254,11 @@ def test_from_far_the_state_is_the_most_probable_one() -> None:
     best = least_squares(residual, begin, x_scale=scale, xtol=1e-14, ftol=1e-14, gtol=1e-14).x
     kalman = ErrorStateFilter(wide, ())
     kalman.absorb(predicted, epoch, near)
-    assert apart(between(prior, kalman.state, ()), best, kalman.P) < 0.2
+    assert separate(between(prior, kalman.state, ()), best, kalman.P) < 0.2
     error, H = measured_rows(epoch, near, ())
     once = a_filter(kalman.P_prior)
     once.update_from_far(H @ begin - error, H)
-    assert apart(once.x, best, kalman.P) > 2.0
+    assert separate(once.x, best, kalman.P) > 2.0
 
 
 # --- with process noise on the calibration ---
@@ -310,23 +310,23 @@ def test_the_filter_is_the_graph_with_process_noise_on_the_calibration() -> None
     variance = np.diag(start.cov)[MOTION:] * rng.uniform(0.5, 2.0, dimension(blocks))
     later, offset = start.time + elapsed, site.platform.imu.time_offset
     imu = an_imu(start.time, later, rng)
-    found = {}
+    result = {}
     for name, walk in (("whole", variance), ("half", 0.5 * variance)):
         noise = ProcessNoise(blocks, walk)
         predicted = propagate(start, imu, later, site, offset, noise, blocks=blocks)
         epoch = an_epoch(site, predicted.state, blocks, np.random.default_rng(3))
         kalman = ErrorStateFilter(start, blocks)
         kalman.absorb(predicted, epoch)
-        found[name] = kalman.state
+        result[name] = kalman.state
     noise = ProcessNoise(blocks, variance)
     predicted = propagate(start, imu, later, site, offset, noise, blocks=blocks)
     epoch = an_epoch(site, predicted.state, blocks, np.random.default_rng(3))
     rows = measured_rows(epoch, predicted.state, blocks)
     step, cov = by_graph(start, predicted, elapsed * variance, rows)
-    went = max(1.0, apart(step, 0.0 * step, cov))
-    assert apart(between(predicted.state, found["whole"], blocks), step, cov) < 1e-7 * went
-    assert apart(found["whole"].cov, cov, cov) < 1e-7
-    assert apart(found["half"].cov, cov, cov) > 0.05
+    went = max(1.0, separate(step, 0.0 * step, cov))
+    assert separate(between(predicted.state, result["whole"], blocks), step, cov) < 1e-7 * went
+    assert separate(result["whole"].cov, cov, cov) < 1e-7
+    assert separate(result["half"].cov, cov, cov) > 0.05
 
 
 # --- the bank ---
@@ -352,6 +352,6 @@ def test_filters_of_the_bank_are_this_one_without_a_beacon(considered: int, drif
         alone.F, alone.Q = predicted.transition, predicted.noise
         alone.predict()
         alone.update_from_far(-error[owner != group], H[owner != group])
-        assert apart(bank._cov[1 + group], alone.P, alone.P) < close
+        assert separate(bank._cov[1 + group], alone.P, alone.P) < close
         if group >= 0:
-            assert apart(bank._step[group] + went, alone.x, alone.P) < close
+            assert separate(bank._step[group] + went, alone.x, alone.P) < close

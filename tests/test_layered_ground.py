@@ -38,18 +38,18 @@ def test_layers_of_one_conductivity_are_one_and_deep_in_it_a_full_space() -> Non
     beacon = true_site(ROCK, 1).beacons[0]
     whole = beacon_fields_world(beacon, POINTS)
     still = beacon_fields_world(replace(beacon, conductivity=0.0), POINTS)
-    found = {
+    result = {
         top: still + layered_effect(beacon, POINTS, Layers((top,), (0.01,)))
         for top in (1500.0, 300.0, 60.0)
     }
-    assert relative_to_group(found[1500.0], whole) < 1e-6
+    assert relative_to_group(result[1500.0], whole) < 1e-6
     few = still[:3] + layered_effect(beacon, POINTS[:3], Layers((60.0,), (0.01,)))
-    assert relative_to_group(few, found[60.0][:3]) < 1e-6  # on another grid
-    far, near = (relative_to_group(found[top], whole) for top in (300.0, 60.0))
+    assert relative_to_group(few, result[60.0][:3]) < 1e-6  # on another grid
+    far, near = (relative_to_group(result[top], whole) for top in (300.0, 60.0))
     assert 1e-4 < far < 0.01
     assert 0.05 < near < 0.3
     split = still + layered_effect(beacon, POINTS, Layers((60.0, -50.0), (0.01, 0.01)))
-    assert relative_to_group(split, found[60.0]) < 1e-6
+    assert relative_to_group(split, result[60.0]) < 1e-6
 
 
 @pytest.mark.slow

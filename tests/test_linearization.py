@@ -53,17 +53,17 @@ def an_epoch(site: Site, predicted: State, rng: np.random.Generator) -> FieldPha
     """Return the fields at the true pose, as an epoch of that prediction."""
     time, now = np.array([predicted.time]), np.zeros(1, dtype=np.int64)
     true = Trajectory(time, TRUE_ROTATION[None], TRUE_POSITION[None])
-    believed = replace(
+    assumed = replace(
         true,
         world_from_body=predicted.world_from_body[None],
         position_world=predicted.position_world[None],
     )
     samples = simulate_fields(site, true, NOISE_DENSITY, rng)
     offset = np.array([site.platform.imu.time_offset])
-    return field_phasors(site, samples, now, believed, np.zeros((1, 3)), offset, 1.0)
+    return field_phasors(site, samples, now, assumed, np.zeros((1, 3)), offset, 1.0)
 
 
-def carried(state: State, site: Site) -> Propagated:
+def propagated(state: State, site: Site) -> Propagated:
     """Return a prediction whose covariance is that of the state, over a moment."""
     time = np.arange(state.time - 0.1, state.time + 0.1, 0.01)
     still = np.repeat([[0.0, 0.0, 0.0]], len(time), axis=0)
@@ -86,13 +86,13 @@ def most_probable(phasors: FieldPhasors, predicted: State) -> Array:
         error = phasors.error(states_of([at]), predicted.calibration)
         return np.concatenate([error.ravel(), information * step])
 
-    found = least_squares(residual, np.zeros(6), x_scale=1e-3, xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    return np.asarray(found.x)
+    result = least_squares(residual, np.zeros(6), x_scale=1e-3, xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    return np.asarray(result.x)
 
 
 def updated(phasors: FieldPhasors, predicted: State, site: Site) -> State:
     light = ErrorStateFilter(predicted, ())
-    light.absorb(carried(predicted, site), [phasors])
+    light.absorb(propagated(predicted, site), [phasors])
     return light.state
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Refuse
-from live_states import EPOCH_NS, LOST, example_state, told_of, write_walk
+from live_states import EPOCH_NS, MAX_FINAL_STEP_SIGMAS, example_state, release_gain, write_walk
 
 from magfusion.estimation.online.navigator import NavigatorSettings
 from magfusion.files.log import read_log
@@ -31,7 +31,7 @@ descriptor_pb2 = pytest.importorskip("google.protobuf.descriptor_pb2")
 descriptor_pool = pytest.importorskip("google.protobuf.descriptor_pool")
 message_factory = pytest.importorskip("google.protobuf.message_factory")
 
-PATIENCE = 60.0  # s
+MAX_WAIT = 60.0  # s
 
 
 class App:
@@ -40,17 +40,17 @@ class App:
     def __init__(self, connection: Any) -> None:
         self.connection, self.channels = connection, {}
         while len(self.channels) < 3:
-            told = json.loads(connection.recv(timeout=PATIENCE))
-            for channel in told.get("channels", ()):
+            reported = json.loads(connection.recv(timeout=MAX_WAIT))
+            for channel in reported.get("channels", ()):
                 self.channels[channel["id"]] = channel
         wanted = [{"id": number, "channelId": number} for number in self.channels]
         connection.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
         # Answered after what came before it.
-        assert connection.ping().wait(PATIENCE)
+        assert connection.ping().wait(MAX_WAIT)
 
     def next(self) -> tuple[str, int, Any]:
         """Return topic, time (ns) and content of the next message."""
-        while isinstance(data := self.connection.recv(timeout=PATIENCE), str):
+        while isinstance(data := self.connection.recv(timeout=MAX_WAIT), str):
             pass
         kind, number, stamp = struct.unpack_from("<BIQ", data)
         assert kind == 1
@@ -85,17 +85,17 @@ def server() -> Iterator[FoxgloveServer]:
 
 def test_the_app_reads_state_pose_and_transform(server: FoxgloveServer) -> None:
     state = example_state(1)
-    told = told_of(state)
+    reported = release_gain(state)
     stamp = EPOCH_NS + round(1e9 * state.time)
     with connected(server.port) as connection:
         app = App(connection)
-        server.take(state, told)
+        server.take(state, reported)
         received = [app.next() for _ in range(3)]
     assert {topic for topic, _, _ in received} == {"/magfusion/state", "/magfusion/pose", "/tf"}
     for topic, time, content in received:
         assert time == stamp
         if topic == "/magfusion/state":
-            assert content == told
+            assert content == reported
             continue
         assert content.timestamp.ToNanoseconds() == stamp
         if topic == "/tf":
@@ -115,11 +115,11 @@ def test_the_app_reads_state_pose_and_transform(server: FoxgloveServer) -> None:
 
 def test_of_a_lost_state_and_before_the_first_there_is_no_pose(server: FoxgloveServer) -> None:
     good = example_state(2)
-    lost = replace(good, judgement=LOST)
+    lost_epochs = replace(good, judgement=MAX_FINAL_STEP_SIGMAS)
     with connected(server.port) as connection:
         app = App(connection)
-        for state in (None, lost, good):
-            server.take(state, told_of(lost if state is None else state))
+        for state in (None, lost_epochs, good):
+            server.take(state, release_gain(lost_epochs if state is None else state))
         received = [app.next() for _ in range(5)]
     assert [topic for topic, _, _ in received[:2]] == ["/magfusion/state"] * 2
     assert received[1][2]["verdict"] == "failed"
@@ -140,7 +140,7 @@ class Held(io.RawIOBase):
         return True
 
     def readinto(self, buffer: Any) -> int:
-        assert self.listening.wait(PATIENCE)
+        assert self.listening.wait(MAX_WAIT)
         return self.records.readinto(buffer)
 
 
@@ -179,7 +179,7 @@ def test_a_pipe_is_followed_live(log: Path) -> None:
     follower.start()
     source = io.BufferedReader(Held(records.getvalue(), listening))
     run_stream(log / "site.yaml", settings, source, sink, io.StringIO())
-    follower.join(PATIENCE)
+    follower.join(MAX_WAIT)
     printed = [json.loads(line) for line in sink.getvalue().splitlines()]
     states = [content for topic, _, content in received if topic == "/magfusion/state"]
     assert states == printed
@@ -191,19 +191,19 @@ def test_a_pipe_is_followed_live(log: Path) -> None:
 
 @pytest.mark.parametrize("address", ["", ":", "home", "127.0.0.1:", "127.0.0.1:70000", ":8765"])
 def test_a_bad_address_is_refused(log: Path, refuse: Refuse, address: str) -> None:
-    said = refuse("navigate", "-", "--site", log / "site.yaml", "--foxglove", address)
-    assert f"--foxglove {address!r}: is not an address to listen at; write a port" in said
+    findings = refuse("navigate", "-", "--site", log / "site.yaml", "--foxglove", address)
+    assert f"--foxglove {address!r}: is not an address to listen at; write a port" in findings
 
 
 def test_a_port_that_is_taken_is_refused(log: Path, refuse: Refuse, server: FoxgloveServer) -> None:
-    said = refuse("navigate", "-", "--site", log / "site.yaml", "--foxglove", server.port)
-    assert f"--foxglove '{server.port}': it cannot listen there (" in said
-    assert "give another port" in said
+    findings = refuse("navigate", "-", "--site", log / "site.yaml", "--foxglove", server.port)
+    assert f"--foxglove '{server.port}': it cannot listen there (" in findings
+    assert "give another port" in findings
 
 
 def test_what_is_not_installed_is_named(
     log: Path, refuse: Refuse, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "foxglove", None)
-    said = refuse("navigate", "-", "--site", log / "site.yaml", "--foxglove", "8765")
-    assert "pip install 'magfusion[foxglove]'" in said
+    findings = refuse("navigate", "-", "--site", log / "site.yaml", "--foxglove", "8765")
+    assert "pip install 'magfusion[foxglove]'" in findings

@@ -13,7 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Refuse, run_command
-from live_states import DOUBTFUL, EPOCH_NS, LOST, example_state, piped, told_of, write_walk
+from live_states import (
+    DOUBTFUL,
+    EPOCH_NS,
+    MAX_FINAL_STEP_SIGMAS,
+    example_state,
+    piped,
+    release_gain,
+    write_walk,
+)
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.graph.state import moved_to
@@ -37,12 +45,12 @@ class Receiver:
     def datagrams(self) -> list[bytes]:
         """Return what has come: on this machine it is there once it was sent."""
         self.socket.setblocking(False)
-        found = []
+        result = []
         while True:
             try:
-                found.append(self.socket.recv(65536))
+                result.append(self.socket.recv(65536))
             except BlockingIOError:
-                return found
+                return result
 
 
 @pytest.fixture
@@ -62,11 +70,11 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def heard(log: Path) -> Iterator[tuple[list[dict[str, Any]], list[bytes]]]:
+def detected(log: Path) -> Iterator[tuple[list[dict[str, Any]], list[bytes]]]:
     """Return the states of a pipe, and the datagrams that went out beside them."""
     receiver = Receiver()
-    states, said = piped(log, LiveSettings(mavlink=receiver.address))
-    assert said == ""
+    states, findings = piped(log, LiveSettings(mavlink=receiver.address))
+    assert findings == ""
     yield states, receiver.datagrams()
     receiver.socket.close()
 
@@ -96,9 +104,9 @@ def compared(message: dict[str, Any], state: dict[str, Any]) -> None:
 
 
 def test_pymavlink_reads_every_state_of_a_pipe(
-    heard: tuple[list[dict[str, Any]], list[bytes]],
+    detected: tuple[list[dict[str, Any]], list[bytes]],
 ) -> None:
-    states, datagrams = heard
+    states, datagrams = detected
     messages = parsed(datagrams)
     assert len(messages) == len(datagrams)  # one each, none of them bad
     odometry = [one.to_dict() for one in messages if one.get_type() == "ODOMETRY"]
@@ -116,33 +124,33 @@ def test_pymavlink_reads_every_state_of_a_pipe(
     assert [one.get_seq() for one in messages] == list(range(len(messages)))
 
 
-def wait_for(found: Callable[[], Any], step: Callable[[], object]) -> Any:
+def wait_for(result: Callable[[], Any], step: Callable[[], object]) -> Any:
     """Return what is found at last; a step is taken as long as it is not, for half a minute."""
     for _ in range(3000):
-        if found():
-            return found()
+        if result():
+            return result()
         step()
         time.sleep(0.01)
     raise AssertionError("nothing came within half a minute")
 
 
-def test_the_parser_of_mavsdk_reads_it(heard: tuple[list[dict[str, Any]], list[bytes]]) -> None:
+def test_the_parser_of_mavsdk_reads_it(detected: tuple[list[dict[str, Any]], list[bytes]]) -> None:
     """The C++ of MAVSDK, which lets an application follow a vehicle."""
     mavsdk = pytest.importorskip("mavsdk.mavsdk")
     from mavsdk.component_type import ComponentType
     from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkDirect
     from mavsdk.plugins.telemetry.telemetry import Telemetry
 
-    states, datagrams = heard
+    states, datagrams = detected
     last = next(d for d in reversed(datagrams) if parsed([d])[0].get_type() == "ODOMETRY")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         out.bind(("127.0.0.1", 0))
         station = mavsdk.Mavsdk(
             mavsdk.Configuration.create_with_component_type(ComponentType.GROUND_STATION)
         )
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free_parameters:
+            free_parameters.bind(("127.0.0.1", 0))
+            port = free_parameters.getsockname()[1]
         station.add_any_connection(f"udpin://127.0.0.1:{port}")
 
         def send_beats() -> None:
@@ -152,18 +160,18 @@ def test_the_parser_of_mavsdk_reads_it(heard: tuple[list[dict[str, Any]], list[b
             out.sendto(last, ("127.0.0.1", port))
 
         read: list[Any] = []
-        told: list[Any] = []
+        reported: list[Any] = []
         try:
             system = wait_for(station.get_systems, send_beats)[0]
             direct, telemetry = MavlinkDirect(system), Telemetry(system)
             direct.subscribe_message("ODOMETRY", lambda message, _: read.append(message))
-            telemetry.subscribe_odometry(lambda odometry, _: told.append(odometry))
-            wait_for(lambda: read and told, send_odometry)
+            telemetry.subscribe_odometry(lambda odometry, _: reported.append(odometry))
+            wait_for(lambda: read and reported, send_odometry)
         finally:
             station.destroy()
     compared(json.loads(read[0].fields_json), states[-1])
     assert (read[0].system_id, read[0].component_id) == (1, 197)
-    place, turn = told[0].position_body, told[0].q
+    place, turn = reported[0].position_body, reported[0].q
     px, py, pz = states[-1]["position"]
     assert np.allclose([place.x_m, place.y_m, place.z_m], [px, -py, -pz], rtol=0.0, atol=1e-6)
     w, x, y, z = states[-1]["quaternion"]
@@ -202,7 +210,7 @@ def test_the_covariance_is_that_of_what_the_message_says(seed: int) -> None:
     """By differences: how position, attitude and velocity of the message move with the state."""
     state = example_state(seed)
 
-    def said(step: np.ndarray[Any, np.dtype[np.float64]]) -> tuple[Any, Rotation, Any]:
+    def findings(step: np.ndarray[Any, np.dtype[np.float64]]) -> tuple[Any, Rotation, Any]:
         one = odometry_message(odometry_of(moved_to(state, state.calibration, step)), 50, 0)
         w, x, y, z = one.q
         place, speed = np.array([one.x, one.y, one.z]), np.array([one.vx, one.vy, one.vz])
@@ -211,8 +219,8 @@ def test_the_covariance_is_that_of_what_the_message_says(seed: int) -> None:
     size, columns = 1e-5, []
     for k in range(15):
         step = size * np.eye(15)[k]
-        (place, turn, speed), (back, turned, slow) = said(step), said(-step)
-        moved = np.concatenate([place - back, (turn * turned.inv()).as_rotvec(), speed - slow])
+        (place, turn, speed), (back, rotated, slow) = findings(step), findings(-step)
+        moved = np.concatenate([place - back, (turn * rotated.inv()).as_rotvec(), speed - slow])
         columns.append(moved / (2.0 * size))
     jacobian = np.array(columns).T
     expected = jacobian @ state.cov @ jacobian.T
@@ -240,10 +248,10 @@ def test_quality_falls_with_the_protection_level_and_halves_with_doubt() -> None
 def test_of_a_lost_state_only_the_heartbeat_tells(receiver: Receiver) -> None:
     sender = MavlinkSender(receiver.address, EPOCH_NS)
     good = example_state(4)
-    lost = replace(good, time=good.time + 2.0, judgement=LOST)
+    lost_epochs = replace(good, time=good.time + 2.0, judgement=MAX_FINAL_STEP_SIGMAS)
     again = replace(good, time=good.time + 4.0)
-    for state in (good, lost, again):
-        sender.take(state, told_of(state))
+    for state in (good, lost_epochs, again):
+        sender.take(state, release_gain(state))
     assert sender.close() is None
     kinds = [
         (one.get_type(), getattr(one, "system_status", None))
@@ -262,7 +270,7 @@ def test_of_a_lost_state_only_the_heartbeat_tells(receiver: Receiver) -> None:
 def test_resets_and_stamps_are_those_of_the_log(receiver: Receiver) -> None:
     sender = MavlinkSender(receiver.address, EPOCH_NS)
     state = replace(example_state(4), reset_counter=257)
-    sender.take(state, told_of(state))
+    sender.take(state, release_gain(state))
     sender.close()
     _, message = parsed(receiver.datagrams())
     assert message.reset_counter == 1  # of eight bits
@@ -273,25 +281,30 @@ def test_who_cannot_be_reached_stops_nothing() -> None:
     """Everybody may not be sent to without being asked for, so that the kernel refuses it."""
     sender, state = MavlinkSender("udpout:255.255.255.255:14550", 0), example_state(4)
     for later in range(3):
-        sender.take(state, told_of(state) | {"time": state.time + 0.1 * later})
-    said = sender.close()
-    assert said is not None
-    assert said.startswith("--mavlink: 4 messages could not be sent (")  # one of them a heartbeat
+        sender.take(state, release_gain(state) | {"time": state.time + 0.1 * later})
+    findings = sender.close()
+    assert findings is not None
+    assert findings.startswith(
+        "--mavlink: 4 messages could not be sent ("
+    )  # one of them a heartbeat
 
 
 def test_the_replay_of_a_log_sends_them_too(
-    log: Path, tmp_path: Path, receiver: Receiver, heard: tuple[list[dict[str, Any]], list[bytes]]
+    log: Path,
+    tmp_path: Path,
+    receiver: Receiver,
+    detected: tuple[list[dict[str, Any]], list[bytes]],
 ) -> None:
     run_command(
         *("navigate", log, "--estimator", "ekf", "--mavlink", receiver.address),
         *("-o", tmp_path / "run"),
     )
-    found = [one for one in parsed(receiver.datagrams()) if one.get_type() == "ODOMETRY"]
-    started = [state for state in heard[0] if state["started"]]
-    for message, state in zip(found, started, strict=True):
-        told = message.to_dict()
-        assert abs(told.pop("time_usec") - EPOCH_NS // 1000 - 1e6 * state["time"]) <= 1.0
-        compared(told | {"time_usec": round(1e6 * state["time"])}, state)
+    result = [one for one in parsed(receiver.datagrams()) if one.get_type() == "ODOMETRY"]
+    started = [state for state in detected[0] if state["started"]]
+    for message, state in zip(result, started, strict=True):
+        reported = message.to_dict()
+        assert abs(reported.pop("time_usec") - EPOCH_NS // 1000 - 1e6 * state["time"]) <= 1.0
+        compared(reported | {"time_usec": round(1e6 * state["time"])}, state)
 
 
 @pytest.mark.parametrize(
@@ -307,9 +320,9 @@ def test_the_replay_of_a_log_sends_them_too(
 def test_a_bad_address_is_refused(
     log: Path, tmp_path: Path, refuse: Refuse, address: str, sentence: str
 ) -> None:
-    said = refuse("navigate", log, "-o", tmp_path / "run", "--mavlink", address)
-    assert f"--mavlink {address!r}: " in said
-    assert sentence in said
+    findings = refuse("navigate", log, "-o", tmp_path / "run", "--mavlink", address)
+    assert f"--mavlink {address!r}: " in findings
+    assert sentence in findings
     assert sentence in refuse("navigate", "-", "--site", log / "site.yaml", "--mavlink", address)
 
 
@@ -317,5 +330,7 @@ def test_what_is_not_installed_is_named(
     log: Path, refuse: Refuse, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20", None)
-    said = refuse("navigate", "-", "--site", log / "site.yaml", "--mavlink", "udpout:[::1]:14550")
-    assert "pip install 'magfusion[mavlink]'" in said
+    findings = refuse(
+        "navigate", "-", "--site", log / "site.yaml", "--mavlink", "udpout:[::1]:14550"
+    )
+    assert "pip install 'magfusion[mavlink]'" in findings

@@ -14,7 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Refuse
-from live_states import EPOCH_NS, LOST, example_state, piped, told_of, write_walk
+from live_states import (
+    EPOCH_NS,
+    MAX_FINAL_STEP_SIGMAS,
+    example_state,
+    piped,
+    release_gain,
+    write_walk,
+)
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
@@ -34,7 +41,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from magfusion.results.odometry_dds import RosPublisher, odometry_message
-from magfusion.results.ros_messages import Odometry
+from magfusion.results.ros_messages import OdometryMessage
 
 # Only this machine, without multicast, which not every network has.
 LOOPBACK = """<CycloneDDS><Domain Id="any">
@@ -110,12 +117,12 @@ def test_a_subscriber_that_knows_only_the_topic_receives_it(domain: int, topic: 
     with subprocess.Popen([*command, f"rt{topic}"], stdout=subprocess.PIPE) as running:
         assert running.stdout is not None
         while not select.select([running.stdout], [], [], 0.02)[0]:
-            publisher.take(state, told_of(state))
+            publisher.take(state, release_gain(state))
         line = running.stdout.readline()
     assert publisher.close() is None
-    told = json.loads(line)
-    assert told["type"] == "nav_msgs::msg::dds_::Odometry_"
-    message, odometry = told["message"], odometry_of(state, EPOCH_NS)
+    reported = json.loads(line)
+    assert reported["type"] == "nav_msgs::msg::dds_::Odometry_"
+    message, odometry = reported["message"], odometry_of(state, EPOCH_NS)
     stamp = message["header"]["stamp"]
     assert stamp["sec"] * 1_000_000_000 + stamp["nanosec"] == odometry.stamp_ns
     assert (message["header"]["frame_id"], message["child_frame_id"]) == ("map", "base_link")
@@ -128,9 +135,11 @@ def test_every_state_of_a_pipe_that_is_not_lost_is_published(
     log: Path, domain: int, topic: str
 ) -> None:
     participant = DomainParticipant(domain)
-    reader = DataReader(participant, Topic(participant, f"rt{topic}", Odometry), qos=ROS_DEFAULT)
-    states, said = piped(log, LiveSettings(ros2=topic))
-    assert said == ""
+    reader = DataReader(
+        participant, Topic(participant, f"rt{topic}", OdometryMessage), qos=ROS_DEFAULT
+    )
+    states, findings = piped(log, LiveSettings(ros2=topic))
+    assert findings == ""
     received = reader.take(100)
     started = [state for state in states if state["started"]]
     assert len(started) >= 3
@@ -138,35 +147,39 @@ def test_every_state_of_a_pipe_that_is_not_lost_is_published(
         x, y, z, w = (getattr(message.pose.pose.orientation, name) for name in "xyzw")
         assert np.allclose([w, x, y, z], state["quaternion"], rtol=0.0, atol=1e-12)
         speed = message.twist.twist.linear
-        turned = Rotation.from_quat([x, y, z, w]).apply([speed.x, speed.y, speed.z])
-        assert np.allclose(turned, state["velocity"], rtol=0.0, atol=1e-12)
+        rotated = Rotation.from_quat([x, y, z, w]).apply([speed.x, speed.y, speed.z])
+        assert np.allclose(rotated, state["velocity"], rtol=0.0, atol=1e-12)
         sigma = np.sqrt(np.diag(np.reshape(message.pose.covariance, (6, 6)))[:3])
         assert np.allclose(sigma, state["sigma"]["position"], rtol=1e-9, atol=0.0)
 
 
 def test_a_lost_state_is_not_published(domain: int, topic: str) -> None:
     participant = DomainParticipant(domain)
-    reader = DataReader(participant, Topic(participant, f"rt{topic}", Odometry), qos=ROS_DEFAULT)
+    reader = DataReader(
+        participant, Topic(participant, f"rt{topic}", OdometryMessage), qos=ROS_DEFAULT
+    )
     publisher, good = RosPublisher(topic, 0, "world", "body"), example_state(5)
-    lost = replace(good, judgement=LOST)
-    for state in (None, lost, good, lost):
-        publisher.take(state, told_of(good))
+    lost_epochs = replace(good, judgement=MAX_FINAL_STEP_SIGMAS)
+    for state in (None, lost_epochs, good, lost_epochs):
+        publisher.take(state, release_gain(good))
     publisher.close()
     assert len(reader.take(10)) == 1
 
 
 @pytest.mark.parametrize("name", ["odometry", "/", "/robot/", "/my topic", "/1st"])
 def test_a_name_that_is_no_topic_is_refused(log: Path, refuse: Refuse, name: str) -> None:
-    said = refuse("navigate", "-", "--site", log / "site.yaml", "--ros2", name)
-    assert f"--ros2 {name!r}: is not a topic; write one like /robot/odometry" in said
+    findings = refuse("navigate", "-", "--site", log / "site.yaml", "--ros2", name)
+    assert f"--ros2 {name!r}: is not a topic; write one like /robot/odometry" in findings
 
 
 def test_frames_are_named_for_somebody(log: Path, refuse: Refuse) -> None:
-    said = refuse("navigate", "-", "--site", log / "site.yaml", "--frame", "map")
-    assert "--frame and --child require --foxglove or --ros2; give one of them" in said
+    findings = refuse("navigate", "-", "--site", log / "site.yaml", "--frame", "map")
+    assert "--frame and --child require --foxglove or --ros2; give one of them" in findings
     for names in (("--frame", "body"), ("--child", "world"), ("--child", " ")):
-        said = refuse("navigate", "-", "--site", log / "site.yaml", "--ros2", "/odometry", *names)
-        assert "must differ" in said or "must not be empty" in said
+        findings = refuse(
+            "navigate", "-", "--site", log / "site.yaml", "--ros2", "/odometry", *names
+        )
+        assert "must differ" in findings or "must not be empty" in findings
 
 
 @pytest.mark.parametrize("number", ["233", "-1", "home"])
@@ -174,13 +187,13 @@ def test_a_domain_that_is_none_is_refused(
     log: Path, refuse: Refuse, monkeypatch: pytest.MonkeyPatch, number: str
 ) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", number)
-    said = refuse("navigate", "-", "--site", log / "site.yaml", "--ros2", "/odometry")
-    assert f"ROS_DOMAIN_ID: found {number!r}; it should be from 0 to 232" in said
+    findings = refuse("navigate", "-", "--site", log / "site.yaml", "--ros2", "/odometry")
+    assert f"ROS_DOMAIN_ID: found {number!r}; it should be from 0 to 232" in findings
 
 
 def test_what_is_not_installed_is_named(
     log: Path, refuse: Refuse, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "cyclonedds.domain", None)
-    said = refuse("navigate", "-", "--site", log / "site.yaml", "--ros2", "/odometry")
-    assert "pip install 'magfusion[ros2]'" in said
+    findings = refuse("navigate", "-", "--site", log / "site.yaml", "--ros2", "/odometry")
+    assert "pip install 'magfusion[ros2]'" in findings

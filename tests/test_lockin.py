@@ -17,7 +17,7 @@ from magfusion.receiver.windows import LockinSettings, default_settings
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.field import synchronised_drives
 from magfusion.simulation.log import simulate_fields
-from magfusion.simulation.motion import Motion, static_motion
+from magfusion.simulation.motion import SimulatedMotion, static_motion
 from magfusion.simulation.waveform import Mains, simulate_waveform
 
 RATE_HZ = 400.0
@@ -38,7 +38,7 @@ def spinning(rate_body):
     knots = np.arange(21.0)
     attitude = RotationSpline(knots, Rotation.from_rotvec(knots[:, None] * rate_body))
     place = BSpline(np.array([0.0, 1.0]), PLACE[None], 0)
-    return Motion(place, attitude, BPoly(np.ones((1, 1)), np.array([0.0, 20.0])))
+    return SimulatedMotion(place, attitude, BPoly(np.ones((1, 1)), np.array([0.0, 20.0])))
 
 
 def imu_of(motion, duration):
@@ -79,10 +79,10 @@ def _phasors(operator, measured):
     return operator.demodulate_both(measured, measured)[2]
 
 
-def worst(found, expected):
+def worst(result, expected):
     """Return the largest error of a phasor in units of its own size."""
     size = np.linalg.norm(expected, axis=-1)
-    return np.max(np.linalg.norm(found - expected, axis=-1) / size)
+    return np.max(np.linalg.norm(result - expected, axis=-1) / size)
 
 
 def rms(error):
@@ -139,8 +139,8 @@ def test_a_gyro_bias_that_is_told_is_taken_off():
     windows = choose_windows(waveform, imu, site, WINDOW)
     truth = true_phasors(site, motion, windows.centre)
     errors = []
-    for told in (None, bias, np.broadcast_to(bias, imu.gyro_body.shape)):
-        known = on_clock(imu, site.platform.imu.time_offset, told)
+    for reported in (None, bias, np.broadcast_to(bias, imu.gyro_body.shape)):
+        known = on_clock(imu, site.platform.imu.time_offset, reported)
         operator = window_operator(waveform, known, site, WINDOW, windows)
         errors.append(worst(_phasors(operator, waveform.measured_sensor), truth))
     assert errors[0] > 1e-4
@@ -201,10 +201,10 @@ def test_the_claimed_covariance_is_that_of_white_noise():
     noise = np.random.default_rng(3).normal(0.0, sigma, (200_000, 3)) @ mixing.T
     fields = noise_only(noise)
     assert len(fields) == 1250
-    claimed, found = np.mean(fields.phasor_cov, axis=0), empirical_cov(fields)
+    claimed, result = np.mean(fields.phasor_cov, axis=0), empirical_cov(fields)
     for channel in range(4):
         # Of 2500 quadratures in three axes: a variance is within 2.8 % (one sigma).
-        ratio = np.linalg.eigvals(np.linalg.solve(claimed[channel], found[channel])).real
+        ratio = np.linalg.eigvals(np.linalg.solve(claimed[channel], result[channel])).real
         assert np.min(ratio) > 0.88
         assert np.max(ratio) < 1.12
     # Each eigenvector of the claim is an axis of the noise, the largest first.
@@ -219,9 +219,9 @@ def test_the_claimed_covariance_holds_for_windows_of_each_kind_with_mains():
     settings = LockinSettings(window=0.6, step=0.6, mains_hz=50.0)
     fields = received(waveform, still_imu(250.0), site, settings)
     claimed = np.mean(np.trace(fields.phasor_cov, axis1=2, axis2=3), axis=0)
-    found = np.trace(empirical_cov(fields), axis1=1, axis2=2)
+    result = np.trace(empirical_cov(fields), axis1=1, axis2=2)
     # 416 windows, six quadratures each: 2.8 % (one sigma), and the claim's own 2 %.
-    np.testing.assert_allclose(found / claimed, np.ones(4), atol=0.14)
+    np.testing.assert_allclose(result / claimed, np.ones(4), atol=0.14)
 
 
 def test_each_window_by_itself_is_covered_by_its_own_claim():
@@ -238,10 +238,10 @@ def test_coloured_noise_is_claimed_tone_by_tone_and_axis_by_axis():
     noise[:, 1] = lfilter([1.0], [1.0, -0.8], noise[:, 1])  # red
     noise[:, 2] *= 4.0
     fields = noise_only(noise)
-    found = np.einsum("cii->ci", empirical_cov(fields))
-    ratio = np.einsum("cii->ci", np.mean(fields.phasor_cov, axis=0)) / found
-    assert found[0, 1] / found[3, 1] > 2.0  # 20 Hz against 35 Hz
-    np.testing.assert_allclose(found[:, 2] / found[:, 0], np.full(4, 16.0), rtol=0.15)
+    result = np.einsum("cii->ci", empirical_cov(fields))
+    ratio = np.einsum("cii->ci", np.mean(fields.phasor_cov, axis=0)) / result
+    assert result[0, 1] / result[3, 1] > 2.0  # 20 Hz against 35 Hz
+    np.testing.assert_allclose(result[:, 2] / result[:, 0], np.full(4, 16.0), rtol=0.15)
     assert np.all(np.abs(ratio[:, [0, 2]] - 1.0) < 0.12)  # three sigma
     # Far noise leaks into the probes more than into the tones: the claim errs to the safe side.
     assert np.all((ratio[:, 1] > 0.95) & (ratio[:, 1] < 1.5))
@@ -270,10 +270,10 @@ def holding(centre, begin, end):
     return (centre + 0.2 > begin) & (centre - 0.2 < end)
 
 
-def check_drop(kept, full, reasons, spoilt, reason):
-    np.testing.assert_allclose(kept, full[~spoilt], rtol=1e-12)
-    assert reasons == {reason: int(spoilt.sum())}
-    assert spoilt.sum() > 2
+def check_drop(kept, full, reasons, corrupted, reason):
+    np.testing.assert_allclose(kept, full[~corrupted], rtol=1e-12)
+    assert reasons == {reason: int(corrupted.sum())}
+    assert corrupted.sum() > 2
 
 
 def ordinary(duration=8.0):
@@ -293,19 +293,19 @@ def test_a_saturated_stretch_drops_the_windows_that_hold_it(axis, sign):
     measured = waveform.measured_sensor.copy()
     measured[1203:1323, axis] = sign * 1e-4  # 3.0075 s to 3.305 s
     kept, full, reasons = drops(replace(waveform, measured_sensor=measured), still_imu(8.0))
-    spoilt = holding(full, 3.0075, 3.3051)
-    check_drop(kept, full, reasons, spoilt, "magnetometer saturated")
+    corrupted = holding(full, 3.0075, 3.3051)
+    check_drop(kept, full, reasons, corrupted, "magnetometer saturated")
 
 
 def test_held_samples_are_no_saturation():
     """A magnetometer that is read twice as fast as it measures, and one with coarse steps."""
     waveform = ordinary()
-    held = waveform.measured_sensor.copy()
-    again = np.random.default_rng(5).random(len(held)) < 0.4
+    fixed = waveform.measured_sensor.copy()
+    again = np.random.default_rng(5).random(len(fixed)) < 0.4
     for k in np.flatnonzero(again[1:]) + 1:
-        held[k] = held[k - 1]
+        fixed[k] = fixed[k - 1]
     coarse = 1e-6 * np.round(waveform.measured_sensor / 1e-6)
-    for measured in (held, coarse):
+    for measured in (fixed, coarse):
         kept, full, reasons = drops(replace(waveform, measured_sensor=measured), still_imu(8.0))
         assert reasons == {}
         assert len(kept) == len(full)
@@ -387,8 +387,8 @@ def test_a_gap_in_the_imu_drops_the_windows_that_reach_into_it():
     keep = (imu.time <= 3.0) | (imu.time >= 3.5)
     cut = ImuSamples(imu.time[keep], imu.gyro_body[keep], imu.accel_body[keep])
     kept, full, reasons = drops(ordinary(), cut)
-    spoilt = holding(full, 3.0, 3.5)
-    check_drop(kept, full, reasons, spoilt, "gap in the inertial stream")
+    corrupted = holding(full, 3.0, 3.5)
+    check_drop(kept, full, reasons, corrupted, "gap in the inertial stream")
 
 
 def test_windows_beyond_the_imu_are_dropped():

@@ -77,13 +77,13 @@ def test_the_claimed_variance_is_that_of_both_quadratures(
     """In a window of few periods the sine shares its shape with a drift, the cosine does not."""
     count = 2000
     fields, steady = of_white_noise(frequency_hz, count, length, averaged=50)
-    found = np.mean(quadratures(fields) ** 2)
+    result = np.mean(quadratures(fields) ** 2)
     claimed = np.mean(np.diagonal(fields.phasor_cov[:, 0], axis1=1, axis2=2))
     # 12,000 numbers: a variance is within 1.3 %, one sigma, and the claimed one within 1 %.
-    assert found / claimed == pytest.approx(1.0, abs=0.06)
-    found = np.mean(steady.measured_sensor**2)
+    assert result / claimed == pytest.approx(1.0, abs=0.06)
+    result = np.mean(steady.measured_sensor**2)
     claimed = np.mean(np.diagonal(steady.cov, axis1=1, axis2=2))
-    assert found / claimed == pytest.approx(1.0, abs=0.08)
+    assert result / claimed == pytest.approx(1.0, abs=0.08)
 
 
 def test_a_window_by_itself_claims_no_precision_that_its_few_numbers_made_up() -> None:
@@ -113,16 +113,16 @@ def test_a_turn_that_no_gyro_saw_has_errors_of_the_claimed_spread() -> None:
     windows, time = windows_of(count, length)
     field = rng.normal(0.0, 1e-7, (count, 3))  # T, at the centre of each window
     own = np.repeat(np.arange(count), windows.count)
-    turned = rng.normal(0.0, 1.0, (count, 3))[own] * (time - windows.centre[own])[:, None]
+    rotated = rng.normal(0.0, 1.0, (count, 3))[own] * (time - windows.centre[own])[:, None]
     carrier = np.cos(2.0 * np.pi * frequency_hz * time)[:, None]
-    samples = Rotation.from_rotvec(turned).inv().apply(carrier * field[own])
+    samples = Rotation.from_rotvec(rotated).inv().apply(carrier * field[own])
     fields, _ = lockin.demodulate(samples)
     error = quadratures(fields) - np.stack([field, np.zeros_like(field)])
-    found = np.mean(np.sum(error**2, axis=-1))
+    result = np.mean(np.sum(error**2, axis=-1))
     claimed = np.mean(np.trace(fields.phasor_cov[:, 0], axis1=1, axis2=2))
-    assert np.sqrt(found) > 1e-9  # T; what is claimed is no rounding
+    assert np.sqrt(result) > 1e-9  # T; what is claimed is no rounding
     # Half the square of a turn about each of two axes falls on the field, as claimed of all three.
-    assert 0.25 < found / claimed < 0.7
+    assert 0.25 < result / claimed < 0.7
 
 
 def parts(imu: ImuSamples) -> tuple[Array, Array, Array]:

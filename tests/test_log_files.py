@@ -37,13 +37,13 @@ def _arrays(log: Log) -> dict[str, np.ndarray]:
     }
 
 
-def _assert_same(found: Log, expected: Log, rtol: float = 0.0) -> None:
-    assert (found.name, found.epoch_ns, found.source) == ("walk", EPOCH_NS, "test")
-    assert found.fields is not None
+def _assert_same(result: Log, expected: Log, rtol: float = 0.0) -> None:
+    assert (result.name, result.epoch_ns, result.source) == ("walk", EPOCH_NS, "test")
+    assert result.fields is not None
     assert expected.fields is not None
-    assert found.fields.channels == expected.fields.channels
+    assert result.fields.channels == expected.fields.channels
     arrays = _arrays(expected)
-    for name, value in _arrays(found).items():
+    for name, value in _arrays(result).items():
         # Times are kept to the nanosecond, attitudes as quaternions.
         atol = {"time": 1e-9, "world_from_body": 1e-14}.get(name.split(".")[1], 0.0)
         np.testing.assert_allclose(value, arrays[name], rtol=rtol, atol=atol, err_msg=name)
@@ -74,8 +74,8 @@ def test_stamps_of_today_keep_their_nanoseconds(tmp_path: Path) -> None:
     write_log(replace(example_log(), imu=imu), tmp_path / "walk")
     stamps = pa.parquet.read_table(tmp_path / "walk" / "imu.parquet")["time_ns"].to_pylist()
     assert stamps == [EPOCH_NS + 3 + 100_000 * k for k in range(5)]
-    found = read_log(tmp_path / "walk").imu.time
-    np.testing.assert_allclose(found, imu.time, rtol=0, atol=1e-18)  # s
+    result = read_log(tmp_path / "walk").imu.time
+    np.testing.assert_allclose(result, imu.time, rtol=0, atol=1e-18)  # s
 
 
 def test_slices_share_no_sample_and_lose_none(tmp_path: Path) -> None:
@@ -144,21 +144,23 @@ def test_sigma_alone_stands_for_an_isotropic_covariance(tmp_path: Path) -> None:
     assert len(covs) == 6
     written = read_log(path.parent).fields
     pa.parquet.write_table(table.drop_columns(covs), path)
-    found = read_log(path.parent).fields
+    result = read_log(path.parent).fields
     assert written is not None
-    assert found is not None
+    assert result is not None
     variance = np.trace(written.phasor_cov, axis1=2, axis2=3) / 3.0
     expected = variance[..., None, None] * np.eye(3)
-    np.testing.assert_allclose(1e18 * found.phasor_cov, 1e18 * expected, rtol=1e-12, atol=0)  # nT^2
+    np.testing.assert_allclose(
+        1e18 * result.phasor_cov, 1e18 * expected, rtol=1e-12, atol=0
+    )  # nT^2
 
 
 def test_a_trajectory_survives_its_table(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     trajectory = example_trajectory(rng, np.arange(30) * 0.01)
     write_trajectory(trajectory, tmp_path / "t.parquet", EPOCH_NS)
-    found = read_trajectory(tmp_path / "t.parquet", EPOCH_NS)
+    result = read_trajectory(tmp_path / "t.parquet", EPOCH_NS)
     for name, value in vars(trajectory).items():
-        np.testing.assert_allclose(getattr(found, name), value, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(getattr(result, name), value, rtol=1e-12, atol=1e-14)
     names = pa.parquet.read_schema(tmp_path / "t.parquet").names
     assert names[-21:][:7] == ["cov_00", "cov_01", "cov_02", "cov_03", "cov_04", "cov_05", "cov_11"]
     poses = Trajectory(trajectory.time, trajectory.world_from_body, trajectory.position_world)

@@ -39,7 +39,7 @@ from magfusion.jobs.replay import ReplaySettings, run, run_replay
 from magfusion.model.samples import ImuSamples, Log, Waveform
 
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
-SURE_POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 
 def _named(make: Any, k: int) -> Any:
@@ -62,7 +62,7 @@ def _sure_pose(k: int) -> Any:
     pose = STORE.types["geometry_msgs/msg/PoseWithCovariance"](
         pose_message(k).pose, np.arange(36.0)
     )
-    return STORE.types[SURE_POSE](pose_message(k).header, pose)
+    return STORE.types[POSE_WITH_COVARIANCE](pose_message(k).header, pose)
 
 
 TOPICS = {
@@ -71,7 +71,7 @@ TOPICS = {
     "/pose": (POSE, lambda k: _named(pose_message, k)),
     "/odom": (ODOMETRY, lambda k: _named(odometry_message, k)),
     "/tf": (TRANSFORM, _transform),
-    "/sure": (SURE_POSE, _sure_pose),
+    "/sure": (POSE_WITH_COVARIANCE, _sure_pose),
 }
 
 
@@ -98,18 +98,18 @@ def test_numbers_cut_from_messages_are_those_that_the_library_reads(
     monkeypatch.setattr(bag_rows, "PART", part)
     cut = _columns(bag, truth)
     monkeypatch.setattr(bag_rows, "TAILS", {})
-    for found, expected in zip(cut, _columns(bag, truth), strict=True):
-        np.testing.assert_array_equal(found, expected)
+    for result, expected in zip(cut, _columns(bag, truth), strict=True):
+        np.testing.assert_array_equal(result, expected)
 
 
 def test_messages_that_end_otherwise_are_left_to_the_library(
     bag: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     expected = _columns(bag, "/pose")
-    off = bag_rows.TAILS[IMU]._replace(taken=(14, 15, 16, 25, 26, 27))
+    off = bag_rows.TAILS[IMU]._replace(read_rows=(14, 15, 16, 25, 26, 27))
     monkeypatch.setattr(bag_rows, "TAILS", {IMU: off})
-    for found, known in zip(_columns(bag, "/pose"), expected, strict=True):
-        np.testing.assert_array_equal(found, known)
+    for result, known in zip(_columns(bag, "/pose"), expected, strict=True):
+        np.testing.assert_array_equal(result, known)
 
 
 def test_one_message_that_was_not_measured_is_found_among_all(tmp_path: Path) -> None:
@@ -122,11 +122,11 @@ def test_reading_and_importing_a_bag_tell_how_far_they_are(
     bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bag_rows, "PART", 8)
-    told: list[tuple[str, int, int]] = []
-    read_bag(bag, topics=Topics(truth="/pose"), report=lambda *one: told.append(one))
-    assert [done for _, done, _ in told] == sorted(done for _, done, _ in told)
-    assert {(stage, total) for stage, _, total in told} == {("reading", 120)}
-    told.clear()
+    reported: list[tuple[str, int, int]] = []
+    read_bag(bag, topics=Topics(truth="/pose"), report=lambda *one: reported.append(one))
+    assert [done for _, done, _ in reported] == sorted(done for _, done, _ in reported)
+    assert {(stage, total) for stage, _, total in reported} == {("reading", 120)}
+    reported.clear()
     monkeypatch.setattr(bag_table, "ROWS", 16)
     plans = plan_bag(bag, {}, ("truth",), Findings())
     rows: list[int] = []
@@ -213,9 +213,9 @@ def test_a_table_is_read_in_the_memory_of_a_part(
     table = pa.table({"time_ns": np.arange(count) * 10**7, **columns})
     pyarrow.parquet.write_table(table, tmp_path / "magnetometer.parquet", row_group_size=6000)
     whole, before = table.nbytes, pa.total_allocated_bytes()
-    most = read = 0
+    maximum = read = 0
     for part in table_stream.table_pieces(tmp_path / "magnetometer.parquet", FIELD_LAYOUT, Span(0)):
         read += len(part)
-        most = max(most, pa.total_allocated_bytes() - before)
+        maximum = max(maximum, pa.total_allocated_bytes() - before)
     assert read == count
-    assert most < 0.5 * whole  # Arrow reads ahead all there is, unless it is told not to
+    assert maximum < 0.5 * whole  # Arrow reads ahead all there is, unless it is told not to

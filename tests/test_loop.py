@@ -24,8 +24,8 @@ def at(distance: float, angle: float) -> Array:
     return distance * RADIUS * (np.cos(angle) * AXIS + np.sin(angle) * ACROSS)
 
 
-def relative(found: Array, expected: Array) -> float:
-    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+def relative(result: Array, expected: Array) -> float:
+    return float(np.linalg.norm(result - expected) / np.linalg.norm(expected))
 
 
 def complete_integrals(parameter: Decimal) -> tuple[Decimal, Decimal]:
@@ -71,8 +71,8 @@ def test_no_digit_is_lost_near_or_far(distance: float) -> None:
 def test_on_the_axis_it_is_the_elementary_formula() -> None:
     z = np.array([0.0, 0.02, 0.15, 1.0, 40.0, 1e5])
     expected = 2.0 * MU0_OVER_4PI * MOMENT / (z**2 + RADIUS**2)[:, None] ** 1.5
-    found = loop_field(z[:, None] * AXIS, MOMENT, RADIUS)
-    np.testing.assert_allclose(found, expected, rtol=1e-14)
+    result = loop_field(z[:, None] * AXIS, MOMENT, RADIUS)
+    np.testing.assert_allclose(result, expected, rtol=1e-14)
 
 
 @pytest.mark.parametrize("distance", [0.4, 0.8, 1.3, 3.0, 20.0])
@@ -109,9 +109,9 @@ def test_amperes_law() -> None:
         path = (centre + 0.4 * np.cos(turn))[:, None] * ACROSS - 0.4 * np.sin(turn)[:, None] * AXIS
         ahead = -0.4 * (np.sin(turn)[:, None] * ACROSS + np.cos(turn)[:, None] * AXIS)
         field = loop_field(RADIUS * path, MOMENT, RADIUS)
-        found = np.sum(field * ahead) * RADIUS * 2.0 * np.pi / 200
+        result = np.sum(field * ahead) * RADIUS * 2.0 * np.pi / 200
         expected = 4.0 * np.pi * MU0_OVER_4PI * through
-        assert abs(found - expected) < 1e-10 * 4.0 * np.pi * MU0_OVER_4PI * CURRENT
+        assert abs(result - expected) < 1e-10 * 4.0 * np.pi * MU0_OVER_4PI * CURRENT
 
 
 @pytest.mark.parametrize("distance", [0.01, 0.5, 0.9, 1.2, 2.0, 5.0, 1e2, 1e4, 1e6])
@@ -122,8 +122,8 @@ def test_the_gradient_is_that_of_the_field(distance: float) -> None:
         expected = central_difference(
             lambda d, o=offset: loop_field(o + d, MOMENT, RADIUS), 3, step
         )
-        field, found = loop_field_and_gradient(offset, MOMENT, RADIUS)
-        assert relative(found, expected) < 1e-7
+        field, result = loop_field_and_gradient(offset, MOMENT, RADIUS)
+        assert relative(result, expected) < 1e-7
         np.testing.assert_array_equal(field, loop_field(offset, MOMENT, RADIUS))
 
 
@@ -134,8 +134,8 @@ def test_far_away_it_differs_from_the_dipole_by_the_next_term_alone() -> None:
         for angle, share in ((0.0, -1.5), (0.5 * np.pi, 1.125)):
             offset = at(distance, angle)
             dipole = dipole_field(offset, MOMENT)
-            found = float(loop_field(offset, MOMENT, RADIUS) @ dipole / (dipole @ dipole)) - 1.0
-            assert abs(found - share * ratio) < 3.0 * ratio**2 + 2e-15
+            result = float(loop_field(offset, MOMENT, RADIUS) @ dipole / (dipole @ dipole)) - 1.0
+            assert abs(result - share * ratio) < 3.0 * ratio**2 + 2e-15
         for angle in ANGLES:
             offset = at(distance, angle)
             error = relative(loop_field(offset, MOMENT, RADIUS), dipole_field(offset, MOMENT))

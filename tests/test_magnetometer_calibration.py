@@ -23,7 +23,7 @@ from magnetometer_calibrations_compared import (
 from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.ellipsoid import fit_ellipsoid, fit_ellipsoid_gravity
-from magfusion.calibration.graph import Estimate
+from magfusion.calibration.graph import CalibrationEstimate
 from magfusion.calibration.magnetometer import (
     MagnetometerFit,
     field_from_measured,
@@ -33,7 +33,12 @@ from magfusion.calibration.magnetometer import (
     refined,
     to_paper,
 )
-from magfusion.calibration.magnetometer_graph import Epochs, Prior, Readings, fit_graph
+from magfusion.calibration.magnetometer_graph import (
+    MagnetometerEpochs,
+    MagnetometerPrior,
+    Readings,
+    fit_graph,
+)
 from magfusion.errors import EstimationError
 from magfusion.papers.p001_magnetometer.equations import SENSOR_FROM_NED
 from magfusion.papers.p001_magnetometer.twelve_positions import (
@@ -230,25 +235,27 @@ def hand_graph(
     rng = np.random.default_rng(seed + 1)
     force = compared.GRAVITY * (up + compared.ACCEL_NOISE * rng.standard_normal(up.shape))
     sigma = np.full(readings, compared.GRAVITY * compared.ACCEL_NOISE)
-    epochs = [Epochs(m, HAND_NOISE, f, sigma) for m, f in zip(measured, force, strict=True)]
+    epochs = [
+        MagnetometerEpochs(m, HAND_NOISE, f, sigma) for m, f in zip(measured, force, strict=True)
+    ]
     return compared.graphs(sensors, epochs, 0.3)
 
 
 def test_the_graph_weighs_size_and_angle_by_the_noise_they_share() -> None:
     sensors = draw_sensors(40, np.random.default_rng(10))
-    fit, found = hand_graph(sensors, 50, 11)
+    fit, result = hand_graph(sensors, 50, 11)
     measured, up = turned_by_hand(sensors, 50, HAND_NOISE, 11)
     ellipsoid = compared.angle_deg(sensors, fit_ellipsoid_gravity(measured, up, SIZE))
     assert compared.angle_deg(sensors, fit) < 0.85 * ellipsoid
-    assert found == pytest.approx(12.0, abs=3.0 * np.sqrt(24.0 / 40))
+    assert result == pytest.approx(12.0, abs=3.0 * np.sqrt(24.0 / 40))
 
 
 @pytest.mark.slow
 def test_the_graph_reaches_what_the_analysis_reached() -> None:
     sensors = draw_sensors(200, np.random.default_rng(12))
-    fit, found = hand_graph(sensors, 200, 13)
+    fit, result = hand_graph(sensors, 200, 13)
     assert compared.angle_deg(sensors, fit) == pytest.approx(0.057, abs=0.01)
-    assert found == pytest.approx(12.0, abs=1.1)
+    assert result == pytest.approx(12.0, abs=1.1)
 
 
 @pytest.mark.slow
@@ -270,7 +277,7 @@ def test_on_a_tilting_table_the_graph_finds_the_tilts() -> None:
 def test_the_rows_of_the_graph_are_the_derivatives_of_their_residuals() -> None:
     rng = np.random.default_rng(15)
     attitudes = Rotation.random(3, rng=rng).as_matrix()
-    epochs = Epochs(
+    epochs = MagnetometerEpochs(
         measured_sensor=1e-5 * rng.standard_normal((3, 3)),
         field_sigma=1e-6,
         accel_body=9.0 * rng.standard_normal((3, 3)),
@@ -279,29 +286,31 @@ def test_the_rows_of_the_graph_are_the_derivatives_of_their_residuals() -> None:
     mounting = Rotation.random(rng=rng).as_matrix()
     matrix = np.eye(3) + 0.1 * rng.standard_normal((3, 3))
     offset = 1e-6 * rng.standard_normal(3)
-    prior = Prior(mounting, matrix, offset, PRIOR_COV, FIELD_LEVEL, 0.1, 9.8, 0.1, size_sigma=1.0)
+    prior = MagnetometerPrior(
+        mounting, matrix, offset, PRIOR_COV, FIELD_LEVEL, 0.1, 9.8, 0.1, size_sigma=1.0
+    )
     problem = Readings(epochs, prior)
     calibration = problem.declared + 0.1 * rng.standard_normal(17)
 
-    def state(turn: np.ndarray, step: np.ndarray) -> Estimate:
+    def state(turn: np.ndarray, step: np.ndarray) -> CalibrationEstimate:
         values = gtsam.Values()
         for i, attitude in enumerate(attitudes):
             moved = gtsam.Rot3(attitude).retract(turn)
             values.insert(gtsam.symbol("x", i), moved)
-        return Estimate(values, calibration + step)
+        return CalibrationEstimate(values, calibration + step)
 
     still, no_step = np.zeros(3), np.zeros(17)
     _, by_attitude, by_calibration = problem.rows(state(still, no_step))
-    turned = central_difference(lambda w: problem.rows(state(w, no_step))[0], 3, 1e-5)
-    np.testing.assert_allclose(by_attitude, turned, rtol=1e-6, atol=1e-6)
+    rotated = central_difference(lambda w: problem.rows(state(w, no_step))[0], 3, 1e-5)
+    np.testing.assert_allclose(by_attitude, rotated, rtol=1e-6, atol=1e-6)
     stepped = central_difference(lambda s: problem.rows(state(still, s))[0], 17, 1e-5)
     np.testing.assert_allclose(by_calibration, stepped, rtol=1e-6, atol=1e-6)
 
 
 def test_a_graph_without_any_attitude_says_so() -> None:
-    prior = Prior(np.eye(3), np.eye(3), np.zeros(3), PRIOR_COV, FIELD_LEVEL)
+    prior = MagnetometerPrior(np.eye(3), np.eye(3), np.zeros(3), PRIOR_COV, FIELD_LEVEL)
     with pytest.raises(EstimationError, match="attitudes"):
-        fit_graph(Epochs(np.tile(FIELD_LEVEL, (4, 1)), 1e-9), prior)
+        fit_graph(MagnetometerEpochs(np.tile(FIELD_LEVEL, (4, 1)), 1e-9), prior)
 
 
 def test_missing_orientations_are_told_in_words() -> None:
@@ -324,14 +333,14 @@ def test_a_refined_sensor_keeps_what_is_known_of_either_part_of_the_matrix() -> 
     cov = scale @ (root @ root.T + 3.0 * np.eye(12)) @ scale
     turn = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
     cov += 0.05**2 * np.outer(turn, turn)  # the mounting about x is hardly known
-    found = refined(plain, MagnetometerFit(np.eye(3), np.zeros(3), cov))
+    result = refined(plain, MagnetometerFit(np.eye(3), np.zeros(3), cov))
     sum_yz, less_yz = np.eye(12)[5] + np.eye(12)[7], np.eye(12)[7] - np.eye(12)[5]
-    told = prior_cov(found)
-    assert sum_yz @ told @ sum_yz == pytest.approx(sum_yz @ cov @ sum_yz, rel=1e-9)
-    assert less_yz @ told @ less_yz == pytest.approx(less_yz @ cov @ less_yz, rel=1e-9)
-    assert found.sigma.rotation_sensor[0] > 0.04
+    reported = prior_cov(result)
+    assert sum_yz @ reported @ sum_yz == pytest.approx(sum_yz @ cov @ sum_yz, rel=1e-9)
+    assert less_yz @ reported @ less_yz == pytest.approx(less_yz @ cov @ less_yz, rel=1e-9)
+    assert result.sigma.rotation_sensor[0] > 0.04
     np.testing.assert_allclose(
-        found.sigma.offset, np.sqrt(np.diagonal(cov))[9:], rtol=1e-12, atol=0.0
+        result.sigma.offset, np.sqrt(np.diagonal(cov))[9:], rtol=1e-12, atol=0.0
     )
 
 
@@ -344,9 +353,9 @@ def test_the_calibrated_field_is_what_made_the_readings() -> None:
 
 
 def test_eq_2_cannot_be_meant_as_printed() -> None:
-    printed, mended = twelve_positions.misprint(0.02)
+    printed, cleaned = twelve_positions.misprint(0.02)
     assert printed == pytest.approx(0.0, abs=1e-12)
-    assert mended == pytest.approx(0.02, abs=1e-12)
+    assert cleaned == pytest.approx(0.02, abs=1e-12)
 
 
 def test_the_comparison_ends_with_one_json_line(
@@ -373,9 +382,9 @@ def test_twelve_stops_in_a_stream_end_with_one_json_line_and_a_picture(
     given = ["twelve_positions.py", "--quick", "--seed", "2", "-o", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", given)
     twelve_positions.main()
-    found = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert max(found["exactness"]) < 1e-10
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert max(result["exactness"]) < 1e-10
     # A degree of tilt stays in the formulas; the graph finds it by gyro and accelerometer.
-    assert found["session_deg"]["formulas"] > 0.4
-    assert found["session_deg"]["graph"] < 0.05
+    assert result["session_deg"]["formulas"] > 0.4
+    assert result["session_deg"]["graph"] < 0.05
     assert (tmp_path / "twelve_positions.png").read_bytes().startswith(b"\x89PNG")

@@ -10,7 +10,7 @@ from conftest import run_command
 
 from magfusion.calibration.magnetometer_size import calibrate_alone
 from magfusion.calibration.steady_field import steady_field
-from magfusion.estimation.data_checks.mending import mended
+from magfusion.estimation.data_checks.data_cleaning import clean_log
 from magfusion.files.log import write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.jobs.calibrate_magnetometer import run_calibrate_magnetometer
@@ -46,36 +46,36 @@ def test_stamps_of_a_host_give_way_to_the_clock_of_the_sensor(host: scenario.Hos
 
 
 def test_bursts_are_spread_and_nothing_else_is() -> None:
-    taken = 0.01 * np.arange(400)
-    assert spread_bursts(taken) is None
-    assert spread_bursts(taken + 0.003 * np.random.default_rng(1).random(400)) is None
-    arrived = 0.04 * np.ceil(taken / 0.04 + 1e-9) + 1e-4 * (np.arange(400) % 4)
+    selected = 0.01 * np.arange(400)
+    assert spread_bursts(selected) is None
+    assert spread_bursts(selected + 0.003 * np.random.default_rng(1).random(400)) is None
+    arrived = 0.04 * np.ceil(selected / 0.04 + 1e-9) + 1e-4 * (np.arange(400) % 4)
     spread = spread_bursts(arrived)
     assert spread is not None
-    late = spread - taken
+    late = spread - selected
     assert np.ptp(late) < 0.011
-    switched = (taken + 0.96 * np.repeat(np.arange(4), 100)).copy()
+    switched = (selected + 0.96 * np.repeat(np.arange(4), 100)).copy()
     assert spread_bursts(switched) is None
 
 
 def test_a_robots_hard_iron_is_found_by_turning_as_far_as_a_wrist_does() -> None:
     case = scenario.Case(90.0, 2, "jitter", "as declared", "nothing", duration=20.0)
-    row = scenario.judged(case)
+    row = scenario.judge_run(case)
     assert (row.verdict, row.determined, row.wrong) == ("trustworthy", 3, False)
 
 
 @pytest.mark.parametrize("imu", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_a_field_that_is_not_the_sites_is_named_as_the_cause(imu: bool) -> None:
     given = ("jitter", "30 uT indoors", "room for iron")
-    row = scenario.judged(scenario.Case(180.0, 2, *given, imu, duration=20.0))
-    told = r"field of (29|30|31)[.\d]* uT.* the site declares 47.9 uT: steel is near"
+    row = scenario.judge_run(scenario.Case(180.0, 2, *given, imu, duration=20.0))
+    reported = r"field of (29|30|31)[.\d]* uT.* the site declares 47.9 uT: steel is near"
     assert row.verdict == "failed"
-    assert re.search(told, row.said), row.said
+    assert re.search(reported, row.findings), row.findings
 
 
 def test_without_an_imu_the_size_of_the_field_tells_shape_and_offset() -> None:
     case = scenario.Case(120.0, 3, "bursts", "as declared", "nothing", False, duration=20.0)
-    row = scenario.judged(case)
+    row = scenario.judge_run(case)
     assert (row.verdict, row.determined, row.wrong) == ("trustworthy", 3, False)
 
 
@@ -84,26 +84,26 @@ def test_a_log_without_an_imu_makes_a_site_and_says_what_it_lacks(tmp_path: Path
     case = scenario.Case(120.0, 3, "jitter", "as declared", "nothing", False, duration=30.0)
     log, true = written(case, tmp_path)
     report = run_calibrate_magnetometer(Job(log, None, tmp_path / "out"))
-    found = load_site(tmp_path / "out" / "site.yaml", without=True).platform.magnetometer
-    assert np.max(np.abs(found.offset - true)) < LIMIT
-    assert np.max(np.abs(found.offset - true) / found.sigma.offset) < scenario.SIGMAS
+    result = load_site(tmp_path / "out" / "site.yaml", without=True).platform.magnetometer
+    assert np.max(np.abs(result.offset - true)) < LIMIT
+    assert np.max(np.abs(result.offset - true) / result.sigma.offset) < scenario.SIGMAS
     notes = report["notes"]
     assert isinstance(notes, list)
     assert any("no IMU" in note for note in notes)
     # Which rotation made a sphere of it the size does not tell: that stays as it was declared.
-    left, _, right = np.linalg.svd(found.matrix)
-    assert np.max(np.abs(left @ right - np.eye(3))) < 0.02
+    remaining, _, right = np.linalg.svd(result.matrix)
+    assert np.max(np.abs(remaining @ right - np.eye(3))) < 0.02
 
 
 @pytest.mark.slow
 def test_of_one_axis_the_mirror_image_is_not_taken_for_the_offset() -> None:
     case = scenario.Case(180.0, 1, "jitter", "as declared", "room for iron", False, seed=2)
     log, site, true = scenario.recorded(case)
-    log = mended(log, site)
+    log = clean_log(log, site)
     assert log.waveform is not None
-    found = calibrate_alone(log.waveform, site)
-    own = np.abs(found.graph.fit.offset - true) < 3.5 * found.magnetometer.sigma.offset
-    assert found.rival is not None or np.all(own)
+    result = calibrate_alone(log.waveform, site)
+    own = np.abs(result.graph.fit.offset - true) < 3.5 * result.magnetometer.sigma.offset
+    assert result.rival is not None or np.all(own)
 
 
 @pytest.mark.slow
@@ -126,7 +126,7 @@ def test_one_command_makes_a_site_that_the_other_jobs_take(
 @pytest.mark.parametrize("imu", [True, False])
 def test_nothing_is_called_determined_and_wrong(imu: bool) -> None:
     rows = [
-        scenario.judged(scenario.Case(turn, axes, "jitter", field, declared, imu, duration=40.0))
+        scenario.judge_run(scenario.Case(turn, axes, "jitter", field, declared, imu, duration=40.0))
         for turn, axes in ((20.0, 3), (45.0, 2), (90.0, 1), (180.0, 1))
         for field in scenario.FIELDS
         for declared in ("sheet", "nothing")
@@ -137,6 +137,6 @@ def test_nothing_is_called_determined_and_wrong(imu: bool) -> None:
 @pytest.mark.parametrize("seed", [pytest.param(1, marks=pytest.mark.slow), 5])
 def test_one_axis_and_a_field_of_unknown_size_determine_no_offset(seed: int) -> None:
     case = scenario.Case(90.0, 1, "bursts", "not declared", "room for iron", seed=seed)
-    row = scenario.judged(case)
+    row = scenario.judge_run(case)
     assert row.verdict in ("refused", "failed")
-    assert "earth_field_t" in row.said
+    assert "earth_field_t" in row.findings

@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.estimation.demodulation.hearing import heard_site
+from magfusion.estimation.demodulation.beacon_selection import select_detected
 from magfusion.files.site import load_site, save_site
-from magfusion.model.audibility import are_many, largest_fields, owned_at, tones_of
+from magfusion.model.detection_range import are_many, largest_fields, owned_at, tones_of
 from magfusion.model.parameters import (
     channels_of,
     choose_blocks,
@@ -19,7 +19,7 @@ from magfusion.model.parameters import (
     linearize_channels,
     of_beacons,
     predict_channels,
-    with_unheard,
+    with_undetected,
 )
 from magfusion.model.samples import FieldSamples, ImuSamples, Log
 from magfusion.model.site import BeaconSigma, Site, Slots
@@ -90,11 +90,11 @@ def test_no_field_is_larger_than_the_largest(building: Site) -> None:
 def test_a_phasor_is_of_the_loudest_that_drowns_the_others() -> None:
     site = many_beacons.building(np.random.default_rng(5), 2, 1, lambda _i, _j: 40.0)
     a, b = (beacon.position_world for beacon in site.beacons)
-    aside = np.array([2.0, 0.0, 0.0])
-    owned = owned_at(site, np.array([a + aside, 0.5 * (a + b), b - aside]))
+    lateral = np.array([2.0, 0.0, 0.0])
+    owned = owned_at(site, np.array([a + lateral, 0.5 * (a + b), b - lateral]))
     assert owned.channels.tolist() == [[True, False], [False, False], [False, True]]
     # What is not foreseen of the other is added to the covariance.
-    largest = largest_fields(site, np.array([a + aside]))
+    largest = largest_fields(site, np.array([a + lateral]))
     assert owned.others[0, 0] == pytest.approx(largest[0, 1])
 
 
@@ -103,14 +103,14 @@ def test_of_many_only_those_are_calculated_that_are_heard(building: Site) -> Non
     site = replace(building, beacons=tuple(replace(b, sigma=sigma) for b in building.beacons[:40]))
     calibration, blocks = initial_calibration(site, 0.0), choose_blocks(site)
     states = walk(40, (20.0, 20.0))
-    heard = np.random.default_rng(3).random((40, 40)) < 0.1
+    detected = np.random.default_rng(3).random((40, 40)) < 0.1
     place = states.time, states.world_from_body, states.position_world
     twist = np.zeros((40, 6))
     whole = linearize_channels(calibration, blocks, *place, twist)
-    some = linearize_channels(calibration, blocks, *place, twist, heard)
+    some = linearize_channels(calibration, blocks, *place, twist, detected)
     for every, part in zip(whole, some, strict=True):
         size = np.max(np.abs(every))
-        np.testing.assert_allclose(part[heard], every[heard], rtol=1e-9, atol=1e-12 * size)
+        np.testing.assert_allclose(part[detected], every[detected], rtol=1e-9, atol=1e-12 * size)
 
 
 def test_the_strengths_of_tones_tell_the_way(building: Site) -> None:
@@ -124,12 +124,12 @@ def test_the_strengths_of_tones_tell_the_way(building: Site) -> None:
 
 def test_each_phasor_that_is_left_is_of_its_beacon(building: Site) -> None:
     states = walk(30, (30.0, 22.0))
-    found = owned_by(received(building, states), building)
+    result = owned_by(received(building, states), building)
     true = simulate_fields(building, states, 1e-30, np.random.default_rng(0)).phasor_sensor
-    valid = found.valid
+    valid = result.valid
     assert 3 < np.mean(np.sum(valid, axis=1)) < 40
-    error = (found.phasor_sensor - true)[valid]
-    sigma = np.sqrt(np.trace(found.phasor_cov, axis1=-2, axis2=-1)[valid] / 3.0)
+    error = (result.phasor_sensor - true)[valid]
+    sigma = np.sqrt(np.trace(result.phasor_cov, axis1=-2, axis2=-1)[valid] / 3.0)
     assert np.max(np.abs(error) / sigma[:, None]) < 6.0
     assert np.sqrt(np.mean(np.abs(error) ** 2 / sigma[:, None] ** 2 / 2.0)) < 1.1
 
@@ -148,7 +148,7 @@ def test_two_halves_alike_are_ambiguous() -> None:
 
 def test_what_is_not_heard_stays_as_declared(building: Site, tmp_path: Path) -> None:
     samples = received(building, walk(20, (30.0, 22.0)))
-    log, site = heard_site(log_of(owned_by(samples, building)), building)
+    log, site = select_detected(log_of(owned_by(samples, building)), building)
     assert 3 < len(site.beacons) < 60
     assert log.fields is not None
     assert log.fields.channels == site.channels
@@ -157,14 +157,14 @@ def test_what_is_not_heard_stays_as_declared(building: Site, tmp_path: Path) -> 
     save_site(site, tmp_path / "site.yaml")
     again = load_site(tmp_path / "site.yaml")
     assert [b.name for b in again.beacons] == [b.name for b in building.beacons]
-    every = with_unheard(initial_calibration(site, 0.0))
+    every = with_undetected(initial_calibration(site, 0.0))
     assert len(every.site.beacons) == len(every.drift) == len(building.beacons)
 
 
 def test_few_beacons_are_left_as_they_are(building: Site) -> None:
     few = replace(building, beacons=building.beacons[:4])
     log = log_of(simulate_fields(few, walk(3, (3.0, 3.0)), SIGMA, np.random.default_rng(0)))
-    assert heard_site(log, few) == (log, few)
+    assert select_detected(log, few) == (log, few)
 
 
 def test_some_beacons_are_predicted_as_among_all(building: Site) -> None:
@@ -180,7 +180,7 @@ def test_coverage_of_many_is_that_of_those_in_reach(building: Site) -> None:
     points: Array = np.array([[40.0, 30.0, 1.2], [42.0, 31.0, 1.2]])
     whole = coverage(building, points, 0.4)
     near = np.max(largest_fields(building, points), axis=0) > SIGMA
-    alone = tuple(b for b, heard in zip(building.beacons, near, strict=True) if heard)
+    alone = tuple(b for b, detected in zip(building.beacons, near, strict=True) if detected)
     few = coverage(replace(building, beacons=alone[:24]), points, 0.4)
     assert np.all(whole.determined)
     assert np.all(whole.position_sigma < 0.1)
@@ -201,11 +201,11 @@ def test_slots_are_told_apart_by_when_they_are_sent(building: Site) -> None:
 def test_of_several_magnetometers_all_beacons_are_calculated(building: Site) -> None:
     known = building.platform.magnetometer
     pair = replace(known, name="a"), replace(known, name="b", position_body=np.array([0.1, 0, 0]))
-    site = replace(building, platform=building.platform.carrying(pair))
+    site = replace(building, platform=building.platform.with_magnetometers(pair))
     assert are_many(building)
     assert not are_many(site)
     log = log_of(simulate_fields(site, walk(3, (3.0, 3.0)), SIGMA, np.random.default_rng(0)))
-    assert heard_site(log, site) == (log, site)
+    assert select_detected(log, site) == (log, site)
     calibration, beacons = initial_calibration(site, 0.0), np.array([3, 50, 77])
     states = walk(4, (30.0, 22.0))
     place = states.time, states.world_from_body, states.position_world
@@ -217,6 +217,6 @@ def test_of_several_magnetometers_all_beacons_are_calculated(building: Site) -> 
 
 @pytest.mark.slow
 def test_a_building_errs_as_those_that_are_heard() -> None:
-    found = many_beacons.compared_hearing(0.4, 1)
-    assert found["all"].rms_m < 1.2 * found["heard alone"].rms_m
-    assert found["all"].nees < 6.0
+    result = many_beacons.compared_detection(0.4, 1)
+    assert result["all"].rms_m < 1.2 * result["heard alone"].rms_m
+    assert result["all"].nees < 6.0

@@ -18,7 +18,7 @@ from magfusion.files.plain_data import resume, to_plain
 from magfusion.files.site import load_site, save_site
 from magfusion.files.stream import Record
 from magfusion.jobs.import_log import ImportSettings, run_import
-from magfusion.model.marks import SILENT, UNTOLD, Marks, SlotColumn, marks_of_column
+from magfusion.model.marks import SILENT, UNKNOWN_SLOT, Marks, SlotColumn, marks_of_column
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import MarkedSlots, Site, Slots
 from magfusion.receiver.ambient import uneven_weights
@@ -70,7 +70,7 @@ def _still(end: float) -> ImuSamples:
 def _slots_beside(waveform: Waveform) -> np.ndarray:
     """Return the slot of each sample, as a driver would write it."""
     assert waveform.marks is not None
-    slot = np.full(len(waveform), UNTOLD)
+    slot = np.full(len(waveform), UNKNOWN_SLOT)
     for begin, end, one in zip(*vars(waveform.marks).values(), strict=True):
         slot[(waveform.time >= begin) & (waveform.time < end)] = one
     return slot
@@ -79,16 +79,16 @@ def _slots_beside(waveform: Waveform) -> np.ndarray:
 @pytest.mark.parametrize("carrier_hz", [CARRIER_HZ, 0.0])
 def test_each_burst_gives_its_coils_field_at_its_own_time(carrier_hz: float) -> None:
     marks = _marks(1.0)
-    found, dropped = received(_waveform(marks, 1.0, carrier_hz), _still(2.0), _site(carrier_hz))
+    result, dropped = received(_waveform(marks, 1.0, carrier_hz), _still(2.0), _site(carrier_hz))
     driven = marks.rows(marks.slot != SILENT)
-    channel = np.argmax(found.valid, axis=1)
+    channel = np.argmax(result.valid, axis=1)
     assert not dropped
     assert np.array_equal(channel, driven.slot)
-    assert np.max(np.abs(found.time - 0.5 * (driven.begin + driven.end))) < 1.0 / RATE_HZ
-    rows = np.arange(len(found))
-    error = found.phasor_sensor[rows, channel] - COUPLING[channel]
+    assert np.max(np.abs(result.time - 0.5 * (driven.begin + driven.end))) < 1.0 / RATE_HZ
+    rows = np.arange(len(result))
+    error = result.phasor_sensor[rows, channel] - COUPLING[channel]
     assert np.max(np.abs(np.mean(error, axis=0))) < 1e-10
-    sigma = np.sqrt(np.trace(found.phasor_cov[rows, channel], axis1=1, axis2=2).mean() / 3.0)
+    sigma = np.sqrt(np.trace(result.phasor_cov[rows, channel], axis1=1, axis2=2).mean() / 3.0)
     off = float(np.sqrt(np.mean(error.real**2)))
     # Hum of 150 nT is most of what pulses of direct current are under.
     assert off < (1.4 * sigma if carrier_hz else 3e-9)
@@ -110,9 +110,9 @@ def test_the_ambient_field_of_uneven_bursts_is_told_with_the_mains() -> None:
     index, weight = uneven_weights(
         centre[driven], length[driven], centre[silent], length[silent], 8, 50.0
     )
-    found = np.sum(weight * mean[silent][index], axis=1)
+    result = np.sum(weight * mean[silent][index], axis=1)
     inside = slice(50, -50)
-    assert np.max(np.abs(found - mean[driven])[inside]) < 1e-4
+    assert np.max(np.abs(result - mean[driven])[inside]) < 1e-4
     assert np.ptp(phase) > 100.0
 
 
@@ -129,30 +129,30 @@ def test_a_stream_in_odd_pieces_gives_what_the_log_gives(carrier_hz: float) -> N
     whole, _ = received(waveform, imu, site)
     marks = waveform.marks
     assert marks is not None
-    for beside in (False, True):
+    for others in (False, True):
         receiver = receiver_of(site)
         slot, parts, end, rng = _slots_beside(waveform), [], 0, np.random.default_rng(1)
         while end < len(waveform):
             first, end = end, min(end + int(rng.integers(50, 900)), len(waveform))
-            if beside:
-                receiver.hear_slots(waveform.time[first:end], slot[first:end])
+            if others:
+                receiver.add_slots(waveform.time[first:end], slot[first:end])
             else:
-                since, until = waveform.time[first], waveform.time[end - 1]
-                told = (marks.end > since) & (marks.end <= until)
-                receiver.hear_marks(marks.rows(told | ((first == 0) & (marks.end <= until))))
+                start_time, until = waveform.time[first], waveform.time[end - 1]
+                reported = (marks.end > start_time) & (marks.end <= until)
+                receiver.add_marks(marks.rows(reported | ((first == 0) & (marks.end <= until))))
             come = Waveform(waveform.time[:end], waveform.measured_sensor[:end])
             if receiver.grid is None and end > 3000:
                 receiver.begin(come, imu)
             if receiver.grid is not None:
                 parts.append(receiver.push(come, imu, float(come.time[-1])))
-        found = FieldSamples.joined(parts)
-        kept = np.isin(whole.time, found.time) if not beside else np.ones(len(whole), dtype=bool)
-        assert len(found) > len(whole) - 8
-        if beside:  # edges of bursts are those of samples
-            assert np.max(np.abs(found.time - whole.time[: len(found)])) < 1.0 / RATE_HZ
+        result = FieldSamples.joined(parts)
+        kept = np.isin(whole.time, result.time) if not others else np.ones(len(whole), dtype=bool)
+        assert len(result) > len(whole) - 8
+        if others:  # edges of bursts are those of samples
+            assert np.max(np.abs(result.time - whole.time[: len(result)])) < 1.0 / RATE_HZ
         elif carrier_hz:
-            ours, theirs = found.phasor_sensor, whole.phasor_sensor[kept]
-            assert np.allclose(ours, theirs, rtol=1e-9, atol=0.0, equal_nan=True)
+            ours, neighbours = result.phasor_sensor, whole.phasor_sensor[kept]
+            assert np.allclose(ours, neighbours, rtol=1e-9, atol=0.0, equal_nan=True)
 
 
 def test_bursts_of_a_short_cycle_are_one_epoch_in_a_stream_too() -> None:
@@ -188,23 +188,25 @@ def test_a_coil_that_comes_again_begins_another_epoch(slots: list[int], sizes: l
     phasor[np.arange(len(slots)), slots] = 1e-7
     cov = np.where(np.isnan(phasor.real), np.nan, 1.0)[..., None] * 1e-20 * np.eye(3)
     rows = FieldSamples(time, np.full(len(time), 2e-3), site.channels, phasor, cov)
-    found = cycles(rows, turn_of(_still(1.0), site), site)
-    assert np.sum(found.valid, axis=1).tolist() == sizes
+    result = cycles(rows, turn_of(_still(1.0), site), site)
+    assert np.sum(result.valid, axis=1).tolist() == sizes
 
 
 def test_slots_beside_samples_are_bursts_in_whatever_pieces() -> None:
     time = np.arange(40) * 1e-3
-    slot = np.repeat([UNTOLD, 0, UNTOLD, 1, SILENT, 2, 2, UNTOLD], 5)
+    slot = np.repeat([UNKNOWN_SLOT, 0, UNKNOWN_SLOT, 1, SILENT, 2, 2, UNKNOWN_SLOT], 5)
     whole = marks_of_column(time, slot)
     assert whole.slot.tolist() == [0, 1, SILENT, 2]
     assert np.allclose(whole.begin, [4.5e-3, 14.5e-3, 19.5e-3, 24.5e-3], rtol=0.0, atol=1e-12)
     assert np.allclose(whole.end, [9.5e-3, 19.5e-3, 24.5e-3, 34.5e-3], rtol=0.0, atol=1e-12)
     column, parts = SlotColumn(), Marks.none()
     for first, last in [(0, 3), (3, 4), (4, 22), (22, 23), (23, 31), (31, 40)]:
-        parts = parts.joined(column.hear(time[first:last], slot[first:last]))
-        parts = parts.joined(column.hear(time[first:last], slot[first:last]))  # twice: no matter
-    for ours, theirs in zip(vars(parts).values(), vars(whole).values(), strict=True):
-        assert np.allclose(ours, theirs, rtol=0.0, atol=1e-12)
+        parts = parts.joined(column.add_samples(time[first:last], slot[first:last]))
+        parts = parts.joined(
+            column.add_samples(time[first:last], slot[first:last])
+        )  # twice: no matter
+    for ours, others in zip(vars(parts).values(), vars(whole).values(), strict=True):
+        assert np.allclose(ours, others, rtol=0.0, atol=1e-12)
 
 
 def test_a_checkpoint_in_the_middle_of_a_burst_goes_on() -> None:
@@ -213,14 +215,14 @@ def test_a_checkpoint_in_the_middle_of_a_burst_goes_on() -> None:
     runs = []
     for cut in (False, True):
         receiver = receiver_of(site)
-        receiver.hear_slots(waveform.time[:half], slot[:half])
+        receiver.add_slots(waveform.time[:half], slot[:half])
         early = waveform.rows(slice(half))
         receiver.begin(early, imu)
         receiver.push(early, imu, float(early.time[-1]))
         if cut:
             data, receiver = to_plain(receiver), receiver_of(site)
             resume(receiver, data, "receiver")
-        receiver.hear_slots(waveform.time[half:], slot[half:])
+        receiver.add_slots(waveform.time[half:], slot[half:])
         runs.append(receiver.push(waveform, imu, float(waveform.time[-1])))
     assert len(runs[0]) > 50
     assert np.array_equal(*(run.phasor_sensor for run in runs), equal_nan=True)
@@ -236,7 +238,7 @@ def test_what_is_kept_does_not_grow() -> None:
     for end in range(4000, len(waveform), 4000):
         now = waveform.time[end - 1]
         own = (marks.end > waveform.time[end - 4000]) & (marks.end <= now)
-        receiver.hear_marks(marks.rows(own))
+        receiver.add_marks(marks.rows(own))
         receiver.push(waveform.rows(slice(end)), imu, float(now))
         kept.append(len(receiver.bursts))
     assert max(kept[-3:]) <= max(kept[5:10]) + 20
@@ -275,8 +277,8 @@ def test_marks_that_cannot_be_are_refused(marks: Marks | None, sentence: str) ->
 
 def test_a_long_burst_is_taken_in_pieces() -> None:
     marks = Marks(np.array([1.0]), np.array([3.5]), np.array([1]))
-    found, _ = received(_waveform(marks, 2.6), _still(3.7), _site())
-    assert found.window.tolist() == pytest.approx([1.0, 1.0, 0.5])
+    result, _ = received(_waveform(marks, 2.6), _still(3.7), _site())
+    assert result.window.tolist() == pytest.approx([1.0, 1.0, 0.5])
 
 
 def _table(path: Path, **columns: list[float | None]) -> None:
@@ -327,10 +329,10 @@ def test_slots_beside_samples_are_read_and_refused(tmp_path: Path) -> None:
     table = pa.parquet.read_table(path)
     slot: list[float | None] = [None, None, *[0] * 50, *[-1] * 50, *[2] * (len(table) - 102)]
     pa.parquet.write_table(table.append_column("slot", pa.array(slot, pa.int64())), path)
-    found = read_log(tmp_path / "log").waveform
-    assert found is not None
-    assert found.marks is not None
-    assert found.marks.slot.tolist() == [0, SILENT, 2]
+    result = read_log(tmp_path / "log").waveform
+    assert result is not None
+    assert result.marks is not None
+    assert result.marks.slot.tolist() == [0, SILENT, 2]
     slot[7] = 1.5
     pa.parquet.write_table(table.append_column("slot", pa.array(slot, pa.float64())), path)
     with pytest.raises(InputError, match=r"column slot, row 7 .*1.5; write the number"):
@@ -385,17 +387,17 @@ def test_records_of_marks_are_checked(record: dict[str, object], sentence: str) 
 
 
 def test_a_foreign_table_brings_the_slot_beside_its_samples(tmp_path: Path) -> None:
-    told = ["0", "", "1", "-1", "2"]
-    rows = [f"{0.01 * k:.2f},1e-5,2e-5,{4e-5 + 1e-9 * k:.9f},{told[k // 8]}" for k in range(40)]
+    reported = ["0", "", "1", "-1", "2"]
+    rows = [f"{0.01 * k:.2f},1e-5,2e-5,{4e-5 + 1e-9 * k:.9f},{reported[k // 8]}" for k in range(40)]
     (tmp_path / "mag.csv").write_text("\n".join(["t,bx,by,bz,mux", *rows]) + "\n")
-    said = ("magnetometer.time=t[s]", "magnetometer.field=bx,by,bz[T]", "magnetometer.slot=mux")
-    settings = ImportSettings(magnetometer=tmp_path / "mag.csv", map=said)
+    findings = ("magnetometer.time=t[s]", "magnetometer.field=bx,by,bz[T]", "magnetometer.slot=mux")
+    settings = ImportSettings(magnetometer=tmp_path / "mag.csv", map=findings)
     run_import(settings, tmp_path / "log")
-    found = read_log(tmp_path / "log").waveform
-    assert found is not None
-    assert found.marks is not None
-    assert found.marks.slot.tolist() == [0, 1, SILENT, 2]
-    assert len(found) == 40
+    result = read_log(tmp_path / "log").waveform
+    assert result is not None
+    assert result.marks is not None
+    assert result.marks.slot.tolist() == [0, 1, SILENT, 2]
+    assert len(result) == 40
 
 
 def test_what_hum_leaves_of_pulses_is_in_their_covariance() -> None:
@@ -406,11 +408,11 @@ def test_what_hum_leaves_of_pulses_is_in_their_covariance() -> None:
     phase = 2.0 * np.pi * 170.0 * waveform.time
     phase += np.cumsum(0.05 * rng.standard_normal(len(phase)))
     line = 2e-8 * np.cos(phase)[:, None] * [0.6, 0.0, 0.8]
-    for beside in (0.0, 1.0):
-        wave = replace(waveform, measured_sensor=waveform.measured_sensor + beside * line)
-        found, _ = received(wave, _still(2.0), _site(0.0))
-        channel, rows = np.argmax(found.valid, axis=1), np.arange(len(found))
-        error = (found.phasor_sensor[rows, channel] - COUPLING[channel]).real
-        cov = found.phasor_cov[rows, channel]
+    for others in (0.0, 1.0):
+        wave = replace(waveform, measured_sensor=waveform.measured_sensor + others * line)
+        result, _ = received(wave, _still(2.0), _site(0.0))
+        channel, rows = np.argmax(result.valid, axis=1), np.arange(len(result))
+        error = (result.phasor_sensor[rows, channel] - COUPLING[channel]).real
+        cov = result.phasor_cov[rows, channel]
         nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error)
         assert 1.5 < np.mean(nees) < 6.0

@@ -75,13 +75,13 @@ def test_roll_and_pitch_are_those_of_least_distance() -> None:
     rng = np.random.default_rng(2)
     rpy = attitudes(5)
     noisy = predict_field(rpy, FIELD_WORLD) + rng.normal(0.0, 10.0 * SIGMA, (5, 3))
-    found = match_roll_pitch(noisy, YAW, FIELD_WORLD, SIGMA)
+    result = match_roll_pitch(noisy, YAW, FIELD_WORLD, SIGMA)
     for axis in (0, 1):
         for shift in (-1e-3, 1e-3):
-            moved = found.rpy[:, 0].copy()
+            moved = result.rpy[:, 0].copy()
             moved[:, axis] += shift
             distance = np.linalg.norm(predict_field(moved, FIELD_WORLD) - noisy, axis=1)
-            assert np.all(distance > found.residual[:, 0])
+            assert np.all(distance > result.residual[:, 0])
 
 
 @pytest.mark.parametrize("kind", ["roll", "roll-pitch"])
@@ -91,11 +91,11 @@ def test_the_scatter_is_as_large_as_is_claimed(kind: str) -> None:
     noise = np.random.default_rng(3).normal(0.0, SIGMA, (draws, 3))
     noisy = predict_field(one, FIELD_WORLD) + noise
     if kind == "roll":
-        found = match_roll(noisy, 0.2, YAW, FIELD_WORLD, SIGMA)
+        result = match_roll(noisy, 0.2, YAW, FIELD_WORLD, SIGMA)
     else:
-        found = match_roll_pitch(noisy, YAW, FIELD_WORLD, SIGMA)
-    measured = np.std(found.rpy[:, 0], axis=0)
-    np.testing.assert_allclose(measured, np.mean(found.sigma[:, 0], axis=0), rtol=0.03, atol=1e-12)
+        result = match_roll_pitch(noisy, YAW, FIELD_WORLD, SIGMA)
+    measured = np.std(result.rpy[:, 0], axis=0)
+    np.testing.assert_allclose(measured, np.mean(result.sigma[:, 0], axis=0), rtol=0.03, atol=1e-12)
 
 
 def test_both_solutions_of_the_pitch_are_returned_and_explain_the_field() -> None:
@@ -104,22 +104,22 @@ def test_both_solutions_of_the_pitch_are_returned_and_explain_the_field() -> Non
     pitch = np.concatenate([np.linspace(32.0, 50.0, 20), np.linspace(68.0, 87.0, 20)]) * DEGREE
     rpy = np.stack([np.linspace(-3.0, 3.0, 40), pitch, np.full(40, yaw)], axis=1)
     field_body = predict_field(rpy, FIELD_WORLD)
-    found = match_roll_pitch(field_body, yaw, FIELD_WORLD, 1e-9)
-    assert np.all(found.ambiguous)
-    assert np.nanmax(found.residual) < 1e-17  # T
-    error = np.abs(wrap(found.rpy - rpy[:, None])).max(axis=2)
+    result = match_roll_pitch(field_body, yaw, FIELD_WORLD, 1e-9)
+    assert np.all(result.ambiguous)
+    assert np.nanmax(result.residual) < 1e-17  # T
+    error = np.abs(wrap(result.rpy - rpy[:, None])).max(axis=2)
     np.testing.assert_allclose(error.min(axis=1), 0.0, rtol=0, atol=1e-7)
     assert np.all(np.argmin(error, axis=1) == np.repeat([0, 1], 20))
-    side = fold_side(found.rpy[..., 1], yaw, FIELD_WORLD)
+    side = fold_side(result.rpy[..., 1], yaw, FIELD_WORLD)
     np.testing.assert_allclose(side[:, 0], -side[:, 1], rtol=1e-6, atol=0)
 
 
 def test_at_the_fold_nothing_is_determined_and_beyond_it_nothing_is_ambiguous() -> None:
     fold = float(np.arctan2(4.7e-5, 2.7e-5))  # nose down, heading along world y
     rpy = np.array([[0.3, fold + 1e-4, 0.5 * np.pi], [0.3, -0.3, 0.5 * np.pi]])
-    found = match_roll_pitch(predict_field(rpy, FIELD_WORLD), rpy[:, 2], FIELD_WORLD, SIGMA)
-    assert found.determined[:, 0].tolist() == [False, True]
-    assert found.ambiguous.tolist() == [True, False]
+    result = match_roll_pitch(predict_field(rpy, FIELD_WORLD), rpy[:, 2], FIELD_WORLD, SIGMA)
+    assert result.determined[:, 0].tolist() == [False, True]
+    assert result.ambiguous.tolist() == [True, False]
 
 
 def test_the_family_of_attitudes_over_yaw_explains_one_vector() -> None:
@@ -129,12 +129,12 @@ def test_the_family_of_attitudes_over_yaw_explains_one_vector() -> None:
     whole = family.determined[:, 0]
     assert whole.sum() > 30
     assert np.max(family.residual[whole, 0]) < 1e-17  # T
-    turned = Rotation.from_matrix(matrices(family.rpy[whole, 0]))
-    assert (turned[0].inv() * turned).magnitude().max() > 2.0  # rad
+    rotated = Rotation.from_matrix(matrices(family.rpy[whole, 0]))
+    assert (rotated[0].inv() * rotated).magnitude().max() > 2.0  # rad
 
 
 @pytest.mark.parametrize(
-    ("match", "told"),
+    ("match", "reported"),
     [
         (lambda h: match_roll(h, 0.0, 0.0, np.array([5e-5, 1e-7, 0.0]), SIGMA), "axis of roll"),
         (lambda h: match_roll_pitch(h, 0.0, np.array([0.0, 5e-5, 0.0]), SIGMA), "axis of pitch"),
@@ -144,9 +144,9 @@ def test_the_family_of_attitudes_over_yaw_explains_one_vector() -> None:
         ),
     ],
 )
-def test_an_angle_about_the_field_is_refused(match: object, told: str) -> None:
+def test_an_angle_about_the_field_is_refused(match: object, reported: str) -> None:
     assert callable(match)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=reported):
         match(np.array([[1e-5, 2e-5, 4e-5]]))
 
 
@@ -154,8 +154,8 @@ def test_with_gravity_all_three_angles_are_exact() -> None:
     true = Rotation.random(50, random_state=np.random.default_rng(4))
     field_body = true.apply(FIELD_WORLD, inverse=True)
     force_body = true.apply([0.0, 0.0, 9.8], inverse=True)
-    found = attitude_with_gravity(field_body, force_body, FIELD_WORLD, 0.01, 0.02)
-    np.testing.assert_allclose(found, true.as_matrix(), rtol=0, atol=1e-12)
+    result = attitude_with_gravity(field_body, force_body, FIELD_WORLD, 0.01, 0.02)
+    np.testing.assert_allclose(result, true.as_matrix(), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("database", [grid(5.0), circle(5.0)], ids=["roll-pitch", "roll"])
@@ -173,8 +173,8 @@ def test_every_entry_finds_itself(database: AttitudeDatabase) -> None:
 def test_a_field_that_the_database_does_not_know_is_not_determined() -> None:
     index = prepare(grid(5.0, pitch=(-20.0, 20.0)))
     rpy = np.array([[0.1, 0.1, YAW], [0.1, -1.0, YAW]])
-    found = match_nearest(index, predict_field(rpy, FIELD_WORLD), 1e-9)
-    assert found.determined[:, 0].tolist() == [True, False]
+    result = match_nearest(index, predict_field(rpy, FIELD_WORLD), 1e-9)
+    assert result.determined[:, 0].tolist() == [True, False]
 
 
 def distort(field_body: np.ndarray) -> np.ndarray:
@@ -212,8 +212,8 @@ def test_a_turn_about_a_vertical_axis_is_a_database_of_roll() -> None:
     field_body = np.einsum("nij,i->nj", turn, FIELD_WORLD)
     database = build_database(field_body, turn, "table").database
     assert database.angles == "roll"
-    found = match_interpolated(prepare(database), field_body, SIGMA)
-    np.testing.assert_allclose(wrap(found.rpy[:, 0, 0] - roll), 0.0, rtol=0, atol=1e-4)
+    result = match_interpolated(prepare(database), field_body, SIGMA)
+    np.testing.assert_allclose(wrap(result.rpy[:, 0, 0] - roll), 0.0, rtol=0, atol=1e-4)
 
 
 def test_building_keeps_to_one_side_of_the_fold_and_a_database_of_both_is_refused() -> None:
@@ -226,13 +226,15 @@ def test_building_keeps_to_one_side_of_the_fold_and_a_database_of_both_is_refuse
         prepare(AttitudeDatabase(field_body, rpy, "roll-pitch", "log"))
 
 
-@pytest.mark.parametrize(("angles", "told"), [(None, "gravity"), ("roll", "axis of roll rotates")])
+@pytest.mark.parametrize(
+    ("angles", "reported"), [(None, "gravity"), ("roll", "axis of roll rotates")]
+)
 def test_three_angles_of_one_vector_are_refused_with_what_is_lacking(
-    angles: str | None, told: str
+    angles: str | None, reported: str
 ) -> None:
     turn = Rotation.random(500, random_state=np.random.default_rng(6)).as_matrix()
     field_body = np.einsum("nij,i->nj", turn, FIELD_WORLD)
-    with pytest.raises(InputError, match=told) as refused:
+    with pytest.raises(InputError, match=reported) as refused:
         build_database(field_body, turn, "log", angles)
     assert "\n" not in str(refused.value)
 
@@ -268,7 +270,7 @@ def _spoil(table: pa.Table, name: str, value: object) -> pa.Table:
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         (lambda t: t.replace_schema_metadata({}), "is no attitude database"),
         (
@@ -289,12 +291,14 @@ def _spoil(table: pa.Table, name: str, value: object) -> pa.Table:
         ),
     ],
 )
-def test_a_file_that_is_no_database_is_refused(change: object, told: str, tmp_path: Path) -> None:
+def test_a_file_that_is_no_database_is_refused(
+    change: object, reported: str, tmp_path: Path
+) -> None:
     path = tmp_path / "attitudes.parquet"
     write_database(circle(10.0), path)
     assert callable(change)
     pa.parquet.write_table(change(pa.parquet.read_table(path)), path)
-    with pytest.raises(InputError, match=told) as refused:
+    with pytest.raises(InputError, match=reported) as refused:
         read_database(path)
     assert str(path) in str(refused.value)
 

@@ -70,21 +70,21 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def report(path: Path) -> dict[str, Any]:
-    told: dict[str, Any] = json.loads((path / "report.json").read_text())
-    return told
+    reported: dict[str, Any] = json.loads((path / "report.json").read_text())
+    return reported
 
 
 def test_the_database_has_table_picture_and_report(logs: Path) -> None:
-    found = logs / "nod_table"
+    result = logs / "nod_table"
     names = {"attitudes.parquet", "attitudes.png", "report.html", "report.json"}
-    assert {path.name for path in found.iterdir()} == names
-    assert (found / "attitudes.png").read_bytes().startswith(b"\x89PNG")
-    told = report(found)
-    assert told["angles"] == "roll-pitch"
-    assert 12 <= told["entries"] < told["measurements"]
-    assert told["held_yaw_deg"] == pytest.approx(np.rad2deg(YAW), abs=1e-6)
+    assert {path.name for path in result.iterdir()} == names
+    assert (result / "attitudes.png").read_bytes().startswith(b"\x89PNG")
+    reported = report(result)
+    assert reported["angles"] == "roll-pitch"
+    assert 12 <= reported["entries"] < reported["measurements"]
+    assert reported["held_yaw_deg"] == pytest.approx(np.rad2deg(YAW), abs=1e-6)
     # Averaging over four degrees shortens 50 microtesla by ten nanotesla.
-    assert told["unexplained_by_a_uniform_field_t"] < 1e-8
+    assert reported["unexplained_by_a_uniform_field_t"] < 1e-8
 
 
 @pytest.mark.parametrize(("method", "limit"), [("nearest", 2.0), ("interpolated", 0.3)])
@@ -96,13 +96,13 @@ def test_roll_and_pitch_are_found_in_the_database_of_another_log(
                     "--method", method, "-o", tmp_path / "out")  # fmt: skip
     names = {"attitude.parquet", "attitude.png", "report.html", "report.json"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
-    told = report(tmp_path / "out")
-    assert told["roll_rms_deg"] < limit
-    assert told["pitch_rms_deg"] < limit
+    reported = report(tmp_path / "out")
+    assert reported["roll_rms_deg"] < limit
+    assert reported["pitch_rms_deg"] < limit
     # Each claims as much as it errs.
-    assert 0.4 < told["pitch_rms_deg"] / told["pitch_sigma_median_deg"] < 2.5
+    assert 0.4 < reported["pitch_rms_deg"] / reported["pitch_sigma_median_deg"] < 2.5
     table = pyarrow.parquet.read_table(tmp_path / "out" / "attitude.parquet").to_pydict()
-    assert len(table["time_ns"]) == told["epochs"]
+    assert len(table["time_ns"]) == reported["epochs"]
     assert set(table["yaw_sigma_deg"]) == {0.0}
 
 
@@ -121,38 +121,38 @@ def test_roll_is_found_by_its_database_and_in_closed_form(logs: Path, tmp_path: 
 
 def test_gravity_adds_the_third_angle(logs: Path, tmp_path: Path) -> None:
     run_command("match", logs / "rests", "--gravity", "-o", tmp_path / "out")
-    told = report(tmp_path / "out")
-    assert told["angles"] == "roll-pitch-yaw"
-    assert told["attitude_rmse_deg"] < 0.1
-    assert 0 < told["epochs_not_determined"] < 0.2 * told["epochs"]
-    assert told["reasons"][0]["code"] == "geometry"
+    reported = report(tmp_path / "out")
+    assert reported["angles"] == "roll-pitch-yaw"
+    assert reported["attitude_rmse_deg"] < 0.1
+    assert 0 < reported["epochs_not_determined"] < 0.2 * reported["epochs"]
+    assert reported["reasons"][0]["code"] == "geometry"
 
 
 def test_gravity_is_not_believed_in_motion(logs: Path, tmp_path: Path) -> None:
     run_command("match", logs / "wander", "--gravity", "-o", tmp_path / "out")
-    told = report(tmp_path / "out")
-    assert told["epochs_not_determined"] == told["epochs"]
-    assert told["verdict"] == "doubtful"
-    assert "not_compared" in told
+    reported = report(tmp_path / "out")
+    assert reported["epochs_not_determined"] == reported["epochs"]
+    assert reported["verdict"] == "doubtful"
+    assert "not_compared" in reported
 
 
 def test_both_pitches_are_written_where_there_are_two(logs: Path, tmp_path: Path) -> None:
     run_command("match", logs / "dive", "--yaw-deg", np.rad2deg(YAW), "-o", tmp_path / "out")
-    told = report(tmp_path / "out")
-    assert told["epochs_with_two_pitches"] > 0
-    assert told["max_of_nearer_solution_deg"] < 1.0 < told["pitch_max_deg"]
+    reported = report(tmp_path / "out")
+    assert reported["epochs_with_two_pitches"] > 0
+    assert reported["max_of_nearer_solution_deg"] < 1.0 < reported["pitch_max_deg"]
     table = pyarrow.parquet.read_table(tmp_path / "out" / "attitude.parquet").to_pydict()
-    assert table["hypothesis"].count(1) == told["epochs_with_two_pitches"]
+    assert table["hypothesis"].count(1) == reported["epochs_with_two_pitches"]
 
 
 def test_a_platform_whose_yaw_wanders_makes_no_database(logs: Path, refuse: Refuse) -> None:
-    told = refuse("calibrate", "attitude-database", logs / "wander", "-o", logs / "none")
-    assert "yaw rotates by" in told
-    assert "gravity" in told
+    reported = refuse("calibrate", "attitude-database", logs / "wander", "-o", logs / "none")
+    assert "yaw rotates by" in reported
+    assert "gravity" in reported
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "reported"),
     [
         ((), "give the yaw"),
         (("--angles", "roll-pitch-yaw"), "two of three angles"),
@@ -170,10 +170,10 @@ def test_a_platform_whose_yaw_wanders_makes_no_database(logs: Path, refuse: Refu
     ],
 )
 def test_what_cannot_be_told_is_refused(
-    logs: Path, tmp_path: Path, refuse: Refuse, options: tuple[str, ...], told: str
+    logs: Path, tmp_path: Path, refuse: Refuse, options: tuple[str, ...], reported: str
 ) -> None:
     known = [logs / o if (logs / o).is_dir() else o for o in options]
-    assert told in refuse("match", logs / "nod_again", *known, "-o", tmp_path / "out")
+    assert reported in refuse("match", logs / "nod_again", *known, "-o", tmp_path / "out")
 
 
 @pytest.mark.parametrize("place", [None, {"location": True}])
@@ -214,14 +214,14 @@ def test_a_log_without_truth_needs_a_reference(logs: Path, tmp_path: Path, refus
 
 
 def test_a_dead_magnetometer_is_refused(logs: Path, tmp_path: Path, refuse: Refuse) -> None:
-    spoilt = shutil.copytree(logs / "turn", tmp_path / "dead")
+    corrupted = shutil.copytree(logs / "turn", tmp_path / "dead")
     offset = demo_site().platform.magnetometer.offset
     change_table(
-        spoilt / "magnetometer.parquet",
+        corrupted / "magnetometer.parquet",
         lambda c: [
             c.update({f"field_{x}": [o] * len(c["time_ns"])})
             for x, o in zip("xyz", offset, strict=True)
         ],
     )
-    told = refuse("match", spoilt, "--yaw-deg", 3, "-o", tmp_path / "out")
-    assert "the field is zero at" in told
+    reported = refuse("match", corrupted, "--yaw-deg", 3, "-o", tmp_path / "out")
+    assert "the field is zero at" in reported

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 @pytest.fixture(scope="module")
 def rolls() -> dict[tuple[str, float, float], roll_matching.Row]:
-    found = roll_matching.run(roll_matching.Config())
-    return {(row.axis, row.step_deg, row.noise_mg): row for row in found}
+    result = roll_matching.run(roll_matching.Config())
+    return {(row.axis, row.step_deg, row.noise_mg): row for row in result}
 
 
 @pytest.fixture(scope="module")
@@ -64,9 +64,9 @@ def test_the_calibrated_magnetometer_errs_as_twelve_positions_let_it() -> None:
     angles = []
     for _ in range(200):
         matrix, offset = roll_matching.calibrated_error(roll_matching.Config(), rng)
-        found = true @ matrix.T + offset
-        sine = np.linalg.norm(np.cross(found, true), axis=1)
-        angles.append(np.arctan2(sine, np.sum(found * true, axis=1)))
+        result = true @ matrix.T + offset
+        sine = np.linalg.norm(np.cross(result, true), axis=1)
+        angles.append(np.arctan2(sine, np.sum(result * true, axis=1)))
     assert np.rad2deg(np.sqrt(np.mean(np.square(angles)))) == pytest.approx(0.225, abs=0.02)
 
 

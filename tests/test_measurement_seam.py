@@ -170,7 +170,7 @@ def test_the_batch_fuses_ranges_at_times_of_their_own() -> None:
     assert set(time) <= set(fused.states.time.tolist())
     np.testing.assert_array_equal(fused.states.time[fused.epoch], fused.fields.time)
     ate = [
-        trajectory_errors(found.states, small.truth, max_gap=1.0).ate for found in (alone, fused)
+        trajectory_errors(result.states, small.truth, max_gap=1.0).ate for result in (alone, fused)
     ]
     assert ate[1] < 0.5 * ate[0]
 
@@ -235,11 +235,11 @@ def test_the_batch_finds_a_scale_factor_of_the_gyro() -> None:
     imu = replace(small.imu, gyro_body=(1.0 + TRUE_SCALE) * small.imu.gyro_body)
     log = replace(small.log, imu=imu)
     settings = SmootherSettings(estimate=("gyro-scale",), parameters=KINDS)
-    found = smooth(log, small.site, settings)
-    sigma = float(np.sqrt(found.calibration_cov[-1, -1]))
-    assert found.converged
+    result = smooth(log, small.site, settings)
+    sigma = float(np.sqrt(result.calibration_cov[-1, -1]))
+    assert result.converged
     assert sigma < 0.1 * TRUE_SCALE
-    scale = scale_of(found.calibration, found.declared, found.blocks)
+    scale = scale_of(result.calibration, result.declared, result.blocks)
     assert scale == pytest.approx(TRUE_SCALE, abs=4.0 * sigma)
 
 
@@ -259,5 +259,5 @@ def test_online_the_scale_factor_of_the_gyro_is_found(estimator: Estimator) -> N
     own = next(b for b in navigator.blocks if isinstance(b.parameter, GyroScale))
     sigma = float(np.sqrt(state.cov[15:, 15:][own.columns, own.columns][0, 0]))
     assert sigma < 0.1 * TRUE_SCALE
-    found = float(state.calibration.others["imu.gyro_scale"][0])
-    assert found == pytest.approx(TRUE_SCALE, abs=4.0 * sigma)
+    result = float(state.calibration.others["imu.gyro_scale"][0])
+    assert result == pytest.approx(TRUE_SCALE, abs=4.0 * sigma)

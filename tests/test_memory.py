@@ -39,25 +39,25 @@ def test_an_array_takes_the_pages_of_one_that_was_freed() -> None:
 
 
 def test_only_a_large_program_gives_back_what_it_freed(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
+    requested: list[str] = []
 
     def of_glibc(name: str) -> object:
-        return lambda _: asked.append(name)
+        return lambda _: requested.append(name)
 
     monkeypatch.setattr(memory, "_of_glibc", of_glibc)
     monkeypatch.setattr(memory, "RESIDENT", 1e15)
     memory.give_back_memory()
-    assert asked == []
+    assert requested == []
     monkeypatch.setattr(memory, "RESIDENT", 1e6)
     memory.give_back_memory()
-    assert asked == ["malloc_trim"]
+    assert requested == ["malloc_trim"]
 
 
 def test_a_system_that_tells_nothing_is_given_everything_back(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    asked: list[str] = []
-    monkeypatch.setattr(memory, "_of_glibc", lambda name: lambda _: asked.append(name))
+    requested: list[str] = []
+    monkeypatch.setattr(memory, "_of_glibc", lambda name: lambda _: requested.append(name))
     monkeypatch.setattr(memory, "PAGES", tmp_path / "none")
     memory.give_back_memory()
-    assert asked == ["malloc_trim"]
+    assert requested == ["malloc_trim"]

@@ -58,10 +58,10 @@ def test_silent_is_what_is_wrong_and_neither_said_nor_listed() -> None:
     good = replace(ROW, mistake="good", nees=6.0)
     right = replace(ROW, verdict="doubtful", codes=("lever_arm",), seconds=4.0)
     rows = [good, ROW, right, replace(right, codes=("geometry",), seconds=1.0)]
-    found = summed(rows)
-    assert found.silent == ("lever_20cm (moving, smooth)",)
-    assert found.right_first == pytest.approx(1.0 / 3.0)
-    assert found.slow == ("lever_20cm (moving, smooth)",)
+    result = summed(rows)
+    assert result.silent == ("lever_20cm (moving, smooth)",)
+    assert result.right_first == pytest.approx(1.0 / 3.0)
+    assert result.slow == ("lever_20cm (moving, smooth)",)
     assert "SILENT" in table(rows)
 
 

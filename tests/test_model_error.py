@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
-from magfusion.estimation.measurements.model_error import alike_in_batch, alike_online
+from magfusion.estimation.measurements.model_error import (
+    epochs_sharing_error,
+    epochs_sharing_error_online,
+)
 from magfusion.estimation.measurements.phasors import field_phasors
 from magfusion.model.field import model_error_cov
 from magfusion.model.samples import FieldSamples
@@ -20,31 +23,33 @@ LENGTH = 0.5  # m
 
 def test_epochs_at_rest_are_one_and_epochs_far_apart_are_many() -> None:
     rest = np.tile([1.0, 2.0, 3.0], (40, 1))
-    assert np.allclose(alike_in_batch(rest, LENGTH), 40.0, rtol=1e-12, atol=0.0)
-    apart = np.arange(30.0)[:, None] * [20.0, 0.0, 0.0]
-    assert np.allclose(alike_in_batch(apart, LENGTH), 1.0, rtol=1e-9, atol=0.0)
-    assert np.allclose(alike_in_batch(rest, 0.0), 1.0, rtol=0.0, atol=0.0)
+    assert np.allclose(epochs_sharing_error(rest, LENGTH), 40.0, rtol=1e-12, atol=0.0)
+    separate = np.arange(30.0)[:, None] * [20.0, 0.0, 0.0]
+    assert np.allclose(epochs_sharing_error(separate, LENGTH), 1.0, rtol=1e-9, atol=0.0)
+    assert np.allclose(epochs_sharing_error(rest, 0.0), 1.0, rtol=0.0, atol=0.0)
 
 
 def test_the_count_is_the_sum_of_correlations_with_all_epochs() -> None:
     rng = np.random.default_rng(0)
     place = np.cumsum(0.05 * rng.standard_normal((300, 3)), axis=0)
     exact = np.sum(np.exp(-np.linalg.norm(place[:, None] - place, axis=2) / LENGTH), axis=1)
-    found = alike_in_batch(place, LENGTH)
-    assert np.max(np.abs(found / exact - 1.0)) < 0.1  # epochs of an eighth of a metre are counted
+    result = epochs_sharing_error(place, LENGTH)
+    assert np.max(np.abs(result / exact - 1.0)) < 0.1  # epochs of an eighth of a metre are counted
     # A second visit averages nothing: twice the epochs, each counting half.
-    again = alike_in_batch(np.tile(place, (2, 1)), LENGTH)
-    assert np.allclose(again, 2.0 * np.tile(found, 2), rtol=1e-9, atol=0.0)
+    again = epochs_sharing_error(np.tile(place, (2, 1)), LENGTH)
+    assert np.allclose(again, 2.0 * np.tile(result, 2), rtol=1e-9, atol=0.0)
 
 
 def test_online_the_count_is_that_of_a_straight_path() -> None:
     speed, step = 0.5, 0.2
     path = np.arange(-400, 401)[:, None] * [speed * step, 0.0, 0.0]
     exact = np.sum(np.exp(-np.linalg.norm(path, axis=1) / LENGTH))
-    assert alike_online(speed, step, LENGTH) == pytest.approx(exact, rel=1e-6)
-    assert alike_online(0.0, step, LENGTH) == pytest.approx(100.0, rel=0.01)  # twenty seconds
-    assert alike_online(100.0, step, LENGTH) == pytest.approx(1.0, rel=0.01)
-    assert alike_online(speed, step, 0.0) == 1.0
+    assert epochs_sharing_error_online(speed, step, LENGTH) == pytest.approx(exact, rel=1e-6)
+    assert epochs_sharing_error_online(0.0, step, LENGTH) == pytest.approx(
+        100.0, rel=0.01
+    )  # twenty seconds
+    assert epochs_sharing_error_online(100.0, step, LENGTH) == pytest.approx(1.0, rel=0.01)
+    assert epochs_sharing_error_online(speed, step, 0.0) == 1.0
 
 
 def test_epochs_that_share_their_model_error_have_the_information_of_one() -> None:
@@ -57,9 +62,9 @@ def test_epochs_that_share_their_model_error_have_the_information_of_one() -> No
     still = np.tile([2.0, 2.0, 1.0], (count, 1))
     poses = Trajectory(time, np.tile(np.eye(3), (count, 1, 1)), still)
     epoch, rate = np.arange(count), np.zeros((count, 3))
-    alike = alike_in_batch(still, LENGTH)
+    shared = epochs_sharing_error(still, LENGTH)
     measured = field_phasors(
-        site, samples, epoch, poses, rate, np.zeros(len(epoch)), 1.0, alike=alike
+        site, samples, epoch, poses, rate, np.zeros(len(epoch)), 1.0, shared_by=shared
     )
     root = measured.sqrt_information[:, 0, :3, :3]
     mean_cov = np.linalg.inv(np.sum(np.swapaxes(root, 1, 2) @ root, axis=0))
@@ -75,11 +80,11 @@ def test_epochs_that_share_their_model_error_have_the_information_of_one() -> No
 
 def _in_iron(seed: int, length: float) -> float:
     config = SimulationConfig(DEMO_BOX_WORLD, duration=30.0, motion="walk", iron=8, perturb=False)
-    made = simulate_log(demo_site(), config, np.random.default_rng(seed))
+    built = simulate_log(demo_site(), config, np.random.default_rng(seed))
     site = replace(demo_site(), model_error=0.01, model_error_length=length)
-    assert made.log.truth is not None
-    result = smooth(made.log, site, SmootherSettings(tune=False))
-    nees = trajectory_errors(result.states, made.log.truth).nees
+    assert built.log.truth is not None
+    result = smooth(built.log, site, SmootherSettings(tune=False))
+    nees = trajectory_errors(result.states, built.log.truth).nees
     assert nees is not None
     return float(np.mean(nees))
 

@@ -43,7 +43,7 @@ def known(part: Beacon | Site) -> dict[str, object]:
     return {name: getattr(part, name) for name in names}
 
 
-def anew(site: Site) -> Site:
+def restart(site: Site) -> Site:
     def coil(one: Coil) -> Coil:
         return replace(one, moment_beacon=one.moment_beacon.copy())
 
@@ -59,12 +59,12 @@ def test_a_site_with_larger_moments_is_one_made_anew(make):
         known(part)
     factors = {b.name: 1.1 + 0.1 * np.arange(len(b.coils))[:, None] for b in site.beacons[:2]}
     moments = {b.name: b.moments_beacon * factors[b.name] for b in site.beacons[:2]}
-    found = with_moments(site, moments)
-    expected = anew(found)
-    for one, other in zip((found, *found.beacons), (expected, *expected.beacons), strict=True):
+    result = with_moments(site, moments)
+    expected = restart(result)
+    for one, other in zip((result, *result.beacons), (expected, *expected.beacons), strict=True):
         for name, value in known(other).items():
             np.testing.assert_equal(known(one)[name], value, name)
-    for one, other in zip(linearized(found), linearized(expected), strict=True):
+    for one, other in zip(linearized(result), linearized(expected), strict=True):
         np.testing.assert_array_equal(one, other)
-    assert not np.array_equal(before[0], linearized(found)[0])
+    assert not np.array_equal(before[0], linearized(result)[0])
     assert np.array_equal(site.beacons[0].moments_beacon, make().beacons[0].moments_beacon)

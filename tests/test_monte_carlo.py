@@ -49,24 +49,24 @@ def test_results_come_in_order_and_depend_on_the_seed_alone() -> None:
 
 def test_the_work_is_done_by_other_processes_with_one_thread_each() -> None:
     before = os.environ.get("OMP_NUM_THREADS")
-    found = run_many(draw, INPUTS, workers=2)
-    assert os.getpid() not in {pid for _, pid, _ in found}
-    assert {threads for _, _, threads in found} == {"1"}
+    result = run_many(draw, INPUTS, workers=2)
+    assert os.getpid() not in {pid for _, pid, _ in result}
+    assert {threads for _, _, threads in result} == {"1"}
     assert os.environ.get("OMP_NUM_THREADS") == before
 
 
 def test_a_cluster_gives_the_same_numbers(cluster: str) -> None:
-    found = run_many(draw, INPUTS, seed=3, cluster=cluster)
-    assert [value for value, _, _ in found] == run_many(same, INPUTS, seed=3, workers=1)
-    assert os.getpid() not in {pid for _, pid, _ in found}
+    result = run_many(draw, INPUTS, seed=3, cluster=cluster)
+    assert [value for value, _, _ in result] == run_many(same, INPUTS, seed=3, workers=1)
+    assert os.getpid() not in {pid for _, pid, _ in result}
 
 
 @pytest.mark.parametrize("where", ["here", "processes", "cluster"])
 def test_progress_is_told(where: str, cluster: str) -> None:
-    told: list[tuple[str, int, int]] = []
+    reported: list[tuple[str, int, int]] = []
     place = {"here": {"workers": 1}, "processes": {"workers": 2}, "cluster": {"cluster": cluster}}
-    run_many(same, INPUTS, report=lambda *stage: told.append(stage), **place[where])
-    assert told == [("runs", done, 5) for done in range(6)]
+    run_many(same, INPUTS, report=lambda *stage: reported.append(stage), **place[where])
+    assert reported == [("runs", done, 5) for done in range(6)]
 
 
 def test_no_inputs_give_no_results() -> None:

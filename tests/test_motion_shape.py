@@ -10,10 +10,10 @@ from magfusion.estimation.demodulation.motion_shape import MotionShape, motion_a
 from magfusion.estimation.graph.preintegration import low_passed
 from magfusion.model.field import observe_earth
 from magfusion.model.parameters import initial_calibration, predict_channels
-from magfusion.model.quaternion import inverse, matrices, of_vectors, product, turned
+from magfusion.model.quaternion import inverse, matrices, of_vectors, product, rotate
 from magfusion.model.site import ImuModel, Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.waveform import Motion, carriers, predicted_waveform
+from magfusion.model.waveform import MotionChange, carriers, predicted_waveform
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.motion import turning_motion
@@ -45,7 +45,7 @@ def of_kind(kind: str) -> Site:
     return site
 
 
-def moved(motion: Trajectory, change: Motion, step: float) -> Trajectory:
+def moved(motion: Trajectory, change: MotionChange, step: float) -> Trajectory:
     turn = Rotation.from_rotvec(step * change.rotation_world).as_matrix()
     position = motion.position_world + step * change.position_world
     return replace(motion, world_from_body=turn @ motion.world_from_body, position_world=position)
@@ -68,9 +68,9 @@ def test_samples_are_phasors_on_their_carriers_with_the_earth_field(kind, motion
     phasor = predict_channels(calibration, motion.time, *pose)
     beacons = np.einsum("ncx,nc->nx", phasor, carrier).real
     earth = observe_earth(site.platform.magnetometer, motion.world_from_body, EARTH_WORLD)
-    found, by = predicted_waveform(motion, calibration, EARTH_WORLD, carrier)
+    result, by = predicted_waveform(motion, calibration, EARTH_WORLD, carrier)
     expected = beacons + earth.measured_sensor
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * np.max(np.abs(expected)))
+    np.testing.assert_allclose(result, expected, rtol=0, atol=1e-13 * np.max(np.abs(expected)))
     assert not np.any(by)
 
 
@@ -79,7 +79,7 @@ def test_samples_change_with_the_motion_as_their_difference(kind, motion) -> Non
     calibration = initial_calibration(of_kind(kind), 2.0)
     frequencies = np.concatenate([b.tone_frequencies_hz for b in calibration.site.beacons])
     carrier, rng = carriers(frequencies, motion.time), np.random.default_rng(1)
-    change = Motion(*rng.normal(size=(2, len(motion.time), 3)))
+    change = MotionChange(*rng.normal(size=(2, len(motion.time), 3)))
     _, by = predicted_waveform(motion, calibration, EARTH_WORLD, carrier, change)
     step = 1e-5
     ahead, behind = (
@@ -123,9 +123,9 @@ def test_quaternions_turn_as_scipy_s_rotations_do() -> None:
     a[0] = 0.0
     one, two = Rotation.from_rotvec(a), Rotation.from_rotvec(b)
     p, q = of_vectors(a.T), of_vectors(b.T)
-    for found, expected in (
+    for result, expected in (
         (matrices(product(p, q)), (one * two).as_matrix()),
         (matrices(inverse(p)), one.inv().as_matrix()),
-        (turned(p, vector.T).T, one.apply(vector)),
+        (rotate(p, vector.T).T, one.apply(vector)),
     ):
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14 * np.max(np.abs(vector)))
+        np.testing.assert_allclose(result, expected, rtol=0, atol=1e-14 * np.max(np.abs(vector)))

@@ -49,14 +49,14 @@ def predicted(case: Case, length: int, patch: pytest.MonkeyPatch) -> TakenOff:
 def test_stretches_of_any_length_give_the_same(
     case: Case, length: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(path_field, "FEWEST_POINTS", 1 << 20)  # nodes lie where a stretch begins
+    monkeypatch.setattr(path_field, "MIN_POINTS", 1 << 20)  # nodes lie where a stretch begins
     whole = predicted(case, 1 << 20, monkeypatch)
-    found = predicted(case, length, monkeypatch)
+    result = predicted(case, length, monkeypatch)
     assert whole.wanted is not None
-    assert found.wanted is not None
-    pairs = [(found.unexplained_sensor, whole.unexplained_sensor)]
-    pairs.append((found.change_sensor, whole.change_sensor))
-    pairs += [(vars(found.wanted)[k], v) for k, v in vars(whole.wanted).items() if v is not None]
+    assert result.wanted is not None
+    pairs = [(result.unexplained_sensor, whole.unexplained_sensor)]
+    pairs.append((result.change_sensor, whole.change_sensor))
+    pairs += [(vars(result.wanted)[k], v) for k, v in vars(whole.wanted).items() if v is not None]
     for own, expected in pairs:
         np.testing.assert_allclose(own, expected, rtol=0, atol=1e-11 * np.max(np.abs(expected)))
 
@@ -66,15 +66,15 @@ def test_through_nodes_the_samples_are_the_same_to_a_hundred_thousandth(
 ) -> None:
     samples, states, imu, calibration = case
     calibration = replace(calibration, site=replace(calibration.site, earth_field_world=None))
-    found = taken_off(samples, states, imu, calibration, 3e-3, 0.4)
-    monkeypatch.setattr(path_field, "FEWEST_POINTS", 1 << 20)
+    result = taken_off(samples, states, imu, calibration, 3e-3, 0.4)
+    monkeypatch.setattr(path_field, "MIN_POINTS", 1 << 20)
     exact = taken_off(samples, states, imu, calibration, 3e-3, 0.4)
     field = np.linalg.norm(samples.measured_sensor - exact.unexplained_sensor, axis=1)
-    apart = np.linalg.norm(found.unexplained_sensor - exact.unexplained_sensor, axis=1)
-    assert 0.0 < np.max(apart) < 1e-5 * np.max(field)
-    assert np.sqrt(np.mean(apart**2)) < 1e-6 * np.sqrt(np.mean(field**2))
+    separate = np.linalg.norm(result.unexplained_sensor - exact.unexplained_sensor, axis=1)
+    assert 0.0 < np.max(separate) < 1e-5 * np.max(field)
+    assert np.sqrt(np.mean(separate**2)) < 1e-6 * np.sqrt(np.mean(field**2))
     change = np.sqrt(np.mean(exact.change_sensor**2))
-    assert np.sqrt(np.mean((found.change_sensor - exact.change_sensor) ** 2)) < 1e-3 * change
+    assert np.sqrt(np.mean((result.change_sensor - exact.change_sensor) ** 2)) < 1e-3 * change
 
 
 def test_a_stretch_asks_for_the_samples_about_it_alone(

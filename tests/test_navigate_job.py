@@ -35,11 +35,11 @@ def smoothed(worked: Worked, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def phasors(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a log of phasors alone, which is navigated in no time."""
     path = tmp_path_factory.mktemp("phasors") / "log"
-    made = online_log(3, 30.0)
-    truth = made.motion.trajectory(made.imu.time)
-    log = Log("phasors", 1_700_000_000_000_000_000, "test", made.imu, None, made.fields, truth)
+    built = online_log(3, 30.0)
+    truth = built.motion.trajectory(built.imu.time)
+    log = Log("phasors", 1_700_000_000_000_000_000, "test", built.imu, None, built.fields, truth)
     write_log(log, path)
-    save_site(made.site, path / "site.yaml")
+    save_site(built.site, path / "site.yaml")
     return path
 
 
@@ -114,9 +114,9 @@ def test_the_lagged_states_are_better_than_the_current(phasors: Path, tmp_path: 
 def test_what_was_refused_is_counted(phasors: Path, tmp_path: Path) -> None:
     log = read_log(phasors)
     assert log.fields is not None
-    spoilt = log.fields.phasor_sensor.copy()
-    spoilt[40:43, 1] += 1e-6
-    fields = replace(log.fields, phasor_sensor=spoilt)
+    corrupted = log.fields.phasor_sensor.copy()
+    corrupted[40:43, 1] += 1e-6
+    fields = replace(log.fields, phasor_sensor=corrupted)
     write_log(replace(log, fields=fields), tmp_path / "log")
     save_site(load_site(phasors / "site.yaml"), tmp_path / "log" / "site.yaml")
     run_command("navigate", tmp_path / "log", "-o", tmp_path / "run", "--estimator", "ekf")
@@ -219,8 +219,8 @@ def test_a_clock_that_jumped_is_refused_and_leaves_nothing(
 
     for name in ("imu", "magnetometer"):
         change_table(log / f"{name}.parquet", jump)
-    told = refuse("navigate", log, "-o", tmp_path / "run", "--estimator", "ekf")
-    assert "more than an hour after the row above: the clock jumped" in told
+    reported = refuse("navigate", log, "-o", tmp_path / "run", "--estimator", "ekf")
+    assert "more than an hour after the row above: the clock jumped" in reported
 
 
 def test_other_files_in_the_output_are_not_touched(

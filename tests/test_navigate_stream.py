@@ -57,9 +57,9 @@ def records(walk: OnlineLog, form: Format = "json") -> bytes:
 
 
 def answered(site: Path, given: bytes, settings: StreamSettings = EKF) -> tuple[list[Any], str]:
-    sink, told = io.BytesIO(), io.StringIO()
-    run_stream(site, settings, io.BytesIO(given), sink, told)
-    return [json.loads(line) for line in sink.getvalue().splitlines()], told.getvalue()
+    sink, reported = io.BytesIO(), io.StringIO()
+    run_stream(site, settings, io.BytesIO(given), sink, reported)
+    return [json.loads(line) for line in sink.getvalue().splitlines()], reported.getvalue()
 
 
 @pytest.mark.parametrize("form", ["json", "msgpack"])
@@ -73,11 +73,11 @@ def test_a_stream_leads_to_the_states_of_the_log(walk: OnlineLog, site: Path, fo
     states = [s for s in given if s["started"]]
     assert len(states) >= 14
     # The site went through its file, whose angles are in degrees.
-    for found, own in zip(states, expected, strict=True):
-        assert found["time"] == own["time"]
-        assert found["heard"] == own["heard"]
+    for result, own in zip(states, expected, strict=True):
+        assert result["time"] == own["time"]
+        assert result["heard"] == own["heard"]
         for name in ("position", "quaternion", "velocity", "gyro_bias", "accel_bias"):
-            assert np.allclose(found[name], own[name], rtol=1e-6, atol=1e-8)
+            assert np.allclose(result[name], own[name], rtol=1e-6, atol=1e-8)
     assert {name for s in states for name in s["heard"]} == {b.name for b in walk.site.beacons}
     waiting = [s["time"] for s in given if not s["started"]]
     assert np.all(np.diff(waiting) >= 1.0)
@@ -91,7 +91,7 @@ def test_nan_and_null_are_missing_samples_as_in_tables(
     """The same states as where the samples were never sent, and a count at the end."""
     lines = [json.loads(line) for line in records(walk).splitlines()]
     inertial = [k for k, one in enumerate(lines) if "imu" in one][200:1000:100]
-    left = [one for k, one in enumerate(lines) if k not in inertial]
+    remaining = [one for k, one in enumerate(lines) if k not in inertial]
     spoiled = [json.loads(json.dumps(one)) for one in lines]
     for k, value in zip(inertial, (np.nan, None) * len(inertial), strict=False):
         gyro = np.array(spoiled[k]["imu"]["gyro"], dtype=object)
@@ -99,20 +99,20 @@ def test_nan_and_null_are_missing_samples_as_in_tables(
         spoiled[k]["imu"]["gyro"] = gyro.tolist()
     write = msgpack.packb if form == "msgpack" else lambda one: json.dumps(one).encode() + b"\n"
     settings = StreamSettings(EKF.navigator, form)
-    expected, _ = answered(site, b"".join(write(one) for one in left), settings)
-    found, told = answered(site, b"".join(write(one) for one in spoiled), settings)
+    expected, _ = answered(site, b"".join(write(one) for one in remaining), settings)
+    result, reported = answered(site, b"".join(write(one) for one in spoiled), settings)
     count = sum(np.size(lines[k]["imu"]["time"]) for k in inertial)
-    assert [s for s in found if s["started"]] == [s for s in expected if s["started"]]
-    assert told == f"magfusion: imu: {count} samples are NaN. They are left out.\n"
+    assert [s for s in result if s["started"]] == [s for s in expected if s["started"]]
+    assert reported == f"magfusion: imu: {count} samples are NaN. They are left out.\n"
 
 
 def test_a_stream_that_begins_with_missing_samples_waits(site: Path) -> None:
     """What holds no sample has no time at which anything could be said."""
     missing = json_line({"imu": {"time": 1.0, "gyro": [None, 0.0, 0.0], "accel": [0.0, 0.0, 9.8]}})
     present = json_line({"imu": {"time": 1.1, "gyro": [0.0, 0.0, 0.0], "accel": [0.0, 0.0, 9.8]}})
-    found, told = answered(site, missing + present)
-    assert [line["time"] for line in found] == [1.1]
-    assert told == "magfusion: imu: 1 samples are NaN. They are left out.\n"
+    result, reported = answered(site, missing + present)
+    assert [line["time"] for line in result] == [1.1]
+    assert reported == "magfusion: imu: 1 samples are NaN. They are left out.\n"
 
 
 def test_a_state_tells_all_that_is_known(walk: OnlineLog, site: Path) -> None:
@@ -141,10 +141,10 @@ def test_phasors_are_the_same_on_the_other_side_of_the_pipe(walk: OnlineLog) -> 
     cov = fields.phasor_cov[:1] * np.array([1.0, 2.0, 3.0])
     one = FieldSamples(fields.time[:1], fields.window[:1], fields.channels, phasor, cov)
     line = json_line(fields_content(one))
-    (found,) = read_records(io.BytesIO(line), "json")
-    assert found.record is not None
-    assert found.record.fields is not None
-    back = field_samples(found.record.fields, fields.channels)
+    (result,) = read_records(io.BytesIO(line), "json")
+    assert result.record is not None
+    assert result.record.fields is not None
+    back = field_samples(result.record.fields, fields.channels)
     assert np.array_equal(back.phasor_sensor, phasor, equal_nan=True)
     detected = [0, 1, 3]
     assert np.array_equal(back.phasor_cov[:, detected], cov[:, detected])
@@ -206,10 +206,10 @@ def test_a_bad_line_is_refused_in_one_sentence(
     good = json_line({"magnetometer": {"time": 0.0, "field": VECTOR}})
     with pytest.raises(InputError) as raised:
         answered(site, good + b"\n" + line + b"\n")
-    told = str(raised.value)
-    assert told.startswith("standard input, line 3: ")
-    assert sentence in told
-    assert "\n" not in told
+    reported = str(raised.value)
+    assert reported.startswith("standard input, line 3: ")
+    assert sentence in reported
+    assert "\n" not in reported
 
 
 def test_bad_lines_are_counted_and_passed_over_where_that_is_asked(
@@ -220,11 +220,11 @@ def test_bad_lines_are_counted_and_passed_over_where_that_is_asked(
     jumped = json_line({"imu": {"time": 1e6, "gyro": VECTOR, "accel": VECTOR}})
     dirty = [*lines[:50], b"nonsense\n", *lines[50:200], jumped, *lines[200:]]
     going = StreamSettings(EKF.navigator, keep_going=True)
-    found, told = answered(site, b"".join(dirty), going)
-    assert found == clean
-    assert "line 51: found" in told
-    assert "line 202: imu: its clock jumped ahead" in told
-    assert told.splitlines()[-1] == "magfusion: 2 records were skipped"
+    result, reported = answered(site, b"".join(dirty), going)
+    assert result == clean
+    assert "line 51: found" in reported
+    assert "line 202: imu: its clock jumped ahead" in reported
+    assert reported.splitlines()[-1] == "magfusion: 2 records were skipped"
 
 
 def test_message_pack_that_breaks_off_inside_is_refused(site: Path) -> None:

@@ -11,8 +11,8 @@ from time_slots_and_mains import tracker
 from magfusion.estimation.graph.propagation import propagate
 from magfusion.estimation.graph.state import State, as_trajectory, between, moved
 from magfusion.estimation.measurements.phasors import field_phasors
+from magfusion.estimation.online_integrity.dead_reckoning_check import LATE, DeadReckoningCheck
 from magfusion.estimation.online_integrity.near_metal import NearMetal
-from magfusion.estimation.online_integrity.reckoned import LATE, Reckoned
 from magfusion.model.parameters import initial_calibration, predict_channels
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site, Slots
@@ -64,7 +64,7 @@ def _state(time: float, cov: Array) -> State:
     )
 
 
-def _said(share: Array) -> list[tuple[bool, bool]]:
+def _findings(share: Array) -> list[tuple[bool, bool]]:
     """Return of epochs at rest whether metal is near, and comes; it makes a share of the field."""
     rng = np.random.default_rng(3)
     metal, shape = NearMetal(SITE, ()), rng.standard_normal((3, 3)) / np.sqrt(3.0)
@@ -86,9 +86,9 @@ def _said(share: Array) -> list[tuple[bool, bool]]:
             phasor_cov=cov_t2,
         )
         now = np.zeros(1, dtype=np.int64)
-        found = field_phasors(SITE, samples, now, poses, np.zeros((1, 3)), np.zeros(1), 1.0)
-        weighed = metal.weighed(found, state, samples.valid[0])
-        assert metal.near or weighed is found
+        result = field_phasors(SITE, samples, now, poses, np.zeros((1, 3)), np.zeros(1), 1.0)
+        weighed = metal.weighed(result, state, samples.valid[0])
+        assert metal.near or weighed is result
         out.append((metal.near, metal.comes))
     return out
 
@@ -96,17 +96,17 @@ def _said(share: Array) -> list[tuple[bool, bool]]:
 def test_metal_is_noticed_when_it_comes_and_forgotten_when_it_has_gone() -> None:
     share = np.zeros(300)
     share[80:140] = 0.03
-    said = _said(share)
-    near = np.array([one for one, _ in said])
+    findings = _findings(share)
+    near = np.array([one for one, _ in findings])
     assert not np.any(near[:80])
     assert np.all(near[84:140])
     assert not np.any(near[290:])
-    assert sum(comes for _, comes in said) == 1
+    assert sum(comes for _, comes in findings) == 1
 
 
 def test_what_was_there_from_the_beginning_has_not_come() -> None:
-    said = _said(np.full(80, 0.03))
-    assert not any(near for near, _ in said)
+    findings = _findings(np.full(80, 0.03))
+    assert not any(near for near, _ in findings)
 
 
 def test_what_is_taken_back_is_where_the_inertial_data_lead() -> None:
@@ -115,15 +115,15 @@ def test_what_is_taken_back_is_where_the_inertial_data_lead() -> None:
     time = np.arange(0.0, 1.2, 2e-3)
     rates = 0.5 * np.sin(3.0 * time)[:, None] * [1.0, -0.6, 0.3]
     imu = ImuSamples(time, rates, np.tile([1.0, 0.5, 9.6], (len(time), 1)))
-    reckoned, beginning = Reckoned(()), _state(0.1, cov)
+    dead_reckoned, beginning = DeadReckoningCheck(()), _state(0.1, cov)
     state, end = beginning, 0.1 + 1.6 * LATE
     for until in np.arange(0.1 + STEP, end - 0.5 * STEP, STEP):
         predicted = propagate(state, imu, until, site, 0.0)
         step = 1e-5 * rng.standard_normal(15)
         updated = replace(moved(predicted.state, (), step), cov=0.9 * predicted.state.cov)
-        reckoned.hear(state, predicted, updated)
+        dead_reckoned.update(state, predicted, updated)
         state = updated
-    back = reckoned.taken_back(propagate(state, imu, end, site, 0.0))
+    back = dead_reckoned.taken_back(propagate(state, imu, end, site, 0.0))
     alone = propagate(beginning, imu, end, site, 0.0).state
     assert np.max(np.abs(between(alone, back, ()))) < 1e-7
     sigma = np.sqrt(np.diagonal(alone.cov))

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.posterior import variance_components
 from magfusion.estimation.posterior.noise_tuning import Tuned, tuned_site
-from magfusion.estimation.posterior.residual_shares import ChannelErrors
+from magfusion.estimation.posterior.residual_redundancy import ChannelErrors
 from magfusion.estimation.posterior.tuned_noise import tuned_noise
 from magfusion.estimation.posterior.variance_components import (
     KINDS,
@@ -21,7 +21,7 @@ from magfusion.estimation.posterior.variance_components import (
     STUDENT,
     BeaconErrors,
     BeaconParts,
-    likeliest,
+    maximize_likelihood,
     parts_of,
 )
 from magfusion.estimation.solve.bounded import minimise_curved
@@ -53,8 +53,8 @@ Cost = Callable[[np.ndarray], np.ndarray]
 Curved = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
-def found(result: Smoothed, key: str) -> np.ndarray:
-    return np.array([t.found for t in result.noise if t.key == key])
+def tuned(result: Smoothed, key: str) -> np.ndarray:
+    return np.array([t.estimated for t in result.noise if t.key == key])
 
 
 def mean_nees(result: Smoothed, log: Log) -> float:
@@ -76,11 +76,11 @@ def plain(log: Log) -> Smoothed:
 
 def test_the_dipole_model_is_found_to_be_better_than_declared(log: Log, plain: Smoothed) -> None:
     """A coil of 0.1 m is a dipole within a thousandth here; half a per cent was declared."""
-    error = found(plain, "model_error")
+    error = tuned(plain, "model_error")
     assert len(error) == 4
     assert np.all(error < 0.6 * 0.005)
     assert np.mean(error) < 0.4 * 0.005
-    assert np.all((found(plain, "noise_factor") > 0.5) & (found(plain, "noise_factor") < 1.3))
+    assert np.all((tuned(plain, "noise_factor") > 0.5) & (tuned(plain, "noise_factor") < 1.3))
     untuned = smooth(log, declared(), SmootherSettings(tune=False))
     assert untuned.noise == ()
     assert log.truth is not None
@@ -93,7 +93,7 @@ def test_the_dipole_model_is_found_to_be_better_than_declared(log: Log, plain: S
 def test_densities_declared_too_small_are_found(log: Log) -> None:
     result = smooth(log, declared(imu=1.0 / 5.0))
     for kind, true in (("gyro_noise", 3e-4), ("accel_noise", 3e-3)):
-        assert 0.5 * true < found(result, kind)[0] < 2.0 * true, kind
+        assert 0.5 * true < tuned(result, kind)[0] < 2.0 * true, kind
     untuned = smooth(log, declared(imu=1.0 / 5.0), SmootherSettings(tune=False))
     assert mean_nees(untuned, log) > mean_nees(result, log)
 
@@ -101,7 +101,7 @@ def test_densities_declared_too_small_are_found(log: Log) -> None:
 def test_what_is_declared_too_large_of_the_imu_stays(log: Log) -> None:
     """Scale and vibration may be in it, which are not white."""
     result = smooth(log, declared(imu=3.0))
-    assert found(result, "gyro_noise") == pytest.approx(3.0 * 3e-4)
+    assert tuned(result, "gyro_noise") == pytest.approx(3.0 * 3e-4)
 
 
 def test_a_result_is_the_same_again(log: Log, plain: Smoothed) -> None:
@@ -116,7 +116,7 @@ def test_the_refined_site_has_what_was_found(plain: Smoothed, tmp_path: Path) ->
     by_name = {b.name: b for b in site.beacons}
     for one in plain.noise:
         part = site.platform.imu if one.owner == "imu" else by_name[one.owner]
-        assert getattr(part, one.key) == pytest.approx(one.found, rel=1e-12)
+        assert getattr(part, one.key) == pytest.approx(one.estimated, rel=1e-12)
 
 
 def test_a_site_that_says_nothing_of_it_is_as_before(tmp_path: Path) -> None:
@@ -130,16 +130,16 @@ def test_a_site_that_says_nothing_of_it_is_as_before(tmp_path: Path) -> None:
 
 
 def test_more_than_three_times_the_noise_is_a_doubt_and_less_is_only_said() -> None:
-    louder, quieter = Tuned("B", "model_error", 0.005, 0.04), Tuned("A", "noise_factor", 1.0, 0.2)
+    stronger, quieter = Tuned("B", "model_error", 0.005, 0.04), Tuned("A", "noise_factor", 1.0, 0.2)
     usual = Tuned("imu", "gyro_noise", 3e-4, 8e-4)
-    doubt, remark = tuned_noise([usual, louder, quieter])
+    doubt, remark = tuned_noise([usual, stronger, quieter])
     assert doubt.verdict is Verdict.DOUBTFUL
     assert "beacon B is 0.04, declared 0.005" in doubt.text
     assert "gyroscope" not in doubt.text
     assert remark.verdict is Verdict.TRUSTWORTHY
     assert "beacon A" in remark.text
     assert list(tuned_noise([usual])) == []
-    site = tuned_site(demo_site(), [louder, quieter, usual])
+    site = tuned_site(demo_site(), [stronger, quieter, usual])
     assert [b.model_error for b in site.beacons] == [None, 0.04, None, None]
     assert site.platform.imu.gyro_noise == 8e-4
 
@@ -163,7 +163,7 @@ def test_of_a_strong_beacon_nothing_is_found_that_was_not_declared() -> None:
     variance = np.array([1.0, 0.25, 0.0, 0.0]) @ parts
     square = variance * rng.chisquare(6, 400)
     fixed, weight = np.zeros((1, 400)), np.full((1, 400), 0.5)
-    log = likeliest(square[None], parts[None], fixed, weight, 6, KINDS)[0]
+    log = maximize_likelihood(square[None], parts[None], fixed, weight, 6, KINDS)[0]
     noise, _, _, white = np.exp(2.0 * log)[:, None] * parts
     assert np.mean(noise + white) == pytest.approx(1.0, abs=0.2)
 
@@ -171,22 +171,22 @@ def test_of_a_strong_beacon_nothing_is_found_that_was_not_declared() -> None:
 def test_slope_and_curvature_of_the_likelihood_are_its_derivatives(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    asked: list[tuple[np.ndarray, np.ndarray]] = []
+    requested: list[tuple[np.ndarray, np.ndarray]] = []
 
     def compare(cost: Cost, curved: Curved, start: np.ndarray, *_: object) -> np.ndarray:
         at, step = start + 0.3, 1e-6 * np.eye(start.shape[1])
         slope = [(cost(at + one) - cost(at - one)) / 2e-6 for one in step]
         curvature = [(curved(at + one)[0] - curved(at - one)[0]) / 2e-6 for one in step]
-        asked.append((curved(at)[0], np.stack(slope, axis=1)))
-        asked.append((curved(at)[1], np.stack(curvature, axis=1)))
+        requested.append((curved(at)[0], np.stack(slope, axis=1)))
+        requested.append((curved(at)[1], np.stack(curvature, axis=1)))
         return start
 
     monkeypatch.setattr(variance_components, "minimise_curved", compare)
     rng = np.random.default_rng(0)
     parts, square = rng.uniform(0.1, 2.0, (2, 4, 50)), rng.chisquare(6, (2, 50))
-    likeliest(square, parts, np.full((2, 50), 0.1), np.full((2, 50), 0.5), 6, KINDS)
-    assert len(asked) == 2
-    for given, expected in asked:
+    maximize_likelihood(square, parts, np.full((2, 50), 0.1), np.full((2, 50), 0.5), 6, KINDS)
+    assert len(requested) == 2
+    for given, expected in requested:
         assert given == pytest.approx(expected, rel=1e-6)
 
 
@@ -195,8 +195,8 @@ def test_no_quasi_newton_search_finds_a_likelier_noise(monkeypatch: pytest.Monke
     behind: list[float] = []
 
     def compare(cost: Cost, curved: Curved, start: np.ndarray, limits: np.ndarray) -> np.ndarray:
-        found = minimise_curved(cost, curved, start, limits)
-        assert np.all((found >= limits[:, 0]) & (found <= limits[:, 1]))
+        result = minimise_curved(cost, curved, start, limits)
+        assert np.all((result >= limits[:, 0]) & (result <= limits[:, 1]))
         options = {"maxiter": 500, "ftol": 1e-15, "gtol": 1e-9}
         for k in range(len(start)):
 
@@ -204,12 +204,12 @@ def test_no_quasi_newton_search_finds_a_likelier_noise(monkeypatch: pytest.Monke
                 return float(cost(np.tile(at, (len(start), 1)))[k])
 
             other = minimize(own, start[k], method="L-BFGS-B", bounds=limits, options=options)
-            behind.append(float(cost(found)[k]) - float(other.fun))
-        return found
+            behind.append(float(cost(result)[k]) - float(other.fun))
+        return result
 
     monkeypatch.setattr(variance_components, "minimise_curved", compare)
     square, parts = _many_sizes(20)
-    likeliest(square, parts, np.full((20, 480), 0.1), np.full((20, 480), 0.5), 6, KINDS)
+    maximize_likelihood(square, parts, np.full((20, 480), 0.1), np.full((20, 480), 0.5), 6, KINDS)
     assert len(behind) == 20
     assert max(behind) < 1e-3  # of a log-likelihood
 
@@ -234,29 +234,29 @@ def test_no_noise_found_from_the_start_is_likelier_than_from_what_was_found_befo
     costs: list[np.ndarray] = []
 
     def kept(cost: Cost, curved: Curved, start: np.ndarray, limits: np.ndarray) -> np.ndarray:
-        found = minimise_curved(cost, curved, start, limits)
-        costs.append(cost(found))
-        return found
+        result = minimise_curved(cost, curved, start, limits)
+        costs.append(cost(result))
+        return result
 
     monkeypatch.setattr(variance_components, "minimise_curved", kept)
     square, parts = _many_sizes(40)
     fixed, weight = np.full((40, 480), 0.1), np.full((40, 480), 0.5)
     weight[:, ::2] = 0.1
-    before = likeliest(square, parts, fixed, weight, 6, KINDS)
+    before = maximize_likelihood(square, parts, fixed, weight, 6, KINDS)
     assert np.any(before[:, 2] < -9.0)
     weight[:, ::2] = 0.5
-    likeliest(square, parts, fixed, weight, 6, KINDS)
-    likeliest(square, parts, fixed, weight, 6, KINDS, before)
+    maximize_likelihood(square, parts, fixed, weight, 6, KINDS)
+    maximize_likelihood(square, parts, fixed, weight, 6, KINDS, before)
     assert np.max(costs[2] - costs[1]) < 1e-3  # of a log-likelihood
 
 
 def test_searches_side_by_side_know_nothing_of_each_other() -> None:
     square, parts = _many_sizes(6)
     fixed, weight = np.full((6, 480), 0.1), np.full((6, 480), 0.5)
-    together = likeliest(square, parts, fixed, weight, 6, KINDS)
+    together = maximize_likelihood(square, parts, fixed, weight, 6, KINDS)
     for k in range(6):
         one = slice(k, k + 1)
-        alone = likeliest(square[one], parts[one], fixed[one], weight[one], 6, KINDS)
+        alone = maximize_likelihood(square[one], parts[one], fixed[one], weight[one], 6, KINDS)
         assert together[one] == pytest.approx(alone, abs=1e-9)
 
 
@@ -265,27 +265,27 @@ def test_rows_that_a_beacon_has_more_than_another_change_nothing() -> None:
 
     def errors(count: int) -> BeaconErrors:
         noise, rough, smooth, inertial = rng.normal(size=(4, count, 6))
-        left = noise, 0.3 * rough, 0.3 * smooth, 0.1 * inertial
+        remaining = noise, 0.3 * rough, 0.3 * smooth, 0.1 * inertial
         variance = np.full(count, 6.0), rng.uniform(1.0, 50.0, count)
         seen = rng.normal(size=(count, 6)) * 1.5
-        channel = ChannelErrors(np.arange(count), seen, left, variance, (1.0, 0.01))
+        channel = ChannelErrors(np.arange(count), seen, remaining, variance, (1.0, 0.01))
         return BeaconErrors([channel], (1.0, 0.01), bent=True)
 
     several = [errors(160), errors(80), replace(errors(120), bent=False), errors(4)]
-    alike = np.full(160, 10.0)
-    together = parts_of(several, alike, 1)
+    shared = np.full(160, 10.0)
+    together = parts_of(several, shared, 1)
     assert together[3] is None
     assert together[2] is not None
     assert together[2].model is None
-    for one, beside in zip(several, together, strict=True):
-        alone = parts_of([one], alike, 1)[0]
-        assert (alone is None) == (beside is None)
-        if alone is not None and beside is not None:
-            assert _numbers(beside) == pytest.approx(_numbers(alone), rel=1e-9)
+    for one, others in zip(several, together, strict=True):
+        alone = parts_of([one], shared, 1)[0]
+        assert (alone is None) == (others is None)
+        if alone is not None and others is not None:
+            assert _numbers(others) == pytest.approx(_numbers(alone), rel=1e-9)
 
 
 def _numbers(part: BeaconParts) -> list[float]:
-    return [part.white, part.model or 0.0, part.smooth, part.taken]
+    return [part.white, part.model or 0.0, part.smooth, part.accepted_factor]
 
 
 @pytest.mark.slow
@@ -297,11 +297,11 @@ def test_a_survey_by_hand_is_not_taken_for_noise_of_the_imu() -> None:
     )
     site = replace(site, beacons=beacons)
     config = SimulationConfig(DEMO_BOX_WORLD, duration=20.0, motion="walk")
-    made = simulate_log(site, config, np.random.default_rng(3)).log
-    result = smooth(made, site)
+    built = simulate_log(site, config, np.random.default_rng(3)).log
+    result = smooth(built, site)
     for kind, true in (("gyro_noise", 3e-4), ("accel_noise", 3e-3)):
-        assert found(result, kind)[0] < 2.0 * true, kind
-    assert np.all(found(result, "noise_factor") < 2.0)
+        assert tuned(result, kind)[0] < 2.0 * true, kind
+    assert np.all(tuned(result, "noise_factor") < 2.0)
 
 
 @pytest.mark.slow

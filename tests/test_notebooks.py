@@ -38,5 +38,5 @@ def test_a_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyP
     shell = [cell for cell in notebook.cells if "!magfusion" in cell.source]
     assert shell
     for cell in shell:  # a command that fails does not stop a notebook
-        said = "".join(output.get("text", "") for output in cell.outputs)
-        assert "results in" in said, said
+        findings = "".join(output.get("text", "") for output in cell.outputs)
+        assert "results in" in findings, findings

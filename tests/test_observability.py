@@ -23,7 +23,7 @@ from magfusion.model.site import BeaconSigma, MagnetometerSigma, Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.results.gauge import Gauge, gauges
 from magfusion.results.motion_coverage import missing_motion, motion_coverage
-from magfusion.results.observability import Observability, gauge_basis, observability
+from magfusion.results.observability import CalibrationObservability, gauge_basis, observability
 from magfusion.results.transfer import Estimated, agreement
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 
@@ -44,8 +44,8 @@ def uncertain(site: Site) -> Site:
 def poses(count: int, seed: int = 1) -> Trajectory:
     rng = np.random.default_rng(seed)
     position = rng.uniform(*DEMO_BOX_WORLD, (count, 3))
-    turned = Rotation.random(count, random_state=rng).as_matrix()
-    return Trajectory(np.arange(float(count)), turned, position)
+    rotated = Rotation.random(count, random_state=rng).as_matrix()
+    return Trajectory(np.arange(float(count)), rotated, position)
 
 
 def linear(
@@ -81,9 +81,9 @@ def problem(request: pytest.FixtureRequest) -> tuple[Calibration, tuple[Block, .
 def test_no_measurement_tells_a_gauge(problem: tuple[Calibration, tuple[Block, ...]]) -> None:
     calibration, blocks = problem
     by_pose, by_calibration = linear(calibration, blocks, poses(20))
-    found = gauges(calibration, blocks)
-    assert len(found) >= 11  # shifts, turns, the scale of moments, the mounting, the scale of all
-    for gauge in found:
+    result = gauges(calibration, blocks)
+    assert len(result) >= 11  # shifts, turns, the scale of moments, the mounting, the scale of all
+    for gauge in result:
         if not (gauge.name.startswith("all distances") and len(calibration.site.channels) > 4):
             assert unexplained(gauge, by_pose, by_calibration) < 1e-9, gauge.name
 
@@ -125,8 +125,8 @@ def test_a_synchronised_beacon_cannot_hide_a_turn_in_its_phase() -> None:
 def test_a_beacon_that_is_held_holds_them_all() -> None:
     site = uncertain(demo_site(coil_radius=None))
     known = replace(site.beacons[0].sigma, position_world=np.zeros(3))
-    held = replace(site, beacons=(replace(site.beacons[0], sigma=known), *site.beacons[1:]))
-    names = [g.name for g in gauges(initial_calibration(held, 0.0), choose_blocks(held, GROUPS))]
+    fixed = replace(site, beacons=(replace(site.beacons[0], sigma=known), *site.beacons[1:]))
+    names = [g.name for g in gauges(initial_calibration(fixed, 0.0), choose_blocks(fixed, GROUPS))]
     assert not any("shifted" in name for name in names)
 
 
@@ -141,14 +141,14 @@ def posterior(
     by_turn = by_pose[..., :3] @ np.swapaxes(at.world_from_body, 1, 2)
     shared = np.concatenate([by_calibration, by_turn], axis=-1)
     by_place = by_pose[..., 3:]
-    free = shared - by_place @ (np.linalg.pinv(by_place) @ shared)
-    rows = free.reshape(-1, dimension(blocks) + 3) / sigma
+    free_parameters = shared - by_place @ (np.linalg.pinv(by_place) @ shared)
+    rows = free_parameters.reshape(-1, dimension(blocks) + 3) / sigma
     weight = np.concatenate([prior_sigma(blocks) ** -2.0, np.full(3, 1e-2)])
     return np.linalg.inv(rows.T @ rows + np.diag(weight))[:-3, :-3]
 
 
 @pytest.fixture(scope="module")
-def seen() -> tuple[Calibration, tuple[Block, ...], Observability]:
+def seen() -> tuple[Calibration, tuple[Block, ...], CalibrationObservability]:
     """Return what 60 poses tell of four beacons, without gravity."""
     site = uncertain(demo_site(coil_radius=None))
     calibration, blocks = initial_calibration(site, 0.0), choose_blocks(site, GROUPS)
@@ -157,38 +157,38 @@ def seen() -> tuple[Calibration, tuple[Block, ...], Observability]:
 
 
 def test_the_gauge_is_named_with_what_it_leaves(
-    seen: tuple[Calibration, tuple[Block, ...], Observability],
+    seen: tuple[Calibration, tuple[Block, ...], CalibrationObservability],
 ) -> None:
-    _, blocks, found = seen
-    words = [one.words for one in found.gauge]
+    _, blocks, result = seen
+    words = [one.words for one in result.gauge]
     # Four beacons of 5 cm each: their mean is known to 2.5 cm.
     assert "all beacons shifted together along x by 2.5 cm" in words[0]
     assert "no log can determine it" in words[0]
     assert any("rotated together about the vertical" in text for text in words)
     assert any("moments larger together" in text for text in words)
-    assert [one.ratio for one in found.gauge] == pytest.approx([1.0] * len(words), abs=1e-6)
+    assert [one.ratio for one in result.gauge] == pytest.approx([1.0] * len(words), abs=1e-6)
     # Tilt and scale are open where there is no IMU, and are told apart from the gauge.
-    assert sum("tilted" in one.words for one in found.weakest) == 2
-    assert sum("all distances larger" in one.words for one in found.weakest) == 1
-    assert found.determined == dimension(blocks) - len(words) - len(found.weakest)
+    assert sum("tilted" in one.words for one in result.weakest) == 2
+    assert sum("all distances larger" in one.words for one in result.weakest) == 1
+    assert result.determined == dimension(blocks) - len(words) - len(result.weakest)
 
 
 def test_beside_the_gauge_all_is_determined(
-    seen: tuple[Calibration, tuple[Block, ...], Observability],
+    seen: tuple[Calibration, tuple[Block, ...], CalibrationObservability],
 ) -> None:
-    _, blocks, found = seen
+    _, blocks, result = seen
     position = next(b for b in blocks if b.name == "B.position").columns
-    assert np.all(found.ratio[position] > 0.5)
-    assert np.all(found.ratio_but_for_gauge[position] < 0.1)
+    assert np.all(result.ratio[position] > 0.5)
+    assert np.all(result.ratio_but_for_gauge[position] < 0.1)
 
 
 def test_the_gauge_basis_is_orthonormal_and_of_no_effect(
-    seen: tuple[Calibration, tuple[Block, ...], Observability],
+    seen: tuple[Calibration, tuple[Block, ...], CalibrationObservability],
 ) -> None:
-    calibration, blocks, found = seen
+    calibration, blocks, result = seen
     basis = gauge_basis(calibration, blocks)
     np.testing.assert_allclose(basis.T @ basis, np.eye(basis.shape[1]), rtol=0.0, atol=1e-12)
-    assert basis.shape[1] == len(found.gauge) == 8  # 3 shifts, heading, scale, 3 of the mounting
+    assert basis.shape[1] == len(result.gauge) == 8  # 3 shifts, heading, scale, 3 of the mounting
 
 
 def test_a_weak_direction_is_told_by_what_dominates_it() -> None:
@@ -203,13 +203,13 @@ def test_a_weak_direction_is_told_by_what_dominates_it() -> None:
     weak[own["B.position"].start + 2] = 0.8
     weak[own["B.log_moment"]] = -0.6 / np.sqrt(2.0)
     scaled = 1e-4 * np.eye(len(prior)) + 0.81 * np.outer(weak, weak)
-    found = observability(calibration, blocks, scaled * prior[:, None] * prior)
-    assert len(found.weakest) == 1
-    assert found.weakest[0].ratio == pytest.approx(0.9, abs=1e-3)
-    told = "the height of beacon B by +3.6 cm against the moments of beacon B by -1.1 %"
-    assert found.weakest[0].words.startswith(told)
-    assert not found.gauge
-    assert found.determined == len(prior) - 1
+    result = observability(calibration, blocks, scaled * prior[:, None] * prior)
+    assert len(result.weakest) == 1
+    assert result.weakest[0].ratio == pytest.approx(0.9, abs=1e-3)
+    reported = "the height of beacon B by +3.6 cm against the moments of beacon B by -1.1 %"
+    assert result.weakest[0].words.startswith(reported)
+    assert not result.gauge
+    assert result.determined == len(prior) - 1
 
 
 def test_missing_motion_is_told_from_what_is_open_and_where_the_platform_was() -> None:
@@ -228,12 +228,12 @@ def test_missing_motion_is_told_from_what_is_open_and_where_the_platform_was() -
     assert covered.rest_share == 0.0
     np.testing.assert_allclose(covered.turned_deg, 0.0, atol=1e-9)
     cov = posterior(calibration, blocks, still, 1e-10)
-    found = observability(calibration, blocks, cov)
-    told = " ".join(missing_motion(covered, calibration, blocks, found))
-    assert f"never closer than {to_c:.1f} m to beacon C" in told
-    assert "hardly rotated about its x and y and z" in told
-    assert "moved by only 0 cm along x, 0 cm along y, 0 cm along z" in told
-    assert "was never stationary" in told
+    result = observability(calibration, blocks, cov)
+    reported = " ".join(missing_motion(covered, calibration, blocks, result))
+    assert f"never closer than {to_c:.1f} m to beacon C" in reported
+    assert "hardly rotated about its x and y and z" in reported
+    assert "moved by only 0 cm along x, 0 cm along y, 0 cm along z" in reported
+    assert "was never stationary" in reported
 
 
 def test_nothing_is_missing_where_all_is_determined() -> None:
@@ -242,8 +242,8 @@ def test_nothing_is_missing_where_all_is_determined() -> None:
     time = np.arange(0.0, 20.0, 0.01)
     imu = ImuSamples(time, np.zeros((2000, 3)), np.tile([0.0, 0.0, 9.81], (2000, 1)))
     at = poses(60)
-    found = observability(calibration, blocks, posterior(calibration, blocks, at, 1e-11))
-    assert missing_motion(motion_coverage(at, calibration, imu), calibration, blocks, found) == []
+    result = observability(calibration, blocks, posterior(calibration, blocks, at, 1e-11))
+    assert missing_motion(motion_coverage(at, calibration, imu), calibration, blocks, result) == []
 
 
 def test_the_difference_of_two_estimates_has_the_sigma_that_agreement_says() -> None:

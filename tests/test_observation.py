@@ -100,7 +100,7 @@ def attitude(rotvec):
     return Rotation.from_rotvec(rotvec).as_matrix()
 
 
-def turned(rotation, rotvec):
+def rotated(rotation, rotvec):
     return rotation @ attitude(rotvec)
 
 
@@ -124,7 +124,7 @@ def test_the_platforms_block_is_the_right_perturbation_of_its_pose(source, rotve
     block = seen_from(source, rotvec).platform_pose
 
     def by_rotation(step):
-        return predict(source, MAGNETOMETER, turned(rotation, step), POSITION, phase)
+        return predict(source, MAGNETOMETER, rotated(rotation, step), POSITION, phase)
 
     def by_translation(step):
         return predict(source, MAGNETOMETER, rotation, POSITION + rotation @ step, phase)
@@ -140,7 +140,7 @@ def test_the_beacons_block_is_the_right_perturbation_of_its_pose(source, rotvec)
     block = seen_from(source, rotvec).beacon_pose
 
     def by_rotation(step):
-        moved = replace(source, world_from_beacon=turned(frame, step))
+        moved = replace(source, world_from_beacon=rotated(frame, step))
         return predict(moved, MAGNETOMETER, rotation, POSITION, phase)
 
     def by_translation(step):
@@ -159,7 +159,7 @@ def test_the_sensors_block_is_the_right_perturbation_of_its_mounting(source, rot
     block = seen_from(source, rotvec).body_from_sensor
 
     def by_rotation(step):
-        moved = replace(MAGNETOMETER, body_from_sensor=turned(mounting, step))
+        moved = replace(MAGNETOMETER, body_from_sensor=rotated(mounting, step))
         return predict(source, moved, rotation, POSITION, phase)
 
     def by_translation(step):
@@ -218,7 +218,7 @@ def test_the_time_offset_block_goes_back_along_the_twist(source, rotvec):
         # Stamped t but taken later: at the time t of the log the body is not yet there.
         elapsed = -step[0]
         place = POSITION + rotation @ velocity_body * elapsed
-        return predict(source, MAGNETOMETER, turned(rotation, rate * elapsed), place, phase)
+        return predict(source, MAGNETOMETER, rotated(rotation, rate * elapsed), place, phase)
 
     twist = np.concatenate([rate, velocity_body])
     block = seen_from(source, rotvec, twist_body=twist).time_offset
@@ -245,13 +245,13 @@ def magpylibs_coil(coil):
         )
     area = np.pi * coil.radius**2
     if coil.length is None:
-        made = magpylib.current.Circle(diameter=2.0 * coil.radius, current=size / area)
+        built = magpylib.current.Circle(diameter=2.0 * coil.radius, current=size / area)
     else:
         magnetisation = (0.0, 0.0, size / (area * coil.length))
-        made = magpylib.magnet.Cylinder(
+        built = magpylib.magnet.Cylinder(
             dimension=(2.0 * coil.radius, coil.length), magnetization=magnetisation
         )
-    return made.rotate(Rotation.align_vectors(coil.moment_beacon, [0.0, 0.0, 1.0])[0])
+    return built.rotate(Rotation.align_vectors(coil.moment_beacon, [0.0, 0.0, 1.0])[0])
 
 
 @every_attitude
@@ -279,9 +279,9 @@ def test_the_value_is_what_a_magnetometer_sees_of_magpylibs_sources(source, rotv
             ]
         )
         expected = (measured_from_world @ fields_world.T @ currents).T
-        found = np.real(value[k] * np.exp(1j * cycle)[:, None])
+        result = np.real(value[k] * np.exp(1j * cycle)[:, None])
         # magpylib takes mu0 as measured, which is 4 pi 1e-7 within 1e-9.
-        assert relative_to_group(found, expected) < 1e-9
+        assert relative_to_group(result, expected) < 1e-9
 
 
 @every_attitude
@@ -294,17 +294,17 @@ def test_a_field_map_turns_and_stretches_the_field_in_world_axes(rotvec):
     plain = seen_from(replace(source, field_map=None), rotvec).phasor_sensor
     plain_world = plain @ np.linalg.inv(measured_from_world).T
     mapped_world = np.exp(log_gain) * (plain_world + np.cross(turn_world, plain_world))
-    found = seen_from(source, rotvec).phasor_sensor
+    result = seen_from(source, rotvec).phasor_sensor
     assert abs(log_gain) > 0.01
-    assert relative_to_group(found, mapped_world @ measured_from_world.T) < 1e-13
+    assert relative_to_group(result, mapped_world @ measured_from_world.T) < 1e-13
 
 
 def test_the_offset_of_the_magnetometer_leaves_phasors_alone():
     source = BEACONS["two axes"]
     moved = replace(MAGNETOMETER, offset=np.array([1e-5, 2e-5, -3e-5]))
     rotation = attitude(ATTITUDES["generic"])
-    found, expected = (predict(source, m, rotation, POSITION) for m in (moved, MAGNETOMETER))
-    assert np.array_equal(found, expected)
+    result, expected = (predict(source, m, rotation, POSITION) for m in (moved, MAGNETOMETER))
+    assert np.array_equal(result, expected)
 
 
 @every_beacon

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from small_problem import small_log
 
 from magfusion.estimation.batch.on_new_clock import on_new_clock
-from magfusion.estimation.batch.prepared import prepared
+from magfusion.estimation.batch.preprocessed_log import preprocess
 from magfusion.estimation.batch.settings import SmootherSettings
 from magfusion.model.progress import quiet
 from magfusion.model.trajectory import Trajectory
@@ -31,7 +31,7 @@ def _at(time: Array, labels: Array) -> Trajectory:
 
 def test_states_are_the_motion_by_the_new_clock() -> None:
     small = small_log(3, epochs=12)
-    log = prepared(small.log, small.site, SmootherSettings(), quiet)
+    log = preprocess(small.log, small.site, SmootherSettings(), quiet)
     imu = replace(log.imu, gyro_body=np.tile(TURN + BIAS, (len(log.imu), 1)))
     demodulation = replace(log.demodulation, log=replace(log.demodulation.log, imu=imu))
     log = replace(log, demodulation=demodulation)
@@ -41,12 +41,12 @@ def test_states_are_the_motion_by_the_new_clock() -> None:
     standing = np.arange(len(time)) == 4
     lag[standing] = 0.0
     states, expected = _at(time, time), _at(time - lag, time)
-    found = on_new_clock(log, states, old, new, standing)
-    np.testing.assert_allclose(found.world_from_body, expected.world_from_body, atol=1e-12)
+    result = on_new_clock(log, states, old, new, standing)
+    np.testing.assert_allclose(result.world_from_body, expected.world_from_body, atol=1e-12)
     inner = slice(1, -1)
-    position = found.position_world[inner] - expected.position_world[inner]
+    position = result.position_world[inner] - expected.position_world[inner]
     assert np.max(np.abs(position)) < np.max(lag**2)  # of second order
-    velocity = found.velocity_world, expected.velocity_world
+    velocity = result.velocity_world, expected.velocity_world
     assert velocity[0] is not None
     assert velocity[1] is not None
     np.testing.assert_allclose(velocity[0], velocity[1], atol=1e-12)

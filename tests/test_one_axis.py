@@ -14,7 +14,7 @@ from conftest import Refuse, run_command
 from magfusion.estimation.snapshot.coil_fix import CoilFixes, Gain, _Problem, fix_coil
 from magfusion.estimation.snapshot.coil_poses import (
     judged_poses,
-    nearest_told,
+    nearest_reported,
     nearest_truth,
     poses_of,
 )
@@ -60,27 +60,27 @@ def epochs(value: Array, *, signed: bool) -> CoilEpochs:
 
 
 @pytest.fixture(scope="module")
-def found(site: Site) -> CoilFixes:
+def result(site: Site) -> CoilFixes:
     own = epochs(seen(site, 3.1), signed=False)
     return fix_coil(own, initial_calibration(site, 0.0), Gain())
 
 
-def test_amplitudes_of_unknown_gain_give_place_and_line(found: CoilFixes) -> None:
-    np.testing.assert_allclose(found.position_world[:, 0], PLACE, atol=1e-5)
-    across = np.cross(found.axis_world[:, 0], AXIS)
+def test_amplitudes_of_unknown_gain_give_place_and_line(result: CoilFixes) -> None:
+    np.testing.assert_allclose(result.position_world[:, 0], PLACE, atol=1e-5)
+    across = np.cross(result.axis_world[:, 0], AXIS)
     np.testing.assert_allclose(across, np.zeros((3, 3)), atol=1e-3)
-    np.testing.assert_allclose(np.linalg.norm(found.axis_world[:, 0], axis=1), 3.1, rtol=1e-3)
-    assert not np.isfinite(found.cost[:, 1:]).any()  # in front of the coils there is no other
+    np.testing.assert_allclose(np.linalg.norm(result.axis_world[:, 0], axis=1), 3.1, rtol=1e-3)
+    assert not np.isfinite(result.cost[:, 1:]).any()  # in front of the coils there is no other
 
 
-def test_equal_epochs_have_equal_answers(found: CoilFixes, site: Site) -> None:
-    fixes = poses_of(found, np.arange(3.0), site, signed=False)
+def test_equal_epochs_have_equal_answers(result: CoilFixes, site: Site) -> None:
+    fixes = poses_of(result, np.arange(3.0), site, signed=False)
     for part in (fixes.world_from_body, fixes.position_world, fixes.pose_cov):
         np.testing.assert_allclose(part[1, 0], part[2, 0], rtol=1e-7, atol=1e-12)
 
 
-def test_the_roll_is_that_of_any(found: CoilFixes, site: Site) -> None:
-    fixes = poses_of(found, np.arange(3.0), site, signed=False)
+def test_the_roll_is_that_of_any(result: CoilFixes, site: Site) -> None:
+    fixes = poses_of(result, np.arange(3.0), site, signed=False)
     sigma = np.sqrt(np.diagonal(fixes.pose_cov[:, 0], axis1=1, axis2=2))
     assert (sigma[:, 2] > 1.5).all()  # about z, the axis that it has
     assert (sigma[:, :2] < 0.01).all()
@@ -89,9 +89,9 @@ def test_the_roll_is_that_of_any(found: CoilFixes, site: Site) -> None:
 
 def test_signed_phasors_of_a_known_gain_tell_which_way_it_points(site: Site) -> None:
     own = epochs(seen(site, 1.0), signed=True)
-    found = fix_coil(own, initial_calibration(site, 0.0), Gain(1.0, 0.01))
-    np.testing.assert_allclose(found.position_world[:, 0], PLACE, atol=1e-5)
-    np.testing.assert_allclose(found.axis_world[:, 0], AXIS, atol=1e-3)
+    result = fix_coil(own, initial_calibration(site, 0.0), Gain(1.0, 0.01))
+    np.testing.assert_allclose(result.position_world[:, 0], PLACE, atol=1e-5)
+    np.testing.assert_allclose(result.axis_world[:, 0], AXIS, atol=1e-3)
 
 
 @pytest.mark.parametrize("signed", [False, True])
@@ -109,37 +109,37 @@ def test_the_gradient_is_that_of_the_cost(site: Site, *, signed: bool) -> None:
     np.testing.assert_allclose(gradient, slope, rtol=1e-4, atol=1e-6 * np.abs(slope).max())
 
 
-def test_errors_against_the_truth_leave_roll_and_sign_out(found: CoilFixes, site: Site) -> None:
+def test_errors_against_the_truth_leave_roll_and_sign_out(result: CoilFixes, site: Site) -> None:
     sensor = replace(site.platform.magnetometer, position_body=np.array([0.02, 0.03, -0.01]))
     site = replace(site, platform=replace(site.platform, magnetometer=sensor))
-    fixes = poses_of(found, np.arange(3.0), site, signed=False)
+    fixes = poses_of(result, np.arange(3.0), site, signed=False)
     best = fixes.best()
     turn = np.diag([1.0, -1.0, -1.0])  # the axis reversed, and another roll
     other = best.world_from_body @ turn
     coil = best.position_world + best.world_from_body @ sensor.position_body
     truth = Trajectory(best.time, other, coil - other @ sensor.position_body)
-    apart = trajectory_errors(best, truth, max_gap=2.0)
+    separate = trajectory_errors(best, truth, max_gap=2.0)
     same = trajectory_errors(best, nearest_truth(truth, best, site, signed=False), max_gap=2.0)
-    assert apart.ate > 0.01
+    assert separate.ate > 0.01
     assert same.ate < 1e-9
     wide = np.sqrt(np.trace(fixes.pose_cov[:, 0, 3:, 3:], axis1=1, axis2=2))
-    away = np.linalg.norm(apart.position_world, axis=1)
+    away = np.linalg.norm(separate.position_world, axis=1)
     assert (away < 3.0 * wide).all()  # the lever's part is in the covariance
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("one_axis") / "log"
-    scenario.write_log(made, scenario.measured(PLACE, AXIS, np.random.default_rng(1)))
-    return made
+    built = tmp_path_factory.mktemp("one_axis") / "log"
+    scenario.write_log(built, scenario.measured(PLACE, AXIS, np.random.default_rng(1)))
+    return built
 
 
-def copied(log: Path, made: Path, change: Callable[[pa.Table], pa.Table]) -> Path:
-    made.mkdir()
+def copied(log: Path, simulation: Path, change: Callable[[pa.Table], pa.Table]) -> Path:
+    simulation.mkdir()
     for name in ("log.yaml", "site.yaml"):
-        (made / name).write_bytes((log / name).read_bytes())
-    pq.write_table(change(pq.read_table(log / "fields.parquet")), made / "fields.parquet")
-    return made
+        (simulation / name).write_bytes((log / name).read_bytes())
+    pq.write_table(change(pq.read_table(log / "fields.parquet")), simulation / "fields.parquet")
+    return simulation
 
 
 def test_a_site_keeps_the_axes_of_its_receiver(log: Path, tmp_path: Path) -> None:
@@ -148,10 +148,10 @@ def test_a_site_keeps_the_axes_of_its_receiver(log: Path, tmp_path: Path) -> Non
 
 
 def test_other_jobs_refuse_it_in_a_sentence(log: Path, tmp_path: Path, refuse: Refuse) -> None:
-    said = refuse("demodulate", log, "-o", tmp_path / "run")
-    assert said
-    said = refuse("smooth", log, "-o", tmp_path / "run")
-    assert "platform.motion_prior" in said
+    findings = refuse("demodulate", log, "-o", tmp_path / "run")
+    assert findings
+    findings = refuse("smooth", log, "-o", tmp_path / "run")
+    assert "platform.motion_prior" in findings
 
 
 def test_amplitudes_of_two_axes_are_refused_in_a_sentence(
@@ -159,8 +159,8 @@ def test_amplitudes_of_two_axes_are_refused_in_a_sentence(
 ) -> None:
     text = (log / "site.yaml").read_text()
     (tmp_path / "site.yaml").write_text(text.replace("axes: [z]", "axes: [x, z]"))
-    said = refuse("fix", log, "--site", tmp_path / "site.yaml", "-o", tmp_path / "run")
-    assert "is [x, z], but the fields of" in said
+    findings = refuse("fix", log, "--site", tmp_path / "site.yaml", "-o", tmp_path / "run")
+    assert "is [x, z], but the fields of" in findings
 
 
 def test_what_does_not_fit_the_receiver_is_refused(
@@ -170,12 +170,12 @@ def test_what_does_not_fit_the_receiver_is_refused(
         column = table.column_names.index("amplitude")
         return table.set_column(column, "amplitude", pa.array(-table["amplitude"].to_numpy()))
 
-    made = copied(log, tmp_path / "negative", negative)
-    assert "an amplitude has no sign" in refuse("fix", made, "-o", tmp_path / "run")
+    built = copied(log, tmp_path / "negative", negative)
+    assert "an amplitude has no sign" in refuse("fix", built, "-o", tmp_path / "run")
     text = (log / "site.yaml").read_text()
     (tmp_path / "site.yaml").write_text(text.replace("axes: [z]", "axes: [x, y, z]"))
-    said = refuse("fix", log, "--site", tmp_path / "site.yaml", "-o", tmp_path / "run")
-    assert "have one amplitude; declare the axes of the receiver" in said
+    findings = refuse("fix", log, "--site", tmp_path / "site.yaml", "-o", tmp_path / "run")
+    assert "have one amplitude; declare the axes of the receiver" in findings
 
 
 def test_the_report_says_what_is_told_and_what_is_not(log: Path, tmp_path: Path) -> None:
@@ -191,14 +191,14 @@ def test_the_report_says_what_is_told_and_what_is_not(log: Path, tmp_path: Path)
 
 @pytest.mark.slow
 def test_wound_coils_locate_it_with_both_mirrors_and_one_in_front() -> None:
-    found = scenario.run(7, 60)
-    assert found.mirrored == 1.0
-    assert found.alone >= 1.0 - scenario.FEW
-    assert found.roll_open
-    assert found.largest_place_percent <= 100.0 * scenario.LIMIT
+    result = scenario.run(7, 60)
+    assert result.mirrored == 1.0
+    assert result.alone >= 1.0 - scenario.FEW
+    assert result.roll_open
+    assert result.largest_place_percent <= 100.0 * scenario.LIMIT
     # Of all epochs, not of each as the scenario's verdict has it: noise takes one to 0.0107 rad.
-    assert found.axis_rad <= scenario.LIMIT
-    assert 1.5 <= found.nees <= 6.0
+    assert result.axis_rad <= scenario.LIMIT
+    assert 1.5 <= result.nees <= 6.0
 
 
 def test_errors_are_those_of_the_nearest_mirror(site: Site) -> None:
@@ -207,16 +207,16 @@ def test_errors_are_those_of_the_nearest_mirror(site: Site) -> None:
     rng = np.random.default_rng(2)
     noisy = seen(both, 1.0) + SIGMA * rng.standard_normal((3, len(beacons)))
     own = epochs(noisy, signed=True)
-    found = fix_coil(own, initial_calibration(both, 0.0), Gain(1.0, 0.01))
-    fixes = poses_of(found, own.time, both, signed=True)
-    judged = judged_poses(fixes, found, 0, signed=True)
+    result = fix_coil(own, initial_calibration(both, 0.0), Gain(1.0, 0.01))
+    fixes = poses_of(result, own.time, both, signed=True)
+    verdicts = judged_poses(fixes, result, 0, signed=True)
     truth = Trajectory(own.time, np.broadcast_to(np.eye(3), (3, 3, 3)).copy(), PLACE)
-    turned = least_turn(np.array([0.0, 0.0, 1.0]), AXIS)
-    truth = replace(truth, world_from_body=turned)
-    nearest, _ = nearest_told(judged.alone, truth, both)
+    rotated = least_turn(np.array([0.0, 0.0, 1.0]), AXIS)
+    truth = replace(truth, world_from_body=rotated)
+    nearest, _ = nearest_reported(verdicts.alone, truth, both)
     np.testing.assert_allclose(nearest.position_world, PLACE, atol=1e-4)
     against = nearest_truth(truth, nearest, both, signed=True)
     errors = trajectory_errors(nearest, against, max_gap=2.0)
     assert errors.nees is not None
     assert (errors.nees < 30.0).all()
-    assert (np.sum(np.isfinite(judged.fixes.cost), axis=1) == 2).all()
+    assert (np.sum(np.isfinite(verdicts.fixes.cost), axis=1) == 2).all()

@@ -11,7 +11,7 @@ from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver import design
 from magfusion.receiver.design import Designs, Maps
-from magfusion.receiver.even_samples import ALIKE, spacings_of
+from magfusion.receiver.even_samples import RATE_TOLERANCES, spacings_of
 from magfusion.receiver.lockin import WindowOperator, window_operator
 from magfusion.receiver.lockin_receiver import LockinReceiver
 from magfusion.receiver.turn import BodyTurn, body_turn_of, on_clock
@@ -43,13 +43,13 @@ def one_by_one(
     """Return the operators of all windows as they are kept, and as each is made by itself."""
     windows = receiver.whole(wave, imu)[0]
     known = on_clock(imu, site.platform.imu.time_offset)
-    turned, own, alone = body_turn_of(known), [], []
+    rotated, own, alone = body_turn_of(known), [], []
     for k in range(len(windows)):
         window = windows.rows(slice(k, k + 1))
         first, count = int(window.first[0]), int(window.count[0])
         samples = wave.rows(slice(first, first + count))
         here = replace(window, first=np.zeros(1, dtype=np.int64))
-        turn = BodyTurn(turned(samples.time), turned(here.centre))
+        turn = BodyTurn(rotated(samples.time), rotated(here.centre))
         own.append(receiver.operator_of_one(samples, known, here, site, turn))
         alone.append(window_operator(samples, known, site, SETTINGS, here))
     return own, alone
@@ -63,8 +63,8 @@ def phasors(operator: WindowOperator, wave: Waveform) -> ComplexArray:
 
 def furthest(kept: list[WindowOperator], alone: list[WindowOperator], wave: Waveform) -> float:
     """Return by how much phasors differ, as a share of the largest."""
-    found = np.array([[phasors(o, wave) for o in pair] for pair in zip(kept, alone, strict=True)])
-    return float(np.max(np.abs(found[:, 0] - found[:, 1])) / np.max(np.abs(found)))
+    result = np.array([[phasors(o, wave) for o in pair] for pair in zip(kept, alone, strict=True)])
+    return float(np.max(np.abs(result[:, 0] - result[:, 1])) / np.max(np.abs(result)))
 
 
 def test_even_samples_share_a_few_designs_and_phasors_are_the_same() -> None:
@@ -72,7 +72,7 @@ def test_even_samples_share_a_few_designs_and_phasors_are_the_same() -> None:
     receiver = LockinReceiver(site, SETTINGS)
     kept, alone = one_by_one(receiver, site, wave, imu)
     assert len(kept) > 40
-    assert furthest(kept, alone, wave) < ALIKE[1]
+    assert furthest(kept, alone, wave) < RATE_TOLERANCES[1]
     assert len(receiver._even) <= 14  # seven spacings, and what rounding makes of them
 
 
@@ -81,7 +81,7 @@ def test_what_was_asked_before_does_not_matter() -> None:
     kept, _ = one_by_one(LockinReceiver(site, SETTINGS), site, wave, imu)
     again, _ = one_by_one(LockinReceiver(site, SETTINGS), site, wave, imu)
     last = again[-1].designs
-    fresh = replace(again[-1], designs=replace(last, even={}, kept={}, asked=set()))
+    fresh = replace(again[-1], designs=replace(last, even={}, kept={}, requested=set()))
     assert np.array_equal(phasors(kept[-1], wave), phasors(fresh, wave))
 
 
@@ -93,24 +93,27 @@ def test_uneven_samples_have_designs_of_their_own() -> None:
     assert not receiver._even
 
 
-@pytest.mark.parametrize("alike", ALIKE)
+@pytest.mark.parametrize("shared_by", RATE_TOLERANCES)
 @pytest.mark.parametrize("error", [0.9, 2000.0])
-def test_times_are_even_within_a_phase(alike: float, error: float) -> None:
+def test_times_are_even_within_a_phase(shared_by: float, error: float) -> None:
     fastest_hz, count = 40.0, np.array([81, 80])
     time = np.stack([np.linspace(-0.2, 0.2, 81), np.linspace(-0.1, 0.3, 81)])
     time[1, -1] = 0.0  # no sample of it
     exact, other = spacings_of(time, count, fastest_hz)
-    time[1, 40] += error * alike / (2.0 * np.pi * fastest_hz)
+    time[1, 40] += error * shared_by / (2.0 * np.pi * fastest_hz)
     same, moved = spacings_of(time, count, fastest_hz)
     assert same == exact
-    if alike * error > ALIKE[1]:
+    if shared_by * error > RATE_TOLERANCES[1]:
         assert moved is None
         return
     assert moved is not None
-    assert (moved.step == exact.step) == (alike * error < ALIKE[0])
+    assert (moved.step == exact.step) == (shared_by * error < RATE_TOLERANCES[0])
     assert moved != other or moved.step == exact.step
     off = np.max(np.abs(moved.times() - time[1, :80]))
-    assert 2.0 * np.pi * fastest_hz * off <= (1.0 + 1e-9) * ALIKE[0 if alike * error < 1e-9 else 1]
+    assert (
+        2.0 * np.pi * fastest_hz * off
+        <= (1.0 + 1e-9) * RATE_TOLERANCES[0 if shared_by * error < 1e-9 else 1]
+    )
 
 
 def test_windows_of_even_samples_share_their_designs(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,22 +121,22 @@ def test_windows_of_even_samples_share_their_designs(monkeypatch: pytest.MonkeyP
     site, wave, imu = recorded(0.0)
     missing = np.arange(len(wave)) != 1500  # a window with a gap is not even
     wave = replace(wave, time=wave.time[missing], measured_sensor=wave.measured_sensor[missing])
-    found = LockinReceiver(site, SETTINGS).whole(wave, imu)[1]
-    made = 0
-    own = Designs._made
+    result = LockinReceiver(site, SETTINGS).whole(wave, imu)[1]
+    built = 0
+    own = Designs._build
 
     def counted(self: Designs, *args: Any) -> Maps:
-        nonlocal made
-        made += len(args[0])
+        nonlocal built
+        built += len(args[0])
         return own(self, *args)
 
-    monkeypatch.setattr(Designs, "_made", counted)
+    monkeypatch.setattr(Designs, "_build", counted)
     again = LockinReceiver(site, SETTINGS).whole(wave, imu)[1]
-    np.testing.assert_array_equal(again.phasor_sensor, found.phasor_sensor)
-    assert 0 < made < 0.25 * len(found)
+    np.testing.assert_array_equal(again.phasor_sensor, result.phasor_sensor)
+    assert 0 < built < 0.25 * len(result)
     monkeypatch.setattr(design, "spacings_of", lambda time, *_: [None] * len(time))
     alone = LockinReceiver(site, SETTINGS).whole(wave, imu)[1]
     size = np.nanmax(np.abs(alone.phasor_sensor))
-    assert np.nanmax(np.abs(found.phasor_sensor - alone.phasor_sensor)) < 2e-6 * size
+    assert np.nanmax(np.abs(result.phasor_sensor - alone.phasor_sensor)) < 2e-6 * size
     cov = float(np.nanmax(alone.phasor_cov))
-    np.testing.assert_allclose(found.phasor_cov, alone.phasor_cov, rtol=1e-4, atol=1e-6 * cov)
+    np.testing.assert_allclose(result.phasor_cov, alone.phasor_cov, rtol=1e-4, atol=1e-6 * cov)

@@ -115,28 +115,28 @@ def test_there_is_no_state_before_the_start(walk: OnlineLog) -> None:
 def test_the_state_between_epochs_is_carried_on_by_the_imu(
     walk: OnlineLog, estimator: Estimator
 ) -> None:
-    apart, ahead = [], []
+    separate, ahead = [], []
 
     def watch(navigator: Navigator, now: float) -> None:
         if navigator.started and now > 12.0:
             state = navigator.state()
             truth = walk.motion.trajectory(np.array([state.time]))
-            apart.append(np.linalg.norm(state.position_world - truth.position_world[0]))
+            separate.append(np.linalg.norm(state.position_world - truth.position_world[0]))
             ahead.append(now - state.time)
 
     navigate(walk, NavigatorSettings(estimator), watch=watch)
     assert np.max(ahead) < 0.03  # s; an IMU sample
-    assert np.sqrt(np.mean(np.square(apart))) < 0.004  # m
+    assert np.sqrt(np.mean(np.square(separate))) < 0.004  # m
 
 
 @pytest.mark.parametrize("estimator", BOTH)
 @pytest.mark.parametrize(
-    ("lost", "during", "fixes"), [([1], 0.006, 0), ([0, 1, 3], 0.05, 0), ([0, 1, 2, 3], 3.0, 1)]
+    ("missing", "during", "fixes"), [([1], 0.006, 0), ([0, 1, 3], 0.05, 0), ([0, 1, 2, 3], 3.0, 1)]
 )
 def test_beacons_vanish_and_come_back(
-    walk: OnlineLog, estimator: Estimator, lost: list[int], during: float, fixes: int
+    walk: OnlineLog, estimator: Estimator, missing: list[int], during: float, fixes: int
 ) -> None:
-    holed = replace(walk, fields=silent(walk.fields, lost, 25.0, 50.0))
+    holed = replace(walk, fields=silent(walk.fields, missing, 25.0, 50.0))
     navigator, states = navigate(holed, NavigatorSettings(estimator))
     time, error = distance(walk, states)
     assert np.max(error[(time > 25.0) & (time < 50.0)]) < during  # m
@@ -227,8 +227,8 @@ def test_late_and_disordered_samples_change_nothing_within_the_delay(estimator: 
     late = [s for s in disordered if s.time in by_time]
     assert len(late) >= len(disordered) - 2
     for state in late[-6:]:
-        apart = state.position_world - by_time[state.time].position_world
-        assert np.linalg.norm(apart) < 0.1 * state.position_sigma
+        separate = state.position_world - by_time[state.time].position_world
+        assert np.linalg.norm(separate) < 0.1 * state.position_sigma
 
 
 @pytest.mark.parametrize("estimator", BOTH)
@@ -294,7 +294,7 @@ def test_outliers_are_refused_one_by_one(walk: OnlineLog, estimator: Estimator) 
 def test_a_platform_that_was_carried_away_is_found_again(estimator: Estimator) -> None:
     log, moved = online_log(21, 30.0), []
 
-    def carry(navigator: Navigator, now: float) -> None:
+    def propagate_passage(navigator: Navigator, now: float) -> None:
         if now == 15.0:
             inner = navigator._estimator  # nothing that arrives could tell it so much nonsense
             assert inner is not None
@@ -302,12 +302,12 @@ def test_a_platform_that_was_carried_away_is_found_again(estimator: Estimator) -
             inner.replace_state(replace(inner.state, position_world=wrong))
             moved.append(inner.state.time)
 
-    navigator, states = navigate(log, NavigatorSettings(estimator), watch=carry)
+    navigator, states = navigate(log, NavigatorSettings(estimator), watch=propagate_passage)
     assert navigator.counts["lost and found again"] == 1
     time, error = distance(log, states)
-    lost = time[error > 0.3]
-    assert len(lost) >= 3
-    assert np.max(lost) - moved[0] < 3.0  # s; five epochs
+    lost_epochs = time[error > 0.3]
+    assert len(lost_epochs) >= 3
+    assert np.max(lost_epochs) - moved[0] < 3.0  # s; five epochs
     assert np.max(error[time > moved[0] + 5.0]) < 0.006  # m
 
 
@@ -365,13 +365,13 @@ def test_the_lagged_states_are_every_epoch_once_and_better(walk: OnlineLog) -> N
 
 
 def recovers(
-    estimator: Estimator, log: OnlineLog, lost: tuple[float, float], gap: tuple[float, float]
+    estimator: Estimator, log: OnlineLog, missing: tuple[float, float], gap: tuple[float, float]
 ) -> None:
     """Outliers, a lost beacon, a gap of the IMU, late fields; ten epochs after, all is as before.
 
     The position error returns below three times its nominal value.
     """
-    begin, end = lost
+    begin, end = missing
     fields, _ = spoiled(silent(log.fields, [1], begin, end), 0.2, begin, end)
     disturbed = replace(log, imu=without_imu(log.imu, *gap), fields=fields)
     usual = nominal(log, NavigatorSettings(estimator))

@@ -9,7 +9,7 @@ from magfusion.estimation.graph.state import MOTION, State
 from magfusion.estimation.online_integrity.gate import Gate
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.estimation.online_integrity.magnetometer_watch import MagnetometerWatch
-from magfusion.estimation.online_integrity.online import OnlineWitness
+from magfusion.estimation.online_integrity.online import OnlineMonitor
 from magfusion.model.parameters import Block, choose_blocks, initial_calibration, retract
 from magfusion.model.site import BeaconSigma
 from magfusion.simulation.demo_site import demo_site
@@ -25,7 +25,7 @@ SITE = replace(
 )
 
 
-def state_with(moved: float, sigma: float) -> tuple[State, Block, OnlineWitness]:
+def state_with(moved: float, sigma: float) -> tuple[State, Block, OnlineMonitor]:
     """Return a state whose third beacon moved along x (m), of some sigma (m)."""
     blocks = choose_blocks(SITE, ("beacons",))
     block = next(b for b in blocks if b.name == "C.position")
@@ -39,11 +39,11 @@ def state_with(moved: float, sigma: float) -> tuple[State, Block, OnlineWitness]
     still = np.zeros(3)
     level = np.array([0.0, 0.0, 1.0])
     state = State(1.0, np.eye(3), level, still, still, still, calibration, np.diag(variance))
-    return state, block, OnlineWitness(SITE, blocks)
+    return state, block, OnlineMonitor(SITE, blocks)
 
 
 @pytest.mark.parametrize(
-    ("moved", "sigma", "share", "said"),
+    ("moved", "sigma", "share", "findings"),
     [
         (0.028, 0.0135, 0.0, True),
         # Three prior sigmas: the directions of the beacons, only considered, are in it.
@@ -54,11 +54,11 @@ def state_with(moved: float, sigma: float) -> tuple[State, Block, OnlineWitness]
     ],
 )
 def test_what_was_only_considered_moves_what_is_estimated(
-    moved: float, sigma: float, share: float, said: bool
+    moved: float, sigma: float, share: float, findings: bool
 ) -> None:
-    state, block, witness = state_with(moved, sigma)
-    borrowed = {block.name: np.full(3, share * sigma**2)}
-    witness.begin(0.0, Judgement(), borrowed)
+    state, block, monitor = state_with(moved, sigma)
+    shared_offsets = {block.name: np.full(3, share * sigma**2)}
+    monitor.begin(0.0, Judgement(), shared_offsets)
     gate = Gate(SITE.channels, (), MagnetometerWatch(SITE))
-    heard = witness.judgement(state, gate, None, Judgement())
-    assert any(f.code == "prior" and "C.position" in f.text for f in heard.findings) == said
+    detected = monitor.judgement(state, gate, None, Judgement())
+    assert any(f.code == "prior" and "C.position" in f.text for f in detected.findings) == findings

@@ -118,9 +118,9 @@ def test_a_run_from_a_checkpoint_is_the_same() -> None:
     kept = first.checkpoint()
     second = restored(small.site, NAVIGATOR, kept)
     _feed(second, small, 70, EPOCHS)
-    expected, found = (n.judgement.protection_level_m for n in (whole, second))
+    expected, result = (n.judgement.protection_level_m for n in (whole, second))
     assert expected is not None
-    assert found == pytest.approx(expected, rel=1e-6)
+    assert result == pytest.approx(expected, rel=1e-6)
 
 
 def test_a_checkpoint_with_filters_of_another_shape_is_refused() -> None:
@@ -141,9 +141,9 @@ def test_a_bank_begins_without_the_pose_that_all_beacons_made() -> None:
     bank = SubsetBank(small.site, navigator.blocks, 0)
     assert bank.separation(state) is None
     bank._begin(state)
-    found = bank.separation(state)
-    assert found is not None
-    np.testing.assert_allclose(found.step, 0.0, atol=0.0)
-    least = np.diagonal(found.separation_cov[0, 0])
+    result = bank.separation(state)
+    assert result is not None
+    np.testing.assert_allclose(result.step, 0.0, atol=0.0)
+    least = np.diagonal(result.separation_cov[0, 0])
     np.testing.assert_allclose(least, WIDE[:6] ** 2, rtol=1e-6)
-    assert np.max(found.excess(Risk(), SLACK)) == 0.0
+    assert np.max(result.excess(Risk(), SLACK)) == 0.0

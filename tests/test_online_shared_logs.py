@@ -38,10 +38,10 @@ def compared(request: pytest.FixtureRequest) -> Compared:
     site, now = replace(declared, model_error_length=0.0), {}
     estimators: tuple[Literal["smoother", "ekf"], ...] = ("ekf", "smoother")
     for estimator in estimators:
-        made, left = online(log, site, NavigatorSettings(estimator=estimator, lag=LAG))
-        now[estimator] = row(log, estimator, made)
+        built, remaining = online(log, site, NavigatorSettings(estimator=estimator, lag=LAG))
+        now[estimator] = row(log, estimator, built)
     whole = smooth(log, site, SmootherSettings(tune=False))
-    return Compared(row(log, "batch", whole.states), now, row(log, "lagged", left))
+    return Compared(row(log, "batch", whole.states), now, row(log, "lagged", remaining))
 
 
 def test_where_the_survey_is_exact_the_future_is_worth_little(compared: Compared) -> None:
@@ -77,12 +77,12 @@ def test_who_calibrated_once_navigates_nearly_as_well_as_who_smooths() -> None:
     lagged = rows["fixed lag, lagged, calibrated"]
     assert lagged.aligned_position_cm < FIXED_LAG * batch
     assert rows["filter, calibrated"].aligned_position_cm < FILTER * batch
-    for found in rows.values():
-        assert found.nees is not None
-        assert found.nees < 12.0  # of 6; with the sigmas alone 13 to 15
+    for result in rows.values():
+        assert result.nees is not None
+        assert result.nees < 12.0  # of 6; with the sigmas alone 13 to 15
 
 
 def test_the_claimed_covariance_is_of_the_errors_order(compared: Compared) -> None:
-    for found in (*compared.now.values(), compared.lagged):
-        assert found.nees is not None
-        assert 0.5 < found.nees < 18.0  # of 6: one log with a wrong survey is one draw
+    for result in (*compared.now.values(), compared.lagged):
+        assert result.nees is not None
+        assert 0.5 < result.nees < 18.0  # of 6: one log with a wrong survey is one draw

@@ -54,10 +54,10 @@ def test_an_attached_magnet_is_found_and_said(attached, smoothed):
     true = np.diff([log.waveform.measured_sensor[k] - seen(log, k) for k in (200, 1400)], axis=0)
     np.testing.assert_allclose(after - before, 1e6 * true[0], atol=2.5)
     assert 11.5 < smoothed.changed[0] < 14.0
-    said = remarks(
+    findings = remarks(
         smoothed.states, smoothed.disturbance, smoothed.changed, np.array([0, 16.4, -41.4])
     )
-    assert {"geometry", "body_iron"} <= {finding.code for finding in said}
+    assert {"geometry", "body_iron"} <= {finding.code for finding in findings}
     assert site.beacons == ()
 
 
@@ -115,9 +115,9 @@ def test_a_gap_is_bridged_by_gravity_and_field(attached):
     log, site = attached
     kept = (log.imu.time < 14.0) | (log.imu.time > 18.0)
     imu = ImuSamples(*(getattr(log.imu, n)[kept] for n in ("time", "gyro_body", "accel_body")))
-    found = oriented(replace(log, imu=imu), site)
-    late = found.time > 22.0
-    assert scenario.errors(found.time[late], found.world_from_body[late], log.truth)[2] < 1.5
+    result = oriented(replace(log, imu=imu), site)
+    late = result.time > 22.0
+    assert scenario.errors(result.time[late], result.world_from_body[late], log.truth)[2] < 1.5
 
 
 @pytest.mark.parametrize("name", ["smooth", "navigate"])
@@ -159,12 +159,12 @@ def test_the_pipe_tells_an_orientation_for_each_sample_and_no_position(attached)
         )
     source.seek(0)
     assert run_orientation_stream(site, "json", False, source, sink, io.StringIO()) == 0
-    told = [json.loads(line) for line in sink.getvalue().splitlines()]
-    assert len(told) > 780
-    assert {t["position"] for t in told} == {None}
-    time = np.array([t["time"] for t in told])
+    reported = [json.loads(line) for line in sink.getvalue().splitlines()]
+    assert len(reported) > 780
+    assert {t["position"] for t in reported} == {None}
+    time = np.array([t["time"] for t in reported])
     assert np.all(np.diff(time) > 0.0)
-    turn = Rotation.from_quat([t["quaternion"] for t in told], scalar_first=True).as_matrix()
+    turn = Rotation.from_quat([t["quaternion"] for t in reported], scalar_first=True).as_matrix()
     heading, _, tilt = scenario.errors(time, turn, log.truth)
     assert tilt < 1.0
     assert heading < 8.0
@@ -173,11 +173,11 @@ def test_the_pipe_tells_an_orientation_for_each_sample_and_no_position(attached)
 def test_what_swings_with_an_arm_is_not_taken_for_a_bias():
     """With all of the speed and the field for the biases, tilt errs by more than a degree here."""
     log, site = worlds.simulated("slow carrying", 0, duration=30.0, rate=50.0, share=0.05)
-    found = oriented(log, site, back=False)
-    heading, _, tilt = scenario.errors(found.time, found.world_from_body, log.truth)
+    result = oriented(log, site, back=False)
+    heading, _, tilt = scenario.errors(result.time, result.world_from_body, log.truth)
     assert tilt < 0.5
     assert heading < 1.5
-    assert np.max(np.abs(found.states[-1].accel_bias)) < 0.1  # m/s^2; as declared, it is 0.005
+    assert np.max(np.abs(result.states[-1].accel_bias)) < 0.1  # m/s^2; as declared, it is 0.005
 
 
 @pytest.mark.parametrize("kind", ["slow carrying", "violent carrying"])
@@ -218,7 +218,7 @@ def test_in_the_mean_it_is_better_than_vqf_and_claims_no_more_than_is_true():
         for seed in range(3):
             rows += scenario.rows_of(*worlds.simulated(kind, seed, 30.0, 50.0, 1.0))
     for way in ("online", "offline"):
-        ours, theirs = ([r for r in rows if r.way == w] for w in (way, f"VQF {way}"))
-        mean = [np.mean([np.hypot(r.heading_deg, r.tilt_deg) for r in o]) for o in (ours, theirs)]
+        ours, others = ([r for r in rows if r.way == w] for w in (way, f"VQF {way}"))
+        mean = [np.mean([np.hypot(r.heading_deg, r.tilt_deg) for r in o]) for o in (ours, others)]
         assert mean[0] < mean[1]
         assert np.mean([r.heading_nees for r in ours]) < 1.5

@@ -22,10 +22,10 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, StateTrust, Trust, Unverified, Verdict
 from magfusion.results.errors import trajectory_errors
-from magfusion.results.figures import Estimate, Figure, Figures, heading
+from magfusion.results.figures import Figure, Figures, ParameterEstimate, heading
 from magfusion.results.page import PAGE
-from magfusion.results.page_motion import Motion
-from magfusion.results.plots.chart import Band, Chart, Line, svg, thinned, ticks
+from magfusion.results.page_motion import MotionPage
+from magfusion.results.plots.chart import Chart, ChartBand, ChartLine, svg, thinned, ticks
 from magfusion.results.provenance import Run, recorded_as
 from magfusion.results.report import FAILED, dropped_figures, write_report
 from magfusion.results.verdict import trust_figures
@@ -94,7 +94,7 @@ def _site() -> Site:
     return replace(site, beacons=(replace(first, name=EVIL), *others))
 
 
-def _motion(truth: bool = True) -> Motion:
+def _motion(truth: bool = True) -> MotionPage:
     rng = np.random.default_rng(3)
     time = np.linspace(0.0, 80.0, N)
     true = Trajectory(
@@ -110,13 +110,13 @@ def _motion(truth: bool = True) -> Motion:
     trust = StateTrust((Verdict.DOUBTFUL,) * N, level, level, excluded)
     residuals = {EVIL: (time, np.abs(rng.standard_normal(N)))}
     errors = trajectory_errors(states, true) if truth else None
-    return Motion(_site(), states, true if truth else None, errors, residuals, trust)
+    return MotionPage(_site(), states, true if truth else None, errors, residuals, trust)
 
 
 def _figures() -> Figures:
     known = {"label": "position", "sigma": 0.01, "prior_sigma": 0.05}
-    shift = Estimate("{beacon}.position_x_m", 0.25, "m", EVIL, declared=-6.0, **known)
-    turn = Estimate("{beacon}.rotation_x_deg", -0.1, "deg", EVIL, **known)
+    shift = ParameterEstimate("{beacon}.position_x_m", 0.25, "m", EVIL, declared=-6.0, **known)
+    turn = ParameterEstimate("{beacon}.rotation_x_deg", -0.1, "deg", EVIL, **known)
     return (
         heading("smooth", f"log of {EVIL}")
         | trust_figures(TRUST)
@@ -183,18 +183,18 @@ def test_the_page_says_what_was_found_refused_and_how_it_was_run(page: Page) -> 
 
 def test_without_truth_the_page_shows_what_is_claimed(tmp_path: Path) -> None:
     write_report(tmp_path, _figures(), _motion(truth=False))
-    found = Page(tmp_path / PAGE)
-    found.check()
-    assert "Estimated accuracy" in found.text
-    assert "protection level" in found.text
-    assert "called from Python" in found.text
+    result = Page(tmp_path / PAGE)
+    result.check()
+    assert "Estimated accuracy" in result.text
+    assert "protection level" in result.text
+    assert "called from Python" in result.text
 
 
 @pytest.mark.parametrize("states", [1, 2])
 def test_a_page_of_hardly_any_states_is_written(states: int, tmp_path: Path) -> None:
     motion = _motion(truth=False)
     few = {name: part[:states] for name, part in vars(motion.states).items() if part is not None}
-    write_report(tmp_path, _figures(), Motion(motion.site, Trajectory(**few)))
+    write_report(tmp_path, _figures(), MotionPage(motion.site, Trajectory(**few)))
     Page(tmp_path / PAGE).check()
 
 
@@ -208,9 +208,9 @@ def test_a_direction_that_is_open_hides_nothing(tmp_path: Path) -> None:
         assert motion.errors is not None
         errors = replace(motion.errors, pose_cov=cov)
         write_report(tmp_path, _figures(), replace(motion, states=states, errors=errors))
-        found = Page(tmp_path / PAGE)
-        found.check()
-        assert "error (mm)" in found.text
+        result = Page(tmp_path / PAGE)
+        result.check()
+        assert "error (mm)" in result.text
 
 
 def test_of_a_failed_job_the_page_lies_with_what_was_found(tmp_path: Path) -> None:
@@ -218,18 +218,18 @@ def test_of_a_failed_job_the_page_lies_with_what_was_found(tmp_path: Path) -> No
     failed = Trust((Finding("no_solution", "There is none.", Verdict.FAILED),))
     write_report(tmp_path, heading("match", "log") | trust_figures(failed))
     assert {path.name for path in tmp_path.iterdir()} == {"report.json", FAILED}
-    found = Page(tmp_path / FAILED / PAGE)
-    assert "FAILED Do not use" in found.text
+    result = Page(tmp_path / FAILED / PAGE)
+    assert "FAILED Do not use" in result.text
 
 
 def test_pictures_are_inside_as_far_as_there_is_room(tmp_path: Path) -> None:
     (tmp_path / "beacon.png").write_bytes(b"\x89PNG")
     (tmp_path / "large.png").write_bytes(bytes(LARGEST))
     write_report(tmp_path, _figures())
-    found = Page(tmp_path / PAGE)
-    found.check()
-    assert found.addresses == ["data:image/png;base64,iVBORw=="]
-    assert "see large.png, in the same directory" in found.text
+    result = Page(tmp_path / PAGE)
+    result.check()
+    assert result.addresses == ["data:image/png;base64,iVBORw=="]
+    assert "see large.png, in the same directory" in result.text
 
 
 def test_a_command_tells_its_page_how_it_was_called(
@@ -245,12 +245,12 @@ def test_a_command_tells_its_page_how_it_was_called(
 
     monkeypatch.setattr("magfusion.jobs.coverage.COMMAND", Command(CoverageSettings, run))
     run_command("coverage", site, "-o", output, "--height", 1)
-    found = Page(output / PAGE)
-    found.check()
-    assert f"magfusion coverage {site} -o {output} --height 1" in found.text
-    assert f"{site} 3 {ABC}" in found.text
-    assert "height 1.0 given" in found.text
-    assert "spacing default" in found.text
+    result = Page(output / PAGE)
+    result.check()
+    assert f"magfusion coverage {site} -o {output} --height 1" in result.text
+    assert f"{site} 3 {ABC}" in result.text
+    assert "height 1.0 given" in result.text
+    assert "spacing default" in result.text
 
 
 def test_a_command_that_fails_tells_it_too(
@@ -265,9 +265,9 @@ def test_a_command_that_fails_tells_it_too(
         main(["coverage", str(tmp_path / "site.yaml"), "-o", str(tmp_path / "reach")])
     assert ended.value.code == 1
     assert "there is none" in capsys.readouterr().err
-    found = Page(tmp_path / "reach" / FAILED / PAGE)
-    assert f"magfusion coverage {tmp_path / 'site.yaml'}" in found.text
-    assert "there is none" in found.text
+    result = Page(tmp_path / "reach" / FAILED / PAGE)
+    assert f"magfusion coverage {tmp_path / 'site.yaml'}" in result.text
+    assert "there is none" in result.text
 
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), "")
@@ -311,11 +311,11 @@ def test_a_browser_shows_the_verdict_the_charts_and_nothing_beside_the_page(
 def test_ticks_are_round_and_within() -> None:
     rng = np.random.default_rng(5)
     for low, span in zip(rng.normal(0.0, 1e3, 300), 10.0 ** rng.uniform(-6, 6, 300), strict=True):
-        found = ticks(low, low + span)
-        assert 2 <= len(found) <= 7
-        assert low - 1e-6 * span <= found[0]
-        assert found[-1] <= low + span * (1 + 1e-6)
-        step = f"{found[1] - found[0]:.1e}"
+        result = ticks(low, low + span)
+        assert 2 <= len(result) <= 7
+        assert low - 1e-6 * span <= result[0]
+        assert result[-1] <= low + span * (1 + 1e-6)
+        step = f"{result[1] - result[0]:.1e}"
         assert step[0] in "125"
 
 
@@ -334,6 +334,6 @@ def test_a_thinned_line_keeps_its_extremes_and_its_gaps() -> None:
 @pytest.mark.parametrize("values", [[0.0, 0.0], [np.nan, np.nan], [1e-12, 1e9], [5.0, 5.0]])
 def test_any_numbers_can_be_drawn(values: list[float], log: bool) -> None:
     x, y = np.arange(2.0), np.array(values)
-    drawn = svg(Chart("t", "x", "y", (Line(x, y),), (Band(x, y, y + 1.0),), log=log))
+    drawn = svg(Chart("t", "x", "y", (ChartLine(x, y),), (ChartBand(x, y, y + 1.0),), log=log))
     assert "nan" not in drawn
     assert "inf" not in drawn

@@ -46,10 +46,10 @@ def test_000_one_silent_slot_does_not_determine_nine_entries() -> None:
 
 
 def test_000_the_printed_correction_makes_known_errors_worse() -> None:
-    found = tracker_as_printed.run(tracker_as_printed.Config(poses=5000))
-    assert found.not_corrected == pytest.approx(2.45, abs=0.12)  # deg
-    assert found.as_printed == pytest.approx(4.84, abs=0.25)
-    assert found.put_right < 0.02
+    result = tracker_as_printed.run(tracker_as_printed.Config(poses=5000))
+    assert result.not_corrected == pytest.approx(2.45, abs=0.12)  # deg
+    assert result.as_printed == pytest.approx(4.84, abs=0.25)
+    assert result.put_right < 0.02
 
 
 def test_000_the_scenario_ends_with_one_json_line(
@@ -57,8 +57,8 @@ def test_000_the_scenario_ends_with_one_json_line(
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["tracker_as_printed.py", "--quick"])
     tracker_as_printed.main()
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert told["put_right"] < told["not_corrected"] < told["as_printed"]
+    reported = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert reported["put_right"] < reported["not_corrected"] < reported["as_printed"]
 
 
 def test_000_rows_of_table_1_that_cannot_be() -> None:
@@ -87,9 +87,9 @@ def test_000_four_readings_of_a_single_axis_probe_do_not_see_a_tilt() -> None:
     across = np.linalg.norm(of_x[..., 1:], axis=-1) / np.abs(of_x[0, 0, 0, 0])
     assert np.max(across[:, :, 1:]) > tilt  # which a probe of three axes does see
     whole = np.moveaxis(field, (2, 3), (0, 1))  # (tilt, coil, axis, side, 3)
-    found = helmert(measure(whole, 0.3, on_axis=False).moments)
+    result = helmert(measure(whole, 0.3, on_axis=False).moments)
     np.testing.assert_allclose(
-        np.linalg.norm(found, axis=1), tilt * np.array([0.0, 1.0, 1.0]), rtol=1e-3, atol=1e-9
+        np.linalg.norm(result, axis=1), tilt * np.array([0.0, 1.0, 1.0]), rtol=1e-3, atol=1e-9
     )
 
 
@@ -106,8 +106,8 @@ def test_001_eq_12_and_13_give_eq_16_only_with_the_field_for_m() -> None:
     last = [p001.eq_14_y_at_3(NED, *sensor), p001.eq_15_y_at_4(NED, *sensor)]
     for mn, md, exact in ((bn, bd, True), (bn, 1.3 * bd, False), (0.7 * bn, bd, False)):
         first = [by + ky * (be + exy * bn + ezy * md), by + ky * (-be - exy * mn + ezy * md)]
-        found = p001.eq_16_misalignment(np.array([*first, *last]), bd, ky)
-        assert bool(abs(found - ezy) < 1e-9) is exact
+        result = p001.eq_16_misalignment(np.array([*first, *last]), bd, ky)
+        assert bool(abs(result - ezy) < 1e-9) is exact
     # And as they are called here, they are those with the field.
     called = [p001.eq_12_y_at_1(NED, *sensor), p001.eq_13_y_at_2(NED, *sensor)]
     assert p001.eq_16_misalignment(np.array([*called, *last]), bd, ky) == pytest.approx(ezy)
@@ -209,16 +209,16 @@ def test_004_the_mean_over_beacons_of_eq_29_costs_its_gain() -> None:
         slope = fit_lines(reach, known.amplitude).slope
         _, point = nearest(known, amplitude, NEIGHBOURS)
         fixed = p004.eq_28_range(reach[point], amplitude[:, None], known.amplitude[point], slope)
-        apart = np.mean(np.abs(fixed - reach[point]), axis=-1)  # over the beacons
-        found = np.concatenate(
+        separate = np.mean(np.abs(fixed - reach[point]), axis=-1)  # over the beacons
+        result = np.concatenate(
             [
                 trilaterate(one[None], points, points.mean(axis=0) + np.array([0.0, 0.0, 0.1]))
-                for one, points in zip(apart, known.position_world[point], strict=True)
+                for one, points in zip(separate, known.position_world[point], strict=True)
             ]
         )
-        found[:, 2] = target[:, 2]  # which fingerprints of one height cannot tell
+        result[:, 2] = target[:, 2]  # which fingerprints of one height cannot tell
         ours = locate_by_differential_range(known, amplitude)
-        errors.append([np.linalg.norm(p - target, axis=1).mean() for p in (found, ours)])
+        errors.append([np.linalg.norm(p - target, axis=1).mean() for p in (result, ours)])
     printed, right = np.mean(errors, axis=0)
     assert printed > 0.08  # m
     assert right == pytest.approx(0.008, rel=0.3)

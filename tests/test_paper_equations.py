@@ -37,7 +37,7 @@ VERDICT = re.compile(r"\b(Right|Misprint|False|Corrected|Unclear)\b")
 # The register ----------------------------------------------------------------------------------
 
 
-def told(module: ModuleType) -> dict[str, str]:
+def reported(module: ModuleType) -> dict[str, str]:
     """Return the text under each name of a module, in the order of the file."""
     nodes = ast.parse(inspect.getsource(module)).body
     texts: dict[str, str] = {}
@@ -64,7 +64,7 @@ def test_every_number_of_a_paper_is_a_function_or_has_a_reason(paper: str) -> No
 @pytest.mark.parametrize("paper", PAPERS)
 def test_every_equation_says_what_is_known_of_it(paper: str) -> None:
     module, _ = PAPERS[paper]
-    texts = told(module)
+    texts = reported(module)
     assert texts.keys() == {name for name in vars(module) if NAME.fullmatch(name)}
     for name, text in texts.items():
         assert VERDICT.search(text), f"{name} has no verdict"
@@ -82,12 +82,12 @@ def test_000_eq_5_needs_one_ambient_vector_and_eq_10_a_moment_a_coil() -> None:
     sent, seen = (np.eye(3) + 0.1 * rng.standard_normal((3, 3)) for _ in range(2))
     ideal = p000.eq_01_coupling(MU0_OVER_4PI, attitude, position, sent)
     antenna = Antenna(sent.T, np.zeros((3, 3)), seen, np.zeros((3, 3)))
-    found = p000.eq_10_coupling(antenna, np.swapaxes(attitude, 1, 2), position).value
-    np.testing.assert_allclose(found, seen @ ideal, rtol=0, atol=1e-12 * np.max(np.abs(ideal)))
+    result = p000.eq_10_coupling(antenna, np.swapaxes(attitude, 1, 2), position).value
+    np.testing.assert_allclose(result, seen @ ideal, rtol=0, atol=1e-12 * np.max(np.abs(ideal)))
     silent = np.max(np.abs(ideal)) * rng.standard_normal((20, 3, 1))
     measured = p000.eq_05_coupling(MU0_OVER_4PI, attitude, position, sent, silent * np.ones(3))
-    left = measured - silent
-    np.testing.assert_allclose(left, ideal, rtol=0, atol=1e-13 * np.max(np.abs(measured)))
+    remaining = measured - silent
+    np.testing.assert_allclose(remaining, ideal, rtol=0, atol=1e-13 * np.max(np.abs(measured)))
 
 
 def test_000_eq_18_is_a_rotation_to_first_order_and_eq_20_its_inverse() -> None:
@@ -130,9 +130,14 @@ def test_001_readings_on_the_table_are_those_of_the_printed_lines() -> None:
 
 def test_001_eq_16_finds_what_eq_2_has_with_bz_and_nothing_as_printed() -> None:
     on_table = p001.SENSOR_FROM_NED[:4] @ NED
-    for voltage, found in ((p001.eq_02_voltage_y, E[1, 2]), (p001.eq_02_voltage_y_as_printed, 0.0)):
+    for voltage, result in (
+        (p001.eq_02_voltage_y, E[1, 2]),
+        (p001.eq_02_voltage_y_as_printed, 0.0),
+    ):
         readings = voltage(on_table, *SENSOR)
-        assert p001.eq_16_misalignment(readings, NED[2], SCALE[1]) == pytest.approx(found, abs=1e-9)
+        assert p001.eq_16_misalignment(readings, NED[2], SCALE[1]) == pytest.approx(
+            result, abs=1e-9
+        )
 
 
 def test_001_the_database_asks_what_eq_17_to_20_ask() -> None:
@@ -147,19 +152,21 @@ def test_001_the_database_asks_what_eq_17_to_20_ask() -> None:
             rpy[:, 1] = 0.1
         entries = predict_field(rpy, north)
         index = prepare(AttitudeDatabase(entries, rpy, angles, "drawn"))
-        asked = entries[:20] + 1e-6 * rng.standard_normal((20, 3))
-        apart, row = nearest_entries(index, asked)
-        np.testing.assert_array_equal(row[:, 0], nearest(asked, entries))
-        np.testing.assert_allclose(distance(asked, entries[row[:, 0]]), apart[:, 0], rtol=1e-9)
+        requested = entries[:20] + 1e-6 * rng.standard_normal((20, 3))
+        separate, row = nearest_entries(index, requested)
+        np.testing.assert_array_equal(row[:, 0], nearest(requested, entries))
+        np.testing.assert_allclose(
+            distance(requested, entries[row[:, 0]]), separate[:, 0], rtol=1e-9
+        )
 
 
 def test_001_eq_18_does_not_see_a_turn_about_the_field() -> None:
     rpy = np.array([0.2, -0.3, 0.4])
     about = Rotation.from_rotvec(2.0 * NED / np.linalg.norm(NED))
-    turned = (about * Rotation.from_euler("xyz", rpy)).as_euler("xyz")
-    assert np.max(np.abs(turned - rpy)) > 1.0  # rad
-    apart = p001.eq_20_distance(predict_field(rpy, NED), predict_field(turned, NED))
-    assert apart < 1e-15  # T
+    rotated = (about * Rotation.from_euler("xyz", rpy)).as_euler("xyz")
+    assert np.max(np.abs(rotated - rpy)) > 1.0  # rad
+    separate = p001.eq_20_distance(predict_field(rpy, NED), predict_field(rotated, NED))
+    assert separate < 1e-15  # T
 
 
 # 002 -------------------------------------------------------------------------------------------
@@ -188,8 +195,8 @@ def test_002_the_law_of_cosines_and_the_misfit_vanish_at_the_true_centre() -> No
     length = p002.eq_10_lengths(places)
     assert length[:2] == pytest.approx([4.0, 4.0])  # of the first and the second, and the third
     cosine = p002.eq_09_cosines(direction)
-    left = p002.eq_11_misfit(reach, cosine, length)
-    np.testing.assert_allclose(left, 0.0, rtol=0, atol=1e-12)
+    remaining = p002.eq_11_misfit(reach, cosine, length)
+    np.testing.assert_allclose(remaining, 0.0, rtol=0, atol=1e-12)
     assert p002.eq_12_misfit(centre, places, reach) == pytest.approx(0.0, abs=1e-12)
     moved = p002.eq_12_misfit(centre + np.array([0.0, 0.0, 0.01]), places, reach)
     assert moved == pytest.approx(np.sum((0.01 * direction[:, 2]) ** 2), rel=0.05)
@@ -211,8 +218,8 @@ def test_002_eq_26_holds_to_first_order_only() -> None:
         noise = share * np.linalg.norm(coils, axis=-1, keepdims=True) * draws
         drawn = coils + np.concatenate([noise, -noise])
         seen = drawn[:, 0] + 1j * drawn[:, 1]
-        found = calibrate_as_printed(seen, magnetometers, beacon_calibration.MOMENT, hemisphere)
-        bias.append(np.abs(np.mean(found.centre_world, axis=0)))
+        result = calibrate_as_printed(seen, magnetometers, beacon_calibration.MOMENT, hemisphere)
+        bias.append(np.abs(np.mean(result.centre_world, axis=0)))
     np.testing.assert_allclose(bias[1], [2.7e-3, 6.0e-3, 2.9e-3], rtol=0, atol=1e-3)  # m
     assert np.linalg.norm(bias[1]) / np.linalg.norm(bias[0]) == pytest.approx(25.0, rel=0.15)
 
@@ -281,8 +288,8 @@ def test_004_pairs_a_quarter_period_apart_give_one_normal_of_the_wrong_sign() ->
     np.testing.assert_allclose(pairs, -normal[:, None] * np.ones((40, 1)), rtol=0, atol=1e-10)
     mean = p004.eq_11_mean_as_printed(pairs)
     np.testing.assert_allclose(mean, -normal, rtol=0, atol=1e-10)
-    lost = p004.eq_11_mean_as_printed(fields) / np.sqrt(unit)[:, None]
-    np.testing.assert_allclose(lost, 0.0, rtol=0, atol=1e-12)
+    lost_epochs = p004.eq_11_mean_as_printed(fields) / np.sqrt(unit)[:, None]
+    np.testing.assert_allclose(lost_epochs, 0.0, rtol=0, atol=1e-12)
     phasor = fields[:, 0] - 1j * fields[:, 10]
     np.testing.assert_allclose(p004.eq_11_normal(phasor) / unit[:, None], normal, atol=1e-10)
 
@@ -345,8 +352,8 @@ def test_004_eq_21_as_printed_is_no_rotation_where_directions_err() -> None:
     assert np.median(bent(p004.eq_21_attitude_as_printed(seen, world))) > 0.02
     nearest = p004.eq_21_attitude(seen, world)
     assert np.max(bent(nearest)) < 1e-12
-    apart = Rotation.from_matrix(nearest @ true).magnitude() / DEGREE
-    assert np.max(apart) < 10.0
+    separate = Rotation.from_matrix(nearest @ true).magnitude() / DEGREE
+    assert np.max(separate) < 10.0
 
 
 def test_004_rings_make_up_a_conducting_sphere_only_with_lenz_sign() -> None:
@@ -395,8 +402,8 @@ def test_004_ranges_by_fingerprints_are_exact_where_the_line_is_and_as_printed_n
 
 def test_004_the_mean_over_fingerprints_meets_one_exactly() -> None:
     place = np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0]]])
-    found = p004.eq_27_position(np.array([[0.2, 0.1, 0.4]]), place)
-    np.testing.assert_allclose(found, [[10.0 / 17.5, 5.0 / 17.5, 0.0]], rtol=1e-12)
+    result = p004.eq_27_position(np.array([[0.2, 0.1, 0.4]]), place)
+    np.testing.assert_allclose(result, [[10.0 / 17.5, 5.0 / 17.5, 0.0]], rtol=1e-12)
     met = p004.eq_27_position(np.array([[0.2, 0.0, 0.4]]), place)
     np.testing.assert_array_equal(met, place[:, 1])
 

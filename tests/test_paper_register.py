@@ -13,7 +13,16 @@ import pytest
 
 from magfusion.cli import main
 from magfusion.jobs.papers import PapersSettings, run_papers
-from magfusion.papers.register import FINDINGS, ROOMS, Finding, Kind, Numbered, Paper, paper, papers
+from magfusion.papers.register import (
+    FINDINGS,
+    ROOMS,
+    Finding,
+    Kind,
+    NumberedEntry,
+    Paper,
+    paper,
+    papers,
+)
 
 ROOT = Path(__file__).parents[1]
 # Counted in the papers: numbered equations, tables, figures.
@@ -21,16 +30,16 @@ PRINTED = {"000": (20, 1, 7), "001": (20, 1, 6), "002": (33, 0, 10), "004": (31,
 ALL = [entry for number in ROOMS for entry in paper(number).entries]
 
 
-def _id(one: Numbered) -> str:
+def _id(one: NumberedEntry) -> str:
     return f"{one.paper} {one.name}"
 
 
 @pytest.mark.parametrize("number", ROOMS)
 def test_no_number_of_a_paper_is_missing(number: str) -> None:
-    found = paper(number)
+    result = paper(number)
     for kind, last in zip(get_args(Kind), PRINTED[number], strict=False):
-        assert [one.number for one in found.of(kind)] == list(range(1, last + 1)), kind
-    claims = [one.number for one in found.of("claim")]
+        assert [one.number for one in result.of(kind)] == list(range(1, last + 1)), kind
+    claims = [one.number for one in result.of("claim")]
     assert claims == list(range(1, len(claims) + 1))
     assert len(claims) >= 10
 
@@ -41,7 +50,7 @@ def _tests(path: str) -> set[str]:
     return {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
 
 
-def _not_there(one: Numbered) -> Iterator[str]:
+def _not_there(one: NumberedEntry) -> Iterator[str]:
     """Yield what an entry names and is not there: functions, tests, a scenario."""
     for whole in one.functions:
         module, _, name = whole.rpartition(".")
@@ -83,10 +92,12 @@ def test_an_equation_is_called_in_its_own_room_what_the_register_calls_it(number
         if not own:
             assert one.number in room.NOT_FUNCTIONS
             continue
-        told = " ".join(_text(source, name) for name in own)
+        reported = " ".join(_text(source, name) for name in own)
         words = {"right": "Right", "misprint": "Misprint|Corrected", "unclear": "Unclear"}
         wanted = words.get(one.entry.finding, "False|Corrected")
-        assert re.search(rf"\b({wanted})\b", told), f"{_id(one)}: {one.entry.finding}, but {told}"
+        assert re.search(rf"\b({wanted})\b", reported), (
+            f"{_id(one)}: {one.entry.finding}, but {reported}"
+        )
         if one.entry.finding == "right":
             assert not any(name.endswith("_as_printed") for name in own), _id(one)
 
@@ -112,11 +123,11 @@ def test_a_citation_has_what_finds_the_paper(one: Paper) -> None:
 # The command ----------------------------------------------------------------------------------
 
 
-def _said(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+def _findings(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
     with pytest.raises(SystemExit) as ended:
         main(["papers", *words])
-    said = capsys.readouterr()
-    return int(ended.value.code or 0), said.out, said.err
+    findings = capsys.readouterr()
+    return int(ended.value.code or 0), findings.out, findings.err
 
 
 @pytest.mark.parametrize("number", ROOMS)
@@ -126,37 +137,37 @@ def test_one_command_says_where_it_is_whether_it_is_right_and_how_that_is_known(
     for one in paper(number).entries:
         run_papers(PapersSettings(paper=number, number=tuple(one.name.lower().split())))
         flat = " ".join(capsys.readouterr().out.split())
-        for told in (one.entry.says, one.entry.finding, *one.functions, *one.entry.tests):
-            assert " ".join(told.split()) in flat, _id(one)
+        for reported in (one.entry.says, one.entry.finding, *one.functions, *one.entry.tests):
+            assert " ".join(reported.split()) in flat, _id(one)
 
 
 @pytest.mark.parametrize("words", ["7", "07", "eq7", "Eq. (7)", "equation 7", "EQ 7"])
 def test_a_number_may_be_written_as_in_the_paper(
     words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert _said(capsys, "004", *words.split())[1].startswith("Paper 004, Eq 7\n")
+    assert _findings(capsys, "004", *words.split())[1].startswith("Paper 004, Eq 7\n")
 
 
 def test_all_of_a_kind_a_whole_paper_and_all_papers_are_listed(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     number = len(paper("004").of("claim"))
-    shown = _said(capsys, "004", "claims")[1]
+    shown = _findings(capsys, "004", "claims")[1]
     assert len(re.findall(r"^Claim \d+ ", shown, re.M)) == number
-    assert "Eq 31" in _said(capsys, "004")[1]
-    assert all(f"Paper {one}: " in _said(capsys)[1] for one in ROOMS)
-    assert _said(capsys, "10.11834/jrs.20210056")[1] == _said(capsys, "004")[1]
+    assert "Eq 31" in _findings(capsys, "004")[1]
+    assert all(f"Paper {one}: " in _findings(capsys)[1] for one in ROOMS)
+    assert _findings(capsys, "10.11834/jrs.20210056")[1] == _findings(capsys, "004")[1]
 
 
 def test_json_has_the_same(capsys: pytest.CaptureFixture[str]) -> None:
-    (told,) = json.loads(_said(capsys, "004", "fig", "8", "--json")[1])
-    assert (told["name"], told["finding"]) == ("Fig 8", "not reproducible")
-    assert {one["paper"] for one in json.loads(_said(capsys, "--json")[1])} == set(ROOMS)
-    assert len(json.loads(_said(capsys, "004", "--json")[1])) == len(paper("004").entries)
+    (reported,) = json.loads(_findings(capsys, "004", "fig", "8", "--json")[1])
+    assert (reported["name"], reported["finding"]) == ("Fig 8", "not reproducible")
+    assert {one["paper"] for one in json.loads(_findings(capsys, "--json")[1])} == set(ROOMS)
+    assert len(json.loads(_findings(capsys, "004", "--json")[1])) == len(paper("004").entries)
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "reported"),
     [
         (("004", "32"), "paper 004 has no '32'; it has eq 1 to 31, table 1, fig 1 to 11, claim 1"),
         (("002", "table", "1"), "paper 002 has no 'table 1'; it has eq 1 to 33, fig 1 to 10"),
@@ -166,11 +177,11 @@ def test_json_has_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     ],
 )
 def test_what_is_not_there_is_refused_with_what_is(
-    words: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]
+    words: tuple[str, ...], reported: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    status, shown, refused = _said(capsys, *words)
+    status, shown, refused = _findings(capsys, *words)
     assert (status, shown) == (2, "")
-    assert refused.startswith(f"magfusion: {told}")
+    assert refused.startswith(f"magfusion: {reported}")
     assert refused.count("\n") == 1
 
 

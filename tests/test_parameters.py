@@ -20,7 +20,7 @@ from magfusion.model.parameters import (
     PHASOR_PARAMETERS,
     Block,
     Parameter,
-    Unit,
+    ParameterUnit,
     choose_blocks,
     considered_blocks,
     corrected_imu,
@@ -99,16 +99,16 @@ def well_surveyed():
 @pytest.mark.parametrize("seed", [4, 5, 6])
 def test_difference_undoes_retract(seed):
     start, step = moved_calibration(), small_step(seed)
-    found = difference(start, retract(start, ALL, step), ALL)
-    np.testing.assert_allclose(found, step, rtol=1e-9, atol=1e-15)
+    result = difference(start, retract(start, ALL, step), ALL)
+    np.testing.assert_allclose(result, step, rtol=1e-9, atol=1e-15)
 
 
 def test_retract_undoes_difference():
     a, b = moved_calibration(7), moved_calibration(8)
     again = retract(a, ALL, difference(a, b, ALL))
     time, rotation, position = epochs()
-    found, expected = (predict_channels(c, time, rotation, position) for c in (again, b))
-    assert relative_to_group(found, expected) < 1e-12
+    result, expected = (predict_channels(c, time, rotation, position) for c in (again, b))
+    assert relative_to_group(result, expected) < 1e-12
     assert again.time_offset == pytest.approx(b.time_offset, rel=1e-12)
 
 
@@ -130,8 +130,8 @@ def test_steps_of_all_beacons_at_once_are_those_of_each_alone():
     np.testing.assert_allclose(difference(at_once, one_by_one, ALL), 0.0, atol=1e-15)
     for block in ALL:
         alone = block.parameter.difference(start, at_once, block.owner)
-        found = difference(start, at_once, ALL)[block.columns]
-        np.testing.assert_allclose(found, alone, rtol=1e-13, atol=1e-16)
+        result = difference(start, at_once, ALL)[block.columns]
+        np.testing.assert_allclose(result, alone, rtol=1e-13, atol=1e-16)
 
 
 def test_retract_turns_on_the_right_and_shifts_beacons_in_world_axes():
@@ -162,9 +162,9 @@ def test_each_block_of_the_jacobian_is_the_derivative_through_retract(block):
         moved = retract(start, alone, step)
         # A sample is taken later than stamped: at the time of an epoch the body is not yet there.
         late = (moved.imu_offset(time) - start.imu_offset(time))[:, None]
-        turned = rotation @ Rotation.from_rotvec(-rate * late).as_matrix()
+        rotated = rotation @ Rotation.from_rotvec(-rate * late).as_matrix()
         place = position - late * (rotation @ velocity_body[..., None])[..., 0]
-        return real(predict_channels(moved, time, turned, place))
+        return real(predict_channels(moved, time, rotated, place))
 
     twist = np.concatenate([rate, velocity_body], axis=1)
     blocks = GAINS if block in GAINS else ALL
@@ -178,8 +178,8 @@ def test_the_poses_block_is_the_derivative_by_the_pose():
     start, (time, rotation, position) = moved_calibration(), epochs()
 
     def predicted(step):
-        turned = rotation @ Rotation.from_rotvec(step[:3]).as_matrix()
-        return real(predict_channels(start, time, turned, position + rotation @ step[3:]))
+        rotated = rotation @ Rotation.from_rotvec(step[:3]).as_matrix()
+        return real(predict_channels(start, time, rotated, position + rotation @ step[3:]))
 
     _, by_pose, by_calibration = linearize_channels(start, (), time, rotation, position)
     expected = central_difference(predicted, 6, 1e-5)
@@ -294,12 +294,12 @@ def test_columns_follow_each_other_and_carry_the_sites_sigmas():
 def test_held_and_estimated_are_together_all_that_is_uncertain(groups):
     site = mixed_site()
     estimated = choose_blocks(site, groups)
-    held = considered_blocks(site, estimated)
-    names = [{b.name for b in blocks} for blocks in (estimated, held)]
+    fixed = considered_blocks(site, estimated)
+    names = [{b.name for b in blocks} for blocks in (estimated, fixed)]
     assert names[0] | names[1] == {b.name for b in ALL}
     assert not names[0] & names[1]
-    assert dimension(estimated) + dimension(held) == dimension(ALL)
-    assert [b.columns.start for b in held[1:]] == [b.columns.stop for b in held[:-1]]
+    assert dimension(estimated) + dimension(fixed) == dimension(ALL)
+    assert [b.columns.start for b in fixed[1:]] == [b.columns.stop for b in fixed[:-1]]
 
 
 def test_a_beacon_may_be_called_sensor_or_magnetometer():
@@ -309,8 +309,8 @@ def test_a_beacon_may_be_called_sensor_or_magnetometer():
     step = small_step(12)
     plain_moved = retract(initial_calibration(plain, 0.0), ALL, step)
     odd_moved = retract(initial_calibration(odd, 0.0), blocks, step)
-    found, expected = (predict_channels(c, *epochs()) for c in (odd_moved, plain_moved))
-    assert np.array_equal(found, expected)
+    result, expected = (predict_channels(c, *epochs()) for c in (odd_moved, plain_moved))
+    assert np.array_equal(result, expected)
     start = initial_calibration(odd, 0.0)
     np.testing.assert_allclose(difference(start, odd_moved, blocks), step, rtol=1e-9, atol=1e-15)
     own = choose_blocks(odd, ["beacons", "moments"])
@@ -321,21 +321,23 @@ def refined(shrink=0.1):
     declared = initial_calibration(mixed_site(), REFERENCE_TIME)
     fitted = retract(declared, ALL, small_step(13))
     cov = np.diag((shrink * prior_sigma(ALL)) ** 2)
-    told = parameter_estimates(declared, fitted, ALL, cov)
-    return fitted, told, refined_site(fitted, ALL, cov, told, "walk")
+    reported = parameter_estimates(declared, fitted, ALL, cov)
+    return fitted, reported, refined_site(fitted, ALL, cov, reported, "walk")
 
 
 def test_a_parameter_is_determined_where_the_data_halved_its_sigma():
     declared = initial_calibration(mixed_site(), REFERENCE_TIME)
     shrink = np.tile([0.9, 1.1], dimension(ALL))[: dimension(ALL)] * DETERMINED_RATIO
-    told = parameter_estimates(declared, declared, ALL, np.diag((shrink * prior_sigma(ALL)) ** 2))
-    assert [f.determined for f in told] == list(shrink < DETERMINED_RATIO)
-    assert {f.change for f in told} == {0.0}
+    reported = parameter_estimates(
+        declared, declared, ALL, np.diag((shrink * prior_sigma(ALL)) ** 2)
+    )
+    assert [f.determined for f in reported] == list(shrink < DETERMINED_RATIO)
+    assert {f.change for f in reported} == {0.0}
 
 
 def test_estimates_are_named_with_the_unit_of_their_figures():
-    told = {f.key: f for f in refined()[1]}
-    assert len(told) == dimension(ALL)
+    reported = {f.key: f for f in refined()[1]}
+    assert len(reported) == dimension(ALL)
     step = dict(zip([f.key for f in refined()[1]], small_step(13), strict=True))
     units = {
         "A.rotation_y_deg": DEGREE,
@@ -352,11 +354,11 @@ def test_estimates_are_named_with_the_unit_of_their_figures():
         "imu.clock_rate_ppm": 1e-6,
     }
     for name, unit in units.items():
-        assert told[name].change == pytest.approx(step[name] / unit, rel=1e-8), name
-    assert told["A.rotation_y_deg"].prior_sigma == pytest.approx(0.04 / DEGREE)
-    assert told["A.rotation_y_deg"].sigma == pytest.approx(0.004 / DEGREE)
-    assert told["C.drift_ppm"].prior_sigma == pytest.approx(20.0)
-    assert told["magnetometer.matrix_yx"].prior_sigma == pytest.approx(0.04)
+        assert reported[name].change == pytest.approx(step[name] / unit, rel=1e-8), name
+    assert reported["A.rotation_y_deg"].prior_sigma == pytest.approx(0.04 / DEGREE)
+    assert reported["A.rotation_y_deg"].sigma == pytest.approx(0.004 / DEGREE)
+    assert reported["C.drift_ppm"].prior_sigma == pytest.approx(20.0)
+    assert reported["magnetometer.matrix_yx"].prior_sigma == pytest.approx(0.04)
 
 
 def test_a_refined_site_has_the_fitted_values_and_the_posterior_sigmas():
@@ -393,12 +395,12 @@ def test_a_refined_site_keeps_the_sigmas_of_what_was_not_estimated():
 
 
 def test_a_refined_site_survives_its_file_and_tells_what_was_determined(tmp_path):
-    fitted, told, site = refined()
+    fitted, reported, site = refined()
     save_site(site, tmp_path / "site.yaml")
     again = load_site(tmp_path / "site.yaml")
     # The drive belongs to the log: phases and drifts are not the site's.
     steady = tuple(block for block in ALL if block.group != "phase")
-    expected, found = (
+    expected, result = (
         replace(
             fitted,
             site=s,
@@ -407,16 +409,16 @@ def test_a_refined_site_survives_its_file_and_tells_what_was_determined(tmp_path
         )
         for s in (site, again)
     )
-    step = difference(expected, found, steady)
+    step = difference(expected, result, steady)
     assert np.max(np.abs(step)) < 1e-13
     loaded = prior_sigma(choose_blocks(again, GROUPS))
     np.testing.assert_allclose(loaded, prior_sigma(choose_blocks(site, GROUPS)), rtol=1e-12)
     assert isinstance(again.platform.magnetometer.sigma, MagnetometerSigma)
     record = again.calibration
     assert record["log"] == "walk"
-    assert record["determined"] == [f.key for f in told]
+    assert record["determined"] == [f.key for f in reported]
     assert record["undetermined"] == []
-    drive = {f.key: [f.change, f.sigma] for f in told if "phase" in f.name or "drift" in f.name}
+    drive = {f.key: [f.change, f.sigma] for f in reported if "phase" in f.name or "drift" in f.name}
     assert len(drive) == 6
     assert record["drive"] == drive
 
@@ -425,7 +427,7 @@ class GyroScale(Parameter):
     """A parameter that the package does not know."""
 
     group, owner, kind = "gyro", "imu", "gyro_scale"
-    components, unit = ("x", "y", "z"), Unit("ppm", 1e-6)
+    components, unit = ("x", "y", "z"), ParameterUnit("ppm", 1e-6)
     inertial = of_log = True
 
     def sigma(self, site, owner):  # noqa: ARG002
@@ -444,8 +446,8 @@ def test_a_parameter_from_outside_is_one_class():
     np.testing.assert_array_equal(prior_sigma(blocks)[own[0].columns], 1e-3)
     (alone,) = choose_blocks(site, ["gyro"], parameters=kinds)
     assert (alone.key, alone.columns) == (own[0].key, slice(0, 3))
-    held = considered_blocks(site, choose_blocks(site), parameters=kinds)
-    assert "imu.gyro_scale" in [b.name for b in held]
+    fixed = considered_blocks(site, choose_blocks(site), parameters=kinds)
+    assert "imu.gyro_scale" in [b.name for b in fixed]
 
     declared = initial_calibration(site, REFERENCE_TIME)
     step = np.random.default_rng(14).normal(size=dimension(blocks)) * np.minimum(
@@ -457,16 +459,16 @@ def test_a_parameter_from_outside_is_one_class():
     np.testing.assert_allclose(back[-3:], -step[own[0].columns], rtol=1e-12)
 
     cov = np.diag((0.1 * prior_sigma(blocks)) ** 2)
-    told = parameter_estimates(declared, fitted, blocks, cov)
-    finding = next(f for f in told if f.key == "imu.gyro_scale_y_ppm")
+    reported = parameter_estimates(declared, fitted, blocks, cov)
+    finding = next(f for f in reported if f.key == "imu.gyro_scale_y_ppm")
     assert finding.change == pytest.approx(step[own[0].columns][1] / 1e-6, rel=1e-12)
     assert finding.prior_sigma == pytest.approx(1000.0)
-    refined = refined_site(fitted, blocks, cov, told, "walk")
+    refined = refined_site(fitted, blocks, cov, reported, "walk")
     assert finding.key in refined.calibration["determined"]
     assert refined.calibration["drive"][finding.key] == [finding.change, finding.sigma]
     assert not [c for c in refined.correlation.parameters if c.kind == "gyro_scale"]
-    found = observability(fitted, blocks, cov)
-    assert len(found.ratio) == dimension(blocks)
+    result = observability(fitted, blocks, cov)
+    assert len(result.ratio) == dimension(blocks)
     assert parameter_names(tuple(own), fitted)[0][0] == "imu.gyro_scale 0"
 
 

@@ -55,32 +55,32 @@ def test_a_walk_among_coils_is_predicted_to_a_hundred_thousandth(
     path, current = _walk(count), _currents(source, count)
     velocity = _velocity(path)
     exact = driven_field(source, path, current, velocity)
-    found = field_along_path(source, path, current, velocity)
-    assert np.any(found.field != exact.field)  # found otherwise
+    result = field_along_path(source, path, current, velocity)
+    assert np.any(result.field != exact.field)  # found otherwise
     size = np.sqrt(np.mean(current**2, axis=-1)) * np.linalg.norm(
         driven_field(source, path, np.ones_like(current)).field, axis=-1
     )
-    apart = np.linalg.norm(found.field - exact.field, axis=-1)
-    assert np.max(apart / (size + np.linalg.norm(exact.field, axis=-1))) < 2e-5
-    assert found.along is not None
+    separate = np.linalg.norm(result.field - exact.field, axis=-1)
+    assert np.max(separate / (size + np.linalg.norm(exact.field, axis=-1))) < 2e-5
+    assert result.along is not None
     assert exact.along is not None
-    assert np.max(np.abs(found.along - exact.along)) < 5e-3 * np.max(np.abs(exact.along))
+    assert np.max(np.abs(result.along - exact.along)) < 5e-3 * np.max(np.abs(exact.along))
     without = field_along_path(source, path, current)
     assert without.along is None
-    np.testing.assert_array_equal(without.field, found.field)
+    np.testing.assert_array_equal(without.field, result.field)
 
 
 def test_a_path_close_to_a_coil_or_with_a_gap_is_taken_point_by_point() -> None:
     source = alone(_sized(demo_site()).beacons[0])
-    beside = source.position_world + np.array([0.15, 0.0, 0.0])
+    others = source.position_world + np.array([0.15, 0.0, 0.0])
     for path in (
-        beside + 0.02 * np.random.default_rng(0).standard_normal((300, 3)),
+        others + 0.02 * np.random.default_rng(0).standard_normal((300, 3)),
         np.concatenate([_walk(100), _walk(100) + 1.0]),
         _walk(20),
     ):
         current = _currents(source, len(path))
-        exact, found = (f(source, path, current) for f in (driven_field, field_along_path))
-        np.testing.assert_array_equal(found.field, exact.field)
+        exact, result = (f(source, path, current) for f in (driven_field, field_along_path))
+        np.testing.assert_array_equal(result.field, exact.field)
 
 
 def test_nodes_are_the_closer_the_nearer_the_coil_is() -> None:
@@ -93,7 +93,7 @@ def test_nodes_are_the_closer_the_nearer_the_coil_is() -> None:
             source, (path - source.position_world) @ source.world_from_beacon
         )
 
-    assert samples(0.3) < samples(1.0) <= path_field.MOST
+    assert samples(0.3) < samples(1.0) <= path_field.MAX_NODE_SAMPLES
     assert samples(0.05) == 0  # in the coil
 
 
@@ -102,6 +102,6 @@ def test_a_still_path_has_the_field_of_its_place() -> None:
     path = np.tile(source.position_world + np.array([1.0, 0.5, 0.2]), (200, 1))
     current = _currents(source, len(path))
     exact = driven_field(source, path, current, np.zeros_like(path))
-    found = field_along_path(source, path, current, np.zeros_like(path))
-    np.testing.assert_allclose(found.field, exact.field, rtol=1e-12)
-    np.testing.assert_array_equal(found.along, exact.along)
+    result = field_along_path(source, path, current, np.zeros_like(path))
+    np.testing.assert_allclose(result.field, exact.field, rtol=1e-12)
+    np.testing.assert_array_equal(result.along, exact.along)

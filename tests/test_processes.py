@@ -103,10 +103,10 @@ def test_a_table_of_which_only_the_beginning_was_read_lets_the_process_end(tmp_p
 
 
 def test_refused_commands_end_in_order(tables: Path) -> None:
-    asked = [words for words in REFUSED for _ in range(AT_A_TIME)]
+    requested = [words for words in REFUSED for _ in range(AT_A_TIME)]
     with ThreadPoolExecutor(AT_A_TIME) as pool:
-        ended = list(pool.map(lambda words: magfusion(tables, words), asked))
-    for words, done in zip(asked, ended, strict=True):
+        ended = list(pool.map(lambda words: magfusion(tables, words), requested))
+    for words, done in zip(requested, ended, strict=True):
         assert done.returncode == 2, f"{words}: {done.returncode} {done.stderr[-500:]}"
         assert re.fullmatch(r"magfusion: [^\n]+\n", done.stderr), done.stderr
     assert not (tables / "log").exists()

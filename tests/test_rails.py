@@ -16,12 +16,12 @@ from magfusion.simulation.field import beacon_fields_world, phasors_world
 from magfusion.simulation.layers import Layers
 from magfusion.simulation.pipe import MU0, Pipe, Steel
 from magfusion.simulation.rails import (
-    beside_wells,
     laid,
     layered_at,
     magnetised_world,
     rails_option,
     secondary_world,
+    steel_along_wells,
 )
 from magfusion.units import Array
 
@@ -97,7 +97,7 @@ def test_source_and_sensor_change_places() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "findings"),
     [
         ("0.05:1,2,3", "is no bar or tube"),
         ("0.05:1,2:4,5,6", "is no bar or tube"),
@@ -106,8 +106,8 @@ def test_source_and_sensor_change_places() -> None:
         ("nan:0,0,0:5,0,0", "wall <= radius"),
     ],
 )
-def test_what_is_no_rail_is_refused(text: str, said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_what_is_no_rail_is_refused(text: str, findings: str) -> None:
+    with pytest.raises(InputError, match=findings):
         rails_option(text)
 
 
@@ -138,19 +138,19 @@ def test_across_a_long_rail_at_rest_is_a_cylinder_in_an_even_field(
     square = np.sum(point[:, 1:] ** 2, axis=1)[:, None]
     outward = point * [0.0, 1.0, 1.0] / np.sqrt(square)
     expected = share * 0.05**2 / square * (2.0 * (outward @ across)[:, None] * outward - across)
-    found = magnetised_world(steel, across, point)
-    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-10)
+    result = magnetised_world(steel, across, point)
+    np.testing.assert_allclose(result, expected, rtol=2e-3, atol=2e-10)
 
 
 def test_a_bar_that_hardly_answers_itself_has_the_field_of_a_bar_magnet() -> None:
     half, mu = np.array([10.0, 0.0, 0.0]), 1.0 + 1e-4
     steel = Steel((Pipe(-half, half, 0.05, 0.05, mu, segment=0.1),))
     point = np.array([[10.6, 0.6, 0.2], [3.0, 0.9, 0.0], [40.0, 5.0, 1.0]])
-    found = magnetised_world(steel, np.array([3e-5, 0.0, 0.0]), point)
+    result = magnetised_world(steel, np.array([3e-5, 0.0, 0.0]), point)
     bar = magpylib.magnet.Cylinder(polarization=(0.0, 0.0, 3e-5 * (mu - 1.0)), dimension=(0.1, 20))
     expected = bar.rotate_from_angax(90.0, "y").getB(point)
     assert np.all(
-        np.linalg.norm(found - expected, axis=1) < 5e-3 * np.linalg.norm(expected, axis=1)
+        np.linalg.norm(result - expected, axis=1) < 5e-3 * np.linalg.norm(expected, axis=1)
     )
 
 
@@ -160,15 +160,15 @@ def test_a_short_bar_is_magnetised_as_its_slices_are() -> None:
     The poles of the simulator are rings, not discs: at twenty diameters that is seven per cent.
     """
     count, along = 40, np.array([3e-5, 0.0, 0.0])
-    half, apart = np.array([1.0, 0.0, 0.0]), np.arange(count) * 2.0 / count
+    half, separate = np.array([1.0, 0.0, 0.0]), np.arange(count) * 2.0 / count
     pipe = Pipe(-half, half, 0.05, 0.05, segment=0.05)
     moment = Steel((pipe,)).moments(np.tile(along, (count, 1, 1)), 0.0).sum(axis=0)[0, 0].real
     one = magpylib.magnet.Cylinder(polarization=(0.0, 0.0, 1.0), dimension=(0.1, 2.0 / count))
     section = [
-        one.getB(np.column_stack([np.full(count, 0.05 * root), 0.0 * apart, apart]))[:, 2]
+        one.getB(np.column_stack([np.full(count, 0.05 * root), 0.0 * separate, separate]))[:, 2]
         for root in np.sqrt((np.arange(8) + 0.5) / 8.0)
     ]
-    strength = np.mean(section, axis=0) - (apart == 0.0)
+    strength = np.mean(section, axis=0) - (separate == 0.0)
     matrix = strength[np.abs(np.arange(count)[:, None] - np.arange(count))]
     slices = np.linalg.solve(np.eye(count) - 99.0 * matrix, np.full(count, 99.0))
     expected = np.mean(slices) * pipe.area * pipe.length * along[0] / MU0
@@ -191,10 +191,10 @@ def test_a_rail_in_layers_is_driven_by_their_field() -> None:
 
 def test_steel_beside_wells_keeps_off_the_magnets_way() -> None:
     way = np.linspace([-5.0, 0.0, 0.0], [5.0, 0.0, 0.0], 500)
-    (near,) = beside_wells(rails_option("0.05:-5,1,0:5,1,0"), [way])
+    (near,) = steel_along_wells(rails_option("0.05:-5,1,0:5,1,0"), [way])
     assert near.segment == pytest.approx(10.0 / 40.0)
     with pytest.raises(InputError, match=r"number 1 comes within .* of the sensor"):
-        beside_wells(rails_option("0.05:0,-3,0:0,3,0"), [way])
+        steel_along_wells(rails_option("0.05:0,-3,0:0,3,0"), [way])
 
 
 @pytest.mark.slow
@@ -214,5 +214,5 @@ def test_beside_steel_what_is_trusted_is_no_farther_off_than_it_says(
     run_command("simulate", "-o", log, "--duration", 30, "--seed", seed, "--rails", rails)
     for job in ("smooth", "navigate"):
         run_command(job, log, "-o", tmp_path / job)
-        found = json.loads((tmp_path / job / "report.json").read_text())
-        assert found["verdict"] != "trustworthy" or found["nees_mean"] <= 12.0, job
+        result = json.loads((tmp_path / job / "report.json").read_text())
+        assert result["verdict"] != "trustworthy" or result["nees_mean"] <= 12.0, job

@@ -22,23 +22,23 @@ def _stream(seed: int) -> Waveform:
 
 @pytest.mark.parametrize("before", [30, 300])
 def test_windows_one_by_one_are_judged_as_all_at_once(before: int) -> None:
-    spoilt = 0
+    corrupted = 0
     for seed in range(24):
         waveform, one_by_one, at_once = _stream(seed), _unknown(), _unknown()
         first = np.arange(0, len(waveform) - LENGTH, STEP)
         whole = saturated(waveform, first, first + LENGTH, at_once)
         single = []
         for begin in first.tolist():
-            since = max(begin - before, 0)
-            samples = waveform.rows(slice(since, begin + LENGTH))
-            own = np.array([begin - since])
+            start_time = max(begin - before, 0)
+            samples = waveform.rows(slice(start_time, begin + LENGTH))
+            own = np.array([begin - start_time])
             single.append(bool(saturated(samples, own, own + LENGTH, one_by_one)[0]))
         assert single == whole.tolist()
         for one, other in zip(one_by_one, at_once, strict=True):
             assert (one.low, one.high, one.finest) == (other.low, other.high, other.finest)
             assert one.kept == other.kept
-        spoilt += int(np.sum(whole))
-    assert 24 < spoilt < 24 * len(first) - 24  # it is no question of none, or of all
+        corrupted += int(np.sum(whole))
+    assert 24 < corrupted < 24 * len(first) - 24  # it is no question of none, or of all
 
 
 def _unknown() -> tuple[RangeEnds, ...]:

@@ -76,13 +76,13 @@ def test_the_cost_of_a_followed_angle_falls_along_its_gradient(scene: scenario.S
 def test_the_pose_is_found_within_its_sigmas_by_an_angle_that_is_followed(
     scene: scenario.Scene,
 ) -> None:
-    told = ranging_log(
+    reported = ranging_log(
         replace(scene.log, rotation=None), scenario.declared_site(cased=False), QUICK.window
     )
-    found = find_range(scenario.declared_site(cased=False), told.windows)
-    error = scenario.pose_error(scene, told.windows, found, measured=False)
-    assert found.converged
-    assert scenario.nees(error, found, measured=False) < 22.5  # one in a thousand, of six
+    result = find_range(scenario.declared_site(cased=False), reported.windows)
+    error = scenario.pose_error(scene, reported.windows, result, measured=False)
+    assert result.converged
+    assert scenario.nees(error, result, measured=False) < 22.5  # one in a thousand, of six
 
 
 @pytest.fixture(scope="module")
@@ -95,45 +95,47 @@ def ranged(scene: scenario.Scene) -> tuple[Ranged, RangingWindows]:
 def test_wells_are_those_of_the_poses_and_their_sigmas_of_differences(
     scene: scenario.Scene, ranged: tuple[Ranged, RangingWindows]
 ) -> None:
-    found, windows = ranged
+    result, windows = ranged
     axis = np.array([1.0, 0.0, 0.0])
-    assert found.converged
-    error = scenario.pose_error(scene, windows, found)
-    assert scenario.nees(error, found, measured=True) < 22.5  # one in a thousand
-    for own in scene.passes:
-        one = Wells(found, windows, axis).abreast(own.sensor_depth)
-        true = scene.wells.abreast(own)
+    assert result.converged
+    error = scenario.pose_error(scene, windows, result)
+    assert scenario.nees(error, result, measured=True) < 22.5  # one in a thousand
+    for own in scene.transits:
+        one = Wells(result, windows, axis).wells_at(own.sensor_depth)
+        true = scene.wells.truth_of(own)
         assert abs(one.distance - true[0]) < 4.0 * one.distance_sigma
-        turned = np.angle(np.exp(1j * (one.direction - true[1])))
-        assert abs(turned) < 4.0 * one.direction_sigma
+        rotated = np.angle(np.exp(1j * (one.direction - true[1])))
+        assert abs(rotated) < 4.0 * one.direction_sigma
 
     def words(step: Array) -> Array:
-        state = np.concatenate([found.world_from_body.ravel(), found.position_world, found.values])
+        state = np.concatenate(
+            [result.world_from_body.ravel(), result.position_world, result.values]
+        )
         moved = _moved(state[None], step[None])[0]
         other = replace(
-            found,
+            result,
             world_from_body=moved[:9].reshape(3, 3),
             position_world=moved[9:12],
             values=moved[12:],
         )
         wells = Wells(other, windows, axis)
-        one, apart = wells.abreast(2.0), wells.divergence()
-        return np.array([one.distance, one.direction, one.depth, apart.right, apart.up])
+        one, separate = wells.wells_at(2.0), wells.divergence()
+        return np.array([one.distance, one.direction, one.depth, separate.right, separate.up])
 
-    n = len(found.cov)
+    n = len(result.cov)
     steps = 1e-6 * np.eye(n)
     slope = np.stack([(words(s) - words(-s)) / 2e-6 for s in steps], axis=1)
-    sigma = np.sqrt(np.diagonal(slope @ found.cov @ slope.T))
-    wells = Wells(found, windows, axis)
-    one, apart = wells.abreast(2.0), wells.divergence()
-    told = [
+    sigma = np.sqrt(np.diagonal(slope @ result.cov @ slope.T))
+    wells = Wells(result, windows, axis)
+    one, separate = wells.wells_at(2.0), wells.divergence()
+    reported = [
         one.distance_sigma,
         one.direction_sigma,
         one.depth_sigma,
-        apart.right_sigma,
-        apart.up_sigma,
+        separate.right_sigma,
+        separate.up_sigma,
     ]
-    np.testing.assert_allclose(told, sigma, rtol=1e-4)
+    np.testing.assert_allclose(reported, sigma, rtol=1e-4)
 
 
 def test_a_screw_is_a_turn_about_the_magnet() -> None:
@@ -159,8 +161,8 @@ def test_the_job_says_it_in_the_words_of_a_driller(scene: scenario.Scene, tmp_pa
     run_command("range", log, "-o", tmp_path / "out")
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["verdict"] == "trustworthy"
-    for k, own in enumerate(scene.passes, start=1):
-        distance, direction, depth = scene.wells.abreast(own)
+    for k, own in enumerate(scene.transits, start=1):
+        distance, direction, depth = scene.wells.truth_of(own)
         assert report[f"place_{k}_distance_m"] == pytest.approx(distance, abs=0.05)
         assert report[f"place_{k}_high_side_deg"] == pytest.approx(
             np.rad2deg(direction) % 360.0, abs=1.0
@@ -170,11 +172,11 @@ def test_the_job_says_it_in_the_words_of_a_driller(scene: scenario.Scene, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("lacking", "said"),
+    ("lacking", "findings"),
     [("depth", "measured depth of the magnet"), ("rotor", "one beacon with rotor")],
 )
 def test_what_ranging_lacks_is_said(
-    lacking: str, said: str, scene: scenario.Scene, tmp_path: Path, refuse: Refuse
+    lacking: str, findings: str, scene: scenario.Scene, tmp_path: Path, refuse: Refuse
 ) -> None:
     log = _written(scene, tmp_path)
     if lacking == "depth":
@@ -183,7 +185,7 @@ def test_what_ranging_lacks_is_said(
         site = scenario.declared_site(cased=False)
         plain = replace(site.beacons[0], rotor=None)
         save_site(replace(site, beacons=(plain,)), log / "site.yaml")
-    assert said in refuse("range", log, "-o", tmp_path / "out")
+    assert findings in refuse("range", log, "-o", tmp_path / "out")
 
 
 def test_a_casing_is_for_ranging_alone(
@@ -196,9 +198,9 @@ def test_a_casing_is_for_ranging_alone(
 
 def test_without_inertial_samples_directions_are_the_tools(scene: scenario.Scene) -> None:
     log = replace(scene.log, imu=ImuSamples.empty(), inertial=False)
-    told = ranging_log(log, scenario.declared_site(cased=False), QUICK.window)
-    assert not told.high_side
-    assert told.inclination is None
+    reported = ranging_log(log, scenario.declared_site(cased=False), QUICK.window)
+    assert not reported.high_side
+    assert reported.inclination is None
 
 
 @pytest.mark.slow
@@ -208,9 +210,9 @@ def test_published_accuracy_is_bettered_by_a_factor_of_five_and_no_error_is_beyo
     """The scenario's rule, but for its lower bound of the NEES: of few draws it scatters."""
     pytest.importorskip("empymod")  # the layers of the scenario
     rows = [scenario.run_one(scenario.CROSSING, scenario.Config(), seed) for seed in range(1, 7)]
-    found = scenario.judged(rows)
-    assert found.rms_share <= scenario.PUBLISHED / scenario.BETTER
-    assert found.nees <= scenario.MOST_NEES
+    result = scenario.judge_ranging(rows)
+    assert result.rms_share <= scenario.PUBLISHED / scenario.BETTER
+    assert result.nees <= scenario.MOST_NEES
 
 
 def test_a_depth_that_errs_shifts_a_window_along_the_slope(scene: scenario.Scene) -> None:

@@ -22,7 +22,7 @@ def test_every_block_of_the_readme_runs_and_shows_what_it_says(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("told", "shown", "same"),
+    ("reported", "shown", "same"),
     [
         ("0.0293", "0.0294", True),
         ("0.0293", "0.0331", False),
@@ -36,9 +36,9 @@ def test_every_block_of_the_readme_runs_and_shows_what_it_says(tmp_path: Path) -
     ],
 )
 def test_a_number_is_what_is_told_within_a_tenth_or_its_last_digit(
-    told: str, shown: str, same: bool
+    reported: str, shown: str, same: bool
 ) -> None:
-    assert agree(told, shown) is same
+    assert agree(reported, shown) is same
 
 
 def test_other_words_numbers_and_lines_are_told_and_the_machines_speed_is_not() -> None:

@@ -172,9 +172,9 @@ def test_time_slots_lose_the_same_slots_for_the_same_reasons(
 
 
 def test_a_job_demodulates_as_its_settings_ask(tmp_path: Path) -> None:
-    asked = LockinSettings(window=0.8, step=0.8)
+    requested = LockinSettings(window=0.8, step=0.8)
     run_command("simulate", "-o", tmp_path / "log", "--duration", 20)
     job = Job(tmp_path / "log", None, tmp_path / "run")
-    run_smooth(job, SmootherSettings(lockin=asked))
+    run_smooth(job, SmootherSettings(lockin=requested))
     written = json.loads((tmp_path / "run" / "report.json").read_text())
     assert written["epochs"] == 25

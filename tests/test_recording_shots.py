@@ -32,10 +32,10 @@ def _shot(recording: Path, directory: Path) -> np.ndarray:
         text=True,
         timeout=150,
     )
-    said = run.stdout + run.stderr
-    if not png.is_file() and re.search("adapter|wgpu|graphics|libGL|libEGL|xkb", said, re.I):
-        pytest.skip(f"the viewer has no graphics here: {said.strip().splitlines()[-1]}")
-    assert png.is_file(), said
+    findings = run.stdout + run.stderr
+    if not png.is_file() and re.search("adapter|wgpu|graphics|libGL|libEGL|xkb", findings, re.I):
+        pytest.skip(f"the viewer has no graphics here: {findings.strip().splitlines()[-1]}")
+    assert png.is_file(), findings
     pixels = np.asarray(imread(png))[..., :3]
     assert pixels.shape[0] / pixels.shape[1] == pytest.approx(SIZE[1] / SIZE[0], rel=0.01)
     return pixels.max(axis=2)
@@ -64,16 +64,18 @@ def test_a_smoothed_walk_opens_with_verdict_scene_scales_and_errors(
     assert _in_use(shot, (0.25, 0.65), (0.0, 0.6)) > 0.9  # scene, its grid at least
     assert _in_use(shot, (0.25, 0.95), (0.62, 1.0)) > 0.8  # errors
     # Left of each of the plots of errors stand three numbers: of zero, above and below.
-    left = shot[int(0.24 * height) : int(0.96 * height), int(0.602 * width) : int(0.616 * width)]
-    rows = np.flatnonzero((left > TEXT).any(axis=1))
+    remaining = shot[
+        int(0.24 * height) : int(0.96 * height), int(0.602 * width) : int(0.616 * width)
+    ]
+    rows = np.flatnonzero((remaining > TEXT).any(axis=1))
     groups = 1 + int(np.sum(np.diff(rows) > 0.008 * height))
     assert groups >= 9
 
 
 def test_a_coverage_opens_with_its_points_and_their_colours(worked: Worked, tmp_path: Path) -> None:
-    made = tmp_path / "coverage"
-    run_command("coverage", worked.log / "site.yaml", "-o", made, "--spacing", 1)
-    shot = _shot(made / "run.rrd", tmp_path)
+    built = tmp_path / "coverage"
+    run_command("coverage", worked.log / "site.yaml", "-o", built, "--spacing", 1)
+    shot = _shot(built / "run.rrd", tmp_path)
     assert _in_use(shot, (0.3, 0.9), (0.1, 0.7)) > 0.9
     legend = shot[int(0.07 * len(shot)) : int(0.3 * len(shot)), int(0.76 * shot.shape[1]) :]
     assert np.mean(legend > TEXT) > 0.005

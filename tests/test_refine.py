@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from magfusion.errors import EstimationError
 from magfusion.estimation.snapshot.fix import Gravity
 from magfusion.estimation.snapshot.likelihood import fix_epochs
-from magfusion.estimation.snapshot.problem import CHUNK, FREE
+from magfusion.estimation.snapshot.problem import CHUNK, ESTIMABLE
 from magfusion.estimation.snapshot.refine import refine
 from magfusion.model.field_map import FieldMap
 from magfusion.model.noise import measurement_cov, paired_whitening, sensor_positions, stacked
@@ -66,8 +66,8 @@ def deviations(fixes, truth):
     """Return the truth's right perturbation of the fixes, rotation then position, (n, 6)."""
     body_from_world = np.swapaxes(fixes.world_from_body[:, 0], 1, 2)
     turn = Rotation.from_matrix(body_from_world @ truth.world_from_body).as_rotvec()
-    apart = truth.position_world - fixes.position_world[:, 0]
-    return np.concatenate([turn, (body_from_world @ apart[..., None])[..., 0]], axis=1)
+    separate = truth.position_world - fixes.position_world[:, 0]
+    return np.concatenate([turn, (body_from_world @ separate[..., None])[..., 0]], axis=1)
 
 
 def nees(fixes, truth):
@@ -76,26 +76,34 @@ def nees(fixes, truth):
 
 
 @pytest.mark.parametrize("survey_error", [False, True])
-@pytest.mark.parametrize("free", [(), ("phase",), ("gain",), FREE])
-def test_without_noise_the_truth_is_found_from_nearby(survey_error, free):
+@pytest.mark.parametrize("free_parameters", [(), ("phase",), ("gain",), ESTIMABLE])
+def test_without_noise_the_truth_is_found_from_nearby(survey_error, free_parameters):
     site, truth = dipoles(4), poses(CHUNK + 100)
     fixes = refined(
-        site, seen(site, truth, 0.0), astray(truth), survey_error=survey_error, free=free
+        site,
+        seen(site, truth, 0.0),
+        astray(truth),
+        survey_error=survey_error,
+        free_parameters=free_parameters,
     )
     assert fixes.cost.shape == (len(truth), 1)
     right = np.max(np.abs(deviations(fixes, truth)), axis=1) < EXACT
     # Free gains make other minima; where these lie nearer, that is where the start leads.
-    assert np.mean(right) > (0.99 if "gain" in free else 0.9995)
+    assert np.mean(right) > (0.99 if "gain" in free_parameters else 0.9995)
 
 
 def test_it_ends_where_the_search_ends_with_the_same_covariance():
     site, truth = dipoles(), poses(60)
     samples = seen(site, truth)
-    found = refined(site, samples, astray(truth))
+    result = refined(site, samples, astray(truth))
     expected = fix_epochs(samples, initial_calibration(site, 0.0), survey_error=False)
-    np.testing.assert_allclose(found.position_world[:, 0], expected.position_world[:, 0], atol=1e-6)
-    np.testing.assert_allclose(found.pose_cov[:, 0], expected.pose_cov[:, 0], rtol=1e-3, atol=1e-12)
-    np.testing.assert_allclose(found.cost[:, 0], expected.cost[:, 0], rtol=1e-4)
+    np.testing.assert_allclose(
+        result.position_world[:, 0], expected.position_world[:, 0], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        result.pose_cov[:, 0], expected.pose_cov[:, 0], rtol=1e-3, atol=1e-12
+    )
+    np.testing.assert_allclose(result.cost[:, 0], expected.cost[:, 0], rtol=1e-4)
 
 
 def test_it_stays_on_the_side_where_it_starts():
@@ -115,10 +123,12 @@ def test_gravity_and_a_prior_count_as_they_do_in_the_search():
         "gravity": Gravity(truth.world_from_body[:, 2], np.full(40, 0.01)),
         "prior": replace(truth, pose_cov=np.broadcast_to(1e-4 * np.eye(6), (40, 6, 6)).copy()),
     }
-    found = refined(site, samples, astray(truth), **known)
+    result = refined(site, samples, astray(truth), **known)
     expected = fix_epochs(samples, initial_calibration(site, 0.0), survey_error=False, **known)
-    np.testing.assert_allclose(found.position_world[:, 0], expected.position_world[:, 0], atol=1e-6)
-    np.testing.assert_allclose(found.residual_rms[:, 0], expected.residual_rms[:, 0], rtol=1e-4)
+    np.testing.assert_allclose(
+        result.position_world[:, 0], expected.position_world[:, 0], atol=1e-6
+    )
+    np.testing.assert_allclose(result.residual_rms[:, 0], expected.residual_rms[:, 0], rtol=1e-4)
 
 
 def test_no_epoch_at_all_is_an_estimation_error():
@@ -130,7 +140,7 @@ def test_no_epoch_at_all_is_an_estimation_error():
 def test_what_cannot_be_free_is_refused_by_name():
     site, truth = dipoles(), poses(2)
     with pytest.raises(ValueError, match="'matrix'"):
-        refined(site, seen(site, truth), truth, free=("matrix",))
+        refined(site, seen(site, truth), truth, free_parameters=("matrix",))
 
 
 @pytest.mark.parametrize("from_guess", [True, False])
@@ -141,7 +151,7 @@ def test_phases_and_gains_that_the_site_does_not_know_of_are_found(from_guess):
     odd = replace(calibration, phase=lag, log_gain=gain)
     phasor = predict_channels(odd, truth.time, truth.world_from_body, truth.position_world)
     samples = replace(seen(site, truth), phasor_sensor=phasor)
-    options = {"survey_error": False, "free": FREE, "gain_sigma": 10.0}
+    options = {"survey_error": False, "free_parameters": ESTIMABLE, "gain_sigma": 10.0}
     if from_guess:
         fixes = refine(samples, calibration, astray(truth, metres=0.02), **options)
     else:
@@ -151,14 +161,14 @@ def test_phases_and_gains_that_the_site_does_not_know_of_are_found(from_guess):
     np.testing.assert_allclose(fixes.phase[right, 0], np.broadcast_to(lag, (80, 4))[right], 0, 1e-3)
     gains = np.broadcast_to(gain, (80, 4))[right]
     np.testing.assert_allclose(fixes.log_gain[right, 0], gains, 0, 1e-3)
-    held = refined(site, samples, truth)
-    assert np.median(held.cost) > 1e3 * np.median(fixes.cost[right, 0] + 1.0)
+    fixed = refined(site, samples, truth)
+    assert np.median(fixed.cost) > 1e3 * np.median(fixes.cost[right, 0] + 1.0)
 
 
 def test_a_gain_is_held_by_its_prior():
     site, truth = dipoles(), poses(20)
     samples = seen(site, truth)
-    firm = refined(site, samples, truth, free=("gain",), gain_sigma=1e-6)
+    firm = refined(site, samples, truth, free_parameters=("gain",), gain_sigma=1e-6)
     plain = refined(site, samples, truth)
     np.testing.assert_allclose(firm.position_world, plain.position_world, atol=1e-7)
     np.testing.assert_allclose(firm.pose_cov, plain.pose_cov, rtol=1e-3, atol=1e-12)
@@ -178,24 +188,26 @@ def test_the_gain_of_a_beacon_with_several_tones_is_one():
         phasor_sensor=phasor,
         phasor_cov=np.broadcast_to(SIGMA**2 * np.eye(3), (30, channels, 3, 3)).copy(),
     )
-    fixes = refine(samples, calibration, truth, survey_error=False, free=("gain",), gain_sigma=10.0)
+    fixes = refine(
+        samples, calibration, truth, survey_error=False, free_parameters=("gain",), gain_sigma=10.0
+    )
     np.testing.assert_allclose(
         fixes.log_gain[:, 0], np.broadcast_to(odd.log_gain, (30, channels)), atol=1e-4
     )
 
 
 # (free, rms of the bound: position (m), attitude (deg)); physics of the beacon papers, section 7.
-PRICES = [((), 0.0009, 0.045), (("phase",), 0.0015, 0.064), (FREE, 0.0137, 0.126)]
+PRICES = [((), 0.0009, 0.045), (("phase",), 0.0015, 0.064), (ESTIMABLE, 0.0137, 0.126)]
 
 
-@pytest.mark.parametrize(("free", "metres", "degrees"), PRICES)
-def test_what_free_phases_and_gains_cost_in_the_room_of_paper_004(free, metres, degrees):
+@pytest.mark.parametrize(("free_parameters", "metres", "degrees"), PRICES)
+def test_what_free_phases_and_gains_cost_in_the_room_of_paper_004(free_parameters, metres, degrees):
     rng = np.random.default_rng(4)
     site = draw_world(S0, rng, model_error=0.0).site
     position = ROOM.draw_targets(rng, 3000)
     level = np.broadcast_to(np.eye(3), (3000, 3, 3)).copy()
     truth = Trajectory(np.arange(3000.0), level, position)
-    fixes = refined(site, seen(site, truth), truth, free=free)
+    fixes = refined(site, seen(site, truth), truth, free_parameters=free_parameters)
     variance = np.diagonal(fixes.pose_cov[:, 0], axis1=1, axis2=2)
     bound = np.sqrt(np.mean(np.sum(variance[:, 3:], axis=1)))
     assert bound == pytest.approx(metres, rel=0.05)
@@ -237,9 +249,9 @@ def test_a_map_counts_by_how_well_it_is_known_where_the_fix_is(from_guess):
         fixes = refined(site, samples, astray(truth, metres=0.02))
     else:
         fixes = fix_epochs(samples, calibration, survey_error=False)
-    found = fixes.best()
+    result = fixes.best()
     error = stacked(
-        predict_channels(calibration, found.time, found.world_from_body, found.position_world)
+        predict_channels(calibration, result.time, result.world_from_body, result.position_world)
         - samples.phasor_sensor
     )
 
@@ -249,6 +261,6 @@ def test_a_map_counts_by_how_well_it_is_known_where_the_fix_is(from_guess):
         return np.sum(white**2, axis=(1, 2, 3))
 
     # The weights are those of the first solution, millimetres from the last.
-    there = chi_square(sensor_positions(site, found))
+    there = chi_square(sensor_positions(site, result))
     np.testing.assert_allclose(fixes.cost[:, 0], there, rtol=0.02)
     assert np.median(np.abs(chi_square(None) / there - 1.0)) > 0.1

@@ -10,7 +10,7 @@ from conftest import run_command
 from tracker_site import body_poses, in_beacon, tracker_site
 
 from magfusion.errors import InputError
-from magfusion.estimation.integrity.place_witness import of_place
+from magfusion.estimation.integrity.region_test import of_place
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.files.log import write_log
@@ -49,12 +49,12 @@ def test_a_lone_tracker_has_one_pose_in_its_hemisphere_and_two_without() -> None
     height = in_beacon(site, attitude, place)[1][:, 2]
     kept = np.flatnonzero(height > 0.08)[:NUMBER]  # m, of 0.3 to 0.6
     attitude, place = attitude[kept], place[kept]
-    without, told = fixed(site, attitude, place), fixed(facing(site), attitude, place)
+    without, reported = fixed(site, attitude, place), fixed(facing(site), attitude, place)
     assert np.all(np.abs(without.probability[:, 1] - 0.5) < 0.01)
     wrong = np.linalg.norm(without.position_world[:, 0] - place, axis=1) > 0.1
     assert 0.2 < np.mean(wrong) < 0.8
-    np.testing.assert_allclose(told.position_world[:, 0], place, rtol=0, atol=1e-4)
-    assert np.all(told.probability[:, 0] > 1.0 - 1e-6)
+    np.testing.assert_allclose(reported.position_world[:, 0], place, rtol=0, atol=1e-4)
+    assert np.all(reported.probability[:, 0] > 1.0 - 1e-6)
 
 
 def test_a_room_and_a_half_space_are_one_line_each() -> None:
@@ -65,9 +65,9 @@ def test_a_room_and_a_half_space_are_one_line_each() -> None:
     box = np.array([[x, -np.inf, -np.inf], [np.inf, np.inf, np.inf]])
     half = HalfSpace(np.array([3.0, 0.0, 0.0]), np.array([x, 7.0, -2.0]))
     for region in (Region(box_world=box), Region(half_space=half)):
-        found = fixed(replace(site, region=region), attitude, place)
-        np.testing.assert_allclose(found.position_world[:, 0], place, rtol=0, atol=1e-4)
-        assert np.all(found.probability[:, 0] > 1.0 - 1e-6)
+        result = fixed(replace(site, region=region), attitude, place)
+        np.testing.assert_allclose(result.position_world[:, 0], place, rtol=0, atol=1e-4)
+        assert np.all(result.probability[:, 0] > 1.0 - 1e-6)
 
 
 def test_near_the_plane_both_poses_are_kept_and_it_is_said() -> None:
@@ -77,12 +77,12 @@ def test_near_the_plane_both_poses_are_kept_and_it_is_said() -> None:
     height = np.linspace(-0.002, 0.004, 20)  # m, at 0.5 m
     sensor = beacon.world_from_beacon @ np.array([[0.4] * 20, [0.3] * 20, height])
     place = beacon.position_world + sensor.T - attitude @ lever
-    found = fixed(site, attitude, place)
-    assert np.all(found.probability[:, 1] > 0.2)
-    first = (found.world_from_body, found.position_world, found.pose_cov)
-    (said,) = of_place(site, found.time, *(part[:, 0] for part in first))
-    assert said.code == "region_edge"
-    assert "the plane through beacon T" in said.text
+    result = fixed(site, attitude, place)
+    assert np.all(result.probability[:, 1] > 0.2)
+    first = (result.world_from_body, result.position_world, result.pose_cov)
+    (findings,) = of_place(site, result.time, *(part[:, 0] for part in first))
+    assert findings.code == "region_edge"
+    assert "the plane through beacon T" in findings.text
 
 
 def test_poses_behind_are_found_and_said_to_be_outside() -> None:
@@ -90,12 +90,12 @@ def test_poses_behind_are_found_and_said_to_be_outside() -> None:
     site = tracker_site(np.random.default_rng(1), centre=0.0)
     far = Region(box_world=np.array([[50.0, 50.0, 50.0], [60.0, 60.0, 60.0]]))
     attitude, place = body_poses(site, 10, np.random.default_rng(5))
-    found = fixed(replace(site, region=far), attitude, place)
-    assert np.all(np.isfinite(found.cost[:, 0]))
-    first = (found.world_from_body, found.position_world, found.pose_cov)
-    said = of_place(replace(site, region=far), found.time, *(part[:, 0] for part in first))
-    assert [finding.code for finding in said] == ["outside_region"]
-    assert "the lower limit of" in said[0].text
+    result = fixed(replace(site, region=far), attitude, place)
+    assert np.all(np.isfinite(result.cost[:, 0]))
+    first = (result.world_from_body, result.position_world, result.pose_cov)
+    findings = of_place(replace(site, region=far), result.time, *(part[:, 0] for part in first))
+    assert [finding.code for finding in findings] == ["outside_region"]
+    assert "the lower limit of" in findings[0].text
 
 
 def test_a_site_keeps_what_it_says_of_the_place(tmp_path: Path) -> None:
@@ -134,7 +134,7 @@ def test_a_region_that_says_nothing_is_refused(line: str, place: str, tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("where", "found"),
+    ("where", "result"),
     [
         (Where(("A=+w",)), "a direction is one of"),
         (Where(("Z=+x",)), "no beacon 'Z'"),
@@ -145,10 +145,10 @@ def test_a_region_that_says_nothing_is_refused(line: str, place: str, tmp_path: 
         (Where(region="-inf,inf,-inf,inf,-inf,inf"), "one finite"),
     ],
 )
-def test_what_the_command_line_cannot_mean_is_refused(where: Where, found: str) -> None:
+def test_what_the_command_line_cannot_mean_is_refused(where: Where, result: str) -> None:
     with pytest.raises(InputError) as refused:
         where.bounded(demo_site())
-    assert found in str(refused.value)
+    assert result in str(refused.value)
 
 
 def test_the_command_line_says_it_to_a_site() -> None:
@@ -162,7 +162,7 @@ def test_the_command_line_says_it_to_a_site() -> None:
 
 
 @pytest.fixture(scope="module")
-def lone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def single(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return phasors of a walk in front of a lone beacon of three coils."""
     root = tmp_path_factory.mktemp("lone")
     plain = demo_site(coil_radius=None)
@@ -190,9 +190,9 @@ def lone(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("job", ["fix", "smooth", "navigate"])
-def test_every_job_takes_it_on_the_command_line(job: str, lone: Path, tmp_path: Path) -> None:
+def test_every_job_takes_it_on_the_command_line(job: str, single: Path, tmp_path: Path) -> None:
     options = ("--hemisphere", "+x") if job != "smooth" else ("--region", "0,9,-9,9,-9,9")
-    run_command(job, lone, "-o", tmp_path / "run", *options)
+    run_command(job, single, "-o", tmp_path / "run", *options)
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["ate_m"] < 0.3
     assert not report.get("ambiguous")
@@ -200,8 +200,8 @@ def test_every_job_takes_it_on_the_command_line(job: str, lone: Path, tmp_path: 
     assert "ambiguous" not in {reason["code"] for reason in report["reasons"]}
 
 
-def test_without_it_the_opposite_side_is_said_to_be_open(lone: Path, tmp_path: Path) -> None:
-    run_command("fix", lone, "-o", tmp_path / "run")
+def test_without_it_the_opposite_side_is_said_to_be_open(single: Path, tmp_path: Path) -> None:
+    run_command("fix", single, "-o", tmp_path / "run")
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["ambiguity_mirror_epochs"] == report["epochs"]
     assert "ambiguous" in {reason["code"] for reason in report["reasons"]}

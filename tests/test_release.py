@@ -57,10 +57,10 @@ def _metadata(wheel: Path) -> str:
 
 def test_a_checkout_knows_its_commit() -> None:
     """Whether it runs from the tree, or was installed of it."""
-    told = _git("rev-parse", "HEAD").strip()
+    reported = _git("rev-parse", "HEAD").strip()
     known = commit()
     assert known is not None
-    assert told.startswith(known.removesuffix("-dirty"))
+    assert reported.startswith(known.removesuffix("-dirty"))
 
 
 @pytest.mark.slow
@@ -73,15 +73,15 @@ def test_wheel_and_sdist_hold_the_package_and_the_commit(tmp_path: Path) -> None
     (tree,) = (tmp_path / "tree").iterdir()
     assert tracked <= {str(path.relative_to(tree)) for path in tree.rglob("*")}
     wheels = [_built(ROOT, "wheel", tmp_path / "a"), _built(tree, "wheel", tmp_path / "b")]
-    told = []
+    reported = []
     for wheel in wheels:
         with zipfile.ZipFile(wheel) as archive:
             names = set(archive.namelist())
-            told.append(archive.read("magfusion/commit.txt").decode())
+            reported.append(archive.read("magfusion/commit.txt").decode())
         assert tracked <= names
         assert not {name.split("/")[0] for name in names} - {"magfusion", _metadata(wheel)}
-    assert told[0] == told[1]
-    assert _git("rev-parse", "HEAD").startswith(told[0].strip().removesuffix("-dirty"))
+    assert reported[0] == reported[1]
+    assert _git("rev-parse", "HEAD").startswith(reported[0].strip().removesuffix("-dirty"))
 
 
 def test_every_python_that_the_package_accepts_is_tried() -> None:
@@ -133,8 +133,10 @@ def test_a_bug_report_asks_for_what_explains_it() -> None:
         assert {"name", "description", "body"} <= set(form)
         fields = [field for field in form["body"] if field["type"] != "markdown"]
         assert len({field["id"] for field in fields}) == len(fields) > 0
-    asked = str(forms["bug_report"])
-    assert all(what in asked for what in ("report.json", "magfusion --version", "magfusion check"))
+    requested = str(forms["bug_report"])
+    assert all(
+        what in requested for what in ("report.json", "magfusion --version", "magfusion check")
+    )
 
 
 def test_the_readme_of_a_package_index_has_absolute_links() -> None:

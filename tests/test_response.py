@@ -11,7 +11,7 @@ from scipy.signal import bilinear, freqz, lfilter
 from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.demodulation.demodulation import phasors
-from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.integrity.judge import judge_result
 from magfusion.files.site import load_site, save_site
 from magfusion.model.parameters import initial_calibration, predict_channels
 from magfusion.model.response import AxisResponses, FrequencyResponse
@@ -63,13 +63,13 @@ def test_phasors_are_predicted_as_they_are_measured(filtered: Log) -> None:
     error = {}
     for name, known in (("declared", site), ("not declared", demo_site())):
         expected = predict_channels(initial_calibration(known, 0.0), time, *pose)[0]
-        found = np.mean(fields.phasor_sensor, axis=0)
-        error[name] = np.linalg.norm(found - expected, axis=1) / np.linalg.norm(expected, axis=1)
+        result = np.mean(fields.phasor_sensor, axis=0)
+        error[name] = np.linalg.norm(result - expected, axis=1) / np.linalg.norm(expected, axis=1)
     assert np.max(error["declared"]) < 0.003
     assert np.min(error["not declared"]) > 0.05
 
 
-def apart(site: Site) -> Site:
+def separate(site: Site) -> Site:
     """Return the site with axes that answer each in its own way."""
     lag = -np.arctan(FREQUENCIES / CUT_OFF)
     x, y, z = (FrequencyResponse(FREQUENCIES, np.cos(k * lag), k * lag) for k in (0.5, 1.0, 1.5))
@@ -77,7 +77,7 @@ def apart(site: Site) -> Site:
     return replace(site, platform=replace(site.platform, magnetometer=magnetometer))
 
 
-@pytest.mark.parametrize("respond", [answering, apart])
+@pytest.mark.parametrize("respond", [answering, separate])
 def test_simulated_samples_are_what_such_a_magnetometer_reads(
     respond: Callable[[Site], Site],
 ) -> None:
@@ -87,19 +87,19 @@ def test_simulated_samples_are_what_such_a_magnetometer_reads(
     assert log.truth is not None
     fields = phasors(log, site)[0].rows(slice(2, None))
     pose = log.truth.world_from_body[:1], log.truth.position_world[:1]
-    found = np.mean(fields.phasor_sensor, axis=0)
+    result = np.mean(fields.phasor_sensor, axis=0)
     for known, differs in ((site, False), (demo_site(), True)):
         expected = predict_channels(initial_calibration(known, 0.0), fields.time[:1], *pose)[0]
-        off = np.linalg.norm(found - expected, axis=1) / np.linalg.norm(expected, axis=1)
+        off = np.linalg.norm(result - expected, axis=1) / np.linalg.norm(expected, axis=1)
         assert np.min(off) > 0.05 if differs else np.max(off) < 0.003
 
 
 def test_samples_of_axes_that_answer_apart_are_followed_along_a_motion() -> None:
-    site = apart(demo_site())
+    site = separate(demo_site())
     config = SimulationConfig(DEMO_BOX_WORLD, duration=6.0, perturb=False)
     walk = simulate_log(site, config, np.random.default_rng(3))
-    found = smooth(walk.log, site, SmootherSettings(tune=False)).states
-    errors = trajectory_errors(found, walk.motion.trajectory(found.time))
+    result = smooth(walk.log, site, SmootherSettings(tune=False)).states
+    errors = trajectory_errors(result, walk.motion.trajectory(result.time))
     assert errors.ate < 0.01
     assert errors.nees is not None
     assert np.mean(errors.nees) < 12.0  # of six degrees of freedom, of states that err alike
@@ -108,11 +108,11 @@ def test_samples_of_axes_that_answer_apart_are_followed_along_a_motion() -> None
 def test_a_site_keeps_the_response(tmp_path: Path) -> None:
     site = answering(demo_site())
     save_site(site, tmp_path / "site.yaml")
-    found = load_site(tmp_path / "site.yaml").platform.magnetometer.response
+    result = load_site(tmp_path / "site.yaml").platform.magnetometer.response
     expected = site.platform.magnetometer.response
-    assert found is not None
+    assert result is not None
     assert expected is not None
-    for one, other in zip(vars(found).values(), vars(expected).values(), strict=True):
+    for one, other in zip(vars(result).values(), vars(expected).values(), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9)
 
 
@@ -155,9 +155,9 @@ def test_a_filtered_log_smooths_like_any_other() -> None:
     assert log.truth is not None
     size, verdict = {}, {}
     for name, site in (("declared", answering(demo_site())), ("not declared", demo_site())):
-        result, trust = judged(smooth(log, site, SmootherSettings()), log)
-        found = trajectory_errors(result.states, log.truth)
-        error = np.linalg.norm(found.position_world, axis=1)
+        result, trust = judge_result(smooth(log, site, SmootherSettings()), log)
+        estimate = trajectory_errors(result.states, log.truth)
+        error = np.linalg.norm(estimate.position_world, axis=1)
         size[name], verdict[name] = float(np.sqrt(np.mean(error**2))), trust.verdict
     assert size["declared"] < 0.003  # m
     assert verdict["declared"] is Verdict.TRUSTWORTHY

@@ -7,7 +7,7 @@ import pytest
 
 from magfusion.estimation.batch.batch import Smoothed, smooth
 from magfusion.estimation.batch.between_epochs import at_rate
-from magfusion.estimation.batch.prepared import LONGEST_STEP
+from magfusion.estimation.batch.preprocessed_log import LONGEST_STEP
 from magfusion.estimation.graph.state import as_trajectory
 from magfusion.estimation.online.navigator import Navigator
 from magfusion.model.samples import Log, Waveform

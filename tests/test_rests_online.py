@@ -17,14 +17,14 @@ from far_and_weak import (
     STORMS,
     errors_in_sigmas,
     far_site,
-    witnessed_log,
+    monitored_log,
 )
 
 from magfusion.errors import InputError
-from magfusion.estimation.rests.at_rest import AtRest, Rest, at_rest
-from magfusion.estimation.rests.rest_running import Running
+from magfusion.estimation.rests.reference_noise_cancellation import JudgedTone
 from magfusion.estimation.rests.rest_stream import FIRST, LATER, RestNavigator
-from magfusion.estimation.rests.rest_witness import Judged
+from magfusion.estimation.rests.running_stationary_mean import RunningMean
+from magfusion.estimation.rests.stationary_integration import IntegratedRests, Rest, integrate_rests
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.jobs.navigate_rests import How, replayed, run_rests_stream
@@ -32,7 +32,7 @@ from magfusion.jobs.replay import run_replay
 from magfusion.model.samples import FieldSamples, Waveform
 from magfusion.model.trust import Risk
 from magfusion.receiver.integration import Integrated
-from magfusion.receiver.reference_clock import Clock, lag_in
+from magfusion.receiver.reference_clock import ReferenceClock, lag_in
 from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
 from magfusion.simulation.motion import Rests
 from magfusion.units import Array, ComplexArray
@@ -42,45 +42,47 @@ CHANNELS, FREEDOM = 4, 20
 
 def stretch(site_channels: tuple[tuple[str, int], ...], rng: np.random.Generator) -> Rest:
     """Return a stretch of unit noise alone, with covariances that as many readings tell."""
-    beside = rng.standard_normal((CHANNELS, FREEDOM, 3))
-    cov = np.einsum("cki,ckj->cij", beside, beside) / (FREEDOM - 4.0)
+    others = rng.standard_normal((CHANNELS, FREEDOM, 3))
+    cov = np.einsum("cki,ckj->cij", others, others) / (FREEDOM - 4.0)
     drawn = rng.standard_normal((2, CHANNELS, 3))
     phasor: ComplexArray = drawn[0] + 1j * drawn[1]
     fields = FieldSamples(np.zeros(1), np.full(1, 100.0), site_channels, phasor[None], cov[None])
     tones = [
-        Judged(Integrated(phasor[c], cov[c], FREEDOM, 0.0, 1.0), np.nan, hears=False, hidden=0.0)
+        JudgedTone(
+            Integrated(phasor[c], cov[c], FREEDOM, 0.0, 1.0), np.nan, detects=False, hidden=0.0
+        )
         for c in range(CHANNELS)
     ]
     return Rest(fields, np.ones(CHANNELS), tones, None)
 
 
 def test_stretches_add_up_with_a_true_covariance_and_no_more_false_alarms() -> None:
-    site, rng, square, alarms, asked = far_site(), np.random.default_rng(5), [], 0, 0.05
+    site, rng, square, alarms, requested = far_site(), np.random.default_rng(5), [], 0, 0.05
     runs, looks = 150, 8
     for _ in range(runs):
-        running, loud = Running.begun(0.0, CHANNELS), np.zeros(CHANNELS, dtype=bool)
+        running, strong = RunningMean.begun(0.0, CHANNELS), np.zeros(CHANNELS, dtype=bool)
         for k in range(looks):
             one = stretch(site.channels, rng)
-            running = running.beside(one, site, 100.0 * (k + 1), 1e9, asked)
-            loud |= running.chance(site) < asked
-        alarms += int(np.sum(loud))
-        found = running.fields(site, 1e9)
-        error, cov = found.phasor_sensor[0], found.phasor_cov[0]
+            running = running.with_stretch(one, site, 100.0 * (k + 1), 1e9, requested)
+            strong |= running.chance(site) < requested
+        alarms += int(np.sum(strong))
+        result = running.fields(site, 1e9)
+        error, cov = result.phasor_sensor[0], result.phasor_cov[0]
         solved = np.linalg.solve(cov, error[..., None])[..., 0]
         square.append(np.real(np.sum(np.conj(error) * solved, axis=1)))
     count = runs * CHANNELS
     assert abs(float(np.mean(square)) - 6.0) < 4.0 * np.sqrt(12.0 / count) + 0.3
     # All looks of a rest together: at most what was asked, and not much less than a third of it.
-    assert 0.2 * asked < alarms / count < asked + 4.0 * np.sqrt(asked / count)
+    assert 0.2 * requested < alarms / count < requested + 4.0 * np.sqrt(requested / count)
 
 
 def test_what_is_older_weighs_less_where_phases_wander() -> None:
     site, rng = far_site(), np.random.default_rng(6)
-    steady, wandering = Running.begun(0.0, CHANNELS), Running.begun(0.0, CHANNELS)
+    steady, wandering = RunningMean.begun(0.0, CHANNELS), RunningMean.begun(0.0, CHANNELS)
     for k in range(20):
         one = stretch(site.channels, rng)
-        steady = steady.beside(one, site, 100.0 * (k + 1), 1e9, 0.01)
-        wandering = wandering.beside(one, site, 100.0 * (k + 1), 400.0, 0.01)
+        steady = steady.with_stretch(one, site, 100.0 * (k + 1), 1e9, 0.01)
+        wandering = wandering.with_stretch(one, site, 100.0 * (k + 1), 400.0, 0.01)
     share = np.trace(wandering.information, axis1=1, axis2=2) / np.trace(
         steady.information, axis1=1, axis2=2
     )
@@ -88,8 +90,8 @@ def test_what_is_older_weighs_less_where_phases_wander() -> None:
 
 
 def test_the_clock_of_a_reference_is_followed() -> None:
-    made = witnessed_log(far_site(), 300.0, 1, FAR_AWAY, STORMS, -0.4, 3e-5)
-    wave, reference, clock = made.log.waveform, made.log.reference, Clock()
+    built = monitored_log(far_site(), 300.0, 1, FAR_AWAY, STORMS, -0.4, 3e-5)
+    wave, reference, clock = built.log.waveform, built.log.reference, ReferenceClock()
     assert wave is not None
     assert reference is not None
     for begin in (0.0, 100.0, 200.0):
@@ -97,7 +99,7 @@ def test_the_clock_of_a_reference_is_followed() -> None:
         near = slice(*np.searchsorted(reference.time, [begin - 10.0, begin + 110.0]))
         seen = lag_in(wave.rows(rows), reference.rows(near), np.array(FREQUENCIES_HZ))
         assert seen is not None
-        clock = clock.heard(*seen)
+        clock = clock.updated(*seen)
     line = clock.line
     assert line is not None
     at = np.array([0.0, 300.0])
@@ -105,38 +107,38 @@ def test_the_clock_of_a_reference_is_followed() -> None:
 
 
 def test_a_rest_in_stretches_is_what_it_is_at_once_and_a_reference_that_fails_is_said() -> None:
-    made = witnessed_log(far_site(), 300.0, 4, FAR_AWAY, STORMS, LATE, RATE)
-    site, reference = made.true_site, made.log.reference
+    built = monitored_log(far_site(), 300.0, 4, FAR_AWAY, STORMS, LATE, RATE)
+    site, reference = built.true_site, built.log.reference
     assert reference is not None
     navigator = RestNavigator(site)
-    states = replayed(made.log, navigator)
+    states = replayed(built.log, navigator)
     # Memory: a stretch and what is waited for, however long it rests.
     assert navigator.kept < (LATER + 30.0) * (2.0 * RATE_HZ + 25.0)
-    whole = at_rest(made.log, site).fields
+    whole = integrate_rests(built.log, site).fields
     last = states[-1].samples
     assert last is not None
     assert [state.duration for state in states[:2]] == [FIRST, FIRST + LATER]
     ratio = sigma(last) / sigma(whole)
     assert np.all((ratio > 0.5) & (ratio < 2.0))
     assert np.nanmin(states[-1].gain) > 4.0
-    assert np.mean(square_of(last, made)) < 6.0 + 4.0 * np.sqrt(12.0 / 4.0)
+    assert np.mean(square_of(last, built)) < 6.0 + 4.0 * np.sqrt(12.0 / 4.0)
     there = reference.time < 150.0
     cut = Waveform(reference.time[there], reference.measured_sensor[there])
-    failing = replayed(replace(made.log, reference=cut), RestNavigator(site))
+    failing = replayed(replace(built.log, reference=cut), RestNavigator(site))
     codes = [{f.code for f in state.trust.findings} for state in failing]
     assert "reference_unused" not in codes[0]
     assert "reference_unused" in codes[-1]
     assert failing[-1].samples is not None
-    assert np.mean(square_of(failing[-1].samples, made)) < 6.0 + 4.0 * np.sqrt(12.0 / 4.0)
+    assert np.mean(square_of(failing[-1].samples, built)) < 6.0 + 4.0 * np.sqrt(12.0 / 4.0)
 
 
 def sigma(samples: FieldSamples) -> Array:
     return np.asarray(np.sqrt(np.trace(samples.phasor_cov[0], axis1=1, axis2=2)))
 
 
-def square_of(samples: FieldSamples, made: SimulatedLog) -> Array:
+def square_of(samples: FieldSamples, simulation: SimulatedLog) -> Array:
     none = np.zeros((1, CHANNELS))
-    return errors_in_sigmas(AtRest(samples, none, none == 0.0, {}), made)
+    return errors_in_sigmas(IntegratedRests(samples, none, none == 0.0, {}), simulation)
 
 
 def test_rests_go_through_log_and_pipe(tmp_path: Path, refuse: Refuse) -> None:
@@ -149,16 +151,16 @@ def test_rests_go_through_log_and_pipe(tmp_path: Path, refuse: Refuse) -> None:
         magnetometer_rate_hz=RATE_HZ,
         perturb=False,
     )
-    made = simulate_log(site, config, np.random.default_rng(4))
-    write_log(made.log, tmp_path / "log")
+    built = simulate_log(site, config, np.random.default_rng(4))
+    write_log(built.log, tmp_path / "log")
     save_site(site, tmp_path / "log" / "site.yaml")
     run_command("navigate", tmp_path / "log", "--at-rest", "-o", tmp_path / "run")
-    told = json.loads((tmp_path / "run" / "report.json").read_text())
-    assert told["rests"] >= 2
-    assert told["nees_mean"] < 6.0 + 4.0 * np.sqrt(12.0 / 2.0)
+    reported = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert reported["rests"] >= 2
+    assert reported["nees_mean"] < 6.0 + 4.0 * np.sqrt(12.0 / 2.0)
     source, sink, messages = io.BytesIO(), io.BytesIO(), io.StringIO()
     other = Waveform(np.arange(0.0, 100.0, 0.1), np.zeros((1000, 3)))
-    run_replay(replace(made.log, reference=other), source, "json", realtime=False)
+    run_replay(replace(built.log, reference=other), source, "json", realtime=False)
     assert b'"reference"' in source.getvalue()
     source.seek(0)
     how = How(None, 1e-3, Risk())
@@ -168,19 +170,19 @@ def test_rests_go_through_log_and_pipe(tmp_path: Path, refuse: Refuse) -> None:
     assert standing[0]
     assert False in standing
     assert True in standing[standing.index(False) :]
-    truth = made.log.truth
+    truth = built.log.truth
     assert truth is not None
     for line in lines:
         if line["standing"] and line["position"] is not None:
             there = truth.position_world[np.searchsorted(truth.time, line["time"]) - 1]
             away = np.abs(np.array(line["position"]) - there)
             assert np.all(away < 5.0 * np.array(line["sigma"]["position"]))
-    said = refuse("navigate", tmp_path / "log", "--at-rest", "--rate", "imu", "-o", "x")
-    assert "--rate is for navigation in motion" in said
+    findings = refuse("navigate", tmp_path / "log", "--at-rest", "--rate", "imu", "-o", "x")
+    assert "--rate is for navigation in motion" in findings
 
 
 @pytest.mark.parametrize(
-    ("record", "told"),
+    ("record", "reported"),
     [
         ({"reference": {"time": [0.0, 1.0], "field": [[0, 0, 0]]}}, "field has 1 rows for 2"),
         ({"reference": {"time": [0.0], "field": [[0, 0]]}}, "three numbers"),
@@ -190,8 +192,8 @@ def test_rests_go_through_log_and_pipe(tmp_path: Path, refuse: Refuse) -> None:
         ),
     ],
 )
-def test_a_record_that_cannot_be_is_refused(record: dict[str, object], told: str) -> None:
+def test_a_record_that_cannot_be_is_refused(record: dict[str, object], reported: str) -> None:
     source = io.BytesIO(json.dumps(record).encode() + b"\n")
     how = How(None, 1e-3, Risk())
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=reported):
         run_rests_stream(far_site(), how, "json", False, source, io.BytesIO(), io.StringIO())

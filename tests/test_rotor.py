@@ -92,13 +92,13 @@ def test_the_simulator_turns_the_moment_itself() -> None:
 
 def test_a_speed_that_drifts_smears_nothing_by_the_angle() -> None:
     wave, angle, phasor = _recorded(np.random.default_rng(2))
-    found = demodulate_rotor(wave, angle, _site().beacons[0], _site(), 10.0)
-    assert len(found.fields) == 6
-    error = found.fields.phasor_sensor[:, 0] - phasor
-    sigma = np.sqrt(np.diagonal(found.fields.phasor_cov[:, 0], axis1=1, axis2=2))
+    result = demodulate_rotor(wave, angle, _site().beacons[0], _site(), 10.0)
+    assert len(result.fields) == 6
+    error = result.fields.phasor_sensor[:, 0] - phasor
+    sigma = np.sqrt(np.diagonal(result.fields.phasor_cov[:, 0], axis1=1, axis2=2))
     assert np.sqrt(np.mean(np.abs(error / sigma) ** 2) / 2.0) == pytest.approx(1.0, abs=0.35)
     speeds = np.diff(np.interp(np.arange(0.0, 60.5, 10.0), wave.time, angle)) / 20.0 / np.pi
-    np.testing.assert_allclose(found.speed_hz[:5], speeds[:5], rtol=1e-2)
+    np.testing.assert_allclose(result.speed_hz[:5], speeds[:5], rtol=1e-2)
     clock = 2.0 * np.pi * SPEED_HZ * wave.time
     by_clock = demodulate_rotor(wave, clock, _site().beacons[0], _site(), 10.0).fields
     share = np.linalg.norm(by_clock.phasor_sensor[:, 0], axis=1) / np.linalg.norm(phasor)
@@ -108,10 +108,10 @@ def test_a_speed_that_drifts_smears_nothing_by_the_angle() -> None:
 def test_an_angle_that_nobody_measures_is_followed_through_the_field() -> None:
     wave, angle, _ = _recorded(np.random.default_rng(3))
     rotor = replace(ROTOR, speed_sigma_hz=0.3, speed_walk_hz_rts=0.15)
-    found = followed_angle(wave, SPEED_HZ, rotor)
-    left = found - angle
-    left -= np.median(left)
-    assert np.max(np.abs(left[100:-100])) < 0.3
+    result = followed_angle(wave, SPEED_HZ, rotor)
+    remaining = result - angle
+    remaining -= np.median(remaining)
+    assert np.max(np.abs(remaining[100:-100])) < 0.3
 
 
 def test_noise_alone_is_no_magnet() -> None:
@@ -127,9 +127,9 @@ def test_a_rotor_and_a_casing_come_back_from_a_file(tmp_path: Path) -> None:
     site = replace(site, platform=replace(site.platform, magnetometer=sensor))
     save_site(site, tmp_path / "site.yaml")
     back = load_site(tmp_path / "site.yaml")
-    found = back.platform.magnetometer.casing
-    assert found is not None
-    assert vars(found) == pytest.approx(vars(casing), rel=1e-12)
+    result = back.platform.magnetometer.casing
+    assert result is not None
+    assert vars(result) == pytest.approx(vars(casing), rel=1e-12)
     rotor = back.beacons[0].rotor
     assert rotor is not None
     np.testing.assert_allclose(rotor.turning_moments, ROTOR.turning_moments, rtol=1e-12)
@@ -140,14 +140,14 @@ def test_a_rotor_and_a_casing_come_back_from_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "findings"),
     [
         ("rotor: {moment_a_m2: 100, axis: [1, 0, 0], zero: [1, 0, 1]}", "across the axis"),
         ("rotor: {moment_a_m2: 100}\n  coils: [{moment_a_m2: [1, 0, 0]}]", "remove it or rotor"),
         ("synchronised: true", "coils"),
     ],
 )
-def test_a_rotor_that_is_none_is_refused(given: str, said: str, tmp_path: Path) -> None:
+def test_a_rotor_that_is_none_is_refused(given: str, findings: str, tmp_path: Path) -> None:
     text = f"""magfusion_site: 1
 beacons:
 - name: bit
@@ -157,20 +157,20 @@ beacons:
 platform: {{magnetometer: {{noise_density_t_rthz: 1.0e-11}}}}
 """
     (tmp_path / "site.yaml").write_text(text)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=findings):
         load_site(tmp_path / "site.yaml", unknown=True)
 
 
 def test_angles_and_depths_come_back_from_a_log(tmp_path: Path) -> None:
     wave, angle, _ = _recorded(np.random.default_rng(5))
-    turned = RotorAngles(wave.time, {"bit": np.mod(angle, 2.0 * np.pi)})
+    rotated = RotorAngles(wave.time, {"bit": np.mod(angle, 2.0 * np.pi)})
     depths = Depths({"bit": np.array([[0.0, 60.0], [1000.0, 1006.0]])})
-    log = Log("log", 0, "", ImuSamples.empty(), wave, rotation=turned, depths=depths)
+    log = Log("log", 0, "", ImuSamples.empty(), wave, rotation=rotated, depths=depths)
     write_log(log, tmp_path / "log")
     back = read_log(tmp_path / "log")
     assert back.rotation is not None
     assert back.depths is not None
-    np.testing.assert_array_equal(back.rotation.angle["bit"], turned.angle["bit"])
+    np.testing.assert_array_equal(back.rotation.angle["bit"], rotated.angle["bit"])
     middle = back.depths.at("bit", np.array([30.0]))
     assert middle is not None
     assert middle[0] == pytest.approx(1003.0)
@@ -182,9 +182,9 @@ def test_a_thin_wall_is_the_limit_of_the_exact_one(frequency_hz: float) -> None:
     exact = wall_transmission(
         Pipe(np.zeros(3), np.array([10.0, 0.0, 0.0]), 0.1, 0.0002, 1000.0, 5e6), frequency_hz
     )
-    found = tube_transmission(thin, frequency_hz)
-    assert found.across == pytest.approx(exact.across, rel=5e-3)
-    assert found.along == pytest.approx(exact.along, rel=5e-3)
+    result = tube_transmission(thin, frequency_hz)
+    assert result.across == pytest.approx(exact.across, rel=5e-3)
+    assert result.along == pytest.approx(exact.along, rel=5e-3)
     # Of a steady field, in closed form.
     steady = wall_transmission(Pipe(np.zeros(3), np.ones(3), 0.1, 0.01), 1e-6).across
     assert steady == pytest.approx(1.0 / (1.0 + 99.0**2 / 400.0 * (1.0 - 0.9**2)), rel=1e-4)
@@ -216,18 +216,18 @@ def test_an_encoder_refers_the_phasors_of_every_job_to_its_angle() -> None:
     field = dipole_field(offset, turned_moment(ROTOR, Shaft(), angle))
     field += NOISE * 10.0 * rng.standard_normal(field.shape)
     rest = ImuSamples(time, np.zeros((4000, 3)), np.tile([0.0, 0.0, 9.8], (4000, 1)))
-    turned = RotorAngles(time, {"bit": np.mod(angle, 2.0 * np.pi)})
-    log = turning_currents(Log("log", 0, "", rest, Waveform(time, field), rotation=turned), site)
+    rotated = RotorAngles(time, {"bit": np.mod(angle, 2.0 * np.pi)})
+    log = turning_currents(Log("log", 0, "", rest, Waveform(time, field), rotation=rotated), site)
     log, known = with_drives(log, site)
-    found = referred(phasors(log, known, None)[0], known)
+    result = referred(phasors(log, known, None)[0], known)
     cosine, sine = dipole_field(offset, ROTOR.turning_moments)
-    measured = found.phasor_sensor[1:-1, 0]
+    measured = result.phasor_sensor[1:-1, 0]
     error = np.linalg.norm(measured - (cosine - 1j * sine), axis=1)
     assert np.max(error) < 0.02 * np.linalg.norm(cosine - 1j * sine)
 
 
 def test_an_angle_of_no_rotor_is_refused() -> None:
-    turned = RotorAngles(np.zeros(1), {"other": np.zeros(1)})
-    log = Log("log", 0, "", ImuSamples.empty(), rotation=turned)
+    rotated = RotorAngles(np.zeros(1), {"other": np.zeros(1)})
+    log = Log("log", 0, "", ImuSamples.empty(), rotation=rotated)
     with pytest.raises(InputError, match="no rotor of this name"):
         turning_currents(log, _site())

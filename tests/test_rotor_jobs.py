@@ -98,8 +98,8 @@ def test_a_stream_without_the_angles_is_refused_when_they_are_missed(tmp_path: P
     source = io.BytesIO("\n".join(records).encode())
     with pytest.raises(InputError, match="drive_bit"):
         run_stream(tmp_path / "site.yaml", StreamSettings(), source, io.BytesIO(), io.StringIO())
-    free = SITE.replace("synchronised: true", "synchronised: false")
-    (tmp_path / "site.yaml").write_text(free)
+    free_parameters = SITE.replace("synchronised: true", "synchronised: false")
+    (tmp_path / "site.yaml").write_text(free_parameters)
     with pytest.raises(InputError, match="cosine of its angle"):
         run_stream(tmp_path / "site.yaml", StreamSettings(), source, io.BytesIO(), io.StringIO())
 

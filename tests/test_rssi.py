@@ -26,33 +26,33 @@ def test_every_epoch_of_a_batch_is_located_exactly_on_the_side_of_its_start() ->
     rng = np.random.default_rng(1)
     points = rng.uniform([0.6, 0.6, -1.5], [5.1, 3.9, 1.5], (500, 3))
     start = points + rng.uniform(-1.0, 1.0, points.shape) * [1.0, 1.0, 0.0]
-    found = trilaterate(distances(points, FLAT).reshape(50, 10, 3), FLAT, start.reshape(50, 10, 3))
-    np.testing.assert_allclose(found.reshape(-1, 3), points, rtol=0, atol=1e-6)  # m
+    result = trilaterate(distances(points, FLAT).reshape(50, 10, 3), FLAT, start.reshape(50, 10, 3))
+    np.testing.assert_allclose(result.reshape(-1, 3), points, rtol=0, atol=1e-6)  # m
 
 
 def test_a_beacon_out_of_the_plane_decides_between_the_sides_wherever_the_start_is() -> None:
     rng = np.random.default_rng(2)
     points = rng.uniform([0.6, 0.6, 0.2], [5.1, 3.9, 1.5], (200, 3))
     ranges = distances(points, SOLID)
-    found = trilaterate_from_both_sides(ranges, SOLID, MIDDLE * [1.0, 1.0, -4.0])
-    np.testing.assert_allclose(found, points, rtol=0, atol=1e-7)  # m
+    result = trilaterate_from_both_sides(ranges, SOLID, MIDDLE * [1.0, 1.0, -4.0])
+    np.testing.assert_allclose(result, points, rtol=0, atol=1e-7)  # m
 
 
 def test_one_plane_leaves_the_side_to_the_start() -> None:
     ranges = distances(MIDDLE, FLAT)
     for side in (1.0, -1.0):
         start = np.array([2.0, 2.0, side])
-        found = trilaterate_from_both_sides(ranges, FLAT, start)
-        np.testing.assert_allclose(found, MIDDLE * [1.0, 1.0, side], rtol=0, atol=1e-9)  # m
+        result = trilaterate_from_both_sides(ranges, FLAT, start)
+        np.testing.assert_allclose(result, MIDDLE * [1.0, 1.0, side], rtol=0, atol=1e-9)  # m
 
 
 def test_ranges_that_do_not_meet_are_fitted_as_well_as_a_general_solver_does() -> None:
     rng = np.random.default_rng(3)
     ranges = distances(MIDDLE, FLAT) * np.exp(rng.normal(0.0, 0.4, (100, 3)))
-    found = trilaterate(ranges, FLAT, MIDDLE)
-    in_plane = np.abs(found[:, 2]) < 1e-6  # where the ranges are too short to leave it
+    result = trilaterate(ranges, FLAT, MIDDLE)
+    in_plane = np.abs(result[:, 2]) < 1e-6  # where the ranges are too short to leave it
     assert 10 < np.sum(in_plane) < 90
-    misfit = np.sum((distances(found, FLAT) - ranges) ** 2, axis=1)
+    misfit = np.sum((distances(result, FLAT) - ranges) ** 2, axis=1)
     for r, ours in zip(ranges, misfit, strict=True):
         other = least_squares(lambda p, r=r: distances(p, FLAT) - r, MIDDLE, xtol=1e-12, ftol=1e-12)
         assert ours <= 2.0 * other.cost + 1e-9  # m^2
@@ -70,8 +70,8 @@ def test_the_minor_axis_gives_the_range_in_every_direction_and_the_rms_does_not(
     offset = reach[:, None] * direction / np.linalg.norm(direction, axis=1, keepdims=True)
     x, y = (dipole_field(offset, 65.0 * np.eye(3)[axis]) for axis in (0, 1))
     minor = semi_axes(x - 1j * y)[:, :1]
-    found = ranges_from_minor_axis(minor, np.array([65.0]))[:, 0]
-    np.testing.assert_allclose(found, reach, rtol=1e-9)
+    result = ranges_from_minor_axis(minor, np.array([65.0]))[:, 0]
+    np.testing.assert_allclose(result, reach, rtol=1e-9)
     constant = rms_amplitude(x - 1j * y) * reach**3
     # From pole to equator: paper 004, Eq 14, takes it for a constant.
     assert np.ptp(np.cbrt(constant)) / np.min(np.cbrt(constant)) == pytest.approx(0.165, abs=0.01)
@@ -92,8 +92,8 @@ def test_each_block_has_the_line_of_its_own_points() -> None:
     here = lines.at(np.array([[1.0, 3.0, 0.5], [5.0, 1.0, 0.5], [2.0, 2.0, 0.5]]))
     np.testing.assert_allclose(here.slope, [[-3.0] * 3, [-2.8] * 3, [-2.9] * 3], rtol=1e-9)
     np.testing.assert_allclose(here.intercept, [[-11.8] * 3, [-12.0] * 3, [-11.8] * 3], rtol=1e-9)
-    found = ranges_from_lines(lines.at(points), amplitude)
-    np.testing.assert_allclose(found, distances(points, FLAT), rtol=1e-9)
+    result = ranges_from_lines(lines.at(points), amplitude)
+    np.testing.assert_allclose(result, distances(points, FLAT), rtol=1e-9)
 
 
 def test_a_block_with_too_few_points_keeps_the_overall_line() -> None:

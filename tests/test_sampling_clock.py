@@ -22,10 +22,10 @@ def _stamped(
     """Return when samples were taken and how a host stamped them (s)."""
     rng = np.random.default_rng(seed)
     tick = np.arange(COUNT)[rng.random(COUNT) >= share_lost]
-    taken = STEP * tick * (1.0 + 1e-6 * drift_ppm * np.sin(0.2 * np.pi * tick / COUNT))
-    stamps = taken + STEP * scatter * rng.standard_normal(len(taken))
+    selected = STEP * tick * (1.0 + 1e-6 * drift_ppm * np.sin(0.2 * np.pi * tick / COUNT))
+    stamps = selected + STEP * scatter * rng.standard_normal(len(selected))
     kept = np.concatenate([[True], np.diff(np.maximum.accumulate(stamps)) > 0.0])
-    return taken[kept], stamps[kept]
+    return selected[kept], stamps[kept]
 
 
 @pytest.mark.parametrize(
@@ -33,10 +33,10 @@ def _stamped(
     [(0.05, 0.0, 0.0), (0.05, 0.1, 0.0), (0.1, 0.05, 50.0), (0.2, 0.01, 0.0), (0.25, 0.0, 100.0)],
 )
 def test_samples_get_their_ticks_back(scatter: float, share_lost: float, drift_ppm: float) -> None:
-    taken, stamps = _stamped(scatter, share_lost, drift_ppm)
+    selected, stamps = _stamped(scatter, share_lost, drift_ppm)
     clock = sampling_clock(stamps)
     assert clock is not None
-    off = clock.time - taken
+    off = clock.time - selected
     assert np.mean(np.abs(off) > 0.5 * STEP) < 0.01  # given another tick
     assert np.median(np.abs(off)) < 0.1 * scatter * STEP + 1e-5  # s
     assert clock.scatter == pytest.approx(scatter * STEP, rel=0.1)
@@ -45,33 +45,33 @@ def test_samples_get_their_ticks_back(scatter: float, share_lost: float, drift_p
 
 @pytest.mark.parametrize("seed", range(5))
 def test_scatter_of_stamps_does_not_bend_an_even_clock(seed: int) -> None:
-    taken, stamps = _stamped(0.1, seed=seed)
+    selected, stamps = _stamped(0.1, seed=seed)
     clock = sampling_clock(stamps)
     assert clock is not None
     assert np.ptp(np.diff(clock.time)) < 1e-12  # s
-    rate = np.polyfit(taken, clock.time - taken, 1)[0]
-    assert abs(rate) < 4.0 * np.sqrt(12.0 / len(taken)) * 0.1 * STEP / taken[-1]
+    rate = np.polyfit(selected, clock.time - selected, 1)[0]
+    assert abs(rate) < 4.0 * np.sqrt(12.0 / len(selected)) * 0.1 * STEP / selected[-1]
 
 
 def test_lost_samples_are_counted() -> None:
     _, stamps = _stamped(0.1, 0.05)
     clock = sampling_clock(stamps)
     assert clock is not None
-    assert clock.lost == COUNT - len(stamps)
+    assert clock.lost_count == COUNT - len(stamps)
 
 
 def test_a_clock_goes_on_behind_a_gap() -> None:
-    taken, stamps = _stamped(0.1)
-    kept = (taken < 8.0) | (taken > 11.0)
+    selected, stamps = _stamped(0.1)
+    kept = (selected < 8.0) | (selected > 11.0)
     clock = sampling_clock(stamps[kept])
     assert clock is not None
-    assert np.max(np.abs(clock.time - taken[kept])) < 0.1 * STEP
+    assert np.max(np.abs(clock.time - selected[kept])) < 0.1 * STEP
 
 
 @pytest.mark.parametrize("share_lost", [0.0, 0.2])
 def test_even_stamps_stay(share_lost: float) -> None:
-    taken, _ = _stamped(0.0, share_lost)
-    assert sampling_clock(taken) is None
+    selected, _ = _stamped(0.0, share_lost)
+    assert sampling_clock(selected) is None
 
 
 def test_stamps_without_a_clock_stay() -> None:
@@ -100,13 +100,13 @@ def test_the_tones_tell_a_host_that_stamps_late_from_a_sampler_that_samples_unev
         imu=ImuSamples(_scattered(imu.time, 1), imu.gyro_body, imu.accel_body),
         waveform=Waveform(_scattered(waveform.time, 2), waveform.measured_sensor),
     )
-    mended = on_even_clocks(late, site)
-    assert mended.waveform is not None
-    assert {k: v.replaced for k, v in mended.clocks.items()} == {
+    cleaned = on_even_clocks(late, site)
+    assert cleaned.waveform is not None
+    assert {k: v.replaced for k, v in cleaned.clocks.items()} == {
         "imu": True,
         "magnetometer": True,
     }
-    assert np.max(np.abs(mended.waveform.time - waveform.time)) < 2e-4  # s
+    assert np.max(np.abs(cleaned.waveform.time - waveform.time)) < 2e-4  # s
     # The same stamps, and samples that were taken at them.
     at = _scattered(waveform.time, 2)
     values = [np.interp(at, waveform.time, axis) for axis in waveform.measured_sensor.T]

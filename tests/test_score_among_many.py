@@ -15,7 +15,7 @@ from magfusion.estimation.online.navigator import Navigator
 from magfusion.estimation.online.navigator_settings import NavigatorSettings
 from magfusion.estimation.online_integrity.score_epochs import MEMORY
 from magfusion.estimation.online_integrity.score_online import OnlineScore
-from magfusion.model.audibility import are_many
+from magfusion.model.detection_range import are_many
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
@@ -24,7 +24,7 @@ from magfusion.simulation.log import simulate_fields
 
 NOW = np.zeros(1, dtype=np.int64)
 STEP = 0.4  # s
-NOBODY = ImuSamples(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+NO_OWNER = ImuSamples(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 def state_at(site: Site, time: float, rng: np.random.Generator) -> State:
@@ -42,22 +42,24 @@ def state_at(site: Site, time: float, rng: np.random.Generator) -> State:
     )
 
 
-def phasors_at(state: State, site: Site, heard: list[int], rng: np.random.Generator) -> Measurement:
+def phasors_at(
+    state: State, site: Site, detected: list[int], rng: np.random.Generator
+) -> Measurement:
     at = np.array([state.time]), state.world_from_body[None], state.position_world[None]
     poses = Trajectory(*at)
     samples = simulate_fields(site, poses, 1e-9, rng)
     kept = np.zeros(len(site.channels), dtype=bool)
-    kept[heard] = True
-    found = np.where(kept[:, None], samples.phasor_sensor, np.nan)
-    samples = replace(samples, phasor_sensor=found)
+    kept[detected] = True
+    result = np.where(kept[:, None], samples.phasor_sensor, np.nan)
+    samples = replace(samples, phasor_sensor=result)
     return field_phasors(site, samples, NOW, poses, np.zeros((1, 3)), np.zeros(1), 1.0)
 
 
 def nothing_yet(score: OnlineScore) -> Score:
-    size = len(score.asked.unit)
+    size = len(score.targets.unit)
     none = np.zeros((size, 0))
     return Score(
-        score.asked.held,
+        score.targets.fixed_blocks,
         np.zeros((size, size)),
         np.zeros(size),
         none,
@@ -71,27 +73,27 @@ def test_who_comes_later_is_asked_as_if_it_had_been_there_all_the_time() -> None
     site = many_beacons.building(rng, 6, 5, many_beacons.reused_hz)
     assert are_many(site)
     every, some = (OnlineScore(site, (), (), steady=False) for _ in range(2))
-    every._heard_at = dict.fromkeys((b.name for b in site.beacons), 0.0)
+    every._detected_at = dict.fromkeys((b.name for b in site.beacons), 0.0)
     every.begin(nothing_yet(every), 0.0)
-    some._heard_at = dict.fromkeys((b.name for b in site.beacons[:3]), 0.0)
+    some._detected_at = dict.fromkeys((b.name for b in site.beacons[:3]), 0.0)
     some.begin(nothing_yet(some), 0.0)
     before = state_at(site, 0.0, rng)
     for k in range(6):
         state = state_at(site, STEP * (k + 1), rng)
-        found = phasors_at(state, site, [k, k + 1, k + 2], rng)
+        result = phasors_at(state, site, [k, k + 1, k + 2], rng)
         transition = np.eye(MOTION)
         transition[3:6, 6:9] = STEP * np.eye(3)
         for score in (every, some):
-            score.predict(before, state, transition, NOBODY)
-            score.measured([found], state)
+            score.predict(before, state, transition, NO_OWNER)
+            score.measured([result], state)
         before = state
     assert every._sums is not None
     assert some._sums is not None
     names = [b.name for b in site.beacons]
-    assert some.asked.names == tuple(names[:8])
-    assert every.asked.names == tuple(names)
-    here, there = some.asked.among(every.asked)
-    assert len(here) == len(some.asked.unit)
+    assert some.targets.names == tuple(names[:8])
+    assert every.targets.names == tuple(names)
+    here, there = some.targets.among(every.targets)
+    assert len(here) == len(some.targets.unit)
     whole, part = every._sums, some._sums
     size = np.max(np.abs(whole.information))
     expected = whole.information[np.ix_(there, there)]
@@ -106,12 +108,12 @@ def test_nobody_is_asked_of_long_after_it_was_heard() -> None:
     rng = np.random.default_rng(4)
     site = many_beacons.building(rng, 6, 5, many_beacons.reused_hz)
     score = OnlineScore(site, (), (), steady=False)
-    score._heard_at = dict.fromkeys((b.name for b in site.beacons[:3]), 0.0)
+    score._detected_at = dict.fromkeys((b.name for b in site.beacons[:3]), 0.0)
     score.begin(nothing_yet(score), 0.0)
-    for time, heard in ((1.0, 1), (MEMORY + 2.0, 10)):
+    for time, detected in ((1.0, 1), (MEMORY + 2.0, 10)):
         state = state_at(site, time, rng)
-        score.measured([phasors_at(state, site, [heard], rng)], state)
-    assert score.asked.names == (site.beacons[10].name,)
+        score.measured([phasors_at(state, site, [detected], rng)], state)
+    assert score.targets.names == (site.beacons[10].name,)
 
 
 @pytest.mark.slow
@@ -120,9 +122,9 @@ def test_a_beacon_that_is_met_later_and_stands_elsewhere_is_named() -> None:
     log = many_beacons.walked(site, 0.9, many_beacons.WING_WORLD, 600.0, 2)
     assert log.truth is not None
     time, places = log.truth.time, np.array([b.position_world for b in site.beacons])
-    apart = np.linalg.norm(log.truth.position_world[:, None] - places, axis=2)
-    far_first = np.min(apart[time < 12.0], axis=0) > 9.0
-    met = int(np.argmin(np.where(far_first, np.min(apart[time < 50.0], axis=0), np.inf)))
+    separate = np.linalg.norm(log.truth.position_world[:, None] - places, axis=2)
+    far_first = np.min(separate[time < 12.0], axis=0) > 9.0
+    met = int(np.argmin(np.where(far_first, np.min(separate[time < 50.0], axis=0), np.inf)))
     wrong = list(site.beacons)
     moved = wrong[met].position_world + np.array([0.05, 0.0, 0.0])
     wrong[met] = replace(wrong[met], position_world=moved)
@@ -131,6 +133,6 @@ def test_a_beacon_that_is_met_later_and_stands_elsewhere_is_named() -> None:
     navigator.add_imu(log.imu.time, log.imu.gyro_body, log.imu.accel_body)
     navigator.add_magnetometer(log.waveform.time, log.waveform.measured_sensor)
     navigator.take()
-    said = [f.text for f in navigator.summary.trust.findings if f.code == "beacon_pose"]
-    assert said
-    assert wrong[met].name in said[0]
+    findings = [f.text for f in navigator.summary.trust.findings if f.code == "beacon_pose"]
+    assert findings
+    assert wrong[met].name in findings[0]

@@ -8,22 +8,22 @@ from small_problem import small_log
 
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.graph.state import states_in
-from magfusion.estimation.integrity import held_columns, midway, score
+from magfusion.estimation.integrity import change_detection, fixed_parameter_columns, score
 from magfusion.estimation.integrity.score import Score, answered, scores_of
 from magfusion.estimation.integrity.suspects import held_blocks
 from magfusion.estimation.measurements import phasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.posterior import chain_left, chain_system
+from magfusion.estimation.posterior import block_tridiagonal_system, schur_complement
 from magfusion.model.parameters import placed
 from magfusion.model.samples import ImuSamples
 
 
-def _asked(result: Smoothed, imu: ImuSamples) -> tuple[Score, Score]:
+def _requested(result: Smoothed, imu: ImuSamples) -> tuple[Score, Score]:
     """Return the score of what is held, and with what may change in the middle."""
     middle = float(np.mean(result.fields.time))
-    found = scores_of(result, imu, midway._blocks(result.declared.site, middle))
-    assert found is not None
-    return found.held, answered(result, found.every, imu)
+    estimate = scores_of(result, imu, change_detection._blocks(result.declared.site, middle))
+    assert estimate is not None
+    return estimate.fixed, answered(result, estimate.every, imu)
 
 
 @pytest.mark.parametrize("estimated", [True, False])
@@ -38,12 +38,12 @@ def test_a_sweep_gives_the_score_of_the_tree(
     assert bool(result.blocks) == estimated
     assert result.field_errors
     monkeypatch.setattr(score, "left_of_chain", lambda *_: None)
-    trees = _asked(result, small.log.imu)
+    trees = _requested(result, small.log.imu)
     monkeypatch.undo()
-    monkeypatch.setattr(chain_left, "STRETCH", 7)
-    monkeypatch.setattr(held_columns, "STRETCH", 5)
-    monkeypatch.setattr(chain_system, "SIDES", 1.0)  # one block at once
-    for chain, tree in zip(_asked(result, small.log.imu), trees, strict=True):
+    monkeypatch.setattr(schur_complement, "STRETCH", 7)
+    monkeypatch.setattr(fixed_parameter_columns, "STRETCH", 5)
+    monkeypatch.setattr(block_tridiagonal_system, "SIDES", 1.0)  # one block at once
+    for chain, tree in zip(_requested(result, small.log.imu), trees, strict=True):
         assert np.any(chain.information != tree.information)  # found otherwise
         unit = np.sqrt(np.diagonal(tree.information))
         scale = np.where(unit > 0.0, unit, 1.0)
@@ -54,8 +54,8 @@ def test_a_sweep_gives_the_score_of_the_tree(
         )
         np.testing.assert_allclose(chain.gradient / scale, tree.gradient / scale, atol=1e-7)
         largest = np.max(np.abs(tree.by_pose), axis=(0, 1))
-        apart = np.max(np.abs(chain.by_pose - tree.by_pose), axis=(0, 1))
-        assert np.all(apart <= 1e-7 * largest)
+        separate = np.max(np.abs(chain.by_pose - tree.by_pose), axis=(0, 1))
+        assert np.all(separate <= 1e-7 * largest)
         np.testing.assert_allclose(chain.by_calibration, tree.by_calibration, atol=1e-7)
         np.testing.assert_array_equal(chain.spread, tree.spread)
 

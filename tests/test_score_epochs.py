@@ -10,7 +10,12 @@ from test_smoothed_separation import EPOCHS, _walk
 from magfusion.estimation.graph.state import between
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.estimation.online.navigator import Navigator
-from magfusion.estimation.online_integrity.score_epochs import Epoch, Passed, Sums, heard
+from magfusion.estimation.online_integrity.score_epochs import (
+    Epoch,
+    EpochTransition,
+    Sums,
+    add_epochs,
+)
 from magfusion.estimation.online_integrity.score_online import MOST_WAITING
 from magfusion.model.parameters import BEACON_POSITION
 
@@ -24,24 +29,24 @@ def _waiting() -> tuple[Navigator, Sums, list[Epoch]]:
     _feed(navigator, small, 0, LAST)
     score = navigator._update.score
     score.settle()
-    score._asked_at = np.inf
+    score._scored_at = np.inf
     _feed(navigator, small, LAST, LAST + MOST_WAITING - 1)
     assert score._sums is not None
     return navigator, score._sums, list(score._waiting)
 
 
-def _assert_alike(found: Sums, expected: Sums) -> None:
+def _assert_alike(result: Sums, expected: Sums) -> None:
     size = np.max(np.abs(expected.information))
-    np.testing.assert_allclose(found.information, expected.information, atol=1e-9 * size)
+    np.testing.assert_allclose(result.information, expected.information, atol=1e-9 * size)
     scale = np.max(np.abs(expected.gradient))
-    np.testing.assert_allclose(found.gradient, expected.gradient, atol=1e-9 * scale)
-    np.testing.assert_allclose(found.response, expected.response, rtol=1e-6, atol=1e-12)
-    assert found.time == expected.time
+    np.testing.assert_allclose(result.gradient, expected.gradient, atol=1e-9 * scale)
+    np.testing.assert_allclose(result.response, expected.response, rtol=1e-6, atol=1e-12)
+    assert result.time == expected.time
 
 
 def test_epochs_together_tell_what_they_tell_one_by_one() -> None:
     navigator, sums, waiting = _waiting()
-    asked = navigator._update.score.asked
+    requested = navigator._update.score.targets
     assert len(waiting) == MOST_WAITING - 1
     offsets = {epoch.predicted.calibration.time_offset for epoch in waiting}
     assert len(offsets) > 1  # what an epoch is linearised with changes from one to the next
@@ -50,8 +55,8 @@ def test_epochs_together_tell_what_they_tell_one_by_one() -> None:
     waiting[5] = waiting[5]._replace(measurements=())
     one_by_one = sums
     for epoch in waiting:
-        one_by_one = heard(one_by_one, [epoch], asked)
-    together = heard(sums, waiting, asked)
+        one_by_one = add_epochs(one_by_one, [epoch], requested)
+    together = add_epochs(sums, waiting, requested)
     _assert_alike(together, one_by_one)
     learnt = np.abs(together.information - sums.information)
     assert np.max(learnt) > 0.01 * np.max(np.abs(sums.information))
@@ -59,19 +64,21 @@ def test_epochs_together_tell_what_they_tell_one_by_one() -> None:
 
 def test_an_epoch_that_measured_nothing_only_carries_the_response_on() -> None:
     navigator, sums, waiting = _waiting()
-    asked, last = navigator._update.score.asked, waiting[0]
+    requested, last = navigator._update.score.targets, waiting[0]
     turns, none = (np.eye(3), np.eye(3)), np.zeros(3)
     size = len(last.predicted.cov)
     transition = np.eye(size)
     transition[3:6, 6:9] = 0.5 * np.eye(3)
-    found = heard(sums, [Epoch(last.predicted, Passed(transition, turns, none, none))], asked)
-    own = transition[: asked.size, : asked.size]
-    gravity = next(b.columns for b in asked.held if b.owner == "site")
-    others = np.setdiff1d(np.arange(len(asked.unit)), np.arange(gravity.start, gravity.stop))
+    result = add_epochs(
+        sums, [Epoch(last.predicted, EpochTransition(transition, turns, none, none))], requested
+    )
+    own = transition[: requested.size, : requested.size]
+    gravity = next(b.columns for b in requested.fixed_blocks if b.owner == "site")
+    others = np.setdiff1d(np.arange(len(requested.unit)), np.arange(gravity.start, gravity.stop))
     expected = own @ sums.response
-    np.testing.assert_allclose(found.response[:, others], expected[:, others], atol=1e-15)
+    np.testing.assert_allclose(result.response[:, others], expected[:, others], atol=1e-15)
     kept = np.exp(-(last.predicted.time - sums.time) / 60.0)
-    np.testing.assert_allclose(found.information, kept * sums.information, rtol=1e-12)
+    np.testing.assert_allclose(result.information, kept * sums.information, rtol=1e-12)
 
 
 @pytest.mark.parametrize("axis", [0, 2])
@@ -86,13 +93,13 @@ def test_the_response_is_how_the_estimate_moves_with_what_it_holds(axis: int) ->
         _feed(navigator, small, 0, EPOCHS)
     states = [navigator.take()[-1] for navigator in runs]
     score = runs[0]._update.score
-    sums, asked = score.settle(), score.asked
+    sums, requested = score.settle(), score.targets
     assert sums is not None
-    (block,) = (b for b in asked.held if b.key == (BEACON_POSITION, first.name))
-    unit = asked.unit[block.columns][axis]
+    (block,) = (b for b in requested.fixed_blocks if b.key == (BEACON_POSITION, first.name))
+    unit = requested.unit[block.columns][axis]
     expected = -sums.response[:6, block.columns][:, axis] * 1e-3 / unit
-    found = between(states[0], states[1], ())[:6]
+    result = between(states[0], states[1], ())[:6]
     size = np.linalg.norm(expected[3:])
     assert size > 1e-4  # m
-    np.testing.assert_allclose(found[3:], expected[3:], atol=0.05 * size)
-    np.testing.assert_allclose(found[:3], expected[:3], atol=0.05 * size)  # as much at a metre
+    np.testing.assert_allclose(result[3:], expected[3:], atol=0.05 * size)
+    np.testing.assert_allclose(result[:3], expected[:3], atol=0.05 * size)  # as much at a metre

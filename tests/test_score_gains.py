@@ -2,28 +2,33 @@
 
 import numpy as np
 
-from magfusion.estimation.integrity.held import freed_by, gains
+from magfusion.estimation.integrity.fixed_parameter_test import gains, release_fault
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.online_integrity.asked import Asked
+from magfusion.estimation.online_integrity.score_targets import ScoreTargets
 from magfusion.simulation.demo_site import demo_site
 
 KNOWN, UNKNOWN = 50.0, 1e-4  # by how many typical errors a direction is told of, squared
 
 
 def test_all_at_once_gain_what_each_alone_does() -> None:
-    rng, score = np.random.default_rng(4), Asked(demo_site(), (), (), steady=False)
+    rng, score = np.random.default_rng(4), ScoreTargets(demo_site(), (), (), steady=False)
     size = len(score.unit)
     root = rng.standard_normal((size, size)) / np.sqrt(size)
     axes = np.linalg.qr(rng.standard_normal((size, size)))[0]
-    told = np.where(np.arange(size) < size // 2, KNOWN, UNKNOWN)  # half of it is not told of
-    information = (axes * told) @ axes.T + 1e-9 * root @ root.T
+    reported = np.where(np.arange(size) < size // 2, KNOWN, UNKNOWN)  # half of it is not told of
+    information = (axes * reported) @ axes.T + 1e-9 * root @ root.T
     gradient = information @ rng.standard_normal(size) * 3.0
     nothing = np.zeros((size, 0))
-    known = Score(score.held, information, gradient, nothing, np.zeros((1, 6, size)), nothing.T)
-    alone = [freed_by(np.eye(6)[None], known, s, information, gradient) for s in score.suspects]
-    combine = np.zeros((len(alone), size, max(s.combine.shape[1] for s in score.suspects)))
-    for room, suspect in zip(combine, score.suspects, strict=True):
-        room[:, : suspect.combine.shape[1]] = suspect.combine
+    known = Score(
+        score.fixed_blocks, information, gradient, nothing, np.zeros((1, 6, size)), nothing.T
+    )
+    alone = [
+        release_fault(np.eye(6)[None], known, s, information, gradient)
+        for s in score.fault_candidates
+    ]
+    combine = np.zeros((len(alone), size, max(s.combine.shape[1] for s in score.fault_candidates)))
+    for room, fault in zip(combine, score.fault_candidates, strict=True):
+        room[:, : fault.combine.shape[1]] = fault.combine
     expected = [0.0 if one is None else one.gain for one in alone]
     assert np.ptp(expected) > 100.0  # chi square; they differ
     np.testing.assert_allclose(gains(combine, information, gradient), expected, atol=1e-6)

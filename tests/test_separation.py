@@ -51,37 +51,37 @@ def test_a_radius_is_exceeded_no_more_often_than_it_says_and_not_much_less(sprea
     root = turn @ np.diag(spread)
     cov = np.zeros((6, 6))
     cov[:3, :3] = cov[3:, 3:] = root @ root.T
-    found = radii(cov)
-    np.testing.assert_allclose(found.largest, max(spread), rtol=1e-9)
-    np.testing.assert_allclose(found.whole, np.linalg.norm(spread), rtol=1e-12)
-    radius = found.beyond(probability)[0]
+    result = radii(cov)
+    np.testing.assert_allclose(result.largest, max(spread), rtol=1e-9)
+    np.testing.assert_allclose(result.whole, np.linalg.norm(spread), rtol=1e-12)
+    radius = result.beyond(probability)[0]
     norm = np.linalg.norm(rng.standard_normal((400_000, 3)) @ root.T, axis=1)
     count = np.sum(norm > radius)
     assert count <= binom.isf(1e-4, len(norm), probability)
     assert np.quantile(norm, 1.0 - probability) > (0.75 if probability < 0.1 else 0.5) * radius
-    assert np.all(found.tail(np.array(radius)) <= (1.0 + 1e-6) * probability)
+    assert np.all(result.tail(np.array(radius)) <= (1.0 + 1e-6) * probability)
 
 
 def test_the_step_is_that_of_the_least_squares_without_the_beacon():
     rng = np.random.default_rng(3)
     jacobian, noise = _linear(rng, 5), rng.standard_normal((5, len(OWNER)))
-    found = _separated(jacobian, noise)
+    result = _separated(jacobian, noise)
     for j in range(BEACONS):
         kept = j != OWNER
         without = _error(jacobian[:, kept], noise[:, kept])
-        np.testing.assert_allclose(found.step[:, j], without - _error(jacobian, noise), atol=1e-9)
-        left = noise[:, kept] + (jacobian[:, kept] @ without[..., None])[..., 0]
-        np.testing.assert_allclose(found.cost[:, j], np.sum(left**2, axis=1), rtol=1e-8)
+        np.testing.assert_allclose(result.step[:, j], without - _error(jacobian, noise), atol=1e-9)
+        remaining = noise[:, kept] + (jacobian[:, kept] @ without[..., None])[..., 0]
+        np.testing.assert_allclose(result.cost[:, j], np.sum(remaining**2, axis=1), rtol=1e-8)
     # Of estimates by the same measurements the covariance of the step is the difference.
     np.testing.assert_allclose(
-        found.separation_cov, found.subset_cov - found.cov[:, None], rtol=1e-6, atol=1e-9
+        result.separation_cov, result.subset_cov - result.cov[:, None], rtol=1e-6, atol=1e-9
     )
 
 
 def test_without_a_fault_alarms_come_no_more_often_than_promised():
     rng, risk, count = np.random.default_rng(4), Risk(false_alarm=0.02), 20_000
-    found = _separated(_linear(rng, count), rng.standard_normal((count, len(OWNER))))
-    alarms = int(np.sum(np.any(found.excess(risk) > 1.0, axis=1)))
+    result = _separated(_linear(rng, count), rng.standard_normal((count, len(OWNER))))
+    alarms = int(np.sum(np.any(result.excess(risk) > 1.0, axis=1)))
     assert alarms <= binom.isf(1e-4, count, risk.false_alarm)
     assert alarms > 0.05 * risk.false_alarm * count
 
@@ -97,37 +97,37 @@ def test_what_a_false_beacon_does_unseen_stays_within_the_level(size):
     gain = np.linalg.pinv(jacobian)
     worst = np.linalg.svd(gain[:, 3:, rows])[2][:, 0]
     noise[:, rows] += size * worst
-    found = linear_separation(jacobian, noise, None, owner, 3)
+    result = linear_separation(jacobian, noise, None, owner, 3)
     # Two at once would have the whole of so small a risk.
     prior = np.where(np.arange(3) == 0, risk.fault, 0.0) * np.ones((count, 1))
-    position_m, _ = protection_levels(found, risk, prior=prior)
+    position_m, _ = protection_levels(result, risk, prior=prior)
     error = np.linalg.norm(_error(jacobian, noise)[:, 3:], axis=1)
-    unseen = (error > position_m) & ~np.any(found.excess(risk) > 1.0, axis=1)
-    most = risk.total / 2.0 / (risk.fault if size else 1.0)
+    unseen = (error > position_m) & ~np.any(result.excess(risk) > 1.0, axis=1)
+    maximum = risk.total / 2.0 / (risk.fault if size else 1.0)
     assert np.all(np.isfinite(position_m))
-    assert np.sum(unseen) <= binom.isf(1e-4, count, most)
+    assert np.sum(unseen) <= binom.isf(1e-4, count, maximum)
 
 
 def test_two_beacons_that_may_be_false_at_once_leave_no_level():
-    found = _separated(_linear(np.random.default_rng(6), 3), np.zeros((3, len(OWNER))))
-    assert np.all(np.isnan(protection_levels(found, Risk(total=1e-6))[0]))
-    assert np.all(np.isfinite(protection_levels(found, Risk(total=1e-6, fault=1e-4))[0]))
+    result = _separated(_linear(np.random.default_rng(6), 3), np.zeros((3, len(OWNER))))
+    assert np.all(np.isnan(protection_levels(result, Risk(total=1e-6))[0]))
+    assert np.all(np.isfinite(protection_levels(result, Risk(total=1e-6, fault=1e-4))[0]))
 
 
 def test_a_beacon_that_is_not_heard_is_no_risk():
     jacobian = _linear(np.random.default_rng(7), 4)
     jacobian[:, OWNER >= 2] = 0.0
-    found = _separated(jacobian, np.zeros((4, len(OWNER))))
-    assert np.all(found.prior(Risk())[:, 2:] == 0.0)
-    np.testing.assert_allclose(found.step[:, 2:], 0.0, atol=1e-12)
-    assert np.all(np.isfinite(protection_levels(found, Risk())[0]))
+    result = _separated(jacobian, np.zeros((4, len(OWNER))))
+    assert np.all(result.prior(Risk())[:, 2:] == 0.0)
+    np.testing.assert_allclose(result.step[:, 2:], 0.0, atol=1e-12)
+    assert np.all(np.isfinite(protection_levels(result, Risk())[0]))
 
 
 def test_a_level_reaches_to_a_rival_that_is_too_likely():
     weight = np.array([[0.3, 1e-7], [1e-7, 1e-9]])
     distance = np.array([[2.0, 5.0], [2.0, 5.0]])
-    found = with_rivals(np.array([0.01, 0.01]), distance, weight, 1e-5)
-    np.testing.assert_allclose(found, [2.01, 0.01], rtol=1e-12)
+    result = with_rivals(np.array([0.01, 0.01]), distance, weight, 1e-5)
+    np.testing.assert_allclose(result, [2.01, 0.01], rtol=1e-12)
 
 
 def _room(beacons=4, *, synchronised=True):
@@ -171,15 +171,15 @@ def _position_error(fixes, truth):
 def test_a_false_beacon_is_found_and_left_out(share, alarms):
     site, count = _room(), 100
     samples, truth, false = _seen(site, count, share)
-    found = _separate(site, samples)
-    alarmed = np.any(found.excess > 1.0, axis=1)
+    result = _separate(site, samples)
+    alarmed = np.any(result.excess > 1.0, axis=1)
     assert np.mean(alarmed) >= alarms
     right = [
-        found.states.excluded[i] == (site.beacons[false[i]].name,) for i in np.flatnonzero(alarmed)
+        result.states.excluded[i] == (site.beacons[false[i]].name,) for i in np.flatnonzero(alarmed)
     ]
     assert np.mean(right) >= 0.98
-    error = _position_error(found.fixes, truth)
-    undetected = ~alarmed & (error > found.states.protection_level_m)
+    error = _position_error(result.fixes, truth)
+    undetected = ~alarmed & (error > result.states.protection_level_m)
     assert not np.any(undetected)
     clean = _position_error(_separate(site, _seen(site, count, 0.0)[0]).fixes, truth)
     assert np.median(error[alarmed]) < 2.0 * np.median(clean)
@@ -189,15 +189,15 @@ def test_good_fixes_stay_as_they_were_and_have_a_useful_level():
     site = _room()
     samples, truth, _ = _seen(site, 200, 0.0)
     before = fix_epochs(samples, initial_calibration(site, 0.0), survey_error=False)
-    found = _separate(site, samples)
-    same = [not names for names in found.states.excluded]
+    result = _separate(site, samples)
+    same = [not names for names in result.states.excluded]
     assert np.mean(same) >= 0.99
     np.testing.assert_array_equal(
-        found.fixes.position_world[same], before.position_world[same], strict=True
+        result.fixes.position_world[same], before.position_world[same], strict=True
     )
-    level = found.states.protection_level_m
+    level = result.states.protection_level_m
     assert np.mean(np.isfinite(level)) >= 0.99
-    assert not np.any(_position_error(found.fixes, truth) > level)
+    assert not np.any(_position_error(result.fixes, truth) > level)
     radius = 3.0 * np.sqrt(np.trace(before.pose_cov[:, 0, 3:, 3:], axis1=1, axis2=2))
     assert np.nanmedian(level / radius) <= 4.0
 
@@ -205,9 +205,9 @@ def test_good_fixes_stay_as_they_were_and_have_a_useful_level():
 def test_one_beacon_has_no_level_and_that_is_no_doubt():
     site = _room(1)
     samples, _, _ = _seen(site, 10, 0.0)
-    found = _separate(site, samples)
-    assert np.all(np.isnan(found.states.protection_level_m))
-    trust = separation_trust(found, ("A",), Risk())
+    result = _separate(site, samples)
+    assert np.all(np.isnan(result.states.protection_level_m))
+    trust = separation_trust(result, ("A",), Risk())
     assert trust.verdict is Verdict.TRUSTWORTHY
     assert [finding.code for finding in trust.findings] == ["no_redundancy"]
 
@@ -216,16 +216,16 @@ def test_two_beacons_that_contradict_each_other_are_in_doubt_and_honest():
     """Which of the two is false cannot be told."""
     site = _room(2)
     samples, truth, _ = _seen(site, 40, 0.05, always=0)
-    found = _separate(site, samples)
-    doubtful = np.array([v is Verdict.DOUBTFUL for v in found.states.verdict])
+    result = _separate(site, samples)
+    doubtful = np.array([v is Verdict.DOUBTFUL for v in result.states.verdict])
     assert np.mean(doubtful) > 0.5
-    assert not any(found.states.excluded)
-    assert np.all(np.isnan(found.states.protection_level_m[doubtful]))
-    assert separation_trust(found, ("A", "B"), Risk()).verdict is Verdict.DOUBTFUL
-    rotation = found.fixes.world_from_body[:, 0]
-    shift = found.fixes.position_world[:, 0] - truth.position_world
+    assert not any(result.states.excluded)
+    assert np.all(np.isnan(result.states.protection_level_m[doubtful]))
+    assert separation_trust(result, ("A", "B"), Risk()).verdict is Verdict.DOUBTFUL
+    rotation = result.fixes.world_from_body[:, 0]
+    shift = result.fixes.position_world[:, 0] - truth.position_world
     body = (np.swapaxes(rotation, 1, 2) @ shift[..., None])[..., 0]
-    cov = found.fixes.pose_cov[:, 0, 3:, 3:]
+    cov = result.fixes.pose_cov[:, 0, 3:, 3:]
     nees = np.einsum("ni,nij,nj->n", body, np.linalg.inv(cov), body)
     assert np.median(nees[doubtful]) < 12.0
 
@@ -239,11 +239,11 @@ def test_a_mirrored_pose_is_within_the_level():
     )
     site = replace(site, beacons=flat)
     samples, truth, _ = _seen(site, 20, 0.0)
-    found = _separate(site, samples)
+    result = _separate(site, samples)
     mirrored = 2.0 * truth.position_world[:, 2]
-    known = np.isfinite(found.states.protection_level_m)
+    known = np.isfinite(result.states.protection_level_m)
     assert np.mean(known) > 0.9
-    assert np.all(found.states.protection_level_m[known] > 0.9 * mirrored[known])
+    assert np.all(result.states.protection_level_m[known] > 0.9 * mirrored[known])
 
 
 def test_no_separation_is_told_of_an_estimate_that_does_not_exist():

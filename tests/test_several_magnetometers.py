@@ -62,7 +62,7 @@ def two_magnetometers(site: Site | None = None) -> Site:
     """Both uneven, 0.27 m apart, by different clocks; the second by axes that answer apart."""
     site = mixed_site() if site is None else site
     known = site.platform.magnetometer
-    left = replace(known, name="left", position_body=np.array([0.13, 0.02, 0.01]))
+    remaining = replace(known, name="left", position_body=np.array([0.13, 0.02, 0.01]))
     right = replace(
         known,
         name="right",
@@ -73,11 +73,13 @@ def two_magnetometers(site: Site | None = None) -> Site:
         clock_offset=0.004,
         sigma=replace(known.sigma, clock_offset=5e-4),
     )
-    return replace(site, platform=site.platform.carrying((left, right)))
+    return replace(site, platform=site.platform.with_magnetometers((remaining, right)))
 
 
 def only(site: Site, which: int) -> Site:
-    return replace(site, platform=site.platform.carrying((site.platform.magnetometers[which],)))
+    return replace(
+        site, platform=site.platform.with_magnetometers((site.platform.magnetometers[which],))
+    )
 
 
 def poses(count: int, seed: int = 2) -> Trajectory:
@@ -96,11 +98,11 @@ def real(phasor: np.ndarray) -> np.ndarray:
 def test_the_model_agrees_with_the_simulator_which_does_not_know_it() -> None:
     site, at = two_magnetometers(), poses(4)
     simulated = simulate_fields(site, at, 1e-30, np.random.default_rng(0))
-    found = predict_channels(
+    result = predict_channels(
         initial_calibration(site, 0.0), at.time, at.world_from_body, at.position_world
     )
     size = np.max(np.abs(simulated.phasor_sensor))
-    assert np.max(np.abs(found - simulated.phasor_sensor)) < 1e-9 * size
+    assert np.max(np.abs(result - simulated.phasor_sensor)) < 1e-9 * size
     assert simulated.magnetometers == ("left",) * 6 + ("right",) * 6
 
 
@@ -128,9 +130,9 @@ def test_the_jacobian_is_the_derivative_of_the_prediction() -> None:
     )
 
     def seen(calibration: Calibration, step: np.ndarray) -> np.ndarray:
-        turned = at.world_from_body @ Rotation.from_rotvec(step[:3]).as_matrix()
+        rotated = at.world_from_body @ Rotation.from_rotvec(step[:3]).as_matrix()
         place = at.position_world + at.world_from_body @ step[3:]
-        return real(predict_channels(calibration, at.time, turned, place))
+        return real(predict_channels(calibration, at.time, rotated, place))
 
     assert relative_to_group(value, seen(start, np.zeros(6))) < 1e-14
     assert relative_to_group(by_pose, central_difference(lambda s: seen(start, s), 6, 1e-5)) < 1e-8
@@ -150,15 +152,17 @@ def test_the_jacobian_is_the_derivative_of_the_prediction() -> None:
 def test_a_site_keeps_its_magnetometers(tmp_path: Path) -> None:
     site = two_magnetometers()
     save_site(site, tmp_path / "site.yaml")
-    found = load_site(tmp_path / "site.yaml", several=True)
-    for mine, theirs in zip(site.platform.magnetometers, found.platform.magnetometers, strict=True):
-        assert (mine.name, mine.clock_offset) == (theirs.name, theirs.clock_offset)
-        assert mine.sigma.clock_offset == theirs.sigma.clock_offset
-        np.testing.assert_allclose(mine.position_body, theirs.position_body)
-    answer = found.platform.further[0].response
+    result = load_site(tmp_path / "site.yaml", several=True)
+    for mine, others in zip(
+        site.platform.magnetometers, result.platform.magnetometers, strict=True
+    ):
+        assert (mine.name, mine.clock_offset) == (others.name, others.clock_offset)
+        assert mine.sigma.clock_offset == others.sigma.clock_offset
+        np.testing.assert_allclose(mine.position_body, others.position_body)
+    answer = result.platform.further[0].response
     assert isinstance(answer, AxisResponses)
     np.testing.assert_allclose(answer.y.gain, axis(0.8, 0.1).gain)
-    save_site(found, tmp_path / "again.yaml")
+    save_site(result, tmp_path / "again.yaml")
     assert (tmp_path / "again.yaml").read_text() == (tmp_path / "site.yaml").read_text()
 
 
@@ -166,7 +170,7 @@ NAMED = "  magnetometers:\n  - name: left\n"
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "findings"),
     [
         (("name: right", "name: left"), r"magnetometers\[1\].name: found 'left'; give it another"),
         (("name: right", "name: A"), r"magnetometers\[1\].name: found 'A'.*beacons\[0\]"),
@@ -177,26 +181,28 @@ NAMED = "  magnetometers:\n  - name: left\n"
         (("frequency_hz: 60.0", "frequency_hz: 30.0"), r"axis_responses.x: found .*as far as"),
     ],
 )
-def test_what_does_not_fit_is_refused(tmp_path: Path, change: tuple[str, str], said: str) -> None:
+def test_what_does_not_fit_is_refused(
+    tmp_path: Path, change: tuple[str, str], findings: str
+) -> None:
     save_site(two_magnetometers(), tmp_path / "site.yaml")
     text = (tmp_path / "site.yaml").read_text()
     assert change[0] in text
     (tmp_path / "site.yaml").write_text(text.replace(*change, 1))
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=findings):
         load_site(tmp_path / "site.yaml", several=True)
 
 
 def by_own_clock(site: Site, at: Trajectory, which: int, seed: int) -> FieldSamples:
     """Return what one magnetometer recorded, as it stamps it."""
     own = only(site, which)
-    found = simulate_fields(own, at, 1e-10, np.random.default_rng(seed))
+    result = simulate_fields(own, at, 1e-10, np.random.default_rng(seed))
     sensor = own.platform.magnetometer
     tones = np.concatenate([beacon.tone_frequencies_hz for beacon in own.beacons])
     turn = np.exp(2j * np.pi * tones * sensor.clock_offset)
     return replace(
-        found,
-        time=found.time - sensor.clock_offset,
-        phasor_sensor=found.phasor_sensor * turn[:, None],
+        result,
+        time=result.time - sensor.clock_offset,
+        phasor_sensor=result.phasor_sensor * turn[:, None],
         magnetometers=(sensor.name,) * len(own.channels),
     )
 
@@ -217,17 +223,17 @@ def recorded(site: Site, path: Path) -> tuple[FieldSamples, Trajectory]:
 def test_fields_are_arranged_by_the_clock_of_the_log(tmp_path: Path) -> None:
     site = two_magnetometers()
     raw, at = recorded(site, tmp_path)
-    found = order_channels(raw, site)
-    np.testing.assert_allclose(found.time, at.time, atol=1e-9)
-    assert found.channels == site.channels
-    left, right = (found.valid[:, site.of_sensor(k)] for k in range(2))
+    result = order_channels(raw, site)
+    np.testing.assert_allclose(result.time, at.time, atol=1e-9)
+    assert result.channels == site.channels
+    remaining, right = (result.valid[:, site.of_sensor(k)] for k in range(2))
     assert np.all(right)
-    assert np.all(left[::2])
-    assert not np.any(left[1::2])
+    assert np.all(remaining[::2])
+    assert not np.any(remaining[1::2])
     expected = predict_channels(
         initial_calibration(site, 0.0), at.time, at.world_from_body, at.position_world
     )
-    error = np.abs(found.phasor_sensor - expected)[found.valid]
+    error = np.abs(result.phasor_sensor - expected)[result.valid]
     assert np.max(error) < 1e-9
 
 
@@ -263,18 +269,18 @@ def test_fields_that_do_not_say_whose_they_are_are_refused(tmp_path: Path) -> No
 def test_one_that_hears_nothing_is_named_and_left_out() -> None:
     site = two_magnetometers()
     at = poses(12)
-    found = simulate_fields(site, at, 1e-10, np.random.default_rng(0))
+    result = simulate_fields(site, at, 1e-10, np.random.default_rng(0))
     noise = np.random.default_rng(1).normal(0.0, 1e-10, (2, 12, 6, 3))
-    quiet = found.phasor_sensor.copy()
+    quiet = result.phasor_sensor.copy()
     quiet[:, site.of_sensor(1)] = noise[0] + 1j * noise[1]
-    log = Log("two", 0, "simulation", NO_SAMPLES, fields=replace(found, phasor_sensor=quiet))
-    left, alone = without_silent(log, site)
-    assert [finding.code for finding in left.noticed] == ["magnetometer_silent"]
-    assert "right detects no beacon in 12 epochs" in left.noticed[0].text
+    log = Log("two", 0, "simulation", NO_SAMPLES, fields=replace(result, phasor_sensor=quiet))
+    remaining, alone = without_silent(log, site)
+    assert [finding.code for finding in remaining.noticed] == ["magnetometer_silent"]
+    assert "right detects no beacon in 12 epochs" in remaining.noticed[0].text
     assert [sensor.name for sensor in alone.platform.magnetometers] == ["left"]
-    assert left.fields is not None
-    np.testing.assert_array_equal(left.fields.phasor_sensor, quiet[:, site.of_sensor(0)])
-    both = replace(log, fields=found)
+    assert remaining.fields is not None
+    np.testing.assert_array_equal(remaining.fields.phasor_sensor, quiet[:, site.of_sensor(0)])
+    both = replace(log, fields=result)
     assert without_silent(both, site) == (both, site)
 
 
@@ -283,14 +289,14 @@ def test_the_first_that_hears_nothing_stays_in_the_file_and_keeps_the_clock(tmp_
     first, second = two_magnetometers().platform.magnetometers
     third = replace(second, name="third", clock_offset=-0.002)
     site = two_magnetometers()
-    site = replace(site, platform=site.platform.carrying((first, second, third)))
-    found = simulate_fields(site, poses(12), 1e-10, np.random.default_rng(0))
+    site = replace(site, platform=site.platform.with_magnetometers((first, second, third)))
+    result = simulate_fields(site, poses(12), 1e-10, np.random.default_rng(0))
     noise = np.random.default_rng(1).normal(0.0, 1e-10, (2, 12, 6, 3))
     for dead in ((0,), (0, 1), (1, 2), (0, 2)):
-        quiet = found.phasor_sensor.copy()
+        quiet = result.phasor_sensor.copy()
         for which in dead:
             quiet[:, site.of_sensor(which)] = noise[0] + 1j * noise[1]
-        fields = replace(found, phasor_sensor=quiet)
+        fields = replace(result, phasor_sensor=quiet)
         log, alone = without_silent(Log("three", 0, "simulation", NO_SAMPLES, fields=fields), site)
         assert log.fields is not None
         assert len(alone.platform.magnetometers) == 3 - len(dead)
@@ -321,41 +327,41 @@ def walked(seed: int) -> tuple[Log, Site, SimulatedLog]:
 
 def test_the_clock_of_the_second_is_found_by_the_phases() -> None:
     log, site, walk = walked(3)
-    found = smooth(log, site, SmootherSettings(tune=False))
+    result = smooth(log, site, SmootherSettings(tune=False))
     true = walk.true_site.platform.further[0].clock_offset - 0.004
-    late = found.calibration.clock_offsets[1]
-    names = [block.name for block in found.blocks]
+    late = result.calibration.clock_offsets[1]
+    names = [block.name for block in result.blocks]
     assert "right.clock_offset" in names
-    column = found.blocks[names.index("right.clock_offset")].columns.start
-    sigma = np.sqrt(found.calibration_cov[column, column])
+    column = result.blocks[names.index("right.clock_offset")].columns.start
+    sigma = np.sqrt(result.calibration_cov[column, column])
     assert abs(late - true) < 4.0 * sigma < 1e-4
-    assert trajectory_errors(found.states, walk.motion.trajectory(found.states.time)).ate < 5e-3
+    assert trajectory_errors(result.states, walk.motion.trajectory(result.states.time)).ate < 5e-3
 
 
 @pytest.mark.slow
 def test_one_that_is_mounted_otherwise_is_named_and_the_other_goes_on() -> None:
     log, site, _ = walked(4)
-    left, right = site.platform.magnetometers
+    remaining, right = site.platform.magnetometers
     turn = Rotation.from_euler("x", 8.0, degrees=True).as_matrix()
     wrong = replace(right, body_from_sensor=right.body_from_sensor @ turn)
-    site = replace(site, platform=site.platform.carrying((left, wrong)))
+    site = replace(site, platform=site.platform.with_magnetometers((remaining, wrong)))
 
     def solve(log: Log, site: Site) -> Smoothed:
         return smooth(log, site, SmootherSettings(tune=False))
 
-    found = agreed(solve(log, site), log, site, solve, solve)
-    assert [finding.code for finding in found.findings] == ["magnetometer_excluded"]
-    assert "Magnetometer right" in found.findings[0].text
-    assert [sensor.name for sensor in found.site.platform.magnetometers] == ["left"]
+    result = agreed(solve(log, site), log, site, solve, solve)
+    assert [finding.code for finding in result.findings] == ["magnetometer_excluded"]
+    assert "Magnetometer right" in result.findings[0].text
+    assert [sensor.name for sensor in result.site.platform.magnetometers] == ["left"]
 
 
 @pytest.mark.slow
 def test_online_as_offline_it_is_named_at_the_start_and_the_other_is_not_blamed() -> None:
     log, site, walk = walked(4)
-    left, right = site.platform.magnetometers
+    remaining, right = site.platform.magnetometers
     turn = Rotation.from_euler("x", 8.0, degrees=True).as_matrix()
     wrong = replace(right, body_from_sensor=right.body_from_sensor @ turn)
-    site = replace(site, platform=site.platform.carrying((left, wrong)))
+    site = replace(site, platform=site.platform.with_magnetometers((remaining, wrong)))
     navigator, states = Navigator(site, NavigatorSettings("ekf")), list[JudgedState]()
     for _, piece in Replay(log).pieces():
         feed(navigator, piece)
@@ -367,6 +373,6 @@ def test_online_as_offline_it_is_named_at_the_start_and_the_other_is_not_blamed(
         assert len(named) == 1
         assert named[0].text.startswith("Magnetometer right contradicts the others")
         assert not any("left.rotation" in f.text or f.code == "mounting" for f in reasons)
-    found = as_trajectory(states)
-    errors = trajectory_errors(found, walk.motion.trajectory(found.time))
+    result = as_trajectory(states)
+    errors = trajectory_errors(result, walk.motion.trajectory(result.time))
     assert errors.ate < 0.02

@@ -41,15 +41,15 @@ def known(walk: SimulatedLog, time: np.ndarray) -> tuple[Calibration, Trajectory
 
 
 def test_what_is_left_of_the_motion_is_far_less_than_without(walk: SimulatedLog) -> None:
-    found = demodulated_several(walk.log, walk.true_site)
-    calibration, states = known(walk, found.fields.time)
-    wave = found.compensated(calibration, states)
+    result = demodulated_several(walk.log, walk.true_site)
+    calibration, states = known(walk, result.fields.time)
+    wave = result.compensated(calibration, states)
     pose = states.time, states.world_from_body, states.position_world
     expected = predict_channels(calibration, *pose)
     size = np.linalg.norm(expected, axis=2)
     before, after = (
         np.linalg.norm(fields.phasor_sensor - expected, axis=2) / size
-        for fields in (found.fields, wave.fields)
+        for fields in (result.fields, wave.fields)
     )
     for k in range(2):
         mine = walk.true_site.of_sensor(k)
@@ -58,9 +58,9 @@ def test_what_is_left_of_the_motion_is_far_less_than_without(walk: SimulatedLog)
 
 def test_each_is_demodulated_as_if_it_were_alone(walk: SimulatedLog) -> None:
     site = walk.true_site
-    found = demodulated_several(walk.log, site)
-    calibration, states = known(walk, found.fields.time)
-    wave = found.compensated(calibration, states)
+    result = demodulated_several(walk.log, site)
+    calibration, states = known(walk, result.fields.time)
+    wave = result.compensated(calibration, states)
     for k, sensor in enumerate(site.platform.magnetometers):
         own = walk.log.waveforms[sensor.name]
         log = replace(

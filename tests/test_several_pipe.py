@@ -12,7 +12,7 @@ import pytest
 from test_several_magnetometers import two_magnetometers
 
 from magfusion.errors import InputError
-from magfusion.estimation.demodulation.demodulated_apart import demodulated_apart
+from magfusion.estimation.demodulation.separate_demodulation import demodulated_apart
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.fields import by_own_clocks
 from magfusion.files.log import write_log
@@ -71,8 +71,8 @@ def piped(
     settings = StreamSettings(EKF) if settings is None else settings
     source, sink = io.BytesIO(b"".join(map(json_line, lines))), io.BytesIO()
     run_stream(directory / "site.yaml", settings, source, sink, io.StringIO())
-    told = [json.loads(line) for line in sink.getvalue().splitlines()]
-    return [state for state in told if state["started"]]
+    reported = [json.loads(line) for line in sink.getvalue().splitlines()]
+    return [state for state in reported if state["started"]]
 
 
 @pytest.mark.parametrize("kind", ["raw", "demodulated"])
@@ -84,11 +84,11 @@ def test_a_log_and_its_records_lead_to_the_same_states(
     settings = NavigateSettings(log=directory, estimator="ekf")
     run_navigate(settings, tmp_path / "out")
     expected = read_trajectory(tmp_path / "out" / "trajectory.parquet", log.epoch_ns)
-    found = piped(records(directory), directory)
-    assert len(found) == len(expected.time) > 10
+    result = piped(records(directory), directory)
+    assert len(result) == len(expected.time) > 10
     for name, values in (("time", expected.time), ("position", expected.position_world)):
-        told = np.array([state[name] for state in found])
-        np.testing.assert_allclose(told, values, rtol=0.0, atol=1e-7)
+        reported = np.array([state[name] for state in result])
+        np.testing.assert_allclose(reported, values, rtol=0.0, atol=1e-7)
 
 
 def delayed(lines: list[dict[str, Any]], name: str, late: float) -> list[dict[str, Any]]:
@@ -109,9 +109,9 @@ def test_one_that_is_late_changes_no_state(
 ) -> None:
     directory = written(request.getfixturevalue(kind), site, tmp_path)
     lines = records(directory)
-    expected, found = piped(lines, directory), piped(delayed(lines, "right", 0.3), directory)
-    assert len(found) == len(expected)
-    for one, other in zip(found, expected, strict=True):
+    expected, result = piped(lines, directory), piped(delayed(lines, "right", 0.3), directory)
+    assert len(result) == len(expected)
+    for one, other in zip(result, expected, strict=True):
         assert abs(one["time"] - other["time"]) < 1e-9
         # The start's passes end at a share of a sigma: what rounding makes of that is below 0.1 um.
         np.testing.assert_allclose(one["position"], other["position"], rtol=0.0, atol=1e-7)
@@ -132,17 +132,17 @@ def test_one_that_falls_silent_is_named_and_the_other_goes_on(
         if next(iter(line.values())).get("magnetometer") != "right"
         or np.max(next(iter(line.values()))["time"]) < 6.5
     ]
-    found = piped(lines, directory)
+    result = piped(lines, directory)
     silent = [
         state
-        for state in found
+        for state in result
         if any(r["code"] == "magnetometer_silent" for r in state["remarks"])
     ]
     assert silent
     assert all("Magnetometer right has sent nothing" in str(state["remarks"]) for state in silent)
     assert silent[0]["time"] > 6.0
-    assert found[-1]["time"] > 8.0
-    before = [state for state in found if state not in silent]
+    assert result[-1]["time"] > 8.0
+    before = [state for state in result if state not in silent]
     # With half of what was heard the position is known less.
     assert max(silent[-1]["sigma"]["position"]) > max(before[-1]["sigma"]["position"])
 
@@ -156,8 +156,8 @@ def test_one_that_comes_again_is_heard_again(site: Site, demodulated: Log, tmp_p
         if next(iter(line.values())).get("magnetometer") != "right"
         or not 5.9 < np.max(next(iter(line.values()))["time"]) < 7.9
     ]
-    found = piped(lines, directory)
-    named = [bool(state["remarks"]) for state in found]
+    result = piped(lines, directory)
+    named = [bool(state["remarks"]) for state in result]
     assert any(named)
     assert not named[-1]
 
@@ -219,8 +219,8 @@ def test_samples_and_fields_in_one_stream_are_refused(site: Site, tmp_path: Path
         {"magnetometer": {**samples, "magnetometer": "left"}},
         {"fields": {**fields, "magnetometer": "right"}},
     ]
-    for order, said in ((lines, "fields: they are mixed"), (lines[::-1], "mixed with fields")):
-        with pytest.raises(InputError, match=said):
+    for order, findings in ((lines, "fields: they are mixed"), (lines[::-1], "mixed with fields")):
+        with pytest.raises(InputError, match=findings):
             piped(order, tmp_path)
 
 

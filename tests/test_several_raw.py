@@ -11,9 +11,9 @@ import pytest
 from test_several_magnetometers import only, two_magnetometers
 
 from magfusion.errors import InputError
-from magfusion.estimation.demodulation.demodulated_apart import demodulated_apart, of_site
 from magfusion.estimation.demodulation.demodulation import phasors
-from magfusion.estimation.demodulation.warming import at_reference
+from magfusion.estimation.demodulation.separate_demodulation import demodulated_apart, of_site
+from magfusion.estimation.demodulation.temperature_compensation import at_reference
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.files.fields import by_own_clocks, order_channels
 from magfusion.files.log import read_log, write_log
@@ -25,7 +25,7 @@ from magfusion.jobs.inputs import Job
 from magfusion.model.parameters import initial_calibration, predict_channels
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
-from magfusion.model.temperature import SensorWarming
+from magfusion.model.temperature import SensorTemperatureModel
 from magfusion.receiver.windows import LockinSettings, default_settings
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
@@ -63,11 +63,11 @@ def rewritten(directory: Path, **columns: pa.Array | None) -> None:
 
 
 def test_samples_are_read_as_they_were_written(walk: SimulatedLog, directory: Path) -> None:
-    found = read_log(directory).waveforms
-    assert list(found) == ["left", "right"]
+    result = read_log(directory).waveforms
+    assert list(result) == ["left", "right"]
     for name, wave in walk.log.waveforms.items():
-        np.testing.assert_allclose(found[name].time, wave.time, rtol=0.0, atol=1e-9)
-        np.testing.assert_array_equal(found[name].measured_sensor, wave.measured_sensor)
+        np.testing.assert_allclose(result[name].time, wave.time, rtol=0.0, atol=1e-9)
+        np.testing.assert_array_equal(result[name].measured_sensor, wave.measured_sensor)
 
 
 def test_noise_of_instruments_is_their_own(walk: SimulatedLog, site: Site) -> None:
@@ -115,9 +115,9 @@ def test_phasors_by_own_clocks_come_back(walk: SimulatedLog, site: Site) -> None
     assert fields is not None
     own = by_own_clocks(fields, site)
     assert len(own) > len(fields)
-    found = order_channels(own, site)
-    np.testing.assert_allclose(found.time, fields.time, rtol=0.0, atol=1e-9)
-    np.testing.assert_allclose(found.phasor_sensor, fields.phasor_sensor, rtol=1e-9, atol=0.0)
+    result = order_channels(own, site)
+    np.testing.assert_allclose(result.time, fields.time, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(result.phasor_sensor, fields.phasor_sensor, rtol=1e-9, atol=0.0)
 
 
 def test_phasors_are_those_of_the_true_motion(walk: SimulatedLog) -> None:
@@ -146,8 +146,8 @@ def test_demodulate_then_fix_is_fix(directory: Path, tmp_path: Path) -> None:
     first, second = (np.column_stack([t[n].to_numpy() for n in names]) for t in tables)
     # Stamps are rounded to 1 ns; a fix ends within a thousandth of its sigma of centimetres.
     np.testing.assert_allclose(first, second, rtol=0.0, atol=1e-5)
-    said = json.loads((tmp_path / "raw" / "report.json").read_text())
-    assert "demodulated_apart" in json.dumps(said)
+    findings = json.loads((tmp_path / "raw" / "report.json").read_text())
+    assert "demodulated_apart" in json.dumps(findings)
 
 
 def test_a_fix_of_both_is_near_the_truth(walk: SimulatedLog, site: Site) -> None:
@@ -165,15 +165,15 @@ def test_a_fix_of_both_is_near_the_truth(walk: SimulatedLog, site: Site) -> None
 
 def test_of_one_without_samples_it_is_said(walk: SimulatedLog, site: Site) -> None:
     log = replace(walk.log, waveforms={"right": walk.log.waveforms["right"]})
-    found = demodulated_apart(log, site)
-    assert "There are no samples of magnetometer left." in found.noticed[-1].text
-    assert found.log.fields is not None
-    assert not np.any(found.log.fields.valid[:, site.of_sensor(0)])
+    result = demodulated_apart(log, site)
+    assert "There are no samples of magnetometer left." in result.noticed[-1].text
+    assert result.log.fields is not None
+    assert not np.any(result.log.fields.valid[:, site.of_sensor(0)])
 
 
 def test_a_site_of_one_takes_what_is_of_it(walk: SimulatedLog, site: Site) -> None:
-    found = of_site(walk.log, only(site, 1))
-    assert found.waveform is walk.log.waveforms["right"]
+    result = of_site(walk.log, only(site, 1))
+    assert result.waveform is walk.log.waveforms["right"]
     named = replace(walk.log, waveforms={"right": walk.log.waveforms["right"]})
     other = demo_site(coil_radius=None)
     assert of_site(named, other).waveform is walk.log.waveforms["right"]
@@ -216,25 +216,27 @@ def test_rests_of_several_are_refused(directory: Path, tmp_path: Path) -> None:
 
 
 def test_check_judges_each_by_its_name(directory: Path, walk: SimulatedLog) -> None:
-    gone = walk.log.waveforms["right"]
-    kept = (gone.time < 3.0) | (gone.time > 4.0)
-    waves = {**walk.log.waveforms, "right": gone.rows(kept)}
+    elapsed = walk.log.waveforms["right"]
+    kept = (elapsed.time < 3.0) | (elapsed.time > 4.0)
+    waves = {**walk.log.waveforms, "right": elapsed.rows(kept)}
     write_log(replace(walk.log, waveforms=waves), directory)
-    found = run_check(CheckSettings(log=directory))
-    assert found["left_gaps"] == 0
-    assert found["right_gaps"] == 1
-    assert np.isclose(float(str(found["right_gap_s"])), 1.0, rtol=0.0, atol=0.02)
-    assert {"left_rate_hz", "right_rate_hz", "left_heard_A", "right_snr_D"} <= set(found)
-    assert "imu_rate_hz" in found
-    assert "Of right:" in json.dumps(dict(found))
+    result = run_check(CheckSettings(log=directory))
+    assert result["left_gaps"] == 0
+    assert result["right_gaps"] == 1
+    assert np.isclose(float(str(result["right_gap_s"])), 1.0, rtol=0.0, atol=0.02)
+    assert {"left_rate_hz", "right_rate_hz", "left_heard_A", "right_snr_D"} <= set(result)
+    assert "imu_rate_hz" in result
+    assert "Of right:" in json.dumps(dict(result))
     (directory / "site.yaml").unlink()
     assert run_check(CheckSettings(log=directory))["right_gaps"] == 1
 
 
 def test_what_temperature_does_to_one_of_several_is_refused(site: Site) -> None:
     first = site.platform.magnetometers[0]
-    warm = replace(first, warming=SensorWarming(1e-3 * np.eye(3), np.zeros(3), 20.0))
+    warm = replace(
+        first, temperature_model=SensorTemperatureModel(1e-3 * np.eye(3), np.zeros(3), 20.0)
+    )
     sensors = (warm, *site.platform.further)
-    site = replace(site, platform=site.platform.carrying(sensors))
+    site = replace(site, platform=site.platform.with_magnetometers(sensors))
     with pytest.raises(InputError, match=f"{first.name}: warming of several magnetometers"):
         at_reference(Log("warm", 0, "test", ImuSamples.empty()), site)

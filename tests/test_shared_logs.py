@@ -97,13 +97,13 @@ def test_evo_finds_the_same_errors_in_the_tum_file(walk: Result) -> None:
     estimate.reduce_to_ids(np.flatnonzero(exists))
     quaternion = Rotation.from_matrix(true.world_from_body).as_quat(scalar_first=True)
     truth = PoseTrajectory3D(true.position_world, quaternion, estimate.timestamps)
-    found = {}
+    result = {}
     for part in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg):
         metric = APE(part)
         metric.process_data((truth, estimate))
-        found[part] = metric.get_statistic(StatisticsType.rmse)
-    position = found[PoseRelation.translation_part]
-    angle = found[PoseRelation.rotation_angle_deg]
+        result[part] = metric.get_statistic(StatisticsType.rmse)
+    position = result[PoseRelation.translation_part]
+    angle = result[PoseRelation.rotation_angle_deg]
     assert estimate.num_poses > 900
     assert centimetres(position) <= 0.6
     assert angle <= 0.2
@@ -147,10 +147,10 @@ def test_a_turn_with_a_bad_survey_is_found_and_the_survey_mended(tmp_path: Path)
 @needs_shared_logs
 @pytest.mark.slow
 def test_a_walk_with_free_clocks_and_a_bad_survey_is_found(tmp_path: Path) -> None:
-    free = smoothed("walk_unsynchronised", tmp_path / "result")
-    assert free.report["converged"]
-    assert centimetres(free.errors.aligned_ate) <= 0.8
-    assert free.errors.aligned_attitude_rmse_deg <= 0.3
-    assert position_inside_3_sigma(free.errors) >= 0.99
-    assert free.report["held_aligned_ate_m"] > free.report["aligned_ate_m"]
-    assert any("drift" in name for name in free.report["determined"])
+    free_parameters = smoothed("walk_unsynchronised", tmp_path / "result")
+    assert free_parameters.report["converged"]
+    assert centimetres(free_parameters.errors.aligned_ate) <= 0.8
+    assert free_parameters.errors.aligned_attitude_rmse_deg <= 0.3
+    assert position_inside_3_sigma(free_parameters.errors) >= 0.99
+    assert free_parameters.report["held_aligned_ate_m"] > free_parameters.report["aligned_ate_m"]
+    assert any("drift" in name for name in free_parameters.report["determined"])

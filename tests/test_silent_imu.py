@@ -36,8 +36,8 @@ def simulated(rate_hz: float = 400.0) -> SimulatedLog:
     return simulate_log(site, config, np.random.default_rng(3))
 
 
-def state_at(made: SimulatedLog, time: float) -> State:
-    truth = made.motion.trajectory(np.array([time]))
+def state_at(simulation: SimulatedLog, time: float) -> State:
+    truth = simulation.motion.trajectory(np.array([time]))
     assert truth.velocity_world is not None
     sigma = np.repeat([0.01, 0.01, 0.3, 0.01, 0.01], 3)
     return State(
@@ -47,26 +47,26 @@ def state_at(made: SimulatedLog, time: float) -> State:
         truth.velocity_world[0],
         np.zeros(3),
         np.zeros(3),
-        initial_calibration(made.true_site, time),
+        initial_calibration(simulation.true_site, time),
         np.diag(sigma**2),
     )
 
 
-def stretch(made: SimulatedLog) -> Waveform:
-    wave = made.log.waveform
+def stretch(simulation: SimulatedLog) -> Waveform:
+    wave = simulation.log.waveform
     assert wave is not None
     inside = (wave.time > BEGIN) & (wave.time < BEGIN + SPAN)
     return Waveform(wave.time[inside], wave.measured_sensor[inside])
 
 
 def test_the_turn_is_found_without_a_gyro() -> None:
-    made = simulated()
-    wave = stretch(made)
-    found = motion_from_field(state_at(made, BEGIN), wave)
-    assert found is not None
-    rate = made.motion.rate_body(wave.time)
+    built = simulated()
+    wave = stretch(built)
+    result = motion_from_field(state_at(built, BEGIN), wave)
+    assert result is not None
+    rate = built.motion.rate_body(wave.time)
     assert np.sqrt(np.mean(np.sum(rate**2, axis=1))) > 0.3  # rad/s; there is a turn to be found
-    missed = np.sum(found.imu.gyro_body - rate, axis=0) * np.median(np.diff(wave.time))
+    missed = np.sum(result.imu.gyro_body - rate, axis=0) * np.median(np.diff(wave.time))
     assert np.linalg.norm(missed) < 0.02  # rad; over the whole stretch
 
 
@@ -77,12 +77,12 @@ def without_imu(log: Log, begin: float, end: float) -> Log:
 
 
 def test_a_batch_knows_where_it_is_in_a_gap_of_the_imu() -> None:
-    made = simulated(rate_hz=200.0)
+    built = simulated(rate_hz=200.0)
     begin, end = 5.0, 7.0
-    log = without_imu(made.log, begin, end)
-    result = smooth(log, made.true_site, SmootherSettings(tune=False))
+    log = without_imu(built.log, begin, end)
+    result = smooth(log, built.true_site, SmootherSettings(tune=False))
     assert INERTIAL_GAP not in result.dropped
-    assert result.bridged >= 2.0 / result.fields.window[0]
+    assert result.gap_bridged >= 2.0 / result.fields.window[0]
     assert log.truth is not None
     errors = trajectory_errors(result.states, log.truth)
     assert errors.nees is not None
@@ -98,12 +98,12 @@ def test_a_batch_knows_where_it_is_in_a_gap_of_the_imu() -> None:
 
 
 def test_fields_that_contradict_the_state_are_not_followed() -> None:
-    made = simulated()
-    wave = stretch(made)
+    built = simulated()
+    wave = stretch(built)
     rng = np.random.default_rng(1)
     noise = 1e-6 * rng.standard_normal(wave.measured_sensor.shape)
     false = replace(wave, measured_sensor=wave.measured_sensor + noise)
-    assert motion_from_field(state_at(made, BEGIN), false) is None
+    assert motion_from_field(state_at(built, BEGIN), false) is None
 
 
 def test_accelerations_that_nobody_measured_have_phasor_errors_of_the_claimed_spread() -> None:
@@ -125,9 +125,9 @@ def test_accelerations_that_nobody_measured_have_phasor_errors_of_the_claimed_sp
     attitude = Rotation.random(count, random_state=3)
     place = np.array([3.0, 2.5, 1.0]) + rng.uniform(-0.5, 0.5, (count, 3))
     half = 0.5 * (time - centre[own])[:, None] ** 2
-    turned = attitude[own] * Rotation.from_rotvec(half * rng.normal(0.0, 1.5, (count, 3))[own])
+    rotated = attitude[own] * Rotation.from_rotvec(half * rng.normal(0.0, 1.5, (count, 3))[own])
     moved = place[own] + half * rng.normal(0.0, 3.0, (count, 3))[own]
-    phasor = predict_channels(calibration, time, turned.as_matrix(), moved)
+    phasor = predict_channels(calibration, time, rotated.as_matrix(), moved)
     tones = np.concatenate([beacon.tone_frequencies_hz for beacon in site.beacons])
     carrier = np.exp(2j * np.pi * tones * time[:, None])
     waveform = Waveform(time, np.sum((carrier[..., None] * phasor).real, axis=1))

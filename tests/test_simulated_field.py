@@ -46,8 +46,8 @@ def around(radius, count=200):
     return points * radius / np.linalg.norm(points, axis=1)[:, None]
 
 
-def relative_error(found, expected):
-    return np.linalg.norm(found - expected, axis=1).max() / np.linalg.norm(expected, axis=1).min()
+def relative_error(result, expected):
+    return np.linalg.norm(result - expected, axis=1).max() / np.linalg.norm(expected, axis=1).min()
 
 
 @pytest.mark.parametrize("distance", [0.5, 0.8, 3.0])
@@ -59,8 +59,8 @@ def test_a_coil_with_a_radius_has_the_field_of_magpylibs_circle(distance):
         current=current, diameter=2.0 * radius, orientation=axis, position=centre
     )
     points = centre + around(distance)
-    found = coil_field(points, Coil(moment, centre_beacon=centre, radius=radius))
-    assert relative_error(found, circle.getB(points)) < 1e-7
+    result = coil_field(points, Coil(moment, centre_beacon=centre, radius=radius))
+    assert relative_error(result, circle.getB(points)) < 1e-7
 
 
 def test_a_coil_with_radius_and_length_has_the_field_of_magpylibs_cylinder():
@@ -175,9 +175,9 @@ def test_drift_and_phase_turn_the_tone_as_they_say():
         for k, beacon in enumerate(site.beacons):
             carrier = np.exp(-2j * np.pi * beacon.frequency_hz * wave.time[window])
             phasor = 2.0 * np.mean(wave.measured_sensor[window] * carrier[:, None], axis=0)
-            turned = np.angle(np.vdot(declared[k], phasor) * np.exp(-1j * phase[k]))
+            rotated = np.angle(np.vdot(declared[k], phasor) * np.exp(-1j * phase[k]))
             expected = 2.0 * np.pi * beacon.frequency_hz * drift[k] * (start + 0.5)
-            assert turned == pytest.approx(expected, abs=2e-3)  # rad, leakage of the other tones
+            assert rotated == pytest.approx(expected, abs=2e-3)  # rad, leakage of the other tones
 
 
 def test_phasors_in_hand_are_those_of_the_waveform():

@@ -52,10 +52,10 @@ def test_velocity_acceleration_and_rate_are_the_derivatives_of_the_pose(motion):
     before, here, after = (motion.position_world(time + k * h) for k in (-1, 0, 1))
     velocity = (after - before) / (2.0 * h)
     acceleration = (after - 2.0 * here + before) / h**2
-    turned = motion.world_from_body(time - h).inv() * motion.world_from_body(time + h)
+    rotated = motion.world_from_body(time - h).inv() * motion.world_from_body(time + h)
     np.testing.assert_allclose(motion.velocity_world(time), velocity, atol=1e-7)  # m/s
     np.testing.assert_allclose(motion.acceleration_world(time), acceleration, atol=1e-5)  # m/s^2
-    rate = turned.as_rotvec() / (2.0 * h)
+    rate = rotated.as_rotvec() / (2.0 * h)
     np.testing.assert_allclose(motion.rate_body(time), rate, atol=1e-6)  # rad/s
 
 
@@ -163,8 +163,8 @@ def test_gtsam_integrates_silent_samples_back_to_the_pose(motion):
         start.velocity_world[0],
     )
     final = integrated.predict(begin, gtsam.imuBias.ConstantBias())
-    turned = motion.world_from_body(end)[0].inv() * Rotation.from_matrix(final.attitude().matrix())
-    assert turned.magnitude() < 5e-6  # rad
+    rotated = motion.world_from_body(end)[0].inv() * Rotation.from_matrix(final.attitude().matrix())
+    assert rotated.magnitude() < 5e-6  # rad
     moved = motion.position_world(end)[0]
     np.testing.assert_allclose(final.position(), moved, atol=2e-3)  # m
     np.testing.assert_allclose(final.velocity(), motion.velocity_world(end)[0], atol=2e-4)  # m/s

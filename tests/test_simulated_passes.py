@@ -39,24 +39,24 @@ def _site(directory: Path, text: str = SITE) -> Path:
 @pytest.mark.parametrize("encoder", [True, False])
 def test_a_site_alone_is_simulated_and_ranged(encoder: bool, tmp_path: Path) -> None:
     log, out = tmp_path / "log", tmp_path / "out"
-    told = () if encoder else ("--no-encoder",)
+    reported = () if encoder else ("--no-encoder",)
     wells = ("--wells", tmp_path / "wells.yaml")
-    run_command("simulate", "--site", _site(tmp_path), *wells, "-o", log, "--seed", 7, *told)
+    run_command("simulate", "--site", _site(tmp_path), *wells, "-o", log, "--seed", 7, *reported)
     names = pyarrow.parquet.read_schema(log / "magnetometer.parquet").names
     assert ("rotor_bit" in names) == encoder
     run_command("range", log, "-o", out)
-    true, found = (json.loads((path / "report.json").read_text()) for path in (log, out))
-    assert found["verdict"] == "trustworthy"
+    true, result = (json.loads((path / "report.json").read_text()) for path in (log, out))
+    assert result["verdict"] == "trustworthy"
     assert (out / "range.png").read_bytes()[1:4] == b"PNG"
     assert "down the hole and by depth" in (out / "report.html").read_text()
     for k in (1, 2):
         for name in ("distance", "high_side", "abreast_depth"):
             unit = "deg" if name == "high_side" else "m"
-            error = found[f"place_{k}_{name}_{unit}"] - true[f"place_{k}_{name}_{unit}"]
-            assert abs(error) < 4.0 * found[f"place_{k}_{name}_sigma_{unit}"], name
+            error = result[f"place_{k}_{name}_{unit}"] - true[f"place_{k}_{name}_{unit}"]
+            assert abs(error) < 4.0 * result[f"place_{k}_{name}_sigma_{unit}"], name
     for name in ("leads_right", "leads_up"):
-        error = found[f"{name}_deg"] - true[f"{name}_deg"]
-        assert abs(error) < 4.0 * found[f"{name}_sigma_deg"], name
+        error = result[f"{name}_deg"] - true[f"{name}_deg"]
+        assert abs(error) < 4.0 * result[f"{name}_sigma_deg"], name
 
 
 def test_wells_lead_apart_as_their_file_says() -> None:
@@ -65,7 +65,7 @@ def test_wells_lead_apart_as_their_file_says() -> None:
         wells = TwoWells(9.0, 1.0, 0.3, lean_of(right, up), 0.2, 1.0, 4.0, 8.0, 0.1)
         np.testing.assert_allclose(wells.leads(), (right, up), atol=1e-12)
         axis = Rotation.random(random_state=rng).as_matrix()[0]
-        for one in wells.passes(np.zeros(2), axis_beacon=axis):
+        for one in wells.transits_of(np.zeros(2), axis_beacon=axis):
             np.testing.assert_allclose(one.world_from_rotor @ axis, wells.along_world, atol=1e-12)
             assert np.linalg.det(one.world_from_rotor) == pytest.approx(1.0)
 
@@ -81,7 +81,7 @@ def test_a_harmonic_turns_as_often_as_it_says() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "findings"),
     [
         (("--iron", 3), "--iron"),
         (("--motion", "turn"), "--motion"),
@@ -89,9 +89,9 @@ def test_a_harmonic_turns_as_often_as_it_says() -> None:
     ],
 )
 def test_what_does_not_go_with_a_well_is_refused(
-    given: tuple[object, ...], said: str, tmp_path: Path, refuse: Refuse
+    given: tuple[object, ...], findings: str, tmp_path: Path, refuse: Refuse
 ) -> None:
-    assert said in refuse("simulate", "--site", _site(tmp_path), *given, "-o", tmp_path / "log")
+    assert findings in refuse("simulate", "--site", _site(tmp_path), *given, "-o", tmp_path / "log")
 
 
 def test_wells_and_casings_are_of_a_rotor_that_is_to_be_found(

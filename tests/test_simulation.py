@@ -44,13 +44,15 @@ def test_drawn_calibrations_have_the_statistics_that_the_site_declares():
     magnetometer = site.platform.magnetometer
     scaled = {name: [] for name in ("position", "rotation", "moment", "matrix", "offset", "mount")}
     for draw in draws:
-        for true, told in zip(draw.beacons, site.beacons, strict=True):
-            turn_beacon = Rotation.from_matrix(told.world_from_beacon.T @ true.world_from_beacon)
-            moved = true.position_world - told.position_world
-            scaled["position"].append(moved / told.sigma.position_world)
-            scaled["rotation"].append(turn_beacon.as_rotvec() / told.sigma.rotation_beacon)
+        for true, reported in zip(draw.beacons, site.beacons, strict=True):
+            turn_beacon = Rotation.from_matrix(
+                reported.world_from_beacon.T @ true.world_from_beacon
+            )
+            moved = true.position_world - reported.position_world
+            scaled["position"].append(moved / reported.sigma.position_world)
+            scaled["rotation"].append(turn_beacon.as_rotvec() / reported.sigma.rotation_beacon)
             gain = np.linalg.norm(true.moments_beacon, axis=1) / 220.0
-            scaled["moment"].append(np.log(gain) / told.sigma.log_moment)
+            scaled["moment"].append(np.log(gain) / reported.sigma.log_moment)
         true_one, sigma = draw.platform.magnetometer, magnetometer.sigma
         turn_sensor = Rotation.from_matrix(
             magnetometer.body_from_sensor.T @ true_one.body_from_sensor
@@ -72,9 +74,9 @@ def test_only_beacons_without_synchronisation_drift():
     assert low < sum(np.sum((d.drift / site.clock.drift_sigma) ** 2) for d in draws) < high
     phases = np.array([d.phase for d in draws])
     assert abs(np.mean(np.exp(1j * phases))) < 0.15  # 4 sigma of 800 even phases
-    told = draw_drives(demo_site(), rng)
-    assert not told.phase.any()
-    assert not told.drift.any()
+    reported = draw_drives(demo_site(), rng)
+    assert not reported.phase.any()
+    assert not reported.drift.any()
 
 
 def test_a_log_is_reproducible_from_its_seed():
@@ -106,9 +108,9 @@ def test_a_log_is_true_to_its_truth(kind):
     assert run.time_offset == -0.004
     assert len(imu) == 2400
     assert len(run.log.waveform) == 4800
-    taken = imu.time + run.time_offset
-    exact = run.motion.rate_body(taken)
-    late = [np.interp(taken, truth.time, b) for b in truth.gyro_bias_body.T]
+    selected = imu.time + run.time_offset
+    exact = run.motion.rate_body(selected)
+    late = [np.interp(selected, truth.time, b) for b in truth.gyro_bias_body.T]
     inside = slice(1, None)
     # The bias walks 1e-5 rad/s per root second: 7e-7 from sample to sample.
     np.testing.assert_allclose(

@@ -105,25 +105,25 @@ def _again(site: Site, folder: Path) -> Site:
     return load_site(folder / "saved.yaml")
 
 
-def _assert_same(found: Any, wanted: Any, place: str = "site") -> None:
+def _assert_same(result: Any, wanted: Any, place: str = "site") -> None:
     """Compare to float precision; values that went through degrees to 1e-12 (rad)."""
     if dataclasses.is_dataclass(wanted):
-        assert type(found) is type(wanted), place
+        assert type(result) is type(wanted), place
         for field in dataclasses.fields(wanted):
             name = field.name
-            _assert_same(getattr(found, name), getattr(wanted, name), f"{place}.{name}")
+            _assert_same(getattr(result, name), getattr(wanted, name), f"{place}.{name}")
     elif isinstance(wanted, tuple):
-        assert len(found) == len(wanted), place
-        for i, (a, b) in enumerate(zip(found, wanted, strict=True)):
+        assert len(result) == len(wanted), place
+        for i, (a, b) in enumerate(zip(result, wanted, strict=True)):
             _assert_same(a, b, f"{place}[{i}]")
     elif place.endswith(("_from_beacon", "_from_sensor", ".phase")):
-        np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-12, err_msg=place)
+        np.testing.assert_allclose(result, wanted, rtol=0.0, atol=1e-12, err_msg=place)
     elif ".rotation_" in place or place.endswith((".phase_walk", ".declination_sigma", "ion_walk")):
-        np.testing.assert_allclose(found, wanted, rtol=4e-15, atol=0.0, err_msg=place)
+        np.testing.assert_allclose(result, wanted, rtol=4e-15, atol=0.0, err_msg=place)
     elif isinstance(wanted, np.ndarray):
-        np.testing.assert_array_equal(found, wanted, err_msg=place)
+        np.testing.assert_array_equal(result, wanted, err_msg=place)
     else:
-        assert found == wanted, place
+        assert result == wanted, place
 
 
 OUT_OF_RANGE: list[tuple[Key, Any, str]] = [
@@ -238,15 +238,15 @@ def test_a_bad_value_is_refused_with_its_place_itself_and_the_remedy(
     changes = [(key, value)]
     if "location" in key:
         changes.append(((*WORLD, "earth_field_t"), None))
-    said = _refusal(_with(*changes), tmp_path)
-    assert said.startswith(f"{tmp_path / 'site.yaml'}: {_path(key)}"), said
-    found = (
+    findings = _refusal(_with(*changes), tmp_path)
+    assert findings.startswith(f"{tmp_path / 'site.yaml'}: {_path(key)}"), findings
+    result = (
         value["latitude_deg"] if isinstance(value, dict) and value.get("latitude_deg") else value
     )
-    assert f"found {found!r:.57}" in said
-    assert remedy in said
-    assert "\n" not in said
-    assert "Entry" not in said, "a name of our code"
+    assert f"found {result!r:.57}" in findings
+    assert remedy in findings
+    assert "\n" not in findings
+    assert "Entry" not in findings, "a name of our code"
 
 
 NEEDED: list[Key] = [
@@ -270,8 +270,8 @@ def test_a_missing_key_is_named(key: Key, tmp_path: Path) -> None:
 @pytest.mark.parametrize("key", sorted(LOCATION))
 def test_a_location_is_given_whole(key: str, tmp_path: Path) -> None:
     part = {k: v for k, v in LOCATION.items() if k != key}
-    said = _refusal(_with((WORLD, {"location": part})), tmp_path)
-    assert f": world.location.{key}: is missing; add it" in said
+    findings = _refusal(_with((WORLD, {"location": part})), tmp_path)
+    assert f": world.location.{key}: is missing; add it" in findings
 
 
 @pytest.mark.parametrize(
@@ -295,7 +295,7 @@ def test_a_location_is_given_whole(key: str, tmp_path: Path) -> None:
 )
 def test_an_unknown_key_is_answered_by_the_known_ones(owner: Key, tmp_path: Path) -> None:
     key = (*owner, "colour")
-    said = _refusal(_with((key, "red")), tmp_path)
+    findings = _refusal(_with((key, "red")), tmp_path)
     known = {
         (): "beacons",
         WORLD: "earth_field_t",
@@ -309,36 +309,36 @@ def test_an_unknown_key_is_answered_by_the_known_ones(owner: Key, tmp_path: Path
         MAGNETOMETER: "noise_density_t_rthz",
         (*MAGNETOMETER, "sigma"): "offset_t",
     }.get(owner, "position_m")
-    assert f": {_path(key)}: is not a known key; remove it or write one of" in said
-    assert known in said
+    assert f": {_path(key)}: is not a known key; remove it or write one of" in findings
+    assert known in findings
 
 
 def test_the_first_of_several_mistakes_is_told_and_the_others_counted(tmp_path: Path) -> None:
     changes = [((*BEACON, "frequency_hz"), 0), ((*IMU, "gyro_noise"), 0), ((*COIL, "slot"), -1)]
-    said = _refusal(_with(*changes), tmp_path)
-    assert "beacons[0].frequency_hz: found 0" in said
-    assert said.endswith("(and 2 more in this file).")
+    findings = _refusal(_with(*changes), tmp_path)
+    assert "beacons[0].frequency_hz: found 0" in findings
+    assert findings.endswith("(and 2 more in this file).")
 
 
 def test_two_beacons_of_one_name_are_refused(tmp_path: Path) -> None:
-    said = _refusal(_with((("beacons", 1, "name"), "A")), tmp_path)
-    assert "beacons[1].name: found 'A'; give it another name than beacons[0]" in said
+    findings = _refusal(_with((("beacons", 1, "name"), "A")), tmp_path)
+    assert "beacons[1].name: found 'A'; give it another name than beacons[0]" in findings
 
 
 def test_earth_field_and_location_are_not_both_given(tmp_path: Path) -> None:
-    said = _refusal(_with(((*WORLD, "location"), LOCATION)), tmp_path)
-    assert "world.earth_field_t: found [0.0, 1.89e-05, -4.54e-05]" in said
-    assert "location, not both" in said
+    findings = _refusal(_with(((*WORLD, "location"), LOCATION)), tmp_path)
+    assert "world.earth_field_t: found [0.0, 1.89e-05, -4.54e-05]" in findings
+    assert "location, not both" in findings
 
 
 @pytest.mark.parametrize("date", ["March", "2026-02-30", 5, "2026-03-01 10:00:00", "2040-01-01"])
 def test_a_date_that_is_none_or_beyond_the_igrf_is_refused(date: object, tmp_path: Path) -> None:
-    said = _refusal(_with((WORLD, {"location": LOCATION | {"date": date}})), tmp_path)
-    assert "world.location.date: found" in said
+    findings = _refusal(_with((WORLD, {"location": LOCATION | {"date": date}})), tmp_path)
+    assert "world.location.date: found" in findings
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "findings"),
     [
         (b"", "found None at the top; write a mapping"),
         (b"- 1\n- 2", "found [1, 2] at the top; write a mapping"),
@@ -365,11 +365,11 @@ def test_a_date_that_is_none_or_beyond_the_igrf_is_refused(date: object, tmp_pat
     ],
 )
 def test_what_is_no_yaml_mapping_of_plain_values_is_refused_in_one_sentence(
-    text: str | bytes, said: str, tmp_path: Path
+    text: str | bytes, findings: str, tmp_path: Path
 ) -> None:
     sentence = _refusal(text, tmp_path)
     assert sentence.startswith(f"{tmp_path / 'site.yaml'}: ")
-    assert said in sentence
+    assert findings in sentence
     assert "\n" not in sentence
 
 
@@ -416,8 +416,8 @@ def test_roll_pitch_yaw_are_turns_about_the_world_axes_x_y_z_in_that_order(tmp_p
     sensor = (*MAGNETOMETER, "body_from_sensor", "rpy_deg")
     changes = [((*BEACON, "rpy_deg"), [20, -35, 130]), (sensor, [20.0, -35.0, 130.0])]
     site = _loaded(_with(*changes), tmp_path)
-    for found in (site.beacons[0].world_from_beacon, site.platform.magnetometer.body_from_sensor):
-        np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-15)
+    for result in (site.beacons[0].world_from_beacon, site.platform.magnetometer.body_from_sensor):
+        np.testing.assert_allclose(result, wanted, rtol=0.0, atol=1e-15)
 
 
 def test_a_scalar_sigma_stands_for_every_entry_and_degrees_become_radians(tmp_path: Path) -> None:
@@ -534,10 +534,10 @@ def test_an_earth_field_other_than_the_locations_is_what_is_kept(tmp_path: Path)
     site = _loaded(_with((WORLD, {"location": LOCATION})), tmp_path)
     assert site.earth_field_world is not None
     assert _again(site, tmp_path).location == site.location
-    turned = dataclasses.replace(site, earth_field_world=1.01 * site.earth_field_world)
-    again = _again(turned, tmp_path)
+    rotated = dataclasses.replace(site, earth_field_world=1.01 * site.earth_field_world)
+    again = _again(rotated, tmp_path)
     assert again.location is None
-    _assert_same(again.earth_field_world, turned.earth_field_world)
+    _assert_same(again.earth_field_world, rotated.earth_field_world)
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,9 @@ from time_slots_and_mains import tracker
 
 from magfusion.estimation.graph.state import States
 from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
-from magfusion.estimation.snapshot.apart import by_motion, linearized, predicted
 from magfusion.estimation.snapshot.likelihood import fix_epochs
-from magfusion.estimation.snapshot.problem import Motion, Problem, State, epochs_of
+from magfusion.estimation.snapshot.problem import CycleMotion, FixProblem, FixState, epochs_of
+from magfusion.estimation.snapshot.sequential_channels import by_motion, linearized, predicted
 from magfusion.model.parameters import initial_calibration, predict_channels
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site, Slots
@@ -84,11 +84,11 @@ def _states(poses: Trajectory, step: np.ndarray) -> States:
 
 def test_a_cycle_is_predicted_where_each_slot_was() -> None:
     site = _site()
-    found = cycles(_slot_rows(site, 40), turn_of(_imu(), site), site)
-    assert len(found) == 10
-    measured = _measured(site, found)
+    result = cycles(_slot_rows(site, 40), turn_of(_imu(), site), site)
+    assert len(result) == 10
+    measured = _measured(site, result)
     size = np.max(np.linalg.norm(measured.sqrt_information @ measured.measured[..., None], axis=2))
-    states = _states(_poses(found.time), np.zeros(9))
+    states = _states(_poses(result.time), np.zeros(9))
     calibration = initial_calibration(site, 0.0)
     # Half a cycle later the lever has swung by 0.4 degrees more than its tangent says.
     assert np.max(np.abs(measured.error(states, calibration))) < 1e-4 * size
@@ -98,9 +98,9 @@ def test_a_cycle_is_predicted_where_each_slot_was() -> None:
 
 def test_derivatives_are_those_of_the_prediction() -> None:
     site = _site()
-    found = cycles(_slot_rows(site, 8), turn_of(_imu(), site), site)
-    measured, calibration = _measured(site, found), initial_calibration(site, 0.0)
-    poses = _poses(found.time)
+    result = cycles(_slot_rows(site, 8), turn_of(_imu(), site), site)
+    measured, calibration = _measured(site, result), initial_calibration(site, 0.0)
+    poses = _poses(result.time)
     rows = measured.linearize(_states(poses, np.zeros(9)), calibration, ())
     assert rows.by_pose is not None
     assert rows.by_velocity is not None
@@ -116,8 +116,8 @@ def test_a_slot_that_was_lost_leaves_the_others_of_its_cycle() -> None:
     site = _site()
     rows = _slot_rows(site, 40)
     kept = np.arange(len(rows)) != 4
-    found = cycles(rows.rows(kept), turn_of(_imu(), site), site)
-    assert np.sum(found.valid, axis=1).tolist() == [3, 2] + [3] * 8
+    result = cycles(rows.rows(kept), turn_of(_imu(), site), site)
+    assert np.sum(result.valid, axis=1).tolist() == [3, 2] + [3] * 8
     assert len(whole_cycles(rows.rows(kept), _imu(), site)) == 9
 
 
@@ -172,14 +172,20 @@ def test_a_fix_takes_the_motion_within_a_cycle_from_those_beside_it() -> None:
     assert np.mean(nees) < 12.0
 
 
-def _problem(site: Site, samples: FieldSamples) -> tuple[Problem, State]:
+def _problem(site: Site, samples: FieldSamples) -> tuple[FixProblem, FixState]:
     calibration = initial_calibration(site, 0.0)
     (epochs,) = epochs_of(
-        samples, calibration, gravity=None, prior=None, survey_error=False, free=(), gain_sigma=0.1
+        samples,
+        calibration,
+        gravity=None,
+        prior=None,
+        survey_error=False,
+        free_parameters=(),
+        gain_sigma=0.1,
     )
     assert samples.ahead is not None
     shift = samples.ahead[..., None] * VELOCITY_WORLD
-    problem = replace(epochs.problem, motion=Motion(shift, np.abs(samples.ahead) * 0.3))
+    problem = replace(epochs.problem, motion=CycleMotion(shift, np.abs(samples.ahead) * 0.3))
     at = _poses(samples.time)
     return problem, problem.start(at.world_from_body, at.position_world)
 

@@ -18,20 +18,20 @@ CONFIG = mains.Config(runs=40)
 def test_pulses_under_hum_are_wrong_by_what_the_analysis_found(
     slot: float, attitude_deg: tuple[float, ...]
 ) -> None:
-    found = mains.pulsed(CONFIG, slot, 50.0)
-    ours = [found[removal][1] for removal in ("none", "subtract", "interpolate")]
+    result = mains.pulsed(CONFIG, slot, 50.0)
+    ours = [result[removal][1] for removal in ("none", "subtract", "interpolate")]
     # 40 poses and directions of a skewed error: a tenth.
     assert ours == pytest.approx(attitude_deg, rel=0.2)
     if slot == 5e-3:
-        assert found["subtract"][1] > 1.3 * found["none"][1]
+        assert result["subtract"][1] > 1.3 * result["none"][1]
     else:
-        assert found["state"][1] < 1e-6
+        assert result["state"][1] < 1e-6
 
 
 def test_slots_of_a_mains_cycle_stand_hum_that_is_off_its_frequency() -> None:
-    found = mains.pulsed(mains.Config(runs=12, cycles=9), 20e-3, 49.8)
-    assert found["none"][1] == pytest.approx(0.037, abs=0.012)
-    assert found["subtract"][1] < 0.004
+    result = mains.pulsed(mains.Config(runs=12, cycles=9), 20e-3, 49.8)
+    assert result["none"][1] == pytest.approx(0.037, abs=0.012)
+    assert result["subtract"][1] < 0.004
 
 
 @pytest.mark.parametrize(
@@ -71,21 +71,21 @@ def test_what_coils_of_true_size_turn_the_closed_form_by_is_taken_off(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The next term of a coil's field goes with the square of its radius over the distance."""
-    found = mains.taken_for_dipoles_deg(CONFIG)
+    result = mains.taken_for_dipoles_deg(CONFIG)
     monkeypatch.setattr(mains, "COIL_RADIUS", 0.5 * mains.COIL_RADIUS)
     smaller = mains.taken_for_dipoles_deg(CONFIG)
-    assert found["dipoles"] / smaller["dipoles"] == pytest.approx(4.0, rel=0.01)
+    assert result["dipoles"] / smaller["dipoles"] == pytest.approx(4.0, rel=0.01)
     noise_deg = mains.PRINTED_NOISE_DEG["none"]  # at 60 dB; as measured here
     assert mains.COIL_RADIUS == 0.01  # halved
-    assert found["dipoles"] == pytest.approx(2.0 * noise_deg, rel=0.1)
-    assert found["coils"] < 1e-6
+    assert result["dipoles"] == pytest.approx(2.0 * noise_deg, rel=0.1)
+    assert result["coils"] < 1e-6
 
 
 @pytest.mark.parametrize(("slot_ms", "skew_deg"), [(1.0, 0.13), (5.0, 0.68), (20.0, 2.5)])
 def test_slots_at_their_own_times_have_no_skew(slot_ms: float, skew_deg: float) -> None:
-    found = moving.skew(moving.Config(), slot_ms)
-    assert found.together_deg == pytest.approx(skew_deg, rel=0.147)  # 0.68 +- 0.1
-    assert found.apart_deg < 1e-6
+    result = moving.skew(moving.Config(), slot_ms)
+    assert result.together_deg == pytest.approx(skew_deg, rel=0.147)  # 0.68 +- 0.1
+    assert result.apart_deg < 1e-6
 
 
 def test_the_scenario_prints_its_figures_as_the_last_line(

@@ -23,7 +23,7 @@ SLOTS = Slots(1.0 / 480.0, 4)
 RATE_HZ = 20e3
 
 
-def _free(carrier_hz: float, slots: Slots = SLOTS) -> Site:
+def _free_parameters(carrier_hz: float, slots: Slots = SLOTS) -> Site:
     site = tracker(carrier_hz, slots)
     return replace(site, beacons=(replace(site.beacons[0], synchronised=False),))
 
@@ -48,18 +48,18 @@ def _stream(
     return Waveform(time, driven + hum + noise + [2e-5, 1e-5, 4e-5])
 
 
-def _late(found: float, start: float, slots: Slots = SLOTS) -> float:
+def _late(result: float, start: float, slots: Slots = SLOTS) -> float:
     """Return by how much a cycle is found late (s)."""
-    return (found - start + 0.5 * slots.cycle) % slots.cycle - 0.5 * slots.cycle
+    return (result - start + 0.5 * slots.cycle) % slots.cycle - 0.5 * slots.cycle
 
 
 @pytest.mark.parametrize("start", [0.0, 1.3e-3, 5.1e-3, 7.7e-3])
 @pytest.mark.parametrize("carrier_hz", [2e3, 6e3])
 def test_a_cycle_is_found_under_hum_in_the_earth_field(carrier_hz: float, start: float) -> None:
-    found = slot_start(_stream(carrier_hz, start, 0.0, 0.3), _free(carrier_hz), RATE_HZ)
-    assert found is not None
+    result = slot_start(_stream(carrier_hz, start, 0.0, 0.3), _free_parameters(carrier_hz), RATE_HZ)
+    assert result is not None
     # A quarter of a carrier's cycle, and a sample.
-    assert abs(_late(found, start)) < 0.25 / carrier_hz + 1.0 / RATE_HZ
+    assert abs(_late(result, start)) < 0.25 / carrier_hz + 1.0 / RATE_HZ
 
 
 @pytest.mark.parametrize("cycles_hz", [250.0, 480.0, 500.0, 625.0])
@@ -68,23 +68,25 @@ def test_a_cycle_of_few_whole_samples_is_found(cycles_hz: float, start: float) -
     """Forty samples of every cycle are at the same places of it, and there are none between."""
     slots = Slots(0.25 / cycles_hz, 4)
     waveform = _stream(6e3, start, 0.0, 0.3, slots=slots)
-    found = slot_start(waveform, _free(6e3, slots), RATE_HZ)
-    assert found is not None
-    assert abs(_late(found, start, slots)) < 0.25 / 6e3 + 1.0 / RATE_HZ
+    result = slot_start(waveform, _free_parameters(6e3, slots), RATE_HZ)
+    assert result is not None
+    assert abs(_late(result, start, slots)) < 0.25 / 6e3 + 1.0 / RATE_HZ
 
 
 def test_where_no_coil_is_driven_none_is_found() -> None:
-    assert slot_start(_stream(6e3, 0.0, 0.0, 0.3, signal=0.0), _free(6e3), RATE_HZ) is None
+    assert (
+        slot_start(_stream(6e3, 0.0, 0.0, 0.3, signal=0.0), _free_parameters(6e3), RATE_HZ) is None
+    )
 
 
 @pytest.mark.parametrize(
     ("site", "searched"),
     [
         (tracker(6e3, SLOTS), False),
-        (_free(6e3), True),
-        (_free(0.0), False),  # pulses have no carrier
-        (_free(6e3, Slots(1e-3, 3)), False),  # none is silent
-        (_free(6e3, Slots(1e-3, 6)), True),
+        (_free_parameters(6e3), True),
+        (_free_parameters(0.0), False),  # pulses have no carrier
+        (_free_parameters(6e3, Slots(1e-3, 3)), False),  # none is silent
+        (_free_parameters(6e3, Slots(1e-3, 6)), True),
     ],
 )
 def test_only_what_a_stream_can_tell_is_searched(site: Site, searched: bool) -> None:
@@ -92,7 +94,7 @@ def test_only_what_a_stream_can_tell_is_searched(site: Site, searched: bool) -> 
 
 
 def test_a_clock_that_runs_away_is_followed() -> None:
-    site, ppm = _free(6e3), 100.0
+    site, ppm = _free_parameters(6e3), 100.0
     waveform = _stream(6e3, 2.2e-3, ppm, 4.0)
     time = np.arange(0.9, 5.2, 2e-3)
     imu = ImuSamples(time, np.zeros((len(time), 3)), np.zeros((len(time), 3)))
@@ -114,7 +116,7 @@ def test_a_clock_that_runs_away_is_followed() -> None:
 
 
 def test_a_whole_log_is_followed_as_a_stream_is() -> None:
-    site, ppm = _free(6e3), 100.0
+    site, ppm = _free_parameters(6e3), 100.0
     waveform = _stream(6e3, 2.2e-3, ppm, 6.0)
     silent = waveform.time < 1.5  # the source is switched on later
     waveform.measured_sensor[silent] = np.array([2e-5, 1e-5, 4e-5]) + 3e-9 * np.sin(
@@ -122,8 +124,8 @@ def test_a_whole_log_is_followed_as_a_stream_is() -> None:
     )
     time = np.arange(0.9, 7.2, 2e-3)
     imu = ImuSamples(time, np.zeros((len(time), 3)), np.zeros((len(time), 3)))
-    found, _ = received(waveform, imu, site)
-    kept = found.rows(found.time > 2.0)
+    result, _ = received(waveform, imu, site)
+    kept = result.rows(result.time > 2.0)
     size = np.linalg.norm(kept.phasor_sensor, axis=2)
     # In six seconds the clock runs more than a quarter of a slot away.
     assert np.max(np.nanstd(size, axis=0) / np.nanmean(size, axis=0)) < 0.02
@@ -137,7 +139,7 @@ def test_a_whole_log_is_followed_as_a_stream_is() -> None:
 
 def test_pulses_whose_timing_nobody_knows_are_refused() -> None:
     with pytest.raises(InputError, match=r"direct-current pulses by its own clock"):
-        SlotReceiver(_free(0.0)).check()
+        SlotReceiver(_free_parameters(0.0)).check()
 
 
 def test_the_pipe_says_why_there_is_no_state(tmp_path: Path) -> None:
@@ -155,8 +157,8 @@ def test_the_pipe_says_why_there_is_no_state(tmp_path: Path) -> None:
         lines.append(json.dumps({"imu": imu, "magnetometer": magnetometer}))
     source, sink = io.BytesIO("\n".join(lines).encode()), io.BytesIO()
     run_stream(tmp_path / "site.yaml", StreamSettings(), source, sink, io.StringIO())
-    told = [json.loads(line) for line in sink.getvalue().splitlines()]
-    assert told[0]["reasons"] == []
-    (reason,) = told[-1]["reasons"]
+    reported = [json.loads(line) for line in sink.getvalue().splitlines()]
+    assert reported[0]["reasons"] == []
+    (reason,) = reported[-1]["reasons"]
     assert reason["code"] == "no_start"
     assert "too slow for slots" in reason["text"]

@@ -28,7 +28,7 @@ from magfusion.receiver.turn import on_clock
 from magfusion.receiver.windows import LockinSettings, sent_frequencies_hz
 from magfusion.simulation.field import synchronised_drives
 from magfusion.simulation.inertial import simulate_imu
-from magfusion.simulation.motion import Motion, Rests, static_motion, turning_motion
+from magfusion.simulation.motion import Rests, SimulatedMotion, static_motion, turning_motion
 from magfusion.simulation.waveform import simulate_waveform
 
 BOX_WORLD = np.array([[0.25, -0.25, -0.25], [0.75, 0.25, 0.25]])  # m
@@ -48,8 +48,8 @@ def _hum(slot: float, hum_hz: float, removal: Removal, cycles: int = 20) -> list
     for phase in np.linspace(0.0, np.pi, 24, endpoint=False):
         hum = np.cos(2.0 * np.pi * hum_hz * time + phase)[:, None] * [1.0, 0.0, 0.0]
         settings = SlotSettings(removal, "rectangular")
-        found, _ = received(Waveform(time, hum), _still(time[-1]), site, settings)
-        inner = found.phasor_sensor[15:-15, :, 0]
+        result, _ = received(Waveform(time, hum), _still(time[-1]), site, settings)
+        inner = result.phasor_sensor[15:-15, :, 0]
         worst = np.maximum(worst, np.nanmax(np.abs(inner), axis=0))
     return [float(20.0 * np.log10(w + 1e-12)) for w in worst]
 
@@ -98,18 +98,18 @@ def test_a_steady_field_and_a_drift_weigh_nothing(removal: Removal) -> None:
     assert np.nansum(weight, axis=1) == pytest.approx(1.0)
     if removal != "subtract":
         inner = slice(3, -3)
-        told = np.sum(weight * silent[index], axis=1)
-        assert told[inner] == pytest.approx(driven[inner])
+        reported = np.sum(weight * silent[index], axis=1)
+        assert reported[inner] == pytest.approx(driven[inner])
 
 
-def _turning(duration: float) -> Motion:
+def _turning(duration: float) -> SimulatedMotion:
     rests = Rests(start=0.2, move=duration, pause=0.1)
     rng = np.random.default_rng(2)
     return turning_motion(rng, duration, BOX_WORLD, 0.3, rate_rms=1.5, rests=rests)
 
 
 def _recorded(
-    site: Site, motion: Motion, rate_hz: float, duration: float, gyro_bias: float = 0.0
+    site: Site, motion: SimulatedMotion, rate_hz: float, duration: float, gyro_bias: float = 0.0
 ) -> tuple[Waveform, ImuSamples]:
     imu = replace(site.platform.imu, gyro_noise=0.0, gyro_bias_sigma=0.0, gyro_bias_walk=0.0)
     rng = np.random.default_rng(3)
@@ -118,22 +118,22 @@ def _recorded(
     return waveform, replace(samples, gyro_body=samples.gyro_body + gyro_bias)
 
 
-def _wrong(site: Site, found: FieldSamples, motion: Motion) -> float:
+def _wrong(site: Site, result: FieldSamples, motion: SimulatedMotion) -> float:
     """Return the largest error of a field, relative to K/R^3 at half a metre."""
-    at = motion.trajectory(found.time)
+    at = motion.trajectory(result.time)
     calibration = initial_calibration(site, 0.0)
     true = predict_channels(calibration, at.time, at.world_from_body, at.position_world)
-    return float(np.max(np.abs((found.phasor_sensor - true)[found.valid]))) / UNIT
+    return float(np.max(np.abs((result.phasor_sensor - true)[result.valid]))) / UNIT
 
 
 def _with_earth(site: Site) -> Site:
-    turned = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    rotated = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
     matrix = np.eye(3) + 0.05 * np.arange(9.0).reshape(3, 3) / 9.0
     sensor = replace(
         site.platform.magnetometer,
         matrix=matrix,
         offset=np.array([3e-7, -2e-7, 1e-7]),
-        body_from_sensor=turned,
+        body_from_sensor=rotated,
         position_body=np.array([0.02, 0.01, -0.03]),
     )
     platform = replace(site.platform, magnetometer=sensor)
@@ -145,23 +145,23 @@ def test_a_turning_body_measures_pulses_free_of_the_earth_field(removal: Removal
     site = _with_earth(tracker(0.0, Slots(2.5e-3, 4, start=0.4e-3)))
     motion = _turning(2.0)
     waveform, imu = _recorded(site, motion, 16e3, 2.0)
-    found, _ = received(waveform, imu, site, SlotSettings(removal, "rectangular"))
+    result, _ = received(waveform, imu, site, SlotSettings(removal, "rectangular"))
     # The Earth field is 70 times K/R^3 and turns by a quarter degree in a slot.
-    assert len(found) > 590
-    assert _wrong(site, found, motion) < 1e-4
-    assert np.all(np.sum(found.valid, axis=1) == 1)
-    assert np.all(np.diff(found.time) > 2.4e-3)
+    assert len(result) > 590
+    assert _wrong(site, result, motion) < 1e-4
+    assert np.all(np.sum(result.valid, axis=1) == 1)
+    assert np.all(np.diff(result.time) > 2.4e-3)
 
 
-def _without_ends(found: FieldSamples) -> FieldSamples:
+def _without_ends(result: FieldSamples) -> FieldSamples:
     """Return what has silent slots on both sides."""
     rows = slice(3, -3)
     return replace(
-        found,
-        time=found.time[rows],
-        window=found.window[rows],
-        phasor_sensor=found.phasor_sensor[rows],
-        phasor_cov=found.phasor_cov[rows],
+        result,
+        time=result.time[rows],
+        window=result.window[rows],
+        phasor_sensor=result.phasor_sensor[rows],
+        phasor_cov=result.phasor_cov[rows],
     )
 
 
@@ -172,15 +172,15 @@ def test_a_gyro_bias_costs_the_paper_dearly_and_its_neighbours_nothing() -> None
     wrong = {}
     for removal in ("subtract", "interpolate"):
         settings = SlotSettings(removal, "rectangular")
-        found, _ = received(waveform, imu, site, settings)
-        wrong[removal] = _wrong(site, _without_ends(found), motion)
+        result, _ = received(waveform, imu, site, settings)
+        wrong[removal] = _wrong(site, _without_ends(result), motion)
     receiver = receiver_of(site, SlotSettings("subtract", "rectangular"))
     windows, _ = receiver.whole(waveform, imu)
     known = on_clock(imu, site.platform.imu.time_offset, np.full(3, 0.02))
-    mended, _ = receiver.phasors(waveform, known, windows, site)
+    cleaned, _ = receiver.phasors(waveform, known, windows, site)
     assert wrong["subtract"] > 5e-3
     assert wrong["interpolate"] < 1e-4
-    assert _wrong(site, mended, motion) < 1e-4
+    assert _wrong(site, cleaned, motion) < 1e-4
 
 
 @pytest.mark.parametrize("taper", ["rectangular", "hann"])
@@ -188,9 +188,9 @@ def test_a_carrier_needs_no_whole_number_of_cycles(taper: Any) -> None:
     site = _with_earth(tracker(3.3e3, Slots(2.5e-3, 4), phase=0.7))
     motion = _turning(1.0)
     waveform, imu = _recorded(site, motion, 16e3, 1.0)
-    found, dropped = received(waveform, imu, site, SlotSettings("none", taper))
+    result, dropped = received(waveform, imu, site, SlotSettings("none", taper))
     assert not dropped
-    assert _wrong(site, found, motion) < 1e-3
+    assert _wrong(site, result, motion) < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -207,13 +207,13 @@ def test_the_covariance_is_that_of_the_noise(
     site = tracker(carrier_hz, Slots(5e-3, 4), density=1e-10)
     motion = static_motion(np.array([0.5, 0.1, -0.2]), Rotation.identity())
     waveform, imu = _recorded(site, motion, 8e3, 20.0)
-    found, _ = received(waveform, imu, site, SlotSettings(removal, taper))
-    at = motion.trajectory(found.time)
+    result, _ = received(waveform, imu, site, SlotSettings(removal, taper))
+    at = motion.trajectory(result.time)
     true = predict_channels(
         initial_calibration(site, 0.0), at.time, at.world_from_body, at.position_world
     )
-    wrong = (found.phasor_sensor - true)[found.valid].real
-    share = np.einsum("ni,nij,nj->n", wrong, np.linalg.inv(found.phasor_cov[found.valid]), wrong)
+    wrong = (result.phasor_sensor - true)[result.valid].real
+    share = np.einsum("ni,nij,nj->n", wrong, np.linalg.inv(result.phasor_cov[result.valid]), wrong)
     # 3000 slots of three components scatter by 1.5 %; the inverse of a covariance measured with 128
     # degrees of freedom is too large by 128 / 124.
     assert np.mean(share) / 3.0 == pytest.approx(128.0 / 124.0, abs=0.045)
@@ -230,11 +230,11 @@ def test_what_turns_in_the_earth_field_is_no_noise(carrier_hz: float) -> None:
     site = _with_earth(tracker(carrier_hz, slots, density=1e-10))
     waveform, imu = _recorded(site, _turning(3.0), 16e3, 3.0)
     settings = SlotSettings("none" if carrier_hz else "subtract", "rectangular")
-    found, _ = received(waveform, imu, site, settings)
+    result, _ = received(waveform, imu, site, settings)
     matrix = site.platform.magnetometer.matrix
     # White noise enters after the matrix; 128 degrees of freedom give a variance within a third.
     expected = 1e-20 / slots.duration
-    share = np.diagonal(found.phasor_cov[found.valid], axis1=1, axis2=2) / expected
+    share = np.diagonal(result.phasor_cov[result.valid], axis1=1, axis2=2) / expected
     assert np.linalg.cond(matrix) < 1.2
     assert np.median(share) == pytest.approx(1.0, abs=0.15)
 
@@ -247,9 +247,9 @@ def test_a_cycle_as_one_epoch_is_turned_to_its_own_time() -> None:
         moving, position=static_motion(np.array([0.5, 0, 0]), moving.attitude(0.0)).position
     )
     waveform, imu = _recorded(site, motion, 16e3, 1.0)
-    found, _ = received(waveform, imu, site, default_slot_settings(site))
-    cycles = whole_cycles(found, imu, site)
-    assert len(cycles) == len(found) // 3
+    result, _ = received(waveform, imu, site, default_slot_settings(site))
+    cycles = whole_cycles(result, imu, site)
+    assert len(cycles) == len(result) // 3
     assert np.all(cycles.valid)
     assert _wrong(site, cycles, motion) < 1e-4
     again = whole_cycles(cycles, imu, site)
@@ -263,11 +263,11 @@ def test_a_gap_costs_the_slots_in_it_and_no_others() -> None:
     kept = (waveform.time < 0.5) | (waveform.time >= 0.6)
     short = Waveform(waveform.time[kept], waveform.measured_sensor[kept])
     whole, none = received(waveform, imu, site, default_slot_settings(site))
-    found, dropped = received(short, imu, site, default_slot_settings(site))
+    result, dropped = received(short, imu, site, default_slot_settings(site))
     assert not none
-    lost = (whole.time > 0.5) & (whole.time < 0.6)
-    np.testing.assert_allclose(found.time, whole.time[~lost], rtol=1e-12)
-    assert _wrong(site, found, motion) < 0.02
+    lost_epochs = (whole.time > 0.5) & (whole.time < 0.6)
+    np.testing.assert_allclose(result.time, whole.time[~lost_epochs], rtol=1e-12)
+    assert _wrong(site, result, motion) < 0.02
     assert set(dropped) <= {"gap in the magnetometer stream"}
 
 
@@ -315,12 +315,12 @@ def test_silent_slots_have_one_carrier() -> None:
 def test_beacons_keep_one_schedule_and_a_slot_each() -> None:
     site = tracker(2e3, Slots(5e-3, 4))
     first = site.beacons[0]
-    for other, said in (
+    for other, findings in (
         (replace(first, name="U", slots=None), "and beacon U none"),
         (replace(first, name="U", slots=Slots(4e-3, 4)), "and beacon U another one"),
         (replace(first, name="U"), "beacons T and U are both driven in slot 0"),
     ):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=findings):
             schedule(replace(site, beacons=(first, other)))
 
 
@@ -362,7 +362,7 @@ def test_a_schedule_survives_its_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "findings"),
     [
         ({"slots": {"duration_s": 0.005, "count": 2}}, "beacons[0].coils[2].slot: found 2; give"),
         ({"slots": {"duration_s": 0.0, "count": 4}}, "beacons[0].slots.duration_s: found 0.0"),
@@ -372,7 +372,7 @@ def test_a_schedule_survives_its_file(tmp_path: Path) -> None:
     ],
 )
 def test_a_schedule_that_cannot_be_is_refused(
-    change: dict[str, Any], said: str, tmp_path: Path
+    change: dict[str, Any], findings: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "site.yaml"
     save_site(tracker(0.0, Slots(5e-3, 4)), path)
@@ -381,7 +381,7 @@ def test_a_schedule_that_cannot_be_is_refused(
     path.write_text(yaml.safe_dump(content))
     with pytest.raises(InputError) as caught:
         load_site(path)
-    assert said in str(caught.value)
+    assert findings in str(caught.value)
 
 
 def test_rounding_does_not_take_a_slots_first_sample() -> None:

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from time_slots_and_mains import tracker
 
 from magfusion.errors import EstimationError
-from magfusion.estimation.snapshot.apart import linearized, predicted
 from magfusion.estimation.snapshot.likelihood import fix_epochs
-from magfusion.estimation.snapshot.problem import Problem, State, epochs_of
+from magfusion.estimation.snapshot.problem import FixProblem, FixState, epochs_of
+from magfusion.estimation.snapshot.sequential_channels import linearized, predicted
 from magfusion.model.parameters import initial_calibration, predict_channels
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site, Slots
@@ -64,14 +64,14 @@ def cycles_of(site: Site) -> FieldSamples:
     return whole_cycles(slots_of(site), imu(), site)
 
 
-def problem_of(site: Site) -> Problem:
+def problem_of(site: Site) -> FixProblem:
     calibration = initial_calibration(site, 0.0)
     (epochs,) = epochs_of(
         *(cycles_of(site), calibration),
         gravity=None,
         prior=None,
         survey_error=False,
-        free=(),
+        free_parameters=(),
         gain_sigma=0.2,
     )
     return epochs.problem
@@ -96,18 +96,18 @@ def test_a_turning_receiver_of_two_axes_is_located_and_its_other_poses_are_told(
 def test_where_it_was_turned_is_in_the_prediction_and_its_derivative() -> None:
     site = heard_by("xy")
     problem = problem_of(site)
-    assert problem.turned is not None
+    assert problem.channel_rotation is not None
     truth = poses(problem.time)
     here = problem.start(truth.world_from_body, truth.position_world)
     there = np.einsum("...ii->...i", problem.sqrt_information) > 0.0
-    left = (predicted(problem, here) - problem.measured).reshape(*there.shape[:2], 2, 3)
+    remaining = (predicted(problem, here) - problem.measured).reshape(*there.shape[:2], 2, 3)
     size = np.max(np.abs(problem.measured))
-    assert np.max(np.abs(np.where(there[:, :, None], left, 0.0))) < 1e-9 * size
+    assert np.max(np.abs(np.where(there[:, :, None], remaining, 0.0))) < 1e-9 * size
 
     def moved(step: np.ndarray) -> np.ndarray:
         turn = here.rotation @ Rotation.from_rotvec(step[:3]).as_matrix()
         shift = (here.rotation @ step[3:, None])[..., 0]
-        state = State(turn, here.position + shift, here.phase, here.log_gain)
+        state = FixState(turn, here.position + shift, here.phase, here.log_gain)
         return predicted(problem, state)
 
     value, by_pose, _ = linearized(problem, here)
@@ -120,7 +120,7 @@ def test_slots_of_a_receiver_without_all_axes_are_not_turned() -> None:
     assert np.array_equal(slot_turn_of(imu(), heard_by("xy"))(time), np.tile(np.eye(3), (5, 1, 1)))
     whole = heard_by("xyz")
     assert np.array_equal(slot_turn_of(imu(), whole)(time), turn_of(imu(), whole)(time))
-    assert cycles_of(whole).turned is None
+    assert cycles_of(whole).channel_rotation is None
 
 
 def test_one_axis_about_a_lone_source_is_said_to_be_too_little() -> None:

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Refuse, run_command
-from far_and_weak import FAR_AWAY, RATE_HZ, far_site, witnessed_log
+from far_and_weak import FAR_AWAY, RATE_HZ, far_site, monitored_log
 from rests_smoothed import Config, run
 
 from magfusion.estimation.batch.log_graph import overlap
 from magfusion.estimation.graph.measurement import Rows
 from magfusion.estimation.graph.state import States
-from magfusion.estimation.measurements.zero_rate import ZeroRate, freed_of_bias, zero_rate
-from magfusion.estimation.rests.at_rest import at_rest
+from magfusion.estimation.measurements.zero_rate import ZeroRate, without_bias, zero_rate
+from magfusion.estimation.rests.stationary_integration import integrate_rests
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.model.parameters import initial_calibration
@@ -39,11 +39,11 @@ def test_rests_of_unequal_length_share_no_sample() -> None:
     rests = epochs([3600.0, 3600.0, 100.0], [1800.0, 5500.0, 7400.0])
     assert rests.of_rests
     assert overlap(rests) == 1.0
-    assert rests.at_rest(np.array([10.0, 3650.0, 7320.0, 7400.0])).tolist() == [1, 0, 0, 1]
+    assert rests.is_stationary(np.array([10.0, 3650.0, 7320.0, 7400.0])).tolist() == [1, 0, 0, 1]
     windows = epochs([0.4, 0.4, 0.4], [0.2, 0.4, 0.6])
     assert not windows.of_rests
     assert overlap(windows) == pytest.approx(2.0)
-    assert not windows.at_rest(np.array([0.2])).any()
+    assert not windows.is_stationary(np.array([0.2])).any()
 
 
 def test_a_zero_rate_is_the_mean_of_what_the_gyroscope_shows_in_the_rest_alone() -> None:
@@ -53,20 +53,20 @@ def test_a_zero_rate_is_the_mean_of_what_the_gyroscope_shows_in_the_rest_alone()
     imu = ImuSamples(time, gyro, np.zeros_like(gyro))
     at, offset = np.array([1.0, 10.0, 20.0]), np.zeros(3)
     within = np.zeros(3), np.full(3, 20.0)
-    found = zero_rate(np.arange(3), at, within, imu, offset, 1e-4)
-    assert found is not None
-    np.testing.assert_allclose(found.measured_body[2], np.mean(gyro[1900:2000], axis=0))
-    np.testing.assert_allclose(found.sigma[1], 1e-4 / np.sqrt(2.0))
-    known = freed_of_bias(imu, np.array([0.0, 25.0]), np.array([20.0, 40.0]))
+    result = zero_rate(np.arange(3), at, within, imu, offset, 1e-4)
+    assert result is not None
+    np.testing.assert_allclose(result.measured_body[2], np.mean(gyro[1900:2000], axis=0))
+    np.testing.assert_allclose(result.sigma[1], 1e-4 / np.sqrt(2.0))
+    known = without_bias(imu, np.array([0.0, 25.0]), np.array([20.0, 40.0]))
     for rows in (slice(0, 2000), slice(2500, 4000)):
         assert np.max(np.abs(np.mean(known.gyro_body[rows], axis=0))) < 1e-6
     assert np.mean(known.gyro_body[2100:2400]) == pytest.approx(1.0, abs=1e-3)
 
 
 def test_an_hour_in_one_place_is_two_epochs_and_halving_loses_nothing() -> None:
-    made = witnessed_log(far_site(), 240.0, 3, FAR_AWAY, 0.0)
-    log = replace(made.log, reference=None)
-    one, two = (at_rest(log, far_site(), least=least) for least in (1, 2))
+    built = monitored_log(far_site(), 240.0, 3, FAR_AWAY, 0.0)
+    log = replace(built.log, reference=None)
+    one, two = (integrate_rests(log, far_site(), least=least) for least in (1, 2))
     assert (len(one.fields), len(two.fields)) == (1, 2)
     weight = np.linalg.inv(two.fields.phasor_cov)
     together = np.linalg.inv(np.sum(weight, axis=0))
@@ -86,16 +86,16 @@ def test_smooth_integrates_rests_and_refuses_what_it_cannot(tmp_path: Path, refu
         magnetometer_rate_hz=RATE_HZ,
         perturb=False,
     )
-    made = simulate_log(site, config, np.random.default_rng(4))
-    write_log(made.log, tmp_path / "log")
+    built = simulate_log(site, config, np.random.default_rng(4))
+    write_log(built.log, tmp_path / "log")
     save_site(site, tmp_path / "log" / "site.yaml")
     run_command("smooth", tmp_path / "log", "--at-rest", "-o", tmp_path / "run")
-    told = json.loads((tmp_path / "run" / "report.json").read_text())
-    assert told["rests"] >= 2
-    assert told["verdict"] == "trustworthy"
+    reported = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert reported["rests"] >= 2
+    assert reported["verdict"] == "trustworthy"
     # Of the path between rests the inertial stream alone tells, as it never moves far.
-    assert told["ate_m"] < 3.0
-    assert told["nees_mean"] < 16.0
+    assert reported["ate_m"] < 3.0
+    assert reported["nees_mean"] < 16.0
     log = tmp_path / "log"
     assert "integrates one log" in refuse("smooth", log, log, "--at-rest", "-o", "x")
     assert "omit --earth and" in refuse("smooth", log, "--at-rest", "--earth", "-o", "x")
@@ -124,6 +124,6 @@ def test_the_derivative_of_a_zero_rate_is_that_of_differences() -> None:
 @pytest.mark.slow
 def test_all_rests_in_one_solution_know_more_than_each_and_no_more_than_is_so() -> None:
     alone, _, together = run(Config(rest=150.0, runs=4, seed=30))
-    assert alone.told == together.told == 12
+    assert alone.findings == together.findings == 12
     assert together.position_m < alone.position_m
     assert 2.0 < together.nees < 11.0  # of four logs

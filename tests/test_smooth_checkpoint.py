@@ -39,7 +39,7 @@ def whole(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def left(log: Path, tmp_path: Path) -> Path:
+def remaining(log: Path, tmp_path: Path) -> Path:
     """Return what a run left that was killed in its third pass."""
 
     def kill(stage: str, _done: int, _total: int) -> None:
@@ -54,13 +54,13 @@ def left(log: Path, tmp_path: Path) -> Path:
 
 
 def test_a_killed_run_goes_on_to_the_same_result(
-    log: Path, whole: Path, left: Path, tmp_path: Path
+    log: Path, whole: Path, remaining: Path, tmp_path: Path
 ) -> None:
-    told: list[str] = []
-    settings = SmoothSettings(log=log, checkpoint=left, resume=True)
-    run(settings, tmp_path / "run", lambda stage, _done, _total: told.append(stage))
-    assert next(stage for stage in told if stage.startswith("pass ")) == "pass 3"
-    assert not left.exists()
+    reported: list[str] = []
+    settings = SmoothSettings(log=log, checkpoint=remaining, resume=True)
+    run(settings, tmp_path / "run", lambda stage, _done, _total: reported.append(stage))
+    assert next(stage for stage in reported if stage.startswith("pass ")) == "pass 3"
+    assert not remaining.exists()
     own, same = (read_trajectory(p / "trajectory.parquet", 0) for p in (tmp_path / "run", whole))
     for field in fields(own):
         np.testing.assert_array_equal(getattr(own, field.name), getattr(same, field.name))
@@ -68,27 +68,29 @@ def test_a_killed_run_goes_on_to_the_same_result(
         assert (tmp_path / "run" / name).read_bytes() == (whole / name).read_bytes()
 
 
-def test_a_damaged_checkpoint_is_refused_and_kept(log: Path, left: Path, tmp_path: Path) -> None:
-    sound = left.read_bytes()
-    settings = SmoothSettings(log=log, checkpoint=left, resume=True)
+def test_a_damaged_checkpoint_is_refused_and_kept(
+    log: Path, remaining: Path, tmp_path: Path
+) -> None:
+    sound = remaining.read_bytes()
+    settings = SmoothSettings(log=log, checkpoint=remaining, resume=True)
     spoiled = bytearray(sound)
     spoiled[len(sound) // 2] ^= 1
     for damaged in (sound[:-1], bytes(spoiled)):
-        left.write_bytes(damaged)
+        remaining.write_bytes(damaged)
         with pytest.raises(InputError, match=r"passes.bin: is damaged; run without --resume"):
             run(settings, tmp_path / "run")
-        assert left.read_bytes() == damaged
-    left.write_bytes(sound)
+        assert remaining.read_bytes() == damaged
+    remaining.write_bytes(sound)
     site = load_site(log / "site.yaml")
     other = replace(site, model_error=2.0 * site.model_error + 1e-4)
     save_site(other, tmp_path / "other.yaml")
     with pytest.raises(InputError, match="is the checkpoint of another log, site or setting"):
         run(replace(settings, site=tmp_path / "other.yaml"), tmp_path / "run")
-    left.write_text("notes of mine, longer than a header " * 9)
+    remaining.write_text("notes of mine, longer than a header " * 9)
     for resume in (True, False):
         with pytest.raises(InputError, match=r"passes\.bin: is n"):
             run(replace(settings, resume=resume), tmp_path / "run")
-    assert left.read_text().startswith("notes of mine")
+    assert remaining.read_text().startswith("notes of mine")
 
 
 def test_what_has_no_passes_to_keep_is_refused(log: Path, tmp_path: Path) -> None:

@@ -77,8 +77,8 @@ def turns(angle: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def plain() -> Run:
-    site, made = simulated(1)
-    return Run(site, made, smooth(made.log, site))
+    site, built = simulated(1)
+    return Run(site, built, smooth(built.log, site))
 
 
 def test_a_log_is_smoothed_without_any_hint_of_the_start(plain: Run) -> None:
@@ -89,25 +89,25 @@ def test_a_log_is_smoothed_without_any_hint_of_the_start(plain: Run) -> None:
     assert plain.errors.inside_3_sigma is not None
     assert plain.errors.inside_3_sigma > 0.97
     assert plain.result.dropped == {}
-    assert plain.result.bridged == 0
+    assert plain.result.gap_bridged == 0
 
 
 def test_the_passes_settle_where_the_first_pass_was_not(plain: Run) -> None:
-    first = smooth(plain.simulated.log, plain.site, SmootherSettings(passes=1))
+    first = smooth(plain.simulated.log, plain.site, SmootherSettings(max_iterations=1))
     assert not first.converged
-    assert first.passes == 1
-    assert plain.result.passes > 2
+    assert first.iteration_count == 1
+    assert plain.result.iteration_count > 2
     moved = first.states.position_world - plain.result.states.position_world
     assert np.sqrt(np.mean(moved**2)) > 5e-5  # m
-    again = smooth(plain.simulated.log, plain.site, SmootherSettings(passes=12))
-    settled = again.states.position_world - plain.result.states.position_world
-    assert np.max(np.abs(settled)) < 1e-6  # m
+    again = smooth(plain.simulated.log, plain.site, SmootherSettings(max_iterations=12))
+    converged = again.states.position_world - plain.result.states.position_world
+    assert np.max(np.abs(converged)) < 1e-6  # m
 
 
 def test_the_start_is_the_right_hypothesis_at_every_epoch(plain: Run) -> None:
     truth = plain.simulated.motion.trajectory(plain.result.start.states.time)
-    apart = plain.result.start.states.position_world - truth.position_world
-    assert np.max(np.linalg.norm(apart, axis=1)) < 0.2  # m; a mirror is metres away
+    separate = plain.result.start.states.position_world - truth.position_world
+    assert np.max(np.linalg.norm(separate, axis=1)) < 0.2  # m; a mirror is metres away
     assert plain.result.rival_chi_square is None or plain.result.rival_chi_square > 1e3
 
 
@@ -131,8 +131,8 @@ def test_velocities_and_biases_are_the_true_ones(plain: Run) -> None:
 def test_the_imus_clock_is_recovered_within_three_sigma(
     seed: int, time_offset: float, clock_rate: float
 ) -> None:
-    site, made = simulated(seed, time_offset=time_offset, clock_rate=clock_rate)
-    result = smooth(made.log, site)
+    site, built = simulated(seed, time_offset=time_offset, clock_rate=clock_rate)
+    result = smooth(built.log, site)
     assert [b.name for b in result.blocks] == ["imu.time_offset", "imu.clock_rate"]
     sigma = np.sqrt(np.diag(result.calibration_cov))
     assert abs(result.calibration.time_offset - time_offset) < 3.0 * sigma[0]
@@ -147,8 +147,8 @@ def test_the_imus_clock_is_recovered_within_three_sigma(
 
 
 def test_unsynchronised_beacons_give_up_phase_and_drift() -> None:
-    site, made = simulated(5, synchronised=False)
-    run = Run(site, made, smooth(made.log, site))
+    site, built = simulated(5, synchronised=False)
+    run = Run(site, built, smooth(built.log, site))
     step = difference(true_calibration(run), run.result.calibration, run.result.blocks)
     sigma = np.sqrt(np.diagonal(run.result.calibration_cov))
     seen = set()
@@ -160,7 +160,7 @@ def test_unsynchronised_beacons_give_up_phase_and_drift() -> None:
         assert np.all(np.abs(error) < 3.5 * sigma[block.columns]), block.name
         assert sigma[block.columns][0] < {"phase": 0.02, "drift": 5e-6}[block.kind]
     assert len(seen) == 2 * len(site.beacons)
-    assert np.max(np.abs(made.drives.drift)) > 1e-5  # there was something to find
+    assert np.max(np.abs(built.drives.drift)) > 1e-5  # there was something to find
     assert run.errors.aligned_ate < 0.006  # m
     assert run.errors.ate < 0.01  # m
 
@@ -175,9 +175,9 @@ def test_start_phases_find_a_drift_of_many_turns() -> None:
     phase = at_middle + 2.0 * np.pi * (time[:, None] - middle) * frequencies * drift
     assert np.ptp(phase[:, 0]) > 20.0  # rad; three turns
     noisy = turns(phase + rng.normal(0.0, 0.3, phase.shape))
-    found = start_phases(initial_calibration(site, middle), time, noisy)
-    assert np.allclose(found.drift, drift, rtol=0.0, atol=2e-6)
-    assert np.all(np.abs(turns(found.phase - at_middle)) < 0.05)  # rad
+    result = start_phases(initial_calibration(site, middle), time, noisy)
+    assert np.allclose(result.drift, drift, rtol=0.0, atol=2e-6)
+    assert np.all(np.abs(turns(result.phase - at_middle)) < 0.05)  # rad
 
 
 def without_imu(log: Log, start: float, end: float) -> Log:
@@ -198,7 +198,7 @@ def test_a_gap_in_the_magnetometer_is_bridged_by_the_imu(plain: Run) -> None:
     result = smooth(holed, plain.site)
     run = Run(plain.site, plain.simulated, result)
     assert result.dropped["gap in the magnetometer stream"] >= 2
-    assert result.bridged == 0
+    assert result.gap_bridged == 0
     step = np.diff(result.states.time)
     assert 1.5 < np.max(step) < 2.5  # s
     assert run.errors.ate < 0.008  # m
@@ -210,7 +210,7 @@ def test_a_gap_in_the_imu_is_bridged_and_counted(plain: Run) -> None:
     holed = without_imu(plain.simulated.log, 8.0, 9.0)
     result = smooth(holed, plain.site)
     run = Run(plain.site, plain.simulated, result)
-    assert result.bridged >= 1
+    assert result.gap_bridged >= 1
     within = (result.states.time > 8.1) & (result.states.time < 8.9)
     assert np.sum(within) >= 3  # fields are heard there
     assert result.dropped["gap in the inertial stream"] <= 1  # and only an edge is lost
@@ -237,11 +237,11 @@ def test_overlapping_windows_are_not_counted_twice(plain: Run) -> None:
     assert overlap(samples) == pytest.approx(2.0)
     spread, _ = phasors(plain.simulated.log, plain.site, LockinSettings(window=0.4, step=0.5))
     assert overlap(spread) == 1.0
-    site, made = simulated(8)
+    site, built = simulated(8)
     sigma = {}
     for step in (0.4, 0.1):
         settings = SmootherSettings(lockin=LockinSettings(window=0.4, step=step))
-        cov = smooth(made.log, surveyed_exactly(site), settings).states.pose_cov
+        cov = smooth(built.log, surveyed_exactly(site), settings).states.pose_cov
         assert cov is not None
         sigma[step] = np.median(np.sqrt(np.diagonal(cov, axis1=1, axis2=2)), axis=0)
     # Four times as many windows of the same samples hold no more information.
@@ -258,16 +258,16 @@ def among_beacons(seed: int, number: int) -> tuple[Site, SimulatedLog]:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_one_beacon_leaves_two_chains_of_which_one_is_right(seed: int) -> None:
-    site, made = among_beacons(seed, 1)
-    samples, _ = phasors(made.log, site, LockinSettings(window=0.4, step=0.2))
-    fixes = first_fixes(samples, made.log, initial_calibration(site, 0.0))
-    truth = made.motion.trajectory(fixes.time).position_world
+    site, built = among_beacons(seed, 1)
+    samples, _ = phasors(built.log, site, LockinSettings(window=0.4, step=0.2))
+    fixes = first_fixes(samples, built.log, initial_calibration(site, 0.0))
+    truth = built.motion.trajectory(fixes.time).position_world
 
     def wrong(position: np.ndarray) -> float:
         return float(np.mean(np.linalg.norm(position - truth, axis=1) > 0.3))  # m
 
     assert wrong(fixes.best().position_world) > 0.3  # a single epoch cannot tell the mirrors apart
-    chains = choose_chains(fixes, made.log.imu, 0.0, site)
+    chains = choose_chains(fixes, built.log.imu, 0.0, site)
     shares = sorted(wrong(chain.states.position_world) for chain in chains)
     assert len(shares) == 2
     assert shares[0] < 0.06
@@ -276,22 +276,22 @@ def test_one_beacon_leaves_two_chains_of_which_one_is_right(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_motion_decides_between_the_mirrors_of_one_beacon(seed: int) -> None:
-    site, made = among_beacons(seed, 1)
+    site, built = among_beacons(seed, 1)
     settings = SmootherSettings(lockin=LockinSettings(window=0.4, step=0.2))
-    run = Run(site, made, smooth(made.log, site, settings))
+    run = Run(site, built, smooth(built.log, site, settings))
     assert run.errors.ate < 0.1  # m; the mirror is metres away
     assert run.result.rival_chi_square is not None
     assert run.result.rival_chi_square > 25.0
 
 
 def test_progress_is_told_from_first_to_last() -> None:
-    site, made = simulated(7)
-    told: list[tuple[str, int, int]] = []
-    smooth(made.log, site, report=lambda *step: told.append(step))
-    assert [stage for stage, _, _ in told[:3]] == ["demodulating", "finding a start", "pass 1"]
-    assert told[-1][0] == "done"
-    assert told[-1][1] == told[-1][2]
-    done = [count for _, count, _ in told]
+    site, built = simulated(7)
+    reported: list[tuple[str, int, int]] = []
+    smooth(built.log, site, report=lambda *step: reported.append(step))
+    assert [stage for stage, _, _ in reported[:3]] == ["demodulating", "finding a start", "pass 1"]
+    assert reported[-1][0] == "done"
+    assert reported[-1][1] == reported[-1][2]
+    done = [count for _, count, _ in reported]
     assert done == sorted(done)
 
 
@@ -314,10 +314,10 @@ def test_a_log_without_any_field_is_refused(plain: Run) -> None:
 def test_two_epochs_are_enough(plain: Run) -> None:
     result = smooth(cut(plain.simulated.log, 0.7), plain.site)
     assert len(result.states) == 2
-    apart = result.states.position_world - plain.result.states.position_world[:2]
-    assert np.max(np.abs(apart)) < 0.02  # m
+    separate = result.states.position_world - plain.result.states.position_world[:2]
+    assert np.max(np.abs(separate)) < 0.02  # m
 
 
 def test_settings_without_a_pass_are_refused() -> None:
     with pytest.raises(ValueError, match="passes"):
-        SmootherSettings(passes=0)
+        SmootherSettings(max_iterations=0)

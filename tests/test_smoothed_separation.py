@@ -11,7 +11,7 @@ from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.graph import considered, factors
 from magfusion.estimation.integrity.smoothed_exclusion import SLACK, separated_smooth
 from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
-from magfusion.estimation.posterior import chain_system, marginals, native_rows
+from magfusion.estimation.posterior import block_tridiagonal_system, marginals, native_rows
 from magfusion.estimation.posterior.separation import protection_levels
 from magfusion.estimation.solve.chain import Chain, solve_chain
 from magfusion.model.trust import Risk, Verdict
@@ -65,19 +65,19 @@ def test_a_chain_is_solved_as_the_dense_system_is(border: int) -> None:
         chain.border[:, i] += np.swapaxes(own, 1, 2) @ by
         chain.border[:, i + 1] += np.swapaxes(after, 1, 2) @ by
         chain.corner[...] += np.swapaxes(by, 1, 2) @ by
-    found = solve_chain(chain, size)
+    result = solve_chain(chain, size)
     for v in range(variants):
         whole, right = _dense(chain, v)
         inverse = np.linalg.inv(whole)
         expected = inverse @ right
         np.testing.assert_allclose(
-            found.states[v].reshape(n * size, r), expected[: n * size], rtol=1e-7, atol=1e-9
+            result.states[v].reshape(n * size, r), expected[: n * size], rtol=1e-7, atol=1e-9
         )
-        np.testing.assert_allclose(found.border[v], expected[n * size :], rtol=1e-7, atol=1e-9)
-        assert found.explained[v] == pytest.approx(right[:, 0] @ expected[:, 0], rel=1e-7)
+        np.testing.assert_allclose(result.border[v], expected[n * size :], rtol=1e-7, atol=1e-9)
+        assert result.explained[v] == pytest.approx(right[:, 0] @ expected[:, 0], rel=1e-7)
         for i in range(n):
             own = slice(i * size, (i + 1) * size)
-            np.testing.assert_allclose(found.cov[v, i], inverse[own, own], rtol=1e-6, atol=1e-9)
+            np.testing.assert_allclose(result.cov[v, i], inverse[own, own], rtol=1e-6, atol=1e-9)
 
 
 def _walk(seed: int, beacons: int = 4) -> SmallLog:
@@ -121,12 +121,12 @@ def _when() -> BoolArray:
 def test_the_sweep_agrees_with_the_graph_and_with_a_log_without_the_beacon() -> None:
     small = _walk(1)
     result = _smoothed(small, None)
-    found = separate_smoothed(result)
-    assert found is not None
+    estimate = separate_smoothed(result)
+    assert estimate is not None
     assert result.states.pose_cov is not None
     sigma = np.sqrt(np.einsum("nii->ni", result.states.pose_cov))
     scale = sigma[:, :, None] * sigma[:, None, :]
-    np.testing.assert_allclose(found.cov / scale, result.states.pose_cov / scale, atol=1e-3)
+    np.testing.assert_allclose(estimate.cov / scale, result.states.pose_cov / scale, atol=1e-3)
     for beacon in (0, 2):
         missing = [name == small.site.beacons[beacon].name for name, _ in small.fields.channels]
         phasor = np.where(np.array(missing)[:, None], np.nan, small.fields.phasor_sensor)
@@ -134,13 +134,13 @@ def test_the_sweep_agrees_with_the_graph_and_with_a_log_without_the_beacon() -> 
         without = _smoothed(replace(small, fields=fields), None)
         moved = without.states.position_world - result.states.position_world
         body = np.swapaxes(result.states.world_from_body, 1, 2) @ moved[..., None]
-        expected = found.step[:, beacon, 3:]
+        expected = estimate.step[:, beacon, 3:]
         # What is left is of second order: it grows with the step, which is up to 1.6 sigma here.
         step = max(np.max(sigma[:, 3:]), np.max(np.abs(expected)))
         assert np.max(np.abs(body[..., 0] - expected)) < 0.1 * step
         assert without.states.pose_cov is not None
         np.testing.assert_allclose(
-            np.einsum("nii->ni", found.subset_cov[:, beacon]),
+            np.einsum("nii->ni", estimate.subset_cov[:, beacon]),
             np.einsum("nii->ni", without.states.pose_cov),
             rtol=0.05,
         )
@@ -155,28 +155,28 @@ def test_piece_by_piece_a_log_is_separated_as_at_once(monkeypatch: pytest.Monkey
     known = separate_smoothed(result), _marginals(result)
     for module in (factors, native_rows):
         monkeypatch.setattr(module, "PIECE", 7)
-    monkeypatch.setattr(chain_system, "AT_ONCE", 1.0)  # one beacon at once
+    monkeypatch.setattr(block_tridiagonal_system, "AT_ONCE", 1.0)  # one beacon at once
     monkeypatch.setattr(considered, "AT_ONCE", 1.0)  # and one parameter that is held
-    found = separate_smoothed(result), _marginals(result)
+    estimate = separate_smoothed(result), _marginals(result)
     assert known[0] is not None
-    assert found[0] is not None
+    assert estimate[0] is not None
     for name, value in vars(known[0]).items():
         scale = max(float(np.max(np.abs(value))), 1e-300)
-        np.testing.assert_allclose(getattr(found[0], name), value, rtol=1e-7, atol=1e-10 * scale)
-    for one, other in zip(known[1], found[1], strict=True):
+        np.testing.assert_allclose(getattr(estimate[0], name), value, rtol=1e-7, atol=1e-10 * scale)
+    for one, other in zip(known[1], estimate[1], strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=0.0)
 
 
 def test_what_is_considered_is_taken_in_groups(monkeypatch: pytest.MonkeyPatch) -> None:
     result = _smoothed(_walk(1))
     known = separate_smoothed(result), _marginals(result)
-    monkeypatch.setattr(chain_system, "SIDES", 1.0)  # one block at once
-    assert len(chain_system.column_groups(result.uncertain, result.graph.epochs)) > 3
-    found = separate_smoothed(result), _marginals(result)
+    monkeypatch.setattr(block_tridiagonal_system, "SIDES", 1.0)  # one block at once
+    assert len(block_tridiagonal_system.column_groups(result.uncertain, result.graph.epochs)) > 3
+    estimate = separate_smoothed(result), _marginals(result)
     assert known[0] is not None
-    assert found[0] is not None
-    pairs = [(getattr(found[0], name), value) for name, value in vars(known[0]).items()]
-    for one, other in (*pairs, *zip(found[1], known[1], strict=True)):
+    assert estimate[0] is not None
+    pairs = [(getattr(estimate[0], name), value) for name, value in vars(known[0]).items()]
+    for one, other in (*pairs, *zip(estimate[1], known[1], strict=True)):
         scale = max(float(np.max(np.abs(other))), 1e-300)
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * scale)
 
@@ -185,11 +185,13 @@ def test_what_is_considered_is_taken_in_groups(monkeypatch: pytest.MonkeyPatch) 
 def test_good_logs_stay_as_they_are_within_a_useful_level(seed: int) -> None:
     small = _walk(seed)
     result = _smoothed(small)
-    found = separated_smooth(result)
-    assert found.trust.verdict is Verdict.TRUSTWORTHY
-    assert not any(found.states.excluded)
-    np.testing.assert_array_equal(found.result.states.position_world, result.states.position_world)
-    level = found.states.protection_level_m
+    estimate = separated_smooth(result)
+    assert estimate.trust.verdict is Verdict.TRUSTWORTHY
+    assert not any(estimate.states.excluded)
+    np.testing.assert_array_equal(
+        estimate.result.states.position_world, result.states.position_world
+    )
+    level = estimate.states.protection_level_m
     error = np.linalg.norm(result.states.position_world - small.truth.position_world, axis=1)
     assert np.all(error < level)
     assert result.states.pose_cov is not None
@@ -206,37 +208,37 @@ def test_a_beacon_that_is_false_for_a_while_is_left_out(
     clean = _rms(_smoothed(small), small)
     shape = np.cumsum(_when()) / np.sum(_when()) * _when() if ramp else _when()
     faulted = _false(small, size * shape)
-    found = separated_smooth(_smoothed(faulted, loss))
-    assert _rms(found.result, small) < 1.5 * clean
-    named = {name for names in found.states.excluded for name in names}
+    result = separated_smooth(_smoothed(faulted, loss))
+    assert _rms(result.result, small) < 1.5 * clean
+    named = {name for names in result.states.excluded for name in names}
     assert named == {small.site.beacons[1].name}
-    out = np.array([bool(names) for names in found.states.excluded])
+    out = np.array([bool(names) for names in result.states.excluded])
     assert np.mean(out[_when()]) > (0.5 if ramp else 0.95)
     assert np.mean(out[~_when()]) < 0.15
-    assert [finding.code for finding in found.trust.findings] == ["beacon_excluded"]
-    assert found.trust.verdict is Verdict.TRUSTWORTHY
-    error = np.linalg.norm(found.result.states.position_world - small.truth.position_world, axis=1)
-    assert np.all(error < found.states.protection_level_m)
+    assert [finding.code for finding in result.trust.findings] == ["beacon_excluded"]
+    assert result.trust.verdict is Verdict.TRUSTWORTHY
+    error = np.linalg.norm(result.result.states.position_world - small.truth.position_world, axis=1)
+    assert np.all(error < result.states.protection_level_m)
 
 
 def test_beacons_that_all_contradict_each_other_are_in_doubt() -> None:
     small = _walk(4)
     for beacon, share in enumerate((0.04, -0.04, 0.05, -0.03)):
         small = _false(small, np.full(EPOCHS, share), beacon)
-    found = separated_smooth(_smoothed(small))
-    assert found.trust.verdict is Verdict.DOUBTFUL
-    assert found.trust.reasons[0].code == "separation"
-    assert Verdict.DOUBTFUL in found.states.verdict
-    doubtful = np.array([v is Verdict.DOUBTFUL for v in found.states.verdict])
-    assert np.all(np.isnan(found.states.protection_level_m[doubtful]))
+    result = separated_smooth(_smoothed(small))
+    assert result.trust.verdict is Verdict.DOUBTFUL
+    assert result.trust.reasons[0].code == "separation"
+    assert Verdict.DOUBTFUL in result.states.verdict
+    doubtful = np.array([v is Verdict.DOUBTFUL for v in result.states.verdict])
+    assert np.all(np.isnan(result.states.protection_level_m[doubtful]))
 
 
 def test_one_beacon_is_no_doubt_but_has_no_level() -> None:
     result = _smoothed(_walk(5, beacons=1))
-    found = separated_smooth(result)
-    assert np.all(np.isnan(found.states.protection_level_m))
-    assert found.trust.verdict is Verdict.TRUSTWORTHY
-    assert [finding.code for finding in found.trust.findings] == ["no_redundancy"]
+    estimate = separated_smooth(result)
+    assert np.all(np.isnan(estimate.states.protection_level_m))
+    assert estimate.trust.verdict is Verdict.TRUSTWORTHY
+    assert [finding.code for finding in estimate.trust.findings] == ["no_redundancy"]
 
 
 @pytest.mark.slow
@@ -246,10 +248,10 @@ def test_clean_logs_have_alarms_no_more_often_than_promised() -> None:
     for seed in range(100, 100 + logs):
         small = _walk(seed)
         result = _smoothed(small)
-        found = separate_smoothed(result)
-        assert found is not None
-        alarmed += bool(np.any(found.excess(risk, SLACK) > 1.0))
-        level_m, _ = protection_levels(found, risk, SLACK)
+        estimate = separate_smoothed(result)
+        assert estimate is not None
+        alarmed += bool(np.any(estimate.excess(risk, SLACK) > 1.0))
+        level_m, _ = protection_levels(estimate, risk, SLACK)
         error = np.linalg.norm(result.states.position_world - small.truth.position_world, axis=1)
         beyond += bool(np.any(error > level_m))
     assert alarmed <= binom.isf(1e-3, logs, 0.02)
@@ -262,7 +264,7 @@ def test_the_chain_gives_the_covariance_of_the_tree(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(marginals, "AGREED", 0.0)  # so that the tree is asked for all
     tree = _marginals(result)
     sigma = np.sqrt(np.einsum("nii->ni", tree[0]))
-    apart = np.abs(chain[0] - tree[0]) / (sigma[:, :, None] * sigma[:, None])
-    assert 0.0 < np.max(apart) < 1e-9
+    separate = np.abs(chain[0] - tree[0]) / (sigma[:, :, None] * sigma[:, None])
+    assert 0.0 < np.max(separate) < 1e-9
     for one, other in zip(chain[1:], tree[1:], strict=True):
         np.testing.assert_allclose(one, other, atol=1e-9 * float(np.max(np.abs(other))))

@@ -15,7 +15,7 @@ from small_problem import SmallLog, small_log, small_problem
 from magfusion.errors import EstimationError
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.graph.factors import CALIBRATION_KEY
-from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate, read_states
+from magfusion.estimation.graph.graph import Graph, GraphEstimate, initial_estimate, read_states
 from magfusion.estimation.graph.measurement import robust_weight
 from magfusion.estimation.graph.state import states_in
 from magfusion.estimation.measurements.phasors import FieldPhasors
@@ -129,24 +129,24 @@ def native_graph(
     return graph
 
 
-def native_values(problem: Graph, estimate: Estimate) -> gtsam.Values:
+def native_values(problem: Graph, estimate: GraphEstimate) -> gtsam.Values:
     values = gtsam.Values(estimate.values)
     insert_calibration(values, estimate.calibration, problem.declared, problem.blocks)
     return values
 
 
 @pytest.fixture(scope="module")
-def solved() -> tuple[SmallLog, Graph, Estimate, float]:
+def solved() -> tuple[SmallLog, Graph, GraphEstimate, float]:
     """Solve a small problem with all of the survey estimated, by the own loop."""
     small = small_log(1)
     problem, start = small_problem(small, choose_blocks(small.site, SURVEY))
-    found = optimise(problem, start, iterations=50, tolerance=1e-13)
-    assert found.converged
-    return small, problem, found.estimate, found.cost
+    result = optimise(problem, start, iterations=50, tolerance=1e-13)
+    assert result.converged
+    return small, problem, result.estimate, result.cost
 
 
 def test_the_loop_ends_where_gtsams_own_optimizer_ends(
-    solved: tuple[SmallLog, Graph, Estimate, float],
+    solved: tuple[SmallLog, Graph, GraphEstimate, float],
 ) -> None:
     small, problem, estimate, cost = solved
     graph = native_graph(small, problem, problem.blocks)
@@ -170,22 +170,22 @@ def test_the_loop_ends_where_gtsams_own_optimizer_ends(
     assert np.max(np.abs(difference(problem.declared, estimate.calibration, problem.blocks))) > 1e-4
 
 
-def test_the_cost_is_gtsams_anywhere(solved: tuple[SmallLog, Graph, Estimate, float]) -> None:
+def test_the_cost_is_gtsams_anywhere(solved: tuple[SmallLog, Graph, GraphEstimate, float]) -> None:
     small, problem, estimate, _ = solved
     rng = np.random.default_rng(2)
     step = prior_sigma(problem.blocks) * rng.standard_normal(dimension(problem.blocks))
-    elsewhere = Estimate(estimate.values, retract(estimate.calibration, problem.blocks, step))
+    elsewhere = GraphEstimate(estimate.values, retract(estimate.calibration, problem.blocks, step))
     native = native_graph(small, problem, problem.blocks).error(native_values(problem, elsewhere))
     assert problem.cost(elsewhere) == pytest.approx(native, rel=1e-9)
 
 
-def same_covariance(found: np.ndarray, expected: np.ndarray, rtol: float) -> bool:
+def same_covariance(result: np.ndarray, expected: np.ndarray, rtol: float) -> bool:
     """Compare after division by the expected sigmas: metres and radians alike."""
     sigma = np.sqrt(np.diagonal(expected))
-    return bool(np.max(np.abs(found - expected) / np.outer(sigma, sigma)) < rtol)
+    return bool(np.max(np.abs(result - expected) / np.outer(sigma, sigma)) < rtol)
 
 
-def test_the_marginals_are_gtsams(solved: tuple[SmallLog, Graph, Estimate, float]) -> None:
+def test_the_marginals_are_gtsams(solved: tuple[SmallLog, Graph, GraphEstimate, float]) -> None:
     small, problem, estimate, _ = solved
     graph = native_graph(small, problem, problem.blocks)
     native = gtsam.Marginals(graph, native_values(problem, estimate))
@@ -200,7 +200,7 @@ def test_the_marginals_are_gtsams(solved: tuple[SmallLog, Graph, Estimate, float
 # --- dense linear algebra ---
 
 
-def dense(problem: Graph, estimate: Estimate) -> tuple[np.ndarray, gtsam.Ordering]:
+def dense(problem: Graph, estimate: GraphEstimate) -> tuple[np.ndarray, gtsam.Ordering]:
     ordering = gtsam.Ordering()
     for symbol in (X, V, B):
         for i in range(problem.epochs):
@@ -211,19 +211,21 @@ def dense(problem: Graph, estimate: Estimate) -> tuple[np.ndarray, gtsam.Orderin
     return np.array(jacobian), ordering
 
 
-def whitened_response(small: SmallLog, estimate: Estimate, held: tuple[Block, ...]) -> np.ndarray:
+def whitened_response(
+    small: SmallLog, estimate: GraphEstimate, fixed: tuple[Block, ...]
+) -> np.ndarray:
     """Field residuals' derivative by held parameters, in units of their sigma."""
     poses, time = states_in(estimate.values), small.fields.time
     cov = measurement_cov(small.site, small.fields)
     root = np.linalg.inv(np.linalg.cholesky(cov))
 
     def residual(step: np.ndarray) -> np.ndarray:
-        moved = retract(estimate.calibration, held, step * prior_sigma(held))
+        moved = retract(estimate.calibration, fixed, step * prior_sigma(fixed))
         phasor = predict_channels(moved, time, poses.world_from_body, poses.position_world)
         parts = [(root @ part[..., None])[..., 0] for part in (phasor.real, phasor.imag)]
         return np.concatenate(parts, axis=-1).ravel()
 
-    return central_difference(residual, dimension(held), 1e-2)
+    return central_difference(residual, dimension(fixed), 1e-2)
 
 
 def phasors_of(problem: Graph) -> FieldPhasors:
@@ -232,7 +234,7 @@ def phasors_of(problem: Graph) -> FieldPhasors:
     return fields
 
 
-def weight_roots(problem: Graph, estimate: Estimate) -> np.ndarray:
+def weight_roots(problem: Graph, estimate: GraphEstimate) -> np.ndarray:
     """Square root of each field residual's robust weight, as a column."""
     fields = phasors_of(problem)
     error = fields.error(states_in(estimate.values), estimate.calibration)
@@ -251,16 +253,16 @@ def test_what_is_held_is_considered_as_dense_algebra_has_it(
     problem, start = small_problem(small, choose_blocks(small.site, groups), loss=loss)
     estimate = optimise(problem, start, iterations=50, tolerance=1e-12).estimate
     wanted = considered_blocks(small.site, problem.blocks)
-    held = tuple(b for b in wanted if b.group != "time-offset")
-    poses, calibration, _ = marginals(problem, estimate, held)
+    fixed = tuple(b for b in wanted if b.group != "time-offset")
+    poses, calibration, _ = marginals(problem, estimate, fixed)
     alone, _, _ = marginals(problem, estimate)
 
     jacobian, _ = dense(problem, estimate)
     inverse = np.linalg.pinv(jacobian, rcond=1e-15)
     fields = slice(problem.native.size(), None)
     rows = sum(problem.native.at(i).dim() for i in range(fields.start))
-    response = np.zeros((len(jacobian), dimension(held)))
-    by_held = weight_roots(problem, estimate) * whitened_response(small, estimate, held)
+    response = np.zeros((len(jacobian), dimension(fixed)))
+    by_held = weight_roots(problem, estimate) * whitened_response(small, estimate, fixed)
     response[rows : rows + len(by_held)] = by_held
     moved = inverse @ response
     noise = inverse @ inverse.T
@@ -280,17 +282,17 @@ def test_a_considered_survey_covers_errors_of_the_survey() -> None:
     rng = np.random.default_rng(4)
     small = small_log(4, epochs=6, perturb=False)
     problem, start = small_problem(small, ())
-    held = tuple(b for b in considered_blocks(small.site, ()) if b.group != "time-offset")
+    fixed = tuple(b for b in considered_blocks(small.site, ()) if b.group != "time-offset")
     estimate = optimise(problem, start, tolerance=1e-12).estimate
-    with_survey, _, _ = marginals(problem, estimate, held)
+    with_survey, _, _ = marginals(problem, estimate, fixed)
     alone, _, _ = marginals(problem, estimate)
     steps = []
     for _ in range(300):
         moved = retract(
-            problem.declared, held, prior_sigma(held) * rng.standard_normal(dimension(held))
+            problem.declared, fixed, prior_sigma(fixed) * rng.standard_normal(dimension(fixed))
         )
-        found = optimise(replace(problem, declared=moved), Estimate(estimate.values, moved))
-        pose = found.estimate.values.atPose3(X(3))
+        result = optimise(replace(problem, declared=moved), GraphEstimate(estimate.values, moved))
+        pose = result.estimate.values.atPose3(X(3))
         steps.append(estimate.values.atPose3(X(3)).localCoordinates(pose))
     # The data stay as they are: what scatters is the survey's part of the covariance.
     ratio = np.var(steps, axis=0) / np.diagonal(with_survey[3] - alone[3])
@@ -370,14 +372,14 @@ def disturbed(truth: Trajectory, seed: int, metre: float, rad: float) -> Traject
     )
 
 
-def plain_gauss_newton(problem: Graph, estimate: Estimate, steps: int) -> float:
+def plain_gauss_newton(problem: Graph, estimate: GraphEstimate, steps: int) -> float:
     """Return the cost after undamped steps; infinite where they lead to a singular system."""
     ordering = nested_dissection(problem.epochs, CALIBRATION_KEY)
     try:
         for _ in range(steps):
             step = problem.linearized(estimate).optimize(ordering)
-            turned = retract(estimate.calibration, problem.blocks, step.at(CALIBRATION_KEY))
-            estimate = Estimate(estimate.values.retract(step), turned)
+            rotated = retract(estimate.calibration, problem.blocks, step.at(CALIBRATION_KEY))
+            estimate = GraphEstimate(estimate.values.retract(step), rotated)
         return problem.cost(estimate)
     except RuntimeError:
         return np.inf
@@ -389,17 +391,17 @@ def test_the_loop_recovers_by_damping_where_plain_steps_are_lost() -> None:
     reached = optimise(problem, good, iterations=50)
     bad = initial_estimate(disturbed(small.truth, 11, metre=1.0, rad=1.2), problem.declared)
     costs = [problem.cost(bad)]
-    found = optimise(problem, bad, iterations=200, report=lambda _, cost: costs.append(cost))
-    assert found.converged
-    assert found.cost == pytest.approx(reached.cost, rel=1e-4)
+    result = optimise(problem, bad, iterations=200, report=lambda _, cost: costs.append(cost))
+    assert result.converged
+    assert result.cost == pytest.approx(reached.cost, rel=1e-4)
     assert np.all(np.diff(costs) <= 0.0)
     assert plain_gauss_newton(problem, bad, 60) > 1e3 * reached.cost
 
 
 def test_a_start_without_finite_cost_is_refused() -> None:
     small = small_log(6, epochs=4)
-    lost = replace(small.truth, position_world=np.full((4, 3), np.nan))
-    problem, start = small_problem(small, (), start=lost)
+    lost_epochs = replace(small.truth, position_world=np.full((4, 3), np.nan))
+    problem, start = small_problem(small, (), start=lost_epochs)
     with pytest.raises(EstimationError, match="no finite cost"):
         optimise(problem, start)
 
@@ -417,12 +419,12 @@ def with_outliers(small: SmallLog, seed: int, share: float) -> SmallLog:
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
 def test_a_robust_loss_survives_twenty_per_cent_of_outliers(loss: str) -> None:
     small = small_log(7, perturb=False)
-    spoilt = with_outliers(small, 7, 0.2)
+    corrupted = with_outliers(small, 7, 0.2)
     ate = {}
     for name in (None, loss):
-        problem, start = small_problem(spoilt, (), loss=name)
-        found = optimise(problem, start, iterations=100)
-        states = read_states(found.estimate.values, small.truth.time)
+        problem, start = small_problem(corrupted, (), loss=name)
+        result = optimise(problem, start, iterations=100)
+        states = read_states(result.estimate.values, small.truth.time)
         ate[name] = trajectory_errors(states, small.truth, max_gap=1.0).ate
     assert ate[loss] < 0.01  # m
     assert ate[None] > 0.03  # m
@@ -430,14 +432,14 @@ def test_a_robust_loss_survives_twenty_per_cent_of_outliers(loss: str) -> None:
 
 
 def test_a_robust_loss_survives_outliers_from_its_own_start() -> None:
-    spoilt = with_outliers(small_log(8, epochs=40, perturb=False), 8, 0.2)
-    found = {
-        loss: smooth(spoilt.log, spoilt.site, SmootherSettings(loss=loss, estimate=()))
+    corrupted = with_outliers(small_log(8, epochs=40, perturb=False), 8, 0.2)
+    result = {
+        loss: smooth(corrupted.log, corrupted.site, SmootherSettings(loss=loss, estimate=()))
         for loss in (None, "cauchy")
     }
     ate = {
-        loss: trajectory_errors(result.states, spoilt.truth, max_gap=1.0).ate
-        for loss, result in found.items()
+        loss: trajectory_errors(result.states, corrupted.truth, max_gap=1.0).ate
+        for loss, result in result.items()
     }
     assert ate["cauchy"] < 0.01  # m
     assert ate[None] > 3.0 * ate["cauchy"]
@@ -456,12 +458,12 @@ def test_a_missing_channel_has_no_say() -> None:
     assert np.all(rows.error[4, 1] == 0.0)
     assert np.all(rows.by_pose[7] == 0.0)
     assert np.all(rows.error[4, 0] != 0.0)
-    found = optimise(problem, start)
-    states = read_states(found.estimate.values, small.truth.time)
+    result = optimise(problem, start)
+    states = read_states(result.estimate.values, small.truth.time)
     assert trajectory_errors(states, small.truth, max_gap=1.0).ate < 0.01  # m
-    poses, _, _ = marginals(problem, found.estimate)
+    poses, _, _ = marginals(problem, result.estimate)
     trace = np.trace(poses[:, 3:, 3:], axis1=1, axis2=2)
-    whole, _, _ = marginals(small_problem(small, ())[0], found.estimate)
+    whole, _, _ = marginals(small_problem(small, ())[0], result.estimate)
     ratio = trace / np.trace(whole[:, 3:, 3:], axis1=1, axis2=2)
     assert np.argmax(ratio) == 7  # the IMU alone carries the empty epoch
     assert ratio[7] > 1.1
@@ -474,8 +476,8 @@ def test_loose_coupling_agrees_with_tight_within_millimetres() -> None:
     loose = smooth(small.log, small.site, SmootherSettings(coupling="loose"))
     assert loose.blocks == ()
     assert np.all(np.isnan(loose.residual))
-    apart = np.linalg.norm(loose.states.position_world - tight.states.position_world, axis=1)
-    assert np.max(apart) < 0.005  # m
+    separate = np.linalg.norm(loose.states.position_world - tight.states.position_world, axis=1)
+    assert np.max(separate) < 0.005  # m
     for result in (tight, loose):
         assert trajectory_errors(result.states, small.truth, max_gap=1.0).ate < 0.01  # m
 

@@ -50,6 +50,6 @@ def test_a_line_of_dipoles_is_the_sum_of_a_fine_array() -> None:
     points = everywhere(1.0)[:50]
     places = (np.arange(4000) + 0.5) / 4000 * 0.2 - 0.1  # m along the axis
     array = sum(dipole_field(points - [0.0, 0.0, z], MOMENT / 4000) for z in places)
-    found = solenoid_field(points, MOMENT, length=0.2)
-    error = np.linalg.norm(found - array, axis=1) / np.linalg.norm(found, axis=1)
+    result = solenoid_field(points, MOMENT, length=0.2)
+    error = np.linalg.norm(result - array, axis=1) / np.linalg.norm(result, axis=1)
     assert np.max(error) < 1e-7  # quadrature

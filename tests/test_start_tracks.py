@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 from magfusion.estimation.batch.strides import strides_between
 from magfusion.estimation.batch.tracks import (
     MOTION,
-    Heard,
+    TrackPhasors,
     Tracks,
-    carried,
-    heard,
     moved,
+    propagate_tracks,
     rows_at,
+    track_phasors,
     updated,
 )
 from magfusion.estimation.graph.propagation import propagate
@@ -29,18 +29,18 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD
 from magfusion.simulation.log import simulate_fields
-from magfusion.simulation.motion import Motion, Rests, random_walk_motion
+from magfusion.simulation.motion import Rests, SimulatedMotion, random_walk_motion
 
 OFFSET = 0.003  # s
 EPOCHS = np.array([1.0, 1.1, 1.35, 1.4, 2.0])
 
 
-def walk() -> Motion:
+def walk() -> SimulatedMotion:
     rests = Rests(start=0.0, move=10.0, pause=1.0)
     return random_walk_motion(np.random.default_rng(3), 4.0, DEMO_BOX_WORLD, 1.0, rests=rests)
 
 
-def ideal_imu(motion: Motion, site: Site) -> ImuSamples:
+def ideal_imu(motion: SimulatedMotion, site: Site) -> ImuSamples:
     """Return samples without any error, stamped too early by the offset."""
     time = np.arange(0.0, 3.0, 1e-3)
     force = motion.specific_force_body(time, site.gravity)
@@ -53,16 +53,16 @@ def free_site() -> Site:
     return replace(site, beacons=(one, replace(other, synchronised=False)))
 
 
-def hearing_of(site: Site, motion: Motion) -> Heard:
+def hearing_of(site: Site, motion: SimulatedMotion) -> TrackPhasors:
     truth = motion.trajectory(EPOCHS)
     samples = simulate_fields(site, truth, SIGMA, np.random.default_rng(1), window=0.1)
-    return heard(samples, initial_calibration(site, 0.0))
+    return track_phasors(samples, initial_calibration(site, 0.0))
 
 
-def tracks_at(site: Site, motion: Motion, k: int, sigma: float = 1e-3) -> Tracks:
+def tracks_at(site: Site, motion: SimulatedMotion, k: int, sigma: float = 1e-3) -> Tracks:
     """Return the truth as a track, and one beside it."""
     at = motion.trajectory(EPOCHS[k : k + 1])
-    channels, free = len(site.channels), sum(not b.synchronised for b in site.beacons)
+    channels, free_parameters = len(site.channels), sum(not b.synchronised for b in site.beacons)
     assert at.velocity_world is not None
     none = np.zeros((2, channels))
     return Tracks(
@@ -74,7 +74,7 @@ def tracks_at(site: Site, motion: Motion, k: int, sigma: float = 1e-3) -> Tracks
         gyro_bias=np.array([[0, 0, 0], [2e-3, -1e-3, 3e-3]]),
         phase=none + 0.2 * np.arange(2)[:, None] * (np.arange(channels) == 1),
         rate=none.copy(),
-        cov=np.tile(sigma**2 * np.eye(MOTION + 2 * free), (2, 1, 1)),
+        cov=np.tile(sigma**2 * np.eye(MOTION + 2 * free_parameters), (2, 1, 1)),
         cost=np.zeros(2),
         parent=np.arange(2),
     )
@@ -83,9 +83,9 @@ def tracks_at(site: Site, motion: Motion, k: int, sigma: float = 1e-3) -> Tracks
 def test_strides_carry_the_true_state_along_the_true_motion() -> None:
     site, motion = free_site(), walk()
     strides = strides_between(ideal_imu(motion, site), OFFSET, EPOCHS)
-    hearing = hearing_of(site, motion)
+    detection = hearing_of(site, motion)
     for k in range(len(strides)):
-        there = carried(tracks_at(site, motion, k), strides, k, hearing, backward=False)
+        there = propagate_tracks(tracks_at(site, motion, k), strides, k, detection, backward=False)
         truth = motion.trajectory(EPOCHS[k + 1 : k + 2])
         assert truth.velocity_world is not None
         np.testing.assert_allclose(there.position[0], truth.position_world[0], atol=1e-6)
@@ -96,9 +96,9 @@ def test_strides_carry_the_true_state_along_the_true_motion() -> None:
 def test_the_way_back_is_the_way_there() -> None:
     site, motion = free_site(), walk()
     strides = strides_between(ideal_imu(motion, site), OFFSET, EPOCHS)
-    hearing, tracks = hearing_of(site, motion), tracks_at(site, motion, 1)
-    there = carried(tracks, strides, 1, hearing, backward=False)
-    back = carried(there, strides, 1, hearing, backward=True)
+    detection, tracks = hearing_of(site, motion), tracks_at(site, motion, 1)
+    there = propagate_tracks(tracks, strides, 1, detection, backward=False)
+    back = propagate_tracks(there, strides, 1, detection, backward=True)
     for name in ("rotation", "position", "velocity", "phase"):
         np.testing.assert_allclose(getattr(back, name), getattr(tracks, name), atol=1e-12)
     # The noise of the stride counts on both ways.
@@ -112,7 +112,7 @@ def test_a_gap_of_the_stream_is_found_wherever_it_lies() -> None:
     imu = ideal_imu(motion, site)
     heard_of = (imu.time < 1.36) | (imu.time > 1.7)
     some = ImuSamples(imu.time[heard_of], imu.gyro_body[heard_of], imu.accel_body[heard_of])
-    assert strides_between(some, OFFSET, EPOCHS).bridged.tolist() == [False, False, True, True]
+    assert strides_between(some, OFFSET, EPOCHS).gap_bridged.tolist() == [False, False, True, True]
 
 
 def test_a_stream_that_ends_early_is_extended() -> None:
@@ -120,19 +120,19 @@ def test_a_stream_that_ends_early_is_extended() -> None:
     imu = ideal_imu(motion, site)
     short = ImuSamples(*(part[imu.time < 1.39] for part in vars(imu).values()))
     strides = strides_between(short, OFFSET, EPOCHS)
-    assert strides.bridged.tolist() == [False, False, True, True]
+    assert strides.gap_bridged.tolist() == [False, False, True, True]
     assert np.max(np.abs(strides.displacement[-1])) < 0.6 * 11.0 * 0.6**2  # m; no spline runs away
 
 
 def test_rows_are_differentiated() -> None:
     site, motion = free_site(), walk()
-    hearing, tracks = hearing_of(site, motion), tracks_at(site, motion, 2)
-    free = hearing.free
+    detection, tracks = hearing_of(site, motion), tracks_at(site, motion, 2)
+    free_parameters = detection.free_phases
 
     def error(step: np.ndarray) -> np.ndarray:
-        return rows_at(moved(tracks, np.tile(step, (2, 1)), free), hearing, 2)[0]
+        return rows_at(moved(tracks, np.tile(step, (2, 1)), free_parameters), detection, 2)[0]
 
-    _, by = rows_at(tracks, hearing, 2)
+    _, by = rows_at(tracks, detection, 2)
     expected = central_difference(error, by.shape[2], 1e-5)
     for part in (slice(0, 3), slice(3, 6), slice(MOTION, MOTION + 1)):
         assert relative_to_group(by[..., part], expected[..., part]) < 1e-7
@@ -143,10 +143,12 @@ def test_rows_are_differentiated() -> None:
 def test_a_stride_and_an_update_are_those_of_the_filter(k: int) -> None:
     """The filter preintegrates by GTSAM and updates by filterpy."""
     site, motion = surveyed_site(), walk()
-    imu, hearing = ideal_imu(motion, site), hearing_of(site, motion)
+    imu, detection = ideal_imu(motion, site), hearing_of(site, motion)
     tracks = tracks_at(site, motion, k, sigma=3e-4).rows(np.array([0]))
     strides = strides_between(imu, OFFSET, EPOCHS)
-    ours = updated(carried(tracks, strides, k, hearing, backward=False), hearing, k + 1)
+    ours = updated(
+        propagate_tracks(tracks, strides, k, detection, backward=False), detection, k + 1
+    )
 
     state = State(
         time=float(EPOCHS[k]),
@@ -166,29 +168,29 @@ def test_a_stride_and_an_update_are_those_of_the_filter(k: int) -> None:
         samples.time, predicted.state.world_from_body[None], predicted.state.position_world[None]
     )
     phasors = field_phasors(site, samples, np.zeros(1, dtype=int), pose, np.zeros((1, 3)), 0.0, 1.0)
-    theirs = ErrorStateFilter(state, ())
-    theirs.absorb(predicted, [phasors])
-    sigma = np.sqrt(np.diag(theirs.state.cov))
-    body_from_world = theirs.state.world_from_body.T
-    turned = Rotation.from_matrix(body_from_world @ ours.rotation[0]).as_rotvec()
-    shifted = body_from_world @ (ours.position[0] - theirs.state.position_world)
-    faster = ours.velocity[0] - theirs.state.velocity_world
-    assert np.max(np.abs(np.concatenate([turned, shifted, faster])) / sigma[:9]) < 0.03
+    others = ErrorStateFilter(state, ())
+    others.absorb(predicted, [phasors])
+    sigma = np.sqrt(np.diag(others.state.cov))
+    body_from_world = others.state.world_from_body.T
+    rotated = Rotation.from_matrix(body_from_world @ ours.rotation[0]).as_rotvec()
+    shifted = body_from_world @ (ours.position[0] - others.state.position_world)
+    faster = ours.velocity[0] - others.state.velocity_world
+    assert np.max(np.abs(np.concatenate([rotated, shifted, faster])) / sigma[:9]) < 0.03
     turn = np.eye(MOTION)
     turn[3:6, 3:6] = body_from_world
-    error = (turn @ ours.cov[0] @ turn.T - theirs.state.cov) / np.outer(sigma, sigma)
+    error = (turn @ ours.cov[0] @ turn.T - others.state.cov) / np.outer(sigma, sigma)
     assert np.max(np.abs(error)) < 0.05  # a stride leaves out what is second to its noise
 
 
 def test_what_is_not_credible_costs_little_more_the_worse_it_is() -> None:
     site, motion = surveyed_site(), walk()
-    hearing, tracks = hearing_of(site, motion), tracks_at(site, motion, 1)
-    good = updated(tracks, hearing, 1)
+    detection, tracks = hearing_of(site, motion), tracks_at(site, motion, 1)
+    good = updated(tracks, detection, 1)
     costs = []
     for size in (10.0, 1000.0):
-        false = hearing.measured.copy()
+        false = detection.measured.copy()
         false[1] *= size
-        bad = updated(tracks, replace(hearing, measured=false), 1)
+        bad = updated(tracks, replace(detection, measured=false), 1)
         assert np.linalg.norm(bad.position[0] - tracks.position[0]) < 0.01  # m
         costs.append(float(bad.cost[0] - good.cost[0]))
     assert 0.0 < costs[0] < costs[1] < 5.0 * costs[0]

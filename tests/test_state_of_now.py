@@ -16,9 +16,14 @@ from test_parameters import GyroScale
 from magfusion.estimation.graph.process_noise import calibration_process_noise
 from magfusion.estimation.graph.propagation import propagate
 from magfusion.estimation.graph.state import MOTION, State, between, moved
-from magfusion.estimation.online.carried import Departure, carried_states, carry, departing
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.online.state_of_now import CarriedState
+from magfusion.estimation.online.propagated import (
+    PropagationStart,
+    initial_passage,
+    propagate_passage,
+    states_along,
+)
+from magfusion.estimation.online.state_of_now import PropagatedState
 from magfusion.estimation.posterior.separation import radii
 from magfusion.files.site import save_site
 from magfusion.jobs.replay import run_replay
@@ -38,18 +43,20 @@ def walk() -> OnlineLog:
     return online_log(0, 11.0, rate_hz=100.0)
 
 
-def carried(
+def propagated(
     log: OnlineLog, settings: NavigatorSettings, **how: Any
-) -> tuple[Navigator, list[CarriedState]]:
-    found: list[CarriedState] = []
-    navigator, _ = navigate(log, settings, watch=lambda n, _: found.extend(n.take_carried()), **how)
-    return navigator, found
+) -> tuple[Navigator, list[PropagatedState]]:
+    result: list[PropagatedState] = []
+    navigator, _ = navigate(
+        log, settings, watch=lambda n, _: result.extend(n.take_propagated()), **how
+    )
+    return navigator, result
 
 
-def departure_at(navigator: Navigator, state: State) -> Departure:
+def departure_at(navigator: Navigator, state: State) -> PropagationStart:
     arrived = navigator._arrived
     assert arrived.usual is not None
-    return Departure(
+    return PropagationStart(
         state,
         navigator.site,
         navigator.blocks,
@@ -60,34 +67,34 @@ def departure_at(navigator: Navigator, state: State) -> Departure:
 
 
 @pytest.fixture(scope="module")
-def departed(walk: OnlineLog) -> tuple[Navigator, Departure, ImuSamples]:
+def exceeding(walk: OnlineLog) -> tuple[Navigator, PropagationStart, ImuSamples]:
     """Return a state within the buffered stream that moves fast, between two samples."""
     navigator, _ = navigate(walk, NavigatorSettings("ekf"))
-    found = navigator.state(-np.inf)
+    result = navigator.state(-np.inf)
     moving = replace(
-        found, time=found.time - 1.0 + 0.0013, velocity_world=np.array([1.0, 0.3, -0.2])
+        result, time=result.time - 1.0 + 0.0013, velocity_world=np.array([1.0, 0.3, -0.2])
     )
-    imu = navigator._arrived.inertial_samples(found.time - 1.5)
+    imu = navigator._arrived.inertial_samples(result.time - 1.5)
     return navigator, departure_at(navigator, moving), imu
 
 
-def carried_in_chunks(departure: Departure, imu: ImuSamples, chunk: int) -> list[State]:
-    stamps, last = imu.time + departure.time_offset, departing(departure)
-    wanted, found = stamps[stamps > departure.state.time], []
+def carried_in_chunks(start: PropagationStart, imu: ImuSamples, chunk: int) -> list[State]:
+    stamps, last = imu.time + start.time_offset, initial_passage(start)
+    wanted, result = stamps[stamps > start.state.time], []
     for begin in range(0, len(wanted), chunk):
         own = wanted[begin : begin + chunk]
         come = slice(0, int(np.searchsorted(stamps, own[-1], side="right")))
-        passage, last = carry(
-            departure,
+        passage, last = propagate_passage(
+            start,
             last,
             ImuSamples(imu.time[come], imu.gyro_body[come], imu.accel_body[come]),
             own,
         )
-        found += carried_states(departure, passage)
-    return found
+        result += states_along(start, passage)
+    return result
 
 
-def apart(one: State, other: State, navigator: Navigator) -> float:
+def separate(one: State, other: State, navigator: Navigator) -> float:
     """Return the largest difference of two states in units of the sigmas of one."""
     step = between(one, other, navigator.blocks)[:9]
     return float(np.max(np.abs(step) / np.sqrt(np.diagonal(other.cov))[:9]))
@@ -95,68 +102,68 @@ def apart(one: State, other: State, navigator: Navigator) -> float:
 
 @pytest.mark.parametrize("chunk", [1, 7, 1000])
 def test_carried_by_single_steps_is_integrated_directly(
-    departed: tuple[Navigator, Departure, ImuSamples], chunk: int
+    exceeding: tuple[Navigator, PropagationStart, ImuSamples], chunk: int
 ) -> None:
     """Directly: by GTSAM's preintegration from the epoch on, as the estimators predict."""
-    navigator, departure, imu = departed
-    found = carried_in_chunks(departure, imu, chunk)
-    assert len(found) > 95
-    for state in (found[0], found[20], found[-1]):
+    navigator, start, imu = exceeding
+    result = carried_in_chunks(start, imu, chunk)
+    assert len(result) > 95
+    for state in (result[0], result[20], result[-1]):
         direct = propagate(
-            departure.state,
+            start.state,
             imu,
             state.time,
-            departure.site,
-            departure.time_offset,
-            departure.process_noise,
-            departure.usual,
-            departure.blocks,
+            start.site,
+            start.time_offset,
+            start.process_noise,
+            start.usual,
+            start.blocks,
         ).state
-        assert apart(state, direct, navigator) < 1e-3
+        assert separate(state, direct, navigator) < 1e-3
         scale = np.sqrt(np.diagonal(direct.cov))
         assert np.max(np.abs(state.cov - direct.cov) / scale / scale[:, None]) < 5e-3
 
 
 def test_moments_walk_as_declared_while_the_state_is_carried(
-    departed: tuple[Navigator, Departure, ImuSamples],
+    exceeding: tuple[Navigator, PropagationStart, ImuSamples],
 ) -> None:
     """A supply that warms up changes its moments by 0.5 in an hour: by 0.7 % in a second."""
-    _, departure, imu = departed
+    _, start, imu = exceeding
     site = replace(demo_site(), clock=ClockModel(log_moment_walk=0.5))
     blocks, known = choose_blocks(site, ("moments",)), 1e-3
     cov = known**2 * np.eye(MOTION + dimension(blocks))
-    calibration = initial_calibration(site, departure.state.time)
-    state = replace(departure.state, cov=cov, calibration=calibration)
+    calibration = initial_calibration(site, start.state.time)
+    state = replace(start.state, cov=cov, calibration=calibration)
     walk = calibration_process_noise(site, blocks)
-    own = replace(departure, site=site, state=state, blocks=blocks, process_noise=walk)
-    found = carried_in_chunks(own, imu, 9)[-1]
-    gained = np.diagonal(found.cov)[MOTION:] - known**2
+    own = replace(start, site=site, state=state, blocks=blocks, process_noise=walk)
+    result = carried_in_chunks(own, imu, 9)[-1]
+    gained = np.diagonal(result.cov)[MOTION:] - known**2
     assert gained[0] > known**2
-    expected = 0.5**2 * (found.time - state.time) / 3600.0
+    expected = 0.5**2 * (result.time - state.time) / 3600.0
     np.testing.assert_allclose(gained, expected, rtol=1e-6)
 
 
 def test_a_parameter_of_the_imu_has_its_share_in_the_covariance(
-    departed: tuple[Navigator, Departure, ImuSamples],
+    exceeding: tuple[Navigator, PropagationStart, ImuSamples],
 ) -> None:
-    _, departure, imu = departed
+    _, start, imu = exceeding
     navigator = Navigator(
-        departure.site, NavigatorSettings("ekf", parameters=(GyroScale(),), estimate=("gyro",))
+        start.site, NavigatorSettings("ekf", parameters=(GyroScale(),), estimate=("gyro",))
     )
     size = MOTION + sum(len(b.sigma) for b in navigator.blocks)
     assert size > MOTION
     cov = 1e-8 * np.eye(size)
     cov[MOTION:, MOTION:] *= 1e4
-    state = replace(departure.state, cov=cov)
+    state = replace(start.state, cov=cov)
     own = replace(
-        departure, state=state, blocks=navigator.blocks, process_noise=navigator._process_noise
+        start, state=state, blocks=navigator.blocks, process_noise=navigator._process_noise
     )
-    found = carried_in_chunks(own, imu, 9)[-1]
+    result = carried_in_chunks(own, imu, 9)[-1]
     direct = propagate(
-        state, imu, found.time, own.site, own.time_offset, None, own.usual, own.blocks
+        state, imu, result.time, own.site, own.time_offset, None, own.usual, own.blocks
     )
     scale = np.sqrt(np.diagonal(direct.state.cov))
-    assert np.max(np.abs(found.cov - direct.state.cov) / scale / scale[:, None]) < 5e-3
+    assert np.max(np.abs(result.cov - direct.state.cov) / scale / scale[:, None]) < 5e-3
 
 
 def test_steps_are_the_integral_of_a_constant_rate_and_force() -> None:
@@ -164,7 +171,7 @@ def test_steps_are_the_integral_of_a_constant_rate_and_force() -> None:
     rng = np.random.default_rng(3)
     gyro, accel = rng.normal(0.0, 2.0, (4, 3)), rng.normal(0.0, 5.0, (4, 3))
     dt = np.array([1e-3, 0.02, 0.3, 1.7])
-    turned, parts = steps_of(gyro, accel, dt), 10_000
+    rotated, parts = steps_of(gyro, accel, dt), 10_000
     for k in range(4):
         small = dt[k] / parts
         turn = Rotation.from_rotvec(np.arange(parts)[:, None] * small * gyro[k])
@@ -172,9 +179,9 @@ def test_steps_are_the_integral_of_a_constant_rate_and_force() -> None:
         gained = np.cumsum(middle.apply(accel[k]) * small, axis=0)
         moved = np.sum((gained - 0.5 * small * middle.apply(accel[k])) * small, axis=0)
         whole = Rotation.from_rotvec(dt[k] * gyro[k]).as_matrix()
-        assert turned.rotation[k] == pytest.approx(whole, abs=1e-12)
-        assert turned.velocity[k] == pytest.approx(gained[-1], rel=1e-6, abs=1e-9)
-        assert turned.position[k] == pytest.approx(moved, rel=1e-6, abs=1e-9)
+        assert rotated.rotation[k] == pytest.approx(whole, abs=1e-12)
+        assert rotated.velocity[k] == pytest.approx(gained[-1], rel=1e-6, abs=1e-9)
+        assert rotated.position[k] == pytest.approx(moved, rel=1e-6, abs=1e-9)
 
 
 def test_the_covariance_of_carrying_is_that_of_its_errors_unless_the_gyro_is_worse() -> None:
@@ -210,17 +217,19 @@ def test_the_covariance_of_carrying_is_that_of_its_errors_unless_the_gyro_is_wor
             start = moved(exact, (), sigma * rng.normal(size=MOTION))
             site = replace(log.site, platform=replace(log.site.platform, imu=declared))
             noise = calibration_process_noise(site, ())
-            departure = Departure(start, site, (), noise, 0.0, 0.01)
-            passage, _ = carry(departure, departing(departure), imu, np.array([begin + 0.4]))
-            (found,) = carried_states(departure, passage)
+            first = PropagationStart(start, site, (), noise, 0.0, 0.01)
+            passage, _ = propagate_passage(
+                first, initial_passage(first), imu, np.array([begin + 0.4])
+            )
+            (result,) = states_along(first, passage)
             later = replace(
                 exact,
                 world_from_body=true.world_from_body[1],
                 position_world=true.position_world[1],
                 velocity_world=true.velocity_world[1],
             )
-            error = between(found, later, ())[:6]
-            squares.append(float(error @ np.linalg.solve(found.cov[:6, :6], error)))
+            error = between(result, later, ())[:6]
+            squares.append(float(error @ np.linalg.solve(result.cov[:6, :6], error)))
         mean[worse] = float(np.mean(squares))
     assert 4.5 < mean[1.0] < 7.7  # six degrees of freedom, 40 runs
     assert mean[3.0] > 9.0
@@ -236,28 +245,29 @@ def test_the_covariance_is_that_of_the_errors_unless_the_gyro_noise_is_wrong(
     for seed in range(3):
         log = online_log(seed, 20.0, every=1.0)
         imu = log.site.platform.imu
-        for wrong, found in nees.items():
+        for wrong, result in nees.items():
             noise = replace(imu, gyro_noise=20.0 * imu.gyro_noise)
             rng = np.random.default_rng(100 + seed)
             noisy = simulate_imu(log.motion, noise, log.site.gravity, 50.0, 20.0, rng).samples
-            told = replace(noise, gyro_noise=noise.gyro_noise / wrong)
-            site = replace(log.site, platform=replace(log.site.platform, imu=told))
+            reported = replace(noise, gyro_noise=noise.gyro_noise / wrong)
+            site = replace(log.site, platform=replace(log.site.platform, imu=reported))
             own = replace(log, site=site, imu=noisy)
-            _, states = carried(own, NavigatorSettings(estimator, rate="imu"))
+            _, states = propagated(own, NavigatorSettings(estimator, rate="imu"))
             errors = own.errors([s for s in states if s.time - s.epoch > 0.5])
             assert errors.nees is not None
-            found.append(float(np.mean(errors.nees)))
+            result.append(float(np.mean(errors.nees)))
     assert 4.0 < np.mean(nees[1.0]) < 9.0  # six degrees of freedom
     assert np.mean(nees[3.0]) > 9.0
 
 
 def test_a_correction_enters_smoothly_and_its_rest_is_in_the_covariance(walk: OnlineLog) -> None:
     sudden, smooth = (
-        carried(walk, replace(IMU, blend=length, risk=Risk()))[1] for length in (0.0, 0.4)
+        propagated(walk, replace(IMU, correction_time=length, risk=Risk()))[1]
+        for length in (0.0, 0.4)
     )
     assert [s.time for s in sudden] == [s.time for s in smooth]
 
-    def jumps(states: list[CarriedState]) -> np.ndarray:
+    def jumps(states: list[PropagatedState]) -> np.ndarray:
         """Return what the position changed by beyond its velocity (m)."""
         step = np.diff([s.position_world for s in states], axis=0)
         return np.linalg.norm(
@@ -277,7 +287,7 @@ def test_a_correction_enters_smoothly_and_its_rest_is_in_the_covariance(walk: On
 
 
 def test_levels_grow_with_the_covariance_while_a_state_is_carried(walk: OnlineLog) -> None:
-    _, states = carried(walk, replace(IMU, risk=Risk()))
+    _, states = propagated(walk, replace(IMU, risk=Risk()))
     last = [s for s in states if s.epoch == states[-1].epoch]
     level = [s.judgement.protection_level_m for s in last]
     assert all(value is not None for value in level)
@@ -311,10 +321,10 @@ def test_a_late_field_changes_the_past_and_is_carried_to_now(walk: OnlineLog) ->
 @pytest.mark.slow
 def test_the_counter_rises_once_where_the_pose_is_found_again(walk: OnlineLog) -> None:
     holed = replace(walk, fields=silent(walk.fields, [0, 1, 2, 3], 7.0, 10.0))
-    navigator, states = carried(holed, replace(IMU, blend=0.5))
-    taken = navigator.counts["found by a fix"] + navigator.counts["lost and found again"]
-    assert navigator.state().reset_counter == states[-1].reset_counter <= max(taken, 1)
-    assert carried(walk, IMU)[1][-1].reset_counter == 0
+    navigator, states = propagated(holed, replace(IMU, correction_time=0.5))
+    selected = navigator.counts["found by a fix"] + navigator.counts["lost and found again"]
+    assert navigator.state().reset_counter == states[-1].reset_counter <= max(selected, 1)
+    assert propagated(walk, IMU)[1][-1].reset_counter == 0
 
 
 @pytest.mark.slow
@@ -328,8 +338,8 @@ def test_a_pipe_tells_the_state_of_now(walk: OnlineLog, tmp_path: Path) -> None:
         run_replay(log, sink, "json", realtime=False)
     with source.open("rb") as records:
         done = subprocess.run(command, stdin=records, capture_output=True, check=True, timeout=120)
-    told = [json.loads(line) for line in done.stdout.splitlines()]
-    states = [line for line in told if line["started"]][1:]  # the first is that of the start
+    reported = [json.loads(line) for line in done.stdout.splitlines()]
+    states = [line for line in reported if line["started"]][1:]  # the first is that of the start
     time = np.array([state["time"] for state in states])
     assert np.diff(time) == pytest.approx(0.01, abs=1e-9)
     assert (time - 0.02) * 100.0 == pytest.approx(np.round((time - 0.02) * 100.0), abs=1e-6)

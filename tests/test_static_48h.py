@@ -13,14 +13,14 @@ import pytest
 import static_48h
 from static_48h import CASES, HOUR, METHODS, Config, Errors, Row
 
-from magfusion.simulation.drift import Clock, Drift
+from magfusion.simulation.drift import Drift, DriveClock
 from magfusion.simulation.monte_carlo import run_many
 from magfusion.simulation.waveform import Mains
 from magfusion.simulation.worlds import F1, S0, draw_world
 
 TONES_HZ = np.array([25.0, 20.0, 30.0])
 COARSE = Config(worlds=1, interval=1800.0)
-SETTLED = COARSE.time > COARSE.settled_hours * HOUR
+CONVERGED_STEP = COARSE.time > COARSE.settled_hours * HOUR
 World = dict[tuple[str, str], Errors]
 
 
@@ -62,23 +62,23 @@ def test_a_slow_clock_turns_the_attitude_where_the_phase_is_believed(
 
 def test_one_world_shows_the_clock_and_its_remedy(world: World) -> None:
     case = "0.01 ppm clock"
-    turned = static_48h.slopes(COARSE, world[case, "ML+map"].attitude[None])
-    assert turned == pytest.approx(6.4, rel=0.07)  # deg / 24 h
-    free, paper = world[case, "ML+map, phase free"], world[case, "A3"]
-    for found, method in ((free, "ML+map, phase free"), (paper, "A3")):
+    rotated = static_48h.slopes(COARSE, world[case, "ML+map"].attitude[None])
+    assert rotated == pytest.approx(6.4, rel=0.07)  # deg / 24 h
+    free_parameters, paper = world[case, "ML+map, phase free"], world[case, "A3"]
+    for result, method in ((free_parameters, "ML+map, phase free"), (paper, "A3")):
         unharmed = world["current drive", method]
         # The noise meets another phase: alike, not equal.
-        assert np.mean(found.attitude) == pytest.approx(np.mean(unharmed.attitude), rel=0.1)
-        assert np.mean(found.position) == pytest.approx(np.mean(unharmed.position), rel=0.1)
+        assert np.mean(result.attitude) == pytest.approx(np.mean(unharmed.attitude), rel=0.1)
+        assert np.mean(result.position) == pytest.approx(np.mean(unharmed.position), rel=0.1)
 
 
 def test_heat_moves_fixes_within_hours_and_a_free_gain_moves_them_back(world: World) -> None:
     for method in ("A3", "ML+map"):
         cold, warm = (world[case, method].position for case in ("current drive", "voltage drive"))
-        assert np.mean(warm[SETTLED]) > 3.0 * np.mean(cold[SETTLED])
-        assert warm[0] < 0.7 * np.mean(warm[SETTLED])
-    warm, freed = (world["voltage drive", m].position for m in ("ML+map", "ML+map, gain free"))
-    assert np.mean(freed[SETTLED]) < 0.3 * np.mean(warm[SETTLED])
+        assert np.mean(warm[CONVERGED_STEP]) > 3.0 * np.mean(cold[CONVERGED_STEP])
+        assert warm[0] < 0.7 * np.mean(warm[CONVERGED_STEP])
+    warm, released = (world["voltage drive", m].position for m in ("ML+map", "ML+map, gain free"))
+    assert np.mean(released[CONVERGED_STEP]) < 0.3 * np.mean(warm[CONVERGED_STEP])
 
 
 def test_the_map_beats_the_paper(world: World) -> None:
@@ -110,11 +110,11 @@ def test_the_day_is_twice_as_loud_and_the_weights_say_so() -> None:
     hour = config.time % (24.0 * HOUR) / HOUR
     day, night = (np.abs(hour - at) < 1.0 for at in (14.0, 2.0))
     rms = [np.sqrt(np.mean(drawn.added.real[part] ** 2)) for part in (day, night)]
-    said = [np.sqrt(np.mean(drawn.sigma[part] ** 2)) for part in (day, night)]
-    np.testing.assert_allclose(rms, said, rtol=0.05)
+    findings = [np.sqrt(np.mean(drawn.sigma[part] ** 2)) for part in (day, night)]
+    np.testing.assert_allclose(rms, findings, rtol=0.05)
     assert rms[0] / rms[1] == pytest.approx(2.0, rel=0.08)
     # 0.4 nT / sqrt(Hz) in a window of a second.
-    assert said[0] == pytest.approx(0.4e-9, rel=0.02)
+    assert findings[0] == pytest.approx(0.4e-9, rel=0.02)
 
 
 def test_a_clock_turns_the_phasors_and_nothing_else() -> None:
@@ -124,11 +124,11 @@ def test_a_clock_turns_the_phasors_and_nothing_else() -> None:
     around = static_48h.draw_surroundings(world, config, np.random.default_rng(1))
     still, fast = (
         around.measure(world, drift, config, seed=1).phasor_sensor
-        for drift in (Drift(), Drift(clock=Clock(rate=1e-8)))
+        for drift in (Drift(), Drift(clock=DriveClock(rate=1e-8)))
     )
-    turned = np.angle(np.sum(np.conj(still) * fast, axis=-1))
+    rotated = np.angle(np.sum(np.conj(still) * fast, axis=-1))
     expected = 2.0 * np.pi * TONES_HZ * 1e-8 * config.time[:, None]
-    np.testing.assert_allclose(turned, expected, rtol=1e-9)
+    np.testing.assert_allclose(rotated, expected, rtol=1e-9)
     np.testing.assert_allclose(np.abs(fast), np.abs(still), rtol=1e-9)
 
 
@@ -154,7 +154,7 @@ def test_a_drift_across_a_larger_constant_error_shows_in_its_component_alone() -
 
 def test_slopes_are_those_of_the_settled_part() -> None:
     days = COARSE.time / 86_400.0
-    error = np.where(SETTLED, 0.3 + np.array([[0.02], [-0.5]]) * days, 99.0)
+    error = np.where(CONVERGED_STEP, 0.3 + np.array([[0.02], [-0.5]]) * days, 99.0)
     np.testing.assert_allclose(static_48h.slopes(COARSE, error), [0.02, -0.5], rtol=1e-9)
 
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.batch.batch import smooth
 from magfusion.estimation.data_checks.steady_field import off_earth
-from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.integrity.judge import judge_result
 from magfusion.model.trust import Verdict
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
@@ -23,13 +23,13 @@ def _earth() -> Array:
     return SITE.earth_field_world
 
 
-def _turned(angle_deg: float) -> Array:
+def _rotated(angle_deg: float) -> Array:
     return np.asarray(Rotation.from_rotvec([0.0, 0.0, angle_deg * DEGREE]).apply(_earth()))
 
 
 @pytest.mark.parametrize("angle_deg", [-120.0, 30.0])
 def test_a_turn_about_the_vertical_is_one_of_the_surveys_axes(angle_deg: float) -> None:
-    off = off_earth(SITE, _turned(angle_deg) - _earth(), EXACT)
+    off = off_earth(SITE, _rotated(angle_deg) - _earth(), EXACT)
     assert off is not None
     assert off.of_survey
     assert off.turn == pytest.approx(abs(angle_deg) * DEGREE, abs=1e-9)
@@ -41,16 +41,16 @@ def test_a_turn_about_the_vertical_is_one_of_the_surveys_axes(angle_deg: float) 
 
 def test_what_the_declaration_allows_is_not_said() -> None:
     declination_deg = SITE.earth.declination_sigma / DEGREE
-    assert off_earth(SITE, _turned(2.0 * declination_deg) - _earth(), EXACT) is None
+    assert off_earth(SITE, _rotated(2.0 * declination_deg) - _earth(), EXACT) is None
     assert off_earth(replace(SITE, earth_field_world=None), _earth(), EXACT) is None
 
 
 def test_a_heading_that_is_not_known_tells_nothing_of_the_survey() -> None:
     unknown = np.diag([0.0, 0.0, 0.5**2])  # rad^2
-    left = _turned(30.0) - _earth()
-    assert off_earth(SITE, left, unknown) is None
+    remaining = _rotated(30.0) - _earth()
+    assert off_earth(SITE, remaining, unknown) is None
     steeper = np.diag([0.5**2, 0.0, 0.0])
-    assert off_earth(SITE, left, steeper) is not None
+    assert off_earth(SITE, remaining, steeper) is not None
 
 
 def test_another_size_is_no_turn() -> None:
@@ -65,10 +65,10 @@ def test_another_size_is_no_turn() -> None:
 def test_a_smoothed_log_is_doubted_where_the_survey_has_other_axes() -> None:
     rng = np.random.default_rng(3)
     log = simulate_log(SITE, SimulationConfig(DEMO_BOX_WORLD, duration=16.0), rng).log
-    _, right = judged(smooth(log, SITE), log)
+    _, right = judge_result(smooth(log, SITE), log)
     assert right.verdict is Verdict.TRUSTWORTHY
-    site = replace(SITE, earth_field_world=_turned(30.0))
-    result, wrong = judged(smooth(log, site), log)
+    site = replace(SITE, earth_field_world=_rotated(30.0))
+    result, wrong = judge_result(smooth(log, site), log)
     assert wrong.verdict is Verdict.DOUBTFUL
     assert wrong.reasons[0].code == "earth_field"
     cov = result.states.pose_cov

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from magfusion.errors import InputError
-from magfusion.estimation.data_checks.recording import recorded
+from magfusion.estimation.data_checks.data_quality import recorded
 from magfusion.files.plausible import check_imu
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.units import DEGREE, STANDARD_GRAVITY, Array
@@ -28,7 +28,7 @@ def rolling(rate: float) -> tuple[Array, Array]:
     return np.array([rate, 0.0, 0.0]), STANDARD_GRAVITY * across
 
 
-def told(imu: ImuSamples) -> set[str]:
+def reported(imu: ImuSamples) -> set[str]:
     return {one.code for one in recorded(Log("odd", 0, "test", imu), None)}
 
 
@@ -52,7 +52,7 @@ RIGHT = {
 def test_nothing_is_said_of_strange_motion(name: str) -> None:
     check_imu(RIGHT[name], "imu")
     assert (
-        told(RIGHT[name])
+        reported(RIGHT[name])
         & {
             *(
                 "accel_units",
@@ -72,11 +72,11 @@ def test_deg_s_is_told_from_missing_gravity() -> None:
     rate, force = rolling(20.0 * DEGREE)
     wrong = samples(rate / DEGREE, force)
     check_imu(wrong, "imu")
-    assert "gyro_units" in told(wrong)
-    assert "gravity_missing" not in told(wrong)
-    assert told(samples(rate, force)) & {"gyro_units", "gravity_missing"} == set()
+    assert "gyro_units" in reported(wrong)
+    assert "gravity_missing" not in reported(wrong)
+    assert reported(samples(rate, force)) & {"gyro_units", "gravity_missing"} == set()
     fast, turning = rolling(150.0 * DEGREE)
-    assert "gyro_sign" in told(samples(-fast, turning))
+    assert "gyro_sign" in reported(samples(-fast, turning))
 
 
 def test_rates_that_gravity_contradicts_are_in_deg_s() -> None:
@@ -86,9 +86,9 @@ def test_rates_that_gravity_contradicts_are_in_deg_s() -> None:
 
 
 def test_free_fall_throughout_is_a_cause_of_missing_gravity() -> None:
-    found = [
+    result = [
         one
         for one in recorded(Log("odd", 0, "test", samples(np.zeros(3), np.zeros(3))), None)
         if one.code == "gravity_missing"
     ]
-    assert "free fall" in found[0].text
+    assert "free fall" in result[0].text

@@ -28,8 +28,8 @@ def stream(seed, count=300):
     return 7.0 + np.cumsum(rng.uniform(2e-3, 2e-2, count)), rng.normal(0.0, 2.0, (count, 3))
 
 
-def largest_angle(found, expected):
-    return np.max((found.inv() * expected).magnitude())
+def largest_angle(result, expected):
+    return np.max((result.inv() * expected).magnitude())
 
 
 def tumbling(seed=1, duration=20.0):
@@ -42,22 +42,22 @@ def tumbling(seed=1, duration=20.0):
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 300])
 def test_the_attitude_is_the_product_of_the_increments_taken_one_by_one(count):
     time, gyro = stream(1, count)
-    found = attitude_from_gyro(time, gyro)
+    result = attitude_from_gyro(time, gyro)
     pose = gtsam.Rot3()
     expected = [pose.matrix()]
     for turn in rotation_increments(time, gyro).as_rotvec():
         pose = pose.compose(gtsam.Rot3.Expmap(turn))
         expected.append(pose.matrix())
-    assert len(found) == count
-    assert largest_angle(found, Rotation.from_matrix(expected)) < 1e-12  # rad
+    assert len(result) == count
+    assert largest_angle(result, Rotation.from_matrix(expected)) < 1e-12  # rad
 
 
 def test_a_constant_rate_turns_by_its_product_with_time():
     time, _ = stream(2)
     rate = np.array([0.3, -1.2, 2.0])
-    found = attitude_from_gyro(time, np.broadcast_to(rate, (len(time), 3)))
+    result = attitude_from_gyro(time, np.broadcast_to(rate, (len(time), 3)))
     expected = Rotation.from_rotvec((time - time[0])[:, None] * rate)
-    assert largest_angle(found, expected) < 1e-12  # rad
+    assert largest_angle(result, expected) < 1e-12  # rad
 
 
 def test_the_attitude_of_a_body_that_tumbles_is_its_true_one_to_second_order():
@@ -66,8 +66,8 @@ def test_the_attitude_of_a_body_that_tumbles_is_its_true_one_to_second_order():
     for rate_hz in (50.0, 100.0, 200.0):
         time = np.arange(0.0, 20.0, 1.0 / rate_hz)
         truth = motion.world_from_body(time)
-        found = attitude_from_gyro(time, motion.rate_body(time))
-        errors.append(largest_angle(truth[0] * found, truth))
+        result = attitude_from_gyro(time, motion.rate_body(time))
+        errors.append(largest_angle(truth[0] * result, truth))
     # The mean of two rates leaves what is curved between them.
     assert errors[2] < 1e-4  # rad in 20 s at 200 Hz
     assert errors[0] / errors[1] > 3.5
@@ -82,9 +82,9 @@ def test_a_rate_that_turns_its_direction_is_seen_beyond_its_mean():
     expected = Rotation.identity()
     for rate in rates:
         expected = expected * Rotation.from_rotvec(rate * step / fine)
-    found = rotation_increments(np.array([0.0, step]), ends)[0]
+    result = rotation_increments(np.array([0.0, step]), ends)[0]
     without = Rotation.from_rotvec(ends.mean(axis=0) * step)
-    assert largest_angle(found, expected) < 1e-2 * largest_angle(without, expected)
+    assert largest_angle(result, expected) < 1e-2 * largest_angle(without, expected)
 
 
 def test_the_attitude_between_samples_lies_on_the_true_motion():
@@ -92,39 +92,39 @@ def test_the_attitude_between_samples_lies_on_the_true_motion():
     time = np.arange(0.0, 20.0, 0.005)
     wanted = np.random.default_rng(3).uniform(0.0, time[-1], 500)
     gyro = motion.rate_body(time)
-    found = attitude_at(motion.world_from_body(time), time, gyro, wanted)
-    assert largest_angle(found, motion.world_from_body(wanted)) < 2e-5  # rad
+    result = attitude_at(motion.world_from_body(time), time, gyro, wanted)
+    assert largest_angle(result, motion.world_from_body(wanted)) < 2e-5  # rad
 
 
 def test_on_a_sample_the_attitude_is_that_of_the_sample():
     time, gyro = stream(4, 20)
     attitude = Rotation.random(20, random_state=5)
-    found = attitude_at(attitude, time, gyro, time[::-1])
-    assert largest_angle(found, attitude[::-1]) < 1e-14
+    result = attitude_at(attitude, time, gyro, time[::-1])
+    assert largest_angle(result, attitude[::-1]) < 1e-14
 
 
 def test_just_before_a_sample_the_attitude_meets_it():
     time, gyro = stream(6, 50)
     attitude = attitude_from_gyro(time, gyro)
-    found = attitude_at(attitude, time, gyro, time[1:] - 1e-9)
+    result = attitude_at(attitude, time, gyro, time[1:] - 1e-9)
     # Coning is left out between samples: rates of 3 rad/s that change wholly in 20 ms.
-    assert largest_angle(found, attitude[1:]) < 2e-3
+    assert largest_angle(result, attitude[1:]) < 2e-3
     smooth = np.stack([np.cos(time), np.sin(time), 0.5 * np.ones_like(time)], axis=1)
     attitude = attitude_from_gyro(time, smooth)
-    found = attitude_at(attitude, time, smooth, time[1:] - 1e-9)
-    assert largest_angle(found, attitude[1:]) < 2e-6
+    result = attitude_at(attitude, time, smooth, time[1:] - 1e-9)
+    assert largest_angle(result, attitude[1:]) < 2e-6
 
 
 def test_beyond_the_stream_the_end_rates_are_held():
     time, gyro = stream(7, 10)
     attitude = attitude_from_gyro(time, gyro)
     wanted = np.array([time[0] - 0.1, time[-1] + 0.2])
-    found = attitude_at(attitude, time, gyro, wanted)
+    result = attitude_at(attitude, time, gyro, wanted)
     expected = [
         attitude[0] * Rotation.from_rotvec(-0.1 * gyro[0]),
         attitude[-1] * Rotation.from_rotvec(0.2 * gyro[-1]),
     ]
-    assert largest_angle(found, Rotation.concatenate(expected)) < 1e-12
+    assert largest_angle(result, Rotation.concatenate(expected)) < 1e-12
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 64, 65, 300])
@@ -135,9 +135,9 @@ def test_at_some_times_only_the_attitude_is_that_of_the_whole_chain(monkeypatch,
     rng = np.random.default_rng(9)
     between = rng.uniform(time[0], time[-1], 20)
     wanted = np.concatenate([between, time, [time[0] - 0.1, time[-1] + 0.2], time[-1:]])
-    found = attitude_from_gyro_at(time, gyro, wanted)
+    result = attitude_from_gyro_at(time, gyro, wanted)
     expected = attitude_at(attitude_from_gyro(time, gyro), time, gyro, wanted)
-    assert largest_angle(found, expected) < 1e-13  # rad
+    assert largest_angle(result, expected) < 1e-13  # rad
 
 
 @pytest.mark.parametrize("kind", ["walk", "turn"])
@@ -146,15 +146,15 @@ def test_a_body_rests_where_it_is_simulated_at_rest_and_nowhere_in_motion(kind):
     config = SimulationConfig(DEMO_BOX_WORLD, 60.0, kind, rests=rests)
     run = simulate_log(demo_site(), config, np.random.default_rng(8))
     imu, motion = run.log.imu, run.motion
-    found = resting(imu.time, imu.gyro_body, imu.accel_body, motion=MotionModel())
+    result = resting(imu.time, imu.gyro_body, imu.accel_body, motion=MotionModel())
     speed = np.linalg.norm(motion.velocity_world(imu.time), axis=1)
     rate = np.linalg.norm(motion.rate_body(imu.time), axis=1)
     still = (speed == 0.0) & (rate == 0.0)
     quiet_all_around = np.convolve(still, np.ones(201), mode="same") == 201  # 1 s at 200 Hz
     assert quiet_all_around.sum() > 1500
-    assert np.all(found[quiet_all_around])
+    assert np.all(result[quiet_all_around])
     # Ramps begin as softly as a quintic: a body slower than this is as good as at rest.
-    assert not np.any(found[(speed > 0.2) & (rate > 0.1)])
+    assert not np.any(result[(speed > 0.2) & (rate > 0.1)])
     assert np.sum((speed > 0.2) & (rate > 0.1)) > 4000
 
 
@@ -167,18 +167,18 @@ def still_stream(seconds=4.0, rate_hz=100.0):
 
 def test_the_ends_of_a_stream_are_not_known_to_rest():
     time, gyro, accel = still_stream()
-    found = resting(time, gyro, accel, motion=MotionModel())
+    result = resting(time, gyro, accel, motion=MotionModel())
     inside = (time >= 0.5) & (time <= time[-1] - 0.5)
-    assert np.array_equal(found, inside)
+    assert np.array_equal(result, inside)
 
 
 @pytest.mark.parametrize("which", ["gyro", "accel"])
 def test_a_knock_spoils_the_rest_around_it_and_no_more(which):
     time, gyro, accel = still_stream()
     {"gyro": gyro, "accel": accel}[which][200] += 5.0  # at 2 s
-    found = resting(time, gyro, accel, motion=MotionModel())
-    assert not np.any(found[np.abs(time - 2.0) < 0.49])
-    assert np.all(found[(np.abs(time - 2.0) > 0.51) & (time >= 0.5) & (time <= time[-1] - 0.5)])
+    result = resting(time, gyro, accel, motion=MotionModel())
+    assert not np.any(result[np.abs(time - 2.0) < 0.49])
+    assert np.all(result[(np.abs(time - 2.0) > 0.51) & (time >= 0.5) & (time <= time[-1] - 0.5)])
 
 
 def test_a_steady_turn_under_gravity_is_no_rest():
@@ -218,9 +218,9 @@ def test_quaternions_of_matrices_are_those_of_any_turn() -> None:
     half_turns *= np.pi / np.linalg.norm(half_turns, axis=1, keepdims=True)
     vectors = np.concatenate([np.zeros((1, 3)), rng.normal(0.0, 2.0, (500, 3)), half_turns])
     turns = Rotation.from_rotvec(vectors)
-    found = of_matrices(turns.as_matrix())
-    np.testing.assert_allclose(np.linalg.norm(found, axis=0), 1.0, rtol=1e-15)
-    assert largest_angle(Rotation.from_quat(found.T, scalar_first=True), turns) < 1e-14
+    result = of_matrices(turns.as_matrix())
+    np.testing.assert_allclose(np.linalg.norm(result, axis=0), 1.0, rtol=1e-15)
+    assert largest_angle(Rotation.from_quat(result.T, scalar_first=True), turns) < 1e-14
 
 
 def test_a_field_is_turned_back_by_the_inverse_of_what_turned_it() -> None:

@@ -46,11 +46,13 @@ def _importers(library: str) -> set[str]:
     }
 
 
-def _offenders(paths: Iterable[Path], found: Callable[[ast.Module], Iterable[object]]) -> list[str]:
+def _offenders(
+    paths: Iterable[Path], result: Callable[[ast.Module], Iterable[object]]
+) -> list[str]:
     """Return a line for each file in which something was found."""
     out = []
     for path in paths:
-        there = list(found(parsed(path)))
+        there = list(result(parsed(path)))
         if there:
             out.append(f"{_name(path)}: {', '.join(map(str, there))}")
     return out
@@ -61,26 +63,26 @@ def test_a_wing_imports_only_from_wings_below_it() -> None:
 
 
 def test_a_room_imports_only_from_rooms_of_its_wing_below_it() -> None:
-    found = [line for wing in ROOMS for line in upward(wing)]
-    assert not found, "\n".join(found)
+    result = [line for wing in ROOMS for line in upward(wing)]
+    assert not result, "\n".join(result)
 
 
 def test_the_order_names_every_wing_and_no_room_that_is_not_there() -> None:
     assert {room_of(name) for name in modules() if name.count(".") > 1} == set(ROOMS)
     there = {wing: {room_of(name, wing) for name in modules()} for wing in ROOMS}
-    gone = [
+    elapsed = [
         f"{wing}.{room}"
         for wing, rooms in ROOMS.items()
         for room in rooms
         if room not in there[wing]
     ]
-    assert not gone
+    assert not elapsed
     assert all(len(set(rooms)) == len(rooms) for rooms in ROOMS.values())
 
 
 def test_no_files_import_one_another_in_a_circle() -> None:
-    found = circles(file_graph())
-    assert not found, "\n".join(map(", ".join, found))
+    result = circles(file_graph())
+    assert not result, "\n".join(map(", ".join, result))
 
 
 def test_a_circle_is_found() -> None:
@@ -232,8 +234,8 @@ def test_tests_state_the_tolerance_of_allclose() -> None:
     def hidden(tree: ast.Module) -> list[int]:
         return [n.lineno for n in ast.walk(tree) if _compares_with_hidden_tolerance(n)]
 
-    found = _offenders(sorted((ROOT / "tests").glob("*.py")), hidden)
-    assert not found, "\n".join(["allclose without rtol and atol in lines", *found])
+    result = _offenders(sorted((ROOT / "tests").glob("*.py")), hidden)
+    assert not result, "\n".join(["allclose without rtol and atol in lines", *result])
 
 
 @pytest.mark.parametrize(
@@ -277,8 +279,8 @@ def test_nothing_is_decided_by_the_name_of_a_parameters_kind() -> None:
     def named(tree: ast.Module) -> list[int]:
         return [node.lineno for node in ast.walk(tree) if _names_a_kind(node)]
 
-    found = _offenders(_modules(), named)
-    assert not found, "\n".join(["kinds or groups are compared in lines", *found])
+    result = _offenders(_modules(), named)
+    assert not result, "\n".join(["kinds or groups are compared in lines", *result])
 
 
 @pytest.mark.parametrize(
@@ -314,5 +316,5 @@ def _constants(tree: ast.Module) -> Iterator[str]:
 
 
 def test_what_describes_the_platforms_motion_or_a_clock_is_in_the_site() -> None:
-    found = _offenders(_modules(), lambda tree: filter(_OF_THE_SITE.fullmatch, _constants(tree)))
-    assert not found, "\n".join(found)
+    result = _offenders(_modules(), lambda tree: filter(_OF_THE_SITE.fullmatch, _constants(tree)))
+    assert not result, "\n".join(result)

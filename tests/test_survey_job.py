@@ -150,8 +150,8 @@ def test_the_command_writes_survey_picture_and_report(surveyed: tuple[Path, Path
     assert report["epochs_dropped"] == report["epochs_dropped_too_close_to_another_point"]
     truth = read_log(log).truth
     assert truth is not None
-    apart = np.linalg.norm(truth.position_world[:, None] - survey.position_world, axis=2)
-    assert np.max(np.min(apart, axis=0)) < 0.01  # m
+    separate = np.linalg.norm(truth.position_world[:, None] - survey.position_world, axis=2)
+    assert np.max(np.min(separate, axis=0)) < 0.01  # m
 
 
 def test_the_poses_may_come_from_a_smoothed_result(worked: Worked, tmp_path: Path) -> None:
@@ -237,7 +237,7 @@ def test_a_method_of_the_paper_asks_for_a_survey(
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "reported"),
     [
         (("--survey", "x"), "--method"),
         (("--method", "paper-knn", "--survey", "x", "--block", "2"), "paper-lines"),
@@ -248,9 +248,9 @@ def test_a_method_of_the_paper_asks_for_a_survey(
     ],
 )
 def test_options_of_fix_that_do_not_fit_are_refused(
-    options: tuple[str, ...], told: str, worked: Worked, tmp_path: Path, refuse: Refuse
+    options: tuple[str, ...], reported: str, worked: Worked, tmp_path: Path, refuse: Refuse
 ) -> None:
-    assert told in refuse("fix", worked.log, "-o", tmp_path / "fix", *options)
+    assert reported in refuse("fix", worked.log, "-o", tmp_path / "fix", *options)
 
 
 def _refused_fix(log: Path, survey: Path, tmp_path: Path, refuse: Refuse) -> str:
@@ -281,13 +281,13 @@ def _without(columns: dict[str, Any], dropped: set[str], points: int = 1000) -> 
 
 
 @pytest.mark.parametrize(
-    ("dropped", "points", "told"),
+    ("dropped", "points", "reported"),
     [({"A", "B"}, 1000, "require 3 rotating beacons"), (set(), 3, "has 3 points")],
 )
 def test_a_survey_of_too_few_beacons_or_points_is_refused(
     dropped: set[str],
     points: int,
-    told: str,
+    reported: str,
     surveyed: tuple[Path, Path],
     tmp_path: Path,
     refuse: Refuse,
@@ -295,7 +295,7 @@ def test_a_survey_of_too_few_beacons_or_points_is_refused(
     survey = shutil.copytree(surveyed[1], tmp_path / "survey")
     change_table(survey / "survey.parquet", lambda c: _without(c, dropped, points))
     sentence = _refused_fix(surveyed[0], survey, tmp_path, refuse)
-    assert told in sentence
+    assert reported in sentence
     assert str(survey) in sentence
 
 
@@ -325,7 +325,7 @@ def test_epochs_that_hear_too_little_are_refused_with_the_reason(
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "reported"),
     [
         (("--spacing", "-1"), "--spacing"),
         (("--spacing", "nan"), "--spacing"),
@@ -335,9 +335,9 @@ def test_epochs_that_hear_too_little_are_refused_with_the_reason(
     ],
 )
 def test_options_of_survey_that_do_not_fit_are_refused(
-    options: tuple[str, ...], told: str, worked: Worked, tmp_path: Path, refuse: Refuse
+    options: tuple[str, ...], reported: str, worked: Worked, tmp_path: Path, refuse: Refuse
 ) -> None:
-    assert told in refuse("survey", worked.log, "-o", tmp_path / "survey", *options)
+    assert reported in refuse("survey", worked.log, "-o", tmp_path / "survey", *options)
 
 
 def test_a_log_without_truth_asks_for_a_trajectory(

@@ -58,8 +58,8 @@ def test_the_dipole_amplitude_is_the_rms_of_two_quadrature_dipoles() -> None:
     offset = position_world[:, None] - table1.BEACONS_WORLD - [0.0, 0.0, -0.2]
     fields = [dipole_field(offset, 70.0 * np.eye(3)[axis]) for axis in (0, 1)]
     rms = np.sqrt(sum(np.sum(field**2, axis=-1) for field in fields) / 2.0)
-    found = np.exp(model.log_amplitude(position_world))
-    np.testing.assert_allclose(found, rms, rtol=1e-12)
+    result = np.exp(model.log_amplitude(position_world))
+    np.testing.assert_allclose(result, rms, rtol=1e-12)
 
 
 def test_lines_through_an_inverse_cube_law_locate_exactly() -> None:
@@ -71,8 +71,8 @@ def test_lines_through_an_inverse_cube_law_locate_exactly() -> None:
     lines = fit_lines(distances(points, beacons), amplitude)
     np.testing.assert_allclose(lines.slope, -3.0, rtol=1e-9)
     np.testing.assert_allclose(np.exp(lines.intercept), 1e-5, rtol=1e-9)
-    found = trilaterate(ranges_from_lines(lines, amplitude[1]), beacons, np.array([3.0, 2.0, 1.0]))
-    np.testing.assert_allclose(found, points[1], atol=1e-8)  # m
+    result = trilaterate(ranges_from_lines(lines, amplitude[1]), beacons, np.array([3.0, 2.0, 1.0]))
+    np.testing.assert_allclose(result, points[1], atol=1e-8)  # m
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from warming import (
+from temperature_drift import (
     EVERY,
     MATRIX_PER_K,
     OFFSET_PER_K,
@@ -15,13 +15,16 @@ from warming import (
     REFERENCE,
     Config,
     run,
+    temperature_site,
     warm_log,
     warmer,
-    warming_site,
 )
 
 from magfusion.errors import InputError
-from magfusion.estimation.demodulation.warming import at_reference, samples_at_reference
+from magfusion.estimation.demodulation.temperature_compensation import (
+    at_reference,
+    samples_at_reference,
+)
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online.restored import restored
 from magfusion.files.log import read_log, write_log
@@ -49,12 +52,12 @@ def warm() -> Log:
 
 def test_a_warm_beacon_is_one_of_other_moments() -> None:
     degrees = Temperatures({name: np.stack([READINGS, warmth(READINGS)]) for name in "ABCD"})
-    site, time = replace(warming_site(), temperatures=degrees), np.array([7.25])
+    site, time = replace(temperature_site(), temperatures=degrees), np.array([7.25])
     more = np.interp(7.25, READINGS, warmer(READINGS))
     scaled = tuple(
         replace(
             b,
-            warming=None,
+            temperature_model=None,
             coils=tuple(
                 replace(c, moment_beacon=np.exp(PER_K * more) * c.moment_beacon) for c in b.coils
             ),
@@ -62,16 +65,16 @@ def test_a_warm_beacon_is_one_of_other_moments() -> None:
         for b in site.beacons
     )
     pose = np.eye(3)[None], np.array([[3.0, 2.0, 1.0]])
-    found, expected = (
+    result, expected = (
         predict_channels(initial_calibration(known, 0.0), time, *pose)
         for known in (site, replace(site, beacons=scaled))
     )
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    np.testing.assert_allclose(result, expected, rtol=1e-12)
     assert np.max(np.abs(np.exp(PER_K * more) - 1.0)) > 0.05
 
 
 def test_samples_are_those_of_the_reference() -> None:
-    rng, sensor = np.random.default_rng(1), warming_site().platform.magnetometer
+    rng, sensor = np.random.default_rng(1), temperature_site().platform.magnetometer
     sensor = replace(
         sensor, matrix=np.eye(3) + 0.1 * rng.standard_normal((3, 3)), offset=np.full(3, 3e-6)
     )
@@ -79,18 +82,20 @@ def test_samples_are_those_of_the_reference() -> None:
     above = (degc - REFERENCE)[:, None]
     matrix = sensor.matrix + above[..., None] * MATRIX_PER_K
     measured = (matrix @ field[..., None])[..., 0] + sensor.offset + above * OFFSET_PER_K
-    found = samples_at_reference(measured, degc, sensor)
-    np.testing.assert_allclose(found, field @ sensor.matrix.T + sensor.offset, atol=1e-17)
+    result = samples_at_reference(measured, degc, sensor)
+    np.testing.assert_allclose(result, field @ sensor.matrix.T + sensor.offset, atol=1e-17)
 
 
 def test_log_and_site_keep_what_they_say(warm: Log, tmp_path: Path) -> None:
-    site = warming_site()
+    site = temperature_site()
     write_log(warm, tmp_path / "log")
     save_site(site, tmp_path / "site.yaml")
     known, log = load_site(tmp_path / "site.yaml"), read_log(tmp_path / "log", 5.0, 9.0)
-    assert known.beacons[1].warming == site.beacons[1].warming
-    assert known.platform.magnetometer.warming is not None
-    np.testing.assert_array_equal(known.platform.magnetometer.warming.matrix_per_k, MATRIX_PER_K)
+    assert known.beacons[1].temperature_model == site.beacons[1].temperature_model
+    assert known.platform.magnetometer.temperature_model is not None
+    np.testing.assert_array_equal(
+        known.platform.magnetometer.temperature_model.matrix_per_k, MATRIX_PER_K
+    )
     assert log.temperatures is not None
     assert set(log.temperatures.readings) == {"A", "B", "C", "D", "magnetometer"}
     np.testing.assert_allclose(log.temperatures.readings["B"][1], warmth(READINGS))
@@ -107,16 +112,16 @@ def test_a_temperature_in_kelvin_is_refused(tmp_path: Path, warm: Log) -> None:
 
 
 def test_what_is_declared_and_not_recorded_is_said(warm: Log) -> None:
-    log, _ = at_reference(replace(warm, temperatures=None), warming_site())
+    log, _ = at_reference(replace(warm, temperatures=None), temperature_site())
     (finding,) = [f for f in log.noticed if f.code == "temperature_missing"]
     assert "beacon A" in finding.text
     assert "the magnetometer" in finding.text
-    log, _ = at_reference(warm, warming_site())
+    log, _ = at_reference(warm, temperature_site())
     assert not [f for f in log.noticed if f.code == "temperature_missing"]
 
 
 def test_a_run_that_goes_on_knows_how_warm_it_is() -> None:
-    site = warming_site()
+    site = temperature_site()
     first = Navigator(site)
     for when in (1.0, 2.0, 2.0):  # the last is passed over
         first.add_temperature("B", when, 30.0 + when)
@@ -143,9 +148,9 @@ def test_a_warm_log_is_as_good_as_a_cold_one() -> None:
 
 @pytest.mark.slow
 def test_the_pipe_hears_what_the_log_has(warm: Log, tmp_path: Path) -> None:
-    save_site(warming_site(), tmp_path / "site.yaml")
+    save_site(temperature_site(), tmp_path / "site.yaml")
     write_log(warm, tmp_path / "log")
-    given, told = io.BytesIO(), io.StringIO()
+    given, reported = io.BytesIO(), io.StringIO()
     run_replay(read_log(tmp_path / "log", None, 9.0), given, "json", realtime=False)
     assert given.getvalue().count(b'"temperature"') > 10
     worst = {}
@@ -155,7 +160,7 @@ def test_the_pipe_hears_what_the_log_has(warm: Log, tmp_path: Path) -> None:
     ):
         sink = io.BytesIO()
         settings = StreamSettings(NavigatorSettings("ekf"))
-        run_stream(tmp_path / "site.yaml", settings, io.BytesIO(records), sink, told)
+        run_stream(tmp_path / "site.yaml", settings, io.BytesIO(records), sink, reported)
         lines = [json.loads(line) for line in sink.getvalue().splitlines()]
         states = [line for line in lines if line["started"]]
         nearest = [np.argmin(np.abs(warm.truth.time - state["time"])) for state in states]
@@ -168,11 +173,11 @@ def test_the_pipe_hears_what_the_log_has(warm: Log, tmp_path: Path) -> None:
 
 def test_demodulated_phasors_lack_no_temperature(warm: Log, tmp_path: Path) -> None:
     write_log(warm, tmp_path / "log")
-    save_site(warming_site(), tmp_path / "log" / "site.yaml")
+    save_site(temperature_site(), tmp_path / "log" / "site.yaml")
     run_demodulate(DemodulateSettings(log=tmp_path / "log", end=8.0), tmp_path / "phasors")
     log, site = at_reference(
         read_log(tmp_path / "phasors"), load_site(tmp_path / "phasors" / "site.yaml")
     )
-    assert site.platform.magnetometer.warming is None
-    assert all(beacon.warming is not None for beacon in site.beacons)
+    assert site.platform.magnetometer.temperature_model is None
+    assert all(beacon.temperature_model is not None for beacon in site.beacons)
     assert not [f for f in log.noticed if f.code == "temperature_missing"]

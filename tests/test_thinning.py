@@ -9,8 +9,8 @@ import pytest
 from magfusion.estimation.batch.batch import Smoothed, smooth
 from magfusion.estimation.graph import imu_decimation as thinning
 from magfusion.estimation.graph.imu_decimation import (
-    FEWEST_LEFT,
     JOINED,
+    MIN_JOINED_STEPS,
     MOST_TURN,
     preintegrate_stream,
     thinned,
@@ -30,7 +30,7 @@ ACCEL_BIAS, GYRO_BIAS = np.array([0.1, 0.2, -0.3]), np.array([0.01, -0.02, 0.03]
 BOX_WORLD = np.array([[1.2, 1.2, 0.6], [4.8, 3.8, 1.6]])
 EPOCHS = np.array([1.0033, 25.0, 29.502, 31.503, 79.9981])  # s; mostly between samples
 BY = (25, 20, 10, 25)  # steps joined in the intervals
-FEWEST = FEWEST_LEFT * min(JOINED)  # steps of an interval that is thinned
+MIN_COUNT = MIN_JOINED_STEPS * min(JOINED)  # steps of an interval that is thinned
 LONG_EPOCHS = np.arange(0.505, 119.0, 30.0)
 
 
@@ -85,7 +85,7 @@ def test_a_first_order_mean_of_the_steps_would_not_do():
     )
     dt = increments.dt[: tens * 10].reshape(tens, 10).sum(axis=1)
     rows = np.array([0, tens * 10])
-    plain = Increments(gyro, accel, dt, np.array([0, tens]), increments.bridged)
+    plain = Increments(gyro, accel, dt, np.array([0, tens]), increments.gap_bridged)
     single = replace(increments, first=rows)
     zero = np.zeros((2, 3))
     (mean,), (whole,) = (preintegrate(i, MEMS, GRAVITY, zero, zero) for i in (plain, single))
@@ -117,19 +117,19 @@ def test_a_change_of_bias_moves_joined_steps_as_the_single_ones():
         change = np.linalg.norm(expected.position() - kept.position())
         assert change > 1e-3  # m: there is something to be right about
         assert np.linalg.norm(moved.position() - expected.position()) < tolerance * change
-        turned = np.linalg.norm(_turn(moved.attitude(), expected.attitude()))
-        assert turned < tolerance * np.linalg.norm(_turn(kept.attitude(), expected.attitude()))
+        rotated = np.linalg.norm(_turn(moved.attitude(), expected.attitude()))
+        assert rotated < tolerance * np.linalg.norm(_turn(kept.attitude(), expected.attitude()))
 
 
 def test_short_intervals_gaps_and_fast_turns_keep_their_single_steps():
     imu = recorded(1.0)
-    short = cut_at_epochs(imu, 0.0, np.arange(1.0, 59.0, 0.009 * FEWEST))
+    short = cut_at_epochs(imu, 0.0, np.arange(1.0, 59.0, 0.009 * MIN_COUNT))
     zero = np.zeros((len(short.first), 3))
     assert thinned(short, zero, zero) is short
     gap = (imu.time > 40.0) & (imu.time < 40.5)
     holed = ImuSamples(imu.time[~gap], imu.gyro_body[~gap], imu.accel_body[~gap])
     increments = cut_at_epochs(holed, 0.0, EPOCHS)
-    assert list(increments.bridged) == [False, False, False, True]
+    assert list(increments.gap_bridged) == [False, False, False, True]
     single = np.diff(increments.first)
     steps = np.diff(thinned(increments, at(ACCEL_BIAS), at(GYRO_BIAS)).first)
     assert np.all(steps[:3] < single[:3] / 5)
@@ -150,12 +150,12 @@ def test_stretches_of_a_stream_are_preintegrated_as_the_whole(monkeypatch, offse
     imu = ImuSamples(imu.time[~gap], imu.gyro_body[~gap], imu.accel_body[~gap])
     epochs = np.sort(np.concatenate([LONG_EPOCHS, [3.0, 3.1, 100.0]]))
     bias = at(ACCEL_BIAS, epochs), at(GYRO_BIAS, epochs)
-    whole, bridged = preintegrate_stream(imu, offset, epochs, MEMS, GRAVITY, *bias)
+    whole, gap_bridged = preintegrate_stream(imu, offset, epochs, MEMS, GRAVITY, *bias)
     monkeypatch.setattr(thinning, "STRETCH", 1000)
     parts, bridged_parts = preintegrate_stream(imu, offset, epochs, MEMS, GRAVITY, *bias)
     assert len(whole) == len(parts) == len(epochs) - 1
-    assert np.sum(bridged) == 1
-    assert np.array_equal(bridged, bridged_parts)
+    assert np.sum(gap_bridged) == 1
+    assert np.array_equal(gap_bridged, bridged_parts)
     for one, other in zip(whole, parts, strict=True):
         assert one.equals(other, 1e-9)
 
@@ -186,15 +186,15 @@ def test_a_log_is_smoothed_alike_from_joined_and_from_single_steps(monkeypatch):
     assert_alike(joined, single)
 
 
-def assert_alike(found: Smoothed, expected: Smoothed) -> None:
-    assert found.converged
+def assert_alike(result: Smoothed, expected: Smoothed) -> None:
+    assert result.converged
     assert expected.converged
     sigma, other = (
-        np.sqrt(np.diagonal(s.states.pose_cov, axis1=1, axis2=2)) for s in (found, expected)
+        np.sqrt(np.diagonal(s.states.pose_cov, axis1=1, axis2=2)) for s in (result, expected)
     )
     assert np.max(np.abs(other / sigma - 1.0)) < 1e-4
-    moved = np.abs(found.states.position_world - expected.states.position_world)
+    moved = np.abs(result.states.position_world - expected.states.position_world)
     assert np.max(moved / sigma[:, 3:]) < 1e-3
-    turned = found.states.world_from_body - expected.states.world_from_body
-    assert np.max(np.abs(turned)) < 1e-3 * np.min(sigma[:, :3])
-    assert abs(found.cost / expected.cost - 1.0) < 1e-4
+    rotated = result.states.world_from_body - expected.states.world_from_body
+    assert np.max(np.abs(rotated)) < 1e-3 * np.min(sigma[:, :3])
+    assert abs(result.cost / expected.cost - 1.0) < 1e-4

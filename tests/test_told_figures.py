@@ -35,7 +35,7 @@ class Figure(StrictModel):
         return self
 
 
-class Told(StrictModel):
+class Reported(StrictModel):
     """A sentence with figures, and the command that makes them."""
 
     file: str = Field(alias="in")
@@ -53,7 +53,7 @@ class Told(StrictModel):
 
 
 class _Register(StrictModel):
-    figures: list[Told]
+    figures: list[Reported]
     given: list[str]
 
 
@@ -66,33 +66,33 @@ def _flat(name: str) -> str:
 
 
 def test_the_figures_are_printed_and_what_holds_them_is_there() -> None:
-    for told in REGISTER.figures:
-        assert told.says in _flat(told.file)
-        for figure in told.figures:
-            assert figure.value in told.says
+    for reported in REGISTER.figures:
+        assert reported.says in _flat(reported.file)
+        for figure in reported.figures:
+            assert figure.value in reported.says
             if figure.test is not None:
                 path, _, name = figure.test.partition("::")
                 tree = ast.parse((ROOT / path).read_text())
                 functions = {n.name for n in tree.body if isinstance(n, ast.FunctionDef)}
-                assert name in functions, f"{told.says}: {figure.test}"
+                assert name in functions, f"{reported.says}: {figure.test}"
 
 
 MEASURED = [
-    pytest.param(told, id=told.says[:50], marks=[pytest.mark.slow] if told.slow else [])
-    for told in REGISTER.figures
-    if told.command
+    pytest.param(reported, id=reported.says[:50], marks=[pytest.mark.slow] if reported.slow else [])
+    for reported in REGISTER.figures
+    if reported.command
 ]
 
 
-@pytest.mark.parametrize("told", MEASURED)
-def test_the_command_gives_the_figures(told: Told, tmp_path: Path) -> None:
-    assert told.command is not None
-    if "{logs}" in told.command and not LOGS.is_dir():
+@pytest.mark.parametrize("reported", MEASURED)
+def test_the_command_gives_the_figures(reported: Reported, tmp_path: Path) -> None:
+    assert reported.command is not None
+    if "{logs}" in reported.command and not LOGS.is_dir():
         pytest.skip("the shared logs are not beside the repository")
-    found = _measured(told.command, tmp_path)
-    for figure in told.figures:
+    result = _measured(reported.command, tmp_path)
+    for figure in reported.figures:
         if figure.key:
-            value: Any = found
+            value: Any = result
             for part in figure.key:
                 value = value[part]
             assert figure.factor * float(value) == pytest.approx(
@@ -130,11 +130,11 @@ def test_every_number_in_the_prose_is_measured_or_given(name: str) -> None:
     """Outside of blocks, which `test_readme` runs, of code, and of what it points to."""
     prose = re.sub(r"^```.*?^```$", "", (ROOT / name).read_text(), flags=re.M | re.S)
     prose = _plain(re.sub(r"^#+.*$", " ", prose, flags=re.M))
-    known = [_plain(told.says) for told in REGISTER.figures if told.file == name]
+    known = [_plain(reported.says) for reported in REGISTER.figures if reported.file == name]
     for phrase in known + (REGISTER.given if name == "README.md" else []):
         prose = prose.replace(phrase, " ")
-    found = NUMBER.findall(NAMED.sub(" ", prose))
-    assert not found, "put it into told_figures.yaml with what makes it, or into docs/measured.md"
+    result = NUMBER.findall(NAMED.sub(" ", prose))
+    assert not result, "put it into told_figures.yaml with what makes it, or into docs/measured.md"
 
 
 def _plain(text: str) -> str:
@@ -146,5 +146,7 @@ def test_what_is_given_is_in_the_readme() -> None:
 
 
 def test_the_drift_of_the_readme_is_that_of_its_page() -> None:
-    (told,) = re.findall(r"-?[\d.]+ ± [\d.]+ mm and -?[\d.]+ ± [\d.]+° a day", _flat("README.md"))
-    assert told in _flat("docs/jobs/drift.md")
+    (reported,) = re.findall(
+        r"-?[\d.]+ ± [\d.]+ mm and -?[\d.]+ ± [\d.]+° a day", _flat("README.md")
+    )
+    assert reported in _flat("docs/jobs/drift.md")

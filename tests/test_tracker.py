@@ -40,8 +40,8 @@ from magfusion.units import DEGREE, MU0_OVER_4PI
 NONE = np.zeros((3, 3))
 
 
-def between_deg(found: np.ndarray, true: np.ndarray) -> np.ndarray:
-    turn = np.swapaxes(true, -1, -2) @ found
+def between_deg(result: np.ndarray, true: np.ndarray) -> np.ndarray:
+    turn = np.swapaxes(true, -1, -2) @ result
     return np.asarray(Rotation.from_matrix(turn).magnitude() / DEGREE)
 
 
@@ -60,8 +60,8 @@ def rms(error: np.ndarray) -> float:
 
 
 def polar(matrix: np.ndarray) -> np.ndarray:
-    left, _, right = np.linalg.svd(matrix)
-    return left @ right
+    remaining, _, right = np.linalg.svd(matrix)
+    return remaining @ right
 
 
 def test_one_svd_gives_attitude_range_and_bearing_exactly() -> None:
@@ -112,9 +112,9 @@ def test_angles_and_attitude(angles_deg: tuple[float, float, float]) -> None:
 
 def test_the_printed_arctan_is_wrong_by_half_a_turn() -> None:
     attitude = attitude_from_angles(np.array([170.0, 0.0, 10.0]) * DEGREE)
-    for turned in (attitude, attitude_from_angles(np.array([10.0, 0.0, 170.0]) * DEGREE)):
-        angles = euler_angles(turned) / DEGREE
-        printed = [f(turned) / DEGREE for f in (eq_12_yaw_as_printed, eq_14_roll_as_printed)]
+    for rotated in (attitude, attitude_from_angles(np.array([10.0, 0.0, 170.0]) * DEGREE)):
+        angles = euler_angles(rotated) / DEGREE
+        printed = [f(rotated) / DEGREE for f in (eq_12_yaw_as_printed, eq_14_roll_as_printed)]
         wrong = np.abs(angles[[0, 2]]) > 90.0
         np.testing.assert_allclose(np.abs(angles[[0, 2]] - printed), 180.0 * wrong, atol=1e-12)
 
@@ -145,8 +145,8 @@ def test_eq_11_corrected_is_exact() -> None:
     receiver, transmitter = (np.eye(3) + 0.1 * rng.standard_normal((3, 3)) for _ in range(2))
     ambient = 1e-6 * rng.standard_normal((3, 1)) * np.ones(3)  # T, the same in every slot
     seen = np.linalg.inv(receiver) @ coupling @ transmitter + ambient
-    found = eq_11_attitude(seen, position, receiver, transmitter, ambient)
-    np.testing.assert_allclose(found, attitude, rtol=0, atol=1e-12)
+    result = eq_11_attitude(seen, position, receiver, transmitter, ambient)
+    np.testing.assert_allclose(result, attitude, rtol=0, atol=1e-12)
 
 
 def test_printed_rotations_make_it_worse_and_corrected_ones_better() -> None:
@@ -247,9 +247,9 @@ def test_the_likelihood_agrees_with_the_closed_form() -> None:
     fixes = fix_epochs(samples, initial_calibration(site, 0.0), survey_error=False)
     unit = unit_coupling(beacon, phasor, sensor.matrix)
     closed, _ = world_poses(site, beacon, locate_by_svd(unit))
-    apart = between_deg(fixes.world_from_body[:, 0], closed[:, 0])
+    separate = between_deg(fixes.world_from_body[:, 0], closed[:, 0])
     error = between_deg(closed[:, 0], attitude)
-    assert rms(apart) < 0.5 * rms(error)
+    assert rms(separate) < 0.5 * rms(error)
     assert rms(between_deg(fixes.world_from_body[:, 0], attitude)) == pytest.approx(
         rms(error), rel=0.1
     )
@@ -266,10 +266,10 @@ def test_refined_poses_know_the_centres() -> None:
     start = locate_by_svd(unit).nearest(true[1])
     begin = np.swapaxes(start.sensor_from_beacon, 1, 2)
     coupling = np.swapaxes((phasor * np.exp(-0.3j * np.arange(3))[:, None]).real, 1, 2)
-    found = refine_poses(antenna, coupling, begin, start.position_beacon[:, 0])
+    result = refine_poses(antenna, coupling, begin, start.position_beacon[:, 0])
     assert rms(between_deg(begin, true[0])) > 0.1
-    np.testing.assert_allclose(found[0], true[0], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found[1], true[1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(result[0], true[0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(result[1], true[1], rtol=0, atol=1e-9)
 
 
 def test_the_general_fix_knows_the_centres_too() -> None:
@@ -291,4 +291,4 @@ def test_a_runaway_is_no_pose() -> None:
     antenna = antenna_of(site.beacons[0], site.platform.magnetometer)
     wrong = np.broadcast_to(np.eye(3), (3, 3, 3))
     with pytest.raises(EstimationError, match="does not converge"):
-        refine_poses(antenna, coupling, wrong, 3.0 * position[::-1], passes=2)
+        refine_poses(antenna, coupling, wrong, 3.0 * position[::-1], iterations=2)

@@ -88,11 +88,11 @@ def test_the_smoother_has_no_skew(imu_rate_hz: float, left_deg: float) -> None:
     site, log, motion = _noiseless(2.0, imu_rate_hz)
     rate_deg_s = np.rad2deg(np.linalg.norm(motion.rate_body(log.imu.time), axis=1))
     assert np.max(rate_deg_s) > 90.0
-    found = smooth(log, replace(site, model_error=0.0)).states
+    result = smooth(log, replace(site, model_error=0.0)).states
     assert log.fields is not None
-    assert len(found) == len(log.fields)
+    assert len(result) == len(log.fields)
     assert log.truth is not None
-    errors = trajectory_errors(found, log.truth)
+    errors = trajectory_errors(result, log.truth)
     assert errors.attitude_rmse_deg < left_deg
     assert errors.ate < 1e-6
 
@@ -124,9 +124,9 @@ def _recorded(path: Path, carrier_hz: float, duration: float = 3.0) -> Path:
 
 
 def _figures(directory: Path) -> dict[str, Any]:
-    found = json.loads((directory / "report.json").read_text())
-    assert isinstance(found, dict)
-    return found
+    result = json.loads((directory / "report.json").read_text())
+    assert isinstance(result, dict)
+    return result
 
 
 @pytest.mark.parametrize("carrier_hz", [0.0, 2e3])
@@ -156,18 +156,18 @@ def test_raw_slots_navigate_as_well_as_the_phasors_of_the_whole_log(
     log = _recorded(tmp_path / "log", carrier_hz, 8.0)
     run_command("demodulate", log, "-o", tmp_path / "phasors")
     run_command("smooth", log, "-o", tmp_path / "smoothed")
-    for made, name in ((log, "raw"), (tmp_path / "phasors", "known")):
-        run_command("navigate", made, "--estimator", "ekf", "-o", tmp_path / name)
+    for built, name in ((log, "raw"), (tmp_path / "phasors", "known")):
+        run_command("navigate", built, "--estimator", "ekf", "-o", tmp_path / name)
     recorded = read_log(log)
     assert recorded.truth is not None
     # The two may begin at other times, and settle from there.
-    found = []
+    result = []
     for name in ("raw", "known"):
         states = read_tum(tmp_path / name / "trajectory.tum", recorded.epoch_ns)
         late = states.time > 5.0
         parts = states.time, states.world_from_body, states.position_world
-        found.append(trajectory_errors(Trajectory(*(p[late] for p in parts)), recorded.truth))
-    raw, known = found
+        result.append(trajectory_errors(Trajectory(*(p[late] for p in parts)), recorded.truth))
+    raw, known = result
     # A state comes with the end of a cycle, of all its slots.
     assert 3 * len(raw.time) > 0.9 * len(known.time)
     assert raw.attitude_rmse_deg < 1.15 * known.attitude_rmse_deg

@@ -93,8 +93,8 @@ def test_coils_of_true_size_are_beyond_a_bench_of_dipoles_and_within_the_fit_of_
     assert rows["U"].attitude_deg == pytest.approx(points["U"].attitude_deg, rel=0.1)
     assert rows["P6"].attitude_deg > 1.4 * points["P6"].attitude_deg
     assert rows["J"].attitude_deg == pytest.approx(points["J"].attitude_deg, rel=0.1)
-    told = tracker_table1.report_levels("A", tuple(rows.values())).splitlines()
-    assert told[3].endswith("not Table 1")  # of the paper's own calibration
+    reported = tracker_table1.report_levels("A", tuple(rows.values())).splitlines()
+    assert reported[3].endswith("not Table 1")  # of the paper's own calibration
 
 
 def test_couplings_and_bench_are_those_of_wires_by_other_codes() -> None:
@@ -115,23 +115,23 @@ def test_couplings_and_bench_are_those_of_wires_by_other_codes() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("snr_db", "most"), [(60.0, 0.8), (65.0, 0.65)])
-def test_uncertain_poses_belong_in_the_graph(snr_db: float, most: float) -> None:
-    found = tracker_table1.run_uncertain(replace(SCENARIO_E, snr_db=snr_db))
-    assert found.graph_to_exact <= most
-    assert found.improvement >= 6.0
-    assert 0.85 <= found.chi2_per_dof <= 1.1
+@pytest.mark.parametrize(("snr_db", "maximum"), [(60.0, 0.8), (65.0, 0.65)])
+def test_uncertain_poses_belong_in_the_graph(snr_db: float, maximum: float) -> None:
+    result = tracker_table1.run_uncertain(replace(SCENARIO_E, snr_db=snr_db))
+    assert result.graph_to_exact <= maximum
+    assert result.improvement >= 6.0
+    assert 0.85 <= result.chi2_per_dof <= 1.1
     # Of 40 parameters and 200 antennas; one gain is left to the prior, four times too wide.
-    assert found.nees == pytest.approx(39.0 / 40.0, abs=3.0 * np.sqrt(2.0 / 40.0 / 200.0))
+    assert result.nees == pytest.approx(39.0 / 40.0, abs=3.0 * np.sqrt(2.0 / 40.0 / 200.0))
 
 
 def test_uncertain_poses_belong_in_the_graph_on_a_few_antennas() -> None:
-    found = tracker_table1.run_uncertain(replace(SCENARIO_E, antennas=30))
-    assert found.graph_to_exact <= 0.8
-    assert found.improvement >= 6.0
-    assert 0.85 <= found.chi2_per_dof <= 1.1
-    assert found.volume_position_mm < 1.1
-    assert found.volume_attitude_deg < 0.16
+    result = tracker_table1.run_uncertain(replace(SCENARIO_E, antennas=30))
+    assert result.graph_to_exact <= 0.8
+    assert result.improvement >= 6.0
+    assert 0.85 <= result.chi2_per_dof <= 1.1
+    assert result.volume_position_mm < 1.1
+    assert result.volume_attitude_deg < 0.16
 
 
 def test_the_dipole_errs_with_the_square_of_the_size(
@@ -164,8 +164,8 @@ def test_the_exact_coupling_is_that_of_biot_and_savart() -> None:
 
 
 def test_a_calibration_finds_the_sizes() -> None:
-    found = learn_sizes(tracker_near_field.Config())
-    assert found == pytest.approx((1.0, 1.0), abs=0.05)
+    result = learn_sizes(tracker_near_field.Config())
+    assert result == pytest.approx((1.0, 1.0), abs=0.05)
 
 
 def _last_line(
@@ -185,8 +185,8 @@ def test_table_1_ends_with_one_json_line_and_draws(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = ["--quick", "-o", str(tmp_path / "out")]
-    found = _last_line("table1", tracker_table1.main, options, capsys, monkeypatch)
-    assert found.keys() == {"printed", "A", "F2", "common", "E", "others"}
+    result = _last_line("table1", tracker_table1.main, options, capsys, monkeypatch)
+    assert result.keys() == {"printed", "A", "F2", "common", "E", "others"}
     assert (tmp_path / "out" / "tracker_table1.png").stat().st_size > 10_000
 
 
@@ -195,6 +195,6 @@ def test_the_near_field_ends_with_one_json_line_and_draws(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = ["--seed", "3", "-o", str(tmp_path)]
-    found = _last_line("near", tracker_near_field.main, options, capsys, monkeypatch)
-    assert found["slope"] == pytest.approx(-2.0, abs=0.15)
+    result = _last_line("near", tracker_near_field.main, options, capsys, monkeypatch)
+    assert result["slope"] == pytest.approx(-2.0, abs=0.15)
     assert (tmp_path / "tracker_near_field.png").stat().st_size > 10_000

@@ -22,7 +22,7 @@ from magfusion.files.log import write_log
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site, save_site
 from magfusion.files.survey import read_survey, write_survey
-from magfusion.jobs.calibrate_log import Score, Transfer, transferred
+from magfusion.jobs.calibrate_log import PartScore, Transfer, transferred
 from magfusion.model.trust import CODES, Verdict
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD
 from magfusion.simulation.log import SimulationConfig, simulate_log
@@ -51,8 +51,8 @@ def test_honest_declarations_are_contradicted_as_rarely_as_it_is_said(independen
     cov = prior + posterior if independent else prior - posterior
     names = ["a", "b", "c", "d"]
     drawn = changes(rng, 4000, prior, posterior, independent)
-    said = [bool(contradiction(names, d, cov, prior, REMEDY).findings) for d in drawn]
-    assert np.sum(said) <= 20 + 3.0 * np.sqrt(20)  # 0.5 %
+    findings = [bool(contradiction(names, d, cov, prior, REMEDY).findings) for d in drawn]
+    assert np.sum(findings) <= 20 + 3.0 * np.sqrt(20)  # 0.5 %
 
 
 @pytest.mark.parametrize(
@@ -61,25 +61,25 @@ def test_honest_declarations_are_contradicted_as_rarely_as_it_is_said(independen
 def test_a_parameter_far_from_its_declared_value_is_named(sigmas, verdict):
     prior, change = np.eye(6), np.zeros(6)
     change[2] = sigmas * np.sqrt(0.96)
-    found = contradiction(list("abcdef"), change, 0.96 * prior, prior, REMEDY)
-    assert [f.verdict for f in found.findings] == ([] if verdict is None else [verdict])
-    for finding in found.findings:
+    result = contradiction(list("abcdef"), change, 0.96 * prior, prior, REMEDY)
+    assert [f.verdict for f in result.findings] == ([] if verdict is None else [verdict])
+    for finding in result.findings:
         assert f"c by {sigmas:.1f}" in finding.text
         assert finding.text.endswith(REMEDY)
-        assert found.excess == pytest.approx(sigmas**2)
+        assert result.excess == pytest.approx(sigmas**2)
 
 
 def test_many_small_changes_together_contradict_the_site():
     prior = np.eye(40)
-    found = contradiction([f"p{i}" for i in range(40)], np.full(40, 2.0), prior, prior, REMEDY)
-    assert found.findings[0].verdict is Verdict.FAILED
-    assert found.excess == pytest.approx(4.0)
+    result = contradiction([f"p{i}" for i in range(40)], np.full(40, 2.0), prior, prior, REMEDY)
+    assert result.findings[0].verdict is Verdict.FAILED
+    assert result.excess == pytest.approx(4.0)
 
 
 def test_what_the_data_say_nothing_of_contradicts_nothing():
     prior = np.eye(2)
-    found = contradiction(["a", "b"], np.array([9.0, 0.1]), np.diag([1e-4, 0.9]), prior, REMEDY)
-    assert not found.findings
+    result = contradiction(["a", "b"], np.array([9.0, 0.1]), np.diag([1e-4, 0.9]), prior, REMEDY)
+    assert not result.findings
 
 
 def test_residuals_are_doubted_where_they_are_larger_and_no_chance():
@@ -108,8 +108,8 @@ def failing(*arguments: object) -> None:
     assert ended.value.code == 1
 
 
-def codes(told: dict[str, Any]) -> list[str]:
-    return [reason["code"] for reason in told["reasons"]]
+def codes(reported: dict[str, Any]) -> list[str]:
+    return [reason["code"] for reason in reported["reasons"]]
 
 
 def test_a_mirrored_fix_is_never_trusted_and_its_covariance_holds_both_poses(
@@ -120,12 +120,12 @@ def test_a_mirrored_fix_is_never_trusted_and_its_covariance_holds_both_poses(
     run_command("simulate", "--site", tmp_path / "one.yaml", "-o", tmp_path / "log",
                 "--duration", 10)  # fmt: skip
     run_command("fix", tmp_path / "log", "-o", tmp_path / "fixes")
-    told = report(tmp_path / "fixes")
-    assert told["verdict"] == "doubtful"
-    assert "ambiguous" in codes(told)
+    reported = report(tmp_path / "fixes")
+    assert reported["verdict"] == "doubtful"
+    assert "ambiguous" in codes(reported)
     rows = pyarrow.parquet.read_table(tmp_path / "fixes" / "trajectory.parquet").to_pydict()
     assert set(rows["verdict"]) == {"doubtful"}
-    assert told["inside_3_sigma"] > 0.9
+    assert reported["inside_3_sigma"] > 0.9
 
 
 def test_a_beacon_that_is_not_where_it_should_be_is_left_out_and_told(
@@ -136,10 +136,10 @@ def test_a_beacon_that_is_not_where_it_should_be_is_left_out_and_told(
     moved = replace(first, position_world=first.position_world + np.array([0.3, 0.0, 0.0]))
     save_site(replace(site, beacons=(moved, *rest)), tmp_path / "moved.yaml")
     run_command("fix", worked.log, "--site", tmp_path / "moved.yaml", "-o", tmp_path / "fixes")
-    told = report(tmp_path / "fixes")
-    said = [one["text"] for one in told["remarks"] if one["code"] == "beacon_excluded"]
-    assert f"beacon {first.name} contradict" in said[0]
-    assert told["nees_mean"] < 12.0
+    reported = report(tmp_path / "fixes")
+    findings = [one["text"] for one in reported["remarks"] if one["code"] == "beacon_excluded"]
+    assert f"beacon {first.name} contradict" in findings[0]
+    assert reported["nees_mean"] < 12.0
 
 
 def test_every_code_is_told_in_words() -> None:
@@ -156,9 +156,9 @@ def test_every_code_is_told_in_words() -> None:
 def contradicted(directory: Path) -> dict[str, Any]:
     """Return the report of a result that is failed, and nothing else under a result's name."""
     assert {path.name for path in directory.iterdir()} == {"report.json", "failed"}
-    told = report(directory)
-    assert told["verdict"] == "failed"
-    return told
+    reported = report(directory)
+    assert reported["verdict"] == "failed"
+    return reported
 
 
 def calibrated_beacon(root: Path, declared_noise: float = 1.0) -> Path:
@@ -179,9 +179,9 @@ def test_noise_three_times_as_declared_makes_a_beacon_doubtful_and_its_sigmas_la
     clean = calibrated_beacon(tmp_path / "as_declared")
     doubtful = calibrated_beacon(tmp_path / "more", declared_noise=1.0 / 3.0)
     assert report(clean)["verdict"] == "trustworthy"
-    told = report(doubtful)
-    assert told["verdict"] == "doubtful"
-    assert set(codes(told)) == {"field_residuals"}
+    reported = report(doubtful)
+    assert reported["verdict"] == "doubtful"
+    assert set(codes(reported)) == {"field_residuals"}
     before, after = (load_site(place / "site.yaml").beacons for place in (clean, doubtful))
     for old, new in zip(before, after, strict=True):
         assert np.all(new.sigma.position_world > 0.6 * old.sigma.position_world)
@@ -189,14 +189,14 @@ def test_noise_three_times_as_declared_makes_a_beacon_doubtful_and_its_sigmas_la
 
 def test_a_beacon_far_from_where_the_site_has_it_fails(tmp_path: Path) -> None:
     site, _ = written(tmp_path)
-    sure = replace(site.beacons[0].sigma, position_world=np.full(3, 1e-3))
-    beacons = tuple(replace(beacon, sigma=sure) for beacon in site.beacons)
+    certain = replace(site.beacons[0].sigma, position_world=np.full(3, 1e-3))
+    beacons = tuple(replace(beacon, sigma=certain) for beacon in site.beacons)
     save_site(replace(site, beacons=beacons), tmp_path / "site.yaml")
     failing("calibrate", "beacon", tmp_path / "survey.parquet",
             "--site", tmp_path / "site.yaml", "-o", tmp_path / "out")  # fmt: skip
-    told = contradicted(tmp_path / "out")
-    assert codes(told)[0] == "prior"
-    assert "position" in told["reasons"][0]["text"]
+    reported = contradicted(tmp_path / "out")
+    assert codes(reported)[0] == "prior"
+    assert "position" in reported["reasons"][0]["text"]
 
 
 def test_couplings_noisier_than_declared_make_an_antenna_doubtful(tmp_path: Path) -> None:
@@ -215,7 +215,7 @@ def test_couplings_noisier_than_declared_make_an_antenna_doubtful(tmp_path: Path
 
 
 @pytest.fixture(scope="module")
-def turned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def rotated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the log of a platform that is turned, with a site whose Earth field is wrong."""
     rests = Rests(2.0, 60.0, 0.0)
     config = SimulationConfig(DEMO_BOX_WORLD, 40.0, "turn", rests=rests, time_offset=0.0)
@@ -228,16 +228,16 @@ def turned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def test_a_field_of_another_size_fails_the_magnetometer(turned: Path, tmp_path: Path) -> None:
-    failing("calibrate", "magnetometer", turned, "-o", tmp_path / "out")
+def test_a_field_of_another_size_fails_the_magnetometer(rotated: Path, tmp_path: Path) -> None:
+    failing("calibrate", "magnetometer", rotated, "-o", tmp_path / "out")
     assert set(codes(contradicted(tmp_path / "out"))) & {"prior", "earth_field"}
 
 
-def test_a_field_of_another_size_fails_matching(turned: Path, tmp_path: Path) -> None:
-    failing("match", turned, "--yaw-deg", 10, "-o", tmp_path / "out")
-    told = contradicted(tmp_path / "out")
-    assert "earth_field" in codes(told)
-    assert [one["parameter"] for one in told["unverified"]] == ["earth.field", "given.yaw"]
+def test_a_field_of_another_size_fails_matching(rotated: Path, tmp_path: Path) -> None:
+    failing("match", rotated, "--yaw-deg", 10, "-o", tmp_path / "out")
+    reported = contradicted(tmp_path / "out")
+    assert "earth_field" in codes(reported)
+    assert [one["parameter"] for one in reported["unverified"]] == ["earth.field", "given.yaw"]
 
 
 def test_attitudes_of_another_clock_make_no_database(tmp_path: Path) -> None:
@@ -269,9 +269,9 @@ def test_a_map_of_exchanged_beacons_fails(tmp_path: Path) -> None:
 def test_a_log_that_contradicts_its_survey_is_told(worked: Worked, tmp_path: Path) -> None:
     site = load_site(worked.log / "site.yaml")
     first, *rest = site.beacons
-    sure = replace(first.sigma, position_world=np.full(3, 0.02))
+    certain = replace(first.sigma, position_world=np.full(3, 0.02))
     place = first.position_world + np.array([0.2, 0.0, 0.0])
-    moved = replace(first, position_world=place, sigma=sure)
+    moved = replace(first, position_world=place, sigma=certain)
     save_site(replace(site, beacons=(moved, *rest)), tmp_path / "moved.yaml")
     failing("calibrate", "log", worked.log, "--site", tmp_path / "moved.yaml",
             "-o", tmp_path / "out")  # fmt: skip
@@ -293,11 +293,11 @@ def test_whatever_fails_leaves_a_report_that_says_so(
     monkeypatch.setattr("magfusion.estimation.batch.self_survey.smooth_and_place", fails)
     capfd.readouterr()
     failing("calibrate", "log", worked.log, "-o", tmp_path / "out")
-    told = contradicted(tmp_path / "out")
-    assert codes(told) == ["no_solution"]
+    reported = contradicted(tmp_path / "out")
+    assert codes(reported) == ["no_solution"]
     assert capfd.readouterr().out.splitlines()[1] == "FAILED"
     failing("calibrate", "log", worked.log, "-o", tmp_path / "out", "--json")
-    assert json.loads(capfd.readouterr().out) == told
+    assert json.loads(capfd.readouterr().out) == reported
 
 
 def test_what_failed_is_shown_with_its_reasons(
@@ -317,9 +317,9 @@ def test_what_failed_is_shown_with_its_reasons(
 
 
 def test_parts_of_a_log_that_disagree_are_told() -> None:
-    scores = [Score(0.5, None, None)] * 2
+    scores = [PartScore(0.5, None, None)] * 2
     agreed = Transfer(scores, scores, [(0, 1), (1, 0)], 3.0)
     assert not transferred(agreed).findings
     assert transferred(agreed._replace(disagreement=8.0)).verdict is Verdict.DOUBTFUL
-    worse = [Score(0.9, None, None)] * 2
+    worse = [PartScore(0.9, None, None)] * 2
     assert transferred(agreed._replace(calibrated=worse)).verdict is Verdict.DOUBTFUL

@@ -39,7 +39,7 @@ def navigated(log: OnlineLog, estimator: str) -> tuple[Navigator, list[JudgedSta
     return navigator, [state for state in states if isinstance(state, JudgedState)]
 
 
-def turned(fields: FieldSamples, begin: float, end: float, channels: object) -> FieldSamples:
+def rotated(fields: FieldSamples, begin: float, end: float, channels: object) -> FieldSamples:
     """Return phasors of which some have a wrong phase for a while: no pose explains them."""
     phasor, own = fields.phasor_sensor.copy(), (fields.time > begin) & (fields.time < end)
     angle = np.linspace(1.0, 2.5, phasor.shape[1])[:, None]
@@ -75,19 +75,21 @@ def test_states_are_carried_with_the_noise_that_the_samples_have(
     quiet = replace(imu, gyro_noise=imu.gyro_noise / 10.0, accel_noise=imu.accel_noise / 10.0)
     site = replace(walk.site, platform=replace(walk.site.platform, imu=quiet))
 
-    def found() -> tuple[set[str], float]:
+    def result() -> tuple[set[str], float]:
         _, states = navigated(replace(walk, site=site), "ekf")
         nees = walk.errors(states).nees
         assert nees is not None
         return codes(states), float(np.mean(nees))
 
-    said, nees = found()
-    assert "imu_noise" in said
-    assert "beacon_excluded" not in said  # a fix better than the states is no reason to refuse it
+    findings, nees = result()
+    assert "imu_noise" in findings
+    assert (
+        "beacon_excluded" not in findings
+    )  # a fix better than the states is no reason to refuse it
     assert nees < 9.0
     monkeypatch.setattr(navigator_module, "measured_noise", lambda _, declared: (declared, []))
-    said, without = found()
-    assert "beacon_excluded" in said
+    findings, without = result()
+    assert "beacon_excluded" in findings
     assert without > 2.0 * nees
 
 
@@ -95,28 +97,28 @@ def test_states_are_carried_with_the_noise_that_the_samples_have(
 def test_a_platform_that_nothing_explains_is_lost_until_it_is_found(
     walk: OnlineLog, estimator: str
 ) -> None:
-    wrong = replace(walk, fields=turned(walk.fields, 20.0, 27.0, slice(None)))
+    wrong = replace(walk, fields=rotated(walk.fields, 20.0, 27.0, slice(None)))
     navigator, states = navigated(wrong, estimator)
-    lost = [state.time for state in states if state.lost]
+    lost_epochs = [state.time for state in states if state.is_lost]
     # Five epochs tell a loss, the last of which is half a second before.
-    assert 20.0 < lost[0] < 23.5
-    assert 26.0 < lost[-1] < 27.0 + LONGEST_WAIT + 0.5
-    found = [state for state in states if state.time > lost[-1]]
-    assert found[0].verdict is Verdict.DOUBTFUL
-    assert "found_again" in codes(found[:1])
-    assert found[-1].verdict is Verdict.TRUSTWORTHY
-    assert np.max(np.linalg.norm(walk.errors(found).position_world, axis=1)) < 0.03  # m
+    assert 20.0 < lost_epochs[0] < 23.5
+    assert 26.0 < lost_epochs[-1] < 27.0 + LONGEST_WAIT + 0.5
+    result = [state for state in states if state.time > lost_epochs[-1]]
+    assert result[0].verdict is Verdict.DOUBTFUL
+    assert "found_again" in codes(result[:1])
+    assert result[-1].verdict is Verdict.TRUSTWORTHY
+    assert np.max(np.linalg.norm(walk.errors(result).position_world, axis=1)) < 0.03  # m
     summary = navigator.summary
     assert summary.trust.verdict is Verdict.DOUBTFUL
-    assert summary.lost_states == len(lost)
-    assert summary.longest_loss == pytest.approx(found[0].time - lost[0], abs=0.01)
+    assert summary.lost_states == len(lost_epochs)
+    assert summary.longest_loss == pytest.approx(result[0].time - lost_epochs[0], abs=0.01)
 
 
 @pytest.mark.parametrize("estimator", BOTH)
 def test_the_states_of_a_loss_that_is_not_told_yet_cover_their_errors(estimator: str) -> None:
     log = online_log(21, 20.0)
 
-    def carry(navigator: Navigator, now: float) -> None:
+    def propagate_passage(navigator: Navigator, now: float) -> None:
         if now == 15.0:
             inner = navigator._estimator  # nothing that arrives could tell it so much nonsense
             assert inner is not None
@@ -124,7 +126,7 @@ def test_the_states_of_a_loss_that_is_not_told_yet_cover_their_errors(estimator:
             inner.replace_state(replace(inner.state, position_world=wrong))
 
     settings = NavigatorSettings(estimator)  # type: ignore[arg-type]
-    _, states = navigate(log, settings, watch=carry)
+    _, states = navigate(log, settings, watch=propagate_passage)
     errors = log.errors(states)
     assert errors.nees is not None
     for state, nees, error in zip(states, errors.nees, errors.position_world, strict=True):
@@ -136,12 +138,12 @@ def test_the_states_of_a_loss_that_is_not_told_yet_cover_their_errors(estimator:
 
 @pytest.mark.parametrize("estimator", BOTH)
 def test_a_beacon_that_is_refused_again_and_again_is_named(walk: OnlineLog, estimator: str) -> None:
-    wrong = replace(walk, fields=turned(walk.fields, 20.0, 60.0, [1]))
+    wrong = replace(walk, fields=rotated(walk.fields, 20.0, 60.0, [1]))
     _, states = navigated(wrong, estimator)
     after = [state for state in states if state.time > 21.0]
     assert {state.judgement.excluded for state in after if state.judgement.excluded} == {("B",)}
     assert "beacon_excluded" in codes(after)
-    assert not any(state.lost for state in after)
+    assert not any(state.is_lost for state in after)
     named = [f.text for s in after for f in s.judgement.reasons if f.code == "beacon_excluded"]
     assert all("beacon B" in text for text in named)
     assert np.max(np.linalg.norm(walk.errors(after).position_world, axis=1)) < 0.01  # m
@@ -177,7 +179,7 @@ def test_an_imu_that_comes_loose_is_noticed(walk: OnlineLog, estimator: str) -> 
 def test_a_navigator_that_is_lost_goes_on_from_its_checkpoint_to_the_last_bit(
     walk: OnlineLog,
 ) -> None:
-    log = replace(walk, fields=turned(walk.fields, 20.0, 27.0, slice(None)))
+    log = replace(walk, fields=rotated(walk.fields, 20.0, 27.0, slice(None)))
     twins: dict[float, Navigator] = {}
 
     def watch(navigator: Navigator, now: float) -> None:
@@ -209,24 +211,24 @@ def written(walk: OnlineLog, path: Path) -> Path:
 
 
 def test_in_a_pipe_a_loss_gives_no_pose(walk: OnlineLog, tmp_path: Path) -> None:
-    log = replace(walk, fields=turned(walk.fields, 20.0, 24.0, slice(None)))
+    log = replace(walk, fields=rotated(walk.fields, 20.0, 24.0, slice(None)))
     save_site(walk.site, tmp_path / "site.yaml")
     lines, _ = answered(
         tmp_path / "site.yaml", records(log), StreamSettings(NavigatorSettings("ekf"))
     )
-    told = [line for line in lines if line["started"]]
-    lost = [line for line in told if line["lost"]]
-    assert len(lost) >= 2
-    for line in lost:
+    reported = [line for line in lines if line["started"]]
+    lost_epochs = [line for line in reported if line["lost"]]
+    assert len(lost_epochs) >= 2
+    for line in lost_epochs:
         assert line["verdict"] == "failed"
         assert line["reasons"][0]["code"] == "lost"
         assert not line.keys() & {"position", "quaternion", "velocity", "sigma"}
-    for line in told:
+    for line in reported:
         assert line["lost"] is (line["verdict"] == "failed")
         assert line["lost"] or len(line["position"]) == 3
         assert line["protection_level_m"] is None
-    assert told[-1]["verdict"] == "trustworthy"
-    assert told[-1]["reasons"] == []
+    assert reported[-1]["verdict"] == "trustworthy"
+    assert reported[-1]["reasons"] == []
     waiting = [line for line in lines if not line["started"]]
     assert all(line["verdict"] is None and line["reasons"] == [] for line in waiting)
 
@@ -235,7 +237,7 @@ def test_in_a_pipe_a_loss_gives_no_pose(walk: OnlineLog, tmp_path: Path) -> None
 def test_a_loss_that_was_found_again_makes_the_whole_doubtful(
     walk: OnlineLog, tmp_path: Path
 ) -> None:
-    log = replace(walk, fields=turned(walk.fields, 20.0, 26.0, slice(None)))
+    log = replace(walk, fields=rotated(walk.fields, 20.0, 26.0, slice(None)))
     output = tmp_path / "run"
     run_command("navigate", written(log, tmp_path / "log"), "-o", output)
     figures = json.loads((output / "report.json").read_text())
@@ -261,14 +263,14 @@ def test_a_loss_that_was_found_again_makes_the_whole_doubtful(
 def test_a_log_that_ends_lost_has_failed_and_leaves_no_result(
     walk: OnlineLog, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    log = replace(walk, fields=turned(walk.fields, 20.0, 99.0, slice(None)))
+    log = replace(walk, fields=rotated(walk.fields, 20.0, 99.0, slice(None)))
     path, output = written(log, tmp_path / "log"), tmp_path / "run"
     with pytest.raises(SystemExit) as ended:
         main(["navigate", str(path), "-o", str(output), "--estimator", "ekf"])
     assert ended.value.code == 1
-    told = capfd.readouterr().err
-    assert "failed: " in told
-    assert told.count("\n") == 1
+    reported = capfd.readouterr().err
+    assert "failed: " in reported
+    assert reported.count("\n") == 1
     assert {file.name for file in output.iterdir()} == {"report.json", "failed"}
     figures = json.loads((output / "report.json").read_text())
     assert figures["verdict"] == "failed"
@@ -304,11 +306,11 @@ def test_a_running_mean_is_worth_fewer_samples_than_it_has_seen() -> None:
 
 
 def test_the_worst_state_counts_unless_it_was_a_loss_that_ended() -> None:
-    said = {v: Judgement((Finding("lost", "Lost.", v),)) for v in Verdict}
-    said[Verdict.TRUSTWORTHY] = Judgement()
+    findings = {v: Judgement((Finding("lost", "Lost.", v),)) for v in Verdict}
+    findings[Verdict.TRUSTWORTHY] = Judgement()
     summary, verdicts = Summary(), []
     for k, verdict in enumerate((*Verdict, Verdict.TRUSTWORTHY)):
-        summary.note(float(k), said[verdict])
+        summary.note(float(k), findings[verdict])
         verdicts.append(summary.trust.verdict)
     assert verdicts == [*Verdict, Verdict.DOUBTFUL]
     assert summary.lost_states == 1
@@ -323,8 +325,8 @@ def test_what_is_held_and_wrong_is_named_as_the_motion_tells_of_it() -> None:
     site = replace(log.site, platform=replace(log.site.platform, magnetometer=wrong))
     navigator, states = navigated(replace(log, site=site), "ekf")
     assert "lever_arm" in {reason.code for reason in navigator.summary.trust.reasons}
-    told = [state for state in states if "lever_arm" in codes([state])]
-    assert told[0].time < 12.0
-    nees = log.errors(told).nees
+    reported = [state for state in states if "lever_arm" in codes([state])]
+    assert reported[0].time < 12.0
+    nees = log.errors(reported).nees
     assert nees is not None
     assert np.mean(nees) < 20.0

@@ -17,7 +17,7 @@ from magfusion.estimation.data_checks.statistics import (
     log_p_chi_square,
     sigmas,
 )
-from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.integrity.judge import judge_result
 from magfusion.estimation.integrity.score import scores_of
 from magfusion.estimation.integrity.suspects import CODE, held_blocks, suspects
 from magfusion.model.parameters import LOG_MOMENT, SENSOR_POSITION, SENSOR_ROTATION
@@ -39,7 +39,7 @@ def a_log(seed: int, *, perturb: bool = True) -> tuple[Log, Site]:
 
 def verdict_on(log: Log, site: Site) -> tuple[Smoothed, Smoothed, Trust]:
     result = smooth(log, site, SmootherSettings(loss="cauchy"))
-    return (result, *judged(result, log))
+    return (result, *judge_result(result, log))
 
 
 def nees(result: Smoothed, log: Log) -> float:
@@ -126,9 +126,9 @@ def test_a_false_bias_of_the_imu_is_said() -> None:
     log, site = a_log(1, perturb=False)
     imu = replace(log.imu, gyro_body=log.imu.gyro_body + np.array([0.0, 0.1, 0.0]))
     _, _, trust = verdict_on(replace(log, imu=imu), site)
-    said = next(f for f in trust.reasons if f.code == "imu_bias")
-    assert "gyroscope" in said.text
-    assert "on y" in said.text
+    findings = next(f for f in trust.reasons if f.code == "imu_bias")
+    assert "gyroscope" in findings.text
+    assert "on y" in findings.text
 
 
 def test_a_disturbed_beacon_is_said_with_its_time() -> None:
@@ -138,8 +138,8 @@ def test_a_disturbed_beacon_is_said_with_its_time() -> None:
     phasor[now, 1] *= 1.1
     false = replace(log, fields=replace(log.fields, phasor_sensor=phasor))
     _, honest, trust = verdict_on(false, site)
-    said = next(f for f in trust.findings if f.code == "field_residuals")
-    assert f"beacon {site.beacons[1].name}" in said.text
+    findings = next(f for f in trust.findings if f.code == "field_residuals")
+    assert f"beacon {site.beacons[1].name}" in findings.text
     assert nees(honest, log) < COVERED
 
 
@@ -157,8 +157,8 @@ def test_at_rest_the_lever_arm_is_listed_as_unverified() -> None:
         accel_body=force + model.accel_noise * rate * rng.standard_normal((n, 3)),
     )
     noise = 2e-9 * rng.standard_normal((2, *log.fields.phasor_sensor.shape))
-    at_rest = np.repeat(log.fields.phasor_sensor[:1], len(log.fields), axis=0)
-    fields = replace(log.fields, phasor_sensor=at_rest + noise[0] + 1j * noise[1])
+    stationary = np.repeat(log.fields.phasor_sensor[:1], len(log.fields), axis=0)
+    fields = replace(log.fields, phasor_sensor=stationary + noise[0] + 1j * noise[1])
     result, _, trust = verdict_on(replace(log, imu=imu, fields=fields, truth=None), site)
     listed = {one.name: one for one in trust.unverified}
     assert "sensor.position" in listed
@@ -174,21 +174,21 @@ def test_the_score_foretells_what_solving_again_finds() -> None:
     off = with_magnetometer(
         site, position_body=site.platform.magnetometer.position_body + np.array([0.01, 0.0, 0.0])
     )
-    held = smooth(log, off, SmootherSettings(estimate=()))
-    scores = scores_of(held, log.imu)
+    fixed = smooth(log, off, SmootherSettings(estimate=()))
+    scores = scores_of(fixed, log.imu)
     assert scores is not None
-    score = scores.held
-    lever = next(b for b in score.held if b.parameter == SENSOR_POSITION)
+    score = scores.fixed
+    lever = next(b for b in score.fixed if b.parameter == SENSOR_POSITION)
     rows = np.arange(len(score.information))[lever.columns]
     information = score.information[np.ix_(rows, rows)]
     step = lever.sigma * np.linalg.solve(information, score.gradient[rows])
     sigma = site.platform.magnetometer.sigma
     wide = replace(sigma, position_body=np.full(3, 10.0))
     magnetometer = replace(off.platform.magnetometer, sigma=wide)
-    free = replace(off, platform=replace(off.platform, magnetometer=magnetometer))
-    freed = smooth(log, free, SmootherSettings(estimate=("extrinsics",)))
-    found = freed.calibration.site.platform.magnetometer.position_body
-    change = found - off.platform.magnetometer.position_body
+    free_parameters = replace(off, platform=replace(off.platform, magnetometer=magnetometer))
+    released = smooth(log, free_parameters, SmootherSettings(estimate=("extrinsics",)))
+    result = released.calibration.site.platform.magnetometer.position_body
+    change = result - off.platform.magnetometer.position_body
     # The mounting was free as well there, and moves little.
     np.testing.assert_allclose(step, change, atol=2e-3)
     spread = lever.sigma[0] * np.sqrt(np.linalg.inv(information)[0, 0])
@@ -197,14 +197,14 @@ def test_the_score_foretells_what_solving_again_finds() -> None:
 
 def test_everything_that_is_held_is_asked() -> None:
     _, site = a_log(1)
-    held = held_blocks(site, (), steady=False)
-    kinds = {block.parameter for block in held}
+    fixed = held_blocks(site, (), steady=False)
+    kinds = {block.parameter for block in fixed}
     assert {LOG_MOMENT, SENSOR_POSITION, SENSOR_ROTATION} <= kinds
-    assert sum(b.parameter == LOG_MOMENT for b in held) == len(site.beacons)
-    asked = list(suspects(site, held))
-    assert len({s.name for s in asked}) >= len(held)
-    fewer = held_blocks(site, held[:3], steady=False)
-    assert {b.key for b in fewer} == {b.key for b in held[3:]}
+    assert sum(b.parameter == LOG_MOMENT for b in fixed) == len(site.beacons)
+    requested = list(suspects(site, fixed))
+    assert len({s.name for s in requested}) >= len(fixed)
+    fewer = held_blocks(site, fixed[:3], steady=False)
+    assert {b.key for b in fewer} == {b.key for b in fixed[3:]}
 
 
 def test_probabilities_far_out_are_finite_and_right() -> None:

@@ -23,23 +23,23 @@ def _trajectory() -> Trajectory:
 def test_evo_reads_what_was_written(tmp_path: Path) -> None:
     trajectory = _trajectory()
     write_tum(trajectory, tmp_path / "t.tum", EPOCH_NS)
-    found = file_interface.read_tum_trajectory_file(str(tmp_path / "t.tum"))
-    assert found.check()[0]
-    late = found.timestamps - EPOCH_NS * 1e-9
+    result = file_interface.read_tum_trajectory_file(str(tmp_path / "t.tum"))
+    assert result.check()[0]
+    late = result.timestamps - EPOCH_NS * 1e-9
     np.testing.assert_allclose(late, trajectory.time, rtol=0, atol=1e-6)  # s, a double's of today
-    np.testing.assert_allclose(found.positions_xyz, trajectory.position_world, rtol=0, atol=1e-9)
-    matrices = np.array(found.poses_se3)[:, :3, :3]
+    np.testing.assert_allclose(result.positions_xyz, trajectory.position_world, rtol=0, atol=1e-9)
+    matrices = np.array(result.poses_se3)[:, :3, :3]
     np.testing.assert_allclose(matrices, trajectory.world_from_body, rtol=0, atol=1e-8)  # rad
 
 
 def test_evo_s_files_are_read(tmp_path: Path) -> None:
     trajectory = _trajectory()
     write_tum(trajectory, tmp_path / "ours.tum", 0)
-    theirs = file_interface.read_tum_trajectory_file(str(tmp_path / "ours.tum"))
-    file_interface.write_tum_trajectory_file(str(tmp_path / "theirs.tum"), theirs)
-    found = read_tum(tmp_path / "theirs.tum")
-    np.testing.assert_allclose(found.time, trajectory.time, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found.world_from_body, trajectory.world_from_body, atol=1e-8)
+    others = file_interface.read_tum_trajectory_file(str(tmp_path / "ours.tum"))
+    file_interface.write_tum_trajectory_file(str(tmp_path / "theirs.tum"), others)
+    result = read_tum(tmp_path / "theirs.tum")
+    np.testing.assert_allclose(result.time, trajectory.time, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(result.world_from_body, trajectory.world_from_body, atol=1e-8)
 
 
 def test_nanoseconds_of_today_survive(tmp_path: Path) -> None:
@@ -49,11 +49,11 @@ def test_nanoseconds_of_today_survive(tmp_path: Path) -> None:
     assert lines[0] == "# time_s x y z qx qy qz qw"
     stamps = [int(line.split()[0].replace(".", "")) - EPOCH_NS for line in lines[1:]]
     assert stamps == [0, 1_000_000, 2_000_003, 4_000_000_000]
-    found = read_tum(tmp_path / "t.tum", EPOCH_NS)
-    np.testing.assert_allclose(found.time, trajectory.time, rtol=0, atol=1e-15)  # s
-    np.testing.assert_allclose(found.position_world, trajectory.position_world, atol=1e-9)
+    result = read_tum(tmp_path / "t.tum", EPOCH_NS)
+    np.testing.assert_allclose(result.time, trajectory.time, rtol=0, atol=1e-15)  # s
+    np.testing.assert_allclose(result.position_world, trajectory.position_world, atol=1e-9)
     turn = Rotation.from_matrix(
-        found.world_from_body.transpose(0, 2, 1) @ trajectory.world_from_body
+        result.world_from_body.transpose(0, 2, 1) @ trajectory.world_from_body
     )
     np.testing.assert_allclose(turn.magnitude(), 0.0, atol=1e-8)  # rad
 
@@ -68,9 +68,9 @@ def test_times_before_the_epoch_keep_their_sign(tmp_path: Path) -> None:
 
 def test_comments_and_empty_lines_are_passed_over(tmp_path: Path) -> None:
     (tmp_path / "t.tum").write_text(f"# comment\n\n  {GOOD}  \n\t1e0 1 2 3 0 0 1 0\n")
-    found = read_tum(tmp_path / "t.tum")
-    np.testing.assert_array_equal(found.time, [0.0, 1.0])
-    np.testing.assert_allclose(found.world_from_body[1], np.diag([-1.0, -1.0, 1.0]), atol=1e-15)
+    result = read_tum(tmp_path / "t.tum")
+    np.testing.assert_array_equal(result.time, [0.0, 1.0])
+    np.testing.assert_allclose(result.world_from_body[1], np.diag([-1.0, -1.0, 1.0]), atol=1e-15)
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from magfusion.estimation.batch.batch import SmootherSettings
-from magfusion.estimation.data_checks.recording import BRIDGED, recorded
-from magfusion.estimation.data_checks.spectrum import beside_lines
+from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
+from magfusion.estimation.data_checks.spectrum import with_disturbing_lines
 from magfusion.estimation.demodulation.demodulation import phasors
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
@@ -43,15 +43,15 @@ def radiated() -> SimulatedLog:
 def off(log: SimulatedLog, site: Site, lockin: LockinSettings | None = None) -> Array:
     """Return by how much the phasors of A and B differ from those of the whole declaration."""
     whole = phasors(log.log, RADIATING, LockinSettings(0.4, 0.2))[0].phasor_sensor[:, :2]
-    found = phasors(log.log, site, lockin)[0]
-    assert found.time[0] == pytest.approx(0.2, abs=0.01)
-    count = min(len(whole), len(found))
-    left = np.abs(found.phasor_sensor[:count, :2] - whole[:count])
-    return np.sqrt(np.mean(left**2, axis=(0, 2))) / np.sqrt(np.mean(np.abs(whole) ** 2))
+    result = phasors(log.log, site, lockin)[0]
+    assert result.time[0] == pytest.approx(0.2, abs=0.01)
+    count = min(len(whole), len(result))
+    remaining = np.abs(result.phasor_sensor[:count, :2] - whole[:count])
+    return np.sqrt(np.mean(remaining**2, axis=(0, 2))) / np.sqrt(np.mean(np.abs(whole) ** 2))
 
 
 def test_two_undeclared_beacons_are_fitted_beside_the_declared(radiated: SimulatedLog) -> None:
-    settings = beside_lines(radiated.log, declaring(2), None)
+    settings = with_disturbing_lines(radiated.log, declaring(2), None)
     assert settings is not None
     np.testing.assert_allclose(sorted(settings.lines_hz), [30.0, 35.0], rtol=0.0, atol=0.05)
     # By the same window, lines fitted at what was found of their frequencies are as good as tones.
@@ -62,27 +62,27 @@ def test_two_undeclared_beacons_are_fitted_beside_the_declared(radiated: Simulat
 
 
 def test_what_is_fitted_is_said_and_no_reason_for_doubt(radiated: SimulatedLog) -> None:
-    found = [
+    result = [
         one
-        for one in recorded(radiated.log, declaring(2), BRIDGED, beacons=True)
+        for one in recorded(radiated.log, declaring(2), BRIDGED_CODES, beacons=True)
         if one.code in ("fitted_line", "undeclared_line")
     ]
-    assert [one.code for one in found] == ["fitted_line"]
-    assert found[0].verdict is Verdict.TRUSTWORTHY
-    assert "fitted with the tones" in found[0].text
-    assert "30.0" in found[0].text
-    assert "35.0" in found[0].text
+    assert [one.code for one in result] == ["fitted_line"]
+    assert result[0].verdict is Verdict.TRUSTWORTHY
+    assert "fitted with the tones" in result[0].text
+    assert "30.0" in result[0].text
+    assert "35.0" in result[0].text
 
 
 def test_nothing_is_fitted_where_all_is_declared(radiated: SimulatedLog) -> None:
-    assert beside_lines(radiated.log, RADIATING, None) is None
+    assert with_disturbing_lines(radiated.log, RADIATING, None) is None
     given = LockinSettings(0.5, 0.25)
-    assert beside_lines(radiated.log, RADIATING, given) is given
+    assert with_disturbing_lines(radiated.log, RADIATING, given) is given
 
 
 def test_a_window_that_was_asked_for_is_kept(radiated: SimulatedLog) -> None:
     given = LockinSettings(0.6, 0.3)
-    settings = beside_lines(radiated.log, declaring(2), given)
+    settings = with_disturbing_lines(radiated.log, declaring(2), given)
     assert settings is not None
     assert (settings.window, settings.step) == (0.6, 0.3)
     assert len(settings.lines_hz) == 2
@@ -93,10 +93,10 @@ def test_a_line_too_close_to_a_tone_is_left_and_said() -> None:
     moved = replace(RADIATING.beacons[0], frequency_hz=20.9)
     both = replace(RADIATING, beacons=(moved, *RADIATING.beacons[1:]))
     log = simulated(both).log
-    settings = beside_lines(log, RADIATING, None)
+    settings = with_disturbing_lines(log, RADIATING, None)
     assert settings is None
     assert "undeclared_line" in {
-        one.code for one in recorded(log, RADIATING, BRIDGED, beacons=True)
+        one.code for one in recorded(log, RADIATING, BRIDGED_CODES, beacons=True)
     }
 
 
@@ -107,9 +107,9 @@ def _errors(log: SimulatedLog, site: Site, place: Path) -> tuple[float, float]:
     smoothed = run_smooth(Job(place / "log", None, place / "smoothed"), SmootherSettings())
     settings = NavigateSettings(log=place / "log", estimator="ekf")
     navigated = run_navigate(settings, place / "navigated")
-    found = [figures["ate_m"] for figures in (smoothed, navigated)]
-    assert all(isinstance(one, float) for one in found)
-    return float(found[0]), float(found[1])  # type: ignore[arg-type]
+    result = [figures["ate_m"] for figures in (smoothed, navigated)]
+    assert all(isinstance(one, float) for one in result)
+    return float(result[0]), float(result[1])  # type: ignore[arg-type]
 
 
 @pytest.mark.slow

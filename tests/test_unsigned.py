@@ -45,8 +45,8 @@ def amplitudes(calibration: Calibration, truth: Trajectory, sigma: float) -> Fie
     phasor[..., 0] = np.abs(seen[..., 2])
     cov = np.broadcast_to(sigma**2 * np.eye(3), (*phasor.shape, 3)).copy()
     window, channels = np.full(COUNT, 0.1), site.channels
-    found = FieldSamples(truth.time, window, channels, phasor, cov, axes="x", signed=False)
-    return along_axis(found, site)
+    result = FieldSamples(truth.time, window, channels, phasor, cov, axes="x", signed=False)
+    return along_axis(result, site)
 
 
 def measured(calibration: Calibration, samples: FieldSamples, truth: Trajectory) -> FieldPhasors:
@@ -67,9 +67,9 @@ def test_the_rows_are_the_derivatives_of_amplitudes(calibration: Calibration) ->
     rows = phasors.linearize(states(truth.world_from_body, truth.position_world), calibration, ())
     np.testing.assert_allclose(rows.error, 0.0, atol=1e-6)
     assert rows.by_pose is not None
-    heard = np.any(phasors.sqrt_information != 0.0, axis=(2, 3))
+    detected = np.any(phasors.sqrt_information != 0.0, axis=(2, 3))
     root = np.sqrt(np.sum(phasors.sqrt_information**2, axis=(2, 3)))
-    assert np.array_equal(np.linalg.matrix_rank(phasors.sqrt_information), heard.astype(int))
+    assert np.array_equal(np.linalg.matrix_rank(phasors.sqrt_information), detected.astype(int))
     for axis in range(6):
         sides = []
         for sign in (1.0, -1.0):
@@ -80,25 +80,27 @@ def test_the_rows_are_the_derivatives_of_amplitudes(calibration: Calibration) ->
             seen = predict_channels(calibration, truth.time, turn, place)
             sides.append(np.abs(seen[..., 2]))
         slope = root * (sides[0] - sides[1]) / (2.0 * STEP)
-        found = np.sum(rows.by_pose[..., axis], axis=2)
-        np.testing.assert_allclose(found[heard], slope[heard], rtol=1e-4, atol=1e-3 * root.max())
+        result = np.sum(rows.by_pose[..., axis], axis=2)
+        np.testing.assert_allclose(
+            result[detected], slope[detected], rtol=1e-4, atol=1e-3 * root.max()
+        )
 
 
 def test_what_is_predicted_near_zero_is_left_out_and_counted(calibration: Calibration) -> None:
     truth = poses()
     samples = amplitudes(calibration, truth, 3e-9)
     seen = predict_channels(calibration, truth.time, truth.world_from_body, truth.position_world)
-    found = with_signs(samples, truth, calibration)
+    result = with_signs(samples, truth, calibration)
     size = np.abs(seen[..., 2])
-    assert count_open(samples, found) == np.sum(~found.valid) > 0
-    assert not found.valid[size < 4.0 * 3e-9].any()
-    assert found.valid[size > 6.0 * 3e-9].all()
-    kept = found.valid
-    np.testing.assert_allclose(found.phasor_sensor[kept, 2], seen[kept, 2], rtol=1e-9)
+    assert count_open(samples, result) == np.sum(~result.valid) > 0
+    assert not result.valid[size < 4.0 * 3e-9].any()
+    assert result.valid[size > 6.0 * 3e-9].all()
+    kept = result.valid
+    np.testing.assert_allclose(result.phasor_sensor[kept, 2], seen[kept, 2], rtol=1e-9)
     wide = replace(truth, pose_cov=np.tile(0.1**2 * np.eye(6), (COUNT, 1, 1)))
     assert np.sum(with_signs(samples, wide, calibration).valid) < np.sum(kept)
-    assert np.all(found.numbers == found.valid)
-    assert np.array_equal(np.sum(found.told, axis=2), found.valid)
+    assert np.all(result.numbers == result.valid)
+    assert np.array_equal(np.sum(result.is_measured, axis=2), result.valid)
 
 
 def test_amplitudes_are_of_one_axis(calibration: Calibration) -> None:
@@ -116,8 +118,8 @@ def test_jobs_that_take_no_amplitudes_say_so(
     fields = amplitudes(calibration, poses(), 1e-10)
     write_log(Log("few", 0, "test", ImuSamples.empty(), fields=fields), tmp_path / "log")
     save_site(calibration.site, tmp_path / "log" / "site.yaml")
-    said = refuse("check", tmp_path / "log")
-    assert "unsigned amplitudes are supported by fix, smooth and navigate only" in said
+    findings = refuse("check", tmp_path / "log")
+    assert "unsigned amplitudes are supported by fix, smooth and navigate only" in findings
 
 
 def test_the_pipe_takes_amplitudes_as_a_log_has_them(calibration: Calibration) -> None:
@@ -126,27 +128,29 @@ def test_the_pipe_takes_amplitudes_as_a_log_has_them(calibration: Calibration) -
     for number, numbered in enumerate(read_records(BytesIO(lines), "json")):
         assert numbered.record is not None
         assert numbered.record.fields is not None
-        found = along_axis(site_fields(numbered.record.fields, site), site)
+        result = along_axis(site_fields(numbered.record.fields, site), site)
         one = samples.rows(slice(number, number + 1))
-        assert not found.signed
-        assert found.axes == one.axes
-        assert np.array_equal(found.phasor_sensor, one.phasor_sensor, equal_nan=True)
-        assert np.array_equal(found.phasor_cov, one.phasor_cov, equal_nan=True)
+        assert not result.signed
+        assert result.axes == one.axes
+        assert np.array_equal(result.phasor_sensor, one.phasor_sensor, equal_nan=True)
+        assert np.array_equal(result.phasor_cov, one.phasor_cov, equal_nan=True)
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "findings"),
     [
         ({"amplitudes": {"C0": [-1e-9]}, "sigma": 1e-10}, "an amplitude has no sign"),
         ({"sigma": 1e-10}, "either phasors or amplitudes"),
         ({"amplitudes": {"C0": [1e-9]}}, "either sigma or covariance"),
     ],
 )
-def test_what_is_no_record_of_amplitudes_is_refused(fields: dict[str, object], said: str) -> None:
+def test_what_is_no_record_of_amplitudes_is_refused(
+    fields: dict[str, object], findings: str
+) -> None:
     line = json_line({"fields": {"time": 0.0, "window": 0.1, **fields}})
-    (found,) = read_records(BytesIO(line), "json")
-    assert found.record is None
-    assert said in found.refusal
+    (result,) = read_records(BytesIO(line), "json")
+    assert result.record is None
+    assert findings in result.refusal
 
 
 def test_amplitudes_among_phasors_are_refused(calibration: Calibration) -> None:

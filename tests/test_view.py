@@ -74,12 +74,12 @@ def chunks(tmp_path_factory: pytest.TempPathFactory) -> list[Chunk]:
 
 
 def _column(chunks: list[Chunk], entity: str, component: str, static: bool) -> pa.RecordBatch:
-    found = [
+    result = [
         chunk.to_record_batch()
         for chunk in chunks
         if chunk.entity_path == f"/{entity}" and chunk.is_static is static
     ]
-    return next(batch for batch in found if component in batch.schema.names)
+    return next(batch for batch in result if component in batch.schema.names)
 
 
 def _series(chunks: list[Chunk], entity: str, component: str) -> tuple[np.ndarray, np.ndarray]:

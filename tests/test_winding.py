@@ -37,8 +37,8 @@ def of_every_turn(winding: Winding, offset: Array) -> Array:
     return total
 
 
-def worst(found: Array, true: Array) -> float:
-    return float(np.max(np.linalg.norm(found - true, axis=1) / np.linalg.norm(true, axis=1)))
+def worst(result: Array, true: Array) -> float:
+    return float(np.max(np.linalg.norm(result - true, axis=1) / np.linalg.norm(true, axis=1)))
 
 
 WOUND = """\
@@ -70,15 +70,15 @@ def test_the_declared_coil_has_the_field_of_every_turn(
     save_site(load_site(site), again)
     beacon = load_site(again).beacons[0]
     size = np.hypot(winding.radii[-1], np.ptp(winding.heights))
-    left = []
+    remaining = []
     for distance in (3.0 * size, 6.0 * size):
         offset = around(distance)
         true = of_every_turn(winding, offset)
-        left.append(worst(coil_fields(alone(beacon), offset)[:, 0], true))
+        remaining.append(worst(coil_fields(alone(beacon), offset)[:, 0], true))
         dipole = dipole_field(offset, np.tile(beacon.coils[0].moment_beacon, (len(offset), 1)))
         assert worst(dipole, true) > 0.008
-    assert left[0] < allowed
-    assert left[1] < max(left[0] / 15.0, 1e-9)
+    assert remaining[0] < allowed
+    assert remaining[1] < max(remaining[0] / 15.0, 1e-9)
 
 
 @pytest.mark.parametrize("winding", [FLAT, LONG, THICK, SINGLE])
@@ -103,7 +103,7 @@ COIL = "coils:\n      - "
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "findings"),
     [
         (("current_a: 8.0", "current_a: 0.0"), "coils[0].winding.current_a: found 0.0;"),
         (("[0.72, -0.96, 1.6]", "[0, 0, 0]"), "winding.axis: found [0, 0, 0]; give the direction"),
@@ -122,7 +122,7 @@ COIL = "coils:\n      - "
     ],
 )
 def test_a_winding_that_is_none_is_answered_by_its_place(
-    change: tuple[str, str], said: str, tmp_path: Path
+    change: tuple[str, str], findings: str, tmp_path: Path
 ) -> None:
     text = WOUND.format(FLAT)
     assert change[0] in text
@@ -130,7 +130,7 @@ def test_a_winding_that_is_none_is_answered_by_its_place(
     path.write_text(text.replace(*change))
     with pytest.raises(InputError) as caught:
         load_site(path)
-    assert said in str(caught.value)
+    assert findings in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

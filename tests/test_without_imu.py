@@ -14,7 +14,7 @@ from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import smooth
 from magfusion.estimation.graph.preintegration import cut_at_epochs, preintegrate
 from magfusion.estimation.graph.state import as_trajectory
-from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.integrity.judge import judge_result
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.log import read_log, write_log
 from magfusion.files.site import load_site, save_site
@@ -66,7 +66,7 @@ def exact(prior: MotionPrior | None = A_HAND) -> Site:
     return replace(site, beacons=beacons, platform=platform, model_error=1e-7)
 
 
-def heard(site: Site, truth: Trajectory, rng: np.random.Generator) -> Log:
+def detected(site: Site, truth: Trajectory, rng: np.random.Generator) -> Log:
     fields = simulate_fields(site, truth, 1e-9, rng)
     fields = replace(fields, window=np.full(len(fields), 1.0 / HZ))
     return Log("free", EPOCH_NS, "test", ImuSamples.empty(), fields=fields, truth=truth)
@@ -76,7 +76,7 @@ def by_hand(seed: int, duration: float) -> tuple[Site, Log]:
     rng, site = np.random.default_rng(seed), exact()
     rests = Rests(0.0, duration, 0.0)
     motion = random_walk_motion(rng, duration, DEMO_BOX_WORLD, rests=rests)
-    return site, heard(site, motion.trajectory(np.arange(0.2, duration, 1.0 / HZ)), rng)
+    return site, detected(site, motion.trajectory(np.arange(0.2, duration, 1.0 / HZ)), rng)
 
 
 def by_chance(seed: int, duration: float, prior: MotionPrior) -> tuple[Site, Log]:
@@ -92,31 +92,33 @@ def by_chance(seed: int, duration: float, prior: MotionPrior) -> tuple[Site, Log
         turn = turn * one
         turns.append(turn.as_matrix())
     kept = np.arange(40, count, round(1.0 / HZ / dt))
-    return site, heard(site, Trajectory(dt * (1 + kept), np.array(turns)[kept], place[kept]), rng)
+    return site, detected(
+        site, Trajectory(dt * (1 + kept), np.array(turns)[kept], place[kept]), rng
+    )
 
 
 def nees(states: Trajectory, truth: Trajectory | None) -> float:
     assert truth is not None
-    found = trajectory_errors(states, truth).nees
-    assert found is not None
-    return float(np.mean(found))
+    result = trajectory_errors(states, truth).nees
+    assert result is not None
+    return float(np.mean(result))
 
 
 def test_the_covariance_holds_for_motion_of_that_density() -> None:
-    found = []
+    estimate = []
     for seed in (0, 2):
         log, site = without_imu(*reversed(by_chance(seed, 3.0, MotionPrior(0.3, 2.0))))
         result = smooth(log, site)
-        found.append(nees(result.states, log.truth))
+        estimate.append(nees(result.states, log.truth))
         tuned = {t.key: t.factor for t in result.noise if t.owner == "motion_prior"}
         assert set(tuned) == {"angular_accel_density", "accel_density"}
         assert max(tuned.values()) < 1.3
-    assert 4.0 < np.mean(found) < 9.0
+    assert 4.0 < np.mean(estimate) < 9.0
 
 
 def test_the_covariance_holds_for_a_hand_and_the_prior_helps() -> None:
     site, log = by_hand(1, 3.0)
-    result, trust = judged(smooth(log, site), log)
+    result, trust = judge_result(smooth(log, site), log)
     assert trust.verdict == "trustworthy"
     assert 4.0 < nees(result.states, log.truth) < 9.0
     alone = trajectory_errors(result.start.states, log.truth).position_world
@@ -149,11 +151,11 @@ def test_a_navigator_needs_no_inertial_samples(estimator: str) -> None:
     navigator = Navigator(site, NavigatorSettings(estimator=estimator, lag=0.5))
     for one in log.fields.epochs():
         navigator.add_fields(one)
-    made = navigator.take()
-    assert len(made) > 40
+    built = navigator.take()
+    assert len(built) > 40
     assert navigator.judgement.verdict == "trustworthy"
-    assert made[-1].reset_counter == 0
-    states = as_trajectory([*made])
+    assert built[-1].reset_counter == 0
+    states = as_trajectory([*built])
     assert 3.0 < nees(states, log.truth) < 10.0
     with pytest.raises(InputError, match=r"describe platform\.imu"):
         navigator.add_imu(np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))
@@ -189,8 +191,8 @@ def test_a_site_without_an_imu_is_written_and_read(tmp_path: Path) -> None:
     assert read.platform.motion_prior == A_HAND
     assert read.gravity == site.gravity
     assert read.platform.motion == site.platform.motion
-    found = as_declared(on_motion_prior(read))
-    assert found.platform == read.platform
+    result = as_declared(on_motion_prior(read))
+    assert result.platform == read.platform
 
 
 @pytest.fixture
@@ -206,11 +208,11 @@ def test_fix_and_survey_need_no_imu_and_smooth_says_what_it_needs(
     bare: Path, tmp_path: Path, refuse: Refuse
 ) -> None:
     assert len(read_log(bare).imu) == 0
-    said = refuse("smooth", bare, "-o", tmp_path / "run")
-    assert "platform.motion_prior" in said
+    findings = refuse("smooth", bare, "-o", tmp_path / "run")
+    assert "platform.motion_prior" in findings
     assert "platform.motion_prior" in refuse("navigate", bare, "-o", tmp_path / "run")
-    said = refuse("calibrate", "magnetometer", bare, "-o", tmp_path / "run")
-    assert "give the log with magnetometer.parquet" in said
+    findings = refuse("calibrate", "magnetometer", bare, "-o", tmp_path / "run")
+    assert "give the log with magnetometer.parquet" in findings
     run_command("fix", bare, "-o", tmp_path / "fixes")
     report = json.loads((tmp_path / "fixes" / "report.json").read_text())
     assert report["nees_mean"] < 9.0

@@ -25,21 +25,21 @@ from magfusion.simulation.worlds import (
     S0,
     S1,
     SCENARIOS,
-    Layout,
-    Receiver,
     Scenario,
-    World,
+    SceneLayout,
+    SimulatedReceiver,
+    SimulatedWorld,
+    detection_reach,
     draw_world,
-    felt_reach,
     ring,
 )
 from magfusion.units import DEGREE, MU0_OVER_4PI, NANOTESLA, Array, ComplexArray
 
-SILENT = Receiver(sample_sigma=0.0, quantisation=0.0)
+SILENT = SimulatedReceiver(sample_sigma=0.0, quantisation=0.0)
 LEVEL = np.eye(3)
 
 
-def drawn(scenario: Scenario, seed: int = 0, layout: Layout = ROOM) -> World:
+def drawn(scenario: Scenario, seed: int = 0, layout: SceneLayout = ROOM) -> SimulatedWorld:
     return draw_world(scenario, np.random.default_rng(seed), layout)
 
 
@@ -175,8 +175,8 @@ def test_coils_of_46_cm_differ_from_dipoles_as_the_independent_analysis_found(
     outward /= np.linalg.norm(outward, axis=1)[:, None]
     coils, dipoles = (true_phasors(s, distance * outward)[:, 0] for s in (P0, S0))
     assert 100.0 * rms(size(coils - dipoles) / size(dipoles)) == pytest.approx(percent, rel=0.05)
-    found = eq_07_direction(plane_normal(coils))
-    angle = np.arccos(np.clip(np.sum(found * outward, axis=1), -1.0, 1.0))
+    result = eq_07_direction(plane_normal(coils))
+    angle = np.arccos(np.clip(np.sum(result * outward, axis=1), -1.0, 1.0))
     assert rms(angle) / DEGREE == pytest.approx(direction_deg, rel=0.06)
 
 
@@ -194,11 +194,11 @@ def test_iron_disturbs_by_the_cube_of_its_radius() -> None:
 
 def test_iron_is_drawn_from_as_far_as_it_is_felt() -> None:
     """What a sphere there adds to the field along it is the receiver's noise."""
-    middle, receiver = np.array([2.85, 2.25, 0.5]), Receiver()
+    middle, receiver = np.array([2.85, 2.25, 0.5]), SimulatedReceiver()
     away = np.mean(np.linalg.norm(BEACONS_WORLD - middle, axis=1))
     field = MU0_OVER_4PI * 65.0 / away**3 * np.array([0.0, 0.0, 1.0])
     for radius, scenario in ((0.25, P1), (0.40, P2)):
-        reach = felt_reach(radius, ROOM, receiver)
+        reach = detection_reach(radius, ROOM, receiver)
         spheres = Spheres(np.zeros((1, 3)), np.array([radius]), np.array([1e9]), np.zeros(1))
         point = np.array([[0.0, 0.0, radius + reach]])
         added = spheres.secondary_world(field[None, None].astype(complex), np.ones(1), point)
@@ -216,7 +216,7 @@ def test_iron_is_drawn_from_as_far_as_it_is_felt() -> None:
 
 
 def test_phasor_noise_is_that_of_a_lock_in_over_quantised_samples() -> None:
-    receiver = Receiver()
+    receiver = SimulatedReceiver()
     rng = np.random.default_rng(8)
     sample = rng.normal(37.0 * NANOTESLA, receiver.sample_sigma, (20_000, receiver.samples))
     quantised = receiver.quantisation * np.round(sample / receiver.quantisation)
@@ -244,8 +244,8 @@ def test_a_turned_sensor_sees_the_same_field_in_its_own_axes() -> None:
     points = ROOM.draw_targets(np.random.default_rng(11), 30)
     turn = Rotation.random(30, rng=np.random.default_rng(12)).as_matrix()
     level = world.measure(points, LEVEL, np.random.default_rng(13)).phasor_sensor
-    turned = world.measure(points, turn, np.random.default_rng(13)).phasor_sensor
-    back = np.einsum("nij,ncj->nci", turn, turned)
+    rotated = world.measure(points, turn, np.random.default_rng(13)).phasor_sensor
+    back = np.einsum("nij,ncj->nci", turn, rotated)
     np.testing.assert_allclose(back / NANOTESLA, level / NANOTESLA, rtol=1e-9, atol=1e-9)
 
 
@@ -284,7 +284,7 @@ def mean_error(
     model_error: float,
     worlds: int = 3,
     count: int = 60,
-    layout: Layout = ROOM,
+    layout: SceneLayout = ROOM,
 ) -> float:
     errors = []
     for seed in range(worlds):
@@ -327,9 +327,9 @@ def test_disturbed_worlds_are_as_hard_as_the_independent_analysis_found(
     """
     lower, upper = ROOM.targets_world
     box = np.stack([lower, [upper[0], lower[1] + 3.0, upper[2]]])
-    theirs = replace(ROOM, fingerprints_world=box)
-    found = mean_error(scenario, 0.02, worlds=20, layout=theirs)
-    assert found == pytest.approx(expected, rel=0.35)
+    others = replace(ROOM, fingerprints_world=box)
+    result = mean_error(scenario, 0.02, worlds=20, layout=others)
+    assert result == pytest.approx(expected, rel=0.35)
 
 
 @pytest.mark.slow

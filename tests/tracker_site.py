@@ -15,7 +15,7 @@ from magfusion.model.site import (
 )
 
 
-def turned(*rotvec: float) -> np.ndarray:
+def rotated(*rotvec: float) -> np.ndarray:
     """Return the matrix of a rotation vector (rad)."""
     return np.asarray(Rotation.from_rotvec(rotvec).as_matrix())
 
@@ -32,7 +32,7 @@ def tracker_site(
     beacon = Beacon(
         name="T",
         position_world=np.array([0.2, -0.1, 0.9]),
-        world_from_beacon=turned(0.4, -0.3, 1.1),
+        world_from_beacon=rotated(0.4, -0.3, 1.1),
         frequency_hz=1000.0,
         coils=tuple(
             Coil(moment, 0.3 * slot, centre * rng.standard_normal(3), slot=slot)
@@ -43,7 +43,7 @@ def tracker_site(
     )
     magnetometer = Magnetometer(
         position_body=np.array([0.05, -0.02, 0.03]),
-        body_from_sensor=turned(0.2, 0.1, -0.9),
+        body_from_sensor=rotated(0.2, 0.1, -0.9),
         noise_density=1e-10,
         matrix=coils(),
         offset=np.zeros(3),

@@ -63,13 +63,13 @@ def bench_batch(hours: float, seed: int) -> dict[str, float]:
     assert log.fields is not None
     before = bare_loop(site, log.imu)
     began = time.process_time()
-    found = smooth(log, site)
+    result = smooth(log, site)
     seconds = time.process_time() - began
     bare = 0.5 * (before + bare_loop(site, log.imu))
     scale = LONGEST_HOURS / hours
-    cov = found.states.pose_cov
+    cov = result.states.pose_cov
     assert cov is not None
-    error = found.states.position_world - POSITION_WORLD
+    error = result.states.position_world - POSITION_WORLD
     return {
         "batch_hours": hours,
         "batch_imu_samples": len(log.imu),
@@ -80,8 +80,8 @@ def bench_batch(hours: float, seed: int) -> dict[str, float]:
         "batch_s_for_48_h": seconds * scale,
         "batch_bare_loop_s_for_48_h": bare * scale,
         "batch_bare_loops": seconds / bare,
-        "batch_passes": found.passes,
-        "batch_converged": float(found.converged),
+        "batch_passes": result.iteration_count,
+        "batch_converged": float(result.converged),
         "batch_position_rms_m": float(np.sqrt(np.mean(error**2))),
         "batch_position_sigma_m": float(
             np.sqrt(np.mean(np.diagonal(cov, axis1=1, axis2=2)[:, 3:]))

@@ -63,18 +63,18 @@ def run(options: argparse.Namespace, place: Path) -> Kept:
     settings = NavigatorSettings(estimator=options.estimator, lockin=lockin, risk=Risk())
     key = run_key("bench_days", options.hours, options.rate_hz, options.seed, options.estimator)
     begun = begin(place, key, world.site, settings, Kept(world.start()), resume=options.resume)
-    navigator, kept = begun.navigator, begun.beside
+    navigator, kept = begun.navigator, begun.extra
     print("  hour  states  ms a state   loops      MiB  error/mm  (rms, of that hour)")
     for block in range(begun.position, config.blocks):
-        made = world.stretch(block, 1, kept.biases)
-        imu, began = made.imu, block * BLOCK
+        built = world.stretch(block, 1, kept.biases)
+        imu, began = built.imu, block * BLOCK
         rng = np.random.default_rng((*seed, block))
         parts = world.motion, world.true_site, drives, options.rate_hz, BLOCK, rng
         field = simulate_waveform(*parts, begin=began)
         bare = bare_loop(imu, world.site.platform.imu, world.site.gravity) * len(imu)
         states, spent = [], time.process_time()
         for own in pieces(field.time, began):
-            navigator.hear_imu(imu.time[own], imu.gyro_body[own], imu.accel_body[own])
+            navigator.propagate_imu(imu.time[own], imu.gyro_body[own], imu.accel_body[own])
             navigator.add_magnetometer(field.time[own], field.measured_sensor[own])
             states += navigator.take()
             navigator.take_lagged()
@@ -85,7 +85,7 @@ def run(options: argparse.Namespace, place: Path) -> Kept:
         ]
         kept = replace(
             kept,
-            biases=made.after,
+            biases=built.after,
             seconds=kept.seconds + spent,
             bare=kept.bare + bare,
             states=kept.states + len(states),
@@ -116,7 +116,7 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as directory:
         kept = run(options, options.checkpoint or Path(directory) / "checkpoint.bin")
-    found = {
+    result = {
         "states": kept.states,
         "error_mm": 1e3 * (kept.squares / max(kept.states, 1)) ** 0.5,
         "largest_mib": kept.largest_mib,
@@ -124,7 +124,7 @@ def main() -> None:
         "seconds": kept.seconds,
         "loops": kept.seconds / kept.bare,
     }
-    print(json.dumps(found))
+    print(json.dumps(result))
     sys.exit(int(kept.largest_mib > GOAL_MIB))
 
 

@@ -154,13 +154,13 @@ def run_rival(scene: Scene, model: Model, method: str, fixes: int) -> tuple[Arra
     """Solve the first epochs by scipy; return positions, shape (fixes, 3), and seconds a fix."""
     root = paired_whitening(measurement_cov(scene.site, scene.samples), scene.samples.valid)
     measured = stacked(scene.samples.phasor_sensor)
-    found = np.empty((fixes, 3))
+    result = np.empty((fixes, 3))
     started = time.process_time()
     for i in range(fixes):
         epoch = Epoch(scene, model, root[i], measured[i], i)
         solution = least_squares(epoch.residual, np.zeros(6), epoch.jacobian, method=method)
-        found[i] = epoch.pose(solution.x)[1]
-    return found, (time.process_time() - started) / fixes
+        result[i] = epoch.pose(solution.x)[1]
+    return result, (time.process_time() - started) / fixes
 
 
 def models(scene: Scene) -> dict[str, Model]:
@@ -181,7 +181,7 @@ def models(scene: Scene) -> dict[str, Model]:
     return {"": whole, "_narrow": narrow}
 
 
-def say(text: str) -> None:
+def declare(text: str) -> None:
     """Tell the progress, apart from the result."""
     print(text, file=sys.stderr, flush=True)
 
@@ -190,23 +190,23 @@ def compare(fixes: int, rival_fixes: int, seed: int) -> dict[str, float]:
     """Run everything; return the figures by name."""
     scene = make_scene(fixes, seed)
     figures: dict[str, float] = {"fixes": fixes, "rival_fixes": rival_fixes}
-    runs, apart = [], 0.0
+    runs, separate = [], 0.0
     for name, model in models(scene).items():
         # Ours between the rivals: a shared machine is not as fast now as a minute ago.
         ours, seconds = run_ours(scene)
         runs.append(1e6 * seconds / fixes)
-        say(f"ours: {runs[-1]:.1f} us a fix")
+        declare(f"ours: {runs[-1]:.1f} us a fix")
         for method in METHODS:
             position, each = run_rival(scene, model, method, rival_fixes)
             figures[f"scipy_{method}{name}_us"] = 1e6 * each
-            say(f"scipy {method}{name}: {1e6 * each:.0f} us a fix")
+            declare(f"scipy {method}{name}: {1e6 * each:.0f} us a fix")
             away = np.linalg.norm(position - ours.position_world[:rival_fixes, 0], axis=1)
-            apart = max(apart, float(np.max(away)))
+            separate = max(separate, float(np.max(away)))
     figures["ours_us"] = float(np.mean(runs))
     for name in models(scene):
         rival = min(figures[f"scipy_{method}{name}_us"] for method in METHODS)
         figures[f"speedup{name}"] = rival / figures["ours_us"]
-    figures["apart_m"] = apart
+    figures["apart_m"] = separate
     return figures
 
 

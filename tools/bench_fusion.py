@@ -32,7 +32,7 @@ from bench_batch import bench_batch
 from native_graph import native_graph
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate
+from magfusion.estimation.graph.graph import Graph, GraphEstimate, initial_estimate
 from magfusion.estimation.graph.inertial import inertial_graph
 from magfusion.estimation.graph.preintegration import cut_at_epochs, preintegrate
 from magfusion.estimation.measurements.phasors import FieldPhasors
@@ -144,10 +144,10 @@ class Ours:
     """Our loop on one scene, run once or more."""
 
     problem: Graph
-    start: Estimate
+    start: GraphEstimate
     preintegrate_seconds: float
     build_seconds: float
-    found: Optimised[Estimate]
+    trajectory: Optimised[GraphEstimate]
     runs: list[float]
 
     @property
@@ -157,31 +157,31 @@ class Ours:
 
     def figures(self, prefix: str) -> dict[str, float]:
         """Return times and cost, each name with a prefix."""
-        work = self.problem.epochs * self.found.iterations
+        work = self.problem.epochs * self.trajectory.iterations
         return {
             f"{prefix}_epochs": self.problem.epochs,
             f"{prefix}_s": self.seconds,
-            f"{prefix}_iterations": self.found.iterations,
+            f"{prefix}_iterations": self.trajectory.iterations,
             f"{prefix}_us_per_epoch_iteration": 1e6 * self.seconds / work,
             f"{prefix}_preintegrate_s": self.preintegrate_seconds,
             f"{prefix}_build_s": self.build_seconds,
-            f"{prefix}_cost": self.found.cost,
+            f"{prefix}_cost": self.trajectory.cost,
         }
 
     def again(self) -> float:
         """Run once more; return the time an epoch and iteration (us)."""
         self.runs.append(timed(partial(optimise, self.problem, self.start, tolerance=TOLERANCE))[1])
-        say(f"ours: {self.problem.epochs} epochs, {self.runs[-1]:.2f} s")
-        return 1e6 * self.runs[-1] / (self.problem.epochs * self.found.iterations)
+        declare(f"ours: {self.problem.epochs} epochs, {self.runs[-1]:.2f} s")
+        return 1e6 * self.runs[-1] / (self.problem.epochs * self.trajectory.iterations)
 
 
 def run_ours(scene: Scene, repeats: int) -> Ours:
     """Run our loop."""
     problem, build_seconds = timed(scene.problem)
     start = initial_estimate(scene.start, scene.declared)
-    found, seconds = timed(partial(optimise, problem, start, tolerance=TOLERANCE))
-    say(f"ours: {problem.epochs} epochs, {found.iterations} iterations, {seconds:.2f} s")
-    ours = Ours(problem, start, scene.preintegrate_seconds, build_seconds, found, [seconds])
+    result, seconds = timed(partial(optimise, problem, start, tolerance=TOLERANCE))
+    declare(f"ours: {problem.epochs} epochs, {result.iterations} iterations, {seconds:.2f} s")
+    ours = Ours(problem, start, scene.preintegrate_seconds, build_seconds, result, [seconds])
     for _ in range(repeats - 1):
         ours.again()
     return ours
@@ -194,12 +194,12 @@ def run_native(scene: Scene) -> dict[str, float]:
     started = time.process_time()
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, ordering)
     cost, seconds = optimizer.error(), 0.0
-    say(f"native: {len(scene.start)} epochs, start, cost {cost:.6g}")
+    declare(f"native: {len(scene.start)} epochs, start, cost {cost:.6g}")
     for _ in range(NATIVE_ITERATIONS):
         optimizer.iterate()
         before, cost = cost, optimizer.error()
         seconds = time.process_time() - started
-        say(f"native: iteration {optimizer.iterations()}, cost {cost:.9g}, {seconds:.1f} s")
+        declare(f"native: iteration {optimizer.iterations()}, cost {cost:.9g}, {seconds:.1f} s")
         if before - cost <= TOLERANCE * (1.0 + cost):
             break
     return {
@@ -212,7 +212,7 @@ def run_native(scene: Scene) -> dict[str, float]:
     }
 
 
-def say(text: str) -> None:
+def declare(text: str) -> None:
     """Tell the progress, apart from the result."""
     print(text, file=sys.stderr, flush=True)
 
@@ -221,7 +221,7 @@ def compare(native_epochs: int, long_epochs: int, seed: int) -> dict[str, float]
     """Run everything; return the figures by name."""
     scene = make_scene(EPOCHS, seed)
     short = run_ours(scene, repeats=3)
-    _, marginal_seconds = timed(partial(marginals, short.problem, short.found.estimate))
+    _, marginal_seconds = timed(partial(marginals, short.problem, short.trajectory.estimate))
     same = native_epochs == EPOCHS
     rival_scene = scene if same else make_scene(native_epochs, seed)
     rival = short if same else run_ours(rival_scene, repeats=3)
@@ -234,7 +234,7 @@ def compare(native_epochs: int, long_epochs: int, seed: int) -> dict[str, float]
     figures["marginals_s"] = marginal_seconds
     figures["ours_at_native_epochs_s"] = rival.seconds
     figures["speedup"] = native["native_s"] / rival.seconds
-    figures["cost_difference"] = abs(rival.found.cost / native["native_cost"] - 1.0)
+    figures["cost_difference"] = abs(rival.trajectory.cost / native["native_cost"] - 1.0)
     figures["growth"] = float(np.median(growth))
     return figures
 

@@ -40,13 +40,13 @@ class Usage(NamedTuple):
 
 def used(command: tuple[str, ...]) -> Usage:
     """Run a command to its end; return what it took."""
-    with tempfile.TemporaryFile() as said, Path(os.devnull).open("wb") as nothing:
-        process = subprocess.Popen(command, stdout=nothing, stderr=said)
+    with tempfile.TemporaryFile() as findings, Path(os.devnull).open("wb") as nothing:
+        process = subprocess.Popen(command, stdout=nothing, stderr=findings)
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
-            said.seek(0)
-            raise SystemExit(f"{' '.join(command)}: {said.read().decode()[-2000:]}")
+            findings.seek(0)
+            raise SystemExit(f"{' '.join(command)}: {findings.read().decode()[-2000:]}")
     return Usage(usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024.0)
 
 
@@ -150,7 +150,7 @@ def read_all(path: Path) -> None:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    found: dict[str, list[list[float]]] = {}
+    result: dict[str, list[list[float]]] = {}
     with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
         for connection, _, raw in reader.messages():
             message: Any = reader.deserialize(raw, connection.msgtype)
@@ -159,8 +159,8 @@ def read_all(path: Path) -> None:
             for name in ("angular_velocity", "linear_acceleration", "magnetic_field"):
                 vector = getattr(message, name, None)
                 row += [] if vector is None else [vector.x, vector.y, vector.z]
-            found.setdefault(connection.topic, []).append(row)
-    print({topic: np.array(rows).shape for topic, rows in found.items()})
+            result.setdefault(connection.topic, []).append(row)
+    print({topic: np.array(rows).shape for topic, rows in result.items()})
 
 
 def piped(path: str, site: str) -> None:
@@ -199,17 +199,19 @@ def commands(room: Path, minutes: float) -> dict[str, tuple[str, ...]]:
     }
 
 
-def told(name: str, minutes: float, found: Usage, start: Usage, before: tuple[float, Usage]) -> str:
+def reported(
+    name: str, minutes: float, result: Usage, start: Usage, before: tuple[float, Usage]
+) -> str:
     """Return a line of the table."""
     rate_hz = 60.0 * LONG_RATE_HZ if name == "replay" else RATE_HZ
     samples = 60.0 * rate_hz * (minutes - BEGINNING)
-    grown = (found.mib - before[1].mib) / (minutes - before[0])
+    grown = (result.mib - before[1].mib) / (minutes - before[0])
     goal = ""
     if name == "smooth" and minutes == GOAL_MINUTES:
         goal = f"   goal: {GOAL_S:.0f} s, {GOAL_MIB:.0f} MiB"
-    each = 1e6 * (found.seconds - start.seconds) / samples
-    line = f"{name:<12}{minutes:6.4g}{found.seconds:9.1f} s{each:9.1f}"
-    return f"{line}{found.mib:7.0f}{grown:9.1f}{goal}"
+    each = 1e6 * (result.seconds - start.seconds) / samples
+    line = f"{name:<12}{minutes:6.4g}{result.seconds:9.1f} s{each:9.1f}"
+    return f"{line}{result.mib:7.0f}{grown:9.1f}{goal}"
 
 
 def main() -> None:
@@ -263,12 +265,12 @@ def measure(
         start = used(commands(room, BEGINNING)[name])
         before = BEGINNING, start
         for length in minutes:
-            found = used(commands(room, length)[name])
-            print(told(name, length, found, start, before), flush=True)
-            figures.append({"command": name, "minutes": length, **found._asdict()})
+            result = used(commands(room, length)[name])
+            print(reported(name, length, result, start, before), flush=True)
+            figures.append({"command": name, "minutes": length, **result._asdict()})
             goal = name == "smooth" and length == GOAL_MINUTES
-            missed |= goal and (found.seconds > GOAL_S or found.mib > GOAL_MIB)
-            before = length, found
+            missed |= goal and (result.seconds > GOAL_S or result.mib > GOAL_MIB)
+            before = length, result
         figures[-1]["wall_s"] = time.time() - began
     return figures, missed
 

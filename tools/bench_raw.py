@@ -71,18 +71,18 @@ def bare_loop(site: Site, imu: ImuSamples) -> float:
 def measured(goal: Goal, log: Path, site: Site, imu: ImuSamples, room: Path) -> dict[str, Any]:
     """Run a command on a log and on its beginning; return its figures."""
     later = imu.time > imu.time[0] + BEGINNING
-    left = ImuSamples(imu.time[later], imu.gyro_body[later], imu.accel_body[later])
-    loops = [bare_loop(site, left)]
+    remaining = ImuSamples(imu.time[later], imu.gyro_body[later], imu.accel_body[later])
+    loops = [bare_loop(site, remaining)]
     output = room / goal.name.replace(" ", "_")
     beginning = (*PROGRAM, *goal.command, str(log), "--end", str(BEGINNING))
     used((*beginning, "-o", f"{output}_first"))  # keeps byte code, as an installation has
     seconds = used((*PROGRAM, *goal.command, str(log), "-o", str(output))).seconds
-    loops.append(bare_loop(site, left))
+    loops.append(bare_loop(site, remaining))
     startup = used((*beginning, "-o", f"{output}_beginning")).seconds
     imports = used((sys.executable, "-c", IMPORTS)).seconds
-    loops.append(bare_loop(site, left))
+    loops.append(bare_loop(site, remaining))
     report = json.loads((output / "report.json").read_text())
-    found = {
+    result = {
         "seconds": seconds,
         "startup": startup,
         "imports": imports,
@@ -90,19 +90,19 @@ def measured(goal: Goal, log: Path, site: Site, imu: ImuSamples, room: Path) -> 
         "loops": (seconds - startup) / float(np.mean(loops)),
         "startup_of_imports": startup / imports,
     }
-    return found | {k: v for k, v in report.items() if k.startswith("update_")}
+    return result | {k: v for k, v in report.items() if k.startswith("update_")}
 
 
-def told(goal: Goal, found: dict[str, Any]) -> str:
+def reported(goal: Goal, result: dict[str, Any]) -> str:
     """Return a line of the table."""
     line = (
-        f"{goal.name:<10}{found['seconds']:8.1f} s{found['startup']:7.1f} s{found['bare']:7.2f} s"
-        f"{found['loops']:8.0f}{goal.loops:6.0f}"
-        f"{found['startup_of_imports']:9.1f}{STARTUP_GOAL:5.1f}"
+        f"{goal.name:<10}{result['seconds']:8.1f} s{result['startup']:7.1f} s{result['bare']:7.2f} s"
+        f"{result['loops']:8.0f}{goal.loops:6.0f}"
+        f"{result['startup_of_imports']:9.1f}{STARTUP_GOAL:5.1f}"
     )
     if goal.update_ms is None:
         return line
-    p50, p99 = found["update_p50_ms"], found["update_p99_ms"]
+    p50, p99 = result["update_p50_ms"], result["update_p99_ms"]
     return f"{line}{p50:9.1f}{goal.update_ms:6.0f}{p99 / p50:7.1f}{SPREAD_GOAL:5.1f}"
 
 
@@ -146,12 +146,12 @@ def main() -> None:
             "command     processor  start  a loop   loops  goal  of imports   p50/ms  goal  p99/p50"
         )
         for goal in chosen:
-            figures[goal.name] = found = measured(goal, log, site, imu, room)
-            print(told(goal, found), flush=True)
-            missed |= found["loops"] > goal.loops or found["startup_of_imports"] > STARTUP_GOAL
+            figures[goal.name] = result = measured(goal, log, site, imu, room)
+            print(reported(goal, result), flush=True)
+            missed |= result["loops"] > goal.loops or result["startup_of_imports"] > STARTUP_GOAL
             if goal.update_ms is not None:
-                missed |= found["update_p50_ms"] > goal.update_ms
-                missed |= found["update_p99_ms"] > SPREAD_GOAL * found["update_p50_ms"]
+                missed |= result["update_p50_ms"] > goal.update_ms
+                missed |= result["update_p99_ms"] > SPREAD_GOAL * result["update_p50_ms"]
         shown = used((*PROGRAM, "--help")).seconds
         figures["help"] = {"seconds": shown}
         print(f"{'--help':<10}{shown:8.1f} s   goal: {HELP_GOAL} s")

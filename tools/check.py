@@ -20,7 +20,7 @@ STATIC = {
 TESTS = {"tests": ["pytest", "-q"]}
 
 
-def passes(name: str, command: list[str]) -> bool:
+def run_check(name: str, command: list[str]) -> bool:
     """Run one check; show what it says only where it fails."""
     started = time.monotonic()
     process = subprocess.run(
@@ -40,7 +40,7 @@ def main() -> int:
     )
     parser.add_argument("--no-tests", action="store_true", help="leave the test suite out")
     checks = STATIC if parser.parse_args().no_tests else STATIC | TESTS
-    failed = [name for name, command in checks.items() if not passes(name, command)]
+    failed = [name for name, command in checks.items() if not run_check(name, command)]
     print(f"failed: {', '.join(failed)}" if failed else "all checks passed")
     return 1 if failed else 0
 

@@ -50,12 +50,12 @@ def _grid(points: int) -> tuple[Array, Array]:
 
 def dipole(figure: Figure) -> None:
     """Draw field lines of one coil; ellipses of a rotating beacon, small where it is weak."""
-    left, right = figure.subplots(1, 2)
+    remaining, right = figure.subplots(1, 2)
     along, places = _grid(60)
     field = dipole_field(places, np.array([0.0, 220.0, 0.0]))
     colour = np.log10(np.linalg.norm(field, axis=-1) / NANOTESLA)
-    left.streamplot(along, along, field[..., 0], field[..., 1], color=colour, density=1.2)
-    _titled(left, "field of one coil, its moment upwards", "x (m)", "y (m)")
+    remaining.streamplot(along, along, field[..., 0], field[..., 1], color=colour, density=1.2)
+    _titled(remaining, "field of one coil, its moment upwards", "x (m)", "y (m)")
     site = demo_site(coil_radius=None)
     beacon = replace(site.beacons[0], position_world=np.zeros(3), world_from_beacon=np.eye(3))
     magnetometer = replace(
@@ -73,7 +73,7 @@ def dipole(figure: Figure) -> None:
         right.plot(place[0] + shown[0, 0], place[1] + shown[0, 1], ".", color=WRONG)
     right.plot(0.0, 0.0, "k*")
     _titled(right, "a rotating beacon; dots: at the zero of the phase", "x (m)", "y (m)")
-    for axes in (left, right):
+    for axes in (remaining, right):
         axes.set_aspect("equal")
 
 
@@ -114,14 +114,14 @@ def _gains(site: Site, declared: Site) -> dict[str, float]:
     result = smooth(log, declared, SmootherSettings(estimate=()))
     scores = scores_of(result, log.imu)
     assert scores is not None
-    score = scores.held
+    score = scores.fixed
     gains = {}
-    for suspect in suspects(declared, score.held):
-        gradient = suspect.combine.T @ score.gradient
-        information = suspect.combine.T @ score.information @ suspect.combine
-        degrees = suspect.combine.shape[1]
+    for fault in suspects(declared, score.fixed):
+        gradient = fault.combine.T @ score.gradient
+        information = fault.combine.T @ score.information @ fault.combine
+        degrees = fault.combine.shape[1]
         fall = float(gradient @ np.linalg.pinv(information, rcond=1e-10) @ gradient)
-        gains[suspect.name] = max(gains.get(suspect.name, 0.0), fall / degrees)
+        gains[fault.name] = max(gains.get(fault.name, 0.0), fall / degrees)
     return gains
 
 
@@ -156,8 +156,8 @@ def separation(figure: Figure) -> None:
         spoiled = replace(samples, phasor_sensor=samples.phasor_sensor * false)
         fixes = fix_epochs(spoiled, calibration)
         separated = separate_fixes(spoiled, calibration, fixes)
-        for found, into in ((fixes, errors), (separated.fixes, kept)):
-            off = np.linalg.norm(found.position_world[:, 0] - truth.position_world, axis=1)
+        for result, into in ((fixes, errors), (separated.fixes, kept)):
+            off = np.linalg.norm(result.position_world[:, 0] - truth.position_world, axis=1)
             into.append(1e3 * np.median(off))
         levels.append(1e3 * np.nanmedian(separated.states.protection_level_m))
     axes = figure.subplots()
@@ -180,14 +180,14 @@ FIGURES: dict[str, tuple[Callable[[Figure], None], tuple[float, float]]] = {
 def draw(names: list[str], directory: Path = DIRECTORY) -> list[Path]:
     """Draw figures, and return where they are."""
     directory.mkdir(parents=True, exist_ok=True)
-    made = []
+    built = []
     for name in names:
         make, size = FIGURES[name]
         figure = Figure(figsize=size, layout="constrained")
         make(figure)
-        made.append(directory / f"{name}.png")
-        figure.savefig(made[-1], dpi=80)
-    return made
+        built.append(directory / f"{name}.png")
+        figure.savefig(built[-1], dpi=80)
+    return built
 
 
 def main() -> None:

@@ -17,7 +17,7 @@ from latex2mathml.converter import convert
 from magfusion.jobs import JOBS
 from magfusion.jobs.settings import Command, Option, options
 from magfusion.model.trust import CODES
-from magfusion.papers.register import FINDINGS, KINDS, Numbered, paper, papers
+from magfusion.papers.register import FINDINGS, KINDS, NumberedEntry, paper, papers
 
 OPTIONS = re.compile(r"<!-- options: ([a-z -]+) -->")
 ENTRY = re.compile(r"^### `(\w+)`$", re.M)
@@ -103,12 +103,12 @@ def paper_page(number: str) -> str:
     for kind, short in KINDS.items():
         rows = [_paper_row(entry) for entry in one.of(kind)]
         if rows:
-            told = _table((short, "says", "finding", "function", "shown by"), rows)
-            parts.append(f"## {kind.capitalize()}s\n\n{told}")
+            reported = _table((short, "says", "finding", "function", "shown by"), rows)
+            parts.append(f"## {kind.capitalize()}s\n\n{reported}")
     return "\n\n".join(parts)
 
 
-def _paper_row(one: Numbered) -> tuple[str, ...]:
+def _paper_row(one: NumberedEntry) -> tuple[str, ...]:
     entry = one.entry
     place = f" (section {entry.where})" if entry.where else ""
     finding = f"*{entry.finding}*{f': {entry.why}' if entry.why else ''}"
@@ -131,9 +131,9 @@ def _mathml(formula: str) -> str:
 
 def on_page_markdown(markdown: str, **_: object) -> str:
     """Fill the tables in; called by mkdocs for every page."""
-    filled = OPTIONS.sub(lambda found: option_table(found[1]), markdown)
-    filled = PAPER.sub(lambda found: paper_page(found[1]), filled)
+    filled = OPTIONS.sub(lambda result: option_table(result[1]), markdown)
+    filled = PAPER.sub(lambda result: paper_page(result[1]), filled)
     filled = filled.replace(PAPERS_HERE, papers_table()) if PAPERS_HERE in filled else filled
-    filled = FORMULA.sub(lambda found: _mathml(found[1]), filled)
-    filled = ENTRY.sub(lambda found: found[0] + _meaning(found[1]), filled)
+    filled = FORMULA.sub(lambda result: _mathml(result[1]), filled)
+    filled = ENTRY.sub(lambda result: result[0] + _meaning(result[1]), filled)
     return filled.replace(CODES_HERE, code_table())

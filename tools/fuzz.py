@@ -77,29 +77,29 @@ def run_case(case: Case, inputs: Path, place: Path) -> str | None:
         return f"raised\n{traceback.format_exc()}"
     finally:
         sys.stdin = streams
-    said = err.getvalue()
-    return _wrong(status, said, _listing(place), before, passed="--keep-going" in command)
+    findings = err.getvalue()
+    return _wrong(status, findings, _listing(place), before, passed="--keep-going" in command)
 
 
 def _wrong(
-    status: object, said: str, after: dict[str, bytes], before: dict[str, bytes], *, passed: bool
+    status: object, message: str, after: dict[str, bytes], before: dict[str, bytes], *, passed: bool
 ) -> str | None:
     if status not in (0, 1, 2):
-        return f"exit {status}: {said}"
-    if "internal error" in said or "Traceback" in said:
-        return said
-    if "not enough memory" in said:
-        return f"memory: {said}"
-    if status and not passed and (said.count("\n") != 1 or not said.startswith("magfusion")):
-        return f"exit {status} with other than one sentence: {said!r}"
+        return f"exit {status}: {message}"
+    if "internal error" in message or "Traceback" in message:
+        return message
+    if "not enough memory" in message:
+        return f"memory: {message}"
+    if status and not passed and (message.count("\n") != 1 or not message.startswith("magfusion")):
+        return f"exit {status} with other than one sentence: {message!r}"
     changed = [name for name, digest in before.items() if after.get(name) != digest]
     if changed:
         return f"changed its input {changed}"
-    left = sorted(set(after) - set(before))
-    if status == 2 and left:
-        return f"exit 2 and left {left}: {said}"
-    if any(Path(name).name.startswith(".") for name in left):
-        return f"left what is unfinished: {left}"
+    remaining = sorted(set(after) - set(before))
+    if status == 2 and remaining:
+        return f"exit 2 and left {remaining}: {message}"
+    if any(Path(name).name.startswith(".") for name in remaining):
+        return f"left what is unfinished: {remaining}"
     return None
 
 
@@ -115,8 +115,8 @@ def _batch(seed: int, count: int, inputs: Path, scratch: Path, until: float) -> 
     """Run cases in this process, writing down each before it runs and what was wrong with it."""
     import hypothesis
 
-    most = MEMORY + _reserved()
-    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    maximum = MEMORY + _reserved()
+    resource.setrlimit(resource.RLIMIT_DATA, (maximum, maximum))
     warnings.simplefilter("ignore")
     gc.freeze()  # what all cases share is no garbage
     log = (scratch / "log").open("a", buffering=1)
@@ -175,10 +175,10 @@ def run_batch(
         time.sleep(0.2)
     if (scratch / "broken").exists():
         hung = (scratch / "broken").read_text()
-    return _told(_lines(scratch), hung or f"ended the process ({ended})")
+    return _message_of(_lines(scratch), hung or f"ended the process ({ended})")
 
 
-def _told(lines: list[dict[str, Any]], otherwise: str) -> tuple[int, list[Find]]:
+def _message_of(lines: list[dict[str, Any]], otherwise: str) -> tuple[int, list[Find]]:
     finds, case, count = [], None, 0
     for line in lines:
         if "case" in line:
@@ -194,8 +194,8 @@ def _told(lines: list[dict[str, Any]], otherwise: str) -> tuple[int, list[Find]]
 
 def _lines(scratch: Path) -> list[dict[str, Any]]:
     log = scratch / "log"
-    found = log.read_text().splitlines(keepends=True) if log.exists() else []
-    return [json.loads(line) for line in found if line.endswith("\n")]
+    result = log.read_text().splitlines(keepends=True) if log.exists() else []
+    return [json.loads(line) for line in result if line.endswith("\n")]
 
 
 def fuzz(examples: int, seconds: float, seed: int, workplace: Path) -> tuple[int, list[Find]]:
@@ -207,8 +207,8 @@ def fuzz(examples: int, seconds: float, seed: int, workplace: Path) -> tuple[int
     until, ran, finds = time.monotonic() + seconds, 0, []
     while ran < examples and time.monotonic() < until:
         wanted = min(BATCH, examples - ran)
-        count, found = run_batch(seed, wanted, inputs, workplace / "batch", until)
-        ran, finds, seed = ran + max(count, 1), finds + found, seed + 1
+        count, result = run_batch(seed, wanted, inputs, workplace / "batch", until)
+        ran, finds, seed = ran + max(count, 1), finds + result, seed + 1
     return ran, finds
 
 

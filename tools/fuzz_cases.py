@@ -183,7 +183,7 @@ def apply(  # noqa: C901 - one line a kind
                 _mutate(content, change)
             site.write_text(yaml.safe_dump(content))
         case "site_bytes":
-            site.write_bytes(_spoilt(site.read_bytes(), case["changes"]))
+            site.write_bytes(_corrupted(site.read_bytes(), case["changes"]))
         case "header":
             content = yaml.safe_load((log / "log.yaml").read_text())
             for change in case["changes"]:
@@ -193,17 +193,17 @@ def apply(  # noqa: C901 - one line a kind
             _table(log, case)
         case "table_bytes":
             path = log / f"{case['stem']}.parquet"
-            path.write_bytes(_spoilt(path.read_bytes(), case["changes"]))
+            path.write_bytes(_corrupted(path.read_bytes(), case["changes"]))
         case "stream" | "stream_bytes":
             words, given = _stream(case)
         case "checkpoint":
             state = place / "state.bin"
-            state.write_bytes(_spoilt((inputs / "state.bin").read_bytes(), case["changes"]))
+            state.write_bytes(_corrupted((inputs / "state.bin").read_bytes(), case["changes"]))
             words = f"navigate - --site SITE --resume --checkpoint {state}"
         case "bag":
             bag = place / f"bag{case['suffix']}"
             start = b"\x89MCAP0\r\n" if case["suffix"] == ".mcap" else b"SQLite format 3\0"
-            bag.write_bytes(_spoilt(start + bytes(200) + start, case["changes"]))
+            bag.write_bytes(_corrupted(start + bytes(200) + start, case["changes"]))
             words = f"replay {bag}"
     names = {"LOG": str(log), "SITE": str(site), "OUT": str(place / "out")}
     command = [names.get(word, word) for word in words.split()]
@@ -241,7 +241,7 @@ def _change_at(content: Any, key: Any, change: dict[str, Any]) -> None:
             content.extend(copy.deepcopy(content[key]) for _ in range(5))
 
 
-def _spoilt(content: bytes, changes: list[dict[str, Any]]) -> bytes:
+def _corrupted(content: bytes, changes: list[dict[str, Any]]) -> bytes:
     for change in changes:
         at, value = int(change["at"] * len(content)), base64.b64decode(change["value"])
         match change["how"]:
@@ -316,7 +316,7 @@ def _stream(case: Case) -> tuple[str, bytes]:
             _mutate(content, change)
     write = _json if case["form"] == "json" else _msgpack
     given = b"".join(map(write, content))
-    return words, given if case["kind"] == "stream" else _spoilt(given, case["changes"])
+    return words, given if case["kind"] == "stream" else _corrupted(given, case["changes"])
 
 
 def _json(record: Any) -> bytes:

@@ -44,25 +44,25 @@ def parsed(path: Path) -> ast.Module:
 @cache
 def imports_of(path: Path) -> tuple[str, ...]:
     """Return the dotted names that a file imports, wherever the import stands."""
-    found: list[str] = []
+    result: list[str] = []
     for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names]
+            result += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "relative imports hide the floor"
-            found += [f"{node.module}.{alias.name}" for alias in node.names]
-    return tuple(found)
+            result += [f"{node.module}.{alias.name}" for alias in node.names]
+    return tuple(result)
 
 
 def own_imports(path: Path) -> set[str]:
     """Return the modules of the package that a file imports."""
-    known, found = modules(), set()
+    known, result = modules(), set()
     for name in imports_of(path):
         while name and name not in known:
             name = name.rpartition(".")[0]
         if name:
-            found.add(name)
-    return found
+            result.add(name)
+    return result
 
 
 @cache
@@ -112,7 +112,7 @@ def circles(graph: Graph) -> list[list[str]]:
     number: dict[str, int] = {}
     lowest: dict[str, int] = {}
     open_nodes: list[str] = []
-    found: list[list[str]] = []
+    result: list[list[str]] = []
 
     def visit(node: str) -> None:
         number[node] = lowest[node] = len(number)
@@ -125,13 +125,13 @@ def circles(graph: Graph) -> list[list[str]]:
                 lowest[node] = min(lowest[node], number[other])
         if lowest[node] == number[node]:
             begin = open_nodes.index(node)
-            found.append(sorted(open_nodes[begin:]))
+            result.append(sorted(open_nodes[begin:]))
             del open_nodes[begin:]
 
     for node in graph:
         if node not in number:
             visit(node)
-    return [circle for circle in found if len(circle) > 1]
+    return [circle for circle in result if len(circle) > 1]
 
 
 def room_circles() -> list[list[str]]:
@@ -186,8 +186,8 @@ def measured() -> dict[str, dict[str, float]]:
     }
 
 
-def _inside(found: Iterable[list[str]]) -> int:
-    return sum(map(len, found))
+def _inside(result: Iterable[list[str]]) -> int:
+    return sum(map(len, result))
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ ROOMS = {
             magnetometer
             site trajectory
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
-            audibility field ground moments without_imu
+            detection_range field ground moments without_imu
             parameters path_field strapdown_steps
             noise prior waveform
         """,
@@ -40,7 +40,7 @@ ROOMS = {
             plain_table plausible row_table site_draft site_ground site_values standard_streams
             bag_rows checkpoint correlation field_map kept probe row_file survey table yaml_files
             attitude_table drive_columns fields hall instruments readings_table site_casing
-            site_correlation site_motion site_region site_response site_rotor site_warming
+            site_correlation site_motion site_region site_response site_rotor site_temperature
             trajectory_table wells_file
             bag depth_table fix_table marks_table result_states rotor_columns site_plain site_text
             temperature_table tum
@@ -106,7 +106,7 @@ ROOMS = {
             allan_noise checkpoint failure orientation settings without_beacons
             allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
             calibrate_magnetometer check design_settings drift_world evaluate export init_settings
-            live papers range_wells rates region replay rest_settings simulate_passes smooth_result
+            live papers range_wells rates region replay rest_settings simulate_ranging smooth_result
             survey view
             antenna_fit demodulate design_motion drift_figures fix import_log init_questions
             joint_tasks match_trust navigate_settings simulate stream

@@ -82,7 +82,7 @@ def line_count(paths: Iterable[Path]) -> int:
 def code_lines(path: Path, tree: ast.Module) -> int:
     """Return the lines of a file that hold code: no docstrings, comments and blanks."""
     text = path.read_text(encoding="utf-8")
-    held = {
+    fixed = {
         line
         for token in tokenize.generate_tokens(io.StringIO(text).readline)
         if token.type not in _BLANK
@@ -91,8 +91,8 @@ def code_lines(path: Path, tree: ast.Module) -> int:
     for node in ast.walk(tree):
         if isinstance(node, Function | ast.ClassDef | ast.Module) and ast.get_docstring(node):
             first = node.body[0]
-            held -= set(range(first.lineno, (first.end_lineno or first.lineno) + 1))
-    return len(held)
+            fixed -= set(range(first.lineno, (first.end_lineno or first.lineno) + 1))
+    return len(fixed)
 
 
 def constants(tree: ast.Module) -> int:
@@ -156,13 +156,13 @@ def sizes(trees: Trees, package: Trees, tests: Trees | None = None) -> dict[str,
     tests : mapping, optional
         Whose lines are compared with those of the files.
     """
-    found = [function for _, function in functions(trees)]
+    result = [function for _, function in functions(trees)]
     lines = line_count(trees)
     built, declared = calls(package), records(trees)
     out = {
-        **spread("function_lines", [lines_of(function) for function in found]),
-        **spread("cyclomatic", [complexity(function) for function in found]),
-        **spread("decisions", [decisions(function) for function in found]),
+        **spread("function_lines", [lines_of(function) for function in result]),
+        **spread("cyclomatic", [complexity(function) for function in result]),
+        **spread("decisions", [decisions(function) for function in result]),
         "records": len(declared),
         "records_built_once_at_most": sum(built[name] <= 1 for name in declared),
         "lines": lines,

@@ -77,16 +77,16 @@ class _Level:
             last = len(mean) - 2 * m + 1
             if last <= first:
                 continue
-            left, middle = slice(first, last), slice(first + m, last + m)
+            residual, middle = slice(first, last), slice(first + m, last + m)
             right = slice(first + 2 * m, last + 2 * m)
             if complete:
-                step = (weighed[right] - 2.0 * weighed[middle] + weighed[left]) / m
+                step = (weighed[right] - 2.0 * weighed[middle] + weighed[residual]) / m
             else:
-                before, after = there[middle] - there[left], there[right] - there[middle]
+                before, after = there[middle] - there[residual], there[right] - there[middle]
                 whole = (before >= THERE * m) & (after >= THERE * m)
                 safe = np.where(whole, after, 1.0)[:, None], np.where(whole, before, 1.0)[:, None]
                 step = (weighed[right] - weighed[middle]) / safe[0]
-                step -= (weighed[middle] - weighed[left]) / safe[1]
+                step -= (weighed[middle] - weighed[residual]) / safe[1]
                 step = step[whole]
             self.square[m] += 0.5 * np.einsum("na,na->a", step, step)
             self.count[m] += len(step)

@@ -23,11 +23,11 @@ SHAPE = 0.05  # relative: what an instrument may deviate from these four at any 
 FILTERED = 6  # octaves at the beginning that an instrument's own filter may spoil
 GOOD = 0.6  # of the chi square a degree of freedom, from which another beginning is tried
 MISFIT = 2.5  # of the same, from which the noise is of another kind
-PASSES, SETTLED = 30, 1e-5
+MAX_ITERATIONS, CONVERGED_STEP = 30, 1e-5
 TWO_SIDED, ONE_SIDED = 1.96, 1.645  # of 95 %
 # Correlation of cluster times that are 0, 1, 2 ... octaves apart.
-_ALIKE_WHITE = np.array([1.0, 0.52, 0.2, 0.05])
-_ALIKE_WALK = np.array([1.0, 0.88, 0.65, 0.46, 0.31, 0.2, 0.12, 0.06])
+_WHITE_CORRELATION = np.array([1.0, 0.52, 0.2, 0.05])
+_WALK_CORRELATION = np.array([1.0, 0.88, 0.65, 0.46, 0.31, 0.2, 0.12, 0.06])
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Fitted:
     high: float
 
     @property
-    def found(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether it differs significantly from zero."""
         return self.low > 0.0
 
@@ -94,22 +94,22 @@ class AllanFit:
         An estimator models white noise and a random walk, but no flicker: with ``sqrt(3) v / (2
         n)`` their minimum Allan variance is the estimated ``v``.
         """
-        walk = self.walk.value if self.walk.found else self.walk.high
+        walk = self.walk.value if self.walk.is_significant else self.walk.high
         if self.white.value == 0.0:
             return walk
         return max(float(np.sqrt(3.0) * self.least**2 / (2.0 * self.white.value)), walk)
 
 
-def fit_allan(found: AllanVariance, axis: int) -> AllanFit | None:
+def fit_allan(result: AllanVariance, axis: int) -> AllanFit | None:
     """Return the noise components of an axis' Allan variance; None for too few cluster times.
 
     An instrument's own filter makes short clusters smoother than white noise.  Where the fit does
     not match them, it begins at longer cluster times.
     """
-    enough = np.asarray(found.clusters >= LEAST_CLUSTERS)
-    usable = np.logical_and.reduce([found.octave, enough, found.variance[:, axis] > 0.0])
-    tau, variance = found.tau[usable], found.variance[usable, axis]
-    clusters = found.clusters[usable]
+    enough = np.asarray(result.clusters >= LEAST_CLUSTERS)
+    usable = np.logical_and.reduce([result.octave, enough, result.variance[:, axis] > 0.0])
+    tau, variance = result.tau[usable], result.variance[usable, axis]
+    clusters = result.clusters[usable]
     best: AllanFit | None = None
     for first in range(FILTERED + 1):
         if len(tau) - first < LEAST_POINTS:
@@ -131,11 +131,11 @@ def _fit(tau: Array, variance: Array, clusters: Array) -> AllanFit:
     design = _design(tau)
     relative = 2.0 / clusters + SHAPE**2
     model = variance
-    for _ in range(PASSES):
+    for _ in range(MAX_ITERATIONS):
         weight = 1.0 / (np.sqrt(relative) * model)
         square = _not_negative(design * weight[:, None], variance * weight)
         before, model = model, np.maximum(design @ square, 1e-6 * variance)
-        if np.all(np.abs(model - before) < SETTLED * model):
+        if np.all(np.abs(model - before) < CONVERGED_STEP * model):
             break
     cov = _covariance(design, model, relative, clusters, square)
     sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
@@ -169,11 +169,11 @@ def _not_negative(design: Array, value: Array) -> Array:
         for chosen in combinations(range(design.shape[1]), count):
             columns = list(chosen)
             part = np.linalg.lstsq(design[:, columns] / scale[columns], value, rcond=None)[0]
-            left = value - design[:, columns] @ (part / scale[columns])
-            if np.all(part >= 0.0) and float(left @ left) < cost:
+            residual = value - design[:, columns] @ (part / scale[columns])
+            if np.all(part >= 0.0) and float(residual @ residual) < cost:
                 best = np.zeros(design.shape[1])
                 best[columns] = part / scale[columns]
-                cost = float(left @ left)
+                cost = float(residual @ residual)
     return best
 
 
@@ -185,24 +185,24 @@ def _covariance(
     Flicker and walk are estimated even where their squares are zero; quantization only where its
     square is not.
     """
-    free = [k for k in range(4) if k > 0 or square[0] > 0.0]
-    weighed = design[:, free] / model[:, None] / relative[:, None]
-    normal = (design[:, free] / model[:, None]).T @ weighed
+    free_parameters = [k for k in range(4) if k > 0 or square[0] > 0.0]
+    weighed = design[:, free_parameters] / model[:, None] / relative[:, None]
+    normal = (design[:, free_parameters] / model[:, None]).T @ weighed
     scale = np.sqrt(np.diag(normal))
     inverse = np.linalg.pinv(normal / np.outer(scale, scale), hermitian=True)
     inverse = inverse / np.outer(scale, scale)
     white = np.minimum(design[:, :2] @ square[:2] / model, 1.0)
-    apart = np.abs(np.arange(len(model))[:, None] - np.arange(len(model)))
-    of_white = np.append(_ALIKE_WHITE, 0.0)[np.minimum(apart, len(_ALIKE_WHITE))]
-    of_walk = np.append(_ALIKE_WALK, 0.0)[np.minimum(apart, len(_ALIKE_WALK))]
+    separate = np.abs(np.arange(len(model))[:, None] - np.arange(len(model)))
+    of_white = np.append(_WHITE_CORRELATION, 0.0)[np.minimum(separate, len(_WHITE_CORRELATION))]
+    of_walk = np.append(_WALK_CORRELATION, 0.0)[np.minimum(separate, len(_WALK_CORRELATION))]
     both = np.outer(white, 1.0 - white)
-    alike = np.outer(white, white) * of_white + np.outer(1.0 - white, 1.0 - white) * of_walk
-    alike += (both + both.T) * np.sqrt(of_white * of_walk)
+    shared = np.outer(white, white) * of_white + np.outer(1.0 - white, 1.0 - white) * of_walk
+    shared += (both + both.T) * np.sqrt(of_white * of_walk)
     spread = np.sqrt(2.0 / clusters)
-    errors = alike * np.outer(spread, spread) + SHAPE**2 * of_walk
+    errors = shared * np.outer(spread, spread) + SHAPE**2 * of_walk
     gain = inverse @ weighed.T
     out = np.zeros((4, 4))
-    out[np.ix_(free, free)] = gain @ errors @ gain.T
+    out[np.ix_(free_parameters, free_parameters)] = gain @ errors @ gain.T
     return out
 
 

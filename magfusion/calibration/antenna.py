@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magfusion.errors import EstimationError
-from magfusion.estimation.solve.batched import Normal, minimise, normal_equations
+from magfusion.estimation.solve.batched import NormalEquations, minimise, normal_equations
 from magfusion.model.antenna import (
     CENTRES,
     KAPPAS,
@@ -145,7 +145,7 @@ def fit_at_known_poses(
     coupling = survey.coupling.reshape(-1, n, 3, 3)
     weight = 1.0 / survey.sigma.reshape(-1, n)[..., None, None]
 
-    def normal(rows: IntArray, scaled: Array) -> Normal:
+    def normal(rows: IntArray, scaled: Array) -> NormalEquations:
         """Return the product of the root and (vector - mean)."""
         antenna = antenna_from_vector((mean[rows] + scaled @ root.T)[:, None])
         seen = model(antenna, rotation[rows], position[rows])
@@ -154,23 +154,23 @@ def fit_at_known_poses(
         fields = normal_equations(
             error.reshape(len(rows), -1), jacobian.reshape(len(rows), -1, len(sigma))
         )
-        return Normal(
+        return NormalEquations(
             fields.cost + np.sum(scaled**2, axis=-1),
             fields.gradient + scaled,
             fields.information + np.eye(len(sigma)),
         )
 
-    found = minimise(normal, np.zeros_like(mean), passes=ITERATIONS, absolute=CONVERGED**2)
-    if not np.all(found.converged):
+    result = minimise(normal, np.zeros_like(mean), max_iterations=ITERATIONS, absolute=CONVERGED**2)
+    if not np.all(result.converged):
         raise EstimationError(
             f"the antenna calibration does not converge in {ITERATIONS} iterations: poses and"
             " couplings are inconsistent by far more than the prior allows"
         )
-    cov = root @ np.linalg.inv(found.information) @ root.T
+    cov = root @ np.linalg.inv(result.information) @ root.T
     return AntennaFit(
-        antenna=antenna_from_vector((mean + found.state @ root.T).reshape(*lead, -1)),
+        antenna=antenna_from_vector((mean + result.state @ root.T).reshape(*lead, -1)),
         cov=cov.reshape(*lead, *cov.shape[1:]),
-        chi2=found.cost.reshape(lead),
+        chi2=result.cost.reshape(lead),
         dof=9 * n,
         beacon_from_sensor=survey.beacon_from_sensor,
         position_beacon=survey.position_beacon,
@@ -189,14 +189,14 @@ def with_receiver_gain(fit: AntennaFit, declared: Antenna) -> AntennaFit:
     fit : AntennaFit
         Of one antenna.
     """
-    found = fit.antenna
-    size = np.linalg.norm(found.sensitivities_sensor, axis=-1)
+    result = fit.antenna
+    size = np.linalg.norm(result.sensitivities_sensor, axis=-1)
     reference = np.linalg.norm(declared.sensitivities_sensor, axis=-1)
     factor = float(np.exp(np.mean(np.log(reference / size))))
     fixed = replace(
-        found,
-        moments_beacon=found.moments_beacon / factor,
-        sensitivities_sensor=found.sensitivities_sensor * factor,
+        result,
+        moments_beacon=result.moments_beacon / factor,
+        sensitivities_sensor=result.sensitivities_sensor * factor,
     )
     scale = np.ones(len(fit.cov))
     scale[MOMENTS], scale[SENSITIVITIES] = 1.0 / factor, factor

@@ -16,7 +16,7 @@ from magfusion.calibration.antenna import (
     Observe,
     prior_root,
 )
-from magfusion.calibration.graph import CalibrationGraph, Estimate, solve
+from magfusion.calibration.graph import CalibrationEstimate, CalibrationGraph, solve
 from magfusion.model.antenna import Antenna, antenna_from_vector, observe_antenna
 from magfusion.units import Array
 
@@ -62,7 +62,7 @@ def fit_at_uncertain_poses(
     n, mean, root = len(survey.position_beacon), start.vector(), prior_root(sigma)
     weight = 1.0 / survey.sigma[:, None, None]
 
-    def rows(estimate: Estimate) -> tuple[Array, Array, Array]:
+    def rows(estimate: CalibrationEstimate) -> tuple[Array, Array, Array]:
         antenna = antenna_from_vector(mean + root @ estimate.calibration)
         seen = model(antenna, *_poses(estimate.values, n))
         return (
@@ -82,12 +82,14 @@ def fit_at_uncertain_poses(
     steps = {X(i): POSE_STEP for i in range(n)}
     none = np.zeros(len(root))
     graph = CalibrationGraph(rows, native, none, np.eye(len(root)), steps)
-    found, cov = solve(graph, Estimate(values, none), "antenna", ITERATIONS, CONVERGED**2)
-    beacon_from_sensor, position_beacon = _poses(found.estimate.values, n)
+    result, cov = solve(
+        graph, CalibrationEstimate(values, none), "antenna", ITERATIONS, CONVERGED**2
+    )
+    beacon_from_sensor, position_beacon = _poses(result.estimate.values, n)
     return AntennaFit(
-        antenna=antenna_from_vector(mean + root @ found.estimate.calibration),
+        antenna=antenna_from_vector(mean + root @ result.estimate.calibration),
         cov=root @ cov @ root.T,
-        chi2=np.asarray(2.0 * found.cost),
+        chi2=np.asarray(2.0 * result.cost),
         dof=survey.coupling.size - n * int(np.sum(precision == 0.0)),
         beacon_from_sensor=beacon_from_sensor,
         position_beacon=position_beacon,

@@ -33,7 +33,7 @@ _PARTS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Observability:
+class AntennaObservability:
     """Observability of the antennas from couplings at some poses.
 
     Parameters
@@ -43,7 +43,7 @@ class Observability:
         and sensitivities and to the mean distance.
     null_space : tuple of str
         One line for each group of undetermined combinations, in words.
-    fewest_poses : int
+    min_poses : int
         Number of these poses, in their order, with which the rank is reached.
     """
 
@@ -51,7 +51,7 @@ class Observability:
     rank: int
     singular: Array
     null_space: tuple[str, ...]
-    fewest_poses: int
+    min_poses: int
 
 
 def observability(
@@ -61,7 +61,7 @@ def observability(
     attitudes_known: bool = True,
     positions_known: bool = True,
     centred: bool = False,
-) -> Observability:
+) -> AntennaObservability:
     """Return the observability of the antennas from a survey, without any prior.
 
     Parameters
@@ -76,24 +76,26 @@ def observability(
     centred : bool
         All coils of an antenna are at its origin; the centres are no parameters.
     """
-    free = ([] if attitudes_known else [0, 1, 2]) + ([] if positions_known else [3, 4, 5])
+    free_parameters = ([] if attitudes_known else [0, 1, 2]) + (
+        [] if positions_known else [3, 4, 5]
+    )
     columns = np.arange(antenna.vector().shape[-1])
     if centred:
         columns = np.setdiff1d(columns, np.r_[CENTRES, SENSOR_CENTRES])
     scale = _scale(antenna, float(np.mean(np.linalg.norm(survey.position_beacon, axis=-1))))
-    rows = _remaining(survey, antenna, scale, free)[:, :, columns]
+    rows = _remaining(survey, antenna, scale, free_parameters)[:, :, columns]
     whole = rows.reshape(-1, len(columns))
     _, size, right = np.linalg.svd(whole, full_matrices=True)
     size = np.concatenate([size, np.zeros(len(columns) - len(size))])
     rank = int(np.sum(size > NO_INFORMATION * size[0]))
     null = np.zeros((len(columns) - rank, len(scale)))
     null[:, columns] = right[rank:]
-    return Observability(
+    return AntennaObservability(
         parameters=len(columns),
         rank=rank,
         singular=size / size[0],
         null_space=_in_words(null, _gauges(antenna, survey.beacon_from_sensor[0]), scale),
-        fewest_poses=_fewest(rows, rank),
+        min_poses=_min_poses(rows, rank),
     )
 
 
@@ -108,19 +110,21 @@ def _scale(antenna: Antenna, distance: float) -> Array:
     return scale
 
 
-def _remaining(survey: AntennaSurvey, antenna: Antenna, scale: Array, free: list[int]) -> Array:
+def _remaining(
+    survey: AntennaSurvey, antenna: Antenna, scale: Array, directions: list[int]
+) -> Array:
     """Return the whitened Jacobian of each pose, less its projection on the pose, (n, rows, k)."""
     seen = observe_antenna(antenna, survey.beacon_from_sensor, survey.position_beacon)
     weight = 1.0 / survey.sigma[:, None, None]
     rows = (seen.antenna * weight[..., None] * scale).reshape(len(weight), 9, -1)
-    if not free:
+    if not directions:
         return rows
-    by_pose = (seen.pose * weight[..., None]).reshape(len(weight), 9, 6)[..., free]
-    left, _, _ = np.linalg.svd(by_pose / np.linalg.norm(by_pose, axis=1, keepdims=True))
-    return np.swapaxes(left[..., len(free) :], 1, 2) @ rows
+    by_pose = (seen.pose * weight[..., None]).reshape(len(weight), 9, 6)[..., directions]
+    residual, _, _ = np.linalg.svd(by_pose / np.linalg.norm(by_pose, axis=1, keepdims=True))
+    return np.swapaxes(residual[..., len(directions) :], 1, 2) @ rows
 
 
-def _fewest(rows: Array, rank: int) -> int:
+def _min_poses(rows: Array, rank: int) -> int:
     for number in range(1, len(rows)):
         size = np.linalg.svd(rows[:number].reshape(-1, rows.shape[-1]), compute_uv=False)
         if int(np.sum(size > NO_INFORMATION * size[0])) == rank:
@@ -138,7 +142,7 @@ def _gauges(antenna: Antenna, beacon_from_sensor: Array) -> dict[str, Array]:
         tangent = np.array([np.concatenate([p.ravel() for p in part]) for part in parts])
         return np.pad(tangent, ((0, 0), (0, antenna.vector().shape[-1] - KAPPAS.start)))
 
-    def turned(coils: Array, axis: Array) -> Array:
+    def rotated(coils: Array, axis: Array) -> Array:
         return coils @ skew(axis).T
 
     shifts = [np.tile(axis, (3, 1)) for axis in unit]
@@ -150,10 +154,10 @@ def _gauges(antenna: Antenna, beacon_from_sensor: Array) -> dict[str, Array]:
             (moments, zero, -axes, zero)
         ),
         "rotation of the transmitter's frame": rows(
-            *((turned(moments, a), turned(centres, a), zero, zero) for a in unit)
+            *((rotated(moments, a), rotated(centres, a), zero, zero) for a in unit)
         ),
         "rotation of the receiver's frame": rows(
-            *((zero, zero, turned(axes, a), turned(arms, a)) for a in unit)
+            *((zero, zero, rotated(axes, a), rotated(arms, a)) for a in unit)
         ),
         "shift of the transmitter's centres": rows(*((zero, s, zero, zero) for s in shifts)),
         "shift of the receiver's centres": rows(*((zero, zero, zero, s) for s in shifts)),

@@ -12,7 +12,7 @@ import numpy as np
 
 from magfusion.calibration.antenna import CONVERGED, ITERATIONS
 from magfusion.errors import EstimationError
-from magfusion.estimation.solve.batched import Normal, minimise, normal_equations
+from magfusion.estimation.solve.batched import NormalEquations, minimise, normal_equations
 from magfusion.model.coil_field import alone, coil_fields
 from magfusion.model.physics.finite_size import coil_coupling
 from magfusion.model.probe import ProbeReadings
@@ -123,25 +123,27 @@ def fit_by_probe(
         Where it does not converge.
     """
 
-    def normal(_: IntArray, scaled: Array) -> Normal:
+    def normal(_: IntArray, scaled: Array) -> NormalEquations:
         vector = start + scaled[0] * sigma
         error = (predict(vector, readings) - readings.reading) / readings.sigma
         jacobian = _term(vector, readings)[1] / readings.sigma[:, None] * sigma
         seen = normal_equations(error[None], jacobian[None])
-        return Normal(
+        return NormalEquations(
             seen.cost + np.sum(scaled**2, axis=-1),
             seen.gradient + scaled,
             seen.information + np.eye(len(sigma)),
         )
 
-    found = minimise(normal, np.zeros((1, len(sigma))), passes=ITERATIONS, absolute=CONVERGED**2)
-    if not found.converged[0]:
+    result = minimise(
+        normal, np.zeros((1, len(sigma))), max_iterations=ITERATIONS, absolute=CONVERGED**2
+    )
+    if not result.converged[0]:
         raise EstimationError(
             f"the probe's readings do not converge in {ITERATIONS} steps: places, axes or signs"
             " disagree with the coils by far more than the prior allows"
         )
-    cov = np.linalg.inv(found.information[0]) * np.outer(sigma, sigma)
-    return ProbeFit(start + found.state[0] * sigma, cov, float(found.cost[0]), len(readings))
+    cov = np.linalg.inv(result.information[0]) * np.outer(sigma, sigma)
+    return ProbeFit(start + result.state[0] * sigma, cov, float(result.cost[0]), len(readings))
 
 
 def in_units_of_sensitivity(readings: ProbeReadings, vector: Array) -> ProbeReadings:

@@ -64,7 +64,7 @@ def of_site(beacon: Beacon, sensor: Magnetometer) -> Observe:
     """Return a model that puts antennas into a site's coils and magnetometer."""
     mounted = replace(sensor, position_body=np.zeros(3), body_from_sensor=np.eye(3))
     placed = replace(beacon, position_world=np.zeros(3), world_from_beacon=np.eye(3))
-    undone = np.exp(-1j * np.array([coil.phase for coil in beacon.coils]))
+    reverted = np.exp(-1j * np.array([coil.phase for coil in beacon.coils]))
 
     def observed(antenna: Antenna, beacon_from_sensor: Array, position_beacon: Array) -> Coupling:
         seen = observe_antenna(antenna, beacon_from_sensor, position_beacon)
@@ -78,7 +78,7 @@ def of_site(beacon: Beacon, sensor: Magnetometer) -> Observe:
             beacon_from_sensor,
             position_beacon,
         )
-        return seen._replace(value=np.swapaxes((phasor * undone[:, None]).real, -1, -2))
+        return seen._replace(value=np.swapaxes((phasor * reverted[:, None]).real, -1, -2))
 
     return observed
 
@@ -181,5 +181,5 @@ def into_mounting(
 
 def _nearest_turn(rows: Array, declared: Array) -> Array:
     """Return the rotation Q for which ``rows @ Q`` is nearest to the declared matrix."""
-    left, _, right = np.linalg.svd(rows.T @ declared)
-    return np.asarray(left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right)
+    residual, _, right = np.linalg.svd(rows.T @ declared)
+    return np.asarray(residual @ np.diag([1.0, 1.0, np.linalg.det(residual @ right)]) @ right)

@@ -61,8 +61,8 @@ def fixed_poses(site: Site, beacon: Beacon, survey: BodySurvey) -> tuple[Array, 
         cov,
     )
     fixes = fix_epochs(samples, initial_calibration(replace(alone, correlation=None), 0.0))
-    apart = np.linalg.norm(fixes.position_world - survey.position_world[:, None], axis=-1)
-    best = np.argmin(np.where(np.isfinite(fixes.cost), apart, np.inf), axis=1)
+    separate = np.linalg.norm(fixes.position_world - survey.position_world[:, None], axis=-1)
+    best = np.argmin(np.where(np.isfinite(fixes.cost), separate, np.inf), axis=1)
     rows = np.arange(n)
     return fixes.world_from_body[rows, best], fixes.position_world[rows, best]
 
@@ -119,10 +119,10 @@ def expected(site: Site, beacon: Beacon, fit: AntennaFit, survey: BodySurvey) ->
     gain[:, 3:] -= skew(lever) @ gain[:, :3]
     of_pose = gain @ cov @ np.swapaxes(gain, 1, 2)
     diagonal = np.diagonal(of_pose, axis1=1, axis2=2).reshape(n, 2, 3)
-    left = np.linalg.svd(by_pose / np.linalg.norm(by_pose, axis=1, keepdims=True))[0][..., 6:]
-    beside = np.swapaxes(left, 1, 2)
-    rest = beside @ (seen.value - survey.coupling).reshape(n, 9, 1)
-    declared = beside @ cov @ left
+    residual = np.linalg.svd(by_pose / np.linalg.norm(by_pose, axis=1, keepdims=True))[0][..., 6:]
+    others = np.swapaxes(residual, 1, 2)
+    rest = others @ (seen.value - survey.coupling).reshape(n, 9, 1)
+    declared = others @ cov @ residual
     excess = np.swapaxes(rest, 1, 2) @ np.linalg.solve(declared, rest)
     return Expected(np.sum(diagonal, axis=2), excess[:, 0, 0] / 3.0)
 

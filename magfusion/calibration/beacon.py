@@ -12,7 +12,7 @@ import numpy as np
 import scipy.ndimage
 
 from magfusion.errors import InputError
-from magfusion.estimation.solve.batched import Normal, minimise, normal_equations
+from magfusion.estimation.solve.batched import NormalEquations, minimise, normal_equations
 from magfusion.model.field import observe_from
 from magfusion.model.site import Beacon, Magnetometer
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
@@ -128,13 +128,13 @@ def calibrate_beacon(measured: BeaconMeasurements, reach: float = REACH) -> Beac
     runs, count = starts.shape[:2]
     owner = np.repeat(np.arange(runs), count)
 
-    def model(rows: IntArray, centre: Array) -> Normal:
+    def model(rows: IntArray, centre: Array) -> NormalEquations:
         return normal_equations(*_projected(measured, seen[owner[rows]], centre)[:2])
 
-    found = minimise(model, starts.reshape(-1, 3))
-    costs = found.cost.reshape(runs, count)
+    result = minimise(model, starts.reshape(-1, 3))
+    costs = result.cost.reshape(runs, count)
     order = np.argsort(costs, axis=1)
-    centres = np.take_along_axis(found.state.reshape(runs, count, 3), order[..., None], axis=1)
+    centres = np.take_along_axis(result.state.reshape(runs, count, 3), order[..., None], axis=1)
     costs = np.take_along_axis(costs, order, axis=1)
     best = centres[:, 0]
     _, _, moments, jacobian = _projected(measured, seen, best)
@@ -189,9 +189,9 @@ def _columns(measured: BeaconMeasurements, centre: Array) -> tuple[Array, Array]
     value : ndarray, shape (k, numbers, moments)
     by_centre : ndarray, shape (k, numbers, moments, 3)
     """
-    beacon, turned = measured.beacon, measured.world_from_body
+    beacon, rotated = measured.beacon, measured.world_from_body
     offset = measured.position_world - centre[:, None]
-    bodies = np.broadcast_to(turned, (*offset.shape[:2], 3, 3))
+    bodies = np.broadcast_to(rotated, (*offset.shape[:2], 3, 3))
     units = measured.unit_moments
     shape = (*offset.shape[:2], len(beacon.tones), 3, len(units))
     value = np.zeros(shape, dtype=np.complex128)
@@ -206,7 +206,7 @@ def _columns(measured: BeaconMeasurements, centre: Array) -> tuple[Array, Array]
         )
         alone = replace(beacon, position_world=np.zeros(3), coils=axes, field_map=None)
         seen, by_pose = observe_from(alone, measured.magnetometer, bodies, offset)
-        by_place = -by_pose[..., 3:] @ np.swapaxes(turned, -1, -2)[:, None]
+        by_place = -by_pose[..., 3:] @ np.swapaxes(rotated, -1, -2)[:, None]
         value[:, :, tone][..., own] = np.einsum("ua,kpai->kpiu", units[own, tone], seen)
         slope[:, :, tone][..., own, :] = np.einsum("ua,kpaij->kpiuj", units[own, tone], by_place)
     flat = slope.reshape(*shape[:-1], -1)

@@ -12,7 +12,12 @@ from magfusion.calibration.beacon import (
     whitened_parts,
 )
 from magfusion.estimation.snapshot.candidates import wahba
-from magfusion.estimation.solve.batched import Normal, minimise, moved_poses, normal_equations
+from magfusion.estimation.solve.batched import (
+    NormalEquations,
+    minimise,
+    moved_poses,
+    normal_equations,
+)
 from magfusion.model.coil_field import as_points, is_sized
 from magfusion.model.field import observe, predict
 from magfusion.model.site import Beacon, BeaconSigma
@@ -70,8 +75,8 @@ def attitudes(beacon: Beacon, moments_world: ComplexArray) -> tuple[Array, Array
         if not beacon.synchronised:
             in_world = declared @ np.swapaxes(rotation, -1, -2)
             phase = np.angle(np.sum(moments_world * in_world.conj(), axis=-1))
-        turned = moments_world * np.exp(-1j * phase)[..., None]
-        correlation = np.einsum("rki,kj->rij", turned, unit.conj()).real
+        rotated = moments_world * np.exp(-1j * phase)[..., None]
+        correlation = np.einsum("rki,kj->rij", rotated, unit.conj()).real
         rotation = wahba(correlation + 1e-9 * beacon.world_from_beacon)
     return rotation, phase
 
@@ -88,8 +93,8 @@ def coil_moments(
 
     Where a tone drives more coils than its field can separate, the change is the smallest possible.
     """
-    turned = (moments_world * np.exp(-1j * phase)[..., None]) @ world_from_beacon
-    change = turned - _drive(beacon)
+    rotated = (moments_world * np.exp(-1j * phase)[..., None]) @ world_from_beacon
+    change = rotated - _drive(beacon)
     drive = np.concatenate([beacon.excitation.real, beacon.excitation.imag], axis=1).T
     parts = np.concatenate([change.real, change.imag], axis=-2)
     return beacon.moments_beacon + np.linalg.pinv(drive) @ parts
@@ -128,19 +133,19 @@ def calibrate_one(measured: BeaconMeasurements, reach: float) -> tuple[BeaconFit
     declared, seen, sized = measured.beacon, measured.phasor_sensor, is_sized(measured.beacon)
     for _ in range(TURNS if sized or declared.centres_beacon.any() else 1):
         fits = calibrate_beacon(measured, reach)
-        found, _ = attitudes(measured.beacon, fits.moments_world)
+        result, _ = attitudes(measured.beacon, fits.moments_world)
         used = measured
-        turned = replace(declared, world_from_beacon=found[0])
+        rotated = replace(declared, world_from_beacon=result[0])
         of_size = _of_size(measured, refine(measured, fits)) if sized else 0.0
-        measured = replace(measured, beacon=turned, phasor_sensor=seen - of_size)
+        measured = replace(measured, beacon=rotated, phasor_sensor=seen - of_size)
     return fits, refine(used, fits)
 
 
-def _of_size(measured: BeaconMeasurements, found: RefinedBeacon) -> ComplexArray:
+def _of_size(measured: BeaconMeasurements, result: RefinedBeacon) -> ComplexArray:
     """Return the contribution of the coils' size to the phasors, shape (points, tones, 3)."""
     place = (measured.magnetometer, measured.world_from_body, measured.position_world)
-    phase = np.broadcast_to(found.phase, (len(measured.position_world), len(found.phase)))
-    return predict(found.beacon, *place, phase) - predict(as_points(found.beacon), *place, phase)
+    phase = np.broadcast_to(result.phase, (len(measured.position_world), len(result.phase)))
+    return predict(result.beacon, *place, phase) - predict(as_points(result.beacon), *place, phase)
 
 
 def refine(measured: BeaconMeasurements, fits: BeaconFits, run: int = 0) -> RefinedBeacon:
@@ -150,16 +155,16 @@ def refine(measured: BeaconMeasurements, fits: BeaconFits, run: int = 0) -> Refi
     coils = coil_moments(declared, moments, rotation, phase)[0]
     spread = _spread(measured, moments[0], rotation[0], coils)
     cov = spread @ fits.cov[run, 3:, 3:] @ spread.T
-    free = open_axes(declared)
-    known = np.eye(3) - free.T @ free
+    free_parameters = open_axes(declared)
+    known = np.eye(3) - free_parameters.T @ free_parameters
     turn = known @ cov[:3, :3] @ known
-    prior = free @ np.diag(declared.sigma.rotation_beacon**2) @ free.T
+    prior = free_parameters @ np.diag(declared.sigma.rotation_beacon**2) @ free_parameters.T
     sigma = BeaconSigma(
         position_world=np.sqrt(np.diag(fits.cov[run, :3, :3])),
-        rotation_beacon=np.sqrt(np.diag(turn + free.T @ prior @ free)),
+        rotation_beacon=np.sqrt(np.diag(turn + free_parameters.T @ prior @ free_parameters)),
         log_moment=np.sqrt(np.diag(cov[3:, 3:])),
     )
-    found = replace(
+    result = replace(
         declared,
         position_world=fits.centre_world[run],
         world_from_beacon=rotation[0],
@@ -170,7 +175,7 @@ def refine(measured: BeaconMeasurements, fits: BeaconFits, run: int = 0) -> Refi
         sigma=sigma,
         field_map=None,  # it corrected the beacon as it was declared
     )
-    return RefinedBeacon(found, phase[0], free)
+    return RefinedBeacon(result, phase[0], free_parameters)
 
 
 def _spread(
@@ -180,9 +185,9 @@ def _spread(
     step = 1e-5 * float(np.max(np.abs(moments)))
     units = step * measured.unit_moments
     sides = np.concatenate([units, -units])
-    turned, phase = attitudes(measured.beacon, moments + sides)
-    sizes = np.linalg.norm(coil_moments(measured.beacon, moments + sides, turned, phase), axis=-1)
-    angle = Rotation.from_matrix(rotation.T @ turned).as_rotvec()
+    rotated, phase = attitudes(measured.beacon, moments + sides)
+    sizes = np.linalg.norm(coil_moments(measured.beacon, moments + sides, rotated, phase), axis=-1)
+    angle = Rotation.from_matrix(rotation.T @ rotated).as_rotvec()
     value = np.hstack([angle, np.log(sizes / np.linalg.norm(coils, axis=-1))])
     count = len(units)
     return (value[:count] - value[count:]).T / (2.0 * step)
@@ -208,23 +213,23 @@ def fit_known_moments(
     """
     seen = np.nan_to_num(measured.phasor_sensor)
 
-    def model(rows: IntArray, pose: Array) -> Normal:
+    def model(rows: IntArray, pose: Array) -> NormalEquations:
         rotation, centre = pose[:, :9].reshape(-1, 3, 3), pose[:, 9:]
         # The beacon is fixed; magnetometers move with the frame in which it has the requested pose.
         back = measured.beacon.world_from_beacon @ np.swapaxes(rotation, -1, -2)
         position = (measured.position_world - centre[:, None]) @ np.swapaxes(back, -1, -2)
-        found = observe(
+        result = observe(
             replace(measured.beacon, field_map=None),
             measured.magnetometer,
             back[:, None] @ measured.world_from_body,
             position + measured.beacon.position_world,
         )
-        error = (found.phasor_sensor - seen[rows])[..., None]
+        error = (result.phasor_sensor - seen[rows])[..., None]
         return normal_equations(
-            whitened_parts(measured, error)[..., 0], whitened_parts(measured, found.beacon_pose)
+            whitened_parts(measured, error)[..., 0], whitened_parts(measured, result.beacon_pose)
         )
 
     start = np.concatenate([world_from_beacon.reshape(-1, 9), centre_world], axis=-1)
-    found = minimise(model, start, moved_poses)
-    pose = found.state
-    return pose[:, 9:], pose[:, :9].reshape(-1, 3, 3), np.asarray(np.linalg.inv(found.information))
+    result = minimise(model, start, moved_poses)
+    pose = result.state
+    return pose[:, 9:], pose[:, :9].reshape(-1, 3, 3), np.asarray(np.linalg.inv(result.information))

@@ -13,14 +13,14 @@ from magfusion.calibration.magnetometer import MagnetometerFit
 from magfusion.errors import EstimationError
 from magfusion.estimation.solve.batched import (
     SINGULAR,
-    Normal,
+    NormalEquations,
     conditioning,
     minimise,
     normal_equations,
 )
 from magfusion.units import Array, IntArray
 
-FEWEST_READINGS = 9
+MIN_READINGS = 9
 EXACT = 1e-12  # of the field; a residual that is rounding
 # Thresholds for readings on no ellipsoid, far from rounding errors and from any real instrument.
 NARROWEST = 0.03  # shortest over longest axis
@@ -51,9 +51,9 @@ def fit_ellipsoid(measured: Array, field_size: float) -> MagnetometerFit:
         Where the readings lie on no ellipsoid: too few of them, or all on one side.
     """
     scaled = measured / field_size
-    if scaled.shape[-2] < FEWEST_READINGS:
+    if scaled.shape[-2] < MIN_READINGS:
         raise EstimationError(
-            f"{scaled.shape[-2]} readings do not determine an ellipsoid; give {FEWEST_READINGS}"
+            f"{scaled.shape[-2]} readings do not determine an ellipsoid; give {MIN_READINGS}"
         )
     basis = np.zeros((6, 3, 3))
     for k, (i, j) in enumerate(_SYMMETRIC):
@@ -65,8 +65,8 @@ def fit_ellipsoid(measured: Array, field_size: float) -> MagnetometerFit:
         inverse = np.einsum("...k,kij->...ij", state[..., :6], basis)
         return _size_rows(points, inverse, state[..., 6:], basis)
 
-    found, error, jacobian = _solved(rows_at, start, scaled)
-    inverse = np.einsum("...k,kij->...ij", found[..., :6], basis)
+    result, error, jacobian = _solved(rows_at, start, scaled)
+    inverse = np.einsum("...k,kij->...ij", result[..., :6], basis)
     variance = np.sum(error**2, axis=-1)[..., None, None] / max(error.shape[-1] - 9, 1)
     cov = variance * np.linalg.inv(np.swapaxes(jacobian, -1, -2) @ jacobian)
     axes = np.linalg.eigvalsh(inverse)
@@ -77,7 +77,7 @@ def fit_ellipsoid(measured: Array, field_size: float) -> MagnetometerFit:
         or np.any(sigma > LOOSEST * axes[..., -1])
     ):
         raise EstimationError(_NO_ELLIPSOID)
-    return _fit(inverse, found[..., 6:], cov, basis, field_size)
+    return _fit(inverse, result[..., 6:], cov, basis, field_size)
 
 
 def fit_ellipsoid_gravity(measured: Array, up_sensor: Array, field_size: float) -> MagnetometerFit:
@@ -111,8 +111,8 @@ def fit_ellipsoid_gravity(measured: Array, up_sensor: Array, field_size: float) 
     vertical = np.mean(np.sum(up * _field(scaled, first, shape.offset), axis=-1), axis=-1)
     flat = first.reshape(*first.shape[:-2], 9)
     start = np.concatenate([flat, shape.offset, vertical[..., None]], axis=-1)
-    found, error, jacobian = _solved(_both_rows, start, scaled, up)
-    inverse, vertical = found[..., :9].reshape(first.shape), found[..., 12]
+    result, error, jacobian = _solved(_both_rows, start, scaled, up)
+    inverse, vertical = result[..., :9].reshape(first.shape), result[..., 12]
     n = scaled.shape[-2]
     variance = np.sum(error**2, axis=-1)[..., None, None] / max(2 * n - 13, 1)
     transposed = np.swapaxes(jacobian, -1, -2)
@@ -122,7 +122,7 @@ def fit_ellipsoid_gravity(measured: Array, up_sensor: Array, field_size: float) 
     unit = np.linalg.inv(square)
     cov = variance * (unit @ noise @ unit)
     basis = np.eye(9).reshape(9, 3, 3)
-    return _fit(inverse, found[..., 9:12], cov[..., :12, :12], basis, field_size)
+    return _fit(inverse, result[..., 9:12], cov[..., :12, :12], basis, field_size)
 
 
 def _field(measured: Array, inverse: Array, centre: Array) -> Array:
@@ -141,15 +141,15 @@ def _solved(
     """
     each = [part.reshape(-1, *part.shape[-2:]) for part in readings]
 
-    def model(rows: IntArray, state: Array) -> Normal:
+    def model(rows: IntArray, state: Array) -> NormalEquations:
         return normal_equations(*rows_at(*(part[rows] for part in each), state))
 
     solution = minimise(model, start.reshape(-1, start.shape[-1]), absolute=EXACT**2)
-    found = solution.state.reshape(start.shape)
-    error, jacobian = rows_at(*readings, found)
+    result = solution.state.reshape(start.shape)
+    error, jacobian = rows_at(*readings, result)
     if not np.all(solution.converged) or np.any(conditioning(jacobian) < SINGULAR):
         raise EstimationError(_NO_ELLIPSOID)
-    return found, error, jacobian
+    return result, error, jacobian
 
 
 def _algebraic(points: Array) -> tuple[Array, Array]:
@@ -164,14 +164,14 @@ def _algebraic(points: Array) -> tuple[Array, Array]:
     )
     if np.any(conditioning(design) < SINGULAR):
         raise EstimationError(_NO_ELLIPSOID)
-    found = np.sum(np.linalg.pinv(design), axis=-1)
-    shape = np.empty((*found.shape[:-1], 3, 3))
+    result = np.sum(np.linalg.pinv(design), axis=-1)
+    shape = np.empty((*result.shape[:-1], 3, 3))
     for k, (i, j) in enumerate(_SYMMETRIC):
-        shape[..., i, j] = shape[..., j, i] = found[..., k]
+        shape[..., i, j] = shape[..., j, i] = result[..., k]
     along = np.linalg.eigvalsh(shape)
     if np.any(np.min(np.abs(along), axis=-1) < NARROWEST**2 * np.max(np.abs(along), axis=-1)):
         raise EstimationError(_NO_ELLIPSOID)
-    middle = -np.linalg.solve(shape, found[..., 6:, None])
+    middle = -np.linalg.solve(shape, result[..., 6:, None])
     size = 1.0 + np.sum(middle[..., 0] * (shape @ middle)[..., 0], axis=-1)
     values, vectors = np.linalg.eigh(shape / size[..., None, None])
     if not np.all(values > 0.0):
@@ -225,5 +225,5 @@ def _fit(
     flat = by_inverse.reshape(*matrix.shape[:-2], count, 9)
     change[..., :9, :count] = np.swapaxes(flat, -1, -2)
     change[..., 9:, count:] = field_size * np.eye(3)
-    found = change @ cov @ np.swapaxes(change, -1, -2)
-    return MagnetometerFit(matrix, field_size * centre, found)
+    result = change @ cov @ np.swapaxes(change, -1, -2)
+    return MagnetometerFit(matrix, field_size * centre, result)

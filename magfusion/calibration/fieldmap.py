@@ -24,10 +24,10 @@ from magfusion.model.field_map import (
 from magfusion.model.site import Site
 from magfusion.units import Array, ComplexArray, IntArray
 
-FEWEST_POINTS = 8
+MIN_POINTS = 8
 LEARNT_FROM = 100  # points, at most, that decide on the process; the map itself takes all
 RELINEARISATIONS = 6  # at most
-SETTLED = 1e-4  # change of log-gain and rotation (rad) at which there is no need of another
+CONVERGED_STEP = 1e-4  # change of log-gain and rotation (rad) at which there is no need of another
 _WEAKEST = 0.1  # gain that a relinearisation starts from, and its inverse the strongest
 FOLDS = 5  # parts of the survey, each predicted from the others
 _FREEDOM = 4.0  # of Student's t
@@ -127,22 +127,22 @@ def learn_field_map(site: Site, points: MapPoints) -> MapFit:
         Where a beacon was detected at too few points.
     """
     detected = _all_detected(site, points)
-    for beacon, found in zip(site.beacons, detected, strict=True):
-        if len(found.sensor_world) < FEWEST_POINTS:
+    for beacon, result in zip(site.beacons, detected, strict=True):
+        if len(result.sensor_world) < MIN_POINTS:
             raise EstimationError(
-                f"beacon {beacon.name} was detected at {len(found.sensor_world)} points; a map"
-                f" requires {FEWEST_POINTS}; survey more of the room"
+                f"beacon {beacon.name} was detected at {len(result.sensor_world)} points; a map"
+                f" requires {MIN_POINTS}; survey more of the room"
             )
     process = _best_process(detected)
-    maps = [_conditioned(found, process) for found in detected]
+    maps = [_conditioned(result, process) for result in detected]
     beacons = tuple(replace(b, field_map=m) for b, m in zip(site.beacons, maps, strict=True))
     names = [b.name for b in site.beacons]
-    errors = [_cross_validated(found, process) for found in detected]
+    errors = [_cross_validated(result, process) for result in detected]
     return MapFit(
         site=replace(site, beacons=beacons),
         error_without={n: e[0] for n, e in zip(names, errors, strict=True)},
         error_with={n: e[1] for n, e in zip(names, errors, strict=True)},
-        points={n: len(found.sensor_world) for n, found in zip(names, detected, strict=True)},
+        points={n: len(result.sensor_world) for n, result in zip(names, detected, strict=True)},
     )
 
 
@@ -150,8 +150,8 @@ def _all_detected(site: Site, points: MapPoints) -> list[_DetectedFields]:
     sensor = site.platform.magnetometer
     world_from_sensor = points.world_from_body @ sensor.body_from_sensor
     sensor_world = points.position_world + points.world_from_body @ sensor.position_body
-    undone = np.swapaxes(world_from_sensor @ np.linalg.inv(sensor.matrix), -1, -2)
-    found, start = [], 0
+    reverted = np.swapaxes(world_from_sensor @ np.linalg.inv(sensor.matrix), -1, -2)
+    result, start = [], 0
     for beacon in site.beacons:
         tones = slice(start, start + len(beacon.tones))
         start = tones.stop
@@ -169,15 +169,15 @@ def _all_detected(site: Site, points: MapPoints) -> list[_DetectedFields]:
         there = np.isfinite(measured).all(axis=(1, 2))
         # A near-identity matrix leaves white noise white.
         variance = np.tile(points.sigma[:, tones] ** 2, 2)
-        found.append(
+        result.append(
             _DetectedFields(
                 sensor_world[there],
-                _stacked(plain @ undone)[there],
-                _stacked(measured @ undone)[there],
+                _stacked(plain @ reverted)[there],
+                _stacked(measured @ reverted)[there],
                 variance[there],
             )
         )
-    return found
+    return result
 
 
 def _aligned(plain: ComplexArray, measured: ComplexArray) -> ComplexArray:
@@ -197,12 +197,12 @@ def _reduced(detected: _DetectedFields, state: Array, residual: float) -> tuple[
     """
     gain = np.exp(state[:, :1, None])
     turn = skew(state[:, 1:])
-    turned = gain * (detected.model + detected.model @ np.swapaxes(turn, -1, -2))
+    rotated = gain * (detected.model + detected.model @ np.swapaxes(turn, -1, -2))
     by_rotation = -gain[..., None] * skew(detected.model)
-    design = np.concatenate([turned[..., None], by_rotation], axis=-1)  # (m, tones, 3, 4)
+    design = np.concatenate([rotated[..., None], by_rotation], axis=-1)  # (m, tones, 3, 4)
     strength = np.mean(np.sum(detected.model**2, axis=2), axis=1)[:, None]
     weight = 1.0 / (detected.variance + residual**2 * strength / 3.0)
-    error = detected.measured - turned + (design @ state[:, None, :, None])[..., 0]
+    error = detected.measured - rotated + (design @ state[:, None, :, None])[..., 0]
     weighted = design * weight[..., None, None]
     information = np.einsum("mtia,mtib->mab", weighted, design)
     vector = np.einsum("mtia,mti->ma", weighted, error)
@@ -232,7 +232,7 @@ def _conditioned(detected: _DetectedFields, process: _Process) -> FieldMap:
         before, state = state, (kernel @ weights).reshape(count, COMPONENTS)
         # Where a survey is of other beacons, steps would diverge.
         state[:, 0] = np.clip(state[:, 0], np.log(_WEAKEST), -np.log(_WEAKEST))
-        if np.max(np.abs(state - before)) < SETTLED:
+        if np.max(np.abs(state - before)) < CONVERGED_STEP:
             break
     return FieldMap(
         points_world=detected.sensor_world,
@@ -251,14 +251,14 @@ def _best_process(detected: Sequence[_DetectedFields]) -> _Process:
     The maximum likelihood would be dominated by the few points near iron and explain all as noise.
     """
     parts = [_folds(_evenly(h, LEARNT_FROM), FOLDS) for h in detected]
-    count = sum(asked.model.size for folds in parts for _, asked in folds)
+    count = sum(requested.model.size for folds in parts for _, requested in folds)
 
     def cost(log_process: Array) -> float:
         process = _Process(*np.exp(log_process))
         return sum(_surprise(*fold, process) for folds in parts for fold in folds) / count
 
-    found = minimise_bounded(cost, np.log(_START), np.log(_LIMITS))
-    return _Process(*(float(v) for v in np.exp(found)))
+    result = minimise_bounded(cost, np.log(_START), np.log(_LIMITS))
+    return _Process(*(float(v) for v in np.exp(result)))
 
 
 def _folds(detected: _DetectedFields, folds: int) -> list[tuple[_DetectedFields, _DetectedFields]]:
@@ -273,40 +273,42 @@ def _folds(detected: _DetectedFields, folds: int) -> list[tuple[_DetectedFields,
     ]
 
 
-def _surprise(known: _DetectedFields, asked: _DetectedFields, process: _Process) -> float:
+def _surprise(known: _DetectedFields, requested: _DetectedFields, process: _Process) -> float:
     """Return the negative log-score of a map's predictions, up to a constant."""
-    found = _conditioned(known, process)
-    strength = np.mean(np.sum(asked.model**2, axis=2), axis=1)
-    error = found.relative_variance(asked.sensor_world)
-    variance = np.mean(asked.variance, axis=1) + error * strength / 3.0
-    square = np.sum((asked.measured - _mapped(found, asked)) ** 2, axis=(1, 2)) / variance
-    size = asked.model[0].size
+    result = _conditioned(known, process)
+    strength = np.mean(np.sum(requested.model**2, axis=2), axis=1)
+    error = result.relative_variance(requested.sensor_world)
+    variance = np.mean(requested.variance, axis=1) + error * strength / 3.0
+    square = np.sum((requested.measured - _mapped(result, requested)) ** 2, axis=(1, 2)) / variance
+    size = requested.model[0].size
     spread = 0.5 * size * np.log(variance / strength)
     tail = 0.5 * (_FREEDOM + size) * np.log1p(square / _FREEDOM)
     return float(np.sum(spread + tail))
 
 
-def _mapped(found: FieldMap, asked: _DetectedFields) -> Array:
-    value, _ = found.mean(asked.sensor_world)
-    turned = asked.model + np.cross(value[:, None, 1:], asked.model)
-    return np.exp(value[:, :1, None]) * turned
+def _mapped(result: FieldMap, requested: _DetectedFields) -> Array:
+    value, _ = result.mean(requested.sensor_world)
+    rotated = requested.model + np.cross(value[:, None, 1:], requested.model)
+    return np.exp(value[:, :1, None]) * rotated
 
 
-def _evenly(detected: _DetectedFields, most: int) -> _DetectedFields:
+def _evenly(detected: _DetectedFields, maximum: int) -> _DetectedFields:
     count = len(detected.sensor_world)
-    if count <= most:
+    if count <= maximum:
         return detected
-    rows = np.unique(np.linspace(0, count - 1, most).astype(np.int64))
+    rows = np.unique(np.linspace(0, count - 1, maximum).astype(np.int64))
     return _DetectedFields(*(part[rows] for part in detected))
 
 
 def _cross_validated(detected: _DetectedFields, process: _Process) -> tuple[float, float]:
     """Return the relative error at left-out points, without the map and with it."""
-    without, left = [], []
-    for known, asked in _folds(detected, FOLDS):
-        without.append(_relative(asked.model, asked.measured))
-        left.append(_relative(_mapped(_conditioned(known, process), asked), asked.measured))
-    return _rms(np.concatenate(without)), _rms(np.concatenate(left))
+    without, residual = [], []
+    for known, requested in _folds(detected, FOLDS):
+        without.append(_relative(requested.model, requested.measured))
+        residual.append(
+            _relative(_mapped(_conditioned(known, process), requested), requested.measured)
+        )
+    return _rms(np.concatenate(without)), _rms(np.concatenate(residual))
 
 
 def _relative(model: Array, measured: Array) -> Array:

@@ -20,7 +20,7 @@ CALIBRATION_KEY = gtsam.symbol("c", 0)
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class CalibrationEstimate:
     """The estimate that the optimiser updates.
 
     Parameters
@@ -34,12 +34,12 @@ class Estimate:
     calibration: Array
 
 
-Rows = Callable[[Estimate], tuple[Array, Array, Array]]
+Rows = Callable[[CalibrationEstimate], tuple[Array, Array, Array]]
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationGraph:
-    """A `magfusion.estimation.solve.bordered.Problem`.
+    """A `magfusion.estimation.solve.bordered.BorderedProblem`.
 
     Parameters
     ----------
@@ -68,16 +68,16 @@ class CalibrationGraph:
             out.push_back(key)
         return out
 
-    def _prior(self, estimate: Estimate) -> tuple[Array, Array]:
+    def _prior(self, estimate: CalibrationEstimate) -> tuple[Array, Array]:
         sqrt_information = np.linalg.inv(np.linalg.cholesky(self.cov))
         return sqrt_information, sqrt_information @ (estimate.calibration - self.declared)
 
-    def cost(self, estimate: Estimate) -> float:
+    def cost(self, estimate: CalibrationEstimate) -> float:
         """Return half the sum of squared whitened residuals, priors included."""
         error, (_, step) = self.rows(estimate)[0], self._prior(estimate)
         return float(0.5 * (np.sum(error**2) + step @ step) + self.native.error(estimate.values))
 
-    def linearized(self, estimate: Estimate) -> gtsam.GaussianFactorGraph:
+    def linearized(self, estimate: CalibrationEstimate) -> gtsam.GaussianFactorGraph:
         """Return the linear graph at an estimate."""
         graph = self.native.linearize(estimate.values)
         error, by_pose, by_calibration = self.rows(estimate)
@@ -89,9 +89,9 @@ class CalibrationGraph:
         graph.push_back(gtsam.JacobianFactor(CALIBRATION_KEY, sqrt_information, -step, unit))
         return graph
 
-    def moved(self, estimate: Estimate, step: gtsam.VectorValues) -> Estimate:
+    def moved(self, estimate: CalibrationEstimate, step: gtsam.VectorValues) -> CalibrationEstimate:
         """Return the estimate updated by a step of every variable."""
-        return Estimate(
+        return CalibrationEstimate(
             estimate.values.retract(step), estimate.calibration + step.at(CALIBRATION_KEY)
         )
 
@@ -101,8 +101,12 @@ class CalibrationGraph:
 
 
 def solve(
-    graph: CalibrationGraph, start: Estimate, name: str, iterations: int, tolerance: float
-) -> tuple[Optimised[Estimate], Array]:
+    graph: CalibrationGraph,
+    start: CalibrationEstimate,
+    name: str,
+    iterations: int,
+    tolerance: float,
+) -> tuple[Optimised[CalibrationEstimate], Array]:
     """Return the best estimate, and the covariance of its calibration, shape (k, k).
 
     Parameters
@@ -117,15 +121,15 @@ def solve(
     EstimationError
         Where the loop does not converge, or the graph leaves a variable undetermined.
     """
-    found = optimise(graph, start, iterations=iterations, tolerance=tolerance)
-    if not found.converged:
+    result = optimise(graph, start, iterations=iterations, tolerance=tolerance)
+    if not result.converged:
         raise EstimationError(
             f"the calibration of the {name} does not converge in {iterations} iterations: readings"
             " and priors are inconsistent by far more than their sigmas allow"
         )
-    linear, ordering = graph.linearized(found.estimate), graph.ordering
+    linear, ordering = graph.linearized(result.estimate), graph.ordering
     try:
-        return found, last_marginal(eliminate(linear, ordering), linear, ordering)
+        return result, last_marginal(eliminate(linear, ordering), linear, ordering)
     except (RuntimeError, np.linalg.LinAlgError) as failure:
         raise EstimationError(
             f"the calibration of the {name} cannot be solved: its poses are not determined"

@@ -104,7 +104,7 @@ def missing_orientations(up_sensor: Array) -> list[str]:
     missing = []
     for name, along in zip(_AXES, unit.T, strict=True):
         ways = (("up", float(np.max(along))), ("down", -float(np.min(along))))
-        never = [way for way, most in ways if most < np.cos(POINTED)]
+        never = [way for way, maximum in ways if maximum < np.cos(POINTED)]
         if never:
             missing.append(f"the sensor's {name} axis never pointed {' or '.join(never)}")
     return missing

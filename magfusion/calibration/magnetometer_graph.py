@@ -12,7 +12,7 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 from scipy.spatial.transform import Rotation
 
-from magfusion.calibration.graph import CalibrationGraph, Estimate, solve
+from magfusion.calibration.graph import CalibrationEstimate, CalibrationGraph, solve
 from magfusion.calibration.magnetometer import MagnetometerFit
 from magfusion.errors import EstimationError
 from magfusion.model.field import by_matrix, skew
@@ -22,12 +22,12 @@ from magfusion.units import Array
 GYRO_BIAS_KEY = gtsam.symbol("g", 0)
 COLUMNS = 17  # matrix, offset, dip, accelerometer bias, logarithm of the field's size
 MOST_STEPS = 40
-SETTLED = 1e-9  # relative decrease of the cost that ends the loop
+MIN_COST_DECREASE = 1e-9  # relative decrease of the cost that ends the loop
 ATTITUDE_STEP, GYRO_BIAS_STEP = np.full(3, 0.3), np.full(3, 0.01)  # rad, rad/s
 
 
 @dataclass(frozen=True, eq=False)
-class Epochs:
+class MagnetometerEpochs:
     """Readings of the instruments at each attitude, and the priors of the attitudes.
 
     Parameters
@@ -61,7 +61,7 @@ class Epochs:
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class MagnetometerPrior:
     """Priors of the calibration; a sigma of zero fixes a value.
 
     Parameters
@@ -132,7 +132,7 @@ class Readings:
     The calibration is the estimated subset of the seventeen columns.
     """
 
-    def __init__(self, epochs: Epochs, prior: Prior) -> None:
+    def __init__(self, epochs: MagnetometerEpochs, prior: MagnetometerPrior) -> None:
         self.size = float(np.linalg.norm(prior.field_world))
         self.prior, self.n = prior, len(epochs)
         self.field_world = prior.field_world / self.size
@@ -159,7 +159,7 @@ class Readings:
         cov[16, 16] = self.prior.size_sigma**2
         return cov[np.ix_(self.active, self.active)]
 
-    def all_columns(self, estimate: Estimate) -> Array:
+    def all_columns(self, estimate: CalibrationEstimate) -> Array:
         """Return all seventeen columns, estimated and fixed."""
         out = self.declared.copy()
         out[self.active] = estimate.calibration
@@ -173,7 +173,7 @@ class Readings:
         field = down.apply(self.field_world)
         return field, -np.cross(across, field)
 
-    def rows(self, estimate: Estimate) -> tuple[Array, Array, Array]:
+    def rows(self, estimate: CalibrationEstimate) -> tuple[Array, Array, Array]:
         """Return whitened residuals (n, m) with derivatives by attitude and calibration."""
         c, mounting = self.all_columns(estimate), self.prior.body_from_sensor
         body_from_world = np.swapaxes(_attitudes(estimate.values, self.n), -1, -2)
@@ -204,7 +204,9 @@ class Readings:
         )
 
 
-def fit_graph(epochs: Epochs, prior: Prior, start: MagnetometerFit | None = None) -> GraphFit:
+def fit_graph(
+    epochs: MagnetometerEpochs, prior: MagnetometerPrior, start: MagnetometerFit | None = None
+) -> GraphFit:
     """Estimate matrix, offset, attitudes and inertial biases from all readings.
 
     Parameters
@@ -229,26 +231,26 @@ def fit_graph(epochs: Epochs, prior: Prior, start: MagnetometerFit | None = None
         cov=readings.prior_cov(),
         steps=steps,
     )
-    found, own_cov = solve(graph, first, "magnetometer", MOST_STEPS, SETTLED)
+    result, own_cov = solve(graph, first, "magnetometer", MOST_STEPS, MIN_COST_DECREASE)
     cov = np.zeros((COLUMNS, COLUMNS))
     cov[np.ix_(readings.active, readings.active)] = own_cov
     cov /= np.outer(readings.unit, readings.unit)
-    c, values = readings.all_columns(found.estimate) / readings.unit, found.estimate.values
-    turned = values.exists(GYRO_BIAS_KEY)
+    c, values = readings.all_columns(result.estimate) / readings.unit, result.estimate.values
+    rotated = values.exists(GYRO_BIAS_KEY)
     return GraphFit(
         fit=MagnetometerFit(c[:9].reshape(3, 3), c[9:12], cov[:12, :12]),
         world_from_body=_attitudes(values, readings.n),
         dip_change=float(c[12]),
         accel_bias_body=prior.gravity * c[13:16],
-        gyro_bias_body=values.atVector(GYRO_BIAS_KEY) if turned else np.zeros(3),
-        field_residual=readings.rows(found.estimate)[0][:, :3],
-        chi_square=2.0 * found.cost,
-        iterations=found.iterations,
+        gyro_bias_body=values.atVector(GYRO_BIAS_KEY) if rotated else np.zeros(3),
+        field_residual=readings.rows(result.estimate)[0][:, :3],
+        chi_square=2.0 * result.cost,
+        iterations=result.iterations,
         size_ratio=float(np.exp(c[16])),
     )
 
 
-def _native(epochs: Epochs, prior: Prior) -> gtsam.NonlinearFactorGraph:
+def _native(epochs: MagnetometerEpochs, prior: MagnetometerPrior) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     if epochs.world_from_body is not None and epochs.table_sigma is not None:
         noise = gtsam.noiseModel.Isotropic.Sigma(3, epochs.table_sigma)
@@ -267,7 +269,9 @@ def _attitudes(values: gtsam.Values, n: int) -> Array:
     return np.array([values.atRot3(X(i)).matrix() for i in range(n)])
 
 
-def _start(readings: Readings, epochs: Epochs, start: MagnetometerFit | None) -> Estimate:
+def _start(
+    readings: Readings, epochs: MagnetometerEpochs, start: MagnetometerFit | None
+) -> CalibrationEstimate:
     calibration = readings.declared.copy()
     if start is not None:
         calibration[:12] = np.concatenate([start.matrix.ravel(), start.offset / readings.size])
@@ -285,4 +289,4 @@ def _start(readings: Readings, epochs: Epochs, start: MagnetometerFit | None) ->
         values.insert(X(i), gtsam.Rot3(attitude))
     if any(turn is not None for turn in epochs.turns):
         values.insert(GYRO_BIAS_KEY, np.zeros(3))
-    return Estimate(values, calibration[readings.active])
+    return CalibrationEstimate(values, calibration[readings.active])

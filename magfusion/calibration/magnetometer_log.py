@@ -17,8 +17,18 @@ from magfusion.calibration.magnetometer import (
     refined,
     spread,
 )
-from magfusion.calibration.magnetometer_graph import Epochs, GraphFit, Prior, fit_graph
-from magfusion.calibration.magnetometer_start import likeliest, rival_offset, saying, starts
+from magfusion.calibration.magnetometer_graph import (
+    GraphFit,
+    MagnetometerEpochs,
+    MagnetometerPrior,
+    fit_graph,
+)
+from magfusion.calibration.magnetometer_start import (
+    most_probable_fit,
+    report_missing,
+    rival_offset,
+    starts,
+)
 from magfusion.calibration.steady_field import LONGEST, SteadyField, average, steady_field
 from magfusion.calibration.stops import distinct, find_stops
 from magfusion.errors import EstimationError, InputError
@@ -28,7 +38,7 @@ from magfusion.model.site import Magnetometer, Site
 from magfusion.units import DEGREE, Array
 
 POSITIONS = 12
-FEWEST_EPOCHS = 20  # of slow turning
+MIN_EPOCHS = 20  # of slow turning
 ONE_AXIS = 1.5 * DEGREE  # RMS; a field that wanders less in its second direction saw no turning
 KNOWN_DIP = 3.0 * DEGREE  # sigma; what steel in a building does to a reference field
 UNKNOWN_DIP = 1.0  # rad
@@ -42,7 +52,7 @@ IN_STEP = 4.0
 FIRST_SIGMA = 1e-3  # of the field, before its noise is measured
 FIELD_SCALES = (0.05, 20.0)  # by which the first guess of an undeclared field's size may be wrong
 LINEARITY = 2e-5  # of the field; a reading is no better than this, however long the window
-PASSES = 3
+MAX_ITERATIONS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +82,7 @@ class LogCalibration:
 
     magnetometer: Magnetometer
     graph: GraphFit
-    prior: Prior
+    prior: MagnetometerPrior
     readings: SteadyField
     field_sigma: float
     missing: list[str]
@@ -115,22 +125,22 @@ def calibrate_log(
         seen = _field_seen(readings, known, begun[0].matrix, begun[0].offset)
         prior = replace(prior, field_world=seen)
     sigma = FIRST_SIGMA * float(np.linalg.norm(prior.field_world))
-    for _ in range(PASSES):
-        epochs = Epochs(
+    for _ in range(MAX_ITERATIONS):
+        epochs = MagnetometerEpochs(
             measured_sensor=readings.measured_sensor,
             field_sigma=sigma,
             accel_body=readings.accel_body,
             accel_sigma=_accel_sigma(readings, site, at_stops),
             turns=turns,
         )
-        with saying(missing, field_known=site.earth_field_world is not None):
-            graph = likeliest(epochs, prior, begun)
+        with report_missing(missing, field_known=site.earth_field_world is not None):
+            graph = most_probable_fit(epochs, prior, begun)
             start = graph.fit
             if site.earth_field_world is None:
                 prior = _sized(prior, graph)
-        found = replace(known, matrix=start.matrix, offset=start.offset)
-        readings = _readings(waveform, imu, site, found, at_stops)
-        sigma = _field_sigma(readings, found, prior)
+        result = replace(known, matrix=start.matrix, offset=start.offset)
+        readings = _readings(waveform, imu, site, result, at_stops)
+        sigma = _field_sigma(readings, result, prior)
         begun = (start,)
     rival = rival_offset(epochs, prior, graph)
     if at_stops:
@@ -158,9 +168,9 @@ def _readings(
 ) -> SteadyField:
     if not at_stops:
         readings = steady_field(waveform, imu, site, magnetometer=known)
-        if len(readings) < FEWEST_EPOCHS:
+        if len(readings) < MIN_EPOCHS:
             raise InputError(
-                f"magnetometer: the log gives {len(readings)} readings; {FEWEST_EPOCHS} are"
+                f"magnetometer: the log gives {len(readings)} readings; {MIN_EPOCHS} are"
                 " required; rotate the sensor slowly for a minute"
             )
         return readings
@@ -195,22 +205,22 @@ def _refuse_one_axis(
         )
 
 
-def _refuse_few_stops(found: int, missing: list[str]) -> None:
-    if missing or found < POSITIONS:
+def _refuse_few_stops(result: int, missing: list[str]) -> None:
+    if missing or result < POSITIONS:
         raise InputError(
-            f"imu: the stops have {found} different orientations and {POSITIONS} are required"
+            f"imu: the stops have {result} different orientations and {POSITIONS} are required"
             + "".join(f"; {sentence}" for sentence in missing)
             + "; stop with each axis up and down, at two headings each"
         )
 
 
-def _prior(site: Site, readings: SteadyField) -> Prior:
+def _prior(site: Site, readings: SteadyField) -> MagnetometerPrior:
     known, imu = site.platform.magnetometer, site.platform.imu
     field, dip_sigma, size_sigma = site.earth_field_world, KNOWN_DIP, 0.0
     if field is None:
         field = _field_seen(readings, known, known.matrix, known.offset)
         dip_sigma, size_sigma = UNKNOWN_DIP, WIDE_SIZE
-    return Prior(
+    return MagnetometerPrior(
         body_from_sensor=known.body_from_sensor,
         matrix=known.matrix,
         offset=known.offset,
@@ -239,7 +249,7 @@ def _starts(
     imu: ImuSamples,
     site: Site,
     up_sensor: Array,
-    prior: Prior,
+    prior: MagnetometerPrior,
     missing: list[str],
 ) -> tuple[MagnetometerFit, ...]:
     """Return the initial estimate: from the ellipsoid where readings surround it, else the gyro."""
@@ -251,22 +261,22 @@ def _starts(
     return starts(readings, imu, lag, known, prior.cov[9:, 9:], size)
 
 
-def _accel_sigma(readings: SteadyField, site: Site, at_rest: bool) -> Array:
+def _accel_sigma(readings: SteadyField, site: Site, is_stationary: bool) -> Array:
     """Return the noise of the specific force, motion included."""
     imu = site.platform.imu
     variance = 1.5 * imu.accel_noise**2 / readings.window + ACCEL_FLOOR**2
-    if not at_rest:
+    if not is_stationary:
         excess = np.linalg.norm(readings.accel_body, axis=1) - site.gravity
         variance += IN_STEP**2 * uniform_filter1d(excess**2, SHAKEN, mode="nearest")
     return np.sqrt(variance)
 
 
-def _field_sigma(readings: SteadyField, found: Magnetometer, prior: Prior) -> float:
+def _field_sigma(readings: SteadyField, result: Magnetometer, prior: MagnetometerPrior) -> float:
     """Return the noise of a reading from the field's magnitude, which is attitude-independent."""
-    field = field_from_measured(readings.measured_sensor, found.matrix, found.offset)
+    field = field_from_measured(readings.measured_sensor, result.matrix, result.offset)
     size = np.linalg.norm(prior.field_world)
-    left = np.linalg.norm(field, axis=1) - size
-    scatter = np.sqrt(np.sum(left**2) / max(len(left) - 9, 1))
+    residual = np.linalg.norm(field, axis=1) - size
+    scatter = np.sqrt(np.sum(residual**2) / max(len(residual) - 9, 1))
     return float(max(scatter, LINEARITY * size))
 
 
@@ -301,7 +311,7 @@ def _turns(
     return tuple(out)
 
 
-def _sized(prior: Prior, graph: GraphFit) -> Prior:
+def _sized(prior: MagnetometerPrior, graph: GraphFit) -> MagnetometerPrior:
     """Return the prior with the estimated magnitude of the field.
 
     The initial magnitude is as wrong as the declared offset.
@@ -314,7 +324,9 @@ def _sized(prior: Prior, graph: GraphFit) -> Prior:
     return replace(prior, field_world=graph.size_ratio * prior.field_world)
 
 
-def _spread_unseen(epochs: Epochs, prior: Prior, start: MagnetometerFit) -> float | None:
+def _spread_unseen(
+    epochs: MagnetometerEpochs, prior: MagnetometerPrior, start: MagnetometerFit
+) -> float | None:
     """Return the spread of the field in each half with the calibration of the other half."""
     half, n = len(epochs) // 2, len(epochs)
     fields = []
@@ -327,7 +339,7 @@ def _spread_unseen(epochs: Epochs, prior: Prior, start: MagnetometerFit) -> floa
     return spread(np.concatenate(fields))
 
 
-def _part(epochs: Epochs, part: slice) -> Epochs:
+def _part(epochs: MagnetometerEpochs, part: slice) -> MagnetometerEpochs:
     assert epochs.accel_body is not None
     assert epochs.accel_sigma is not None
     begin, end, _ = part.indices(len(epochs))
@@ -351,16 +363,18 @@ def _no_better(
     declared = field_from_measured(readings.measured_sensor, known.matrix, known.offset)
     sizes = np.linalg.norm(declared, axis=1)
     size = np.mean(sizes) if field_world is None else np.linalg.norm(field_world)
-    left = float(np.sqrt(np.mean((sizes - size) ** 2)) / size)
-    return unseen > left * (1.0 - float(np.sqrt(0.5 / len(readings))))
+    residual = float(np.sqrt(np.mean((sizes - size) ** 2)) / size)
+    return unseen > residual * (1.0 - float(np.sqrt(0.5 / len(readings))))
 
 
-def _turned_only(known: Magnetometer, fit: MagnetometerFit, prior: Prior) -> MagnetometerFit:
+def _turned_only(
+    known: Magnetometer, fit: MagnetometerFit, prior: MagnetometerPrior
+) -> MagnetometerFit:
     """Return the declared shape and offset and their covariance, with the estimated rotation."""
-    left, _, right = np.linalg.svd(np.linalg.inv(known.matrix) @ fit.matrix)
+    residual, _, right = np.linalg.svd(np.linalg.inv(known.matrix) @ fit.matrix)
     turn = np.stack([(known.matrix @ skew(axis)).ravel() for axis in np.eye(3)], axis=1)
     rotation = np.zeros((12, 12))
     rotation[:9, :9] = turn @ np.linalg.pinv(turn)
     shape = np.eye(12) - rotation
     cov = rotation @ fit.cov @ rotation.T + shape @ prior.cov @ shape.T
-    return MagnetometerFit(known.matrix @ left @ right, known.offset, cov)
+    return MagnetometerFit(known.matrix @ residual @ right, known.offset, cov)

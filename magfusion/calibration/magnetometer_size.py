@@ -15,25 +15,25 @@ from magfusion.calibration.magnetometer import (
     prior_cov,
     refined,
 )
-from magfusion.calibration.magnetometer_graph import GraphFit, Prior
+from magfusion.calibration.magnetometer_graph import GraphFit, MagnetometerPrior
 from magfusion.calibration.magnetometer_log import LINEARITY, LogCalibration
-from magfusion.calibration.magnetometer_start import APART, UNLIKELY, mirrored, places
+from magfusion.calibration.magnetometer_start import DISTINCT_CHI_SQUARE, UNLIKELY, mirrored, places
 from magfusion.calibration.steady_field import SteadyField, steady_alone
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.solve.batched import Normal, minimise, normal_equations
+from magfusion.estimation.solve.batched import NormalEquations, minimise, normal_equations
 from magfusion.model.samples import Waveform
 from magfusion.model.site import Magnetometer, Site
 from magfusion.units import DEGREE, Array, IntArray
 
-FEWEST = 20  # readings
+MIN_READINGS = 20  # readings
 NEW = 1.0 * DEGREE  # of the field: what turned less since the last reading is no further one
 NARROW = 3.0 * DEGREE  # RMS in the second direction; less is turning about no axis
 FIRST_SIGMA = 1e-3  # of the field, before the scatter is known
 HOMOGENEOUS = 1e-3  # of the field; what steel changes it by over the length of an arm
 WIDE_SIZE = 10.0  # of the field's size, where nobody declared it
-PASSES = 3
+MAX_ITERATIONS = 3
 KNOWN_SIZE = 1e-6  # of the field's size, where it was declared
-SETTLED = 1e-4  # of a chi square, which another step would gain
+MIN_CHI_SQUARE_GAIN = 1e-4  # of a chi square, which another step would gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +58,12 @@ class _Sphere:
         jacobian = np.concatenate([by_matrix, -back, by_size], axis=2)
         return (size - state[:, 12:] * self.size) / self.sigma, jacobian / self.sigma
 
-    def normal(self, _: IntArray, state: Array) -> Normal:
+    def normal(self, _: IntArray, state: Array) -> NormalEquations:
         """Return the normal equations at states (k, 13), priors included."""
         step = (state - self.declared) @ self.root.T
         prior = normal_equations(step, np.broadcast_to(self.root, (len(state), 13, 13)))
-        told = normal_equations(*self.rows(state))
-        return Normal(*(one + other for one, other in zip(told, prior, strict=True)))
+        reported = normal_equations(*self.rows(state))
+        return NormalEquations(*(one + other for one, other in zip(reported, prior, strict=True)))
 
     def minima(self, begun: list[MagnetometerFit]) -> list[tuple[Array, Array, float]]:
         """Return state, covariance (13, 13) and cost of the converged minima.
@@ -74,19 +74,19 @@ class _Sphere:
             Where no start converges.
         """
         start = np.array([[*one.matrix.ravel(), *one.offset, 1.0] for one in begun])
-        found = minimise(self.normal, start, absolute=SETTLED)
-        if not np.any(found.converged):
+        result = minimise(self.normal, start, absolute=MIN_CHI_SQUARE_GAIN)
+        if not np.any(result.converged):
             raise EstimationError(
                 "the field's magnitude does not determine the calibration; rotate the sensor about"
                 " all axes"
             )
-        rows = np.flatnonzero(found.converged)
+        rows = np.flatnonzero(result.converged)
         unit = np.linalg.inv(self.root)
         out = []
         for k in rows:
-            scaled = unit.T @ found.information[k] @ unit
+            scaled = unit.T @ result.information[k] @ unit
             cov = unit @ np.linalg.inv(scaled) @ unit.T
-            out.append((found.state[k], cov, float(found.cost[k])))
+            out.append((result.state[k], cov, float(result.cost[k])))
         return out
 
 
@@ -107,14 +107,14 @@ def calibrate_alone(waveform: Waveform, site: Site) -> LogCalibration:
         Where the calibration has no solution.
     """
     known = site.platform.magnetometer
-    readings = _apart(steady_alone(waveform, site), known)
+    readings = _at_distinct_fields(steady_alone(waveform, site), known)
     _refuse_little(readings, known, site)
     declared = field_from_measured(readings.measured_sensor, known.matrix, known.offset)
     field_world, size_sigma = site.earth_field_world, 0.0
     if field_world is None:
         field_world = np.array([0.0, 0.0, float(np.median(np.linalg.norm(declared, axis=1)))])
         size_sigma = WIDE_SIZE
-    prior = Prior(
+    prior = MagnetometerPrior(
         body_from_sensor=known.body_from_sensor,
         matrix=known.matrix,
         offset=known.offset,
@@ -123,13 +123,13 @@ def calibrate_alone(waveform: Waveform, site: Site) -> LogCalibration:
     )
     size = float(np.linalg.norm(field_world))
     sigma, begun = FIRST_SIGMA * size, _begun(readings, prior, size)
-    for _ in range(PASSES):
+    for _ in range(MAX_ITERATIONS):
         problem = _problem(readings, prior, size, sigma, size_sigma)
-        found = problem.minima(begun)
-        state, cov, cost = min(found, key=lambda one: one[2])
+        result = problem.minima(begun)
+        state, cov, cost = min(result, key=lambda one: one[2])
         error = sigma * problem.rows(state[None])[0][0]
         scatter = float(np.sqrt(np.sum(error**2) / max(len(error) - 9, 1)))
-        begun = [_fit(one[0], one[1]) for one in found]
+        begun = [_fit(one[0], one[1]) for one in result]
         sigma = max(scatter, HOMOGENEOUS * state[12] * size, LINEARITY * size)
     fit = _fit(state, cov)
     flat = mirrored(readings.measured_sensor, fit)
@@ -143,7 +143,7 @@ def calibrate_alone(waveform: Waveform, site: Site) -> LogCalibration:
         gyro_bias_body=np.zeros(3),
         field_residual=(error / sigma)[:, None],
         chi_square=cost,
-        iterations=PASSES,
+        iterations=MAX_ITERATIONS,
     )
     return LogCalibration(
         magnetometer=refined(known, fit),
@@ -159,7 +159,7 @@ def calibrate_alone(waveform: Waveform, site: Site) -> LogCalibration:
     )
 
 
-def _apart(readings: SteadyField, known: Magnetometer) -> SteadyField:
+def _at_distinct_fields(readings: SteadyField, known: Magnetometer) -> SteadyField:
     """Return readings between which the field rotates; repeated readings at rest add nothing."""
     field = field_from_measured(readings.measured_sensor, known.matrix, np.zeros(3))
     reach = NEW * 0.5 * float(np.max(np.ptp(field, axis=0)))
@@ -178,10 +178,10 @@ def _apart(readings: SteadyField, known: Magnetometer) -> SteadyField:
 
 def _refuse_little(readings: SteadyField, known: Magnetometer, site: Site) -> None:
     remedy = "rotate it slowly about all its axes for a minute, or record an IMU as well"
-    if len(readings) < FEWEST:
+    if len(readings) < MIN_READINGS:
         raise InputError(
             f"magnetometer: the log gives {len(readings)} readings of different directions, and"
-            f" {FEWEST} are required; {remedy}"
+            f" {MIN_READINGS} are required; {remedy}"
         )
     field = field_from_measured(readings.measured_sensor, known.matrix, known.offset)
     size = np.linalg.norm(
@@ -195,7 +195,7 @@ def _refuse_little(readings: SteadyField, known: Magnetometer, site: Site) -> No
         )
 
 
-def _begun(readings: SteadyField, prior: Prior, size: float) -> list[MagnetometerFit]:
+def _begun(readings: SteadyField, prior: MagnetometerPrior, size: float) -> list[MagnetometerFit]:
     """Return initial estimates: the centre of the sphere, on both sides where that is ambiguous."""
     inverse = np.linalg.inv(prior.matrix)
     field = (readings.measured_sensor - prior.offset) @ inverse.T
@@ -203,8 +203,8 @@ def _begun(readings: SteadyField, prior: Prior, size: float) -> list[Magnetomete
     rows = 2.0 * (field - middle)
     length = np.sum(field**2, axis=1)
     noise = (0.1 * size**2) ** 2
-    told = np.linalg.inv(inverse @ prior.cov[9:, 9:] @ inverse.T)
-    square = rows.T @ rows / noise + told
+    reported = np.linalg.inv(inverse @ prior.cov[9:, 9:] @ inverse.T)
+    square = rows.T @ rows / noise + reported
     centre = np.linalg.solve(square, rows.T @ (length - np.mean(length)) / noise)
     least = np.linalg.eigh(square)[1][:, 0]
     return [
@@ -216,7 +216,7 @@ def _begun(readings: SteadyField, prior: Prior, size: float) -> list[Magnetomete
 
 
 def _problem(
-    readings: SteadyField, prior: Prior, size: float, sigma: float, size_sigma: float
+    readings: SteadyField, prior: MagnetometerPrior, size: float, sigma: float, size_sigma: float
 ) -> _Sphere:
     declared = np.concatenate([prior.matrix.ravel(), prior.offset, [1.0]])
     root = np.zeros((13, 13))
@@ -230,11 +230,14 @@ def _fit(state: Array, cov: Array) -> MagnetometerFit:
 
 
 def _rival(
-    found: list[tuple[Array, Array, float]], fit: MagnetometerFit, cost: float
+    result: list[tuple[Array, Array, float]], fit: MagnetometerFit, cost: float
 ) -> Array | None:
     """Return another offset (T) that explains the readings nearly as well, if there is one."""
-    for state, _, other in found:
+    for state, _, other in result:
         off = state[9:12] - fit.offset
-        if off @ np.linalg.solve(fit.cov[9:, 9:], off) > APART and other < cost + UNLIKELY:
+        if (
+            off @ np.linalg.solve(fit.cov[9:, 9:], off) > DISTINCT_CHI_SQUARE
+            and other < cost + UNLIKELY
+        ):
             return np.asarray(state[9:12])
     return None

@@ -13,7 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from magfusion.calibration.magnetometer import MagnetometerFit, field_from_measured
-from magfusion.calibration.magnetometer_graph import Epochs, GraphFit, Prior, fit_graph
+from magfusion.calibration.magnetometer_graph import (
+    GraphFit,
+    MagnetometerEpochs,
+    MagnetometerPrior,
+    fit_graph,
+)
 from magfusion.calibration.steady_field import SteadyField
 from magfusion.errors import EstimationError
 from magfusion.model.samples import ImuSamples
@@ -24,7 +29,10 @@ from magfusion.units import Array
 LAGS = (1.0, 2.0, 4.0, 8.0)  # s; over which a gyro's bias turns little
 NEAR = 0.3  # of a lag, by which two readings may be nearer or farther
 FARTHEST, STEPS = 4e-4, 801  # T; hard iron along the direction that is told least
-APART, UNLIKELY = 16.0, 25.0  # chi square by which an offset is another one, and by which it is out
+DISTINCT_CHI_SQUARE, UNLIKELY = (
+    16.0,
+    25.0,
+)  # chi square by which an offset is another one, and by which it is out
 FLAT = 0.15  # of the field, by which readings leave their plane; beyond, none mistakes its sides
 READING = 0.02  # of the field: how wrong turned readings are, against the prior of the offset
 
@@ -88,20 +96,24 @@ def mirrored(measured: Array, fit: MagnetometerFit) -> MagnetometerFit | None:
     return replace(fit, offset=fit.offset + 2.0 * far * fit.matrix @ axes[:, 0])
 
 
-def likeliest(epochs: Epochs, prior: Prior, begun: tuple[MagnetometerFit, ...]) -> GraphFit:
+def most_probable_fit(
+    epochs: MagnetometerEpochs, prior: MagnetometerPrior, begun: tuple[MagnetometerFit, ...]
+) -> GraphFit:
     """Return the most probable of the solutions reached from several starts."""
-    found, failure = [], EstimationError("")
+    result, failure = [], EstimationError("")
     for start in begun:
         try:
-            found.append(fit_graph(epochs, prior, start))
+            result.append(fit_graph(epochs, prior, start))
         except EstimationError as error:
             failure = error
-    if not found:
+    if not result:
         raise failure
-    return min(found, key=lambda graph: graph.chi_square)
+    return min(result, key=lambda graph: graph.chi_square)
 
 
-def rival_offset(epochs: Epochs, prior: Prior, graph: GraphFit) -> Array | None:
+def rival_offset(
+    epochs: MagnetometerEpochs, prior: MagnetometerPrior, graph: GraphFit
+) -> Array | None:
     """Return another offset (T) that explains the readings nearly as well, if there is one.
 
     For readings in one plane the mirror image fits equally well: the magnitude is the same.
@@ -115,14 +127,14 @@ def rival_offset(epochs: Epochs, prior: Prior, graph: GraphFit) -> Array | None:
     except EstimationError:
         return None
     off = other.fit.offset - fit.offset
-    elsewhere = off @ np.linalg.solve(fit.cov[9:, 9:], off) > APART
+    elsewhere = off @ np.linalg.solve(fit.cov[9:, 9:], off) > DISTINCT_CHI_SQUARE
     return (
         other.fit.offset if elsewhere and other.chi_square < graph.chi_square + UNLIKELY else None
     )
 
 
 @contextmanager
-def saying(missing: list[str], *, field_known: bool) -> Iterator[None]:
+def report_missing(missing: list[str], *, field_known: bool) -> Iterator[None]:
     """Add the missing orientations, and a remedy, to a failure."""
     try:
         yield
@@ -142,5 +154,5 @@ def places(field: Array, direction: Array, size: float) -> Array:
     across = np.sum(field**2, axis=1) - along**2
     sizes = np.sqrt(np.maximum(across, 0.0) + (along - tried[:, None]) ** 2)
     cost = np.mean((sizes - size) ** 2, axis=1)
-    found = tried[1:-1][(cost[1:-1] < cost[:-2]) & (cost[1:-1] <= cost[2:])]
-    return found if len(found) else tried[[int(np.argmin(cost))]]
+    result = tried[1:-1][(cost[1:-1] < cost[:-2]) & (cost[1:-1] <= cost[2:])]
+    return result if len(result) else tried[[int(np.argmin(cost))]]

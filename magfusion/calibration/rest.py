@@ -42,7 +42,7 @@ class Blocks:
     scatter: Array
     change: Array
 
-    def unlike(self) -> BoolArray:
+    def outlying(self) -> BoolArray:
         """Return which stretches are shaken, knocked or frozen relative to the others, (n,)."""
         if len(self.begin) < 4:
             return np.zeros(len(self.begin), dtype=bool)
@@ -50,10 +50,10 @@ class Blocks:
         shaken = self.scatter > SHAKEN * usual
         knocked = self.change > KNOCKED * np.median(self.change, axis=0)
         frozen = np.all(self.scatter < STILL * usual, axis=1)
-        loud = (shaken & (self.scatter > 0.0)) | (knocked & (self.change > 0.0))
-        return np.asarray(frozen | loud.any(axis=1))
+        strong = (shaken & (self.scatter > 0.0)) | (knocked & (self.change > 0.0))
+        return np.asarray(frozen | strong.any(axis=1))
 
-    def departed(self, limit: Array) -> BoolArray:
+    def exceeding(self, limit: Array) -> BoolArray:
         """Return in which stretches an axis deviates or scatters beyond limits (axes,)."""
         off = np.abs(self.mean - np.median(self.mean, axis=0))
         return np.asarray(((off > limit) | (self.scatter > limit)).any(axis=1))
@@ -76,7 +76,7 @@ class RestStream:
         self._begin = self._end = 0.0
         self._sum = np.zeros(axes)
         self._origin = np.zeros(axes)
-        self._alike = np.zeros(axes)
+        self._repeated = np.zeros(axes)
         self._changed = 0
         self._rest = np.zeros((0, axes))
         self._rest_begin = 0.0
@@ -104,7 +104,7 @@ class RestStream:
             self._begin = self._rest_begin = float(time[0])
             self._origin = np.nan_to_num(values[0])
         previous = time[0] - self._step if self._last is None else self._last[0]
-        self._count_alike(values)
+        self._count_repeated(values)
         missing = _missing(np.diff(time, prepend=previous) / self._step)
         for first in range(0, len(time), ROWS):
             part = slice(first, first + ROWS)
@@ -128,14 +128,14 @@ class RestStream:
         return self._origin + self._sum / max(len(self), 1)
 
     @property
-    def lost(self) -> float:
+    def missing_share(self) -> float:
         """Share of the samples that are missing."""
         return self.allan.missing / max(self._slots, 1)
 
     @property
     def repeated(self) -> Array:
         """Share of saturated samples, among those that are not all the same."""
-        return self._alike / max(self._changed, 1)
+        return self._repeated / max(self._changed, 1)
 
     def allan_variance(self) -> AllanVariance:
         """Return the Allan variance of the samples so far."""
@@ -151,11 +151,11 @@ class RestStream:
         mean, scatter, change = (np.array([row[k] for row in rows]) for k in (2, 3, 4))
         return Blocks(begin, end, mean, scatter, change)
 
-    def _count_alike(self, values: Array) -> None:
+    def _count_repeated(self, values: Array) -> None:
         before = values[:1] * np.nan if self._last is None else self._last[1][None]
         same = values == np.concatenate([before, values[:-1]])
         changed = ~same.all(axis=1)
-        self._alike += np.sum(same[changed], axis=0)
+        self._repeated += np.sum(same[changed], axis=0)
         self._changed += int(np.sum(changed))
 
     def _fill(self, values: Array, missing: IntArray) -> None:

@@ -21,8 +21,8 @@ SHORTEST = 0.2  # s; ten periods of the mains
 LONGEST = 2.0  # s; over which a gyro's bias turns less than it matters
 GAP = 3.5  # a gap is this many times what intervals are up to; two lost samples are none
 UP_TO = 95.0  # percent of the intervals, so that stamps of a host make no gaps
-SHORTEST_ALONE, FEWEST_ALONE = 0.05, 5.0  # s, samples; of a window without a gyro
-TURNED = 0.05  # of all that the field changes by
+SHORTEST_ALONE, MIN_WINDOW_SAMPLES = 0.05, 5.0  # s, samples; of a window without a gyro
+MIN_TURN_CHANGE = 0.05  # of all that the field changes by
 MOST_OF_WINDOW = 0.5  # that may pass without a sample, however long intervals are
 
 
@@ -97,7 +97,7 @@ def steady_field(
 def steady_alone(waveform: Waveform, site: Site) -> SteadyField:
     """Average a waveform without a gyro, over windows that are as short as possible.
 
-    Windows in which the field rotates by more than `TURNED` are omitted: their mean is too small.
+    Windows in which the field rotates by more than `MIN_TURN_CHANGE` are omitted: their mean is too small.
 
     Raises
     ------
@@ -106,7 +106,9 @@ def steady_alone(waveform: Waveform, site: Site) -> SteadyField:
     """
     time = waveform.time
     usual = float(np.median(np.diff(time)))
-    length = window_length(site) if site.beacons else max(SHORTEST_ALONE, FEWEST_ALONE * usual)
+    length = (
+        window_length(site) if site.beacons else max(SHORTEST_ALONE, MIN_WINDOW_SAMPLES * usual)
+    )
     centre = np.arange(time[0] + 0.5 * length, time[-1] - 0.5 * length, length)
     window = np.full(len(centre), length)
     whole = _whole(time, centre, window)
@@ -119,7 +121,7 @@ def steady_alone(waveform: Waveform, site: Site) -> SteadyField:
     mean = _tapered_means(time, waveform.measured_sensor, centre, window)
     rate = np.linalg.norm(np.gradient(mean, centre, axis=0), axis=1)
     far = float(np.linalg.norm(np.ptp(mean, axis=0)))
-    slow = rate * length < TURNED * far
+    slow = rate * length < MIN_TURN_CHANGE * far
     centre, window, mean = centre[slow], window[slow], mean[slow]
     return SteadyField(centre, window, mean, np.zeros_like(mean))
 

@@ -61,7 +61,7 @@ def naming(path: Path, unfinished: Path | None = None) -> Iterator[None]:
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield a temporary name beside ``path`` that takes its place only if nothing fails."""
     clear_abandoned(path)
-    unfinished = _beside(path, UNFINISHED)
+    unfinished = _temporary_path(path, UNFINISHED)
     try:
         with naming(path, unfinished):
             yield unfinished
@@ -73,16 +73,16 @@ def whole_file(path: Path) -> Iterator[Path]:
 def clear_abandoned(path: Path) -> None:
     """Remove what a run that was killed left beside ``path``; give back what it had moved away."""
     own = re.compile(abandoned_pattern(re.escape(path.name)))
-    for left in _entries(path.parent):
-        found = own.fullmatch(left.name)
-        if found is None or found["machine"] != _machine() or _runs(int(found["process"])):
+    for remaining in _entries(path.parent):
+        result = own.fullmatch(remaining.name)
+        if result is None or result["machine"] != _machine() or _runs(int(result["process"])):
             continue
-        if found["kind"] == FORMER and not os.path.lexists(path):
-            left.rename(path)
-        elif left.is_dir():
-            shutil.rmtree(left, ignore_errors=True)
+        if result["kind"] == FORMER and not os.path.lexists(path):
+            remaining.rename(path)
+        elif remaining.is_dir():
+            shutil.rmtree(remaining, ignore_errors=True)
         else:
-            left.unlink(missing_ok=True)
+            remaining.unlink(missing_ok=True)
 
 
 def abandoned_pattern(name: str) -> str:
@@ -91,7 +91,7 @@ def abandoned_pattern(name: str) -> str:
     return rf"\.{name}\.(?P<machine>[0-9a-f]{{8}})-(?P<process>\d+)\.(?P<kind>{kinds})"
 
 
-def _beside(path: Path, kind: str) -> Path:
+def _temporary_path(path: Path, kind: str) -> Path:
     return path.with_name(f".{path.name}.{_machine()}-{os.getpid()}.{kind}")
 
 
@@ -133,8 +133,8 @@ def whole_directory(path: Path, replaces: Callable[[Path], bool]) -> Iterator[Pa
     path = real(path)
     refuse_in_the_way(path, replaces)
     clear_abandoned(path)
-    unfinished = _beside(path, UNFINISHED)
-    made = [parent for parent in path.parents if not parent.exists()]
+    unfinished = _temporary_path(path, UNFINISHED)
+    built = [parent for parent in path.parents if not parent.exists()]
     try:
         _make(unfinished)
         with naming(path, unfinished):
@@ -143,7 +143,7 @@ def whole_directory(path: Path, replaces: Callable[[Path], bool]) -> Iterator[Pa
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
         if not path.exists():
-            _remove_empty(made)
+            _remove_empty(built)
 
 
 def _make(path: Path) -> None:
@@ -165,7 +165,7 @@ def _take_place(unfinished: Path, path: Path) -> None:
     if not path.exists():
         unfinished.rename(path)
         return
-    former = _beside(path, FORMER)
+    former = _temporary_path(path, FORMER)
     path.rename(former)
     try:
         unfinished.rename(path)

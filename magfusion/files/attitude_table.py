@@ -159,8 +159,8 @@ def _check_columns(schema: pa.Schema, path: Path) -> None:
         if schema.names.count(name) != 1:
             raise InputError(f"{path}: column {name} is missing or repeated; build the file again.")
         if not pa.types.is_floating(schema.field(name).type):
-            found = schema.field(name).type
-            raise InputError(f"{path}: column {name} holds {found}; build the file again.")
+            result = schema.field(name).type
+            raise InputError(f"{path}: column {name} holds {result}; build the file again.")
 
 
 def _numbers(table: pa.Table, name: str, path: Path) -> Array:

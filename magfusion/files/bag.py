@@ -78,8 +78,8 @@ def read_bag(
         Where the bag cannot be read, has no topic of a sensor or several of one kind of which
         none was named, or holds messages that no instrument gives.
     """
-    found = _opened(path, topics or Topics(), report)
-    imu, field, truth = (found.get(role) for role in ("imu", "magnetometer", "truth"))
+    result = _opened(path, topics or Topics(), report)
+    imu, field, truth = (result.get(role) for role in ("imu", "magnetometer", "truth"))
     first = field if imu is None else imu
     if first is None:
         raise InputError(
@@ -87,9 +87,9 @@ def read_bag(
             " inertial sensor beside it."
         )
     span = Span(int(first.time_ns[0]), start, end)
-    told: list[Finding] = []
+    declared: list[Finding] = []
     imu, field, truth = (
-        None if one is None else _measured(one.within(span), role, told)
+        None if one is None else _measured(one.within(span), role, declared)
         for one, role in ((imu, "IMU"), (field, "magnetometer"), (truth, "truth"))
     )
     return Log(
@@ -99,7 +99,7 @@ def read_bag(
         imu=ImuSamples.empty() if imu is None else _imu(imu, span),
         waveform=None if field is None else _waveform(field, span),
         truth=None if truth is None else _trajectory(truth, span),
-        noticed=tuple(told),
+        noticed=tuple(declared),
     )
 
 
@@ -126,13 +126,13 @@ def _read(reader: AnyReader, path: Path, topics: Topics, report: Report) -> dict
     parts: dict[str, list[Messages]] = {role: [] for role in wanted}
     for role, part in read_parts(reader, wanted, report):
         parts[role].append(part)
-    found = {}
+    result = {}
     for role, one in wanted.items():
         if not parts[role]:
             raise InputError(f"{one.place}: holds no messages; record it, or leave it out.")
         stamps, values = (np.concatenate(column) for column in zip(*parts.pop(role), strict=True))
-        found[role] = _sorted(one.place, one.connections[0].msgtype, stamps, values)
-    return found
+        result[role] = _sorted(one.place, one.connections[0].msgtype, stamps, values)
+    return result
 
 
 def _chosen(
@@ -145,10 +145,10 @@ def _chosen(
     names = sorted({c.topic for c in connections})
     if topic is not None:
         if topic not in names:
-            found = ", ".join(names) or "none"
+            result = ", ".join(names) or "none"
             raise InputError(
                 f"{path}: has no topic {topic} of {' or '.join(msgtypes)} for {role} (found"
-                f" {found}); name another."
+                f" {result}); name another."
             )
         connections = [c for c in connections if c.topic == topic]
     elif len(names) > 1:
@@ -181,12 +181,12 @@ def _sorted(place: str, msgtype: str, stamps: IntArray, values: Array) -> _Strea
     return _Stream(place, msgtype, stamps, values)
 
 
-def _measured(stream: _Stream, role: str, told: list[Finding]) -> _Stream:
+def _measured(stream: _Stream, role: str, declared: list[Finding]) -> _Stream:
     """Return the messages that hold a sample, and tell of the others."""
-    lost = LostRows.of(stream.time_ns, stream.values)
+    lost_epochs = LostRows.of(stream.time_ns, stream.values)
     for too_many, rows, remedy in zip(
-        lost.too_many,
-        (lost.twice, lost.absent),
+        lost_epochs.too_many,
+        (lost_epochs.twice, lost_epochs.absent),
         (
             "have the stamp of another; stamp each message with its own time",
             "hold NaN; record the topic again",
@@ -198,8 +198,8 @@ def _measured(stream: _Stream, role: str, told: list[Finding]) -> _Stream:
                 f"{stream.place}: {np.sum(rows)} of {len(rows)} messages {remedy} (the first is"
                 f" stamped {stream.time_ns[np.argmax(rows)]} ns)."
             )
-    told += lost.told(role)
-    kept = lost.kept
+    declared += lost_epochs.findings(role)
+    kept = lost_epochs.kept
     return _Stream(stream.place, stream.msgtype, stream.time_ns[kept], stream.values[kept])
 
 

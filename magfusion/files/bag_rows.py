@@ -18,7 +18,7 @@ from magfusion.files.messages import (
     IMU,
     ODOMETRY,
     POSE,
-    SURE_POSE,
+    POSE_WITH_COVARIANCE,
     TRANSFORM,
     Row,
     refuse_absent,
@@ -44,14 +44,14 @@ class Tail(NamedTuple):
     ----------
     numbers : int
         How many there are.
-    taken : tuple of int
+    read_rows : tuple of int
         Which make a row.
     absent : tuple of int
         Which say by -1 that something was not measured.
     """
 
     numbers: int
-    taken: tuple[int, ...]
+    read_rows: tuple[int, ...]
     absent: tuple[int, ...] = ()
 
 
@@ -61,7 +61,7 @@ TAILS: dict[str, Tail] = {
     IMU: Tail(37, (13, 14, 15, 25, 26, 27), (16, 28)),
     FIELD: Tail(12, (0, 1, 2)),
     POSE: Tail(7, _POSE),
-    SURE_POSE: Tail(43, _POSE),
+    POSE_WITH_COVARIANCE: Tail(43, _POSE),
     TRANSFORM: Tail(7, _POSE),
     # Pose and twist, each with its covariance.
     ODOMETRY: Tail(85, (*_POSE, 43, 44, 45)),
@@ -128,18 +128,18 @@ def read_parts(
 
 def _part(reader: AnyReader, wanted: Wanted, raws: list[bytes]) -> Messages:
     msgtype = wanted.connections[0].msgtype
-    first = _told(reader, wanted, msgtype, raws[:1])
+    first = _decoded(reader, wanted, msgtype, raws[:1])
     cut = _cut(reader.is2, TAILS.get(msgtype), raws)
     if cut is None:
-        return _told(reader, wanted, msgtype, raws)
+        return _decoded(reader, wanted, msgtype, raws)
     stamps, doubles, tail = cut
-    values = np.take(doubles, tail.taken, axis=1)
-    alike = stamps[0] == first.stamps[0]
-    if not (alike and np.array_equal(values[:1], first.values, equal_nan=True)):
-        return _told(reader, wanted, msgtype, raws)
+    values = np.take(doubles, tail.read_rows, axis=1)
+    shared = stamps[0] == first.stamps[0]
+    if not (shared and np.array_equal(values[:1], first.values, equal_nan=True)):
+        return _decoded(reader, wanted, msgtype, raws)
     absent = np.flatnonzero((doubles[:, tail.absent] == -1.0).any(axis=1))
     if len(absent):
-        _told(reader, wanted, msgtype, [raws[absent[0]]])  # which refuses it
+        _decoded(reader, wanted, msgtype, [raws[absent[0]]])  # which refuses it
     return Messages(stamps, values)
 
 
@@ -161,7 +161,7 @@ def _cut(is2: bool, tail: Tail | None, raws: list[bytes]) -> tuple[IntArray, Arr
     return stamps, doubles.reshape(-1, tail.numbers), tail
 
 
-def _told(reader: AnyReader, wanted: Wanted, msgtype: str, raws: list[bytes]) -> Messages:
+def _decoded(reader: AnyReader, wanted: Wanted, msgtype: str, raws: list[bytes]) -> Messages:
     """Return messages as the library reads them."""
     stamps, values = [], []
     for raw in raws:

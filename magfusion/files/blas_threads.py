@@ -32,10 +32,10 @@ def warn_about_threads() -> None:
     from threadpoolctl import threadpool_info
 
     libraries = [one for one in threadpool_info() if one["user_api"] == "blas"]
-    most = max((one["num_threads"] for one in libraries), default=1)
-    if most > 1:
+    maximum = max((one["num_threads"] for one in libraries), default=1)
+    if maximum > 1:
         warnings.warn(
-            f"BLAS uses {most} threads, which costs up to twice the processor time and saves none:"
+            f"BLAS uses {maximum} threads, which costs up to twice the processor time and saves none:"
             f" the matrices of magfusion are small. Set {THREADS[0]}=1 before NumPy is imported,"
             " or call threadpoolctl.threadpool_limits(1, user_api='blas'). Any value of"
             f" {THREADS[0]} silences this warning.",

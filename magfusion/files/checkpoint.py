@@ -155,7 +155,7 @@ def read_checkpoint(path: Path, key: str | None = None) -> Checkpoint | None:
     if len(content) != length or digest.digest() != whole[_HEADER.size : start]:
         raise InputError(f"{path}: is damaged; run without --resume, or restore the file")
     try:
-        found = msgpack.unpackb(
+        result = msgpack.unpackb(
             content,
             object_hook=_array,
             ext_hook=_no_extension,
@@ -164,17 +164,17 @@ def read_checkpoint(path: Path, key: str | None = None) -> Checkpoint | None:
         )
     except (ValueError, msgpack.UnpackException, RecursionError) as error:
         raise InputError(f"{path}: holds no plain data ({error}); run without --resume") from error
-    if not isinstance(found, dict):
+    if not isinstance(result, dict):
         raise InputError(f"{path}: holds no mapping; run without --resume")
-    return Checkpoint(own_key, position, found)
+    return Checkpoint(own_key, position, result)
 
 
-def _read(path: Path, most: int) -> bytes:
+def _read(path: Path, maximum: int) -> bytes:
     if not path.is_file():
         raise InputError(f"{path}: is no regular file; {_REMEDY}")
     try:
         with path.open("rb") as stream:
-            return stream.read(most)
+            return stream.read(maximum)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {_REMEDY}") from error
 
@@ -187,15 +187,15 @@ def _header(start: bytes, path: Path, key: str | None) -> tuple[int, str, int]:
         )
     if len(start) < _HEADER.size + _DIGEST:
         raise InputError(f"{path}: is damaged; run without --resume, or restore the file")
-    _, version, position, found, length = _HEADER.unpack_from(start)
+    _, version, position, result, length = _HEADER.unpack_from(start)
     if version != VERSION:
         raise InputError(f"{path}: is of another version of magfusion; run without --resume")
-    if key is not None and found.hex() != key:
+    if key is not None and result.hex() != key:
         raise InputError(
             f"{path}: is the checkpoint of another log, site or setting; repeat the command as it"
             " was, or run without --resume"
         )
-    return position, found.hex(), length
+    return position, result.hex(), length
 
 
 def _plain_array(value: object) -> object:
@@ -210,11 +210,11 @@ def _plain_array(value: object) -> object:
     raise TypeError(f"{type(value).__name__} is no plain data")
 
 
-def _array(found: dict[str, Any]) -> dict[str, Any] | AnyArray:
+def _array(result: dict[str, Any]) -> dict[str, Any] | AnyArray:
     """Return the array that a mapping describes, if it is one."""
-    if found.keys() != _ARRAY:
-        return found
-    dtype, shape, data = found["dtype"], found["shape"], found["data"]
+    if result.keys() != _ARRAY:
+        return result
+    dtype, shape, data = result["dtype"], result["shape"], result["data"]
     if not (
         dtype in DTYPES
         and isinstance(data, bytes)

@@ -57,16 +57,16 @@ def read_correlation(path: Path) -> tuple[Correlation, Array]:
         rows = zip(*(table[name].to_pylist() for name in _NAMES), strict=True)
         parameters = tuple(Component(str(g), str(o), str(k), int(c)) for g, o, k, c in rows)
         sigma = np.array(table["sigma"].to_pylist(), dtype=np.float64)
-        found = np.array(table["correlation"].to_pylist(), dtype=np.float64)
+        result = np.array(table["correlation"].to_pylist(), dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: a column holds no numbers; {again}") from error
-    if not _is_correlation(found, len(parameters)) or len(set(parameters)) < len(parameters):
+    if not _is_correlation(result, len(parameters)) or len(set(parameters)) < len(parameters):
         raise InputError(f"{path}: holds what no correlation is; {again}")
-    return Correlation(parameters, 0.5 * (found + found.T)), sigma
+    return Correlation(parameters, 0.5 * (result + result.T)), sigma
 
 
-def _is_correlation(found: Array, size: int) -> bool:
-    if size == 0 or found.shape != (size, size) or not np.all(np.isfinite(found)):
+def _is_correlation(result: Array, size: int) -> bool:
+    if size == 0 or result.shape != (size, size) or not np.all(np.isfinite(result)):
         return False
-    uneven = max(np.max(np.abs(found - found.T)), np.max(np.abs(np.diagonal(found) - 1.0)))
-    return bool(uneven < ROUNDING and np.linalg.eigvalsh(found)[0] > SMALLEST)
+    uneven = max(np.max(np.abs(result - result.T)), np.max(np.abs(np.diagonal(result) - 1.0)))
+    return bool(uneven < ROUNDING and np.linalg.eigvalsh(result)[0] > SMALLEST)

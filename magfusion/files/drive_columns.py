@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 
-from magfusion.files.table import Layout, Span, read_table
+from magfusion.files.table import Span, TableLayout, read_table
 from magfusion.model.drive import DriveSamples
 from magfusion.model.samples import Waveform
 from magfusion.units import Array
@@ -54,7 +54,7 @@ def read_drive(path: Path | None, span: Span) -> DriveSamples | None:
     names = () if path is None else drive_columns(path)
     if path is None or not names:
         return None
-    table = read_table(path, Layout(numbers=names, repeats=True), span)
+    table = read_table(path, TableLayout(numbers=names, repeats=True), span)
     values = table.numbers(names, nan=True)
     kept = (np.diff(table.time, prepend=-np.inf) > 0.0) & np.isfinite(values).all(axis=1)
     if not np.any(kept):
@@ -63,7 +63,7 @@ def read_drive(path: Path | None, span: Span) -> DriveSamples | None:
     return DriveSamples(table.time[kept], own)
 
 
-def columns_beside(drive: DriveSamples, waveform: Waveform) -> dict[str, Array]:
+def current_columns_of(drive: DriveSamples, waveform: Waveform) -> dict[str, Array]:
     """Return the columns of currents at a magnetometer's samples, NaN where there was none."""
     at = np.minimum(np.searchsorted(drive.time, waveform.time), len(drive.time) - 1)
     same = drive.time[at] == waveform.time

@@ -77,11 +77,11 @@ def find_magnetometer(path: Path) -> Path | None:
     InputError
         Where there are several.
     """
-    found = _magnetometers(path)
-    if len(found) > 1:
-        names = ", ".join(table.parent.name for table in found)
+    result = _magnetometers(path)
+    if len(result) > 1:
+        names = ", ".join(table.parent.name for table in result)
         raise InputError(f"{path / 'mav0'}: holds several magnetometers: {names}; keep one.")
-    return found[0] if found else None
+    return result[0] if result else None
 
 
 def _magnetometers(path: Path) -> list[Path]:
@@ -98,16 +98,16 @@ def _read_truth(path: Path, span: Span) -> Trajectory:
 
 
 def _first_stamp(path: Path) -> int:
-    found = "no row"
+    result = "no row"
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             rows = csv.reader(stream)
             next(rows)
-            found = next(rows)[0]
-        return int(found)
+            result = next(rows)[0]
+        return int(result)
     except (StopIteration, IndexError, ValueError) as error:
         raise InputError(
-            f"{path}: first column, row 0 (counted from 0): found {found}; write nanoseconds."
+            f"{path}: first column, row 0 (counted from 0): found {result}; write nanoseconds."
         ) from error
     except (OSError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read ({error}); write the file again.") from error

@@ -21,20 +21,20 @@ _NUMBERS = (*_POSITION, *_WEIGHTS, *_INFORMATION, *_PROCESS)
 
 def write_field_maps(maps: dict[str, FieldMap], path: Path) -> None:
     """Write the maps of beacons by name."""
-    parts = [_columns(name, found) for name, found in maps.items()]
+    parts = [_columns(name, result) for name, result in maps.items()]
     table = pa.table({k: np.concatenate([p[k] for p in parts]) for k in ("beacon", *_NUMBERS)})
     with whole_file(path) as unfinished:
         pa.parquet.write_table(table, unfinished)
 
 
-def _columns(name: str, found: FieldMap) -> dict[str, Array]:
-    count = len(found.points_world)
+def _columns(name: str, result: FieldMap) -> dict[str, Array]:
+    count = len(result.points_world)
     columns = {"beacon": np.full(count, name, dtype=object)}
-    columns |= dict(zip(_POSITION, found.points_world.T, strict=True))
-    columns |= dict(zip(_WEIGHTS, found.weights.T, strict=True))
-    upper = found.information[:, *np.triu_indices(COMPONENTS)]
+    columns |= dict(zip(_POSITION, result.points_world.T, strict=True))
+    columns |= dict(zip(_WEIGHTS, result.weights.T, strict=True))
+    upper = result.information[:, *np.triu_indices(COMPONENTS)]
     columns |= dict(zip(_INFORMATION, upper.T, strict=True))
-    return columns | {k: np.full(count, getattr(found, k)) for k in _PROCESS}
+    return columns | {k: np.full(count, getattr(result, k)) for k in _PROCESS}
 
 
 def _table(path: Path) -> pa.Table:

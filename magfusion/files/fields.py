@@ -8,7 +8,7 @@ import pyarrow as pa
 
 from magfusion.errors import InputError
 from magfusion.files.plausible import check_field
-from magfusion.files.table import TIME, Layout, Span, Table, read_table, write_table
+from magfusion.files.table import TIME, Span, Table, TableLayout, read_table, write_table
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.units import Array, IntArray
@@ -21,7 +21,7 @@ SAME_TIME = 1e-7  # s; less is rounding of stamps
 LEAST_ROWS = 8  # fewer may be zero in a component by their pose
 _AMPLITUDE, _MAGNETOMETER = "amplitude", "magnetometer"
 _PARTS = {axis: (f"re_{axis}", f"im_{axis}") for axis in "xyz"}
-_LAYOUT = Layout(
+_LAYOUT = TableLayout(
     numbers=("sigma", "window"),
     integers=(TIME, "tone"),
     texts=("beacon",),
@@ -92,15 +92,15 @@ def read_fields(path: Path, span: Span) -> FieldSamples:
     nothing = ~np.any(np.isfinite(phasor[row, column]), axis=1)
     table.refuse(nothing, "beacon", column, "every component is missing; leave the row out")
     if not signed:
-        found = phasor[row, column, 0].real
-        table.refuse(found < 0.0, _AMPLITUDE, found, "an amplitude has no sign; write re and im")
+        result = phasor[row, column, 0].real
+        table.refuse(result < 0.0, _AMPLITUDE, result, "an amplitude has no sign; write re and im")
     size = np.sqrt(np.nansum(np.abs(phasor[row, column]) ** 2, axis=1))
     check_field(size, str(path))
     cov = np.full((*phasor.shape, 3), np.nan)
     cov[row, column] = _covariance(table)
     at = table.time[first], window[first]
-    found = FieldSamples(*at, channels, phasor, cov, axes=axes, signed=signed)
-    return replace(found, magnetometers=magnetometers)
+    result = FieldSamples(*at, channels, phasor, cov, axes=axes, signed=signed)
+    return replace(result, magnetometers=magnetometers)
 
 
 def order_channels(fields: FieldSamples, site: Site) -> FieldSamples:
@@ -134,7 +134,7 @@ def order_channels(fields: FieldSamples, site: Site) -> FieldSamples:
         )
     parts = []
     for sensor in sensors:
-        one = replace(site, platform=site.platform.carrying((sensor,)))
+        one = replace(site, platform=site.platform.with_magnetometers((sensor,)))
         own = _ordered(fields.of_magnetometer(sensor.name), one)
         parts.append(on_log_clock(own, one))
     return side_by_side(parts, site)

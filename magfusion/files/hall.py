@@ -64,8 +64,8 @@ def _meet(one: Array, other: Array) -> bool:
         way, to = edge[1] - edge[0], point - edge[0]
         return float(way[0] * to[1] - way[1] * to[0])
 
-    apart = side(one, other[0]) * side(one, other[1]), side(other, one[0]) * side(other, one[1])
-    if apart[0] > 0.0 or apart[1] > 0.0:
+    separate = side(one, other[0]) * side(one, other[1]), side(other, one[0]) * side(other, one[1])
+    if separate[0] > 0.0 or separate[1] > 0.0:
         return False
     low, high = (
         np.maximum(one.min(axis=0), other.min(axis=0)),

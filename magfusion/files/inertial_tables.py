@@ -7,11 +7,11 @@ from typing import TypeVar
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.files.drive_columns import columns_beside
+from magfusion.files.drive_columns import current_columns_of
 from magfusion.files.lost_rows import LostRows
 from magfusion.files.plausible import check_field, check_imu
-from magfusion.files.rotor_columns import angles_beside
-from magfusion.files.table import TIME, Layout, Span, Table, read_table, write_table
+from magfusion.files.rotor_columns import angle_columns_of
+from magfusion.files.table import TIME, Span, Table, TableLayout, read_table, write_table
 from magfusion.model.drive import DriveSamples
 from magfusion.model.rotor import RotorAngles
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
@@ -24,9 +24,9 @@ Stream = TypeVar("Stream", FieldSamples, Trajectory)
 _GYRO = ("gyro_x", "gyro_y", "gyro_z")
 _ACCEL = ("accel_x", "accel_y", "accel_z")
 FIELD = ("field_x", "field_y", "field_z")
-IMU_LAYOUT = Layout(numbers=(*_GYRO, *_ACCEL), repeats=True)
-FIELD_LAYOUT = Layout(numbers=FIELD, repeats=True)
-_SOME_AXES = Layout(numbers=(), repeats=True, some=FIELD)
+IMU_LAYOUT = TableLayout(numbers=(*_GYRO, *_ACCEL), repeats=True)
+FIELD_LAYOUT = TableLayout(numbers=FIELD, repeats=True)
+_SOME_AXES = TableLayout(numbers=(), repeats=True, some=FIELD)
 
 
 def read_imu(
@@ -99,15 +99,15 @@ def measured_rows(
 ) -> tuple[Array, Array, tuple[Finding, ...]]:
     """Return times (s) and columns of the rows that hold a sample, and what the others are."""
     values = table.numbers(names, nan=True)
-    lost = LostRows.of(table.time_ns, values)
-    too_often, too_many = lost.too_many
+    lost_epochs = LostRows.of(table.time_ns, values)
+    too_often, too_many = lost_epochs.too_many
     if too_often:
         remedy = "the time of the row above: remove one of the two"
-        table.refuse(lost.twice, TIME, table.time_ns, remedy)
+        table.refuse(lost_epochs.twice, TIME, table.time_ns, remedy)
     if too_many:
         name = next(n for n, v in zip(names, values.T, strict=True) if np.isnan(v).any())
-        table.refuse(lost.absent, name, np.full(len(table), np.nan), "write a finite number")
-    return table.time[lost.kept], values[lost.kept], lost.told(stream)
+        table.refuse(lost_epochs.absent, name, np.full(len(table), np.nan), "write a finite number")
+    return table.time[lost_epochs.kept], values[lost_epochs.kept], lost_epochs.findings(stream)
 
 
 def write_waveform(
@@ -121,8 +121,8 @@ def write_waveform(
     columns: dict[str, object] = {TIME: Span(epoch_ns).stamps(waveform.time)}
     values = dict(zip(FIELD, waveform.measured_sensor.T, strict=True))
     columns |= {name: value for name, value in values.items() if name[-1] in waveform.axes}
-    columns |= {} if drive is None else columns_beside(drive, waveform)
-    columns |= {} if rotation is None else angles_beside(rotation, waveform)
+    columns |= {} if drive is None else current_columns_of(drive, waveform)
+    columns |= {} if rotation is None else angle_columns_of(rotation, waveform)
     write_table(columns, path)
 
 

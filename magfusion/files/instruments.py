@@ -7,7 +7,7 @@ is brought up to the same.
 
 What a sheet does not say is how the bias walks.  A walk ``k`` beside white noise ``n`` has its
 least Allan variance, ``2 n k / sqrt(3)``, at ``sqrt(3) n / k``: ``k`` is such that this is the
-stability in run, and that the least is reached within `TURNS` (within `TURNS_UNSAID` where the
+stability in run, and that the least is reached within `TURNS` (within `DEFAULT_TURNS` where the
 sheet has none).
 """
 
@@ -26,7 +26,7 @@ from magfusion.files.yaml_files import StrictModel, read_yaml
 from magfusion.model.site import ImuModel
 from magfusion.units import DEGREE
 
-TURNS, TURNS_UNSAID = 1000.0, 100.0  # s
+TURNS, DEFAULT_TURNS = 1000.0, 100.0  # s
 MICRO_G = 9.80665e-6  # m/s^2
 HOUR = 3600.0  # s
 UNNAMED = "MEMS"  # what is taken where nothing is named
@@ -171,15 +171,15 @@ def bias_walk(density: float, in_run: float | None) -> float:
     """
     white = density / math.sqrt(2.0)
     if in_run is None:
-        return math.sqrt(3.0) * white / TURNS_UNSAID
+        return math.sqrt(3.0) * white / DEFAULT_TURNS
     return math.sqrt(3.0) * max(in_run**2 / (2.0 * white), white / TURNS)
 
 
 @cache
 def imus() -> Mapping[str, ImuSheet]:
     """Return the inertial sensors that are known by name."""
-    found = read_yaml(Path(__file__).with_name("imus.yaml"), _Imus).root
-    return {name: _imu_sheet(name, entry) for name, entry in found.items()}
+    result = read_yaml(Path(__file__).with_name("imus.yaml"), _Imus).root
+    return {name: _imu_sheet(name, entry) for name, entry in result.items()}
 
 
 def _imu_sheet(name: str, entry: _ImuEntry) -> ImuSheet:
@@ -192,14 +192,14 @@ def _imu_sheet(name: str, entry: _ImuEntry) -> ImuSheet:
         gyro_bias_sigma=_rounded(gyro.offset_deg_s * DEGREE),
         accel_bias_sigma=_rounded(1e3 * accel.offset_mg * MICRO_G),
     )
-    said = gyro.in_run is not None, accel.in_run is not None
-    return ImuSheet(name, entry.source, tuple(entry.checked), model, said)
+    declared = gyro.in_run is not None, accel.in_run is not None
+    return ImuSheet(name, entry.source, tuple(entry.checked), model, declared)
 
 
 @cache
 def magnetometers() -> Mapping[str, MagnetometerSheet]:
     """Return the magnetometers that are known by name."""
-    found = read_yaml(Path(__file__).with_name("magnetometers.yaml"), _Magnetometers).root
+    result = read_yaml(Path(__file__).with_name("magnetometers.yaml"), _Magnetometers).root
     return {
         name: MagnetometerSheet(
             name,
@@ -208,7 +208,7 @@ def magnetometers() -> Mapping[str, MagnetometerSheet]:
             max(1e-9 * entry.offset_nt, BODY_IRON),
             entry.scale,
         )
-        for name, entry in found.items()
+        for name, entry in result.items()
     }
 
 

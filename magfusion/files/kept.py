@@ -13,14 +13,14 @@ from magfusion.files.atomic import whole_file
 from magfusion.units import AnyArray
 
 
-class Kept(NamedTuple):
+class StoredArrays(NamedTuple):
     """Arrays and plain facts of what was done."""
 
     arrays: Mapping[str, AnyArray]
     facts: dict[str, Any]
 
 
-def save_kept(path: Path, key: str, kept: Kept) -> None:
+def save_kept(path: Path, key: str, kept: StoredArrays) -> None:
     """Write what was done.
 
     Parameters
@@ -34,14 +34,14 @@ def save_kept(path: Path, key: str, kept: Kept) -> None:
         np.savez(file, allow_pickle=False, facts=facts, **kept.arrays)
 
 
-def load_kept(path: Path, key: str) -> Kept | None:
+def load_kept(path: Path, key: str) -> StoredArrays | None:
     """Return what was done with the same key; None where there is nothing, or it cannot be read."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            told = json.loads(str(file["facts"]))
-            if told["key"] != key:
+            declared = json.loads(str(file["facts"]))
+            if declared["key"] != key:
                 return None
-            return Kept({k: file[k] for k in file.files if k != "facts"}, told["facts"])
+            return StoredArrays({k: file[k] for k in file.files if k != "facts"}, declared["facts"])
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
         return None
 

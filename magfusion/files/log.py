@@ -83,8 +83,8 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
         span holds no inertial samples or no field.
     """
     if not path.is_dir():
-        found = "is a file" if path.exists() else "there is no such directory"
-        raise InputError(f"{path}: {found}; give the path of a log's directory.")
+        result = "is a file" if path.exists() else "there is no such directory"
+        raise InputError(f"{path}: {result}; give the path of a log's directory.")
     if not is_log(path):
         raise InputError(f"{path}: holds no {HEADER}; give the path of a log's directory.")
     header = read_yaml(path / HEADER, LogHeader)

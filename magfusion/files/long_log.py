@@ -17,7 +17,7 @@ from magfusion.files.named_samples import MAGNETOMETER
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.rotor_columns import rotor_columns
 from magfusion.files.table import LONGEST_GAP, Span, find_table
-from magfusion.files.table_stream import Piece, pieces
+from magfusion.files.table_stream import SampleBlock, pieces
 from magfusion.files.temperature_table import read_temperatures
 from magfusion.files.yaml_files import read_yaml
 from magfusion.model.samples import FieldSamples, ImuSamples
@@ -35,7 +35,7 @@ class Samples:
     ----------
     place : str
         What a refusal calls it.
-    source : iterator of Piece
+    source : iterator of SampleBlock
     columns : int
         Of a row.
 
@@ -45,7 +45,7 @@ class Samples:
         When it begins (s); None of one without samples.
     """
 
-    def __init__(self, place: str, source: Iterator[Piece], columns: int) -> None:
+    def __init__(self, place: str, source: Iterator[SampleBlock], columns: int) -> None:
         self._place, self._source = place, source
         self._time, self._values = np.empty(0), np.empty((0, columns))
         self._newest, self._checked, self._at = -np.inf, False, 0
@@ -77,7 +77,7 @@ class Samples:
             self._take(piece)
         return True
 
-    def _take(self, piece: Piece) -> None:
+    def _take(self, piece: SampleBlock) -> None:
         kept = np.diff(piece.time, prepend=self._newest) > 0.0
         kept &= ~np.isnan(piece.values).any(axis=1)
         self._time, self._values, self._at = piece.time[kept], piece.values[kept], 0

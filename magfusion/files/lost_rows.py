@@ -34,7 +34,7 @@ class LostRows(NamedTuple):
             return False, False
         return bool(np.mean(self.twice) > MOST_TWICE), bool(np.mean(self.absent) > MOST_MISSING)
 
-    def told(self, stream: str) -> tuple[Finding, ...]:
+    def findings(self, stream: str) -> tuple[Finding, ...]:
         """Return how many rows are left out of a stream, and why."""
         return tuple(
             Finding(code, f"{stream}: {text} They are left out.", Verdict.TRUSTWORTHY)

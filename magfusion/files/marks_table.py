@@ -13,19 +13,19 @@ from magfusion.files.drive_columns import column_names
 from magfusion.files.table import (
     LARGEST_TIME_NS,
     TIME,
-    Layout,
     Span,
     Table,
+    TableLayout,
     read_table,
     write_table,
 )
-from magfusion.model.marks import SILENT, UNTOLD, Marks, marks_of_column
+from magfusion.model.marks import SILENT, UNKNOWN_SLOT, Marks, marks_of_column
 from magfusion.units import Array, BoolArray, IntArray
 
 SLOT, END = "slot", "end_ns"
 LARGEST_SLOT = 10_000
-_BESIDE = Layout(numbers=(SLOT,), repeats=True)
-_BURSTS = Layout(numbers=(), integers=(TIME, END, SLOT), repeats=True)
+_SLOT_LAYOUT = TableLayout(numbers=(SLOT,), repeats=True)
+_BURSTS = TableLayout(numbers=(), integers=(TIME, END, SLOT), repeats=True)
 _REMEDY = f"write the number of a coil's slot, or {SILENT} where none is driven"
 
 
@@ -37,20 +37,20 @@ def read_marks(magnetometer: Path | None, bursts: Path | None, span: Span) -> Ma
     InputError
         As `read_table`; or where both ways are gone, a slot is none, or bursts overlap.
     """
-    beside = magnetometer is not None and SLOT in column_names(magnetometer)
-    if bursts is not None and beside:
+    others = magnetometer is not None and SLOT in column_names(magnetometer)
+    if bursts is not None and others:
         raise InputError(
             f"{bursts}: marks the bursts that the column {SLOT} of {magnetometer} marks, too; keep"
             " one of them."
         )
     if bursts is not None:
         return _read_bursts(bursts, span)
-    return _read_column(magnetometer, span) if magnetometer is not None and beside else None
+    return _read_column(magnetometer, span) if magnetometer is not None and others else None
 
 
 def slots_of(values: Array) -> IntArray:
     """Return the slots that numbers beside samples mean, NaN where nothing is said."""
-    return np.where(np.isnan(values), UNTOLD, values).astype(np.int64)
+    return np.where(np.isnan(values), UNKNOWN_SLOT, values).astype(np.int64)
 
 
 def is_slot(values: Array) -> BoolArray:
@@ -60,7 +60,7 @@ def is_slot(values: Array) -> BoolArray:
 
 
 def _read_column(path: Path, span: Span) -> Marks:
-    table = read_table(path, _BESIDE, span)
+    table = read_table(path, _SLOT_LAYOUT, span)
     values = table.numbers((SLOT,), nan=True)[:, 0]
     table.refuse(~is_slot(values), SLOT, values, _REMEDY)
     once = np.diff(table.time, prepend=-np.inf) > 0.0

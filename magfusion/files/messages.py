@@ -9,7 +9,7 @@ IMU = "sensor_msgs/msg/Imu"
 FIELD = "sensor_msgs/msg/MagneticField"
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE = "geometry_msgs/msg/PoseStamped"
-SURE_POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 USUAL = (IMU, FIELD, ODOMETRY, POSE)  # taken before others that play the same role
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -61,7 +61,7 @@ ROWS: dict[str, dict[str, Row]] = {
     "truth": {
         ODOMETRY: _odometry_row,
         POSE: _pose_row,
-        SURE_POSE: _sure_pose_row,
+        POSE_WITH_COVARIANCE: _sure_pose_row,
         TRANSFORM: transform_row,
     },
 }

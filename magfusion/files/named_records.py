@@ -51,7 +51,7 @@ def site_fields(entry: FieldsRecord, site: Site) -> FieldSamples:
     sensors = site.platform.magnetometers
     if len(sensors) == 1:
         return field_samples(entry, site.channels)
-    one = replace(site, platform=site.platform.carrying((sensors[which],)))
+    one = replace(site, platform=site.platform.with_magnetometers((sensors[which],)))
     own = on_log_clock(field_samples(entry, one.channels), one)
     none = FieldSamples.empty(one.channels)
     return side_by_side([own if k == which else none for k in range(len(sensors))], site)

@@ -13,13 +13,13 @@ from magfusion.files.inertial_tables import FIELD, measured_rows
 from magfusion.files.marks_table import SLOT
 from magfusion.files.plausible import check_field
 from magfusion.files.rotor_columns import rotor_columns
-from magfusion.files.table import TIME, Layout, Span, read_table, write_table
+from magfusion.files.table import TIME, Span, TableLayout, read_table, write_table
 from magfusion.model.samples import Waveform
 from magfusion.model.trust import Finding
 from magfusion.units import IntArray
 
 MAGNETOMETER = "magnetometer"
-_LAYOUT = Layout(numbers=FIELD, texts=(MAGNETOMETER,), repeats=True)
+_LAYOUT = TableLayout(numbers=FIELD, texts=(MAGNETOMETER,), repeats=True)
 
 
 def names_magnetometers(path: Path | None) -> bool:
@@ -44,16 +44,16 @@ def read_waveforms(
         As `read_table` and `check_field`; or where currents, slots or angles stand beside them.
     """
     assert path is not None
-    beside = [n for n in column_names(path) if n == SLOT]
-    beside = [*beside, *drive_columns(path), *rotor_columns(path)]
-    if beside:
+    others = [n for n in column_names(path) if n == SLOT]
+    others = [*others, *drive_columns(path), *rotor_columns(path)]
+    if others:
         raise InputError(
-            f"{path}: {', '.join(beside)}: beside the samples of several magnetometers nothing else"
+            f"{path}: {', '.join(others)}: beside the samples of several magnetometers nothing else"
             " is recorded yet; give bursts in marks.parquet, and leave the rest out."
         )
     table = read_table(path, _LAYOUT, span)
     names, of = table.texts(MAGNETOMETER)
-    found: dict[str, Waveform] = {}
+    result: dict[str, Waveform] = {}
     noticed: list[Finding] = []
     for k, name in enumerate(names):
         own = np.flatnonzero(of == k)
@@ -68,11 +68,11 @@ def read_waveforms(
             time=table.time[own],
             first_row=0,
         )
-        time, values, lost = measured_rows(mine, FIELD, f"{MAGNETOMETER} {name}")
+        time, values, lost_epochs = measured_rows(mine, FIELD, f"{MAGNETOMETER} {name}")
         check_field(np.linalg.norm(values, axis=1), str(place))
-        found[name] = Waveform(time, values)
-        noticed += lost
-    return found, tuple(noticed)
+        result[name] = Waveform(time, values)
+        noticed += lost_epochs
+    return result, tuple(noticed)
 
 
 def write_waveforms(waveforms: Mapping[str, Waveform], path: Path, epoch_ns: int) -> None:

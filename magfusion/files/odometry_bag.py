@@ -88,19 +88,19 @@ def write_bag(
 
 def _messages(states: ResultStates, frames: Frames, types: Any) -> Iterator[tuple[Any, Any]]:
     """Yield odometry and pose of each state."""
-    found = states.trajectory
-    quaternion = Rotation.from_matrix(found.world_from_body).as_quat().tolist()
-    cov = _pose_covariance(found).reshape(-1, 36)
-    velocity = np.zeros((len(found), 3))
-    if found.velocity_world is not None:
-        velocity = np.einsum("nji,nj->ni", found.world_from_body, found.velocity_world)
+    result = states.trajectory
+    quaternion = Rotation.from_matrix(result.world_from_body).as_quat().tolist()
+    cov = _pose_covariance(result).reshape(-1, 36)
+    velocity = np.zeros((len(result), 3))
+    if result.velocity_world is not None:
+        velocity = np.einsum("nji,nj->ni", result.world_from_body, result.velocity_world)
     vector, unknown = types["geometry_msgs/msg/Vector3"], (UNKNOWN_VARIANCE * np.eye(6)).ravel()
     for k, stamp in enumerate(states.stamp_ns.tolist()):
         time = types["builtin_interfaces/msg/Time"](*divmod(stamp, _NS))
         header = types["std_msgs/msg/Header"](time, frames.world)
         pose = types["geometry_msgs/msg/PoseWithCovariance"](
             types["geometry_msgs/msg/Pose"](
-                types["geometry_msgs/msg/Point"](*found.position_world[k].tolist()),
+                types["geometry_msgs/msg/Point"](*result.position_world[k].tolist()),
                 types["geometry_msgs/msg/Quaternion"](*quaternion[k]),
             ),
             cov[k],

@@ -25,9 +25,9 @@ def refuse_unfolding(
     InputError
     """
     for name in names:
-        found = file.schema_arrow.field(name).type
-        if pa.types.is_nested(found):
-            raise InputError(f"{path}: column {name} holds {found}; write numbers or text.")
+        result = file.schema_arrow.field(name).type
+        if pa.types.is_nested(result):
+            raise InputError(f"{path}: column {name} holds {result}; write numbers or text.")
     for group in groups:
         size = sum(
             group.column(k).total_uncompressed_size

@@ -131,14 +131,14 @@ class _Reader:
         if origin in (list, deque, tuple, dict, Counter, Mapping):
             return self._collection(origin, inner, data, place, like)
         try:
-            found = self._made(kind, data, place, like)
+            result = self._constructed(kind, data, place, like)
             if kind in self._rules.checks:
-                self._rules.checks[kind](found)
+                self._rules.checks[kind](result)
         except InputError:  # a part of it has said where and what
             raise
         except (ValueError, IndexError, RuntimeError) as error:
             raise _refusal(place, str(error).strip().split("\n")[0]) from error
-        return found
+        return result
 
     def resumed(self, part: object, data: Any, place: str) -> object:
         """Return a running part with the state that data hold."""
@@ -146,7 +146,7 @@ class _Reader:
             setattr(part, name, value)
         return part
 
-    def _made(self, kind: Any, data: Any, place: str, like: object) -> Any:
+    def _constructed(self, kind: Any, data: Any, place: str, like: object) -> Any:
         if kind in self._rules.readers:
             return self._rules.readers[kind](data)
         if isinstance(kind, type) and is_dataclass(kind):
@@ -171,15 +171,15 @@ class _Reader:
             raise _refusal(place, f"has {len(data)} parts, not {len(kinds)}")
         # Running parts take their state in their place.
         parts = like if isinstance(like, list) and len(like) == len(data) else [None] * len(data)
-        found = [
+        result = [
             self.value(kind, part, f"{place}[{k}]", own)
             for k, (kind, part, own) in enumerate(zip(kinds, data, parts, strict=True))
         ]
         if origin is deque:
-            return deque(found, like.maxlen if isinstance(like, deque) else None)
+            return deque(result, like.maxlen if isinstance(like, deque) else None)
         if origin in (list, tuple):
-            return origin(found)
-        return Counter(dict(found)) if origin is Counter else dict(found)
+            return origin(result)
+        return Counter(dict(result)) if origin is Counter else dict(result)
 
     def _attributes(self, kind: type, data: Any, place: str, like: object) -> dict[str, Any]:
         names, hints = _names(kind), get_type_hints(kind)

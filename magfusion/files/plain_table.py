@@ -43,17 +43,17 @@ def read_whole(path: Path, what: str) -> pa.Table:
 def column(table: pa.Table, name: str, path: Path) -> pa.ChunkedArray:
     """Return a column that must be there."""
     if name not in table.column_names:
-        found = ", ".join(table.column_names)
-        raise InputError(f"{path}: column {name} is missing (found {found}); add it.")
+        result = ", ".join(table.column_names)
+        raise InputError(f"{path}: column {name} is missing (found {result}); add it.")
     return table[name]
 
 
 def numbers(table: pa.Table, name: str, path: Path) -> Array:
     """Return a column of finite numbers."""
-    found = column(table, name, path)
-    if not (pa.types.is_floating(found.type) or pa.types.is_integer(found.type)):
-        raise InputError(f"{path}: column {name} holds {found.type}; write numbers.")
-    value = np.asarray(found.to_numpy(), dtype=np.float64)
+    result = column(table, name, path)
+    if not (pa.types.is_floating(result.type) or pa.types.is_integer(result.type)):
+        raise InputError(f"{path}: column {name} holds {result.type}; write numbers.")
+    value = np.asarray(result.to_numpy(), dtype=np.float64)
     refuse_rows(~np.isfinite(value), path, f"column {name}", value, "a finite number")
     return value
 

@@ -13,8 +13,8 @@ FASTEST_RATE = 80.0  # rad/s; beyond the range of any
 LARGEST_RATE_IN_DEGREES = 6000.0  # deg/s, and as much written for rad/s
 LARGEST_FORCE = 1e4  # m/s^2
 SOUND = 0.98  # of the samples, by size
-WITNESSED = 2.0  # s
-MOST_WITNESSES = 20_000  # samples
+CHECKED_DURATION = 2.0  # s
+MAX_TEST_SAMPLES = 20_000  # samples
 ONE_WAY = 0.9  # length of the mean of directions that are one
 WEIGHT_IN_G = (0.9, 1.1)  # where gravity is 9.8 m/s^2
 # Of the median, what nine in ten samples exceed: of a specific force without gravity half.
@@ -73,14 +73,14 @@ def _keeps_its_direction(imu: ImuSamples) -> bool:
     acceleration of a g's tenth turns with the motion that makes it.
     """
     step = np.diff(imu.time, append=imu.time[-1:])
-    step[step > WITNESSED] = 0.0
-    count = max(1, int(WITNESSED / max(float(np.median(step)), SHORTEST_STEP)))
+    step[step > CHECKED_DURATION] = 0.0
+    count = max(1, int(CHECKED_DURATION / max(float(np.median(step)), SHORTEST_STEP)))
     if len(imu) < 2 * count:
         return True  # too little to contradict the size
     ahead: list[Array] = []
     firm: list[float] = []
     world_from_body = np.eye(3)
-    for k in range(min(len(imu), MOST_WITNESSES)):
+    for k in range(min(len(imu), MAX_TEST_SAMPLES)):
         if k % count == 0:
             if ahead:
                 firm.append(float(np.linalg.norm(np.mean(ahead, axis=0))))

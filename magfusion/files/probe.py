@@ -45,13 +45,13 @@ def read_probe(path: Path) -> dict[Side, ProbeReadings]:
     position = np.stack([numbers(table, name, path) for name in POSITION], axis=1)
     reach = np.linalg.norm(position, axis=1)
     refuse_rows(reach == 0.0, path, "columns position_x to position_z", reach, "a place beside it")
-    found = ProbeReadings(coil, position, *_readings(table, path), sigma)
-    if found.axis.ndim == 3:
-        found = _each_axis(found)
+    result = ProbeReadings(coil, position, *_readings(table, path), sigma)
+    if result.axis.ndim == 3:
+        result = _each_axis(result)
     side = _sides(table, path)
-    side = np.repeat(side, len(found) // len(side))
+    side = np.repeat(side, len(result) // len(side))
     present: tuple[Side, ...] = get_args(Side)
-    return {name: found.rows(side == name) for name in present if np.any(side == name)}
+    return {name: result.rows(side == name) for name in present if np.any(side == name)}
 
 
 def _readings(table: pa.Table, path: Path) -> tuple[Array, Array]:
@@ -70,13 +70,13 @@ def _readings(table: pa.Table, path: Path) -> tuple[Array, Array]:
     return axis / length[:, None], numbers(table, "reading", path)
 
 
-def _each_axis(found: ProbeReadings) -> ProbeReadings:
+def _each_axis(result: ProbeReadings) -> ProbeReadings:
     return ProbeReadings(
-        np.repeat(found.coil, 3),
-        np.repeat(found.position, 3, axis=0),
-        found.axis.reshape(-1, 3),
-        found.reading.ravel(),
-        np.repeat(found.sigma, 3),
+        np.repeat(result.coil, 3),
+        np.repeat(result.position, 3, axis=0),
+        result.axis.reshape(-1, 3),
+        result.reading.ravel(),
+        np.repeat(result.sigma, 3),
     )
 
 

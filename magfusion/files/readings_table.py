@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from magfusion.files.table import TIME, Layout, Span, read_table, write_table
+from magfusion.files.table import TIME, Span, TableLayout, read_table, write_table
 from magfusion.units import Array
 
 PART = "part"
@@ -35,7 +35,7 @@ def read_readings(
     InputError
         As `read_table`; or where a value is out of bounds, or a part has two at one time.
     """
-    layout = Layout(numbers=(column,), texts=(PART,), repeats=True)
+    layout = TableLayout(numbers=(column,), texts=(PART,), repeats=True)
     table = read_table(path, layout, Span(epoch_ns))
     value = table.numbers((column,))[:, 0]
     table.refuse((value < bounds[0]) | (value > bounds[1]), column, value, remedy)

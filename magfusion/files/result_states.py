@@ -9,7 +9,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from magfusion.errors import InputError
-from magfusion.files.table import Layout, Span, read_table
+from magfusion.files.table import Span, TableLayout, read_table
 from magfusion.files.trajectory_table import read_trajectory, trajectory_columns
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Verdict
@@ -48,13 +48,13 @@ def read_result_states(path: Path) -> ResultStates:
     InputError
         As `magfusion.files.trajectory_table.read_trajectory`, or where no state has a pose.
     """
-    stamps = read_table(path, Layout(numbers=()), Span(0)).time_ns
+    stamps = read_table(path, TableLayout(numbers=()), Span(0)).time_ns
     trajectory = read_trajectory(path, int(stamps[0]))
     columns = pa.csv.read_csv(path) if path.suffix == ".csv" else pa.parquet.read_table(path)
     kept = np.ones(len(stamps), dtype=bool)
     if VERDICT in columns.column_names:
         failed = str(Verdict.FAILED)
-        kept = np.array([said != failed for said in columns[VERDICT].to_pylist()])
+        kept = np.array([declared != failed for declared in columns[VERDICT].to_pylist()])
     if not kept.any():
         raise InputError(
             f"{path}: its {len(stamps)} states have all failed, so that none has a pose; its"
@@ -90,6 +90,6 @@ def write_csv(states: ResultStates, path: Path) -> None:
 
 def write_kitti(states: ResultStates, path: Path) -> None:
     """Write poses as the KITTI odometry benchmark does: 3 rows of 4, one line a pose, no times."""
-    found = states.trajectory
-    matrices = np.concatenate([found.world_from_body, found.position_world[:, :, None]], axis=2)
+    result = states.trajectory
+    matrices = np.concatenate([result.world_from_body, result.position_world[:, :, None]], axis=2)
     np.savetxt(path, matrices.reshape(-1, 12), fmt="%.9f")

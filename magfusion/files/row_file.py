@@ -23,7 +23,7 @@ BATCH = 4096  # additions that wait at most
 
 
 @dataclass(frozen=True)
-class Mark:
+class RowPosition:
     """How far a file of rows went when a checkpoint was made.
 
     Parameters
@@ -64,7 +64,7 @@ class RowFile:
     ----------
     columns : mapping of str to int
         Name of each column and how many numbers it has in a row; one without any is left out.
-    mark : Mark, optional
+    mark : RowPosition, optional
         From which to go on; None begins anew.
 
     Raises
@@ -73,7 +73,9 @@ class RowFile:
         Where the file is not as the mark says, or, without one, is no file of rows.
     """
 
-    def __init__(self, path: Path, columns: Mapping[str, int], mark: Mark | None = None) -> None:
+    def __init__(
+        self, path: Path, columns: Mapping[str, int], mark: RowPosition | None = None
+    ) -> None:
         self.path = path
         self.columns = {name: size for name, size in columns.items() if size}
         self._waiting: list[list[Array]] = []
@@ -99,11 +101,11 @@ class RowFile:
         if len(self._waiting) == BATCH:
             self._write()
 
-    def settle(self) -> Mark:
+    def settle(self) -> RowPosition:
         """See that all rows are on the disk; return how far the file goes."""
         self._write()
         os.fsync(self._stream.fileno())
-        return Mark(self.count, self._stream.tell(), self._digest.hexdigest())
+        return RowPosition(self.count, self._stream.tell(), self._digest.hexdigest())
 
     def rows(self) -> dict[str, Array]:
         """Return all rows by column, shape (rows, numbers) each."""
@@ -135,16 +137,16 @@ class RowFile:
             self._waiting.clear()
         self._stream.flush()
 
-    def _checked(self, mark: Mark) -> "hashlib._Hash":
+    def _checked(self, mark: RowPosition) -> "hashlib._Hash":
         """Return the digest of what the mark says is there, after a look at all of it."""
         wrong = InputError(f"{self.path}: is not as its checkpoint says; run without --resume")
-        digest, left = hashlib.sha256(), mark.size
+        digest, remaining = hashlib.sha256(), mark.size
         try:
             with self.path.open("rb") as stream:
-                while left and (part := stream.read(min(left, 1 << 20))):
+                while remaining and (part := stream.read(min(remaining, 1 << 20))):
                     digest.update(part)
-                    left -= len(part)
-            if left or digest.hexdigest() != mark.sha256 or _schema(self.path) != self._layout:
+                    remaining -= len(part)
+            if remaining or digest.hexdigest() != mark.sha256 or _schema(self.path) != self._layout:
                 raise wrong
         except (OSError, pa.ArrowException) as error:
             raise wrong from error

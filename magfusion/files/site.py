@@ -32,7 +32,7 @@ from magfusion.files.site_schema import (
     SiteEntry,
     SlotsEntry,
 )
-from magfusion.files.site_warming import warming_entry
+from magfusion.files.site_temperature import temperature_entry
 from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
 from magfusion.model.arguments import check_arguments
 from magfusion.model.field_map import FieldMap
@@ -175,10 +175,10 @@ def save_site(site: Site, path: Path | str) -> None:
     check_arguments("save_site", site=(site, Site))
     path, site = Path(path), as_declared(site)
     maps = {b.name: b.field_map for b in site.every_beacon if b.field_map is not None}
-    beside = path.with_name(f"{path.stem}_field_map.parquet")
+    others = path.with_name(f"{path.stem}_field_map.parquet")
     content = {
         "magfusion_site": 1,
-        "world": _world_entry(site) | ({"field_map": beside.name} if maps else {}),
+        "world": _world_entry(site) | ({"field_map": others.name} if maps else {}),
         "beacons": [_beacon_entry(b) for b in site.every_beacon],
         "platform": {
             **imu_entry(site.platform.imu),
@@ -194,7 +194,7 @@ def save_site(site: Site, path: Path | str) -> None:
     if site.calibration is not None:
         content["calibration"] = plain(site.calibration)
     if maps:
-        write_field_maps(maps, beside)
+        write_field_maps(maps, others)
     if site.correlation is not None:
         correlation = path.with_name(f"{path.stem}_correlation.parquet")
         content["correlation"] = correlation.name
@@ -246,7 +246,7 @@ def _beacon(entry: BeaconEntry) -> Beacon:
         model_error=entry.model_error,
         noise_factor=entry.noise_factor,
         hemisphere_beacon=entry.hemisphere,
-        warming=None if entry.warming is None else entry.warming.warming(),
+        temperature_model=None if entry.warming is None else entry.warming.temperature_model(),
         sigma=BeaconSigma(
             position_world=sigma.position_m,
             rotation_beacon=sigma.rotation_deg * DEGREE,
@@ -323,7 +323,7 @@ def _noise_entry(beacon: Beacon) -> dict[str, Any]:
         entry["noise_factor"] = float(beacon.noise_factor)
     if beacon.hemisphere_beacon is not None:
         entry["hemisphere"] = plain(beacon.hemisphere_beacon)
-    return entry | warming_entry(beacon.warming)
+    return entry | temperature_entry(beacon.temperature_model)
 
 
 def _slots(entry: SlotsEntry | str | None) -> Slots | MarkedSlots | None:

@@ -78,7 +78,7 @@ def beacon_draft(text: str, place: str = "--beacon") -> BeaconDraft:
     where = f"{place} {text!r}"
     if not name or "=" in name:
         raise InputError(f"{where}: begin with the beacon's name, as in {EXAMPLE}")
-    said: dict[str, str] = {}
+    declared: dict[str, str] = {}
     for part in parts:
         key, equals, value = part.partition("=")
         if not equals or not value:
@@ -88,18 +88,20 @@ def beacon_draft(text: str, place: str = "--beacon") -> BeaconDraft:
             )
         if key not in KEYS:
             raise InputError(f"{where}: {key} is not a known key; write one of {', '.join(KEYS)}")
-        if key in said:
+        if key in declared:
             raise InputError(f"{where}: {key} is given twice; keep one")
-        said[key] = value
+        declared[key] = value
     draft = BeaconDraft(
         name,
-        position_m=_vector(where, "position_m", said),
-        rpy_deg=_vector(where, "rpy_deg", said),
-        frequency_hz=_numbers(where, "frequency_hz", said),
-        moment_a_m2=_numbers(where, "moment_a_m2", said),
-        axes=said.get("axes"),
-        radius_m=None if "radius_m" not in said else numbers(where, said["radius_m"], (1,))[0],
-        synchronised=_truth(where, said.get("synchronised")),
+        position_m=_vector(where, "position_m", declared),
+        rpy_deg=_vector(where, "rpy_deg", declared),
+        frequency_hz=_numbers(where, "frequency_hz", declared),
+        moment_a_m2=_numbers(where, "moment_a_m2", declared),
+        axes=declared.get("axes"),
+        radius_m=None
+        if "radius_m" not in declared
+        else numbers(where, declared["radius_m"], (1,))[0],
+        synchronised=_truth(where, declared.get("synchronised")),
     )
     _check_coils(where, draft)
     return draft
@@ -126,19 +128,19 @@ def _check_coils(where: str, draft: BeaconDraft) -> None:
         )
 
 
-def _vector(where: str, key: str, said: dict[str, str]) -> Numbers | None:
-    if said.get(key, UNKNOWN) == UNKNOWN:
+def _vector(where: str, key: str, text: dict[str, str]) -> Numbers | None:
+    if text.get(key, UNKNOWN) == UNKNOWN:
         return None
-    return numbers(f"{where}: {key}", said[key], (3,))
+    return numbers(f"{where}: {key}", text[key], (3,))
 
 
-def _numbers(where: str, key: str, said: dict[str, str]) -> Numbers | None:
-    if key not in said:
+def _numbers(where: str, key: str, text: dict[str, str]) -> Numbers | None:
+    if key not in text:
         return None
-    found = numbers(f"{where}: {key}", said[key], (1, 2, 3))
-    if min(found) <= 0.0:
-        raise InputError(f"{where}: {key}={said[key]}: it must be above zero")
-    return found
+    result = numbers(f"{where}: {key}", text[key], (1, 2, 3))
+    if min(result) <= 0.0:
+        raise InputError(f"{where}: {key}={text[key]}: it must be above zero")
+    return result
 
 
 def _truth(where: str, value: str | None) -> bool | None:
@@ -158,16 +160,16 @@ def numbers(where: str, text: str, counts: tuple[int, ...]) -> Numbers:
         Where one is none, or their count is not among those wanted.
     """
     try:
-        found = tuple(float(part) for part in text.strip("[]()").split(","))
+        result = tuple(float(part) for part in text.strip("[]()").split(","))
     except ValueError:
-        found = ()
-    if len(found) not in counts or not all(map(math.isfinite, found)):
+        result = ()
+    if len(result) not in counts or not all(map(math.isfinite, result)):
         wanted = " or ".join(map(str, counts))
         raise InputError(
             f"{where}: found {text!r}; write {wanted} number{'s' if counts != (1,) else ''},"
             " separated by commas without blanks"
         )
-    return found
+    return result
 
 
 def place_of(text: str) -> Place:

@@ -17,11 +17,11 @@ def log_sigma(conductivity: float, sigma: float) -> float:
 
 def ground_entry(site: Site) -> dict[str, Any]:
     """Return what a site's file says of it; nothing where nothing conducts."""
-    found = conductivity_of(site)
-    if not found:
+    result = conductivity_of(site)
+    if not result:
         return {}
-    entry: dict[str, Any] = {"conductivity_s_m": float(found)}
+    entry: dict[str, Any] = {"conductivity_s_m": float(result)}
     if site.log_conductivity_sigma:
-        sigma = found * math.expm1(site.log_conductivity_sigma)
+        sigma = result * math.expm1(site.log_conductivity_sigma)
         entry["sigma"] = {"conductivity_s_m": float(sigma)}
     return entry

@@ -22,6 +22,7 @@ from magfusion.files.site_response import (
     response_entry,
     responses_of,
 )
+from magfusion.files.site_temperature import SensorTemperatureEntry, temperature_entry
 from magfusion.files.site_values import (
     LARGEST_NOISE_DENSITY,
     LARGEST_OFFSET,
@@ -41,7 +42,6 @@ from magfusion.files.site_values import (
     tesla,
     zeros,
 )
-from magfusion.files.site_warming import SensorWarmingEntry, warming_entry
 from magfusion.files.yaml_files import StrictModel
 from magfusion.model.site import Magnetometer, MagnetometerSigma, Platform
 from magfusion.units import Array
@@ -86,7 +86,7 @@ class MagnetometerEntry(StrictModel):
     coil_centres_m: Annotated[Array, array(3, 3, largest=10.0, unit="m")] | None = None
     coil_kappa_m2: Annotated[float, between(-1.0, 1.0)] = Magnetometer.coil_kappa
     offset_walk_t: Annotated[NotNegative, tesla(LARGEST_OFFSET)] = 2e-8  # gained in an hour
-    warming: SensorWarmingEntry | None = None
+    warming: SensorTemperatureEntry | None = None
     response: Listed | None = None
     axis_responses: AxisResponsesEntry | None = None
     casing: CasingEntry | None = None
@@ -149,9 +149,9 @@ def check_tones(sensor: MagnetometerEntry, tones_hz: Array, at: tuple[str | int,
             check_response(entries, tones_hz, (*at, "axis_responses", axis))
     highest = float(np.max(tones_hz, initial=0.0))
     if 2.0 * np.pi * highest * sensor.sigma.clock_offset_s > LARGEST_PHASE:
-        most = LARGEST_PHASE / (2.0 * np.pi * highest)
+        maximum = LARGEST_PHASE / (2.0 * np.pi * highest)
         remedy = (
-            f"give at most {most:.2g} s, {LARGEST_PHASE:g} rad of the tone at {highest:g} Hz:"
+            f"give at most {maximum:.2g} s, {LARGEST_PHASE:g} rad of the tone at {highest:g} Hz:"
             " beyond it the phases of magnetometers cannot be compared; record all by one clock"
         )
         raise refusal_at((*at, "sigma", "clock_offset_s"), sensor.sigma.clock_offset_s, remedy)
@@ -169,7 +169,7 @@ def magnetometer_of(entry: MagnetometerEntry) -> Magnetometer:
         coil_centres_sensor=entry.coil_centres_m,
         offset_walk=entry.offset_walk_t,
         coil_kappa=entry.coil_kappa_m2,
-        warming=None if entry.warming is None else entry.warming.warming(),
+        temperature_model=None if entry.warming is None else entry.warming.temperature_model(),
         response=responses_of(entry.response, entry.axis_responses),
         casing=None if entry.casing is None else entry.casing.casing(),
         axes="".join(sorted(set(entry.axes or Magnetometer.axes))),
@@ -209,7 +209,7 @@ def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
     clock = {"clock_offset_s": float(sigma.clock_offset)} if sigma.clock_offset else {}
     return (
         own
-        | warming_entry(magnetometer.warming)
+        | temperature_entry(magnetometer.temperature_model)
         | response_entry(magnetometer.response)
         | casing_entry(magnetometer.casing)
         | {

@@ -61,11 +61,11 @@ def rpy_deg(matrix: Array) -> Any:
     """Return roll, pitch, yaw; Rotation.as_euler loses 1e-7 rad where the pitch is near 90 deg."""
     yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
     pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[0, 0], matrix[1, 0]))
-    turned, raised = Rotation.from_rotvec(
+    rotated, raised = Rotation.from_rotvec(
         np.array([[0.0, 0.0, yaw], [0.0, pitch, 0.0]])
     ).as_matrix()
     return degrees(
-        np.array([Rotation.from_matrix((turned @ raised).T @ matrix).as_rotvec()[0], pitch, yaw])
+        np.array([Rotation.from_matrix((rotated @ raised).T @ matrix).as_rotvec()[0], pitch, yaw])
     )
 
 

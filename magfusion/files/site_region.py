@@ -52,7 +52,7 @@ class RegionEntry(StrictModel):
     half_space: HalfSpaceEntry | None = None
 
     @model_validator(mode="after")
-    def _says_something(self) -> Self:
+    def _check_not_empty(self) -> Self:
         if self.box_m is None and self.half_space is None:
             raise refusal_at((), {}, "give box_m or half_space, or remove region")
         return self

@@ -43,12 +43,12 @@ class AxisResponsesEntry(StrictModel):
 
 
 def responses_of(
-    alike: list[ResponseEntry] | None, apart: AxisResponsesEntry | None
+    shared_by: list[ResponseEntry] | None, separately: AxisResponsesEntry | None
 ) -> FrequencyResponse | AxisResponses | None:
     """Return what entries say of all axes, or of each."""
-    if apart is not None:
-        return AxisResponses(*(_response(entries) for entries in apart.axes.values()))
-    return _response(alike) if alike else None
+    if separately is not None:
+        return AxisResponses(*(_response(entries) for entries in separately.axes.values()))
+    return _response(shared_by) if shared_by else None
 
 
 def _response(entries: list[ResponseEntry]) -> FrequencyResponse:

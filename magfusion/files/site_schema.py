@@ -21,6 +21,7 @@ from magfusion.files.site_magnetometer import (
 from magfusion.files.site_motion import ImuEntry, MotionEntry, MotionPriorEntry
 from magfusion.files.site_region import RegionEntry
 from magfusion.files.site_rotor import RotorEntry
+from magfusion.files.site_temperature import MomentTemperatureEntry
 from magfusion.files.site_values import (
     HIGHEST_FREQUENCY,
     LARGEST_ANGLE,
@@ -50,7 +51,6 @@ from magfusion.files.site_values import (
     tesla,
     zeros,
 )
-from magfusion.files.site_warming import WarmingEntry
 from magfusion.files.yaml_files import StrictModel
 from magfusion.model.physics.winding import Winding, wound_coil
 from magfusion.model.site import (
@@ -150,7 +150,7 @@ class WindingEntry(StrictModel):
     pitch_m: _Length | None = None
 
     @model_validator(mode="after")
-    def _turns_beside_each_other(self) -> Self:
+    def _check_turns_fit(self) -> Self:
         if self.pitch_m is not None and self.pitch_m < self.wire_m:
             remedy = "give at least wire_m, or remove it: turns lie beside each other"
             raise refusal_at(("pitch_m",), self.pitch_m, remedy)
@@ -271,7 +271,7 @@ class BeaconEntry(StrictModel):
     model_error: _Share | None = None
     noise_factor: _Positive = Beacon.noise_factor
     hemisphere: Annotated[Array, array(3), AfterValidator(a_direction)] | None = None
-    warming: WarmingEntry | None = None
+    warming: MomentTemperatureEntry | None = None
     sigma: BeaconSigmaEntry = Field(default_factory=BeaconSigmaEntry)
 
     @model_validator(mode="after")
@@ -321,7 +321,7 @@ class BeaconEntry(StrictModel):
             if coil.slot is None or coil.slot >= self.slots.count:
                 remedy = f"give one of the beacon's {self.slots.count} slots, counted from 0"
                 raise refusal_at(("coils", i, "slot"), coil.slot, remedy)
-        if not self.synchronised and not self._slots_tell():
+        if not self.synchronised and not self._slots_are_unique():
             remedy = (
                 "write true, which counts slots on the log's clock; for slots to be found in the"
                 " stream drive the coils with a carrier and leave one slot silent"
@@ -339,24 +339,24 @@ class BeaconEntry(StrictModel):
                 raise refusal_at(("synchronised",), False, remedy)
         return self
 
-    def _slots_tell(self) -> bool:
+    def _slots_are_unique(self) -> bool:
         """Return whether a stream can tell when a cycle begins."""
         assert isinstance(self.slots, SlotsEntry)
         driven = {coil.slot for coil in self.coils or []}
         count = self.slots.count
-        turned = (
+        rotated = (
             {(slot + k) % count for slot in driven if slot is not None} for k in range(1, count)
         )
         coils = self.coils or []
         carrier = all((coil.frequency_hz or self.frequency_hz) > 0.0 for coil in coils)
-        return carrier and len(driven) < count and all(other != driven for other in turned)
+        return carrier and len(driven) < count and all(other != driven for other in rotated)
 
     @model_validator(mode="after")
     def _one_sigma_per_coil(self) -> Self:
-        found, coils = self.sigma.log_moment, self.coil_count
-        if found.ndim and len(found) != coils:
+        result, coils = self.sigma.log_moment, self.coil_count
+        if result.ndim and len(result) != coils:
             remedy = f"give one number or a list of {coils}, one per coil"
-            raise refusal_at(("sigma", "log_moment"), found.tolist(), remedy)
+            raise refusal_at(("sigma", "log_moment"), result.tolist(), remedy)
         return self
 
 
@@ -408,10 +408,10 @@ class SiteEntry(StrictModel):
         for i, sensor in enumerate(self.platform.every):
             key = ("magnetometers", i) if several else ("magnetometer",)
             check_tones(sensor, np.array(tones), ("platform", *key))
-        taken = [sensor.name for sensor in self.platform.every] if several else []
+        selected = [sensor.name for sensor in self.platform.every] if several else []
         for i, beacon in enumerate(self.beacons):
-            if beacon.name in taken:
-                place = ("platform", "magnetometers", taken.index(beacon.name), "name")
+            if beacon.name in selected:
+                place = ("platform", "magnetometers", selected.index(beacon.name), "name")
                 raise refusal_at(place, beacon.name, f"give it another name than beacons[{i}]")
         return self
 

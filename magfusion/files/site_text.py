@@ -59,26 +59,26 @@ def site_text(draft: SiteDraft) -> str:
 
 def to_do(draft: SiteDraft) -> list[str]:
     """Return, in words, what was assumed."""
-    alike: dict[str, list[str]] = {}
+    shared: dict[str, list[str]] = {}
     for beacon in draft.beacons:
-        alike.setdefault("; ".join(_assumed(beacon)), []).append(beacon.name)
-    found = [
+        shared.setdefault("; ".join(_assumed(beacon)), []).append(beacon.name)
+    result = [
         f"beacon{'s' if len(names) > 1 else ''} {', '.join(names)}: {words}"
-        for words, names in alike.items()
+        for words, names in shared.items()
         if words
     ]
     if not draft.beacons:
-        found.append("no beacon is described: only the attitude can be found, by smooth --earth")
+        result.append("no beacon is described: only the attitude can be found, by smooth --earth")
     if draft.place is None:
-        found.append("standard gravity, and no Earth field: --location gives both")
+        result.append("standard gravity, and no Earth field: --location gives both")
     for what, name in (("imu", draft.imu.name), ("magnetometer", draft.magnetometer.name)):
         if name == UNNAMED:
-            found.append(f"{what}: figures of no particular instrument: --{what} takes a name")
+            result.append(f"{what}: figures of no particular instrument: --{what} takes a name")
     if draft.position_m is None:
-        found.append("magnetometer: in the IMU's origin: --lever gives its position")
+        result.append("magnetometer: in the IMU's origin: --lever gives its position")
     if draft.rpy_deg is None:
-        found.append("magnetometer: turned as the IMU: --mounting gives its attitude")
-    return found
+        result.append("magnetometer: turned as the IMU: --mounting gives its attitude")
+    return result
 
 
 def _assumed(beacon: BeaconDraft) -> list[str]:
@@ -111,9 +111,9 @@ def _list(values: Numbers) -> str:
 
 def _world(draft: SiteDraft) -> Iterator[str]:
     gravity = STANDARD_GRAVITY if draft.gravity is None else draft.gravity
-    said = "m/s^2, normal gravity at the location" if draft.place else "m/s^2, standard"
+    declared = "m/s^2, normal gravity at the location" if draft.place else "m/s^2, standard"
     yield "world:"
-    yield _line(f"  gravity_m_s2: {_number(gravity)}", said, draft.place is None)
+    yield _line(f"  gravity_m_s2: {_number(gravity)}", declared, draft.place is None)
     yield _line(f"  model_error: {_number(MODEL_ERROR)}", "relative, of the beacons' fields: iron.")
     yield _line("", "0.005 in a wooden house, 0.02 and more among steel")
     place = draft.place
@@ -190,8 +190,8 @@ def _platform(draft: SiteDraft) -> Iterator[str]:
     yield f"    # {_origin(draft.imu)}"
     yield "    # More where the platform shakes; measure yours at rest by magfusion allan LOG."
     gyro, accel = (
-        "the sheet's stability in run" if said else "by a rule: the sheet has none"
-        for said in draft.imu.turns
+        "the sheet's stability in run" if declared else "by a rule: the sheet has none"
+        for declared in draft.imu.turns
     )
     for key, value, words in (
         ("gyro_noise", imu.gyro_noise, "rad/s/sqrt(Hz), white noise"),
@@ -220,13 +220,13 @@ def _platform(draft: SiteDraft) -> Iterator[str]:
 
 def _mounting(draft: SiteDraft) -> Iterator[str]:
     zero = (0.0, 0.0, 0.0)
-    lever, turned = draft.position_m, draft.rpy_deg
+    lever, rotated = draft.position_m, draft.rpy_deg
     yield "    body_from_sensor:"
     position = _list(zero if lever is None else lever)
     yield _line(f"      position_m: {position}", "m, from the IMU, in its axes", lever is None)
-    rotation = _list(zero if turned is None else turned)
+    rotation = _list(zero if rotated is None else rotated)
     yield _line(
-        f"      rpy_deg: {rotation}", "its axes in the IMU's, as of a beacon", turned is None
+        f"      rpy_deg: {rotation}", "its axes in the IMU's, as of a beacon", rotated is None
     )
 
 

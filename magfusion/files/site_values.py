@@ -32,9 +32,9 @@ def refusal(remedy: str) -> PydanticCustomError:
     return PydanticCustomError("site", "{remedy}", {"remedy": remedy})
 
 
-def refusal_at(key: tuple[str | int, ...], found: object, remedy: str) -> ValidationError:
+def refusal_at(key: tuple[str | int, ...], result: object, remedy: str) -> ValidationError:
     """Return the refusal of a value that a validator of its mapping found."""
-    detail = InitErrorDetails(type=refusal(remedy), loc=key, input=found)
+    detail = InitErrorDetails(type=refusal(remedy), loc=key, input=result)
     return ValidationError.from_exception_data("site", [detail])
 
 
@@ -164,12 +164,12 @@ def iso_date(value: object) -> str:
         raise refusal("give a date as YYYY-MM-DD") from None
 
 
-def between(least: float, most: float) -> AfterValidator:
+def between(least: float, maximum: float) -> AfterValidator:
     """Return a check of bounds, themselves allowed."""
 
     def check(value: float) -> float:
-        if not least <= value <= most:
-            raise refusal(f"it should lie between {least:g} and {most:g}")
+        if not least <= value <= maximum:
+            raise refusal(f"it should lie between {least:g} and {maximum:g}")
         return value
 
     return AfterValidator(check)

@@ -15,11 +15,11 @@ from pydantic_core import PydanticCustomError
 from magfusion.errors import InputError
 from magfusion.files.drive_columns import beacon_of
 from magfusion.files.marks_table import is_slot, slots_of
-from magfusion.files.site_warming import COLDEST, HOTTEST
+from magfusion.files.site_temperature import COLDEST, HOTTEST
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS
 from magfusion.files.yaml_files import StrictModel, sentence
 from magfusion.model.drive import DriveSamples
-from magfusion.model.marks import UNTOLD
+from magfusion.model.marks import UNKNOWN_SLOT
 from magfusion.model.samples import FieldSamples
 from magfusion.units import AnyArray, Array, ComplexArray, IntArray
 
@@ -28,7 +28,7 @@ _CHUNK = 1 << 16  # bytes
 LARGEST_RECORD = 1 << 24  # bytes; minutes of samples
 # MessagePack reserves what a list announces before it reads it.
 LONGEST_LIST = 1 << 17
-LATEST = 1e-9 * LARGEST_TIME_NS  # s
+MAX_TIME_S = 1e-9 * LARGEST_TIME_NS  # s
 
 
 def _numbers(value: object, what: str, *, missing: bool = False) -> Array:
@@ -40,54 +40,56 @@ def _numbers(value: object, what: str, *, missing: bool = False) -> Array:
         Whether null and NaN are taken, for a sample that is not there.
     """
     try:
-        found = np.asarray(value)
+        result = np.asarray(value)
     except ValueError:
-        found = np.empty(0, dtype=object)
-    if missing and found.dtype.kind == "O":
-        found = _with_nulls(found)
-    sound = np.abs(found) < LARGEST_NUMBER if found.dtype.kind in "iuf" else np.zeros(1, dtype=bool)
-    if missing and found.dtype.kind == "f":
-        sound |= np.isnan(found)
+        result = np.empty(0, dtype=object)
+    if missing and result.dtype.kind == "O":
+        result = _with_nulls(result)
+    sound = (
+        np.abs(result) < LARGEST_NUMBER if result.dtype.kind in "iuf" else np.zeros(1, dtype=bool)
+    )
+    if missing and result.dtype.kind == "f":
+        sound |= np.isnan(result)
     if not np.all(sound):
         raise PydanticCustomError("numbers", "it should be {what}, finite", {"what": what})
-    return np.asarray(found, dtype=float)
+    return np.asarray(result, dtype=float)
 
 
-def _with_nulls(found: NDArray[np.object_]) -> NDArray[np.generic]:
+def _with_nulls(result: NDArray[np.object_]) -> NDArray[np.generic]:
     """Return numbers with NaN for null; as it is where it holds anything else."""
-    kinds = {type(one) for one in found.ravel()}
-    return found.astype(float) if kinds <= {int, float, type(None)} and found.size else found
+    kinds = {type(one) for one in result.ravel()}
+    return result.astype(float) if kinds <= {int, float, type(None)} and result.size else result
 
 
 def _times(value: object) -> Array:
-    found = np.atleast_1d(_numbers(value, "a time in seconds, or a list of them"))
-    if found.ndim != 1 or not np.all(np.abs(found) <= LATEST):
+    result = np.atleast_1d(_numbers(value, "a time in seconds, or a list of them"))
+    if result.ndim != 1 or not np.all(np.abs(result) <= MAX_TIME_S):
         raise PydanticCustomError("times", "it should be a time in seconds, or a list of them")
-    return found
+    return result
 
 
 def _vectors(value: object) -> Array:
-    found = np.atleast_2d(_numbers(value, "three numbers, or a list of such", missing=True))
-    if found.ndim != 2 or found.shape[1] != 3:
+    result = np.atleast_2d(_numbers(value, "three numbers, or a list of such", missing=True))
+    if result.ndim != 2 or result.shape[1] != 3:
         raise PydanticCustomError("vectors", "it should be three numbers, or a list of such")
-    return found
+    return result
 
 
 def _series(value: object) -> Array:
     what = "a number, or a list of them"
-    found = np.atleast_1d(_numbers(value, what, missing=True))
-    if found.ndim != 1:
+    result = np.atleast_1d(_numbers(value, what, missing=True))
+    if result.ndim != 1:
         raise PydanticCustomError("series", "it should be {what}", {"what": what})
-    return found
+    return result
 
 
 def _slots(value: object) -> IntArray:
     """Return slots beside samples; null and NaN say nothing."""
-    found = _series(value)
-    if not np.all(is_slot(found)):
+    result = _series(value)
+    if not np.all(is_slot(result)):
         what = "for each sample null, -1 where no coil is driven, or the number of a slot"
         raise PydanticCustomError("slots", "it should be {what}", {"what": what})
-    return slots_of(found)
+    return slots_of(result)
 
 
 def _phasor(value: object) -> ComplexArray:
@@ -99,30 +101,30 @@ def _phasor(value: object) -> ComplexArray:
     for i, tone in enumerate(value):
         if tone is None:
             continue
-        found = _numbers(tone, what, missing=True)
-        if found.shape != (2, 3):
+        result = _numbers(tone, what, missing=True)
+        if result.shape != (2, 3):
             raise PydanticCustomError("phasor", "it should be {what}", {"what": what})
-        out[i] = found[0] + 1j * found[1]
+        out[i] = result[0] + 1j * result[1]
     return out
 
 
 def _amplitudes(value: object) -> ComplexArray:
     """Return the amplitudes of a beacon's tones, (tones, 3), in the first column."""
-    found = _series(value)
-    if np.any(found < 0.0):
+    result = _series(value)
+    if np.any(result < 0.0):
         text = "an amplitude has no sign; it should not be below zero, or be a phasor"
         raise PydanticCustomError("amplitudes", text)
-    out = np.full((len(found), 3), np.nan, dtype=complex)
-    out[:, 0] = found
+    out = np.full((len(result), 3), np.nan, dtype=complex)
+    out[:, 0] = result
     return out
 
 
 def _covariance(value: object) -> Array:
     what = "a list of symmetric, positive 3 x 3 matrices (T^2), one for each tone"
-    found = _numbers(value, what)
-    if found.ndim != 3 or found.shape[1:] != (3, 3) or np.any(np.linalg.eigvalsh(found) <= 0.0):
+    result = _numbers(value, what)
+    if result.ndim != 3 or result.shape[1:] != (3, 3) or np.any(np.linalg.eigvalsh(result) <= 0.0):
         raise PydanticCustomError("covariance", "it should be {what}", {"what": what})
-    return found
+    return result
 
 
 class _Arrays(StrictModel):
@@ -137,7 +139,7 @@ class ImuRecord(_Arrays):
     accel: Annotated[Array, PlainValidator(_vectors)]
 
     @model_validator(mode="after")
-    def _alike(self) -> "ImuRecord":
+    def _check_lengths(self) -> "ImuRecord":
         _check_lengths(self.time, gyro=self.gyro, accel=self.accel)
         return self
 
@@ -155,7 +157,7 @@ class MagnetometerRecord(_Arrays):
     magnetometer: str | None = None
 
     @model_validator(mode="after")
-    def _alike(self) -> "MagnetometerRecord":
+    def _check_lengths(self) -> "MagnetometerRecord":
         _check_lengths(self.time, field=self.field)
         if self.slot is not None:
             _check_lengths(self.time, slot=self.slot)
@@ -169,7 +171,7 @@ class ReferenceRecord(_Arrays):
     field: Annotated[Array, PlainValidator(_vectors)]
 
     @model_validator(mode="after")
-    def _alike(self) -> "ReferenceRecord":
+    def _check_lengths(self) -> "ReferenceRecord":
         _check_lengths(self.time, field=self.field)
         return self
 
@@ -182,7 +184,7 @@ class FieldsRecord(_Arrays):
     several that measured them.
     """
 
-    time: float = Field(ge=-LATEST, le=LATEST)
+    time: float = Field(ge=-MAX_TIME_S, le=MAX_TIME_S)
     window: float = Field(ge=1e-6, le=3600.0)
     phasors: dict[str, Annotated[ComplexArray, PlainValidator(_phasor)]] | None = None
     amplitudes: dict[str, Annotated[ComplexArray, PlainValidator(_amplitudes)]] | None = None
@@ -212,7 +214,7 @@ class FieldsRecord(_Arrays):
 class TemperatureRecord(StrictModel):
     """Temperatures (degrees Celsius) of beacons, or of the ``magnetometer``, from a time on."""
 
-    time: float = Field(ge=-LATEST, le=LATEST)
+    time: float = Field(ge=-MAX_TIME_S, le=MAX_TIME_S)
     degc: dict[str, Annotated[float, Field(ge=COLDEST, le=HOTTEST)]]
 
 
@@ -225,7 +227,7 @@ class DriveRecord(_Arrays):
     ] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _alike(self) -> "DriveRecord":
+    def _check_lengths(self) -> "DriveRecord":
         _check_lengths(self.time, **self.current)
         return self
 
@@ -238,9 +240,9 @@ class MarksRecord(_Arrays):
     slot: Annotated[IntArray, PlainValidator(_slots)]
 
     @model_validator(mode="after")
-    def _alike(self) -> "MarksRecord":
+    def _check_lengths(self) -> "MarksRecord":
         _check_lengths(self.start, end=self.end, slot=self.slot)
-        if np.any(self.slot == UNTOLD):
+        if np.any(self.slot == UNKNOWN_SLOT):
             raise PydanticCustomError("slots", "each mark should have a slot")
         return self
 
@@ -318,7 +320,7 @@ def _noise(entry: FieldsRecord, name: str, tone: int) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Numbered:
+class NumberedRecord:
     """A record with its place in the stream, or the sentence that says why it is none."""
 
     number: int
@@ -326,7 +328,7 @@ class Numbered:
     refusal: str = ""
 
 
-def read_records(stream: BinaryIO, form: Format) -> Iterator[Numbered]:
+def read_records(stream: BinaryIO, form: Format) -> Iterator[NumberedRecord]:
     """Yield the records of a stream as they come; blank lines are passed over.
 
     Raises
@@ -337,14 +339,14 @@ def read_records(stream: BinaryIO, form: Format) -> Iterator[Numbered]:
     return _json_records(stream) if form == "json" else _msgpack_records(stream)
 
 
-def _json_records(stream: BinaryIO) -> Iterator[Numbered]:
+def _json_records(stream: BinaryIO) -> Iterator[NumberedRecord]:
     number = 0
     while line := stream.readline(LARGEST_RECORD + 1):
         number += 1
         if len(line) > LARGEST_RECORD:
             while line and not line.endswith(b"\n"):
                 line = stream.readline(_CHUNK)
-            yield Numbered(number, None, _TOO_LARGE)
+            yield NumberedRecord(number, None, _TOO_LARGE)
         elif line.strip():
             yield _checked(number, partial(Record.model_validate_json, line))
 
@@ -352,7 +354,7 @@ def _json_records(stream: BinaryIO) -> Iterator[Numbered]:
 _TOO_LARGE = f"is larger than {LARGEST_RECORD >> 20} MiB; write fewer samples in a record."
 
 
-def _msgpack_records(stream: BinaryIO) -> Iterator[Numbered]:
+def _msgpack_records(stream: BinaryIO) -> Iterator[NumberedRecord]:
     number, fed = 0, 0
     unpacker = msgpack.Unpacker(
         max_buffer_size=LARGEST_RECORD + _CHUNK,
@@ -383,11 +385,11 @@ def _msgpack_records(stream: BinaryIO) -> Iterator[Numbered]:
 _RECORD = "standard input, record"
 
 
-def _checked(number: int, read: Callable[[], Record]) -> Numbered:
+def _checked(number: int, read: Callable[[], Record]) -> NumberedRecord:
     try:
-        return Numbered(number, read())
+        return NumberedRecord(number, read())
     except ValidationError as error:
-        return Numbered(number, None, sentence(error, Record, "record"))
+        return NumberedRecord(number, None, sentence(error, Record, "record"))
 
 
 def json_line(content: dict[str, Any]) -> bytes:

@@ -69,12 +69,12 @@ class Span:
     def _stamp(self, time: float | None, default: int) -> int:
         if time is None:
             return default
-        most = LARGEST_TIME_NS * NANOSECOND
-        stamp = self.epoch_ns + round(max(-most, min(time, most)) / NANOSECOND)
+        maximum = LARGEST_TIME_NS * NANOSECOND
+        stamp = self.epoch_ns + round(max(-maximum, min(time, maximum)) / NANOSECOND)
         return max(-LARGEST_TIME_NS, min(stamp, LARGEST_TIME_NS))
 
 
-class Layout(NamedTuple):
+class TableLayout(NamedTuple):
     """Columns of a table.
 
     Parameters
@@ -99,23 +99,23 @@ class Layout(NamedTuple):
     some: tuple[str, ...] = ()
     optional_texts: tuple[str, ...] = ()
 
-    def _wanted(self, found: Sequence[str]) -> list[str]:
+    def _wanted(self, result: Sequence[str]) -> list[str]:
         """Return the columns to read, where the optional ones are as found."""
-        groups = [g for g in self.optional if set(g) & set(found)]
-        texts = [*self.texts, *filter(found.__contains__, self.optional_texts)]
-        some = [*filter(found.__contains__, self.some)] or self.some
+        groups = [g for g in self.optional if set(g) & set(result)]
+        texts = [*self.texts, *filter(result.__contains__, self.optional_texts)]
+        some = [*filter(result.__contains__, self.some)] or self.some
         return [*self.integers, *texts, *self.numbers, *itertools.chain(*groups), *some]
 
-    def chosen(self, found: Sequence[str], path: Path) -> list[str]:
+    def chosen(self, result: Sequence[str], path: Path) -> list[str]:
         """Return the columns to read of those found; refuse a table that lacks one."""
-        wanted = self._wanted(found)
-        missing = [name for name in wanted if name not in found]
+        wanted = self._wanted(result)
+        missing = [name for name in wanted if name not in result]
         if missing:
             raise InputError(
-                f"{path}: {_listed('column', missing)} missing (found {', '.join(found)});"
+                f"{path}: {_listed('column', missing)} missing (found {', '.join(result)});"
                 " add what is missing."
             )
-        repeated = [name for name in wanted if list(found).count(name) > 1]
+        repeated = [name for name in wanted if list(result).count(name) > 1]
         if repeated:
             raise InputError(f"{path}: {_listed('column', repeated)} repeated; keep one of each.")
         return wanted
@@ -191,13 +191,13 @@ class Table:
             encoded = encoded.combine_chunks()
         return encoded.dictionary.to_pylist(), encoded.indices.to_numpy().astype(np.int64)
 
-    def refuse(self, bad: AnyArray, name: str, found: AnyArray, remedy: str) -> None:
+    def refuse(self, bad: AnyArray, name: str, result: AnyArray, remedy: str) -> None:
         """Raise an InputError that names the first bad row, if there is one."""
         if bad.any():
             k = int(np.argmax(bad))
             raise InputError(
                 f"{self.path}: column {name}, row {self.first_row + k} (counted from 0):"
-                f" found {found[k]}; {remedy}."
+                f" found {result[k]}; {remedy}."
             )
 
     def _present(self, name: str) -> pa.ChunkedArray:
@@ -216,7 +216,7 @@ def find_table(directory: Path, stem: str) -> Path | None:
     return paths[0] if paths else None
 
 
-def read_table(path: Path, layout: Layout, span: Span, names: tuple[str, ...] = ()) -> Table:
+def read_table(path: Path, layout: TableLayout, span: Span, names: tuple[str, ...] = ()) -> Table:
     """Read the columns of a layout and the rows of a span.
 
     A Parquet file is mapped, and only the row groups that the span needs are decoded.
@@ -272,7 +272,7 @@ def write_table(columns: dict[str, object], path: Path) -> None:
         )
 
 
-def _read_parquet(path: Path, layout: Layout, span: Span) -> tuple[pa.Table, int]:
+def _read_parquet(path: Path, layout: TableLayout, span: Span) -> tuple[pa.Table, int]:
     options = {"memory_map": True, "page_checksum_verification": True, "pre_buffer": False}
     with pa.parquet.ParquetFile(path, **options) as file:
         _refuse_empty(file.metadata.num_rows, path)
@@ -303,7 +303,7 @@ def _groups_within(file: pa.parquet.ParquetFile, span: Span) -> range:
     return range(within[0], within[-1] + 1) if within else range(0)
 
 
-def _read_csv(path: Path, layout: Layout, renamed: tuple[str, ...]) -> pa.Table:
+def _read_csv(path: Path, layout: TableLayout, renamed: tuple[str, ...]) -> pa.Table:
     if path.stat().st_size > MOST_BYTES:
         raise InputError(
             f"{path}: is larger than {MOST_BYTES >> 20} MiB; write it as Parquet, of which a part"
@@ -311,11 +311,11 @@ def _read_csv(path: Path, layout: Layout, renamed: tuple[str, ...]) -> pa.Table:
         )
     with path.open(newline="", encoding="utf-8-sig") as stream:
         header = next(csv.reader(stream), [])
-    found = [*renamed[: len(header)], *(name.strip() for name in header[len(renamed) :])]
-    names = layout.chosen(found, path)
+    result = [*renamed[: len(header)], *(name.strip() for name in header[len(renamed) :])]
+    names = layout.chosen(result, path)
     data = pa.csv.read_csv(
         path,
-        read_options=pa.csv.ReadOptions(column_names=found, skip_rows=1),
+        read_options=pa.csv.ReadOptions(column_names=result, skip_rows=1),
         convert_options=pa.csv.ConvertOptions(
             include_columns=names, column_types={name: layout.csv_type(name) for name in names}
         ),
@@ -324,7 +324,7 @@ def _read_csv(path: Path, layout: Layout, renamed: tuple[str, ...]) -> pa.Table:
     return data
 
 
-def check_times(whole: Table, time_ns: IntArray, layout: Layout, span: Span) -> None:
+def check_times(whole: Table, time_ns: IntArray, layout: TableLayout, span: Span) -> None:
     """Refuse times that are no nanoseconds, or not sorted."""
     far = np.abs(time_ns) > LARGEST_TIME_NS
     whole.refuse(far, TIME, time_ns, "write nanoseconds")
@@ -346,9 +346,9 @@ def _integers(column: pa.ChunkedArray, name: str, path: Path) -> IntArray:
     return np.asarray(column.to_numpy(), dtype=np.int64)
 
 
-def _integer_type(found: pa.DataType, name: str, path: Path) -> None:
-    if not pa.types.is_integer(found):
-        raise InputError(f"{path}: column {name} holds {found}; write integers (int64).")
+def _integer_type(result: pa.DataType, name: str, path: Path) -> None:
+    if not pa.types.is_integer(result):
+        raise InputError(f"{path}: column {name} holds {result}; write integers (int64).")
 
 
 def _refuse_empty(rows: int, path: Path) -> None:

@@ -15,7 +15,7 @@ from magfusion.files.inertial_tables import FIELD_LAYOUT, IMU_LAYOUT
 from magfusion.files.log import HEADER, LogHeader, is_log
 from magfusion.files.open import open_log
 from magfusion.files.parquet_bounds import BATCH, refuse_unfolding
-from magfusion.files.table import TIME, Layout, Span, Table, check_times, find_table
+from magfusion.files.table import TIME, Span, Table, TableLayout, check_times, find_table
 from magfusion.files.yaml_files import read_yaml
 from magfusion.units import Array, IntArray
 
@@ -24,7 +24,7 @@ STREAMS = {"imu": IMU_LAYOUT, "magnetometer": FIELD_LAYOUT}
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
+class SampleBlock:
     """Consecutive samples of a stream.
 
     Parameters
@@ -45,7 +45,7 @@ def pieces(
     start: float | None = None,
     end: float | None = None,
     topics: Topics | None = None,
-) -> Iterator[Piece]:
+) -> Iterator[SampleBlock]:
     """Yield a stream of a log, ``imu`` or ``magnetometer``; nothing where the log has none.
 
     A log's own tables are read piece by piece; an EuRoC folder and a bag are read whole first.
@@ -62,12 +62,12 @@ def pieces(
     table = find_table(path, stream)
     if table is not None:
         for part in table_pieces(table, STREAMS[stream], Span(header.epoch_ns, start, end)):
-            yield Piece(part.time, part.numbers(STREAMS[stream].numbers, nan=True))
+            yield SampleBlock(part.time, part.numbers(STREAMS[stream].numbers, nan=True))
 
 
 def _whole(
     path: Path, stream: str, start: float | None, end: float | None, topics: Topics | None
-) -> Iterator[Piece]:
+) -> Iterator[SampleBlock]:
     log = open_log(path, start, end, topics)
     if stream == "imu":
         time, values = log.imu.time, np.hstack([log.imu.gyro_body, log.imu.accel_body])
@@ -76,10 +76,10 @@ def _whole(
     else:
         time, values = log.waveform.time, log.waveform.measured_sensor
     for first in range(0, len(time), BATCH):
-        yield Piece(time[first : first + BATCH], values[first : first + BATCH])
+        yield SampleBlock(time[first : first + BATCH], values[first : first + BATCH])
 
 
-def table_pieces(path: Path, layout: Layout, span: Span) -> Iterator[Table]:
+def table_pieces(path: Path, layout: TableLayout, span: Span) -> Iterator[Table]:
     """Yield the rows of a span, in tables of at most `BATCH` rows.
 
     Raises
@@ -120,7 +120,7 @@ def _check_order(whole: Table, time_ns: IntArray, last: int | None) -> None:
         whole.refuse(before, TIME, time_ns, remedy)
 
 
-def _batches(path: Path, layout: Layout) -> Iterator[pa.RecordBatch]:
+def _batches(path: Path, layout: TableLayout) -> Iterator[pa.RecordBatch]:
     if path.suffix == ".csv":
         types = {name: layout.csv_type(name) for name in (TIME, *layout.numbers)}
         convert = pa.csv.ConvertOptions(column_types=types)

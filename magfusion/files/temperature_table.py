@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from magfusion.files.readings_table import read_readings, write_readings
-from magfusion.files.site_warming import COLDEST, HOTTEST
+from magfusion.files.site_temperature import COLDEST, HOTTEST
 from magfusion.model.temperature import Temperatures
 
 DEGC = "temperature_degc"

@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
-from magfusion.files.table import TIME, Layout, Span, Table, read_table, write_table
+from magfusion.files.table import TIME, Span, Table, TableLayout, read_table, write_table
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import StateTrust
 from magfusion.units import Array, IntArray
@@ -18,7 +18,7 @@ _GYRO_BIAS = ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")
 _ACCEL_BIAS = ("accel_bias_x", "accel_bias_y", "accel_bias_z")
 _UPPER = np.triu_indices(6)
 _COV = tuple(f"cov_{i}{j}" for i, j in zip(*_UPPER, strict=True))
-_LAYOUT = Layout(
+_LAYOUT = TableLayout(
     numbers=(*_POSITION, *_QUATERNION), optional=(_VELOCITY, _GYRO_BIAS, _ACCEL_BIAS, _COV)
 )
 QUATERNION_TOLERANCE = 1e-3  # of its length from one

@@ -86,5 +86,5 @@ def _stamp(path: Path, number: int, text: str) -> int:
     return stamp
 
 
-def _refuse(path: Path, number: int, found: str, wanted: str) -> None:
-    raise InputError(f"{path}: line {number}: found {found}; write {wanted}.")
+def _refuse(path: Path, number: int, result: str, wanted: str) -> None:
+    raise InputError(f"{path}: line {number}: found {result}; write {wanted}.")

@@ -10,7 +10,7 @@ from magfusion.files.yaml_files import StrictModel, read_yaml
 
 _Length = Annotated[float, Field(gt=0.0), between(1e-2, 1e3)]
 _Angle = Annotated[float, between(-360.0, 360.0)]
-_Apart = Annotated[float, between(-60.0, 60.0)]
+Separation = Annotated[float, between(-60.0, 60.0)]
 
 
 class WellsEntry(StrictModel):
@@ -23,8 +23,8 @@ class WellsEntry(StrictModel):
     distance_m: _Length = 25.0
     high_side_deg: _Angle = 60.0
     inclination_deg: Annotated[float, between(0.0, 120.0)] = 89.0
-    leads_right_deg: _Apart = 2.0
-    leads_up_deg: _Apart = -1.0
+    leads_right_deg: Separation = 2.0
+    leads_up_deg: Separation = -1.0
     apart_m: Annotated[float, between(0.0, 1e3)] = 15.0
     reach_m: _Length = 30.0
     speed_m_s: Annotated[float, between(1e-3, 10.0)] = 0.1

@@ -99,8 +99,8 @@ for _end in (_Loader, _Dumper):
 
 def _text(path: Path) -> str:
     if not path.is_file():
-        found = "is a directory" if path.is_dir() else "there is no such file"
-        raise InputError(f"{path}: {found}; give the path of a YAML file.")
+        result = "is a directory" if path.is_dir() else "there is no such file"
+        raise InputError(f"{path}: {result}; give the path of a YAML file.")
     try:
         with path.open("rb") as stream:
             content = stream.read(LARGEST_YAML + 1)

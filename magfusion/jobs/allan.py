@@ -15,7 +15,7 @@ from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
-    from magfusion.jobs.allan_noise import Measured
+    from magfusion.jobs.allan_noise import MeasuredNoise
     from magfusion.jobs.inputs import Job
     from magfusion.model.site import Site
 
@@ -45,14 +45,14 @@ def run_allan(settings: AllanSettings, output: Path, report: Report = quiet) -> 
     claimed, job = claim(output, "allan"), settings.job(output)
     began = time.perf_counter()
     site = _site(job)
-    found = measured(job, site, report)
-    figures = heading("allan", job.log_path.resolve().name) | trust_figures(found.trust)
-    figures |= _figures(found)
+    result = measured(job, site, report)
+    figures = heading("allan", job.log_path.resolve().name) | trust_figures(result.trust)
+    figures |= _figures(result)
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     with claimed as whole:
-        write_allan_plot(found_in(whole, found.trust) / "allan.png", found.plotted())
-        if site is not None and found.trust.verdict is not Verdict.FAILED:
-            save_site(with_noise(site, found), whole / "site.yaml")
+        write_allan_plot(found_in(whole, result.trust) / "allan.png", result.plotted())
+        if site is not None and result.trust.verdict is not Verdict.FAILED:
+            save_site(with_noise(site, result), whole / "site.yaml")
         write_report(whole, figures)
     report("done", 3, 3)
     return figures
@@ -64,13 +64,13 @@ def _site(job: Job) -> Site | None:
     return load_site(job.declared_path, unknown=True, without=True)
 
 
-def with_noise(site: Site, found: Measured) -> Site:
+def with_noise(site: Site, fitted: MeasuredNoise) -> Site:
     """Return a site with the estimated noise; a bias sigma is only ever increased.
 
     One switch-on gives a lower limit of the bias's sigma, but no upper limit.
     """
     imu, magnetometer = site.platform.imu, site.platform.magnetometer
-    keys = found.keys
+    keys = fitted.keys
     for key, value in keys.items():
         if key == "noise_density_t_rthz":
             magnetometer = replace(magnetometer, noise_density=value)
@@ -81,20 +81,20 @@ def with_noise(site: Site, found: Measured) -> Site:
     return replace(site, platform=replace(site.platform, imu=imu, magnetometer=magnetometer))
 
 
-def _figures(found: Measured) -> Figures:
+def _figures(fitted: MeasuredNoise) -> Figures:
     """Return the figures of the site's keys, and those of each axis."""
     figures = Figures(
-        Figure("duration_s", found.duration, "s"),
+        Figure("duration_s", fitted.duration, "s"),
         *(
             Figure(f"{stream}_samples", count, section=Section.REPORT)
-            for stream, count in found.samples.items()
+            for stream, count in fitted.samples.items()
         ),
     )
-    for key, value in found.keys.items():
-        low, high = found.intervals.get(key, (None, None))
+    for key, value in fitted.keys.items():
+        low, high = fitted.intervals.get(key, (None, None))
         between = "" if low is None else f" (95 %: {low:.3g} to {high:.3g})"
-        figures |= Figures(Figure(key, value, f"{found.units[key]}{between}", label=key))
-    for one in found.instruments:
+        figures |= Figures(Figure(key, value, f"{fitted.units[key]}{between}", label=key))
+    for one in fitted.instruments:
         for axis, fit in zip(AXES, one.fits, strict=True):
             if fit is None:
                 continue

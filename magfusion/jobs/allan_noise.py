@@ -18,7 +18,7 @@ from magfusion.estimation.data_checks.samples import (
     repeated_samples,
 )
 from magfusion.estimation.data_checks.stamps import uneven_stamps
-from magfusion.files.table_stream import Piece, pieces
+from magfusion.files.table_stream import SampleBlock, pieces
 from magfusion.jobs.inputs import Job
 from magfusion.model.progress import Report
 from magfusion.model.samples import ImuSamples, Log, Waveform
@@ -26,9 +26,9 @@ from magfusion.model.site import MotionModel, Site
 from magfusion.model.trust import Finding, Trust, Unverified, Verdict
 from magfusion.units import DEGREE, Array
 
-WITNESSES = (uneven_stamps, frozen_samples, repeated_samples, clipped_samples, false_samples)
+STREAM_TESTS = (uneven_stamps, frozen_samples, repeated_samples, clipped_samples, false_samples)
 # Stamps contain little noise if evenly sampled; missing samples are tracked.
-COPED = frozenset({"jitter", "samples_lost", "repeated_stamps", "missing_samples"})
+TOLERATED_CODES = frozenset({"jitter", "samples_lost", "repeated_stamps", "missing_samples"})
 MOST_LOST = 0.05  # share of the samples, from which it matters after all
 MOVED = 0.2  # share of the time, from which it was no rest
 STANDARD_GRAVITY, GRAVITY_UNSURE = 9.80665, 0.03  # m/s^2, without a site
@@ -71,7 +71,7 @@ class Instrument:
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class MeasuredNoise:
     """Estimated noise.
 
     Parameters
@@ -96,7 +96,7 @@ class Measured:
 
 
 @dataclass
-class _Said:
+class _StreamFindings:
     """Findings of the blocks of a stream, the worst of each kind."""
 
     pieces: int = 0
@@ -110,12 +110,12 @@ class _Said:
             worse = finding if finding.weight > before.weight else before
             self.worst[key] = count + 1, worse
 
-    def findings(self, lost: float) -> Iterator[Finding]:
+    def findings(self, missing_share: float) -> Iterator[Finding]:
         for count, finding in self.worst.values():
             verdict = finding.verdict
             if verdict is Verdict.FAILED and count <= HALF * self.pieces:
                 verdict = Verdict.DOUBTFUL
-            if finding.code in COPED and lost < MOST_LOST:
+            if finding.code in TOLERATED_CODES and missing_share < MOST_LOST:
                 verdict = Verdict.TRUSTWORTHY
             where = ""
             if self.pieces > 1:
@@ -123,7 +123,7 @@ class _Said:
             yield replace(finding, text=finding.text + where, verdict=verdict)
 
 
-def measured(job: Job, site: Site | None, report: Report) -> Measured:
+def measured(job: Job, site: Site | None, report: Report) -> MeasuredNoise:
     """Estimate the noise of a log at rest.
 
     Raises
@@ -137,29 +137,29 @@ def measured(job: Job, site: Site | None, report: Report) -> Measured:
     duration = 0.0
     for k, (stream, parts) in enumerate(_STREAMS.items()):
         report(f"reading {stream}", k, 3)
-        rest, said = _gathered(job, stream, 3 * len(parts))
-        if not said.pieces:
+        rest, messages = _gathered(job, stream, 3 * len(parts))
+        if not messages.pieces:
             continue
         samples[stream] = len(rest)
         duration = max(duration, rest.duration)
-        own = list(said.findings(rest.lost))
+        own = list(messages.findings(rest.missing_share))
         if stream == "imu":
             own += _moved(rest, motion)
-        found = _instruments(_without_motion(rest, job, stream, motion), parts)
-        coarse = tuple(one.name for one in found if one.coarse)
+        result = _instruments(_without_motion(rest, job, stream, motion), parts)
+        coarse = tuple(one.name for one in result if one.coarse)
         findings += [f for f in own if f.code not in OF_STEPS or not f.text.startswith(coarse)]
-        instruments += found
+        instruments += result
     if not instruments:
         raise InputError(f"{job.log_path}: holds neither inertial nor magnetometer samples")
     for one in instruments:
-        findings += _judged(one, duration)
+        findings += _deviation_findings(one, duration)
     keys, intervals, units = _keys(instruments, site)
-    held = tuple(_held(keys)) if "accel_bias_sigma" in keys else ()
-    trust = Trust(tuple(findings), held)
-    return Measured(trust, duration, samples, tuple(instruments), keys, intervals, units)
+    fixed = tuple(_unverified_bounds(keys)) if "accel_bias_sigma" in keys else ()
+    trust = Trust(tuple(findings), fixed)
+    return MeasuredNoise(trust, duration, samples, tuple(instruments), keys, intervals, units)
 
 
-def _gathered(job: Job, stream: str, width: int) -> tuple[RestStream, _Said]:
+def _gathered(job: Job, stream: str, width: int) -> tuple[RestStream, _StreamFindings]:
     """Return the samples of a stream at rest, and the findings of its blocks.
 
     Raises
@@ -167,19 +167,19 @@ def _gathered(job: Job, stream: str, width: int) -> tuple[RestStream, _Said]:
     InputError
         Where there are too few samples.
     """
-    rest, said = RestStream(width), _Said()
+    rest, findings = RestStream(width), _StreamFindings()
     for piece in _pieces(job, stream):
         rest.add(piece.time, piece.values)
-        said.add(_of_piece(stream, piece))
-    if said.pieces and len(rest) < LEAST_SAMPLES:
+        findings.add(_of_piece(stream, piece))
+    if findings.pieces and len(rest) < LEAST_SAMPLES:
         raise InputError(
             f"{job.log_path}: {stream} has {len(rest)} samples in the selected part; record at rest"
             " for at least some minutes, better for hours"
         )
-    return rest, said
+    return rest, findings
 
 
-def _pieces(job: Job, stream: str) -> Iterator[Piece]:
+def _pieces(job: Job, stream: str) -> Iterator[SampleBlock]:
     return pieces(job.log_path, stream, job.start, job.end, job.topics)
 
 
@@ -192,10 +192,10 @@ def _limits(rest: RestStream, motion: MotionModel) -> Array:
 def _without_motion(rest: RestStream, job: Job, stream: str, motion: MotionModel) -> RestStream:
     """Return a stream without the stretches that were shaken, knocked or frozen."""
     blocks = rest.blocks()
-    unlike = blocks.unlike() | blocks.departed(_limits(rest, motion))
-    if not unlike.any() or np.mean(unlike) > MOVED:
+    differing = blocks.outlying() | blocks.exceeding(_limits(rest, motion))
+    if not differing.any() or np.mean(differing) > MOVED:
         return rest
-    begin, end = blocks.begin[unlike], blocks.end[unlike]
+    begin, end = blocks.begin[differing], blocks.end[differing]
     quiet = RestStream(len(rest.mean))
     for piece in _pieces(job, stream):
         at = np.searchsorted(begin, piece.time, side="right") - 1
@@ -222,7 +222,7 @@ def _instruments(rest: RestStream, parts: tuple[tuple[str, str, str], ...]) -> l
     return out
 
 
-def _of_piece(stream: str, piece: Piece) -> list[Finding]:
+def _of_piece(stream: str, piece: SampleBlock) -> list[Finding]:
     there = np.isfinite(piece.values).all(axis=1)
     fresh = np.diff(piece.time, prepend=-np.inf) > 0.0
     time, values = piece.time[there & fresh], piece.values[there & fresh]
@@ -233,7 +233,7 @@ def _of_piece(stream: str, piece: Piece) -> list[Finding]:
     else:
         wave = Waveform(time, values)
     log = Log("piece", 0, "", imu, wave)
-    return [finding for witness in WITNESSES for finding in witness(log, None)]
+    return [finding for monitor in STREAM_TESTS for finding in monitor(log, None)]
 
 
 def _moved(rest: RestStream, motion: MotionModel) -> Iterator[Finding]:
@@ -241,8 +241,8 @@ def _moved(rest: RestStream, motion: MotionModel) -> Iterator[Finding]:
     blocks = rest.blocks()
     if len(blocks.begin) == 0:
         return
-    away = blocks.departed(_limits(rest, motion))
-    moved = away | blocks.unlike()
+    away = blocks.exceeding(_limits(rest, motion))
+    moved = away | blocks.outlying()
     share = float(np.mean(moved))
     if not moved.any():
         return
@@ -264,7 +264,7 @@ def _moved(rest: RestStream, motion: MotionModel) -> Iterator[Finding]:
     )
 
 
-def _judged(one: Instrument, duration: float) -> Iterator[Finding]:
+def _deviation_findings(one: Instrument, duration: float) -> Iterator[Finding]:
     """Yield findings on the Allan deviations of an instrument."""
     if len(one.known) < 3:
         yield Finding(
@@ -299,9 +299,9 @@ def _judged(one: Instrument, duration: float) -> Iterator[Finding]:
         )
     if one.key == "magnetometer":
         return
-    open_ = [axis for axis, fit in zip(AXES, one.known, strict=True) if not fit.walk.found]
+    open_ = [axis for axis, fit in zip(AXES, one.known, strict=True) if not fit.walk.is_significant]
     if open_:
-        high = max(fit.walk.high for fit in one.known if not fit.walk.found)
+        high = max(fit.walk.high for fit in one.known if not fit.walk.is_significant)
         yield Finding(
             "few_data",
             f"{one.name}: the log of {_span(duration)} is too short for the bias random walk on"
@@ -330,17 +330,17 @@ def _keys(
     for one in instruments:
         if not one.known:
             continue
-        loud = max(one.known, key=lambda fit: fit.white.value)
+        strong = max(one.known, key=lambda fit: fit.white.value)
         if one.key == "magnetometer":
             if max(fit.misfit for fit in one.known) < MISFIT:
                 key = "noise_density_t_rthz"
-                keys[key], units[key] = float(DENSITY * loud.white.value), "T/sqrt(Hz)"
-                intervals[key] = DENSITY * loud.white.low, DENSITY * loud.white.high
+                keys[key], units[key] = float(DENSITY * strong.white.value), "T/sqrt(Hz)"
+                intervals[key] = DENSITY * strong.white.low, DENSITY * strong.white.high
             continue
         noise, walk, sigma = f"{one.key}_noise", f"{one.key}_bias_walk", f"{one.key}_bias_sigma"
-        keys[noise] = loud.white.value if loud.white.found else loud.white.high
+        keys[noise] = strong.white.value if strong.white.is_significant else strong.white.high
         units[noise] = f"{one.unit}/sqrt(Hz)"
-        intervals[noise] = loud.white.low, loud.white.high
+        intervals[noise] = strong.white.low, strong.white.high
         keys[walk], units[walk] = max(fit.covering_walk for fit in one.known), f"{one.unit}/sqrt(s)"
         units[sigma] = one.unit
         if one.key == "gyro":
@@ -352,7 +352,7 @@ def _keys(
     return keys, intervals, units
 
 
-def _held(keys: dict[str, float]) -> Iterator[Unverified]:
+def _unverified_bounds(keys: dict[str, float]) -> Iterator[Unverified]:
     sigma = keys["accel_bias_sigma"]
     tilt = sigma / STANDARD_GRAVITY / DEGREE
     yield Unverified("imu.accel_bias across gravity", f"{sigma:.3g} m/s^2", 0.0, tilt)

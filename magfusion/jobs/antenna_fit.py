@@ -40,7 +40,7 @@ from magfusion.units import DEGREE, Array
 
 if TYPE_CHECKING:
     from magfusion.calibration.antenna import AntennaFit
-    from magfusion.calibration.antenna_observability import Observability
+    from magfusion.calibration.antenna_observability import AntennaObservability
     from magfusion.calibration.antenna_probe import Predict
     from magfusion.calibration.antenna_site import BodySurvey
     from magfusion.calibration.antenna_tracking import PoseErrors
@@ -67,7 +67,7 @@ class Bench:
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class AntennaSolution:
     """The antennas of a bench.
 
     Parameters
@@ -76,7 +76,7 @@ class Solved:
         Mean before the survey: from the site and the probe.
     root : ndarray, shape (k, k)
         Factor of its covariance.
-    observed : Observability, optional
+    observed : AntennaObservability, optional
         What the survey's poses determine.
     probed : dict
         Relative leave-one-out errors of readings, before and after.
@@ -87,7 +87,7 @@ class Solved:
     fit: AntennaFit
     prior: Array
     root: Array
-    observed: Observability | None
+    observed: AntennaObservability | None
     probed: dict[Side, tuple[Array, Array]] = field(default_factory=dict)
     elsewhere: Array | None = None
 
@@ -98,7 +98,7 @@ def declared_sigma(start: Antenna, *, sizes: bool) -> Array:
     return prior_sigma(start, GAIN_SIGMA, TILT_SIGMA, CENTRE_SIGMA, kappa)
 
 
-def solved(bench: Bench, settings: AntennaSettings) -> Solved:
+def solved(bench: Bench, settings: AntennaSettings) -> AntennaSolution:
     """Return the maximum-likelihood antennas of all readings.
 
     Raises
@@ -114,17 +114,17 @@ def solved(bench: Bench, settings: AntennaSettings) -> Solved:
         chi2, dof = chi2 + of_side[0], dof + of_side[1]
     root = np.asarray(np.linalg.cholesky(cov))
     if bench.survey is None:
-        found = antenna_from_vector(mean)
+        result = antenna_from_vector(mean)
         poses = np.zeros((0, 3, 3)), np.zeros((0, 3))
-        fit = AntennaFit(found, cov, np.asarray(chi2), dof, *poses)
-        return Solved(fit, mean, root, None, errors)
+        fit = AntennaFit(result, cov, np.asarray(chi2), dof, *poses)
+        return AntennaSolution(fit, mean, root, None, errors)
     fit = _by_survey(bench, bench.survey, mean, root, settings)
     own = bench.survey.of_sensor(bench.beacon, bench.site.platform.magnetometer)
     whole = replace(fit, chi2=fit.chi2 + chi2, dof=fit.dof + dof)
     written = with_fit(bench.site, bench.beacon, fit)
     beacon = next(b for b in written.beacons if b.name == bench.beacon.name)
     elsewhere = turned_elsewhere(written, beacon, fit, bench.survey)
-    return Solved(whole, mean, root, observability(own, fit.antenna), errors, elsewhere)
+    return AntennaSolution(whole, mean, root, observability(own, fit.antenna), errors, elsewhere)
 
 
 def _by_survey(
@@ -189,7 +189,7 @@ def _of_coils(beacon: Beacon, size: int) -> Predict:
 
 
 def left_out(
-    bench: Bench, declared: Site, found: Solved, settings: AntennaSettings
+    bench: Bench, declared: Site, result: AntennaSolution, settings: AntennaSettings
 ) -> tuple[PoseErrors, PoseErrors]:
     """Return errors of fixes with the declared site, and with sites fitted without each pose.
 
@@ -199,18 +199,18 @@ def left_out(
     assert survey is not None
     own = np.array([settings.pose_rotation_deg * DEGREE, settings.pose_position_m])
     n = len(survey.sigma)
-    apart, square, excess = np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
+    separate, square, excess = np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
     fold = np.arange(n) % FOLDS
     with TemporaryDirectory() as directory:
         for k in range(FOLDS):
             rows = fold == k
-            fit = _by_survey(bench, survey.rows(~rows), found.prior, found.root, settings)
+            fit = _by_survey(bench, survey.rows(~rows), result.prior, result.root, settings)
             path = Path(directory) / "site.yaml"
             save_site(with_fit(bench.site, bench.beacon, fit), path)
             site = load_site(path)
             beacon = next(b for b in site.beacons if b.name == name)
-            apart[rows] = differences(site, beacon, survey.rows(rows))
-            made = expected(site, beacon, fit, survey.rows(rows))
-            square[rows], excess[rows] = made.square, made.excess
+            separate[rows] = differences(site, beacon, survey.rows(rows))
+            built = expected(site, beacon, fit, survey.rows(rows))
+            square[rows], excess[rows] = built.square, built.excess
     before = own_errors(differences(declared, bench.beacon, survey), own, None)
-    return before, own_errors(apart, own, Expected(square, excess))
+    return before, own_errors(separate, own, Expected(square, excess))

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from magfusion.model.antenna import Antenna
     from magfusion.model.probe import ProbeReadings
 
-FEWEST_POSES = 5  # four determine the antenna; with less than one to spare nothing is tested
+MIN_POSES = 5  # four determine the antenna; with less than one to spare nothing is tested
 
 
 def tracker(site: Site, name: str | None) -> Beacon:
@@ -40,28 +40,28 @@ def tracker(site: Site, name: str | None) -> Beacon:
     names = ", ".join(b.name for b in site.beacons)
     trackers = [b for b in site.beacons if len(b.coils) == 3 and len(b.tones) == 3]
     if name is not None:
-        found = [b for b in site.beacons if b.name == name]
-        if not found:
+        result = [b for b in site.beacons if b.name == name]
+        if not result:
             raise InputError(f"has no beacon {name} (it has {names}); choose one with --beacon")
     else:
-        found = trackers
-    if len(found) != 1:
-        what = "no beacon" if not found else f"{len(found)} beacons"
+        result = trackers
+    if len(result) != 1:
+        what = "no beacon" if not result else f"{len(result)} beacons"
         raise InputError(
             f"has {what} of three coils, each in a separate tone or slot; describe the tracker, or"
             " choose one with --beacon"
         )
-    if not found[0].synchronised:
+    if not result[0].synchronised:
         raise InputError(
-            f"beacon {found[0].name} is not synchronised: the sign of its couplings is unknown;"
+            f"beacon {result[0].name} is not synchronised: the sign of its couplings is unknown;"
             " survey it with synchronised: true"
         )
-    if found[0].field_map is not None:
+    if result[0].field_map is not None:
         raise InputError(
-            f"beacon {found[0].name} has a field map of the old antennas; calibrate the antennas"
+            f"beacon {result[0].name} has a field map of the old antennas; calibrate the antennas"
             " first, then calibrate the map again"
         )
-    return found[0]
+    return result[0]
 
 
 def couplings(survey: Survey, beacon: Beacon) -> tuple[BodySurvey, int]:
@@ -84,10 +84,10 @@ def couplings(survey: Survey, beacon: Beacon) -> tuple[BodySurvey, int]:
     columns = [survey.channels.index(channel) for channel in wanted]
     phasor, sigma = survey.phasor_sensor[:, columns], survey.sigma[:, columns]
     whole = np.isfinite(phasor).all(axis=(1, 2))
-    if np.sum(whole) < FEWEST_POSES:
+    if np.sum(whole) < MIN_POSES:
         raise InputError(
             f"has {np.sum(whole)} poses with all three tones of beacon {beacon.name}; survey at"
-            f" least {FEWEST_POSES}, at different positions and attitudes"
+            f" least {MIN_POSES}, at different positions and attitudes"
         )
     # Tones are in the order of the coils, one each.
     declared = np.array([coil.phase for coil in beacon.coils])
@@ -146,14 +146,14 @@ def probed(paths: tuple[Path, ...]) -> dict[Side, ProbeReadings]:
     ------
     InputError
     """
-    found: dict[Side, ProbeReadings] = {}
+    result: dict[Side, ProbeReadings] = {}
     for path in paths:
         for side, readings in read_probe(path).items():
-            before = found.get(side)
+            before = result.get(side)
             parts = [readings] if before is None else [before, readings]
             columns = [[getattr(p, n) for p in parts] for n in readings.__dataclass_fields__]
-            found[side] = ProbeReadings(*(np.concatenate(c) for c in columns))
-    return found
+            result[side] = ProbeReadings(*(np.concatenate(c) for c in columns))
+    return result
 
 
 def columns_of(side: Side, size: int) -> IntArray:

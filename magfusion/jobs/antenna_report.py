@@ -9,14 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.jobs.antenna_fit import declared_sigma
 from magfusion.model.antenna import CENTRES, KAPPAS, MOMENTS, SENSITIVITIES, SENSOR_CENTRES
-from magfusion.results.figures import Estimate, Figure, Figures
+from magfusion.results.figures import Figure, Figures, ParameterEstimate
 from magfusion.units import DEGREE
 
 if TYPE_CHECKING:
     from magfusion.calibration.antenna import AntennaFit
-    from magfusion.calibration.antenna_observability import Observability
+    from magfusion.calibration.antenna_observability import AntennaObservability
     from magfusion.calibration.antenna_tracking import PoseErrors
-    from magfusion.jobs.antenna_fit import Bench, Solved
+    from magfusion.jobs.antenna_fit import AntennaSolution, Bench
     from magfusion.jobs.antenna_settings import AntennaSettings
     from magfusion.model.antenna import Antenna
     from magfusion.model.site import Site
@@ -24,64 +24,69 @@ if TYPE_CHECKING:
 _AXES = "xyz"
 
 
-def estimates(fit: AntennaFit, start: Antenna, *, sizes: bool) -> list[Estimate]:
+def estimates(fit: AntennaFit, start: Antenna, *, sizes: bool) -> list[ParameterEstimate]:
     """Return every parameter of the antennas with its sigma and that of its prior."""
     blocks = ("transmitter.moment", "transmitter.centre", "receiver.matrix", "receiver.centre")
     names = [f"{block}_{coil}{axis}" for block in blocks for coil in _AXES for axis in _AXES]
     names += [*(f"transmitter.kappa_{c}" for c in _AXES), "receiver.kappa"] if sizes else []
-    found = fit.antenna.vector()
+    result = fit.antenna.vector()
     prior = declared_sigma(start, sizes=True)
-    columns = (found - start.vector(), np.diagonal(fit.cov), prior)
+    columns = (result - start.vector(), np.diagonal(fit.cov), prior)
     rows = zip(names, *(column[: len(names)] for column in columns), strict=True)
     return [
-        Estimate(name, float(change), sigma=float(np.sqrt(variance)), prior_sigma=float(before))
+        ParameterEstimate(
+            name, float(change), sigma=float(np.sqrt(variance)), prior_sigma=float(before)
+        )
         for name, change, variance, before in rows
     ]
 
 
 def read_figures(bench: Bench, dropped: int) -> Figures:
     """Return the number of readings."""
-    found = []
+    result = []
     if bench.survey is not None:
-        found += [Figure("poses", len(bench.survey.sigma)), Figure("poses_dropped", dropped)]
+        result += [Figure("poses", len(bench.survey.sigma)), Figure("poses_dropped", dropped)]
     for side, readings in bench.probed.items():
-        found.append(Figure(f"{side}_probe_readings", len(readings), label=f"{side}, readings"))
-    return Figures(*found)
+        result.append(Figure(f"{side}_probe_readings", len(readings), label=f"{side}, readings"))
+    return Figures(*result)
 
 
-def error_figures(errors: tuple[PoseErrors, PoseErrors] | None, solved: Solved) -> Figures:
+def error_figures(errors: tuple[PoseErrors, PoseErrors] | None, solved: AntennaSolution) -> Figures:
     """Return errors before and after: of fixes at poses, and of probe readings at points."""
-    found, probed = [], solved.probed
+    result, probed = [], solved.probed
     for k, (name, unit, size) in enumerate((("attitude", "deg", DEGREE), ("position", "m", 1.0))):
         for when, one in zip(("before", "after"), errors or (), strict=False):
             key = f"{name}_{unit}_{when}"
             raw = float(np.sqrt(np.mean(one.difference[:, k] ** 2))) / size
             words = f"{name} error {when}"
-            found.append(Figure(key, float(one.rms[k]) / size, unit, label=words))
-            found.append(
+            result.append(Figure(key, float(one.rms[k]) / size, unit, label=words))
+            result.append(
                 Figure(f"{key}_against_survey", raw, unit, label=f"{words}, incl. the survey's own")
             )
             if when == "after":
                 known = float(one.rms_sigma[k]) / size
-                found.append(Figure(f"{key}_sigma", known, unit, label=f"{words}, known to"))
+                result.append(Figure(f"{key}_sigma", known, unit, label=f"{words}, known to"))
                 assert solved.elsewhere is not None
-                turned, words = float(solved.elsewhere[k]) / size, f"{name} error in any attitude"
-                found.append(Figure(f"{name}_{unit}_any_attitude", turned, unit, label=words))
+                rotated, words = float(solved.elsewhere[k]) / size, f"{name} error in any attitude"
+                result.append(Figure(f"{name}_{unit}_any_attitude", rotated, unit, label=words))
     for side, (before, after) in probed.items():
         for when, value in (("before", before), ("after", after)):
             rms = float(np.sqrt(np.mean(value**2)))
             words = f"{side}, field at points left out, {when}"
-            found.append(Figure(f"{side}_field_error_{when}", rms, label=words))
-    return Figures(*found)
+            result.append(Figure(f"{side}_field_error_{when}", rms, label=words))
+    return Figures(*result)
 
 
 def figures(
-    fit: AntennaFit, observed: Observability | None, start: Antenna, settings: AntennaSettings
+    fit: AntennaFit,
+    observed: AntennaObservability | None,
+    start: Antenna,
+    settings: AntennaSettings,
 ) -> Figures:
     """Return estimated and undetermined parameters of the antennas."""
     sigma = np.sqrt(np.diagonal(fit.cov))
-    found = fit.antenna.vector()
-    change = found - start.vector()
+    result = fit.antenna.vector()
+    change = result - start.vector()
     chi2 = float(fit.chi2 / fit.dof)
     figures = [Figure("chi2_per_dof", chi2, label="chi square per degree of freedom")]
     if observed is not None:
@@ -97,7 +102,7 @@ def figures(
             Figure(f"{name}_sigma_largest", float(np.max(sigma[columns])), unit),
         ]
     if settings.sizes:
-        kappas = np.stack([found[KAPPAS], sigma[KAPPAS]])
+        kappas = np.stack([result[KAPPAS], sigma[KAPPAS]])
         sizes = {"transmitter": np.mean(kappas[:, :3], axis=1)}
         sizes |= {f"transmitter_{c}": kappas[:, k] for k, c in enumerate(_AXES)}
         for name, (value, error) in (sizes | {"receiver": kappas[:, 3]}).items():
@@ -109,31 +114,31 @@ def figures(
     return Figures(*figures)
 
 
-def _observed_figures(observed: Observability, *, exact: bool) -> list[Figure]:
+def _observed_figures(observed: AntennaObservability, *, exact: bool) -> list[Figure]:
     return [
         Figure("poses_taken_as", "exact" if exact else "uncertain"),
         Figure("parameters", observed.parameters),
         Figure("rank", observed.rank),
         Figure("not_seen_by_these_poses", list(observed.null_space)),
         Figure("weakest_seen_relative", float(observed.singular[observed.rank - 1])),
-        Figure("fewest_of_these_poses", observed.fewest_poses),
+        Figure("fewest_of_these_poses", observed.min_poses),
     ]
 
 
 def mounting_figures(site: Site, declared: Site) -> Figures:
     """Return the change of the receiver's mounting relative to the declared, and its sigmas."""
-    found, before = site.platform.magnetometer, declared.platform.magnetometer
-    turn = before.body_from_sensor.T @ found.body_from_sensor
-    turned = float(Rotation.from_matrix(turn).magnitude()) / DEGREE
-    moved = float(np.linalg.norm(found.position_body - before.position_body))
-    known = float(np.max(found.sigma.rotation_sensor)) / DEGREE
+    result, before = site.platform.magnetometer, declared.platform.magnetometer
+    turn = before.body_from_sensor.T @ result.body_from_sensor
+    rotated = float(Rotation.from_matrix(turn).magnitude()) / DEGREE
+    moved = float(np.linalg.norm(result.position_body - before.position_body))
+    known = float(np.max(result.sigma.rotation_sensor)) / DEGREE
     return Figures(
-        Figure("boresight_change_deg", turned, "deg", label="boresight, change"),
+        Figure("boresight_change_deg", rotated, "deg", label="boresight, change"),
         Figure("boresight_sigma_deg", known, "deg", label="boresight, sigma an axis"),
         Figure("lever_change_m", moved, "m", label="lever arm, change"),
         Figure(
             "lever_sigma_m",
-            float(np.max(found.sigma.position_body)),
+            float(np.max(result.sigma.position_body)),
             "m",
             label="lever arm, sigma an axis",
         ),

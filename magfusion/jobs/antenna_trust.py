@@ -14,16 +14,16 @@ from magfusion.units import DEGREE, Array
 if TYPE_CHECKING:
     from magfusion.calibration.antenna import AntennaFit
     from magfusion.calibration.antenna_tracking import PoseErrors
-    from magfusion.jobs.antenna_fit import Solved
-    from magfusion.results.figures import Estimate
+    from magfusion.jobs.antenna_fit import AntennaSolution
+    from magfusion.results.figures import ParameterEstimate
 
-ALIKE = 2.0  # expected errors in any attitude, by those at surveyed poses
+MAX_ERROR_RATIO = 2.0  # expected errors in any attitude, by those at surveyed poses
 WORSE = 1.5  # errors at poses left out, by those of the declared antenna
 
 
-def judged(
-    found: Solved,
-    estimates: list[Estimate],
+def judge_fit(
+    result: AntennaSolution,
+    estimates: list[ParameterEstimate],
     errors: tuple[PoseErrors, PoseErrors] | None,
 ) -> tuple[AntennaFit, Trust]:
     """Return a fit with a covariance consistent with its tests, and their findings.
@@ -34,7 +34,7 @@ def judged(
         Of fixes at surveyed poses with the declared antenna, and with one fitted without the pose;
         None without a survey.
     """
-    fit = found.fit
+    fit = result.fit
     fitted = unexplained(
         "the couplings" if errors else "the probe's readings",
         float(fit.chi2),
@@ -51,16 +51,16 @@ def judged(
         "Check moments, wiring and frames of the tracker in the site.",
     )
     findings = _transferred(*errors) if errors else []
-    if found.observed is not None and found.observed.null_space:
+    if result.observed is not None and result.observed.null_space:
         text = (
-            f"These poses do not determine {', '.join(found.observed.null_space)}: the declared"
+            f"These poses do not determine {', '.join(result.observed.null_space)}: the declared"
             " values and wide sigmas are kept."
         )
         findings.append(Finding("geometry", text, Verdict.TRUSTWORTHY))
-    if errors and found.elsewhere is not None:
-        findings += _in_other_attitudes(found.elsewhere, errors[1])
+    if errors and result.elsewhere is not None:
+        findings += _in_other_attitudes(result.elsewhere, errors[1])
     if errors is None:
-        findings += _of_probe(found, estimates)
+        findings += _of_probe(result, estimates)
     trust, excess = trust_of(fitted, moved)
     return replace(fit, cov=excess * fit.cov), trust | Trust(tuple(findings))
 
@@ -70,10 +70,10 @@ def _transferred(before: PoseErrors, after: PoseErrors) -> list[Finding]:
     findings = []
     for k, (what, size, unit) in enumerate((("attitude", DEGREE, "deg"), ("position", 1e-3, "mm"))):
         ratio = float(after.rms[k] / before.rms[k])
-        sure = after.rms[k] - before.rms[k] > 2.0 * float(
+        certain = after.rms[k] - before.rms[k] > 2.0 * float(
             np.hypot(after.rms_sigma[k], before.rms_sigma[k])
         )
-        if ratio > WORSE and sure:
+        if ratio > WORSE and certain:
             text = (
                 f"At poses not used in the fit, the {what} error of the antenna is"
                 f" {after.rms[k] / size:.2g} {unit}, that of the declared one"
@@ -86,21 +86,21 @@ def _transferred(before: PoseErrors, after: PoseErrors) -> list[Finding]:
 def _in_other_attitudes(elsewhere: Array, after: PoseErrors) -> list[Finding]:
     """Return whether fixes are predicted to be worse in attitudes that were not surveyed."""
     ratio = elsewhere / np.maximum(after.rms, 1e-12)
-    if float(np.max(ratio)) <= ALIKE:
+    if float(np.max(ratio)) <= MAX_ERROR_RATIO:
         return []
-    (turn, place), (turned, placed) = elsewhere, after.rms
+    (turn, place), (rotated, placed) = elsewhere, after.rms
     text = (
         f"The surveyed attitudes are too similar: predicted errors of fixes in other attitudes are"
         f" {turn / DEGREE:.2g} deg and {1e3 * place:.2g} mm, in the surveyed ones"
-        f" {turned / DEGREE:.2g} deg and {1e3 * placed:.2g} mm. Survey attitudes rotated about all"
+        f" {rotated / DEGREE:.2g} deg and {1e3 * placed:.2g} mm. Survey attitudes rotated about all"
         " axes."
     )
-    return [Finding("transfer", text, weight=float(np.max(ratio)) / ALIKE)]
+    return [Finding("transfer", text, weight=float(np.max(ratio)) / MAX_ERROR_RATIO)]
 
 
-def _of_probe(found: Solved, estimates: list[Estimate]) -> list[Finding]:
+def _of_probe(result: AntennaSolution, estimates: list[ParameterEstimate]) -> list[Finding]:
     """Return what the probe's readings do not determine, and that no pose was tested."""
-    own = tuple(f"{side}." for side in found.probed)
+    own = tuple(f"{side}." for side in result.probed)
     open_ones = [e.key for e in estimates if e.key.startswith(own) and not e.determined]
     findings = []
     if open_ones:
@@ -112,6 +112,6 @@ def _of_probe(found: Solved, estimates: list[Estimate]) -> list[Finding]:
         findings.append(Finding("geometry", text, Verdict.TRUSTWORTHY))
     text = (
         "No pose was tested: the errors of fixes with these antennas are unknown. Give a survey of"
-        f" some known poses with --probe ({', '.join(sorted(found.probed))} read)."
+        f" some known poses with --probe ({', '.join(sorted(result.probed))} read)."
     )
     return [*findings, Finding("few_data", text, Verdict.TRUSTWORTHY)]

@@ -10,7 +10,7 @@ import numpy as np
 
 from magfusion.calibration.steady_field import average, window_length
 from magfusion.errors import InputError
-from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.files.attitude_table import write_database
 from magfusion.jobs.settings import Command, LogSettings, Settings, option
 from magfusion.model.site import Site
@@ -114,13 +114,13 @@ def run_attitude_database(settings: DatabaseSettings, output: Path) -> Figures:
     log, site = read_job(job)
     reference, place = _reference(job, log, settings.trajectory)
     with named(job.log_path):
-        found = steady(log, site, settings)
-    poses, known = interpolate(reference, found.time, MAX_GAP)
+        result = steady(log, site, settings)
+    poses, known = interpolate(reference, result.time, MAX_GAP)
     if not np.any(known):
         raise InputError(f"{place}: does not cover the magnetometer's time; give a longer one")
     with named(job.log_path):
         built = build_database(
-            found.field_body[known],
+            result.field_body[known],
             poses.world_from_body,
             log.name,
             settings.angles,
@@ -130,7 +130,7 @@ def run_attitude_database(settings: DatabaseSettings, output: Path) -> Figures:
     entries = built.database
     _, pitch, yaw = entries.rpy[0] / DEGREE
     fixed = [Figure("held_pitch_deg", float(pitch), "deg")] if entries.angles == "roll" else []
-    trust = judged(index, site, log)
+    trust = judge_database(index, site, log)
     figures = (
         heading("calibrate attitude-database", log.name)
         | trust_figures(trust)
@@ -148,20 +148,20 @@ def run_attitude_database(settings: DatabaseSettings, output: Path) -> Figures:
     with claimed as whole:
         directory = found_in(whole, trust)
         write_database(entries, directory / TABLE)
-        left = entries.field_body - predict_field(entries.rpy, index.field_world)
-        write_database_plot(directory / "attitudes.png", entries, left)
+        remaining = entries.field_body - predict_field(entries.rpy, index.field_world)
+        write_database_plot(directory / "attitudes.png", entries, remaining)
         write_report(whole, figures)
     refuse_failed(job.log_path, output, trust)
     return figures
 
 
-def judged(index: Index, site: Site, log: Log) -> Trust:
+def judge_database(index: Index, site: Site, log: Log) -> Trust:
     """Return whether a database is consistent with one uniform field.
 
     Iron on the platform may distort it, which is the purpose of a database; attitudes without any
     similarity to a uniform field are wrong.
     """
-    found = list(recorded(log, site, BRIDGED))
+    result = list(recorded(log, site, BRIDGED_CODES))
     size = float(np.linalg.norm(index.field_world))
     share = float(np.sqrt(3.0)) * index.sigma / size
     if share > DISTORTED:
@@ -171,7 +171,7 @@ def judged(index: Index, site: Site, log: Log) -> Trust:
             " attitudes are not those of this log (other clock, axes or mounting), or strong iron"
             " is on the platform."
         )
-        found.append(Finding("earth_field", text, verdict, share / DISTORTED))
+        result.append(Finding("earth_field", text, verdict, share / DISTORTED))
     if site.earth_field_world is not None:
         declared = float(np.linalg.norm(site.earth_field_world))
         off = max(size / declared, declared / size) - 1.0
@@ -181,8 +181,8 @@ def judged(index: Index, site: Site, log: Log) -> Trust:
                 f" {1e6 * declared:.3g} uT: check the unit of magnetometer.parquet and the sensor's"
                 " calibration."
             )
-            found.append(Finding("earth_field", text, Verdict.FAILED, off / CONTRADICTED))
-    return Trust(tuple(found))
+            result.append(Finding("earth_field", text, Verdict.FAILED, off / CONTRADICTED))
+    return Trust(tuple(result))
 
 
 def _reference(job: Job, log: Log, trajectory: Path | None) -> tuple[Trajectory, Path]:

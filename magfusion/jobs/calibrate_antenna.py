@@ -12,7 +12,7 @@ from magfusion.calibration.antenna_site import into_mounting, with_fit
 from magfusion.calibration.antenna_tracking import PoseErrors
 from magfusion.files.site import load_site, save_site
 from magfusion.files.survey import read_survey
-from magfusion.jobs import antenna_report as told
+from magfusion.jobs import antenna_report as reported
 from magfusion.jobs.antenna_fit import Bench, left_out, solved
 from magfusion.jobs.antenna_inputs import (
     couplings,
@@ -22,7 +22,7 @@ from magfusion.jobs.antenna_inputs import (
     tracker,
 )
 from magfusion.jobs.antenna_settings import AntennaSettings
-from magfusion.jobs.antenna_trust import judged
+from magfusion.jobs.antenna_trust import judge_fit
 from magfusion.jobs.receiver_axes import three_axes
 from magfusion.jobs.settings import Command
 from magfusion.model.antenna import antenna_from_vector, antenna_of
@@ -71,13 +71,13 @@ def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
     if survey is not None and settings.boresight:
         site = mounted_by_fixes(survey, site, beacon)
     bench = Bench(site, beacon, start, survey, probed(settings.probe))
-    found = solved(bench, settings)
+    result = solved(bench, settings)
     errors: tuple[PoseErrors, PoseErrors] | None = None
     if survey is not None:
-        errors = left_out(bench, declared, found, settings)
-    estimates = told.estimates(found.fit, start, sizes=settings.sizes)
-    fit, trust = judged(found, estimates, errors)
-    estimates = told.estimates(fit, start, sizes=settings.sizes)
+        errors = left_out(bench, declared, result, settings)
+    estimates = reported.estimates(result.fit, start, sizes=settings.sizes)
+    fit, trust = judge_fit(result, estimates, errors)
+    estimates = reported.estimates(fit, start, sizes=settings.sizes)
     if settings.boresight:
         sensor = site.platform.magnetometer
         fit, mounted = into_mounting(fit, sensor, start.sensitivities_sensor)
@@ -86,10 +86,10 @@ def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
         heading(JOB, settings.name)
         | trust_figures(trust)
         | Figures(Figure("beacon", beacon.name))
-        | told.read_figures(bench, dropped)
-        | told.error_figures(errors, found)
-        | told.figures(fit, found.observed, start, settings)
-        | (told.mounting_figures(site, declared) if settings.boresight else Figures())
+        | reported.read_figures(bench, dropped)
+        | reported.error_figures(errors, result)
+        | reported.figures(fit, result.observed, start, settings)
+        | (reported.mounting_figures(site, declared) if settings.boresight else Figures())
         | determined_figures(estimates)
     )
     refined = replace(

@@ -22,14 +22,14 @@ from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Beacon, Site
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.figures import (
-    Estimate,
     Figure,
     Figures,
+    ParameterEstimate,
     calibration_record,
     determined_figures,
     heading,
 )
-from magfusion.results.verdict import said_as_notes, trust_figures
+from magfusion.results.verdict import notes_of, trust_figures
 from magfusion.units import DEGREE, Array
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from magfusion.calibration.beacon_refined import RefinedBeacon
     from magfusion.files.survey import Survey
     from magfusion.model.trust import Trust
-    from magfusion.results.figures import Estimate, Figures
+    from magfusion.results.figures import Figures, ParameterEstimate
     from magfusion.results.plots.beacon import BeaconPanel
 
 
@@ -92,19 +92,19 @@ def run_calibrate_beacon(settings: BeaconSettings, output: Path, report: Report 
             " survey again"
         )
     beacons = _chosen(site, survey, settings.beacon, survey_path)
-    found, trust = [], Trust()
+    result, trust = [], Trust()
     for done, beacon in enumerate(beacons):
         report(f"beacon {beacon.name}", done, len(beacons))
         with named(survey_path):
-            honest, said = judged(_calibrated(site, beacon, survey))
-        found.append(honest)
-        trust |= said
+            honest, findings = judge_calibration(_calibrated(site, beacon, survey))
+        result.append(honest)
+        trust |= findings
     report("done", len(beacons), len(beacons))
-    figures = _figures(survey_path, survey, found, trust)
+    figures = _figures(survey_path, survey, result, trust)
     with claimed as whole:
         directory = found_in(whole, trust)
-        save_site(_refined_site(site, found, survey_path), directory / "site.yaml")
-        write_beacon_plot(directory / "beacon.png", [_panel(c) for c in found])
+        save_site(_refined_site(site, result, survey_path), directory / "site.yaml")
+        write_beacon_plot(directory / "beacon.png", [_panel(c) for c in result])
         write_report(whole, figures)
     refuse_failed(survey_path, output, trust)
     return figures
@@ -161,45 +161,45 @@ def _calibrated(site: Site, beacon: Beacon, survey: Survey) -> _Calibrated:
     return _Calibrated(measured, *calibrate_one(measured, reach), survey.point[detected])
 
 
-def _residual(found: _Calibrated) -> Array:
+def _residual(calibration: _Calibrated) -> Array:
     """Return the root mean square of each point's whitened residual."""
-    measured = found.measured
-    turned, place = measured.world_from_body, measured.position_world
-    phase = np.broadcast_to(found.refined.phase, (len(place), len(found.refined.phase)))
-    model = predict(found.refined.beacon, measured.magnetometer, turned, place, phase)
+    measured = calibration.measured
+    rotated, place = measured.world_from_body, measured.position_world
+    phase = np.broadcast_to(calibration.refined.phase, (len(place), len(calibration.refined.phase)))
+    model = predict(calibration.refined.beacon, measured.magnetometer, rotated, place, phase)
     error = np.nan_to_num(measured.phasor_sensor[0]) - model
     parts = np.stack([error.real, error.imag], axis=2) * measured.weight[..., None]
     numbers = 6 * np.count_nonzero(measured.valid, axis=1)
     return np.asarray(np.sqrt(np.sum(parts**2, axis=(1, 2, 3)) / numbers))
 
 
-def _panel(found: _Calibrated) -> BeaconPanel:
+def _panel(calibration: _Calibrated) -> BeaconPanel:
     from magfusion.results.plots.beacon import BeaconPanel
 
     return BeaconPanel(
-        declared=found.measured.beacon,
-        found=found.refined.beacon,
-        centre_cov=found.fits.cov[0, :3, :3],
-        point=found.point,
-        residual=_residual(found),
+        declared=calibration.measured.beacon,
+        estimated=calibration.refined.beacon,
+        centre_cov=calibration.fits.cov[0, :3, :3],
+        point=calibration.point,
+        residual=_residual(calibration),
     )
 
 
-def _estimates(found: _Calibrated) -> list[Estimate]:
+def _estimates(calibration: _Calibrated) -> list[ParameterEstimate]:
     """Return each parameter before and after the survey."""
-    old, new = found.measured.beacon, found.refined.beacon
+    old, new = calibration.measured.beacon, calibration.refined.beacon
     turn = Rotation.from_matrix(old.world_from_beacon.T @ new.world_from_beacon).as_rotvec()
     size = [np.linalg.norm(b.moments_beacon, axis=1) for b in (old, new)]
-    left_open = np.any(np.abs(found.refined.open_beacon) > 0.5, axis=0)
+    left_open = np.any(np.abs(calibration.refined.open_beacon) > 0.5, axis=0)
     coils = [f"_{i}" for i in range(len(size[0]))] if len(size[0]) > 1 else [""]
 
     def of(
         kind: str, unit: str, tails: list[str], *values: Array, former: Array | None = None
-    ) -> list[Estimate]:
+    ) -> list[ParameterEstimate]:
         known = [None] * len(tails) if former is None else former.tolist()
         rows = zip(tails, *(np.broadcast_to(v, len(tails)) for v in values), known, strict=True)
         return [
-            Estimate(
+            ParameterEstimate(
                 f"{{beacon}}.{kind}{tail}",
                 float(change),
                 unit,
@@ -215,7 +215,7 @@ def _estimates(found: _Calibrated) -> list[Estimate]:
 
     place = new.position_world - old.position_world
     sigma, prior, closed = new.sigma, old.sigma, np.zeros(1)
-    turned = (turn, sigma.rotation_beacon, prior.rotation_beacon)
+    rotated = (turn, sigma.rotation_beacon, prior.rotation_beacon)
     return [
         *of(
             "position",
@@ -231,7 +231,7 @@ def _estimates(found: _Calibrated) -> list[Estimate]:
             "rotation",
             "deg",
             ["_x_deg", "_y_deg", "_z_deg"],
-            *(v / DEGREE for v in turned),
+            *(v / DEGREE for v in rotated),
             left_open,
         ),
         *of(
@@ -246,16 +246,16 @@ def _estimates(found: _Calibrated) -> list[Estimate]:
     ]
 
 
-def judged(found: _Calibrated) -> tuple[_Calibrated, Trust]:
+def judge_calibration(calibration: _Calibrated) -> tuple[_Calibrated, Trust]:
     """Return a calibration with sigmas consistent with its tests, and their findings."""
-    name = found.refined.beacon.name
+    name = calibration.refined.beacon.name
     fitted = unexplained(
         f"beacon {name}",
-        float(found.fits.chi_square[0]),
-        found.freedom,
+        float(calibration.fits.chi_square[0]),
+        calibration.freedom,
         "Check the poses of the survey, iron near the beacon, and whether it was moved.",
     )
-    closed = [one for one in _estimates(found) if not one.is_open]
+    closed = [one for one in _estimates(calibration) if not one.is_open]
     prior = np.diag([one.prior_sigma**2 for one in closed])
     moved = contradiction(
         [one.key for one in closed],
@@ -272,31 +272,31 @@ def judged(found: _Calibrated) -> tuple[_Calibrated, Trust]:
             f"Beacon {name} could also be at {np.round(place, 3).tolist()}: the chi square there is"
             f" higher by only {worse:.2g}; measure at more points.",
         )
-        for place, worse in _rivals(found)
+        for place, worse in _rivals(calibration)
     ]
-    if len(found.refined.open_beacon):
+    if len(calibration.refined.open_beacon):
         text = (
             f"The field does not determine a rotation of beacon {name} about its own axis: the"
             " declared attitude and its sigma are kept."
         )
         findings.append(Finding("geometry", text, Verdict.TRUSTWORTHY))
-    sigma, scale = found.refined.beacon.sigma, float(np.sqrt(excess))
+    sigma, scale = calibration.refined.beacon.sigma, float(np.sqrt(excess))
     honest = replace(
         sigma,
         position_world=scale * sigma.position_world,
         rotation_beacon=scale * sigma.rotation_beacon,
         log_moment=scale * sigma.log_moment,
     )
-    refined = replace(found.refined, beacon=replace(found.refined.beacon, sigma=honest))
-    return replace(found, refined=refined), trust | Trust(tuple(findings))
+    refined = replace(calibration.refined, beacon=replace(calibration.refined.beacon, sigma=honest))
+    return replace(calibration, refined=refined), trust | Trust(tuple(findings))
 
 
-def _figures(path: Path, survey: Survey, found: list[_Calibrated], trust: Trust) -> Figures:
+def _figures(path: Path, survey: Survey, calibration: list[_Calibrated], trust: Trust) -> Figures:
     from magfusion.results.report import residual_figure
 
-    estimates = [estimate for c in found for estimate in _estimates(c)]
+    estimates = [estimate for c in calibration for estimate in _estimates(c)]
     figures = [Figure("points", len(survey))]
-    for c in found:
+    for c in calibration:
         old, new = c.measured.beacon, c.refined.beacon
         chi_square = float(c.fits.chi_square[0])
         moved = float(np.linalg.norm(new.position_world - old.position_world))
@@ -313,35 +313,35 @@ def _figures(path: Path, survey: Survey, found: list[_Calibrated], trust: Trust)
         | trust_figures(trust)
         | Figures(*figures, *estimates)
         | determined_figures(estimates)
-        | said_as_notes(trust)
+        | notes_of(trust)
     )
 
 
-def _bent_deg(found: _Calibrated) -> float:
+def _bent_deg(calibration: _Calibrated) -> float:
     """Return the largest angle between a coil and its nominal direction in its beacon (deg)."""
     old, new = (
         b.moments_beacon / np.linalg.norm(b.moments_beacon, axis=1, keepdims=True)
-        for b in (found.measured.beacon, found.refined.beacon)
+        for b in (calibration.measured.beacon, calibration.refined.beacon)
     )
     sine = np.linalg.norm(np.cross(old, new), axis=1)
     return float(np.max(np.arctan2(sine, np.sum(old * new, axis=1))) / DEGREE)
 
 
-def _rivals(found: _Calibrated) -> list[tuple[Array, float]]:
-    from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
+def _rivals(calibration: _Calibrated) -> list[tuple[Array, float]]:
+    from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
 
-    excess = found.fits.rival_chi_square[0] - found.fits.chi_square[0]
+    excess = calibration.fits.rival_chi_square[0] - calibration.fits.chi_square[0]
     out: list[tuple[Array, float]] = []
-    for place, worse in zip(found.fits.rivals_world[0], excess, strict=True):
+    for place, worse in zip(calibration.fits.rivals_world[0], excess, strict=True):
         new = all(np.linalg.norm(place - other) > 0.01 for other, _ in out)
         if worse < AMBIGUOUS_CHI_SQUARE and new:
             out.append((place, float(worse)))
     return out
 
 
-def _refined_site(site: Site, found: list[_Calibrated], path: Path) -> Site:
-    new = {c.refined.beacon.name: c.refined.beacon for c in found}
-    estimates = [estimate for c in found for estimate in _estimates(c)]
+def _refined_site(site: Site, calibration: list[_Calibrated], path: Path) -> Site:
+    new = {c.refined.beacon.name: c.refined.beacon for c in calibration}
+    estimates = [estimate for c in calibration for estimate in _estimates(c)]
     beacons = tuple(new.get(b.name, b) for b in site.beacons)
     known = site.correlation
     return replace(

@@ -11,7 +11,7 @@ import numpy as np
 
 from magfusion.calibration.fieldmap import MapPoints, learn_field_map, thinned
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.files.site import load_site, save_site
 from magfusion.files.survey import read_survey
 from magfusion.jobs.receiver_axes import three_axes
@@ -85,7 +85,7 @@ def run_calibrate_fieldmap(settings: MapSettings, output: Path, report: Report =
     except EstimationError as error:
         raise InputError(f"{settings.source}: {error}") from error
     report("done", 2, 2)
-    trust = judged(fit, streams)
+    trust = judge_map(fit, streams)
     figures = heading("calibrate fieldmap", settings.source.stem) | trust_figures(trust)
     figures |= Figures(Figure("points", len(points))) | _figures(fit) | extra
     with claimed as whole:
@@ -97,7 +97,7 @@ def run_calibrate_fieldmap(settings: MapSettings, output: Path, report: Report =
     return figures
 
 
-def judged(fit: MapFit, streams: tuple[Finding, ...] = ()) -> Trust:
+def judge_map(fit: MapFit, streams: tuple[Finding, ...] = ()) -> Trust:
     """Return whether a map is valid at points not used in it.
 
     Parameters
@@ -105,20 +105,20 @@ def judged(fit: MapFit, streams: tuple[Finding, ...] = ()) -> Trust:
     streams : tuple of Finding
         Of the log that the points come from.
     """
-    found = []
+    result = []
     for beacon, error in fit.error_with.items():
         without = fit.error_without[beacon]
-        said = (
+        findings = (
             f"Beacon {beacon}: at left-out points the field error with the map is"
             f" {100.0 * error:.2g} %, without it {100.0 * without:.2g} %"
         )
         if error > UNEXPLAINED:
-            text = f"{said}: check that the survey is of this site, and its frame and units."
-            found.append(Finding("transfer", text, Verdict.FAILED, error / UNEXPLAINED))
+            text = f"{findings}: check that the survey is of this site, and its frame and units."
+            result.append(Finding("transfer", text, Verdict.FAILED, error / UNEXPLAINED))
         elif error > WORSE * without:
-            text = f"{said}: survey more densely, or omit the map."
-            found.append(Finding("transfer", text, weight=error / without))
-    return Trust((*found, *streams))
+            text = f"{findings}: survey more densely, or omit the map."
+            result.append(Finding("transfer", text, weight=error / without))
+    return Trust((*result, *streams))
 
 
 def _survey_path(path: Path) -> Path | None:
@@ -131,9 +131,9 @@ def _survey_path(path: Path) -> Path | None:
 def _from_survey(settings: MapSettings, path: Path) -> tuple[Site, MapPoints, Figures]:
     if settings.trajectory is not None:
         raise InputError(f"{path}: a survey has its own poses; omit --trajectory")
-    beside = path.parent / "site.yaml"
-    site_path = beside if settings.site is None else settings.site
-    if settings.site is None and not beside.is_file():
+    others = path.parent / "site.yaml"
+    site_path = others if settings.site is None else settings.site
+    if settings.site is None and not others.is_file():
         raise InputError(f"{path}: has no site.yaml next to it; give it with --site SITE.yaml")
     site = three_axes(load_site(site_path), site_path)
     return site, points_of(read_survey(path), site, path), Figures()
@@ -188,7 +188,7 @@ def _from_log(settings: MapSettings) -> tuple[Site, MapPoints, Figures, tuple[Fi
     points = MapPoints(
         there.world_from_body, there.position_world, samples.phasor_sensor[exists], sigma
     )
-    streams = recorded(log, site, BRIDGED)
+    streams = recorded(log, site, BRIDGED_CODES)
     return site, thinned(points, site, settings.spacing), dropped_figures(dropped), streams
 
 
@@ -207,18 +207,18 @@ def _samples(log: Log, site: Site, poses: Trajectory) -> tuple[FieldSamples, dic
 
 
 def _figures(fit: MapFit) -> Figures:
-    found = fit.site.beacons[0].field_map
-    assert found is not None
+    result = fit.site.beacons[0].field_map
+    assert result is not None
     by_beacon: list[tuple[str, str, Mapping[str, float]]] = [
         ("points", "points", fit.points),
         ("relative_error_without", "relative error without the map", fit.error_without),
         ("relative_error_with", "relative error with the map", fit.error_with),
     ]
     return Figures(
-        Figure("length_scale_m", found.length_scale, "m"),
-        Figure("gain_sigma", found.gain_sigma),
-        Figure("rotation_sigma_deg", float(np.rad2deg(found.rotation_sigma)), "deg"),
-        Figure("residual", found.residual),
+        Figure("length_scale_m", result.length_scale, "m"),
+        Figure("gain_sigma", result.gain_sigma),
+        Figure("rotation_sigma_deg", float(np.rad2deg(result.rotation_sigma)), "deg"),
+        Figure("residual", result.residual),
         *(
             Figure(f"{name}_{{beacon}}", values[beacon], "", beacon, label=label)
             for name, label, values in by_beacon

@@ -17,7 +17,7 @@ from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust
-from magfusion.results.figures import Column, Figure, Figures, Section, heading
+from magfusion.results.figures import ErrorColumn, Figure, Figures, Section, heading
 from magfusion.results.motion_coverage import missing_motion, motion_coverage
 from magfusion.results.observability import observability
 from magfusion.results.transfer import Estimated, agreement
@@ -36,12 +36,14 @@ JOB = "calibrate log"
 OF_LOG = ("phase", "time-offset")  # every log has its own: estimated even so
 SHORTEST_PART = 15.0  # s
 MOST_PARTS = 6
-APART = 5.0  # sigmas; the largest of tens of directions, by chance once in thousands
+MAX_DIFFERENCE_SIGMAS = (
+    5.0  # sigmas; the largest of tens of directions, by chance once in thousands
+)
 WORSE = 1.2  # residual on other parts, by that of the declared calibration
 OVERLAP = 2.0  # windows that share their samples
 
 
-class Score(NamedTuple):
+class PartScore(NamedTuple):
     """Fit of a part of a log with the calibration fixed.
 
     Parameters
@@ -62,9 +64,9 @@ class Transfer(NamedTuple):
 
     Parameters
     ----------
-    declared : list of Score
+    declared : list of PartScore
         Of each part, with the survey fixed.
-    calibrated : list of Score
+    calibrated : list of PartScore
         Of each pair of parts: calibrated on the one, scored on the other.
     pairs : list of (int, int)
     disagreement : float
@@ -72,8 +74,8 @@ class Transfer(NamedTuple):
         sigmas.
     """
 
-    declared: list[Score]
-    calibrated: list[Score]
+    declared: list[PartScore]
+    calibrated: list[PartScore]
     pairs: list[tuple[int, int]]
     disagreement: float
 
@@ -101,7 +103,7 @@ def run_calibrate_log(
     """
     from magfusion.estimation.batch.batch import SmootherSettings
     from magfusion.estimation.batch.self_survey import smooth_and_place
-    from magfusion.estimation.integrity.judge import judged
+    from magfusion.estimation.integrity.judge import judge_result
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
     from magfusion.results.plots.log_calibration import write_log_calibration_plot
     from magfusion.results.refinement import parameter_estimates, result_site
@@ -130,21 +132,21 @@ def run_calibrate_log(
             f"{job.site_path or job.log_path}: the site's sigmas are zero or negligible, so that no"
             " parameter can be calibrated; declare the uncertainty of the survey"
         )
-    honest, trust = judged(result, log)
+    honest, trust = judge_result(result, log)
     result, moved = against_site(honest, grown(result, honest))
     compared = None if cuts is None else _transfer(job, site, smoother, cuts, report)
-    trust = _told_once(trust, moved)
+    trust = _report_once(trust, moved)
     if compared is not None:
         trust |= transferred(compared)
     parts_of = result.calibration, result.blocks, result.calibration_cov
-    found = observability(*parts_of)
+    estimate = observability(*parts_of)
     covered = motion_coverage(result.states, result.calibration, log.imu)
     figures = heading(JOB, log.name) | trust_figures(trust)
     figures |= smoothed_figures(result, Section.DIRECTIONS)
     figures |= compared_with_truth(result.states, log)[1]
     figures |= placement_figures(placed, result.calibration.site)
     figures |= _coverage_figures(covered)
-    missing = missing_motion(covered, result.calibration, result.blocks, found)
+    missing = missing_motion(covered, result.calibration, result.blocks, estimate)
     label = "missing motion"
     figures |= Figures(Figure("missing_motion", missing, section=Section.DIRECTIONS, label=label))
     if compared is not None:
@@ -156,22 +158,22 @@ def run_calibrate_log(
         write_log_calibration_plot(
             directory / "calibration.png",
             estimates,
-            found.ratio_but_for_gauge,
-            found.direction_ratio,
+            estimate.ratio_but_for_gauge,
+            estimate.direction_ratio,
         )
         write_report(whole, figures)
     refuse_failed(job.log_path, output, trust)
     return figures
 
 
-def _told_once(trust: Trust, moved: Trust) -> Trust:
+def _report_once(trust: Trust, moved: Trust) -> Trust:
     """Return the union; a finding in both keeps the text of the first."""
-    moved = Trust(tuple(f for f in moved.findings if f.code not in _said(trust, f.verdict)))
-    kept = tuple(f for f in trust.findings if f.code not in _said(moved, f.verdict))
+    moved = Trust(tuple(f for f in moved.findings if f.code not in _codes(trust, f.verdict)))
+    kept = tuple(f for f in trust.findings if f.code not in _codes(moved, f.verdict))
     return Trust(kept, trust.unverified) | moved
 
 
-def _said(trust: Trust, verdict: Verdict) -> set[str]:
+def _codes(trust: Trust, verdict: Verdict) -> set[str]:
     """Return the codes of findings with a verdict at least as bad."""
     return {f.code for f in trust.findings if f.verdict.rank >= verdict.rank}
 
@@ -218,14 +220,16 @@ def against_site(result: Smoothed, least: float = 1.0) -> tuple[Smoothed, Trust]
 
 def transferred(compared: Transfer) -> Trust:
     """Return whether the calibrations of parts of a log agree, and improve its other parts."""
-    found = []
-    if compared.disagreement > APART:
+    result = []
+    if compared.disagreement > MAX_DIFFERENCE_SIGMAS:
         text = (
             f"The calibrations of parts of the log disagree by {compared.disagreement:.1f} sigmas"
             " along a direction that both determine: a change during the log, or too small declared"
             " sigmas."
         )
-        found.append(Finding("transfer", text, weight=compared.disagreement / APART))
+        result.append(
+            Finding("transfer", text, weight=compared.disagreement / MAX_DIFFERENCE_SIGMAS)
+        )
     before, after = (
         float(np.sqrt(np.mean([one.residual**2 for one in scores])))
         for scores in (compared.declared, compared.calibrated)
@@ -235,15 +239,15 @@ def transferred(compared: Transfer) -> Trust:
             f"A calibration on one part of the log has a residual of {after:.3g} on the others, the"
             f" declared one {before:.3g}: record more motion."
         )
-        found.append(Finding("transfer", text, weight=after / before))
-    return Trust(tuple(found))
+        result.append(Finding("transfer", text, weight=after / before))
+    return Trust(tuple(result))
 
 
 def _coverage_figures(covered: MotionCoverage) -> Figures:
     motion = {"motion_at_rest": covered.rest_share}
-    for axis, extent, turned in zip("xyz", covered.extent_world, covered.turned_deg, strict=True):
+    for axis, extent, rotated in zip("xyz", covered.extent_world, covered.turned_deg, strict=True):
         motion[f"motion_extent_{axis}_m"] = float(extent)
-        motion[f"motion_turned_{axis}_deg"] = float(turned)
+        motion[f"motion_turned_{axis}_deg"] = float(rotated)
     return Figures(
         *(
             Figure("nearest_m_{beacon}", least, "m", beacon, Section.REPORT)
@@ -294,24 +298,24 @@ def _transfer(
         report(f"calibration of part {i + 1} on part {j + 1}", done, len(pairs))
         calibrated.append(_score(logs[j], sites[i], settings))
     estimated = [Estimated(r.declared, r.calibration, r.blocks, r.calibration_cov) for r in results]
-    apart = [
+    separate = [
         float(np.max(np.abs(agreement(estimated[i], estimated[j]).by_direction), initial=0.0))
         for i, j in pairs
         if i < j
     ]
-    return Transfer(declared, calibrated, pairs, max(apart))
+    return Transfer(declared, calibrated, pairs, max(separate))
 
 
-def _score(log: Log, site: Site, settings: SmootherSettings) -> Score:
+def _score(log: Log, site: Site, settings: SmootherSettings) -> PartScore:
     from magfusion.estimation.batch.batch import smooth
     from magfusion.results.errors import trajectory_errors
 
     fixed = smooth(log, site, replace(settings, estimate=OF_LOG))
     residual = float(np.sqrt(np.nanmean(fixed.residual**2)))
     if log.truth is None:
-        return Score(residual, None, None)
+        return PartScore(residual, None, None)
     errors = trajectory_errors(fixed.states, log.truth)
-    return Score(residual, errors.aligned_ate, errors.aligned_attitude_rmse_deg)
+    return PartScore(residual, errors.aligned_ate, errors.aligned_attitude_rmse_deg)
 
 
 # Attribute of a score, key of its figure, label and unit.
@@ -328,8 +332,8 @@ def _transfer_figures(transfer: Transfer) -> Figures:
     for (i, j), score in zip(transfer.pairs, transfer.calibrated, strict=True):
         by_part[f"part_{i + 1}_on_{j + 1}"] = score
     columns = (
-        ("declared", Column.FIXED, transfer.declared),
-        ("calibrated", Column.CALIBRATED, transfer.calibrated),
+        ("declared", ErrorColumn.FIXED, transfer.declared),
+        ("calibrated", ErrorColumn.CALIBRATED, transfer.calibrated),
     )
     for name, key, label, unit in _SCORES:
         for which, column, scores in columns:
@@ -343,8 +347,8 @@ def _transfer_figures(transfer: Transfer) -> Figures:
             for part, score in by_part.items()
             if getattr(score, name) is not None
         ]
-    apart = Figure("cross_disagreement_sigma", transfer.disagreement, section=Section.REPORT)
-    return Figures(*figures, apart)
+    separate = Figure("cross_disagreement_sigma", transfer.disagreement, section=Section.REPORT)
+    return Figures(*figures, separate)
 
 
 COMMAND = Command(

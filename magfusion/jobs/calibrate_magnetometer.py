@@ -11,21 +11,21 @@ import numpy as np
 
 from magfusion.calibration.magnetometer import field_from_measured, refined, spread
 from magfusion.errors import InputError
-from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.estimation.snapshot.priors import contradiction, trust_of
 from magfusion.files.site import save_site
 from magfusion.jobs.settings import Command, LogSettings, option
 from magfusion.model.site import Magnetometer, Site
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.figures import (
-    Estimate,
     Figure,
     Figures,
+    ParameterEstimate,
     calibration_record,
     determined_figures,
     heading,
 )
-from magfusion.results.verdict import said_as_notes, trust_figures
+from magfusion.results.verdict import notes_of, trust_figures
 from magfusion.units import DEGREE, NANOTESLA, Array
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from magfusion.jobs.inputs import Job
     from magfusion.model.samples import Log
     from magfusion.model.trust import Finding, Trust
-    from magfusion.results.figures import Estimate, Figures
+    from magfusion.results.figures import Figures, ParameterEstimate
 
 
 JOB = "calibrate magnetometer"
@@ -90,36 +90,38 @@ def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
             " field; give the log with magnetometer.parquet"
         )
     with named(job.log_path):
-        found, trust = calibrated(log, site, positions=positions)
+        result, trust = calibrated(log, site, positions=positions)
     declared = site.platform.magnetometer
-    before, after = _fields(found, declared), _fields(found, found.magnetometer)
-    size = float(np.linalg.norm(found.prior.field_world))
-    estimates = estimates_of(found, declared)
-    figures = _figures(log, found, estimates, before, after, trust)
+    before, after = _fields(result, declared), _fields(result, result.magnetometer)
+    size = float(np.linalg.norm(result.prior.field_world))
+    estimates = estimates_of(result, declared)
+    figures = _figures(log, result, estimates, before, after, trust)
     with claimed as whole:
         directory = found_in(whole, trust)
-        save_site(_refined_site(site, found, log.name, estimates), directory / "site.yaml")
-        _plot(directory / "magnetometer.png", found, before, after, size)
+        save_site(_refined_site(site, result, log.name, estimates), directory / "site.yaml")
+        _plot(directory / "magnetometer.png", result, before, after, size)
         write_report(whole, figures)
     refuse_failed(job.log_path, job.output, trust)
     return figures
 
 
-def _fields(found: LogCalibration, magnetometer: Magnetometer) -> Array:
-    measured = found.readings.measured_sensor
+def _fields(calibration: LogCalibration, magnetometer: Magnetometer) -> Array:
+    measured = calibration.readings.measured_sensor
     return field_from_measured(measured, magnetometer.matrix, magnetometer.offset)
 
 
-def _plot(path: Path, found: LogCalibration, before: Array, after: Array, size: float) -> None:
+def _plot(
+    path: Path, calibration: LogCalibration, before: Array, after: Array, size: float
+) -> None:
     from magfusion.results.plots.magnetometer import write_magnetometer_plot
 
-    write_magnetometer_plot(path, found.readings.time, before, after, size)
+    write_magnetometer_plot(path, calibration.readings.time, before, after, size)
 
 
 def _refined_site(
-    site: Site, found: LogCalibration, log_name: str, estimates: list[Estimate]
+    site: Site, calibration: LogCalibration, log_name: str, estimates: list[ParameterEstimate]
 ) -> Site:
-    platform = replace(site.platform, magnetometer=found.magnetometer)
+    platform = replace(site.platform, magnetometer=calibration.magnetometer)
     known = site.correlation
     return replace(
         site,
@@ -129,9 +131,9 @@ def _refined_site(
     )
 
 
-def estimates_of(found: LogCalibration, declared: Magnetometer) -> list[Estimate]:
+def estimates_of(calibration: LogCalibration, declared: Magnetometer) -> list[ParameterEstimate]:
     """Return the twelve estimated parameters, with those declared in a site."""
-    fit, prior = found.graph.fit, found.prior
+    fit, prior = calibration.graph.fit, calibration.prior
     names = [f"magnetometer.matrix_{row}{column}" for row in _AXES for column in _AXES]
     names += [f"magnetometer.offset_nt_{axis}" for axis in _AXES]
     vectors = [("magnetometer.matrix", "", 1.0)] * 9
@@ -143,7 +145,7 @@ def estimates_of(found: LogCalibration, declared: Magnetometer) -> list[Estimate
     loose[9:] = LOOSE * float(np.linalg.norm(prior.field_world))
     rows = zip(names, vectors, change, *variances, former, loose, strict=True)
     return [
-        Estimate(
+        ParameterEstimate(
             name,
             float(moved / scale),
             unit,
@@ -159,15 +161,15 @@ def estimates_of(found: LogCalibration, declared: Magnetometer) -> list[Estimate
 
 def _figures(
     log: Log,
-    found: LogCalibration,
-    estimates: list[Estimate],
+    calibration: LogCalibration,
+    estimates: list[ParameterEstimate],
     before: Array,
     after: Array,
     trust: Trust,
 ) -> Figures:
-    graph, readings = found.graph, found.readings
+    graph, readings = calibration.graph, calibration.readings
     sizes = [float(np.mean(np.linalg.norm(field, axis=1))) for field in (before, after)]
-    scale = "the site's Earth field" if found.scale_known else "the declared matrix"
+    scale = "the site's Earth field" if calibration.scale_known else "the declared matrix"
     residual = float(np.sqrt(np.mean(graph.field_residual**2)))
     biases = graph.accel_bias_body, graph.gyro_bias_body
     largest = [float(np.max(np.abs(bias))) for bias in biases]
@@ -179,10 +181,10 @@ def _figures(
             Figure("window_s", float(np.median(readings.window)), "s"),
             Figure("spread_before", spread(before)),
             Figure("spread_after", spread(after)),
-            Figure("spread_unseen", found.spread_unseen),
+            Figure("spread_unseen", calibration.spread_unseen),
             Figure("field_size_before_t", sizes[0], "T"),
             Figure("field_size_after_t", sizes[1], "T"),
-            Figure("field_noise_t", found.field_sigma, "T"),
+            Figure("field_noise_t", calibration.field_sigma, "T"),
             Figure("scale_from", scale),
             Figure("dip_change_deg", graph.dip_change / DEGREE, "deg"),
             Figure("accel_bias_m_s2_largest", largest[0], "m/s^2", label="accel bias, largest"),
@@ -191,7 +193,7 @@ def _figures(
             *estimates,
         )
         | determined_figures(estimates)
-        | said_as_notes(trust)
+        | notes_of(trust)
     )
 
 
@@ -208,16 +210,18 @@ def calibrated(log: Log, site: Site, *, positions: bool = False) -> tuple[LogCal
 
     assert log.waveform is not None
     if log.inertial:
-        found = calibrate_log(log.waveform, log.imu, site, at_stops=positions)
+        result = calibrate_log(log.waveform, log.imu, site, at_stops=positions)
     else:
-        found = calibrate_alone(log.waveform, site)
-    return judged(found, site, log)
+        result = calibrate_alone(log.waveform, site)
+    return judge_calibration(result, site, log)
 
 
-def judged(found: LogCalibration, site: Site, log: Log) -> tuple[LogCalibration, Trust]:
+def judge_calibration(
+    calibration: LogCalibration, site: Site, log: Log
+) -> tuple[LogCalibration, Trust]:
     """Return a calibration with sigmas consistent with its tests, and their findings."""
-    declared, prior, fit = site.platform.magnetometer, found.prior, found.graph.fit
-    estimates = estimates_of(found, declared)
+    declared, prior, fit = site.platform.magnetometer, calibration.prior, calibration.graph.fit
+    estimates = estimates_of(calibration, declared)
     change = np.concatenate([(fit.matrix - declared.matrix).ravel(), fit.offset - declared.offset])
     own = contradiction(
         [one.key for one in estimates],
@@ -226,21 +230,23 @@ def judged(found: LogCalibration, site: Site, log: Log) -> tuple[LogCalibration,
         prior.cov,
         "Declare larger sigmas if the sensor was not calibrated before; else check its mounting.",
     )
-    trust, excess = trust_of(own, _beside(found))
+    trust, excess = trust_of(own, _declared_difference(calibration))
     honest = replace(fit, cov=excess * fit.cov)
-    found = replace(
-        found,
-        graph=replace(found.graph, fit=honest),
+    calibration = replace(
+        calibration,
+        graph=replace(calibration.graph, fit=honest),
         magnetometer=refined(declared, honest),
     )
-    platform = replace(site.platform, magnetometer=found.magnetometer)
-    streams = recorded(log, replace(site, platform=platform), BRIDGED)
-    return found, trust | Trust((*_doubts(found, site), *_remarks(found, log), *streams))
+    platform = replace(site.platform, magnetometer=calibration.magnetometer)
+    streams = recorded(log, replace(site, platform=platform), BRIDGED_CODES)
+    return calibration, trust | Trust(
+        (*_doubts(calibration, site), *_remarks(calibration, log), *streams)
+    )
 
 
-def _beside(found: LogCalibration) -> Contradiction:
+def _declared_difference(calibration: LogCalibration) -> Contradiction:
     """Return whether the other estimated parameters contradict the site."""
-    graph, prior = found.graph, found.prior
+    graph, prior = calibration.graph, calibration.prior
     names = ["earth.dip", *(f"imu.{k}_bias_{axis}" for k in ("accel", "gyro") for axis in _AXES)]
     change = np.concatenate([[graph.dip_change], graph.accel_bias_body, graph.gyro_bias_body])
     sigma = np.repeat([prior.dip_sigma, prior.accel_bias_sigma, prior.gyro_bias_sigma], [1, 3, 3])
@@ -252,19 +258,19 @@ def _beside(found: LogCalibration) -> Contradiction:
     return contradiction(names, change, cov, cov, remedy, "The other estimated parameters")
 
 
-def _doubts(found: LogCalibration, site: Site) -> Iterator[Finding]:
-    yield from _of_another_scale(found, site)
-    if found.rival is not None:
-        own, other = (_microtesla(b) for b in (found.magnetometer.offset, found.rival))
+def _doubts(calibration: LogCalibration, site: Site) -> Iterator[Finding]:
+    yield from _of_another_scale(calibration, site)
+    if calibration.rival is not None:
+        own, other = (_microtesla(b) for b in (calibration.magnetometer.offset, calibration.rival))
         yield Finding(
             "ambiguous",
             f"Two offsets fit the readings, {own} and {other} uT, mirror images of each other: the"
             " sensor was rotated about one axis only. Rotate it about a second axis.",
             Verdict.FAILED,
         )
-    yield from _of_another_size(found, site)
-    sigma = float(np.max(found.magnetometer.sigma.offset))
-    size = float(np.linalg.norm(found.prior.field_world))
+    yield from _of_another_size(calibration, site)
+    sigma = float(np.max(calibration.magnetometer.sigma.offset))
+    size = float(np.linalg.norm(calibration.prior.field_world))
     if sigma > LOOSE * size:
         yield Finding(
             "few_data",
@@ -273,7 +279,7 @@ def _doubts(found: LogCalibration, site: Site) -> Iterator[Finding]:
             Verdict.FAILED if sigma > USELESS * size else Verdict.DOUBTFUL,
             weight=sigma / (LOOSE * size),
         )
-    disturbed = found.field_sigma / float(np.linalg.norm(found.prior.field_world))
+    disturbed = calibration.field_sigma / float(np.linalg.norm(calibration.prior.field_world))
     if disturbed > site.earth.strength_sigma:
         yield Finding(
             "earth_field",
@@ -288,14 +294,14 @@ def _microtesla(offset: Array) -> str:
     return "[" + ", ".join(f"{1e6 * axis:.1f}" for axis in offset) + "]"
 
 
-def _of_another_scale(found: LogCalibration, site: Site) -> Iterator[Finding]:
+def _of_another_scale(calibration: LogCalibration, site: Site) -> Iterator[Finding]:
     """Yield a finding if only another scale of the sensor matches the declared field.
 
     It precedes findings of the calibration against its prior, of which it is the cause.
     """
     declared = site.platform.magnetometer.matrix
-    ratio = float(np.cbrt(np.linalg.det(found.graph.fit.matrix) / np.linalg.det(declared)))
-    sigma = float(np.sqrt(np.mean(np.diagonal(found.prior.cov)[[0, 4, 8]]) / 3.0))
+    ratio = float(np.cbrt(np.linalg.det(calibration.graph.fit.matrix) / np.linalg.det(declared)))
+    sigma = float(np.sqrt(np.mean(np.diagonal(calibration.prior.cov)[[0, 4, 8]]) / 3.0))
     far = abs(ratio - 1.0) / min(SCALE, SCALE_SIGMAS * max(sigma, LEAST_SCALE))
     if far < 1.0:
         return
@@ -314,9 +320,9 @@ def _of_another_scale(found: LogCalibration, site: Site) -> Iterator[Finding]:
     yield Finding("earth_field", text, Verdict.FAILED, FIRST + far)
 
 
-def _of_another_size(found: LogCalibration, site: Site) -> Iterator[Finding]:
+def _of_another_size(calibration: LogCalibration, site: Site) -> Iterator[Finding]:
     """Yield findings if the magnitude of the calibrated field is not as declared, or impossible."""
-    size = float(np.mean(np.linalg.norm(_fields(found, found.magnetometer), axis=1)))
+    size = float(np.mean(np.linalg.norm(_fields(calibration, calibration.magnetometer), axis=1)))
     remedy = (
         " A hard iron remains that this motion does not separate from the field: rotate the sensor"
         " about all its axes, and declare a larger sigma of its offset"
@@ -343,8 +349,8 @@ def _of_another_size(found: LogCalibration, site: Site) -> Iterator[Finding]:
         )
 
 
-def _remarks(found: LogCalibration, log: Log) -> Iterator[Finding]:
-    for sentence in found.missing:
+def _remarks(calibration: LogCalibration, log: Log) -> Iterator[Finding]:
+    for sentence in calibration.missing:
         text = f"{sentence[0].upper()}{sentence[1:]}."
         yield Finding("few_data", text, Verdict.TRUSTWORTHY)
     if not log.inertial:
@@ -353,14 +359,14 @@ def _remarks(found: LogCalibration, log: Log) -> Iterator[Finding]:
             " sensor, which stays as declared. Record an IMU as well to estimate it."
         )
         yield Finding("few_data", text, Verdict.TRUSTWORTHY)
-    if not found.scale_known:
+    if not calibration.scale_known:
         yield Finding(
             "few_data",
             "The site has no Earth field: the scale of the matrix is as declared, and only ratios,"
             " angles and offset are estimated; give earth_field_t or a location.",
             Verdict.TRUSTWORTHY,
         )
-    if found.shape_kept:
+    if calibration.shape_kept:
         yield Finding(
             "transfer",
             "The declared shape and offset fit each half of the log as well as the calibration of"

@@ -18,7 +18,7 @@ from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
-    from magfusion.estimation.integrity.first_look import Look
+    from magfusion.estimation.integrity.quick_check import Look
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +40,8 @@ def run_check(
     ------
     InputError
     """
-    from magfusion.estimation.demodulation.demodulated_apart import by_name, each_recorded
-    from magfusion.estimation.integrity.first_look import first_look
+    from magfusion.estimation.demodulation.separate_demodulation import by_name, each_recorded
+    from magfusion.estimation.integrity.quick_check import quick_check
     from magfusion.jobs.inputs import claim, found_in, read_recording
     from magfusion.results.plots.check import write_check_plot
     from magfusion.results.report import write_report
@@ -55,13 +55,13 @@ def run_check(
     lockin = None if site is None or not site.beacons else settings.lockin(job)
     if log.waveforms:
         looks = {
-            name: first_look(own, alone, lockin) for name, own, alone in each_recorded(log, site)
+            name: quick_check(own, alone, lockin) for name, own, alone in each_recorded(log, site)
         }
         trust = Trust(tuple(by_name({name: one.trust.findings for name, one in looks.items()})))
         look = replace(next(iter(looks.values())), trust=trust)
         figures = heading("check", log.name) | trust_figures(trust) | _of_several(looks)
     else:
-        look = first_look(log, site, lockin)
+        look = quick_check(log, site, lockin)
         figures = heading("check", log.name) | trust_figures(look.trust) | check_figures(look)
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     with claimed as whole:
@@ -74,17 +74,17 @@ def run_check(
 
 def _of_several(looks: Mapping[str, Look]) -> Figures:
     """Return the figures of each of several magnetometers by its name; of the IMU once."""
-    found: dict[tuple[str, str | None], Figure] = {}
+    result: dict[tuple[str, str | None], Figure] = {}
     for name, look in looks.items():
         for figure in check_figures(look).all:
             if figure.name.startswith("imu_") or figure.name == "gravity_m_s2":
-                found.setdefault((figure.name, None), figure)
+                result.setdefault((figure.name, None), figure)
             else:
                 key = f"{name}_{figure.name.removeprefix('magnetometer_')}"
-                found[key, figure.beacon] = replace(
+                result[key, figure.beacon] = replace(
                     figure, name=key, label=f"{figure.title} by {name}"
                 )
-    return Figures(*found.values())
+    return Figures(*result.values())
 
 
 def check_figures(look: Look) -> Figures:
@@ -95,7 +95,7 @@ def check_figures(look: Look) -> Figures:
             Figure(f"{one.stream}_rate_hz", one.rate_hz, "Hz"),
             Figure(f"{one.stream}_duration_s", one.end - one.begin, "s"),
             Figure(f"{one.stream}_jitter_ms", 1e3 * one.jitter, "ms"),
-            Figure(f"{one.stream}_lost_share", one.lost, section=Section.REPORT),
+            Figure(f"{one.stream}_lost_share", one.lost_share, section=Section.REPORT),
             Figure(f"{one.stream}_gaps", len(one.gap_begin), section=Section.REPORT),
             Figure(
                 f"{one.stream}_gap_s",
@@ -104,8 +104,8 @@ def check_figures(look: Look) -> Figures:
                 section=Section.REPORT,
             ),
         )
-    figures |= _of_compasses(look)
-    for name, snr, share in look.heard_as():
+    figures |= _gravity_and_field_figures(look)
+    for name, snr, share in look.detection_rows():
         figures |= Figures(
             Figure("snr_{beacon}", snr, beacon=name, label="signal to noise"),
             Figure("heard_{beacon}", share, beacon=name, label="share of the epochs detected"),
@@ -128,7 +128,7 @@ def check_figures(look: Look) -> Figures:
     return figures
 
 
-def _of_compasses(look: Look) -> Figures:
+def _gravity_and_field_figures(look: Look) -> Figures:
     """Return the magnitudes of gravity and field, and the angle between them."""
     means = look.means
     if len(means) == 0:

@@ -12,28 +12,28 @@ from magfusion.files.checkpoint import (
     write_checkpoint,
 )
 from magfusion.files.plain_data import from_plain, to_plain
-from magfusion.files.row_file import Mark
+from magfusion.files.row_file import RowPosition
 from magfusion.jobs.inputs import named
 from magfusion.model.site import Site
 
-Beside = TypeVar("Beside")
+Extra = TypeVar("Extra")
 
 
 @dataclass(frozen=True)
-class Kept:
+class RunProgress:
     """State of a run along a log apart from its navigator: number of rows, and its time (s)."""
 
-    rows: Mark | None = None
+    rows: RowPosition | None = None
     elapsed: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
-class Begun(Generic[Beside]):
+class ResumedRun(Generic[Extra]):
     """A navigator, the position of its run, and the other state of its checkpoint."""
 
     navigator: Navigator
     position: int
-    beside: Beside
+    extra: Extra
 
 
 def begin(
@@ -41,10 +41,10 @@ def begin(
     key: str,
     site: Site,
     settings: NavigatorSettings,
-    beside: Beside,
+    extra: Extra,
     *,
     resume: bool,
-) -> Begun[Beside]:
+) -> ResumedRun[Extra]:
     """Return the navigator of a checkpoint, or a new one where there is none.
 
     Parameters
@@ -53,7 +53,7 @@ def begin(
         Of the checkpoint; None for no checkpoint.
     key : str
         Of the run.
-    `beside` : object
+    `extra` : object
         Other state of a new run; that in the checkpoint has the same type.
     resume : bool
         If false, the run starts from the beginning, and an existing checkpoint is overwritten.
@@ -63,20 +63,20 @@ def begin(
     InputError
         Where the checkpoint is damaged or of another run, or the place is not a checkpoint.
     """
-    found = read_checkpoint(place, key) if place is not None and resume else None
-    if place is None or found is None:
+    result = read_checkpoint(place, key) if place is not None and resume else None
+    if place is None or result is None:
         if place is not None:
             claim_checkpoint(place)
-        return Begun(Navigator(site, settings), 0, beside)
+        return ResumedRun(Navigator(site, settings), 0, extra)
     from magfusion.estimation.online.restored import restored
 
     with named(place):
-        beside = from_plain(type(beside), found.content.get("beside"), "beside")
-        navigator = restored(site, settings, found.content.get("navigator"))
-    return Begun(navigator, found.position, beside)
+        extra = from_plain(type(extra), result.content.get("beside"), "beside")
+        navigator = restored(site, settings, result.content.get("navigator"))
+    return ResumedRun(navigator, result.position, extra)
 
 
-def save(navigator: Navigator, position: int, beside: object, place: Path, key: str) -> None:
+def save(navigator: Navigator, position: int, extra: object, place: Path, key: str) -> None:
     """Write a checkpoint of a navigator, with the other state of the run."""
-    content = {"navigator": navigator.checkpoint(), "beside": to_plain(beside)}
+    content = {"navigator": navigator.checkpoint(), "beside": to_plain(extra)}
     write_checkpoint(Checkpoint(key, position, content), place)

@@ -82,16 +82,16 @@ def run_coverage(settings: CoverageSettings, output: Path) -> Figures:
     spacing = _spacing(box, settings)
     heights = None if settings.height is None else np.array([settings.height])
     points = volume(box, spacing, heights)
-    found = coverage(site, points, window, risk=settings.risks)
+    result = coverage(site, points, window, risk=settings.risks)
     extra = None
     if settings.extra_beacon:
         extra = best_extra_beacon(site, box, lambda s, p: coverage(s, p, window), points)
-    figures = _figures(site_path, site, window, spacing, found, extra)
+    figures = _figures(site_path, site, window, spacing, result, extra)
     beacon = None if extra is None else extra.beacon
     with claimed as directory:
-        write_points(directory / "coverage.parquet", found)
-        write_plot(directory / "coverage.png", site, found, beacon)
-        write_coverage_recording(directory / "run.rrd", site, found, spacing, beacon)
+        write_points(directory / "coverage.parquet", result)
+        write_plot(directory / "coverage.png", site, result, beacon)
+        write_coverage_recording(directory / "run.rrd", site, result, spacing, beacon)
         write_report(directory, figures)
     return figures
 
@@ -131,18 +131,18 @@ def _figures(
     site: Site,
     window: float,
     spacing: float,
-    found: Coverage,
+    coverage: Coverage,
     extra: ExtraBeacon | None,
 ) -> Figures:
-    position, attitude = found.position_quantile, found.attitude_quantile
+    position, attitude = coverage.position_quantile, coverage.attitude_quantile
     figures = [
-        Figure("points", len(found)),
+        Figure("points", len(coverage)),
         Figure("spacing_m", spacing, "m"),
         Figure("window_s", window, "s"),
         Figure("noise_of_a_phasor_t", float(np.sqrt(np.max(phasor_variance(site, window)))), "T"),
-        Figure("share_determined", float(np.mean(found.determined))),
-        Figure("share_below_1_cm", float(np.mean(found.position_sigma < 0.01))),
-        Figure("share_below_10_cm", float(np.mean(found.position_sigma < 0.1))),
+        Figure("share_determined", float(np.mean(coverage.determined))),
+        Figure("share_below_1_cm", float(np.mean(coverage.position_sigma < 0.01))),
+        Figure("share_below_10_cm", float(np.mean(coverage.position_sigma < 0.1))),
         *(
             Figure(f"{name}_sigma_{unit}_{key}", finite(value), unit, label=f"{name} sigma, {word}")
             for name, unit, quantile in (
@@ -154,8 +154,10 @@ def _figures(
                 ("p90", "90th percentile", quantile(0.9)),
             )
         ),
-        *level_figures(found),
-        Figure("beacons_heard_least", int(np.min(found.beacons)), label="beacons in range, least"),
+        *level_figures(coverage),
+        Figure(
+            "beacons_heard_least", int(np.min(coverage.beacons)), label="beacons in range, least"
+        ),
     ]
     if extra is not None:
         figures += [
@@ -169,11 +171,11 @@ def _figures(
     return heading("coverage", site_path.stem) | trust_figures(Trust()) | Figures(*figures)
 
 
-def level_figures(found: Coverage) -> list[Figure]:
+def level_figures(coverage: Coverage) -> list[Figure]:
     """Return median and worst of the protection levels, and where they exist."""
     parts = (
-        ("m", "position", found.protection_level_m),
-        ("deg", "attitude", found.protection_level_deg),
+        ("m", "position", coverage.protection_level_m),
+        ("deg", "attitude", coverage.protection_level_deg),
     )
     figures = [
         Figure(
@@ -186,8 +188,8 @@ def level_figures(found: Coverage) -> list[Figure]:
         if level is not None
         for key, share in (("median", 0.5), ("worst", 1.0))
     ]
-    if found.protection_level_m is not None:
-        share = float(np.mean(np.isfinite(found.protection_level_m)))
+    if coverage.protection_level_m is not None:
+        share = float(np.mean(np.isfinite(coverage.protection_level_m)))
         figures.append(Figure("share_protected", share))
     return figures
 
@@ -197,17 +199,20 @@ def finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def write_points(path: Path, found: Coverage) -> None:
+def write_points(path: Path, coverage: Coverage) -> None:
     """Write every point with its bounds."""
     columns: dict[str, object] = dict(
-        zip(("position_x", "position_y", "position_z"), found.position_world.T, strict=True)
+        zip(("position_x", "position_y", "position_z"), coverage.position_world.T, strict=True)
     )
-    columns |= {"position_sigma": found.position_sigma, "attitude_sigma": found.attitude_sigma}
-    columns |= dict(zip(("worst_x", "worst_y", "worst_z"), found.worst_world.T, strict=True))
-    columns |= {"beacons": found.beacons, "determined": found.determined}
-    if found.protection_level_m is not None and found.protection_level_deg is not None:
-        columns["protection_level_m"] = found.protection_level_m
-        columns["protection_level_deg"] = found.protection_level_deg
+    columns |= {
+        "position_sigma": coverage.position_sigma,
+        "attitude_sigma": coverage.attitude_sigma,
+    }
+    columns |= dict(zip(("worst_x", "worst_y", "worst_z"), coverage.worst_world.T, strict=True))
+    columns |= {"beacons": coverage.beacons, "determined": coverage.determined}
+    if coverage.protection_level_m is not None and coverage.protection_level_deg is not None:
+        columns["protection_level_m"] = coverage.protection_level_m
+        columns["protection_level_deg"] = coverage.protection_level_deg
     write_table(columns, path)
 
 

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.estimation.data_checks.recording import passed_on
+from magfusion.estimation.data_checks.data_quality import passed_on
 from magfusion.estimation.demodulation.drive_reference import referred
 from magfusion.files.fields import by_own_clocks
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.jobs.rest_settings import RestSettings
 from magfusion.jobs.settings import Command, LogSettings, WindowSettings
-from magfusion.model.audibility import MANY
+from magfusion.model.detection_range import MANY
 from magfusion.model.progress import Report, quiet
 from magfusion.model.trust import Trust
 from magfusion.results.figures import Figure, Figures, heading
@@ -41,8 +41,8 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     InputError
         Where the log has no waveform, or no window of it is usable.
     """
-    from magfusion.estimation.demodulation.demodulated_apart import demodulated_apart
     from magfusion.estimation.demodulation.demodulation import phasors
+    from magfusion.estimation.demodulation.separate_demodulation import demodulated_apart
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
     from magfusion.results.report import dropped_figures, write_report
 
@@ -52,11 +52,11 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     log, site = read_job(
         job,
         fewer=not used,
-        apart=not used,
+        separately=not used,
         several=True,
         raw=True,
         reference=used,
-        heard=not used,
+        select_beacons=not used,
         report=report,
     )
     if used and log.waveforms:
@@ -72,10 +72,10 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     with named(job.log_path):
         rested = settings.integrated(log, site, lockin)
         if log.waveforms:
-            apart = demodulated_apart(log, site, lockin)
-            assert apart.log.fields is not None
-            log = replace(apart.log, noticed=(*log.noticed, *apart.noticed))
-            samples, dropped = by_own_clocks(apart.log.fields, site), apart.dropped
+            separate = demodulated_apart(log, site, lockin)
+            assert separate.log.fields is not None
+            log = replace(separate.log, noticed=(*log.noticed, *separate.noticed))
+            samples, dropped = by_own_clocks(separate.log.fields, site), separate.dropped
         elif rested is None:
             samples, dropped = phasors(log, site, lockin)
         else:
@@ -96,7 +96,7 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
         write_log(
             replace(log, waveform=None, fields=samples, drive=None, reference=None), directory
         )
-        save_site(_freed(log, site), directory / "site.yaml")
+        save_site(_without_temperature(log, site), directory / "site.yaml")
         write_report(whole, figures)
     refuse_failed(job.log_path, job.output, trust)
     return figures
@@ -136,13 +136,13 @@ def _of(samples: FieldSamples, channel: int, joint: str) -> str:
     return f"{name}{joint}" if joint == "_" else f"{joint}{name}"
 
 
-def _freed(log: Log, site: Site) -> Site:
+def _without_temperature(log: Log, site: Site) -> Site:
     """Return the site of phasors in which the magnetometer's temperature is compensated."""
     magnetometer = site.platform.magnetometer
     missing = any(finding.code == "temperature_missing" for finding in log.noticed)
-    if magnetometer.warming is None or missing:
+    if magnetometer.temperature_model is None or missing:
         return site
-    at_reference = replace(magnetometer, warming=None)
+    at_reference = replace(magnetometer, temperature_model=None)
     return replace(site, platform=replace(site.platform, magnetometer=at_reference))
 
 

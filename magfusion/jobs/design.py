@@ -23,13 +23,13 @@ from magfusion.model.hall import Hall, Mounts, mounting_places, points_of_use, p
 from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Beacon, Site
 from magfusion.results.coverage import coverage, usual_box
-from magfusion.results.design.pattern import Band, template_of
+from magfusion.results.design.pattern import ToneBand, template_of
 from magfusion.results.design.planning import Task, designed, with_moment
 from magfusion.results.design.turns import cycle_of, is_in_turn
 
 if TYPE_CHECKING:
     from magfusion.model.hall import Hall
-    from magfusion.results.design.pattern import Band
+    from magfusion.results.design.pattern import ToneBand
     from magfusion.results.design.planning import Task
     from magfusion.results.figures import Figures
     from magfusion.units import Array
@@ -60,7 +60,7 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
     first = None if settings.earlier is None else load_site(settings.earlier)
     task = _task(settings, site, hall, spacing)
     alone = len(site.beacons) < 2
-    found = designed(
+    result = designed(
         task,
         starts=settings.starts,
         layouts=max(settings.random, LEAST_DRAWN if alone else 0),
@@ -69,11 +69,11 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
         in_time=lambda: time.monotonic() - begin < 60.0 * settings.minutes,
         report=report,
     )
-    before = found.median_random if alone else site
+    before = result.median_random if alone else site
     assert before is not None
     words = "the given site" if before is site else "a random layout, the median one"
     with claimed as directory:
-        save_site(found.site, directory / "site.yaml")
+        save_site(result.site, directory / "site.yaml")
         new = load_site(directory / "site.yaml")
         maps = [
             coverage(one, task.points, settings.window, risk=settings.risks)
@@ -83,7 +83,7 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
             Panel(f"before: {words}", before, maps[0]),
             Panel("after", new, maps[1]),
         ]
-        figures = design_figures(settings, task, found, panels, spacing)
+        figures = design_figures(settings, task, result, panels, spacing)
         write_points(directory / "coverage.parquet", maps[1])
         write_plot(directory / "design.png", hall, panels)
         write_design_recording(directory / "run.rrd", hall, panels, spacing)
@@ -106,13 +106,13 @@ def _hall(settings: DesignSettings, site: Site) -> tuple[Hall, float]:
     used, room = (np.ptp(prism.box_world, axis=0) for prism in (hall.use, hall.room))
     along = float(np.sum(np.linalg.norm(np.diff(hall.room.edges, axis=1), axis=2)))
     walls = (along / grid + 1.0) * (float(room[2]) / grid + 1.0)
-    for name, step, points, most in (
+    for name, step, points, maximum in (
         ("spacing", spacing, float(np.prod(used / spacing + 1.0)), 4 * MOST_POINTS),
         ("grid", grid, max(walls, float(np.prod(room[:2] / grid + 1.0))), MOST_PLACES),
     ):
-        if points > most:
+        if points > maximum:
             raise InputError(
-                f"--{name} {step:g} gives more than {most} points; choose a larger value"
+                f"--{name} {step:g} gives more than {maximum} points; choose a larger value"
             )
     return hall, spacing
 
@@ -146,7 +146,7 @@ def _task(settings: DesignSettings, site: Site, hall: Hall, spacing: float) -> T
         risk=settings.risks,
         objective=settings.objective,
         axes=int(settings.axes),
-        apart=settings.apart,
+        min_distance=settings.apart,
         clearance=settings.clearance,
         budgeted=settings.moment_budget is not None,
     )
@@ -182,18 +182,18 @@ def _kept(site: Site, keep: str | None) -> Site:
             f"--keep {keep}: the site has no beacon {unknown[0]!r}; it has {', '.join(names)};"
             f" {ALL} keeps them all"
         )
-    gone = [name for name in names if name not in wanted]
+    elapsed = [name for name in names if name not in wanted]
     known = site.correlation
     groups = ("beacons", "moments", "phase")
     return replace(
         site,
         beacons=tuple(b for b in site.beacons if b.name in wanted),
-        calibration=None if gone else site.calibration,
-        correlation=known and known.without(groups, gone),
+        calibration=None if elapsed else site.calibration,
+        correlation=known and known.without(groups, elapsed),
     )
 
 
-def _band(settings: DesignSettings, site: Site) -> Band:
+def _band(settings: DesignSettings, site: Site) -> ToneBand:
     try:
         low, high = (float(part) for part in settings.band.split(","))
     except ValueError:
@@ -207,7 +207,7 @@ def _band(settings: DesignSettings, site: Site) -> Band:
     for axis in () if response is None else response.axes:
         low = max(low, float(axis.frequency_hz[0]))
         high = min(high, float(axis.frequency_hz[-1]))
-    return Band(low, high, settings.window, settings.mains_hz)
+    return ToneBand(low, high, settings.window, settings.mains_hz)
 
 
 COMMAND = Command(

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def design_figures(
-    settings: DesignSettings, task: Task, found: Design, panels: list[Panel], spacing: float
+    settings: DesignSettings, task: Task, result: Design, panels: list[Panel], spacing: float
 ) -> Figures:
     """Return the report of a design: its accuracy, before and after, and its beacons.
 
@@ -35,30 +35,30 @@ def design_figures(
     spacing : float
         Of the points (m).
     """
-    before, after = (panel.found for panel in panels)
-    notes = [] if found.complete else [_OUT_OF_TIME]
+    before, after = (panel.coverage for panel in panels)
+    notes = [] if result.complete else [_OUT_OF_TIME]
     if before.protection_level_m is None or after.protection_level_m is None:
         raise AssertionError("both have a risk")
     worst = float(np.max(after.protection_level_m))
     if not np.isfinite(worst):
         notes.append(_OPEN)
     figures = [
-        Figure("beacons_placed", len(found.new)),
+        Figure("beacons_placed", len(result.new)),
         Figure("beacons_kept", len(task.site.beacons)),
         Figure("objective", settings.objective, section=Section.REPORT),
-        Figure("candidates", found.candidates),
+        Figure("candidates", result.candidates),
         Figure("points", len(task.points)),
         Figure("spacing_m", spacing, "m", section=Section.REPORT),
         Figure("window_s", settings.window, "s"),
-        Figure("search_complete", found.complete),
+        Figure("search_complete", result.complete),
         *level_figures(after),
         *_sigma_figures(after),
         *(
             replace(f, name=f"before_{f.name}", label=f"before: {f.title}")
             for f in [*level_figures(before), *_sigma_figures(before)]
         ),
-        *_random_figures(found.random_worst_m[: settings.random], worst),
-        *(figure for beacon in found.new for figure in _of_beacon(beacon)),
+        *_random_figures(result.random_worst_m[: settings.random], worst),
+        *(figure for beacon in result.new for figure in _of_beacon(beacon)),
         Figure("notes", notes, section=Section.NOTES),
     ]
     return heading("design", settings.site.stem) | trust_figures(Trust()) | Figures(*figures)
@@ -74,11 +74,11 @@ _OPEN = (
 )
 
 
-def _sigma_figures(found: Coverage) -> list[Figure]:
+def _sigma_figures(result: Coverage) -> list[Figure]:
     return [
         Figure(
             f"position_sigma_m_{key}",
-            finite(found.position_quantile(share)),
+            finite(result.position_quantile(share)),
             "m",
             label=f"position sigma, {key}",
         )
@@ -120,10 +120,10 @@ def _of_beacon(beacon: Beacon) -> list[Figure]:
     ]
     rows.append(("moment_a_m2", peak_moment(beacon), "A m^2"))
     return [
-        Figure(f"{{beacon}}.{key}", value, unit, name, label=_spoken(key))
+        Figure(f"{{beacon}}.{key}", value, unit, name, label=_display_name(key))
         for key, value, unit in rows
     ]
 
 
-def _spoken(key: str) -> str:
+def _display_name(key: str) -> str:
     return key.removesuffix("_m").removesuffix("_a_m2").removesuffix("_hz").replace("_", " ")

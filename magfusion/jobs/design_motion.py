@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from magfusion.jobs.design_settings import DesignSettings
     from magfusion.model.hall import Hall
     from magfusion.model.site import Site
-    from magfusion.results.design.motion import Motion, Stop
+    from magfusion.results.design.motion import MotionPlan, Stop
     from magfusion.results.figures import Figures
     from magfusion.units import Array
 
@@ -39,23 +39,23 @@ def run_motion(
 
     assert settings.motion is not None
     claimed = claim(output, "design")
-    found = next_motion(site, points, settings.motion, settings.stop, known=settings.poses_known)
-    if not len(found.parameters.sigma):
+    result = next_motion(site, points, settings.motion, settings.stop, known=settings.poses_known)
+    if not len(result.parameters.sigma):
         raise InputError(
             f"{settings.site}: all sigmas are zero, so that there is no parameter to calibrate;"
             " declare the uncertainty of beacons and magnetometer"
         )
-    figures = _figures(settings, found)
+    figures = _figures(settings, result)
     with claimed as directory:
-        _write_stops(directory / "motion.parquet", found)
-        write_motion_plot(directory / "motion.png", site, hall, found)
+        _write_stops(directory / "motion.parquet", result)
+        write_motion_plot(directory / "motion.png", site, hall, result)
         write_report(directory, figures)
     return figures
 
 
-def said(found: Motion, number: int) -> str:
+def stop_instruction(result: MotionPlan, number: int) -> str:
     """Return the instruction for a stop, and its purpose."""
-    stop, parameters = found.stops[number], found.parameters
+    stop, parameters = result.stops[number], result.parameters
     x, y, z = stop.position_world
     roll, pitch, yaw = stop.rpy_deg
     before, after = (parameters.sized(stop.worst, r) for r in (stop.before, stop.after))
@@ -66,30 +66,30 @@ def said(found: Motion, number: int) -> str:
     )
 
 
-def _figures(settings: DesignSettings, found: Motion) -> Figures:
-    parameters = found.parameters
-    start, left = (parameters.excess(r) for r in (np.ones(len(found.ratio)), found.ratio))
-    asked = parameters.asked
-    beyond = [parameters.names[k][0] for k in np.flatnonzero(~asked)]
-    notes = [said(found, k) for k in range(len(found.stops))]
+def _figures(settings: DesignSettings, result: MotionPlan) -> Figures:
+    parameters = result.parameters
+    start, remaining = (parameters.excess(r) for r in (np.ones(len(result.ratio)), result.ratio))
+    requested = parameters.requested
+    beyond = [parameters.names[k][0] for k in np.flatnonzero(~requested)]
+    notes = [stop_instruction(result, k) for k in range(len(result.stops))]
     if beyond:
         notes.append(
             f"No such stops determine {', '.join(beyond)}: only a better survey does, or"
             " measured poses; for the lever arm, rotation on the spot with an IMU."
         )
     figures = [
-        Figure("stops", len(found.stops)),
+        Figure("stops", len(result.stops)),
         Figure("stop_s", settings.stop, "s"),
         Figure("poses_known", settings.poses_known),
-        Figure("parameters", len(asked)),
-        Figure("parameters_in_reach", int(np.sum(asked))),
+        Figure("parameters", len(requested)),
+        Figure("parameters_in_reach", int(np.sum(requested))),
         *(
             Figure(
                 f"worst_excess_{name}",
-                float(np.max(value[asked], initial=0.0)),
+                float(np.max(value[requested], initial=0.0)),
                 label=f"worst parameter, {name}, in sigmas of the fields' noise",
             )
-            for name, value in (("before", start), ("after", left))
+            for name, value in (("before", start), ("after", remaining))
         ),
         Figure("out_of_reach", beyond, section=Section.REPORT),
         Figure("notes", notes, section=Section.NOTES),
@@ -97,21 +97,21 @@ def _figures(settings: DesignSettings, found: Motion) -> Figures:
     return heading("design", settings.site.stem) | trust_figures(Trust()) | Figures(*figures)
 
 
-def _write_stops(path: Path, found: Motion) -> None:
+def _write_stops(path: Path, result: MotionPlan) -> None:
     def column(of: str) -> Array:
-        return np.array([getattr(stop, of) for stop in found.stops])
+        return np.array([getattr(stop, of) for stop in result.stops])
 
-    parameters = found.parameters
-    size = np.array([parameters.sigma[stop.worst] for stop in found.stops])
-    where, turned = column("position_world").reshape(-1, 3), column("rpy_deg").reshape(-1, 3)
+    parameters = result.parameters
+    size = np.array([parameters.sigma[stop.worst] for stop in result.stops])
+    where, rotated = column("position_world").reshape(-1, 3), column("rpy_deg").reshape(-1, 3)
     columns: dict[str, object] = dict(
         zip(("position_x", "position_y", "position_z"), where.T, strict=True)
     )
-    columns |= dict(zip(("roll_deg", "pitch_deg", "yaw_deg"), turned.T, strict=True))
-    columns["parameter"] = [_name(found, stop) for stop in found.stops]
+    columns |= dict(zip(("roll_deg", "pitch_deg", "yaw_deg"), rotated.T, strict=True))
+    columns["parameter"] = [_name(result, stop) for stop in result.stops]
     columns |= {"sigma_before": size * column("before"), "sigma_after": size * column("after")}
     write_table(columns, path)
 
 
-def _name(found: Motion, stop: Stop) -> str:
-    return found.parameters.names[stop.worst][0]
+def _name(result: MotionPlan, stop: Stop) -> str:
+    return result.parameters.names[stop.worst][0]

@@ -16,15 +16,15 @@ from magfusion.files.checkpoint import read_position
 from magfusion.jobs.settings import Command, RandomSettings, option
 from magfusion.model.progress import Report
 from magfusion.model.trust import Finding, Trust
-from magfusion.results.drift import QUANTITIES, Course, settled_after
+from magfusion.results.drift import QUANTITIES, EstimatorPlot, settled_after
 from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
 from magfusion.simulation.monte_carlo import run_many
 
 if TYPE_CHECKING:
-    from magfusion.jobs.drift_figures import Judgement
+    from magfusion.jobs.drift_figures import Criterion
     from magfusion.jobs.drift_world import Estimator, WorldRun, WorldTask
-    from magfusion.results.drift import Course, Verdict
+    from magfusion.results.drift import EstimatorPlot, Verdict
     from magfusion.results.figures import Figures
 
 
@@ -148,14 +148,14 @@ def summarise(settings: DriftSettings, runs: list[WorldRun]) -> Figures:
 
     A detected instability makes the estimates doubtful; a run too short to decide does not.
     """
-    from magfusion.jobs.drift_figures import STABILITY, judged
+    from magfusion.jobs.drift_figures import STABILITY, judge_runs
 
     figures = Figures()
-    judgements: list[Judgement] = []
+    judgements: list[Criterion] = []
     for estimator in settings.estimators:
         own = [run for run in runs if run.task.estimator == estimator]
-        found, judgements_of_one = judged(estimator, own)
-        figures |= found
+        result, judgements_of_one = judge_runs(estimator, own)
+        figures |= result
         judgements += judgements_of_one
     failed = [one for one in judgements if one.verdict == "fail"]
     trust = Trust(tuple(Finding("unstable", f"{one.sentence}.") for one in failed))
@@ -195,14 +195,14 @@ def overall(verdicts: list[Verdict]) -> Verdict:
     return min(verdicts, key=order.index)
 
 
-def courses(settings: DriftSettings, runs: list[WorldRun]) -> list[Course]:
+def courses(settings: DriftSettings, runs: list[WorldRun]) -> list[EstimatorPlot]:
     """Return the plotted data of each estimator: its errors, and its pace in the first world."""
     from magfusion.jobs.drift_figures import MINUTE, minutes
 
     out = []
     for estimator in settings.estimators:
         own = [r for r in runs if r.task.estimator == estimator]
-        out.append(Course(estimator, tuple(minutes(r) for r in own), MINUTE, own[0].pace))
+        out.append(EstimatorPlot(estimator, tuple(minutes(r) for r in own), MINUTE, own[0].pace))
     return out
 
 
@@ -214,11 +214,11 @@ def _progress(tasks: list[WorldTask], report: Report | None) -> Iterator[None]:
     if report is None:
         yield
         return
-    tell, stop, total = report, threading.Event(), sum(t.stretches for t in tasks)
+    report_progress, stop, total = report, threading.Event(), sum(t.stretches for t in tasks)
 
     def look() -> None:
         while not stop.wait(LOOK):
-            tell("navigating", stretches_done(tasks), total)
+            report_progress("navigating", stretches_done(tasks), total)
 
     thread = threading.Thread(target=look, daemon=True)
     thread.start()

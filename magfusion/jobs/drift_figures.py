@@ -11,7 +11,7 @@ from magfusion.results.drift import (
     CERTAIN,
     CONFIDENCE,
     DAY,
-    FEWEST_COMMON,
+    MIN_COMMON,
     QUANTITIES,
     THREE_SIGMA,
     ErrorSeries,
@@ -33,7 +33,7 @@ MINUTE = 60.0  # s; errors count at the phasors of whole minutes, which rests an
 # False-alarm rate of the chi-square test of the NEES: one run in fifty, fewer as the rests of a
 # world are partly independent of each other.
 NEES_PROBABILITY = 0.98
-CARRIED_LIMIT = 1.0  # m, at rest for a minute without a phasor
+MAX_PROPAGATION_ERROR = 1.0  # m, at rest for a minute without a phasor
 MEMORY_RATIO, MEMORY_GROWTH = 1.10, 20.0  # last hour to second; MiB
 LATENCY_LIMIT = 1.10  # last hour to second, at rest, beside a bare loop of the same minutes
 TIME, SECONDS, UPDATES, MEMORY, DISTORTION, BARE_SAMPLE = range(len(PACE))
@@ -47,7 +47,7 @@ _STARTED = 60.0  # s
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Criterion:
     """One criterion and its verdict.
 
     Parameters
@@ -65,7 +65,7 @@ class Judgement:
 STABILITY = {"pass": "pass", "fail": "fail", "undecided": "inconclusive"}  # in the report
 
 
-def judged(name: str, runs: list[WorldRun]) -> tuple[Figures, list[Judgement]]:
+def judge_runs(name: str, runs: list[WorldRun]) -> tuple[Figures, list[Criterion]]:
     """Return figures of one estimator's runs, each key beginning with its name, and the judgements.
 
     Parameters
@@ -76,10 +76,10 @@ def judged(name: str, runs: list[WorldRun]) -> tuple[Figures, list[Judgement]]:
         One of each world.
     """
     figures: list[Figure] = []
-    judgements: list[Judgement] = []
-    for part in (_drifts, _carried, _consistency, _memory, _latency, _losses):
-        found, own = part(runs)
-        figures += found
+    judgements: list[Criterion] = []
+    for part in (_drifts, _propagation_figures, _consistency, _memory, _latency, _losses):
+        result, own = part(runs)
+        figures += result
         judgements += own
     figures += [Figure(f"{one.name}_verdict", one.verdict) for one in judgements]
     figures += [
@@ -98,7 +98,7 @@ def minutes(run: WorldRun) -> ErrorSeries:
     return evenly(run.errors, MINUTE)
 
 
-def settled(run: WorldRun) -> ErrorSeries:
+def after_settling(run: WorldRun) -> ErrorSeries:
     """Return those after the time from which slopes count."""
     series = minutes(run)
     return series.rows(series.time >= settled_after(run.task.hours))
@@ -106,19 +106,19 @@ def settled(run: WorldRun) -> ErrorSeries:
 
 def drift_of(quantity: Quantity, runs: list[WorldRun]) -> Slope:
     """Return the slope of the length of an error (unit per day)."""
-    every = [settled(run) for run in runs]
+    every = [after_settling(run) for run in runs]
     return slope_over_worlds(
         [s.time for s in every], [quantity.scale * s.size(quantity.part) for s in every]
     )
 
 
-def _drifts(runs: list[WorldRun]) -> tuple[list[Figure], list[Judgement]]:
+def _drifts(runs: list[WorldRun]) -> tuple[list[Figure], list[Criterion]]:
     figures: list[Figure] = []
     judgements = []
     for quantity in QUANTITIES:
         name, unit = quantity.name, quantity.unit
         slope = drift_of(quantity, runs)
-        every = [quantity.scale * settled(run).size(quantity.part) for run in runs]
+        every = [quantity.scale * after_settling(run).size(quantity.part) for run in runs]
         figures += [
             Figure(f"{name}_rms_{unit}", _rms(np.concatenate(every)), quantity.symbol),
             Figure(f"{name}_slope_{unit}_per_day", slope.per_day, f"{quantity.symbol} per day"),
@@ -128,18 +128,18 @@ def _drifts(runs: list[WorldRun]) -> tuple[list[Figure], list[Judgement]]:
         ]
         verdict = slope.verdict(quantity.limit)
         if len(runs) == 1:
-            verdict = verdict_of_one(quantity, slope, settled(runs[0]))
+            verdict = verdict_of_one(quantity, slope, after_settling(runs[0]))
         judgements.append(
-            Judgement(
+            Criterion(
                 f"{name}_drift",
                 verdict,
                 f"{_DRIFTS[verdict].format(name.replace('_', ' '))}: {slope.per_day:+.3g} +-"
                 f" {slope.margin:.2g} {quantity.symbol} a day (95 %), limit {quantity.limit:g}",
             )
         )
-        if len(runs) >= FEWEST_COMMON:
-            found, common = _common(quantity, runs)
-            figures += found
+        if len(runs) >= MIN_COMMON:
+            result, common = _common(quantity, runs)
+            figures += result
             judgements.append(common)
     walking = [run.errors.rows(run.errors.measured & ~_at_minutes(run.errors)) for run in runs]
     position = QUANTITIES[0].part
@@ -147,16 +147,16 @@ def _drifts(runs: list[WorldRun]) -> tuple[list[Figure], list[Judgement]]:
     return [*figures, Figure("position_rms_walking_m", moving, "m")], judgements
 
 
-def _common(quantity: Quantity, runs: list[WorldRun]) -> tuple[list[Figure], Judgement]:
+def _common(quantity: Quantity, runs: list[WorldRun]) -> tuple[list[Figure], Criterion]:
     """Test whether the components drift in the same direction in all worlds."""
-    every = [settled(run) for run in runs]
+    every = [after_settling(run) for run in runs]
     slope = common_slope(
         [s.time for s in every], [quantity.scale * s.error[:, quantity.part] for s in every]
     )
     name, unit = quantity.name, quantity.unit
-    most = float(np.max(np.abs(slope.per_day / slope.standard_error)))
+    maximum = float(np.max(np.abs(slope.per_day / slope.standard_error)))
     figures = [
-        Figure(f"{name}_common_slope_standard_errors", most),
+        Figure(f"{name}_common_slope_standard_errors", maximum),
         Figure(f"{name}_common_slope_probability", slope.probability),
         *(
             Figure(
@@ -168,10 +168,10 @@ def _common(quantity: Quantity, runs: list[WorldRun]) -> tuple[list[Figure], Jud
     word = "a" if slope.verdict == "fail" else "no"
     sentence = (
         f"the errors of {name.replace('_', ' ')} have {word} common drift in all worlds: mean slope"
-        f" of a component at most {most:.1f} standard errors, probability by chance"
+        f" of a component at most {maximum:.1f} standard errors, probability by chance"
         f" {slope.probability:.2g}, limit {THREE_SIGMA:g}"
     )
-    return figures, Judgement(f"{name}_common_drift", slope.verdict, sentence)
+    return figures, Criterion(f"{name}_common_drift", slope.verdict, sentence)
 
 
 def verdict_of_one(quantity: Quantity, slope: Slope, series: ErrorSeries) -> Verdict:
@@ -197,26 +197,26 @@ _DRIFTS = {
 }
 
 
-def _carried(runs: list[WorldRun]) -> tuple[list[Figure], list[Judgement]]:
+def _propagation_figures(runs: list[WorldRun]) -> tuple[list[Figure], list[Criterion]]:
     """Test the states at rest between two phasors, which are propagated by the IMU alone."""
-    found = []
+    result = []
     for run in runs:
         errors = run.errors
         between = errors.rows(~errors.measured & (errors.time > _STARTED))
-        found.append(between.size(QUANTITIES[0].part))
-    every = np.concatenate(found)
+        result.append(between.size(QUANTITIES[0].part))
+    every = np.concatenate(result)
     largest = float(np.max(every, initial=0.0))
     figures = [
         Figure("position_rms_between_fields_m", _rms(every), "m"),
         Figure("position_largest_between_fields_m", largest, "m"),
     ]
-    verdict = within(largest, largest, CARRIED_LIMIT)
+    verdict = within(largest, largest, MAX_PROPAGATION_ERROR)
     word = "is" if verdict == "pass" else "is not"
     sentence = (
         f"the position error between phasors {word} bounded: {_rms(every):.3g} m rms,"
-        f" {largest:.3g} m at most, limit {CARRIED_LIMIT:g}"
+        f" {largest:.3g} m at most, limit {MAX_PROPAGATION_ERROR:g}"
     )
-    return figures, [Judgement("carried", verdict, sentence)]
+    return figures, [Criterion("carried", verdict, sentence)]
 
 
 def _at_minutes(series: ErrorSeries) -> BoolArray:
@@ -230,12 +230,12 @@ def nees_limits(worlds: int) -> tuple[float, float]:
     return float(low) / freedom, float(high) / freedom
 
 
-def _consistency(runs: list[WorldRun]) -> tuple[list[Figure], list[Judgement]]:
+def _consistency(runs: list[WorldRun]) -> tuple[list[Figure], list[Criterion]]:
     figures: list[Figure] = []
     judgements = []
     low, high = nees_limits(len(runs))
     for name in ("pose", "bias"):
-        every = [settled(run) for run in runs]
+        every = [after_settling(run) for run in runs]
         level = [getattr(s, f"{name}_nees") / 6.0 for s in every]
         time = [s.time for s in every]
         mean = float(np.mean(np.concatenate(level)))
@@ -254,7 +254,7 @@ def _consistency(runs: list[WorldRun]) -> tuple[list[Figure], list[Judgement]]:
         verdict: Verdict = "fail" if small or min(halves) < low else "pass"
         word = "consistent" if verdict == "pass" else "too small" if small else "too large"
         judgements.append(
-            Judgement(
+            Criterion(
                 f"{name}_consistency",
                 verdict,
                 f"the estimated standard deviations of the {name} are {word}: NEES per degree of"
@@ -266,7 +266,7 @@ def _consistency(runs: list[WorldRun]) -> tuple[list[Figure], list[Judgement]]:
     return [*figures, Figure("innovation_level", float(np.nanmean(innovation)))], judgements
 
 
-def _memory(runs: list[WorldRun]) -> tuple[list[Figure], list[Judgement]]:
+def _memory(runs: list[WorldRun]) -> tuple[list[Figure], list[Criterion]]:
     growth, ratio = [], []
     for run in runs:
         second, last = (float(np.median(part[:, MEMORY])) for part in _hours(run))
@@ -285,10 +285,10 @@ def _memory(runs: list[WorldRun]) -> tuple[list[Figure], list[Judgement]]:
         f"memory {'does not grow' if stays else 'grows'}: {worst:.3f} times from {_spans(runs[0])},"
         f" {max(growth):+.2f} MiB, limits {MEMORY_RATIO:g} and {MEMORY_GROWTH:g}"
     )
-    return figures, [Judgement("memory", "pass" if stays else "fail", sentence)]
+    return figures, [Criterion("memory", "pass" if stays else "fail", sentence)]
 
 
-def _latency(runs: list[WorldRun]) -> tuple[list[Figure], list[Judgement]]:
+def _latency(runs: list[WorldRun]) -> tuple[list[Figure], list[Criterion]]:
     every = np.concatenate([run.pace[run.pace[:, UPDATES] > 0.0] for run in runs])
     each = 1e3 * every[:, SECONDS] / every[:, UPDATES]
     spent = sum(float(np.sum(run.pace[:, SECONDS])) for run in runs)
@@ -315,7 +315,7 @@ def _latency(runs: list[WorldRun]) -> tuple[list[Figure], list[Judgement]]:
         f" {np.exp(growth - margin):.2f} and {np.exp(growth + margin):.2f} (95 %), in units of a"
         f" bare loop at the same time, limit {LATENCY_LIMIT:g}"
     )
-    return figures, [Judgement("latency", verdict, sentence)]
+    return figures, [Criterion("latency", verdict, sentence)]
 
 
 _SLOWER = {
@@ -345,20 +345,22 @@ def _costs(run: WorldRun) -> tuple[Array, Array]:
 
 def _growth(second: Array, last: Array, confidence: float) -> tuple[float, float]:
     """Return a difference of means and half of its interval, by Welch's approximation."""
-    found = ttest_ind(last, second, equal_var=False)
-    low, high = found.confidence_interval(confidence)
+    result = ttest_ind(last, second, equal_var=False)
+    low, high = result.confidence_interval(confidence)
     return float(np.mean(last) - np.mean(second)), 0.5 * float(high - low)
 
 
-def _losses(runs: list[WorldRun]) -> tuple[list[Figure], list[Judgement]]:
+def _losses(runs: list[WorldRun]) -> tuple[list[Figure], list[Criterion]]:
     total: Counter[str] = Counter()
     for run in runs:
         total.update(run.losses)
     counts = [f"{what}: {count}" for what, count in sorted(total.items())]
-    lost = total["lost and found again"]
-    verdict: Verdict = "fail" if lost else "pass"
-    sentence = f"tracking was lost {lost} times" if lost else "tracking was never lost"
-    return [Figure("losses", counts)], [Judgement("lost", verdict, sentence)]
+    lost_epochs = total["lost and found again"]
+    verdict: Verdict = "fail" if lost_epochs else "pass"
+    sentence = (
+        f"tracking was lost {lost_epochs} times" if lost_epochs else "tracking was never lost"
+    )
+    return [Figure("losses", counts)], [Criterion("lost", verdict, sentence)]
 
 
 def _hour(run: WorldRun) -> float:

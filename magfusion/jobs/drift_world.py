@@ -19,7 +19,7 @@ from magfusion.estimation.graph.state import ACCEL_BIAS, GYRO_BIAS, State
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.atomic import abandoned_pattern
 from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
-from magfusion.files.row_file import Mark, RowFile, claim_rows
+from magfusion.files.row_file import RowFile, RowPosition, claim_rows
 from magfusion.jobs.checkpoint import begin, save
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import ImuModel, Site
@@ -30,8 +30,8 @@ from magfusion.simulation.endurance import (
     HOUR,
     Biases,
     EnduranceConfig,
-    Stretch,
-    World,
+    EnduranceWorld,
+    SimulatedStretch,
     draw_endurance,
     usual_drift,
 )
@@ -125,8 +125,8 @@ class _Progress:
 
     biases: Biases
     bare: float
-    errors: Mark | None = None
-    pace: Mark | None = None
+    errors: RowPosition | None = None
+    pace: RowPosition | None = None
 
 
 def declared_site(drive: str, phase_known: bool) -> Site:
@@ -153,7 +153,7 @@ def declared_site(drive: str, phase_known: bool) -> Site:
     )
 
 
-def draw_task(task: WorldTask) -> World:
+def draw_task(task: WorldTask) -> EnduranceWorld:
     """Return the world of a task; it is the same for both estimators."""
     config = EnduranceConfig(
         hours=task.hours,
@@ -179,20 +179,20 @@ def run_world(task: WorldTask, _rng: np.random.Generator | None = None) -> World
     task.progress.parent.mkdir(parents=True, exist_ok=True)
     unmoved = _Progress(world.start(), 0.0)
     begun = begin(task.progress, task.key, world.site, settings, unmoved, resume=True)
-    navigator, progress = begun.navigator, begun.beside
+    navigator, progress = begun.navigator, begun.extra
     with (
         closing(RowFile(task.progress.with_name(_ERROR_ROWS), _ERRORS, progress.errors)) as errors,
         closing(RowFile(task.progress.with_name(_PACE_ROWS), _PACE, progress.pace)) as pace,
     ):
         for stretch in range(begun.position, task.stretches):
-            made = world.stretch(stretch * STRETCH, STRETCH, progress.biases)
-            sample = bare_loop(made.imu, world.site.platform.imu, world.site.gravity)
-            new, own_pace = navigate(navigator, world, made)
+            built = world.stretch(stretch * STRETCH, STRETCH, progress.biases)
+            sample = bare_loop(built.imu, world.site.platform.imu, world.site.gravity)
+            new, own_pace = navigate(navigator, world, built)
             errors.extend({name: getattr(new, name) for name in _ERRORS})
             own_pace = np.column_stack([own_pace, np.full(len(own_pace), sample)])
             pace.extend(dict(zip(PACE, own_pace.T, strict=True)))
-            bare = progress.bare + sample * len(made.imu)
-            progress = _Progress(made.after, bare, errors.settle(), pace.settle())
+            bare = progress.bare + sample * len(built.imu)
+            progress = _Progress(built.after, bare, errors.settle(), pace.settle())
             save(navigator, stretch + 1, progress, task.progress, task.key)
         series, every = _series(errors.rows()), np.column_stack(list(pace.rows().values()))
     if not navigator.started:
@@ -213,21 +213,27 @@ def _series(rows: dict[str, Array]) -> ErrorSeries:
     )
 
 
-def navigate(navigator: Navigator, world: World, made: Stretch) -> tuple[ErrorSeries, Array]:
+def navigate(
+    navigator: Navigator, world: EnduranceWorld, simulation: SimulatedStretch
+) -> tuple[ErrorSeries, Array]:
     """Process a stretch piece by piece; return the errors of its states and their pace."""
     states: list[State] = []
     pace = []
     # A field at its time, then the inertial samples up to the next one.
-    grid = np.arange(made.imu.time[0], made.imu.time[-1], PIECE)
-    starts = np.union1d(grid, made.fields.time)
-    inertial = np.searchsorted(made.imu.time, [*starts, np.inf])
-    detected = np.searchsorted(made.fields.time, [*starts, np.inf])
+    grid = np.arange(simulation.imu.time[0], simulation.imu.time[-1], PIECE)
+    starts = np.union1d(grid, simulation.fields.time)
+    inertial = np.searchsorted(simulation.imu.time, [*starts, np.inf])
+    detected = np.searchsorted(simulation.fields.time, [*starts, np.inf])
     for i in range(len(starts)):
         rows = slice(inertial[i], inertial[i + 1])
         began = time.process_time()
         for k in range(detected[i], detected[i + 1]):
-            navigator.add_fields(made.fields.rows(slice(k, k + 1)))
-        navigator.add_imu(made.imu.time[rows], made.imu.gyro_body[rows], made.imu.accel_body[rows])
+            navigator.add_fields(simulation.fields.rows(slice(k, k + 1)))
+        navigator.add_imu(
+            simulation.imu.time[rows],
+            simulation.imu.gyro_body[rows],
+            simulation.imu.accel_body[rows],
+        )
         # The estimator's own sigmas: those enlarged by its tests would hide a drift.
         new = [replace(s, cov=s.judgement.estimators(s.cov)) for s in navigator.take()]
         spent = time.process_time() - began
@@ -237,10 +243,10 @@ def navigate(navigator: Navigator, world: World, made: Stretch) -> tuple[ErrorSe
         pace.append([starts[i], spent, len(new), memory_mib(), innovation])
         states += new
     stamps = np.array([s.time for s in states])
-    truth = world.truth(made, stamps)
-    return state_errors(states, truth, np.asarray(np.isin(stamps, made.fields.time))), np.array(
-        pace
-    )
+    truth = world.truth(simulation, stamps)
+    return state_errors(
+        states, truth, np.asarray(np.isin(stamps, simulation.fields.time))
+    ), np.array(pace)
 
 
 def state_errors(states: list[State], truth: Trajectory, measured: BoolArray) -> ErrorSeries:

@@ -37,9 +37,9 @@ def run_evaluate(settings: EvaluateSettings) -> Figures:
     from magfusion.results.report import error_figures
 
     true, epoch_ns = _read_truth(settings)
-    found = read_estimate(settings.estimate, epoch_ns)
+    result = read_estimate(settings.estimate, epoch_ns)
     with named(f"{settings.estimate} against {settings.truth}"):
-        errors = error_figures(trajectory_errors(found, true))
+        errors = error_figures(trajectory_errors(result, true))
     return Figures(Figure("job", "evaluate", section=Section.TITLE)) | errors
 
 

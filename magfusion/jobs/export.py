@@ -67,7 +67,7 @@ def run_export(settings: ExportSettings, output: Path, report: Report = quiet) -
     from magfusion.jobs.inputs import named
 
     form = settings.format_of(output)
-    path, told = _source(settings.result)
+    path, reported = _source(settings.result)
     refuse_place(output)
     states = read_result_states(path)
     if output.exists() and output.samefile(path):
@@ -86,12 +86,12 @@ def run_export(settings: ExportSettings, output: Path, report: Report = quiet) -
         Figure("states", total, label="states written"),
         Figure("states_failed", states.left_out, label="states without a pose, omitted"),
     ]
-    lost = told.get("lost_epochs")
-    if isinstance(lost, int):
-        figures.append(Figure("lost_epochs", lost, label="states lost, without a row"))
-    if "verdict" in told:
+    lost_epochs = reported.get("lost_epochs")
+    if isinstance(lost_epochs, int):
+        figures.append(Figure("lost_epochs", lost_epochs, label="states lost, without a row"))
+    if "verdict" in reported:
         figures.append(
-            Figure("result_verdict", str(told["verdict"]), label="verdict of the result")
+            Figure("result_verdict", str(reported["verdict"]), label="verdict of the result")
         )
     return Figures(*figures)
 
@@ -106,13 +106,13 @@ def _source(result: Path) -> tuple[Path, dict[str, object]]:
             )
         return result, {}
     try:
-        told = json.loads((result / "report.json").read_text(encoding="utf-8"))
+        reported = json.loads((result / "report.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        told = {}
-    told = told if isinstance(told, dict) else {}
+        reported = {}
+    reported = reported if isinstance(reported, dict) else {}
     table = result / "trajectory.parquet"
     if not table.is_file():
-        if told.get("verdict") == "failed":
+        if reported.get("verdict") == "failed":
             raise InputError(
                 f"{result}: its verdict is failed, so that there is no trajectory to export; see"
                 " its report.json for the reason"
@@ -120,7 +120,7 @@ def _source(result: Path) -> tuple[Path, dict[str, object]]:
         raise InputError(
             f"{result}: has no trajectory.parquet; give the result of smooth, fix or navigate"
         )
-    return table, told
+    return table, reported
 
 
 COMMAND = Command(

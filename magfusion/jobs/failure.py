@@ -52,11 +52,11 @@ def failed_figures(
 
 
 def _read(path: Path) -> Figures:
-    told = json.loads(path.read_text(encoding="utf-8"))
+    reported = json.loads(path.read_text(encoding="utf-8"))
     return Figures(
         *(
             Figure(name, value, section=_SHOWN.get(name, Section.REPORT))
-            for name, value in told.items()
+            for name, value in reported.items()
         )
     )
 

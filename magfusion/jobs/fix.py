@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.data_checks.recording import BRIDGED, recorded
-from magfusion.estimation.integrity.place_witness import of_place
+from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
+from magfusion.estimation.integrity.region_test import of_place
 from magfusion.estimation.snapshot.ambiguity import relations
 from magfusion.estimation.snapshot.explained_fixes import explained_fixes
 from magfusion.estimation.snapshot.fix_magnetometers import contradicting_magnetometers
-from magfusion.estimation.snapshot.problem import FREE
+from magfusion.estimation.snapshot.problem import ESTIMABLE
 from magfusion.files.fix_table import write_hypotheses
 from magfusion.files.survey import read_survey
 from magfusion.files.trajectory_table import write_trajectory
@@ -26,7 +26,7 @@ from magfusion.jobs.settings import Command, RiskSettings, WindowSettings, optio
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.progress import Report, quiet
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import Finding, Trust, alike
+from magfusion.model.trust import Finding, Trust, uniform_trust
 from magfusion.papers.p004_fingerprints.algorithms import fix_as_published
 from magfusion.papers.p004_fingerprints.fingerprint import fingerprint_database
 from magfusion.papers.p004_fingerprints.rotating import rotating_beacons, rotating_fields
@@ -105,19 +105,26 @@ def run(settings: FixSettings, output: Path, report: Report = quiet) -> Figures:
     job = settings.job(output)
     if settings.method != "likelihood":
         return run_published_fix(job, settings)
-    free = _free(settings.free)
+    free_parameters = _read_free_parameters(settings.free)
     lockin = settings.lockin(job)
-    return run_fix(job, lockin=lockin, free=free, risk=settings.risks, rest=settings, report=report)
+    return run_fix(
+        job,
+        lockin=lockin,
+        free_parameters=free_parameters,
+        risk=settings.risks,
+        rest=settings,
+        report=report,
+    )
 
 
-def _free(text: str | None) -> tuple[str, ...]:
+def _read_free_parameters(text: str | None) -> tuple[str, ...]:
     """Parse ``phase,gain`` or either."""
     chosen = () if text is None else tuple(part.strip() for part in text.split(","))
-    unknown = [part for part in chosen if part not in FREE]
+    unknown = [part for part in chosen if part not in ESTIMABLE]
     if unknown:
         raise InputError(
             f"--free {text!r}: {unknown[0] or 'nothing'} cannot be estimated with the pose; choose"
-            f" from {', '.join(FREE)}"
+            f" from {', '.join(ESTIMABLE)}"
         )
     return chosen
 
@@ -126,7 +133,7 @@ def run_fix(
     job: Job,
     *,
     lockin: LockinSettings | None = None,
-    free: tuple[str, ...] = (),
+    free_parameters: tuple[str, ...] = (),
     risk: Risk | None = None,
     rest: RestSettings | None = None,
     report: Report = quiet,
@@ -135,7 +142,7 @@ def run_fix(
 
     Parameters
     ----------
-    free : tuple of str
+    free_parameters : tuple of str
         Parameters estimated with the pose in any case, as in
         `magfusion.estimation.snapshot.explained_fixes`.
     risk : Risk, optional
@@ -157,31 +164,36 @@ def run_fix(
     began = time.perf_counter()
     report("demodulating", 0, 3)
     if len(site.platform.magnetometer.axes) == 1:
-        return _run_coil(claimed, job, log, site, lockin, free, report)
+        return _run_coil(claimed, job, log, site, lockin, free_parameters, report)
     with named(job.log_path):
         rested = None if rest is None else rest.integrated(log, site, lockin)
         recording, log = log, log if rested is None else rested.log(log)
         phasor_samples, dropped = phasors(log, site, lockin)
-    hearing = None if rested is None else rested.hearing(site)
-    if rested is not None and not np.any(rested.heard):
+    detection = None if rested is None else rested.detection(site)
+    if rested is not None and not np.any(rested.detected):
         raise EstimationError(f"{job.log_path}: {rested.findings[0].text}")
     report("fixing", 1, 3)
     calibration = initial_calibration(site, float(np.mean(phasor_samples.time)))
     samples, gravity = fix_inputs(phasor_samples, log, site)
-    found = explained_fixes(
-        samples, calibration, gravity=gravity, free=free, risk=risk, report=report
+    result = explained_fixes(
+        samples,
+        calibration,
+        gravity=gravity,
+        free_parameters=free_parameters,
+        risk=risk,
+        report=report,
     )
     report("done", 3, 3)
-    fixes, states = found.fixes, found.states
-    of_log = recorded(recording, site, BRIDGED, beacons=True, hearing=hearing)
-    trust = _trust(found, samples, calibration, of_log)
+    fixes, states = result.fixes, result.states
+    of_log = recorded(recording, site, BRIDGED_CODES, beacons=True, detection=detection)
+    trust = _trust(result, samples, calibration, of_log)
     of_rests = Figures()
     if rested is not None:
         trust |= Trust(rested.findings)
         dropped, of_rests = rested.dropped, rest_figures(rested)
     figures = heading("fix", log.name) | trust_figures(trust) | fix_figures(fixes, site)
     figures |= dropped_figures(dropped) | level_figures(states) | of_rests
-    figures |= Figures(where_found("gain_spread", found.gain_spread > 0.0, found.gain_spread))
+    figures |= Figures(where_found("gain_spread", result.gain_spread > 0.0, result.gain_spread))
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     with claimed as whole:
         directory = found_in(whole, trust)
@@ -201,12 +213,12 @@ def _read(
     log, site = read_job(
         job,
         fewer=True,
-        apart=True,
+        separately=True,
         amplitudes=True,
         several=True,
         lockin=lockin,
         reference=by_rests,
-        heard=not by_rests,
+        select_beacons=not by_rests,
         report=report,
     )
     if by_rests and site.platform.magnetometer.lacking:
@@ -217,17 +229,17 @@ def _read(
 
 
 def _trust(
-    found: ExplainedFixes,
+    result: ExplainedFixes,
     samples: FieldSamples,
     calibration: Calibration,
     of_log: tuple[Finding, ...],
 ) -> Trust:
     """Return the findings of fixes, of the place and of several magnetometers; the recording."""
-    fixes = found.fixes
+    fixes = result.fixes
     best = (fixes.world_from_body, fixes.position_world, fixes.pose_cov)
     place = of_place(calibration.site, fixes.time, *(part[:, 0] for part in best))
     several = contradicting_magnetometers(samples, calibration)
-    return found.trust | Trust((*place, *of_log, *several))
+    return result.trust | Trust((*place, *of_log, *several))
 
 
 def _run_coil(
@@ -236,7 +248,7 @@ def _run_coil(
     log: Log,
     site: Site,
     lockin: LockinSettings | None,
-    free: tuple[str, ...],
+    free_parameters: tuple[str, ...],
     report: Report,
 ) -> Figures:
     """Fix a receiver of one axis, whose roll about it is unobservable."""
@@ -246,24 +258,24 @@ def _run_coil(
 
     with named(job.log_path):
         samples, _ = fix_inputs(phasors(log, site, lockin)[0], log, site)
-    found = find_coil(log, samples, site, free, report)
+    result = find_coil(log, samples, site, free_parameters, report)
     with claimed as whole:
-        directory = found_in(whole, found.trust)
+        directory = found_in(whole, result.trust)
         figures = write_fix_result(
             directory,
-            found.log,
+            result.log,
             site,
-            found.fixes,
-            found.figures,
-            found.states,
-            found.trust,
-            relation=found.relation,
-            columns=found.columns,
-            nearest=found.compared,
+            result.fixes,
+            result.figures,
+            result.states,
+            result.trust,
+            relation=result.relation,
+            columns=result.columns,
+            nearest=result.compared,
         )
         if directory != whole:
             (directory / "report.json").rename(whole / "report.json")
-    refuse_failed(job.log_path, job.output, found.trust)
+    refuse_failed(job.log_path, job.output, result.trust)
     return figures
 
 
@@ -291,7 +303,7 @@ def write_fix_result(
     nearest : Trajectory, optional
         Trajectory compared with the truth, if not that of the best hypotheses.
     """
-    from magfusion.results.page_motion import Motion
+    from magfusion.results.page_motion import MotionPage
     from magfusion.results.recording import write_recording
     from magfusion.results.report import compared_with_truth, write_report
 
@@ -322,7 +334,7 @@ def write_fix_result(
         states=states,
     )
     residual = fixes.residual_rms[:, 0]
-    motion = Motion(site, best, log.truth, errors, trust=states, residual=residual)
+    motion = MotionPage(site, best, log.truth, errors, trust=states, residual=residual)
     write_report(directory, figures | compared, motion)
     return figures | compared
 
@@ -341,7 +353,7 @@ def run_published_fix(job: Job, settings: FixSettings) -> Figures:
     """
     from magfusion.estimation.demodulation.demodulation import phasors
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
-    from magfusion.results.page_motion import Motion
+    from magfusion.results.page_motion import MotionPage
     from magfusion.results.recording import write_recording
     from magfusion.results.report import compared_with_truth, dropped_figures, write_report
 
@@ -367,18 +379,18 @@ def run_published_fix(job: Job, settings: FixSettings) -> Figures:
             f" ({reasons}); make the survey where the log was recorded"
         )
     lever_world = fixes.world_from_body @ site.platform.magnetometer.position_body
-    found = Trajectory(
+    result = Trajectory(
         samples.time[fixes.epoch], fixes.world_from_body, fixes.position_world - lever_world
     )
-    errors, compared = compared_with_truth(found, log)
+    errors, compared = compared_with_truth(result, log)
     text = f"--method {settings.method} has no covariance: the accuracy of a pose is unknown."
-    trust = Trust((Finding("no_covariance", text), *recorded(log, site, BRIDGED)))
+    trust = Trust((Finding("no_covariance", text), *recorded(log, site, BRIDGED_CODES)))
     figures = (
         heading("fix", log.name)
         | trust_figures(trust)
         | Figures(
             Figure("method", settings.method),
-            Figure("epochs", len(found)),
+            Figure("epochs", len(result)),
             Figure("fingerprints", len(database)),
         )
     )
@@ -387,12 +399,12 @@ def run_published_fix(job: Job, settings: FixSettings) -> Figures:
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     with claimed as whole:
         directory = found_in(whole, trust)
-        write_tum(found, directory / "trajectory.tum", log.epoch_ns)
-        rows = alike(len(found), trust.verdict)
-        write_trajectory(found, directory / "trajectory.parquet", log.epoch_ns, rows)
+        write_tum(result, directory / "trajectory.tum", log.epoch_ns)
+        rows = uniform_trust(len(result), trust.verdict)
+        write_trajectory(result, directory / "trajectory.parquet", log.epoch_ns, rows)
         recording = directory / "run.rrd"
-        write_recording(recording, site, found, truth=log.truth, errors=errors, trust=trust)
-        write_report(whole, figures, Motion(site, found, log.truth, errors))
+        write_recording(recording, site, result, truth=log.truth, errors=errors, trust=trust)
+        write_report(whole, figures, MotionPage(site, result, log.truth, errors))
     refuse_failed(job.log_path, job.output, trust)
     return figures
 

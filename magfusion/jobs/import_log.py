@@ -14,7 +14,7 @@ from magfusion.files.foreign.columns import STREAMS
 from magfusion.files.foreign.convert import write_stream
 from magfusion.files.foreign.gather import gather
 from magfusion.files.foreign.halves import HALVES, join_halves
-from magfusion.files.foreign.map_file import asked
+from magfusion.files.foreign.map_file import read_request
 from magfusion.files.foreign.plan import Findings
 from magfusion.files.log import HEADER
 from magfusion.files.yaml_files import write_yaml
@@ -26,8 +26,8 @@ from magfusion.units import NANOSECOND
 
 if TYPE_CHECKING:
     from magfusion.files.foreign.convert import Counts
-    from magfusion.files.foreign.gather import Gathered
-    from magfusion.files.foreign.plan import Findings, Plan
+    from magfusion.files.foreign.gather import GatheredStreams
+    from magfusion.files.foreign.plan import Findings, ImportPlan
 
 FIRST = "first"
 LATE = 1e8  # s; stamps that count from 1970, or from another day
@@ -110,15 +110,17 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
     from magfusion.jobs.inputs import claim
     from magfusion.results.report import write_report
 
-    claimed, told = claim(output, "import"), Findings()
+    claimed, declared = claim(output, "import"), Findings()
     if settings.site is not None and not settings.site.is_file():
-        told.problems.append(f"{settings.site}: there is no such file; give the path of a site.")
+        declared.problems.append(
+            f"{settings.site}: there is no such file; give the path of a site."
+        )
     files = {stream: getattr(settings, stream) for stream in STREAMS}
     if not settings.sources and not any(files.values()) and settings.map_file is None:
         raise InputError(
             "no recording given; give a bag, a folder or tables, or --imu FILE --magnetometer FILE"
         )
-    wanted = asked(
+    wanted = read_request(
         files,
         settings.map,
         settings.rate_hz,
@@ -127,56 +129,56 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         settings.delimiter,
         settings.epoch,
         settings.map_file,
-        told,
+        declared,
     )
-    found = gather([Path(source) for source in settings.sources], wanted, told)
-    epoch = _epoch(wanted.epoch, found)
-    _refuse(told)
+    result = gather([Path(source) for source in settings.sources], wanted, declared)
+    epoch = _epoch(wanted.epoch, result)
+    _refuse(declared)
     with claimed as directory:
         counts: dict[str, Counts] = {}
-        for stream, plan in found.plans.items():
-            told_of = partial(_tell, report, stream, plan)
-            told_of(0)
+        for stream, plan in result.plans.items():
+            release_gain = partial(_report_stream, report, stream, plan)
+            release_gain(0)
             try:
-                shared = sum(p.source is plan.source for p in found.plans.values()) > 1
+                shared = sum(p.source is plan.source for p in result.plans.values()) > 1
                 path = directory / f"{stream}.parquet"
-                counts[stream] = write_stream(plan, path, shared, told_of)
+                counts[stream] = write_stream(plan, path, shared, release_gain)
             except InputError as error:
-                told.problems.append(str(error))
+                declared.problems.append(str(error))
         note = ""
-        if set(HALVES) <= set(counts) and not told.problems:
+        if set(HALVES) <= set(counts) and not declared.problems:
             joined = join_halves(directory, counts)
             counts["imu"], note = joined.counts, joined.note
-        _refuse_apart(counts, told)
-        _refuse(told)
+        _refuse_apart(counts, declared)
+        _refuse(declared)
         epoch_ns = _first(counts) if epoch == FIRST else int(epoch)
-        _write_header(directory, output, found, epoch_ns)
+        _write_header(directory, output, result, epoch_ns)
         report("checking", 0, 1)
-        figures = _checked(directory, output, found, settings.site)
+        figures = _checked(directory, output, result, settings.site)
         figures = heading("import", output.resolve().name) | figures
-        figures |= _figures(found, counts, epoch_ns, epoch == FIRST, note)
+        figures |= _figures(result, counts, epoch_ns, epoch == FIRST, note)
         write_report(directory, figures)
     return figures
 
 
-def _tell(report: Report, stream: str, plan: Plan, rows: int) -> None:
+def _report_stream(report: Report, stream: str, plan: ImportPlan, rows: int) -> None:
     report(f"importing {stream}", rows, max(plan.source.count, rows + 1))
 
 
-def _refuse(told: Findings) -> None:
+def _refuse(declared: Findings) -> None:
     """Raise all problems at once, with options that resolve them."""
-    problems = list(dict.fromkeys(told.problems))
+    problems = list(dict.fromkeys(declared.problems))
     if not problems:
         return
-    if len(problems) == 1 and not told.proposals:
+    if len(problems) == 1 and not declared.proposals:
         raise InputError(problems[0])
     count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
     lines = [f"nothing was imported, for {count}:", *(f"  {one}" for one in problems)]
-    if told.guessed:
+    if declared.guessed:
         lines += ["recognised by name and unit, and used as is:"]
-        lines += [f"  --map {_quoted(one)}" for one in dict.fromkeys(told.guessed)]
-    if told.proposals:
-        proposals = list(dict.fromkeys(told.proposals))
+        lines += [f"  --map {_quoted(one)}" for one in dict.fromkeys(declared.guessed)]
+    if declared.proposals:
+        proposals = list(dict.fromkeys(declared.proposals))
         lines += ["proposed by name and size; check it, and add it to the command:"]
         lines += [f"  --map {_quoted(one)} \\" for one in proposals[:-1]]
         lines += [f"  --map {_quoted(proposals[-1])}"]
@@ -187,29 +189,29 @@ def _quoted(text: str) -> str:
     return shlex.quote(text)
 
 
-def _epoch(text: str | None, found: Gathered) -> str | int:
+def _epoch(text: str | None, result: GatheredStreams) -> str | int:
     """Return the epoch (ns), or `FIRST`."""
     if text is None:
-        return FIRST if found.stamped else 0
+        return FIRST if result.stamped else 0
     if text == FIRST:
         return FIRST
     try:
         return int(text)
     except ValueError:
         pass
-    if not found.bags:
-        found.told.problems.append(
+    if not result.bags:
+        result.findings.problems.append(
             f"--epoch {text!r}: write a stamp in ns, or first; a topic requires a bag."
         )
         return 0
     try:
-        return first_stamp(found.bags[0], text)
+        return first_stamp(result.bags[0], text)
     except InputError as error:
-        found.told.problems.append(str(error))
+        result.findings.problems.append(str(error))
         return 0
 
 
-def _refuse_apart(counts: dict[str, Counts], told: Findings) -> None:
+def _refuse_apart(counts: dict[str, Counts], declared: Findings) -> None:
     """Reject streams whose times do not overlap: they are of different clocks."""
     if not {"imu", "magnetometer"} <= set(counts):
         return
@@ -220,7 +222,7 @@ def _refuse_apart(counts: dict[str, Counts], told: Findings) -> None:
                 f"{stream} {c.first * NANOSECOND:.9g} to {c.last * NANOSECOND:.9g} s"
                 for stream, c in (("imu", one), (name, other))
             ]
-            told.problems.append(
+            declared.problems.append(
                 f"the times of imu and {name} do not overlap ({', '.join(spans)}): bring them to"
                 " one clock, by the unit of a time, --offset TABLE=SECONDS or --rate-hz"
                 " TABLE=HZ@SECONDS."
@@ -232,22 +234,22 @@ def _first(counts: dict[str, Counts]) -> int:
     return (counts["imu"] if "imu" in counts else counts["magnetometer"]).first
 
 
-def _write_header(directory: Path, output: Path, found: Gathered, epoch_ns: int) -> None:
+def _write_header(directory: Path, output: Path, result: GatheredStreams, epoch_ns: int) -> None:
     source = "imported: " + ", ".join(
-        dict.fromkeys(plan.source.place for plan in found.plans.values())
+        dict.fromkeys(plan.source.place for plan in result.plans.values())
     )
     header = {"magfusion_log": 1, "name": output.resolve().name, "epoch_ns": epoch_ns}
     write_yaml(header | {"source": source}, directory / HEADER)
 
 
-def _checked(directory: Path, output: Path, found: Gathered, site: Path | None) -> Figures:
+def _checked(directory: Path, output: Path, result: GatheredStreams, site: Path | None) -> Figures:
     """Return the findings of the check of the log, with the final file names."""
     try:
         figures = run_check(CheckSettings(log=directory, site=site))
     except InputError as error:
         sentence = str(error)
-        halves = [plan for stream, plan in found.plans.items() if stream in ("gyro", "accel")]
-        plans = found.plans | ({"imu": halves[0]} if halves else {})
+        halves = [plan for stream, plan in result.plans.items() if stream in ("gyro", "accel")]
+        plans = result.plans | ({"imu": halves[0]} if halves else {})
         for stream, plan in plans.items():
             file = str(directory / f"{stream}.parquet")
             if file in sentence:
@@ -258,12 +260,12 @@ def _checked(directory: Path, output: Path, found: Gathered, site: Path | None) 
     return Figures(*(f for f in figures.all if f.section is not Section.TITLE))
 
 
-def _place(plan: Plan) -> str:
+def _place(plan: ImportPlan) -> str:
     return f"{plan.source.place} as {plan.stream} by {', '.join(plan.options())}"
 
 
 def _figures(
-    found: Gathered, counts: dict[str, Counts], epoch_ns: int, is_first: bool, note: str
+    result: GatheredStreams, counts: dict[str, Counts], epoch_ns: int, is_first: bool, note: str
 ) -> Figures:
     """Return the numbers of read and omitted rows, and the interpreted columns."""
     figures = Figures(
@@ -284,15 +286,15 @@ def _figures(
                 for reason, count in one.left_out.items()
             ),
         )
-    forms = {p.source.place: p.source.form for p in found.plans.values() if p.source.form}
-    lines = [line for plan in found.plans.values() for line in plan.options()]
+    forms = {p.source.place: p.source.form for p in result.plans.values() if p.source.form}
+    lines = [line for plan in result.plans.values() for line in plan.options()]
     shown = [f"{place}: {form}" for place, form in forms.items()]
     shown += ["interpreted as:", *(f"  --map {_quoted(line)}" for line in lines)]
     figures |= Figures(
         Figure("map", lines, section=Section.REPORT),
         Figure("understood", shown, section=Section.REMARKS),
     )
-    notes = [f"Skipped: {reason}" for reason in found.passed_over]
+    notes = [f"Skipped: {reason}" for reason in result.passed_over]
     notes += [note] if note else []
     begin = (_first(counts) - epoch_ns) * 1e-9
     if not is_first and abs(begin) > LATE:

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from magfusion.errors import InputError
-from magfusion.estimation.data_checks.mending import mended
+from magfusion.estimation.data_checks.data_cleaning import clean_log
 from magfusion.estimation.data_checks.tones import transmitted
 from magfusion.files.atomic import whole_file
 from magfusion.files.instruments import UNNAMED, imus, magnetometers, named_imu, named_magnetometer
@@ -56,19 +56,19 @@ def run_init(settings: InitSettings, output: Path) -> Figures | None:
         return None
     if output.exists() or output.is_symlink():
         raise InputError(f"{output}: already exists; give another file with -o, or remove it")
-    heard = _heard(settings)
-    settings, heard = _asked(settings, heard)
-    draft, findings = _draft(settings, heard)
+    transmitted = _detect_transmitters(settings)
+    settings, transmitted = _complete_settings(settings, transmitted)
+    draft, findings = _draft(settings, transmitted)
     _write(site_text(draft), output)
     findings += [Finding("assumed", f"{sentence}.") for sentence in to_do(draft)]
     return (
         heading("init", output.name)
         | trust_figures(Trust(tuple(findings)))
-        | _figures(draft, heard)
+        | _figures(draft, transmitted)
     )
 
 
-def _heard(settings: InitSettings) -> Transmitted | None:
+def _detect_transmitters(settings: InitSettings) -> Transmitted | None:
     """Return the transmitters in the recording, if there is one."""
     if settings.log is None:
         return None
@@ -81,47 +81,49 @@ def _heard(settings: InitSettings) -> Transmitted | None:
             " frequency_hz with each --beacon"
         )
     site = _bare_site(settings)
-    found = transmitted(mended(log, site), site if settings.mounting is not None else None)
-    if found is None:
+    result = transmitted(clean_log(log, site), site if settings.mounting is not None else None)
+    if result is None:
         raise InputError(
             f"{settings.log}: is too short for a spectrum; record at least ten seconds, or omit"
             " --log"
         )
-    if not found.tones and not settings.beacon:
-        others = f" ({'; '.join(found.others)})" if found.others else ""
+    if not result.tones and not settings.beacon:
+        others = f" ({'; '.join(result.others)})" if result.others else ""
         raise InputError(
             f"{settings.log}: the magnetometer's spectrum has no significant tone{others}; switch"
             " the beacons on, or describe them with --beacon"
         )
-    return found
+    return result
 
 
-def _asked(
-    settings: InitSettings, heard: Transmitted | None
+def _complete_settings(
+    settings: InitSettings, transmitted: Transmitted | None
 ) -> tuple[InitSettings, Transmitted | None]:
     """Prompt for undeclared values on a terminal."""
     if settings.described:
-        return settings, heard
+        return settings, transmitted
     if sys.stdin is not None and sys.stdin.isatty():
         if settings.log is None:
             settings = replace(settings, log=recording())
-            heard = _heard(settings)
-        return answered(settings, () if heard is None else heard.tones), heard
-    if heard is None:
+            transmitted = _detect_transmitters(settings)
+        return answered(settings, () if transmitted is None else transmitted.tones), transmitted
+    if transmitted is None:
         raise InputError(
             "no description given; give --beacon, --log or --imu (see magfusion init --help), or"
             " run it on a terminal for questions"
         )
-    return settings, heard
+    return settings, transmitted
 
 
-def _draft(settings: InitSettings, heard: Transmitted | None) -> tuple[SiteDraft, list[Finding]]:
+def _draft(
+    settings: InitSettings, transmitted: Transmitted | None
+) -> tuple[SiteDraft, list[Finding]]:
     beacons = [beacon_draft(text) for text in settings.beacon]
     names = [beacon.name for beacon in beacons]
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"--beacon {name}: is given twice; use unique names")
-    beacons, findings = _with_tones(beacons, heard)
+    beacons, findings = _with_tones(beacons, transmitted)
     place = None if settings.location is None else place_of(settings.location)
     lever, mounting = settings.lever, settings.mounting
     return SiteDraft(
@@ -136,30 +138,32 @@ def _draft(settings: InitSettings, heard: Transmitted | None) -> tuple[SiteDraft
 
 
 def _with_tones(
-    beacons: list[BeaconDraft], heard: Transmitted | None
+    beacons: list[BeaconDraft], transmitted: Transmitted | None
 ) -> tuple[list[BeaconDraft], list[Finding]]:
     """Return the beacons with the tones of the recording, and findings on their consistency."""
     silent = [beacon.name for beacon in beacons if beacon.frequency_hz is None]
-    if heard is None:
+    if transmitted is None:
         if silent:
             raise InputError(
                 f"--beacon {silent[0]}: frequency_hz is missing; give it in Hz, or a recording with"
                 " --log, in which to find it"
             )
         return beacons, []
-    free = _free_tones(beacons, heard.tones)
-    findings = _switched_off(beacons, heard.tones, free)
-    if len(silent) > 1 or (silent and len(free) != 1):
+    free_slots = _free_tones(beacons, transmitted.tones)
+    findings = _switched_off(beacons, transmitted.tones, free_slots)
+    if len(silent) > 1 or (silent and len(free_slots) != 1):
         raise InputError(
             f"--beacon {silent[0]}: frequency_hz is missing, and the recording does not determine"
-            f" it (significant: {_listed(free) or 'no other tone'}); give frequency_hz"
+            f" it (significant: {_listed(free_slots) or 'no other tone'}); give frequency_hz"
         )
     if not beacons:
-        tones = zip(_names(), heard.tones, strict=False)
+        tones = zip(_names(), transmitted.tones, strict=False)
         return [_of_tone(BeaconDraft(name), tone) for name, tone in tones], findings
     if silent:
-        return [_of_tone(b, free[0]) if b.frequency_hz is None else b for b in beacons], findings
-    return beacons, findings + _undeclared(free)
+        return [
+            _of_tone(b, free_slots[0]) if b.frequency_hz is None else b for b in beacons
+        ], findings
+    return beacons, findings + _undeclared(free_slots)
 
 
 def _near(tone: Tone, frequencies_hz: Iterable[float]) -> bool:
@@ -174,7 +178,7 @@ def _free_tones(beacons: list[BeaconDraft], tones: Iterable[Tone]) -> list[Tone]
 
 
 def _switched_off(
-    beacons: list[BeaconDraft], tones: Iterable[Tone], free: list[Tone]
+    beacons: list[BeaconDraft], tones: Iterable[Tone], free_slots: list[Tone]
 ) -> list[Finding]:
     """Return which frequencies of beacons are not in a recording, and the other tones."""
     return [
@@ -182,7 +186,7 @@ def _switched_off(
             "silent_beacon",
             f"beacon {beacon.name} is not detected at {f:g} Hz in the recording: it is switched"
             " off, far away, or has another frequency"
-            f" ({_listed(free) or 'no other tone is significant'}).",
+            f" ({_listed(free_slots) or 'no other tone is significant'}).",
         )
         for beacon in beacons
         for f in beacon.frequency_hz or ()
@@ -240,11 +244,11 @@ def _write(text: str, output: Path) -> None:
         try:
             load_site(unfinished, unknown=True, without=True)
         except InputError as error:
-            said = str(error).replace(f"{unfinished}: ", "")
-            raise InputError(f"the description is not a valid site: {said}") from error
+            findings = str(error).replace(f"{unfinished}: ", "")
+            raise InputError(f"the description is not a valid site: {findings}") from error
 
 
-def _figures(draft: SiteDraft, heard: Transmitted | None) -> Figures:
+def _figures(draft: SiteDraft, transmitted: Transmitted | None) -> Figures:
     figures = Figures(
         Figure("beacons", len(draft.beacons)),
         Figure("imu", draft.imu.name),
@@ -255,15 +259,15 @@ def _figures(draft: SiteDraft, heard: Transmitted | None) -> Figures:
         figures |= Figures(
             Figure("frequency_{beacon}_hz", beacon.frequency_hz[0], "Hz", beacon=beacon.name)
         )
-    if heard is not None:
-        found = [
+    if transmitted is not None:
+        result = [
             f"{tone.frequency_hz:.5f} ± {tone.sigma_hz:.5f} Hz, {1e9 * tone.amplitude:.3g} nT,"
             f" axes 1:{1.0 / max(tone.roundness, 1e-3):.3g}"
-            for tone in heard.tones
+            for tone in transmitted.tones
         ]
         figures |= Figures(
-            Figure("tones", found, label="tones in the recording"),
-            Figure("other_lines", list(heard.others), section=Section.REPORT),
+            Figure("tones", result, label="tones in the recording"),
+            Figure("other_lines", list(transmitted.others), section=Section.REPORT),
         )
     return figures
 

@@ -30,7 +30,7 @@ def recording() -> Path | None:
             raise InputError(f"{path}: there is no such file or directory")
         return path
 
-    return _ask("A log with the beacons switched on, to find their tones in", there)
+    return _prompt("A log with the beacons switched on, to find their tones in", there)
 
 
 def answered(settings: InitSettings, tones: Iterable[Tone]) -> InitSettings:
@@ -41,18 +41,18 @@ def answered(settings: InitSettings, tones: Iterable[Tone]) -> InitSettings:
     tones : iterable of Tone
         Of the recording; the name of each is a question.
     """
-    heard = list(tones)
+    detected = list(tones)
     beacons: list[str] = []
-    for tone in heard:
+    for tone in detected:
         coils = "two coils" if tone.rotating else "one coil"
         _SCREEN.print(
             f"{tone.meant_hz:g} Hz, {coils}, {1e9 * tone.amplitude:.3g} nT:", style="bold"
         )
         beacons += _beacon(beacons, tone)
-    while not heard and (more := _beacon(beacons, None)):
+    while not detected and (more := _beacon(beacons, None)):
         beacons += more
-    imu = _ask("IMU (--list-imus lists them)", lambda text: named_imu(text).name, UNNAMED)
-    magnetometer = _ask(
+    imu = _prompt("IMU (--list-imus lists them)", lambda text: named_imu(text).name, UNNAMED)
+    magnetometer = _prompt(
         "Magnetometer (--list-magnetometers)", lambda text: named_magnetometer(text).name, UNNAMED
     )
     return replace(
@@ -60,28 +60,28 @@ def answered(settings: InitSettings, tones: Iterable[Tone]) -> InitSettings:
         beacon=tuple(beacons),
         imu=imu,
         magnetometer=magnetometer,
-        lever=_ask("Magnetometer from the IMU, in its axes: x,y,z in m", _vector),
-        mounting=_ask("Magnetometer against the IMU: roll,pitch,yaw in degrees", _vector),
-        location=_ask("Latitude,longitude,height,date, for gravity and heading", _place),
+        lever=_prompt("Magnetometer from the IMU, in its axes: x,y,z in m", _vector),
+        mounting=_prompt("Magnetometer against the IMU: roll,pitch,yaw in degrees", _vector),
+        location=_prompt("Latitude,longitude,height,date, for gravity and heading", _place),
     )
 
 
 def _beacon(before: list[str], tone: Tone | None) -> list[str]:
     """Return a beacon from an option; None if there are no more, or a line is no beacon."""
-    taken = {text.split()[0] for text in before}
-    free = next((c for c in "ABCDEFGHIJKLMNOPQRSTUVWXYZ" if c not in taken), "")
+    selected = {text.split()[0] for text in before}
+    free_parameters = next((c for c in "ABCDEFGHIJKLMNOPQRSTUVWXYZ" if c not in selected), "")
 
     def new(text: str) -> str:
-        if text in taken:
+        if text in selected:
             raise InputError(f"{text} is already described; give another name")
         if text:
             beacon_draft(text)
         return text
 
     if tone is None:
-        name = _ask(f"Name of {'the first' if not before else 'another'} beacon", new)
+        name = _prompt(f"Name of {'the first' if not before else 'another'} beacon", new)
     else:
-        name = _ask("  Name (- if it is no beacon of yours)", new, free)
+        name = _prompt("  Name (- if it is no beacon of yours)", new, free_parameters)
         name = "" if name == "-" else name
     if not name:
         return []
@@ -103,11 +103,11 @@ def _key(words: str, key: str, question: str, usual: str = "", needed: bool = Fa
     def read(text: str) -> str:
         if not text and needed:
             raise InputError("it is required here; or give a recording")
-        said = f" {key}={text.replace(' ', '')}" if text else ""
-        beacon_draft(words + said)
-        return said
+        findings = f" {key}={text.replace(' ', '')}" if text else ""
+        beacon_draft(words + findings)
+        return findings
 
-    return _ask(question, read, usual)
+    return _prompt(question, read, usual)
 
 
 def _vector(text: str) -> str | None:
@@ -122,7 +122,7 @@ def _place(text: str) -> str | None:
     return text or None
 
 
-def _ask(question: str, read: Callable[[str], Answer], usual: str = "") -> Answer:
+def _prompt(question: str, read: Callable[[str], Answer], usual: str = "") -> Answer:
     """Prompt until the answer is valid."""
     shown = f"{question} \\[{usual}]" if usual else question
     while True:

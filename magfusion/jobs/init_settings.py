@@ -36,5 +36,5 @@ class InitSettings(TopicSettings):
     @property
     def described(self) -> bool:
         """Whether the installation itself is described."""
-        said = (self.imu, self.magnetometer, self.lever, self.mounting, self.location)
-        return bool(self.beacon) or any(one is not None for one in said)
+        findings = (self.imu, self.magnetometer, self.lever, self.mounting, self.location)
+        return bool(self.beacon) or any(one is not None for one in findings)

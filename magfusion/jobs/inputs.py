@@ -9,12 +9,12 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.data_checks.data_cleaning import clean_log
 from magfusion.estimation.data_checks.magnetometers import without_silent
-from magfusion.estimation.data_checks.mending import mended
-from magfusion.estimation.demodulation.demodulated_apart import demodulated_apart, of_site
+from magfusion.estimation.demodulation.beacon_selection import select_detected
 from magfusion.estimation.demodulation.drive_reference import turning_currents, with_drives
-from magfusion.estimation.demodulation.hearing import heard_site
-from magfusion.estimation.demodulation.warming import at_reference
+from magfusion.estimation.demodulation.separate_demodulation import demodulated_apart, of_site
+from magfusion.estimation.demodulation.temperature_compensation import at_reference
 from magfusion.estimation.measurements.signs import along_axis
 from magfusion.files.atomic import (
     abandoned_pattern,
@@ -93,18 +93,18 @@ NOT_USED = Finding(
 
 def _may_be_replaced(path: Path, kinds: tuple[str, ...]) -> bool:
     """Return whether a directory contains only an earlier result of these jobs."""
-    found = {entry.name for entry in path.iterdir()}
+    result = {entry.name for entry in path.iterdir()}
     # An incomplete checkpoint of a killed run.
     abandoned = re.compile(abandoned_pattern(r"checkpoint\.(bin|rows)"))
-    found = {name for name in found if not abandoned.fullmatch(name)}
-    if any(found <= UNFINISHED.get(kind, set()) for kind in kinds):
+    result = {name for name in result if not abandoned.fullmatch(name)}
+    if any(result <= UNFINISHED.get(kind, set()) for kind in kinds):
         return True
     try:
         report = json.loads((path / "report.json").read_text(encoding="utf-8"))
         job = report["job"]
     except (OSError, ValueError, KeyError, TypeError):
         return False
-    return job in kinds and found <= WRITTEN[job] | {FAILED, PAGE}
+    return job in kinds and result <= WRITTEN[job] | {FAILED, PAGE}
 
 
 def claim(output: Path, *kinds: str) -> AbstractContextManager[Path]:
@@ -231,12 +231,12 @@ def read_job(
     amplitudes: bool = False,
     reference: bool = False,
     rotor: bool = False,
-    apart: bool = False,
+    separately: bool = False,
     several: bool = False,
     raw: bool = False,
-    anew: bool = False,
+    reread: bool = False,
     lockin: LockinSettings | None = None,
-    heard: bool = True,
+    select_beacons: bool = True,
     report: Report = quiet,
 ) -> tuple[Log, Site]:
     """Read the log and the site of a job, and check their consistency.
@@ -255,17 +255,17 @@ def read_job(
         Whether it uses a reference sensor; if not, that is reported.
     rotor : bool
         Whether it handles the angle of a rotor and a casing itself.
-    apart : bool
+    separately : bool
         Whether each epoch may have a separate phase.
     several : bool
         Whether it accepts several magnetometers.
     raw : bool
         Whether it demodulates the samples of several itself.
-    `anew` : bool
+    `reread` : bool
         Whether it demodulates them again, once the motion is known.
     lockin : LockinSettings, optional
         Demodulation settings for the samples of several magnetometers.
-    `heard` : bool
+    `select_beacons` : bool
         Whether only the beacons detected in a window are used, of many.
 
     Raises
@@ -277,16 +277,16 @@ def read_job(
     log = _as_known(job, _open(job, report), site)
     check_axes(job.declared_path, job.log_path, log, site, fewer=fewer, amplitudes=amplitudes)
     if not rotor:
-        check_rotors(job.declared_path, job.log_path, log, site, apart=apart)
+        check_rotors(job.declared_path, job.log_path, log, site, separately=separately)
     log, site = logged(log, site)
     _require_described(job, log, site)
     if log.waveform is not None:
-        log = mended(log, site)
+        log = clean_log(log, site)
     if log.waveforms and not raw:
         with named(job.log_path):
-            found = demodulated_apart(log, site, lockin, anew=anew)
-        noticed = (*log.noticed, *found.noticed)
-        log, site = without_silent(replace(found.log, noticed=noticed), site)
+            result = demodulated_apart(log, site, lockin, repeated=reread)
+        noticed = (*log.noticed, *result.noticed)
+        log, site = without_silent(replace(result.log, noticed=noticed), site)
     elif log.fields is not None:
         with named(job.log_path):
             log = replace(log, fields=along_axis(order_channels(log.fields, site), site))
@@ -298,10 +298,10 @@ def read_job(
     if log.reference is not None and not reference:
         log = replace(log, reference=None, noticed=(*log.noticed, NOT_USED))
     log, site = at_reference(log, site)
-    if not heard:
+    if not select_beacons:
         return log, site
     with named(job.log_path):
-        return heard_site(log, site)
+        return select_detected(log, site)
 
 
 def _require_described(job: Job, log: Log, site: Site) -> None:
@@ -360,7 +360,7 @@ def read_recording(job: Job, report: Report = quiet) -> tuple[Log, Site | None]:
                 without=True,
                 fewer=True,
                 rotor=is_for_ranging(site),
-                apart=True,
+                separately=True,
                 several=True,
                 raw=True,
                 report=report,
@@ -371,7 +371,7 @@ def read_recording(job: Job, report: Report = quiet) -> tuple[Log, Site | None]:
                     " the samples; give the log with magnetometer.parquet"
                 )
             return log, site
-        return mended(_open(job, report), site), site
+        return clean_log(_open(job, report), site), site
     return open_log(job.log_path, job.start, job.end, job.topics, report), None
 
 

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from magfusion.estimation.batch.chain import Start
-from magfusion.estimation.batch.joint import Said
+from magfusion.estimation.batch.joint import LogReport
 from magfusion.estimation.batch.joint_log import OfLog
-from magfusion.estimation.batch.prepared import Begun
-from magfusion.estimation.posterior.condensed import Condensed
+from magfusion.estimation.batch.preprocessed_log import WarmStart
+from magfusion.estimation.posterior.marginalized_log import MarginalizedLog
 from magfusion.estimation.posterior.noise_tuning import Tuned
-from magfusion.files.kept import Kept, load_kept, save_kept
+from magfusion.files.kept import StoredArrays, load_kept, save_kept
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -61,16 +61,16 @@ def save_alone(path: Path, key: str, alone: Alone) -> None:
         "drift": begun.declared.drift,
         "chosen": begun.start.chosen,
         "determined": begun.start.determined,
-        "said_step": log.said.step,
+        "said_step": log.report.step,
     }
-    arrays |= {f"said_{name}": part for name, part in vars(log.said.part).items()}
+    arrays |= {f"said_{name}": part for name, part in vars(log.report.part).items()}
     facts = {
         "table": alone.facts,
-        "noise": [[t.owner, t.key, t.declared, t.found] for t in log.noise],
+        "noise": [[t.owner, t.key, t.declared, t.estimated] for t in log.noise],
         "rival_chi_square": begun.rival_chi_square,
         **{name: getattr(begun.declared, name) for name in _SCALARS},
     }
-    save_kept(path, key, Kept(arrays, facts))
+    save_kept(path, key, StoredArrays(arrays, facts))
 
 
 def load_alone(path: Path, key: str, site: Site) -> Alone | None:
@@ -96,17 +96,19 @@ def load_alone(path: Path, key: str, site: Site) -> Alone | None:
         determined=np.asarray(arrays["determined"], dtype=bool),
     )
     rival = _states_in(arrays, _RIVAL) if f"{_RIVAL}time" in arrays else None
-    begun = Begun(states, declared, start, facts["rival_chi_square"], rival)
-    part = Condensed(**{name: arrays[f"said_{name}"] for name in Condensed.__dataclass_fields__})
+    begun = WarmStart(states, declared, start, facts["rival_chi_square"], rival)
+    part = MarginalizedLog(
+        **{name: arrays[f"said_{name}"] for name in MarginalizedLog.__dataclass_fields__}
+    )
     noise = tuple(Tuned(*one) for one in facts["noise"])
     standing = np.asarray(arrays["standing"], dtype=bool)
-    said = Said(arrays["said_step"], part)
-    return Alone(OfLog(begun, arrays["steps"], noise, standing, said), facts["table"])
+    findings = LogReport(arrays["said_step"], part)
+    return Alone(OfLog(begun, arrays["steps"], noise, standing, findings), facts["table"])
 
 
 def _of_states(states: Trajectory, prefix: str) -> dict[str, Array]:
-    found = {f"{prefix}{name}": getattr(states, name) for name in _STATES}
-    return {name: value for name, value in found.items() if value is not None}
+    result = {f"{prefix}{name}": getattr(states, name) for name in _STATES}
+    return {name: value for name, value in result.items() if value is not None}
 
 
 def _states_in(arrays: Any, prefix: str) -> Trajectory:

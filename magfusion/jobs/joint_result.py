@@ -18,9 +18,9 @@ from magfusion.jobs.joint_tasks import together_settings
 from magfusion.model.parameters import Calibration
 from magfusion.model.progress import Report
 from magfusion.results.figures import (
-    Estimate,
     Figure,
     Figures,
+    ParameterEstimate,
     Section,
     determined_figures,
     heading,
@@ -82,13 +82,13 @@ def run_joint(
     estimates = parameter_estimates(joint.shared.declared, calibration, blocks, cov)
     figures = heading(command, name) | _figures(joint, calibration, cov, estimates, writes=writes)
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
-    found = observability(calibration, blocks, cov)
+    result = observability(calibration, blocks, cov)
     with claimed as whole:
         keep_results(whole, [(t.name, t.kept, t.job.output) for t in tasks])
         save_site(refined_site(calibration, blocks, cov, estimates, name), whole / "site.yaml")
         write_rows(whole / LOGS_TABLE, joint.table)
         if not writes:
-            ratios = found.ratio_but_for_gauge, found.direction_ratio
+            ratios = result.ratio_but_for_gauge, result.direction_ratio
             write_log_calibration_plot(whole / "calibration.png", estimates, *ratios)
         write_report(whole, figures)
     return figures
@@ -96,22 +96,27 @@ def run_joint(
 
 def _calibration(joint: Joint) -> Calibration:
     """Return the joint calibration, with the noise estimated from the logs (geometric mean)."""
-    found: dict[tuple[str, str], list[Tuned]] = {}
+    result: dict[tuple[str, str], list[Tuned]] = {}
     for log in joint.logs:
         for tuned in log.noise:
-            found.setdefault((tuned.owner, tuned.key), []).append(tuned)
+            result.setdefault((tuned.owner, tuned.key), []).append(tuned)
     noise = [
-        replace(every[0], found=float(np.exp(np.mean(np.log([t.found for t in every])))))
-        for every in found.values()
+        replace(every[0], estimated=float(np.exp(np.mean(np.log([t.estimated for t in every])))))
+        for every in result.values()
     ]
     return with_noise(joint.shared.moved(joint.known.step), noise)
 
 
 def _figures(
-    joint: Joint, calibration: Calibration, cov: Array, estimates: list[Estimate], *, writes: bool
+    joint: Joint,
+    calibration: Calibration,
+    cov: Array,
+    estimates: list[ParameterEstimate],
+    *,
+    writes: bool,
 ) -> Figures:
     section = Section.REPORT if writes else Section.DIRECTIONS
-    found = observability(calibration, joint.shared.blocks, cov)
+    result = observability(calibration, joint.shared.blocks, cov)
     return (
         trust_figures(joint.trust)
         | Figures(
@@ -119,7 +124,7 @@ def _figures(
             Figure("logs_used", sum(row["used"] == "yes" for row in joint.table)),
             Figure("rounds", joint.rounds),
         )
-        | observability_figures(estimates, found, section)
+        | observability_figures(estimates, result, section)
         | Figures(*estimates)
         | determined_figures(estimates)
     )

@@ -15,15 +15,15 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.batch.batch import SmootherSettings
 from magfusion.estimation.batch.joint import (
-    Known,
     Shared,
+    SharedCalibration,
     apart_in_sigmas,
     between,
     known_by,
     uncoupled,
 )
 from magfusion.estimation.batch.joint_log import OfLog
-from magfusion.estimation.integrity.logs_agree import Agreement, agreement
+from magfusion.estimation.integrity.logs_agree import LogAgreement, agreement
 from magfusion.files.atomic import real
 from magfusion.files.checkpoint import run_key
 from magfusion.files.kept import digest_of_files
@@ -42,10 +42,10 @@ from magfusion.model.progress import Report
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk, Trust, Verdict
 from magfusion.results.provenance import versions
-from magfusion.simulation.monte_carlo import Crew, crew
+from magfusion.simulation.monte_carlo import WorkerPool, worker_pool
 from magfusion.units import Rate
 
-SETTLED = 1e-6  # sigmas; a step of the shared calibration that ends the rounds
+CONVERGED_STEP = 1e-6  # sigmas; a step of the shared calibration that ends the rounds
 MOST_ROUNDS = 20
 LARGE = 0.5  # sigmas; rounds that move it by more, and by more each time, are held back
 SMALLEST_SHARE = 0.25
@@ -59,7 +59,7 @@ class Joint:
 
     Parameters
     ----------
-    known : Known
+    known : SharedCalibration
         Of the shared calibration.
     excess : float
         Factor on its variances, as the logs contradict each other.
@@ -70,7 +70,7 @@ class Joint:
     """
 
     shared: Shared
-    known: Known
+    known: SharedCalibration
     excess: float
     logs: tuple[OfLog, ...]
     table: list[dict[str, Any]]
@@ -109,14 +109,14 @@ def tasks_of(jobs: Sequence[Job], smoother: SmootherSettings, output: Path) -> l
 
 def _one_site(jobs: Sequence[Job], smoother: SmootherSettings) -> str:
     """Return the digest of the one site of several logs."""
-    found = {}
+    result = {}
     for job in jobs:
         path = job.declared_path
         read_site(job)
-        beside = [path.with_name(name) for name in _SITE_FILES[1:]]
-        found[digest_of_files([path, *beside])] = path
-    if len(found) > 1:
-        first, other = list(found.values())[:2]
+        others = [path.with_name(name) for name in _SITE_FILES[1:]]
+        result[digest_of_files([path, *others])] = path
+    if len(result) > 1:
+        first, other = list(result.values())[:2]
         raise InputError(
             f"{other}: differs from {first}; logs that refine one site share its file: give it with"
             " --site SITE.yaml"
@@ -128,14 +128,14 @@ def _one_site(jobs: Sequence[Job], smoother: SmootherSettings) -> str:
             " nothing to refine together; declare the uncertainty of the survey, keep --coupling"
             " tight and --estimate as they are, or smooth each log on its own"
         )
-    return next(iter(found))
+    return next(iter(result))
 
 
 def _names(paths: list[Path]) -> list[str]:
     """Return a name for each log: its own, with parent directories where it is not unique."""
     parts = [real(path).with_suffix("").parts[1:] for path in paths]
-    most = max(len(p) for p in parts)
-    for count in range(1, most + 1):
+    maximum = max(len(p) for p in parts)
+    for count in range(1, maximum + 1):
         names = ["_".join(p[-count:]) for p in parts]
         if len(set(names)) == len(names):
             return names
@@ -168,7 +168,7 @@ def refine(
     """
     site = _declared(tasks)
     shared = shared_of(site, tasks[0].smoother)
-    with crew(len(tasks), cluster=cluster, workers=workers) as hands:
+    with worker_pool(len(tasks), cluster=cluster, workers=workers) as hands:
         first = hands.run(alone, tasks, report=_staged(report, "smoothing each log alone"))
         some = [
             (task, one.log)
@@ -186,8 +186,8 @@ def refine(
         # Given the prior of the others, a robust loss soon rejects contradicting measurements.
         agreed = before if any(before.of_log) else _agreement(used, logs, shared)
         given = [
-            LastTask(one, agreed.excess, said, writes, rate, risk)
-            for one, said in zip(
+            LastTask(one, agreed.excess, findings, writes, rate, risk)
+            for one, findings in zip(
                 _round_tasks(used, logs, shared, known), agreed.of_log, strict=True
             )
         ]
@@ -198,7 +198,7 @@ def refine(
         _row(task, one.facts, of_used.get(task.name), far.get(task.name))
         for task, one in zip(tasks, first, strict=True)
     ]
-    trust = trust_of_all(table, agreed, _unheard(site, first), moved)
+    trust = trust_of_all(table, agreed, _undetected(site, first), moved)
     return Joint(shared, known, agreed.excess, tuple(logs), table, trust, rounds)
 
 
@@ -213,52 +213,52 @@ def _staged(report: Report, stage: str) -> Report:
 
 
 def _round_tasks(
-    tasks: list[LogTask], logs: list[OfLog], shared: Shared, known: Known
+    tasks: list[LogTask], logs: list[OfLog], shared: Shared, known: SharedCalibration
 ) -> list[RoundTask]:
-    said = [log.said for log in logs]
+    findings = [log.report for log in logs]
     return [
-        RoundTask(task, log, shared, known_by(shared, said[:i] + said[i + 1 :], known.step))
+        RoundTask(task, log, shared, known_by(shared, findings[:i] + findings[i + 1 :], known.step))
         for i, (task, log) in enumerate(zip(tasks, logs, strict=True))
     ]
 
 
-def _agreement(tasks: list[LogTask], logs: list[OfLog], shared: Shared) -> Agreement:
-    said = [log.said for log in logs]
-    known = known_by(shared, said, np.mean([one.step for one in said], axis=0))
-    return agreement(shared, said, [task.name for task in tasks], known)
+def _agreement(tasks: list[LogTask], logs: list[OfLog], shared: Shared) -> LogAgreement:
+    findings = [log.report for log in logs]
+    known = known_by(shared, findings, np.mean([one.step for one in findings], axis=0))
+    return agreement(shared, findings, [task.name for task in tasks], known)
 
 
 def _rounds(
-    hands: Crew, tasks: list[LogTask], logs: list[OfLog], shared: Shared, report: Report
-) -> tuple[list[OfLog], Known, float, int]:
+    hands: WorkerPool, tasks: list[LogTask], logs: list[OfLog], shared: Shared, report: Report
+) -> tuple[list[OfLog], SharedCalibration, float, int]:
     """Repeat until no log moves the shared calibration.
 
     Where a round moves it farther than the one before, as with contradicting logs, further updates
     are damped.
     """
-    at = np.mean([log.said.step for log in logs], axis=0)
-    known = known_by(shared, [log.said for log in logs], at)
+    at = np.mean([log.report.step for log in logs], axis=0)
+    known = known_by(shared, [log.report for log in logs], at)
     moved, share = np.inf, 1.0
     for done in range(MOST_ROUNDS):
         report("refining together", done, MOST_ROUNDS)
         solved = hands.run(one_round, _round_tasks(tasks, logs, shared, known))
         logs = [
-            replace(new, said=between(shared, old.said, new.said, share))
+            replace(new, report=between(shared, old.report, new.report, share))
             for old, new in zip(logs, solved, strict=True)
         ]
-        after = known_by(shared, [log.said for log in logs], known.step)
+        after = known_by(shared, [log.report for log in logs], known.step)
         before, moved = moved, apart_in_sigmas(after.step, known.step, after.cov) / share
         known = after
-        if moved < SETTLED:
+        if moved < CONVERGED_STEP:
             return logs, known, moved, done + 1
         if moved > before and moved > LARGE and done:
             share = max(0.5 * share, SMALLEST_SHARE)
     return logs, known, moved, MOST_ROUNDS
 
 
-def _unheard(site: Site, first: Sequence[Alone]) -> list[str]:
-    heard = {name for one in first for name in one.facts.get("heard", ())}
-    return [beacon.name for beacon in site.beacons if beacon.name not in heard]
+def _undetected(site: Site, first: Sequence[Alone]) -> list[str]:
+    detected = {name for one in first for name in one.facts.get("heard", ())}
+    return [beacon.name for beacon in site.beacons if beacon.name not in detected]
 
 
 def _row(
@@ -275,7 +275,7 @@ def _row(
 
 
 def trust_of_all(
-    table: list[dict[str, Any]], agreed: Agreement, unheard: list[str], moved: float
+    table: list[dict[str, Any]], agreed: LogAgreement, undetected: list[str], moved: float
 ) -> Trust:
     """Return the joint verdict: consistency between the logs, then the findings of each.
 
@@ -283,31 +283,31 @@ def trust_of_all(
     ----------
     table : list of dict
         A row for each log.
-    `unheard` : list of str
+    `undetected` : list of str
         Beacons that are detected in no log.
     moved : float
         Change of the shared calibration in the last round, in sigmas.
     """
-    found = [finding for said in agreed.of_log for finding in said]
-    contradicted = {finding.text for finding in found}
+    result = [finding for findings in agreed.of_log for finding in findings]
+    contradicted = {finding.text for finding in result}
     for row in table:
         if row["used"] == "no":
             text = f"Log {row['log']} is not used, as it failed alone: {row['reason']}"
-            found.append(Finding("log_left_out", text, weight=100.0))
+            result.append(Finding("log_left_out", text, weight=100.0))
         elif row["code"] and row["reason"] not in contradicted:
             text = f"Log {row['log']}: {row['reason']}"
             verdict = Verdict.DOUBTFUL  # of all; each log has its own
-            found.append(Finding(row["code"], text, verdict))
-    for name in unheard:
+            result.append(Finding(row["code"], text, verdict))
+    for name in undetected:
         text = (
             f"Beacon {name} is not detected in any log; its entry is unchanged. Check that the logs"
             " are of this site."
         )
-        found.append(Finding("silent_beacon", text, weight=50.0))
+        result.append(Finding("silent_beacon", text, weight=50.0))
     if not moved < UNSETTLED:
         text = (
             f"The logs did not converge to one calibration: the last of {MOST_ROUNDS} rounds still"
             f" moved it by {moved:.2g} sigma. Omit the log that is farthest from the others."
         )
-        found.append(Finding("not_converged", text))
-    return Trust(tuple(found))
+        result.append(Finding("not_converged", text))
+    return Trust(tuple(result))

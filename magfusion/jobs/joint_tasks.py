@@ -10,7 +10,7 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.batch.joint import Known, Shared, uncoupled
+from magfusion.estimation.batch.joint import Shared, SharedCalibration, uncoupled
 from magfusion.estimation.batch.joint_log import (
     OfLog,
     after_round,
@@ -18,8 +18,8 @@ from magfusion.estimation.batch.joint_log import (
     of_smoothed,
     solve_round,
 )
-from magfusion.estimation.integrity.judge import judged
-from magfusion.estimation.posterior.condensed import shared_blocks
+from magfusion.estimation.integrity.judge import judge_result
+from magfusion.estimation.posterior.marginalized_log import shared_blocks
 from magfusion.jobs.failure import reason_of
 from magfusion.jobs.inputs import Job, claim, named, read_job
 from magfusion.jobs.joint_kept import Alone, load_alone, save_alone
@@ -65,14 +65,14 @@ class RoundTask:
     ----------
     log : OfLog
     shared : Shared
-    prior : Known
+    prior : SharedCalibration
         From all others and the survey.
     """
 
     task: LogTask
     log: OfLog
     shared: Shared
-    prior: Known
+    prior: SharedCalibration
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ class LastTask:
     ----------
     excess : float
         Factor on the variances, as the logs contradict each other.
-    `said` : tuple of Finding
+    `findings` : tuple of Finding
         On the consistency of this log with the others.
     writes : bool
         Whether its trajectory is written.
@@ -91,7 +91,7 @@ class LastTask:
 
     round: RoundTask
     excess: float
-    said: tuple[Finding, ...]
+    findings: tuple[Finding, ...]
     writes: bool
     rate: Rate
     risk: Risk | None
@@ -132,10 +132,10 @@ def alone(task: LogTask, _rng: np.random.Generator) -> Alone:
     except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
         failed = {"verdict": str(Verdict.FAILED), "code": "no_solution", "reason": reason_of(error)}
         return Alone(None, failed)
-    heard = np.any(result.fields.valid, axis=0).tolist()
-    names = {name for (name, _), yes in zip(result.fields.channels, heard, strict=True) if yes}
+    detected = np.any(result.fields.valid, axis=0).tolist()
+    names = {name for (name, _), yes in zip(result.fields.channels, detected, strict=True) if yes}
     kept = of_smoothed(result, shared)
-    honest, trust = judged(result, log)
+    honest, trust = judge_result(result, log)
     done = Alone(kept, table_facts(honest, trust, log) | {"heard": sorted(names)})
     save_alone(task.kept, task.key, done)
     return done
@@ -168,7 +168,7 @@ def _written(result: Smoothed, log: Log, site: Site, given: LastTask) -> tuple[S
 
     task = given.round.task
     done = finished(
-        log, site, task.smoother, result, given.risk, excess=given.excess, said=given.said
+        log, site, task.smoother, result, given.risk, excess=given.excess, findings=given.findings
     )
     done = with_errors(done, log)
     with claim(task.job.output, "smooth") as whole:
@@ -178,10 +178,10 @@ def _written(result: Smoothed, log: Log, site: Site, given: LastTask) -> tuple[S
 
 def judged_among(result: Smoothed, log: Log, given: LastTask) -> tuple[Smoothed, Trust]:
     """Assess a log, with the findings against the others."""
-    result, trust = judged(result, log)
+    result, trust = judge_result(result, log)
     assert result.states.pose_cov is not None
     wider = replace(result.states, pose_cov=given.excess * result.states.pose_cov)
-    return replace(result, states=wider), trust | Trust(given.said)
+    return replace(result, states=wider), trust | Trust(given.findings)
 
 
 def table_facts(result: Smoothed, trust: Trust, log: Log) -> dict[str, Any]:

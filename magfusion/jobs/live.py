@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class StateSink(Protocol):
     """Receives states one by one, and never blocks the estimator."""
 
-    def take(self, state: JudgedState | None, told: Mapping[str, Any], /) -> None:
+    def take(self, state: JudgedState | None, reported: Mapping[str, Any], /) -> None:
         """Receive a state, None before the first, with its representation in the pipe."""
 
     def close(self) -> str | None:
@@ -107,9 +107,9 @@ def _opened(settings: LiveSettings, site: Site, epoch_ns: int) -> Iterator[State
 class _Viewer(NamedTuple):
     view: LiveView
 
-    def take(self, state: JudgedState | None, told: Mapping[str, Any]) -> None:
-        if state is not None and not state.lost:
-            self.view.show(state, told["distortion"])
+    def take(self, state: JudgedState | None, reported: Mapping[str, Any]) -> None:
+        if state is not None and not state.is_lost:
+            self.view.show(state, reported["distortion"])
 
     def close(self) -> None:
         """Leave the viewer open."""

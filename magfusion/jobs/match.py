@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.files.attitude_table import read_database, write_attitudes
 from magfusion.jobs.attitude_database import MAX_GAP, TABLE, Sampling, steady
-from magfusion.jobs.match_trust import judged
+from magfusion.jobs.match_trust import judge_matches
 from magfusion.jobs.settings import Command, LogSettings, option
 from magfusion.model.physics.earth import earth_field_world
 from magfusion.model.site import Site
@@ -32,7 +32,7 @@ from magfusion.papers.p001_magnetometer.matching_database import (
     match_nearest,
     prepare,
 )
-from magfusion.results.figures import Column, Figure, Figures, Section, heading
+from magfusion.results.figures import ErrorColumn, Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
 from magfusion.units import DEGREE, Array, BoolArray
 
@@ -70,7 +70,7 @@ class MatchSettings(LogSettings, Sampling):
     gravity: bool = option(False, "Estimate all three angles, with the accelerometer, at rest")
 
 
-class _Found(NamedTuple):
+class _Matched(NamedTuple):
     matches: Matches
     method: str
     angles: tuple[int, ...]  # found, of roll, pitch, yaw
@@ -95,36 +95,36 @@ def run_match(settings: MatchSettings, output: Path) -> Figures:
     if settings.gravity:
         require_imu(job, log, "gravity requires the accelerometer")
     with named(job.log_path):
-        taken = steady(log, site, settings)
-    found = _match(job, log, site, taken, settings)
+        selected = steady(log, site, settings)
+    result = _match(job, log, site, selected, settings)
     known = None if settings.database is not None else _earth_field(job, site)
-    matches, trust = judged(found.matches, found.angles, known, taken, site, log)
-    found = found._replace(matches=matches)
-    first = found.matches.determined[:, 0]
+    matches, trust = judge_matches(result.matches, result.angles, known, selected, site, log)
+    result = result._replace(matches=matches)
+    first = result.matches.determined[:, 0]
     figures = [
-        Figure("method", found.method),
-        Figure("angles", "-".join(_NAMES[k] for k in found.angles)),
-        Figure("epochs", len(taken.time)),
-        Figure("epochs_with_two_pitches", int(np.sum(found.matches.ambiguous))),
+        Figure("method", result.method),
+        Figure("angles", "-".join(_NAMES[k] for k in result.angles)),
+        Figure("epochs", len(selected.time)),
+        Figure("epochs_with_two_pitches", int(np.sum(result.matches.ambiguous))),
         Figure("epochs_not_determined", int(np.sum(~first))),
-        Figure("window_s", taken.length, "s"),
+        Figure("window_s", selected.length, "s"),
     ]
     for k in range(3):
-        if k not in found.angles:
-            given = float(found.matches.rpy[0, 0, k] / DEGREE)
+        if k not in result.angles:
+            given = float(result.matches.rpy[0, 0, k] / DEGREE)
             figures.append(Figure(f"given_{_NAMES[k]}_deg", given, "deg"))
         elif np.any(first):
-            sigma = float(np.median(found.matches.sigma[first, 0, k])) / DEGREE
+            sigma = float(np.median(result.matches.sigma[first, 0, k])) / DEGREE
             figures.append(Figure(f"{_NAMES[k]}_sigma_median_deg", sigma, "deg"))
-    true_rpy, compared = _compared(log, taken.time, found)
+    true_rpy, compared = _compared(log, selected.time, result)
     shown = heading("match", log.name) | trust_figures(trust) | Figures(*figures) | compared
     with claimed as whole:
         directory = found_in(whole, trust)
-        parts = (found.matches.rpy, found.matches.sigma, found.matches.residual)
+        parts = (result.matches.rpy, result.matches.sigma, result.matches.residual)
         path = directory / "attitude.parquet"
-        write_attitudes(path, log.epoch_ns, taken.time, *parts, found.matches.determined)
+        write_attitudes(path, log.epoch_ns, selected.time, *parts, result.matches.determined)
         picture = directory / "attitude.png"
-        write_match_plot(picture, taken.time, found.matches, found.angles, true_rpy)
+        write_match_plot(picture, selected.time, result.matches, result.angles, true_rpy)
         write_report(whole, shown)
     refuse_failed(job.log_path, output, trust)
     return shown
@@ -166,8 +166,8 @@ def _check_given(settings: MatchSettings) -> None:
         raise InputError(f"--method {settings.method} requires a database; give it with --database")
     if settings.yaw_deg is None:
         raise InputError(f"without a database {THREE_ANGLES}{_BY}")
-    asked = "roll-pitch" if settings.pitch_deg is None else "roll"
-    if settings.angles not in (None, asked):
+    requested = "roll-pitch" if settings.pitch_deg is None else "roll"
+    if settings.angles not in (None, requested):
         raise InputError(
             "--angles roll requires --pitch-deg and --yaw-deg; --angles roll-pitch takes no"
             " --pitch-deg"
@@ -179,29 +179,29 @@ def _given(settings: MatchSettings) -> bool:
     return any(value is not None for value in values)
 
 
-def _match(job: Job, log: Log, site: Site, taken: Steady, settings: MatchSettings) -> _Found:
+def _match(job: Job, log: Log, site: Site, selected: Steady, settings: MatchSettings) -> _Matched:
     from magfusion.jobs.inputs import named
 
     if settings.database is not None:
-        return _by_database(settings.database, taken, settings)
+        return _by_database(settings.database, selected, settings)
     field_world = _earth_field(job, site)
     with named(job.log_path):
         if settings.gravity:
-            assert taken.force_body is not None
+            assert selected.force_body is not None
             bias = site.platform.imu.accel_bias_sigma
-            force_sigma = float(np.hypot(taken.force_sigma, bias))
-            vectors = (taken.field_body, taken.force_body, field_world, site.gravity)
-            matches = match_with_gravity(*vectors, taken.sigma, force_sigma)
-            matches.determined[:, 0] &= _resting(log, site, taken.time)
-            return _Found(matches, "gravity", (0, 1, 2))
+            force_sigma = float(np.hypot(selected.force_sigma, bias))
+            vectors = (selected.field_body, selected.force_body, field_world, site.gravity)
+            matches = match_with_gravity(*vectors, selected.sigma, force_sigma)
+            matches.determined[:, 0] &= _resting(log, site, selected.time)
+            return _Matched(matches, "gravity", (0, 1, 2))
         assert settings.yaw_deg is not None
         yaw = float(wrap(np.asarray(settings.yaw_deg * DEGREE)))
         if settings.pitch_deg is None:
-            matches = match_roll_pitch(taken.field_body, yaw, field_world, taken.sigma)
-            return _Found(matches, "closed-form", (0, 1))
+            matches = match_roll_pitch(selected.field_body, yaw, field_world, selected.sigma)
+            return _Matched(matches, "closed-form", (0, 1))
         pitch = settings.pitch_deg * DEGREE
-        matches = match_roll(taken.field_body, pitch, yaw, field_world, taken.sigma)
-        return _Found(matches, "closed-form", (0,))
+        matches = match_roll(selected.field_body, pitch, yaw, field_world, selected.sigma)
+        return _Matched(matches, "closed-form", (0,))
 
 
 def _resting(log: Log, site: Site, time: Array) -> BoolArray:
@@ -211,7 +211,7 @@ def _resting(log: Log, site: Site, time: Array) -> BoolArray:
     return still[np.minimum(np.searchsorted(stamps, time), len(stamps) - 1)]
 
 
-def _by_database(place: Path, taken: Steady, settings: MatchSettings) -> _Found:
+def _by_database(place: Path, selected: Steady, settings: MatchSettings) -> _Matched:
     from magfusion.jobs.inputs import named
 
     path = place / TABLE if place.is_dir() else place
@@ -223,18 +223,20 @@ def _by_database(place: Path, taken: Steady, settings: MatchSettings) -> _Found:
         )
     with named(path):
         index = prepare(database)
-    found = (0,) if database.angles == "roll" else (0, 1)
+    result = (0,) if database.angles == "roll" else (0, 1)
     method: Method = settings.method or "interpolated"
     if method == "nearest":
-        return _Found(match_nearest(index, taken.field_body, taken.sigma), method, found)
+        return _Matched(match_nearest(index, selected.field_body, selected.sigma), method, result)
     if method == "interpolated":
-        return _Found(match_interpolated(index, taken.field_body, taken.sigma), method, found)
+        return _Matched(
+            match_interpolated(index, selected.field_body, selected.sigma), method, result
+        )
     _, pitch, yaw = database.rpy[0]
-    known = (index.field_world, float(np.hypot(taken.sigma, index.sigma)))
+    known = (index.field_world, float(np.hypot(selected.sigma, index.sigma)))
     if database.angles == "roll":
-        return _Found(match_roll(taken.field_body, pitch, yaw, *known), method, found)
-    matches = match_roll_pitch(taken.field_body, yaw, *known, side=index.side)
-    return _Found(matches, method, found)
+        return _Matched(match_roll(selected.field_body, pitch, yaw, *known), method, result)
+    matches = match_roll_pitch(selected.field_body, yaw, *known, side=index.side)
+    return _Matched(matches, method, result)
 
 
 def _earth_field(job: Job, site: Site) -> Array:
@@ -251,28 +253,28 @@ def _earth_field(job: Job, site: Site) -> Array:
     return earth_field_world(place.latitude_deg, place.longitude_deg, place.height_m, day)
 
 
-def _compared(log: Log, time: Array, found: _Found) -> tuple[Array | None, Figures]:
+def _compared(log: Log, time: Array, result: _Matched) -> tuple[Array | None, Figures]:
     """Return the true angles (NaN where there are none) and the errors against them."""
     if log.truth is None:
         return None, Figures()
     poses, exists = interpolate(log.truth, time, MAX_GAP)
-    used = exists & found.matches.determined[:, 0]
+    used = exists & result.matches.determined[:, 0]
     if not np.any(used):
         reason = "the truth covers no epoch whose attitude is determined"
         note = f"There is no comparison with the truth: {reason}"
         return None, Figures(Figure("not_compared", reason, section=Section.REPORT, note=note))
-    rpy = found.matches.rpy
+    rpy = result.matches.rpy
     true_rpy = np.full((len(time), 3), np.nan)
-    true_rpy[exists] = _true_angles(poses.world_from_body, rpy[0, 0], found.angles)
+    true_rpy[exists] = _true_angles(poses.world_from_body, rpy[0, 0], result.angles)
     figures = [Figure("compared_epochs", int(np.sum(used)))]
-    for k in found.angles:
+    for k in result.angles:
         either = np.abs(wrap(rpy[..., k] - true_rpy[:, None, k]))[used] / DEGREE
         rms = float(np.sqrt(np.mean(either[:, 0] ** 2)))
         figures += [
             Figure(f"{_NAMES[k]}_rms_deg", rms, "deg"),
             Figure(f"{_NAMES[k]}_max_deg", float(np.max(either[:, 0])), "deg"),
         ]
-    if found.matches.ambiguous[used].any():
+    if result.matches.ambiguous[used].any():
         worst = np.max(np.abs(wrap(rpy - true_rpy[:, None]))[used], axis=2)
         nearer = float(np.nanmin(worst, axis=1).max() / DEGREE)
         figures.append(Figure("max_of_nearer_solution_deg", nearer, "deg"))
@@ -284,7 +286,9 @@ def _whole_attitude(poses: Trajectory, rpy: Array, used: BoolArray) -> Figure:
     true = Rotation.from_matrix(poses.world_from_body[used])
     turn = true.inv() * Rotation.from_euler("xyz", rpy[used])
     rms = float(np.sqrt(np.mean(turn.magnitude() ** 2)) / DEGREE)
-    return Figure("attitude_rmse_deg", rms, "deg", None, Section.ERRORS, "attitude", Column.RMS)
+    return Figure(
+        "attitude_rmse_deg", rms, "deg", None, Section.ERRORS, "attitude", ErrorColumn.RMS
+    )
 
 
 def _true_angles(world_from_body: Array, given: Array, angles: tuple[int, ...]) -> Array:

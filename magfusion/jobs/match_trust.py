@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.model.trust import Finding, Trust, Unverified, Verdict
 from magfusion.units import DEGREE, NANOTESLA, Array
 
@@ -22,15 +22,15 @@ FEW = 0.05  # share of epochs that may be undetermined
 OTHER_SIZE = 0.3  # of the Earth's field, by which it contradicts the site
 EXPLAINED = 1.5  # residual by what is declared, as of whitened residuals
 # Remaining degrees of freedom of a field vector for each number of estimated angles.
-_LEFT = {"roll": 2, "roll-pitch": 1, "roll-pitch-yaw": 2}
+_DIMENSIONS = {"roll": 2, "roll-pitch": 1, "roll-pitch-yaw": 2}
 _NAMES = ("roll", "pitch", "yaw")
 
 
-def judged(
+def judge_matches(
     matches: Matches,
     angles: tuple[int, ...],
     field_world: Array | None,
-    taken: Steady,
+    selected: Steady,
     site: Site,
     log: Log,
 ) -> tuple[Matches, Trust]:
@@ -44,16 +44,18 @@ def judged(
         The field assumed as exact (T); None with a database, which rejects unmatched fields by
         itself.
     """
-    findings = [*_undetermined(matches), *recorded(log, site, BRIDGED)]
+    findings = [*_undetermined(matches), *recorded(log, site, BRIDGED_CODES)]
     unverified = []
     if field_world is not None:
         size, strength = float(np.linalg.norm(field_world)), site.earth.strength_sigma
-        findings += _other_size(taken, size)
+        findings += _other_size(selected, size)
         rms = _residual(matches, angles)
-        ratio = rms / taken.sigma
+        ratio = rms / selected.sigma
         if ratio > EXPLAINED:
             matches = replace(matches, sigma=ratio * matches.sigma)
-        declared = float(np.linalg.norm([taken.sigma, _sensor_sigma(site, size), strength * size]))
+        declared = float(
+            np.linalg.norm([selected.sigma, _sensor_sigma(site, size), strength * size])
+        )
         if rms > EXPLAINED * declared:
             findings.append(
                 Finding(
@@ -65,10 +67,10 @@ def judged(
                     weight=rms / declared,
                 )
             )
-        turned = float(np.hypot(site.earth.declination_sigma, strength)) / DEGREE
+        rotated = float(np.hypot(site.earth.declination_sigma, strength)) / DEGREE
         declination = site.earth.declination_sigma / DEGREE
-        said = f"{100.0 * strength:.2g} %, {declination:.2g} deg"
-        unverified.append(Unverified("earth.field", said, 0.0, turned))
+        messages = f"{100.0 * strength:.2g} %, {declination:.2g} deg"
+        unverified.append(Unverified("earth.field", messages, 0.0, rotated))
     given = [name for k, name in enumerate(_NAMES) if k not in angles]
     unverified += [Unverified(f"given.{name}", "0 deg", 0.0, 0.0) for name in given]
     return matches, Trust(tuple(findings), tuple(unverified))
@@ -76,9 +78,9 @@ def judged(
 
 def _residual(matches: Matches, angles: tuple[int, ...]) -> float:
     """Return the root mean square residual of a component (T)."""
-    left = _LEFT["-".join(_NAMES[k] for k in angles)]
+    remaining = _DIMENSIONS["-".join(_NAMES[k] for k in angles)]
     own = matches.residual[:, 0][matches.determined[:, 0]]
-    return float(np.sqrt(np.mean(own**2) / left)) if len(own) else 0.0
+    return float(np.sqrt(np.mean(own**2) / remaining)) if len(own) else 0.0
 
 
 def _sensor_sigma(site: Site, size: float) -> float:
@@ -108,8 +110,8 @@ def _undetermined(matches: Matches) -> Iterator[Finding]:
         )
 
 
-def _other_size(taken: Steady, size: float) -> Iterator[Finding]:
-    measured = float(np.median(np.linalg.norm(taken.field_body, axis=1)))
+def _other_size(selected: Steady, size: float) -> Iterator[Finding]:
+    measured = float(np.median(np.linalg.norm(selected.field_body, axis=1)))
     off = max(measured / size, size / measured) - 1.0
     if off > OTHER_SIZE:
         yield Finding(

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.data_checks.recording import BRIDGED, recorded
-from magfusion.estimation.data_checks.spectrum import beside_lines
+from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
+from magfusion.estimation.data_checks.spectrum import with_disturbing_lines
 from magfusion.files.checkpoint import claim_checkpoint, run_key
 from magfusion.files.row_file import RowFile, claim_rows
 from magfusion.files.site import load_site
@@ -23,7 +23,7 @@ from magfusion.jobs.navigate_settings import NavigateSettings
 from magfusion.jobs.rates import refuse_rate
 from magfusion.jobs.replay import PIECE, Replay, feed, paced
 from magfusion.jobs.settings import Command
-from magfusion.jobs.state_rows import CARRIED, CURRENT, LAGGED, StateRows, row_columns
+from magfusion.jobs.state_rows import CURRENT, LAGGED, PROPAGATED, StateRows, row_columns
 from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Site
 from magfusion.model.trust import Trust
@@ -131,9 +131,9 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
         fewer=True,
         amplitudes=True,
         several=True,
-        anew=True,
+        reread=True,
         lockin=navigator.lockin,
-        heard=False,
+        select_beacons=False,
         report=report,
     )
     if log.waveforms:  # of which the navigator makes phasors, as it does of a stream
@@ -141,10 +141,10 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
     refuse_rate(job.log_path, log, settings.rates)
     with named(job.log_path):
         require_motion_prior(site)
-    navigator = replace(navigator, lockin=beside_lines(log, site, navigator.lockin))
+    navigator = replace(navigator, lockin=with_disturbing_lines(log, site, navigator.lockin))
     _refuse_phasors(job.log_path, log, settings)
     with state_sinks(settings, site, log.epoch_ns, sys.stderr) as sinks:
-        made = _make_parent(place)
+        built = _make_parent(place)
         run = _open_run(settings, navigator, log, site, place, sinks)
         try:
             with named(job.log_path):
@@ -156,12 +156,12 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
                     write_navigated(directory, log, results)
                 write_report(whole, figures, None if results is None else motion_of(log, results))
         except (InputError, EstimationError):
-            _clear(run, place, made)
+            _clear(run, place, built)
             raise
         finally:
             run.rows.close()
     if settings.checkpoint is not None:
-        _clear(run, place, made)
+        _clear(run, place, built)
     refuse_failed(job.log_path, job.output, trust)
     return figures
 
@@ -190,7 +190,7 @@ def _results(run: NavigateRun) -> tuple[Figures, Trust, NavigateResults | None]:
     log, navigator = run.replay.log, run.navigator
     if not navigator.started:
         trust = no_start(len(run.replay) * PIECE, navigator.why_no_start)
-        trust |= Trust(recorded(log, navigator.site, BRIDGED, beacons=True))
+        trust |= Trust(recorded(log, navigator.site, BRIDGED_CODES, beacons=True))
         trust = with_cause(trust, log, run.site, navigator.settings.lockin)
         return heading("navigate", log.name) | trust_figures(trust), trust, None
     figures, results = navigated(log, navigator, run.rows.rows(), run.elapsed)
@@ -214,21 +214,21 @@ class NavigateRun:
 
 def _make_parent(place: Path) -> list[Path]:
     """Create the checkpoint's directory; return the created directory."""
-    made = [p for p in (place.parent, *place.parent.parents) if not p.exists()]
+    built = [p for p in (place.parent, *place.parent.parents) if not p.exists()]
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
             f"{place.parent}: cannot be written ({error.strerror}); give another path"
         ) from error
-    return made
+    return built
 
 
-def _clear(run: NavigateRun, place: Path, made: list[Path]) -> None:
+def _clear(run: NavigateRun, place: Path, outputs: list[Path]) -> None:
     run.rows.close()
     place.unlink(missing_ok=True)
     run.rows.path.unlink(missing_ok=True)
-    for directory in made:
+    for directory in outputs:
         if not any(directory.iterdir()):
             directory.rmdir()
 
@@ -247,21 +247,21 @@ def _open_run(
     place: Path,
     sinks: tuple[StateSink, ...],
 ) -> NavigateRun:
-    from magfusion.jobs.checkpoint import Kept, begin
+    from magfusion.jobs.checkpoint import RunProgress, begin
 
     known = (log.imu, log.waveform, log.fields, *log.waveforms.values())
     streams = [stream for stream in known if stream is not None]
     key = run_key("navigate", site, navigator, PIECE, log.epoch_ns, streams)
-    begun = begin(place, key, site, navigator, Kept(), resume=settings.resume)
+    begun = begin(place, key, site, navigator, RunProgress(), resume=settings.resume)
     return NavigateRun(
         replay=Replay(log),
         site=site,
         navigator=begun.navigator,
-        rows=StateRows(RowFile(_rows_path(place), row_columns(site), begun.beside.rows)),
+        rows=StateRows(RowFile(_rows_path(place), row_columns(site), begun.extra.rows)),
         place=place,
         key=key,
         position=begun.position,
-        elapsed=begun.beside.elapsed,
+        elapsed=begun.extra.elapsed,
         sinks=sinks,
     )
 
@@ -269,7 +269,7 @@ def _open_run(
 def _advance(run: NavigateRun, settings: NavigateSettings, report: Report) -> None:
     """Process the remaining pieces, and write checkpoints from time to time."""
     began = time.perf_counter() - run.elapsed
-    every, told = max(1, round(settings.every / PIECE)), -np.inf
+    every, reported = max(1, round(settings.every / PIECE)), -np.inf
     for k, piece in paced(run.replay.pieces(run.position), settings.realtime):
         if k % every == 0 and k > run.position:
             _save(run, k, time.perf_counter() - began)
@@ -278,20 +278,20 @@ def _advance(run: NavigateRun, settings: NavigateSettings, report: Report) -> No
         feed(run.navigator, piece)
         states = run.navigator.take()
         spent = (time.perf_counter() - before) / max(len(states), 1)
-        for carried in run.navigator.take_carried():
-            run.rows.add(run.navigator, carried, np.nan, CARRIED)
-            _tell(run, carried)
-            told = carried.time
+        for propagated in run.navigator.take_propagated():
+            run.rows.add(run.navigator, propagated, np.nan, PROPAGATED)
+            _publish(run, propagated)
+            reported = propagated.time
         for state in states:
             # The first state is the result of a whole smoother.
             latency = spent if running else np.nan
             run.rows.add(run.navigator, state, latency, CURRENT)
             if settings.rate == "field":
-                _tell(run, state)
-            elif state.time > told:  # the inertial stream is silent
-                run.rows.add(run.navigator, state, np.nan, CARRIED)
-                _tell(run, state)
-                told = state.time
+                _publish(run, state)
+            elif state.time > reported:  # the inertial stream is silent
+                run.rows.add(run.navigator, state, np.nan, PROPAGATED)
+                _publish(run, state)
+                reported = state.time
         for state in run.navigator.take_lagged():
             run.rows.add(run.navigator, state, np.nan, LAGGED)
         if k % every == 0:
@@ -299,20 +299,20 @@ def _advance(run: NavigateRun, settings: NavigateSettings, report: Report) -> No
     run.elapsed = time.perf_counter() - began
 
 
-def _tell(run: NavigateRun, state: JudgedState) -> None:
+def _publish(run: NavigateRun, state: JudgedState) -> None:
     """Send a state to the live outputs."""
     if run.sinks:
         from magfusion.jobs.stream import state_content
 
-        told = state_content(run.navigator, state)
+        reported = state_content(run.navigator, state)
         for sink in run.sinks:
-            sink.take(state, told)
+            sink.take(state, reported)
 
 
 def _save(run: NavigateRun, position: int, elapsed: float) -> None:
-    from magfusion.jobs.checkpoint import Kept, save
+    from magfusion.jobs.checkpoint import RunProgress, save
 
-    save(run.navigator, position, Kept(run.rows.settle(), elapsed), run.place, run.key)
+    save(run.navigator, position, RunProgress(run.rows.settle(), elapsed), run.place, run.key)
 
 
 COMMAND = Command(

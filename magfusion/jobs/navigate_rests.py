@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.files.site import load_site, save_site
 from magfusion.files.standard_streams import binary_input, binary_output, until_closed
 from magfusion.files.stream import json_line, read_records, whole_rows
@@ -20,7 +20,7 @@ from magfusion.files.tum import write_tum
 from magfusion.model.progress import Report, quiet
 from magfusion.model.quaternion import of_matrices
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import Trust, alike
+from magfusion.model.trust import Trust, uniform_trust
 from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.verdict import trust_figures
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 PIECE = 1.0  # s; of a log that is replayed
 # Options of `navigate` that it uses.
-TAKEN = {
+READERS = {
     *("site", "log", "output", "start", "end", "topics", "as_json", "form", "keep_going"),
     *("at_rest", "false_alarm", "window", "step", "mains_hz", "risk", "fault_prior"),
     *("hemisphere", "region"),
@@ -85,7 +85,7 @@ def refuse_other(given: set[str]) -> None:
     ------
     InputError
     """
-    other = sorted(given - TAKEN)
+    other = sorted(given - READERS)
     if other:
         raise InputError(
             f"--{other[0].replace('_', '-')} is for navigation in motion, --at-rest for a"
@@ -128,7 +128,7 @@ def run_rests(job: Job, how: How, report: Report = quiet) -> Figures:
     from magfusion.jobs.inputs import claim, named, read_job, refuse_failed
 
     claimed = claim(job.output, "navigate")
-    log, site = read_job(job, reference=True, heard=False, report=report)
+    log, site = read_job(job, reference=True, select_beacons=False, report=report)
     if log.waveform is None:
         raise InputError(
             f"{job.log_path}: has no magnetometer.parquet to integrate at rest; give the raw log"
@@ -137,19 +137,19 @@ def run_rests(job: Job, how: How, report: Report = quiet) -> Figures:
     with named(job.log_path):
         navigator = how.navigator(site)
         states = replayed(log, navigator, report)
-    told = [one for one in states if one.found is not None]
-    if not told:
+    reported = [one for one in states if one.fixes is not None]
+    if not reported:
         text = "the platform is nowhere at rest for long enough"
         if any(one.standing for one in states):
             text = states[-1 if states[-1].standing else -2].trust.ordered[0].text
         raise EstimationError(f"{job.log_path}: {text}")
     newest = _newest_of_rests(states)
-    trust = Trust(tuple(recorded(log, site, BRIDGED)))
+    trust = Trust(tuple(recorded(log, site, BRIDGED_CODES)))
     for one in newest:
         trust |= one.trust
     elapsed = Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     with claimed as whole:
-        figures = _written(whole, log, site, told, trust) | _said(newest) | elapsed
+        figures = _written(whole, log, site, reported, trust) | _rest_figures(newest) | elapsed
         from magfusion.results.report import write_report
 
         write_report(whole, figures)
@@ -160,30 +160,30 @@ def run_rests(job: Job, how: How, report: Report = quiet) -> Figures:
 def _newest_of_rests(states: list[RestState]) -> list[RestState]:
     """Return the last state of each rest in which a beacon is detected."""
     out: list[RestState] = []
-    held: RestState | None = None
+    fixed: RestState | None = None
     for one in states:
-        if one.found is not None:
-            held = one
-        if not one.standing and held is not None:
-            out.append(held)
-            held = None
-    return out if held is None else [*out, held]
+        if one.fixes is not None:
+            fixed = one
+        if not one.standing and fixed is not None:
+            out.append(fixed)
+            fixed = None
+    return out if fixed is None else [*out, fixed]
 
 
-def _written(whole: Path, log: Log, site: Site, told: list[RestState], trust: Trust) -> Figures:
+def _written(whole: Path, log: Log, site: Site, reported: list[RestState], trust: Trust) -> Figures:
     """Write the poses, and return their figures."""
     from magfusion.jobs.inputs import found_in
     from magfusion.results.recording import write_recording
     from magfusion.results.report import compared_with_truth
 
-    fixes = [one.found.fixes for one in told if one.found is not None]
+    fixes = [one.fixes.fixes for one in reported if one.fixes is not None]
     best = Trajectory(
-        time=np.array([one.time for one in told]),
+        time=np.array([one.time for one in reported]),
         world_from_body=np.concatenate([f.world_from_body[:, 0] for f in fixes]),
         position_world=np.concatenate([f.position_world[:, 0] for f in fixes]),
         pose_cov=np.concatenate([f.pose_cov[:, 0] for f in fixes]),
     )
-    directory, states = found_in(whole, trust), alike(len(best), trust.verdict)
+    directory, states = found_in(whole, trust), uniform_trust(len(best), trust.verdict)
     errors, compared = compared_with_truth(best, log)
     write_tum(best, directory / "trajectory.tum", log.epoch_ns)
     write_trajectory(best, directory / "trajectory.parquet", log.epoch_ns, states)
@@ -195,12 +195,12 @@ def _written(whole: Path, log: Log, site: Site, told: list[RestState], trust: Tr
     return heading("navigate", log.name) | trust_figures(trust) | compared
 
 
-def _said(newest: list[RestState]) -> Figures:
+def _rest_figures(newest: list[RestState]) -> Figures:
     """Return the final figures of each rest."""
     sigma = [
-        float(np.sqrt(np.trace(one.found.fixes.pose_cov[0, 0, 3:, 3:])))
+        float(np.sqrt(np.trace(one.fixes.fixes.pose_cov[0, 0, 3:, 3:])))
         for one in newest
-        if one.found is not None
+        if one.fixes is not None
     ]
     gain = np.concatenate([one.gain for one in newest])
     used = gain[np.isfinite(gain)]
@@ -241,7 +241,7 @@ def run_rests_stream(
         try:
             if numbered.record is None:
                 raise InputError(numbered.refusal)
-            _take_in(navigator, numbered.record)
+            _process_record(navigator, numbered.record)
         except InputError as error:
             sentence = f"standard input, {_PLACE[form]} {numbered.number}: {error}"
             if not keep_going:
@@ -259,7 +259,7 @@ def run_rests_stream(
     return refused
 
 
-def _take_in(navigator: RestNavigator, record: Record) -> None:
+def _process_record(navigator: RestNavigator, record: Record) -> None:
     if record.imu is not None:
         time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
         navigator.add_imu(time, gyro, accel)
@@ -275,14 +275,14 @@ def _take_in(navigator: RestNavigator, record: Record) -> None:
 
 def rest_content(state: RestState) -> dict[str, Any]:
     """Return a state of a rest as written; unknown values are null."""
-    from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
+    from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
 
     trust, names = state.trust, () if state.samples is None else state.samples.channels
-    heard = zip(names, state.heard.tolist(), strict=False)
+    detected = zip(names, state.detected.tolist(), strict=False)
     gain = zip(names, state.gain.tolist(), strict=False)
-    told: dict[str, Any] = {
+    reported: dict[str, Any] = {
         "time": state.time,
-        "started": state.found is not None,
+        "started": state.fixes is not None,
         "lost": False,
         "standing": state.standing,
         "rest_s": state.duration,
@@ -290,17 +290,17 @@ def rest_content(state: RestState) -> dict[str, Any]:
         "verdict": str(trust.verdict) if state.standing else None,
         "reasons": [{"code": f.code, "text": f.text} for f in trust.reasons],
         "remarks": [{"code": f.code, "text": f.text} for f in trust.remarks],
-        "heard": list(dict.fromkeys(name for (name, _), one in heard if one)),
+        "heard": list(dict.fromkeys(name for (name, _), one in detected if one)),
         "reference_gain": {f"{b}_{t}": g for (b, t), g in gain if np.isfinite(g)},
         "position": None,
     }
-    if state.found is None:
-        return told
-    fixes, levels = state.found.fixes, state.found.states
+    if state.fixes is None:
+        return reported
+    fixes, levels = state.fixes.fixes, state.fixes.states
     rival = fixes.cost[0, 1] - fixes.cost[0, 0] if fixes.cost.shape[1] > 1 else np.inf
     cov, rotation = fixes.pose_cov[0, 0], fixes.world_from_body[0, 0]
     known = bool(fixes.determined[0, 0])
-    told |= {
+    reported |= {
         "excluded": list(levels.excluded[0]),
         "protection_level_m": _finite(levels.protection_level_m[0]),
         "protection_level_deg": _finite(levels.protection_level_deg[0]),
@@ -308,10 +308,10 @@ def rest_content(state: RestState) -> dict[str, Any]:
         "lost": str(trust.verdict) == "failed",
         "velocity": [0.0, 0.0, 0.0],
     }
-    if not known or told["lost"]:
-        return told
+    if not known or reported["lost"]:
+        return reported
     world = rotation @ cov[3:, 3:] @ rotation.T
-    return told | {
+    return reported | {
         "position": fixes.position_world[0, 0].tolist(),
         "quaternion": of_matrices(rotation[None])[:, 0].tolist(),
         "sigma": {

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.estimation.data_checks.signal import Detected
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.initialization.online import NoStart
@@ -17,7 +17,7 @@ from magfusion.estimation.online_integrity.open_roll import comparable
 from magfusion.files.site import save_site
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
-from magfusion.jobs.state_rows import CARRIED, CURRENT, LAGGED, STATE
+from magfusion.jobs.state_rows import CURRENT, LAGGED, PROPAGATED, STATE
 from magfusion.model.parameters import dimension, initial_calibration
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
@@ -25,15 +25,15 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, StateTrust, Trust, Verdict
 from magfusion.results.errors import TrajectoryErrors
 from magfusion.results.figures import (
-    Column,
-    Estimate,
+    ErrorColumn,
     Figure,
     Figures,
+    ParameterEstimate,
     Section,
     determined_figures,
     heading,
 )
-from magfusion.results.page_motion import Motion
+from magfusion.results.page_motion import MotionPage
 from magfusion.results.recording import write_recording
 from magfusion.results.refinement import parameter_estimates, refined_site
 from magfusion.results.report import (
@@ -50,7 +50,7 @@ _VERDICTS = tuple(Verdict)
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class StateSeries:
     """States of one kind, with their findings."""
 
     states: Trajectory
@@ -63,17 +63,17 @@ class NavigateResults:
 
     Parameters
     ----------
-    current, lagged : Part
+    current, lagged : StateSeries
         States as first estimated, and as they left the smoother's window, if there is one.  Lost
         states have no pose and are excluded, unless all have failed.
-    carried : Part, optional
+    propagated : StateSeries, optional
         States between the epochs, if requested.
     """
 
     trust: Trust
-    current: Part
-    lagged: Part | None
-    carried: Part | None
+    current: StateSeries
+    lagged: StateSeries | None
+    propagated: StateSeries | None
     errors: TrajectoryErrors | None
     innovations: dict[str, tuple[Array, Array]]
     refined: Site
@@ -86,10 +86,10 @@ def no_start(seconds: float, why: NoStart) -> Trust:
     return why.trust | Trust((Finding("no_start", text, Verdict.FAILED, weight),))
 
 
-def _not_said_again(online: Trust, heard: tuple[Finding, ...]) -> Trust:
+def _without_repeated(online: Trust, findings: tuple[Finding, ...]) -> Trust:
     """Remove findings of the beginning that also apply to the whole recording."""
     every: dict[tuple[str, str], int] = {}
-    for finding in heard:
+    for finding in findings:
         every[_subject(finding)] = max(finding.verdict.rank, every.get(_subject(finding), 0))
     kept = tuple(f for f in online.findings if f.verdict.rank > every.get(_subject(f), -1))
     return replace(online, findings=kept)
@@ -107,14 +107,14 @@ def _chosen(rows: dict[str, Array], trust: Trust, kind: float) -> BoolArray:
     return own & (rows["verdict"][:, 0] < Verdict.FAILED.rank)
 
 
-def _freed(rows: dict[str, Array], site: Site) -> Detected:
+def _motion_compensated(rows: dict[str, Array], site: Site) -> Detected:
     """Return which beacons were detected at the epochs, corrected for motion in the windows."""
     own = rows["lagged"][:, 0] == CURRENT
     names = tuple(beacon.name for beacon in site.beacons)
     return Detected(rows["time"][own, 0], names, rows["heard"][own] > 0.0)
 
 
-def _part(rows: dict[str, Array], own: BoolArray, site: Site) -> Part | None:
+def _part(rows: dict[str, Array], own: BoolArray, site: Site) -> StateSeries | None:
     if not np.any(own):
         return None
     states = Trajectory(
@@ -131,7 +131,7 @@ def _part(rows: dict[str, Array], own: BoolArray, site: Site) -> Part | None:
     )
     verdict = tuple(_VERDICTS[int(rank)] for rank in rows["verdict"][own, 0])
     level_m, level_deg = rows["levels"][own].T
-    return Part(states, StateTrust(verdict, level_m, level_deg, excluded))
+    return StateSeries(states, StateTrust(verdict, level_m, level_deg, excluded))
 
 
 def navigated(
@@ -149,10 +149,12 @@ def navigated(
     site, settings = navigator.site, navigator.settings
     trusted = _part(rows, _chosen(rows, navigator.summary.trust, CURRENT), site)
     poses = None if trusted is None or settings.earth else trusted.states
-    freed = _freed(rows, site)
-    heard = recorded(log, site, BRIDGED, estimated=poses, beacons=True, freed=freed)
-    said = _not_said_again(navigator.summary.trust, heard)
-    trust = with_cause(said | Trust(heard), log, site, settings.lockin)
+    released = _motion_compensated(rows, site)
+    detected = recorded(
+        log, site, BRIDGED_CODES, estimated=poses, beacons=True, compensated=released
+    )
+    findings = _without_repeated(navigator.summary.trust, detected)
+    trust = with_cause(findings | Trust(detected), log, site, settings.lockin)
     own = _chosen(rows, trust, CURRENT)
     current, lagged = _part(rows, own, site), None
     assert current is not None
@@ -165,13 +167,15 @@ def navigated(
     lagged = _part(rows, _chosen(rows, trust, LAGGED), site)
     if lagged is not None:
         figures |= Figures(Figure("lagged_epochs", len(lagged.states), section=Section.REPORT))
-        left = comparable(log, lagged.states, site)
-        figures |= compared_with_truth(lagged.states, left, Column.LAGGED, "lagged_")[1]
-    carried = _part(rows, _chosen(rows, trust, CARRIED), site)
-    if carried is not None:
-        figures |= Figures(Figure("carried_states", len(carried.states), section=Section.REPORT))
-        now = comparable(log, carried.states, site)
-        figures |= compared_with_truth(carried.states, now, Column.CARRIED, "carried_")[1]
+        remaining = comparable(log, lagged.states, site)
+        figures |= compared_with_truth(lagged.states, remaining, ErrorColumn.LAGGED, "lagged_")[1]
+    propagated = _part(rows, _chosen(rows, trust, PROPAGATED), site)
+    if propagated is not None:
+        figures |= Figures(Figure("carried_states", len(propagated.states), section=Section.REPORT))
+        now = comparable(log, propagated.states, site)
+        figures |= compared_with_truth(propagated.states, now, ErrorColumn.PROPAGATED, "carried_")[
+            1
+        ]
     latency = rows["latency"][rows["lagged"][:, 0] == CURRENT, 0]
     figures |= _update_figures(latency, elapsed)
     figures |= Figures(*estimates) | determined_figures(estimates)
@@ -179,10 +183,12 @@ def navigated(
         beacon.name: (states.time, np.sqrt(rows["distortion"][own, i]))
         for i, beacon in enumerate(site.beacons)
     }
-    return figures, NavigateResults(trust, current, lagged, carried, errors, innovations, refined)
+    return figures, NavigateResults(
+        trust, current, lagged, propagated, errors, innovations, refined
+    )
 
 
-def _calibration(navigator: Navigator, name: str) -> tuple[list[Estimate], Site]:
+def _calibration(navigator: Navigator, name: str) -> tuple[list[ParameterEstimate], Site]:
     """Return the estimates of the calibration, and the refined site."""
     state = navigator.state(-np.inf)
     blocks, _ = navigator.settings.blocks(navigator.site)
@@ -203,16 +209,16 @@ def _settings_figures(settings: NavigatorSettings) -> Figures:
 
 def _run_figures(navigator: Navigator, current: Trajectory) -> Figures:
 
-    lost = navigator.summary
+    lost_epochs = navigator.summary
     assert current.pose_cov is not None
     return (
         Figures(
             Figure("epochs", len(current)),
             Figure("duration_s", float(current.time[-1] - current.time[0]), "s"),
             Figure("first_state_s", float(current.time[0]), "s"),
-            where_found("lost_epochs", lost.lost_states > 0, lost.lost_states),
-            where_found("lost_s", lost.lost_states > 0, lost.lost_time),
-            where_found("longest_loss_s", lost.lost_states > 0, lost.longest_loss),
+            where_found("lost_epochs", lost_epochs.lost_states > 0, lost_epochs.lost_states),
+            where_found("lost_s", lost_epochs.lost_states > 0, lost_epochs.lost_time),
+            where_found("longest_loss_s", lost_epochs.lost_states > 0, lost_epochs.longest_loss),
         )
         | rival_figures(navigator.rival_chi_square)
         | Figures(
@@ -255,17 +261,17 @@ def _memory_mb() -> float | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
-def motion_of(log: Log, results: NavigateResults) -> Motion:
+def motion_of(log: Log, results: NavigateResults) -> MotionPage:
     """Return the content of the page of a navigation."""
     current, innovations = results.current, results.innovations
     own = (results.refined, current.states, log.truth, results.errors, innovations)
-    return Motion(*own, current.trust)
+    return MotionPage(*own, current.trust)
 
 
 def write_navigated(directory: Path, log: Log, results: NavigateResults) -> None:
     """Write all files but the report."""
-    current, lagged, carried = results.current, results.lagged, results.carried
-    written = current if carried is None else carried
+    current, lagged, propagated = results.current, results.lagged, results.propagated
+    written = current if propagated is None else propagated
     write_tum(written.states, directory / "trajectory.tum", log.epoch_ns)
     path = directory / "trajectory.parquet"
     write_trajectory(written.states, path, log.epoch_ns, written.trust)
@@ -282,5 +288,5 @@ def write_navigated(directory: Path, log: Log, results: NavigateResults) -> None
         innovations=results.innovations,
         trust=results.trust,
         states=current.trust,
-        carried=None if carried is None else carried.states,
+        propagated=None if propagated is None else propagated.states,
     )

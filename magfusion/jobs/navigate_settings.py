@@ -96,5 +96,5 @@ class NavigateSettings(
             risk=self.risks,
             rate=self.rates,
             horizon=self.horizon,
-            blend=self.blend,
+            correction_time=self.blend,
         )

@@ -25,9 +25,9 @@ from magfusion.model.progress import Report
 from magfusion.model.samples import Log
 from magfusion.model.site import Magnetometer, Site
 from magfusion.model.trajectory import Trajectory, interpolate
-from magfusion.model.trust import Trust, alike
+from magfusion.model.trust import Trust, uniform_trust
 from magfusion.results.figures import Figure, Figures, Section, heading
-from magfusion.results.page_motion import Motion
+from magfusion.results.page_motion import MotionPage
 from magfusion.results.recording import write_recording
 from magfusion.results.report import write_report
 from magfusion.results.verdict import trust_figures
@@ -61,47 +61,47 @@ def run_orientation(name: str, job: Job, rate: Rate, *, back: bool, report: Repo
     require_imu(job, log, "without beacons the rotation is known only from the gyroscope")
     began = time.perf_counter()
     with named(job.log_path):
-        found = oriented(log, site, back=back, report=report)
+        result = oriented(log, site, back=back, report=report)
     elapsed = time.perf_counter() - began
-    states = _thinned(_trajectory(found, log, site), rate)
+    states = _thinned(_trajectory(result, log, site), rate)
     assert site.earth_field_world is not None
     assert states.pose_cov is not None
-    said = remarks(
-        found.states, found.disturbance, found.changed, site.earth_field_world / MICROTESLA
+    findings = remarks(
+        result.states, result.disturbance, result.changed, site.earth_field_world / MICROTESLA
     )
-    open_heading = np.array([s.cov[2, 2] for s in found.states])
-    usual = found.states[int(np.argsort(open_heading)[len(open_heading) // 2])]
-    said += doubts(usual.cov[:3, :3], np.eye(3))
-    trust = Trust((*log.noticed, *uneven_stamps(log, site), *said))
-    figures = heading(name, log.name) | trust_figures(trust) | _figures(found, states, elapsed)
+    open_heading = np.array([s.cov[2, 2] for s in result.states])
+    usual = result.states[int(np.argsort(open_heading)[len(open_heading) // 2])]
+    findings += doubts(usual.cov[:3, :3], np.eye(3))
+    trust = Trust((*log.noticed, *uneven_stamps(log, site), *findings))
+    figures = heading(name, log.name) | trust_figures(trust) | _figures(result, states, elapsed)
     figures |= _errors(states, log)
-    by_state = alike(len(states), trust.verdict)
-    refined = _refined(site, found.states[-1])
+    by_state = uniform_trust(len(states), trust.verdict)
+    refined = _refined(site, result.states[-1])
     with claimed as whole:
         write_tum(states, whole / "trajectory.tum", log.epoch_ns)
         write_trajectory(states, whole / "trajectory.parquet", log.epoch_ns, by_state)
         save_site(refined, whole / "site.yaml")
         write_recording(whole / "run.rrd", refined, states, trust=trust, states=by_state)
-        write_report(whole, figures, Motion(refined, states, trust=by_state))
+        write_report(whole, figures, MotionPage(refined, states, trust=by_state))
     return figures
 
 
-def _trajectory(found: Oriented, log: Log, site: Site) -> Trajectory:
+def _trajectory(result: Oriented, log: Log, site: Site) -> Trajectory:
     """Return the states at the inertial samples; the position is unknown."""
-    ends, time = found.ends, found.time
+    ends, time = result.ends, result.time
     index = np.clip(np.searchsorted(ends, time), 0, len(ends) - 1)
     noise = site.platform.imu.gyro_noise
     pose = np.empty((len(time), 6, 6))
     pose[:] = np.diag([0.0, 0.0, 0.0, *[ANYWHERE**2] * 3])
-    turn = np.stack([state.cov[:3, :3] for state in found.states])[index]
-    attitude = found.world_from_body
+    turn = np.stack([state.cov[:3, :3] for state in result.states])[index]
+    attitude = result.world_from_body
     rate = np.linalg.norm(log.imu.gyro_body[: len(time)], axis=1)
     floor = (noise**2 * 0.1 + (TIMING * rate) ** 2)[:, None, None] * np.eye(3)
     pose[:, :3, :3] = np.swapaxes(attitude, 1, 2) @ turn @ attitude + floor
     part = {
-        "velocity_world": np.stack([s.velocity_world for s in found.states])[index],
-        "gyro_bias_body": np.stack([s.gyro_bias for s in found.states])[index],
-        "accel_bias_body": np.stack([s.accel_bias for s in found.states])[index],
+        "velocity_world": np.stack([s.velocity_world for s in result.states])[index],
+        "gyro_bias_body": np.stack([s.gyro_bias for s in result.states])[index],
+        "accel_bias_body": np.stack([s.accel_bias for s in result.states])[index],
     }
     return Trajectory(time, attitude, np.zeros((len(time), 3)), **part, pose_cov=pose)
 
@@ -117,8 +117,8 @@ def _thinned(states: Trajectory, rate: Rate) -> Trajectory:
     return Trajectory(**parts)
 
 
-def _figures(found: Oriented, states: Trajectory, elapsed: float) -> Figures:
-    last, cov = found.states[-1], states.pose_cov
+def _figures(result: Oriented, states: Trajectory, elapsed: float) -> Figures:
+    last, cov = result.states[-1], states.pose_cov
     assert cov is not None
     turn = states.world_from_body @ cov[:, :3, :3] @ np.swapaxes(states.world_from_body, 1, 2)
     sigma = np.sqrt(np.diagonal(turn, axis1=1, axis2=2)) / DEGREE
@@ -128,8 +128,8 @@ def _figures(found: Oriented, states: Trajectory, elapsed: float) -> Figures:
         Figure("duration_s", float(states.time[-1] - states.time[0]), "s"),
         Figure("heading_sigma_median_deg", float(np.median(sigma[:, 2])), "deg"),
         Figure("tilt_sigma_median_deg", float(np.median(np.hypot(*sigma[:, :2].T))), "deg"),
-        Figure("field_changes", len(found.changed)),
-        Figure("field_disturbance_max_ut", float(np.max(found.disturbance)), "uT"),
+        Figure("field_changes", len(result.changed)),
+        Figure("field_disturbance_max_ut", float(np.max(result.disturbance)), "uT"),
         Figure("field_lag_ms", 1e3 * last.lag, "ms"),
         Figure("field_lag_sigma_ms", 1e3 * float(np.sqrt(last.cov[LAG, LAG][0, 0])), "ms"),
         Figure("offset_ut", last.offset.tolist(), "uT", section=Section.REPORT),
@@ -175,8 +175,8 @@ def _refined(site: Site, last: Orientation) -> Site:
     turn = old.matrix @ old.body_from_sensor.T @ last.world_from_body.T
     cov = turn @ last.cov[OFFSET, OFFSET] @ turn.T
     sigma = np.sqrt(np.diagonal(cov)) * MICROTESLA
-    found = replace(old, offset=last.offset * MICROTESLA, sigma=replace(old.sigma, offset=sigma))
-    return replace(site, platform=replace(site.platform, magnetometer=found))
+    result = replace(old, offset=last.offset * MICROTESLA, sigma=replace(old.sigma, offset=sigma))
+    return replace(site, platform=replace(site.platform, magnetometer=result))
 
 
 def run_orientation_stream(
@@ -199,7 +199,7 @@ def run_orientation_stream(
         try:
             if numbered.record is None:
                 raise InputError(numbered.refusal)
-            _take_in(navigator, numbered.record)
+            _process_record(navigator, numbered.record)
         except InputError as error:
             sentence = f"standard input, {_PLACE[form]} {numbered.number}: {error}"
             if not keep_going:
@@ -208,12 +208,12 @@ def run_orientation_stream(
             messages.write(f"magfusion: {sentence} (skipped)\n")
             continue
         for state in navigator.take():
-            sink.write(json_line(_told(navigator, state)))
+            sink.write(json_line(_state_row(navigator, state)))
         sink.flush()
     return refused
 
 
-def _take_in(navigator: OrientationNavigator, record: Any) -> None:
+def _process_record(navigator: OrientationNavigator, record: Any) -> None:
     if record.imu is not None:
         time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
         if len(time):
@@ -226,7 +226,7 @@ def _take_in(navigator: OrientationNavigator, record: Any) -> None:
         raise InputError("phasors of beacons that are not in the site; describe them there")
 
 
-def _told(navigator: OrientationNavigator, state: JudgedState) -> dict[str, Any]:
+def _state_row(navigator: OrientationNavigator, state: JudgedState) -> dict[str, Any]:
     """Return a state as written; unknown values are null."""
     sigma = np.sqrt(np.diagonal(state.cov))
     quaternion = Rotation.from_matrix(state.world_from_body).as_quat(scalar_first=True)

@@ -13,7 +13,7 @@ from magfusion.jobs.settings import Command, Settings, argument, option
 from magfusion.papers.register import paper, papers
 
 if TYPE_CHECKING:
-    from magfusion.papers.register import Numbered, Paper
+    from magfusion.papers.register import NumberedEntry, Paper
 
 WIDTH = 100  # columns
 _MARGIN = 11  # of what an entry says, behind what it is
@@ -39,12 +39,12 @@ def run_papers(settings: PapersSettings) -> None:
         Where there is no such paper or entry.
     """
     if settings.paper is None:
-        found = papers()
-        text, content = "\n\n".join(map(_head, found)), [_told(one) for one in found]
+        result = papers()
+        text, content = "\n\n".join(map(_head, result)), [_paper_row(one) for one in result]
     else:
         one = paper(settings.paper)
         words = " ".join(settings.number)
-        entries = one.asked(words) if words else one.entries
+        entries = one.select(words) if words else one.entries
         content = [entry.content() for entry in entries]
         if len(entries) == 1:
             text = "\n\n".join([card(entries[0]), *map(_filled, filter(None, _source(one)))])
@@ -56,10 +56,10 @@ def run_papers(settings: PapersSettings) -> None:
     sys.stdout.write(f"{shown}\n")
 
 
-def _told(one: Paper) -> dict[str, object]:
+def _paper_row(one: Paper) -> dict[str, object]:
     counts = Counter(entry.entry.finding for entry in one.entries)
-    told = {"about": one.about, "note": one.note, "citation": one.citation.model_dump()}
-    return {"paper": one.number, **told, "findings": dict(counts)}
+    reported = {"about": one.about, "note": one.note, "citation": one.citation.model_dump()}
+    return {"paper": one.number, **reported, "findings": dict(counts)}
 
 
 def _source(one: Paper) -> tuple[str, str]:
@@ -69,20 +69,20 @@ def _source(one: Paper) -> tuple[str, str]:
 def _head(one: Paper) -> str:
     """Return the subject of a paper, its source, and the number of findings of each kind."""
     counts = Counter(entry.entry.finding for entry in one.entries)
-    found = ", ".join(f"{count} {finding}" for finding, count in counts.most_common())
+    result = ", ".join(f"{count} {finding}" for finding, count in counts.most_common())
     title = _filled(f"Paper {one.number}: {one.about}")
-    told = (*_source(one), f"{len(one.entries)} entries: {found}")
-    return "\n".join([title, *map(_filled, filter(None, told))])
+    reported = (*_source(one), f"{len(one.entries)} entries: {result}")
+    return "\n".join([title, *map(_filled, filter(None, reported))])
 
 
-def _line(one: Numbered) -> str:
+def _line(one: NumberedEntry) -> str:
     lead = f"{one.name:<{_MARGIN}}{one.entry.finding:<18}"
     return textwrap.fill(
         one.entry.says, WIDTH, initial_indent=lead, subsequent_indent=" " * len(lead)
     )
 
 
-def card(one: Numbered) -> str:
+def card(one: NumberedEntry) -> str:
     """Return one entry in full, for a reader."""
     entry = one.entry
     place = f", section {entry.where}" if entry.where else ""
@@ -95,8 +95,8 @@ def card(one: Numbered) -> str:
         ("scenario", [entry.scenario or ""]),
     ]
     lines = [f"Paper {one.paper}, {one.name}{place}"]
-    for lead, told in rows:
-        for i, text in enumerate(filter(None, told)):
+    for lead, reported in rows:
+        for i, text in enumerate(filter(None, reported)):
             label = f"  {'' if i else lead:<{_MARGIN - 2}}"
             lines.append(_filled(text, label))
     return "\n".join(lines)

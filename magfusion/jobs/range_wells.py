@@ -60,19 +60,19 @@ def run_range(settings: RangeSettings, output: Path) -> Figures:
     log, site = read_job(job, unknown=True, rotor=True)
     errors = DepthErrors(settings.depth_sigma, settings.depth_scale_sigma)
     with named(job.log_path):
-        told = ranging_log(log, site, settings.window, settings.mains_hz, errors)
-    found = find_range(site, told.windows)
-    trust, excess = _judged(log, told, found)
+        ranging = ranging_log(log, site, settings.window, settings.mains_hz, errors)
+    result = find_range(site, ranging.windows)
+    trust, excess = _judge_ranging(log, ranging, result)
     rotor = site.beacons[0].rotor
     assert rotor is not None
-    wells = Wells(found, told.windows, rotor.axis_beacon, excess)
-    windows, fields = told.windows, told.windows.fields
+    wells = Wells(result, ranging.windows, rotor.axis_beacon, excess)
+    windows, fields = ranging.windows, ranging.windows.fields
     magnet = windows.magnet[:, 1] + windows.magnet_from
     sensor = windows.sensor + windows.sensor_from
     places = wells.places(magnet, sensor)
     trust |= _vague(wells, float(sensor[-1]))
     figures = heading("range", log.name) | trust_figures(trust)
-    figures |= _figures(told, found, wells, sensor)
+    figures |= _figures(ranging, result, wells, sensor)
     last = places.place[-1], np.sqrt(np.diagonal(places.cov[-1]))
     figures |= Figures(
         *(
@@ -91,38 +91,38 @@ def run_range(settings: RangeSettings, output: Path) -> Figures:
         "sensor_depth_m": sensor,
         **{f"{w}_m": places.place[:, k] for k, w in enumerate(("ahead", "right", "up"))},
         **{f"{w}_sigma_m": sigma[:, k] for k, w in enumerate(("ahead", "right", "up"))},
-        "speed_hz": told.speed_hz,
+        "speed_hz": ranging.speed_hz,
         "sensor_roll_deg": windows.roll / DEGREE,
     }
     with claimed as whole:
         directory = found_in(whole, trust)
         write_table(columns, directory / "range.parquet")
         picture = RangePicture(magnet, sensor, places.place, places.cov)
-        write_range_plot(directory / "range.png", picture, high_side=told.high_side)
+        write_range_plot(directory / "range.png", picture, high_side=ranging.high_side)
         write_report(whole, figures)
     refuse_failed(job.log_path, output, trust)
     return figures
 
 
-def _judged(log: Log, told: RangingLog, found: Ranged) -> tuple[Trust, float]:
-    from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
+def _judge_ranging(log: Log, ranging_log: RangingLog, ranging: Ranged) -> tuple[Trust, float]:
+    from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
 
-    fields = told.windows.fields
+    fields = ranging_log.windows.fields
     name = fields.channels[0][0]
     remedy = (
         "Check casing, depths and axes of the sensor, use the part in which both wells are straight"
         " (--start, --end), or declare a larger model_error."
     )
-    fitted = unexplained(f"the magnet {name}", found.chi_square, found.freedom, remedy)
+    fitted = unexplained(f"the magnet {name}", ranging.chi_square, ranging.freedom, remedy)
     trust, excess = trust_of(fitted)
     findings = []
-    if found.rival_chi_square < AMBIGUOUS_CHI_SQUARE * excess:
+    if ranging.rival_chi_square < AMBIGUOUS_CHI_SQUARE * excess:
         text = (
             f"A second well geometry fits almost equally well: its chi square is higher by only"
-            f" {found.rival_chi_square:.2g}. Continue the pass beyond the sensor."
+            f" {ranging.rival_chi_square:.2g}. Continue the pass beyond the sensor."
         )
         findings.append(Finding("ambiguous", text))
-    if not found.converged:
+    if not ranging.converged:
         findings.append(
             Finding(
                 "not_converged",
@@ -136,14 +136,14 @@ def _judged(log: Log, told: RangingLog, found: Ranged) -> tuple[Trust, float]:
     if strongest < LEAST_SNR:
         text = f"Signal below noise (SNR {strongest:.2g}). Reduce the distance."
         findings.append(Finding("low_signal", text, Verdict.FAILED))
-    if not told.high_side:
+    if not ranging_log.high_side:
         why = "holds no inertial samples" if not log.inertial else "is of an upright hole"
         text = (
             f"The log {why}, so that directions are from the sensor's third axis, not from the high"
             " side, and the sensor is assumed not to rotate."
         )
         findings.append(Finding("assumed", text))
-    if not told.windows.angle_known:
+    if not ranging_log.windows.angle_known:
         text = (
             "The angle of the shaft is estimated from the field, not measured: the magnet's angle"
             " about it is undetermined. Distance and direction do not depend on it."
@@ -153,7 +153,7 @@ def _judged(log: Log, told: RangingLog, found: Ranged) -> tuple[Trust, float]:
 
 
 def _vague(wells: Wells, sensor: float) -> Trust:
-    one = wells.abreast(sensor)
+    one = wells.wells_at(sensor)
     if one.distance_sigma <= VAGUE * one.distance:
         return Trust()
     text = (
@@ -163,23 +163,23 @@ def _vague(wells: Wells, sensor: float) -> Trust:
     return Trust((Finding("few_data", text),))
 
 
-def _figures(told: RangingLog, found: Ranged, wells: Wells, sensor: object) -> Figures:
+def _figures(ranging_log: RangingLog, ranging: Ranged, wells: Wells, sensor: object) -> Figures:
     figures = [
-        Figure("windows", len(told.windows.fields)),
-        Figure("windows_dropped", told.dropped, section=Section.REPORT),
-        Figure("angle", "measured" if told.windows.angle_known else "followed"),
-        Figure("speed_mean_hz", float(np.mean(told.speed_hz)), "Hz"),
-        Figure("speed_spread_hz", float(np.std(told.speed_hz)), "Hz"),
+        Figure("windows", len(ranging_log.windows.fields)),
+        Figure("windows_dropped", ranging_log.dropped, section=Section.REPORT),
+        Figure("angle", "measured" if ranging_log.windows.angle_known else "followed"),
+        Figure("speed_mean_hz", float(np.mean(ranging_log.speed_hz)), "Hz"),
+        Figure("speed_spread_hz", float(np.std(ranging_log.speed_hz)), "Hz"),
         Figure(
             "residual_rms",
-            float(np.sqrt(found.chi_square / found.freedom)),
+            float(np.sqrt(ranging.chi_square / ranging.freedom)),
             label="residual (1 expected)",
         ),
     ]
-    if told.inclination is not None:
-        figures.append(Figure("inclination_deg", told.inclination / DEGREE, "deg"))
+    if ranging_log.inclination is not None:
+        figures.append(Figure("inclination_deg", ranging_log.inclination / DEGREE, "deg"))
     for k, depth in enumerate(np.unique(np.round(np.asarray(sensor), 2)), start=1):
-        one = wells.abreast(float(depth))
+        one = wells.wells_at(float(depth))
         rows = (
             ("sensor_depth_m", float(depth), "m"),
             ("distance_m", one.distance, "m"),
@@ -190,18 +190,18 @@ def _figures(told: RangingLog, found: Ranged, wells: Wells, sensor: object) -> F
             ("abreast_depth_sigma_m", one.depth_sigma, "m"),
         )
         figures += [Figure(f"place_{k}_{name}", value, unit) for name, value, unit in rows]
-    apart = wells.divergence()
+    separate = wells.divergence()
     figures += [
-        Figure("leads_right_deg", apart.right / DEGREE, "deg"),
-        Figure("leads_right_sigma_deg", apart.right_sigma / DEGREE, "deg"),
-        Figure("leads_up_deg", apart.up / DEGREE, "deg"),
-        Figure("leads_up_sigma_deg", apart.up_sigma / DEGREE, "deg"),
+        Figure("leads_right_deg", separate.right / DEGREE, "deg"),
+        Figure("leads_right_sigma_deg", separate.right_sigma / DEGREE, "deg"),
+        Figure("leads_up_deg", separate.up / DEGREE, "deg"),
+        Figure("leads_up_sigma_deg", separate.up_sigma / DEGREE, "deg"),
     ]
     for name, value, sigma, prior in zip(
-        found.names,
-        found.values.tolist(),
-        np.sqrt(np.diagonal(found.cov)[6:]).tolist(),
-        found.prior_sigma.tolist(),
+        ranging.names,
+        ranging.values.tolist(),
+        np.sqrt(np.diagonal(ranging.cov)[6:]).tolist(),
+        ranging.prior_sigma.tolist(),
         strict=True,
     ):
         figures.append(Figure(f"found_{name}", value, section=Section.REPORT))

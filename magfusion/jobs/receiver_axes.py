@@ -18,7 +18,7 @@ def check_axes(
     if measured <= {"xyz"} and sensor.axes == "xyz" and not amplitude:
         return
     key = f"{declared_path}: platform.magnetometer.axes:"
-    if len(sensor.axes) < 3 and (sensor.warming is not None or sensor.coil_kappa != 0.0):
+    if len(sensor.axes) < 3 and (sensor.temperature_model is not None or sensor.coil_kappa != 0.0):
         raise InputError(
             f"{key} for a receiver of fewer than three axes, warming and coil_kappa_m2 are not"
             " modelled; omit them"

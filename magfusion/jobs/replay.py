@@ -42,7 +42,7 @@ PIECE = 0.05  # s
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
+class Packet:
     """Data that arrive together.
 
     Parameters
@@ -98,13 +98,13 @@ class Replay:
     def __len__(self) -> int:
         return len(self._edges) - 1
 
-    def piece(self, k: int) -> Piece:
+    def piece(self, k: int) -> Packet:
         """Return one piece."""
         imu, waveform = self.log.imu, self.log.waveform
         own = slice(*self._imu[k : k + 2])
         part = slice(*self._waveform[k : k + 2])
         fields, rows = self.log.fields, range(*self._fields[k : k + 2])
-        return Piece(
+        return Packet(
             arrival=float(self._edges[k + 1]),
             imu=ImuSamples(imu.time[own], imu.gyro_body[own], imu.accel_body[own]),
             waveform=None
@@ -116,12 +116,12 @@ class Replay:
 
     def _of_several(self, k: int) -> tuple[tuple[str, Waveform], ...]:
         """Return the samples of each of several magnetometers; the first has the marks."""
-        found: list[tuple[str, Waveform]] = []
+        result: list[tuple[str, Waveform]] = []
         for name, wave in self.log.waveforms.items():
-            marks = None if found else self._marks(wave, k)
+            marks = None if result else self._marks(wave, k)
             part = wave.rows(slice(*self._each[name][k : k + 2]))
-            found.append((name, replace(part, marks=marks)))
-        return tuple(found)
+            result.append((name, replace(part, marks=marks)))
+        return tuple(result)
 
     def _marks(self, waveform: Waveform | None, k: int) -> Marks | None:
         """Return the bursts that have ended since the piece before."""
@@ -130,16 +130,16 @@ class Replay:
         first, last = _places(waveform.marks.end, self._edges[k : k + 2]).tolist()
         return waveform.marks.rows(slice(first if k else 0, last))
 
-    def pieces(self, first: int = 0) -> Iterator[tuple[int, Piece]]:
+    def pieces(self, first: int = 0) -> Iterator[tuple[int, Packet]]:
         """Yield the pieces from the first on, with their index."""
         for k in range(first, len(self)):
             yield k, self.piece(k)
 
 
-def feed(navigator: Navigator, piece: Piece) -> None:
+def feed(navigator: Navigator, piece: Packet) -> None:
     """Feed a piece to a navigator."""
     if len(piece.imu) and navigator.site.platform.inertial:
-        navigator.hear_imu(piece.imu.time, piece.imu.gyro_body, piece.imu.accel_body)
+        navigator.propagate_imu(piece.imu.time, piece.imu.gyro_body, piece.imu.accel_body)
     for name, wave in piece.waves:
         if wave.marks:
             navigator.add_marks(wave.marks)
@@ -150,7 +150,7 @@ def feed(navigator: Navigator, piece: Piece) -> None:
     navigator.advance()
 
 
-def paced(pieces: Iterable[tuple[int, Piece]], realtime: bool) -> Iterator[tuple[int, Piece]]:
+def paced(pieces: Iterable[tuple[int, Packet]], realtime: bool) -> Iterator[tuple[int, Packet]]:
     """Yield pieces with their index, in real time if requested."""
     began: float | None = None
     for k, piece in pieces:
@@ -172,7 +172,7 @@ def _field_arrival(fields: FieldSamples | None) -> Array:
     return np.asarray(np.maximum.accumulate(fields.time + fields.window / 2.0))
 
 
-def _of_long(log: LongLog) -> Iterator[tuple[int, Piece]]:
+def _of_long(log: LongLog) -> Iterator[tuple[int, Packet]]:
     """Yield the pieces of a log that is read concurrently."""
     imu, waveform = log.imu(), log.waveform()
     arrival = _field_arrival(log.fields)
@@ -185,7 +185,7 @@ def _of_long(log: LongLog) -> Iterator[tuple[int, Piece]]:
         time_imu, values = imu.until(edge)
         yield (
             k,
-            Piece(
+            Packet(
                 arrival=edge,
                 imu=ImuSamples(time_imu, values[:, :3], values[:, 3:]),
                 waveform=Waveform(*waveform.until(edge)),
@@ -202,7 +202,7 @@ def _currents(log: Log | LongLog) -> DriveSamples | None:
     return cosines(log.rotation)
 
 
-def _contents(piece: Piece) -> Iterator[dict[str, Any]]:
+def _contents(piece: Packet) -> Iterator[dict[str, Any]]:
     """Yield a piece as records."""
     if len(piece.imu):
         yield imu_content(piece.imu)
@@ -215,7 +215,7 @@ def _contents(piece: Piece) -> Iterator[dict[str, Any]]:
         yield from fields_contents(samples)
 
 
-class _Beside:
+class _Companions:
     """Data with the samples of a log that are known before them."""
 
     def __init__(self, log: Log | LongLog) -> None:
@@ -243,9 +243,9 @@ class _Beside:
 def run_replay(log: Log | LongLog, sink: BinaryIO, form: Format, realtime: bool) -> None:
     """Write a log as the records of a stream, in the order of their arrival."""
     pieces = _of_long(log) if isinstance(log, LongLog) else Replay(log).pieces()
-    beside = _Beside(log)
+    others = _Companions(log)
     for _, piece in paced(pieces, realtime):
-        for content in (*beside.until(piece.arrival), *_contents(piece)):
+        for content in (*others.until(piece.arrival), *_contents(piece)):
             write_record(content, sink, form)
         if realtime:
             sink.flush()
@@ -263,9 +263,9 @@ def run(settings: ReplaySettings) -> None:
 
     sink = binary_output()
     part, topics = (settings.start, settings.end), topics_option(settings.topics)
-    found = long_log(settings.log, *part) or open_log(settings.log, *part, topics)
+    result = long_log(settings.log, *part) or open_log(settings.log, *part, topics)
     with until_closed():
-        run_replay(found, sink, settings.form, settings.realtime)
+        run_replay(result, sink, settings.form, settings.realtime)
 
 
 COMMAND = Command(

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from magfusion.estimation.rests.at_rest import at_rest
+from magfusion.estimation.rests.stationary_integration import integrate_rests
 from magfusion.jobs.settings import Settings, option
 
 if TYPE_CHECKING:
-    from magfusion.estimation.rests.at_rest import AtRest
+    from magfusion.estimation.rests.stationary_integration import IntegratedRests
     from magfusion.model.samples import Log
     from magfusion.model.site import Site
     from magfusion.receiver.windows import LockinSettings
@@ -31,7 +31,7 @@ class RestSettings(Settings):
 
     def integrated(
         self, log: Log, site: Site, lockin: LockinSettings | None, least: int = 1
-    ) -> AtRest | None:
+    ) -> IntegratedRests | None:
         """Return the requested rests of a log; None if not requested.
 
         Parameters
@@ -42,8 +42,8 @@ class RestSettings(Settings):
         Raises
         ------
         InputError
-            As `magfusion.estimation.rests.at_rest.at_rest`.
+            As `magfusion.estimation.rests.stationary_integration.integrate_rests`.
         """
         if not self.at_rest:
             return None
-        return at_rest(log, site, lockin, self.false_alarm, least)
+        return integrate_rests(log, site, lockin, self.false_alarm, least)

@@ -13,7 +13,7 @@ from magfusion.model.site import Beacon, Site
 if TYPE_CHECKING:
     from magfusion.files.stream import Record
 
-PATIENCE = 2.0  # s of samples in a stream, after which the angle of a rotor is missed
+MAX_WAIT = 2.0  # s of samples in a stream, after which the angle of a rotor is missed
 ALL = ""  # as the name of a current that flows through the coils of all
 
 
@@ -26,14 +26,14 @@ def is_for_ranging(site: Site) -> bool:
     )
 
 
-def check_rotors(place: Path, log_path: Path, log: Log, site: Site, *, apart: bool) -> None:
+def check_rotors(place: Path, log_path: Path, log: Log, site: Site, *, separately: bool) -> None:
     """Reject rotors without a required angle, and sites for ranging only.
 
     Parameters
     ----------
     place : Path
         File of the site.
-    apart : bool
+    separately : bool
         Whether each epoch may have a separate phase.
 
     Raises
@@ -66,7 +66,7 @@ def check_rotors(place: Path, log_path: Path, log: Log, site: Site, *, apart: bo
                 f"{place}: rotor of beacon {beacon.name}: is synchronised, but {log_path} has no"
                 f" rotor angle; {remedy}, or write synchronised: false for magfusion fix"
             )
-        if not beacon.synchronised and not apart:
+        if not beacon.synchronised and not separately:
             raise InputError(
                 f"{place}: rotor of beacon {beacon.name}: its angle is not measured, and its speed"
                 f" drifts more than a clock's; {remedy}, or fix each epoch on its own with"
@@ -93,7 +93,7 @@ class AwaitedAngles:
     """Monitor of missing rotor angles in a stream."""
 
     def __init__(self, site: Site) -> None:
-        self._left = {beacon.name for beacon in _wandering(site)}
+        self._awaited = {beacon.name for beacon in _wandering(site)}
         self._first: float | None = None
 
     def see(self, record: Record | None) -> None:
@@ -104,19 +104,19 @@ class AwaitedAngles:
         InputError
             Where samples have arrived for some time without an angle.
         """
-        if record is None or not self._left:
+        if record is None or not self._awaited:
             return
         if record.drive is not None:
             names = {beacon_of(column) for column in record.drive.current}
-            self._left = set() if ALL in names else self._left - names
+            self._awaited = set() if ALL in names else self._awaited - names
         if record.magnetometer is None or not len(record.magnetometer.time):
             return
         if self._first is None:
             self._first = float(record.magnetometer.time[0])
-        if self._left and float(record.magnetometer.time[-1]) > self._first + PATIENCE:
-            name = min(self._left)
+        if self._awaited and float(record.magnetometer.time[-1]) > self._first + MAX_WAIT:
+            name = min(self._awaited)
             raise InputError(
-                f"standard input: {PATIENCE:g} s of samples without a record of drive with"
+                f"standard input: {MAX_WAIT:g} s of samples without a record of drive with"
                 f" drive_{name}: beacon {name} is a rotor; send the cosine of its angle with the"
                 " samples"
             )

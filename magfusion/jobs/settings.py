@@ -98,8 +98,8 @@ def option(default: Any, help: str, **facts: Any) -> Any:
 
 def argument(help: str, default: Any = dataclasses.MISSING, **facts: Any) -> Any:
     """Return a positional field; it is required if it has no default."""
-    asked = {"option": Option(help, positional=True, **facts)}
-    return dataclasses.field(default=default, metadata=asked)
+    requested = {"option": Option(help, positional=True, **facts)}
+    return dataclasses.field(default=default, metadata=requested)
 
 
 def required(help: str, **facts: Any) -> Any:
@@ -109,8 +109,8 @@ def required(help: str, **facts: Any) -> Any:
 
 def options(settings: type[Settings]) -> list[tuple[dataclasses.Field[Any], Option]]:
     """Return the fields that are options, a job's own before those of many jobs."""
-    found = [(f, f.metadata["option"]) for f in dataclasses.fields(settings) if f.metadata]
-    return sorted(found, key=lambda pair: pair[1].common)
+    result = [(f, f.metadata["option"]) for f in dataclasses.fields(settings) if f.metadata]
+    return sorted(result, key=lambda pair: pair[1].common)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,10 +124,10 @@ class Settings:
     """
 
     def __post_init__(self) -> None:
-        for field, asked in options(type(self)):
+        for field, requested in options(type(self)):
             value = getattr(self, field.name)
             if isinstance(value, int | float) and not isinstance(value, bool):
-                asked.check(asked.name or field.name.replace("_", "-"), value)
+                requested.check(requested.name or field.name.replace("_", "-"), value)
 
 
 class Command(NamedTuple):

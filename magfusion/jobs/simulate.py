@@ -13,7 +13,7 @@ from magfusion.files.log import write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.jobs.rotor_inputs import is_for_ranging
 from magfusion.jobs.settings import Command, option
-from magfusion.jobs.simulate_passes import ShaftSettings, run_passes
+from magfusion.jobs.simulate_ranging import ShaftSettings, simulate_ranging
 from magfusion.model.trust import Trust
 from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
@@ -158,7 +158,7 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
     if settings.site is not None:
         site = load_site(settings.site, several=True, unknown=True)
         if is_for_ranging(site):
-            return _passes(settings, site, output)
+            return _simulate_ranging(settings, site, output)
         site = load_site(settings.site, several=True)
     _refuse_wells(settings, site)
     box = box_option(settings.box)
@@ -200,7 +200,7 @@ def _rails(text: str | None, box_world: Array, site: Site) -> Steel | None:
     return laid(rails_option(text), box_world, beacons_world)
 
 
-def _passes(settings: SimulateSettings, site: Site, output: Path) -> Figures:
+def _simulate_ranging(settings: SimulateSettings, site: Site, output: Path) -> Figures:
     """Simulate passes of a magnet in a well, without incompatible options."""
     usual = SimulateSettings(seed=settings.seed)
     without = ("motion", "box", "iron", "ambient", "drift", "storms", "reference", "random_field")
@@ -215,14 +215,14 @@ def _passes(settings: SimulateSettings, site: Site, output: Path) -> Figures:
         raise InputError(
             f"{settings.site}: platform.magnetometers: ranging uses one sensor; describe one"
         )
-    return run_passes(
+    return simulate_ranging(
         site,
         settings,
         output,
         rate_hz=settings.rate,
         perturb=settings.perturb,
         layers=None if settings.ground is None else layers_option(settings.ground),
-        beside=() if settings.rails is None else rails_option(settings.rails),
+        neighbour=() if settings.rails is None else rails_option(settings.rails),
     )
 
 

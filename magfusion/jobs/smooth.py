@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from magfusion.errors import UNOBSERVABLE, EstimationError, InputError
-from magfusion.estimation.data_checks.recording import BRIDGED, beyond, recorded
+from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, beyond, recorded
 from magfusion.estimation.snapshot.coil_gain import with_found_gain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
@@ -37,8 +37,8 @@ from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.estimation.batch.batch import Smoothed, SmootherSettings
-    from magfusion.estimation.batch.passes import PassFile
-    from magfusion.estimation.rests.at_rest import AtRest
+    from magfusion.estimation.batch.outer_iterations import PassFile
+    from magfusion.estimation.rests.stationary_integration import IntegratedRests
     from magfusion.jobs.inputs import Job
     from magfusion.model.samples import Log
     from magfusion.model.site import Site
@@ -195,31 +195,31 @@ def run_smooth(
     if free_gain:
         site = _with_gain(job, log, site, settings)
     _refuse_placing(job, site)
-    passes = None if kept is None else _passes(*kept, log, site, settings)
+    iterations_file = None if kept is None else _iterations_file(*kept, log, site, settings)
     began = time.perf_counter()
     try:
         with named(job.log_path):
-            result, placed = smooth_and_place(log, site, settings, report, passes)
-            log, site, result, said = _agreed(log, site, settings, result, risk)
+            result, placed = smooth_and_place(log, site, settings, report, iterations_file)
+            log, site, result, findings = _agreed(log, site, settings, result, risk)
     except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
         reason = reason_of(error)
         if _has_unknown(site):
             raise EstimationError(f"{job.log_path}: {reason}") from error
         with claimed as whole:
-            told = _save_fixes_instead(whole, settings, log, site, reason)
+            reported = _save_fixes_instead(whole, settings, log, site, reason)
         raise EstimationError(
-            f"{job.log_path}: {told}; the single-epoch fixes are saved in {job.output / FAILED}"
+            f"{job.log_path}: {reported}; the single-epoch fixes are saved in {job.output / FAILED}"
         ) from error
     give_back_memory()
-    said += () if rested is None else beyond(recording, log, site)
-    done = finished(log, site, settings, result, risk, said=said)
+    findings += () if rested is None else beyond(recording, log, site)
+    done = finished(log, site, settings, result, risk, findings=findings)
     figures = done.figures | Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     figures |= Figures() if rested is None else rest_figures(rested)
     done = with_errors(replace(done, figures=figures), log, placed, (site, settings))
     with claimed as whole:
         write_finished(whole, log, done, rate=rate)
-    if passes is not None:
-        passes.place.unlink(missing_ok=True)
+    if iterations_file is not None:
+        iterations_file.place.unlink(missing_ok=True)
     refuse_failed(job.log_path, output=job.output, trust=done.trust)
     return done.figures
 
@@ -250,19 +250,19 @@ def _read(
         fewer=not by_rests,
         amplitudes=not by_rests,
         several=True,
-        anew=not by_rests,
+        reread=not by_rests,
         lockin=settings.lockin,
         reference=by_rests,
-        heard=not by_rests,
+        select_beacons=not by_rests,
         report=report,
     )
 
 
-def _passes(
+def _iterations_file(
     place: Path, resume: bool, log: Log, site: Site, settings: SmootherSettings
 ) -> PassFile:
     """Return the file of the passes, for a log with this site and these settings."""
-    from magfusion.estimation.batch.passes import PassFile
+    from magfusion.estimation.batch.outer_iterations import PassFile
 
     if any(beacon.unknown is not None for beacon in site.beacons):
         raise InputError("--checkpoint requires a site whose beacons are all surveyed; omit it")
@@ -279,7 +279,7 @@ def _passes(
 
 def _rested(
     job: Job, log: Log, site: Site, rest: RestSettings, settings: SmootherSettings
-) -> AtRest:
+) -> IntegratedRests:
     """Return the rests of a log, in any of which at least one beacon is detected."""
     from magfusion.jobs.inputs import named
 
@@ -291,7 +291,7 @@ def _rested(
     with named(job.log_path):
         rested = rest.integrated(log, site, settings.lockin, least=2)
     assert rested is not None
-    if not np.any(rested.heard):
+    if not np.any(rested.detected):
         raise EstimationError(f"{job.log_path}: {rested.findings[-1].text}")
     return rested
 
@@ -321,7 +321,7 @@ def _agreed(
     from magfusion.estimation.integrity.magnetometer_exclusion import agreed
 
     plain = replace(settings, tune=False)
-    found = agreed(
+    estimate = agreed(
         result,
         log,
         site,
@@ -329,7 +329,7 @@ def _agreed(
         lambda log, site: smooth(log, site, plain),
         risk,
     )
-    return found.log, found.site, found.result, found.findings
+    return estimate.log, estimate.site, estimate.result, estimate.findings
 
 
 def _save_fixes_instead(
@@ -350,7 +350,7 @@ def _save_fixes_instead(
         reason = what if code == "geometry" else CONTRADICTION
     text = f"There is no trajectory: {reason}."
     none = Finding(code, text, Verdict.FAILED, weight=0.0)
-    trust = Trust((none, *recorded(log, site, BRIDGED, beacons=True)))
+    trust = Trust((none, *recorded(log, site, BRIDGED_CODES, beacons=True)))
     if code != "geometry":  # of poses that no epoch determines nothing can be tried
         trust = with_cause(trust, log, site, settings.lockin)
     if trust.ordered[0].weight >= OF_CATCH_ALL:

@@ -10,7 +10,7 @@ import numpy as np
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.batch.self_survey import Placement
 from magfusion.estimation.integrity.diagnosis import with_cause
-from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.integrity.judge import judge_result
 from magfusion.estimation.integrity.smoothed_exclusion import (
     separated_smooth,
     states_between,
@@ -31,8 +31,8 @@ from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk, StateTrust, Trust, Verdict
 from magfusion.results.errors import TrajectoryErrors, trajectory_errors
-from magfusion.results.figures import Column, Figure, Figures, Section, heading
-from magfusion.results.page_motion import Motion
+from magfusion.results.figures import ErrorColumn, Figure, Figures, Section, heading
+from magfusion.results.page_motion import MotionPage
 from magfusion.results.recording import write_recording
 from magfusion.results.refinement import result_site
 from magfusion.results.report import (
@@ -76,7 +76,7 @@ def finished(
     risk: Risk | None,
     *,
     excess: float = 1.0,
-    said: tuple[Finding, ...] = (),
+    findings: tuple[Finding, ...] = (),
 ) -> Finished:
     """Assess a smoothed log.
 
@@ -84,18 +84,18 @@ def finished(
     ----------
     excess : float
         Factor on the variances of its poses, from other logs.
-    `said` : tuple of Finding
+    `findings` : tuple of Finding
         From other logs.
     """
     separated = separated_smooth(result, risk)
     give_back_memory()
-    result, trust = judged(separated.result, log)
+    result, trust = judge_result(separated.result, log)
     trust |= Trust((*open_signs(result), *roll_findings(site)))
     result = replace(result, states=with_open_roll(result.states, site))
     if excess > 1.0 and result.states.pose_cov is not None:
         wider = excess * result.states.pose_cov
         result = replace(result, states=replace(result.states, pose_cov=wider))
-    trust = with_cause(trust | separated.trust | Trust(said), log, site, settings.lockin)
+    trust = with_cause(trust | separated.trust | Trust(findings), log, site, settings.lockin)
     by_state = states_judged(separated, result, trust.verdict)
     figures = (
         heading("smooth", log.name)
@@ -169,19 +169,22 @@ def write_finished(whole: Path, log: Log, done: Finished, *, rate: Rate) -> None
         trust=done.trust,
         states=by_state,
     )
-    motion = Motion(refined, result.states, log.truth, done.errors, innovations, by_state)
+    motion = MotionPage(refined, result.states, log.truth, done.errors, innovations, by_state)
     write_report(whole, done.figures, motion)
 
 
 def _innovations(result: Smoothed) -> dict[str, tuple[Array, Array]]:
     channels = result.fields.channels
-    found = {}
+    estimate = {}
     for name in dict.fromkeys(beacon for beacon, _ in channels):
         own = result.residual[:, [beacon == name for beacon, _ in channels]]
         seen = np.isfinite(own).all(axis=(1, 2))
         if np.any(seen):
-            found[name] = (result.fields.time[seen], np.sqrt(np.mean(own[seen] ** 2, axis=(1, 2))))
-    return found
+            estimate[name] = (
+                result.fields.time[seen],
+                np.sqrt(np.mean(own[seen] ** 2, axis=(1, 2))),
+            )
+    return estimate
 
 
 def _fixed_survey_figures(
@@ -196,4 +199,4 @@ def _fixed_survey_figures(
     except RuntimeError as error:
         return Figures(Figure("held_failed", reason_of(error), section=Section.REPORT))
     assert log.truth is not None
-    return error_figures(trajectory_errors(fixed.states, log.truth), Column.FIXED, "held_")
+    return error_figures(trajectory_errors(fixed.states, log.truth), ErrorColumn.FIXED, "held_")

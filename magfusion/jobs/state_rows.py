@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
     from magfusion.estimation.online.navigator import Navigator
     from magfusion.estimation.online_integrity.judgement import JudgedState
-    from magfusion.files.row_file import Mark, RowFile
+    from magfusion.files.row_file import RowFile, RowPosition
     from magfusion.model.site import Site
     from magfusion.units import Array
 
 # Kind of a row: an epoch's state as first estimated, as it left the window, or propagated.
-CURRENT, LAGGED, CARRIED = 0.0, 1.0, 2.0
+CURRENT, LAGGED, PROPAGATED = 0.0, 1.0, 2.0
 STATE = {
     "time": 1,
     "world_from_body": 9,
@@ -33,7 +33,7 @@ TOGETHER = 32  # rows whose levels are found at once
 def row_columns(site: Site) -> dict[str, int]:
     """Return the stored columns of each state, with their number of values."""
     beacons = len(site.beacons)
-    told = {
+    reported = {
         "lagged": 1,
         "reset_counter": 1,
         "latency": 1,
@@ -41,7 +41,7 @@ def row_columns(site: Site) -> dict[str, int]:
         "levels": 2,
         "pose_cov": 36,
     }
-    return told | STATE | {"distortion": beacons, "excluded": beacons, "heard": beacons}
+    return reported | STATE | {"distortion": beacons, "excluded": beacons, "heard": beacons}
 
 
 class StateRows:
@@ -74,7 +74,7 @@ class StateRows:
         self._write()
         return self._rows.rows()
 
-    def settle(self) -> Mark:
+    def settle(self) -> RowPosition:
         """Write all rows to the disk; return the length of the file."""
         self._write()
         return self._rows.settle()
@@ -90,7 +90,7 @@ class StateRows:
         self._waiting = []
         find(levels)
         rows = {name: np.array([row[name] for row in own]) for name in own[0]}
-        rows["levels"] = np.array([one.found for one in levels], dtype=np.float64)
+        rows["levels"] = np.array([one.values for one in levels], dtype=np.float64)
         self._rows.extend(rows)
 
 
@@ -99,7 +99,7 @@ def _row(
 ) -> dict[str, Array | float]:
     """Return a state as a row of `row_columns`, without its levels."""
     level, names = navigator.distortion, [b.name for b in navigator.site.beacons]
-    excluded, heard = state.judgement.excluded, state.judgement.heard
+    excluded, detected = state.judgement.excluded, state.judgement.detected
     return {name: getattr(state, name) for name in STATE} | {
         "lagged": kind,
         "reset_counter": float(state.reset_counter),
@@ -108,5 +108,5 @@ def _row(
         "pose_cov": state.cov[:6, :6].copy(),
         "distortion": np.array([level.get(name, np.nan) for name in names]),
         "excluded": np.array([float(name in excluded) for name in names]),
-        "heard": np.array([float(name in heard) for name in names]),
+        "heard": np.array([float(name in detected) for name in names]),
     }

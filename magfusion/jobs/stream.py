@@ -8,19 +8,19 @@ from typing import Any, BinaryIO, TextIO
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
+from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.graph.state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
 from magfusion.estimation.initialization.online import NoStart
 from magfusion.estimation.measurements.signs import along_axis
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.online.state_of_now import CarriedState
+from magfusion.estimation.online.state_of_now import PropagatedState
 from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.checkpoint import run_key
 from magfusion.files.named_records import site_fields
 from magfusion.files.site import load_site
 from magfusion.files.stream import (
     Format,
-    Numbered,
+    NumberedRecord,
     Record,
     drive_samples,
     json_line,
@@ -114,10 +114,10 @@ def _navigate(
     navigator = begin(place, key, site, settings.navigator, None, resume=settings.resume).navigator
     refused, saved, reached = 0, -np.inf, -np.inf
     missing: Counter[str] = Counter()
-    told, angles = _Told(navigator, sink, others), AwaitedAngles(site)
+    output, angles = _StateWriter(navigator, sink, others), AwaitedAngles(site)
     for numbered in read_records(source, settings.form):
         try:
-            newest = _take_in(navigator, site, numbered, missing, told)
+            newest = _process_record(navigator, site, numbered, missing, output)
         except InputError as error:
             sentence = f"standard input, {_PLACE[settings.form]} {numbered.number}: {error}"
             if not settings.keep_going:
@@ -126,15 +126,15 @@ def _navigate(
             messages.write(f"magfusion: {sentence} (skipped)\n")
             continue
         angles.see(numbered.record)
-        told.epochs()
+        output.epochs()
         if not navigator.started and -np.inf < newest >= reached + WAITING:
-            told.tell(None, _waiting(navigator, newest))
+            output.write(None, _waiting(navigator, newest))
             reached = newest
         sink.flush()
         if place is not None and newest >= saved + settings.every:
             save(navigator, numbered.number, None, place, key)
             saved = newest
-    if told.reference:
+    if output.reference:
         messages.write(f"magfusion: reference: {NOT_ONLINE}\n")
     for stream, count in missing.items():
         messages.write(f"magfusion: {stream}: {count} samples are NaN. They are left out.\n")
@@ -143,7 +143,7 @@ def _navigate(
     return refused
 
 
-class _Told:
+class _StateWriter:
     """Writes states as they are estimated, and sends them to the other outputs.
 
     Parameters
@@ -162,16 +162,16 @@ class _Told:
         self._newest = -np.inf
         self.reference = False
 
-    def tell(self, state: JudgedState | None, told: dict[str, Any]) -> None:
+    def write(self, state: JudgedState | None, output: dict[str, Any]) -> None:
         """Write a state, or the status before the first (None)."""
-        self._sink.write(json_line(told))
+        self._sink.write(json_line(output))
         for other in self._others:
-            other.take(state, told)
+            other.take(state, output)
 
     def now(self) -> None:
         """Write the current states, before any other processing."""
-        for state in self._navigator.take_carried():
-            self.tell(state, state_content(self._navigator, state))
+        for state in self._navigator.take_propagated():
+            self.write(state, state_content(self._navigator, state))
             self._newest = state.time
         self._sink.flush()
 
@@ -179,28 +179,28 @@ class _Told:
         """Write the states of the epochs, except those older than a written current one."""
         for state in self._navigator.take():
             if state.time > self._newest:
-                self.tell(state, state_content(self._navigator, state))
+                self.write(state, state_content(self._navigator, state))
         self._navigator.take_lagged()
 
 
-def _take_in(
+def _process_record(
     navigator: Navigator,
     site: Site,
-    numbered: Numbered,
+    numbered: NumberedRecord,
     missing: Counter[str],
-    told: _Told,
+    output: _StateWriter,
 ) -> float:
     """Feed a record to the navigator, and count missing data; return its newest time (s)."""
     if numbered.record is None:
         raise InputError(numbered.refusal)
     record, newest = numbered.record, -np.inf
-    _take_in_beside(navigator, record)
-    told.reference |= record.reference is not None
+    _process_companions(navigator, record)
+    output.reference |= record.reference is not None
     if record.imu is not None:
         time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
         if len(time):
-            navigator.hear_imu(time, gyro, accel)
-            told.now()
+            navigator.propagate_imu(time, gyro, accel)
+            output.now()
             navigator.advance()
         _count_missing(missing, "imu", len(record.imu.time) - len(time))
         newest = max(newest, _last(time))
@@ -223,7 +223,7 @@ def _count_missing(missing: Counter[str], stream: str, number: int) -> None:
         missing[stream] += number
 
 
-def _take_in_beside(navigator: Navigator, record: Record) -> None:
+def _process_companions(navigator: Navigator, record: Record) -> None:
     """Feed the navigator the data that must precede its samples."""
     if record.temperature is not None:
         for part, degc in record.temperature.degc.items():
@@ -248,10 +248,10 @@ def _waiting(navigator: Navigator, time: float) -> dict[str, Any]:
     if not reasons and why != NoStart():
         reasons = (Finding("no_start", why.reason, Verdict.FAILED),)
     open_ = True if any(reason.code == "ambiguous" for reason in reasons) else None
-    return nothing | {"reasons": _said(reasons), "ambiguous": open_}
+    return nothing | {"reasons": _finding_rows(reasons), "ambiguous": open_}
 
 
-def _said(findings: tuple[Finding, ...]) -> list[dict[str, str]]:
+def _finding_rows(findings: tuple[Finding, ...]) -> list[dict[str, str]]:
     return [{"code": finding.code, "text": finding.text} for finding in findings]
 
 
@@ -260,28 +260,28 @@ def state_content(navigator: Navigator, state: JudgedState) -> dict[str, Any]:
 
     A lost platform has no pose, nor anything derived from it.
     """
-    told = {
+    output = {
         "time": state.time,
-        "carried_s": state.time - state.epoch if isinstance(state, CarriedState) else 0.0,
+        "carried_s": state.time - state.epoch if isinstance(state, PropagatedState) else 0.0,
         "started": True,
-        "lost": state.lost,
+        "lost": state.is_lost,
         "reset_counter": state.reset_counter,
         "verdict": str(state.verdict),
-        "reasons": _said(state.judgement.reasons),
-        "remarks": _said(state.judgement.remarks),
+        "reasons": _finding_rows(state.judgement.reasons),
+        "remarks": _finding_rows(state.judgement.remarks),
         "excluded": list(state.judgement.excluded),
-        "heard": list(state.judgement.heard),
+        "heard": list(state.judgement.detected),
         "protection_level_m": state.judgement.protection_level_m,
         "protection_level_deg": state.judgement.protection_level_deg,
     }
-    if state.lost:
-        return told | {"ambiguous": None, "distortion": dict(navigator.distortion)}
+    if state.is_lost:
+        return output | {"ambiguous": None, "distortion": dict(navigator.distortion)}
     world_from_body, cov = state.world_from_body, state.cov
     rival = navigator.rival_chi_square
     position_cov = world_from_body @ cov[POSITION, POSITION] @ world_from_body.T
     biases, sigmas = _of_imu(navigator, state)
     quaternion = of_matrices(world_from_body[None])[:, 0]
-    return told | {
+    return output | {
         "ambiguous": rival is not None and rival < AMBIGUOUS_CHI_SQUARE,
         "position": state.position_world.tolist(),
         "quaternion": quaternion.tolist(),

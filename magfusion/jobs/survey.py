@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.estimation.data_checks.recording import passed_on
+from magfusion.estimation.data_checks.data_quality import passed_on
 from magfusion.files.survey import Survey, write_survey
 from magfusion.jobs.settings import Command, LogSettings, WindowSettings, option
 from magfusion.model.site import Site
@@ -122,7 +122,11 @@ def make_survey(
     detected = samples.valid.any(axis=1)
     still = np.ones(len(samples), dtype=bool)
     if points == "rests":
-        still = _at_rest(samples, log, site) if log.inertial else _stands(samples, poses)
+        still = (
+            _is_stationary(samples, log, site)
+            if log.inertial
+            else _is_stationary_pose(samples, poses)
+        )
     used = np.flatnonzero(exists & detected & still)
     dropped = {
         "outside the trajectory": int(np.sum(~exists)),
@@ -134,13 +138,13 @@ def make_survey(
     stop = np.arange(len(used))
     if points == "rests":
         stop = _stops(samples.time[used], position)
-    found = [
+    result = [
         _mean(samples, site, used[stop == s], position[stop == s], attitude[stop == s])
         for s in range(int(np.max(stop, initial=-1)) + 1)
     ]
-    kept = _spaced(np.array([p.position_world for p in found]).reshape(-1, 3), spacing)
+    kept = _spaced(np.array([p.position_world for p in result]).reshape(-1, 3), spacing)
     dropped["too close to another point"] = int(np.sum(~np.isin(stop, kept)))
-    chosen = [found[k] for k in kept]
+    chosen = [result[k] for k in kept]
     shape = (len(chosen), len(samples.channels))
     survey = Survey(
         point=np.arange(len(chosen)),
@@ -153,7 +157,7 @@ def make_survey(
     return survey, {reason: number for reason, number in dropped.items() if number}
 
 
-def _at_rest(samples: FieldSamples, log: Log, site: Site) -> BoolArray:
+def _is_stationary(samples: FieldSamples, log: Log, site: Site) -> BoolArray:
     """Return during which windows every inertial sample is at rest."""
     time = log.imu.time + site.platform.imu.time_offset
     motion = site.platform.motion
@@ -165,7 +169,7 @@ def _at_rest(samples: FieldSamples, log: Log, site: Site) -> BoolArray:
     return np.asarray((last > first) & (total[last] == total[first]))
 
 
-def _stands(samples: FieldSamples, poses: Trajectory) -> BoolArray:
+def _is_stationary_pose(samples: FieldSamples, poses: Trajectory) -> BoolArray:
     """Return during which windows the known poses stay within `STILL`, without an IMU."""
     still = np.ones(len(samples), dtype=bool)
     ends = []
@@ -198,15 +202,15 @@ def _mean(
     """Return the mean of the windows of one stop."""
     valid = samples.valid[rows]
     phasor = np.where(valid[..., None], samples.phasor_sensor[rows], 0.0)
-    free = [not b.synchronised for b in site.beacons for _ in b.tones]
+    free_parameters = [not b.synchronised for b in site.beacons for _ in b.tones]
     first = np.take_along_axis(phasor, np.argmax(valid, axis=0)[None, :, None], axis=0)
     lag = np.angle(np.sum(np.conj(first) * phasor, axis=-1))
-    phasor = phasor * np.exp(-1j * np.where(free, lag, 0.0))[..., None]
+    phasor = phasor * np.exp(-1j * np.where(free_parameters, lag, 0.0))[..., None]
     count = np.sum(valid, axis=0)
     share = np.where(count > 0, 1.0 / np.maximum(count, 1), np.nan)
     variance = np.trace(samples.phasor_cov[rows], axis1=2, axis2=3) / 3.0
     variance = share * np.sum(np.where(valid, variance, 0.0), axis=0)
-    independent = np.minimum(_windows_beside(samples, rows), np.maximum(count, 1))
+    independent = np.minimum(_independent_windows(samples, rows), np.maximum(count, 1))
     return _Point(
         position_world=np.mean(position, axis=0),
         world_from_body=Rotation.from_matrix(attitude).mean().as_matrix(),
@@ -215,7 +219,7 @@ def _mean(
     )
 
 
-def _windows_beside(samples: FieldSamples, rows: IntArray) -> float:
+def _independent_windows(samples: FieldSamples, rows: IntArray) -> float:
     """Return the number of non-overlapping windows in a stop."""
     time, window = samples.time[rows], samples.window[rows]
     return float((time[-1] - time[0]) / np.median(window)) + 1.0

@@ -147,13 +147,13 @@ def observe_antenna(
     in_beacon = antenna.sensitivities_sensor @ turn
     place = position_beacon[..., None, :] + antenna.centres_sensor @ turn
     offset = place[..., :, None, :] - antenna.centres_beacon[..., None, :, :]
-    sent, heard = antenna.kappa_beacon, antenna.kappa_sensor
+    sent, detected = antenna.kappa_beacon, antenna.kappa_sensor
     seen = coil_coupling(
         offset,
         np.broadcast_to(antenna.moments_beacon[..., None, :, :], offset.shape),
         np.broadcast_to(in_beacon[..., :, None, :], offset.shape),
         None if sent is None else np.asarray(sent)[..., None, :],
-        None if heard is None else np.asarray(heard)[..., None, None],
+        None if detected is None else np.asarray(detected)[..., None, None],
     )
     back = beacon_from_sensor[..., None, :, :]
     by_offset, by_sensitivity = seen.by_offset @ back, seen.by_sensitivity @ back  # sensor axes

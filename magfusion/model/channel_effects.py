@@ -45,12 +45,12 @@ def responded(site: Site) -> tuple[Array, Array] | None:
     responses, see `axis_factors`.
     """
     sensors = site.platform.magnetometers
-    alike = [s.response if isinstance(s.response, FrequencyResponse) else None for s in sensors]
-    if all(response is None for response in alike) or not site.beacons:
+    shared = [s.response if isinstance(s.response, FrequencyResponse) else None for s in sensors]
+    if all(response is None for response in shared) or not site.beacons:
         return None
     frequencies_hz = site.tone_frequencies_hz
     none = np.zeros_like(frequencies_hz)
-    parts = [(none, none) if r is None else r.at(frequencies_hz) for r in alike]
+    parts = [(none, none) if r is None else r.at(frequencies_hz) for r in shared]
     if len(parts) == 1:
         return parts[0]
     sizes, phases = zip(*parts, strict=True)
@@ -66,10 +66,10 @@ def axis_factors(site: Site) -> ComplexArray | None:
     if not site.beacons or not any(isinstance(s.response, AxisResponses) for s in sensors):
         return None
     frequencies_hz = site.tone_frequencies_hz
-    alike = np.ones((len(frequencies_hz), 3), dtype=np.complex128)
+    shared = np.ones((len(frequencies_hz), 3), dtype=np.complex128)
     return np.concatenate(
         [
-            s.response.factor(frequencies_hz) if isinstance(s.response, AxisResponses) else alike
+            s.response.factor(frequencies_hz) if isinstance(s.response, AxisResponses) else shared
             for s in sensors
         ]
     )
@@ -95,13 +95,15 @@ def warmed(site: Site, time: Array) -> Array | None:
         None where no coefficient is declared, or no temperature measured.
     """
     known = site.temperatures
-    if known is None or all(beacon.warming is None for beacon in site.beacons):
+    if known is None or all(beacon.temperature_model is None for beacon in site.beacons):
         return None
     parts = []
     for beacon in site.beacons:
-        degc = None if beacon.warming is None else known.at(beacon.name, time)
+        degc = None if beacon.temperature_model is None else known.at(beacon.name, time)
         own = np.zeros(np.shape(time))
-        if beacon.warming is not None and degc is not None:
-            own = beacon.warming.log_moment_per_k * (degc - beacon.warming.reference_degc)
+        if beacon.temperature_model is not None and degc is not None:
+            own = beacon.temperature_model.log_moment_per_k * (
+                degc - beacon.temperature_model.reference_degc
+            )
         parts += [own] * len(beacon.tones)
     return of_all_sensors(site, np.stack(parts, axis=-1))

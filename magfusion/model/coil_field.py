@@ -73,7 +73,7 @@ class Sources(NamedTuple):
 
 # Cached as long as beacon and site live: an estimator creates others at every step.
 _ALONE: WeakKeyDictionary[Beacon, Sources] = WeakKeyDictionary()
-_BESIDE: WeakKeyDictionary[Site, "Groups"] = WeakKeyDictionary()
+_GROUPS: WeakKeyDictionary[Site, "Groups"] = WeakKeyDictionary()
 Groups = tuple[tuple[tuple[int, ...], Sources], ...]
 
 
@@ -114,19 +114,19 @@ def side_by_side(site: Site) -> Groups:
     tuple
         Indices of beacons, and their source.
     """
-    known = _BESIDE.get(site)
+    known = _GROUPS.get(site)
     if known is None:
-        known = _BESIDE[site] = _grouped([alone(beacon) for beacon in site.beacons])
+        known = _GROUPS[site] = _grouped([alone(beacon) for beacon in site.beacons])
     return known
 
 
 def keep_sources(site: Site, other: Site) -> None:
     """Reuse the sources of a site for one that differs in the size of moments only, if cached."""
-    known = _BESIDE.get(site)
+    known = _GROUPS.get(site)
     # The loops of a long coil depend on the direction of its moment.
     if known is None or any(c.length is not None for b in other.beacons for c in b.coils):
         return
-    _BESIDE[other] = tuple(
+    _GROUPS[other] = tuple(
         (rows, _with_moments(source, [other.beacons[k].moments_beacon for k in rows]))
         for rows, source in known
     )
@@ -142,8 +142,8 @@ def _grouped(sources: list[Sources]) -> Groups:
     for k, source in enumerate(sources):
         loops, mapped = source.loops, k if source.field_map is not None else None
         shape = source.excitation.shape, loops.first, loops.centre.shape, loops.radius is None
-        alike = (*shape, source.concentric, mapped, source.decay is None)
-        of_form.setdefault(alike, []).append(k)
+        shared = (*shape, source.concentric, mapped, source.decay is None)
+        of_form.setdefault(shared, []).append(k)
     return tuple((tuple(rows), _stacked([sources[k] for k in rows])) for rows in of_form.values())
 
 

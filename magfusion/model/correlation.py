@@ -47,16 +47,16 @@ class Correlation:
 
     def without(self, groups: tuple[str, ...], owners: Iterable[str]) -> "Correlation | None":
         """Return the part without re-estimated groups of some owners."""
-        gone = set(owners)
-        return self.kept(lambda p: p.group not in groups or p.owner not in gone)
+        elapsed = set(owners)
+        return self.kept(lambda p: p.group not in groups or p.owner not in elapsed)
 
     def among(self, parameters: list[Component]) -> Array:
         """Return the coefficients between given parameters, zero for unknown ones, (k, k)."""
         index = {parameter: i for i, parameter in enumerate(self.parameters)}
         mine = [j for j, parameter in enumerate(parameters) if parameter in index]
-        theirs = [index[parameters[j]] for j in mine]
+        others = [index[parameters[j]] for j in mine]
         out = np.eye(len(parameters))
-        out[np.ix_(mine, mine)] = self.coefficients[np.ix_(theirs, theirs)]
+        out[np.ix_(mine, mine)] = self.coefficients[np.ix_(others, others)]
         return out
 
 

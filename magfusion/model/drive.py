@@ -13,7 +13,7 @@ import numpy as np
 
 from magfusion.units import Array, BoolArray, ComplexArray
 
-REMEMBERED = 1000  # readings of each channel that a running estimator keeps
+MAX_READINGS = 1000  # readings of each channel that a running estimator keeps
 LEAST_SHARE = 1e-6  # of a drive that is off, to keep its logarithm finite
 LEAST_ON = 0.05  # of the declared current; below, the drive is off and has no phase
 
@@ -59,7 +59,7 @@ class DriveShares:
         """Return the key of a channel's readings."""
         return f"{tone} {beacon}"
 
-    def hear(self, beacon: str, tone: int, time: Array, share: ComplexArray) -> None:
+    def add_readings(self, beacon: str, tone: int, time: Array, share: ComplexArray) -> None:
         """Add readings of a channel, in order of time, later than the stored ones."""
         key = self.key(beacon, tone)
         known = self.readings.get(key, np.zeros((3, 0)))
@@ -71,9 +71,9 @@ class DriveShares:
         size = np.log(np.maximum(np.abs(share), LEAST_SHARE))
         self.readings[key] = np.concatenate([known, [time, size, angle]], axis=1)
 
-    def forget(self) -> None:
+    def discard_old(self) -> None:
         """Discard readings that a running estimator no longer needs."""
-        self.readings = {key: known[:, -REMEMBERED:] for key, known in self.readings.items()}
+        self.readings = {key: known[:, -MAX_READINGS:] for key, known in self.readings.items()}
 
     def at(self, beacon: str, tone: int, time: Array) -> tuple[Array, Array] | None:
         """Return log-magnitudes and angles (rad) of a channel, of the shape of the times (s).

@@ -28,7 +28,7 @@ from magfusion.model.receive_coils import (
 from magfusion.model.site import Beacon, Magnetometer
 from magfusion.units import AnyArray, Array, ComplexArray
 
-_ALIKE = np.eye(3)  # covariance shape of components with equal, independent errors
+_IDENTITY = np.eye(3)  # covariance shape of components with equal, independent errors
 
 
 def _source(beacon: Beacon | Sources) -> Sources:
@@ -42,7 +42,7 @@ def _offset_beacon(
     return (sensor_world - source.position_world) @ source.world_from_beacon
 
 
-def _turned(excitation: ComplexArray, phase: Array | None) -> ComplexArray:
+def _rotated(excitation: ComplexArray, phase: Array | None) -> ComplexArray:
     """Return the excitation with the drive phase applied, shape (..., coils, tones)."""
     return excitation if phase is None else excitation * np.exp(1j * phase)[..., None, :]
 
@@ -93,7 +93,7 @@ def predict(
     mapped = _mapped(source, offset, coils)
     if mapped is not None:
         coils = (mapped.correction @ coils[..., None])[..., 0]
-    in_beacon = np.swapaxes(_turned(source.excitation, phase), -1, -2) @ coils
+    in_beacon = np.swapaxes(_rotated(source.excitation, phase), -1, -2) @ coils
     body_from_beacon = _times(np.swapaxes(world_from_body, -1, -2), source.world_from_beacon)
     in_body = in_beacon @ np.swapaxes(body_from_beacon, -1, -2)
     return in_body @ (magnetometer.body_from_sensor @ magnetometer.matrix.T)
@@ -138,11 +138,11 @@ def observe(
         Leading axes as those of the poses.
     """
     if is_apart(magnetometer):
-        apart = [
+        separate = [
             observe(beacon, at, world_from_body, position_world, phase, twist_body)
             for at in points_apart(magnetometer)
         ]
-        return joined(apart, magnetometer)
+        return joined(separate, magnetometer)
     mounting, matrix = magnetometer.body_from_sensor, magnetometer.matrix
     seen = _seen(_source(beacon), magnetometer, world_from_body, position_world, phase)
     phasor, platform_pose = seen.phasor_sensor, seen.platform_pose
@@ -153,14 +153,14 @@ def observe(
 
     by_body = platform_pose[..., 3:]
     by_beacon_offset = by_body @ seen.body_from_beacon[..., None, :, :]
-    turned = measured_from_beacon @ skew(field_beacon)
+    rotated = measured_from_beacon @ skew(field_beacon)
     if seen.mapped is not None:  # the map does not move with the beacon
         flat = seen.mapped.slope.reshape(*seen.mapped.slope.shape[:-2], 9)
         slope = (seen.tones_from_coils @ flat).reshape(*field_beacon.shape, 3)
         by_beacon_offset = by_beacon_offset - measured_from_beacon @ slope
         model_beacon = seen.tones_from_coils @ seen.mapped.model_beacon
-        turned = measured_from_beacon @ seen.mapped.correction @ skew(model_beacon)
-    beacon_rotation = by_beacon_offset @ skew(seen.offset_beacon)[..., None, :, :] - turned
+        rotated = measured_from_beacon @ seen.mapped.correction @ skew(model_beacon)
+    beacon_rotation = by_beacon_offset @ skew(seen.offset_beacon)[..., None, :, :] - rotated
     # (..., tones, coils, 3)
     by_coil = seen.coils_beacon[..., None, :, :] * seen.tones_from_coils[..., None]
     by_time_offset: ComplexArray | None = None
@@ -213,11 +213,11 @@ class _Seen(NamedTuple):
     mapped: _Mapped | None
 
 
-def _times(left: AnyArray, right: Array) -> AnyArray:
+def _times(left_factor: AnyArray, right: Array) -> AnyArray:
     """Return ``left @ right`` for stacks with few matrix products instead of many small ones."""
     if right.ndim == 2:
-        return (left.reshape(-1, 3) @ right).reshape(left.shape)
-    return (left.reshape(-1, 3) @ right).reshape(len(right), *left.shape)
+        return (left_factor.reshape(-1, 3) @ right).reshape(left_factor.shape)
+    return (left_factor.reshape(-1, 3) @ right).reshape(len(right), *left_factor.shape)
 
 
 def _seen(
@@ -229,7 +229,7 @@ def _seen(
 ) -> _Seen:
     offset_beacon = _offset_beacon(source, magnetometer, world_from_body, position_world)
     coils, gradients = coil_fields_and_gradients(source, offset_beacon)
-    tones_from_coils = np.swapaxes(_turned(source.excitation, phase), -1, -2)
+    tones_from_coils = np.swapaxes(_rotated(source.excitation, phase), -1, -2)
     body_from_beacon = _times(np.swapaxes(world_from_body, -1, -2), source.world_from_beacon)
     beacon_from_body = np.swapaxes(body_from_beacon, -1, -2)
     body_from_sensor = magnetometer.body_from_sensor @ magnetometer.matrix.T  # not a rotation
@@ -394,4 +394,4 @@ def model_error_cov(phasor_sensor: ComplexArray, model_error: float | Array) -> 
 
 def power_error_cov(power: Array, model_error: float | Array) -> Array:
     """Return the same of the field's mean square in either quadrature, shape (...) (T^2)."""
-    return (model_error**2 * power)[..., None, None] / 3.0 * _ALIKE
+    return (model_error**2 * power)[..., None, None] / 3.0 * _IDENTITY

@@ -103,8 +103,8 @@ class FieldMap:
             spread = near[:, None, :, None] * (np.eye(4) * prior)[None, :, None, :]
             reach = spread.reshape(len(near), 4, -1)
             known = np.einsum("nai,nai->na", reach @ self._reduction, reach)
-            left = np.maximum(prior - known, 0.0)
-            out[part] = np.stack([left[:, 0], np.mean(left[:, 1:], axis=1)], axis=1)
+            remaining = np.maximum(prior - known, 0.0)
+            out[part] = np.stack([remaining[:, 0], np.mean(remaining[:, 1:], axis=1)], axis=1)
         return out
 
     def relative_variance(self, position_world: Array | None = None) -> Array:

@@ -29,7 +29,7 @@ def in_ground(site: Site, conductivity: float) -> Site:
     return replace(site, beacons=beacons)
 
 
-def skin_depths(beacon: Beacon, distance: Array) -> Array:
+def skin_depth_count(beacon: Beacon, distance: Array) -> Array:
     """Return distances (m) in skin depths of a beacon's highest tone."""
     frequency = float(beacon.tone_frequencies_hz.max())
     return np.asarray(distance / skin_depth(frequency, beacon.conductivity))
@@ -48,7 +48,7 @@ def ground_error(site: Site, distance: Array) -> Array:
     ndarray, shape (n, beacons)
         Of the field in the dipole's equatorial plane.
     """
-    depths = [skin_depths(b, distance[:, k]) for k, b in enumerate(site.beacons)]
+    depths = [skin_depth_count(b, distance[:, k]) for k, b in enumerate(site.beacons)]
     x = (1.0 + 1.0j) * np.minimum(np.stack(depths, axis=1), 2.0 * DEEPEST)
     return site.log_conductivity_sigma * np.abs(x**2 * (1.0 - x) / (1.0 + x + x**2)) / 2.0
 
@@ -70,16 +70,16 @@ def range_of_strength(beacon: Beacon, phasor: ComplexArray, direction_beacon: Ar
     """
     total = np.sum(np.abs(phasor) ** 2, axis=(1, 2))[:, None] + _TINY
     drive = beacon.moments_beacon.T @ beacon.excitation  # (3, tones)
-    loudest = 2.0 * MU0_OVER_4PI * np.sqrt(np.sum(np.abs(drive) ** 2))
+    strongest = 2.0 * MU0_OVER_4PI * np.sqrt(np.sum(np.abs(drive) ** 2))
     # With conduction the field is nowhere stronger than that of the dipole at its poles.
-    far = np.log(np.cbrt(loudest / np.sqrt(total))) + np.zeros(len(direction_beacon))
+    far = np.log(np.cbrt(strongest / np.sqrt(total))) + np.zeros(len(direction_beacon))
     near, source = far - _NEARER, alone(beacon)
     for _ in range(_HALVINGS):
         middle = 0.5 * (near + far)
         coils = coil_fields(source, np.exp(middle)[..., None] * direction_beacon)
         seen = beacon.excitation.T @ coils
-        louder = np.sum(np.abs(seen) ** 2, axis=(-1, -2)) > total
-        near, far = np.where(louder, middle, near), np.where(louder, far, middle)
+        stronger = np.sum(np.abs(seen) ** 2, axis=(-1, -2)) > total
+        near, far = np.where(stronger, middle, near), np.where(stronger, far, middle)
     return np.asarray(np.exp(0.5 * (near + far)))
 
 

@@ -134,21 +134,21 @@ def mounting_places(hall: Hall, spacing: float) -> Array:
     """Return mounting places for beacons, on a grid of each surface, shape (n, 3) (m)."""
     mounts, room = hall.mounts, hall.room
     heights = _steps(mounts.heights[0], mounts.heights[1], spacing)
-    found = []
+    result = []
     for wall in mounts.walls:
         start, end = room.edges[wall]
         share = _steps(0.0, 1.0, spacing / float(np.linalg.norm(end - start)))[:, None]
         along = start + share * (end - start)
         plan = np.repeat(along, len(heights), axis=0)
-        found.append(np.column_stack([plan, np.tile(heights, len(along))]))
+        result.append(np.column_stack([plan, np.tile(heights, len(along))]))
     low, high = room.box_world
     flat = np.meshgrid(*(_steps(low[i], high[i], spacing) for i in (0, 1)), indexing="ij")
     plan = np.stack(flat, axis=-1).reshape(-1, 2)
     plan = plan[room.over(plan)]
     for wanted, height in ((mounts.floor, low[2]), (mounts.ceiling, high[2])):
         if wanted:
-            found.append(np.column_stack([plan, np.full(len(plan), height)]))
-    places = np.concatenate(found) if found else np.zeros((0, 3))
+            result.append(np.column_stack([plan, np.full(len(plan), height)]))
+    places = np.concatenate(result) if result else np.zeros((0, 3))
     places = np.unique(np.round(places, 6), axis=0)  # corners belong to two walls
     for prism in mounts.forbidden:
         places = places[~prism.contains(places)]

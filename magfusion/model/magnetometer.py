@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from magfusion.model.physics.casing import Casing
 from magfusion.model.response import AxisResponses, FrequencyResponse
 from magfusion.model.short_repr import short_repr
-from magfusion.model.temperature import SensorWarming
+from magfusion.model.temperature import SensorTemperatureModel
 from magfusion.units import Array
 
 
@@ -55,7 +55,7 @@ class Magnetometer:
         Standard deviation that the offset gains in an hour (T).
     coil_kappa : float
         Finite size of each axis's coil (m^2, `magfusion.model.receive_coils`); zero for a point.
-    warming : SensorWarming, optional
+    temperature_model : SensorTemperatureModel, optional
         Temperature dependence of matrix and offset.
     response : FrequencyResponse or AxisResponses, optional
         Response to alternating fields; None if equal to that of steady fields.
@@ -80,7 +80,7 @@ class Magnetometer:
     coil_centres_sensor: Array | None = None
     offset_walk: float = 2e-8
     coil_kappa: float = 0.0
-    warming: SensorWarming | None = None
+    temperature_model: SensorTemperatureModel | None = None
     response: FrequencyResponse | AxisResponses | None = None
     axes: str = "xyz"
     casing: Casing | None = None

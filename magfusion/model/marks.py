@@ -7,7 +7,7 @@ import numpy as np
 from magfusion.units import Array, BoolArray, IntArray
 
 SILENT = -1  # slot of a time without a driven coil
-UNTOLD = -2  # slot of samples to ignore, while the current settles
+UNKNOWN_SLOT = -2  # slot of samples to ignore, while the current settles
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,20 +70,20 @@ class SlotColumn:
 
     def __init__(self) -> None:
         self._first = self._last = self._before = -np.inf
-        self._slot, self._count = UNTOLD, 0
+        self._slot, self._count = UNKNOWN_SLOT, 0
 
     @property
     def open_since(self) -> float:
         """Time at which the current run began (s)."""
         return self._first
 
-    def hear(self, time: Array, slot: IntArray) -> Marks:
+    def add_samples(self, time: Array, slot: IntArray) -> Marks:
         """Return the bursts completed by samples; samples not later than earlier ones are skipped.
 
         Parameters
         ----------
         slot : int ndarray, shape (n,)
-            Of each sample; `UNTOLD` for samples to ignore.
+            Of each sample; `UNKNOWN_SLOT` for samples to ignore.
         """
         newest = np.maximum.accumulate(np.append(self._last, time))
         later = time > newest[:-1]
@@ -91,37 +91,37 @@ class SlotColumn:
         if len(time) == 0:
             return Marks.none()
         starts = np.flatnonzero(np.diff(slot, prepend=self._slot) != 0)
-        found: list[tuple[float, float, int]] = []
+        result: list[tuple[float, float, int]] = []
         ends = np.append(starts, len(time))
         if ends[0] > 0:  # the current run continues
             self._last, self._count = float(time[ends[0] - 1]), self._count + int(ends[0])
         for first, last in zip(starts.tolist(), ends[1:].tolist(), strict=True):
-            found += self._closed(float(time[first]))
+            result += self._closed(float(time[first]))
             self._before = self._last
             self._first, self._last = float(time[first]), float(time[last - 1])
             self._slot, self._count = int(slot[first]), last - first
-        return _marks(found)
+        return _marks(result)
 
     def ended(self) -> Marks:
         """Return the current burst, if no sample follows."""
         return _marks(self._closed(np.inf))
 
     def _closed(self, following: float) -> list[tuple[float, float, int]]:
-        if self._slot == UNTOLD or self._count < 2:
+        if self._slot == UNKNOWN_SLOT or self._count < 2:
             return []
         half = 0.5 * (self._last - self._first) / (self._count - 1)
         begin = self._first - min(half, 0.5 * (self._first - self._before))
         return [(begin, self._last + min(half, 0.5 * (following - self._last)), self._slot)]
 
 
-def _marks(found: list[tuple[float, float, int]]) -> Marks:
-    if not found:
+def _marks(result: list[tuple[float, float, int]]) -> Marks:
+    if not result:
         return Marks.none()
-    begin, end, slot = zip(*found, strict=True)
+    begin, end, slot = zip(*result, strict=True)
     return Marks(np.array(begin), np.array(end), np.array(slot, dtype=np.int64))
 
 
 def marks_of_column(time: Array, slot: IntArray) -> Marks:
     """Return the bursts from the slot of each sample of a waveform."""
     column = SlotColumn()
-    return column.hear(time, slot).joined(column.ended())
+    return column.add_samples(time, slot).joined(column.ended())

@@ -150,7 +150,7 @@ def sensors_at(site: Site, world_from_body: Array, position_world: Array) -> Arr
     return np.stack([position_world + world_from_body @ s.position_body for s in sensors], axis=1)
 
 
-def alike_beside(site: Site, valid: BoolArray) -> Array:
+def magnetometers_sharing_error(site: Site, valid: BoolArray) -> Array:
     """Return how many magnetometers of an epoch share a field-model error, (n, channels).
 
     The error is caused by iron and correlated over its length scale, so that several
@@ -164,10 +164,10 @@ def alike_beside(site: Site, valid: BoolArray) -> Array:
     places = np.array([sensor.position_body for sensor in site.platform.magnetometers])
     if len(places) == 1 or site.model_error_length <= 0.0:
         return np.ones(valid.shape)
-    apart = np.linalg.norm(places[:, None] - places, axis=2)
-    beside = np.exp(-apart / site.model_error_length) - np.eye(len(places))
+    separate = np.linalg.norm(places[:, None] - places, axis=2)
+    others = np.exp(-separate / site.model_error_length) - np.eye(len(places))
     there = np.stack([np.any(valid[:, site.of_sensor(k)], axis=1) for k in range(len(places))], 1)
-    return np.asarray(1.0 + (there @ beside)[:, site.sensor])
+    return np.asarray(1.0 + (there @ others)[:, site.sensor])
 
 
 def measurement_cov(
@@ -177,8 +177,8 @@ def measurement_cov(
     survey_error: bool = False,
     sensor_world: Array | None = None,
     windows: float = 1.0,
-    alike: Array | float = 1.0,
-    beside: bool = True,
+    shared_by: Array | float = 1.0,
+    neighbours: bool = True,
 ) -> Array:
     """Return the covariance of each phasor component: noise and model error.
 
@@ -192,9 +192,9 @@ def measurement_cov(
         Their approximate positions (m), for the uncertainty of a field map.
     windows : float
         Number of windows that contain each sample, and its noise.
-    alike : ndarray, shape (n,), or float
+    shared_by : ndarray, shape (n,), or float
         Number of epochs that share a model error.
-    beside : bool
+    neighbours : bool
         Whether magnetometers next to each other count as one for their shared error; not where
         the estimate considers it.
 
@@ -203,8 +203,8 @@ def measurement_cov(
     ndarray, shape (n, channels, 3, 3)
         (T^2), measured axes.
     """
-    ways = ((windows, alike),)
-    (total,), square, power = _covs(site, samples, sensor_world, ways, beside=beside)
+    ways = ((windows, shared_by),)
+    (total,), square, power = _covs(site, samples, sensor_world, ways, neighbours=neighbours)
     if survey_error:
         relative = _relative_error(site, square)
         total = total + (relative**2 * power / 3.0)[..., None, None] * np.eye(3)
@@ -216,19 +216,19 @@ def weighed_and_alone(
     samples: FieldSamples,
     sensor_world: Array,
     windows: float,
-    alike: Array | float,
+    shared_by: Array | float,
     *,
-    beside: bool = True,
+    neighbours: bool = True,
 ) -> tuple[Array, Array]:
     """Return `measurement_cov` of epochs with shared noise and model error, and as independent.
 
     Parameters
     ----------
-    `sensor_world`, `windows`, `alike`, `beside`
+    `sensor_world`, `windows`, `shared_by`, `neighbours`
         As of `measurement_cov`.
     """
-    ways = (windows, alike), (1.0, 1.0)
-    (weighed, alone), _, _ = _covs(site, samples, sensor_world, ways, beside=beside)
+    ways = (windows, shared_by), (1.0, 1.0)
+    (weighed, alone), _, _ = _covs(site, samples, sensor_world, ways, neighbours=neighbours)
     return weighed, alone
 
 
@@ -238,23 +238,23 @@ def _covs(
     sensor_world: Array | None,
     ways: tuple[tuple[float, Array | float], ...],
     *,
-    beside: bool,
+    neighbours: bool,
 ) -> tuple[list[Array], Array, Array]:
     """Return noise and model error for several ways of sharing, with squares and their power."""
     own = model_error(site, sensor_world)
     share = None
-    if beside and site.platform.further:
-        share = np.sqrt(alike_beside(site, samples.valid))
+    if neighbours and site.platform.further:
+        share = np.sqrt(magnetometers_sharing_error(site, samples.valid))
     noise = _noise_share(site)
     square = squares(site, samples, sensor_world)
     power = 0.5 * np.sum(square, axis=-1)
-    found = []
-    for windows, alike in ways:
-        error = own * np.sqrt(np.asarray(alike))[..., None]
+    result = []
+    for windows, shared in ways:
+        error = own * np.sqrt(np.asarray(shared))[..., None]
         error = error if share is None else error * share
         noisy = (windows * noise)[:, None, None] * samples.phasor_cov
-        found.append(noisy + power_error_cov(power, error))
-    return found, square, power
+        result.append(noisy + power_error_cov(power, error))
+    return result, square, power
 
 
 def _relative_error(site: Site, square: Array) -> Array:

@@ -7,22 +7,22 @@ from weakref import WeakKeyDictionary
 
 from magfusion.model.site import Site
 
-Found = TypeVar("Found")
+Value = TypeVar("Value")
 
 
-def once_a_site(find: Callable[[Site], Found]) -> Callable[[Site], Found]:
+def once_a_site(find: Callable[[Site], Value]) -> Callable[[Site], Value]:
     """Return a function that caches its result for a site as long as the site lives.
 
     The result must not be modified, nor refer to the site.  Exceptions are not cached.
     """
-    kept: WeakKeyDictionary[Site, Found] = WeakKeyDictionary()
+    kept: WeakKeyDictionary[Site, Value] = WeakKeyDictionary()
 
     @wraps(find)
-    def known(site: Site) -> Found:
+    def known(site: Site) -> Value:
         try:
             return kept[site]
         except KeyError:
-            found = kept[site] = find(site)
-            return found
+            result = kept[site] = find(site)
+            return result
 
     return known

@@ -18,8 +18,8 @@ CIRCLE = 1.5  # of a lever's square, for a position on a circle about the coil, 
 
 def axis_of(sensor: Magnetometer) -> Array:
     """Return the sensitive direction of a magnetometer of one axis, body axes, shape (3,)."""
-    felt = sensor.body_from_sensor @ sensor.matrix["xyz".index(sensor.axes)]
-    return np.asarray(felt / np.linalg.norm(felt))
+    affected = sensor.body_from_sensor @ sensor.matrix["xyz".index(sensor.axes)]
+    return np.asarray(affected / np.linalg.norm(affected))
 
 
 def coil_lever(sensor: Magnetometer) -> Array:

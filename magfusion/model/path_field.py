@@ -12,9 +12,9 @@ from magfusion.units import AnyArray, Array
 
 # Relative to the distance to a coil: at this node spacing the cubic errs by some millionths of the
 # field, as does the gradient where the path bends away from the line by as much.
-APART, ASIDE = 0.04, 1e-3
-FEWEST, MOST = 4, 32  # samples between nodes; with fewer nothing is gained
-FEWEST_POINTS = 64
+NODE_SPACING, LATERAL_SPACING = 0.04, 1e-3
+MIN_NODE_SAMPLES, MAX_NODE_SAMPLES = 4, 32  # samples between nodes; with fewer nothing is gained
+MIN_POINTS = 64
 AT_ONCE = 1 << 11  # samples with one node spacing, that of their nearest coil
 
 
@@ -30,30 +30,30 @@ def field_along_path(
     position_world : ndarray, shape (n, 3)
         In the order of the path (m).
     """
-    if source.field_map is not None or len(position_world) < FEWEST_POINTS:
+    if source.field_map is not None or len(position_world) < MIN_POINTS:
         return driven_field(source, position_world, current, along_world)
-    found = []
+    result = []
     for begin in range(0, len(position_world), AT_ONCE):
         rows = slice(begin, begin + AT_ONCE)
         place, own = position_world[rows], current[..., rows, :]
         along = None if along_world is None else along_world[rows]
         offset = (place - source.position_world) @ source.world_from_beacon
         samples = _from_node_to_node(source, offset)
-        if samples < FEWEST:
-            found.append(driven_field(source, place, own, along))
+        if samples < MIN_NODE_SAMPLES:
+            result.append(driven_field(source, place, own, along))
         else:
-            found.append(_between_nodes(source, offset, own, along, samples))
-    if len(found) == 1:
-        return found[0]
-    by = [part.along for part in found if part.along is not None]
+            result.append(_between_nodes(source, offset, own, along, samples))
+    if len(result) == 1:
+        return result[0]
+    by = [part.along for part in result if part.along is not None]
     return Driven(
-        np.concatenate([part.field for part in found], axis=-2),
+        np.concatenate([part.field for part in result], axis=-2),
         np.concatenate(by, axis=-2) if by else None,
     )
 
 
 def _from_node_to_node(source: Sources, offset_beacon: Array) -> int:
-    """Return how many samples may separate two nodes, at most `MOST`."""
+    """Return how many samples may separate two nodes, at most `MAX_NODE_SAMPLES`."""
     loops = source.loops
     reach = np.linalg.norm(loops.centre, axis=-1)
     if loops.radius is not None:
@@ -63,13 +63,13 @@ def _from_node_to_node(source: Sources, offset_beacon: Array) -> int:
     )
     near, path = float(np.min(distance)), offset_beacon.reshape(-1, *offset_beacon.shape[-2:])[0]
     step = np.diff(path, axis=0)
-    if near <= 0.0 or len(step) < FEWEST_POINTS - 1:
+    if near <= 0.0 or len(step) < MIN_POINTS - 1:
         return 0
     longest = float(np.max(np.linalg.norm(step, axis=1)))
     bent = float(np.max(np.linalg.norm(np.diff(step, axis=0), axis=1)))
-    by_step = APART * near / max(longest, 1e-12)
-    by_bend = float(np.sqrt(8.0 * ASIDE * near / max(bent, 1e-12)))
-    return int(min(by_step, by_bend, MOST))
+    by_step = NODE_SPACING * near / max(longest, 1e-12)
+    by_bend = float(np.sqrt(8.0 * LATERAL_SPACING * near / max(bent, 1e-12)))
+    return int(min(by_step, by_bend, MAX_NODE_SAMPLES))
 
 
 def _between_nodes(
@@ -90,12 +90,12 @@ def _between_nodes(
     value, slope = _in_world(source, coils), _in_world(source, np.moveaxis(gradients, -1, -3))
     begin = offset_beacon[..., node[:-1], None, :]
     chord = offset_beacon[..., node[1:], None, :] - begin
-    aside = offset_beacon[..., row, :] - begin - share * chord
-    weight = np.empty((*aside.shape[:-1], 8))
+    lateral = offset_beacon[..., row, :] - begin - share * chord
+    weight = np.empty((*lateral.shape[:-1], 8))
     weight[..., :1] = back**2 * (1.0 + 2.0 * share)
     weight[..., 1:2] = share**2 * (3.0 - 2.0 * share)
-    weight[..., 2:5] = (share * back**2) * chord + back * aside
-    weight[..., 5:] = share * aside - (share**2 * back) * chord
+    weight[..., 2:5] = (share * back**2) * chord + back * lateral
+    weight[..., 5:] = share * lateral - (share**2 * back) * chord
     ends = slope[..., :-1, :, :], slope[..., 1:, :, :]
     values = value[..., :-1, None, :], value[..., 1:, None, :]
 
@@ -116,6 +116,6 @@ def _between_nodes(
 
 def _in_world(source: Sources, of_coils: AnyArray) -> AnyArray:
     """Return vectors of each coil, shape (..., coils, 3), as (..., 3 * coils), world axes."""
-    turned = of_coils.reshape(*source.world_from_beacon.shape[:-2], -1, 3)
-    turned = turned @ np.swapaxes(source.world_from_beacon, -1, -2)
-    return np.asarray(turned.reshape(*of_coils.shape[:-2], -1))
+    rotated = of_coils.reshape(*source.world_from_beacon.shape[:-2], -1, 3)
+    rotated = rotated @ np.swapaxes(source.world_from_beacon, -1, -2)
+    return np.asarray(rotated.reshape(*of_coils.shape[:-2], -1))

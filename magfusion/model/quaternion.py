@@ -30,7 +30,7 @@ def product(a: Array, b: Array) -> Array:
     return out
 
 
-def turned(quaternion: Array, vector: Array) -> Array:
+def rotate(quaternion: Array, vector: Array) -> Array:
     """Return vectors, shape (3, ...), rotated by unit quaternions, shape (4, ...)."""
     lever = 2.0 * cross(quaternion[1:], vector)
     return np.asarray(vector + quaternion[0] * lever + cross(quaternion[1:], lever))
@@ -38,8 +38,8 @@ def turned(quaternion: Array, vector: Array) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """Return the cross products of vectors, shape (3, ...)."""
-    found = a.take(_NEXT, axis=0) * b.take(_LAST, axis=0)
-    return np.asarray(found - a.take(_LAST, axis=0) * b.take(_NEXT, axis=0))
+    result = a.take(_NEXT, axis=0) * b.take(_LAST, axis=0)
+    return np.asarray(result - a.take(_LAST, axis=0) * b.take(_NEXT, axis=0))
 
 
 def components(rotation: Rotation) -> Array:

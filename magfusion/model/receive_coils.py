@@ -93,24 +93,26 @@ def points_apart(magnetometer: Magnetometer) -> list[Magnetometer]:
     ]
 
 
-def joined_phasors(apart: list[ComplexArray], magnetometer: Magnetometer) -> ComplexArray:
+def joined_phasors(separately: list[ComplexArray], magnetometer: Magnetometer) -> ComplexArray:
     """Return the phasors of the coils from those (..., tones, 3) at `points_apart`."""
-    return _joined_axes(apart, magnetometer)
+    return _joined_axes(separately, magnetometer)
 
 
-def joined_samples(apart: list[Array], magnetometer: Magnetometer) -> Array:
+def joined_samples(separately: list[Array], magnetometer: Magnetometer) -> Array:
     """Return the samples of the coils from those (..., 3) at `points_apart`."""
-    return _joined_axes(apart, magnetometer)
+    return _joined_axes(separately, magnetometer)
 
 
-def _joined_axes(apart: Sequence[Any], magnetometer: Magnetometer) -> Any:
+def _joined_axes(separately: Sequence[Any], magnetometer: Magnetometer) -> Any:
     weights = _along(magnetometer)[1]
     count = len(weights)
-    rows = [sum(w * apart[i * count + k][..., i] for k, w in enumerate(weights)) for i in range(3)]
+    rows = [
+        sum(w * separately[i * count + k][..., i] for k, w in enumerate(weights)) for i in range(3)
+    ]
     return np.stack(rows, axis=-1)
 
 
-def joined(apart: list[Observation], magnetometer: Magnetometer) -> Observation:
+def joined(separately: list[Observation], magnetometer: Magnetometer) -> Observation:
     """Return the observation of the coils from those at `points_apart`."""
     centres, (places, weights) = _centres_sensor(magnetometer), _along(magnetometer)
     count, names = len(weights), ("platform_pose", "beacon_pose", "log_moments")
@@ -121,7 +123,7 @@ def joined(apart: list[Observation], magnetometer: Magnetometer) -> Observation:
         across = (np.eye(3) - np.outer(axis, axis)) / size
         own: dict[str, ComplexArray] = {}
         for k, (place, weight) in enumerate(zip(places, weights, strict=True)):
-            seen = apart[i * count + k]
+            seen = separately[i * count + k]
             parts = {name: getattr(seen, name)[..., i, :] for name in names}
             mounting = seen.body_from_sensor[..., i, :].copy()
             matrix = seen.matrix[..., i, :].copy()
@@ -134,10 +136,10 @@ def joined(apart: list[Observation], magnetometer: Magnetometer) -> Observation:
             blocks[name].append(part)
     return Observation(
         **{name: np.stack(rows, axis=-2) for name, rows in blocks.items()},
-        phasor_sensor=joined_phasors([o.phasor_sensor for o in apart], magnetometer),
-        phase=joined_phasors([o.phase for o in apart], magnetometer),
-        time_offset=_joined_if_there([o.time_offset for o in apart], magnetometer),
-        log_conductivity=_joined_if_there([o.log_conductivity for o in apart], magnetometer),
+        phasor_sensor=joined_phasors([o.phasor_sensor for o in separately], magnetometer),
+        phase=joined_phasors([o.phase for o in separately], magnetometer),
+        time_offset=_joined_if_there([o.time_offset for o in separately], magnetometer),
+        log_conductivity=_joined_if_there([o.log_conductivity for o in separately], magnetometer),
     )
 
 

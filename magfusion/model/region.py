@@ -85,26 +85,26 @@ def bounds_of(region: Region | None, sources: Sequence[_Source]) -> Bounds | Non
     sources : sequence of Beacon
         A beacon of unknown position adds no plane.
     """
-    found: list[tuple[Array, float, str]] = []
+    result: list[tuple[Array, float, str]] = []
     box = None if region is None else region.box_world
     if box is not None:
         for axis, letter in enumerate("xyz"):
             for corner, sign, side in ((0, 1.0, "lower"), (1, -1.0, "upper")):
                 if np.isfinite(box[corner, axis]):
                     limit = float(sign * box[corner, axis])
-                    found.append((sign * np.eye(3)[axis], limit, f"the {side} limit of {letter}"))
+                    result.append((sign * np.eye(3)[axis], limit, f"the {side} limit of {letter}"))
     half = None if region is None else region.half_space
     if half is not None:
         normal = half.normal_world / np.linalg.norm(half.normal_world)
-        found.append((normal, float(normal @ half.through_world), "the plane of the region"))
+        result.append((normal, float(normal @ half.through_world), "the plane of the region"))
     for source in sources:
         if source.hemisphere_beacon is not None:
             normal = source.world_from_beacon @ source.hemisphere_beacon
             normal = normal / np.linalg.norm(normal)
             offset = float(normal @ source.position_world)
             if np.isfinite(offset) and np.all(np.isfinite(normal)):
-                found.append((normal, offset, f"the plane through beacon {source.name}"))
-    if not found:
+                result.append((normal, offset, f"the plane through beacon {source.name}"))
+    if not result:
         return None
-    normals, offsets, names = zip(*found, strict=True)
+    normals, offsets, names = zip(*result, strict=True)
     return Bounds(np.array(normals), np.array(offsets), tuple(names))

@@ -104,7 +104,7 @@ class FieldSamples:
         prediction.
     magnetometers : tuple of str
         Name of the magnetometer of each channel; empty for a single one.
-    turned : ndarray, shape (n, channels, 3, 3), optional
+    channel_rotation : ndarray, shape (n, channels, 3, 3), optional
         From the body's axes at the measurement to those at ``time``, where phasors are in the
         former: of coils driven in turn, by a receiver that lacks axes.
     """
@@ -120,7 +120,7 @@ class FieldSamples:
     axes: str = "xyz"
     signed: bool = True
     magnetometers: tuple[str, ...] = ()
-    turned: Array | None = None
+    channel_rotation: Array | None = None
 
     def __post_init__(self) -> None:
         n, c = len(self.time), len(self.channels)
@@ -130,8 +130,8 @@ class FieldSamples:
             ("phasor_cov", (n, c, 3, 3)),
         ):
             if getattr(self, name).shape != shape:
-                found = getattr(self, name).shape
-                raise ValueError(f"{name} must have shape {shape}; got {found}")
+                result = getattr(self, name).shape
+                raise ValueError(f"{name} must have shape {shape}; got {result}")
 
     def __len__(self) -> int:
         return len(self.time)
@@ -144,7 +144,7 @@ class FieldSamples:
         end, begin = self.time + 0.5 * self.window, self.time - 0.5 * self.window
         return bool(np.all(begin[1:] >= end[:-1] - 1e-6))
 
-    def at_rest(self, time: Array) -> BoolArray:
+    def is_stationary(self, time: Array) -> BoolArray:
         """Return which times are within a stationary interval that is an epoch, shape (n,)."""
         if not self.of_rests:
             return np.zeros(len(time), dtype=bool)
@@ -197,7 +197,7 @@ class FieldSamples:
             self.axes,
             self.signed,
             self.magnetometers,
-            None if self.turned is None else self.turned[kept],
+            None if self.channel_rotation is None else self.channel_rotation[kept],
         )
 
     def of_magnetometer(self, name: str) -> "FieldSamples":
@@ -246,7 +246,7 @@ class FieldSamples:
         return (2 if self.signed else 1) * np.sum(self.there, axis=2)
 
     @property
-    def told(self) -> BoolArray:
+    def is_measured(self) -> BoolArray:
         """Real, then imaginary, parts measured in each row, shape (n, channels, 6).
 
         An amplitude is one part, in place of the real one.
@@ -293,7 +293,7 @@ class StreamClock:
         Between two samples (s).
     scatter : float
         Root mean square of the stamps about the clock (s).
-    lost : int
+    lost_count : int
         Missing samples outside gaps.
     replaced : bool
         Whether the clock replaces the stamps; otherwise the samples were taken at the stamps.
@@ -301,7 +301,7 @@ class StreamClock:
 
     step: float
     scatter: float
-    lost: int
+    lost_count: int
     replaced: bool
 
 

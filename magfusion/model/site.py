@@ -18,7 +18,7 @@ from magfusion.model.platform_motion import MotionModel as MotionModel
 from magfusion.model.region import Bounds, Region, bounds_of
 from magfusion.model.rotor import Rotor as Rotor
 from magfusion.model.short_repr import short_repr
-from magfusion.model.temperature import Temperatures, Warming
+from magfusion.model.temperature import MomentTemperatureModel, Temperatures
 from magfusion.model.time_division import MarkedSlots as MarkedSlots
 from magfusion.model.time_division import Slots as Slots
 from magfusion.units import Array, ComplexArray, IntArray
@@ -113,7 +113,7 @@ class Beacon:
         Of its own field; the site's if None.
     noise_factor : float
         Noise of its phasors relative to that measured near its tones.
-    warming : Warming, optional
+    temperature_model : MomentTemperatureModel, optional
         Temperature dependence of its moments.
     hemisphere_beacon : ndarray, shape (3,), optional
         Direction, of any length, of the half space that contains the magnetometer.
@@ -141,7 +141,7 @@ class Beacon:
     model_error: float | None = None
     noise_factor: float = 1.0
     hemisphere_beacon: Array | None = None
-    warming: Warming | None = None
+    temperature_model: MomentTemperatureModel | None = None
     conductivity: float = 0.0
     rotor: Rotor | None = None
     planned: bool = False
@@ -269,7 +269,7 @@ class Platform:
         """Every magnetometer."""
         return (self.magnetometer, *self.further)
 
-    def carrying(self, magnetometers: tuple[Magnetometer, ...]) -> "Platform":
+    def with_magnetometers(self, magnetometers: tuple[Magnetometer, ...]) -> "Platform":
         """Return the platform with other magnetometers."""
         return replace(self, magnetometer=magnetometers[0], further=magnetometers[1:])
 
@@ -313,7 +313,7 @@ class Site:
         Of the logarithm of its conductivity; zero means known.
     reference_world : ndarray, shape (3,), optional
         Position of a second magnetometer that measures the noise (m).
-    unheard : tuple of (int, Beacon)
+    undetected : tuple of (int, Beacon)
         Beacons not detected in a log, with their indices among all; they remain as declared.
     """
 
@@ -335,7 +335,7 @@ class Site:
     drives: DriveShares | None = None
     log_conductivity_sigma: float = 0.0
     reference_world: Array | None = None
-    unheard: tuple[tuple[int, Beacon], ...] = ()
+    undetected: tuple[tuple[int, Beacon], ...] = ()
 
     @cached_property
     def bounds(self) -> Bounds | None:
@@ -346,7 +346,7 @@ class Site:
     def every_beacon(self) -> tuple[Beacon, ...]:
         """Detected and undetected beacons, in the order of the file."""
         every = list(self.beacons)
-        for number, beacon in self.unheard:
+        for number, beacon in self.undetected:
             every.insert(number, beacon)
         return tuple(every)
 

@@ -107,8 +107,8 @@ def attitude_at(attitude: Rotation, time: Array, gyro_body: Array, wanted: Array
     Rotation
         m rotations.
     """
-    found = turn_at(components(attitude), time, gyro_body, wanted)
-    return Rotation.from_quat(found.T, scalar_first=True)
+    result = turn_at(components(attitude), time, gyro_body, wanted)
+    return Rotation.from_quat(result.T, scalar_first=True)
 
 
 def turn_at(turn: Array, time: Array, gyro_body: Array, wanted: Array) -> Array:
@@ -117,8 +117,8 @@ def turn_at(turn: Array, time: Array, gyro_body: Array, wanted: Array) -> Array:
     for lo in range(0, len(wanted), CHUNK):
         rows = slice(lo, lo + CHUNK)
         index = _sample_before(time, wanted[rows])
-        since = _turn_since(index, time, gyro_body, wanted[rows])
-        out[:, rows] = product(turn[:, index], since)
+        start_time = _turn_since(index, time, gyro_body, wanted[rows])
+        out[:, rows] = product(turn[:, index], start_time)
     return out
 
 
@@ -146,17 +146,17 @@ def turn_from_gyro_at(time: Array, gyro_body: Array, wanted: Array) -> Array:
     """Return `attitude_from_gyro_at` as quaternions, shape (4, m), scalar first."""
     index = _sample_before(time, wanted)
     quaternion = np.tile([[1.0], [0.0], [0.0], [0.0]], len(wanted))
-    carried = quaternion[:, :1]
+    propagated = quaternion[:, :1]
     for lo in range(0, len(time) - 1, CHUNK):
         piece = slice(lo, lo + CHUNK + 1)
         steps = of_vectors(_increments(time[piece], gyro_body[piece]).T)
         count = steps.shape[1]
         here = np.flatnonzero((index > lo) & (index <= lo + count))
-        turned = product(carried, _products_of_first(steps, np.append(index[here] - lo, count)))
-        quaternion[:, here] = turned[:, :-1]
-        carried = turned[:, -1:]
-    since = _turn_since(index, time, gyro_body, wanted)
-    return product(quaternion, since)
+        rotated = product(propagated, _products_of_first(steps, np.append(index[here] - lo, count)))
+        quaternion[:, here] = rotated[:, :-1]
+        propagated = rotated[:, -1:]
+    start_time = _turn_since(index, time, gyro_body, wanted)
+    return product(quaternion, start_time)
 
 
 def _products_of_first(quaternion: Array, count: IntArray) -> Array:
@@ -266,8 +266,8 @@ def resting(
     """
     span = motion.rest_span if span is None else span
     centre = np.concatenate([gyro_body.mean(axis=0), accel_body.mean(axis=0)])
-    asked = time if at is None else time[at]
-    quiet = np.empty(len(asked), dtype=bool)
+    requested = time if at is None else time[at]
+    quiet = np.empty(len(requested), dtype=bool)
     for begin in range(0, len(time), CHUNK):
         own: slice | IntArray = slice(begin, begin + CHUNK)
         if at is not None:
@@ -275,12 +275,12 @@ def resting(
         here = time[begin : begin + CHUNK]
         first = np.searchsorted(time, here[0] - span / 2)
         last = np.searchsorted(time, here[-1] + span / 2, side="right")
-        lo = np.searchsorted(time[first:last], asked[own] - span / 2)
-        hi = np.searchsorted(time[first:last], asked[own] + span / 2, side="right")
+        lo = np.searchsorted(time[first:last], requested[own] - span / 2)
+        hi = np.searchsorted(time[first:last], requested[own] + span / 2, side="right")
         both = np.concatenate([gyro_body[first:last], accel_body[first:last]], axis=1)
         gyro, accel = _variance(both - centre, lo, hi).T
         quiet[own] = (gyro < motion.rest_gyro**2) & (accel < motion.rest_accel**2)
-    inside = (asked - span / 2 >= time[0]) & (asked + span / 2 <= time[-1])
+    inside = (requested - span / 2 >= time[0]) & (requested + span / 2 <= time[-1])
     return quiet & inside
 
 

@@ -10,7 +10,7 @@ from magfusion.units import Array
 SMALL = 0.03  # rad; below it the series are as accurate as the closed forms
 
 
-class Turned(NamedTuple):
+class StepMotion(NamedTuple):
     """Increments of steps, in body axes at the beginning of each.
 
     Parameters
@@ -26,7 +26,7 @@ class Turned(NamedTuple):
     position: Array
 
 
-def steps_of(gyro_body: Array, accel_body: Array, dt: Array) -> Turned:
+def steps_of(gyro_body: Array, accel_body: Array, dt: Array) -> StepMotion:
     """Return the increments of steps with constant rate and specific force in body axes.
 
     Parameters
@@ -60,4 +60,4 @@ def steps_of(gyro_body: Array, accel_body: Array, dt: Array) -> Turned:
     rotation = np.eye(3) + first[:, None, None] * across + second[:, None, None] * twice
     velocity = accel_body + second[:, None] * once_on + third[:, None] * twice_on
     position = 0.5 * accel_body + third[:, None] * once_on + fourth[:, None] * twice_on
-    return Turned(rotation, velocity * length, position * length**2)
+    return StepMotion(rotation, velocity * length, position * length**2)

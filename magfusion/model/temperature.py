@@ -12,11 +12,11 @@ import numpy as np
 from magfusion.units import Array
 
 MAGNETOMETER = "magnetometer"  # name of that part; all others are beacons
-REMEMBERED = 1000  # readings of each part that a running estimator keeps
+MAX_READINGS = 1000  # readings of each part that a running estimator keeps
 
 
 @dataclass(frozen=True)
-class Warming:
+class MomentTemperatureModel:
     """Temperature dependence of the moments of a beacon's coils.
 
     Parameters
@@ -32,7 +32,7 @@ class Warming:
 
 
 @dataclass(frozen=True, eq=False)
-class SensorWarming:
+class SensorTemperatureModel:
     """Temperature dependence of a magnetometer's matrix and offset.
 
     Parameters
@@ -84,11 +84,11 @@ class Temperatures:
     def __init__(self, readings: Mapping[str, Array] | None = None) -> None:
         self.readings = {} if readings is None else dict(readings)
 
-    def hear(self, part: str, time: float, degc: float) -> None:
+    def add_reading(self, part: str, time: float, degc: float) -> None:
         """Add a reading; one older than the last is ignored."""
         known = self.readings.get(part, np.zeros((2, 0)))
         if known.shape[1] == 0 or time > known[0, -1]:
-            self.readings[part] = np.column_stack([known[:, -REMEMBERED:], [time, degc]])
+            self.readings[part] = np.column_stack([known[:, -MAX_READINGS:], [time, degc]])
 
     def at(self, part: str, time: Array) -> Array | None:
         """Return temperatures of a part at times, same shape; None without a reading."""

@@ -128,12 +128,12 @@ def interpolate(
     before = np.where(known[after] == time, after, np.maximum(after - 1, 0))
     step = known[after] - known[before]
     exists = (known[before] <= time) & (time <= known[after]) & (step <= max_gap)
-    wanted, left, right = time[exists], before[exists], after[exists]
+    wanted, remaining, right = time[exists], before[exists], after[exists]
     # On a sample both neighbours are that sample, and the step is zero.
-    share = (wanted - known[left]) / np.where(left == right, 1.0, step[exists])
+    share = (wanted - known[remaining]) / np.where(remaining == right, 1.0, step[exists])
     position = trajectory.position_world
     turn = _slerp(known, trajectory.world_from_body, wanted)
-    moved = position[left] + share[:, None] * (position[right] - position[left])
+    moved = position[remaining] + share[:, None] * (position[right] - position[remaining])
     return Trajectory(wanted, turn, moved), exists
 
 

@@ -296,7 +296,7 @@ class StateTrust:
         )
 
 
-def alike(count: int, verdict: Verdict) -> StateTrust:
+def uniform_trust(count: int, verdict: Verdict) -> StateTrust:
     """Return the same verdict for every state, without protection levels."""
     nothing = np.full(count, np.nan)
     return StateTrust((verdict,) * count, nothing, nothing, ((),) * count)

@@ -20,7 +20,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.units import AnyArray, Array, ComplexArray
 
 
-class Motion(NamedTuple):
+class MotionChange(NamedTuple):
     """Rate of change of a motion, shape (n, 3) both, world axes.
 
     Parameters
@@ -45,7 +45,7 @@ def predicted_waveform(
     calibration: Calibration,
     earth_field_world: Array,
     carrier: ComplexArray,
-    change: Motion | None = None,
+    change: MotionChange | None = None,
     *,
     through_nodes: bool = False,
 ) -> tuple[Array, Array]:
@@ -59,7 +59,7 @@ def predicted_waveform(
         (T)
     carrier : complex ndarray, shape (n, channels)
         As of `carriers`.
-    change : Motion, optional
+    change : MotionChange, optional
         Derivative of the motion.
     through_nodes : bool
         Whether expensive fields are interpolated by `magfusion.model.path_field`.
@@ -95,7 +95,7 @@ def _read(
     calibration: Calibration,
     earth_field_world: Array,
     carrier: ComplexArray,
-    change: Motion | None,
+    change: MotionChange | None,
     through_nodes: bool,
 ) -> tuple[Array, Array]:
     """Return the samples of axes with equal response, as `predicted_waveform`."""
@@ -112,11 +112,11 @@ def _read(
             through_nodes,
         )
         return field + magnetometer.offset, by
-    apart = [
+    separate = [
         _at_point(at, motion, calibration.site, earth_field_world, currents, change, through_nodes)
         for at in points_apart(magnetometer)
     ]
-    field, by = (joined_samples([part[k] for part in apart], magnetometer) for k in range(2))
+    field, by = (joined_samples([part[k] for part in separate], magnetometer) for k in range(2))
     return field + magnetometer.offset, by
 
 
@@ -147,7 +147,7 @@ def _at_point(
     site: Site,
     earth_field_world: Array,
     currents: list[AnyArray],
-    change: Motion | None,
+    change: MotionChange | None,
     through_nodes: bool,
 ) -> tuple[Array, Array]:
     """Return the samples of a magnetometer with concentric axes, without its offset."""
@@ -160,8 +160,8 @@ def _at_point(
     for (_, source), current in zip(side_by_side(site), currents, strict=True):
         place = motion.position_world + lever
         # For dipoles the interpolation costs more than it saves.
-        dear = source.loops.radius is not None or source.decay is not None
-        field_at = field_along_path if dear and through_nodes else driven_field
+        expensive = source.loops.radius is not None or source.decay is not None
+        field_at = field_along_path if expensive and through_nodes else driven_field
         driven = field_at(source, place, current, along)
         field += np.sum(driven.field.reshape(-1, *field.shape), axis=0)
         if driven.along is not None:

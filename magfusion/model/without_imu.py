@@ -41,7 +41,7 @@ def on_motion_prior(site: Site) -> Site:
         time_offset_sigma=0.0,
         clock_rate_sigma=0.0,
     )
-    axis = _held(site)
+    axis = _unobservable_axis(site)
     if axis is not None:
         imu = HeldModel(**vars(imu), held_axis=axis)
     platform, motion = site.platform, site.platform.motion
@@ -54,7 +54,7 @@ def on_motion_prior(site: Site) -> Site:
     )
 
 
-def _held(site: Site) -> tuple[float, float, float] | None:
+def _unobservable_axis(site: Site) -> tuple[float, float, float] | None:
     """Return the axis of the coil with unobservable roll; None if there are more axes."""
     platform = site.platform
     if platform.further or len(platform.magnetometer.axes) != 1:
@@ -70,8 +70,8 @@ def as_declared(site: Site) -> Site:
         return site
     prior = platform.motion_prior
     if prior is not None:
-        found = platform.imu.accel_noise, platform.imu.gyro_bias_walk
-        prior = MotionPrior(*found, prior.rate_sigma)
+        result = platform.imu.accel_noise, platform.imu.gyro_bias_walk
+        prior = MotionPrior(*result, prior.rate_sigma)
     return replace(
         site,
         gravity=replaced.gravity,

@@ -31,7 +31,7 @@ ROOMS = {
     "002": "p002_beacon",
     "004": "p004_fingerprints",
 }
-_ASKED = re.compile(r"(?:(eq|tab|fig|claim)[a-z]*)?[\s.(]*(\d*)[\s.)]*", re.ASCII)
+_QUERY = re.compile(r"(?:(eq|tab|fig|claim)[a-z]*)?[\s.(]*(\d*)[\s.)]*", re.ASCII)
 
 
 class Citation(StrictModel):
@@ -59,7 +59,7 @@ class Citation(StrictModel):
         )
 
 
-class Entry(StrictModel):
+class PaperEntry(StrictModel):
     """One equation, table, figure or claim.
 
     Parameters
@@ -92,7 +92,7 @@ class Entry(StrictModel):
     scenario: str | None = None
 
     @model_validator(mode="after")
-    def _told(self) -> Self:
+    def _check_declared(self) -> Self:
         if self.finding != "right" and not self.why:
             raise ValueError(f"a finding of {self.finding} requires a reason (why)")
         if not (self.why or self.functions or self.tests or self.scenario):
@@ -100,7 +100,7 @@ class Entry(StrictModel):
         return self
 
 
-_Entries = dict[int, Entry]
+_Entries = dict[int, PaperEntry]
 
 
 class _File(StrictModel):
@@ -113,13 +113,13 @@ class _File(StrictModel):
     claims: _Entries = Field(default_factory=dict)
 
 
-class Numbered(StrictModel):
+class NumberedEntry(StrictModel):
     """An entry with its paper and number."""
 
     paper: str
     category: Kind
     number: int
-    entry: Entry
+    entry: PaperEntry
 
     @property
     def name(self) -> str:
@@ -150,13 +150,13 @@ class Paper(StrictModel):
     about: str
     note: str
     citation: Citation
-    entries: list[Numbered]
+    entries: list[NumberedEntry]
 
-    def of(self, kind: Kind) -> list[Numbered]:
+    def of(self, kind: Kind) -> list[NumberedEntry]:
         """Return the entries of one kind."""
         return [one for one in self.entries if one.category == kind]
 
-    def asked(self, words: str) -> list[Numbered]:
+    def select(self, words: str) -> list[NumberedEntry]:
         """Return the entries selected by ``7``, ``eq 7``, ``fig. 8`` or ``claims``.
 
         Raises
@@ -164,22 +164,22 @@ class Paper(StrictModel):
         InputError
             Where the paper has no such entry.
         """
-        parts = _ASKED.fullmatch(words.lower())
+        parts = _QUERY.fullmatch(words.lower())
         if parts is None or not any(parts.groups()):
             raise InputError(f"{words!r} is not an entry of paper {self.number}; {self._offer()}")
         kind = next(k for k in get_args(Kind) if k.startswith(parts[1] or "eq"))
-        found = [one for one in self.of(kind) if int(parts[2] or one.number) == one.number]
-        if not found:
+        result = [one for one in self.of(kind) if int(parts[2] or one.number) == one.number]
+        if not result:
             raise InputError(f"paper {self.number} has no {words.strip()!r}; {self._offer()}")
-        return found
+        return result
 
     def _offer(self) -> str:
-        held = [
+        fixed = [
             f"{KINDS[kind].lower()} {few[0].number}" + f" to {few[-1].number}" * (len(few) > 1)
             for kind in KINDS
             if (few := self.of(kind))
         ]
-        return f"it has {', '.join(held)}"
+        return f"it has {', '.join(fixed)}"
 
 
 def paper(name: str) -> Paper:
@@ -192,10 +192,10 @@ def paper(name: str) -> Paper:
     """
     if name in ROOMS:
         return _read(name)
-    found = [one for one in papers() if one.citation.doi == name.lower()]
-    if not found:
+    result = [one for one in papers() if one.citation.doi == name.lower()]
+    if not result:
         raise InputError(f"there is no paper {name!r}; give one of {', '.join(ROOMS)}")
-    return found[0]
+    return result[0]
 
 
 def papers() -> list[Paper]:
@@ -216,7 +216,7 @@ def _read(number: str) -> Paper:
     )
 
 
-def _numbered(number: str, file: _File) -> Iterator[Numbered]:
+def _numbered(number: str, file: _File) -> Iterator[NumberedEntry]:
     for kind in get_args(Kind):
         for place, entry in sorted(getattr(file, f"{kind}s").items()):
-            yield Numbered(paper=number, category=kind, number=place, entry=entry)
+            yield NumberedEntry(paper=number, category=kind, number=place, entry=entry)

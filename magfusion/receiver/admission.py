@@ -74,7 +74,7 @@ class Windows:
 
 
 @dataclass(frozen=True)
-class Grid:
+class WindowGrid:
     """Windows of one length at a fixed step.
 
     Parameters
@@ -185,7 +185,12 @@ class Admission:
     ends: tuple[RangeEnds, ...] = field(default_factory=lambda: tuple(RangeEnds() for _ in "xyz"))
 
     def verdicts(
-        self, grid: Grid, windows: Windows, waveform: Waveform, imu_time: Array, growth: Growth
+        self,
+        grid: WindowGrid,
+        windows: Windows,
+        waveform: Waveform,
+        imu_time: Array,
+        growth: Growth,
     ) -> IntArray:
         """Return the reason to drop each window, an index into `REASONS`; -1 for none.
 
@@ -203,19 +208,19 @@ class Admission:
         """
         half = windows.length / 2.0 + grid.early
         begin, end = windows.centre - half, windows.centre + windows.length / 2.0 - grid.early
-        found = np.full(len(windows), -1)
+        result = np.full(len(windows), -1)
 
-        def drop(reason: str, spoilt: BoolArray) -> None:
-            found[(found < 0) & spoilt] = REASONS.index(reason)
+        def drop(reason: str, corrupted: BoolArray) -> None:
+            result[(result < 0) & corrupted] = REASONS.index(reason)
 
         time, step = waveform.time, self.magnetometer_step
         gap = (time[1:] - time[:-1] > 1.5 * step).nonzero()[0]
         # From just before the first missing sample to just after the last.
         lacking = meets(time[gap] + 0.75 * step, time[gap + 1] - 0.75 * step, begin, end)
         few = (windows.count + self.slack) * step < self.least_share * windows.length
-        asked = lacking & ~few
-        if asked.any():
-            lacking[asked] = growth(windows.rows(asked), time) > MOST_GROWTH
+        requested = lacking & ~few
+        if requested.any():
+            lacking[requested] = growth(windows.rows(requested), time) > MOST_GROWTH
         drop(MAGNETOMETER_GAP, lacking)
         drop(TOO_FEW, few)
         if self.clips:
@@ -226,7 +231,7 @@ class Admission:
         if self.needs_turn:
             silence = silences(imu_time, self.imu_step, self.imu_margin)
             drop(INERTIAL_GAP, meets(*silence, begin, end - LATEST_USE * step))
-        return found
+        return result
 
 
 _NEVER = np.array([np.inf])

@@ -17,7 +17,7 @@ LEAST_TURNS = (
     1.2  # of an alias of the mains in the span of the state, which distinguishes it from a ramp
 )
 HARMONICS = (1, 3, 5)  # of the mains, whose waveform is symmetric
-LEAST_TOLD = 0.2  # least singular value of a separable design; that of a column of ones is one
+MIN_INFORMATION = 0.2  # least singular value of a separable design; that of a column of ones is one
 FARTHEST, FARTHEST_BURSTS = 1.0, 16.0  # s, or lengths: slots farther away are not used
 STRETCH = 4  # largest extension of the state where that separates mains and drift
 
@@ -118,8 +118,8 @@ def _state_design(elapsed: Array, near: Array, count: int, mains_turns: float) -
 def _same_cycle(driven: IntArray, silent: IntArray, count: int) -> tuple[IntArray, Array]:
     lo = np.searchsorted(silent // count, driven // count)
     hi = np.searchsorted(silent // count, driven // count, side="right")
-    most = max(int(np.max(hi - lo)), 1)
-    index = lo[:, None] + np.arange(most)
+    maximum = max(int(np.max(hi - lo)), 1)
+    index = lo[:, None] + np.arange(maximum)
     there = index < hi[:, None]
     weight = np.where(there, 1.0 / np.maximum(hi - lo, 1)[:, None], 0.0)
     weight[hi == lo] = np.nan
@@ -130,15 +130,15 @@ def _interpolated(
     driven: IntArray, silent: IntArray, after: IntArray, count: int
 ) -> tuple[IntArray, Array]:
     right = np.minimum(after, len(silent) - 1)
-    left = np.maximum(after - 1, 0)
-    span = np.maximum(silent[right] - silent[left], 1)
-    share = np.clip((driven - silent[left]) / span, 0.0, 1.0)
+    residual = np.maximum(after - 1, 0)
+    span = np.maximum(silent[right] - silent[residual], 1)
+    share = np.clip((driven - silent[residual]) / span, 0.0, 1.0)
     weight = np.stack([1.0 - share, share], axis=1)
     weight[span > 2 * count] = np.nan  # a gap
-    outside = (driven < silent[left]) | (driven > silent[right])
-    reach = np.minimum(np.abs(driven - silent[left]), np.abs(driven - silent[right]))
+    outside = (driven < silent[residual]) | (driven > silent[right])
+    reach = np.minimum(np.abs(driven - silent[residual]), np.abs(driven - silent[right]))
     weight[outside & (reach > count)] = np.nan
-    return np.stack([left, right], axis=1), weight
+    return np.stack([residual, right], axis=1), weight
 
 
 def uneven_weights(
@@ -173,20 +173,20 @@ def uneven_weights(
     if len(silent) == 0 or len(driven) == 0:
         return ambient_weights(np.arange(len(driven)), np.zeros(0, dtype=np.int64), 1, "state")
     index, weight = _uneven(driven, driven_length, silent, silent_length, number, ())[:2]
-    left = np.arange(len(driven) if mains_hz else 0)
+    residual = np.arange(len(driven) if mains_hz else 0)
     for orders in (HARMONICS, HARMONICS[:1]):
         lines_hz = tuple(order * mains_hz for order in orders)
         for wide in (number, 2 * number, STRETCH * number):
-            if len(left) == 0:
+            if len(residual) == 0:
                 break
-            own = (driven[left], driven_length[left])
-            wider, better, told = _uneven(*own, silent, silent_length, wide, lines_hz)
+            own = (driven[residual], driven_length[residual])
+            wider, better, dimensions = _uneven(*own, silent, silent_length, wide, lines_hz)
             spare = ((0, 0), (0, max(wider.shape[1] - index.shape[1], 0)))
             index, weight = np.pad(index, spare), np.pad(weight, spare)
-            rows, width = left[told], wider.shape[1]
+            rows, width = residual[dimensions], wider.shape[1]
             index[rows], weight[rows] = 0, 0.0
-            index[rows, :width], weight[rows, :width] = wider[told], better[told]
-            left = left[~told]
+            index[rows, :width], weight[rows, :width] = wider[dimensions], better[dimensions]
+            residual = residual[~dimensions]
     return index, weight
 
 
@@ -219,8 +219,10 @@ def _uneven(
     inverse = np.linalg.pinv(design, rcond=1e-6)
     weight = np.einsum("nc,nck->nk", np.stack(wanted, axis=1), inverse)
     least = np.linalg.svd(design, compute_uv=False)[:, -1] / np.sqrt(number)
-    told = least > LEAST_TOLD if number >= len(columns) else np.zeros(len(driven), dtype=bool)
-    return index, np.where(near.any(axis=1)[:, None], weight, np.nan), told
+    dimensions = (
+        least > MIN_INFORMATION if number >= len(columns) else np.zeros(len(driven), dtype=bool)
+    )
+    return index, np.where(near.any(axis=1)[:, None], weight, np.nan), dimensions
 
 
 def removed(

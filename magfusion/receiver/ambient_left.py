@@ -10,7 +10,7 @@ from magfusion.receiver.ambient import removed, uneven_weights
 from magfusion.receiver.noise import smoothed_over_windows
 from magfusion.units import Array, ComplexArray
 
-FEWEST = 3  # silent bursts needed to predict one from both sides
+MIN_SILENT_BURSTS = 3  # silent bursts needed to predict one from both sides
 
 
 def left_by_ambient(
@@ -36,20 +36,22 @@ def left_by_ambient(
     spread : (float, int)
         Longest pause between bursts that are averaged together (s), and how many are averaged.
     """
-    if len(time) < FEWEST:
+    if len(time) < MIN_SILENT_BURSTS:
         return np.zeros_like(noise)
     index, weight = uneven_weights(time, length, time, length, *state)
-    left = removed(still, still, index, weight).real
-    told = np.isfinite(left).all(axis=1)
-    if np.sum(told) < FEWEST:
+    residual = removed(still, still, index, weight).real
+    dimensions = np.isfinite(residual).all(axis=1)
+    if np.sum(dimensions) < MIN_SILENT_BURSTS:
         return np.zeros_like(noise)
     square = np.where(np.isfinite(weight), weight, 0.0) ** 2
     expected = noise + np.einsum("nk,nkxy->nxy", square, noise[index])
-    excess = left[:, :, None] * left[:, None] - expected
+    excess = residual[:, :, None] * residual[:, None] - expected
     # The neighbours have as much hum as the predicted burst.
-    excess = (excess / (1.0 + np.sum(square, axis=1))[:, None, None])[told]
-    mean = smoothed_over_windows(excess[:, None], time[told], spread[0], spread[1], None)[:, 0]
+    excess = (excess / (1.0 + np.sum(square, axis=1))[:, None, None])[dimensions]
+    mean = smoothed_over_windows(excess[:, None], time[dimensions], spread[0], spread[1], None)[
+        :, 0
+    ]
     value, vector = np.linalg.eigh(mean)
     mean = vector * np.maximum(value, 0.0)[:, None] @ np.swapaxes(vector, 1, 2)
-    after = np.clip(np.searchsorted(time[told], time), 0, len(mean) - 1)
+    after = np.clip(np.searchsorted(time[dimensions], time), 0, len(mean) - 1)
     return np.asarray(mean[after])

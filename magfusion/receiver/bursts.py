@@ -11,7 +11,7 @@ from magfusion.units import Array
 TOGETHER = 0.2  # of the mean step; samples closer than that arrived in one burst
 SHARE = 0.4  # least share of such short steps where samples come in bursts
 LONGEST = 0.1  # s between two bursts; a longer pause is a switched stream, not a bus
-MOST = 32  # samples in a burst
+MAX_SAMPLES = 32  # samples in a burst
 PAUSE = 3.0  # times the usual time between bursts: a gap, over which nothing is spread
 
 
@@ -28,20 +28,20 @@ def spread_bursts(stamps: Array) -> Array | None:
     ndarray, shape (n,), or None
         Strictly increasing (s); the last sample of a burst keeps its stamp.
     """
-    if len(stamps) < 2 * MOST:
+    if len(stamps) < 2 * MAX_SAMPLES:
         return None
     step = np.diff(stamps)
     inside = step[step < 2.0 * LONGEST]
-    if len(inside) < MOST:
+    if len(inside) < MAX_SAMPLES:
         return None
-    apart = step > TOGETHER * float(np.mean(inside))
-    if np.mean(~apart) < SHARE:
+    separate = step > TOGETHER * float(np.mean(inside))
+    if np.mean(~separate) < SHARE:
         return None
-    last = np.append(np.flatnonzero(apart), len(stamps) - 1)
+    last = np.append(np.flatnonzero(separate), len(stamps) - 1)
     count = np.diff(last, prepend=-1)
     between = np.diff(stamps[last])
     usual = float(np.median(between))
-    if usual > LONGEST or np.median(count) > MOST:
+    if usual > LONGEST or np.median(count) > MAX_SAMPLES:
         return None
     each = usual / float(np.median(count))
     whole = between < PAUSE * usual

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from magfusion.errors import InputError
-from magfusion.model.audibility import (
+from magfusion.model.detection_range import (
     only_owned,
     owned_at,
     tones_of,
@@ -30,12 +30,14 @@ LOWEST_SPAN = 3.0  # m; of heights, where all beacons are at one
 EVERY = 0.8  # s
 FASTEST = 4.0  # m/s
 NOT_AS_DECLARED = 0.1  # of an amplitude, in addition to its change between nodes
-UNLIKE = 30.0  # largest chi square of one epoch, which bounds the effect of a faulty beacon
+MAX_FALSE_CHI_SQUARE = (
+    30.0  # largest chi square of one epoch, which bounds the effect of a faulty beacon
+)
 AS_LIKELY = 16.0  # of chi square, within which another position is possible
 MARGIN = 2.0  # m; position error of the track
 
 
-class Way(NamedTuple):
+class SensorPath(NamedTuple):
     """Coarse track of the magnetometer, accurate to about one grid pitch.
 
     Parameters
@@ -79,7 +81,7 @@ class _Grid(NamedTuple):
         return np.stack([axis[i] for axis, i in zip(self.axes, index, strict=True)], axis=-1)
 
 
-def way_of(samples: FieldSamples, site: Site) -> Way:
+def way_of(samples: FieldSamples, site: Site) -> SensorPath:
     """Return the most probable track of a log through its site.
 
     Parameters
@@ -104,7 +106,7 @@ def way_of(samples: FieldSamples, site: Site) -> Way:
     for k in range(len(time)):
         likely = every[total[k] < total[k, best[k]] + AS_LIKELY]
         spread[k] = np.max(np.linalg.norm((likely - position[k])[:, :2], axis=1))
-    return Way(time, position, spread)
+    return SensorPath(time, position, spread)
 
 
 def _thinned(time: Array, step: float) -> IntArray:
@@ -126,8 +128,8 @@ def _grid_of(site: Site) -> _Grid:
     node = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     tones = tones_of(site)
     power, change = (np.zeros((len(node), len(tones.frequencies_hz))) for _ in range(2))
-    apart = 0.5 * np.array([pitch, pitch, axes[2][1] - axes[2][0]])
-    missed = float(np.linalg.norm(apart) / np.sqrt(3.0))
+    separate = 0.5 * np.array([pitch, pitch, axes[2][1] - axes[2][0]])
+    missed = float(np.linalg.norm(separate) / np.sqrt(3.0))
     start = 0
     for beacon in site.beacons:
         phasor = predict(beacon, _plain(site), np.broadcast_to(np.eye(3), (len(node), 3, 3)), node)
@@ -161,7 +163,9 @@ def _cost(grid: _Grid, strength: Array, noise: Array) -> Array:
     for k in range(len(strength)):
         variance = own + noise[k]
         square = (np.hypot(grid.strength, np.sqrt(2.0 * noise[k])) - strength[k]) ** 2 / variance
-        out[k] = np.sum(np.minimum(square, UNLIKE) + np.log(variance / noise[k]), axis=1)
+        out[k] = np.sum(
+            np.minimum(square, MAX_FALSE_CHI_SQUARE) + np.log(variance / noise[k]), axis=1
+        )
     return out
 
 
@@ -194,11 +198,11 @@ def owned_by(samples: FieldSamples, site: Site) -> FieldSamples:
     if not tones_of(site).reused or len(samples) == 0:
         return samples
     place, margin = way_of(samples, site).at(samples.time)
-    found = only_owned(samples, owned_at(site, place, margin=margin[:, None]))
-    if not np.any(found.valid):
+    result = only_owned(samples, owned_at(site, place, margin=margin[:, None]))
+    if not np.any(result.valid):
         raise InputError(
             "beacons share frequencies, and the received amplitudes do not identify them:"
             " several positions are equally probable (ambiguous); record longer, or in range of"
             " more beacons"
         )
-    return found
+    return result

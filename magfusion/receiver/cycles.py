@@ -59,14 +59,14 @@ def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSam
     InputError
         Where there is no such cycle.
     """
-    found = cycles(samples, turn_of(on_clock(imu, site.platform.imu.time_offset), site), site)
-    whole: BoolArray = np.all(found.valid, axis=1)
+    result = cycles(samples, turn_of(on_clock(imu, site.platform.imu.time_offset), site), site)
+    whole: BoolArray = np.all(result.valid, axis=1)
     if not np.any(whole):
         raise InputError(
             f"no cycle of slots holds all of {len(samples.channels)} coils;"
             " record longer, or give the site in which the log was recorded"
         )
-    return found.rows(whole)
+    return result.rows(whole)
 
 
 def cycles(
@@ -89,13 +89,13 @@ def cycles(
     time: Array = np.bincount(cycle, samples.time) / np.bincount(cycle)
     phasor = np.full((number, *samples.phasor_sensor.shape[1:]), np.nan, dtype=np.complex128)
     cov = np.full((number, *samples.phasor_cov.shape[1:]), np.nan)
-    turned = None
+    rotated = None
     if site.platform.magnetometer.lacking:
         # The field along the other axes is unknown: no field can be rotated.
         still_from_body = matrices(measured_from_still.still_from_body(samples.time[row]))
         still_from_epoch = matrices(measured_from_still.still_from_body(time))[cycle[row]]
-        turned = np.broadcast_to(np.eye(3), cov.shape).copy()
-        turned[cycle[row], channel] = np.swapaxes(still_from_epoch, 1, 2) @ still_from_body
+        rotated = np.broadcast_to(np.eye(3), cov.shape).copy()
+        rotated[cycle[row], channel] = np.swapaxes(still_from_epoch, 1, 2) @ still_from_body
         phasor[cycle[row], channel] = samples.phasor_sensor[row, channel]
         cov[cycle[row], channel] = samples.phasor_cov[row, channel]
     else:
@@ -117,7 +117,7 @@ def cycles(
         phasor_cov=cov,
         ahead=ahead,
         axes=samples.axes,
-        turned=turned,
+        channel_rotation=rotated,
     )
 
 
@@ -159,12 +159,12 @@ def _marked(
         Longest time from the first to the last burst of a cycle, and between two (s).
     """
     cycle = np.zeros(len(time), dtype=np.int64)
-    taken: set[int] = set()
+    selected: set[int] = set()
     first = before = -np.inf
     newest = -1
     for k, (when, one) in enumerate(zip(time.tolist(), slot.tolist(), strict=True)):
-        if newest < 0 or one in taken or when - first > longest or when - before > pause:
-            newest, taken, first = newest + 1, set(), when
+        if newest < 0 or one in selected or when - first > longest or when - before > pause:
+            newest, selected, first = newest + 1, set(), when
         cycle[k], before = newest, when
-        taken.add(one)
+        selected.add(one)
     return cycle

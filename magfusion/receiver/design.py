@@ -19,7 +19,7 @@ CHUNK = 64  # windows demodulated at once, so that their arrays fit the CPU cach
 LARGEST = 2**28  # bytes of the maps of one chunk; many tones in long windows shrink the chunk
 KEPT = 256 * 2**20  # bytes of cached maps; others are recomputed
 EVEN_KEPT = 64  # maps of evenly spaced samples
-FEWEST_ALIKE = 4  # windows for each of their spacings
+MIN_SHARED_WINDOWS = 4  # windows for each of their spacings
 WORST_CONDITION = 1e8  # of a normal matrix; beyond, its columns are not separable
 
 
@@ -40,7 +40,7 @@ class Maps(NamedTuple):
         Of these, for samples with a variance of one.
     probes : ndarray, shape (n, tones, 4, m)
         To the residuals of probes next to each tone, scaled to unit variance.
-    told : int ndarray, shape (n, tones)
+    dimensions : int ndarray, shape (n, tones)
         Number of independent probe directions of each tone.
     """
 
@@ -50,7 +50,7 @@ class Maps(NamedTuple):
     solver: Array
     variance: Array
     probes: Array
-    told: IntArray
+    dimensions: IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class Designs:
     windows: Windows
     even: dict[Spacing, Maps] = field(default_factory=dict)
     kept: dict[int, Maps] = field(default_factory=dict)
-    asked: set[int] = field(default_factory=set)
+    requested: set[int] = field(default_factory=set)
 
     def pieces(self) -> Iterator[tuple[slice, Maps]]:
         """Yield windows with their maps, as many at once as fit in memory.
@@ -90,26 +90,26 @@ class Designs:
             if maps is None:
                 maps, own = self._maps(self.windows.rows(rows))
                 few = len(self.windows) <= chunk
-                worth = few or (own and begin in self.asked)
+                worth = few or (own and begin in self.requested)
                 if worth and self._size() + _size(maps) < KEPT:
                     self.kept[begin] = maps
-            self.asked.add(begin)
+            self.requested.add(begin)
             yield rows, maps
 
     def _at_once(self) -> int:
         """Return how many windows are demodulated at once."""
-        most = int(self.windows.count.max(initial=1))
+        maximum = int(self.windows.count.max(initial=1))
         columns = 6 * len(self.frequencies_hz) + 2
-        return min(max(LARGEST // (8 * most * columns), 1), CHUNK)
+        return min(max(LARGEST // (8 * maximum * columns), 1), CHUNK)
 
     def _size(self) -> int:
         return sum(map(_size, self.kept.values()))
 
     def design(self, elapsed: Array, weight: BoolArray) -> Array:
         """Return the columns fitted to windows, shape (n, m, columns)."""
-        found = design_of(elapsed, self.settings, self.frequencies_hz, self.nuisance_hz)
-        found *= weight[..., None]
-        return found
+        result = design_of(elapsed, self.settings, self.frequencies_hz, self.nuisance_hz)
+        result *= weight[..., None]
+        return result
 
     def _maps(self, windows: Windows) -> tuple[Maps, bool]:
         """Return the maps of some windows, and whether most were computed for them alone."""
@@ -127,14 +127,14 @@ class Designs:
             elapsed[k, : own.number] = own.times()
         parts: list[Maps] = []
         if rows:
-            made = self._made(index[rows], weight[rows], elapsed[rows])
+            built = self._build(index[rows], weight[rows], elapsed[rows])
             if rows == list(range(len(windows))) and (uneven or len(windows) > 1):
-                return made, True  # all differ, and none was cached
-            known |= self._kept(made, new)
-            parts = [_rows(made, slice(len(new), None), None)]
+                return built, True  # all differ, and none was cached
+            known |= self._kept(built, new)
+            parts = [_rows(built, slice(len(new), None), None)]
         parts = [*map(known.__getitem__, distinct), *parts]
         which = _places(spacings, list(distinct))
-        return _chosen(index, weight, parts, which), FEWEST_ALIKE * len(rows) > len(windows)
+        return _chosen(index, weight, parts, which), MIN_SHARED_WINDOWS * len(rows) > len(windows)
 
     def _known(self, spacings: Iterable[Spacing]) -> dict[Spacing, Maps]:
         """Return the cached maps of spacings and mark them as most recently used."""
@@ -142,29 +142,31 @@ class Designs:
         self.even.update(known)
         return known
 
-    def _kept(self, made: Maps, spacings: Sequence[Spacing]) -> dict[Spacing, Maps]:
+    def _kept(self, simulation: Maps, spacings: Sequence[Spacing]) -> dict[Spacing, Maps]:
         """Cache the maps of spacings, one a row, and drop the least recently used."""
-        new = {own: _rows(made, slice(k, k + 1), own.number) for k, own in enumerate(spacings)}
+        new = {
+            own: _rows(simulation, slice(k, k + 1), own.number) for k, own in enumerate(spacings)
+        }
         self.even.update(new)
         while len(self.even) > EVEN_KEPT:
             del self.even[next(iter(self.even))]
         return new
 
-    def _made(self, index: IntArray, weight: BoolArray, elapsed: Array) -> Maps:
+    def _build(self, index: IntArray, weight: BoolArray, elapsed: Array) -> Maps:
         design, n = self.design(elapsed, weight), len(self.frequencies_hz)
         projected = np.swapaxes(design, -1, -2)
         inverse = np.asarray(np.linalg.inv(projected @ design))
-        told = np.r_[0, 2 : 2 + 2 * n]
-        beside_hz = np.concatenate([self.nuisance_hz, self.settings.lines_hz])
-        probes = probes_left(self.frequencies_hz, beside_hz, elapsed, weight, design, inverse)
+        dimensions = np.r_[0, 2 : 2 + 2 * n]
+        extra_lines_hz = np.concatenate([self.nuisance_hz, self.settings.lines_hz])
+        probes = probes_left(self.frequencies_hz, extra_lines_hz, elapsed, weight, design, inverse)
         return Maps(
             sample=index,
             weight=weight,
             elapsed=elapsed,
-            solver=inverse[:, told] @ projected,
-            variance=np.einsum("nii->ni", inverse)[:, told],
+            solver=inverse[:, dimensions] @ projected,
+            variance=np.einsum("nii->ni", inverse)[:, dimensions],
             probes=probes[0],
-            told=probes[1],
+            dimensions=probes[1],
         )
 
 
@@ -184,7 +186,7 @@ def _rows(maps: Maps, rows: slice, count: int | None) -> Maps:
         solver=maps.solver[rows, :, :count].copy(),
         variance=maps.variance[rows].copy(),
         probes=maps.probes[rows, ..., :count].copy(),
-        told=maps.told[rows].copy(),
+        dimensions=maps.dimensions[rows].copy(),
     )
 
 
@@ -205,8 +207,8 @@ def _chosen(index: IntArray, weight: BoolArray, parts: list[Maps], which: IntArr
         for each in zip(*((p.elapsed, p.solver, p.probes) for p in parts), strict=True)
     )
     variance = np.concatenate([part.variance for part in parts])
-    told = np.concatenate([part.told for part in parts])
-    if len(told) == 1:  # all windows have one number
+    dimensions = np.concatenate([part.dimensions for part in parts])
+    if len(dimensions) == 1:  # all windows have one number
         return Maps(
             index,
             weight,
@@ -214,10 +216,16 @@ def _chosen(index: IntArray, weight: BoolArray, parts: list[Maps], which: IntArr
             np.broadcast_to(solver, (count, *solver.shape[1:])),
             np.broadcast_to(variance, (count, *variance.shape[1:])),
             np.broadcast_to(probes, (count, *probes.shape[1:])),
-            np.broadcast_to(told, (count, *told.shape[1:])),
+            np.broadcast_to(dimensions, (count, *dimensions.shape[1:])),
         )
     return Maps(
-        index, weight, elapsed[which], solver[which], variance[which], probes[which], told[which]
+        index,
+        weight,
+        elapsed[which],
+        solver[which],
+        variance[which],
+        probes[which],
+        dimensions[which],
     )
 
 
@@ -235,8 +243,8 @@ def nuisances_hz(settings: LockinSettings, frequencies: Array, nyquist_hz: float
         return np.zeros(0)
     lines = np.arange(settings.mains_hz, 0.95 * nyquist_hz, settings.mains_hz)[:6]
     others = np.concatenate([frequencies, settings.lines_hz])
-    apart = np.min(np.abs(lines[:, None] - others), axis=1) * settings.window
-    return lines[apart > 0.8]
+    separate = np.min(np.abs(lines[:, None] - others), axis=1) * settings.window
+    return lines[separate > 0.8]
 
 
 def padded(windows: Windows, time: Array) -> tuple[IntArray, BoolArray, Array]:

@@ -58,12 +58,12 @@ def drive_channels(site: Site, columns: Mapping[str, object]) -> tuple[Channel, 
                 f"drive_{column}: the site has no beacon {column}; name one of"
                 f" {', '.join(sorted(names))}, or write drive for one current through all"
             )
-    found = []
+    result = []
     for beacon in site.beacons:
         column = beacon.name if beacon.name in columns else ""
         if column in columns:
-            found += list(_of_beacon(beacon, column))
-    return tuple(found)
+            result += list(_of_beacon(beacon, column))
+    return tuple(result)
 
 
 def _of_beacon(beacon: Beacon, column: str) -> Iterator[Channel]:
@@ -155,16 +155,16 @@ class DriveReceiver:
         hop, length, begin = self._grid()
         if self.next_number is None:
             self.next_number = int(np.ceil((self.time[0] - begin) / hop - 1e-6))
-        found: dict[Channel, list[tuple[float, complex]]] = {}
+        result: dict[Channel, list[tuple[float, complex]]] = {}
         channels = drive_channels(self._site, dict.fromkeys(self.columns))
         while begin + self.next_number * hop + length <= self.time[-1] + 0.6 * self.step:
             first = begin + self.next_number * hop
             for channel, share in self._window(channels, first, length):
-                found.setdefault(channel, []).append((first + 0.5 * length, share))
+                result.setdefault(channel, []).append((first + 0.5 * length, share))
             self.next_number += 1
-        for channel, readings in found.items():
+        for channel, readings in result.items():
             time, shares = np.array([t for t, _ in readings]), np.array([s for _, s in readings])
-            self.shares.hear(channel.beacon, channel.tone, time, shares)
+            self.shares.add_readings(channel.beacon, channel.tone, time, shares)
         kept = self.time > begin + self.next_number * hop - self.step
         self.time, self.values = self.time[kept], self.values[kept]
 
@@ -192,8 +192,8 @@ class DriveReceiver:
             own = tuple(c for c in channels if c.column == column)
             if own:
                 bends = 0 if has_schedule(self._site) else 2
-                found = _currents(elapsed, self.values[rows, k], own, bends)
-                yield from self._shares(own, *found, first + 0.5 * length)
+                result = _currents(elapsed, self.values[rows, k], own, bends)
+                yield from self._shares(own, *result, first + 0.5 * length)
 
     def _shares(
         self, channels: tuple[Channel, ...], current: ComplexArray, sigma: float, centre: float
@@ -234,8 +234,8 @@ def _currents(
     inverse = np.linalg.pinv(design)
     fitted = inverse @ values
     spread = len(values) - design.shape[1]
-    left = np.sqrt(np.sum((values - design @ fitted) ** 2) / max(spread, 1))
-    n, noise = len(channels), left * np.linalg.norm(inverse[: len(waves) + 1], axis=1)
+    residual = np.sqrt(np.sum((values - design @ fitted) ** 2) / max(spread, 1))
+    n, noise = len(channels), residual * np.linalg.norm(inverse[: len(waves) + 1], axis=1)
     if direct:
         return np.full(n, fitted[0], dtype=complex), float(noise[0])
     return fitted[1 : 1 + n] - 1j * fitted[1 + n : 1 + 2 * n], float(np.max(noise[1:]))

@@ -14,7 +14,9 @@ from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import default_settings
 from magfusion.units import Array
 
-ASTRAY = 4.0  # steps; largest error of counted samples where a bus delivers several at a time
+MAX_COUNT_ERROR = (
+    4.0  # steps; largest error of counted samples where a bus delivers several at a time
+)
 
 
 def on_even_clocks(log: Log, site: Site) -> Log:
@@ -23,16 +25,16 @@ def on_even_clocks(log: Log, site: Site) -> Log:
     The magnetometer decides between ticks and stamps: at the correct times, tones and rotation
     leave a smaller residual.  The IMU follows that decision.
     """
-    found = {"imu": _clock(log.imu.time, site)}
+    result = {"imu": _clock(log.imu.time, site)}
     if log.waveform is not None:
-        found["magnetometer"] = _clock(log.waveform.time, site)
-    clocks = {name: clock for name, clock in found.items() if clock is not None}
+        result["magnetometer"] = _clock(log.waveform.time, site)
+    clocks = {name: clock for name, clock in result.items() if clock is not None}
     if not clocks:
         return log
     even = _at(log, clocks)
     replaced = "magnetometer" not in clocks or _evener(log, even, site)
     notes = {
-        name: StreamClock(clock.step, clock.scatter, clock.lost, replaced)
+        name: StreamClock(clock.step, clock.scatter, clock.lost_count, replaced)
         for name, clock in clocks.items()
     }
     return replace(even if replaced else log, clocks=notes)
@@ -40,17 +42,17 @@ def on_even_clocks(log: Log, site: Site) -> Log:
 
 def _clock(stamps: Array, site: Site) -> SamplingClock | None:
     """Return the uniform clock of stamps, which a bus may have bundled."""
-    apart = None if has_schedule(site) else spread_bursts(stamps)
-    if apart is None:
+    separate = None if has_schedule(site) else spread_bursts(stamps)
+    if separate is None:
         return sampling_clock(stamps)
     # Without losses, samples are counted; a lost one shifts the later ones by at most one step.
-    steps = np.diff(apart)
+    steps = np.diff(separate)
     step = float(np.mean(steps[steps < LONGEST]))
     breaks = np.flatnonzero(steps >= LONGEST) + 1
-    parts = np.split(apart, breaks)
+    parts = np.split(separate, breaks)
     time = np.concatenate([smooth_clock(np.arange(len(part)), part) for part in parts])
-    if np.any(np.diff(time) <= 0.0) or np.max(np.abs(time - apart)) > ASTRAY * step:
-        time = apart
+    if np.any(np.diff(time) <= 0.0) or np.max(np.abs(time - separate)) > MAX_COUNT_ERROR * step:
+        time = separate
     return SamplingClock(time, step, float(np.sqrt(np.mean((time - stamps) ** 2))), 0)
 
 

@@ -11,7 +11,7 @@ from magfusion.units import Array, IntArray
 
 # Largest time error of evenly spaced samples (rad of the fastest tone): of clocks with full
 # precision, and of those with nanoseconds.
-ALIKE = (1e-9, 1e-6)
+RATE_TOLERANCES = (1e-9, 1e-6)
 WITHIN = 1.5  # steps of time error; each of the two numbers of a spacing is rounded to one half
 
 
@@ -40,16 +40,16 @@ def spacings_of(time: Array, count: IntArray, fastest_hz: float) -> list[Spacing
     fastest_hz : float
         Highest frequency of a tone.
     """
-    found: list[Spacing | None] = [None] * len(count)
-    for alike in ALIKE:
-        step = alike / (2.0 * np.pi * WITHIN * fastest_hz)
+    result: list[Spacing | None] = [None] * len(count)
+    for shared in RATE_TOLERANCES:
+        step = shared / (2.0 * np.pi * WITHIN * fastest_hz)
         middle, half, even = _rounded(time, count, step)
         for k in np.flatnonzero(even).tolist():
-            if found[k] is None:
-                found[k] = Spacing(int(count[k]), int(middle[k]), int(half[k]), step)
-        if None not in found:
+            if result[k] is None:
+                result[k] = Spacing(int(count[k]), int(middle[k]), int(half[k]), step)
+        if None not in result:
             break
-    return found
+    return result
 
 
 def _rounded(time: Array, count: IntArray, step: float) -> tuple[Array, Array, Array]:

@@ -59,13 +59,13 @@ def hum_of(waveform: Waveform, mains_hz: float) -> Hum | None:
     if len(centre) < 2 * SMOOTHED:
         return nominal
     looks = _looks(waveform, centre, mains_hz * orders, step)
-    beside = np.sum(np.conj(looks[:-1]) * looks[1:], axis=-1)
+    others = np.sum(np.conj(looks[:-1]) * looks[1:], axis=-1)
     power = np.sum(np.abs(looks) ** 2, axis=(0, 2))
-    coherence = np.abs(np.sum(beside, axis=0)) / np.maximum(power, 1e-300)
+    coherence = np.abs(np.sum(others, axis=0)) / np.maximum(power, 1e-300)
     best = int(np.argmax(np.where(coherence > COHERENT, power, -1.0)))
     if coherence[best] <= COHERENT:
         return nominal
-    smooth = np.apply_along_axis(np.convolve, 0, beside[:, best], np.ones(SMOOTHED), "same")
+    smooth = np.apply_along_axis(np.convolve, 0, others[:, best], np.ones(SMOOTHED), "same")
     off = np.angle(smooth) / (2.0 * np.pi * orders[best] * 0.5 * SPAN)
     turns = np.concatenate([[0.0], np.cumsum(0.5 * SPAN * (mains_hz + off))])
     return Hum(mains_hz + float(np.mean(off)), orders, centre, turns)

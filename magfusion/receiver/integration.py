@@ -14,10 +14,10 @@ from scipy.special import chdtrc, chdtri, fdtrc, gammaln
 from magfusion.receiver.pieces import Pieces
 from magfusion.units import Array, ComplexArray
 
-NEAREST, MOST_BESIDE = 2, 12  # resolutions: the first whose power is noise; how many
-LEAST_BESIDE = 3
+NEAREST, MAX_NEIGHBOURS = 2, 12  # resolutions: the first whose power is noise; how many
+MIN_NEIGHBOURS = 3
 FARTHEST = 0.4  # of the inverse length of a piece, at which its taper still has gain
-LEAST_LENGTHS = (NEAREST + LEAST_BESIDE) / FARTHEST  # of a piece, in a stationary interval
+LEAST_LENGTHS = (NEAREST + MIN_NEIGHBOURS) / FARTHEST  # of a piece, in a stationary interval
 LEVEL = 31  # pieces over which the noise level is estimated
 HUBER = 2.0  # times the noise level, beyond which a piece is down-weighted
 ROUNDS = 3
@@ -75,7 +75,7 @@ def trace_chance(trace: float, freedom: int) -> float:
     return float(fdtrc(p * q, second, trace / freedom / c * second / (p * q)))
 
 
-def integrated(found: Pieces, tone: int, time: float) -> Integrated:
+def integrated(result: Pieces, tone: int, time: float) -> Integrated:
     """Return one tone of a stationary interval, integrated over its pieces.
 
     Parameters
@@ -83,18 +83,18 @@ def integrated(found: Pieces, tone: int, time: float) -> Integrated:
     time : float
         Reference time of centroid and spread (s).
     """
-    phasor, elapsed = found.phasor[:, tone], found.centre - time
+    phasor, elapsed = result.phasor[:, tone], result.centre - time
     there = np.isfinite(phasor).all(axis=1)
     phasor, elapsed = phasor[there], elapsed[there]
     weight = _weights(phasor)
     mean = np.asarray(weight @ phasor)
-    span = float(np.ptp(elapsed)) + found.length
-    most = int(FARTHEST * span / found.length) - NEAREST
-    beside = NEAREST + np.arange(int(np.clip(most, LEAST_BESIDE, MOST_BESIDE)))
-    offsets_hz = np.concatenate([-beside, beside]) / span
-    heard = _heard(offsets_hz * found.length)
+    span = float(np.ptp(elapsed)) + result.length
+    maximum = int(FARTHEST * span / result.length) - NEAREST
+    others = NEAREST + np.arange(int(np.clip(maximum, MIN_NEIGHBOURS, MAX_NEIGHBOURS)))
+    offsets_hz = np.concatenate([-others, others]) / span
+    detected = _taper_response(offsets_hz * result.length)
     carrier = np.exp(-2j * np.pi * offsets_hz[:, None] * elapsed)
-    power = ((carrier * weight) @ (phasor - mean)) / heard[:, None]
+    power = ((carrier * weight) @ (phasor - mean)) / detected[:, None]
     freedom = 2 * len(offsets_hz)
     sample = np.real(power.T @ np.conj(power)) / freedom
     # The sample covariance is biased for few readings; its inverse is corrected.
@@ -104,7 +104,7 @@ def integrated(found: Pieces, tone: int, time: float) -> Integrated:
     return Integrated(mean, cov, freedom, centroid, spread)
 
 
-def _heard(bins: Array) -> Array:
+def _taper_response(bins: Array) -> Array:
     """Return the gain of a Hann taper at an offset in bins."""
     return np.asarray(np.sinc(bins) / (1.0 - bins**2))
 
@@ -124,7 +124,7 @@ def _weights(phasor: ComplexArray) -> Array:
 
 
 @dataclass(frozen=True)
-class Search:
+class FrequencySearch:
     """Result of a search for the frequency of a beacon.
 
     Parameters
@@ -139,7 +139,9 @@ class Search:
     trials: float
 
 
-def searched(found: Pieces, tones: list[int], frequencies_hz: Array, largest: float) -> Search:
+def searched(
+    result: Pieces, tones: list[int], frequencies_hz: Array, largest: float
+) -> FrequencySearch:
     """Return the relative clock error that maximises the power of tones.
 
     Parameters
@@ -149,14 +151,14 @@ def searched(found: Pieces, tones: list[int], frequencies_hz: Array, largest: fl
     largest : float
         Largest relative error searched, on either side.
     """
-    there = np.isfinite(found.phasor[:, tones]).all(axis=(1, 2))
-    centre = found.centre[there]
-    half = float(np.ptp(centre)) + found.length
+    there = np.isfinite(result.phasor[:, tones]).all(axis=(1, 2))
+    centre = result.centre[there]
+    half = float(np.ptp(centre)) + result.length
     elapsed = centre - np.mean(centre)
     highest = float(np.max(frequencies_hz[tones]))
     own = []
     for tone in tones:
-        phasor = found.phasor[there, tone]
+        phasor = result.phasor[there, tone]
         weight = _weights(phasor)
         noise = float(np.median(np.sum(np.abs(phasor) ** 2, axis=1)))
         own.append(weight[:, None] * phasor / np.sqrt(noise))
@@ -168,7 +170,7 @@ def searched(found: Pieces, tones: list[int], frequencies_hz: Array, largest: fl
         near = np.clip(best + finer * np.arange(-6.0, 7.0), -largest, largest)
         best = float(near[np.argmax(_loudness(own, tones, frequencies_hz, elapsed, near))])
     slope = float(np.pi * half / np.sqrt(3.0))
-    return Search(best, 2.0 * largest * highest * slope)
+    return FrequencySearch(best, 2.0 * largest * highest * slope)
 
 
 def _loudness(
@@ -193,7 +195,7 @@ def chance_of_any(chances: list[float], trials: float) -> float:
     chances : list of float
         Of each tone of a beacon, at its frequency.
     trials : float
-        As of `Search`.
+        As of `FrequencySearch`.
     """
     square = float(sum(chdtri(6, max(c, 1e-300)) for c in chances))
     degrees = 6 * len(chances)

@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.model.audibility import tones_of
+from magfusion.model.detection_range import tones_of
 from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
-from magfusion.receiver.admission import Grid, Windows, sample_rate_hz
+from magfusion.receiver.admission import WindowGrid, Windows, sample_rate_hz
 from magfusion.receiver.design import nuisances_hz
 from magfusion.receiver.lockin_receiver import LEAST_SHARE, LockinReceiver
 from magfusion.receiver.slots import has_schedule
@@ -27,35 +27,35 @@ SHORT_WINDOW = 0.2  # s
 NODES = (-0.87, 0.0, 0.87)  # half windows from the centre: changes in between are a parabola
 LONGEST_APART = 1.0  # s; longer windows to separate tones hold too much motion
 SAME_TIMES = 1e-8  # s; sample times that are no farther apart have the same design
-FAINTEST = 1e-3  # of the largest singular value; smaller ones carry no information
+MIN_SINGULAR_VALUE = 1e-3  # of the largest singular value; smaller ones carry no information
 PROBES = 6  # on either side of the tones, a window's resolution apart
 CLEAR = 1.5  # resolutions between a probe and a line
 
 
-def joint_settings(site: Site, asked: LockinSettings | None) -> LockinSettings | None:
+def joint_settings(site: Site, requested: LockinSettings | None) -> LockinSettings | None:
     """Return the settings for joint reception of a site's close tones; None if they are not close.
 
     Parameters
     ----------
-    asked : LockinSettings, optional
+    requested : LockinSettings, optional
         Requested windows; then there is no joint reception.
     """
-    usual = _long(site, asked)
+    usual = _long(site, requested)
     if usual is None or bool(site.platform.further) or bool(site.platform.magnetometer.lacking):
         return None
     return LockinSettings(SHORT_WINDOW, SHORT_WINDOW, usual.mains_hz, 16)
 
 
-def long_windows(site: Site, asked: LockinSettings | None) -> tuple[Finding, ...]:
+def long_windows(site: Site, requested: LockinSettings | None) -> tuple[Finding, ...]:
     """Return a finding, with the reason, if close tones are received separately.
 
     Parameters
     ----------
-    asked : LockinSettings, optional
+    requested : LockinSettings, optional
         As of `joint_settings`.
     """
-    usual = _long(site, asked)
-    if usual is None or joint_settings(site, asked) is not None:
+    usual = _long(site, requested)
+    if usual is None or joint_settings(site, requested) is not None:
         return ()
     why = "several magnetometers" if site.platform.further else "fewer axes than three"
     text = (
@@ -67,9 +67,9 @@ def long_windows(site: Site, asked: LockinSettings | None) -> tuple[Finding, ...
     return (Finding("long_windows", text, Verdict.TRUSTWORTHY, 0.5),)
 
 
-def _long(site: Site, asked: LockinSettings | None) -> LockinSettings | None:
+def _long(site: Site, requested: LockinSettings | None) -> LockinSettings | None:
     """Return the windows that separate close tones; None where the tones are not close."""
-    if asked is not None or len(site.beacons) < 2 or has_schedule(site):
+    if requested is not None or len(site.beacons) < 2 or has_schedule(site):
         return None
     if not site.platform.inertial:
         return None
@@ -88,13 +88,13 @@ class JointDesign(NamedTuple):
         Orthonormal: the tones orthogonal to steady field, drift and mains.
     tones : ndarray, shape (nodes, directions, 2 tones)
         Cosines and sines of each tone in these directions, by node.
-    beside : ndarray, shape (m, probes)
+    extra_design : ndarray, shape (m, probes)
         Orthonormal, next to the tones: directions of noise.
     """
 
     across: Array
     tones: Array
-    beside: Array
+    extra_design: Array
 
     @staticmethod
     def of(
@@ -118,18 +118,20 @@ class JointDesign(NamedTuple):
         angle = 2.0 * np.pi * elapsed[:, None] * frequencies_hz
         tones = np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
         across, size, _ = np.linalg.svd(_without(tones, fitted), full_matrices=False)
-        kept = int(np.sum(size > FAINTEST * size[0])) if directions is None else directions
+        kept = (
+            int(np.sum(size > MIN_SINGULAR_VALUE * size[0])) if directions is None else directions
+        )
         rows = min(kept, len(size))
         basis = np.zeros((len(elapsed), kept))
         basis[:, :rows] = across[:, :rows]
         probes_hz = _probes(frequencies_hz, mains_hz, nyquist_hz, settings.window)
         angle = 2.0 * np.pi * elapsed[:, None] * probes_hz
         probes = np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
-        known = np.column_stack([fitted, across[:, size > FAINTEST * size[0]]])
+        known = np.column_stack([fitted, across[:, size > MIN_SINGULAR_VALUE * size[0]]])
         return JointDesign(
             across=basis,
             tones=basis.T @ (_parts(elapsed, 0.5 * settings.window).T[..., None] * tones),
-            beside=_orthonormal(_without(probes, known)),
+            extra_design=_orthonormal(_without(probes, known)),
         )
 
 
@@ -149,17 +151,19 @@ def _without(columns: Array, fitted: Array) -> Array:
 def _orthonormal(columns: Array) -> Array:
     """Return an orthonormal basis of the span of columns."""
     basis, size, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(basis[:, size > FAINTEST * np.max(size, initial=0.0)])
+    return np.asarray(basis[:, size > MIN_SINGULAR_VALUE * np.max(size, initial=0.0)])
 
 
 def _probes(frequencies_hz: Array, mains_hz: Array, nyquist_hz: float, window: float) -> Array:
     """Return probe frequencies next to the tones, clear of all lines (Hz)."""
     lines = np.concatenate([[0.0, nyquist_hz], frequencies_hz, mains_hz])
     reach = PROBES / window
-    asked = np.arange(np.min(frequencies_hz) - reach, np.max(frequencies_hz) + reach, 1.0 / window)
-    asked = asked[(asked > 0.0) & (asked < nyquist_hz)]
-    clear = np.min(np.abs(asked[:, None] - lines), axis=1) > CLEAR / window
-    return np.asarray(asked[clear])
+    requested = np.arange(
+        np.min(frequencies_hz) - reach, np.max(frequencies_hz) + reach, 1.0 / window
+    )
+    requested = requested[(requested > 0.0) & (requested < nyquist_hz)]
+    clear = np.min(np.abs(requested[:, None] - lines), axis=1) > CLEAR / window
+    return np.asarray(requested[clear])
 
 
 @dataclass(eq=False)
@@ -190,15 +194,15 @@ class JointDesigns:
 class JointReceiver(LockinReceiver):
     """Receiver of close tones: short contiguous windows, admitted by the common rules."""
 
-    def beside_lines(self, found: LockinSettings | None) -> None:
+    def fit_extra_lines(self, result: LockinSettings | None) -> None:
         """Set extra lines to fit with the tones; call it before `begin`."""
-        if found is not None:
-            self.beside = replace(self.settings, lines_hz=found.lines_hz)
+        if result is not None:
+            self.extra_lines = replace(self.settings, lines_hz=result.lines_hz)
 
     def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
         """Lay windows from the first sample on, as `Receiver.begin`."""
         rate_hz, settings = sample_rate_hz(waveform), self.settings
-        grid = Grid(
+        grid = WindowGrid(
             centre=settings.first_centre(float(waveform.time[0]) - 0.5 / rate_hz),
             step=settings.step,
             length=settings.window,

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.model.audibility import tones_of
-from magfusion.model.quaternion import inverse, matrices, turned
+from magfusion.model.detection_range import tones_of
+from magfusion.model.quaternion import inverse, matrices, rotate
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.admission import (
@@ -22,7 +22,7 @@ from magfusion.receiver.admission import (
 )
 from magfusion.receiver.design import Designs, Maps, nuisances_hz
 from magfusion.receiver.noise import (
-    noise_beside_tones,
+    noise_around_tones,
     not_below,
     smoothed_over_windows,
 )
@@ -32,7 +32,7 @@ from magfusion.receiver.turn import (
     body_turn_of,
     measured_from_body,
     on_clock,
-    standing_in,
+    zero_rate_filler,
 )
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import AnyArray, Array, BoolArray, ComplexArray, IntArray
@@ -64,7 +64,7 @@ class WindowOperator:
     unseen : bool ndarray, shape (windows,)
         Windows in a gap of the gyro: the ramps follow the unknown rotation, and its square is
         noise.
-    apart : bool ndarray, shape (windows,)
+    is_separable : bool ndarray, shape (windows,)
         Windows whose noise differs from that of their neighbours: their rotation was estimated
         without a gyro.
     lacking : tuple of int
@@ -79,7 +79,7 @@ class WindowOperator:
     measured_from_still: Array
     declared_noise: float
     unseen: BoolArray
-    apart: BoolArray
+    is_separable: BoolArray
     lacking: tuple[int, ...] = ()
     tone_of_channel: IntArray | None = None
 
@@ -107,13 +107,13 @@ class WindowOperator:
         return samples, steady
 
     def demodulate_both(
-        self, measured_sensor: Array, beside: Array | None = None
+        self, measured_sensor: Array, others: Array | None = None
     ) -> tuple[FieldSamples, SteadyFields, ComplexArray]:
         """Return `demodulate` of a waveform, and the phasors of another at the same sample times.
 
         Parameters
         ----------
-        beside : ndarray, shape (samples, 3), optional
+        others : ndarray, shape (samples, 3), optional
             The other waveform (T); without it the last result is empty.
 
         Returns
@@ -122,20 +122,20 @@ class WindowOperator:
             Phasors of the other: measured axes at the centre of the window (T).
         """
         still, parts = self._still(measured_sensor), []
-        other = None if beside is None else self._still(beside)
+        other = None if others is None else self._still(others)
         n, none = len(self.designs.frequencies_hz), np.zeros((0, 0, 3), dtype=np.complex128)
         for rows, maps in self.designs.pieces():
             turn, field = self.measured_from_still[rows], _of_windows(still, maps)
             fitted = maps.solver @ field
-            noise = noise_beside_tones(maps.probes @ field[:, None], maps.told)
-            found = self._phasor(rows, fitted[:, 1:])
+            noise = noise_around_tones(maps.probes @ field[:, None], maps.dimensions)
+            result = self._phasor(rows, fitted[:, 1:])
             own, by = maps.variance, none
             if other is not None:
                 by = self._phasor(rows, maps.solver[:, 1:] @ _of_windows(other, maps))
             parts.append(
                 (
-                    found,
-                    self._bent(rows, maps, found),
+                    result,
+                    self._bent(rows, maps, result),
                     0.5 * (own[:, 1 : 1 + n] + own[:, 1 + n :]),
                     turn[:, None] @ noise @ np.swapaxes(turn, 1, 2)[:, None],
                     (turn @ fitted[:, 0, :, None])[..., 0],
@@ -148,7 +148,7 @@ class WindowOperator:
         )
         centre, settings = self.designs.windows.centre, self.designs.settings
         smooth = smoothed_over_windows(
-            noise, centre, settings.step, settings.noise_windows, self.unseen | self.apart
+            noise, centre, settings.step, settings.noise_windows, self.unseen | self.is_separable
         )
         smooth = not_below(smooth, self.declared_noise)
         samples = FieldSamples(
@@ -172,8 +172,8 @@ class WindowOperator:
             design = self.designs.design(maps.elapsed, maps.weight)
             field, projected = _of_windows(still, maps), np.swapaxes(design, -1, -2)
             fitted = np.linalg.solve(projected @ design, projected @ field)
-            left = field - design @ fitted
-            out.append(np.sum(left**2, axis=(1, 2)) / np.sum(maps.weight, axis=1))
+            residual = field - design @ fitted
+            out.append(np.sum(residual**2, axis=(1, 2)) / np.sum(maps.weight, axis=1))
         return np.concatenate(out)
 
     def _still(self, measured_sensor: Array) -> Array:
@@ -182,10 +182,10 @@ class WindowOperator:
         for begin in range(0, len(out), AT_ONCE):
             rows = slice(begin, begin + AT_ONCE)
             in_body = self.body_from_measured @ measured_sensor[rows].T
-            out[rows] = turned(self.still_from_body[:, rows], in_body).T
+            out[rows] = rotate(self.still_from_body[:, rows], in_body).T
         return out
 
-    def _bent(self, rows: slice, maps: Maps, found: ComplexArray) -> Array:
+    def _bent(self, rows: slice, maps: Maps, result: ComplexArray) -> Array:
         """Return the variance of phasors (n, tones, 3) by the square of an unobserved rotation.
 
         Shape (n, tones) (T^2): the response of the design to a tone that decreases with time
@@ -199,7 +199,7 @@ class WindowOperator:
         cosine = self.designs.design(elapsed, maps.weight[unseen])[..., 2 : 2 + n]
         square = (UNSEEN_TURN * elapsed[..., None]) ** 2  # half of it for each transverse axis
         out[unseen] = np.einsum("ntm,nmt->nt", maps.solver[unseen, 1 : 1 + n], square * cosine) ** 2
-        return out * np.nansum(np.abs(found) ** 2, axis=-1)
+        return out * np.nansum(np.abs(result) ** 2, axis=-1)
 
     def _phasor(self, rows: slice, fitted: Array) -> ComplexArray:
         """Return phasors of the cosines and sines, shape (n, 2 tones, 3), of some windows."""
@@ -207,9 +207,9 @@ class WindowOperator:
         cosine, sine = fitted[:, : len(frequencies)], fitted[:, len(frequencies) :]
         reference = np.exp(-2j * np.pi * frequencies * centre[:, None])
         still = (cosine - 1j * sine) * reference[..., None]
-        found = still @ np.swapaxes(self.measured_from_still[rows], 1, 2)
-        found[..., self.lacking] = np.nan
-        return np.asarray(found)
+        result = still @ np.swapaxes(self.measured_from_still[rows], 1, 2)
+        result[..., self.lacking] = np.nan
+        return np.asarray(result)
 
 
 def _of_windows(still: Array, maps: Maps) -> Array:
@@ -252,7 +252,7 @@ def window_operator(
     margin = 2.0 * step + 3.0 * site.platform.imu.time_offset_sigma
     silence = silences(imu.time, step, margin)
     if turn is None or len(silence[0]) > 1:  # the last gap follows the stream
-        still_from_body = body_turn_of(standing_in(imu, silence))
+        still_from_body = body_turn_of(zero_rate_filler(imu, silence))
         turn = BodyTurn(still_from_body(waveform.time), still_from_body(windows.centre))
     from_body, still = measured_from_body(site), turn.at_samples
     at_centre = matrices(inverse(turn.at_centres))
@@ -271,7 +271,7 @@ def window_operator(
         measured_from_still=from_body @ at_centre,
         declared_noise=site.platform.magnetometer.noise_density * float(np.sqrt(nyquist_hz)),
         unseen=meets_silence(windows, settings.window, 0.5 / nyquist_hz, silence),
-        apart=np.zeros(len(windows), dtype=bool),
+        is_separable=np.zeros(len(windows), dtype=bool),
         lacking=lacking,
         tone_of_channel=tones.of_channel if tones.reused else None,
     )

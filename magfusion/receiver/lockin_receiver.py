@@ -5,11 +5,11 @@ from functools import cached_property
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.model.audibility import tones_of
+from magfusion.model.detection_range import tones_of
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.admission import (
-    Grid,
+    WindowGrid,
     Windows,
     sample_rate_hz,
 )
@@ -34,13 +34,13 @@ LEAST_SHARE = 0.5  # of the samples of a window: its design shows whether they s
 class LockinReceiver(Receiver):
     """Receiver of simultaneous tones: overlapping windows, long against the motion."""
 
-    remembered = 0
+    history_length = 0
     # With the extra lines fitted with the tones; part of a checkpoint.
-    beside: LockinSettings | None
+    extra_lines: LockinSettings | None
 
     def __init__(self, site: Site, settings: LockinSettings | None = None) -> None:
         super().__init__(site)
-        self._given, self.beside = settings, None
+        self._given, self.extra_lines = settings, None
         self._designs: Designs | None = None
         self._even: dict[Spacing, Maps] = {}
         self._even_by: tuple[LockinSettings, bytes, float] | None = None
@@ -49,7 +49,7 @@ class LockinReceiver(Receiver):
     @property
     def settings(self) -> LockinSettings:
         """Window and step, chosen from the tones if not given."""
-        return self._chosen if self.beside is None else self.beside
+        return self._chosen if self.extra_lines is None else self.extra_lines
 
     @cached_property
     def _chosen(self) -> LockinSettings:
@@ -80,7 +80,7 @@ class LockinReceiver(Receiver):
                 " too few to separate tones, drift and steady field; choose a longer window"
                 f" (--window), or sample faster than at {rate_hz:.4g} Hz"
             )
-        grid = Grid(
+        grid = WindowGrid(
             centre=self.settings.first_centre(float(waveform.time[0]) - 0.5 / rate_hz),
             step=self.settings.step,
             length=window,
@@ -90,8 +90,8 @@ class LockinReceiver(Receiver):
 
     def whole(self, waveform: Waveform, imu: ImuSamples) -> tuple[Windows, FieldSamples]:
         """Return windows and phasors as `Receiver.whole`, each phasor of one beacon."""
-        windows, found = super().whole(waveform, imu)
-        return windows, owned_by(found, self.site)
+        windows, result = super().whole(waveform, imu)
+        return windows, owned_by(result, self.site)
 
     def sent(self, waveform: Waveform, imu: ImuSamples) -> FieldSamples:
         """Return the phasors of each channel, of any beacon on its frequency."""

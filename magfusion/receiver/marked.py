@@ -8,7 +8,7 @@ from magfusion.errors import InputError
 from magfusion.model.marks import Marks
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site
-from magfusion.receiver.admission import Grid, Windows, sample_rate_hz
+from magfusion.receiver.admission import WindowGrid, Windows, sample_rate_hz
 from magfusion.receiver.cycles import cycles
 from magfusion.receiver.marked_bursts import LATE, LONGEST_BURST, Bursts
 from magfusion.receiver.slot_phasors import SlotValues
@@ -32,7 +32,7 @@ from magfusion.units import Array, BoolArray, IntArray
 TOO_SHORT = "burst too short for its tone"
 OUTSIDE = "burst outside of the samples"
 MEMORY = 2.0  # s; age up to which a burst contributes to the noise and the ambient field
-PATIENCE = 0.5  # s; largest delay of marks after their samples
+MAX_WAIT = 0.5  # s; largest delay of marks after their samples
 ROUNDING = 1e-8  # s; of a stamp
 
 
@@ -47,31 +47,31 @@ class MarkedReceiver(SlotReceiver):
         self.bursts, self._reached = Bursts(site), -np.inf
 
     @property
-    def remembered(self) -> int:
+    def history_length(self) -> int:
         """Number of bursts for which an admitted one is needed, unless they are too old."""
         return history_of(self.site, self.settings) * places(self.site)
 
     @property
     def history(self) -> float:
         """As of `Receiver.history`."""
-        return 0.0 if self.grid is None else MEMORY + PATIENCE + LONGEST_BURST
+        return 0.0 if self.grid is None else MEMORY + MAX_WAIT + LONGEST_BURST
 
     @property
     def marks(self) -> Marks | None:
         """Stored bursts."""
         return self.bursts.marks
 
-    def hear_marks(self, marks: Marks) -> None:
-        """Add bursts, as `Receiver.hear_marks`."""
+    def add_marks(self, marks: Marks) -> None:
+        """Add bursts, as `Receiver.add_marks`."""
         self.bursts.add(marks)
 
-    def hear_slots(self, time: Array, slot: IntArray) -> None:
-        """Add the bursts that the slots of samples complete, as `Receiver.hear_slots`."""
-        self.bursts.add(self.bursts.column.hear(time, slot))
+    def add_slots(self, time: Array, slot: IntArray) -> None:
+        """Add the bursts that the slots of samples complete, as `Receiver.add_slots`."""
+        self.bursts.add(self.bursts.column.add_samples(time, slot))
 
-    def forget_marks(self, before: float) -> None:
-        """Discard bursts, as `Receiver.forget_marks`."""
-        self.bursts.forget(self.bursts.since(before))
+    def discard_marks(self, before: float) -> None:
+        """Discard bursts, as `Receiver.discard_marks`."""
+        self.bursts.discard_before(self.bursts.first_after(before))
 
     def check(self) -> None:
         """Reject beacons that are not all marked, as `Receiver.check`."""
@@ -95,10 +95,10 @@ class MarkedReceiver(SlotReceiver):
                 "magnetometer: the site's slots are marked, but the log has no marks; give each"
                 " sample its slot, or a table of marks with start_ns, end_ns and slot"
             )
-        self.next_number = self.bursts.since(float(waveform.time[0]) - LATE / rate_hz)
+        self.next_number = self.bursts.first_after(float(waveform.time[0]) - LATE / rate_hz)
         # The plateau of a pulse is not saturation.
         clips = not is_pulsed(self.site)
-        self._begin(waveform, imu, Grid(0.0, 0.0, 0.0), LEAST_SHARE_OF_SLOT, clips=clips)
+        self._begin(waveform, imu, WindowGrid(0.0, 0.0, 0.0), LEAST_SHARE_OF_SLOT, clips=clips)
         assert self.admission is not None
         self.admission.slack = 1
 
@@ -106,24 +106,24 @@ class MarkedReceiver(SlotReceiver):
         """Return admitted windows; count also the bursts without samples."""
         self.begin(waveform, imu)
         before = self.next_number - self.bursts.first
-        found = self.admit(waveform, imu)
+        result = self.admit(waveform, imu)
         behind = self.bursts.first + len(self.bursts) - self.next_number
         self._count(OUTSIDE, before + behind)
-        return found
+        return result
 
     def admit(self, waveform: Waveform, imu: ImuSamples, until: float | None = None) -> Windows:
         """Omit also the bursts that are too short for their tone, as `Receiver.admit`."""
-        found = super().admit(waveform, imu, until)
-        turns = found.length * carriers_hz(self.site, places(self.site))[found.place]
-        short = (turns < LEAST_CYCLES) & (turns > 0.0) | (found.count < LEAST_SAMPLES)
+        result = super().admit(waveform, imu, until)
+        turns = result.length * carriers_hz(self.site, places(self.site))[result.place]
+        short = (turns < LEAST_CYCLES) & (turns > 0.0) | (result.count < LEAST_SAMPLES)
         self._count(TOO_SHORT, int(np.sum(short)))
-        return found.rows(~short)
+        return result.rows(~short)
 
     def centre_of(self, number: int) -> float:
         """Return the middle of a burst (s), or its earliest value if not known yet."""
         centre = self.bursts.next_centre(number)
         known = number < self.bursts.first + len(self.bursts)
-        return centre if known else max(centre, self._reached - PATIENCE)
+        return centre if known else max(centre, self._reached - MAX_WAIT)
 
     def _last(self, until: float) -> int:
         assert self.admission is not None
@@ -149,13 +149,15 @@ class MarkedReceiver(SlotReceiver):
             centre = self.bursts.rows(known)[1]
             known = known[centre > new.centre[0] - MEMORY]
         # The burst before the first one limits how far back samples are needed.
-        self.bursts.forget(min([*known[:1].tolist(), self.next_number]) - 1)
+        self.bursts.discard_before(min([*known[:1].tolist(), self.next_number]) - 1)
         return known
 
-    def _joined(self, found: FieldSamples, number: IntArray, turn: Turn) -> FieldSamples:
-        return cycles(found, turn, self.site, self.bursts.epochs(number))
+    def _joined(self, result: FieldSamples, number: IntArray, turn: Turn) -> FieldSamples:
+        return cycles(result, turn, self.site, self.bursts.epochs(number))
 
-    def _held(self, waveform: Waveform, turn: Turn, windows: Windows, site: Site) -> SlotValues:
+    def _fit_slots(
+        self, waveform: Waveform, turn: Turn, windows: Windows, site: Site
+    ) -> SlotValues:
         """Fit bursts from their first sample to the last.
 
         A taper not aligned with the samples leaks carrier power into the noise estimate.
@@ -165,7 +167,7 @@ class MarkedReceiver(SlotReceiver):
         last = waveform.time[windows.first + windows.count - 1]
         length = last - begin + self.admission.magnetometer_step
         fitted = replace(windows, centre=begin + 0.5 * length, length=length)
-        return super()._held(waveform, turn, fitted, site)
+        return super()._fit_slots(waveform, turn, fitted, site)
 
     def _driven(self, windows: Windows) -> BoolArray:
         return np.asarray(owners(self.site, places(self.site))[windows.place] >= 0)

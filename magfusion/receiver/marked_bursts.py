@@ -36,8 +36,8 @@ class Bursts:
     first: int
     column: SlotColumn
     _epoch: IntArray
-    _taken: list[int]
-    _since: float
+    _epoch_bursts: list[int]
+    _epoch_start: float
     _end: float
     _newest: int
 
@@ -45,8 +45,8 @@ class Bursts:
         self._count, self._silences = places(site), is_pulsed(site)
         self._slots = sorted({s for b in site.beacons for _, s in b.tones if s is not None})
         self.marks, self.first, self.column = Marks.none(), 0, SlotColumn()
-        self._epoch, self._taken = np.zeros(0, dtype=np.int64), []
-        self._since = self._end = -np.inf
+        self._epoch, self._epoch_bursts = np.zeros(0, dtype=np.int64), []
+        self._epoch_start = self._end = -np.inf
         self._newest = 0
 
     def __len__(self) -> int:
@@ -81,9 +81,9 @@ class Bursts:
                 f" coils have {slots}; write {SILENT} where none is driven"
             )
         before = np.append(self._end, marks.end)[:-1]
-        askew = (marks.end <= marks.begin) | (marks.begin < before - OVERLAP)
-        if np.any(askew):
-            k = int(np.argmax(askew))
+        misaligned = (marks.end <= marks.begin) | (marks.begin < before - OVERLAP)
+        if np.any(misaligned):
+            k = int(np.argmax(misaligned))
             raise InputError(
                 f"marks: the burst from {marks.begin[k]:.6f} to {marks.end[k]:.6f} s does not"
                 f" follow the one that ends at {before[k]:.6f} s; give bursts in order of time that"
@@ -94,9 +94,17 @@ class Bursts:
         """Return the epoch of the next burst; a silent one has that of the burst before."""
         if slot == SILENT:
             return self._newest
-        if not self._taken or slot in self._taken or centre - self._since > LONGEST_EPOCH:
-            self._newest, self._taken, self._since = self._newest + 1, [], float(centre)
-        self._taken.append(int(slot))
+        if (
+            not self._epoch_bursts
+            or slot in self._epoch_bursts
+            or centre - self._epoch_start > LONGEST_EPOCH
+        ):
+            self._newest, self._epoch_bursts, self._epoch_start = (
+                self._newest + 1,
+                [],
+                float(centre),
+            )
+        self._epoch_bursts.append(int(slot))
         return self._newest
 
     @property
@@ -125,7 +133,7 @@ class Bursts:
         """
         begin = max(next_number - self.first, 0)
         own = slice(begin, None)
-        full = len(self._taken) == len(self._slots)
+        full = len(self._epoch_bursts) == len(self._slots)
         closed = (self._epoch[own] < self._newest) | full | (self.marks.slot[own] == SILENT)
         waiting = np.flatnonzero(~closed | (self.marks.end[own] > until))
         if len(waiting) == 0:
@@ -133,7 +141,7 @@ class Bursts:
         epoch = int(np.searchsorted(self._epoch, self._epoch[begin + waiting[0]]))
         return self.first + max(epoch, begin) - 1
 
-    def since(self, time: float) -> int:
+    def first_after(self, time: float) -> int:
         """Return the number of the first burst that begins at or after a time (s)."""
         return self.first + int(np.searchsorted(self.marks.begin, time))
 
@@ -143,14 +151,14 @@ class Bursts:
 
     def rows(self, number: IntArray) -> tuple[Marks, Array, IntArray]:
         """Return bursts by number, with their middle (s) and place in a cycle."""
-        found = self.marks.rows(number - self.first)
-        return found, _centres(found), found.slot % self._count
+        result = self.marks.rows(number - self.first)
+        return result, _centres(result), result.slot % self._count
 
-    def forget(self, number: int) -> None:
+    def discard_before(self, number: int) -> None:
         """Discard the bursts before a number."""
-        gone = min(max(number - self.first, 0), len(self))
-        self.marks, self._epoch = self.marks.rows(slice(gone, None)), self._epoch[gone:]
-        self.first += gone
+        elapsed = min(max(number - self.first, 0), len(self))
+        self.marks, self._epoch = self.marks.rows(slice(elapsed, None)), self._epoch[elapsed:]
+        self.first += elapsed
 
 
 def _centres(marks: Marks) -> Array:

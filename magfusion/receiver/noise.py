@@ -6,7 +6,7 @@ import numpy as np
 
 from magfusion.units import Array, BoolArray, IntArray
 
-LEFT = 1e-6  # least share of a probe outside the design for its residual to count
+MIN_RESIDUAL_SHARE = 1e-6  # least share of a probe outside the design for its residual to count
 LEAST_SHARE = 0.1  # of the declared noise; constant and coarse samples may show none
 LEAST_NOISE = 1e-18  # T; rounding of the Earth's field
 
@@ -16,8 +16,8 @@ def _probe_frequencies(
 ) -> Array:
     """Return two probes half-way to the neighbours of a tone, clear of every fitted line."""
     lines = np.concatenate([[0.0], frequencies_hz, nuisance_hz])
-    apart = np.abs(lines - frequencies_hz[tone])
-    nearest = float(np.min(apart[apart > 0]))
+    separate = np.abs(lines - frequencies_hz[tone])
+    nearest = float(np.min(separate[separate > 0]))
     shift = min(0.5 * nearest, 2.0 / window)
     return frequencies_hz[tone] + shift * np.array([-1.0, 1.0])
 
@@ -59,14 +59,14 @@ def probes_left(
     probe = np.concatenate([np.cos(angle), np.sin(angle)], axis=2) * weight[:, None, None]
     across = probe.reshape(len(elapsed), -1, elapsed.shape[1])
     removed = (across @ design @ inverse) @ np.swapaxes(design, -1, -2)
-    left = (across - removed).reshape(probe.shape)
-    value, vector = np.linalg.eigh(left @ np.swapaxes(probe, -1, -2))
-    told = value > LEFT * np.sum(probe**2, axis=(-2, -1))[..., None]
-    scale = np.where(told, 1.0 / np.sqrt(np.where(told, value, 1.0)), 0.0)
-    return (scale[..., None] * np.swapaxes(vector, -1, -2)) @ left, np.sum(told, axis=-1)
+    residual = (across - removed).reshape(probe.shape)
+    value, vector = np.linalg.eigh(residual @ np.swapaxes(probe, -1, -2))
+    dimensions = value > MIN_RESIDUAL_SHARE * np.sum(probe**2, axis=(-2, -1))[..., None]
+    scale = np.where(dimensions, 1.0 / np.sqrt(np.where(dimensions, value, 1.0)), 0.0)
+    return (scale[..., None] * np.swapaxes(vector, -1, -2)) @ residual, np.sum(dimensions, axis=-1)
 
 
-def noise_beside_tones(seen: Array, told: IntArray) -> Array:
+def noise_around_tones(seen: Array, dimensions: IntArray) -> Array:
     """Return the covariance per sample of the noise around each tone, in the axes of the samples.
 
     Unobserved directions get the mean noise of the observed ones.
@@ -75,7 +75,7 @@ def noise_beside_tones(seen: Array, told: IntArray) -> Array:
     ----------
     seen : ndarray, shape (n, tones, 4, 3)
         Residuals of probes (T).
-    told : int ndarray, shape (n, tones)
+    dimensions : int ndarray, shape (n, tones)
         As of `probes_left`.
 
     Returns
@@ -83,7 +83,7 @@ def noise_beside_tones(seen: Array, told: IntArray) -> Array:
     ndarray, shape (n, tones, 3, 3)
         (T^2)
     """
-    share = np.maximum(told, 1)[..., None, None] / seen.shape[-2]
+    share = np.maximum(dimensions, 1)[..., None, None] / seen.shape[-2]
     own = np.swapaxes(seen, -1, -2) @ seen / seen.shape[-2]
     unseen = (1.0 / share - 1.0) * np.trace(own, axis1=-2, axis2=-1)[..., None, None]
     return own + unseen / 3.0 * np.eye(3)
@@ -122,10 +122,10 @@ def smoothed_over_windows(
     """
     if len(centre) == 1:
         return noise_cov
-    apart = centre[1:] - centre[:-1] > 1.5 * step
+    separate = centre[1:] - centre[:-1] > 1.5 * step
     if unseen is not None:
-        apart |= unseen[1:] != unseen[:-1]
-    breaks = np.flatnonzero(apart) + 1
+        separate |= unseen[1:] != unseen[:-1]
+    breaks = np.flatnonzero(separate) + 1
     out = np.empty_like(noise_cov)
     for begin, end in pairwise([0, *breaks.tolist(), len(centre)]):
         rows, n = slice(begin, end), end - begin

@@ -15,8 +15,8 @@ from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 CHUNK = 64  # pieces at once
 LEAST_SHARE = 0.9  # of the samples of a piece
-STANDS_OUT = 4.5  # times the median residual; exceeded by noise once in 10^10
-MOST_BANGS, CUT_TWICE = 0.25, 2  # of the samples of a piece; how often they are rejected
+OUTLIER_RATIO = 4.5  # times the median residual; exceeded by noise once in 10^10
+MAX_OUTLIER_SHARE, CUT_TWICE = 0.25, 2  # of the samples of a piece; how often they are rejected
 NO_PROBES = np.zeros(0)
 HUM_CLEAR = 2.0  # resolutions of a piece between a tone and a fitted harmonic
 
@@ -33,18 +33,18 @@ class Pieces:
         (s)
     phasor : complex ndarray, shape (n, tones, components)
         (T), the axes of the sensor; their phase is that of a cosine at time zero of the log.
-    beside : complex ndarray, shape (n, probes, components)
+    extra_lines : complex ndarray, shape (n, probes, components)
         Residual phasors at other frequencies.
     """
 
     centre: Array
     length: float
     phasor: ComplexArray
-    beside: ComplexArray
+    extra_lines: ComplexArray
 
     def rows(self, kept: BoolArray) -> "Pieces":
         """Return a subset of the pieces."""
-        return Pieces(self.centre[kept], self.length, self.phasor[kept], self.beside[kept])
+        return Pieces(self.centre[kept], self.length, self.phasor[kept], self.extra_lines[kept])
 
 
 def pieces(
@@ -53,7 +53,7 @@ def pieces(
     frequencies_hz: Array,
     length: float,
     hum: Hum | None = None,
-    beside_hz: Array = NO_PROBES,
+    extra_lines_hz: Array = NO_PROBES,
 ) -> Pieces:
     """Return the phasors of pieces of a stationary waveform.
 
@@ -67,7 +67,7 @@ def pieces(
         Length of a piece (s).
     hum : Hum, optional
         Its harmonics are fitted with the tones.
-    beside_hz : ndarray, shape (probes,)
+    extra_lines_hz : ndarray, shape (probes,)
         Other frequencies at which the residual is evaluated.
     """
     time = waveform.time
@@ -75,20 +75,22 @@ def pieces(
     count = int((span[1] - span[0] + step) / (0.5 * length)) - 1
     centre = np.asarray(span[0] - 0.5 * step + 0.5 * length * np.arange(1.0, count + 1.0))
     first = np.searchsorted(time, centre - 0.5 * length)
-    held = np.searchsorted(time, centre + 0.5 * length) - first
-    whole = held * step >= LEAST_SHARE * length
-    centre, first, held = centre[whole], first[whole], held[whole]
-    fitted = _Fitted(waveform, frequencies_hz, beside_hz, length, hum)
-    found = [
-        fitted.of(centre[k], first[k], held[k])
+    fixed = np.searchsorted(time, centre + 0.5 * length) - first
+    whole = fixed * step >= LEAST_SHARE * length
+    centre, first, fixed = centre[whole], first[whole], fixed[whole]
+    fitted = _Fitted(waveform, frequencies_hz, extra_lines_hz, length, hum)
+    result = [
+        fitted.of(centre[k], first[k], fixed[k])
         for k in (slice(i, i + CHUNK) for i in range(0, len(centre), CHUNK))
     ]
     components = waveform.measured_sensor.shape[1]
-    none = [np.zeros((0, len(f), components), dtype=complex) for f in (frequencies_hz, beside_hz)]
-    phasor = np.concatenate([none[0], *(one for one, _ in found)])
-    beside = np.concatenate([none[1], *(other for _, other in found)])
+    none = [
+        np.zeros((0, len(f), components), dtype=complex) for f in (frequencies_hz, extra_lines_hz)
+    ]
+    phasor = np.concatenate([none[0], *(one for one, _ in result)])
+    others = np.concatenate([none[1], *(other for _, other in result)])
     alive = np.any(phasor != 0.0, axis=(1, 2))
-    return Pieces(centre, length, phasor, beside).rows(alive)
+    return Pieces(centre, length, phasor, others).rows(alive)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,35 +99,37 @@ class _Fitted:
 
     waveform: Waveform
     frequencies_hz: Array
-    beside_hz: Array
+    extra_lines_hz: Array
     length: float
     hum: Hum | None
 
     def of(
-        self, centre: Array, first: IntArray, held: IntArray
+        self, centre: Array, first: IntArray, held_lines: IntArray
     ) -> tuple[ComplexArray, ComplexArray]:
         """Return the phasors of tones and of probes, shape (n, tones or probes, components)."""
-        reach, time = np.arange(int(np.max(held))), self.waveform.time
+        reach, time = np.arange(int(np.max(held_lines))), self.waveform.time
         index = np.minimum(first[:, None] + reach, len(time) - 1)
         elapsed, field = time[index] - centre[:, None], self.waveform.measured_sensor[index]
-        inside = reach < held[:, None]
+        inside = reach < held_lines[:, None]
         taper = np.where(inside, np.cos(np.pi * elapsed / self.length) ** 2, 0.0)
         design = _design(elapsed, time[index], self.frequencies_hz, self.length, self.hum)
         fitted = _solved(design, taper, field)
         for _ in range(CUT_TWICE):
-            bang = _bangs(field - design @ fitted, inside)
-            if not np.any(bang):
+            impact = _outliers(field - design @ fitted, inside)
+            if not np.any(impact):
                 break
-            taper = np.where(bang, 0.0, taper)
+            taper = np.where(impact, 0.0, taper)
             fitted = _solved(design, taper, field)
         n = len(self.frequencies_hz)
         phasor = fitted[:, 2 : 2 + n] - 1j * fitted[:, 2 + n : 2 + 2 * n]
         turns = np.exp(-2j * np.pi * self.frequencies_hz * centre[:, None])
-        if not len(self.beside_hz):
+        if not len(self.extra_lines_hz):
             return phasor * turns[..., None], np.zeros((len(centre), 0, field.shape[2]), complex)
-        left = (field - design @ fitted) * (taper * 2.0 / np.sum(taper, axis=1)[:, None])[..., None]
-        carrier = np.exp(-2j * np.pi * elapsed[..., None] * self.beside_hz)
-        return phasor * turns[..., None], np.swapaxes(carrier, 1, 2) @ left
+        residual = (field - design @ fitted) * (taper * 2.0 / np.sum(taper, axis=1)[:, None])[
+            ..., None
+        ]
+        carrier = np.exp(-2j * np.pi * elapsed[..., None] * self.extra_lines_hz)
+        return phasor * turns[..., None], np.swapaxes(carrier, 1, 2) @ residual
 
 
 def _solved(design: Array, taper: Array, field: Array) -> Array:
@@ -133,17 +137,17 @@ def _solved(design: Array, taper: Array, field: Array) -> Array:
     return np.asarray(np.linalg.solve(weighted @ design, weighted @ field))
 
 
-def _bangs(left: Array, inside: BoolArray) -> BoolArray:
+def _outliers(residual: Array, inside: BoolArray) -> BoolArray:
     """Return outliers of the sensor in the residual of a piece, shape (n, m).
 
     Where they are many, none is rejected.  Outliers of a reference only affect the weights of
     pieces, so that it does not change the sensor's own result.
     """
-    size = np.linalg.norm(left[..., :3], axis=2)
+    size = np.linalg.norm(residual[..., :3], axis=2)
     usual = np.nanmedian(np.where(inside, size, np.nan), axis=1)
-    found = inside & (size > STANDS_OUT * usual[:, None])
-    few = np.sum(found, axis=1) < MOST_BANGS * np.sum(inside, axis=1)
-    return np.asarray(found & few[:, None])
+    result = inside & (size > OUTLIER_RATIO * usual[:, None])
+    few = np.sum(result, axis=1) < MAX_OUTLIER_SHARE * np.sum(inside, axis=1)
+    return np.asarray(result & few[:, None])
 
 
 def _design(

@@ -43,8 +43,8 @@ class RangeEnds:
 def still(waveform: Waveform, first: IntArray, last: IntArray) -> BoolArray:
     """Return in which windows all samples are equal; arguments as of `saturated`."""
     changes = np.concatenate([[0], np.cumsum(_changed(waveform.measured_sensor))])
-    held = changes[np.maximum(last - 1, first)] == changes[first]
-    return np.asarray(held & (last > first + 1))
+    fixed = changes[np.maximum(last - 1, first)] == changes[first]
+    return np.asarray(fixed & (last > first + 1))
 
 
 def _changed(measured: Array) -> BoolArray:
@@ -67,10 +67,10 @@ def saturated(
     ends : tuple of RangeEnds
         Of the three axes; they are updated.
     """
-    spoilt = np.zeros(len(first), dtype=bool)
+    corrupted = np.zeros(len(first), dtype=bool)
     until = int(np.max(last, initial=0))
     if until == 0:
-        return spoilt
+        return corrupted
     measured = waveform.measured_sensor[:until]
     fresh = np.concatenate([[0], np.flatnonzero(_changed(measured)) + 1])
     begin, end = np.searchsorted(fresh, first), np.searchsorted(fresh, last)
@@ -81,8 +81,8 @@ def saturated(
     value, time = measured[fresh], waveform.time[fresh]
     known = np.array([(one.low, one.high, one.finest, one.kept) for one in ends]).T
     if known[3].min() >= 1 and (value[1:] != value[:-1]).all():
-        _heard(ends, value, time)  # no axis repeats a value, the usual case
-        return spoilt
+        _update_ends(ends, value, time)  # no axis repeats a value, the usual case
+        return corrupted
     low = np.minimum(np.minimum.accumulate(value), known[0])
     high = np.maximum(np.maximum.accumulate(value), known[1])
     change = np.zeros_like(value)
@@ -98,16 +98,16 @@ def saturated(
     kept = np.maximum(np.maximum.accumulate(np.where(inner, length, 0)), known[3])
     for axis in np.flatnonzero(np.max(length, axis=0) >= SHORTEST).tolist():
         runs = _Runs(*(part[:, axis] for part in (value, low, high, finest, start, kept)))
-        spoilt |= _at_end(runs, begin, end)
+        corrupted |= _at_end(runs, begin, end)
     newest = float(time[-1])
     for axis, one in enumerate(ends):
         one.low, one.high = float(low[-1, axis]), float(high[-1, axis])
         one.finest, one.kept = float(finest[-1, axis]), int(kept[-1, axis])
         one.until = max(one.until, newest)
-    return spoilt
+    return corrupted
 
 
-def _heard(ends: tuple[RangeEnds, ...], value: Array, time: Array) -> None:
+def _update_ends(ends: tuple[RangeEnds, ...], value: Array, time: Array) -> None:
     """Update ends with samples (n, 3) that each differ from the one before."""
     low, high = value.min(axis=0).tolist(), value.max(axis=0).tolist()
     finest = np.min(np.abs(value[1:] - value[:-1]), axis=0, initial=np.inf).tolist()
@@ -141,7 +141,7 @@ class _Runs(NamedTuple):
 def _at_end(runs: _Runs, begin: IntArray, end: IntArray) -> BoolArray:
     """Return which windows, samples ``begin`` to before ``end``, contain an end of range."""
     value, low, high, finest, start, kept = runs
-    found = np.zeros(len(begin), dtype=bool)
+    result = np.zeros(len(begin), dtype=bool)
     first = np.flatnonzero(start == np.arange(len(value)))
     stop = np.append(first[1:], len(value))
     extreme = (value[first] == low[stop - 1]) | (value[first] == high[stop - 1])
@@ -155,5 +155,5 @@ def _at_end(runs: _Runs, begin: IntArray, end: IntArray) -> BoolArray:
         least = max(SHORTEST, min(int(kept[at]) + 1, LONGEST))
         whole = np.minimum(stop[within], end[k]) - np.maximum(first[within], begin[k])
         own = value[first[within]]
-        found[k] = bool(np.any((whole >= least) & ((own == low[at]) | (own == high[at]))))
-    return found
+        result[k] = bool(np.any((whole >= least) & ((own == low[at]) | (own == high[at]))))
+    return result

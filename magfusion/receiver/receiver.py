@@ -19,7 +19,7 @@ from magfusion.receiver.admission import (
     INERTIAL_GAP,
     REASONS,
     Admission,
-    Grid,
+    WindowGrid,
     Windows,
     usual_step,
 )
@@ -39,7 +39,7 @@ class Receiver(ABC):
 
     Attributes
     ----------
-    grid : Grid, optional
+    grid : WindowGrid, optional
         Positions of the windows, once it has begun.
     next_number : int
         Number of the next window to assess.
@@ -55,7 +55,7 @@ class Receiver(ABC):
         Windows assessed last that lack only inertial samples.
     """
 
-    grid: Grid | None
+    grid: WindowGrid | None
     admission: Admission | None
     next_number: int
     recent: IntArray
@@ -75,7 +75,7 @@ class Receiver(ABC):
 
     @property
     @abstractmethod
-    def remembered(self) -> int:
+    def history_length(self) -> int:
         """Number of later windows for which an admitted one is needed."""
 
     @property
@@ -83,7 +83,7 @@ class Receiver(ABC):
         """Return how far before a window's centre its phasors need samples (s)."""
         if self.grid is None:
             return 0.0
-        return self.grid.length + (self.remembered + self.grid.together) * self.grid.step
+        return self.grid.length + (self.history_length + self.grid.together) * self.grid.step
 
     @abstractmethod
     def check(self) -> None:
@@ -119,7 +119,7 @@ class Receiver(ABC):
         """
 
     def pushed(
-        self, waveform: Waveform, imu: ImuSamples, windows: Windows, since: int
+        self, waveform: Waveform, imu: ImuSamples, windows: Windows, first_number: int
     ) -> tuple[FieldSamples, int]:
         """Return the phasors of windows from a number on, and the number of these windows.
 
@@ -128,16 +128,16 @@ class Receiver(ABC):
         windows : Windows
             Including the earlier ones that these need.
         """
-        found, number = self.phasors(waveform, imu, windows, self.site)
-        found = found.rows(number >= since)
-        return found, len(found)
+        result, number = self.phasors(waveform, imu, windows, self.site)
+        result = result.rows(number >= first_number)
+        return result, len(result)
 
     @property
     def marks(self) -> Marks | None:
         """Stored bursts; None of drives with a schedule."""
         return None
 
-    def hear_marks(self, marks: Marks) -> None:  # noqa: B027
+    def add_marks(self, marks: Marks) -> None:  # noqa: B027
         """Add marked bursts; drives with a schedule ignore them.
 
         Raises
@@ -146,10 +146,10 @@ class Receiver(ABC):
             Where they are not in order, or a slot has no coil.
         """
 
-    def hear_slots(self, time: Array, slot: IntArray) -> None:  # noqa: B027
-        """Add the slots given per sample, as `hear_marks`."""
+    def add_slots(self, time: Array, slot: IntArray) -> None:  # noqa: B027
+        """Add the slots given per sample, as `add_marks`."""
 
-    def forget_marks(self, before: float) -> None:  # noqa: B027
+    def discard_marks(self, before: float) -> None:  # noqa: B027
         """Discard the bursts before a time (s), as long as none has been assessed."""
 
     def _follow(self, waveform: Waveform) -> None:  # noqa: B027
@@ -186,20 +186,20 @@ class Receiver(ABC):
         """
         assert self.grid is not None
         self._follow(waveform)
-        new = self.admit(*self._since(waveform, imu, time_offset, self.next_number), until)
+        new = self.admit(*self._samples_from(waveform, imu, time_offset, self.next_number), until)
         known = self._known(new)
         oldest = min([*known[:1].tolist(), self.next_number])
-        waveform, imu = self._since(waveform, imu, time_offset, oldest)
+        waveform, imu = self._samples_from(waveform, imu, time_offset, oldest)
         expected = int(np.sum(self._driven(new)))
-        self.recent = known[known >= self.next_number - self.remembered]
+        self.recent = known[known >= self.next_number - self.history_length]
         if expected == 0:
             return FieldSamples.empty(self.site.channels)
         windows = self._windows(known, waveform.time)
         offset = self.site.platform.imu.time_offset if time_offset is None else time_offset
         known_imu = on_clock(imu, offset, gyro_bias_body)
-        found, seen = self.pushed(waveform, known_imu, windows, int(new.number[0]))
+        result, seen = self.pushed(waveform, known_imu, windows, int(new.number[0]))
         self._count(NO_SILENT_SLOT, expected - seen)
-        return found
+        return result
 
     def whole(self, waveform: Waveform, imu: ImuSamples) -> tuple[Windows, FieldSamples]:
         """Return the usable windows of a whole log, and their phasors.
@@ -216,11 +216,11 @@ class Receiver(ABC):
         if expected == 0:
             raise self._none_usable()
         known = on_clock(imu, self.site.platform.imu.time_offset)
-        found, _ = self.phasors(waveform, known, windows, self.site)
-        self._count(NO_SILENT_SLOT, expected - len(found))
-        if len(found) == 0:
+        result, _ = self.phasors(waveform, known, windows, self.site)
+        self._count(NO_SILENT_SLOT, expected - len(result))
+        if len(result) == 0:
             raise self._none_usable()
-        return windows, found
+        return windows, result
 
     def _admitted(self, waveform: Waveform, imu: ImuSamples) -> Windows:
         """Begin, and return the usable windows of a whole log."""
@@ -279,7 +279,7 @@ class Receiver(ABC):
         self.without_turn = windows.rows(verdict == REASONS.index(INERTIAL_GAP))
         return windows.rows(verdict < 0)
 
-    def _since(
+    def _samples_from(
         self, waveform: Waveform, imu: ImuSamples, time_offset: float | None, number: int
     ) -> tuple[Waveform, ImuSamples]:
         """Return the samples needed for windows from a number on."""
@@ -300,7 +300,7 @@ class Receiver(ABC):
         self,
         waveform: Waveform,
         imu: ImuSamples,
-        grid: Grid,
+        grid: WindowGrid,
         share: float,
         *,
         clips: bool,

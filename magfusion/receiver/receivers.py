@@ -78,5 +78,5 @@ def received(
         Where no window is usable.
     """
     receiver = receiver_of(site, settings)
-    _, found = receiver.whole(waveform, imu)
-    return found, receiver.dropped
+    _, result = receiver.whole(waveform, imu)
+    return result, receiver.dropped

@@ -21,8 +21,8 @@ CLEAR_HZ = 0.6  # excluded about tones and mains, which correlate at any lag of 
 LEAST_PEAK = 8.0  # times the scatter of the correlation, for a lag
 FINER = 8  # lags in a sampling step
 NEAR_LAG = 8  # samples about the common lag, in which blocks find their own
-BESIDE = 8  # probes about a tone
-APART = 2.0  # resolutions of a piece, between them and from every tone
+PROBES = 8  # probes about a tone
+PROBE_SPACING = 2.0  # resolutions of a piece, between them and from every tone
 GROUPS = 8  # of successive pieces, every other one used for the estimate
 WORTH = 0.95  # residual power, beyond which a reference is not used
 MEMORY = 0.7  # weight of earlier pieces in each later stretch of a stream
@@ -44,7 +44,7 @@ class Lag:
 NO_LAG = Lag(0.0, 0.0)
 
 
-def beside(waveform: Waveform, reference: Waveform, lag: Lag) -> tuple[Array, BoolArray]:
+def reference_at(waveform: Waveform, reference: Waveform, lag: Lag) -> tuple[Array, BoolArray]:
     """Interpolate a reference to the samples of a waveform (n, 3), and return where it is valid."""
     time = lag.of(reference.time)
     step = float(np.median(np.diff(time)))
@@ -67,17 +67,17 @@ def lag_of(waveform: Waveform, reference: Waveform, lines_hz: Array) -> Lag:
     step = float(np.median(np.diff(waveform.time)))
     size = int(BLOCK / step) // 2 * 2
     starts = np.arange(0, len(waveform) - size + 1, size)
-    even, there = beside(waveform, reference, NO_LAG)
+    even, there = reference_at(waveform, reference, NO_LAG)
     if not len(starts) or not np.any(there):
         return NO_LAG
-    found = correlations(waveform.measured_sensor, even, starts, size, step, lines_hz)
+    result = correlations(waveform.measured_sensor, even, starts, size, step, lines_hz)
     step /= FINER
-    peaks = peak_of(found)
+    peaks = peak_of(result)
     if peaks is None:
         return NO_LAG
     mean, best, lags = peaks
     first = max(best - NEAR_LAG * FINER, 0)
-    own = found[:, first : best + NEAR_LAG * FINER + 1]
+    own = result[:, first : best + NEAR_LAG * FINER + 1]
     near = lags[first : first + own.shape[1]]
     peak = np.clip(np.argmax(own, axis=1), 1, own.shape[1] - 2)
     clear = own[np.arange(len(own)), peak] > np.median(mean) + LEAST_PEAK * _scatter(mean)
@@ -90,8 +90,8 @@ def lag_of(waveform: Waveform, reference: Waveform, lines_hz: Array) -> Lag:
     seen = (near[peak[rows]] + np.clip(finer, -0.5, 0.5)) * step
     rate, offset = np.polyfit(middle[rows], seen, 1)
     # Lags that do not lie on a line are better described by their median.
-    left = seen - offset - rate * middle[rows]
-    rough = np.std(left) / (np.std(middle[rows]) * np.sqrt(len(rows)) + 1e-300)
+    residual = seen - offset - rate * middle[rows]
+    rough = np.std(residual) / (np.std(middle[rows]) * np.sqrt(len(rows)) + 1e-300)
     if abs(rate) < 3.0 * rough:
         return Lag(float(np.median(seen)), 0.0)
     return Lag(float(offset), float(rate))
@@ -116,10 +116,10 @@ def correlations(
     )
 
 
-def peak_of(found: Array) -> tuple[Array, int, IntArray] | None:
+def peak_of(result: Array) -> tuple[Array, int, IntArray] | None:
     """Return the mean correlation by lag, where its peak is, and the lags; None without a peak."""
-    reach = (found.shape[1] - 1) // 2
-    mean = np.mean(found, axis=0)
+    reach = (result.shape[1] - 1) // 2
+    mean = np.mean(result, axis=0)
     best = int(np.argmax(mean))
     if mean[best] - np.median(mean) < LEAST_PEAK * _scatter(mean):
         return None
@@ -139,8 +139,8 @@ def _correlation(own: Array, other: Array, step: float, lines_hz: Array) -> Arra
         clear &= np.abs(hertz - line) > CLEAR_HZ
     spectra = []
     for field in (own, other):
-        found = np.fft.rfft((field - np.mean(field, axis=0)) * taper, axis=0)
-        spectra.append(found / np.maximum(np.abs(found), 1e-300) * clear[:, None])
+        result = np.fft.rfft((field - np.mean(field, axis=0)) * taper, axis=0)
+        spectra.append(result / np.maximum(np.abs(result), 1e-300) * clear[:, None])
     total = np.zeros(FINER * len(own))
     for a in spectra[0].T:
         for b in spectra[1].T:
@@ -150,15 +150,19 @@ def _correlation(own: Array, other: Array, step: float, lines_hz: Array) -> Arra
 
 def probes_hz(tone_hz: float, tones_hz: Array, length: float, highest_hz: float) -> Array:
     """Return the frequencies near a tone used to estimate the matrix, clear of every tone."""
-    offsets = (APART / length) * np.arange(1, 4 * BESIDE)
+    offsets = (PROBE_SPACING / length) * np.arange(1, 4 * PROBES)
     tried = np.concatenate([tone_hz + offsets, tone_hz - offsets])
-    apart = np.min(np.abs(tried[:, None] - tones_hz), axis=1)
-    good = tried[(apart > 0.99 * APART / length) & (tried > APART / length) & (tried < highest_hz)]
-    return np.asarray(good[np.argsort(np.abs(good - tone_hz))][:BESIDE])
+    separate = np.min(np.abs(tried[:, None] - tones_hz), axis=1)
+    good = tried[
+        (separate > 0.99 * PROBE_SPACING / length)
+        & (tried > PROBE_SPACING / length)
+        & (tried < highest_hz)
+    ]
+    return np.asarray(good[np.argsort(np.abs(good - tone_hz))][:PROBES])
 
 
 @dataclass(frozen=True, eq=False)
-class Normal:
+class ReferenceNormalEquations:
     """Normal equations of the matrix between the noise of a sensor and a reference.
 
     Parameters
@@ -171,14 +175,14 @@ class Normal:
     both: ComplexArray
 
     @staticmethod
-    def of(own: ComplexArray, other: ComplexArray, weight: Array) -> "Normal":
+    def of(own: ComplexArray, other: ComplexArray, weight: Array) -> "ReferenceNormalEquations":
         """Compute them from pieces (n, probes, 3) with a weight each (n,)."""
         weighted = np.conj(other) * weight[:, None, None]
-        return Normal(
+        return ReferenceNormalEquations(
             np.einsum("npi,npj->ij", weighted, other), np.einsum("npi,npj->ij", weighted, own)
         )
 
-    def later(self, turn: float) -> "Normal":
+    def later(self, turn: float) -> "ReferenceNormalEquations":
         """Return their contribution to later pieces, after a clock correction by ``turn``.
 
         Parameters
@@ -186,13 +190,13 @@ class Normal:
         turn : float
             Decrease of the reference's phase (rad).
         """
-        return Normal(MEMORY * self.other, MEMORY * np.exp(1j * turn) * self.both)
+        return ReferenceNormalEquations(MEMORY * self.other, MEMORY * np.exp(1j * turn) * self.both)
 
-    def beside(self, more: "Normal | None") -> "Normal":
+    def plus(self, more: "ReferenceNormalEquations | None") -> "ReferenceNormalEquations":
         """Return the sums of both."""
         if more is None:
             return self
-        return Normal(self.other + more.other, self.both + more.both)
+        return ReferenceNormalEquations(self.other + more.other, self.both + more.both)
 
     def solved(self) -> ComplexArray:
         """Return the matrix."""
@@ -207,50 +211,52 @@ class Relation:
     Parameters
     ----------
     matrix : complex ndarray, shape (3, 3)
-    left : float
+    remaining_share : float
         Ratio of the noise power with and without it, in pieces not used for the estimate.
-    normal : Normal
+    normal : ReferenceNormalEquations
         Its normal equations, propagated to later pieces.
     """
 
     matrix: ComplexArray
-    left: float
-    normal: Normal
+    remaining_share: float
+    normal: ReferenceNormalEquations
 
     @property
-    def tells(self) -> bool:
+    def is_effective(self) -> bool:
         """Whether it reduces the noise."""
-        return self.left < WORTH
+        return self.remaining_share < WORTH
 
 
 def relation(
-    found: Pieces, there: BoolArray, columns: slice, before: Normal | None = None
+    result: Pieces, there: BoolArray, columns: slice, before: ReferenceNormalEquations | None = None
 ) -> Relation:
     """Estimate the relation of a sensor and its reference in the probes near a tone.
 
     Parameters
     ----------
-    found : Pieces
+    result : Pieces
         Of six components: the sensor's, and the reference's.
     there : bool ndarray, shape (n,)
         Pieces with a reference.
     columns : slice
         Probes of the tone.
-    before : Normal, optional
+    before : ReferenceNormalEquations, optional
         Of earlier pieces.
     """
-    own, other = found.beside[:, columns, :3], found.beside[:, columns, 3:]
+    own, other = result.extra_lines[:, columns, :3], result.extra_lines[:, columns, 3:]
     power = np.sum(np.abs(own) ** 2, axis=(1, 2))
-    witness = np.sum(np.abs(other) ** 2, axis=(1, 2))
-    usual = max(float(np.median(power)), 1e-300), max(float(np.median(witness)), 1e-300)
+    monitor = np.sum(np.abs(other) ** 2, axis=(1, 2))
+    usual = max(float(np.median(power)), 1e-300), max(float(np.median(monitor)), 1e-300)
     # Noisy pieces are down-weighted: an impact at one sensor is not received by the other.
-    weight = there / (1.0 + power / usual[0] + witness / usual[1])
+    weight = there / (1.0 + power / usual[0] + monitor / usual[1])
     group = np.arange(len(own)) * GROUPS // max(len(own), 1) % 2
-    left = power_before = 0.0
+    residual = power_before = 0.0
     for half in (0, 1):
-        matrix = Normal.of(own, other, weight * (group != half)).beside(before).solved()
+        matrix = (
+            ReferenceNormalEquations.of(own, other, weight * (group != half)).plus(before).solved()
+        )
         mine = (weight * (group == half))[:, None, None]
         power_before += float(np.sum(mine * np.abs(own) ** 2))
-        left += float(np.sum(mine * np.abs(own - other @ matrix.T) ** 2))
-    normal = Normal.of(own, other, weight).beside(before)
-    return Relation(normal.solved(), left / max(power_before, 1e-300), normal)
+        residual += float(np.sum(mine * np.abs(own - other @ matrix.T) ** 2))
+    normal = ReferenceNormalEquations.of(own, other, weight).plus(before)
+    return Relation(normal.solved(), residual / max(power_before, 1e-300), normal)

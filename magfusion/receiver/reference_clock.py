@@ -5,7 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.model.samples import Waveform
-from magfusion.receiver.reference import BLOCK, FINER, NO_LAG, Lag, beside, correlations, peak_of
+from magfusion.receiver.reference import (
+    BLOCK,
+    FINER,
+    NO_LAG,
+    Lag,
+    correlations,
+    peak_of,
+    reference_at,
+)
 from magfusion.units import Array
 
 MEMORY = 0.9  # weight of earlier stretches in each later one
@@ -13,7 +21,7 @@ LAG_SIGMA, RATE_SIGMA = 1e-3, 1e-4  # s, and relative: of an estimated lag, of a
 
 
 @dataclass(frozen=True)
-class Clock:
+class ReferenceClock:
     """Estimated lags, and the line through them.
 
     Parameters
@@ -32,13 +40,13 @@ class Clock:
     square: float = 0.0
     product: float = 0.0
 
-    def heard(self, time: float, lag: float) -> "Clock":
+    def updated(self, time: float, lag: float) -> "ReferenceClock":
         """Return it with the lag at a time added (s)."""
         old = MEMORY * self.weight
         weight = old + 1.0
         off_time, off_lag = time - self.time, lag - self.lag
         share = old / weight
-        return Clock(
+        return ReferenceClock(
             weight,
             self.time + off_time / weight,
             self.lag + off_lag / weight,
@@ -66,13 +74,13 @@ def lag_in(waveform: Waveform, reference: Waveform, lines_hz: Array) -> tuple[fl
     step = float(np.median(np.diff(waveform.time)))
     size = int(BLOCK / step) // 2 * 2
     starts = np.arange(0, len(waveform) - size + 1, size)
-    even, there = beside(waveform, reference, NO_LAG)
+    even, there = reference_at(waveform, reference, NO_LAG)
     if not len(starts) or not np.any(there):
         return None
-    found = peak_of(correlations(waveform.measured_sensor, even, starts, size, step, lines_hz))
-    if found is None:
+    result = peak_of(correlations(waveform.measured_sensor, even, starts, size, step, lines_hz))
+    if result is None:
         return None
-    mean, best, lags = found
+    mean, best, lags = result
     at = int(np.clip(best, 1, len(mean) - 2))
     before, here, after = mean[at - 1 : at + 2]
     finer = 0.5 * (before - after) / min(before - 2.0 * here + after, -1e-300)

@@ -14,7 +14,7 @@ from magfusion.units import AnyArray, Array
 
 LEAST_SAMPLES = 0.8  # of a whole window
 LEAST_TURNS = 4.0  # in a window
-BESIDE = (3.0, 4.0, 5.0, 6.0)  # offset of the probes from a tone (turns in a window)
+PROBE_TURNS = (3.0, 4.0, 5.0, 6.0)  # offset of the probes from a tone (turns in a window)
 POOLED = 4  # windows on either side with which noise is averaged
 MAINS = 3  # number of harmonics
 
@@ -66,16 +66,18 @@ def demodulate_rotor(
         known = np.isfinite(angle[rows])
         if np.sum(known) < LEAST_SAMPLES * window / step:
             continue
-        own, turned = time[rows][known], angle[rows][known]
+        own, rotated = time[rows][known], angle[rows][known]
         if np.max(np.diff(own)) > (1.0 - LEAST_SAMPLES) * window:
             continue
-        turns = abs(turned[-1] - turned[0]) / (2.0 * np.pi)
+        turns = abs(rotated[-1] - rotated[0]) / (2.0 * np.pi)
         if turns < LEAST_TURNS or turns > 0.4 * len(own) / max(orders):
             continue
-        found = _of_window(own - first - 0.5 * window, turned, calm[rows][known], orders, mains_hz)
+        result = _of_window(
+            own - first - 0.5 * window, rotated, calm[rows][known], orders, mains_hz
+        )
         centres.append(first + 0.5 * window)
         speeds.append(turns / (own[-1] - own[0]))
-        for known_parts, part in zip(parts, found, strict=True):
+        for known_parts, part in zip(parts, result, strict=True):
             known_parts.append(part)
     n, tones = len(centres), len(orders)
     phasors, noises, units = (np.array(part) for part in parts)
@@ -109,14 +111,14 @@ def _of_window(
     count, n = len(parts), len(orders)
     real, imaginary = fitted[2 : 2 + n], fitted[2 + count : 2 + count + n]
     unit = np.diagonal(gram)
-    left = field - design @ fitted
+    residual = field - design @ fitted
     span = elapsed[-1] - elapsed[0]
-    beside = np.array([sign * k for k in BESIDE for sign in (-1.0, 1.0)])
+    neighbours = np.array([sign * k for k in PROBE_TURNS for sign in (-1.0, 1.0)])
     noises = []
     for order in orders:
-        probe = np.exp(-1j * (order * angle + 2.0 * np.pi * np.outer(beside, elapsed) / span))
-        seen = probe @ left  # (probes, 3)
-        noises.append(np.real(seen.T @ seen.conj()) / (len(beside) * len(elapsed)))
+        probe = np.exp(-1j * (order * angle + 2.0 * np.pi * np.outer(neighbours, elapsed) / span))
+        seen = probe @ residual  # (probes, 3)
+        noises.append(np.real(seen.T @ seen.conj()) / (len(neighbours) * len(elapsed)))
     variance = 0.5 * (unit[2 : 2 + n] + unit[2 + count : 2 + count + n])
     return real + 1j * imaginary, np.array(noises), variance
 

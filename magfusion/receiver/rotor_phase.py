@@ -20,7 +20,7 @@ REACH = 3.0  # sigmas of the declared speed that are searched
 PER_WIDTH = 8.0  # speeds per inverse length of a piece
 BEYOND = np.array([3.0, 4.0, 5.0, 6.0])  # over a piece's length, beyond the search: noise alone
 ABOUT = 4  # pieces on either side that share a polarisation
-PASSES = 6
+MAX_ITERATIONS = 6
 LEAST_SNR = 3.0  # of the median piece; below, the magnet is not detected
 MOST_SPEEDS = 2000
 
@@ -48,21 +48,21 @@ def followed_angle(waveform: Waveform, frequency_hz: float, rotor: Rotor) -> Arr
     speeds = np.linspace(low, high, max(count, 3))
     power = _powers(time, field, centres, piece, speeds)
     noise = float(np.mean(_powers(time, field, centres, piece, high + BEYOND / piece)))
-    likeliest = _course(power / noise, speeds, rotor.speed_walk_hz_rts * np.sqrt(half))
-    snr = np.median(power[np.arange(len(centres)), likeliest] / noise)
+    most_probable = _course(power / noise, speeds, rotor.speed_walk_hz_rts * np.sqrt(half))
+    snr = np.median(power[np.arange(len(centres)), most_probable] / noise)
     if snr < LEAST_SNR**2:
         raise InputError(
             f"a magnet that rotates at {frequency_hz:g} Hz within {high - frequency_hz:.2g} is not"
             " detected above the noise; record its angle, or check its frequency_hz and"
             " speed_sigma_hz"
         )
-    course = CubicSpline(centres, 2.0 * np.pi * speeds[likeliest])
+    course = CubicSpline(centres, 2.0 * np.pi * speeds[most_probable])
     node = course.antiderivative()(centres)
     walk = (2.0 * np.pi * rotor.speed_walk_hz_rts) ** 2 * half**3
-    for _ in range(PASSES):
+    for _ in range(MAX_ITERATIONS):
         spline = CubicSpline(centres, node)
         pieces, sigma = _pieces(time, field, centres, piece, _gone_on(spline, time))
-        node = node + _smoothed(_left(pieces), sigma, node, walk)
+        node = node + _smoothed(_residual_phase(pieces), sigma, node, walk)
     return _gone_on(CubicSpline(centres, node), time)
 
 
@@ -124,13 +124,13 @@ def _pieces(
         taper = np.hanning(rows.stop - rows.start + 2)[1:-1]
         wave = taper * np.exp(-1j * angle[rows])
         out[i] = 2.0 * (wave @ field[rows]) / np.sum(taper)
-        left = field[rows] - np.real(out[i] * np.exp(1j * angle[rows])[:, None])
-        noise = np.sum(left**2) / left.size * 2.0 * np.sum(taper**2) / np.sum(taper) ** 2
+        residual = field[rows] - np.real(out[i] * np.exp(1j * angle[rows])[:, None])
+        noise = np.sum(residual**2) / residual.size * 2.0 * np.sum(taper**2) / np.sum(taper) ** 2
         sigma[i] = np.sqrt(noise) / max(float(np.linalg.norm(out[i])), 1e-300)
     return out, np.maximum(sigma, 1e-4)
 
 
-def _left(pieces: ComplexArray) -> Array:
+def _residual_phase(pieces: ComplexArray) -> Array:
     """Return the phase of each piece against the polarisation of its neighbours (rad)."""
     n = len(pieces)
     out = np.zeros(n)
@@ -146,12 +146,12 @@ def _left(pieces: ComplexArray) -> Array:
     return out
 
 
-def _smoothed(left: Array, sigma: Array, known: Array, walk: float) -> Array:
+def _smoothed(residual: Array, sigma: Array, known: Array, walk: float) -> Array:
     """Smooth the residual phase so that the speed is a random walk."""
-    n = len(left)
+    n = len(residual)
     weight = 1.0 / sigma**2
     bend = np.array([1.0, -2.0, 1.0])
-    banded, right = np.zeros((3, n)), weight * left
+    banded, right = np.zeros((3, n)), weight * residual
     banded[2] += weight
     for k in range(3):
         for m in range(k, 3):

@@ -23,7 +23,7 @@ MEMORY = 2000  # samples that predict the next ticks
 MOST_PIECES = 40  # used for the median step
 SEARCHED = 0.08  # of the median step, either way
 KNOT = 10.0  # s; a clock's rate changes more slowly
-FEWEST = 50  # samples
+MIN_SAMPLES = 50  # samples
 
 
 class SamplingClock(NamedTuple):
@@ -37,14 +37,14 @@ class SamplingClock(NamedTuple):
         Between two ticks (s).
     scatter : float
         Root mean square of stamps about the clock (s).
-    lost : int
+    lost_count : int
         Ticks without a sample, except in gaps.
     """
 
     time: Array
     step: float
     scatter: float
-    lost: int
+    lost_count: int
 
 
 def sampling_clock(stamps: Array) -> SamplingClock | None:
@@ -70,7 +70,7 @@ def sampling_clock(stamps: Array) -> SamplingClock | None:
     time = np.concatenate([p.time for p in parts])
     if np.any(np.diff(time) <= 0.0):
         return None
-    return SamplingClock(time, step, scatter, sum(p.lost for p in parts))
+    return SamplingClock(time, step, scatter, sum(p.lost_count for p in parts))
 
 
 def _even(stamps: Array, step: float) -> bool:
@@ -103,8 +103,8 @@ def _phasor(stamps: Array, step: float) -> ComplexArray:
 def _of_stretch(stamps: Array, step: float) -> SamplingClock:
     tick = _ticks(stamps, step)
     time = smooth_clock(tick, stamps)
-    lost = int(tick[-1] - tick[0] + 1 - len(tick))
-    return SamplingClock(time, step, 0.0, lost)
+    lost_epochs = int(tick[-1] - tick[0] + 1 - len(tick))
+    return SamplingClock(time, step, 0.0, lost_epochs)
 
 
 def _ticks(stamps: Array, step: float) -> IntArray:
@@ -114,7 +114,7 @@ def _ticks(stamps: Array, step: float) -> IntArray:
     while begin < len(stamps):
         own = stamps[begin : begin + PIECE]
         first = max(0, begin - MEMORY)
-        if begin - first >= 2 * FEWEST:
+        if begin - first >= 2 * MIN_SAMPLES:
             slope, start = np.polyfit(tick[first:begin] - tick[begin - 1], stamps[first:begin], 1)
         else:
             slope, start = step, _phase(own, step) - step
@@ -129,14 +129,14 @@ def _ticks(stamps: Array, step: float) -> IntArray:
 
 def _phase(stamps: Array, step: float) -> float:
     """Return when the tick of a piece's first sample is (s)."""
-    return float(stamps[0] + step * np.angle(_phasor(stamps[:FEWEST], step)) / (2.0 * np.pi))
+    return float(stamps[0] + step * np.angle(_phasor(stamps[:MIN_SAMPLES], step)) / (2.0 * np.pi))
 
 
 def _scatter(stamps: Array, step: float) -> float:
     """Return the scatter of stamps about a uniform clock (s), ignoring lost samples."""
-    apart = np.diff(stamps) / step
-    apart = step * (apart - np.maximum(np.round(apart), 1.0))
-    return float(np.median(np.abs(apart)) / 0.6745 / np.sqrt(2.0))
+    separate = np.diff(stamps) / step
+    separate = step * (separate - np.maximum(np.round(separate), 1.0))
+    return float(np.median(np.abs(separate)) / 0.6745 / np.sqrt(2.0))
 
 
 def _slips(late: Array, sigma: float) -> IntArray:
@@ -153,16 +153,16 @@ def _slips(late: Array, sigma: float) -> IntArray:
     """
     if np.max(np.abs(late)) < 0.5:
         return np.zeros(len(late), dtype=np.int64)
-    lost = np.arange(MOST_LOST + 1)
-    cost = np.where(lost == 0, 0.0, LOSS)
-    came = np.zeros((len(late), len(lost)), dtype=np.int64)
+    lost_epochs = np.arange(MOST_LOST + 1)
+    cost = np.where(lost_epochs == 0, 0.0, LOSS)
+    came = np.zeros((len(late), len(lost_epochs)), dtype=np.int64)
     for k, own in enumerate(late):
         best = np.minimum.accumulate(cost)
-        at = np.maximum.accumulate(np.where(cost == best, lost, 0))
+        at = np.maximum.accumulate(np.where(cost == best, lost_epochs, 0))
         fewer = np.concatenate([[np.inf], best[:-1]]) + LOSS
         jump = fewer < cost
-        came[k] = np.where(jump, np.concatenate([[0], at[:-1]]), lost)
-        cost = np.where(jump, fewer, cost) + 0.5 * np.minimum((own - lost) / sigma, 5.0) ** 2
+        came[k] = np.where(jump, np.concatenate([[0], at[:-1]]), lost_epochs)
+        cost = np.where(jump, fewer, cost) + 0.5 * np.minimum((own - lost_epochs) / sigma, 5.0) ** 2
     slip = np.empty(len(late), dtype=np.int64)
     state = int(np.argmin(cost))
     for k in range(len(late) - 1, -1, -1):
@@ -177,18 +177,18 @@ def smooth_clock(tick: IntArray, stamps: Array) -> Array:
     A knot without support in the data (Schwarz's criterion) would pass the scatter of the stamps
     to the clock, and with it to the phases of all beacons.
     """
-    if len(stamps) < FEWEST:
+    if len(stamps) < MIN_SAMPLES:
         return stamps
-    most = max(int((stamps[-1] - stamps[0]) / KNOT), 1)
-    lines, sigma, least = most, 0.0, np.inf
+    maximum = max(int((stamps[-1] - stamps[0]) / KNOT), 1)
+    lines, sigma, least = maximum, 0.0, np.inf
     best = stamps
     while lines >= 1:
-        found, off = _bent_lines(tick, stamps, lines)
+        result, off = _bent_lines(tick, stamps, lines)
         sigma = sigma or max(float(np.median(np.abs(off))) / 0.6745, 1e-12)
         square = np.minimum(np.abs(off) / sigma, 3.0) ** 2
         cost = float(np.sum(square)) + (lines + 1) * np.log(len(stamps))
         if cost < least:
-            best, least = found, cost
+            best, least = result, cost
         lines //= 2
     return best
 
@@ -198,11 +198,11 @@ def _bent_lines(tick: IntArray, stamps: Array, lines: int) -> tuple[Array, Array
     inner = np.linspace(tick[0], tick[-1], lines + 1)[1:-1]
     ends = (float(tick[0]), float(tick[-1]))
     knots = np.concatenate([[ends[0]] * 2, inner, [ends[1]] * 2])
-    weight, found = np.ones(len(stamps)), stamps
+    weight, result = np.ones(len(stamps)), stamps
     for _ in range(4):
         spline = make_lsq_spline(tick.astype(float), stamps, knots, k=1, w=weight)
-        found = np.asarray(spline(tick.astype(float)))
-        off = np.abs(stamps - found)
+        result = np.asarray(spline(tick.astype(float)))
+        off = np.abs(stamps - result)
         sigma = np.median(off) / 0.6745
         weight = 1.0 / np.maximum(1.0, off / max(3.0 * sigma, 1e-12))
-    return found, stamps - found
+    return result, stamps - result

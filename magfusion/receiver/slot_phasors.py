@@ -180,15 +180,15 @@ def demodulate_slots(
     shared = 0.0 if settings.removal == "none" else 1.0 / max(len(np.unique(place[silent])), 1)
     variance = values.variance[kept] * (1.0 + np.maximum(np.sum(weight**2, axis=1), shared))
     phasor = _applied(turn[kept], value[usable])
-    found = _rows(site, values.time[kept], values.length[kept], owner[place[kept]], phasor)
+    result = _rows(site, values.time[kept], values.length[kept], owner[place[kept]], phasor)
     still_cov = variance[:, None, None] * noise[kept]
     if is_marked(site) and is_pulsed(site) and settings.removal != "none":
         hum = _hum(values.rows(silent), still[silent], noise[silent], site, settings)
-        beside = np.clip(np.searchsorted(silent, kept), 0, max(len(silent) - 1, 0))
-        still_cov += (1.0 + np.sum(weight**2, axis=1))[:, None, None] * hum[beside]
+        others = np.clip(np.searchsorted(silent, kept), 0, max(len(silent) - 1, 0))
+        still_cov += (1.0 + np.sum(weight**2, axis=1))[:, None, None] * hum[others]
     cov = turn[kept] @ still_cov @ np.swapaxes(turn[kept], 1, 2)
-    found.phasor_cov[np.arange(len(kept)), owner[place[kept]]] = cov
-    return found, values.number[kept]
+    result.phasor_cov[np.arange(len(kept)), owner[place[kept]]] = cov
+    return result, values.number[kept]
 
 
 def _ambient(
@@ -304,17 +304,17 @@ def _noise(inside: _Inside, carrier_hz: Array, length: Array, rate_hz: float) ->
     away = 3.0 / length
     above = carrier_hz + away < 0.5 * rate_hz
     probe = np.where(above, carrier_hz + away, carrier_hz - away)
-    turned = np.exp(-2j * np.pi * probe[inside.owner] * inside.elapsed)
-    columns = [np.ones(len(turned)), inside.elapsed / length[inside.owner] - 0.5]
+    rotated = np.exp(-2j * np.pi * probe[inside.owner] * inside.elapsed)
+    columns = [np.ones(len(rotated)), inside.elapsed / length[inside.owner] - 0.5]
     if np.any(carrier_hz):
         angle = 2.0 * np.pi * carrier_hz[inside.owner] * inside.elapsed
         columns += [np.cos(angle), np.sin(angle)]
     known = np.stack(columns, axis=1)
     weighed = inside.hann[:, None] * known
     normal = np.add.reduceat(weighed[:, :, None] * known[:, None], inside.begins, axis=0)
-    right = np.add.reduceat(weighed * turned[:, None], inside.begins, axis=0)
+    right = np.add.reduceat(weighed * rotated[:, None], inside.begins, axis=0)
     share = (_pseudo_inverse(normal) @ right[..., None])[..., 0]
-    blind = inside.hann * (turned - np.sum(known * share[inside.owner], axis=1))
+    blind = inside.hann * (rotated - np.sum(known * share[inside.owner], axis=1))
     seen = np.add.reduceat(blind[:, None] * inside.still, inside.begins, axis=0)
     power = np.add.reduceat(np.abs(blind) ** 2, inside.begins)
     cov = seen[:, :, None] * np.conj(seen[:, None])
@@ -325,8 +325,8 @@ def _pseudo_inverse(normal: Array) -> Array:
     """Return `numpy.linalg.pinv` of positive semidefinite normal matrices, at half its cost."""
     value, vector = np.linalg.eigh(normal)
     value, vector = value[..., ::-1], np.ascontiguousarray(vector[..., ::-1])
-    told = value > 1e-15 * value.shape[-1] * value[..., :1]
-    inverse = np.divide(1.0, value, where=told, out=np.zeros_like(value))
+    dimensions = value > 1e-15 * value.shape[-1] * value[..., :1]
+    inverse = np.divide(1.0, value, where=dimensions, out=np.zeros_like(value))
     return np.asarray(vector @ (inverse[..., None] * np.swapaxes(vector, -1, -2)))
 
 

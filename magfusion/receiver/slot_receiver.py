@@ -10,14 +10,19 @@ from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.admission import (
     ROUNDING,
-    Grid,
+    WindowGrid,
     Windows,
     sample_rate_hz,
 )
 from magfusion.receiver.cycles import cycles, joins
 from magfusion.receiver.receiver import Receiver
 from magfusion.receiver.slot_phasors import SlotValues, demodulate_slots, slot_values
-from magfusion.receiver.slot_timing import check_told, heard_for, is_searched, slot_start
+from magfusion.receiver.slot_timing import (
+    check_timing_declared,
+    informative_share,
+    is_searched,
+    slot_start,
+)
 from magfusion.receiver.slots import (
     SlotSettings,
     check_carriers,
@@ -53,21 +58,21 @@ class SlotReceiver(Receiver):
         return given if isinstance(given, SlotSettings) else slot_settings_of(self.site, given)
 
     @property
-    def remembered(self) -> int:
+    def history_length(self) -> int:
         """Number of slots to whose ambient field and noise an admitted one contributes."""
         return history_of(self.site, self.settings) * schedule(self.site).count
 
     def check(self) -> None:
         """Reject a schedule that not all coils keep, as `Receiver.check`."""
         schedule(self.site)
-        check_told(self.site)
+        check_timing_declared(self.site)
         slot_settings_of(self.site, None if isinstance(self._given, SlotSettings) else self._given)
 
     def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
         """Set up slots from the first whole one of the schedule, as `Receiver.begin`."""
         slots = schedule(self.site)
         rate_hz = sample_rate_hz(waveform)
-        check_told(self.site)
+        check_timing_declared(self.site)
         check_carriers(self.site, rate_hz, self.settings)
         if is_searched(self.site):
             start = slot_start(waveform, self.site, rate_hz)
@@ -77,7 +82,7 @@ class SlotReceiver(Receiver):
                     " closer, or give the log's clock (synchronised: true, with start_s)"
                 )
             slots, self._followed = replace(slots, start=start), float(waveform.time[-1])
-        grid = Grid(
+        grid = WindowGrid(
             centre=slots.start + 0.5 * slots.duration,
             step=slots.duration,
             length=slots.duration,
@@ -96,7 +101,7 @@ class SlotReceiver(Receiver):
         if not is_searched(self.site):
             return super()._admitted(waveform, imu)
         time, refusal, parts = waveform.time, None, [Windows.none()]
-        span = heard_for(schedule(self.site))
+        span = informative_share(schedule(self.site))
         ends = np.searchsorted(time, np.arange(time[0] + span, time[-1], span))
         for end in np.append(ends, len(time)).tolist():
             newest = float(time[end - 1])
@@ -111,9 +116,9 @@ class SlotReceiver(Receiver):
                     continue
             self._follow(look)
             come = waveform.rows(slice(end))
-            own, inertial = self._since(come, imu, None, self.next_number)
-            found = self.admit(own, inertial, None if end == len(time) else newest)
-            parts.append(replace(found, first=found.first + end - len(own)))
+            own, inertial = self._samples_from(come, imu, None, self.next_number)
+            result = self.admit(own, inertial, None if end == len(time) else newest)
+            parts.append(replace(result, first=result.first + end - len(own)))
         if self.grid is None and refusal is not None:
             raise refusal
         return reduce(Windows.joined, parts)
@@ -123,28 +128,28 @@ class SlotReceiver(Receiver):
     ) -> tuple[FieldSamples, IntArray]:
         """Return the phasors of driven slots less the ambient field of the silent ones."""
         turn = slot_turn_of(imu, site)
-        values = self._held(waveform, turn, windows, site)
+        values = self._fit_slots(waveform, turn, windows, site)
         return demodulate_slots(values, turn, site, self.settings)
 
     def pushed(
-        self, waveform: Waveform, imu: ImuSamples, windows: Windows, since: int
+        self, waveform: Waveform, imu: ImuSamples, windows: Windows, first_number: int
     ) -> tuple[FieldSamples, int]:
         """Return the phasors of slots from a number on, as `Receiver.pushed`."""
         turn = slot_turn_of(imu, self.site)
         same = self._values.number[:, None] == windows.number
         known = self._values.rows(np.any(same, axis=1))
         fresh = windows.rows(~np.any(same, axis=0))
-        self._values = known.joined(self._held(waveform, turn, fresh, self.site))
-        found, number = demodulate_slots(self._values, turn, self.site, self.settings)
-        number, found = number[number >= since], found.rows(number >= since)
-        seen = len(found)
+        self._values = known.joined(self._fit_slots(waveform, turn, fresh, self.site))
+        result, number = demodulate_slots(self._values, turn, self.site, self.settings)
+        number, result = number[number >= first_number], result.rows(number >= first_number)
+        seen = len(result)
         if seen and self.joined and not self.site.platform.magnetometer.lacking:
-            found = self._joined(found, number, turn)
-        return found, seen
+            result = self._joined(result, number, turn)
+        return result, seen
 
-    def _joined(self, found: FieldSamples, number: IntArray, turn: Turn) -> FieldSamples:  # noqa: ARG002
+    def _joined(self, result: FieldSamples, number: IntArray, turn: Turn) -> FieldSamples:  # noqa: ARG002
         """Join the slots of each cycle to one epoch, where it is short."""
-        return cycles(found, turn, self.site) if joins(self.site) else found
+        return cycles(result, turn, self.site) if joins(self.site) else result
 
     def _follow(self, waveform: Waveform) -> None:
         """Move the slots half-way to their position in the stream, as one estimate is noisy."""
@@ -161,7 +166,9 @@ class SlotReceiver(Receiver):
             if abs(late) < 0.5 * self.grid.step:
                 self.grid = replace(self.grid, centre=centre + 0.5 * late)
 
-    def _held(self, waveform: Waveform, turn: Turn, windows: Windows, site: Site) -> SlotValues:
+    def _fit_slots(
+        self, waveform: Waveform, turn: Turn, windows: Windows, site: Site
+    ) -> SlotValues:
         assert self.admission is not None
         rate_hz = 1.0 / self.admission.magnetometer_step
         return slot_values(waveform, turn, site, self.settings, windows, rate_hz)

@@ -14,11 +14,11 @@ from magfusion.receiver.slots import carriers_hz, is_marked, is_pulsed, owners, 
 from magfusion.units import AnyArray, Array
 
 BINS = 32  # of a slot
-FEWEST_BINS = 6  # of them with samples; a slot has eight
-FEWEST_CYCLES = 4
+MIN_BINS = 6  # of them with samples; a slot has eight
+MIN_CYCLES = 4
 LONGEST_FOLD = 0.3  # s; clocks that are 100 ppm apart drift by 30 us
 STEADY_CYCLES = 4  # of the carrier, over which the mean is the steady field
-LOUDEST_SILENCE = 0.4  # of the weakest driven slot
+MAX_SILENT_LEVEL = 0.4  # of the weakest driven slot
 
 
 @once_a_site
@@ -32,11 +32,11 @@ def is_searched(site: Site) -> bool:
         return False
     slots = schedule(site)
     silent = owners(site, slots.count) < 0
-    alike = [np.array_equal(np.roll(silent, k), silent) for k in range(1, slots.count)]
-    return not any(alike)
+    shared = [np.array_equal(np.roll(silent, k), silent) for k in range(1, slots.count)]
+    return not any(shared)
 
 
-def check_told(site: Site) -> None:
+def check_timing_declared(site: Site) -> None:
     """Reject pulses of unknown timing.
 
     Raises
@@ -44,18 +44,18 @@ def check_told(site: Site) -> None:
     InputError
         Folded at the cycle, the Earth's field looks like that of a coil.
     """
-    free = [beacon.name for beacon in site.beacons if not beacon.synchronised]
-    if free and is_pulsed(site):
+    free_running = [beacon.name for beacon in site.beacons if not beacon.synchronised]
+    if free_running and is_pulsed(site):
         raise InputError(
-            f"beacon {free[0]} sends direct-current pulses by its own clock (synchronised: false),"
+            f"beacon {free_running[0]} sends direct-current pulses by its own clock (synchronised: false),"
             " and the stream does not identify its slots; record when its cycles begin and give"
             " that (synchronised: true, with start_s), or drive the coils with a carrier"
         )
 
 
-def heard_for(slots: Slots) -> float:
+def informative_share(slots: Slots) -> float:
     """Return the length of stream needed to estimate the begin of a cycle (s)."""
-    return max(LONGEST_FOLD, 2.0 * FEWEST_CYCLES * slots.cycle)
+    return max(LONGEST_FOLD, 2.0 * MIN_CYCLES * slots.cycle)
 
 
 def slot_start(waveform: Waveform, site: Site, rate_hz: float) -> float | None:
@@ -69,9 +69,9 @@ def slot_start(waveform: Waveform, site: Site, rate_hz: float) -> float | None:
         Median sampling rate.
     """
     slots = schedule(site)
-    part = waveform.time >= waveform.time[-1] - heard_for(slots)
+    part = waveform.time >= waveform.time[-1] - informative_share(slots)
     time, measured = waveform.time[part], waveform.measured_sensor[part]
-    if time[-1] - time[0] < FEWEST_CYCLES * slots.cycle:
+    if time[-1] - time[0] < MIN_CYCLES * slots.cycle:
         return None
     folded = _folded(time, measured, site, slots, rate_hz)
     if folded is None:
@@ -85,10 +85,10 @@ def slot_start(waveform: Waveform, site: Site, rate_hz: float) -> float | None:
     silent = owners(site, slots.count) < 0
     fits = []
     for k in range(slots.count):
-        turned = np.roll(level, -k)
-        fits.append(float(np.max(turned[silent]) / np.min(turned[~silent])))
+        rotated = np.roll(level, -k)
+        fits.append(float(np.max(rotated[silent]) / np.min(rotated[~silent])))
     first = int(np.argmin(fits))
-    if fits[first] > LOUDEST_SILENCE:
+    if fits[first] > MAX_SILENT_LEVEL:
         return None
     before, here, after = (steps[(best + k) % BINS] for k in (-1, 0, 1))
     bend = before - 2.0 * here + after
@@ -101,21 +101,21 @@ def _folded(time: Array, measured: Array, site: Site, slots: Slots, rate_hz: flo
     """Return the mean carrier amplitude in each bin of the cycle, from the first sample on."""
     size = np.zeros(len(time))
     for carrier_hz in np.unique(carriers_hz(site, slots.count)):
-        carried = _alone(measured, round(rate_hz * STEADY_CYCLES / carrier_hz))
-        carried = carried * np.exp(-2j * np.pi * carrier_hz * time)[:, None]
+        propagated = _alone(measured, round(rate_hz * STEADY_CYCLES / carrier_hz))
+        propagated = propagated * np.exp(-2j * np.pi * carrier_hz * time)[:, None]
         length = max(2, round(rate_hz * max(2.0 / carrier_hz, slots.duration / 16.0)))
-        size += np.linalg.norm(_mean_about(carried, length), axis=1)
+        size += np.linalg.norm(_mean_about(propagated, length), axis=1)
     bins = np.floor((time - time[0]) / slots.cycle % 1.0 * slots.count * BINS).astype(np.int64)
     bins = np.minimum(bins, slots.count * BINS - 1)
     count = np.bincount(bins, minlength=slots.count * BINS)
-    told = np.flatnonzero(count)
-    if len(told) < FEWEST_BINS * slots.count:
+    dimensions = np.flatnonzero(count)
+    if len(dimensions) < MIN_BINS * slots.count:
         return None
-    mean = np.bincount(bins, size, minlength=len(count))[told] / count[told]
-    if len(told) == len(count):
+    mean = np.bincount(bins, size, minlength=len(count))[dimensions] / count[dimensions]
+    if len(dimensions) == len(count):
         return np.asarray(mean)
     # If whole cycles are whole samples, a cycle has no more bins than samples.
-    return np.interp(np.arange(len(count)), told, mean, period=len(count))
+    return np.interp(np.arange(len(count)), dimensions, mean, period=len(count))
 
 
 def _alone(measured: Array, length: int) -> Array:

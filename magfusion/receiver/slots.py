@@ -92,7 +92,7 @@ def check_kept(site: Site) -> Slots | MarkedSlots:
                 f"beacon {first.name} keeps a schedule of time slots and beacon {beacon.name}"
                 f" {kept}; give both the same slots, in which each coil has its own"
             )
-    taken: dict[int, str] = {}
+    selected: dict[int, str] = {}
     for beacon in site.beacons:
         for _, slot in beacon.tones:
             if slot is None:
@@ -100,12 +100,12 @@ def check_kept(site: Site) -> Slots | MarkedSlots:
                     f"beacon {beacon.name} keeps a schedule of time slots and has a coil without"
                     " one; give every coil its slot"
                 )
-            if slot in taken:
+            if slot in selected:
                 raise InputError(
-                    f"beacons {taken[slot]} and {beacon.name} are both driven in slot {slot};"
+                    f"beacons {selected[slot]} and {beacon.name} are both driven in slot {slot};"
                     " give every coil a slot of its own"
                 )
-            taken[slot] = beacon.name
+            selected[slot] = beacon.name
     return first.slots
 
 
@@ -214,13 +214,13 @@ def check_carriers(site: Site, rate_hz: float, settings: SlotSettings) -> None:
             f" {slots.duration:g} s; give longer slots, a faster carrier, or frequency_hz: 0"
             " in all coils for pulses of direct current"
         )
-    apart = settings.removal != "none"
-    if apart and highest > lowest:
+    separate = settings.removal != "none"
+    if separate and highest > lowest:
         raise InputError(
             "silent slots cannot determine the ambient field at several carriers; demodulate"
             " without them, or drive all coils at one frequency"
         )
-    if (apart or highest == 0.0) and np.all(owners(site, slots.count) >= 0):
+    if (separate or highest == 0.0) and np.all(owners(site, slots.count) >= 0):
         raise InputError(
             f"all {slots.count} time slots are driven and none determines the ambient field; leave"
             " one silent, or drive the coils with a carrier"

@@ -77,7 +77,7 @@ def on_clock(
     return replace(imu, time=imu.time + time_offset, gyro_body=gyro)
 
 
-def standing_in(imu: ImuSamples, silence: tuple[Array, Array]) -> ImuSamples:
+def zero_rate_filler(imu: ImuSamples, silence: tuple[Array, Array]) -> ImuSamples:
     """Return a stream of angular rates that are zero in its gaps.
 
     Parameters

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.model.audibility import phasor_sigma, tones_of, unheard_by_each_other
+from magfusion.model.detection_range import mutually_undetectable, phasor_sigma, tones_of
 from magfusion.model.site import Beacon, Site
 from magfusion.units import Array
 
@@ -107,7 +107,7 @@ def _used_again(site: Site) -> bool:
     for beacon in site.beacons:
         for frequency in beacon.tone_frequencies_hz.tolist():
             others = on_tone.setdefault(frequency, [])
-            if not all(unheard_by_each_other(beacon, other, sigma) for other in others):
+            if not all(mutually_undetectable(beacon, other, sigma) for other in others):
                 return False
             others.append(beacon)
     return True

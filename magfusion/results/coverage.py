@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from magfusion.model.audibility import are_many, largest_fields, phasor_sigma
+from magfusion.model.detection_range import are_many, largest_fields, phasor_sigma
 from magfusion.model.parameters import beacons_of, choose_blocks, initial_calibration
 from magfusion.model.site import Beacon, Site
 from magfusion.model.trust import Risk
@@ -160,20 +160,20 @@ def coverage(
         parts = []
         for start in range(0, len(position_world), TOGETHER):
             points = position_world[start : start + TOGETHER]
-            near = _heard_at(site, points, window)
+            near = _site_detected_at(site, points, window)
             own = _of_window(near, points, window, survey, attitude_known, attitude, risk)
             parts.append(own)
         return _joined(parts)
     return _of_window(site, position_world, window, survey, attitude_known, attitude, risk)
 
 
-def _heard_at(site: Site, position_world: Array, window: float) -> Site:
+def _site_detected_at(site: Site, position_world: Array, window: float) -> Site:
     """Return a site of the beacons that are detected at any of some points."""
     largest = np.max(largest_fields(site, position_world), axis=0)
-    heard = beacons_of(site, np.asarray(largest > phasor_sigma(site, window))).tolist()
-    kept = heard or [0]
+    detected = beacons_of(site, np.asarray(largest > phasor_sigma(site, window))).tolist()
+    kept = detected or [0]
     others = tuple((k, b) for k, b in enumerate(site.beacons) if k not in kept)
-    return replace(site, beacons=tuple(site.beacons[k] for k in kept), unheard=others)
+    return replace(site, beacons=tuple(site.beacons[k] for k in kept), undetected=others)
 
 
 def _joined(parts: list[Coverage]) -> Coverage:
@@ -199,8 +199,8 @@ def _of_window(
     prior = prior_of(site, blocks)
     sensor = position_world + attitude @ site.platform.magnetometer.position_body
     centres = np.array([b.position_world for b in site.beacons])
-    apart = np.linalg.norm(sensor[:, None] - centres, axis=2).min(axis=1)
-    far = np.flatnonzero(apart >= NEAREST)
+    separate = np.linalg.norm(sensor[:, None] - centres, axis=2).min(axis=1)
+    far = np.flatnonzero(separate >= NEAREST)
     cov = np.full((len(position_world), 6, 6), np.inf)
     detected = np.full(len(position_world), len(site.beacons))
     determined = np.zeros(len(position_world), dtype=bool)
@@ -217,10 +217,10 @@ def _of_window(
                 for beacon in range(len(site.beacons))
             ]
             level[rows] = protected((cov[rows], determined[rows]), without, risk)
-    found = _summary(position_world, attitude, cov, detected, determined)
+    result = _summary(position_world, attitude, cov, detected, determined)
     if level is None:
-        return found
-    return replace(found, protection_level_m=level[:, 0], protection_level_deg=level[:, 1])
+        return result
+    return replace(result, protection_level_m=level[:, 0], protection_level_deg=level[:, 1])
 
 
 def best_extra_beacon(
@@ -245,10 +245,10 @@ def best_extra_beacon(
     """
     step = -(-len(position_world) // COMPARED)
     points = position_world[step // 2 :: step]
-    taken = np.array([b.position_world for b in site.beacons])
+    selected = np.array([b.position_world for b in site.beacons])
     best: tuple[float, Beacon] | None = None
     for place in boundary_places(box_world):
-        if np.min(np.linalg.norm(taken - place, axis=1)) < NEAREST:
+        if np.min(np.linalg.norm(selected - place, axis=1)) < NEAREST:
             continue
         beacon = _copy(site, place)
         sigma = bound(replace(site, beacons=(*site.beacons, beacon)), points).position_sigma

@@ -16,9 +16,9 @@ COLOURS = {
 }
 
 
-def bounds(found: Coverage) -> Array:
+def bounds(coverage: Coverage) -> Array:
     """Return the bounds between the colours in equal ratios (m), shape (colours - 1,)."""
-    return bounds_of(found.position_sigma[found.determined])
+    return bounds_of(coverage.position_sigma[coverage.determined])
 
 
 def bounds_of(known: Array) -> Array:
@@ -27,9 +27,9 @@ def bounds_of(known: Array) -> Array:
     return np.geomspace(low, max(high, 1.1 * low), len(COLOURS) - 1)
 
 
-def colour_of(found: Coverage) -> IntArray:
+def colour_of(coverage: Coverage) -> IntArray:
     """Return the index of each point's colour, shape (n,); meaningless where not determined."""
-    return np.digitize(found.position_sigma, bounds(found))
+    return np.digitize(coverage.position_sigma, bounds(coverage))
 
 
 def length(metres: float) -> str:

@@ -18,7 +18,7 @@ from magfusion.units import Array, BoolArray
 DAY, HOUR = 86_400.0, 3600.0  # s
 CONFIDENCE = 0.95  # with which a slope is told to be within its limit
 CERTAIN = 0.999  # and beyond it: many slopes are judged, and one may not fail by chance
-FEWEST_COMMON = 5  # worlds whose scatter determines three slopes
+MIN_COMMON = 5  # worlds whose scatter determines three slopes
 THREE_SIGMA = 0.0027  # how often chance alone goes beyond three standard errors
 # Columns of an error, as in the estimators' states.
 ATTITUDE, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -150,12 +150,12 @@ def common_slope(times: Sequence[Array], values: Sequence[Array]) -> CommonSlope
     Raises
     ------
     ValueError
-        With fewer than `FEWEST_COMMON` worlds, for which the scatter of three components is
+        With fewer than `MIN_COMMON` worlds, for which the scatter of three components is
         unknown.
     """
     worlds = len(values)
-    if worlds < FEWEST_COMMON:
-        raise ValueError(f"at least {FEWEST_COMMON} worlds are needed; got {worlds}")
+    if worlds < MIN_COMMON:
+        raise ValueError(f"at least {MIN_COMMON} worlds are needed; got {worlds}")
     rates = np.array([np.polyfit(t / DAY, v, 1)[0] for t, v in zip(times, values, strict=True)])
     mean, cov = np.mean(rates, axis=0), np.cov(rates, rowvar=False) / worlds
     square = float(mean @ np.linalg.solve(cov, mean))
@@ -218,16 +218,16 @@ def allan_deviation(value: Array, step: float, points: int = 40) -> tuple[Array,
         Up to a third of the series (s; unit of the values).
     """
     columns = value.reshape(len(value), -1)
-    most = len(columns) // 3
-    if most < 1:
+    maximum = len(columns) // 3
+    if maximum < 1:
         return np.empty(0), np.empty(0)
-    counts = np.unique(np.geomspace(1, most, points).astype(int))
+    counts = np.unique(np.geomspace(1, maximum, points).astype(int))
     total = np.concatenate([np.zeros((1, columns.shape[1])), np.cumsum(columns, axis=0)])
-    found = []
+    result = []
     for m in counts:
         mean = (total[m:] - total[:-m]) / m
-        found.append(np.sqrt(0.5 * np.mean((mean[m:] - mean[:-m]) ** 2)))
-    return counts * step, np.array(found)
+        result.append(np.sqrt(0.5 * np.mean((mean[m:] - mean[:-m]) ** 2)))
+    return counts * step, np.array(result)
 
 
 def evenly(series: ErrorSeries, interval: float) -> ErrorSeries:
@@ -289,7 +289,7 @@ def settled_after(hours: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class EstimatorPlot:
     """Plotted data of an estimator.
 
     Parameters

@@ -33,7 +33,7 @@ class Section(StrEnum):
     REPORT = "report"  # of interest only in report.json
 
 
-class Column(StrEnum):
+class ErrorColumn(StrEnum):
     """Columns of the tables of errors, in the order in which they are shown."""
 
     RMS = "rms"
@@ -41,7 +41,7 @@ class Column(StrEnum):
     FIXED = "survey fixed"  # with the declared calibration
     CALIBRATED = "calibrated"
     LAGGED = "lagged"
-    CARRIED = "carried"
+    PROPAGATED = "carried"
     SIGMA = "sigma per axis"
     NONE = ""
 
@@ -60,7 +60,7 @@ class Figure:
         Name of the beacon; the screen lists the same figure of several beacons in one line.
     label : str
         Title on the screen; default: the name without its unit.
-    column : Column
+    column : ErrorColumn
         Of the section's table.
     note : str
         A warning that the screen shows with the figure.
@@ -76,7 +76,7 @@ class Figure:
     beacon: str | None = None
     section: Section = Section.SUMMARY
     label: str = ""
-    column: Column = Column.NONE
+    column: ErrorColumn = ErrorColumn.NONE
     note: str = ""
     remark: str = ""
     refused: bool = False
@@ -103,7 +103,7 @@ class Figure:
 
 
 @dataclass(frozen=True)
-class Estimate(Figure):
+class ParameterEstimate(Figure):
     """One calibration parameter after the fit; the value is its change from the declared one.
 
     Parameters
@@ -191,7 +191,7 @@ def heading(job: str, log: str) -> Figures:
     )
 
 
-def determined_figures(estimates: list[Estimate]) -> Figures:
+def determined_figures(estimates: list[ParameterEstimate]) -> Figures:
     """Return the names of the parameters that the data determined, and of the others."""
     return Figures(
         Figure("determined", [e.key for e in estimates if e.determined], section=Section.REPORT),
@@ -201,7 +201,7 @@ def determined_figures(estimates: list[Estimate]) -> Figures:
     )
 
 
-def calibration_record(log_name: str, estimates: list[Estimate]) -> dict[str, object]:
+def calibration_record(log_name: str, estimates: list[ParameterEstimate]) -> dict[str, object]:
     """Return a refined site's record of its origin."""
     return {"log": log_name, **determined_figures(estimates)}
 

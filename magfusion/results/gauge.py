@@ -23,7 +23,7 @@ from magfusion.model.parameters import (
     Block,
     Calibration,
     Parameter,
-    Unit,
+    ParameterUnit,
     dimension,
 )
 from magfusion.model.site import Beacon
@@ -41,7 +41,7 @@ class Gauge(NamedTuple):
     ----------
     name : str
         E.g. ``all beacons shifted together along x``.
-    unit : Unit
+    unit : ParameterUnit
         Of the amplitude.
     direction : ndarray, shape (dimension,)
         Tangent vector of amplitude one.
@@ -51,7 +51,7 @@ class Gauge(NamedTuple):
 
     name: str
     remedy: str
-    unit: Unit
+    unit: ParameterUnit
     direction: Array
     exact: bool = True
 
@@ -65,11 +65,11 @@ def gauges(calibration: Calibration, blocks: tuple[Block, ...]) -> list[Gauge]:
         Estimated blocks; a gauge that would change other parameters is omitted.
     """
     beacons = calibration.site.beacons
-    found = [*_shifts(beacons, blocks), *_turns(beacons, blocks, (2,))]
-    found += [*_of_sensor(calibration, blocks)]
+    result = [*_shifts(beacons, blocks), *_turns(beacons, blocks, (2,))]
+    result += [*_of_sensor(calibration, blocks)]
     for beacon in beacons:
-        found += _of_drive(beacon, blocks)
-    return found + _turns(beacons, blocks, (0, 1)) + _scale(beacons, blocks)
+        result += _of_drive(beacon, blocks)
+    return result + _turns(beacons, blocks, (0, 1)) + _scale(beacons, blocks)
 
 
 def _scale(beacons: tuple[Beacon, ...], blocks: tuple[Block, ...]) -> list[Gauge]:
@@ -86,29 +86,29 @@ def _scale(beacons: tuple[Beacon, ...], blocks: tuple[Block, ...]) -> list[Gauge
 
 def _joined(blocks: tuple[Block, ...], parts: Parts) -> Array | None:
     """Return the tangent vector of these parts; None where one is not estimated."""
-    out, left = np.zeros(dimension(blocks)), dict(parts)
+    out, remaining = np.zeros(dimension(blocks)), dict(parts)
     for block in blocks:
-        value = left.pop(block.key, None)
+        value = remaining.pop(block.key, None)
         if value is not None:
             out[block.columns] = value
-    return None if any(np.any(value != 0.0) for value in left.values()) else out
+    return None if any(np.any(value != 0.0) for value in remaining.values()) else out
 
 
 def _shifts(beacons: tuple[Beacon, ...], blocks: tuple[Block, ...]) -> list[Gauge]:
-    found = []
+    result = []
     for axis, step in zip(_AXES, np.eye(3), strict=True):
         direction = _joined(blocks, {(BEACON_POSITION, b.name): step for b in beacons})
         if direction is not None:
             name = f"all beacons shifted together along {axis}"
             remedy = "gauge: no log can determine it; survey one beacon better"
-            found.append(Gauge(name, remedy, CENTIMETRE, direction))
-    return found
+            result.append(Gauge(name, remedy, CENTIMETRE, direction))
+    return result
 
 
 def _turns(
     beacons: tuple[Beacon, ...], blocks: tuple[Block, ...], axes: tuple[int, ...]
 ) -> list[Gauge]:
-    found = []
+    result = []
     for k in axes:
         axis_world = np.eye(3)[k]
         parts: Parts = {}
@@ -124,8 +124,8 @@ def _turns(
         else:
             name = f"all beacons tilted together about {_AXES[k]}"
             remedy = "gravity alone observes it; record rest in several attitudes"
-        found.append(Gauge(name, remedy, DEGREES, direction, exact=k == 2))
-    return found
+        result.append(Gauge(name, remedy, DEGREES, direction, exact=k == 2))
+    return result
 
 
 def _of_sensor(calibration: Calibration, blocks: tuple[Block, ...]) -> Iterator[Gauge]:
@@ -138,8 +138,8 @@ def _of_sensor(calibration: Calibration, blocks: tuple[Block, ...]) -> Iterator[
         remedy = "gauge: no log can determine it; measure one beacon's moment, or the gain"
         yield Gauge(name, remedy, PERCENT, direction)
     for axis, step in zip(_AXES, np.eye(3), strict=True):
-        turned: Parts = {(SENSOR_ROTATION, SENSOR_ROTATION.owner): step}
-        direction = _joined(blocks, turned | {place: (matrix @ skew(step)).ravel()})
+        rotated: Parts = {(SENSOR_ROTATION, SENSOR_ROTATION.owner): step}
+        direction = _joined(blocks, rotated | {place: (matrix @ skew(step)).ravel()})
         if direction is not None:
             name = f"the mounting rotated about the sensor's {axis} and the matrix rotated back"
             remedy = "gauge: no log can determine it; fix one of the two"
@@ -149,7 +149,7 @@ def _of_sensor(calibration: Calibration, blocks: tuple[Block, ...]) -> Iterator[
 def _of_drive(beacon: Beacon, blocks: tuple[Block, ...]) -> list[Gauge]:
     """Return rotations of one beacon that its coils' currents compensate, as for a rotating one."""
     drive = beacon.moments_beacon.T @ beacon.excitation  # (3, tones)
-    turned = [(skew(axis) @ drive).ravel() for axis in np.eye(3)]
+    rotated = [(skew(axis) @ drive).ravel() for axis in np.eye(3)]
     shifted = [
         np.where(np.arange(len(beacon.tones)) == k, 1j * drive, 0.0).ravel()
         for k in range(0 if beacon.synchronised else len(beacon.tones))
@@ -158,11 +158,11 @@ def _of_drive(beacon: Beacon, blocks: tuple[Block, ...]) -> list[Gauge]:
         (beacon.moments_beacon[j][:, None] * beacon.excitation[j]).ravel()
         for j in range(len(beacon.coils))
     ]
-    change = np.stack([*turned, *shifted, *grown], axis=1)
+    change = np.stack([*rotated, *shifted, *grown], axis=1)
     change = np.concatenate([change.real, change.imag]) / np.linalg.norm(drive)
     _, size, right = np.linalg.svd(change, full_matrices=True)
     size = np.concatenate([size, np.zeros(len(right) - len(size))])
-    found = []
+    result = []
     for step in right[size < NEARLY_NULL]:
         turn = float(np.linalg.norm(step[:3]))
         tones = len(shifted)
@@ -177,5 +177,5 @@ def _of_drive(beacon: Beacon, blocks: tuple[Block, ...]) -> list[Gauge]:
         against = " against its drive phase" if tones else ""
         name = f"beacon {beacon.name} rotated about its own axis{against}"
         remedy = "gauge: its field does not change; nothing depends on it"
-        found.append(Gauge(name, remedy, DEGREES, direction / turn))
-    return found
+        result.append(Gauge(name, remedy, DEGREES, direction / turn))
+    return result

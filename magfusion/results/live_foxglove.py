@@ -59,7 +59,7 @@ class FoxgloveServer:
             raise InputError(
                 "--foxglove: foxglove-sdk is not installed; pip install 'magfusion[foxglove]'"
             ) from error
-        host, port = _parted(address)
+        host, port = _host_and_port(address)
         context = self._context = foxglove.Context()  # kept, since it takes its channels along
         try:
             self._server = foxglove.start_server(
@@ -81,16 +81,16 @@ class FoxgloveServer:
         """Address of the server."""
         return self._server.port
 
-    def take(self, state: JudgedState | None, told: Mapping[str, Any]) -> None:
+    def take(self, state: JudgedState | None, reported: Mapping[str, Any]) -> None:
         """Publish a state, and its pose if it has one."""
-        stamp = max(0, self._epoch_ns + round(float(told["time"]) * _NS))
-        self._state.log(json_line(dict(told)), log_time=stamp)
-        if state is None or state.lost:
+        stamp = max(0, self._epoch_ns + round(float(reported["time"]) * _NS))
+        self._state.log(json_line(dict(reported)), log_time=stamp)
+        if state is None or state.is_lost:
             return
-        found, make = odometry_of(state, self._epoch_ns), self._messages
-        x, y, z = found.position_world.tolist()
+        result, make = odometry_of(state, self._epoch_ns), self._messages
+        x, y, z = result.position_world.tolist()
         place = make.Vector3(x=x, y=y, z=z)
-        w, x, y, z = found.quaternion.tolist()
+        w, x, y, z = result.quaternion.tolist()
         turn, when = make.Quaternion(x=x, y=y, z=z, w=w), make.Timestamp(*divmod(stamp, _NS))
         pose = make.PoseInFrame(
             timestamp=when,
@@ -114,7 +114,7 @@ class FoxgloveServer:
         self._server.stop()
 
 
-def _parted(address: str) -> tuple[str, int]:
+def _host_and_port(address: str) -> tuple[str, int]:
     """Return host and port of ``[HOST:]PORT``.
 
     Raises

@@ -18,7 +18,7 @@ from magfusion.model.samples import ImuSamples
 from magfusion.model.strapdown import resting
 from magfusion.model.trajectory import Trajectory
 from magfusion.results.figures import DETERMINED_RATIO
-from magfusion.results.observability import Observability, parameter_names
+from magfusion.results.observability import CalibrationObservability, parameter_names
 from magfusion.units import DEGREE, Array, BoolArray
 
 HARDLY_TURNED = 15.0  # deg, root mean square about an axis
@@ -72,10 +72,10 @@ def motion_coverage(
         cosine = (offset / distance) @ (mean / max(float(np.linalg.norm(mean)), 1e-12))
         nearest[beacon.name] = float(np.min(distance))
         spread[beacon.name] = float(np.max(np.arccos(np.clip(cosine, -1.0, 1.0))) / DEGREE)
-    turned = Rotation.from_matrix(states.world_from_body)
+    rotated = Rotation.from_matrix(states.world_from_body)
     motion = calibration.site.platform.motion
     still = resting(imu.time, imu.gyro_body, imu.accel_body, motion=motion)
-    away = (turned.mean().inv() * turned).as_rotvec() / DEGREE
+    away = (rotated.mean().inv() * rotated).as_rotvec() / DEGREE
     return MotionCoverage(
         nearest=nearest,
         spread_deg=spread,
@@ -89,12 +89,12 @@ def missing_motion(
     covered: MotionCoverage,
     calibration: Calibration,
     blocks: tuple[Block, ...],
-    found: Observability,
+    coverage: CalibrationObservability,
 ) -> list[str]:
     """Return sentences on the motion that would determine open parameters, except gauges."""
-    open_ = _open(calibration, blocks, found)
+    open_ = _open(calibration, blocks, coverage)
     out = [_of_beacon(covered, b.name, open_.get(b.name, [])) for b in calibration.site.beacons]
-    out += [_of_turning(covered, blocks, found), _of_extent(covered, blocks, found)]
+    out += [_of_turning(covered, blocks, coverage), _of_extent(covered, blocks, coverage)]
     if covered.rest_share < FEW_RESTS:
         out.append(
             "The platform was never stationary: the IMU's biases, and with them the vertical, are"
@@ -103,13 +103,13 @@ def missing_motion(
     return [sentence for sentence in out if sentence]
 
 
-def _is_open(found: Observability, columns: slice) -> BoolArray:
+def _is_open(coverage: CalibrationObservability, columns: slice) -> BoolArray:
     """Return which parameters of a block the log does not determine, apart from gauges."""
-    return np.nan_to_num(found.ratio_but_for_gauge[columns]) > DETERMINED_RATIO
+    return np.nan_to_num(coverage.ratio_but_for_gauge[columns]) > DETERMINED_RATIO
 
 
 def _open(
-    calibration: Calibration, blocks: tuple[Block, ...], found: Observability
+    calibration: Calibration, blocks: tuple[Block, ...], coverage: CalibrationObservability
 ) -> dict[str, list[str]]:
     """Return each beacon's undetermined parameters with their sigmas, weakest first."""
     names, prior = parameter_names(blocks, calibration), prior_sigma(blocks)
@@ -119,9 +119,9 @@ def _open(
         if not (isinstance(parameter, BeaconParameter) and parameter.declared):
             continue
         rows = np.arange(block.columns.start, block.columns.stop)
-        for row in rows[_is_open(found, block.columns)]:
+        for row in rows[_is_open(coverage, block.columns)]:
             name, unit, scale = names[row]
-            ratio = float(found.ratio_but_for_gauge[row])
+            ratio = float(coverage.ratio_but_for_gauge[row])
             short = name.replace(f" of beacon {block.owner}", "")
             text = f"{short} ({ratio * prior[row] / scale:.2g} {unit})"
             listed.setdefault(block.owner, []).append((ratio, text))
@@ -139,12 +139,14 @@ def _of_beacon(covered: MotionCoverage, name: str, open_: list[str]) -> str:
     )
 
 
-def _of_turning(covered: MotionCoverage, blocks: tuple[Block, ...], found: Observability) -> str:
+def _of_turning(
+    covered: MotionCoverage, blocks: tuple[Block, ...], coverage: CalibrationObservability
+) -> str:
     hardly = np.flatnonzero(covered.turned_deg < HARDLY_TURNED)
     waiting = [
         block.parameter.by_turning
         for block in blocks
-        if block.parameter.by_turning and np.any(_is_open(found, block.columns))
+        if block.parameter.by_turning and np.any(_is_open(coverage, block.columns))
     ]
     if not waiting or not len(hardly):
         return ""
@@ -156,12 +158,14 @@ def _of_turning(covered: MotionCoverage, blocks: tuple[Block, ...], found: Obser
     )
 
 
-def _of_extent(covered: MotionCoverage, blocks: tuple[Block, ...], found: Observability) -> str:
+def _of_extent(
+    covered: MotionCoverage, blocks: tuple[Block, ...], coverage: CalibrationObservability
+) -> str:
     """Return the axes of little motion, if positions of beacons along them are undetermined."""
     waiting = np.zeros(3, dtype=bool)
     for block in blocks:
         if block.parameter == BEACON_POSITION:
-            waiting |= _is_open(found, block.columns)
+            waiting |= _is_open(coverage, block.columns)
     hardly = np.flatnonzero(waiting & (covered.extent_world < HARDLY_MOVED))
     if not len(hardly):
         return ""

@@ -17,7 +17,7 @@ from magfusion.results.gauge import Gauge, gauges
 from magfusion.units import Array
 
 WEAKEST = 5  # directions that are put in words
-NOTHING_SAID = 0.95  # ratio from which directions are alike, so that they may be mixed at will
+DEGENERATE_RATIO = 0.95  # ratio from which directions are alike, so that they may be mixed at will
 SHARE_NAMED = 0.08  # of a direction's square, from which a parameter is named
 MOST_NAMED = 4
 SMALLEST_LISTED = 1e-4  # m, rad or relative; a common shift below it is of no interest
@@ -39,7 +39,7 @@ class Weakness(NamedTuple):
     direction: Array
 
 
-class Observability(NamedTuple):
+class CalibrationObservability(NamedTuple):
     """Observability of the calibration.
 
     Parameters
@@ -68,7 +68,9 @@ class Observability(NamedTuple):
         return int(np.sum(self.direction_ratio < DETERMINED_RATIO))
 
 
-def observability(calibration: Calibration, blocks: tuple[Block, ...], cov: Array) -> Observability:
+def observability(
+    calibration: Calibration, blocks: tuple[Block, ...], cov: Array
+) -> CalibrationObservability:
     """Compare the posterior of a calibration with its prior.
 
     Parameters
@@ -84,13 +86,13 @@ def observability(calibration: Calibration, blocks: tuple[Block, ...], cov: Arra
     scaled = cov / prior[:, None] / prior
     size = dimension(blocks)
     known, nearly, basis = _open_gauge(calibration, blocks, scaled, prior)
-    left = np.eye(size) - basis @ basis.T
-    reduced = left @ scaled @ left
-    share = np.diagonal(left)
+    remaining = np.eye(size) - basis @ basis.T
+    reduced = remaining @ scaled @ remaining
+    share = np.diagonal(remaining)
     share = np.where(share > 1e-6, share, np.nan)
     others = _weakest(blocks, calibration, scaled, basis, prior)
     value = np.linalg.eigvalsh(scaled) if size else np.zeros(0)
-    return Observability(
+    return CalibrationObservability(
         ratio=np.sqrt(np.diagonal(scaled)),
         ratio_but_for_gauge=np.sqrt(np.diagonal(reduced) / share),
         direction_ratio=np.sqrt(np.maximum(value, 0.0)),
@@ -160,13 +162,13 @@ def _weakest(
     size = len(prior)
     if size == gauge.shape[1]:
         return ()
-    beside = np.linalg.svd(np.column_stack([gauge, np.zeros(size)]), full_matrices=True)[0]
-    beside = beside[:, gauge.shape[1] :]
-    value, vector = np.linalg.eigh(beside.T @ scaled @ beside)
-    ratio, column = np.sqrt(np.maximum(value, 0.0))[::-1], (beside @ vector)[:, ::-1]
-    alike = int(np.sum(ratio > NOTHING_SAID))
-    if alike > 1:
-        column = np.column_stack([_simplest(column[:, :alike]), column[:, alike:]])
+    others = np.linalg.svd(np.column_stack([gauge, np.zeros(size)]), full_matrices=True)[0]
+    others = others[:, gauge.shape[1] :]
+    value, vector = np.linalg.eigh(others.T @ scaled @ others)
+    ratio, column = np.sqrt(np.maximum(value, 0.0))[::-1], (others @ vector)[:, ::-1]
+    shared = int(np.sum(ratio > DEGENERATE_RATIO))
+    if shared > 1:
+        column = np.column_stack([_simplest(column[:, :shared]), column[:, shared:]])
         ratio = np.sqrt(np.einsum("ik,ij,jk->k", column, scaled, column))
     open_ = np.flatnonzero(ratio > DETERMINED_RATIO)
     order = open_[np.argsort(-ratio[open_], kind="stable")][:WEAKEST]
@@ -185,10 +187,10 @@ def _simplest(basis: Array, rounds: int = 50) -> Array:
     """Return a basis of the same space whose vectors have few large components each (varimax)."""
     turn = np.eye(basis.shape[1])
     for _ in range(rounds):
-        turned = basis @ turn
-        target = turned**3 - turned * np.mean(turned**2, axis=0)
-        left, _, right = np.linalg.svd(basis.T @ target)
-        turn = left @ right
+        rotated = basis @ turn
+        target = rotated**3 - rotated * np.mean(rotated**2, axis=0)
+        remaining, _, right = np.linalg.svd(basis.T @ target)
+        turn = remaining @ right
     return basis @ turn
 
 
@@ -197,7 +199,7 @@ def parameter_names(
 ) -> list[tuple[str, str, float]]:
     """Return the name of each parameter, its unit, and the size of the unit in SI."""
     return [
-        (b.parameter.called(calibration.site, b.owner, i), *b.parameter.spoken)
+        (b.parameter.called(calibration.site, b.owner, i), *b.parameter.display_unit)
         for b in blocks
         for i in range(len(b.sigma))
     ]
@@ -213,10 +215,10 @@ def _in_words(
     moved = ratio * column * prior
     parts = [(column[k] ** 2, moved[k], *names[k]) for k in range(len(column))]
     for block in blocks[::-1]:
-        if block.parameter == LOG_MOMENT and _alike(moved[block.columns]):
+        if block.parameter == LOG_MOMENT and _are_degenerate(moved[block.columns]):
             share, mean = np.sum(column[block.columns] ** 2), np.mean(moved[block.columns])
             words = f"the moments of beacon {block.owner}"
-            parts[block.columns] = [(share, mean, words, *LOG_MOMENT.spoken)]
+            parts[block.columns] = [(share, mean, words, *LOG_MOMENT.display_unit)]
     parts.sort(key=lambda part: -part[0])
     named = [part for part in parts[:MOST_NAMED] if part[0] > SHARE_NAMED] or parts[:1]
     sign = np.sign(named[0][1]) or 1.0
@@ -225,7 +227,7 @@ def _in_words(
     return f"{listed} (sigma {ratio:.2f} of the survey's)"
 
 
-def _alike(values: Array) -> bool:
+def _are_degenerate(values: Array) -> bool:
     """Return whether the coils of a beacon move together."""
     low, high = np.min(values), np.max(values)
     return len(values) > 1 and bool(low * high > 0.0 and abs(low - high) < 0.5 * abs(low + high))

@@ -12,7 +12,7 @@ from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.odometry_bag import UNKNOWN_VARIANCE
 from magfusion.results import ros_messages as ros
 from magfusion.results.odometry import Odometry, odometry_of
-from magfusion.results.ros_messages import Odometry as Message
+from magfusion.results.ros_messages import OdometryMessage as Message
 
 _TOPIC = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 _LAST_DOMAIN = 232  # its ports are the last ones that there are
@@ -33,7 +33,7 @@ def odometry_message(odometry: Odometry, frame: str, child: str) -> Any:
     w, x, y, z = odometry.quaternion.tolist()
     pose = ros.Pose(ros.Point(*odometry.position_world.tolist()), ros.Quaternion(x, y, z, w))
     twist = ros.Twist(ros.Vector3(*odometry.velocity_body.tolist()), ros.Vector3(0.0, 0.0, 0.0))
-    return ros.Odometry(
+    return ros.OdometryMessage(
         ros.Header(ros.Time(*divmod(odometry.stamp_ns, _NS)), frame),
         child,
         ros.PoseWithCovariance(pose, odometry.pose_cov.ravel().tolist()),
@@ -74,7 +74,7 @@ class RosPublisher:
                 "--ros2: cyclonedds is not installed; pip install 'magfusion[ros2]'"
             ) from error
         # Reliable, since ROS subscribers request that, but it never blocks.
-        asked = Qos(
+        requested = Qos(
             Policy.Reliability.Reliable(max_blocking_time=duration(seconds=0)),
             Policy.History.KeepLast(_DEPTH),
             Policy.Durability.Volatile,
@@ -82,7 +82,7 @@ class RosPublisher:
         try:
             self._participant = DomainParticipant(domain)
             self._writer = DataWriter(
-                self._participant, Topic(self._participant, f"rt{topic}", Message), qos=asked
+                self._participant, Topic(self._participant, f"rt{topic}", Message), qos=requested
             )
         except DDSException as error:
             raise InputError(
@@ -92,9 +92,9 @@ class RosPublisher:
         self._refusal, self._epoch_ns, self._frames = DDSException, epoch_ns, (frame, child)
         self._unsent, self._why = 0, ""
 
-    def take(self, state: JudgedState | None, _told: Mapping[str, Any]) -> None:
+    def take(self, state: JudgedState | None, _reported: Mapping[str, Any]) -> None:
         """Publish a state that is not lost."""
-        if state is None or state.lost:
+        if state is None or state.is_lost:
             return
         try:
             self._writer.write(odometry_message(odometry_of(state, self._epoch_ns), *self._frames))

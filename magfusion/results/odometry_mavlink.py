@@ -34,7 +34,7 @@ def quality_percent(state: JudgedState) -> int:
     return max(1, int(share * 100.0 / (1.0 + level)))
 
 
-def odometry_message(odometry: Odometry, quality: int, resets: int) -> Any:
+def odometry_message(odometry: Odometry, quality: int, discontinuities: int) -> Any:
     """Return a message ODOMETRY, from MAV_FRAME_BODY_FRD to MAV_FRAME_LOCAL_FRD.
 
     Both frames are ours rotated by half a turn about x.  The local one has an arbitrary heading, as
@@ -42,7 +42,7 @@ def odometry_message(odometry: Odometry, quality: int, resets: int) -> Any:
 
     Parameters
     ----------
-    resets : int
+    discontinuities : int
         Number of jumps of the estimate.
     """
     from pymavlink.dialects.v20 import common
@@ -60,7 +60,7 @@ def odometry_message(odometry: Odometry, quality: int, resets: int) -> Any:
         *(3 * [float("nan")]),
         (np.tile(_FRD_COV, (2, 2)) * odometry.pose_cov)[_UPPER].tolist(),
         velocity_cov[_UPPER].tolist(),
-        reset_counter=resets % 256,
+        reset_counter=discontinuities % 256,
         # There is no type for magnetic beacons, and PX4 rejects all but vision.
         estimator_type=common.MAV_ESTIMATOR_TYPE_VIO,
         quality=quality,
@@ -101,17 +101,17 @@ class MavlinkSender:
         self._common, self._epoch_ns, self._beat = common, epoch_ns, -np.inf
         self._unsent, self._why = 0, ""
 
-    def take(self, state: JudgedState | None, told: Mapping[str, Any]) -> None:
+    def take(self, state: JudgedState | None, reported: Mapping[str, Any]) -> None:
         """Send the messages of a state; for a lost one only the heartbeat, without odometry."""
-        found = state if state is not None and not state.lost else None
-        time = float(told["time"])
+        result = state if state is not None and not state.is_lost else None
+        time = float(reported["time"])
         if not self._beat <= time < self._beat + HEARTBEAT:
             self._mav.send(self._heartbeat(state))
             self._beat = time
-        if found is not None:
-            odometry = odometry_of(found, self._epoch_ns)
-            quality = quality_percent(found)
-            self._mav.send(odometry_message(odometry, quality, found.reset_counter))
+        if result is not None:
+            odometry = odometry_of(result, self._epoch_ns)
+            quality = quality_percent(result)
+            self._mav.send(odometry_message(odometry, quality, result.reset_counter))
 
     def write(self, message: bytes) -> None:
         """Send the bytes of a message, or count it as unsent."""
@@ -131,7 +131,7 @@ class MavlinkSender:
         common = self._common
         status = common.MAV_STATE_CALIBRATING
         if state is not None:
-            status = common.MAV_STATE_CRITICAL if state.lost else common.MAV_STATE_ACTIVE
+            status = common.MAV_STATE_CRITICAL if state.is_lost else common.MAV_STATE_ACTIVE
         kind, pilot = common.MAV_TYPE_ONBOARD_CONTROLLER, common.MAV_AUTOPILOT_INVALID
         return common.MAVLink_heartbeat_message(kind, pilot, 0, 0, status, 3)
 
@@ -151,11 +151,11 @@ def _resolved(address: str) -> tuple[int, Any]:
             " udpout:192.168.4.1:14540"
         )
     try:
-        found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)
+        result = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as error:
         raise InputError(
             f"--mavlink {address!r}: the host {host} is unknown"
             f" ({getattr(error, 'strerror', None) or error}); give its IP address"
         ) from error
-    family, _, _, _, to = found[0]
+    family, _, _, _, to = result[0]
     return family, to

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 
-from magfusion.results.figures import Estimate, Figures, Section, Value
+from magfusion.results.figures import Figures, ParameterEstimate, Section, Value
 from magfusion.results.page_motion import (
-    Motion,
+    MotionPage,
     error_section,
     excluded_rows,
     path_section,
@@ -60,12 +60,12 @@ _CAPTIONS = {
 }
 
 
-def write_page(directory: Path, figures: Figures, motion: Motion | None = None) -> None:
+def write_page(directory: Path, figures: Figures, motion: MotionPage | None = None) -> None:
     """Write ``report.html`` with the pictures (``.png``) in the directory.
 
     Parameters
     ----------
-    motion : Motion, optional
+    motion : MotionPage, optional
         The estimated motion, if any.
     """
     blocks = _head(figures)
@@ -135,8 +135,8 @@ def _section(heading: str, content: str) -> str:
 
 def _verdict(figures: Figures, unjudged: str) -> str:
     if "verdict" not in figures:
-        said = f"<strong>NO VERDICT</strong><p>{escape(unjudged)}</p>"
-        return f'<div class="verdict none">{said}</div>'
+        messages = f"<strong>NO VERDICT</strong><p>{escape(unjudged)}</p>"
+        return f'<div class="verdict none">{messages}</div>'
     verdict = str(figures["verdict"])
     reasons = [_finding(one) for one in findings(figures, "reasons")]
     reasons += [f"Noticed: {_finding(one)}" for one in findings(figures, "remarks")]
@@ -163,12 +163,12 @@ def _unverified(figures: Figures) -> str:
     ]
     if not rows:
         return ""
-    said = (
+    messages = (
         "<p>These parameters are fixed at their declared values. If one of them were wrong by its"
         " declared sigma, the data would not show it, and the pose would be wrong by:</p>"
     )
     head = ["parameter", "declared sigma", "position (mm)", "attitude (deg)"]
-    return said + _table([head, *rows])
+    return messages + _table([head, *rows])
 
 
 def _main(figures: Figures) -> str:
@@ -181,7 +181,7 @@ def _main(figures: Figures) -> str:
 
 def _calibration(figures: Figures) -> str:
     """Return the estimate of each parameter before and after, starting at its declared value."""
-    estimates = [f for f in figures.all if isinstance(f, Estimate)]
+    estimates = [f for f in figures.all if isinstance(f, ParameterEstimate)]
     if not estimates:
         return ""
     head = ["parameter", "before", "after", "change in sigmas", "determined by these data"]
@@ -194,16 +194,16 @@ def _calibration(figures: Figures) -> str:
         if change is not None and abs(change) > FAR:
             far.add(len(rows))
         after = f"{_value(one, one.change)} ± {number_text(one.sigma, 2)}"
-        told = "" if change is None else f"{change:+.2f}"
-        rows.append([one.key, before, after, told, "yes" if one.determined else "no"])
-    said = (
+        reported = "" if change is None else f"{change:+.2f}"
+        rows.append([one.key, before, after, reported, "yes" if one.determined else "no"])
+    findings = (
         "<p>Each with one sigma; the change is in sigmas of the declared value, and marked beyond"
         f" {FAR:g}. Parameters that these data do not determine keep their uncertainty.</p>"
     )
-    return said + _table([head, *rows], far)
+    return findings + _table([head, *rows], far)
 
 
-def _value(one: Estimate, change: float) -> str:
+def _value(one: ParameterEstimate, change: float) -> str:
     """Return a parameter after a change, to the second digit of its smaller sigma."""
     sigma = min(filter(None, (one.sigma, one.prior_sigma)), default=0.0)
     if one.declared is None:
@@ -211,7 +211,7 @@ def _value(one: Estimate, change: float) -> str:
     return as_sure(one.declared + change, sigma).removeprefix("+")
 
 
-def _refused(figures: Figures, motion: Motion | None) -> str:
+def _refused(figures: Figures, motion: MotionPage | None) -> str:
     rows = [[labelled(f), number_text(f.value)] for f in figures.all if f.refused and f.value]
     rows += [[what, str(n)] for what, n in ([] if motion is None else excluded_rows(motion))]
     if rows:
@@ -220,12 +220,12 @@ def _refused(figures: Figures, motion: Motion | None) -> str:
 
 
 def _notes(figures: Figures) -> list[str]:
-    said = list(notes(figures))
+    findings = list(notes(figures))
     for figure in figures.all:
         if figure.section in (Section.REMARKS, Section.DIRECTIONS):
-            said += sentences(figure)
-        said += [figure.remark] if figure.remark else []
-    return said
+            findings += sentences(figure)
+        findings += [figure.remark] if figure.remark else []
+    return findings
 
 
 def _pictures(directory: Path, room: int) -> str:

@@ -10,7 +10,7 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import StateTrust
 from magfusion.results.errors import TrajectoryErrors
-from magfusion.results.plots.chart import Band, Chart, Line, Mark, svg
+from magfusion.results.plots.chart import Chart, ChartBand, ChartLine, ChartMark, svg
 from magfusion.units import DEGREE, Array
 
 TIME = "time (s)"
@@ -20,7 +20,7 @@ _GAP = 10.0  # times the usual step; a line across it would invent states
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class MotionPage:
     """A trajectory with its results; as `magfusion.results.recording.write_recording`.
 
     Parameters
@@ -38,39 +38,39 @@ class Motion:
     residual: Array | None = None
 
 
-def path_section(motion: Motion) -> str:
+def path_section(motion: MotionPage) -> str:
     """Return plan and height."""
     _, away = _beacons_near(motion)
     note = f"<p>Outside the plan: {escape(', '.join(away))}.</p>" if away else ""
     return f"{_charts(path_charts(motion))}{note}"
 
 
-def path_charts(motion: Motion) -> list[Chart]:
+def path_charts(motion: MotionPage) -> list[Chart]:
     """Return plan and height, with the truth where there is one."""
     time, position = motion.states.time, _interrupted(motion.states)
-    lines = [Line(position[:, 0], position[:, 1], "estimate")]
-    upright = [Line(time, position[:, 2], "estimate")]
+    lines = [ChartLine(position[:, 0], position[:, 1], "estimate")]
+    upright = [ChartLine(time, position[:, 2], "estimate")]
     truth = _truth_within(motion)
     if truth is not None:
         path = truth.position_world
-        lines.append(Line(path[:, 0], path[:, 1], "truth", "truth"))
-        upright.append(Line(truth.time, path[:, 2], "truth", "truth"))
+        lines.append(ChartLine(path[:, 0], path[:, 1], "truth", "truth"))
+        upright.append(ChartLine(truth.time, path[:, 2], "truth", "truth"))
     beacons, _ = _beacons_near(motion)
     first = motion.states.position_world[0]
-    start = Mark(float(first[0]), float(first[1]), "start", "start")
+    start = ChartMark(float(first[0]), float(first[1]), "start", "start")
     plan = Chart("Plan", "x (m)", "y (m)", tuple(lines), marks=(*beacons, start), equal=True)
-    bands: tuple[Band, ...] = ()
+    bands: tuple[ChartBand, ...] = ()
     high, limits = motion.states.position_world[:, 2], None
     if motion.states.pose_cov is not None:
         sigma, _ = _sigmas(motion.states.pose_cov, motion.states.world_from_body)
-        bands = (Band(time, high - 3.0 * sigma[:, 2], high + 3.0 * sigma[:, 2], "3 sigma"),)
-        room = 0.05 * float(np.ptp(high)) + 3.3 * _most(sigma[:, 2], 95.0) + 1e-3
+        bands = (ChartBand(time, high - 3.0 * sigma[:, 2], high + 3.0 * sigma[:, 2], "3 sigma"),)
+        room = 0.05 * float(np.ptp(high)) + 3.3 * _upper_percentile(sigma[:, 2], 95.0) + 1e-3
         limits = (float(high.min()) - room, float(high.max()) + room)
     height = Chart("Height", TIME, "z (m)", tuple(upright), bands, y_limits=limits)
     return [plan, height]
 
 
-def error_section(motion: Motion) -> tuple[str, str]:
+def error_section(motion: MotionPage) -> tuple[str, str]:
     """Return heading and charts of the errors, or of the sigmas where there is no truth."""
     if motion.errors is not None:
         return "Errors against the truth", _charts([*_of_axes(motion.errors), *size_charts(motion)])
@@ -85,26 +85,28 @@ def error_section(motion: Motion) -> tuple[str, str]:
     )
 
 
-def residual_section(motion: Motion) -> str:
+def residual_section(motion: MotionPage) -> str:
     """Return a chart for each beacon, all with one scale, so that the worst is visible."""
-    found = {f"Beacon {name}": rows for name, rows in (motion.innovations or {}).items()}
+    result = {f"Beacon {name}": rows for name, rows in (motion.innovations or {}).items()}
     if motion.residual is not None:
-        found["All beacons together"] = (motion.states.time, motion.residual)
-    if not found:
+        result["All beacons together"] = (motion.states.time, motion.residual)
+    if not result:
         return ""
-    most = max(3.0, 1.3 * _most(np.concatenate([rms for _, rms in found.values()]), 99.5))
+    maximum = max(
+        3.0, 1.3 * _upper_percentile(np.concatenate([rms for _, rms in result.values()]), 99.5)
+    )
     charts = []
-    for title, (time, rms) in list(found.items())[:MOST_BEACONS]:
+    for title, (time, rms) in list(result.items())[:MOST_BEACONS]:
         ends = time[[0, -1]]
         lines = (
-            Line(ends, np.ones(2), "", "expected"),
-            Line(time, rms, "", dots=True),
+            ChartLine(ends, np.ones(2), "", "expected"),
+            ChartLine(time, rms, "", dots=True),
         )
         charts.append(
-            Chart(title, TIME, "residual", lines, y_limits=(0.0, most), width=330, height=190)
+            Chart(title, TIME, "residual", lines, y_limits=(0.0, maximum), width=330, height=190)
         )
-    left = len(found) - len(charts)
-    more = f"<p>{left} more beacons are in run.rrd.</p>" if left else ""
+    remaining = len(result) - len(charts)
+    more = f"<p>{remaining} more beacons are in run.rrd.</p>" if remaining else ""
     return (
         "<p>Residuals of the fields, in units of their declared sigma: about 1 (the line) where"
         " noise and model are as declared; values above the frame are drawn at its edge.</p>"
@@ -113,7 +115,7 @@ def residual_section(motion: Motion) -> str:
     )
 
 
-def excluded_rows(motion: Motion) -> list[tuple[str, int]]:
+def excluded_rows(motion: MotionPage) -> list[tuple[str, int]]:
     """Return the number of states in which each beacon was excluded."""
     counts: dict[str, int] = {}
     for names in () if motion.trust is None else motion.trust.excluded:
@@ -146,17 +148,19 @@ def _of_axes(errors: TrajectoryErrors) -> list[Chart]:
 
 
 def _error(title: str, unit: str, time: Array, value: Array, sigma: Array | None) -> Chart:
-    bands = () if sigma is None else (Band(time, -3.0 * sigma, 3.0 * sigma, "3 sigma"),)
-    line = Line(time, value, "error", "error")
-    reach = _most(np.abs(value), 100.0)
+    bands = () if sigma is None else (ChartBand(time, -3.0 * sigma, 3.0 * sigma, "3 sigma"),)
+    line = ChartLine(time, value, "error", "error")
+    reach = _upper_percentile(np.abs(value), 100.0)
     if sigma is not None:
-        reach = max(reach, 3.0 * _most(sigma, 95.0))  # an open direction's would hide all others
+        reach = max(
+            reach, 3.0 * _upper_percentile(sigma, 95.0)
+        )  # an open direction's would hide all others
     limits = (-1.1 * reach, 1.1 * reach) if reach > 0.0 else None
     label = f"error ({unit})"
     return Chart(title, TIME, label, (line,), bands, y_limits=limits, width=330, height=200)
 
 
-def size_charts(motion: Motion) -> list[Chart]:
+def size_charts(motion: MotionPage) -> list[Chart]:
     """Return a chart each of position and attitude: error, three sigma and protection level."""
     states, errors, trust = motion.states, motion.errors, motion.trust
     if states.pose_cov is None:
@@ -168,14 +172,14 @@ def size_charts(motion: Motion) -> list[Chart]:
     ):
         largest = _largest(states.pose_cov[:, part, part])
         radius = 3.0 * np.sqrt(np.maximum(largest, 0.0)) / size
-        lines = [Line(states.time, radius, "3 sigma, worst direction", "sigma")]
+        lines = [ChartLine(states.time, radius, "3 sigma, worst direction", "sigma")]
         if trust is not None:
             level = trust.protection_level_m if unit == "m" else trust.protection_level_deg
             if np.any(np.isfinite(level)):
-                lines.append(Line(states.time, level, "protection level", "level"))
+                lines.append(ChartLine(states.time, level, "protection level", "level"))
         if errors is not None:
-            found = np.linalg.norm(errors.pose_body[:, part], axis=1) / size
-            lines.append(Line(errors.time, found, "error", "error"))
+            result = np.linalg.norm(errors.pose_body[:, part], axis=1) / size
+            lines.append(ChartLine(errors.time, result, "error", "error"))
         title = f"{name}: size and bounds"
         charts.append(Chart(title, TIME, unit, tuple(lines), log=True))
     return charts
@@ -199,17 +203,20 @@ def _largest(cov: Array) -> Array:
     return out
 
 
-def _most(values: Array, percentile: float) -> float:
+def _upper_percentile(values: Array, percentile: float) -> float:
     known = values[np.isfinite(values)]
     return float(np.percentile(known, percentile)) if len(known) else 0.0
 
 
 def _unit_of(values: Array, sigma: Array | None) -> tuple[float, str]:
-    largest = max(_most(np.abs(values), 100.0), 0.0 if sigma is None else 3.0 * _most(sigma, 95.0))
+    largest = max(
+        _upper_percentile(np.abs(values), 100.0),
+        0.0 if sigma is None else 3.0 * _upper_percentile(sigma, 95.0),
+    )
     return (1e-3, "mm") if largest < 0.1 else (1.0, "m")
 
 
-def _truth_within(motion: Motion) -> Trajectory | None:
+def _truth_within(motion: MotionPage) -> Trajectory | None:
     truth, time = motion.truth, motion.states.time
     if truth is None:
         return None
@@ -230,7 +237,7 @@ def _interrupted(states: Trajectory) -> Array:
     return position
 
 
-def _beacons_near(motion: Motion) -> tuple[list[Mark], list[str]]:
+def _beacons_near(motion: MotionPage) -> tuple[list[ChartMark], list[str]]:
     """Return the beacons inside the plan, and a note on the others."""
     path = motion.states.position_world[:, :2]
     low, high = path.min(axis=0), path.max(axis=0)
@@ -239,7 +246,7 @@ def _beacons_near(motion: Motion) -> tuple[list[Mark], list[str]]:
     for beacon in motion.site.beacons:
         x, y, z = beacon.position_world.tolist()
         if np.all(np.abs([x, y] - 0.5 * (low + high)) < reach):
-            shown.append(Mark(x, y, beacon.name))
+            shown.append(ChartMark(x, y, beacon.name))
         else:
             away.append(f"beacon {beacon.name} at ({x:.4g}, {y:.4g}, {z:.4g}) m")
     return shown, away

@@ -11,9 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magfusion.estimation.posterior.separation import Separation, protection_levels
-from magfusion.model.audibility import owned_at
+from magfusion.model.detection_range import owned_at
 from magfusion.model.field import model_error_cov
-from magfusion.model.noise import alike_beside, model_error, paired_whitening, sensors_at
+from magfusion.model.noise import (
+    magnetometers_sharing_error,
+    model_error,
+    paired_whitening,
+    sensors_at,
+)
 from magfusion.model.parameters import PHASE, Block, Calibration, linearize_channels
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.site import Site
@@ -103,7 +108,7 @@ def whitened(
     each = [owned_at(site, place).channels for place in np.swapaxes(sensor_world, 0, 1)]
     owned = np.concatenate(each, axis=1)
     if site.platform.further:
-        error = error * np.sqrt(alike_beside(site, owned))
+        error = error * np.sqrt(magnetometers_sharing_error(site, owned))
     cov = noise + model_error_cov(phasor, error)
     sqrt_information = paired_whitening(cov, owned)
     strong = np.linalg.norm(value, axis=2) > DETECTION_CHI_SQUARE * np.sqrt(variance)
@@ -127,10 +132,10 @@ def is_free(blocks: tuple[Block, ...]) -> BoolArray:
 
 def prior_of(site: Site, blocks: tuple[Block, ...]) -> tuple[Array, Array]:
     """Return the scale from unit nuisances, and the prior rows of these about zero."""
-    free = is_free(blocks)
+    free_parameters = is_free(blocks)
     spread = prior_sqrt_covariance(site, blocks)
-    spread[free, free] = 1.0
-    return spread, np.diag((~free).astype(float))
+    spread[free_parameters, free_parameters] = 1.0
+    return spread, np.diag((~free_parameters).astype(float))
 
 
 def root_information(seen: PoseRows, spread: Array, prior: Array, shared: int = 0) -> Array:
@@ -149,10 +154,10 @@ def root_information(seen: PoseRows, spread: Array, prior: Array, shared: int = 
     -------
     ndarray, shape (n, k, shared + 6)
     """
-    told = np.any(seen.by_nuisance, axis=(0, 1)) | np.any(prior, axis=0)
-    told[len(told) - shared :] = True
+    reported = np.any(seen.by_nuisance, axis=(0, 1)) | np.any(prior, axis=0)
+    reported[len(reported) - shared :] = True
     # A column of zeros would use a row of the triangle that others need.
-    by_nuisance, prior = (seen.by_nuisance @ spread)[..., told], prior[:, told]
+    by_nuisance, prior = (seen.by_nuisance @ spread)[..., reported], prior[:, reported]
     count, _, width = by_nuisance.shape
     known = np.zeros((count, len(prior), width + seen.by_pose.shape[-1]))
     known[:, :, :width] = prior

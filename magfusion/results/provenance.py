@@ -81,11 +81,11 @@ def versions() -> str:
 
 def input_files(run: Run) -> list[tuple[str, int, str]]:
     """Return name, size (bytes) and SHA-256 of the input files, also those in directories."""
-    found = []
+    result = []
     for path in run.inputs:
         own = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
-        found += [p for p in own if p.is_file()]
-    return [(str(p), p.stat().st_size, _sha256(p)) for p in found[:MOST_FILES]]
+        result += [p for p in own if p.is_file()]
+    return [(str(p), p.stat().st_size, _sha256(p)) for p in result[:MOST_FILES]]
 
 
 def _sha256(path: Path) -> str:

@@ -63,7 +63,7 @@ COVERAGE = 1e-6  # T, RMS, on the shell drawn around a beacon
 
 _ESTIMATE = (70, 170, 255)
 _TRUTH = (110, 220, 120)
-_CARRIED = (250, 200, 90)
+_PROPAGATED = (250, 200, 90)
 
 
 def write_recording(
@@ -76,7 +76,7 @@ def write_recording(
     innovations: Mapping[str, tuple[Array, Array]] | None = None,
     trust: Trust | None = None,
     states: StateTrust | None = None,
-    carried: Trajectory | None = None,
+    propagated: Trajectory | None = None,
 ) -> None:
     """Write a recording with its layout, complete or not at all.
 
@@ -97,16 +97,16 @@ def write_recording(
         The verdict and its reasons, shown above all views.
     states : StateTrust, optional
         Of the states of the trajectory: protection levels and doubtful states.
-    carried : Trajectory, optional
+    propagated : Trajectory, optional
         The states between those of the trajectory: the body moves along them.
     """
     scale = scene_scale(site, trajectory)
     with whole_recording(path, real(path).parent.name) as recording:
         log_beacons(recording, site, scale)
         _log_path(recording, "world/estimate", trajectory, _ESTIMATE, 1.2)
-        _log_body(recording, trajectory if carried is None else carried, scale)
-        if carried is not None:
-            _log_path(recording, "world/carried", carried, _CARRIED, 0.6)
+        _log_body(recording, trajectory if propagated is None else propagated, scale)
+        if propagated is not None:
+            _log_path(recording, "world/carried", propagated, _PROPAGATED, 0.6)
         _log_sigmas(recording, trajectory, scale)
         if truth is not None:
             _log_path(recording, "world/truth", truth, _TRUTH, 0.8)
@@ -123,7 +123,7 @@ def write_recording(
         if states is not None:
             log_doubtful(recording, trajectory, states, 0.008 * scale.size)
             log_levels(recording, trajectory, states, errors)
-        _log_legend(recording, trajectory, truth is not None, carried is not None, scale)
+        _log_legend(recording, trajectory, truth is not None, propagated is not None, scale)
         drawn = _Drawn(trajectory, errors, innovations or {}, states)
         recording.send_blueprint(_blueprint(site, drawn, scale, banner))
 
@@ -131,19 +131,19 @@ def write_recording(
 def _summary(trajectory: Trajectory, errors: TrajectoryErrors | None) -> str:
     """Return the path's length, its sigmas, and its errors."""
     time = trajectory.time
-    said = [f"{len(time)} poses in {time[-1] - time[0]:.3g} s"]
+    findings = [f"{len(time)} poses in {time[-1] - time[0]:.3g} s"]
     if trajectory.pose_cov is not None:
         widest = [
             3.0 * float(np.sqrt(np.median(np.linalg.eigvalsh(trajectory.pose_cov[:, p, p])[:, -1])))
             for p in (slice(3, 6), slice(0, 3))
         ]
-        said.append(
+        findings.append(
             f"3 sigma {1e3 * widest[0]:.2g} mm and {np.rad2deg(widest[1]):.2g} deg (median)"
         )
     if errors is not None:
         met = f"{1e3 * errors.ate:.2g} mm and {errors.attitude_rmse_deg:.2g} deg"
-        said.append(f"errors {met} rms against the truth")
-    return "; ".join(said)
+        findings.append(f"errors {met} rms against the truth")
+    return "; ".join(findings)
 
 
 def open_viewer(path: Path) -> None:
@@ -191,9 +191,9 @@ def log_beacons(recording: rr.RecordingStream, site: Site, scale: Scale) -> None
         loops = [coil_loop(coil, 0.02 * scale.size) for coil in beacon.coils]
         wires = rr.LineStrips3D(loops, radii=0.0012 * scale.size, colors=colour)
         recording.log(f"{place}/coils", wires, static=True)
-        faint = tuple(channel // 3 for channel in colour)
+        weak = tuple(channel // 3 for channel in colour)
         shell = rr.LineStrips3D(
-            coverage_shell(beacon, COVERAGE), radii=rr.Radius.ui_points(0.6), colors=faint
+            coverage_shell(beacon, COVERAGE), radii=rr.Radius.ui_points(0.6), colors=weak
         )
         recording.log(f"{place}/coverage", shell, static=True)
 
@@ -255,7 +255,7 @@ def _log_legend(
     recording: rr.RecordingStream,
     trajectory: Trajectory,
     has_truth: bool,
-    has_carried: bool,
+    has_propagated: bool,
     scale: Scale,
 ) -> None:
     lines = [
@@ -263,7 +263,7 @@ def _log_legend(
         "|---|---|",
         "| **blue line, box** | estimate; body axes x red, y green, z blue |",
     ]
-    if has_carried:
+    if has_propagated:
         lines.append("| **yellow line** | current states, propagated between field epochs |")
     if has_truth:
         lines.append("| **green beads** | true path, with its gaps |")
@@ -343,5 +343,5 @@ def _blueprint(
     below: rrb.Container | rrb.View = legend
     if lower:
         below = rrb.Horizontal(rrb.Tabs(*lower), legend, column_shares=[1, 1])
-    left = rrb.Vertical(scene_view(site, scale), below, row_shares=[8, 5])
-    return layout(left, rrb.Tabs(*upper), shares=(3, 2), banner=banner)
+    remaining = rrb.Vertical(scene_view(site, scale), below, row_shares=[8, 5])
+    return layout(remaining, rrb.Tabs(*upper), shares=(3, 2), banner=banner)

@@ -19,7 +19,7 @@ _EXTRA = (255, 255, 255)
 
 
 def write_coverage_recording(
-    path: Path, site: Site, found: Coverage, spacing: float, extra: Beacon | None
+    path: Path, site: Site, coverage: Coverage, spacing: float, extra: Beacon | None
 ) -> None:
     """Write a recording of the points, coloured by position sigma, among the beacons.
 
@@ -30,12 +30,12 @@ def write_coverage_recording(
     extra : Beacon, optional
         Best position of one more beacon.
     """
-    places = np.vstack([found.position_world, *(b.position_world for b in site.beacons)])
+    places = np.vstack([coverage.position_world, *(b.position_world for b in site.beacons)])
     low, high = places.min(axis=0), places.max(axis=0)
     scale = Scale(0.5 * (low + high), max(float(np.linalg.norm(high - low)), 1.0), 1)
     with whole_recording(path, "coverage") as recording:
         log_beacons(recording, site, scale)
-        _log_points(recording, found, spacing)
+        _log_points(recording, coverage, spacing)
         if extra is not None:
             mark = rr.Points3D(
                 [extra.position_world],
@@ -44,7 +44,7 @@ def write_coverage_recording(
                 labels="best position of one more beacon",
             )
             recording.log("world/extra_beacon", mark, static=True)
-        legend = rr.TextDocument(_legend(found, extra), media_type=rr.MediaType.MARKDOWN)
+        legend = rr.TextDocument(_legend(coverage, extra), media_type=rr.MediaType.MARKDOWN)
         recording.log("legend", legend, static=True)
         recording.send_blueprint(_blueprint(site, scale))
 
@@ -53,35 +53,37 @@ def _part(colour: str) -> str:
     return colour.replace(" ", "_")
 
 
-def _log_points(recording: rr.RecordingStream, found: Coverage, spacing: float) -> None:
-    kind = colour_of(found)
+def _log_points(recording: rr.RecordingStream, coverage: Coverage, spacing: float) -> None:
+    kind = colour_of(coverage)
     for index, (name, colour) in enumerate(COLOURS.items()):
-        rows = found.determined & (kind == index)
-        centres = found.position_world[rows]
+        rows = coverage.determined & (kind == index)
+        centres = coverage.position_world[rows]
         points = rr.Points3D(centres, radii=0.11 * spacing, colors=colour)
         recording.log(f"world/position_sigma/{_part(name)}", points, static=True)
-        way = 0.35 * spacing * found.worst_world[rows]
+        way = 0.35 * spacing * coverage.worst_world[rows]
         lines = rr.LineStrips3D(
             list(np.stack([centres - way, centres + way], axis=1)),
             radii=rr.Radius.ui_points(0.8),
             colors=colour,
         )
         recording.log(f"world/worst_direction/{_part(name)}", lines, static=True)
-    grey = rr.Points3D(found.position_world[~found.determined], radii=0.07 * spacing, colors=_OPEN)
+    grey = rr.Points3D(
+        coverage.position_world[~coverage.determined], radii=0.07 * spacing, colors=_OPEN
+    )
     recording.log("world/position_sigma/not_determined", grey, static=True)
 
 
-def _legend(found: Coverage, extra: Beacon | None) -> str:
-    between, kind = bounds(found), colour_of(found)
+def _legend(coverage: Coverage, extra: Beacon | None) -> str:
+    between, kind = bounds(coverage), colour_of(coverage)
     lines = ["| drawn | position sigma, three axes together | share |", "|---|---|---|"]
     for index, name in enumerate(COLOURS):
-        share = 100 * np.mean(found.determined & (kind == index))
+        share = 100 * np.mean(coverage.determined & (kind == index))
         if index < len(between):
             interval = f"below {length(between[index])}"
         else:
             interval = f"above {length(between[-1])}"
         lines.append(f"| **{name}** | {interval} | {share:.0f} % |")
-    lines.append(f"| **grey** | not determined | {100 * np.mean(~found.determined):.0f} % |")
+    lines.append(f"| **grey** | not determined | {100 * np.mean(~coverage.determined):.0f} % |")
     lines += [
         "",
         "The Cramér-Rao bound: no estimator is better with one window of the fields alone.",

@@ -76,7 +76,7 @@ def _log_points(
 ) -> None:
     known = np.isfinite(panel.level)
     kind = np.digitize(panel.level, between)
-    where = panel.found.position_world
+    where = panel.coverage.position_world
     for index, (name, colour) in enumerate(COLOURS.items()):
         points = rr.Points3D(where[known & (kind == index)], radii=0.14 * spacing, colors=colour)
         recording.log(f"{place}/level/{name.replace(' ', '_')}", points, static=True)

@@ -8,7 +8,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from magfusion.model.trust import Verdict
-from magfusion.results.drift import HOUR, QUANTITIES, Course, Quantity
+from magfusion.results.drift import HOUR, QUANTITIES, EstimatorPlot, Quantity
 from magfusion.results.recording_file import whole_recording
 from magfusion.results.recording_layout import about_zero, layout, plot, readable_range, span_of
 from magfusion.results.recording_trust import BANNER, banner_text
@@ -21,7 +21,9 @@ _PACE = {_UPDATE: "processor time of an update (ms)", _MEMORY: "memory (MiB)"}
 _SIGMA = [150, 150, 150]
 
 
-def write_drift_recording(path: Path, courses: list[Course], figures: Mapping[str, object]) -> None:
+def write_drift_recording(
+    path: Path, courses: list[EstimatorPlot], figures: Mapping[str, object]
+) -> None:
     """Write a recording of errors, memory and times over the simulated hours."""
     with whole_recording(path, "drift") as recording:
         for course in courses:
@@ -49,7 +51,7 @@ def _banner(figures: Mapping[str, object], notes: list[str]) -> str:
     return banner_text(verdict, [*lines, *(f"- **{note}**" for note in failed)])
 
 
-def _log_errors(recording: rr.RecordingStream, course: Course) -> None:
+def _log_errors(recording: rr.RecordingStream, course: EstimatorPlot) -> None:
     errors = course.errors
     rows = _thinned(len(errors))
     for quantity in QUANTITIES:
@@ -63,25 +65,25 @@ def _log_errors(recording: rr.RecordingStream, course: Course) -> None:
         _send(recording, f"{place}/sigma", errors.time[rows], both, names, [_SIGMA, _SIGMA])
 
 
-def _place(course: Course, quantity: Quantity) -> str:
+def _place(course: EstimatorPlot, quantity: Quantity) -> str:
     return f"{course.name}/{quantity.name}_{quantity.unit}"
 
 
-def _drawn(course: Course, quantity: Quantity) -> tuple[Array, Array]:
+def _drawn(course: EstimatorPlot, quantity: Quantity) -> tuple[Array, Array]:
     """Return the error, shape (n, 3), and three sigmas of its widest axis, in the unit."""
     errors = course.errors
     error = quantity.scale * errors.error[:, quantity.part]
     return error, 3.0 * quantity.scale * np.max(errors.sigma[:, quantity.part], axis=1)
 
 
-def _log_consistency(recording: rr.RecordingStream, course: Course) -> None:
+def _log_consistency(recording: rr.RecordingStream, course: EstimatorPlot) -> None:
     time, levels = _hourly(course)
     for (name, level), colour in zip(levels.items(), _COLOURS, strict=True):
         place = f"{course.name}/consistency/{name}"
         _send(recording, place, time, level[:, None], [name], [colour])
 
 
-def _hourly(course: Course) -> tuple[Array, dict[str, Array]]:
+def _hourly(course: EstimatorPlot) -> tuple[Array, dict[str, Array]]:
     """Return hourly means, the first and the last extended to the ends: one hour is a line too."""
     hours, levels = course.hourly()
     ends = course.errors.time[[0, -1]]
@@ -89,17 +91,17 @@ def _hourly(course: Course) -> tuple[Array, dict[str, Array]]:
     return time, {name: np.pad(level, 1, mode="edge") for name, level in levels.items()}
 
 
-def _log_pace(recording: rr.RecordingStream, course: Course) -> None:
+def _log_pace(recording: rr.RecordingStream, course: EstimatorPlot) -> None:
     for name, (time, values) in _pace(course).items():
         place = f"{course.name}/{name}"
         _send(recording, place, time, values[:, None], [name], [_COLOURS[2]])
 
 
-def _pace(course: Course) -> dict[str, tuple[Array, Array]]:
-    made = course.pace[course.pace[:, 2] > 0.0]
-    made = made[_thinned(len(made))]
-    spent = 1e3 * made[:, 1] / made[:, 2]
-    return {_UPDATE: (made[:, 0], spent), _MEMORY: (made[:, 0], made[:, 3])}
+def _pace(course: EstimatorPlot) -> dict[str, tuple[Array, Array]]:
+    built = course.pace[course.pace[:, 2] > 0.0]
+    built = built[_thinned(len(built))]
+    spent = 1e3 * built[:, 1] / built[:, 2]
+    return {_UPDATE: (built[:, 0], spent), _MEMORY: (built[:, 0], built[:, 3])}
 
 
 def _send(
@@ -119,18 +121,18 @@ def _thinned(count: int) -> slice:
     return slice(None, None, max(1, -(-count // MOST_POINTS)))
 
 
-def _blueprint(courses: list[Course], banner: tuple[str, str]) -> rrb.Blueprint:
+def _blueprint(courses: list[EstimatorPlot], banner: tuple[str, str]) -> rrb.Blueprint:
     tabs = [
         _side_by_side(courses, QUANTITIES[:2], "Position and attitude"),
         _side_by_side(courses, QUANTITIES[2:], "Biases"),
         _own_columns(courses),
     ]
-    judged = rrb.TextDocumentView(origin="judgements", name="Judgements")
-    return layout(rrb.Tabs(*tabs), judged, shares=(3, 1), banner=banner)
+    verdicts = rrb.TextDocumentView(origin="judgements", name="Judgements")
+    return layout(rrb.Tabs(*tabs), verdicts, shares=(3, 1), banner=banner)
 
 
 def _side_by_side(
-    courses: list[Course], quantities: tuple[Quantity, ...], name: str
+    courses: list[EstimatorPlot], quantities: tuple[Quantity, ...], name: str
 ) -> rrb.Horizontal:
     """Return a column per estimator, errors of one quantity on one scale."""
     columns = []
@@ -149,7 +151,7 @@ def _side_by_side(
     return rrb.Horizontal(*columns, name=name)
 
 
-def _own_columns(courses: list[Course]) -> rrb.Horizontal:
+def _own_columns(courses: list[EstimatorPlot]) -> rrb.Horizontal:
     columns = []
     for course in courses:
         span, (_, levels) = span_of(course.errors.time), _hourly(course)
@@ -164,5 +166,5 @@ def _own_columns(courses: list[Course]) -> rrb.Horizontal:
     return rrb.Horizontal(*columns, name="Consistency, time and memory")
 
 
-def _title(course: Course) -> str:
+def _title(course: EstimatorPlot) -> str:
     return course.name.upper() if course.name == "ekf" else course.name.capitalize()

@@ -9,13 +9,13 @@ from magfusion.model.correlation import Correlation, joined
 from magfusion.model.parameters import BeaconParameter, Block, Calibration, difference
 from magfusion.model.prior import parameters_of
 from magfusion.model.site import Site
-from magfusion.results.figures import Estimate, calibration_record
+from magfusion.results.figures import ParameterEstimate, calibration_record
 from magfusion.units import Array
 
 
 def parameter_estimates(
     declared: Calibration, fitted: Calibration, blocks: tuple[Block, ...], cov: Array
-) -> list[Estimate]:
+) -> list[ParameterEstimate]:
     """Return every estimated parameter with its change and its sigmas.
 
     Parameters
@@ -26,7 +26,7 @@ def parameter_estimates(
     change = difference(declared, fitted, blocks)
     sigma = np.sqrt(np.diagonal(cov))
     return [
-        Estimate(
+        ParameterEstimate(
             name,
             float(change[row] / block.parameter.unit.size),
             {"nt": "nT"}.get(block.parameter.unit.text, block.parameter.unit.text),
@@ -68,7 +68,7 @@ def refined_site(
     fitted: Calibration,
     blocks: tuple[Block, ...],
     cov: Array,
-    estimates: list[Estimate],
+    estimates: list[ParameterEstimate],
     log_name: str,
 ) -> Site:
     """Return the site with the fitted values and their posterior sigmas.

@@ -12,7 +12,7 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import Smoothed
-from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
+from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.snapshot.ambiguity import ambiguities, relations
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.one_axis import roll_is_open
@@ -22,35 +22,35 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.results.errors import TrajectoryErrors, trajectory_errors
 from magfusion.results.figures import (
     DETERMINED_RATIO,
-    Column,
-    Estimate,
+    ErrorColumn,
     Figure,
     Figures,
+    ParameterEstimate,
     Section,
     Value,
     determined_figures,
 )
 from magfusion.results.observability import observability
 from magfusion.results.page import write_page
-from magfusion.results.page_motion import Motion
+from magfusion.results.page_motion import MotionPage
 from magfusion.results.refinement import parameter_estimates
 from magfusion.units import Array
 
 if TYPE_CHECKING:
     from magfusion.estimation.batch.self_survey import Placement
-    from magfusion.results.observability import Observability
+    from magfusion.results.observability import CalibrationObservability
 
 FAILED = "failed"  # directory of what was found where the verdict is that
 POOR_FIT = 3.0  # whitened residual, one where noise and model are as declared
 _REPORT, _ERRORS, _SUMMARY = Section.REPORT, Section.ERRORS, Section.SUMMARY
 
 
-def write_report(directory: Path, figures: Figures, motion: Motion | None = None) -> None:
+def write_report(directory: Path, figures: Figures, motion: MotionPage | None = None) -> None:
     """Write ``report.json``, and ``report.html`` with the result: in `FAILED` if that exists.
 
     Parameters
     ----------
-    motion : Motion, optional
+    motion : MotionPage, optional
         Content of the page in addition to the figures and the pictures in the directory.
     """
     text = json.dumps(dict(figures), indent=1, allow_nan=False, default=float)
@@ -59,19 +59,19 @@ def write_report(directory: Path, figures: Figures, motion: Motion | None = None
     write_page(failed if failed.is_dir() else directory, figures, motion)
 
 
-def where_found(name: str, found: bool, value: Value, label: str = "") -> Figure:
+def where_found(name: str, result: bool, value: Value, label: str = "") -> Figure:
     """Return a figure that the screen shows only where it matters."""
-    return Figure(name, value, section=_SUMMARY if found else _REPORT, label=label)
+    return Figure(name, value, section=_SUMMARY if result else _REPORT, label=label)
 
 
 def error_figures(
-    errors: TrajectoryErrors, column: Column = Column.RMS, prefix: str = ""
+    errors: TrajectoryErrors, column: ErrorColumn = ErrorColumn.RMS, prefix: str = ""
 ) -> Figures:
     """Return the errors against the truth: absolute, aligned, relative, and their consistency.
 
     Parameters
     ----------
-    column : Column
+    column : ErrorColumn
         Of the screen's table; consistency is shown only for errors of the result itself.
     prefix : str
         Of the keys.
@@ -81,8 +81,15 @@ def error_figures(
     rows = (
         ("ate_m", errors.ate, "m", _ERRORS, "position", column),
         ("attitude_rmse_deg", errors.attitude_rmse_deg, "deg", _ERRORS, "attitude", column),
-        ("aligned_ate_m", errors.aligned_ate, "m", aligned, "position", Column.ALIGNED),
-        ("aligned_attitude_rmse_deg", attitude_deg, "deg", aligned, "attitude", Column.ALIGNED),
+        ("aligned_ate_m", errors.aligned_ate, "m", aligned, "position", ErrorColumn.ALIGNED),
+        (
+            "aligned_attitude_rmse_deg",
+            attitude_deg,
+            "deg",
+            aligned,
+            "attitude",
+            ErrorColumn.ALIGNED,
+        ),
         ("rpe_translation_m", relative.translation_rmse, "m", _ERRORS, "step, position", column),
         ("rpe_rotation_deg", relative.rotation_rmse_deg, "deg", _ERRORS, "step, attitude", column),
     )
@@ -118,7 +125,7 @@ def sigma_figures(pose_cov: Array) -> Figures:
     )
     return Figures(
         *(
-            Figure(name, value, unit, None, _ERRORS, row, Column.SIGMA)
+            Figure(name, value, unit, None, _ERRORS, row, ErrorColumn.SIGMA)
             for name, value, unit, row in rows
         )
     )
@@ -160,12 +167,12 @@ def residual_figure(beacon: str, rms: float) -> Figure:
 
 def residual_figures(residual: Array, channels: tuple[tuple[str, int], ...]) -> Figures:
     """Return the whitened residual of each beacon."""
-    found = []
+    result = []
     for name in dict.fromkeys(beacon for beacon, _ in channels):
         own = residual[:, [beacon == name for beacon, _ in channels]]
         if np.any(np.isfinite(own)):
-            found.append(residual_figure(name, float(np.sqrt(np.nanmean(own**2)))))
-    return Figures(*found)
+            result.append(residual_figure(name, float(np.sqrt(np.nanmean(own**2)))))
+    return Figures(*result)
 
 
 def rival_figures(chi_square: float | None) -> Figures:
@@ -213,7 +220,7 @@ def smoothed_figures(result: Smoothed, directions: Section = _REPORT) -> Figures
         Figure("epochs", len(states)),
         Figure("duration_s", float(states.time[-1] - states.time[0]), "s"),
         Figure("window_s", float(np.median(result.fields.window)), "s"),
-        Figure("passes", result.passes, section=_REPORT),
+        Figure("passes", result.iteration_count, section=_REPORT),
         Figure("iterations", result.iterations, section=_REPORT),
         Figure(
             "converged",
@@ -221,7 +228,7 @@ def smoothed_figures(result: Smoothed, directions: Section = _REPORT) -> Figures
             section=_REPORT if result.converged else _SUMMARY,
         ),
         Figure("cost", result.cost, section=_REPORT),
-        where_found("intervals_bridged", result.bridged > 0, result.bridged),
+        where_found("intervals_bridged", result.gap_bridged > 0, result.gap_bridged),
         Figure(
             "start_epochs_not_first_hypothesis",
             int(np.sum(result.start.chosen > 0)),
@@ -243,30 +250,30 @@ def smoothed_figures(result: Smoothed, directions: Section = _REPORT) -> Figures
 
 
 def observability_figures(
-    estimates: list[Estimate], found: Observability, section: Section = _REPORT
+    estimates: list[ParameterEstimate], result: CalibrationObservability, section: Section = _REPORT
 ) -> Figures:
     """Return the observability of the calibration, parameter by parameter and in words."""
-    count, determined = len(found.direction_ratio), found.determined
+    count, determined = len(result.direction_ratio), result.determined
     share = f"of {count} directions of the calibration are determined"
     figures = [
         Figure("directions", count, section=_REPORT),
         Figure("directions_determined", determined, section=section, label=share),
-        Figure("directions_gauge", len(found.gauge), section=_REPORT),
+        Figure("directions_gauge", len(result.gauge), section=_REPORT),
     ]
-    beside = found.ratio_but_for_gauge
-    for one, ratio, rest in zip(estimates, found.ratio, beside, strict=True):
-        left = float(rest) if np.isfinite(rest) else None
+    others = result.ratio_but_for_gauge
+    for one, ratio, rest in zip(estimates, result.ratio, others, strict=True):
+        remaining = float(rest) if np.isfinite(rest) else None
         figures += [
             Figure(f"{one.name}_ratio", float(ratio), "", one.beacon, _REPORT),
-            Figure(f"{one.name}_ratio_but_for_gauge", left, "", one.beacon, _REPORT),
+            Figure(f"{one.name}_ratio_but_for_gauge", remaining, "", one.beacon, _REPORT),
         ]
-    known = [e.key for e, rest in zip(estimates, beside, strict=True) if rest < DETERMINED_RATIO]
+    known = [e.key for e, rest in zip(estimates, others, strict=True) if rest < DETERMINED_RATIO]
     return Figures(
         *figures,
         Figure("determined_but_for_gauge", known, section=_REPORT),
         *(
             Figure(name, [one.words for one in open_], section=section, label="open")
-            for name, open_ in (("gauge", found.gauge), ("weakest_directions", found.weakest))
+            for name, open_ in (("gauge", result.gauge), ("weakest_directions", result.weakest))
         ),
     )
 
@@ -278,10 +285,10 @@ def placement_figures(placed: tuple[Placement, ...], site: Site) -> Figures:
     figures = [Figure("placed", [placement.name for placement in placed], section=_REPORT)]
     final = {beacon.name: beacon for beacon in site.beacons}
     for placement in placed:
-        name, found = placement.name, final[placement.name].position_world
+        name, result = placement.name, final[placement.name].position_world
         figures += [
             Figure(f"placed_{{beacon}}_{axis}_m", float(value), "m", name, _REPORT)
-            for axis, value in zip("xyz", found, strict=True)
+            for axis, value in zip("xyz", result, strict=True)
         ]
         places = [
             f"beacon {name} at ({_listed(one.beacon.position_world, 2)}) m:"
@@ -297,7 +304,7 @@ def placement_figures(placed: tuple[Placement, ...], site: Site) -> Figures:
             else ""
         )
         remark = (
-            f"beacon {name} was placed at ({_listed(found, 3)}) m; {len(places)} place(s) explained"
+            f"beacon {name} was placed at ({_listed(result, 3)}) m; {len(places)} place(s) explained"
             " its field"
         )
         figures += [
@@ -337,12 +344,12 @@ def fix_figures(fixes: Fixes, site: Site) -> Figures:
             for kind, count in words.epochs.items()
         ),
         Figure("ambiguity", words.open, section=Section.NOTES),
-        Figure("ambiguity_settled", words.settled, section=Section.REMARKS),
+        Figure("ambiguity_settled", words.resolved, section=Section.REMARKS),
     )
 
 
 def compared_with_truth(
-    estimate: Trajectory, log: Log, column: Column = Column.RMS, prefix: str = ""
+    estimate: Trajectory, log: Log, column: ErrorColumn = ErrorColumn.RMS, prefix: str = ""
 ) -> tuple[TrajectoryErrors | None, Figures]:
     """Return the errors against the log's truth, if it has one there, and their figures."""
     if log.truth is None:

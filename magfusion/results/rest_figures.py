@@ -10,15 +10,15 @@ import numpy as np
 from magfusion.results.figures import Figure, Figures
 
 if TYPE_CHECKING:
-    from magfusion.estimation.rests.at_rest import AtRest
+    from magfusion.estimation.rests.stationary_integration import IntegratedRests
 
 
-def rest_figures(rested: AtRest) -> Figures:
+def rest_figures(rested: IntegratedRests) -> Figures:
     """Return the number of rests, and the strength of each tone in them.
 
     Amplitudes are the peak of the field's magnitude, corrected for noise, of the median rest.
     """
-    amplitude, heard = rested.amplitude(), rested.heard
+    amplitude, detected = rested.amplitude(), rested.detected
     channels = rested.fields.channels
     return Figures(
         Figure("rests", len(rested.fields)),
@@ -36,7 +36,7 @@ def rest_figures(rested: AtRest) -> Figures:
         *(
             Figure(
                 f"heard_{{beacon}}_{tone}",
-                int(np.sum(heard[:, c])),
+                int(np.sum(detected[:, c])),
                 "",
                 beacon,
                 label=f"rests with tone {tone}",
@@ -47,7 +47,7 @@ def rest_figures(rested: AtRest) -> Figures:
     )
 
 
-def _reference_figures(rested: AtRest) -> Iterator[Figure]:
+def _reference_figures(rested: IntegratedRests) -> Iterator[Figure]:
     """Yield the factor by which the reference reduces each sigma; one where it is not used."""
     if rested.gain is None:
         return

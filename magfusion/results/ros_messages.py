@@ -92,7 +92,7 @@ class TwistWithCovariance(IdlStruct, typename="geometry_msgs.msg.dds_.TwistWithC
 
 
 @dataclass
-class Odometry(IdlStruct, typename="nav_msgs.msg.dds_.Odometry_"):
+class OdometryMessage(IdlStruct, typename="nav_msgs.msg.dds_.Odometry_"):
     """Pose in the header's frame, twist in the child's."""
 
     header: Header

@@ -6,7 +6,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from magfusion.results.figures import Estimate, Figure, Figures, Section
+from magfusion.results.figures import Figure, Figures, ParameterEstimate, Section
 from magfusion.results.shown import (
     as_sure,
     column_rows,
@@ -40,7 +40,7 @@ def show(figures: Figures, output: Path | None, console: Console | None = None) 
         *(_of_logs(figure) for figure in figures.of(Section.LOGS)),
         _table(figures.of(Section.ERRORS), ""),
         _summary(figures.of(Section.SUMMARY)),
-        _calibration([f for f in figures.all if isinstance(f, Estimate)]),
+        _calibration([f for f in figures.all if isinstance(f, ParameterEstimate)]),
         _table(figures.of(Section.TRANSFER), "other part of the log"),
     )
     for table in tables:
@@ -51,8 +51,8 @@ def show(figures: Figures, output: Path | None, console: Console | None = None) 
     for sentence in notes(figures):
         console.print(f"note: {sentence}", style="yellow", soft_wrap=True, markup=False)
     for figure in figures.all:
-        settled = sentences(figure) if figure.section is Section.REMARKS else []
-        for sentence in [*settled, *filter(None, [figure.remark])]:
+        converged = sentences(figure) if figure.section is Section.REMARKS else []
+        for sentence in [*converged, *filter(None, [figure.remark])]:
             console.print(sentence, soft_wrap=True, markup=False)
     if output is not None:
         console.print(f"results in {output}", soft_wrap=True, markup=False)
@@ -99,11 +99,11 @@ def _summary(figures: list[Figure]) -> Table:
     return table
 
 
-def _calibration(estimates: list[Estimate]) -> Table:
+def _calibration(estimates: list[ParameterEstimate]) -> Table:
     """Return one row for each vector of estimated parameters."""
     table = Table("calibration", "change", "sigma (largest)", "prior", "determined", box=None)
     table.columns[0].no_wrap = True
-    groups: dict[str, list[Estimate]] = {}
+    groups: dict[str, list[ParameterEstimate]] = {}
     for estimate in estimates:
         groups.setdefault(labelled(estimate), []).append(estimate)
     for label, group in groups.items():

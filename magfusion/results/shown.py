@@ -2,10 +2,10 @@
 
 import math
 
-from magfusion.results.figures import Column, Figure, Figures, Section, Value
+from magfusion.results.figures import ErrorColumn, Figure, Figures, Section, Value
 
 # Codes of reasons with the same content as the note of a figure.
-_SAID = {"residual_rms_{beacon}": {"field_residuals"}, "ambiguous": {"ambiguous"}}
+_REPORTED_BY = {"residual_rms_{beacon}": {"field_residuals"}, "ambiguous": {"ambiguous"}}
 
 
 def notes(figures: Figures) -> list[str]:
@@ -14,16 +14,20 @@ def notes(figures: Figures) -> list[str]:
     codes = {str(one["code"]) for one in findings(figures, "reasons")}
     for figure in figures.all:
         out += sentences(figure) if figure.section is Section.NOTES else []
-        out += [figure.note] if figure.note and codes.isdisjoint(_SAID.get(figure.name, ())) else []
-    said = [one["text"] for key in ("reasons", "remarks") for one in findings(figures, key)]
-    return [note for note in out if not any(str(text) in note for text in said)]
+        out += (
+            [figure.note]
+            if figure.note and codes.isdisjoint(_REPORTED_BY.get(figure.name, ()))
+            else []
+        )
+    messages = [one["text"] for key in ("reasons", "remarks") for one in findings(figures, key)]
+    return [note for note in out if not any(str(text) in note for text in messages)]
 
 
 def findings(figures: Figures, key: str) -> list[dict[str, str | float]]:
     """Return the entries of a report under a key: reasons, remarks, or unverified parameters."""
-    found = figures.get(key, [])
-    assert isinstance(found, list)
-    return [one for one in found if isinstance(one, dict)]
+    result = figures.get(key, [])
+    assert isinstance(result, list)
+    return [one for one in result if isinstance(one, dict)]
 
 
 def sentences(figure: Figure) -> list[str]:
@@ -42,7 +46,7 @@ def labelled(figure: Figure) -> str:
 def column_rows(figures: list[Figure], corner: str) -> list[list[str]]:
     """Return a table of figures by their labels and columns, its head first."""
     used = {figure.column for figure in figures}
-    columns = [column for column in Column if column in used]
+    columns = [column for column in ErrorColumn if column in used]
     rows: dict[str, dict[str, str]] = {}
     for figure in figures:
         rows.setdefault(labelled(figure), {})[figure.column] = number_text(figure.value)

@@ -17,7 +17,7 @@ from magfusion.files.trajectory_table import trajectory_columns
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.results.errors import trajectory_errors
-from magfusion.results.page_motion import Motion, path_charts, size_charts
+from magfusion.results.page_motion import MotionPage, path_charts, size_charts
 from magfusion.results.plots.drawn import draw_charts
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ class ResultTrajectory(Trajectory):
         if len(self) == 0:
             raise InputError("the trajectory has no pose to plot")
         errors = None if truth is None else trajectory_errors(self, truth)
-        motion = Motion(self.site, self, truth, errors)
+        motion = MotionPage(self.site, self, truth, errors)
         return draw_charts([*path_charts(motion), *size_charts(motion)])
 
 

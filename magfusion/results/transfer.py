@@ -18,7 +18,7 @@ class Estimated(NamedTuple):
     cov: Array
 
 
-class Agreement(NamedTuple):
+class CalibrationAgreement(NamedTuple):
     """The difference of two calibrations in its own sigmas.
 
     Parameters
@@ -33,7 +33,7 @@ class Agreement(NamedTuple):
     by_direction: Array
 
 
-def agreement(first: Estimated, second: Estimated) -> Agreement:
+def agreement(first: Estimated, second: Estimated) -> CalibrationAgreement:
     """Compare the calibrations of one installation by two logs.
 
     Both start at the same survey, and keep it where a log adds no information: such directions, the
@@ -57,7 +57,7 @@ def agreement(first: Estimated, second: Estimated) -> Agreement:
     value, vector = np.linalg.eigh(0.5 * both)
     determined = vector[:, np.sqrt(np.maximum(value, 0.0)) < DETERMINED_RATIO]
     variance = np.einsum("ik,ij,jk->k", determined, own, determined)
-    return Agreement(
+    return CalibrationAgreement(
         by_parameter=step / np.sqrt(np.diagonal(both)),
         by_direction=(determined.T @ step) / np.sqrt(variance),
     )

@@ -62,12 +62,12 @@ def trend(time: Array, value: Array) -> Trend:
     design = np.stack([np.ones_like(when), (when - np.mean(when)) / span], axis=1)
     lag = np.abs(when[:, None] - when) / span
     own, fresh = np.eye(len(when)), 1.0 / len(when)
-    found = [
+    result = [
         (memory, *_fitted(design, mean, np.exp(-lag / memory) + noise * own))
         for memory in np.geomspace(0.5 * fresh, LONGEST, TIMES)
         for noise in -np.expm1(-fresh / memory) * np.array(WHITE)
     ]
-    memory, rate, error, likelihood = np.array(found).T
+    memory, rate, error, likelihood = np.array(result).T
     weight = memory * np.exp(likelihood - np.max(likelihood))
     weight /= np.sum(weight)
     freedom = len(when) - 2
@@ -75,8 +75,8 @@ def trend(time: Array, value: Array) -> Trend:
     if not np.any(weight * error > 0.0):
         return Trend(middle / span, 0.0, freedom)
     near, far = (_half_width(rate - middle, error, weight, freedom, tail) for tail in _TAILS)
-    alike = _freedom_of(far / near, freedom)
-    return Trend(middle / span, near / float(stdtrit(alike, _TAILS[0])) / span, alike)
+    shared = _freedom_of(far / near, freedom)
+    return Trend(middle / span, near / float(stdtrit(shared, _TAILS[0])) / span, shared)
 
 
 def _block_means(time: Array, value: Array) -> tuple[Array, Array]:
@@ -95,10 +95,10 @@ def _fitted(design: Array, value: Array, shape: Array) -> tuple[float, float, fl
     """Return slope, its standard error and the restricted log-likelihood under a covariance."""
     lower = np.linalg.cholesky(shape)
     columns = np.linalg.solve(lower, np.column_stack([design, value]))
-    left, upper = np.linalg.qr(columns[:, :2])
-    along = left.T @ columns[:, 2]
+    remaining, upper = np.linalg.qr(columns[:, :2])
+    along = remaining.T @ columns[:, 2]
     slope = float(along[1] / upper[1, 1])
-    rest = columns[:, 2] - left @ along
+    rest = columns[:, 2] - remaining @ along
     freedom = len(value) - 2
     # Below it, the residual of a straight line is rounding.
     least = (1e-12 * float(np.max(np.abs(value)) or 1.0)) ** 2
@@ -123,9 +123,9 @@ def _half_width(offset: Array, error: Array, weight: Array, freedom: float, tail
     return high
 
 
-def _freedom_of(ratio: float, most: float) -> float:
+def _freedom_of(ratio: float, maximum: float) -> float:
     """Return the degrees of freedom with this ratio of the outer to the inner quantile."""
-    low, high = 1.0, float(most)
+    low, high = 1.0, float(maximum)
     for _ in range(50):
         half = 0.5 * (low + high)
         near, far = stdtrit(half, _TAILS)

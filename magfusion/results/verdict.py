@@ -10,13 +10,13 @@ def trust_figures(trust: Trust) -> Figures:
     """Return verdict, reasons, remarks and unverified parameters, for the head of a report."""
     return Figures(
         Figure("verdict", str(trust.verdict), section=Section.VERDICT),
-        Figure("reasons", _said(trust.reasons), section=Section.VERDICT),
-        Figure("remarks", _said(trust.remarks), section=Section.VERDICT),
+        Figure("reasons", _finding_rows(trust.reasons), section=Section.VERDICT),
+        Figure("remarks", _finding_rows(trust.remarks), section=Section.VERDICT),
         Figure("unverified", [_unverified(u) for u in trust.unverified], section=Section.VERDICT),
     )
 
 
-def said_as_notes(trust: Trust) -> Figures:
+def notes_of(trust: Trust) -> Figures:
     """Return all findings as the key ``notes``, which these reports have always had.
 
     The screen shows them with the verdict.
@@ -25,7 +25,7 @@ def said_as_notes(trust: Trust) -> Figures:
     return Figures(Figure("notes", sentences, section=Section.REPORT))
 
 
-def _said(findings: tuple[Finding, ...]) -> list[dict[str, str | float]]:
+def _finding_rows(findings: tuple[Finding, ...]) -> list[dict[str, str | float]]:
     return [{"code": f.code, "text": f.text} for f in findings]
 
 

@@ -13,7 +13,7 @@ from magfusion.simulation.pipe import Steel
 from magfusion.units import AnyArray, Array, ComplexArray
 
 DAY = 86_400.0  # s
-LOUDEST = 14.0 * 3600.0  # s of a day
+NOISIEST_TIME = 14.0 * 3600.0  # s of a day
 CLEARANCE = 0.5  # m from the surface of drawn iron to where the body moves, and to every beacon
 REACH = 0.5  # m beyond that clearance within which iron is drawn where nothing is said
 STEEL_PERMEABILITY = 100.0
@@ -126,9 +126,11 @@ def draw_spheres(
         grown = radius[k] + CLEARANCE + reach
         drawn = rng.uniform(box_world[0] - grown, box_world[1] + grown, (_ATTEMPTS, 3))
         to_box = np.linalg.norm(drawn - np.clip(drawn, box_world[0], box_world[1]), axis=1)
-        free = _farther(drawn, beacons_world, np.full(len(beacons_world), radius[k] + CLEARANCE))
-        free &= _farther(drawn, position_world[:k], radius[k] + radius[:k])
-        fits = np.flatnonzero(free & (to_box > radius[k] + CLEARANCE))
+        free_parameters = _farther(
+            drawn, beacons_world, np.full(len(beacons_world), radius[k] + CLEARANCE)
+        )
+        free_parameters &= _farther(drawn, position_world[:k], radius[k] + radius[:k])
+        fits = np.flatnonzero(free_parameters & (to_box > radius[k] + CLEARANCE))
         if len(fits) == 0:
             raise InputError(
                 f"iron: found {count} spheres, but only {k} fit around the range of the body; give"
@@ -233,17 +235,17 @@ class DayNight:
     ----------
     night, day : float
         Minimum and maximum one-sided density (T/sqrt(Hz)).
-    loudest_time : float
+    noisiest_time : float
         Time of the maximum, seconds since the log's epoch; once a day.
     """
 
     night: float
     day: float
-    loudest_time: float = 0.0
+    noisiest_time: float = 0.0
 
     def density(self, time: Array) -> Array:
         """Return the one-sided density (T/sqrt(Hz)) at the times, shape (n,)."""
-        share = 0.5 + 0.5 * np.cos(2.0 * np.pi * (time - self.loudest_time) / DAY)
+        share = 0.5 + 0.5 * np.cos(2.0 * np.pi * (time - self.noisiest_time) / DAY)
         return self.night + (self.day - self.night) * share
 
 
@@ -253,7 +255,7 @@ def office_noise(epoch_ns: int) -> DayNight:
     Paper 004 has 3 nT.
     """
     midnight = epoch_ns / 1e9 % DAY
-    return DayNight(2e-10, 4e-10, (LOUDEST - midnight) % DAY)
+    return DayNight(2e-10, 4e-10, (NOISIEST_TIME - midnight) % DAY)
 
 
 @dataclass(frozen=True)

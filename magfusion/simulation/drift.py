@@ -93,7 +93,7 @@ class Wander:
 
 
 @dataclass(frozen=True)
-class Clock:
+class DriveClock:
     """The clock of the drives relative to that of the log; both agree at the log's epoch.
 
     Parameters
@@ -142,7 +142,7 @@ class Drift:
         voltage `COPPER_PER_KELVIN`, for a constant current the loss of its source.
     gain : Wander, optional
         Of the logarithm of each beacon's moment, independent between beacons.
-    clock : Clock, optional
+    clock : DriveClock, optional
         One for all drives, as of a common generator.
     sensor : DailySwing, optional
         Temperature of the magnetometer.
@@ -153,7 +153,7 @@ class Drift:
     coils: WarmUp | None = None
     fading_per_kelvin: float = 0.0
     gain: Wander | None = None
-    clock: Clock | None = None
+    clock: DriveClock | None = None
     sensor: DailySwing | None = None
     scale_per_kelvin: float = 0.0
 

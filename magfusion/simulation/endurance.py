@@ -17,16 +17,16 @@ from magfusion.simulation.demo_site import DEMO_BOX_WORLD
 from magfusion.simulation.disturbance import DayNight
 from magfusion.simulation.drift import (
     COPPER_PER_KELVIN,
-    Clock,
     DailySwing,
     Drift,
+    DriveClock,
     Wander,
     WarmUp,
     draw_drift,
 )
 from magfusion.simulation.inertial import BiasInstability
 from magfusion.simulation.log import draw_drives, interpolate, perturb_site, simulate_fields
-from magfusion.simulation.motion import Motion, Rests, random_walk_motion
+from magfusion.simulation.motion import Rests, SimulatedMotion, random_walk_motion
 from magfusion.units import NANOTESLA, Array, BoolArray, ComplexArray
 
 BLOCK = 60.0  # s
@@ -55,7 +55,7 @@ def usual_drift(drive: str, clock_rate: float) -> Drift:
         coils=HEAT,
         fading_per_kelvin=COPPER_PER_KELVIN if drive == "voltage" else CURRENT_PER_KELVIN,
         gain=Wander(rms=0.003, time_constant=4.0 * HOUR),
-        clock=Clock(rate=clock_rate, walk=CLOCK_WALK),
+        clock=DriveClock(rate=clock_rate, walk=CLOCK_WALK),
         sensor=DailySwing(amplitude=4.0, warmest_time=DAYTIME),
         scale_per_kelvin=5e-5,
     )
@@ -118,9 +118,9 @@ class EnduranceConfig:
         """Return at which times the platform walks, is about to walk, or has just walked."""
         rests = self.schedule
         cycle = rests.move + rests.pause
-        since = (time - rests.start + MARGIN) % cycle
+        start_time = (time - rests.start + MARGIN) % cycle
         walks = time >= rests.start - MARGIN
-        return walks & (since <= rests.move + 2.0 * MARGIN)
+        return walks & (start_time <= rests.move + 2.0 * MARGIN)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ class Biases:
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
+class SimulatedStretch:
     """Some minutes of samples and their true values.
 
     Parameters
@@ -157,7 +157,7 @@ class Stretch:
 
 
 @dataclass(frozen=True, eq=False)
-class World:
+class EnduranceWorld:
     """One draw of all true values of a run; a few megabytes for 48 hours.
 
     Parameters
@@ -176,7 +176,7 @@ class World:
     config: EnduranceConfig
     site: Site
     true_site: Site
-    motion: Motion
+    motion: SimulatedMotion
     log_gain: Array
     phase: Array
     scale: Array
@@ -190,7 +190,7 @@ class World:
         walk = first * rng.standard_normal((2, 3))
         return Biases(walk, _wander_sigma(self.config.instability) * rng.standard_normal((2, 3)))
 
-    def stretch(self, first: int, count: int, before: Biases) -> Stretch:
+    def stretch(self, first: int, count: int, before: Biases) -> SimulatedStretch:
         """Return some blocks of samples.
 
         Parameters
@@ -204,14 +204,14 @@ class World:
         inertial, fields = [], []
         still: dict[int, ComplexArray] = {}
         for block in range(first, first + count):
-            made = self._inertial(block, before)
-            before = made[-1]
-            inertial.append(made)
+            built = self._inertial(block, before)
+            before = built[-1]
+            inertial.append(built)
             fields.append(self._fields(block, still))
         time, gyro, accel, gyro_bias, accel_bias = (
-            np.concatenate([made[i] for made in inertial]) for i in range(5)
+            np.concatenate([built[i] for built in inertial]) for i in range(5)
         )
-        return Stretch(
+        return SimulatedStretch(
             first=first,
             imu=ImuSamples(time, gyro, accel),
             fields=FieldSamples.joined(fields),
@@ -220,7 +220,7 @@ class World:
             after=before,
         )
 
-    def truth(self, stretch: Stretch, time: Array) -> Trajectory:
+    def truth(self, stretch: SimulatedStretch, time: Array) -> Trajectory:
         """Return the true values at times within a stretch."""
         known = stretch.imu.time
         return replace(
@@ -237,7 +237,9 @@ class World:
         begin, end = (round(k * BLOCK * rate_hz) for k in (block, block + 1))
         time = np.arange(begin, end) / rate_hz
         ideal = self._ideal(time + imu.time_offset)
-        bias, after = _carried_on(before, imu, self.config.instability, rate_hz, len(time), rng)
+        bias, after = _continued_biases(
+            before, imu, self.config.instability, rate_hz, len(time), rng
+        )
         white = np.sqrt(rate_hz) * rng.standard_normal((2, len(time), 3))
         gyro = ideal[0] + bias[0] + imu.gyro_noise * white[0]
         accel = ideal[1] + bias[1] + imu.accel_noise * white[1]
@@ -245,10 +247,10 @@ class World:
 
     def _ideal(self, time: Array) -> tuple[Array, Array]:
         """Return rate and specific force; evaluated once per rest."""
-        asked = time if np.any(self.config.active(time)) else time[:1]
+        requested = time if np.any(self.config.active(time)) else time[:1]
         return (
-            self.motion.rate_body(asked),
-            self.motion.specific_force_body(asked, self.true_site.gravity),
+            self.motion.rate_body(requested),
+            self.motion.specific_force_body(requested, self.true_site.gravity),
         )
 
     def _fields(self, block: int, still: dict[int, ComplexArray]) -> FieldSamples:
@@ -300,7 +302,7 @@ class World:
         return often[config.active(often) | seldom]
 
 
-def draw_endurance(site: Site, config: EnduranceConfig, seed: tuple[int, ...]) -> World:
+def draw_endurance(site: Site, config: EnduranceConfig, seed: tuple[int, ...]) -> EnduranceWorld:
     """Draw a world.
 
     Parameters
@@ -331,11 +333,11 @@ def draw_endurance(site: Site, config: EnduranceConfig, seed: tuple[int, ...]) -
     own = [
         np.zeros(len(edges))
         if beacon.synchronised
-        else Clock(float(rate), CLOCK_WALK).lead(edges, clock_rng)
+        else DriveClock(float(rate), CLOCK_WALK).lead(edges, clock_rng)
         for beacon, rate in zip(site.beacons, drives.drift, strict=True)
     ]
     lead = drawn.lead[:, None] + np.repeat(np.stack(own, axis=1), tones, axis=1)
-    return World(
+    return EnduranceWorld(
         config=config,
         site=site,
         true_site=true_site,
@@ -358,7 +360,7 @@ def _wander_sigma(instability: BiasInstability | None) -> Array:
     return instability.sigma[:, None]
 
 
-def _carried_on(
+def _continued_biases(
     before: Biases,
     imu: ImuModel,
     instability: BiasInstability | None,

@@ -12,7 +12,7 @@ from magfusion.simulation.ground import ground_effect
 from magfusion.simulation.layers import Layers, layered_effect
 from magfusion.simulation.pipe import Steel
 from magfusion.simulation.rails import layered_at, secondary_world
-from magfusion.simulation.rotor_beacons import Turning
+from magfusion.simulation.rotor_beacons import MagnetRotation
 from magfusion.units import AnyArray, Array, ComplexArray
 
 
@@ -26,13 +26,13 @@ class Drives:
         Of all beacons' tones, one after the other, at the log's epoch (rad).
     drift : ndarray, shape (beacons,)
         Relative frequency error.
-    turning : mapping of str to Turning
+    turning : mapping of str to MagnetRotation
         Of beacons that are magnets on shafts, by name; phase and drift do not apply to them.
     """
 
     phase: Array
     drift: Array
-    turning: Mapping[str, Turning] = field(default_factory=dict)
+    turning: Mapping[str, MagnetRotation] = field(default_factory=dict)
 
 
 def synchronised_drives(site: Site) -> Drives:

@@ -76,8 +76,8 @@ def ground_effect(
 def _parts(coil: Coil) -> list[tuple[Array, float]]:
     """Return the positions of a coil's dipoles, and the share of its moment of each."""
     axis = coil.moment_beacon / np.linalg.norm(coil.moment_beacon)
-    aside = np.eye(3)[int(np.argmin(np.abs(axis)))]
-    first = np.cross(axis, aside) / np.linalg.norm(np.cross(axis, aside))
+    lateral = np.eye(3)[int(np.argmin(np.abs(axis)))]
+    first = np.cross(axis, lateral) / np.linalg.norm(np.cross(axis, lateral))
     second = np.cross(axis, first)
     along = [(0.0, 1.0)]
     if coil.length is not None:
@@ -86,7 +86,7 @@ def _parts(coil: Coil) -> list[tuple[Array, float]]:
     if coil.radius is not None:
         spokes = [(coil.radius * s, w) for s, w in zip(_SPOKES, _SHARES, strict=True)]
     return [
-        (far * axis + spoke.real * first + spoke.imag * second, float(w * v))
+        (far * axis + informative.real * first + informative.imag * second, float(w * v))
         for far, w in along
-        for spoke, v in spokes
+        for informative, v in spokes
     ]

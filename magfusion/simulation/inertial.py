@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from magfusion.errors import InputError
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import ImuModel
-from magfusion.simulation.motion import Motion
+from magfusion.simulation.motion import SimulatedMotion
 from magfusion.units import Array
 
 # A first-order Gauss-Markov process of standard deviation s and correlation time T has its largest
@@ -55,7 +55,7 @@ class SimulatedImu(NamedTuple):
 
 
 def simulate_imu(
-    motion: Motion,
+    motion: SimulatedMotion,
     imu: ImuModel,
     gravity: float,
     rate_hz: float,

@@ -20,15 +20,15 @@ from magfusion.simulation.inertial import BiasInstability, SimulatedImu, simulat
 from magfusion.simulation.layers import Layers
 from magfusion.simulation.magnetometers import answered, names_by_channel
 from magfusion.simulation.motion import (
-    Motion,
     Rests,
+    SimulatedMotion,
     random_walk_motion,
     static_motion,
     turning_motion,
 )
 from magfusion.simulation.perturbed import perturb_site as perturb_site
 from magfusion.simulation.perturbed import with_earth_field
-from magfusion.simulation.rotor_beacons import Turning, recorded_angles, turn_rotors
+from magfusion.simulation.rotor_beacons import MagnetRotation, recorded_angles, turn_rotors
 from magfusion.simulation.shaft import ShaftErrors
 from magfusion.simulation.slots import Multiplexer, draw_marks, is_multiplexed
 from magfusion.simulation.waveform import Mains, beacons_world, simulate_waveform
@@ -137,7 +137,7 @@ class SimulatedLog:
         True calibration, noise and time offset of the IMU.
     drives : Drives
         True phases and drifts.
-    motion : Motion
+    motion : SimulatedMotion
         Exact truth at any time.
     ambient : Ambient, optional
         With the drawn iron.
@@ -148,7 +148,7 @@ class SimulatedLog:
     log: Log
     true_site: Site
     drives: Drives
-    motion: Motion
+    motion: SimulatedMotion
     ambient: Ambient | None = None
 
     @property
@@ -181,7 +181,7 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
     true_site = perturb_site(declared, calibration_rng) if config.perturb else declared
     true_site = _with_instruments(true_site, config)
     shaft_rng, among = calibration_rng, true_site
-    turning: dict[str, Turning] = {}
+    turning: dict[str, MagnetRotation] = {}
     if any(beacon.rotor is not None for beacon in site.beacons):
         shaft_rng = rng.spawn(1)[0]
         among, turning = turn_rotors(true_site, config.shafts, config.duration, shaft_rng)
@@ -241,14 +241,14 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
     return SimulatedLog(log, true_site, drives, motion, ambient)
 
 
-def _truth(motion: Motion, imu: SimulatedImu, site: Site) -> Trajectory:
+def _truth(motion: SimulatedMotion, imu: SimulatedImu, site: Site) -> Trajectory:
     """Return the true states at the stamps of the inertial samples."""
     stamp, clock = imu.samples.time, site.platform.imu
-    taken = (1.0 + clock.clock_rate) * stamp + clock.time_offset
+    selected = (1.0 + clock.clock_rate) * stamp + clock.time_offset
     return replace(
         motion.trajectory(stamp),
-        gyro_bias_body=interpolate(stamp, taken, imu.gyro_bias_body),
-        accel_bias_body=interpolate(stamp, taken, imu.accel_bias_body),
+        gyro_bias_body=interpolate(stamp, selected, imu.gyro_bias_body),
+        accel_bias_body=interpolate(stamp, selected, imu.accel_bias_body),
     )
 
 
@@ -262,7 +262,7 @@ def _of_each(
     sensors = site.platform.magnetometers
     return {
         sensor.name: recorded(
-            replace(site, platform=site.platform.carrying((sensor,))),
+            replace(site, platform=site.platform.with_magnetometers((sensor,))),
             np.random.default_rng(surroundings),
             own,
         )
@@ -346,8 +346,8 @@ def simulate_fields(
             straight = enumerate(fields_world)
             fields_world = [bending.bent_world(i, own, point_world) for i, own in straight]
         world = np.concatenate(fields_world, axis=1)
-        turned = world * np.exp(1j * phase)[..., None]
-        seen = turned @ world_from_sensor @ magnetometer.matrix.T
+        rotated = world * np.exp(1j * phase)[..., None]
+        seen = rotated @ world_from_sensor @ magnetometer.matrix.T
         seen = answered(seen, magnetometer.response, frequencies_hz)
         seen[..., magnetometer.lacking] = np.nan
         parts.append(seen)
@@ -366,10 +366,12 @@ def simulate_fields(
 
 def draw_drives(site: Site, rng: np.random.Generator) -> Drives:
     """Return a random phase per tone and drift for every beacon that is not synchronised."""
-    free = np.array([not beacon.synchronised for beacon in site.beacons], dtype=bool)
+    free_parameters = np.array([not beacon.synchronised for beacon in site.beacons], dtype=bool)
     tones = [len(beacon.tones) for beacon in site.beacons]
-    phase = rng.uniform(-np.pi, np.pi, sum(tones)) * np.repeat(free, tones)
-    return Drives(phase, rng.normal(0.0, site.clock.drift_sigma, len(free)) * free)
+    phase = rng.uniform(-np.pi, np.pi, sum(tones)) * np.repeat(free_parameters, tones)
+    return Drives(
+        phase, rng.normal(0.0, site.clock.drift_sigma, len(free_parameters)) * free_parameters
+    )
 
 
 def _with_instruments(site: Site, config: SimulationConfig) -> Site:
@@ -385,7 +387,7 @@ def _with_instruments(site: Site, config: SimulationConfig) -> Site:
     sensors = tuple(
         replace(m, noise_density=scale * m.noise_density) for m in site.platform.magnetometers
     )
-    return replace(site, platform=replace(site.platform, imu=imu).carrying(sensors))
+    return replace(site, platform=replace(site.platform, imu=imu).with_magnetometers(sensors))
 
 
 def _with_iron(site: Site, config: SimulationConfig, rng: np.random.Generator) -> Ambient | None:
@@ -413,7 +415,7 @@ def _with_bending(
     return replace(ambient or Ambient(), bending=bending)
 
 
-def _motion(config: SimulationConfig, rng: np.random.Generator) -> Motion:
+def _motion(config: SimulationConfig, rng: np.random.Generator) -> SimulatedMotion:
     if config.motion == "static":
         position = rng.uniform(config.box_world[0], config.box_world[1])
         heading = Rotation.from_rotvec([0.0, 0.0, rng.uniform(-np.pi, np.pi)])

@@ -62,12 +62,12 @@ def run_many(
     EstimationError
         Where a process of this machine was killed.
     """
-    with crew(len(inputs), cluster=cluster, workers=workers) as hands:
+    with worker_pool(len(inputs), cluster=cluster, workers=workers) as hands:
         return hands.run(task, inputs, seed=seed, report=report)
 
 
 @dataclass(frozen=True)
-class Crew:
+class WorkerPool:
     """Processes that persist over several calls, so that they are started once.
 
     Parameters
@@ -87,21 +87,23 @@ class Crew:
         report: Report | None = None,
     ) -> list[Output]:
         """Run a task on every input; see `run_many`."""
-        tell = report or (lambda _stage, _done, _total: None)
+        report_progress = report or (lambda _stage, _done, _total: None)
         seeds = np.random.SeedSequence(seed).spawn(len(inputs))
         given = list(zip(inputs, seeds, strict=True))
         if self.executor is None:
-            return list(_here(task, given, tell))
-        return _gather(self.executor, task, given, tell)
+            return list(_here(task, given, report_progress))
+        return _gather(self.executor, task, given, report_progress)
 
 
 @contextmanager
-def crew(most: int, *, cluster: str | None = None, workers: int | None = None) -> Iterator[Crew]:
+def worker_pool(
+    maximum: int, *, cluster: str | None = None, workers: int | None = None
+) -> Iterator[WorkerPool]:
     """Yield an executor of tasks: this process, others of this machine, or a Dask cluster.
 
     Parameters
     ----------
-    most : int
+    maximum : int
         Maximum number of concurrent tasks.
     cluster, workers : str, int, optional
         As of `run_many`.
@@ -113,12 +115,12 @@ def crew(most: int, *, cluster: str | None = None, workers: int | None = None) -
     """
     if workers is not None and workers < 1:
         raise InputError(f"--workers must be at least 1; got {workers}")
-    count = min(workers or len(os.sched_getaffinity(0)), most)
+    count = min(workers or len(os.sched_getaffinity(0)), maximum)
     if cluster is None and count <= 1:
-        yield Crew(None)
+        yield WorkerPool(None)
         return
     with _processes(count) if cluster is None else _dask(cluster) as executor:
-        yield Crew(executor)
+        yield WorkerPool(executor)
 
 
 def _run(
@@ -132,26 +134,26 @@ def _run(
 def _here(
     task: Callable[[Any, np.random.Generator], Output],
     given: list[tuple[Any, np.random.SeedSequence]],
-    tell: Report,
+    report_progress: Report,
 ) -> Iterator[Output]:
-    tell("runs", 0, len(given))
+    report_progress("runs", 0, len(given))
     for done, (one, seed) in enumerate(given, start=1):
         yield _run(task, one, seed)
-        tell("runs", done, len(given))
+        report_progress("runs", done, len(given))
 
 
 def _gather(
     executor: Executor,
     task: Callable[[Any, np.random.Generator], Output],
     given: list[tuple[Any, np.random.SeedSequence]],
-    tell: Report,
+    report_progress: Report,
 ) -> list[Output]:
     futures = [executor.submit(_run, task, one, seed) for one, seed in given]
-    tell("runs", 0, len(futures))
+    report_progress("runs", 0, len(futures))
     try:
         for done, future in enumerate(as_completed(futures), start=1):
             future.result()
-            tell("runs", done, len(futures))
+            report_progress("runs", done, len(futures))
     except BaseException:
         for future in futures:
             future.cancel()

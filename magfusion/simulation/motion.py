@@ -30,7 +30,7 @@ class Rests:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class SimulatedMotion:
     """A motion, at rest before its start and after its end.
 
     Parameters
@@ -105,7 +105,7 @@ def random_walk_motion(
     tilt_rms: float = 0.1,
     heading_rate_rms: float = 0.3,
     rests: Rests | None = None,
-) -> Motion:
+) -> SimulatedMotion:
     """Return a smooth random walk inside a box, as of a person or a robot that carries the body.
 
     Parameters
@@ -132,7 +132,7 @@ def random_walk_motion(
     heading = rng.uniform(-np.pi, np.pi) + np.cumsum(steps)
     attitudes = Rotation.from_euler("z", heading[:, None]) * Rotation.from_rotvec(tilt)
     path = _path_in_box(rng, box_world, speed, moving)
-    return Motion(path, RotationSpline(knots, attitudes), rate)
+    return SimulatedMotion(path, RotationSpline(knots, attitudes), rate)
 
 
 def turning_motion(
@@ -142,7 +142,7 @@ def turning_motion(
     speed: float = 0.3,
     rate_rms: float = 0.6,
     rests: Rests | None = None,
-) -> Motion:
+) -> SimulatedMotion:
     """Return a rotation about all axes, as of a body rotated by hand for calibration.
 
     Parameters
@@ -162,14 +162,14 @@ def turning_motion(
     for step in rng.normal(0.0, rate_rms * ATTITUDE_KNOT / np.sqrt(3.0), (len(knots) - 1, 3)):
         attitudes.append(attitudes[-1] * Rotation.from_rotvec(step))
     path = _path_in_box(rng, box_world, speed, moving)
-    return Motion(path, RotationSpline(knots, Rotation.concatenate(attitudes)), rate)
+    return SimulatedMotion(path, RotationSpline(knots, Rotation.concatenate(attitudes)), rate)
 
 
-def static_motion(position_world: Array, world_from_body: Rotation) -> Motion:
+def static_motion(position_world: Array, world_from_body: Rotation) -> SimulatedMotion:
     """Return a body that is always at rest."""
     still = BSpline(np.array([0.0, 1.0]), np.asarray(position_world, dtype=float)[None], 0)
     attitude = RotationSpline([0.0, 1.0], Rotation.concatenate([world_from_body] * 2))
-    return Motion(still, attitude, BPoly(np.zeros((1, 1)), np.array([0.0, 1.0])))
+    return SimulatedMotion(still, attitude, BPoly(np.zeros((1, 1)), np.array([0.0, 1.0])))
 
 
 def progress_rate(duration: float, rests: Rests) -> BPoly:

@@ -27,7 +27,7 @@ def perturb_site(site: Site, rng: np.random.Generator) -> Site:
     sensors = site.platform.magnetometers
     alone = len(sensors) == 1
     drawn = tuple(_perturb_magnetometer(s, draw, None if alone else s.name) for s in sensors)
-    platform = site.platform.carrying(drawn)
+    platform = site.platform.with_magnetometers(drawn)
     if site.log_conductivity_sigma:
         error = draw("ground", "ground", "conductivity", np.array([site.log_conductivity_sigma]))
         beacons = tuple(replace(b, conductivity=b.conductivity * np.exp(error[0])) for b in beacons)

@@ -211,8 +211,8 @@ class Steel:
             tensor[own, own] = rings[..., None, None] * along
         coupled = np.einsum("iab,ijbc->iajc", answer, tensor).reshape(3 * n, 3 * n)
         driven = np.einsum("iab,ikb->iak", answer, field_world).reshape(3 * n, -1)
-        found = np.linalg.solve(np.eye(3 * n) - coupled, driven)
-        return np.asarray(np.swapaxes(found.reshape(n, 3, -1), 1, 2))
+        result = np.linalg.solve(np.eye(3 * n) - coupled, driven)
+        return np.asarray(np.swapaxes(result.reshape(n, 3, -1), 1, 2))
 
 
 def dipole_tensor(offset: Array) -> Array:

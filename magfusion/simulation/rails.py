@@ -16,7 +16,7 @@ from magfusion.units import Array, ComplexArray
 
 FINE = 0.5  # of the distance to the platform and to beacons: length of a segment
 LONGEST = 0.3  # m; of a segment
-FEWEST = 40  # segments of a bar, whose poles are near its ends
+MIN_SEGMENTS = 40  # segments of a bar, whose poles are near its ends
 NEAREST = 0.1  # m; from the surface of steel to where the body moves, and to every beacon
 MOST_SEGMENTS = 1500
 TOGETHER = 2_000_000  # components of tensors at once
@@ -87,7 +87,7 @@ def laid(pipes: tuple[Pipe, ...], box_world: Array, beacons_world: Array) -> Ste
     return Steel(tuple(whole))
 
 
-def beside_wells(pipes: tuple[Pipe, ...], ways_world: list[Array]) -> tuple[Pipe, ...]:
+def steel_along_wells(pipes: tuple[Pipe, ...], ways_world: list[Array]) -> tuple[Pipe, ...]:
     """Return steel near the paths (n, 3) (m) of a sensor and of a magnet, in short segments.
 
     Raises
@@ -100,8 +100,8 @@ def beside_wells(pipes: tuple[Pipe, ...], ways_world: list[Array]) -> tuple[Pipe
         ways = np.concatenate(ways_world)
         offset = ways - pipe.start_world
         along = np.clip(offset @ pipe.axis_world, 0.0, pipe.length)[:, None]
-        apart = np.linalg.norm(offset - along * pipe.axis_world, axis=1)
-        away = float(np.min(apart)) - pipe.radius
+        separate = np.linalg.norm(offset - along * pipe.axis_world, axis=1)
+        away = float(np.min(separate)) - pipe.radius
         if away < NEAREST:
             raise InputError(
                 f"--rails: number {number} comes within {max(away, 0.0):.2g} m of the path of the"
@@ -114,7 +114,7 @@ def beside_wells(pipes: tuple[Pipe, ...], ways_world: list[Array]) -> tuple[Pipe
 
 
 def _segment(pipe: Pipe, away: float) -> float:
-    return min(max(FINE * away, 0.05), LONGEST, pipe.length / FEWEST)
+    return min(max(FINE * away, 0.05), LONGEST, pipe.length / MIN_SEGMENTS)
 
 
 def _check_count(pipes: list[Pipe]) -> None:
@@ -171,8 +171,10 @@ def secondary_world(
         part = slice(first, first + rows)
         tensor = dipole_tensor(point_world[part][:, None] - centres)
         by_moment = np.swapaxes(tensor, 1, 2).reshape(-1, len(flat))
-        found = (by_moment @ flat.real + 1j * (by_moment @ flat.imag)).reshape(-1, 3, flat.shape[1])
-        out[part] = np.swapaxes(found, 1, 2)
+        result = (by_moment @ flat.real + 1j * (by_moment @ flat.imag)).reshape(
+            -1, 3, flat.shape[1]
+        )
+        out[part] = np.swapaxes(result, 1, 2)
     return out
 
 

@@ -69,10 +69,10 @@ class Surroundings:
     conductivity: float = 0.0  # S/m, without end, where there are no layers
 
 
-def simulate_passes(
+def simulate_transits(
     site: Site,
     shaft: Shaft,
-    passes: tuple[Pass, ...],
+    transits: tuple[Pass, ...],
     around: Surroundings,
     rate_hz: float,
     rng: np.random.Generator,
@@ -93,40 +93,40 @@ def simulate_passes(
     """
     beacon, begin = site.beacons[0], 0.0
     waves, angles, forces, depths, places = [], [], [], [], []
-    for own in passes:
+    for own in transits:
         time = begin + np.arange(int(own.duration * rate_hz)) / rate_hz
         angle = shaft_angle(shaft, beacon.frequency_hz, time, rng)
         forward = 1.0 if own.depth[1] > own.depth[0] else -1.0
         at = own.depth[0] + forward * own.speed * (time - begin)
         waves.append(Waveform(time, _measured(site, shaft, own, around, angle, at, rate_hz, rng)))
         angles.append(angle + shaft.encoder_sigma * rng.standard_normal(len(angle)))
-        felt = time[:: max(int(rate_hz / 10.0), 1)]
-        forces.append((felt, own.world_from_body.T @ np.array([0.0, 0.0, site.gravity])))
-        told = np.linspace(time[0], time[-1], max(int(own.duration), 2))
-        true = np.interp(told, time, at)
-        error = around.depth_sigma * rng.standard_normal(len(told))
-        depths.append(np.stack([told, (1.0 + around.depth_scale) * true + error]))
+        affected = time[:: max(int(rate_hz / 10.0), 1)]
+        forces.append((affected, own.world_from_body.T @ np.array([0.0, 0.0, site.gravity])))
+        reported = np.linspace(time[0], time[-1], max(int(own.duration), 2))
+        true = np.interp(reported, time, at)
+        error = around.depth_sigma * rng.standard_normal(len(reported))
+        depths.append(np.stack([reported, (1.0 + around.depth_scale) * true + error]))
         places.append(np.array([[time[0], time[-1]], [own.sensor_depth] * 2]))
         begin = float(time[-1]) + gap
     wave = Waveform(
         np.concatenate([w.time for w in waves]), np.concatenate([w.measured_sensor for w in waves])
     )
     imu = site.platform.imu
-    felt = np.concatenate([t for t, _ in forces])
+    affected = np.concatenate([t for t, _ in forces])
     force = np.concatenate([np.broadcast_to(f, (len(t), 3)) for t, f in forces])
     rest = ImuSamples(
-        felt,
+        affected,
         imu.gyro_noise * np.sqrt(5.0) * rng.standard_normal(force.shape),
         force + imu.accel_noise * np.sqrt(5.0) * rng.standard_normal(force.shape),
     )
-    turned = RotorAngles(wave.time, {beacon.name: np.mod(np.concatenate(angles), 2.0 * np.pi)})
+    rotated = RotorAngles(wave.time, {beacon.name: np.mod(np.concatenate(angles), 2.0 * np.pi)})
     return Log(
         name="passes",
         epoch_ns=1_700_000_000_000_000_000,
         source="simulation",
         imu=rest,
         waveform=wave,
-        rotation=turned if encoder else None,
+        rotation=rotated if encoder else None,
         depths=Depths(
             {beacon.name: np.concatenate(depths, 1), "magnetometer": np.concatenate(places, 1)}
         ),

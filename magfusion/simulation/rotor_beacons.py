@@ -22,7 +22,7 @@ from magfusion.units import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Turning:
+class MagnetRotation:
     """Rotation of a beacon's magnet.
 
     Parameters
@@ -42,16 +42,16 @@ class Turning:
 
 def turn_rotors(
     site: Site, errors: ShaftErrors, duration: float, rng: np.random.Generator
-) -> tuple[Site, dict[str, Turning]]:
+) -> tuple[Site, dict[str, MagnetRotation]]:
     """Return a site whose rotors have all orders of their true moments, and their rotation."""
-    beacons, turning = list[Beacon](), dict[str, Turning]()
+    beacons, turning = list[Beacon](), dict[str, MagnetRotation]()
     for beacon in site.beacons:
         if beacon.rotor is None:
             beacons.append(beacon)
             continue
         shaft = draw_shaft(beacon.rotor, errors, rng)
         beacons.append(_of_orders(beacon, shaft))
-        turning[beacon.name] = Turning(
+        turning[beacon.name] = MagnetRotation(
             shaft_course(shaft, beacon.frequency_hz, -2.0, duration + 2.0, rng),
             moment_orders(beacon.rotor, shaft).get(0, np.zeros(3)).real,
             shaft.encoder_sigma,
@@ -60,7 +60,7 @@ def turn_rotors(
 
 
 def recorded_angles(
-    turning: Mapping[str, Turning], time: Array, rng: np.random.Generator
+    turning: Mapping[str, MagnetRotation], time: Array, rng: np.random.Generator
 ) -> RotorAngles:
     """Return encoder records at times (n,) (s)."""
     angles = {

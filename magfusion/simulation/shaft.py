@@ -120,10 +120,10 @@ def shaft_course(
     drift[0] = shaft.drift_hz * rng.standard_normal()
     for k in range(1, len(knots)):
         drift[k] = keep * drift[k - 1] + kick[k]
-    turned = CubicSpline(knots, frequency_hz + drift).antiderivative()
+    rotated = CubicSpline(knots, frequency_hz + drift).antiderivative()
 
     def angle(time: Array) -> Array:
-        return np.asarray(shaft.angle_start + 2.0 * np.pi * (turned(time) - turned(first)))
+        return np.asarray(shaft.angle_start + 2.0 * np.pi * (rotated(time) - rotated(first)))
 
     return angle
 

@@ -14,7 +14,7 @@ from magfusion.model.site import Magnetometer, Site, Slots
 from magfusion.simulation.disturbance import Ambient
 from magfusion.simulation.field import Drives, phasors_world
 from magfusion.simulation.magnetometers import answered
-from magfusion.simulation.motion import Motion
+from magfusion.simulation.motion import SimulatedMotion
 from magfusion.simulation.rails import magnetised_world
 from magfusion.simulation.slots import Multiplexer, check_slots, slot_gates
 from magfusion.units import Array, ComplexArray
@@ -64,7 +64,7 @@ def usual_rate_hz(site: Site, burst: float = Multiplexer.burst) -> float:
 
 
 def simulate_waveform(
-    motion: Motion,
+    motion: SimulatedMotion,
     site: Site,
     drives: Drives,
     rate_hz: float,
@@ -155,8 +155,8 @@ def _answered_tones(
     )
     for frequency_hz, tone_world in tones:
         tone = np.einsum("nij,nj->ni", measured_from_world, tone_world)
-        heard = answered(tone[:, None], magnetometer.response, np.array([frequency_hz]))
-        yield np.real(heard[:, 0])
+        detected = answered(tone[:, None], magnetometer.response, np.array([frequency_hz]))
+        yield np.real(detected[:, 0])
 
 
 def _check_tones(site: Site, rate_hz: float, marks: Marks | None, drives: Drives) -> None:

@@ -34,7 +34,7 @@ class TwoWells:
         Of the magnet's angle zero about its shaft (rad).
     ahead : float
         Of the magnet's position at ``depth`` (m).
-    apart : float
+    well_distance : float
         Between the sensor's two places along its well (m).
     reach : float
         Of the magnet's path on either side of the sensor (m).
@@ -50,7 +50,7 @@ class TwoWells:
     lean: tuple[float, float]
     turn: float
     ahead: float
-    apart: float
+    well_distance: float
     reach: float
     speed: float
     depth: float = 0.0
@@ -67,7 +67,7 @@ class TwoWells:
         lean = Rotation.from_rotvec(side @ np.array([0.0, *self.lean]))
         return np.asarray(lean.apply(side[:, 0]))
 
-    def passes(
+    def transits_of(
         self, rolls: Array, lever_body: Array | None = None, axis_beacon: Array | None = None
     ) -> tuple[Pass, ...]:
         """Return a pass for each of two places of the sensor.
@@ -91,10 +91,12 @@ class TwoWells:
             rotor_world = rotor_world @ _first_from(axis_beacon)
         middle = self.distance * across + self.ahead * along
         out = []
-        for place, roll in zip((-0.5 * self.apart, 0.5 * self.apart), rolls, strict=True):
+        for place, roll in zip(
+            (-0.5 * self.well_distance, 0.5 * self.well_distance), rolls, strict=True
+        ):
             body = place * side[:, 0]
-            abreast = float((body - middle) @ along)
-            low, high = abreast - self.reach, abreast + self.reach
+            simultaneous = float((body - middle) @ along)
+            low, high = simultaneous - self.reach, simultaneous + self.reach
             world_from_body = side @ Rotation.from_euler("x", roll).as_matrix()
             sensor = body if lever_body is None else body + world_from_body @ lever_body
             one = Pass(
@@ -128,7 +130,7 @@ class TwoWells:
         down = self.side_world[:, 0]
         return Pipe(-half * down, half * down, radius, *steel, segment)
 
-    def abreast(self, own: Pass) -> tuple[float, float, float]:
+    def truth_of(self, own: Pass) -> tuple[float, float, float]:
         """Return the true values of a pass.
 
         Its distance (m), direction from the high side (rad), and the magnet's depth at the closest

@@ -1,6 +1,6 @@
 """The room of paper 004, and deviations of its field from that of known dipoles.
 
-A `Scenario` specifies the disturbances of a world, `draw_world` draws one, and a `World` gives a
+A `Scenario` specifies the disturbances of a world, `draw_world` draws one, and a `SimulatedWorld` gives a
 sensor's measurements in it, anywhere and with a fingerprint survey.  The estimator's knowledge is
 `World.site`: dipoles, exactly surveyed.  The scenarios are those of the independent analysis of the
 paper: noise alone (S0), a smooth gain error (S1), two sets fitted to the printed errors (F1, F2),
@@ -32,7 +32,7 @@ IRON_PERMEABILITY = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class SceneLayout:
     """Positions of beacons, targets and fingerprints, all level.
 
     Parameters
@@ -74,7 +74,7 @@ class Layout:
         return kept[:count]
 
 
-ROOM = Layout(
+ROOM = SceneLayout(
     beacons_world=np.array([[0.0, 0.0, 0.0], [6.20, 0.54, 0.0], [3.20, 4.28, 0.0]]),
     frequencies_hz=(25.0, 20.0, 30.0),
     targets_world=np.array([[0.6, 0.6, HEIGHT], [5.1, 3.9, HEIGHT]]),
@@ -83,11 +83,11 @@ ROOM = Layout(
 )
 
 
-def ring(beacons: int) -> Layout:
+def ring(beacons: int) -> SceneLayout:
     """Return beacons evenly on a ring of 3.6 m radius, and targets in the 2 m square within."""
     azimuth = 2.0 * np.pi * np.arange(beacons) / beacons
     circle = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(beacons)], axis=1)
-    return Layout(
+    return SceneLayout(
         beacons_world=3.6 * circle,
         frequencies_hz=tuple(20.0 + 5.0 * i for i in range(beacons)),
         targets_world=np.array([[-1.0, -1.0, HEIGHT], [1.0, 1.0, HEIGHT]]),
@@ -96,7 +96,7 @@ def ring(beacons: int) -> Layout:
 
 
 @dataclass(frozen=True)
-class Receiver:
+class SimulatedReceiver:
     """Receiver noise after averaging: white, one epoch from many samples.
 
     Parameters
@@ -144,7 +144,7 @@ class Scenario:
     sphere_radius : tuple of float
         Minimum and maximum (m).
     iron_reach : float, optional
-        Depth of the shell in which iron is drawn (m); `felt_reach` if None.
+        Depth of the shell in which iron is drawn (m); `detection_reach` if None.
     """
 
     name: str
@@ -188,7 +188,7 @@ SCENARIOS = {scenario.name: scenario for scenario in (S0, S1, F1, F2, P0, P1, P2
 
 
 @dataclass(frozen=True, eq=False)
-class World:
+class SimulatedWorld:
     """One draw of a scenario.
 
     Parameters
@@ -208,9 +208,9 @@ class World:
     """
 
     site: Site
-    layout: Layout
+    layout: SceneLayout
     scenario: Scenario
-    receiver: Receiver
+    receiver: SimulatedReceiver
     true_beacons: tuple[Beacon, ...]
     log_gain: SmoothField
     matrix: SmoothField
@@ -274,7 +274,7 @@ class World:
         )
 
 
-def felt_reach(radius: float, layout: Layout, receiver: Receiver) -> float:
+def detection_reach(radius: float, layout: SceneLayout, receiver: SimulatedReceiver) -> float:
     """Return the distance of iron at which its effect in a room's middle equals the noise (m).
 
     A sphere of radius a adds ``2 (a / d)^3`` of the field that it disturbs at distance d from its
@@ -290,10 +290,10 @@ def felt_reach(radius: float, layout: Layout, receiver: Receiver) -> float:
 def draw_world(
     scenario: Scenario,
     rng: np.random.Generator,
-    layout: Layout = ROOM,
-    receiver: Receiver | None = None,
+    layout: SceneLayout = ROOM,
+    receiver: SimulatedReceiver | None = None,
     model_error: float = 0.02,
-) -> World:
+) -> SimulatedWorld:
     """Draw a world.
 
     Parameters
@@ -304,7 +304,7 @@ def draw_world(
             Declared in the site.
     """
     gain_rng, matrix_rng, line_rng, sphere_rng = rng.spawn(4)
-    receiver = receiver or Receiver()
+    receiver = receiver or SimulatedReceiver()
     entry_rms = scenario.matrix_rms / np.sqrt(3.0)
     count = len(layout.beacons_world)
     spheres = None
@@ -320,7 +320,7 @@ def draw_world(
             reach=_iron_reach(scenario, layout, receiver),
         )
     site = _declared_site(layout, model_error)
-    return World(
+    return SimulatedWorld(
         site=site,
         layout=layout,
         scenario=scenario,
@@ -333,10 +333,10 @@ def draw_world(
     )
 
 
-def _iron_reach(scenario: Scenario, layout: Layout, receiver: Receiver) -> float:
+def _iron_reach(scenario: Scenario, layout: SceneLayout, receiver: SimulatedReceiver) -> float:
     if scenario.iron_reach is not None:
         return scenario.iron_reach
-    return felt_reach(scenario.sphere_radius[1], layout, receiver) - CLEARANCE
+    return detection_reach(scenario.sphere_radius[1], layout, receiver) - CLEARANCE
 
 
 def _with_size(beacon: Beacon, scenario: Scenario) -> Beacon:
@@ -345,7 +345,7 @@ def _with_size(beacon: Beacon, scenario: Scenario) -> Beacon:
     return replace(beacon, coils=tuple(coils))
 
 
-def _declared_site(layout: Layout, model_error: float) -> Site:
+def _declared_site(layout: SceneLayout, model_error: float) -> Site:
     """Return level beacons as dipoles, and a bare sensor, all known exactly."""
     plain = demo_site()
     coils = (Coil(np.array([MOMENT, 0.0, 0.0])), Coil(np.array([0.0, MOMENT, 0.0]), -np.pi / 2.0))

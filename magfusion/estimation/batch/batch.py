@@ -7,10 +7,10 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.chain import Start
-from magfusion.estimation.batch.log_graph import PreparedLog, noise_of
+from magfusion.estimation.batch.log_graph import PreprocessedLog, noise_of
 from magfusion.estimation.batch.outer_iteration import (
     advance,
-    begin_passes,
+    begin_iterations,
     demodulate_about,
     nothing_moved,
     plan_pass,
@@ -18,12 +18,12 @@ from magfusion.estimation.batch.outer_iteration import (
     retune,
     solve_about,
 )
-from magfusion.estimation.batch.passes import PassFile
-from magfusion.estimation.batch.prepared import prepared
+from magfusion.estimation.batch.outer_iterations import PassFile
+from magfusion.estimation.batch.preprocessed_log import preprocess
 from magfusion.estimation.batch.settings import SmootherSettings as SmootherSettings
-from magfusion.estimation.data_checks.mending import mended
-from magfusion.estimation.demodulation.hearing import heard_site
-from magfusion.estimation.graph.graph import Estimate, Graph, read_states
+from magfusion.estimation.data_checks.data_cleaning import clean_log
+from magfusion.estimation.demodulation.beacon_selection import select_detected
+from magfusion.estimation.graph.graph import Graph, GraphEstimate, read_states
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.measurements.earth import EarthField, check_earth, disturbed
 from magfusion.estimation.measurements.field_error import field_errors
@@ -80,7 +80,7 @@ class Smoothed:
         Whitened; NaN where a channel is missing, or with loose coupling.
     graph : Graph
         As of the last optimisation.
-    estimate : Estimate
+    estimate : GraphEstimate
         Solution of ``graph``: the states, and the calibration of every segment of a long log.
     rival_chi_square : float, optional
         Excess chi square of the best trajectory from another chain of hypotheses, after its first
@@ -95,7 +95,7 @@ class Smoothed:
         That trajectory.
     dropped : mapping
         Reason to number of windows.
-    bridged : int
+    gap_bridged : int
         Intervals with a gap in the inertial stream.
     earth_residual : ndarray, shape (n, 3), optional
         Whitened; None where the Earth field was not measured.
@@ -114,7 +114,7 @@ class Smoothed:
     epoch_ns : int
         Zero of the log's clock.
     trust : Trust, optional
-        After `magfusion.estimation.integrity.judge.judged`.
+        After `magfusion.estimation.integrity.judge.judge_result`.
     """
 
     states: Trajectory
@@ -128,12 +128,12 @@ class Smoothed:
     residual: Array
     start: Start
     graph: Graph
-    estimate: Estimate
+    estimate: GraphEstimate
     rival_chi_square: float | None
     dropped: Mapping[str, int]
-    bridged: int
+    gap_bridged: int
     cost: float
-    passes: int
+    iteration_count: int
     iterations: int
     converged: bool
     last_move: float = 0.0
@@ -168,7 +168,7 @@ def smooth(
     site: Site,
     settings: SmootherSettings | None = None,
     report: Report = quiet,
-    passes: PassFile | None = None,
+    iterations_file: PassFile | None = None,
 ) -> Smoothed:
     """Estimate the trajectory of a log and its calibration in one solution.
 
@@ -178,7 +178,7 @@ def smooth(
         With a waveform, or with phasors in the site's channel order.
     report : callable, optional
         Called with stage, steps done and total steps.
-    passes : PassFile, optional
+    iterations_file : PassFile, optional
         Checkpoint of the passes, from which a stopped run is resumed.
 
     Raises
@@ -202,58 +202,61 @@ def smooth(
             )
     if settings.earth:
         check_earth(site)
-    log, site = heard_site(log, site, settings.lockin)
-    known = mended(log, site)
-    found = _solved(prepared(known, site, settings, report), settings, report, passes)
-    return replace(found, log_name=log.name, epoch_ns=log.epoch_ns)
+    log, site = select_detected(log, site, settings.lockin)
+    known = clean_log(log, site)
+    result = _solved(preprocess(known, site, settings, report), settings, report, iterations_file)
+    return replace(result, log_name=log.name, epoch_ns=log.epoch_ns)
 
 
 def _solved(
-    log: PreparedLog, settings: SmootherSettings, report: Report, passes: PassFile | None = None
+    log: PreprocessedLog,
+    settings: SmootherSettings,
+    report: Report,
+    iterations_file: PassFile | None = None,
 ) -> Smoothed:
     """Return the posterior of a log after passes until convergence."""
-    first, time, steps = log.declared, log.states.time, settings.passes + 3
+    first, time, steps = log.declared, log.states.time, settings.max_iterations + 3
     calm = quiet_before(log.imu, time - first.imu_offset(time), first.site.platform.motion)
-    known = None if passes is None else passes.begun(log)
-    now = begin_passes(log, settings) if known is None else known
+    known = None if iterations_file is None else iterations_file.begun(log)
+    now = begin_iterations(log, settings) if known is None else known
     log = replace(log, declared=now.declared)
     while True:
         report(f"pass {now.done + 1}", now.done + 2, steps)
         plan, wave = plan_pass(log, now, settings), demodulate_about(log, now)
         solved = solve_about(log, now, wave, calm, plan)
         before, now = now, advance(now, solved)
-        settled = nothing_moved(before, now, solved)
+        converged = nothing_moved(before, now, solved)
         if plan.finds_noise:
             give_back_memory()
-            latest = noise_of(
-                log, solved.graph, solved.found.estimate, now.states, wave, first.site
+            newest = noise_of(
+                log, solved.graph, solved.solution.estimate, now.states, wave, first.site
             )
-            now, settled = retune(before, now, latest, plan), False
+            now, converged = retune(before, now, newest, plan), False
             log = replace(log, declared=now.declared)
-        if settled or now.done >= settings.passes:
+        if converged or now.done >= settings.max_iterations:
             break
         now = relax(log, before, now, solved.graph.blocks)
         del solved  # most of the memory in a long log
         give_back_memory()
-        if passes is not None:
-            passes.keep(now, first, log.blocks)
+        if iterations_file is not None:
+            iterations_file.keep(now, first, log.blocks)
     report("posterior", steps - 1, steps)
     # Receiver data for another pass are no longer needed.
     log = replace(log, demodulation=replace(log.demodulation, receiver=None))
     give_back_memory()
-    found, fields = solved.found, log.samples if wave is None else wave.fields
-    result = posterior(log, solved.graph, found, fields, solved.gaps)
+    estimate, fields = solved.solution, log.samples if wave is None else wave.fields
+    result = posterior(log, solved.graph, estimate, fields, solved.gaps)
     report("done", steps, steps)
     refuse_open(result.states)
     move = 0.0
-    if not (settled and found.converged):
-        unfinished = None if found.converged else (solved.graph, found.estimate)
+    if not (converged and estimate.converged):
+        unfinished = None if estimate.converged else (solved.graph, estimate.estimate)
         move = last_move(before.states, result.states, unfinished)
     return replace(
         result,
         noise=now.tuned,
         standing=now.standing,
-        passes=now.done,
+        iteration_count=now.done,
         iterations=now.iterations,
         converged=move < QUIET,
         last_move=move,
@@ -269,28 +272,32 @@ def solved_again(result: Smoothed, measurements: tuple[Measurement, ...]) -> Smo
         From GTSAM, where these measurements leave the system singular.
     """
     graph = replace(result.graph, measurements=measurements)
-    found = optimise(graph, result.estimate)
-    pose_cov, calibration_cov, response = marginals(graph, found.estimate, result.uncertain)
-    states = read_states(found.estimate.values, result.states.time)
+    estimate = optimise(graph, result.estimate)
+    pose_cov, calibration_cov, response = marginals(graph, estimate.estimate, result.uncertain)
+    states = read_states(estimate.estimate.values, result.states.time)
     phasors = next(m for m in measurements if isinstance(m, FieldPhasors))
-    heard = np.any(phasors.sqrt_information != 0.0, axis=(2, 3))
-    error = graph.residual(phasors.alone(), found.estimate)
+    detected = np.any(phasors.sqrt_information != 0.0, axis=(2, 3))
+    error = graph.residual(phasors.alone(), estimate.estimate)
     return replace(
         result,
         states=replace(states, pose_cov=pose_cov),
-        calibration=found.estimate.calibration,
+        calibration=estimate.estimate.calibration,
         calibration_cov=calibration_cov,
         calibration_response=response,
-        residual=np.where(heard[..., None], error, np.nan),
+        residual=np.where(detected[..., None], error, np.nan),
         graph=graph,
-        estimate=found.estimate,
-        cost=found.cost,
-        iterations=result.iterations + found.iterations,
+        estimate=estimate.estimate,
+        cost=estimate.cost,
+        iterations=result.iterations + estimate.iterations,
     )
 
 
 def posterior(
-    log: PreparedLog, graph: Graph, found: Optimised[Estimate], samples: FieldSamples, gaps: int
+    log: PreprocessedLog,
+    graph: Graph,
+    result: Optimised[GraphEstimate],
+    samples: FieldSamples,
+    gaps: int,
 ) -> Smoothed:
     """Return the posterior of a log from its optimised graph.
 
@@ -301,7 +308,7 @@ def posterior(
     gaps : int
         Number of intervals with a bridged gap.
     """
-    estimate = found.estimate
+    estimate = result.estimate
     states, response = read_states(estimate.values, log.states.time), None
     errors: tuple[Block, ...] = ()
     if log.fixes is None:
@@ -315,11 +322,11 @@ def posterior(
         later = np.searchsorted(log.epoch, np.arange(len(states)))
         response = there[np.minimum(later, len(there) - 1)]
         pose_cov = pose_cov + response @ np.swapaxes(response, 1, 2)
-    left = {type(m): graph.residual(m, estimate) for m in map(alone, graph.measurements)}
-    error = left.get(FieldPhasors, np.nan)
-    residual = np.where(samples.told, error, np.nan)
+    remaining = {type(m): graph.residual(m, estimate) for m in map(alone, graph.measurements)}
+    error = remaining.get(FieldPhasors, np.nan)
+    residual = np.where(samples.is_measured, error, np.nan)
     earth_field = next((m for m in graph.measurements if isinstance(m, EarthField)), None)
-    earth = None if earth_field is None else left[EarthField][:, 0]
+    earth = None if earth_field is None else remaining[EarthField][:, 0]
     return Smoothed(
         states=replace(states, pose_cov=pose_cov),
         epoch=log.epoch,
@@ -337,11 +344,11 @@ def posterior(
         rival=log.rival,
         dropped=log.demodulation.dropped,
         open_signs=count_open(log.samples, samples),
-        bridged=gaps,
-        cost=found.cost,
-        passes=1,
-        iterations=found.iterations,
-        converged=found.converged,
+        gap_bridged=gaps,
+        cost=result.cost,
+        iteration_count=1,
+        iterations=result.iterations,
+        converged=result.converged,
         earth_residual=earth,
         earth_disturbed=(
             None if earth is None or earth_field is None else disturbed(earth, earth_field.repeats)

@@ -17,7 +17,7 @@ from scipy.ndimage import minimum_filter
 from magfusion.errors import EstimationError
 from magfusion.estimation.snapshot.candidates import beacon_directions, wahba
 from magfusion.estimation.solve.batched import (
-    Normal,
+    NormalEquations,
     by_differences,
     minimise,
     normal_equations,
@@ -39,7 +39,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.units import MU0_OVER_4PI, Array, ComplexArray, IntArray
 
 TRAJECTORY_ERROR = 0.03  # relative; of a field predicted from a trajectory of the known beacons
-FEWEST_EPOCHS = 10
+MIN_EPOCHS = 10
 EPOCHS_SEARCHED = 120
 GRID = 24  # points along each axis
 MINIMA = 12  # of the grid that are refined
@@ -48,7 +48,7 @@ EQUALLY_GOOD = 0.9  # of the best agreement of an attitude with the drive
 RANGE_MARGIN = 1.4  # of a range from the field's strength alone
 SAME_PLACE = 0.05  # m
 NO_PRIOR = (100.0, 10.0)  # m, rad; sigmas without information
-STEPS, SETTLED = 40, 1e-8  # of the refinement; relative decrease that ends it
+STEPS, MIN_COST_DECREASE = 40, 1e-8  # of the refinement; relative decrease that ends it
 
 
 class DetectedFields(NamedTuple):
@@ -119,10 +119,10 @@ def detected_along(
         Where it was detected at too few epochs.
     """
     columns = np.array([name == beacon.name for name, _ in samples.channels], dtype=bool)
-    _, ours, theirs = np.intersect1d(samples.time, states.time, return_indices=True)
+    _, ours, others = np.intersect1d(samples.time, states.time, return_indices=True)
     usable = samples.valid[ours][:, columns].all(axis=1)
-    ours, theirs = ours[usable], theirs[usable]
-    if len(ours) < FEWEST_EPOCHS:
+    ours, others = ours[usable], others[usable]
+    if len(ours) < MIN_EPOCHS:
         raise EstimationError(
             f"beacon {beacon.name} was detected at {len(ours)} epochs, too few to place it: record"
             " it for longer, at a smaller distance"
@@ -131,7 +131,7 @@ def detected_along(
     cov = samples.phasor_cov[ours][:, columns] * windows_per_sample
     cov = cov + model_error_cov(phasor, TRAJECTORY_ERROR)
     poses = Trajectory(
-        states.time[theirs], states.world_from_body[theirs], states.position_world[theirs]
+        states.time[others], states.world_from_body[others], states.position_world[others]
     )
     alone = initial_calibration(_alone(beacon, calibration.site), float(np.mean(poses.time)))
     sensor = calibration.site.platform.magnetometer
@@ -171,8 +171,8 @@ def places(detected: DetectedFields) -> list[tuple[float, Beacon]]:
     starts = [start for centre in _centres(detected) for start in _starts(detected, *centre)]
     kept: list[tuple[float, Beacon]] = []
     for chi_square, placed in sorted(_refined(detected, starts), key=lambda one: one[0]):
-        apart = [np.linalg.norm(placed.position_world - b.position_world) for _, b in kept]
-        if min(apart, default=np.inf) > SAME_PLACE:
+        separate = [np.linalg.norm(placed.position_world - b.position_world) for _, b in kept]
+        if min(separate, default=np.inf) > SAME_PLACE:
             kept.append((chi_square, placed))
     return kept
 
@@ -194,11 +194,11 @@ def _centres(detected: DetectedFields) -> list[tuple[Array, float]]:
     cost, centres, there = _polished(
         detected, mesh.reshape(-1, 3)[rows], drifts[np.argmin(misfit[:, rows], axis=0)]
     )
-    apart: list[tuple[Array, float]] = []
+    separate: list[tuple[Array, float]] = []
     for one in np.argsort(cost):
-        if all(np.linalg.norm(centres[one] - other) > SAME_PLACE for other, _ in apart):
-            apart.append((centres[one], float(there[one])))
-    return apart[:MOST_REFINED] + _mirrors(detected)
+        if all(np.linalg.norm(centres[one] - other) > SAME_PLACE for other, _ in separate):
+            separate.append((centres[one], float(there[one])))
+    return separate[:MOST_REFINED] + _mirrors(detected)
 
 
 def _mirrors(detected: DetectedFields) -> list[tuple[Array, float]]:
@@ -286,25 +286,28 @@ def _polished(
 ) -> tuple[Array, Array, Array]:
     """Return the misfit at the minimum near each centre, with its centre and clock error."""
     elapsed, sensor_world, weight, phasor = detected.thinned()
-    free, largest = not detected.beacon.synchronised, detected.alone.site.clock.drift_largest
+    free_parameters, largest = (
+        not detected.beacon.synchronised,
+        detected.alone.site.clock.drift_largest,
+    )
     turns = 2.0 * np.pi * elapsed[:, None] * detected.beacon.tone_frequencies_hz
 
-    def residual(found: Array) -> Array:
-        drift = found[:, 3:] if free else np.zeros((len(found), 1))
+    def residual(result: Array) -> Array:
+        drift = result[:, 3:] if free_parameters else np.zeros((len(result), 1))
         lag = largest * drift[..., None] * turns
         steady = phasor * np.exp(-1j * lag)[..., None]
-        tensor = _tensors(found[:, :3], sensor_world)
+        tensor = _tensors(result[:, :3], sensor_world)
         drive, _ = _drive_at(tensor, weight, steady)
         seen = np.swapaxes(tensor @ drive[:, None], -1, -2)
         error = np.sqrt(weight)[:, None, None] * (steady - seen)
-        return np.concatenate([error.real, error.imag], axis=1).reshape(len(found), -1)
+        return np.concatenate([error.real, error.imag], axis=1).reshape(len(result), -1)
 
-    def model(_: IntArray, found: Array) -> Normal:
-        return normal_equations(*by_differences(residual, found))
+    def model(_: IntArray, result: Array) -> NormalEquations:
+        return normal_equations(*by_differences(residual, result))
 
-    start = np.column_stack([centres, drifts / largest]) if free else centres
-    solved = minimise(model, start, passes=30, relative=SETTLED)
-    there = largest * solved.state[:, 3] if free else np.zeros(len(centres))
+    start = np.column_stack([centres, drifts / largest]) if free_parameters else centres
+    solved = minimise(model, start, max_iterations=30, relative=MIN_COST_DECREASE)
+    there = largest * solved.state[:, 3] if free_parameters else np.zeros(len(centres))
     return solved.cost, solved.state[:, :3], there
 
 
@@ -342,7 +345,7 @@ def _attitudes(
         squares = [np.angle(np.sum(drive**2, axis=0)) for drive in (world, declared)]
         lag = 0.5 * (squares[0] - squares[1])
         signs = product((0.0, np.pi), repeat=tones) if tones > 1 else [(0.0,)]
-        lags = [lag + np.array(turned) for turned in signs]
+        lags = [lag + np.array(rotated) for rotated in signs]
     correlation = np.stack([(world * np.exp(-1j * lag) @ np.conj(declared).T).real for lag in lags])
     attitude = wahba(correlation)
     score = np.sum(attitude * correlation, axis=(1, 2))
@@ -368,7 +371,7 @@ def _refined(detected: DetectedFields, starts: list[Calibration]) -> list[tuple[
             np.concatenate([columns, np.diag(share)]),
         )
 
-    def model(rows: IntArray, state: Array) -> Normal:
+    def model(rows: IntArray, state: Array) -> NormalEquations:
         pairs = [whitened(starts[row], at) for row, at in zip(rows, state, strict=True)]
         error, columns = zip(*pairs, strict=True)
         return normal_equations(np.array(error), np.array(columns))
@@ -376,8 +379,10 @@ def _refined(detected: DetectedFields, starts: list[Calibration]) -> list[tuple[
     def moved(state: Array, step: Array) -> Array:
         return _objects([retract(at, blocks, s) for at, s in zip(state, step, strict=True)])
 
-    found = minimise(model, _objects(starts), moved, passes=STEPS, relative=SETTLED)
-    pairs = zip(found.cost, found.state, strict=True)
+    result = minimise(
+        model, _objects(starts), moved, max_iterations=STEPS, relative=MIN_COST_DECREASE
+    )
+    pairs = zip(result.cost, result.state, strict=True)
     return [(float(cost), at.site.beacons[0]) for cost, at in pairs]
 
 

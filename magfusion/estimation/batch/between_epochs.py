@@ -14,8 +14,8 @@ from gtsam.symbol_shorthand import B, V, X
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.demodulation.motion_shape import motion_at
 from magfusion.estimation.graph.considered import responses
+from magfusion.estimation.graph.dead_reckoning_error import step_noise, step_transitions
 from magfusion.estimation.graph.preintegration import GAP_SAMPLES
-from magfusion.estimation.graph.reckoning_error import step_noise, step_transitions
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.solve.bordered import eliminate
 from magfusion.model.parameters import corrected_imu
@@ -42,14 +42,14 @@ def at_rate(result: Smoothed, log: Log, rate: Literal["imu"] | float) -> Traject
     imu = calibration.on_log_rate(corrected_imu(calibration, result.blocks, log.imu))
     stamps = imu.time + offset
     # Every sample is a step of the covariance, whether or not it is requested.
-    passed, asked = stamps, np.ones(len(stamps), dtype=bool)
+    passed, requested = stamps, np.ones(len(stamps), dtype=bool)
     if rate != "imu":
         first, last = np.ceil(states.time[0] * rate), np.floor(states.time[-1] * rate)
         wanted = np.arange(first, last + 1.0) / rate
         passed = np.union1d(stamps, wanted)
-        asked = np.isin(passed, wanted)
+        requested = np.isin(passed, wanted)
     inside = (passed >= states.time[0]) & (passed <= states.time[-1])
-    passed, asked = passed[inside], asked[inside]
+    passed, requested = passed[inside], requested[inside]
     dense = motion_at(states, imu, offset, result.declared.site.gravity, passed)
 
     def line(known: Array, values: Array | None) -> Array:
@@ -61,13 +61,13 @@ def at_rate(result: Smoothed, log: Log, rate: Literal["imu"] | float) -> Traject
     accel_bias = line(states.time, states.accel_bias_body)
     stream = ImuSamples(passed, line(stamps, imu.gyro_body), line(stamps, imu.accel_body))
     return Trajectory(
-        time=passed[asked],
-        world_from_body=dense.world_from_body[asked],
-        position_world=dense.position_world[asked],
-        velocity_world=None if dense.velocity_world is None else dense.velocity_world[asked],
-        gyro_bias_body=gyro_bias[asked],
-        accel_bias_body=accel_bias[asked],
-        pose_cov=_pose_cov(result, dense, stream, accel_bias)[asked],
+        time=passed[requested],
+        world_from_body=dense.world_from_body[requested],
+        position_world=dense.position_world[requested],
+        velocity_world=None if dense.velocity_world is None else dense.velocity_world[requested],
+        gyro_bias_body=gyro_bias[requested],
+        accel_bias_body=accel_bias[requested],
+        pose_cov=_pose_cov(result, dense, stream, accel_bias)[requested],
     )
 
 
@@ -82,14 +82,14 @@ class _Steps(NamedTuple):
         ``world_from_body`` at the beginning of each step.
     force_world : ndarray, shape (k, steps, 3)
         Specific force (m/s^2).
-    bridged : bool ndarray, shape (k,)
+    gap_bridged : bool ndarray, shape (k,)
         Intervals with a gap of the inertial stream.
     """
 
     length: Array
     rotation: Array
     force_world: Array
-    bridged: BoolArray
+    gap_bridged: BoolArray
 
 
 def _pose_cov(result: Smoothed, dense: Trajectory, stream: ImuSamples, accel_bias: Array) -> Array:
@@ -98,8 +98,8 @@ def _pose_cov(result: Smoothed, dense: Trajectory, stream: ImuSamples, accel_bia
     joint = _joint_cov(result)
     force = stream.accel_body - accel_bias
     usual = float(np.median(np.diff(stream.time)))
-    left = np.clip(np.searchsorted(epochs, stream.time, side="right") - 1, 0, len(epochs) - 2)
-    first = np.searchsorted(left, np.arange(len(epochs)))
+    remaining = np.clip(np.searchsorted(epochs, stream.time, side="right") - 1, 0, len(epochs) - 2)
+    first = np.searchsorted(remaining, np.arange(len(epochs)))
     out = np.empty((len(stream), 6, 6))
     begin = 0
     while begin < len(epochs) - 1:
@@ -111,7 +111,10 @@ def _pose_cov(result: Smoothed, dense: Trajectory, stream: ImuSamples, accel_bia
         end = begin + max(int(longer[0]), 1) if len(longer) else end
         rows, numbers = slice(first[begin], first[end]), np.arange(begin, end)
         count = np.diff(first[begin : end + 1])
-        own, place = left[rows] - begin, np.arange(first[begin], first[end]) - first[left[rows]]
+        own, place = (
+            remaining[rows] - begin,
+            np.arange(first[begin], first[end]) - first[remaining[rows]],
+        )
         edges = np.repeat(epochs[numbers + 1][:, None], int(np.max(count)) + 2, axis=1)
         edges[:, 0] = epochs[numbers]
         edges[own, place + 1] = stream.time[rows]
@@ -174,11 +177,11 @@ def _conditioned(steps: _Steps, last: Array, joint: Array, imu: ImuModel) -> Arr
     joint : ndarray, shape (k, 30, 30)
         Of the states at both ends.
     """
-    transition, noise = _carried(steps, imu)
+    transition, noise = _step_transition(steps, imu)
     whole, total = transition[:, -1], noise[:, -1]
     scale = np.sqrt(np.diagonal(total, axis1=1, axis2=2))
-    left = whole[:, None] @ np.linalg.inv(transition)  # transition of the remaining interval
-    across = left @ noise / scale[:, None, :, None]
+    remaining = whole[:, None] @ np.linalg.inv(transition)  # transition of the remaining interval
+    across = remaining @ noise / scale[:, None, :, None]
     # In units of the noise's sigmas, which differ by many orders of magnitude.
     rounded = (total / (scale[:, :, None] * scale[:, None, :]))[:, None]
     gain = np.swapaxes(np.linalg.solve(rounded, across), 2, 3)[:, :, :6] / scale[:, None, None]
@@ -189,18 +192,18 @@ def _conditioned(steps: _Steps, last: Array, joint: Array, imu: ImuModel) -> Arr
     for k, rotation in ((0, steps.rotation[:, 0]), (MOTION, last)):
         ends[:, k : k + 3, k : k + 3] = ends[:, k + 3 : k + 6, k + 3 : k + 6] = rotation
     joint = ends @ joint @ np.swapaxes(ends, 1, 2)
-    own = noise[:, :, :6, :6] - gain @ (left @ noise)[..., :6]
+    own = noise[:, :, :6, :6] - gain @ (remaining @ noise)[..., :6]
     return both @ joint[:, None] @ np.swapaxes(both, 2, 3) + own
 
 
-def _carried(steps: _Steps, imu: ImuModel) -> tuple[Array, Array]:
+def _step_transition(steps: _Steps, imu: ImuModel) -> tuple[Array, Array]:
     """Return transition and noise from the beginning to the end of each step, world axes.
 
     Shape (k, steps, 15, 15): rotation, position, velocity, accelerometer and gyro bias.
     """
     k, count = steps.length.shape
     own = step_transitions(steps.length, steps.rotation, steps.force_world)
-    added = step_noise(steps.length, imu, steps.bridged[:, None])
+    added = step_noise(steps.length, imu, steps.gap_bridged[:, None])
     transition, noise = np.empty((2, k, count, MOTION, MOTION))
     so_far, spread = np.tile(np.eye(MOTION), (k, 1, 1)), np.zeros((k, MOTION, MOTION))
     for i in range(count):

@@ -14,7 +14,7 @@ def calibration_rules(declared: Calibration, blocks: tuple[Block, ...]) -> Rules
     """Return the serialisation rules of calibrations, as differences from the declared one."""
     names = {block.name for block in blocks}
     return Rules(
-        {Calibration: lambda found: _changes(declared, found)},
+        {Calibration: lambda result: _changes(declared, result)},
         {Calibration: lambda data: _changed(declared, data, names)},
     )
 

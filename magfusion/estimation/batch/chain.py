@@ -77,18 +77,18 @@ def choose_chains(
     unary = np.where(np.isfinite(fixes.cost), unary, np.inf)
     link = _link_cost(fixes, turn, site)
     chains: list[Start] = []
-    left = unary.copy()
+    remaining = unary.copy()
     for _ in range(fixes.cost.shape[1]):
-        chosen, cost = _viterbi(left, link)
+        chosen, cost = _viterbi(remaining, link)
         fresh = all(np.mean(chosen != other.chosen) > 0.5 for other in chains)
         if not fresh or (chains and cost > chains[0].cost + RIVAL_COST):
             break
         steps = link[np.arange(len(link)), chosen[:-1], chosen[1:]]
         leaps = int(np.sum(steps >= LEAP_COST))
         chains.append(replace(start_of(fixes, chosen, cost), leaps=leaps))
-        left[np.arange(len(fixes)), chosen] = np.inf
-        spent = ~np.isfinite(left).any(axis=1)
-        left[spent] = unary[spent]
+        remaining[np.arange(len(fixes)), chosen] = np.inf
+        spent = ~np.isfinite(remaining).any(axis=1)
+        remaining[spent] = unary[spent]
     return tuple(chains)
 
 
@@ -129,8 +129,8 @@ def _link_cost(fixes: Fixes, turn: Array, site: Site) -> Array:
     angle = angle.reshape(between.shape[:-2])
     jump = fixes.position_world[1:, None] - fixes.position_world[:-1, :, None]
     spread = (site.platform.motion.speed_sigma * dt) ** 2 + POSITION_SIGMA**2
-    turned = (site.platform.imu.gyro_bias_sigma * dt) ** 2 + ROTATION_SIGMA**2
-    cost = np.sum(jump**2, axis=-1) / spread[:, None, None] + angle**2 / turned[:, None, None]
+    rotated = (site.platform.imu.gyro_bias_sigma * dt) ** 2 + ROTATION_SIGMA**2
+    cost = np.sum(jump**2, axis=-1) / spread[:, None, None] + angle**2 / rotated[:, None, None]
     return np.minimum(cost, LEAP_COST)
 
 
@@ -176,8 +176,8 @@ def start_phases(calibration: Calibration, time: Array, phase: Array) -> Calibra
             elapsed, phase[:, rows.start], frequency, calibration.site.clock.drift_largest
         )
         rate = 2.0 * np.pi * beacon.tone_frequencies_hz * (drift[i] - calibration.drift[i])
-        left = np.exp(1j * (phase[:, rows] - elapsed[:, None] * rate))
-        new_phase[rows] += np.angle(np.sum(left, axis=0))
+        remaining = np.exp(1j * (phase[:, rows] - elapsed[:, None] * rate))
+        new_phase[rows] += np.angle(np.sum(remaining, axis=0))
     one = new_phase[: start or None]
     return replace(calibration, phase=of_all_sensors(calibration.site, one), drift=drift)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.estimation.posterior.condensed import Condensed, summed, taken_at
+from magfusion.estimation.posterior.marginalized_log import MarginalizedLog, summed, taken_at
 from magfusion.model.correlation import Correlation, joined
 from magfusion.model.parameters import Block, Calibration, difference, prior_sigma, retract
 from magfusion.model.prior import parameters_of, prior_sqrt_information
@@ -42,7 +42,7 @@ class Shared:
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class SharedCalibration:
     """Estimate of the shared calibration.
 
     Parameters
@@ -53,23 +53,23 @@ class Known:
         As estimators use it: by white noise alone.
     by_common : ndarray, shape (s, c)
         Change by one sigma of each parameter that is considered in every log.
-    apart : ndarray, shape (s, s)
+    separate_errors : ndarray, shape (s, s)
         Covariance due to parameters that are considered separately in each log.
     """
 
     step: Array
     cov: Array
     by_common: Array
-    apart: Array
+    separate_errors: Array
 
     @property
     def honest(self) -> Array:
         """Covariance including considered parameters, shape (s, s)."""
-        return self.cov + self.by_common @ self.by_common.T + self.apart
+        return self.cov + self.by_common @ self.by_common.T + self.separate_errors
 
 
 @dataclass(frozen=True, eq=False)
-class Said:
+class LogReport:
     """Information of one log, and its linearisation point of the shared calibration.
 
     Parameters
@@ -79,15 +79,15 @@ class Said:
     """
 
     step: Array
-    part: Condensed
+    part: MarginalizedLog
 
 
-def known_by(shared: Shared, logs: Sequence[Said], at: Array) -> Known:
+def known_by(shared: Shared, logs: Sequence[LogReport], at: Array) -> SharedCalibration:
     """Return the shared calibration from survey and logs after a Gauss-Newton step.
 
     Parameters
     ----------
-    logs : sequence of `Said`
+    logs : sequence of `LogReport`
         Any number.
     at : ndarray, shape (s,)
         From the declared calibration to the linearisation point of the step.
@@ -96,7 +96,7 @@ def known_by(shared: Shared, logs: Sequence[Said], at: Array) -> Known:
     unit = prior_sigma(shared.blocks)
     information = prior.copy()
     gradient = -prior @ difference(shared.declared, here, shared.blocks)
-    by_common, apart = np.zeros((len(at), 0)), np.zeros_like(prior)
+    by_common, separate = np.zeros((len(at), 0)), np.zeros_like(prior)
     if logs:
         parts = [taken_at(s.part, shared.moved(s.step), here, shared.blocks) for s in logs]
         total = summed(parts)
@@ -104,22 +104,22 @@ def known_by(shared: Shared, logs: Sequence[Said], at: Array) -> Known:
         gradient += total.gradient
         by_common = total.by_common
         # Logs of one place may have met the same iron: as if all had met the same.
-        apart = len(logs) * total.by_place + total.by_log
+        separate = len(logs) * total.by_place + total.by_log
     cov = np.linalg.inv(unit[:, None] * information * unit)
     cov = unit[:, None] * (0.5 * (cov + cov.T)) * unit
     after = retract(here, shared.blocks, cov @ gradient)
     step = difference(shared.declared, after, shared.blocks)
-    return Known(step, cov, cov @ by_common, cov @ apart @ cov)
+    return SharedCalibration(step, cov, cov @ by_common, cov @ separate @ cov)
 
 
-def between(shared: Shared, old: Said, new: Said, share: float) -> Said:
+def between(shared: Shared, old: LogReport, new: LogReport, share: float) -> LogReport:
     """Return the information of a log after a share of its change, linearised at the new point."""
     if share == 1.0:
         return new
     here, there = shared.moved(new.step), shared.moved(old.step)
     before = vars(taken_at(old.part, there, here, shared.blocks))
     part = {k: share * v + (1.0 - share) * before[k] for k, v in vars(new.part).items()}
-    return Said(new.step, Condensed(**part))
+    return LogReport(new.step, MarginalizedLog(**part))
 
 
 def apart_in_sigmas(one: Array, other: Array, cov: Array) -> float:
@@ -130,13 +130,15 @@ def apart_in_sigmas(one: Array, other: Array, cov: Array) -> float:
     return float(np.sqrt(max(float(step @ solved), 0.0) / len(step)))
 
 
-def as_prior(known: Known, shared: Shared, blocks: tuple[Block, ...]) -> tuple[Block, ...]:
+def as_prior(
+    known: SharedCalibration, shared: Shared, blocks: tuple[Block, ...]
+) -> tuple[Block, ...]:
     """Return the blocks of a log, with the estimate as prior of those that are shared."""
     sigma, at = np.sqrt(np.diagonal(known.cov)), {b.key: b.columns for b in shared.blocks}
     return tuple(b._replace(sigma=sigma[at[b.key]]) if b.key in at else b for b in blocks)
 
 
-def with_prior(known: Known, shared: Shared, declared: Calibration) -> Calibration:
+def with_prior(known: SharedCalibration, shared: Shared, declared: Calibration) -> Calibration:
     """Return a log's declared calibration with the mean and correlation of the estimate."""
     sigma, own = np.sqrt(np.diagonal(known.cov)), parameters_of(shared.blocks)
     fresh = Correlation(tuple(own), known.cov / sigma[:, None] / sigma)

@@ -6,16 +6,22 @@ from typing import NamedTuple
 import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed, posterior
-from magfusion.estimation.batch.joint import Known, Said, Shared, as_prior, with_prior
-from magfusion.estimation.batch.log_graph import PreparedLog, graph_of
-from magfusion.estimation.batch.prepared import Begun, prepared_again
+from magfusion.estimation.batch.joint import (
+    LogReport,
+    Shared,
+    SharedCalibration,
+    as_prior,
+    with_prior,
+)
+from magfusion.estimation.batch.log_graph import PreprocessedLog, graph_of
+from magfusion.estimation.batch.preprocessed_log import WarmStart, restore_preprocessed
 from magfusion.estimation.batch.settings import SmootherSettings
-from magfusion.estimation.data_checks.mending import mended
+from magfusion.estimation.data_checks.data_cleaning import clean_log
 from magfusion.estimation.demodulation.motion_compensation import MotionCompensated
-from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate, read_states
+from magfusion.estimation.graph.graph import Graph, GraphEstimate, initial_estimate, read_states
 from magfusion.estimation.graph.prior_factor import PriorShift
 from magfusion.estimation.measurements.field_error import field_errors
-from magfusion.estimation.posterior.condensed import columns_of, condensed
+from magfusion.estimation.posterior.marginalized_log import columns_of, marginalize
 from magfusion.estimation.posterior.noise_tuning import Tuned, with_noise
 from magfusion.estimation.solve.bordered import Optimised, eliminate, optimise
 from magfusion.model.parameters import Block, Calibration, difference, dimension, retract
@@ -31,7 +37,7 @@ class OfLog:
 
     Parameters
     ----------
-    begun : Begun
+    begun : WarmStart
         Its states, and its declared calibration.
     steps : ndarray, shape (segments, dimension)
         From its declared calibration to that of each segment of a long log.
@@ -39,23 +45,23 @@ class OfLog:
         Estimated when it was smoothed alone.
     standing : bool ndarray, shape (states,)
         Where the platform is at rest.
-    said : `Said`
+    report : `LogReport`
         Its information on the shared calibration.
     """
 
-    begun: Begun
+    begun: WarmStart
     steps: Array
     noise: tuple[Tuned, ...]
     standing: BoolArray
-    said: Said
+    report: LogReport
 
 
 class Round(NamedTuple):
     """One log, solved with the other logs as its prior."""
 
-    log: PreparedLog
+    log: PreprocessedLog
     graph: Graph
-    found: Optimised[Estimate]
+    solution: Optimised[GraphEstimate]
     wave: MotionCompensated | None
     gaps: int
     shift: PriorShift
@@ -63,21 +69,26 @@ class Round(NamedTuple):
 
 def of_smoothed(result: Smoothed, shared: Shared) -> OfLog:
     """Return the data between rounds of a log that was smoothed alone."""
-    begun = Begun(
+    begun = WarmStart(
         replace(result.states, pose_cov=None),
         result.declared,
         result.start,
         result.rival_chi_square,
         result.rival,
     )
-    part = condensed(result.graph, result.estimate, result.considered, result.field_errors)
-    said = Said(difference(shared.declared, result.calibration, shared.blocks), part)
+    part = marginalize(result.graph, result.estimate, result.considered, result.field_errors)
+    findings = LogReport(difference(shared.declared, result.calibration, shared.blocks), part)
     steps = _steps(result.declared, result.estimate, result.blocks)
-    return OfLog(begun, steps, result.noise, result.standing, said)
+    return OfLog(begun, steps, result.noise, result.standing, findings)
 
 
 def solve_round(
-    log: Log, site: Site, settings: SmootherSettings, kept: OfLog, shared: Shared, prior: Known
+    log: Log,
+    site: Site,
+    settings: SmootherSettings,
+    kept: OfLog,
+    shared: Shared,
+    prior: SharedCalibration,
 ) -> Round:
     """Solve a log from its last states, with the survey and the other logs as its prior.
 
@@ -85,7 +96,7 @@ def solve_round(
 
     Parameters
     ----------
-    prior : Known
+    prior : SharedCalibration
         From all other logs and the survey.
 
     Raises
@@ -94,7 +105,7 @@ def solve_round(
         Where the log is not the one that was smoothed, or cannot be solved.
     """
     declared = with_noise(kept.begun.declared, kept.noise)
-    ready = prepared_again(mended(log, site), site, settings, kept.begun)
+    ready = restore_preprocessed(clean_log(log, site), site, settings, kept.begun)
     blocks, states = ready.blocks, ready.states
     every = tuple(retract(declared, blocks, step) for step in kept.steps)
     ready = replace(
@@ -104,42 +115,42 @@ def solve_round(
     )
     segments = every if len(every) > 1 else ()
     calibration = every[len(every) // 2]
-    by_waveform = ready.demodulation.anew
+    by_waveform = ready.demodulation.can_repeat
     wave = ready.compensated(calibration, states) if by_waveform else None
     graph, gaps = graph_of(ready, states, calibration, wave, kept.standing)
     start = initial_estimate(states, calibration, segments)
-    found = optimise(graph, start)
-    if found.converged:  # costs cannot resolve steps below their own rounding
-        step = eliminate(graph.linearized(found.estimate), graph.ordering).optimize()
-        found = replace(found, estimate=graph.moved(found.estimate, step))
-    return Round(ready, graph, found, wave, gaps, _shift(prior, ready))
+    result = optimise(graph, start)
+    if result.converged:  # costs cannot resolve steps below their own rounding
+        step = eliminate(graph.linearized(result.estimate), graph.ordering).optimize()
+        result = replace(result, estimate=graph.moved(result.estimate, step))
+    return Round(ready, graph, result, wave, gaps, _shift(prior, ready))
 
 
-def _shift(prior: Known, log: PreparedLog) -> PriorShift:
+def _shift(prior: SharedCalibration, log: PreprocessedLog) -> PriorShift:
     """Return the shift of a log's prior from other logs by considered parameters."""
     rows = columns_of(log.blocks, own=False)
     by_considered = np.zeros((len(rows), dimension(log.considered)))
     columns = columns_of(log.considered, own=False)
     if prior.by_common.shape[1]:
         by_considered[np.ix_(rows, columns)] = prior.by_common
-    apart = np.zeros((len(rows), len(prior.step)))
-    value, vector = np.linalg.eigh(prior.apart)
-    apart[rows] = vector * np.sqrt(np.maximum(value, 0.0))
-    return PriorShift(by_considered, apart)
+    separate = np.zeros((len(rows), len(prior.step)))
+    value, vector = np.linalg.eigh(prior.separate_errors)
+    separate[rows] = vector * np.sqrt(np.maximum(value, 0.0))
+    return PriorShift(by_considered, separate)
 
 
 def after_round(kept: OfLog, done: Round, shared: Shared) -> OfLog:
     """Return the data of a log after a round."""
-    estimate, log = done.found.estimate, done.log
+    estimate, log = done.solution.estimate, done.log
     states = read_states(estimate.values, log.states.time)
     measured = log.measured_at(done.graph.measurements)
     here = Trajectory(**{k: v[measured] for k, v in vars(states).items() if v is not None})
     errors = field_errors(estimate.calibration.site, here.time, here)
-    part = condensed(done.graph, estimate, log.considered, errors)
-    said = Said(difference(shared.declared, estimate.calibration, shared.blocks), part)
+    part = marginalize(done.graph, estimate, log.considered, errors)
+    findings = LogReport(difference(shared.declared, estimate.calibration, shared.blocks), part)
     begun = replace(kept.begun, states=states)
     return replace(
-        kept, begun=begun, steps=_steps(kept.begun.declared, estimate, log.blocks), said=said
+        kept, begun=begun, steps=_steps(kept.begun.declared, estimate, log.blocks), report=findings
     )
 
 
@@ -153,7 +164,7 @@ def joint_posterior(kept: OfLog, done: Round, blocks: tuple[Block, ...]) -> Smoo
     """
     samples = done.log.samples if done.wave is None else done.wave.fields
     graph = replace(done.graph, shift=done.shift)
-    result = posterior(done.log, graph, done.found, samples, done.gaps)
+    result = posterior(done.log, graph, done.solution, samples, done.gaps)
     return replace(
         result,
         declared=with_noise(kept.begun.declared, kept.noise),
@@ -163,7 +174,7 @@ def joint_posterior(kept: OfLog, done: Round, blocks: tuple[Block, ...]) -> Smoo
     )
 
 
-def _steps(declared: Calibration, estimate: Estimate, blocks: tuple[Block, ...]) -> Array:
+def _steps(declared: Calibration, estimate: GraphEstimate, blocks: tuple[Block, ...]) -> Array:
     every = estimate.segments or (estimate.calibration,)
     steps = [difference(declared, calibration, blocks) for calibration in every]
     return np.array(steps).reshape(len(every), dimension(blocks))

@@ -14,15 +14,15 @@ from magfusion.estimation.demodulation.close_log import looked_at, without_silen
 from magfusion.estimation.demodulation.demodulation import Demodulation
 from magfusion.estimation.demodulation.motion_compensation import MotionCompensated
 from magfusion.estimation.graph.drift_segments import segments_of
-from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate
+from magfusion.estimation.graph.graph import Graph, GraphEstimate, initial_estimate
 from magfusion.estimation.graph.imu_decimation import preintegrate_stream
 from magfusion.estimation.graph.inertial import Link, Preintegrated, inertial_graph, links_between
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.preintegration import low_passed_rate_at
-from magfusion.estimation.measurements.earth import earth_measurement, unheld
-from magfusion.estimation.measurements.held_roll import held_roll
+from magfusion.estimation.measurements.earth import earth_measurement, unobserved_constraints
+from magfusion.estimation.measurements.fixed_roll import held_roll
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
-from magfusion.estimation.measurements.model_error import alike_in_batch
+from magfusion.estimation.measurements.model_error import epochs_sharing_error
 from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
 from magfusion.estimation.measurements.pose_fix import pose_fixes
 from magfusion.estimation.measurements.signs import with_signs
@@ -39,7 +39,7 @@ from magfusion.units import Array, BoolArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedLog:
+class PreprocessedLog:
     """A log with an initial estimate.
 
     Parameters
@@ -114,10 +114,10 @@ class PreparedLog:
         known = replace(self.demodulation, log=log if imu is log.imu else replace(log, imu=imu))
         path = None if known.close is None else states
         wave = known.compensated(calibration, self.at_fields(states), path)
-        heard, hidden = self.samples.valid, self.demodulation.drowned
+        detected, hidden = self.samples.valid, self.demodulation.masked
         if hidden is not None and np.any(hidden):
-            heard = heard | hidden & above_noise(wave.fields, DETECTION_CHI_SQUARE_ONLINE)
-        return replace(wave, fields=only(wave.fields, heard))
+            detected = detected | hidden & above_noise(wave.fields, DETECTION_CHI_SQUARE_ONLINE)
+        return replace(wave, fields=only(wave.fields, detected))
 
     def with_signs(
         self, calibration: Calibration, states: Trajectory, *, first: bool
@@ -135,18 +135,18 @@ class PreparedLog:
         self, standing: BoolArray, time: Array, calibration: Calibration
     ) -> list[Measurement]:
         """Return the gyro readings at the epochs of whole rests (s), if any."""
-        chosen = np.flatnonzero(standing & self.samples.at_rest(time))
+        chosen = np.flatnonzero(standing & self.samples.is_stationary(time))
         if not len(chosen) or not self.declared.site.platform.inertial:
             return []
         offset = calibration.imu_offset(time[chosen])
         noise = self.declared.site.platform.imu.gyro_noise
         within = self.samples.rest_about(time[chosen])
-        found = zero_rate(chosen, time[chosen], within, self.imu, offset, noise)
-        return [] if found is None else [found]
+        result = zero_rate(chosen, time[chosen], within, self.imu, offset, noise)
+        return [] if result is None else [result]
 
 
 def graph_of(
-    log: PreparedLog,
+    log: PreprocessedLog,
     states: Trajectory,
     calibration: Calibration,
     wave: MotionCompensated | None = None,
@@ -166,7 +166,7 @@ def graph_of(
         Whether another graph will follow, and this one does not determine the final noise: the
         sigmas of the inertial factors may then be a tenth off.
     """
-    links, bridged = _links(log, states, calibration, roughly=roughly)
+    links, gap_bridged = _links(log, states, calibration, roughly=roughly)
     measurements = [
         replace(measurement, epoch=np.searchsorted(states.time, time)[measurement.epoch])
         for time, measurement in log.others
@@ -187,11 +187,11 @@ def graph_of(
     graph = Graph(
         native, tuple(measurements), log.declared, log.blocks, len(states), acting, segments
     )
-    return graph, bridged
+    return graph, gap_bridged
 
 
 def _links(
-    log: PreparedLog, states: Trajectory, calibration: Calibration, *, roughly: bool
+    log: PreprocessedLog, states: Trajectory, calibration: Calibration, *, roughly: bool
 ) -> tuple[tuple[Link, ...], int]:
     """Return the inertial stream between the states, and the number of bridged intervals.
 
@@ -201,31 +201,31 @@ def _links(
     accel, gyro = states.accel_bias_body, states.gyro_bias_body
     assert accel is not None
     assert gyro is not None
-    blocks, bridged = (*log.blocks, *placed(log.considered, dimension(log.blocks))), []
+    blocks, gap_bridged = (*log.blocks, *placed(log.considered, dimension(log.blocks))), []
 
     def preintegrated(calibration: Calibration) -> list[Preintegrated]:
         imu = applied.on_log_rate(corrected_imu(calibration, blocks, log.imu))
         offset, model, gravity = applied.time_offset, site.platform.imu, site.gravity
-        found, gaps = preintegrate_stream(
+        result, gaps = preintegrate_stream(
             imu, offset, states.time, model, gravity, accel, gyro, log.silence, roughly=roughly
         )
-        bridged.append(int(np.sum(gaps)))
-        return found
+        gap_bridged.append(int(np.sum(gaps)))
+        return result
 
     links = links_between(
         preintegrated, calibration, blocks, lambda _: initial_estimate(states, calibration).values
     )
-    return tuple(links), bridged[0]
+    return tuple(links), gap_bridged[0]
 
 
-def _fixes(log: PreparedLog, fixes: Fixes) -> Measurement:
+def _fixes(log: PreprocessedLog, fixes: Fixes) -> Measurement:
     """Return the fixes of the start as pose measurements."""
     cov = fixes.pose_cov[np.arange(len(fixes)), log.start.chosen] * overlap(log.samples)
     return replace(pose_fixes(replace(log.start.states, pose_cov=cov), log.loss), epoch=log.epoch)
 
 
 def _fields(
-    log: PreparedLog,
+    log: PreprocessedLog,
     states: Trajectory,
     calibration: Calibration,
     wave: MotionCompensated | None,
@@ -252,19 +252,21 @@ def _fields(
         overlap(samples),
         by_offset,
         standing=None if standing is None else standing[log.epoch],
-        beside=False,  # its modes are considered
+        others=False,  # its modes are considered
     )
     out: list[Measurement] = [replace(phasors, robust=log.loss)]
     if log.steady is not None:
         steady, step = log.steady if wave is None else wave.steady, _step(samples)
         out.append(earth_measurement(site, steady, log.epoch, rate_body, offset, step))
         detected = np.any(samples.valid, axis=1)
-        out += unheld(states, log.epoch, detected, step, log.declared.site.platform.motion)
+        out += unobserved_constraints(
+            states, log.epoch, detected, step, log.declared.site.platform.motion
+        )
     return out
 
 
 def _with_short(
-    log: PreparedLog,
+    log: PreprocessedLog,
     states: Trajectory,
     calibration: Calibration,
     wave: MotionCompensated | None,
@@ -277,8 +279,8 @@ def _with_short(
         return measurements
     assert wave.wanted is not None
     imu = calibration.on_log_rate(corrected_imu(calibration, log.blocks, log.imu))
-    left, nodes = wave.unexplained_sensor, wave.wanted
-    joint = close.measured(left, nodes, states, calibration, imu, standing)
+    remaining, nodes = wave.unexplained_sensor, wave.wanted
+    joint = close.measured(remaining, nodes, states, calibration, imu, standing)
     joint = without_silent(joint, wave.fields, log.at_fields(states), calibration)
     length = float(np.median(wave.fields.window))
     out = [looked_at(m, joint, length) if isinstance(m, FieldPhasors) else m for m in measurements]
@@ -301,16 +303,16 @@ def _step(samples: FieldSamples) -> float:
 
 
 def noise_of(
-    log: PreparedLog,
+    log: PreprocessedLog,
     graph: Graph,
-    estimate: Estimate,
+    estimate: GraphEstimate,
     states: Trajectory,
     wave: MotionCompensated | None,
     declared: Site,
 ) -> tuple[Tuned, ...]:
     """Return the noise of a log from its solved graph and phasors; see `tune`."""
     samples, here = log.samples if wave is None else wave.fields, log.at_fields(states)
-    alike = alike_in_batch(here.position_world, declared.model_error_length)
+    shared = epochs_sharing_error(here.position_world, declared.model_error_length)
     blind = log.demodulation.blind
-    windows, held = overlap(samples), log.considered
-    return tune(graph, estimate, samples, here, declared, windows, alike, blind, held)
+    windows, fixed = overlap(samples), log.considered
+    return tune(graph, estimate, samples, here, declared, windows, shared, blind, fixed)

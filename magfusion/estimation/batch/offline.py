@@ -16,7 +16,7 @@ import numpy as np
 from magfusion.estimation.batch.chain import Start, choose_chains, start_of, start_phases
 from magfusion.estimation.batch.search import can_search, search
 from magfusion.estimation.demodulation.demodulation import fix_inputs
-from magfusion.estimation.measurements.zero_rate import freed_of_bias
+from magfusion.estimation.measurements.zero_rate import without_bias
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.fix_separation import separate_fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
@@ -37,7 +37,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, IntArray
 
 if TYPE_CHECKING:
-    from magfusion.estimation.batch.search import Found
+    from magfusion.estimation.batch.search import FoundTrajectory
 
 LEAST_DETECTED = 10  # minimum number of epochs with a detected beacon for a start
 
@@ -92,15 +92,15 @@ def begin(
         declared = calibration
         if some.signed:  # amplitudes do not depend on the phase
             declared = start_phases(calibration, fixes.time, start.phase)
-        whole = start if everywhere else _carried(start, imu, offset, samples.time)
+        whole = start if everywhere else _propagated_start(start, imu, offset, samples.time)
         out.append(OfflineStart(whole, whole.states, declared, fixes))
     tracked = epochs.signed and not roll_is_open(calibration.site)
     if not tracked or not _doubtful(chains):
         return out
     if can_search(epochs):
         still = replace(imu, gyro_body=imu.gyro_body - _rest_bias(imu, calibration))
-        for found in search(epochs, fixes, still, calibration):
-            out.append(_tracked(found, fixes, imu, calibration, samples.time))
+        for result in search(epochs, fixes, still, calibration):
+            out.append(_tracked(result, fixes, imu, calibration, samples.time))
     return out
 
 
@@ -109,7 +109,7 @@ def unbiased(imu: ImuSamples, samples: FieldSamples, time_offset: float) -> ImuS
     if not samples.of_rests:
         return imu
     half, stamps = 0.5 * samples.window, samples.time - time_offset
-    return freed_of_bias(imu, stamps - half, stamps + half)
+    return without_bias(imu, stamps - half, stamps + half)
 
 
 def _doubtful(chains: tuple[Start, ...]) -> bool:
@@ -119,21 +119,21 @@ def _doubtful(chains: tuple[Start, ...]) -> bool:
 
 
 def _tracked(
-    found: Found, fixes: Fixes, imu: ImuSamples, calibration: Calibration, time: Array
+    result: FoundTrajectory, fixes: Fixes, imu: ImuSamples, calibration: Calibration, time: Array
 ) -> OfflineStart:
     """Return the trajectory of a track as a start, with the nearest hypotheses of the fixes."""
     offset = calibration.time_offset
-    there = carried(found.states, imu, offset, fixes.time)
+    there = propagated_states(result.states, imu, offset, fixes.time)
     away = np.linalg.norm(fixes.position_world - there.position_world[:, None], axis=2)
     cross = np.einsum("nij,nhij->nh", there.world_from_body, fixes.world_from_body)
-    apart = away**2 + (3.0 - cross) * np.median(away)
-    chosen = np.argmin(np.where(np.isfinite(fixes.cost), apart, np.inf), axis=1)
-    start = start_of(fixes, chosen, found.cost)
-    whole = start if len(fixes) == len(time) else _carried(start, imu, offset, time)
+    separate = away**2 + (3.0 - cross) * np.median(away)
+    chosen = np.argmin(np.where(np.isfinite(fixes.cost), separate, np.inf), axis=1)
+    start = start_of(fixes, chosen, result.cost)
+    whole = start if len(fixes) == len(time) else _propagated_start(start, imu, offset, time)
     return OfflineStart(
         whole,
-        carried(found.states, imu, offset, time),
-        start_phases(calibration, found.states.time, found.phase),
+        propagated_states(result.states, imu, offset, time),
+        start_phases(calibration, result.states.time, result.phase),
         fixes,
     )
 
@@ -168,8 +168,8 @@ def _by_earth(samples: FieldSamples, steady: SteadyFields, imu: ImuSamples, site
     stamps = imu.time + site.platform.imu.time_offset
     attitude = attitude_from_gyro(stamps, imu.gyro_body)
     at_epochs = attitude_at(attitude, stamps, imu.gyro_body, time)
-    turned, span = attitude.apply(imu.accel_body), site.platform.motion.accel_span
-    up_body = at_epochs.inv().apply(mean_about(stamps, turned, time, span))
+    rotated, span = attitude.apply(imu.accel_body), site.platform.motion.accel_span
+    up_body = at_epochs.inv().apply(mean_about(stamps, rotated, time, span))
     sensor = site.platform.magnetometer
     field = (steady.measured_sensor - sensor.offset) @ np.linalg.inv(sensor.matrix).T
     field_body = field @ sensor.body_from_sensor.T
@@ -188,7 +188,9 @@ def _by_earth(samples: FieldSamples, steady: SteadyFields, imu: ImuSamples, site
     )
 
 
-def carried(known: Trajectory, imu: ImuSamples, time_offset: float, time: Array) -> Trajectory:
+def propagated_states(
+    known: Trajectory, imu: ImuSamples, time_offset: float, time: Array
+) -> Trajectory:
     """Return states at other epochs: from the nearest known one, rotated by the gyro.
 
     Parameters
@@ -219,11 +221,11 @@ def _nearest(known: Array, time: Array) -> IntArray:
     return np.where(later, after, after - 1)
 
 
-def _carried(start: Start, imu: ImuSamples, time_offset: float, time: Array) -> Start:
+def _propagated_start(start: Start, imu: ImuSamples, time_offset: float, time: Array) -> Start:
     nearest = _nearest(start.states.time, time)
     return replace(
         start,
-        states=carried(start.states, imu, time_offset, time),
+        states=propagated_states(start.states, imu, time_offset, time),
         phase=start.phase[nearest],
         chosen=start.chosen[nearest],
         determined=start.determined[nearest],

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.estimation.batch.log_graph import PreparedLog
+from magfusion.estimation.batch.log_graph import PreprocessedLog
 from magfusion.estimation.graph.preintegration import low_passed_rate_at
 from magfusion.model.parameters import Calibration, corrected_imu
 from magfusion.model.quaternion import matrices, of_vectors
@@ -13,7 +13,11 @@ from magfusion.units import BoolArray
 
 
 def on_new_clock(
-    log: PreparedLog, states: Trajectory, old: Calibration, new: Calibration, standing: BoolArray
+    log: PreprocessedLog,
+    states: Trajectory,
+    old: Calibration,
+    new: Calibration,
+    standing: BoolArray,
 ) -> Trajectory:
     """Return the states at the log's epochs after a change of the IMU clock.
 

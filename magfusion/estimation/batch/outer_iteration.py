@@ -6,22 +6,22 @@ from typing import NamedTuple
 import numpy as np
 from gtsam.symbol_shorthand import V
 
-from magfusion.estimation.batch.log_graph import PreparedLog, graph_of
+from magfusion.estimation.batch.log_graph import PreprocessedLog, graph_of
 from magfusion.estimation.batch.on_new_clock import on_new_clock
-from magfusion.estimation.batch.passes import Passed
+from magfusion.estimation.batch.outer_iterations import IterationState
 from magfusion.estimation.batch.settings import SmootherSettings
 from magfusion.estimation.demodulation.motion_compensation import MotionCompensated
-from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate, read_states
+from magfusion.estimation.graph.graph import Graph, GraphEstimate, initial_estimate, read_states
 from magfusion.estimation.measurements.zero_velocity import may_stand
 from magfusion.estimation.posterior.convergence import settled_at
+from magfusion.estimation.posterior.fixed_point_acceleration import Step, part_of_the_way
 from magfusion.estimation.posterior.noise_tuning import (
     Tuned,
     as_declared,
     plausible,
     with_noise,
 )
-from magfusion.estimation.posterior.noise_tuning import settled as same_noise
-from magfusion.estimation.posterior.relaxation import Step, part_of_the_way
+from magfusion.estimation.posterior.noise_tuning import has_converged as same_noise
 from magfusion.estimation.solve.bordered import Optimised, eliminate, marginal, optimise
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.model.parameters import Block
@@ -42,23 +42,23 @@ class SolvedPass(NamedTuple):
         Without covariance.
     gaps : int
         Number of intervals with a bridged gap.
-    stood : bool ndarray, shape (states,)
+    was_stationary : bool ndarray, shape (states,)
         Where the platform was detected at rest.
     iterations : int
         Of the optimiser, including those before rests were detected.
     """
 
     graph: Graph
-    found: Optimised[Estimate]
+    solution: Optimised[GraphEstimate]
     states: Trajectory
     gaps: int
-    stood: BoolArray
+    was_stationary: BoolArray
     iterations: int
 
 
-def begin_passes(log: PreparedLog, settings: SmootherSettings) -> Passed:
+def begin_iterations(log: PreprocessedLog, settings: SmootherSettings) -> IterationState:
     """Return the state of a log before its first pass."""
-    return Passed(
+    return IterationState(
         done=0,
         iterations=0,
         tuning=settings.tune and log.fixes is None and log.samples.signed,
@@ -66,12 +66,12 @@ def begin_passes(log: PreparedLog, settings: SmootherSettings) -> Passed:
         declared=log.declared,
         calibration=log.declared,
         segments=(),
-        standing=log.samples.at_rest(log.states.time),
+        standing=log.samples.is_stationary(log.states.time),
         tuned=(),
     )
 
 
-class Plan(NamedTuple):
+class IterationPlan(NamedTuple):
     """Settings of the next pass.
 
     Parameters
@@ -89,21 +89,23 @@ class Plan(NamedTuple):
     roughly: bool
 
 
-def plan_pass(log: PreparedLog, now: Passed, settings: SmootherSettings) -> Plan:
+def plan_pass(
+    log: PreprocessedLog, now: IterationState, settings: SmootherSettings
+) -> IterationPlan:
     """Return the settings of the next pass."""
     # Another pass will follow.
-    short = (now.done == 0 or now.tuning) and now.done + 1 < settings.passes
+    short = (now.done == 0 or now.tuning) and now.done + 1 < settings.max_iterations
     # The final noise is estimated from residuals whitened with the present sigmas.
     finds = now.tuning and (now.done > 0 or not by_waveform(log))
-    return Plan(short, finds, short and not (finds and now.done >= TUNINGS))
+    return IterationPlan(short, finds, short and not (finds and now.done >= TUNINGS))
 
 
-def by_waveform(log: PreparedLog) -> bool:
+def by_waveform(log: PreprocessedLog) -> bool:
     """Return whether each pass demodulates the log again."""
-    return log.fixes is None and log.demodulation.anew
+    return log.fixes is None and log.demodulation.can_repeat
 
 
-def demodulate_about(log: PreparedLog, now: Passed) -> MotionCompensated | None:
+def demodulate_about(log: PreprocessedLog, now: IterationState) -> MotionCompensated | None:
     """Return the phasors demodulated with the last pass's states; None for those of the log."""
     if now.done > 0 and by_waveform(log):
         wave = log.compensated(now.calibration, now.states)
@@ -115,11 +117,11 @@ def demodulate_about(log: PreparedLog, now: Passed) -> MotionCompensated | None:
 
 
 def solve_about(
-    log: PreparedLog,
-    now: Passed,
+    log: PreprocessedLog,
+    now: IterationState,
     wave: MotionCompensated | None,
     calm: BoolArray,
-    plan: Plan,
+    plan: IterationPlan,
 ) -> SolvedPass:
     """Solve the graph linearised at the states of the last pass.
 
@@ -133,20 +135,20 @@ def solve_about(
     roughly = plan.roughly
     graph, gaps = graph_of(log, now.states, now.calibration, wave, now.standing, roughly=roughly)
     begun = initial_estimate(now.states, now.calibration, now.segments)
-    found = optimise(graph, begun, tolerance=tolerance)
-    iterations, after = found.iterations, read_states(found.estimate.values, time)
-    stood = _at_rest(graph, found.estimate, after, calm & ~now.standing, motion)
-    if np.any(stood):  # directly: it costs no preintegration
-        graph = replace(graph, measurements=(*graph.measurements, log.rests(stood)))
-        found = optimise(graph, found.estimate, tolerance=tolerance)
-        iterations += found.iterations
-        after = read_states(found.estimate.values, time)
-    return SolvedPass(graph, found, after, gaps, stood, iterations)
+    result = optimise(graph, begun, tolerance=tolerance)
+    iterations, after = result.iterations, read_states(result.estimate.values, time)
+    stationary = _stationary_epochs(graph, result.estimate, after, calm & ~now.standing, motion)
+    if np.any(stationary):  # directly: it costs no preintegration
+        graph = replace(graph, measurements=(*graph.measurements, log.rests(stationary)))
+        result = optimise(graph, result.estimate, tolerance=tolerance)
+        iterations += result.iterations
+        after = read_states(result.estimate.values, time)
+    return SolvedPass(graph, result, after, gaps, stationary, iterations)
 
 
-def advance(now: Passed, solved: SolvedPass) -> Passed:
+def advance(now: IterationState, solved: SolvedPass) -> IterationState:
     """Return the state of a log after a pass."""
-    estimate = solved.found.estimate
+    estimate = solved.solution.estimate
     return replace(
         now,
         done=now.done + 1,
@@ -154,24 +156,26 @@ def advance(now: Passed, solved: SolvedPass) -> Passed:
         states=solved.states,
         calibration=estimate.calibration,
         segments=estimate.segments,
-        standing=now.standing | solved.stood,
+        standing=now.standing | solved.was_stationary,
     )
 
 
-def nothing_moved(before: Passed, after: Passed, solved: SolvedPass) -> bool:
+def nothing_moved(before: IterationState, after: IterationState, solved: SolvedPass) -> bool:
     """Return whether a pass, not the first, reproduced the result of the one before."""
-    if before.done == 0 or np.any(solved.stood):
+    if before.done == 0 or np.any(solved.was_stationary):
         return False
     return settled_at(before.states, after.states, before.calibration, after.calibration)
 
 
-def retune(before: Passed, after: Passed, latest: tuple[Tuned, ...], plan: Plan) -> Passed:
+def retune(
+    before: IterationState, after: IterationState, newest: tuple[Tuned, ...], plan: IterationPlan
+) -> IterationState:
     """Return the state of a log after a pass, with the noise of its residuals if plausible."""
-    noise = latest if plausible(latest) else as_declared(latest)
-    moves = before.done < TUNINGS and not same_noise(before.tuned, latest)
+    noise = newest if plausible(newest) else as_declared(newest)
+    moves = before.done < TUNINGS and not same_noise(before.tuned, newest)
     return replace(
         after,
-        tuning=(plan.roughly or moves) and plausible(latest),
+        tuning=(plan.roughly or moves) and plausible(newest),
         declared=with_noise(after.declared, noise),
         calibration=with_noise(after.calibration, noise),
         segments=tuple(with_noise(segment, noise) for segment in after.segments),
@@ -179,7 +183,9 @@ def retune(before: Passed, after: Passed, latest: tuple[Tuned, ...], plan: Plan)
     )
 
 
-def relax(log: PreparedLog, before: Passed, after: Passed, blocks: tuple[Block, ...]) -> Passed:
+def relax(
+    log: PreprocessedLog, before: IterationState, after: IterationState, blocks: tuple[Block, ...]
+) -> IterationState:
     """Return the start of the next pass, after accelerating the fixed-point iteration."""
     moved = before.states, after.states, before.calibration, after.calibration
     step = Step.of(before.step, *moved)
@@ -188,15 +194,19 @@ def relax(log: PreparedLog, before: Passed, after: Passed, blocks: tuple[Block, 
     return replace(after, states=states, calibration=calibration, step=step)
 
 
-def _at_rest(
-    graph: Graph, estimate: Estimate, states: Trajectory, asked: BoolArray, motion: MotionModel
+def _stationary_epochs(
+    graph: Graph,
+    estimate: GraphEstimate,
+    states: Trajectory,
+    candidates: BoolArray,
+    motion: MotionModel,
 ) -> BoolArray:
     """Return which epochs with a quiet IMU have the platform at rest."""
-    out = np.zeros(len(asked), dtype=bool)
-    if np.any(asked):
+    out = np.zeros(len(candidates), dtype=bool)
+    if np.any(candidates):
         assert states.velocity_world is not None
         tree = eliminate(graph.linearized(estimate), graph.ordering)
-        rows = np.flatnonzero(asked)
+        rows = np.flatnonzero(candidates)
         cov = np.array([marginal(tree, V(i), 3) for i in rows.tolist()])
         out[rows] = may_stand(states.velocity_world[rows], cov, motion)
     return out

@@ -13,11 +13,11 @@ import numpy as np
 from magfusion.estimation.batch.strides import Strides, strides_between
 from magfusion.estimation.batch.tracks import (
     MOTION,
-    Heard,
+    TrackPhasors,
     Tracks,
-    carried,
-    heard,
+    propagate_tracks,
     rows_at,
+    track_phasors,
     updated,
 )
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
@@ -33,10 +33,10 @@ from magfusion.units import Array, BoolArray, IntArray
 STEP = 0.1  # s; of the epochs that tracks process, unless windows are longer
 VISITS = 6000  # maximum; a longer log has longer steps
 LONGEST_STEP = 2.0  # s; over which an inertial stream still joins fixes
-ANEW = 1.0  # s; between epochs at which tracks may restart
-FIRST_ANEW = 4  # of these, at which drive phases may restart too
+RESTART_INTERVAL = 1.0  # s; between epochs at which tracks may restart
+PHASE_RESTART_EPOCHS = 4  # of these, at which drive phases may restart too
 LEAP = 60.0  # chi square; price of a restart
-MOST = 12  # maximum number of tracks at a time
+MAX_TRACKS = 12  # maximum number of tracks at a time
 WORSE = 250.0  # chi square; a track worse by more is discarded
 SAME_PLACE, SAME_TURN = 0.03, 0.03  # m, rad; within which two tracks are one
 RETURNING = 4  # tracks of the backward search
@@ -46,7 +46,7 @@ FIRST_ROTATION, FIRST_POSITION, FIRST_PHASE = 0.5, 1.0, 1.0  # rad, m, rad; if u
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class FoundTrajectory:
     """Trajectory of a track.
 
     Parameters
@@ -69,14 +69,14 @@ class _Search:
     """Inputs of the search."""
 
     samples: FieldSamples
-    hearing: Heard
+    phasors: TrackPhasors
     strides: Strides
     fixes: Fixes
     gravity: Gravity
 
     @property
     def site(self) -> Site:
-        return self.hearing.site
+        return self.phasors.site
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class _Meeting:
 
     visit: int
     kept: int
-    lost: int
+    lost_epochs: int
     worse: float
 
 
@@ -107,7 +107,7 @@ class _Followed:
 
 def search(
     samples: FieldSamples, fixes: Fixes, imu: ImuSamples, calibration: Calibration
-) -> list[Found]:
+) -> list[FoundTrajectory]:
     """Return the trajectories that explain a log best, the most probable first.
 
     Parameters
@@ -121,21 +121,21 @@ def search(
     some = samples.rows(kept)
     offset, site = calibration.time_offset, calibration.site
     at = Fixes(**{name: value[kept] for name, value in vars(fixes).items()})
-    asked = _Search(
+    search = _Search(
         some,
-        heard(some, calibration),
+        track_phasors(some, calibration),
         strides_between(imu, offset, some.time),
         at,
         _upright(imu, offset, some.time, site),
     )
     count = len(some)
-    ahead = _follow(asked, _seeds(asked, 0), range(count))
+    ahead = _follow(search, _seeds(search, 0), range(count))
     last = ahead.visits[-1]
     best = last.rows(np.argsort(last.cost)[:RETURNING])
     # The backward search uses the forward data again: that gives only its start.
     again = replace(best, cov=4.0 * best.cov, cost=np.zeros(len(best)))
-    back = _follow(asked, replace(again, parent=np.arange(len(again))), range(count - 1, -1, -1))
-    return _trajectories(asked, back)
+    back = _follow(search, replace(again, parent=np.arange(len(again))), range(count - 1, -1, -1))
+    return _trajectories(search, back)
 
 
 def can_search(samples: FieldSamples) -> bool:
@@ -155,27 +155,29 @@ def _upright(imu: ImuSamples, time_offset: float, time: Array, site: Site) -> Gr
     """Return the direction of the mean specific force, which motion disturbs."""
     stamps, motion = imu.time + time_offset, site.platform.motion
     chain = attitude_from_gyro(stamps, imu.gyro_body)
-    turned = mean_about(stamps, chain.apply(imu.accel_body), time, motion.accel_span)
+    rotated = mean_about(stamps, chain.apply(imu.accel_body), time, motion.accel_span)
     if not site.platform.inertial:
         return Gravity(np.tile([0.0, 0.0, 1.0], (len(time), 1)), np.full(len(time), np.inf))
-    up = attitude_at(chain, stamps, imu.gyro_body, time).inv().apply(turned)
+    up = attitude_at(chain, stamps, imu.gyro_body, time).inv().apply(rotated)
     sigma = np.full(len(time), motion.accel_sigma / site.gravity)
     return Gravity(up / np.linalg.norm(up, axis=1, keepdims=True), sigma)
 
 
-def _seeds(asked: _Search, k: int) -> Tracks:
+def _seeds(search: _Search, k: int) -> Tracks:
     """Return tracks that begin at the fixes of an epoch, with their drive phases."""
-    hearing, rows = asked.hearing, np.array([k])
+    phasors, rows = search.phasors, np.array([k])
     fixes = fix_epochs(
-        asked.samples.rows(rows), hearing.calibration, gravity=asked.gravity.rows(rows)
+        search.samples.rows(rows), phasors.calibration, gravity=search.gravity.rows(rows)
     )
     good = np.flatnonzero(np.isfinite(fixes.cost[0]))
-    free, none = int(np.sum(hearing.free)), np.zeros((len(good), 3))
-    clock = asked.site.clock.drift_sigma * 2.0 * np.pi * _frequencies(asked.site)[hearing.free]
-    phases = [np.full(free, FIRST_PHASE), np.maximum(clock, 1e-9)]
-    sigma = np.concatenate([_motion_sigma(asked.site), *phases])
-    mine = asked.site.of_sensor(0)
-    own = hearing.calibration.drive_phase(hearing.time[k])[mine]
+    free_parameters, none = int(np.sum(phasors.free_phases)), np.zeros((len(good), 3))
+    clock = (
+        search.site.clock.drift_sigma * 2.0 * np.pi * _frequencies(search.site)[phasors.free_phases]
+    )
+    phases = [np.full(free_parameters, FIRST_PHASE), np.maximum(clock, 1e-9)]
+    sigma = np.concatenate([_motion_sigma(search.site), *phases])
+    mine = search.site.of_sensor(0)
+    own = phasors.calibration.drive_phase(phasors.time[k])[mine]
     tracks = Tracks(
         rotation=fixes.world_from_body[0, good],
         position=fixes.position_world[0, good],
@@ -183,12 +185,12 @@ def _seeds(asked: _Search, k: int) -> Tracks:
         accel_bias=none,
         gyro_bias=none,
         phase=own + fixes.phase[0, good][:, mine],
-        rate=np.zeros((len(good), len(hearing.free))),
+        rate=np.zeros((len(good), len(phasors.free_phases))),
         cov=np.tile(np.diag(sigma**2), (len(good), 1, 1)),
         cost=fixes.cost[0, good] - fixes.cost[0, 0],
         parent=np.arange(len(good)),
     )
-    _, by = rows_at(tracks, hearing, k)
+    _, by = rows_at(tracks, phasors, k)
     information = np.diag(1.0 / sigma**2) + np.swapaxes(by, 1, 2) @ by
     return replace(tracks, cov=np.asarray(np.linalg.inv(information), dtype=np.float64))
 
@@ -210,28 +212,33 @@ def _frequencies(site: Site) -> Array:
     return np.concatenate([beacon.tone_frequencies_hz for beacon in site.beacons])
 
 
-def _follow(asked: _Search, tracks: Tracks, order: Sequence[int]) -> _Followed:
-    hearing, backward = asked.hearing, order[0] > order[-1]
-    time = hearing.time
+def _follow(search: _Search, tracks: Tracks, order: Sequence[int]) -> _Followed:
+    phasors, backward = search.phasors, order[0] > order[-1]
+    time = phasors.time
     visits, meetings = [_light(tracks)], list[_Meeting]()
-    anew, begun = time[order[0]], 0
-    spent, taken = 0.0, 0.0
+    restarted, begun = time[order[0]], 0
+    spent, selected = 0.0, 0.0
     for i in range(1, len(order)):
         k = order[i]
         before = float(np.min(tracks.cost))
-        tracks = carried(tracks, asked.strides, min(k, order[i - 1]), hearing, backward)
+        tracks = propagate_tracks(tracks, search.strides, min(k, order[i - 1]), phasors, backward)
         tracks = replace(tracks, parent=np.arange(len(tracks)))
-        tracks = updated(tracks, hearing, k)
-        spent, taken = spent + float(np.min(tracks.cost)) - before, taken + hearing.components[k]
+        tracks = updated(tracks, phasors, k)
+        spent, selected = (
+            spent + float(np.min(tracks.cost)) - before,
+            selected + phasors.components[k],
+        )
         # Noise above the declared one increases every difference as well.
-        level = max(1.0, spent / max(taken, 1.0))
-        if abs(time[k] - anew) >= ANEW and hearing.components[k] > 0.0:
-            anew, begun = time[k], begun + 1
-            fresh = not backward and begun <= FIRST_ANEW and bool(np.any(hearing.free))
-            tracks = _with_others(asked, tracks, k, level, fresh=fresh)
+        level = max(1.0, spent / max(selected, 1.0))
+        if abs(time[k] - restarted) >= RESTART_INTERVAL and phasors.components[k] > 0.0:
+            restarted, begun = time[k], begun + 1
+            fresh = (
+                not backward and begun <= PHASE_RESTART_EPOCHS and bool(np.any(phasors.free_phases))
+            )
+            tracks = _with_others(search, tracks, k, level, fresh=fresh)
         tracks, met = _merged(tracks, i)
         meetings += [m for m in met if m.worse < WORSE * level]
-        keep = np.argsort(tracks.cost)[:MOST]
+        keep = np.argsort(tracks.cost)[:MAX_TRACKS]
         keep = keep[tracks.cost[keep] < tracks.cost[keep[0]] + WORSE * level]
         tracks = tracks.rows(keep)
         visits.append(_light(tracks))
@@ -243,13 +250,13 @@ def _light(tracks: Tracks) -> Tracks:
     return replace(tracks, cov=np.zeros((len(tracks), 0, 0)))
 
 
-def _with_others(asked: _Search, tracks: Tracks, k: int, level: float, *, fresh: bool) -> Tracks:
+def _with_others(search: _Search, tracks: Tracks, k: int, level: float, *, fresh: bool) -> Tracks:
     """Return tracks, with new ones at hypotheses of an epoch that no track is near."""
     best = int(np.argmin(tracks.cost))
     price = tracks.cost[best] + LEAP * level
-    others = [_anew(asked, tracks, best, k)]
+    others = [_restart(search, tracks, best, k)]
     if fresh:
-        others.append(_seeds(asked, k))
+        others.append(_seeds(search, k))
     for other in others:
         if len(other):
             parent = np.full(len(other), tracks.parent[best])
@@ -259,25 +266,27 @@ def _with_others(asked: _Search, tracks: Tracks, k: int, level: float, *, fresh:
     return tracks
 
 
-def _anew(asked: _Search, tracks: Tracks, best: int, k: int) -> Tracks:
+def _restart(search: _Search, tracks: Tracks, best: int, k: int) -> Tracks:
     """Return tracks at the fixes of an epoch, with the drive phases of the best track.
 
     Its motion is not used, since that may be the cause of its error.
     """
-    hearing = asked.hearing
-    fixes, row = asked.fixes, k
-    if np.any(hearing.free) and not np.all(fixes.determined[row, np.isfinite(fixes.cost[row])]):
+    phasors = search.phasors
+    fixes, row = search.fixes, k
+    if np.any(phasors.free_phases) and not np.all(
+        fixes.determined[row, np.isfinite(fixes.cost[row])]
+    ):
         # With the track's drive phases the azimuth is observable.
-        site = hearing.site
+        site = phasors.site
         known = tuple(replace(beacon, synchronised=True) for beacon in site.beacons)
         calibration = replace(
-            hearing.calibration,
+            phasors.calibration,
             site=replace(site, beacons=known),
             phase=of_all_sensors(site, tracks.phase[best]),
             drift=np.zeros(len(known)),
-            reference_time=float(hearing.time[k]),
+            reference_time=float(phasors.time[k]),
         )
-        fixes, row = fix_epochs(asked.samples.rows(np.array([k])), calibration), 0
+        fixes, row = fix_epochs(search.samples.rows(np.array([k])), calibration), 0
     cost = fixes.cost[row] - fixes.cost[row, 0]
     good = np.flatnonzero((cost < 2.0 * LEAP) & fixes.determined[row])
     new = tracks.rows(np.full(len(good), best))
@@ -286,7 +295,7 @@ def _anew(asked: _Search, tracks: Tracks, best: int, k: int) -> Tracks:
     to_world[:, 3:, 3:] = rotation
     cov = new.cov.copy()
     cov[:, :MOTION, :] = cov[:, :, :MOTION] = 0.0
-    cov[:, :MOTION, :MOTION] = np.diag(_motion_sigma(asked.site) ** 2)
+    cov[:, :MOTION, :MOTION] = np.diag(_motion_sigma(search.site) ** 2)
     cov[:, :6, :6] = to_world @ fixes.pose_cov[row, good] @ np.swapaxes(to_world, 1, 2)
     none = np.zeros((len(good), 3))
     return replace(
@@ -323,30 +332,30 @@ def _merged(tracks: Tracks, visit: int) -> tuple[Tracks, list[_Meeting]]:
     if len(tracks) == 1:
         return tracks, []
     tracks = tracks.rows(np.argsort(tracks.cost))
-    same, gone, met = _same(tracks, tracks), np.zeros(len(tracks), dtype=bool), []
+    same, elapsed, met = _same(tracks, tracks), np.zeros(len(tracks), dtype=bool), []
     for j in range(1, len(tracks)):
-        better = np.flatnonzero(same[j, :j] & ~gone[:j])
+        better = np.flatnonzero(same[j, :j] & ~elapsed[:j])
         if len(better):
-            i, gone[j] = int(better[0]), True
+            i, elapsed[j] = int(better[0]), True
             worse = float(tracks.cost[j] - tracks.cost[i])
-            kept, lost = int(tracks.parent[i]), int(tracks.parent[j])
-            if kept != lost:
-                met.append(_Meeting(visit - 1, kept, lost, worse))
-    return tracks.rows(~gone), met
+            kept, lost_epochs = int(tracks.parent[i]), int(tracks.parent[j])
+            if kept != lost_epochs:
+                met.append(_Meeting(visit - 1, kept, lost_epochs, worse))
+    return tracks.rows(~elapsed), met
 
 
-def _trajectories(asked: _Search, followed: _Followed) -> list[Found]:
+def _trajectories(search: _Search, followed: _Followed) -> list[FoundTrajectory]:
     """Return the best path, and those that differ from it for a while and are not much worse."""
     last = len(followed.visits) - 1
     order = np.argsort(followed.visits[-1].cost)
     paths = [(float(followed.visits[-1].cost[r]), followed.path(int(r), last)) for r in order]
     best = float(paths[0][0])
     paths += list(_by_stretch(followed, paths[0][1], best))
-    out: list[Found] = []
+    out: list[FoundTrajectory] = []
     for cost, path in sorted(paths, key=lambda pair: pair[0]):
-        found = _read(asked, followed, path, cost)
-        if len(out) <= RIVALS and all(differ(found.states, other.states) for other in out):
-            out.append(found)
+        result = _read(search, followed, path, cost)
+        if len(out) <= RIVALS and all(differ(result.states, other.states) for other in out):
+            out.append(result)
     return out
 
 
@@ -357,7 +366,7 @@ def _by_stretch(
     row_at = dict(path)
     for meeting in followed.meetings:
         if row_at.get(meeting.visit) == meeting.kept:
-            earlier = followed.path(meeting.lost, meeting.visit)
+            earlier = followed.path(meeting.lost_epochs, meeting.visit)
             yield cost + meeting.worse, [p for p in path if p[0] > meeting.visit] + earlier
 
 
@@ -370,20 +379,22 @@ def differ(some: Trajectory, others: Trajectory) -> bool:
     return bool(np.sum(other) * step > STRETCH)
 
 
-def _read(asked: _Search, followed: _Followed, path: list[tuple[int, int]], cost: float) -> Found:
+def _read(
+    search: _Search, followed: _Followed, path: list[tuple[int, int]], cost: float
+) -> FoundTrajectory:
     """Return a path as a trajectory; its visits are in backward order."""
     rows = [(followed.visits[visit], row) for visit, row in path]
 
     def values(name: str) -> Array:
         return np.array([getattr(tracks, name)[row] for tracks, row in rows])
 
-    time = asked.samples.time
-    own = asked.hearing.calibration.drive_phase(time)[:, asked.site.of_sensor(0)]
+    time = search.samples.time
+    own = search.phasors.calibration.drive_phase(time)[:, search.site.of_sensor(0)]
     states = Trajectory(
         time=time,
         world_from_body=values("rotation"),
         position_world=values("position"),
         velocity_world=values("velocity"),
     )
-    phase = np.where(asked.hearing.free, values("phase") - own, 0.0)
-    return Found(states, of_all_sensors(asked.site, phase), cost)
+    phase = np.where(search.phasors.free_phases, values("phase") - own, 0.0)
+    return FoundTrajectory(states, of_all_sensors(search.site, phase), cost)

@@ -26,9 +26,9 @@ from magfusion.model.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from magfusion.estimation.batch.beacon_placement import DetectedFields
-    from magfusion.estimation.batch.passes import PassFile
+    from magfusion.estimation.batch.outer_iterations import PassFile
 
-FEWEST_KNOWN = 2  # beacons; with a single one the trajectory has mirrors
+MIN_KNOWN = 2  # beacons; with a single one the trajectory has mirrors
 WIDE_POSITION = 1.0  # m; prior about an estimated place
 WIDE_ROTATION = 0.5  # rad
 RIVAL = 100.0  # chi square above the best, along the first trajectory, that excludes a hypothesis
@@ -73,7 +73,7 @@ def smooth_and_place(
     site: Site,
     settings: SmootherSettings,
     report: Report,
-    passes: PassFile | None = None,
+    iterations_file: PassFile | None = None,
 ) -> tuple[Smoothed, tuple[Placement, ...]]:
     """Smooth a log and place the beacons that the site declares unknown.
 
@@ -81,7 +81,7 @@ def smooth_and_place(
     ----------
     site : Site
         Without unknown beacons this is `magfusion.estimation.batch.batch.smooth`.
-    passes : PassFile, optional
+    iterations_file : PassFile, optional
         Of a log whose beacons are all known.
 
     Raises
@@ -93,22 +93,22 @@ def smooth_and_place(
     """
     unknown = [beacon for beacon in site.beacons if beacon.unknown is not None]
     if not unknown:
-        return smooth(log, site, settings, report, passes), ()
+        return smooth(log, site, settings, report, iterations_file), ()
     _refuse(site, unknown, settings)
     samples, _ = phasors(log, site, settings.lockin)
     states, calibration = _by_the_known(log, site, samples, settings, report)
-    found = [
+    result = [
         _hypotheses(detected_along(beacon, calibration, samples, states, overlap(samples)))
         for beacon in unknown
     ]
-    return decide(log, site, settings, report, found)
+    return decide(log, site, settings, report, result)
 
 
 def _refuse(site: Site, unknown: list[Beacon], settings: SmootherSettings) -> None:
     known = len(site.beacons) - len(unknown)
-    if known < FEWEST_KNOWN:
+    if known < MIN_KNOWN:
         raise InputError(
-            f"the site has {known} beacons of known position, but {FEWEST_KNOWN} are needed to"
+            f"the site has {known} beacons of known position, but {MIN_KNOWN} are needed to"
             f" place beacon {unknown[0].name}; survey another one"
         )
     groups = settings.estimate
@@ -136,18 +136,18 @@ def _by_the_known(
     )
     fields = fields.rows(np.asarray(fields.valid.any(axis=1)))
     partial = replace(log, waveform=None, fields=fields)
-    found = smooth(partial, known, settings, report)
-    return found.states, found.calibration
+    result = smooth(partial, known, settings, report)
+    return result.states, result.calibration
 
 
 def _hypotheses(detected: DetectedFields) -> Placement:
-    found = places(detected)
-    best, beacon = found[0][0], detected.beacon
+    result = places(detected)
+    best, beacon = result[0][0], detected.beacon
     return Placement(
         beacon.name,
         tuple(
             Hypothesis(_with_prior(placed, beacon), chi_square - best)
-            for chi_square, placed in found
+            for chi_square, placed in result
             if chi_square <= best + RIVAL
         ),
     )
@@ -168,13 +168,13 @@ def decide(
     site: Site,
     settings: SmootherSettings,
     report: Report,
-    found: list[Placement],
+    result: list[Placement],
 ) -> tuple[Smoothed, tuple[Placement, ...]]:
     """Smooth the log with the most probable places; the whole graph decides between them.
 
     Parameters
     ----------
-    found : list of Placement
+    result : list of Placement
         One for each unknown beacon of the site.
 
     Returns
@@ -184,22 +184,22 @@ def decide(
     tuple of Placement
         Best first.
     """
-    choices = list(product(*(range(len(placement.hypotheses)) for placement in found)))
+    choices = list(product(*(range(len(placement.hypotheses)) for placement in result)))
 
     def misfit(choice: tuple[int, ...]) -> float:
-        return sum(p.hypotheses[i].chi_square for p, i in zip(found, choice, strict=True))
+        return sum(p.hypotheses[i].chi_square for p, i in zip(result, choice, strict=True))
 
     choices = sorted(choices, key=misfit)[:MOST_SMOOTHED]
     results = []
     for choice in choices:
-        chosen = [p.hypotheses[i].beacon for p, i in zip(found, choice, strict=True)]
+        chosen = [p.hypotheses[i].beacon for p, i in zip(result, choice, strict=True)]
         by_name = {beacon.name: beacon for beacon in chosen}
         placed = tuple(by_name.get(beacon.name, beacon) for beacon in site.beacons)
         results.append(smooth(log, replace(site, beacons=placed), settings, report))
     order = np.argsort([result.cost for result in results])
     best = int(order[0])
     reported = []
-    for k, placement in enumerate(found):
+    for k, placement in enumerate(result):
         rows: dict[int, Hypothesis] = dict(enumerate(placement.hypotheses))
         for j in order[::-1]:
             excess = 2.0 * (results[j].cost - results[best].cost)

@@ -57,7 +57,7 @@ class SmootherSettings(EstimatorSettings):
     loss : {None, 'huber', 'cauchy'}
         Robust loss of the field measurements, against false beacons, which sums of squares do not
         model; it costs nothing where all are true.
-    passes : int
+    max_iterations : int
         Maximum number of waveform predictions.
     tune : bool
         Whether noise and model error are estimated from the residuals, with their declared values
@@ -70,12 +70,12 @@ class SmootherSettings(EstimatorSettings):
 
     coupling: str = "tight"
     loss: str | None = "cauchy"
-    passes: int = 10
+    max_iterations: int = 10
     tune: bool = True
     measurements: tuple[tuple[Array, Measurement], ...] = ()
 
     def __post_init__(self) -> None:
         if self.earth and self.coupling == "loose":
             raise ValueError("the Earth field requires tight coupling")
-        if self.passes < 1:
-            raise ValueError(f"passes must be at least 1; got {self.passes}")
+        if self.max_iterations < 1:
+            raise ValueError(f"passes must be at least 1; got {self.max_iterations}")

@@ -25,7 +25,7 @@ class Strides:
         By the specific force alone, from rest (m/s, m).
     lever : ndarray, shape (n, 3, 3)
         Integral of the rotation, by which an accelerometer bias changes the velocity (s).
-    bridged : bool ndarray, shape (n,)
+    gap_bridged : bool ndarray, shape (n,)
         Where the stream has a gap.
     """
 
@@ -34,7 +34,7 @@ class Strides:
     velocity: Array
     displacement: Array
     lever: Array
-    bridged: BoolArray
+    gap_bridged: BoolArray
 
     def __len__(self) -> int:
         return len(self.dt)
@@ -59,8 +59,8 @@ def strides_between(imu: ImuSamples, time_offset: float, epochs: Array) -> Strid
     inner = (2.0 * force[:-1] + force[1:]) * step**2 / 6.0
     path = _summed(velocity[:-1] * step + inner)
     axes = chain.as_matrix().reshape(-1, 9)
-    turned = _summed(0.5 * (axes[:-1] + axes[1:]) * step)
-    lever = np.stack([np.interp(epochs, stamps, axis) for axis in turned.T], axis=1)
+    rotated = _summed(0.5 * (axes[:-1] + axes[1:]) * step)
+    lever = np.stack([np.interp(epochs, stamps, axis) for axis in rotated.T], axis=1)
     here = attitude_at(chain, stamps, rate_body, epochs).as_matrix()
     dt, back = np.diff(epochs), np.swapaxes(here[:-1], 1, 2)
     place, speed = hermite(stamps, path, velocity, epochs)
@@ -73,7 +73,7 @@ def strides_between(imu: ImuSamples, time_offset: float, epochs: Array) -> Strid
         velocity=(back @ np.diff(speed, axis=0)[..., None])[..., 0],
         displacement=(back @ moved[..., None])[..., 0],
         lever=back @ np.diff(lever, axis=0).reshape(-1, 3, 3),
-        bridged=np.asarray(np.any(silent, axis=1)),
+        gap_bridged=np.asarray(np.any(silent, axis=1)),
     )
 
 

@@ -26,7 +26,7 @@ ROTATION, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 ACCEL, GYRO = slice(9, 12), slice(12, 15)
 MOTION = 15
 ROUNDS = 3  # of linearisation in one update: the first prediction may be wide
-LOUD = 16.0  # times the expected chi square, above which a channel is downweighted
+STRONG_CHI_SQUARE = 16.0  # times the expected chi square, above which a channel is downweighted
 LEAST_WALK = 1e-9  # of a bias: without any a covariance may become singular
 
 
@@ -75,7 +75,7 @@ class Tracks:
 
 
 @dataclass(frozen=True, eq=False)
-class Heard:
+class TrackPhasors:
     """Phasors of all epochs, prepared for tracks.
 
     Parameters
@@ -86,7 +86,7 @@ class Heard:
         Whitening, including the survey's error.
     components : ndarray, shape (n,)
         Number of components present.
-    free : bool ndarray, shape (channels of a magnetometer,)
+    free_phases : bool ndarray, shape (channels of a magnetometer,)
         Whether the drive phase is unknown.
     blocks : tuple of Block
         Of the unknown phases.
@@ -97,7 +97,7 @@ class Heard:
     measured: Array
     sqrt_information: Array
     components: Array
-    free: BoolArray
+    free_phases: BoolArray
     blocks: tuple[Block, ...]
 
     @property
@@ -106,30 +106,30 @@ class Heard:
         return self.calibration.site
 
 
-def heard(samples: FieldSamples, calibration: Calibration) -> Heard:
+def track_phasors(samples: FieldSamples, calibration: Calibration) -> TrackPhasors:
     """Return phasors prepared for tracks."""
     site = calibration.site
     cov = measurement_cov(site, samples, survey_error=True)
     synchronised = {beacon.name: beacon.synchronised for beacon in site.beacons}
-    return Heard(
+    return TrackPhasors(
         calibration=calibration,
         time=samples.time,
         measured=stacked(samples.phasor_sensor),
         sqrt_information=whitening(cov, samples.there),
         components=np.sum(samples.numbers, axis=1).astype(np.float64),
-        free=np.array(
+        free_phases=np.array(
             [not synchronised[name] for name, _ in samples.channels[site.of_sensor(0)]], dtype=bool
         ),
         blocks=nuisance_blocks(site),
     )
 
 
-def moved(tracks: Tracks, step: Array, free: BoolArray) -> Tracks:
+def moved(tracks: Tracks, step: Array, phases: BoolArray) -> Tracks:
     """Return tracks moved by a tangent vector each, shape (h, 15 + 2 free)."""
     phase, rate = tracks.phase.copy(), tracks.rate.copy()
-    count = int(np.sum(free))
-    phase[:, free] += step[:, MOTION : MOTION + count]
-    rate[:, free] += step[:, MOTION + count :]
+    count = int(np.sum(phases))
+    phase[:, phases] += step[:, MOTION : MOTION + count]
+    rate[:, phases] += step[:, MOTION + count :]
     return replace(
         tracks,
         rotation=tracks.rotation @ _turn(step[:, ROTATION]),
@@ -146,9 +146,11 @@ def _turn(vector: Array) -> Array:
     return Rotation.from_rotvec(vector).as_matrix()
 
 
-def carried(tracks: Tracks, strides: Strides, k: int, hearing: Heard, backward: bool) -> Tracks:
+def propagate_tracks(
+    tracks: Tracks, strides: Strides, k: int, phasors: TrackPhasors, backward: bool
+) -> Tracks:
     """Propagate tracks over a stride: to its end, or from its end to its beginning."""
-    site, free = hearing.site, hearing.free
+    site, free_parameters = phasors.site, phasors.free_phases
     dt, lever = float(strides.dt[k]), strides.lever[k]
     sign = -1.0 if backward else 1.0
     turn = strides.turn[k] @ _turn(-dt * tracks.gyro_bias)
@@ -179,10 +181,10 @@ def carried(tracks: Tracks, strides: Strides, k: int, hearing: Heard, backward: 
     # The attitude error by the gyro's bias grows within the stride.
     step[:, POSITION, GYRO] = first @ np.real(skew(shift)) * dt / 3.0
     step[:, VELOCITY, GYRO] = first @ np.real(skew(gained)) * dt / 2.0
-    count = int(np.sum(free))
+    count = int(np.sum(free_parameters))
     number = np.arange(count)
     step[:, MOTION + number, MOTION + count + number] = dt
-    noise = _noise(site, dt, size, bool(strides.bridged[k]))
+    noise = _noise(site, dt, size, bool(strides.gap_bridged[k]))
     if backward:
         inverse = np.linalg.inv(step)
         cov = inverse @ (tracks.cov + noise) @ np.swapaxes(inverse, 1, 2)
@@ -195,11 +197,11 @@ def _applied(rotation: Array, vector: Array) -> Array:
     return (rotation @ vector[..., None])[..., 0]
 
 
-def _noise(site: Site, dt: float, size: int, bridged: bool) -> Array:
+def _noise(site: Site, dt: float, size: int, gap_bridged: bool) -> Array:
     """Return a stride's process noise, except the velocity error by gyro noise within it."""
     imu, noise = site.platform.imu, np.zeros((size, size))
-    gyro = max(imu.gyro_noise, BRIDGE_GYRO_NOISE) if bridged else imu.gyro_noise
-    accel = max(imu.accel_noise, BRIDGE_ACCEL_NOISE) if bridged else imu.accel_noise
+    gyro = max(imu.gyro_noise, BRIDGE_GYRO_NOISE) if gap_bridged else imu.gyro_noise
+    accel = max(imu.accel_noise, BRIDGE_ACCEL_NOISE) if gap_bridged else imu.accel_noise
     index = np.arange(3)
     noise[index, index] = gyro**2 * dt
     noise[3 + index, 3 + index] = accel**2 * dt**3 / 3.0
@@ -213,44 +215,44 @@ def _noise(site: Site, dt: float, size: int, bridged: bool) -> Array:
     return noise
 
 
-def rows_at(tracks: Tracks, hearing: Heard, k: int) -> tuple[Array, Array]:
+def rows_at(tracks: Tracks, phasors: TrackPhasors, k: int) -> tuple[Array, Array]:
     """Return whitened error (h, rows) and its derivative (h, rows, tangent) at an epoch."""
-    time, free = hearing.time[k], hearing.free
+    time, free_parameters = phasors.time[k], phasors.free_phases
     known = replace(
-        hearing.calibration,
-        phase=of_all_sensors(hearing.site, tracks.phase),
-        drift=np.zeros_like(hearing.calibration.drift),
+        phasors.calibration,
+        phase=of_all_sensors(phasors.site, tracks.phase),
+        drift=np.zeros_like(phasors.calibration.drift),
         reference_time=float(time),
     )
     value, by_pose, by_phase = linearize_channels(
         known,
-        hearing.blocks,
+        phasors.blocks,
         np.full(len(tracks), time),
         tracks.rotation,
         tracks.position,
     )
     back = np.swapaxes(tracks.rotation, 1, 2)[:, None]
     none = np.zeros((*value.shape, 9))
-    still = np.zeros((*value.shape, int(np.sum(free))))
-    error = (value - hearing.measured[k])[..., None]
+    still = np.zeros((*value.shape, int(np.sum(free_parameters))))
+    error = (value - phasors.measured[k])[..., None]
     columns = [by_pose[..., :3], by_pose[..., 3:] @ back, none, by_phase, still, error]
     root = np.broadcast_to(
-        hearing.sqrt_information[k], (len(tracks), *hearing.sqrt_information.shape[1:])
+        phasors.sqrt_information[k], (len(tracks), *phasors.sqrt_information.shape[1:])
     )
     both = whitened(root, np.concatenate(columns, axis=-1))
     return both[..., -1], both[..., :-1]
 
 
-def updated(tracks: Tracks, hearing: Heard, k: int) -> Tracks:
+def updated(tracks: Tracks, phasors: TrackPhasors, k: int) -> Tracks:
     """Update tracks by the phasors of an epoch.
 
     A badly explained channel increases the cost, but its effect on a track is bounded.
     """
-    if hearing.components[k] == 0.0:
+    if phasors.components[k] == 0.0:
         return tracks
     step, there = np.zeros((len(tracks), tracks.cov.shape[1])), tracks
     for _ in range(ROUNDS):
-        error, by = rows_at(there, hearing, k)
+        error, by = rows_at(there, phasors, k)
         # From the prediction, which contains all prior information.
         error = error - (by @ step[..., None])[..., 0]
         excess = _excess(error, by, tracks.cov)
@@ -260,26 +262,26 @@ def updated(tracks: Tracks, hearing: Heard, k: int) -> Tracks:
         spread = by @ across + np.eye(by.shape[1])
         solved = np.linalg.solve(spread, error[..., None])
         before, step = step, -(across @ solved)[..., 0]
-        there = moved(tracks, step, hearing.free)
+        there = moved(tracks, step, phasors.free_phases)
         if np.max(np.abs(step - before)[:, : POSITION.stop]) < 1e-2:
             break
     gain = np.linalg.solve(spread, np.swapaxes(across, 1, 2))
     cov = tracks.cov - across @ gain
     square = np.einsum("hi,hi->h", error, solved[..., 0])
     # As for a loss that grows with the logarithm beyond a credible error.
-    lost = 6.0 * LOUD * np.sum(np.log(np.maximum(excess, 1.0)), axis=1)
+    lost_epochs = 6.0 * STRONG_CHI_SQUARE * np.sum(np.log(np.maximum(excess, 1.0)), axis=1)
     _, volume = np.linalg.slogdet(spread)
     return replace(
         there,
         cov=0.5 * (cov + np.swapaxes(cov, 1, 2)),
-        cost=tracks.cost + square + lost + volume,
+        cost=tracks.cost + square + lost_epochs + volume,
     )
 
 
 def _excess(error: Array, by: Array, cov: Array) -> Array:
     """Return each channel's chi square relative to its prediction, limited to credible errors."""
-    apart = error.reshape(len(error), -1, 6)
-    blocks = by.reshape(*apart.shape, -1)
+    separate = error.reshape(len(error), -1, 6)
+    blocks = by.reshape(*separate.shape, -1)
     spread = blocks @ cov[:, None] @ np.swapaxes(blocks, -1, -2) + np.eye(6)
-    solved = np.linalg.solve(spread, apart[..., None])[..., 0]
-    return np.asarray(np.sum(apart * solved, axis=-1) / (6.0 * LOUD))
+    solved = np.linalg.solve(spread, separate[..., None])[..., 0]
+    return np.asarray(np.sum(separate * solved, axis=-1) / (6.0 * STRONG_CHI_SQUARE))

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from magfusion.estimation.data_checks.compasses import StillMeans
+from magfusion.estimation.data_checks.gravity_and_field_checks import StillMeans
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
@@ -52,15 +52,15 @@ def iron_on_body(means: StillMeans, site: Site) -> Iterator[Finding]:
     angle = np.arccos(np.clip(0.5 * (np.trace(turn, axis1=1, axis2=2) - 1.0), -1.0, 1.0))
     if not np.sqrt(np.mean(angle**2)) > LEAST_TURN * IRON_SPAN:
         return
-    left = after - np.einsum("nij,nj->ni", turn, before)
-    found, cov, explained = _fitted(turn, before, left)
+    residual = after - np.einsum("nij,nj->ni", turn, before)
+    result, cov, explained = _fitted(turn, before, residual)
     sensor = site.platform.magnetometer.sigma
-    matrix, hard = found[:9].reshape(3, 3), found[9:]
+    matrix, hard = result[:9].reshape(3, 3), result[9:]
     soft = 0.5 * (matrix + matrix.T)
     sigma = np.repeat([np.max(sensor.matrix), np.max(sensor.offset) / size], [9, 3])
     # A mounting error is not iron.
     allowed = cov + np.diag(sigma**2) + USUAL_MOUNTING**2 * _MOUNTING @ _MOUNTING.T
-    weight = float(np.sqrt(found @ np.linalg.solve(allowed, found)))
+    weight = float(np.sqrt(result @ np.linalg.solve(allowed, result)))
     share = max(float(np.max(np.abs(soft))), float(np.linalg.norm(hard)))
     if not (weight > LIMIT and explained > EXPLAINED and share > LEAST_SHARE):
         return
@@ -77,34 +77,34 @@ def iron_on_body(means: StillMeans, site: Site) -> Iterator[Finding]:
     )
 
 
-def _fitted(turn: Array, before: Array, left: Array) -> tuple[Array, Array, float]:
+def _fitted(turn: Array, before: Array, residual: Array) -> tuple[Array, Array, float]:
     """Return matrix (9, row by row) and offset (3), their covariance, and the explained share.
 
     Parameters
     ----------
     turn : ndarray, shape (n, 3, 3)
-    before, left : ndarray, shape (n, 3)
+    before, residual : ndarray, shape (n, 3)
         Fields in units of their size.
     """
-    turned = np.einsum("nij,nj->ni", turn, before)
+    rotated = np.einsum("nij,nj->ni", turn, before)
     eye = np.eye(3)
     # (E T b)_i depends on row i of E; (T E b)_i on column i of T and row i of E.
-    by_matrix = np.einsum("ki,nj->nkij", eye, turned) - np.einsum("nki,nj->nkij", turn, before)
+    by_matrix = np.einsum("ki,nj->nkij", eye, rotated) - np.einsum("nki,nj->nkij", turn, before)
     by_offset = eye - turn
-    by_bias = -IRON_SPAN * np.cross(turned[:, :, None], eye, axisa=1, axisb=0, axisc=1)
+    by_bias = -IRON_SPAN * np.cross(rotated[:, :, None], eye, axisa=1, axisb=0, axisc=1)
     parts = [by_matrix.reshape(-1, 3, 9), by_offset, by_bias]
     design = np.concatenate(parts, axis=2).reshape(-1, 15)
-    right = left.ravel()
+    right = residual.ravel()
     prior = np.repeat([USUAL_MATRIX, USUAL_OFFSET, USUAL_BIAS], [9, 3, 3]) ** -2.0
     noise = 1e-4
-    found, inverse = np.zeros(15), np.zeros((15, 15))
+    result, inverse = np.zeros(15), np.zeros((15, 15))
     for _ in range(3):
         information = design.T @ design / noise**2 / CORRELATED + np.diag(prior)
         inverse = np.linalg.inv(information)
-        found = inverse @ (design.T @ right / noise**2 / CORRELATED)
-        noise = max(float(np.sqrt(np.mean((right - design @ found) ** 2))), 1e-6)
+        result = inverse @ (design.T @ right / noise**2 / CORRELATED)
+        noise = max(float(np.sqrt(np.mean((right - design @ result) ** 2))), 1e-6)
     # The part that the gyroscope bias explains is not iron.
-    right = right - design[:, 12:] @ found[12:]
-    after = float(np.sum((right - design[:, :12] @ found[:12]) ** 2))
+    right = right - design[:, 12:] @ result[12:]
+    after = float(np.sum((right - design[:, :12] @ result[:12]) ** 2))
     explained = 1.0 - after / max(float(np.sum(right**2)), 1e-30)
-    return np.asarray(found[:12]), np.asarray(inverse[:12, :12]), explained
+    return np.asarray(result[:12]), np.asarray(inverse[:12, :12]), explained

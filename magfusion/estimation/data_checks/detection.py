@@ -17,7 +17,9 @@ DETECTION_CHI_SQUARE_ONLINE = (
 )
 
 
-LOUD = 25.0  # times the least chi square: a beacon that is always weaker may only be far away
+STRONG_CHI_SQUARE = (
+    25.0  # times the least chi square: a beacon that is always weaker may only be far away
+)
 
 
 def without_silence(samples: FieldSamples) -> FieldSamples:
@@ -26,23 +28,23 @@ def without_silence(samples: FieldSamples) -> FieldSamples:
     Its phasor there is noise and contradicts the model.  A beacon that fades with distance loses
     almost nothing.
     """
-    heard = detected(samples, DETECTION_CHI_SQUARE_ONLINE)
-    loud = detected(samples, LOUD * DETECTION_CHI_SQUARE_ONLINE).any(axis=0)
-    silent = samples.valid & ~heard & loud
+    received = detected(samples, DETECTION_CHI_SQUARE_ONLINE)
+    strong = detected(samples, STRONG_CHI_SQUARE * DETECTION_CHI_SQUARE_ONLINE).any(axis=0)
+    silent = samples.valid & ~received & strong
     return only(samples, ~silent) if np.any(silent) else samples
 
 
-def drowned(samples: FieldSamples) -> BoolArray:
+def masked_phasors(samples: FieldSamples) -> BoolArray:
     """Return which phasors could not show a beacon above the noise, shape (n, channels).
 
     Of those that `without_silence` drops: a beacon of its usual strength would be masked by noise,
     as in fast motion near another coil before that motion is compensated.
     """
-    heard = detected(samples, DETECTION_CHI_SQUARE_ONLINE)
-    power = np.where(heard, np.nansum(np.abs(samples.phasor_sensor) ** 2, axis=-1), np.nan)
-    usual = np.nanmedian(np.where(heard.any(axis=0), power, 0.0), axis=0)
+    received = detected(samples, DETECTION_CHI_SQUARE_ONLINE)
+    power = np.where(received, np.nansum(np.abs(samples.phasor_sensor) ** 2, axis=-1), np.nan)
+    usual = np.nanmedian(np.where(received.any(axis=0), power, 0.0), axis=0)
     share = np.sum(whitening(samples.phasor_cov, samples.there) ** 2, axis=(-1, -2)) / 3.0
-    return np.asarray(samples.valid & ~heard & (usual * share <= DETECTION_CHI_SQUARE_ONLINE))
+    return np.asarray(samples.valid & ~received & (usual * share <= DETECTION_CHI_SQUARE_ONLINE))
 
 
 def above_noise(samples: FieldSamples, least: float) -> BoolArray:
@@ -66,14 +68,14 @@ def detected(samples: FieldSamples, least: float = DETECTION_CHI_SQUARE) -> Bool
         Threshold for the chi square of a phasor's six components against zero.
     """
     # A field perpendicular to the available axes looks like silence.
-    loud = above_noise(samples, least) | samples.partial
+    strong = above_noise(samples, least) | samples.partial
     if len(samples) < 2:
-        return loud
+        return strong
     step = float(np.median(np.diff(samples.time)))
     reach = int(np.ceil(np.median(samples.window) / step - 1e-6))
     whole = np.ones((2 * reach + 1, 1), dtype=bool)
     # A tone that an epoch does not contain has not fallen silent.
-    return loud & np.asarray(binary_erosion(loud | ~samples.valid, whole, border_value=1))
+    return strong & np.asarray(binary_erosion(strong | ~samples.valid, whole, border_value=1))
 
 
 def only(samples: FieldSamples, channels: BoolArray) -> FieldSamples:
@@ -105,12 +107,12 @@ class DetectionFilter:
         step : float
             Since the previous epoch (s).
         """
-        loud, valid = detected(samples, DETECTION_CHI_SQUARE_ONLINE), samples.valid[0]
+        strong, valid = detected(samples, DETECTION_CHI_SQUARE_ONLINE), samples.valid[0]
         reach = int(np.ceil(samples.window[0] / step - 1e-6))
         if self._detected_for is None:
-            self._detected_for = np.full(loud.shape[1], reach)
+            self._detected_for = np.full(strong.shape[1], reach)
         # What an epoch does not hold (another slot's tone) has not fallen silent.
-        counted = np.where(loud[0], self._detected_for + 1, 0)
+        counted = np.where(strong[0], self._detected_for + 1, 0)
         self._detected_for = np.where(valid, counted, self._detected_for)
-        kept = loud & (self._detected_for > reach)
+        kept = strong & (self._detected_for > reach)
         return samples if np.all(kept) else only(samples, kept)

@@ -7,7 +7,7 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array, BoolArray
 
 SAMPLES = 1e7  # of a stream, among which the chance of a false alarm is `CHANCE`
-FEWEST = 6  # equal samples in a row, at least
+MIN_REPEATS = 6  # equal samples in a row, at least
 
 
 class Freeze:
@@ -15,23 +15,23 @@ class Freeze:
 
     Attributes
     ----------
-    since : float
+    frozen_since : float
         Stamp of the first sample equal to the newest (s).
-    found : bool
+    is_frozen : bool
         Whether the instrument is frozen at the newest sample.
     """
 
-    since: float
-    found: bool
+    frozen_since: float
+    is_frozen: bool
     _sample: Array
     _repeats: int
-    _alike: int
+    _repeat_count: int
     _seen: int
 
     def __init__(self) -> None:
-        self.since, self.found = -np.inf, False
+        self.frozen_since, self.is_frozen = -np.inf, False
         self._sample = np.full(3, np.nan)
-        self._repeats, self._alike, self._seen = 0, 0, 0
+        self._repeats, self._repeat_count, self._seen = 0, 0, 0
 
     def stretches(self, time: Array, samples: Array) -> list[tuple[float, float]]:
         """Return begin and end (s) of the stretches in which samples (k, 3) repeat."""
@@ -49,60 +49,66 @@ class Freeze:
         for k in range(len(time)):
             if same[k]:
                 self._repeats += 1
-                self.found = self.found or self._too_long(float(time[k]))
+                self.is_frozen = self.is_frozen or self._too_long(float(time[k]))
             else:
-                self._seen += 1 if self.found else 1 + self._repeats
-                self._alike += 0 if self.found else self._repeats
-                self.since, self.found, self._repeats = float(time[k]), False, 0
-            if self.found:
-                out[self.since] = float(time[k])
+                self._seen += 1 if self.is_frozen else 1 + self._repeats
+                self._repeat_count += 0 if self.is_frozen else self._repeats
+                self.frozen_since, self.is_frozen, self._repeats = float(time[k]), False, 0
+            if self.is_frozen:
+                out[self.frozen_since] = float(time[k])
         return list(out.items())
 
     def _passed(self, time: Array, same: BoolArray) -> bool:
         """Count samples quickly where no repetition is long (the usual case)."""
-        if not (self.found or same.any() or self._repeats >= FEWEST):
-            self._seen, self._alike = (
+        if not (self.is_frozen or same.any() or self._repeats >= MIN_REPEATS):
+            self._seen, self._repeat_count = (
                 self._seen + len(same) + self._repeats,
-                self._alike + self._repeats,
+                self._repeat_count + self._repeats,
             )
-            self._repeats, self.since = 0, float(time[-1])
+            self._repeats, self.frozen_since = 0, float(time[-1])
             return True
         changed = np.flatnonzero(~same)
         ends = np.concatenate([changed, [len(same)]])
         repeats = np.diff(ends, prepend=-1 - self._repeats) - 1
-        if self.found or np.max(repeats) >= FEWEST:
+        if self.is_frozen or np.max(repeats) >= MIN_REPEATS:
             return False
         closed = int(np.sum(repeats[:-1]))
-        self._seen, self._alike = self._seen + len(changed) + closed, self._alike + closed
+        self._seen, self._repeat_count = (
+            self._seen + len(changed) + closed,
+            self._repeat_count + closed,
+        )
         self._repeats = int(repeats[-1])
         if len(changed):
-            self.since = float(time[changed[-1]])
+            self.frozen_since = float(time[changed[-1]])
         return True
 
     def _too_long(self, time: float) -> bool:
         # Instruments quantize, and may be read faster than they measure.
-        usual = min(max(self._alike / max(self._seen, 1), 1e-3), 0.97)
+        usual = min(max(self._repeat_count / max(self._seen, 1), 1e-3), 0.97)
         by_chance = np.log(CHANCE / SAMPLES) / np.log(usual)
-        return self._repeats >= max(by_chance, FEWEST) and time - self.since >= SHORTEST_FREEZE
+        return (
+            self._repeats >= max(by_chance, MIN_REPEATS)
+            and time - self.frozen_since >= SHORTEST_FREEZE
+        )
 
 
 def imu_remarks(
-    since: float | None, begin: float, end: float, *, bridged: bool
+    start_time: float | None, begin: float, end: float, *, gap_bridged: bool
 ) -> tuple[Finding, ...]:
     """Return the findings on the IMU between two epochs (s).
 
     Parameters
     ----------
-    since : float, optional
+    start_time : float, optional
         Start of a freeze (s); None where there is none.
-    bridged : bool
+    gap_bridged : bool
         Whether samples are missing there.
     """
-    if since is not None and end > since:
-        text = f"all axes are frozen since {since:.2f} s: the sensor or its driver hangs. Repeated"
+    if start_time is not None and end > start_time:
+        text = f"all axes are frozen since {start_time:.2f} s: the sensor or its driver hangs. Repeated"
         text += " samples are dropped; the magnetic fields bridge the gap."
         return (Finding("frozen_imu", f"IMU: {text}", Verdict.TRUSTWORTHY),)
-    if not bridged:
+    if not gap_bridged:
         return ()
     text = f"samples are missing between {begin:.2f} and {end:.2f} s. The magnetic"
     return (Finding("gap", f"IMU: {text} fields bridge the gap.", Verdict.TRUSTWORTHY),)

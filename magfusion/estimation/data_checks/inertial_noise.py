@@ -13,7 +13,7 @@ from magfusion.units import Array
 
 BLOCK = 128  # samples per noise measurement
 QUIETEST = 0.1  # share of the blocks that are assumed to be without vibration
-FEWEST = 4  # blocks
+MIN_BLOCKS = 4  # blocks
 MORE = 4.0  # times what is declared; a declared density is a prior with a factor of two
 
 
@@ -30,11 +30,11 @@ def white_density(time: Array, value: Array) -> Array | None:
     value : ndarray, shape (n, 3)
         In any unit; the density is in that unit per square root of hertz.
     """
-    left = np.diff(value, n=3, axis=0)
-    count = len(left) // BLOCK
-    if count < FEWEST:
+    residual = np.diff(value, n=3, axis=0)
+    count = len(residual) // BLOCK
+    if count < MIN_BLOCKS:
         return None
-    blocks = left[: count * BLOCK].reshape(count, BLOCK, 3)
+    blocks = residual[: count * BLOCK].reshape(count, BLOCK, 3)
     variance = np.quantile(np.mean(blocks**2, axis=1) / 20.0, QUIETEST, axis=0)
     return np.asarray(np.sqrt(variance * float(np.median(np.diff(time)))))
 
@@ -53,10 +53,10 @@ def measured_noise(samples: ImuSamples, declared: ImuModel) -> tuple[ImuModel, l
         ("accelerometer", "accel_noise", "m/s^2", samples.accel_body),
     ):
         usual = float(getattr(declared, key))
-        found = white_density(samples.time, value)
-        if found is None or not float(np.median(found)) > MORE * usual:
+        result = white_density(samples.time, value)
+        if result is None or not float(np.median(result)) > MORE * usual:
             continue
-        density = float(np.median(found))
+        density = float(np.median(result))
         model = replace(model, **{key: density})
         text = (
             f"{name}: the noise is {density:.2g} {unit}/sqrt(Hz) even in the quietest parts,"

@@ -9,7 +9,7 @@ from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding
 
-FEWEST = 10  # epochs, before one is reported as silent
+MIN_EPOCHS = 10  # epochs, before one is reported as silent
 
 
 def without_magnetometer(log: Log, site: Site, which: int) -> tuple[Log, Site]:
@@ -26,16 +26,16 @@ def first_magnetometer(log: Log, site: Site) -> tuple[Log, Site]:
 def _only(log: Log, site: Site, kept: list[int]) -> tuple[Log, Site]:
     every = tuple(enumerate(site.platform.magnetometers))
     sensors = tuple(sensor for k, sensor in every if k in kept)
-    gone = tuple((k, sensor) for k, sensor in reversed(every) if k not in kept)
-    platform = site.platform.carrying(sensors)
-    left = replace(site, platform=replace(platform, left_out=(*platform.left_out, *gone)))
+    elapsed = tuple((k, sensor) for k, sensor in reversed(every) if k not in kept)
+    platform = site.platform.with_magnetometers(sensors)
+    residual = replace(site, platform=replace(platform, left_out=(*platform.left_out, *elapsed)))
     fields = None if log.fields is None else of_sensors(log.fields, site, kept)
     waves = {s.name: log.waveforms[s.name] for s in sensors if s.name in log.waveforms}
     if waves and len(kept) == 1:  # on the log's clock, as a log of a single magnetometer
         wave = waves[sensors[0].name]
         wave = replace(wave, time=wave.time + sensors[0].clock_offset)
-        return replace(log, fields=None, waveform=wave, waveforms={}), left
-    return replace(log, fields=fields, waveforms=waves), left
+        return replace(log, fields=None, waveform=wave, waveforms={}), residual
+    return replace(log, fields=fields, waveforms=waves), residual
 
 
 def of_sensors(fields: FieldSamples, site: Site, kept: list[int]) -> FieldSamples:
@@ -62,7 +62,7 @@ def without_silent(log: Log, site: Site) -> tuple[Log, Site]:
         return log, site
     sensors = site.platform.magnetometers
     there = _silent_epochs(log.fields, site)
-    silent = [k for k, n in there.items() if n == 0 or n >= FEWEST]
+    silent = [k for k, n in there.items() if n == 0 or n >= MIN_EPOCHS]
     if not silent or len(silent) == len(sensors):
         return log, site
     noticed = [
@@ -80,10 +80,10 @@ def without_silent(log: Log, site: Site) -> tuple[Log, Site]:
 
 def _silent_epochs(fields: FieldSamples, site: Site) -> dict[int, int]:
     """Return the magnetometers that detect nothing, with the number of epochs of each."""
-    heard = above_noise(fields, DETECTION_CHI_SQUARE_ONLINE)
+    detected = above_noise(fields, DETECTION_CHI_SQUARE_ONLINE)
     mine = {k: site.of_sensor(k) for k in range(len(site.platform.magnetometers))}
     return {
         k: int(np.sum(np.any(fields.valid[:, own], axis=1)))
         for k, own in mine.items()
-        if not np.any(heard[:, own])
+        if not np.any(detected[:, own])
     }

@@ -8,7 +8,7 @@ from magfusion.units import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Running:
+class DecayingSums:
     """Sums with weights that decrease exponentially with age.
 
     Parameters
@@ -28,10 +28,10 @@ class Running:
 
     def with_sample(
         self, value: Array, time: float, memory: float, weight: float = 1.0
-    ) -> "Running":
+    ) -> "DecayingSums":
         """Return the sums with another sample; older ones decay with a time constant (s)."""
         kept = float(np.exp(-max(0.0, time - self.time) / memory))
-        return Running(
+        return DecayingSums(
             kept * self.total + weight * value,
             kept * self.weight + weight,
             kept**2 * self.squares + weight**2,
@@ -49,6 +49,6 @@ class Running:
         return self.weight**2 / self.squares if self.squares > 0.0 else 0.0
 
 
-def nothing(size: int = 1) -> Running:
+def nothing(size: int = 1) -> DecayingSums:
     """Return a running mean without samples."""
-    return Running(np.zeros(size))
+    return DecayingSums(np.zeros(size))

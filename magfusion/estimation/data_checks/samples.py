@@ -20,7 +20,7 @@ CHANCE = 1e-7  # probability of a false alarm per stream
 SHORTEST_FREEZE = 0.15  # s
 DOUBTFUL_FREEZE = 0.25  # s; up to here a beacon is missed once at most
 DEAD = 0.5  # share of the log from which a frozen axis is a dead one
-HELD = 0.05  # share of repeated samples from which it is reported
+MAX_REPEATED_SHARE = 0.05  # share of repeated samples from which it is reported
 OFTEN = 0.4  # share from which the values are late by more than a step
 ALWAYS = 0.98  # share of the samples
 PILE = 5.0  # an extreme value this many times as frequent as its neighbours is a limit
@@ -28,13 +28,13 @@ LEAST_PILE = 12  # samples at a limit
 LEAST_RUN = 3  # of them in a row, at least once
 SPIKE = 15.0  # times the local scatter
 LEAST_SPIKES, SPIKE_SHARE = 5, 2e-4  # fewer may be knocks
-SURE_SPIKE, LEAST_SURE = 30.0, 2  # times the scatter, and how many of those suffice
+CERTAIN_SPIKE, MIN_CERTAIN = 30.0, 2  # times the scatter, and how many of those suffice
 SMOOTH_TONE = 0.15  # cycles a sample; above, neighbours do not predict a sample
 BLOCK = 128  # samples in which the scatter is measured
 AXES = "xyz"
 
 
-class Stream(NamedTuple):
+class InstrumentStream(NamedTuple):
     """The axes of one instrument.
 
     Parameters
@@ -55,18 +55,18 @@ class Stream(NamedTuple):
     axes: str = AXES
 
 
-def streams(log: Log) -> tuple[Stream, ...]:
+def streams(log: Log) -> tuple[InstrumentStream, ...]:
     """Return the raw streams of a log."""
-    found = []
+    result = []
     if log.inertial:
-        found.append(Stream("gyroscope", log.imu.time, log.imu.gyro_body, "rad/s"))
-        found.append(Stream("accelerometer", log.imu.time, log.imu.accel_body, "m/s^2"))
+        result.append(InstrumentStream("gyroscope", log.imu.time, log.imu.gyro_body, "rad/s"))
+        result.append(InstrumentStream("accelerometer", log.imu.time, log.imu.accel_body, "m/s^2"))
     if log.waveform is not None:
         wave = log.waveform
         own = [AXES.index(axis) for axis in wave.axes]
         value = wave.measured_sensor[:, own] if len(own) < len(AXES) else wave.measured_sensor
-        found.append(Stream("magnetometer", wave.time, value, "uT", 1e6, wave.axes))
-    return tuple(one for one in found if len(one.time) > 2)
+        result.append(InstrumentStream("magnetometer", wave.time, value, "uT", 1e6, wave.axes))
+    return tuple(one for one in result if len(one.time) > 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ def runs(flag: BoolArray) -> Runs:
     return Runs(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1))
 
 
-def frozen(stream: Stream, same: BoolArray) -> Runs:
+def frozen(stream: InstrumentStream, same: BoolArray) -> Runs:
     """Return the stretches that are equal for longer than chance allows.
 
     Parameters
@@ -102,9 +102,9 @@ def frozen(stream: Stream, same: BoolArray) -> Runs:
     by_chance = np.log(CHANCE / count) / np.log(min(max(usual, 1e-3), 0.97))
     step = float(np.median(np.diff(stream.time)))
     least = max(by_chance, SHORTEST_FREEZE / step, 6.0)
-    found = runs(same)
-    long = found.last - found.first >= least
-    return Runs(found.first[long], found.last[long])
+    result = runs(same)
+    long = result.last - result.first >= least
+    return Runs(result.first[long], result.last[long])
 
 
 def frozen_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
@@ -121,28 +121,28 @@ def frozen_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
                 yield _freeze(stream, f"axis {stream.axes[axis]}", alone)
 
 
-def _all_frozen(stream: Stream) -> Runs:
+def _all_frozen(stream: InstrumentStream) -> Runs:
     return frozen(stream, np.all(stream.value[1:] == stream.value[:-1], axis=1))
 
 
-def _at_limit(stream: Stream, axis: int, found: Runs) -> bool:
+def _at_limit(stream: InstrumentStream, axis: int, result: Runs) -> bool:
     """Return whether an axis is constant only at its limits."""
     value = stream.value[:, axis]
     low, high = float(np.min(value)), float(np.max(value))
-    at = value[found.first]
+    at = value[result.first]
     if low == high:  # always: if no other axis exceeds it
         return bool(high != 0.0 and abs(high) == np.max(np.abs(stream.value)))
     return bool(np.all((at == low) | (at == high)))
 
 
-def _freeze(stream: Stream, where: str, found: Runs) -> Finding:
-    begin, end = stream.time[found.first], stream.time[found.last]
+def _freeze(stream: InstrumentStream, where: str, result: Runs) -> Finding:
+    begin, end = stream.time[result.first], stream.time[result.last]
     length, span = end - begin, float(stream.time[-1] - stream.time[0])
     share = float(np.sum(length)) / span
     longest = int(np.argmax(length))
-    at = stream.value[found.first[longest]] * stream.scale
+    at = stream.value[result.first[longest]] * stream.scale
     value = f" at {at[stream.axes.index(where[-1])]:.4g} {stream.unit}" if where[-2] == " " else ""
-    more = f" and {len(found) - 1} times more" if len(found) > 1 else ""
+    more = f" and {len(result) - 1} times more" if len(result) > 1 else ""
     dead = share > DEAD
     verdict = Verdict.FAILED if dead else Verdict.DOUBTFUL
     if not dead and length[longest] < DOUBTFUL_FREEZE:
@@ -160,13 +160,13 @@ def _freeze(stream: Stream, where: str, found: Runs) -> Finding:
     )
 
 
-def frozen_rows(stream: Stream) -> IntArray:
+def frozen_rows(stream: InstrumentStream) -> IntArray:
     """Return the repeated samples of a frozen stream: all of a stretch but its first.
 
     Empty for a stream that is frozen most of the time: it cannot be bridged.
     """
-    found = _all_frozen(stream)
-    rows = [np.arange(a + 1, b + 1) for a, b in zip(found.first, found.last, strict=True)]
+    result = _all_frozen(stream)
+    rows = [np.arange(a + 1, b + 1) for a, b in zip(result.first, result.last, strict=True)]
     hung = np.concatenate([np.zeros(0, dtype=np.int64), *rows])
     return hung if len(hung) < DEAD * len(stream.time) else hung[:0]
 
@@ -180,8 +180,8 @@ def repeated_samples(log: Log, site: Site | None) -> Iterator[Finding]:
         share = float(np.mean(np.all(same, axis=1)))
         # Coarse steps repeat by chance, independently per axis.
         by_chance = float(np.prod(np.mean(same, axis=0))) if same.shape[1] > 1 else 0.0
-        held = (share - by_chance) / (1.0 - by_chance) if by_chance < 1.0 else 1.0
-        if held < HELD or share > 0.98:
+        fixed = (share - by_chance) / (1.0 - by_chance) if by_chance < 1.0 else 1.0
+        if fixed < MAX_REPEATED_SHARE or share > 0.98:
             continue
         rate_hz = 1.0 / float(np.median(np.diff(stream.time)))
         own = (1.0 - share) * rate_hz
@@ -192,7 +192,7 @@ def repeated_samples(log: Log, site: Site | None) -> Iterator[Finding]:
             f" read at {rate_hz:.4g} Hz and measures at about {own:.3g} Hz, so that values are late"
             " by up to a step. Read it when a new measurement is ready.",
             Verdict.DOUBTFUL if timed or share > OFTEN else Verdict.TRUSTWORTHY,
-            100.0 + share / HELD,
+            100.0 + share / MAX_REPEATED_SHARE,
         )
 
 
@@ -202,7 +202,7 @@ def clipped_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
         yield from _clipped_axes(stream)
 
 
-def _clipped_axes(stream: Stream) -> Iterator[Finding]:
+def _clipped_axes(stream: InstrumentStream) -> Iterator[Finding]:
     value, still = stream.value, _all_frozen(stream)
     if len(still):
         kept = np.ones(len(stream.time), dtype=bool)
@@ -250,16 +250,16 @@ def clipped(value: Array, largest: float = np.inf) -> tuple[int, float]:
     nearby = max((int(np.sum(value == one)) for one in below[-4:-1]), default=0)
     if len(below) < 3 and count < ALWAYS * len(value):
         return 0, limit
-    found = runs(at)
-    longest = int(np.max(found.last - found.first))
-    apart = (value[1:] == value[:-1])[~at[1:]]
-    held = float(np.mean(apart)) if len(apart) else 0.0
-    by_chance = np.log(CHANCE) / np.log(min(max(held, 1e-3), 0.97))
+    result = runs(at)
+    longest = int(np.max(result.last - result.first))
+    separate = (value[1:] == value[:-1])[~at[1:]]
+    fixed = float(np.mean(separate)) if len(separate) else 0.0
+    by_chance = np.log(CHANCE) / np.log(min(max(fixed, 1e-3), 0.97))
     pile = count > PILE * nearby
     return (count if pile and longest >= max(LEAST_RUN, 0.5 * by_chance) else 0), limit
 
 
-def _spikes(stream: Stream) -> tuple[IntArray, int]:
+def _spikes(stream: InstrumentStream) -> tuple[IntArray, int]:
     """Return the isolated false samples, and how many of them are certain.
 
     They are off the curve through their neighbours, which agree with each other; a knock moves
@@ -272,12 +272,12 @@ def _spikes(stream: Stream) -> tuple[IntArray, int]:
     curve = (4.0 * (before + after) - x[:-4] - x[4:]) / 6.0
     off = np.abs(x[2:-2] - curve)
     floor = 1e-9 * np.max(np.abs(x))
-    apart = np.maximum(np.abs(after - before), np.abs(x[:-4] - x[4:]))
-    alone, scatter = off > 3.0 * apart, _scatter(off)
-    found, sure = (
-        np.any(alone & (off > least * scatter + floor), axis=1) for least in (SPIKE, SURE_SPIKE)
+    separate = np.maximum(np.abs(after - before), np.abs(x[:-4] - x[4:]))
+    alone, scatter = off > 3.0 * separate, _scatter(off)
+    result, certain = (
+        np.any(alone & (off > least * scatter + floor), axis=1) for least in (SPIKE, CERTAIN_SPIKE)
     )
-    return np.flatnonzero(found) + 2, int(np.sum(sure))
+    return np.flatnonzero(result) + 2, int(np.sum(certain))
 
 
 def _scatter(off: Array) -> Array:
@@ -290,18 +290,18 @@ def _scatter(off: Array) -> Array:
     return np.asarray(widest[block])
 
 
-def false_rows(stream: Stream, site: Site | None) -> IntArray:
+def false_rows(stream: InstrumentStream, site: Site | None) -> IntArray:
     """Return the isolated false samples of a stream; none where they are too few to be certain."""
     if next(_clipped_axes(stream), None) is not None:
         return np.zeros(0, dtype=np.int64)  # clipping makes corners
     if stream.name == "magnetometer" and site is not None and not _smooth_between(stream, site):
         return np.zeros(0, dtype=np.int64)
-    rows, sure = _spikes(stream)
-    few = len(rows) < max(LEAST_SPIKES, SPIKE_SHARE * len(stream.value)) and sure < LEAST_SURE
+    rows, certain = _spikes(stream)
+    few = len(rows) < max(LEAST_SPIKES, SPIKE_SHARE * len(stream.value)) and certain < MIN_CERTAIN
     return rows[:0] if few else rows
 
 
-def _smooth_between(stream: Stream, site: Site) -> bool:
+def _smooth_between(stream: InstrumentStream, site: Site) -> bool:
     """Return whether the field of the declared drives is smooth from sample to sample."""
     if has_schedule(site):
         return False

@@ -14,7 +14,7 @@ from scipy.ndimage import median_filter
 
 from magfusion.errors import InputError
 from magfusion.estimation.data_checks.turning import field_body
-from magfusion.model.quaternion import turned
+from magfusion.model.quaternion import rotate
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.site import Site
 from magfusion.model.strapdown import turn_at, turn_from_gyro
@@ -29,16 +29,16 @@ SEGMENT, SHORTEST, SHARE = 8.0, 2.0, 0.35  # s, s, of the log
 LEAST_SEGMENTS = 3
 LOWEST_HZ = 3.0  # Hz; below, the spectrum is that of motion
 STAND_OUT = 30.0  # a line has this many times the neighbouring power
-BESIDE_HZ = 2.5  # on either side, where that power is measured
+NEIGHBOUR_BAND_HZ = 2.5  # on either side, where that power is measured
 WIDTH_HZ = 0.3  # of a line that motion modulates, on either side
 APART_HZ = 0.5  # of two lines
-TELLABLE = 3.0  # resolutions from a tone at which a line is separable from it
+MIN_SEPARATION = 3.0  # resolutions from a tone at which a line is separable from it
 SIDEBAND_HZ = 4.0  # half width of a tone's motion sidebands
 MIRRORED = 0.1  # least power of the mirrored sideband, or of another tone's, as a share
 MAINS_HZ = (50.0, 60.0)
 MAINS_OFF = 0.008  # relative; a line farther off is not mains
 HARMONICS = 6
-FORGOTTEN = 3.0  # a line near a tone and this many times as strong is the beacon itself
+OWN_LINE_RATIO = 3.0  # a line near a tone and this many times as strong is the beacon itself
 ALIASED = 3  # harmonics of the mains whose aliases are searched
 CONSEQUENCE = 3.0  # times the model's error of a tone, from which a leak casts doubt
 FITTED_CONSEQUENCE = 25.0  # the same of mains, which the noise near the tones accounts for
@@ -81,7 +81,7 @@ class Spectrum(NamedTuple):
         return float(np.max(self.power[near], initial=1e-300))
 
 
-class Line(NamedTuple):
+class SpectralLine(NamedTuple):
     """One line of a spectrum (Hz, T)."""
 
     frequency_hz: float
@@ -100,7 +100,7 @@ def still_field(log: Log, site: Site | None) -> Array:
     imu, offset = log.imu, site.platform.imu.time_offset
     turns = turn_from_gyro(imu.time, imu.gyro_body)
     at = turn_at(turns, imu.time, imu.gyro_body, log.vectors.time - offset)
-    return np.ascontiguousarray(turned(at, field.T).T)
+    return np.ascontiguousarray(rotate(at, field.T).T)
 
 
 def spectrum(log: Log, site: Site | None) -> Spectrum | None:
@@ -123,29 +123,29 @@ def spectrum(log: Log, site: Site | None) -> Spectrum | None:
     power = np.zeros(length // 2 + 1)
     for k in first:
         piece = field[k : k + length]
-        found = np.fft.rfft((piece - np.mean(piece, axis=0)) * window, axis=0)
-        power += np.sum(np.abs(found) ** 2, axis=1)
+        result = np.fft.rfft((piece - np.mean(piece, axis=0)) * window, axis=0)
+        power += np.sum(np.abs(result) ** 2, axis=1)
     scale = (2.0 / float(np.sum(window))) ** 2 / max(len(first), 1)
     frequency = np.asarray(np.fft.rfftfreq(length, step), dtype=np.float64)
     return Spectrum(frequency, scale * power, 1.0 / step)
 
 
-def lines(found: Spectrum) -> tuple[Line, ...]:
+def lines(lines_found: Spectrum) -> tuple[SpectralLine, ...]:
     """Return the lines of a spectrum, strongest first."""
-    power, resolution = found.power, found.resolution_hz
-    reach = 2 * int(BESIDE_HZ / resolution) + 1
-    beside = median_filter(power, reach, mode="nearest")
+    power, resolution = lines_found.power, lines_found.resolution_hz
+    reach = 2 * int(NEIGHBOUR_BAND_HZ / resolution) + 1
+    others = median_filter(power, reach, mode="nearest")
     inner = np.arange(1, len(power) - 1)
     top = (power[inner] >= power[inner - 1]) & (power[inner] > power[inner + 1])
-    peaks = inner[top & (power[inner] > STAND_OUT * beside[inner])]
-    peaks = peaks[found.frequency_hz[peaks] > LOWEST_HZ]
-    out: list[Line] = []
+    peaks = inner[top & (power[inner] > STAND_OUT * others[inner])]
+    peaks = peaks[lines_found.frequency_hz[peaks] > LOWEST_HZ]
+    out: list[SpectralLine] = []
     for k in peaks[np.argsort(-power[peaks])]:
         before, here, after = np.log(np.maximum(power[k - 1 : k + 2], 1e-300))
         finer = 0.5 * (before - after) / min(before - 2.0 * here + after, -1e-9)
         frequency = float((k + finer) * resolution)
         if all(abs(frequency - one.frequency_hz) > APART_HZ for one in out):
-            out.append(Line(frequency, found.amplitude(frequency)))
+            out.append(SpectralLine(frequency, lines_found.amplitude(frequency)))
     return tuple(out)
 
 
@@ -170,45 +170,49 @@ def mains_of(frequency_hz: float, rate_hz: float) -> tuple[float, int] | None:
     return None
 
 
-def named_lines(found: Spectrum, site: Site | None) -> tuple[Line, ...]:
+def named_lines(lines_found: Spectrum, site: Site | None) -> tuple[SpectralLine, ...]:
     """Return tones and undeclared lines, without the motion sidebands of a site's tones."""
     tones = [] if site is None else [f for _, f in _tones(site)]
-    return tuple(line for line in lines(found) if not is_sideband(found, line, tones))
+    return tuple(line for line in lines(lines_found) if not is_sideband(lines_found, line, tones))
 
 
-def undeclared(found: Spectrum, site: Site) -> tuple[Line, ...]:
+def undeclared(lines_found: Spectrum, site: Site) -> tuple[SpectralLine, ...]:
     """Return the lines that are neither a declared tone nor one of its motion sidebands."""
     tones = [f for _, f in _tones(site)]
     out = []
-    for line in lines(found):
-        apart = [abs(line.frequency_hz - f) for f in tones]
-        if min(apart, default=np.inf) < TELLABLE * found.resolution_hz:
+    for line in lines(lines_found):
+        separate = [abs(line.frequency_hz - f) for f in tones]
+        if min(separate, default=np.inf) < MIN_SEPARATION * lines_found.resolution_hz:
             continue
-        if not is_sideband(found, line, tones):
+        if not is_sideband(lines_found, line, tones):
             out.append(line)
     return tuple(out)
 
 
-def is_sideband(found: Spectrum, line: Line, tones: list[float]) -> bool:
+def is_sideband(lines_found: Spectrum, line: SpectralLine, tones: list[float]) -> bool:
     """Return whether a line is a motion sideband of a tone: its mirror exists, too."""
-    own = found.peak(line.frequency_hz)
+    own = lines_found.peak(line.frequency_hz)
     for tone in tones:
         off = line.frequency_hz - tone
-        if abs(off) < SIDEBAND_HZ and found.peak(tone) > own:
-            share = own / found.peak(tone)
+        if abs(off) < SIDEBAND_HZ and lines_found.peak(tone) > own:
+            share = own / lines_found.peak(tone)
             mirrors = [(tone, -off), *((f, d) for f in tones if f != tone for d in (off, -off))]
-            if any(found.peak(f + d) > MIRRORED * share * found.peak(f) for f, d in mirrors):
+            if any(
+                lines_found.peak(f + d) > MIRRORED * share * lines_found.peak(f) for f, d in mirrors
+            ):
                 return True
     return False
 
 
-def leaked(line: Line, tone_hz: float, window: float) -> float:
+def leaked(line: SpectralLine, tone_hz: float, window: float) -> float:
     """Return the leakage of a line into the lock-in of a tone (T)."""
     turns = np.pi * abs(line.frequency_hz - tone_hz) * window
     return float(line.amplitude / max(turns, 1.0))
 
 
-def beside_lines(log: Log, site: Site, lockin: LockinSettings | None) -> LockinSettings | None:
+def with_disturbing_lines(
+    log: Log, site: Site, lockin: LockinSettings | None
+) -> LockinSettings | None:
     """Return settings by which the lines that would disturb the tones are fitted with them.
 
     By the beginning of the log; unchanged where nothing disturbs, or the tones are in slots.
@@ -222,8 +226,8 @@ def beside_lines(log: Log, site: Site, lockin: LockinSettings | None) -> LockinS
     wave = log.waveform
     if wave is None or len(wave) < 2 or has_schedule(site) or not site.beacons:
         return lockin
-    found = spectrum(_until(log, wave, float(wave.time[0]) + BEGINNING), site)
-    if found is None:
+    result = spectrum(_until(log, wave, float(wave.time[0]) + BEGINNING), site)
+    if result is None:
         return lockin
     try:
         settings = lockin or usual_lockin(site)
@@ -231,15 +235,15 @@ def beside_lines(log: Log, site: Site, lockin: LockinSettings | None) -> LockinS
         return lockin
     _, tones = map(np.array, zip(*_tones(site), strict=True))
     chosen: tuple[float, ...] = ()
-    for line in undeclared(found, site):
+    for line in undeclared(result, site):
         if len(chosen) == MOST_FITTED:
             break
-        if _consequence(found, line, site, settings)[0] <= CONSEQUENCE:
+        if _consequence(result, line, site, settings)[0] <= CONSEQUENCE:
             continue
         others = np.array([*tones, *chosen])
-        asked = lockin is not None
-        trial = _fitting(line.frequency_hz, others, site, settings, chosen, asked=asked)
-        if trial is not None and separable(1.0 / found.rate_hz, trial, tones):
+        requested = lockin is not None
+        trial = _fitting(line.frequency_hz, others, site, settings, chosen, requested=requested)
+        if trial is not None and separable(1.0 / result.rate_hz, trial, tones):
             settings, chosen = trial, trial.lines_hz
     return settings if chosen else lockin
 
@@ -258,7 +262,7 @@ def _fitting(
     settings: LockinSettings,
     chosen: tuple[float, ...],
     *,
-    asked: bool,
+    requested: bool,
 ) -> LockinSettings | None:
     """Return settings that fit one more line, if a window can be long enough to separate it.
 
@@ -266,15 +270,15 @@ def _fitting(
     ----------
     others_hz : ndarray
         Tones, and lines that are already fitted.
-    asked : bool
+    requested : bool
         Whether the window was requested, and is kept.
     """
-    apart = float(np.min(np.abs(line_hz - others_hz)))
-    needed = (SEPARATED if asked else 2.0) / apart
-    if needed > (settings.window if asked else LONGER * usual_lockin(site).window):
+    separate = float(np.min(np.abs(line_hz - others_hz)))
+    needed = (SEPARATED if requested else 2.0) / separate
+    if needed > (settings.window if requested else LONGER * usual_lockin(site).window):
         return None
     longer = max(settings.window, needed)
-    step = settings.step if asked else longer / 2.0
+    step = settings.step if requested else longer / 2.0
     return replace(settings, window=longer, step=step, lines_hz=(*chosen, line_hz))
 
 
@@ -284,27 +288,29 @@ def undeclared_lines(
     """Yield the lines that the site does not declare, with their effect on its tones."""
     if site is None or has_schedule(site) or len(site.beacons) == 0:
         return
-    found = spectrum(log, site)
-    if found is None:
+    result = spectrum(log, site)
+    if result is None:
         return
     try:
-        settings = beside_lines(log, site, lockin) or usual_lockin(site)
+        settings = with_disturbing_lines(log, site, lockin) or usual_lockin(site)
     except InputError:
         return
-    yield from judged_lines(found, site, settings)
+    yield from judged_lines(result, site, settings)
 
 
-def judged_lines(found: Spectrum, site: Site, settings: LockinSettings) -> Iterator[Finding]:
+def judged_lines(lines_found: Spectrum, site: Site, settings: LockinSettings) -> Iterator[Finding]:
     """Yield the effect of a spectrum's undeclared lines on the tones of a site."""
-    doubtful: list[tuple[float, Line, str]] = []
-    seen: list[tuple[float, Line, str]] = []
+    doubtful: list[tuple[float, SpectralLine, str]] = []
+    seen: list[tuple[float, SpectralLine, str]] = []
     fitted: list[str] = []
-    for line in undeclared(found, site):
+    for line in undeclared(lines_found, site):
         if any(abs(line.frequency_hz - one) < APART_HZ for one in settings.lines_hz):
-            fitted.append(_named(line, site, found, settings))
+            fitted.append(_named(line, site, lines_found, settings))
             continue
-        worst, words = _consequence(found, line, site, settings)
-        limit = FITTED_CONSEQUENCE if mains_of(line.frequency_hz, found.rate_hz) else CONSEQUENCE
+        worst, words = _consequence(lines_found, line, site, settings)
+        limit = (
+            FITTED_CONSEQUENCE if mains_of(line.frequency_hz, lines_found.rate_hz) else CONSEQUENCE
+        )
         (doubtful if worst > limit else seen).append((worst, line, words))
     if fitted:
         yield Finding(
@@ -317,20 +323,20 @@ def judged_lines(found: Spectrum, site: Site, settings: LockinSettings) -> Itera
     for group, verdict in ((doubtful, Verdict.DOUBTFUL), (seen, Verdict.TRUSTWORTHY)):
         if not group:
             continue
-        named = [_named(line, site, found, settings) for _, line, _ in group]
+        named = [_named(line, site, lines_found, settings) for _, line, _ in group]
         more = f" and {len(named) - LISTED} more" if len(named) > LISTED else ""
-        only_mains = all(mains_of(line.frequency_hz, found.rate_hz) for _, line, _ in group)
-        worst, _, most = max(group, key=lambda one: one[0])
+        only_mains = all(mains_of(line.frequency_hz, lines_found.rate_hz) for _, line, _ in group)
+        worst, _, maximum = max(group, key=lambda one: one[0])
         yield Finding(
             "mains" if only_mains else "undeclared_line",
-            f"magnetometer: undeclared lines: {'; '.join(named[:LISTED])}{more}. {most}",
+            f"magnetometer: undeclared lines: {'; '.join(named[:LISTED])}{more}. {maximum}",
             verdict,
             (200.0 if verdict is Verdict.DOUBTFUL else 0.0) + min(worst, 500.0),
         )
 
 
 def _consequence(
-    found: Spectrum, line: Line, site: Site, settings: LockinSettings
+    lines_found: Spectrum, line: SpectralLine, site: Site, settings: LockinSettings
 ) -> tuple[float, str]:
     """Return a line's leakage in units of the model's error, and its description."""
     error = max(site.model_error, LEAST_MODEL_ERROR)
@@ -341,7 +347,7 @@ def _consequence(
     fitted = min(1.0, float(np.pi * off)) if off < 1.0 else 1.0
     worst, where, share = 0.0, "", 0.0
     for name, tone in _tones(site):
-        tone_amplitude = max(found.amplitude(tone), 1e-30)
+        tone_amplitude = max(lines_found.amplitude(tone), 1e-30)
         leak = fitted * leaked(line, tone, settings.window) / tone_amplitude
         if leak / error > worst:
             worst, where, share = leak / error, f"beacon {name} ({tone:g} Hz)", leak
@@ -356,18 +362,18 @@ def _consequence(
     return worst, f"They change {where} by {100.0 * share:.2g} % at most."
 
 
-def _named(line: Line, site: Site, found: Spectrum, settings: LockinSettings) -> str:
+def _named(line: SpectralLine, site: Site, lines_found: Spectrum, settings: LockinSettings) -> str:
     """Return the description of a line: frequency, amplitude, and probable origin."""
     size = f"{line.frequency_hz:.2f} Hz ({1e9 * line.amplitude:.3g} nT)"
-    strongest = max((found.amplitude(f) for _, f in _tones(site)), default=0.0)
-    mains = mains_of(line.frequency_hz, found.rate_hz)
+    strongest = max((lines_found.amplitude(f) for _, f in _tones(site)), default=0.0)
+    mains = mains_of(line.frequency_hz, lines_found.rate_hz)
     for name, tone in _tones(site):
         near = abs(line.frequency_hz - tone) * settings.window < 2.0 and not mains
-        if near and line.amplitude > FORGOTTEN * found.amplitude(tone):
+        if near and line.amplitude > OWN_LINE_RATIO * lines_found.amplitude(tone):
             return f"{size}, probably beacon {name} itself, whose declared frequency_hz is {tone:g}"
         if near:
             return f"{size}, a neighbour of beacon {name} ({tone:g} Hz)"
-        harmonic = None if mains else _order_of(line, tone, found)
+        harmonic = None if mains else _order_of(line, tone, lines_found)
         if harmonic is not None:
             return f"{size}, {harmonic} times the tone of beacon {name}: its drive is distorted"
     if mains is not None:
@@ -380,12 +386,12 @@ def _named(line: Line, site: Site, found: Spectrum, settings: LockinSettings) ->
     return size
 
 
-def _order_of(line: Line, tone: float, found: Spectrum) -> int | None:
+def _order_of(line: SpectralLine, tone: float, lines_found: Spectrum) -> int | None:
     """Return the harmonic order of a weaker line with respect to a tone; None if it has none."""
-    if line.amplitude >= 0.3 * found.amplitude(tone):
+    if line.amplitude >= 0.3 * lines_found.amplitude(tone):
         return None
     for order in range(2, HARMONICS + 1):
-        at = aliased(order * tone, found.rate_hz)
-        if abs(line.frequency_hz - at) < TELLABLE * found.resolution_hz:
+        at = aliased(order * tone, lines_found.rate_hz)
+        if abs(line.frequency_hz - at) < MIN_SEPARATION * lines_found.resolution_hz:
             return order
     return None

@@ -12,11 +12,11 @@ from magfusion.units import Array, IntArray
 
 GAP = 0.5  # s; too long for the estimators to treat as lost samples
 GAP_STEPS = 8.0  # samples, where the stream is slower than that
-LOST = 0.01  # share of the samples from which it is reported
+MAX_LOST_SHARE = 0.01  # share of the samples from which it is reported
 JITTER = 0.05  # of a step
 LATTICE = 0.15  # of a step: stamps scatter less about a lattice, on which missing ones are counted
 BLOCK = 64  # samples over which a clock is assumed even
-ALIKE = 0.9  # share of the longer stream that the shorter one covers
+MIN_COVERAGE = 0.9  # share of the longer stream that the shorter one covers
 ROUNDING = 1e-6  # of a step
 LISTED = 3  # gaps that are listed
 
@@ -33,7 +33,7 @@ class Timing(NamedTuple):
         First and last stamp (s).
     jitter : float
         Of the stamps about an even clock, root mean square (s).
-    lost : float
+    lost_share : float
         Share of the samples that are missing outside the gaps.
     gap_begin, gap_end : ndarray, shape (gaps,)
         (s)
@@ -44,7 +44,7 @@ class Timing(NamedTuple):
     begin: float
     end: float
     jitter: float
-    lost: float
+    lost_share: float
     gap_begin: Array
     gap_end: Array
 
@@ -72,7 +72,7 @@ def timing(stream: str, time: Array) -> Timing | None:
         begin=float(time[0]),
         end=float(time[-1]),
         jitter=jitter,
-        lost=missing / (len(time) + missing),
+        lost_share=missing / (len(time) + missing),
         gap_begin=time[gap],
         gap_end=time[gap + 1],
     )
@@ -90,22 +90,22 @@ def _unevenness(time: Array, step: Array, gap: IntArray) -> float:
     number = np.arange(BLOCK) - 0.5 * (BLOCK - 1)
     centred = block - np.mean(block, axis=1, keepdims=True)
     slope = centred @ number / np.sum(number**2)
-    left = centred - slope[:, None] * number
-    return float(np.sqrt(np.median(np.sum(left**2, axis=1)) / (BLOCK - 2)))
+    residual = centred - slope[:, None] * number
+    return float(np.sqrt(np.median(np.sum(residual**2, axis=1)) / (BLOCK - 2)))
 
 
 def timings(log: Log) -> tuple[Timing, ...]:
     """Return the timing of the raw streams of a log."""
-    found = [timing("imu", log.imu.time)] if log.inertial else []
+    result = [timing("imu", log.imu.time)] if log.inertial else []
     if log.waveform is not None:
-        found.append(timing("magnetometer", log.waveform.time))
-    return tuple(one for one in found if one is not None)
+        result.append(timing("magnetometer", log.waveform.time))
+    return tuple(one for one in result if one is not None)
 
 
 def uneven_stamps(log: Log, _site: Site | None) -> Iterator[Finding]:
     """Yield the defects of a log's time stamps."""
-    found = timings(log)
-    for one in found:
+    result = timings(log)
+    for one in result:
         yield from _of_one(one)
     for stream, clock in log.clocks.items():
         if clock.replaced:
@@ -117,8 +117,8 @@ def uneven_stamps(log: Log, _site: Site | None) -> Iterator[Finding]:
                 Verdict.TRUSTWORTHY,
                 clock.scatter / clock.step / JITTER,
             )
-    if len(found) == 2:
-        yield from _apart(*found)
+    if len(result) == 2:
+        yield from _overlap_findings(*result)
 
 
 def _of_one(one: Timing) -> Iterator[Finding]:
@@ -137,13 +137,13 @@ def _of_one(one: Timing) -> Iterator[Finding]:
             " bridge the gap.",
             weight=1.0 + float(np.max(length)),
         )
-    if one.lost > LOST:
+    if one.lost_share > MAX_LOST_SHARE:
         yield Finding(
             "samples_lost",
-            f"{one.stream}: {100.0 * one.lost:.1f} % of the samples are missing, one or a few at a"
+            f"{one.stream}: {100.0 * one.lost_share:.1f} % of the samples are missing, one or a few at a"
             f" time: link or recorder are too slow for {one.rate_hz:.4g} Hz. Record with a larger"
             " buffer or at a lower rate.",
-            weight=one.lost / LOST,
+            weight=one.lost_share / MAX_LOST_SHARE,
         )
     if one.jitter > JITTER * usual:
         yield Finding(
@@ -156,10 +156,10 @@ def _of_one(one: Timing) -> Iterator[Finding]:
         )
 
 
-def _apart(imu: Timing, field: Timing) -> Iterator[Finding]:
+def _overlap_findings(imu: Timing, field: Timing) -> Iterator[Finding]:
     common = min(imu.end, field.end) - max(imu.begin, field.begin)
     longest = max(imu.end - imu.begin, field.end - field.begin)
-    if common < ALIKE * longest:
+    if common < MIN_COVERAGE * longest:
         yield Finding(
             "streams_apart",
             f"imu runs from {imu.begin:.1f} to {imu.end:.1f} s and magnetometer from"

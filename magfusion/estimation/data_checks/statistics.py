@@ -13,9 +13,9 @@ from scipy.special import chdtrc, gammaln, ndtri_exp
 from magfusion.units import Array, BoolArray
 
 FALSE_ALARMS = 0.005  # of all tests of one result together
-WITNESSES = 5  # that share it equally; each applies Holm's procedure to its part
-WITNESS_BUDGET = FALSE_ALARMS / WITNESSES
-SURE = 1e-9  # probability of six sigma, two-sided: evidence that may fail a result
+TEST_FAMILIES = 5  # that share it equally; each applies Holm's procedure to its part
+TEST_BUDGET = FALSE_ALARMS / TEST_FAMILIES
+P_CERTAIN = 1e-9  # probability of six sigma, two-sided: evidence that may fail a result
 _UNDERFLOW = -600.0  # log probability below which the exact function underflows
 
 
@@ -61,8 +61,8 @@ def holm(log_p: Sequence[float] | Array, budget: float = FALSE_ALARMS) -> BoolAr
     given = np.asarray(log_p, dtype=float)
     out = np.zeros(len(given), dtype=bool)
     order = np.argsort(given, kind="stable")
-    left = np.log(budget) - np.log(np.arange(len(given), 0, -1, dtype=float))
-    missed = np.flatnonzero(~(given[order] <= left))
+    residual = np.log(budget) - np.log(np.arange(len(given), 0, -1, dtype=float))
+    missed = np.flatnonzero(~(given[order] <= residual))
     out[order[: missed[0] if len(missed) else len(given)]] = True
     return out
 

@@ -70,20 +70,20 @@ def off_earth(site: Site, left_world: Array, rotation_cov_world: Array) -> OffEa
         return None
     off, size = float(np.linalg.norm(left_world)), float(np.linalg.norm(earth))
     heading, rest = _heading(earth, earth + left_world)
-    said = (
+    findings = (
         f"The static field differs from the declared Earth field by {1e6 * off:.2g} uT of"
         f" {1e6 * size:.2g} uT at the estimated attitude"
     )
     of_survey = rest < EXPLAINED * off
     if of_survey:
         text = (
-            f"{said}, as if rotated by {heading / DEGREE:+.0f} deg about the vertical. Check the"
+            f"{findings}, as if rotated by {heading / DEGREE:+.0f} deg about the vertical. Check the"
             " axes of earth_field_t and of the beacons' survey (true, grid or magnetic north, east"
             " for north), the magnetometer's mounting (heading), and iron near it."
         )
     else:
         text = (
-            f"{said}. Check the magnetometer's axes and scale, iron on the platform, and"
+            f"{findings}. Check the magnetometer's axes and scale, iron on the platform, and"
             " earth_field_t."
         )
     turn = abs(heading) if of_survey else off / size
@@ -114,7 +114,7 @@ def _heading(earth: Array, field: Array) -> tuple[float, float]:
     turn = float(np.arctan2(field[1], field[0]) - np.arctan2(earth[1], earth[0]))
     turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
     cosine, sine = np.cos(turn), np.sin(turn)
-    turned = np.array(
+    rotated = np.array(
         [cosine * earth[0] - sine * earth[1], sine * earth[0] + cosine * earth[1], earth[2]]
     )
-    return turn, float(np.linalg.norm(field - turned))
+    return turn, float(np.linalg.norm(field - rotated))

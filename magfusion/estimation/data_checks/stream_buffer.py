@@ -62,7 +62,7 @@ class Buffer:
     """
 
     newest: float
-    settled: float
+    closed_until: float
     late: int
     _time: Array
     _rows: Array
@@ -73,7 +73,7 @@ class Buffer:
         self._room: _Room | None = None
         self._waiting: deque[tuple[Array, Array]] = deque()
         self.newest = -np.inf
-        self.settled = -np.inf
+        self.closed_until = -np.inf
         self.late = 0
 
     def add(self, time: Array, rows: Array) -> None:
@@ -88,7 +88,7 @@ class Buffer:
             raise InputError(f"{self.name}: a sample is not finite; drop it from the stream")
         if len(time) == 0:
             return
-        fresh = time > self.settled
+        fresh = time > self.closed_until
         if fresh.all():
             self._waiting.append((time.copy(), rows.copy()))
         else:
@@ -146,12 +146,12 @@ class Buffer:
         hi = min(int(time.searchsorted(end)) + 1, len(time))
         return time[lo:hi], rows[lo:hi]
 
-    def forget(self, before: float, settled: float) -> None:
+    def discard_before(self, before: float, closed_until: float) -> None:
         """Drop older samples except the last; reject later those before the settled time."""
         time, rows = self.rows()
         lo = max(int(time.searchsorted(before, side="right")) - 1, 0)
         self._time, self._rows = time[lo:], rows[lo:]
-        self.settled = max(self.settled, settled)
+        self.closed_until = max(self.closed_until, closed_until)
 
     def __len__(self) -> int:
         return len(self.rows()[0])

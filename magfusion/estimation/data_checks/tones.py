@@ -11,8 +11,8 @@ import numpy as np
 
 from magfusion.estimation.data_checks.spectrum import (
     HARMONICS,
-    TELLABLE,
-    Line,
+    MIN_SEPARATION,
+    SpectralLine,
     Spectrum,
     aliased,
     is_sideband,
@@ -26,7 +26,7 @@ from magfusion.model.site import Site
 from magfusion.receiver.ellipse import semi_axes
 from magfusion.units import Array, ComplexArray
 
-FAINTEST = 3e-3  # of the strongest line; a weaker one is not considered a beacon
+MIN_RELATIVE_STRENGTH = 3e-3  # of the strongest line; a weaker one is not considered a beacon
 DISTORTION = 0.3  # of a tone, below which its multiple is a harmonic
 LONGEST, SHORTEST = 1.0, 0.25  # s, of a window
 CYCLES_APART = 4.0  # periods of the beat with the nearest line in a window
@@ -88,44 +88,44 @@ def transmitted(log: Log, site: Site | None) -> Transmitted | None:
     site : Site, optional
         Only for the magnetometer's mounting; its beacons are ignored.
     """
-    found = spectrum(log, site)
-    if found is None or log.waveform is None:
+    result = spectrum(log, site)
+    if result is None or log.waveform is None:
         return None
-    taken: list[Line] = []
+    selected: list[SpectralLine] = []
     others: list[str] = []
-    for line in lines(found):
-        mains = mains_of(line.frequency_hz, found.rate_hz)
+    for line in lines(result):
+        mains = mains_of(line.frequency_hz, result.rate_hz)
         if mains is not None:
             others.append(f"{line.frequency_hz:.2f} Hz is mains of {mains[0]:g} Hz")
-        elif (taken and line.amplitude < FAINTEST * taken[0].amplitude) or is_sideband(
-            found, line, [one.frequency_hz for one in taken]
-        ):
+        elif (
+            selected and line.amplitude < MIN_RELATIVE_STRENGTH * selected[0].amplitude
+        ) or is_sideband(result, line, [one.frequency_hz for one in selected]):
             continue
-        elif (base := _distorted(line, taken, found)) is not None:
+        elif (base := _distorted(line, selected, result)) is not None:
             others.append(f"{line.frequency_hz:.2f} Hz is a multiple of {base:.2f} Hz")
         else:
-            taken.append(line)
+            selected.append(line)
     field = still_field(log, site)
-    every = np.array([line.frequency_hz for line in lines(found)])
-    tones = [_tone(line, every, log.waveform.time, field) for line in taken]
+    every = np.array([line.frequency_hz for line in lines(result)])
+    tones = [_tone(line, every, log.waveform.time, field) for line in selected]
     tones.sort(key=lambda tone: tone.frequency_hz)
     return Transmitted(tuple(tones), tuple(others))
 
 
-def _distorted(line: Line, taken: list[Line], found: Spectrum) -> float | None:
+def _distorted(line: SpectralLine, selected: list[SpectralLine], result: Spectrum) -> float | None:
     """Return the tone of which a line is a harmonic."""
-    for one in taken:
+    for one in selected:
         for order in range(2, HARMONICS + 1):
-            off = line.frequency_hz - aliased(order * one.frequency_hz, found.rate_hz)
-            near = abs(off) < TELLABLE * found.resolution_hz
+            off = line.frequency_hz - aliased(order * one.frequency_hz, result.rate_hz)
+            near = abs(off) < MIN_SEPARATION * result.resolution_hz
             if near and line.amplitude < DISTORTION * one.amplitude:
                 return one.frequency_hz
     return None
 
 
-def _tone(line: Line, every: Array, time: Array, field: Array) -> Tone:
-    apart = np.abs(every[every != line.frequency_hz] - line.frequency_hz)
-    nearest = float(np.min(apart, initial=line.frequency_hz))
+def _tone(line: SpectralLine, every: Array, time: Array, field: Array) -> Tone:
+    separate = np.abs(every[every != line.frequency_hz] - line.frequency_hz)
+    nearest = float(np.min(separate, initial=line.frequency_hz))
     window = float(np.clip(CYCLES_APART / nearest, SHORTEST, LONGEST))
     frequency, sigma = line.frequency_hz, 1.0 / float(time[-1] - time[0])
     for _ in range(2):
@@ -133,8 +133,8 @@ def _tone(line: Line, every: Array, time: Array, field: Array) -> Tone:
         step, sigma = _turning(centre, phasor)
         frequency += step
     axes = semi_axes(phasor)
-    loud = axes[:, 1] >= np.median(axes[:, 1])
-    roundness = float(np.median(axes[loud, 0] / axes[loud, 1]))
+    strong = axes[:, 1] >= np.median(axes[:, 1])
+    roundness = float(np.median(axes[strong, 0] / axes[strong, 1]))
     return Tone(frequency, sigma, line.amplitude, roundness)
 
 
@@ -169,7 +169,7 @@ def _turning(centre: Array, phasor: ComplexArray) -> tuple[float, float]:
     away = centre - mean
     spread = float(np.sum(weight * away**2))
     fine = float(np.sum(weight * away * phase)) / spread
-    left = phase - float(np.average(phase, weights=weight)) - fine * away
+    residual = phase - float(np.average(phase, weights=weight)) - fine * away
     # The residual varies slowly with the motion: ten consecutive windows count as one.
-    sigma = float(np.sqrt(10.0 * np.sum((weight * away * left) ** 2)) / spread)
+    sigma = float(np.sqrt(10.0 * np.sum((weight * away * residual) ** 2)) / spread)
     return (coarse + fine) / (4.0 * np.pi), sigma / (4.0 * np.pi)

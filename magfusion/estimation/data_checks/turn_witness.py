@@ -9,7 +9,7 @@ from magfusion.estimation.data_checks.turning import (
     EXPLAINED,
     LEAST_TURN,
     Clocks,
-    Turning,
+    FieldRotation,
     axes,
     field_body,
     turning,
@@ -68,14 +68,14 @@ def turned_otherwise(log: Log, site: Site | None) -> Iterator[Finding]:
         yield from _contradicted(found)
 
 
-def _contradicted(found: Turning) -> Iterator[Finding]:
+def _contradicted(found: FieldRotation) -> Iterator[Finding]:
     """Yield what explains a turn of the field that the gyroscope does not, as declared."""
     declared = found.explained(np.eye(3))
     ranked = sorted(axes(), key=found.explained)[::-1]
     best, explained = ranked[0], found.explained(ranked[0])
     if explained > EXPLAINED and BETTER * (1.0 - explained) < 1.0 - declared:
         yield _other_axes(found, best, single=_single(found, ranked, explained))
-    elif found.said > LEAST_TURN:
+    elif found.expected_rate > LEAST_TURN:
         yield Finding(
             "gyro_field",
             f"gyroscope: {_words(found)}, and no exchange of axes or sign explains more than"
@@ -86,14 +86,14 @@ def _contradicted(found: Turning) -> Iterator[Finding]:
         )
 
 
-def _words(found: Turning) -> str:
+def _words(found: FieldRotation) -> str:
     return (
         f"as declared, the gyroscope explains {_percent(found.explained(np.eye(3)))} of the turn of"
         f" the steady field (rms {found.speed / DEGREE:.0f} deg/s)"
     )
 
 
-def _turned_little(found: Turning, site: Site | None) -> Iterator[Finding]:
+def _turned_little(found: FieldRotation, site: Site | None) -> Iterator[Finding]:
     """Yield a mounting that is off by degrees, which explains the turn far better."""
     if site is None:
         return
@@ -116,9 +116,9 @@ def _three(vector: Array) -> str:
     return ", ".join(f"{v:+.2f}" for v in vector)
 
 
-def _turns_alone(log: Log, site: Site | None, found: Turning) -> Iterator[Finding]:
+def _turns_alone(log: Log, site: Site | None, found: FieldRotation) -> Iterator[Finding]:
     """Name a gyroscope that turns while the field stands still: a bias, or another unit."""
-    mean, said = np.mean(log.imu.gyro_body, axis=0), found.said
+    mean, said = np.mean(log.imu.gyro_body, axis=0), found.expected_rate
     words = (
         f"gyroscope: it says that the field turns by {said / DEGREE:.2g} deg/s (rms), and the field"
         " stands still"
@@ -149,12 +149,14 @@ def _turns_alone(log: Log, site: Site | None, found: Turning) -> Iterator[Findin
         )
 
 
-def _single(found: Turning, ranked: list[Array], explained: float) -> bool:
+def _single(found: FieldRotation, ranked: list[Array], explained: float) -> bool:
     """Tell whether the motion tells the best axes from the next."""
     return BETTER * (1.0 - explained) < 1.0 - found.explained(ranked[1])
 
 
-def _other_clock(clock: Clocks, found: Turning, least: float, offset: float) -> Finding | None:
+def _other_clock(
+    clock: Clocks, found: FieldRotation, least: float, offset: float
+) -> Finding | None:
     """Name a shift of the stamps that explains the turn far better, if it is at least so long."""
     (lag, by_lag), declared = clock.lag(), found.explained(np.eye(3))
     otherwise = max(found.explained(one) for one in axes()[1:])
@@ -203,7 +205,7 @@ def _other_scale(scale: float, explained: float) -> Finding:
     )
 
 
-def _other_axes(found: Turning, matrix: Array, *, single: bool) -> Finding:
+def _other_axes(found: FieldRotation, matrix: Array, *, single: bool) -> Finding:
     """Name axes that explain the turn; those of the gyroscope, or of the magnetometer."""
     words, explained = _words(found), found.explained(matrix)
     names = ", ".join(_named(row) for row in matrix)

@@ -31,7 +31,7 @@ for _i, _k, _j in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _EPSILON[_i, _k, _j], _EPSILON[_i, _j, _k] = 1.0, -1.0
 
 
-class Turning(NamedTuple):
+class FieldRotation(NamedTuple):
     """Rate of change of a field in body axes, and its prediction by the gyroscope.
 
     Parameters
@@ -52,28 +52,28 @@ class Turning(NamedTuple):
 
     def explained(self, matrix: Array) -> float:
         """Return the share of the change that a matrix M (3, 3) explains; may be negative."""
-        left = self.change - self.by_matrix @ matrix.ravel()
-        return float(1.0 - np.sum(left**2) / np.sum(self.change**2))
+        residual = self.change - self.by_matrix @ matrix.ravel()
+        return float(1.0 - np.sum(residual**2) / np.sum(self.change**2))
 
     @property
-    def said(self) -> float:
+    def expected_rate(self) -> float:
         """Root mean square rate of the field's direction predicted by the gyroscope (rad/s)."""
-        said = self.by_matrix @ np.eye(3).ravel()
-        return float(np.sqrt(np.mean(np.sum(said**2, axis=1))))
+        findings = self.by_matrix @ np.eye(3).ravel()
+        return float(np.sqrt(np.mean(np.sum(findings**2, axis=1))))
 
     def agreement(self, matrix: Array) -> float:
         """Return the share that a matrix explains with its best positive scale."""
-        said = self.by_matrix @ matrix.ravel()
-        product = float(np.sum(said * self.change))
-        power = float(np.sum(said**2)) * float(np.sum(self.change**2))
+        findings = self.by_matrix @ matrix.ravel()
+        product = float(np.sum(findings * self.change))
+        power = float(np.sum(findings**2)) * float(np.sum(self.change**2))
         return product * abs(product) / max(power, 1e-30)
 
     def mounting(self) -> tuple[Array, float, float]:
         """Return the best small rotation (rad), its sigma, and the residual's improvement."""
-        left = self.change - self.by_matrix @ np.eye(3).ravel()
+        residual = self.change - self.by_matrix @ np.eye(3).ravel()
         # M = I + [turn]x
         by_turn = self.by_matrix @ np.swapaxes(_EPSILON, 1, 2).reshape(3, 9).T
-        rows, right = by_turn.reshape(-1, 3), left.ravel()
+        rows, right = by_turn.reshape(-1, 3), residual.ravel()
         normal = rows.T @ rows
         if np.linalg.cond(normal) > 1e6:
             return np.zeros(3), np.inf, 1.0
@@ -90,11 +90,13 @@ class Turning(NamedTuple):
     @property
     def scale(self) -> float:
         """Factor by which the rates are too small, with axes as declared."""
-        said = self.by_matrix @ np.eye(3).ravel()
-        return float(np.sum(said * self.change) / max(float(np.sum(said**2)), 1e-30))
+        findings = self.by_matrix @ np.eye(3).ravel()
+        return float(np.sum(findings * self.change) / max(float(np.sum(findings**2)), 1e-30))
 
 
-def turning(imu: ImuSamples, field_time: Array, field_body: Array, lag: float = 0.0) -> Turning:
+def turning(
+    imu: ImuSamples, field_time: Array, field_body: Array, lag: float = 0.0
+) -> FieldRotation:
     """Compare the rotation of a field with the gyroscope's.
 
     Parameters
@@ -110,7 +112,7 @@ def turning(imu: ImuSamples, field_time: Array, field_body: Array, lag: float = 
     time = np.arange(field_time[0], field_time[-1] + 0.5 * step, step)
     reach = int(np.ceil(REACH / CUTOFF / step))
     if len(time) < 8 * reach:
-        return Turning(np.zeros((0, 3)), np.zeros((0, 3, 9)))
+        return FieldRotation(np.zeros((0, 3)), np.zeros((0, 3, 9)))
     field = _interpolated(time, field_time, field_body)
     rate = _interpolated(time, imu.time + lag, imu.gyro_body)
     there = _covered(time, field_time, step) & _covered(time, imu.time + lag, step)
@@ -129,7 +131,7 @@ def turning(imu: ImuSamples, field_time: Array, field_body: Array, lag: float = 
     by_matrix = -np.einsum("ikj,nlj->nikl", _EPSILON, both.reshape(-1, 3, 3)).reshape(-1, 3, 9)
     missing = np.concatenate([[0.0], np.cumsum(~there)])
     whole = (missing[2 * reach + 1 :] == missing[: -2 * reach - 1])[::every]
-    return Turning(change[whole], by_matrix[whole])
+    return FieldRotation(change[whole], by_matrix[whole])
 
 
 def _interpolated(time: Array, known: Array, value: Array) -> Array:
@@ -148,12 +150,12 @@ def _covered(time: Array, known: Array, step: float) -> BoolArray:
 @cache
 def axes() -> tuple[Array, ...]:
     """Return the 48 signed axis permutations, the identity first."""
-    found = [
+    result = [
         np.asarray(np.eye(3)[list(order)] * np.array(sign)[:, None])
         for order in permutations(range(3))
         for sign in product((1.0, -1.0), repeat=3)
     ]
-    return tuple(sorted(found, key=lambda m: -float(np.trace(m))))
+    return tuple(sorted(result, key=lambda m: -float(np.trace(m))))
 
 
 def field_body(log: Log, site: Site | None) -> Array:
@@ -172,10 +174,10 @@ def agrees(log: Log, site: Site) -> bool:
     if log.vectors is None or len(log.imu) < 2:
         return False
     offset = site.platform.imu.time_offset
-    found = turning(log.imu, log.vectors.time, field_body(log, site), offset)
-    if len(found.change) < 12 or not found.speed > LEAST_TURN:
+    result = turning(log.imu, log.vectors.time, field_body(log, site), offset)
+    if len(result.change) < 12 or not result.speed > LEAST_TURN:
         return False
-    return found.explained(np.eye(3)) > CONTRADICTED
+    return result.explained(np.eye(3)) > CONTRADICTED
 
 
 def convolved(value: Array, kernel: Array, mode: Literal["valid", "same"]) -> Array:
@@ -207,8 +209,8 @@ def _products(vectors: Array) -> Array:
     x, y, z = vectors.T
     root = np.sqrt(2.0)
     square = x**2 + y**2 + z**2
-    apart = x**2, y**2, z**2, root * x * y, root * y * z, root * z * x
-    return np.stack([square, *apart], axis=1)
+    separate = x**2, y**2, z**2, root * x * y, root * y * z, root * z * x
+    return np.stack([square, *separate], axis=1)
 
 
 class Clocks:
@@ -233,17 +235,19 @@ class Clocks:
         field, change = field[count:-count], change[count:-count]
         total = float(np.sum(change**2))
         # Of field change and field rotation rate; a later sample is read from before.
-        turned, rated = _products(field), _products(rate)
-        turned[:, 1:] *= -1.0
+        rotated, rated = _products(field), _products(rate)
+        rotated[:, 1:] *= -1.0
         pairs = [*zip(rate.T, 2.0 * cross(field.T, change.T), strict=True)]
-        pairs += zip(rated.T, turned.T, strict=True)
-        left = total + np.sum([np.correlate(by, own, "valid") for by, own in pairs], axis=0)[::-1]
-        k = int(np.argmin(left))
+        pairs += zip(rated.T, rotated.T, strict=True)
+        residual = (
+            total + np.sum([np.correlate(by, own, "valid") for by, own in pairs], axis=0)[::-1]
+        )
+        k = int(np.argmin(residual))
         finer = 0.0
         if 0 < k < 2 * count:
-            before, here, after = left[k - 1 : k + 2]
+            before, here, after = residual[k - 1 : k + 2]
             finer = 0.5 * (before - after) / max(before - 2.0 * here + after, 1e-30)
-        return (k - count + float(finer)) * LAG_STEP, 1.0 - float(left[k]) / max(total, 1e-30)
+        return (k - count + float(finer)) * LAG_STEP, 1.0 - float(residual[k]) / max(total, 1e-30)
 
     def rate_error(self) -> float:
         """Return the relative rate error of the inertial stamps, by the lags of both halves."""

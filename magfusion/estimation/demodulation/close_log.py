@@ -11,10 +11,10 @@ import numpy as np
 
 from magfusion.estimation.data_checks.detection import (
     DETECTION_CHI_SQUARE_ONLINE,
-    LOUD,
+    STRONG_CHI_SQUARE,
     above_noise,
 )
-from magfusion.estimation.data_checks.spectrum import beside_lines
+from magfusion.estimation.data_checks.spectrum import with_disturbing_lines
 from magfusion.estimation.demodulation.close_tones import joint_phasors
 from magfusion.estimation.graph.preintegration import low_passed_rate_at
 from magfusion.estimation.measurements.joint_phasors import JointPhasors, at_nearest
@@ -30,7 +30,7 @@ from magfusion.receiver.turn import on_clock
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, BoolArray
 
-NO_SAY = 1e6  # times the variance: a window that is tested, but not used
+IGNORED_VARIANCE_FACTOR = 1e6  # times the variance: a window that is tested, but not used
 
 
 class CloseLog(NamedTuple):
@@ -47,13 +47,13 @@ class CloseLog(NamedTuple):
     time: Array
 
     @staticmethod
-    def of(log: Log, site: Site, asked: LockinSettings | None) -> "CloseLog | None":
+    def of(log: Log, site: Site, requested: LockinSettings | None) -> "CloseLog | None":
         """Return the short windows of a log of close tones; None of any other."""
-        settings = None if log.waveform is None else joint_settings(site, asked)
+        settings = None if log.waveform is None else joint_settings(site, requested)
         if settings is None or log.waveform is None:
             return None
         receiver = JointReceiver(site, settings)
-        receiver.beside_lines(beside_lines(log, site, asked))
+        receiver.fit_extra_lines(with_disturbing_lines(log, site, requested))
         imu = initial_calibration(site, 0.0, float(log.imu.time[0])).on_log_rate(log.imu)
         windows = receiver.admitted(log.waveform, imu)
         return CloseLog(receiver, windows, log.waveform.time) if len(windows) else None
@@ -94,7 +94,7 @@ class CloseLog(NamedTuple):
         assert here.gyro_bias_body is not None
         rate_body = low_passed_rate_at(imu, offset, centre) - here.gyro_bias_body
         bias = interpolated(imu.time + offset, states.time, states.gyro_bias_body)
-        found, _ = joint_phasors(
+        result, _ = joint_phasors(
             self.receiver.designs,
             self.windows,
             self.time,
@@ -108,7 +108,7 @@ class CloseLog(NamedTuple):
             calibration.imu_offset(centre),
             standing=None if standing is None else standing[epoch],
         )
-        return found
+        return result
 
 
 def looked_at(phasors: FieldPhasors, joint: JointPhasors, window: float) -> FieldPhasors:
@@ -121,8 +121,8 @@ def looked_at(phasors: FieldPhasors, joint: JointPhasors, window: float) -> Fiel
     """
     before = np.ones(phasors.measured.shape[:2]) if phasors.excess is None else phasors.excess
     middle = 0.5 * (joint.time[1:] + joint.time[:-1])
-    apart = np.abs(joint.time[np.searchsorted(middle, phasors.time)] - phasors.time)
-    less = np.where(apart < 0.25 * window, NO_SAY, 1.0)[:, None]
+    separate = np.abs(joint.time[np.searchsorted(middle, phasors.time)] - phasors.time)
+    less = np.where(separate < 0.25 * window, IGNORED_VARIANCE_FACTOR, 1.0)[:, None]
     root = phasors.sqrt_information / np.sqrt(less)[..., None, None]
     return replace(phasors, sqrt_information=root, excess=less * before)
 
@@ -144,7 +144,7 @@ def without_silent(
     root = whitening(samples.phasor_cov, every)
     power = np.sum(np.abs((root @ expected[..., None])[..., 0]) ** 2, axis=-1)
     silent = ~above_noise(samples, DETECTION_CHI_SQUARE_ONLINE)
-    silent &= power > LOUD * DETECTION_CHI_SQUARE_ONLINE
+    silent &= power > STRONG_CHI_SQUARE * DETECTION_CHI_SQUARE_ONLINE
     if not np.any(silent):
         return joint
     return joint.leaving_out(at_nearest(samples.time, silent, joint.time))

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.estimation.demodulation.sending import Sending
+from magfusion.estimation.demodulation.active_beacons import ActiveBeacons
 from magfusion.estimation.measurements.joint_phasors import JointPhasors, in_directions
-from magfusion.model.audibility import largest_fields, tones_of
+from magfusion.model.detection_range import largest_fields, tones_of
 from magfusion.model.noise import cholesky, measurement_cov, sensor_positions
 from magfusion.model.parameters import Calibration, linearize_channels
-from magfusion.model.quaternion import inverse, matrices, turned
+from magfusion.model.quaternion import inverse, matrices, rotate
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -36,7 +36,7 @@ def joint_phasors(
     rate_body: Array,
     applied_offset: Array,
     *,
-    alike: Array | float = 1.0,
+    shared_by: Array | float = 1.0,
     standing: BoolArray | None = None,
     noise: Array | None = None,
 ) -> tuple[JointPhasors, Array]:
@@ -79,12 +79,12 @@ def joint_phasors(
     declared = site.platform.magnetometer.noise_density * float(np.sqrt(nyquist_hz))
     smooth = not_below(smooth, declared)
 
-    felt = _felt(calibration, states)
-    basis = _of_channels(tones, windows.centre, site, felt)
+    affected = _predicted_channels(calibration, states)
+    basis = _of_channels(tones, windows.centre, site, affected)
     elapsed, shift = _at_nodes(nodes, states, site)
-    value, strength = _foreseen(calibration, states, elapsed, shift, felt)
+    value, strength = _foreseen(calibration, states, elapsed, shift, affected)
     centre = in_directions(basis, value[..., None])[..., 0]
-    found = JointPhasors(
+    result = JointPhasors(
         epoch=epoch,
         time=states.time,
         measured=seen.reshape(n, -1) + centre,
@@ -96,11 +96,11 @@ def joint_phasors(
         rate_body=rate_body,
         applied_offset=applied_offset,
         moving=np.ones(n, dtype=bool) if standing is None else ~standing,
-        felt=felt,
+        is_predicted=affected,
     )
-    at_centre = value.reshape(n, elapsed.shape[1], *felt.shape[1:], 6)[:, len(NODES) // 2]
-    whitening = _whitening(site, states, at_centre, found, smooth, alike)
-    return replace(found, whitening=whitening), shown
+    at_centre = value.reshape(n, elapsed.shape[1], *affected.shape[1:], 6)[:, len(NODES) // 2]
+    whitening = _whitening(site, states, at_centre, result, smooth, shared_by)
+    return replace(result, whitening=whitening), shown
 
 
 def _averaged(shown: Array, noise: Array | None, windows: Windows, designs: JointDesigns) -> Array:
@@ -128,7 +128,11 @@ def _at_nodes(nodes: Trajectory, states: Trajectory, site: Site) -> tuple[Array,
 
 
 def _foreseen(
-    calibration: Calibration, states: Trajectory, elapsed: Array, shift_body: Array, felt: BoolArray
+    calibration: Calibration,
+    states: Trajectory,
+    elapsed: Array,
+    shift_body: Array,
+    predicted: BoolArray,
 ) -> tuple[Array, Array]:
     """Return the phasors at the nodes (n nodes, channels, 6), and their relative strength.
 
@@ -141,7 +145,7 @@ def _foreseen(
     place = states.position_world[every] + (turn @ shift_body.reshape(-1, 3, 1))[..., 0]
     place += elapsed.reshape(-1, 1) * states.velocity_world[every]
     value, _, _ = linearize_channels(
-        calibration, (), states.time[every], turn, place, heard=felt[every]
+        calibration, (), states.time[every], turn, place, detected=predicted[every]
     )
     size = np.linalg.norm(value, axis=2).reshape(n, count, -1)
     middle = size[:, count // 2][:, None]
@@ -161,7 +165,7 @@ def _seen(
     turn, from_body = body_turn_of(imu), measured_from_body(site)
     back = from_body @ matrices(inverse(turn(windows.centre)))
     in_body = np.linalg.inv(from_body)
-    still = turned(turn(time), in_body @ left_sensor.T).T
+    still = rotate(turn(time), in_body @ left_sensor.T).T
     seen, tones, noise = [], [], []
     for k, (first, count) in enumerate(zip(windows.first, windows.count, strict=True)):
         rows = slice(int(first), int(first + count))
@@ -169,23 +173,23 @@ def _seen(
         field = still[rows] @ back[k].T
         seen.append(design.across.T @ field)
         tones.append(design.tones)
-        beside = design.beside.T @ field
-        noise.append(beside.T @ beside / len(beside))
+        others = design.extra_design.T @ field
+        noise.append(others.T @ others / len(others))
     return np.array(seen), np.array(tones), np.array(noise)
 
 
-def _felt(calibration: Calibration, states: Trajectory) -> BoolArray:
+def _predicted_channels(calibration: Calibration, states: Trajectory) -> BoolArray:
     """Return which channels are predicted at states, shape (n, channels)."""
-    site, sending = calibration.site, Sending.of(calibration, LONGEST_WINDOW)
-    if sending.least is None:
+    site, active_beacons = calibration.site, ActiveBeacons.of(calibration, LONGEST_WINDOW)
+    if active_beacons.least is None:
         return np.ones((len(states), len(site.channels)), dtype=bool)
     largest = largest_fields(site, sensor_positions(site, states)[:, 0])
-    felt = np.asarray(largest > sending.least)
-    felt[~np.any(felt, axis=1), 0] = True
-    return felt
+    affected = np.asarray(largest > active_beacons.least)
+    affected[~np.any(affected, axis=1), 0] = True
+    return affected
 
 
-def _of_channels(by_tone: Array, centre: Array, site: Site, felt: BoolArray) -> Array:
+def _of_channels(by_tone: Array, centre: Array, site: Site, predicted: BoolArray) -> Array:
     """Return directions by cosines and sines in terms of real and imaginary parts of phasors."""
     tones = tones_of(site)
     count = len(tones.frequencies_hz)
@@ -194,8 +198,8 @@ def _of_channels(by_tone: Array, centre: Array, site: Site, felt: BoolArray) -> 
     along, across = by_tone[..., :count], by_tone[..., count:]
     real = along * cosine - across * sine
     imaginary = -along * sine - across * cosine
-    both = np.stack([real, imaginary], axis=-1)[..., tones.of_channel[: felt.shape[1]], :]
-    both = np.where(felt[:, None, None, :, None], both, 0.0)
+    both = np.stack([real, imaginary], axis=-1)[..., tones.of_channel[: predicted.shape[1]], :]
+    both = np.where(predicted[:, None, None, :, None], both, 0.0)
     return np.asarray(np.swapaxes(both.reshape(*both.shape[:3], -1), 1, 2))
 
 
@@ -203,31 +207,35 @@ def _whitening(
     site: Site,
     states: Trajectory,
     value: Array,
-    found: JointPhasors,
+    result: JointPhasors,
     noise: Array,
-    alike: Array | float,
+    shared_by: Array | float,
 ) -> Array:
     """Return the whitening of directions: noise of the samples, and the error of the model."""
-    felt, basis = found.felt, found.basis
+    affected, basis = result.is_predicted, result.basis
     n, directions, nodes, _ = basis.shape
     phasor = value[..., :3] + 1j * value[..., 3:]
     samples = FieldSamples(
         time=states.time,
         window=np.ones(n),
         channels=site.channels,
-        phasor_sensor=np.where(felt[..., None], phasor, np.nan),
-        phasor_cov=np.zeros((*felt.shape, 3, 3)),
+        phasor_sensor=np.where(affected[..., None], phasor, np.nan),
+        phasor_cov=np.zeros((*affected.shape, 3, 3)),
     )
     model = measurement_cov(
-        site, samples, sensor_world=sensor_positions(site, states), alike=alike, beside=False
+        site,
+        samples,
+        sensor_world=sensor_positions(site, states),
+        shared_by=shared_by,
+        neighbours=False,
     )
-    model = np.where(felt[..., None, None], np.nan_to_num(model), 0.0)
+    model = np.where(affected[..., None, None], np.nan_to_num(model), 0.0)
     factor = np.mean([beacon.noise_factor**2 for beacon in site.beacons])
     out = np.empty((n, 3 * directions, 3 * directions))
     for begin in range(0, n, AT_ONCE):
         rows = slice(begin, begin + AT_ONCE)
-        each = basis[rows].reshape(-1, directions, nodes, felt.shape[1], 2)
-        parts = np.einsum("nrkcp,nkc->ncrp", each, found.strength[rows])
+        each = basis[rows].reshape(-1, directions, nodes, affected.shape[1], 2)
+        parts = np.einsum("nrkcp,nkc->ncrp", each, result.strength[rows])
         shape = parts @ np.swapaxes(parts, 2, 3)  # (n, channels, directions, directions)
         size = model[rows].reshape(len(shape), shape.shape[1], 9)
         wide = np.swapaxes(shape.reshape(*shape.shape[:2], -1), 1, 2) @ size

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.data_checks.detection import drowned, without_silence
-from magfusion.estimation.data_checks.spectrum import beside_lines
+from magfusion.estimation.data_checks.detection import masked_phasors, without_silence
+from magfusion.estimation.data_checks.spectrum import with_disturbing_lines
+from magfusion.estimation.demodulation.burial_depth import refuse_too_deep
 from magfusion.estimation.demodulation.close_log import CloseLog
 from magfusion.estimation.demodulation.motion_compensation import (
     KnownMotion,
@@ -17,10 +18,9 @@ from magfusion.estimation.demodulation.motion_compensation import (
 )
 from magfusion.estimation.demodulation.motion_shape import MotionShape
 from magfusion.estimation.demodulation.motion_stretches import STRETCH
-from magfusion.estimation.demodulation.skin_depths import refuse_too_deep
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.likelihood import fix_epochs
-from magfusion.model.audibility import tones_of
+from magfusion.model.detection_range import tones_of
 from magfusion.model.parameters import Calibration
 from magfusion.model.quaternion import unit
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
@@ -54,7 +54,7 @@ class Demodulation:
         Of the waveform; None where the log has only phasors.
     windows : Windows, optional
         Windows of the receiver.
-    drowned : bool ndarray, shape (n, channels), optional
+    masked : bool ndarray, shape (n, channels), optional
         Phasors omitted from ``fields`` in which the motion may mask a beacon; None where the log
         has only phasors.
     blind : bool ndarray, shape (n,), optional
@@ -70,13 +70,13 @@ class Demodulation:
     dropped: Mapping[str, int]
     receiver: Receiver | None = None
     windows: Windows | None = None
-    drowned: BoolArray | None = None
+    masked: BoolArray | None = None
     blind: BoolArray | None = None
     without_turn: Windows = field(default_factory=Windows.none)
     close: CloseLog | None = None
 
     @property
-    def anew(self) -> bool:
+    def can_repeat(self) -> bool:
         """Whether samples are available to demodulate again, once the motion is known."""
         return self.log.waveform is not None
 
@@ -125,8 +125,8 @@ class Demodulation:
         known = on_clock(imu, offset, _bias_at(imu.time + offset, states))
         site, windows = calibration.site, self.windows
         if not isinstance(self.receiver, LockinReceiver):
-            found, _ = self.receiver.phasors(waveform, known, windows, site)
-            return MotionCompensated.of_slots(found)
+            result, _ = self.receiver.phasors(waveform, known, windows, site)
+            return MotionCompensated.of_slots(result)
         length = self.receiver.settings.window
         motion, turn = _integrated_once(
             waveform, imu, offset, states if path is None else path, windows, site
@@ -134,7 +134,7 @@ class Demodulation:
         operator = self.receiver.operator(waveform, known, windows, site, turn)
         del known  # as large as the log
         if self.blind is not None:
-            operator = replace(operator, apart=self.blind)
+            operator = replace(operator, is_separable=self.blind)
         wave = demodulate_about(
             operator,
             waveform.measured_sensor,
@@ -163,9 +163,9 @@ def _integrated_once(
     if len(waveform) > STRETCH:
         return None, None
     shape = MotionShape.of(path, imu, offset, site.gravity)
-    turned = shape.turned_at(waveform.time)
-    turn = BodyTurn(unit(turned), unit(shape.turned_at(windows.centre)))
-    return KnownMotion(shape, turned), turn
+    rotated = shape.turned_at(waveform.time)
+    turn = BodyTurn(unit(rotated), unit(shape.turned_at(windows.centre)))
+    return KnownMotion(shape, rotated), turn
 
 
 def _bias_at(time: Array, states: Trajectory) -> Array:
@@ -192,17 +192,17 @@ def demodulated(log: Log, site: Site, settings: LockinSettings | None = None) ->
         return Demodulation(log, without_silence(log.fields), {})
     if site.platform.further:
         raise InputError("samples of several magnetometers are not demodulated; give their phasors")
-    receiver = receiver_of(site, beside_lines(log, site, settings))
+    receiver = receiver_of(site, with_disturbing_lines(log, site, settings))
     windows, fields = receiver.whole(log.waveform, log.imu)
     refuse_too_deep(fields, site)
-    heard, hidden = without_silence(fields), drowned(fields)
+    detected, hidden = without_silence(fields), masked_phasors(fields)
     if tones_of(site).reused:  # the states will assign phasors to beacons better
         hidden |= ~fields.valid
     without = receiver.without_turn if isinstance(receiver, LockinReceiver) else Windows.none()
     dropped = receiver.dropped
     close = CloseLog.of(log, site, settings)
     return Demodulation(
-        log, heard, dropped, receiver, windows, hidden, without_turn=without, close=close
+        log, detected, dropped, receiver, windows, hidden, without_turn=without, close=close
     )
 
 
@@ -210,8 +210,8 @@ def phasors(
     log: Log, site: Site, settings: LockinSettings | None = None
 ) -> tuple[FieldSamples, Mapping[str, int]]:
     """Return the phasors of a log and the number of dropped windows, as `demodulated`."""
-    found = demodulated(log, site, settings)
-    return found.fields, found.dropped
+    result = demodulated(log, site, settings)
+    return result.fields, result.dropped
 
 
 def gravity_at_rest(imu: ImuSamples, site: Site, time: Array) -> Gravity | None:
@@ -247,14 +247,14 @@ def gravity_at_rest(imu: ImuSamples, site: Site, time: Array) -> Gravity | None:
 
 
 def first_fixes(
-    samples: FieldSamples, log: Log, calibration: Calibration, free: tuple[str, ...] = ()
+    samples: FieldSamples, log: Log, calibration: Calibration, free_parameters: tuple[str, ...] = ()
 ) -> Fixes:
     """Return the fix of every epoch, with gravity where the platform rests.
 
     With time-multiplexed coils a whole cycle is one epoch.
     """
     epochs, gravity = fix_inputs(samples, log, calibration.site)
-    return fix_epochs(epochs, calibration, gravity=gravity, free=free)
+    return fix_epochs(epochs, calibration, gravity=gravity, free_parameters=free_parameters)
 
 
 def fix_inputs(samples: FieldSamples, log: Log, site: Site) -> tuple[FieldSamples, Gravity | None]:

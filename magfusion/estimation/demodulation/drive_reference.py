@@ -48,14 +48,14 @@ def turning_currents(log: Log, site: Site) -> Log:
                 f"rotor_{name}: only magfusion range uses the angle of a rotor with harmonics;"
                 " omit harmonics from the site"
             )
-    turned, known = cosines(log.rotation), log.drive
+    rotated, known = cosines(log.rotation), log.drive
     if known is not None:
-        if not np.array_equal(known.time, turned.time):
+        if not np.array_equal(known.time, rotated.time):
             raise InputError(
                 "magnetometer: currents and angles are missing at different samples; give both"
             )
-        turned = DriveSamples(turned.time, dict(known.current) | dict(turned.current))
-    return replace(log, drive=turned, rotation=None)
+        rotated = DriveSamples(rotated.time, dict(known.current) | dict(rotated.current))
+    return replace(log, drive=rotated, rotation=None)
 
 
 def with_drives(log: Log, site: Site) -> tuple[Log, Site]:

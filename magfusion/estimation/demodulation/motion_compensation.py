@@ -8,11 +8,11 @@ from numpy.linalg import norm
 
 from magfusion.errors import InputError
 from magfusion.estimation.data_checks.detection import only
+from magfusion.estimation.demodulation.active_beacons import ActiveBeacons
 from magfusion.estimation.demodulation.motion_shape import MotionShape
 from magfusion.estimation.demodulation.motion_stretches import joined, only_stretch, stretches
-from magfusion.estimation.demodulation.sending import Sending
 from magfusion.estimation.graph.state import State, as_trajectory
-from magfusion.model.audibility import Owned, only_owned, owned_at
+from magfusion.model.detection_range import Owned, only_owned, owned_at
 from magfusion.model.field import predict_earth
 from magfusion.model.noise import calibration_error, model_error, sensor_positions
 from magfusion.model.parameters import Calibration, linearize_channels, predict_channels
@@ -20,7 +20,7 @@ from magfusion.model.quaternion import unit
 from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.waveform import Motion, carriers, predicted_waveform
+from magfusion.model.waveform import MotionChange, carriers, predicted_waveform
 from magfusion.receiver.cells import owned_by
 from magfusion.receiver.lockin import WindowOperator
 from magfusion.receiver.lockin_receiver import LockinReceiver
@@ -77,7 +77,7 @@ class TakenOff(NamedTuple):
 
     unexplained_sensor: Array
     change_sensor: Array
-    sending: Sending
+    active_beacons: ActiveBeacons
     earth_world: Array
     wanted: Trajectory | None
 
@@ -89,7 +89,7 @@ class KnownMotion(NamedTuple):
     """
 
     shape: MotionShape
-    turned: Array
+    rotation: Array
 
 
 def taken_off(
@@ -120,7 +120,7 @@ def taken_off(
     site, measured_sensor = calibration.site, samples.measured_sensor
     earth = np.zeros(3) if site.earth_field_world is None else site.earth_field_world
     unexplained, change = np.empty_like(measured_sensor), np.empty_like(measured_sensor)
-    sending, others = Sending.of(calibration, window), []
+    active_beacons, others = ActiveBeacons.of(calibration, window), []
     along = (
         stretches(samples.time, path, imu, time_offset, site.gravity)
         if known is None
@@ -128,23 +128,23 @@ def taken_off(
     )
     for stretch in along:
         shape = stretch.shape
-        for rows in stretch.pieces(sending.at_once):
+        for rows in stretch.pieces(active_beacons.at_once):
             time = samples.time[rows]
-            turned = None if known is None else known.turned[:, rows]
-            motion, change_of = shape.changing_at(time, turned)
-            heard = sending.along(motion)
+            rotated = None if known is None else known.rotation[:, rows]
+            motion, change_of = shape.changing_at(time, rotated)
+            detected = active_beacons.along(motion)
             predicted, change[rows] = predicted_waveform(
                 motion,
-                heard,
+                detected,
                 earth,
-                carriers(heard.site.tone_frequencies_hz, time),
-                Motion(*change_of),
+                carriers(detected.site.tone_frequencies_hz, time),
+                MotionChange(*change_of),
                 through_nodes=True,
             )
             unexplained[rows] = measured_sensor[rows] - predicted
         if wanted is not None:
             others.append(stretch.at_others(wanted))
-    return TakenOff(unexplained, change, sending, earth, joined(others) if others else None)
+    return TakenOff(unexplained, change, active_beacons, earth, joined(others) if others else None)
 
 
 def demodulate_about(
@@ -181,34 +181,38 @@ def demodulate_about(
     window = operator.designs.settings.window
     offset = calibration.time_offset
     off = taken_off(samples, known, imu, calibration, offset, window, wanted, motion)
-    earth, sending, unexplained = off.earth_world, off.sending, off.unexplained_sensor
-    rest, left, by_time_offset = operator.demodulate_both(unexplained, off.change_sensor)
+    earth, active_beacons, unexplained = off.earth_world, off.active_beacons, off.unexplained_sensor
+    rest, remaining, by_time_offset = operator.demodulate_both(unexplained, off.change_sensor)
     at_centre = predict_channels(
         calibration, states.time, states.world_from_body, states.position_world
     )
     steady = predict_earth(site.platform.magnetometer, states.world_from_body, earth)
     fields = replace(rest, phasor_sensor=rest.phasor_sensor + at_centre)
     return MotionCompensated(
-        fields=fields if operator.tone_of_channel is None else _of_loudest(fields, sending, states),
+        fields=fields
+        if operator.tone_of_channel is None
+        else _of_strongest(fields, active_beacons, states),
         by_time_offset=by_time_offset,
-        steady=replace(left, measured_sensor=left.measured_sensor + steady),
+        steady=replace(remaining, measured_sensor=remaining.measured_sensor + steady),
         unexplained_sensor=None if wanted is None else unexplained,
         wanted=off.wanted,
     )
 
 
-def _of_loudest(fields: FieldSamples, sending: Sending, states: Trajectory) -> FieldSamples:
+def _of_strongest(
+    fields: FieldSamples, active_beacons: ActiveBeacons, states: Trajectory
+) -> FieldSamples:
     """Return phasors of the strongest on each frequency, minus the prediction of the others."""
-    site = sending.calibration.site
+    site = active_beacons.calibration.site
     places = sensor_positions(site, states)
     place = places[:, 0]  # samples are of a single magnetometer
     unknown = np.ones((len(place), len(site.channels)))
-    felt = sending.along(states)
-    far = np.stack([norm(place - b.position_world, axis=1) for b in felt.site.beacons], axis=1)
-    names = {beacon.name for beacon in felt.site.beacons}
+    affected = active_beacons.along(states)
+    far = np.stack([norm(place - b.position_world, axis=1) for b in affected.site.beacons], axis=1)
+    names = {beacon.name for beacon in affected.site.beacons}
     own = np.array([name in names for name, _ in site.channels])
-    missed = calibration_error(felt.site, far)[:, felt.site.owner]
-    unknown[:, own] = np.hypot(missed, model_error(felt.site, places))
+    missed = calibration_error(affected.site, far)[:, affected.site.owner]
+    unknown[:, own] = np.hypot(missed, model_error(affected.site, places))
     owned, count = owned_at(site, place, unknown=unknown), len(fields.channels)
     return only_owned(fields, Owned(owned.channels[:, :count], owned.others[:, :count]))
 
@@ -224,12 +228,12 @@ def _without_motion(
 
 def _by_strength(operator: WindowOperator, measured_sensor: Array, site: Site) -> MotionCompensated:
     """Demodulate windows of beacons that share frequencies, independent of the position."""
-    found = _without_motion(operator, measured_sensor, site.platform.magnetometer.offset)
+    result = _without_motion(operator, measured_sensor, site.platform.magnetometer.offset)
     try:
-        fields = owned_by(found.fields, site)
+        fields = owned_by(result.fields, site)
     except InputError:
-        fields = only(found.fields, np.zeros(found.fields.valid.shape, dtype=bool))
-    return replace(found, fields=fields, unseen=False)
+        fields = only(result.fields, np.zeros(result.fields.valid.shape, dtype=bool))
+    return replace(result, fields=fields, unseen=False)
 
 
 def demodulate_predicted(
@@ -242,7 +246,7 @@ def demodulate_predicted(
     offset: float,
     *,
     blind: bool = False,
-    lost: bool = False,
+    is_lost: bool = False,
 ) -> MotionCompensated:
     """Demodulate one window about a predicted state.
 
@@ -258,7 +262,7 @@ def demodulate_predicted(
         IMU time offset with which the states were propagated (s).
     blind : bool
         Whether other samples replace inertial ones.
-    lost : bool
+    is_lost : bool
         Whether the predicted position is unknown, so that it does not assign phasors to beacons.
     """
     assert receiver.grid is not None
@@ -272,23 +276,23 @@ def demodulate_predicted(
     centre, path = as_trajectory([predicted]), as_trajectory([before, predicted])
     assert receiver.admission is not None
     shape = MotionShape.of(path, imu, offset, site.gravity, usual=receiver.admission.imu_step)
-    turned = shape.turned_at(np.concatenate([samples.time, window.centre]))
-    whole, turned = unit(turned), turned[:, :-1]
+    rotated = shape.turned_at(np.concatenate([samples.time, window.centre]))
+    whole, rotated = unit(rotated), rotated[:, :-1]
     turn = BodyTurn(whole[:, :-1], whole[:, -1:])
     operator = receiver.operator_of_one(samples, known, alone, site, turn)
     if operator.unseen[0]:
         return _without_motion(operator, samples.measured_sensor, site.platform.magnetometer.offset)
-    if lost and operator.tone_of_channel is not None:
+    if is_lost and operator.tone_of_channel is not None:
         return _by_strength(operator, samples.measured_sensor, receiver.site)
-    motion = KnownMotion(shape, turned)
-    found = demodulate_about(
+    motion = KnownMotion(shape, rotated)
+    result = demodulate_about(
         operator, samples.measured_sensor, centre, imu, calibration, path, motion=motion
     )
     length = receiver.settings.window
     if not blind:
-        return found
-    fields = noisier(found.fields, np.ones(1, dtype=bool), centre, calibration, length)
-    return replace(found, fields=fields)
+        return result
+    fields = noisier(result.fields, np.ones(1, dtype=bool), centre, calibration, length)
+    return replace(result, fields=fields)
 
 
 def noisier(

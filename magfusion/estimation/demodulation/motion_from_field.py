@@ -30,7 +30,7 @@ FIELD_ERROR = 1e-2  # of the beacons' fields: iron, and the calibration
 FIRST_STEADY = 1e-6  # T; error of the steady field in the first sample
 GYRO_ERROR = 0.05  # rad/s; of a rate between two samples of a gyro: vibration
 WORST_MISFIT = 5.0  # mean squared innovation, in units of its expectation
-FEWEST = 8  # samples
+MIN_SAMPLES = 8  # samples
 TURN, PLACE, SPEED, RATE, STEADY = (slice(3 * k, 3 * k + 3) for k in range(5))
 
 
@@ -120,10 +120,10 @@ def motion_from_field(
         Between two inertial samples (s); a longer one is a gap.
     """
     time, calibration = waveform.time, state.calibration
-    if len(time) < FEWEST:
+    if len(time) < MIN_SAMPLES:
         return None
     motion, before, misfit = _begin(state, waveform), state.time, []
-    found: list[_Motion] = []
+    result: list[_Motion] = []
     predictions: list[tuple[_Motion, Array]] = []
     rates = _rates_at(time, imu, longest_step) - state.gyro_bias_body
     for now, measured, rate in zip(time.tolist(), waveform.measured_sensor, rates, strict=True):
@@ -131,24 +131,24 @@ def motion_from_field(
         motion, square = _updated(predictions[-1][0], calibration, now, measured)
         if np.isfinite(rate[0]):
             motion = _turning(motion, rate)
-        found.append(motion)
+        result.append(motion)
         misfit.append(square)
         before = now
     if not np.mean(misfit[len(misfit) // 2 :]) < WORST_MISFIT:
         return None
-    for k in range(len(found) - 2, -1, -1):
+    for k in range(len(result) - 2, -1, -1):
         ahead, by = predictions[k + 1]
-        gain = np.linalg.solve(ahead.cov, by @ found[k].cov).T
-        found[k] = found[k].moved(gain @ ahead.step_to(found[k + 1]), found[k].cov)
-    velocity = np.stack([one.velocity_world for one in found])
+        gain = np.linalg.solve(ahead.cov, by @ result[k].cov).T
+        result[k] = result[k].moved(gain @ ahead.step_to(result[k + 1]), result[k].cov)
+    velocity = np.stack([one.velocity_world for one in result])
     force = np.gradient(velocity, time, axis=0) + np.array([0.0, 0.0, calibration.site.gravity])
-    turned = np.stack([one.world_from_body for one in found])
-    rate = np.stack([one.rate_body for one in found])
-    accel = (np.swapaxes(turned, 1, 2) @ force[..., None])[..., 0]
-    place = np.stack([one.position_world for one in found])
+    rotated = np.stack([one.world_from_body for one in result])
+    rate = np.stack([one.rate_body for one in result])
+    accel = (np.swapaxes(rotated, 1, 2) @ force[..., None])[..., 0]
+    place = np.stack([one.position_world for one in result])
     return FieldMotion(
         ImuSamples(time, rate + state.gyro_bias_body, accel + state.accel_bias_body),
-        Trajectory(time, turned, place, velocity),
+        Trajectory(time, rotated, place, velocity),
     )
 
 
@@ -166,9 +166,9 @@ def _turning(motion: _Motion, rate: Array) -> _Motion:
     """Return a motion with a measured rate (rad/s)."""
     spread = motion.cov[RATE, RATE] + GYRO_ERROR**2 * np.eye(3)
     gain = np.linalg.solve(spread, motion.cov[RATE]).T
-    left = np.eye(MOTION)
-    left[:, RATE] -= gain
-    cov = left @ motion.cov @ left.T + GYRO_ERROR**2 * gain @ gain.T
+    remaining = np.eye(MOTION)
+    remaining[:, RATE] -= gain
+    cov = remaining @ motion.cov @ remaining.T + GYRO_ERROR**2 * gain @ gain.T
     return motion.moved(gain @ (rate - motion.rate_body), cov)
 
 
@@ -227,6 +227,6 @@ def _updated(
     spread = across @ by.T + sigma**2 * np.eye(3)
     gain = np.linalg.solve(spread, across).T
     square = float(error @ np.linalg.solve(spread, error)) / 3.0
-    left = np.eye(MOTION) - gain @ by
-    cov = left @ motion.cov @ left.T + sigma**2 * gain @ gain.T
+    remaining = np.eye(MOTION) - gain @ by
+    cov = remaining @ motion.cov @ remaining.T + sigma**2 * gain @ gain.T
     return motion.moved(gain @ error, cov), square

@@ -17,7 +17,7 @@ from magfusion.model.quaternion import (
     of_matrices,
     of_vectors,
     product,
-    turned,
+    rotate,
     unit,
     vectors,
 )
@@ -127,7 +127,7 @@ class MotionShape:
         for rows in _pieces(len(time)):
             start = _turn_at(states.time, world_from_start, spread, time[rows])
             world_from_body[:, rows] = product(start, chain[:, rows])
-            world_accel[rows] = turned(world_from_body[:, rows], accel[rows].T).T
+            world_accel[rows] = rotate(world_from_body[:, rows], accel[rows].T).T
         del accel  # each of these takes a good part of the log's memory
         world_accel -= [0.0, 0.0, gravity]
         velocity, position = _integrated(time, world_accel)
@@ -152,14 +152,14 @@ class MotionShape:
         near = self._near(np.array([np.min(wanted), np.max(wanted)]))
         return turn_at(self.chain[:, near], self.time[near], self.gyro_body[near], wanted)
 
-    def at(self, wanted: Array, turned: Array | None = None) -> Trajectory:
+    def at(self, wanted: Array, rotated: Array | None = None) -> Trajectory:
         """Return the motion at any times.
 
         Parameters
         ----------
         wanted : ndarray, shape (m,)
             Strictly increasing (s).
-        turned : ndarray, shape (4, m), optional
+        rotated : ndarray, shape (4, m), optional
             As of `turned_at`, if known.
 
         Returns
@@ -174,13 +174,13 @@ class MotionShape:
         lack, slope = hermite(known, *self._lack, inside)
         return Trajectory(
             time=wanted,
-            world_from_body=self._attitude(wanted, turned),
+            world_from_body=self._attitude(wanted, rotated),
             position_world=position + lack + slope * (wanted - inside)[:, None],
             velocity_world=velocity + slope,
         )
 
     def changing_at(
-        self, wanted: Array, turned: Array | None = None
+        self, wanted: Array, rotated: Array | None = None
     ) -> tuple[Trajectory, tuple[Array, Array]]:
         """Return the motion at any times as `at`, and its derivative by the IMU's time offset.
 
@@ -203,7 +203,7 @@ class MotionShape:
         position += lack + slope * (wanted - inside)[:, None]
         motion = Trajectory(
             time=wanted,
-            world_from_body=self._attitude(wanted, turned),
+            world_from_body=self._attitude(wanted, rotated),
             position_world=position[:, :3],
             velocity_world=velocity[:, :3] + slope[:, :3],
         )
@@ -211,10 +211,10 @@ class MotionShape:
         by_rotation -= interpolated(wanted, own, late.rate[near])
         return motion, (by_rotation, position[:, 3:])
 
-    def _attitude(self, wanted: Array, turned: Array | None) -> Array:
-        turned = self.turned_at(wanted) if turned is None else turned
+    def _attitude(self, wanted: Array, rotated: Array | None) -> Array:
+        rotated = self.turned_at(wanted) if rotated is None else rotated
         start = _turn_at(self.states.time, self.world_from_start, self.spread, wanted)
-        return matrices(unit(product(start, turned)))
+        return matrices(unit(product(start, rotated)))
 
     def _near(self, wanted: Array) -> slice:
         """Return the inertial samples needed for some times, with a margin."""
@@ -255,13 +255,13 @@ class MotionShape:
         known = self.states.time
         rate, tilted = self._averaged(self.gyro_body), np.empty_like(self.accel_world)
         for rows in _pieces(len(rate)):
-            rate[rows] = turned(self.world_from_body[:, rows], rate[rows].T).T
+            rate[rows] = rotate(self.world_from_body[:, rows], rate[rows].T).T
         at_states = interpolated(known, self.time, rate)
         # The rotation that the states prevent tilts the specific force.
         for rows in _pieces(len(rate)):
             force = self.accel_world[rows] + np.array([0.0, 0.0, self.gravity])
-            held = interpolated(self.time[rows], known, at_states)
-            tilted[rows] = cross(held.T, force.T).T
+            fixed = interpolated(self.time[rows], known, at_states)
+            tilted[rows] = cross(fixed.T, force.T).T
         speed, moved = _integrated(self.time, tilted)
         del tilted
         moved -= self.velocity_world
@@ -270,8 +270,8 @@ class MotionShape:
         del moved
         # Near a gap, and at the ends, a mean is of another time: the speed gained since the
         # beginning must not matter there.
-        since = self.time - self.time[0]
-        late = self._averaged(since) - since
+        start_time = self.time - self.time[0]
+        late = self._averaged(start_time) - start_time
         uneven = np.flatnonzero(np.abs(late) > 0.5 * self.usual)
         position[uneven] -= late[uneven, None] * speed[uneven]
         velocity = self._averaged(speed)

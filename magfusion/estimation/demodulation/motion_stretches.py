@@ -18,14 +18,14 @@ from magfusion.units import Array
 STRETCH = 1 << 17  # samples; a multiple of those that are predicted at once
 
 
-class Stretch(NamedTuple):
+class SampleStretch(NamedTuple):
     """Consecutive samples.
 
     Parameters
     ----------
     first, last : int
         Index of the first sample, and of the one after the last.
-    since, until : float
+    start, until : float
         Times that are nearest to them (s).
     shape : MotionShape
         Motion in the segment.
@@ -33,7 +33,7 @@ class Stretch(NamedTuple):
 
     first: int
     last: int
-    since: float
+    start: float
     until: float
     shape: MotionShape
 
@@ -44,20 +44,20 @@ class Stretch(NamedTuple):
 
     def at_others(self, wanted: Array) -> Trajectory:
         """Return the motion at those of some times (s) that belong to the segment."""
-        own = wanted[(self.since <= wanted) & (wanted < self.until)]
+        own = wanted[(self.start <= wanted) & (wanted < self.until)]
         if not len(own):
             return Trajectory(own, np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
         return self.shape.at(own)
 
 
-def only_stretch(time: Array, shape: MotionShape) -> Iterator[Stretch]:
+def only_stretch(time: Array, shape: MotionShape) -> Iterator[SampleStretch]:
     """Yield all samples (n,) (s) as one segment with a single shape."""
-    yield Stretch(0, len(time), -np.inf, np.inf, shape)
+    yield SampleStretch(0, len(time), -np.inf, np.inf, shape)
 
 
 def stretches(
     time: Array, path: Trajectory, imu: ImuSamples, time_offset: float, gravity: float
-) -> Iterator[Stretch]:
+) -> Iterator[SampleStretch]:
     """Yield all samples in consecutive segments.
 
     Parameters
@@ -82,9 +82,9 @@ def stretches(
         here = {k: v[states] for k, v in vars(path).items() if v is not None}
         own = ImuSamples(imu.time[samples], imu.gyro_body[samples], imu.accel_body[samples])
         shape = MotionShape.of(Trajectory(**here), own, time_offset, gravity, reach)
-        since = float(time[first]) if first > 0 else -np.inf
+        start_time = float(time[first]) if first > 0 else -np.inf
         until = float(time[last]) if last < len(time) else np.inf
-        yield Stretch(first, last, since, until, shape)
+        yield SampleStretch(first, last, start_time, until, shape)
 
 
 def joined(parts: list[Trajectory]) -> Trajectory:

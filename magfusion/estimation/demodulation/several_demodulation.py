@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.estimation.demodulation.demodulated_apart import each_alone
 from magfusion.estimation.demodulation.demodulation import Demodulation, demodulated
 from magfusion.estimation.demodulation.motion_compensation import MotionCompensated
+from magfusion.estimation.demodulation.separate_demodulation import each_alone
 from magfusion.files.fields import SAME_TIME, side_by_side
 from magfusion.model.parameters import Calibration, seen_by
 from magfusion.model.samples import FieldSamples, Log
@@ -21,7 +21,7 @@ from magfusion.units import BoolArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class MagnetometerPart:
     """Data of one of several magnetometers.
 
     Parameters
@@ -45,14 +45,14 @@ class SeveralDemodulation(Demodulation):
 
     Parameters
     ----------
-    parts : tuple of Part
+    parts : tuple of MagnetometerPart
         Of those that have samples.
     """
 
-    parts: tuple[Part, ...] = ()
+    parts: tuple[MagnetometerPart, ...] = ()
 
     @property
-    def anew(self) -> bool:
+    def can_repeat(self) -> bool:
         """Whether samples are available to demodulate again, once the motion is known."""
         return True
 
@@ -71,10 +71,10 @@ class SeveralDemodulation(Demodulation):
             log = replace(part.demodulation.log, imu=self.log.imu)
             here = {k: v[part.rows] for k, v in vars(states).items() if v is not None}
             known = replace(part.demodulation, log=log)
-            found = known.compensated(seen_by(calibration, part.sensor), Trajectory(**here))
+            result = known.compensated(seen_by(calibration, part.sensor), Trajectory(**here))
             own = part.rows, calibration.site.of_sensor(part.sensor)
-            phasor[own], cov[own] = found.fields.phasor_sensor, found.fields.phasor_cov
-            by_offset[own] = found.by_time_offset
+            phasor[own], cov[own] = result.fields.phasor_sensor, result.fields.phasor_cov
+            by_offset[own] = result.by_time_offset
         wave = MotionCompensated.of_slots(replace(fields, phasor_sensor=phasor, phasor_cov=cov))
         return replace(wave, by_time_offset=by_offset)
 
@@ -98,23 +98,23 @@ def demodulated_several(
     """
     lockin = same_windows(site, settings)
     sensors = [sensor.name for sensor in site.platform.magnetometers]
-    found = {sensors.index(name): one for name, one in _each(log, site, lockin)}
+    result = {sensors.index(name): one for name, one in _each(log, site, lockin)}
     none = FieldSamples.empty(site.channels[: len(site.channels) // len(sensors)])
-    every = [found[k].fields if k in found else none for k in range(len(sensors))]
+    every = [result[k].fields if k in result else none for k in range(len(sensors))]
     fields = side_by_side(every, site)
     hidden: BoolArray = np.zeros(fields.valid.shape, dtype=bool)
     parts = []
-    for sensor, one in found.items():
+    for sensor, one in result.items():
         rows = np.searchsorted(fields.time, one.fields.time - SAME_TIME)
-        parts.append(Part(sensor, rows, one))
-        if one.drowned is not None:
-            hidden[rows, site.of_sensor(sensor)] = one.drowned
+        parts.append(MagnetometerPart(sensor, rows, one))
+        if one.masked is not None:
+            hidden[rows, site.of_sensor(sensor)] = one.masked
     dropped = {
         f"{sensors[sensor]}: {reason}": count
-        for sensor, one in found.items()
+        for sensor, one in result.items()
         for reason, count in one.dropped.items()
     }
-    return SeveralDemodulation(log, fields, dropped, drowned=hidden, parts=tuple(parts))
+    return SeveralDemodulation(log, fields, dropped, masked=hidden, parts=tuple(parts))
 
 
 def _each(

@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 
 from magfusion.estimation.graph.factors import CONSIDERED_KEY
-from magfusion.estimation.graph.graph import Estimate, Graph
+from magfusion.estimation.graph.graph import Graph, GraphEstimate
 from magfusion.estimation.graph.prior_factor import prior_factor
 from magfusion.estimation.solve.bordered import eliminate_partial
 from magfusion.model.parameters import Block
@@ -19,7 +19,7 @@ PER_COLUMN = 400.0  # bytes per parameter and state, in the graph and eliminated
 
 
 def responses(
-    graph: Graph, estimate: Estimate, considered: tuple[Block, ...]
+    graph: Graph, estimate: GraphEstimate, considered: tuple[Block, ...]
 ) -> Iterator[gtsam.VectorValues]:
     """Yield the step of every variable that considered parameters cause.
 
@@ -30,7 +30,7 @@ def responses(
     assert graph.declared is not None
     spread, shift = prior_sqrt_covariance(graph.declared.site, considered), None
     if graph.shift is not None:
-        spread, shift = graph.shift.beside(spread)
+        spread, shift = graph.shift.with_separate_errors(spread)
     group = max(1, int(AT_ONCE / (PER_COLUMN * graph.epochs)))
     for first in range(0, spread.shape[1], group):
         columns = slice(first, first + group)
@@ -41,14 +41,14 @@ def responses(
 
 def _conditional(
     graph: Graph,
-    estimate: Estimate,
+    estimate: GraphEstimate,
     considered: tuple[Block, ...],
     spread: Array,
     shift: Array | None,
 ) -> gtsam.GaussianBayesNet:
     """Return the conditionals of all estimates, given columns of considered parameters."""
     assert graph.declared is not None
-    linear = replace(graph, declared=None).beside(
+    linear = replace(graph, declared=None).with_fixed_columns(
         estimate, considered, spread, graph.by_considered(spread)
     )
     if graph.blocks:

@@ -68,16 +68,18 @@ class Factors:
         right = -rows.error.reshape(len(jacobian), -1)
         if not self._views:
             keys = [(key, part.shape[-1]) for key, part in parts]
-            for epoch, told in zip(self.measurement.epoch.tolist(), self.told, strict=True):
+            for epoch, reported in zip(
+                self.measurement.epoch.tolist(), self.informative_rows, strict=True
+            ):
                 own = [(key(epoch), width) for key, width in keys]
-                size = right.shape[1] if isinstance(told, slice) else len(told)
+                size = right.shape[1] if isinstance(reported, slice) else len(reported)
                 factor = empty_factor(own, size)
                 self.graph.push_back(factor)
                 self._views.append((factor.getA()[:size], factor.getb()[:size]))
-        rows_of = zip(self._views, jacobian, right, self.told, strict=True)
-        for (by, error), own_by, own_right, told in rows_of:
-            by[...] = own_by[told]
-            error[...] = own_right[told]
+        rows_of = zip(self._views, jacobian, right, self.informative_rows, strict=True)
+        for (by, error), own_by, own_right, reported in rows_of:
+            by[...] = own_by[reported]
+            error[...] = own_right[reported]
         return self.graph
 
     def considering(
@@ -108,20 +110,20 @@ class Factors:
         graph = gtsam.GaussianFactorGraph()
         for piece in self.pieces():
             own = piece.rows(states, calibration, self.blocks)
-            parts = piece._beside(states, calibration, own, others, spread, nuisance)
+            parts = piece._with_other_columns(states, calibration, own, others, spread, nuisance)
             for i, epoch in enumerate(piece.measurement.epoch.tolist()):
-                told = piece.told[i]
-                values = np.concatenate([p[i][told] for _, p in parts], axis=1)
+                reported = piece.informative_rows[i]
+                values = np.concatenate([p[i][reported] for _, p in parts], axis=1)
                 size = len(values)
                 factor = empty_factor([(k(epoch), p.shape[-1]) for k, p in parts], size)
                 factor.getA()[:size] = values
                 if explaining:
-                    factor.getb()[:size] = -own.error[i].ravel()[told]
+                    factor.getb()[:size] = -own.error[i].ravel()[reported]
                 graph.push_back(factor)
         return graph
 
     @cached_property
-    def told(self) -> list[slice | IntArray]:
+    def informative_rows(self) -> list[slice | IntArray]:
         """Rows of each epoch's factor: all, or with many beacons those that are predicted."""
         predicted = self.measurement.predicted_groups()
         if predicted is None:
@@ -134,7 +136,7 @@ class Factors:
             part = self.measurement.rows(slice(begin, begin + PIECE))
             yield Factors(part, self.blocks, self.segment, self.own)
 
-    def _beside(
+    def _with_other_columns(
         self,
         states: States,
         calibration: Calibration,
@@ -156,8 +158,8 @@ class Factors:
     def rows(self, states: States, calibration: Calibration, blocks: tuple[Block, ...]) -> Rows:
         """Return the rows at an estimate, weighted by the robust loss."""
         own = states.rows(self.measurement.epoch)
-        found = self.measurement.linearize(own, calibration, blocks)
-        return found.weighed(self.measurement.loss)[0]
+        result = self.measurement.linearize(own, calibration, blocks)
+        return result.weighed(self.measurement.loss)[0]
 
     def _parts(self, rows: Rows) -> list[tuple[Key, Array]]:
         """Return key and derivative, shape (n, rows, k), of every variable involved."""
@@ -167,8 +169,8 @@ class Factors:
             (key, _flat(part)) for key, part in every if part is not None
         ]
         if by_calibration is not None:
-            found = calibration_parts(_flat(by_calibration), self.own)
-            parts += [(_constant(key), part) for key, part in found]
+            result = calibration_parts(_flat(by_calibration), self.own)
+            parts += [(_constant(key), part) for key, part in result]
         return parts
 
 

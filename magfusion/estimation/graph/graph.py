@@ -41,7 +41,7 @@ BIAS_STEP = np.repeat([0.1, 0.01], 3)
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class GraphEstimate:
     """Variables that the smoother estimates.
 
     Parameters
@@ -127,7 +127,7 @@ class Graph:
         segments = [(first[k], self.segments.key(k)) for k in count]
         return nested_dissection(self.epochs, CALIBRATION_KEY, segments)
 
-    def cost(self, estimate: Estimate) -> float:
+    def cost(self, estimate: GraphEstimate) -> float:
         """Return half the sum of squared whitened residuals, priors included."""
         if self.links:
             nothing = estimate.values.zeroVectors()
@@ -147,16 +147,16 @@ class Graph:
         drifts = self.segments.steps(self._calibrations(estimate), self.blocks)
         return total + 0.5 * sum(float(step @ step) for step in drifts)
 
-    def residual(self, measurement: Measurement, estimate: Estimate) -> Array:
+    def residual(self, measurement: Measurement, estimate: GraphEstimate) -> Array:
         """Return the whitened error of a measurement, each segment by its own calibration."""
         states = states_in(estimate.values)
         parts = self._parts(measurement)
         return np.concatenate([p.error(states.rows(p.epoch), estimate.at(k)) for k, p in parts])
 
-    def _calibrations(self, estimate: Estimate) -> list[Calibration]:
+    def _calibrations(self, estimate: GraphEstimate) -> list[Calibration]:
         return [estimate.at(k) for k in range(len(self.segments))]
 
-    def linearized(self, estimate: Estimate) -> gtsam.GaussianFactorGraph:
+    def linearized(self, estimate: GraphEstimate) -> gtsam.GaussianFactorGraph:
         """Return the linear graph at an estimate."""
         graph = self.inertial(estimate)
         states = states_in(estimate.values)
@@ -168,18 +168,18 @@ class Graph:
             graph.push_back(drift)
         return graph
 
-    def moved(self, estimate: Estimate, step: gtsam.VectorValues) -> Estimate:
+    def moved(self, estimate: GraphEstimate, step: gtsam.VectorValues) -> GraphEstimate:
         """Return the estimate moved by a step of every variable."""
         values = estimate.values.retract(step)
         if not self.blocks:
-            return Estimate(values, estimate.calibration)
+            return GraphEstimate(values, estimate.calibration)
         segments = []
         for k, before in enumerate(self._calibrations(estimate)):
             whole, own = np.array(step.at(CALIBRATION_KEY)), self.segments.own(k)
             if own is not None:
                 whole[own[1]] = step.at(own[0])
             segments.append(retract(before, self.blocks, whole))
-        return Estimate(values, segments[self.segments.main], tuple(segments))
+        return GraphEstimate(values, segments[self.segments.main], tuple(segments))
 
     def damping_scales(self) -> list[tuple[int, Array]]:
         """Return, for each key, the step that a unit damping allows."""
@@ -192,7 +192,7 @@ class Graph:
         return [*terms, (CALIBRATION_KEY, sigma)]
 
     def inertial(
-        self, estimate: Estimate, by_others: Array | None = None
+        self, estimate: GraphEstimate, by_others: Array | None = None
     ) -> gtsam.GaussianFactorGraph:
         """Return priors and inertial factors at an estimate, with the calibration's columns.
 
@@ -251,9 +251,9 @@ class Graph:
         # Parameters of the fields alone come last, and have no effect here.
         return np.array([by @ spread[: by.shape[1]] for by in known])
 
-    def beside(
+    def with_fixed_columns(
         self,
-        estimate: Estimate,
+        estimate: GraphEstimate,
         others: tuple[Block, ...],
         spread: Array,
         by_others: Array | None = None,
@@ -301,7 +301,7 @@ class Graph:
 
 def initial_estimate(
     states: Trajectory, calibration: Calibration, segments: tuple[Calibration, ...] = ()
-) -> Estimate:
+) -> GraphEstimate:
     """Return an estimate with the given states; absent biases are zero."""
     zero = np.zeros((len(states), 3))
     accel = zero if states.accel_bias_body is None else states.accel_bias_body
@@ -310,7 +310,7 @@ def initial_estimate(
     at = zip(states.world_from_body, states.position_world, strict=True)
     poses = [gtsam.Pose3(gtsam.Rot3(rotation), position) for rotation, position in at]
     values = values_from(poses, list(velocity), list(np.concatenate([accel, gyro], axis=1)))
-    return Estimate(values, calibration, segments)
+    return GraphEstimate(values, calibration, segments)
 
 
 def read_states(values: gtsam.Values, time: Array) -> Trajectory:

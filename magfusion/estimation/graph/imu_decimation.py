@@ -26,12 +26,12 @@ from magfusion.receiver.admission import meets
 from magfusion.units import Array, BoolArray, IntArray
 
 JOINED = (25, 20, 10)  # steps joined to one
-FEWEST_LEFT = 20  # minimum of joined steps in an interval: sigmas differ by some thousandths
+MIN_JOINED_STEPS = 20  # minimum of joined steps in an interval: sigmas differ by some thousandths
 ROUGHLY_JOINED, ROUGHLY_LEFT = (20, 10, 7, 5), 8  # where errors of sigmas by a tenth are harmless
 MOST_TURN = 0.5  # rad; within a joined step, for the series and for the derivatives
 CHUNK = 32_768  # steps joined at a time: intermediate results stay in the cache
 STRETCH = 200_000  # samples cut at a time: bounds the memory in a long log
-_AT_REST = np.concatenate([np.eye(3), 0.5 * np.eye(3)], axis=1)
+_STATIONARY_STEP = np.concatenate([np.eye(3), 0.5 * np.eye(3)], axis=1)
 # Of `_coefficients` the factors of 1, x^2, x^4 ...
 _SERIES = np.array(
     [
@@ -87,7 +87,7 @@ def preintegrate_stream(
     """
     before = np.searchsorted(imu.time, epochs - time_offset)
     usual = float(np.median(np.diff(imu.time + time_offset)))
-    measured, bridged = [], []
+    measured, gap_bridged = [], []
     begin = 0
     while begin < len(epochs) - 1:
         reach = int(np.searchsorted(before, before[begin] + STRETCH))
@@ -99,13 +99,13 @@ def preintegrate_stream(
         increments = cut_at_epochs(stream, time_offset, epochs[here], usual)
         if silence is not None:
             silent = meets(*silence, epochs[begin:end], epochs[begin + 1 : end + 1])
-            increments = replace(increments, bridged=increments.bridged | silent)
-        ways = (ROUGHLY_JOINED, ROUGHLY_LEFT) if roughly else (JOINED, FEWEST_LEFT)
+            increments = replace(increments, gap_bridged=increments.gap_bridged | silent)
+        ways = (ROUGHLY_JOINED, ROUGHLY_LEFT) if roughly else (JOINED, MIN_JOINED_STEPS)
         increments = thinned(increments, accel_bias[here], gyro_bias[here], *ways)
         measured += preintegrate(increments, model, gravity, accel_bias[here], gyro_bias[here])
-        bridged.append(increments.bridged)
+        gap_bridged.append(increments.gap_bridged)
         begin = end
-    return measured, np.concatenate(bridged)
+    return measured, np.concatenate(gap_bridged)
 
 
 def thinned(
@@ -113,7 +113,7 @@ def thinned(
     accel_bias: Array,
     gyro_bias: Array,
     ways: tuple[int, ...] = JOINED,
-    fewest: int = FEWEST_LEFT,
+    min_steps: int = MIN_JOINED_STEPS,
 ) -> Increments:
     """Join the steps of the long intervals.
 
@@ -124,8 +124,8 @@ def thinned(
         rounding.
     ways : tuple of int
         Numbers of steps that may be joined to one, falling.  For each interval the one that leaves
-        the fewest steps, but at least ``fewest``.
-    fewest : int
+        the fewest steps, but at least ``min_steps``.
+    min_steps : int
         Minimum number of joined steps of an interval.
 
     Returns
@@ -135,10 +135,10 @@ def thinned(
         and steps of fast rotation are not joined.
     """
     steps = increments.first[1:] - increments.first[:-1]
-    steps[increments.bridged] = 0
-    if steps.max(initial=0) < fewest * ways[-1]:
+    steps[increments.gap_bridged] = 0
+    if steps.max(initial=0) < min_steps * ways[-1]:
         return increments
-    way = np.array([_way(number, ways, fewest) for number in steps.tolist()])
+    way = np.array([_way(number, ways, min_steps) for number in steps.tolist()])
     for joined in ways:
         if (long := way == joined).any():
             increments = _with_joined(increments, joined, long, accel_bias, gyro_bias)
@@ -146,9 +146,9 @@ def thinned(
 
 
 @lru_cache(maxsize=4096)
-def _way(steps: int, ways: tuple[int, ...], fewest: int) -> int:
+def _way(steps: int, ways: tuple[int, ...], min_steps: int) -> int:
     """Return how many steps of an interval are joined to one; 1 where it is too short."""
-    enough = [joined for joined in ways if steps >= fewest * joined]
+    enough = [joined for joined in ways if steps >= min_steps * joined]
     return min(enough, key=lambda n: 2 * (steps // (2 * n)) + steps % (2 * n), default=1)
 
 
@@ -159,21 +159,23 @@ def _with_joined(
     every = np.concatenate([increments.gyro_body.T, increments.accel_body.T, increments.dt[None]])
     bias = np.concatenate([gyro_bias.T, accel_bias.T])
     within, number = np.arange(2 * joined).reshape(2, joined).T, max(CHUNK // (2 * joined), 1)
-    made, begun = [], []
+    built, begun = [], []
     for lo in range(0, len(start), number):
         first = start[lo : lo + number]
         steps = every.take(within[..., None] + first, axis=1)
         both, gentle = _joined(steps, bias.take(owner[lo : lo + number], axis=1))
         if not gentle.all():
             both, first = both[..., gentle], first[gentle]
-        made.append(both)
+        built.append(both)
         begun.append(first)
-    first, both = np.concatenate(begun), np.concatenate(made, axis=2)
+    first, both = np.concatenate(begun), np.concatenate(built, axis=2)
     kept = np.ones(len(increments.dt), dtype=bool)
     kept[within[1:, :, None] + first] = False
     every[:, within[0][:, None] + first] = both
     every, ends = every[:, kept], np.append(0, np.cumsum(kept))[increments.first]
-    return Increments(every[:3].T.copy(), every[3:6].T.copy(), every[6], ends, increments.bridged)
+    return Increments(
+        every[:3].T.copy(), every[3:6].T.copy(), every[6], ends, increments.gap_bridged
+    )
 
 
 def _pairs(increments: Increments, joined: int, long: BoolArray) -> tuple[IntArray, IntArray]:
@@ -292,7 +294,7 @@ def _by_force(rotation: Array) -> Array:
     out = np.empty((*once.shape[:-1], 6))
     out[..., :3] = b * once + c * twice
     out[..., 3:] = c * once + d * twice
-    out += _AT_REST
+    out += _STATIONARY_STEP
     return out
 
 

@@ -184,11 +184,11 @@ def joined(parts: Iterable[Measurement], epochs: Iterable[int] | None = None) ->
         own = part.epoch if epoch is None else np.full(len(part.epoch), epoch)
         kinds.setdefault(kind_of(part), []).append((part, own))
     out = []
-    for alike in kinds.values():
-        first = alike[0][0]
+    for shared in kinds.values():
+        first = shared[0][0]
         arrays = [k for k, v in vars(first).items() if isinstance(v, np.ndarray)]
-        whole = {k: np.concatenate([getattr(m, k) for m, _ in alike]) for k in arrays}
-        whole["epoch"] = np.concatenate([epoch for _, epoch in alike])
+        whole = {k: np.concatenate([getattr(m, k) for m, _ in shared]) for k in arrays}
+        whole["epoch"] = np.concatenate([epoch for _, epoch in shared])
         out.append(replace(first, **whole))
     return out
 

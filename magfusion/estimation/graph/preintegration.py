@@ -34,7 +34,7 @@ class Increments:
         (s)
     first : int ndarray, shape (epochs,)
         First step after each epoch.
-    bridged : bool ndarray, shape (epochs - 1,)
+    gap_bridged : bool ndarray, shape (epochs - 1,)
         Intervals in which the stream has a gap.
     """
 
@@ -42,7 +42,7 @@ class Increments:
     accel_body: Array
     dt: Array
     first: IntArray
-    bridged: BoolArray
+    gap_bridged: BoolArray
 
 
 def cut_at_epochs(
@@ -75,16 +75,16 @@ def cut_at_epochs(
     both = interpolated(grid, time, np.concatenate([imu.gyro_body, imu.accel_body], axis=1))
     mean = 0.5 * (both[:-1] + both[1:])
     first = np.searchsorted(grid, epochs)
-    bridged = np.zeros(len(epochs) - 1, dtype=bool)
+    gap_bridged = np.zeros(len(epochs) - 1, dtype=bool)
     if gap.any():
         silent = np.flatnonzero(in_gap(time, grid, known))
-        bridged[np.searchsorted(first, silent, side="right") - 1] = True
+        gap_bridged[np.searchsorted(first, silent, side="right") - 1] = True
     return Increments(
         mean[:, :3].copy(),
         mean[:, 3:].copy(),
         grid[1:] - grid[:-1],
         first,
-        bridged,
+        gap_bridged,
     )
 
 
@@ -182,7 +182,7 @@ def preintegrate(
     ):
         bias = gtsam.imuBias.ConstantBias(accel_bias[i], gyro_bias[i])
         measurement = gtsam.PreintegratedCombinedMeasurementsG(
-            wide if increments.bridged[i] else usual, bias
+            wide if increments.gap_bridged[i] else usual, bias
         )
         steps = accel[lo:hi], gyro[lo:hi], dt[lo:hi]
         # A loop in Python over the samples takes longer.

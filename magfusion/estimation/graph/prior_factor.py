@@ -18,14 +18,14 @@ class PriorShift(NamedTuple):
     ----------
     by_considered : ndarray, shape (dimension, considered)
         Shift by one sigma of each considered parameter.
-    apart : ndarray, shape (dimension, k)
+    separate_errors : ndarray, shape (dimension, k)
         Shift by a unit of each of ``k`` errors that do not affect this log.
     """
 
     by_considered: Array
-    apart: Array
+    separate_errors: Array
 
-    def beside(self, spread: Array) -> tuple[Array, Array]:
+    def with_separate_errors(self, spread: Array) -> tuple[Array, Array]:
         """Return a spread with columns for the separate errors, and the shift in these columns.
 
         Parameters
@@ -34,9 +34,9 @@ class PriorShift(NamedTuple):
             Considered parameters first.
         """
         between = spread.shape[1] - self.by_considered.shape[1]
-        wider = np.pad(spread, ((0, 0), (0, self.apart.shape[1])))
-        nothing = np.zeros((len(self.apart), between))
-        return wider, np.concatenate([self.by_considered, nothing, self.apart], axis=1)
+        wider = np.pad(spread, ((0, 0), (0, self.separate_errors.shape[1])))
+        nothing = np.zeros((len(self.separate_errors), between))
+        return wider, np.concatenate([self.by_considered, nothing, self.separate_errors], axis=1)
 
 
 def prior_factor(

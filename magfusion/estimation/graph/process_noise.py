@@ -38,10 +38,10 @@ class ProcessNoise:
         if not self.variance.any():
             return np.zeros((len(self.variance),) * 2)
         by_walk, columns = np.eye(self._walking), self._columns
-        for block in self._dragging:
-            dragged = block.parameter.drags(calibration, block.owner, time)
-            if dragged is not None and (dragged[0], block.owner) in columns:
-                by_walk[columns[dragged[0], block.owner], block.columns] = dragged[1]
+        for block in self._coupled_blocks:
+            coupled = block.parameter.drags(calibration, block.owner, time)
+            if coupled is not None and (coupled[0], block.owner) in columns:
+                by_walk[columns[coupled[0], block.owner], block.columns] = coupled[1]
         gained, walking = np.zeros((len(self.variance),) * 2), slice(self._walking)
         gained[walking, walking] = by_walk * (self.variance[walking] * elapsed) @ by_walk.T
         return gained
@@ -53,15 +53,15 @@ class ProcessNoise:
     @cached_property
     def _walking(self) -> int:
         """Number of leading parameters that have a random walk or are moved by another's."""
-        dragged = {block.owner for block in self._dragging}
+        coupled = {block.owner for block in self._coupled_blocks}
         return max(
             block.columns.stop
             for block in self.blocks
-            if self.variance[block.columns].any() or block.owner in dragged
+            if self.variance[block.columns].any() or block.owner in coupled
         )
 
     @cached_property
-    def _dragging(self) -> list[Block]:
+    def _coupled_blocks(self) -> list[Block]:
         """Blocks with a random walk that may move other parameters."""
         return [
             block

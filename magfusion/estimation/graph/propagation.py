@@ -33,7 +33,7 @@ class Propagated:
     ----------
     state : State
         At the later time, with its propagated covariance.
-    bridged : bool
+    gap_bridged : bool
         Whether the stream had a gap.
     transition, noise : ndarray, shape (15 + calibration, 15 + calibration)
         Of the state's tangent.
@@ -41,7 +41,7 @@ class Propagated:
 
     state: State
     link: Link
-    bridged: bool
+    gap_bridged: bool
     transition: Array
     noise: Array
 
@@ -91,7 +91,7 @@ def propagate(
         stream = corrected_imu(calibration, blocks, imu)
         increments = cut_at_epochs(stream, time_offset, epochs, usual)
         if blind:
-            increments = replace(increments, bridged=np.ones_like(increments.bridged))
+            increments = replace(increments, gap_bridged=np.ones_like(increments.gap_bridged))
         return Steps(thinned(increments, accel[None], gyro[None]), accel, gyro)
 
     def values(after: gtsam.NavState) -> gtsam.Values:
@@ -106,7 +106,7 @@ def propagate(
         ],
         state.calibration,
         blocks,
-        lambda found: values(found[0].predict(before, bias)),
+        lambda result: values(result[0].predict(before, bias)),
     )
     after = link.measurement.predict(before, bias)
     transition, noise = _linearized(link, values(after), len(state.cov))
@@ -122,8 +122,8 @@ def propagate(
         velocity_world=np.asarray(after.velocity()),
         cov=cov,
     )
-    bridged = bool(own.increments.bridged[0])
-    return Propagated(later, replace(link, steps=own), bridged, transition, noise)
+    gap_bridged = bool(own.increments.gap_bridged[0])
+    return Propagated(later, replace(link, steps=own), gap_bridged, transition, noise)
 
 
 def _linearized(link: Link, values: gtsam.Values, size: int) -> tuple[Array, Array]:

@@ -86,14 +86,14 @@ def values_from(
     for i, (velocity, bias) in enumerate(zip(velocity_world, bias_body, strict=True)):
         step.insert(V(i), velocity)
         step.insert(B(i), bias)
-    values = _at_rest(len(poses)).retract(step)
+    values = _initial_motion(len(poses)).retract(step)
     for i, pose in enumerate(poses):
         values.insert(X(i), pose)
     return values
 
 
 @lru_cache(maxsize=32)
-def _at_rest(epochs: int) -> gtsam.Values:
+def _initial_motion(epochs: int) -> gtsam.Values:
     """Return zero velocities and biases, since inserting a bias takes ten times an update."""
     values, zero = gtsam.Values(), gtsam.imuBias.ConstantBias(np.zeros(3), np.zeros(3))
     for i in range(epochs):

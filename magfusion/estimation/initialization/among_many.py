@@ -80,24 +80,24 @@ def _key(block: Block, some: Site, site: Site) -> Key:
 def _columns(blocks: tuple[Block, ...], known: list[Key]) -> IntArray:
     """Return the indices of known blocks' columns among all."""
     place = {block.key: block.columns for block in blocks}
-    found = [np.arange(place[key].start, place[key].stop) for key in known]
-    return np.concatenate([np.zeros(0, dtype=np.int64), *found])
+    result = [np.arange(place[key].start, place[key].stop) for key in known]
+    return np.concatenate([np.zeros(0, dtype=np.int64), *result])
 
 
 def _whole(state: State, site: Site) -> Calibration:
     """Return the calibration with undetected beacons as the site declares them."""
-    heard, part = _of_all_magnetometers(state.calibration, site), state.calibration.site
-    every = initial_calibration(site, heard.reference_time, heard.imu_begin)
+    detected, part = _of_all_magnetometers(state.calibration, site), state.calibration.site
+    every = initial_calibration(site, detected.reference_time, detected.imu_begin)
     names = {beacon.name: beacon for beacon in part.beacons}
     beacons = np.array([k for k, beacon in enumerate(site.beacons) if beacon.name in names])
     channels = channels_of(site, beacons)
     phase, drift, log_gain = every.phase.copy(), every.drift.copy(), every.log_gain.copy()
-    phase[channels], log_gain[channels] = heard.phase, heard.log_gain
-    drift[beacons] = heard.drift
+    phase[channels], log_gain[channels] = detected.phase, detected.log_gain
+    drift[beacons] = detected.drift
     whole = replace(
-        heard.site, beacons=tuple(names.get(b.name, b) for b in site.beacons), unheard=()
+        detected.site, beacons=tuple(names.get(b.name, b) for b in site.beacons), undetected=()
     )
-    return replace(heard, site=whole, phase=phase, drift=drift, log_gain=log_gain)
+    return replace(detected, site=whole, phase=phase, drift=drift, log_gain=log_gain)
 
 
 def _of_all_magnetometers(calibration: Calibration, site: Site) -> Calibration:
@@ -110,7 +110,7 @@ def _of_all_magnetometers(calibration: Calibration, site: Site) -> Calibration:
     first = part.of_sensor(0)  # drives are the same for every magnetometer
     return replace(
         calibration,
-        site=replace(part, platform=part.platform.carrying(sensors)),
+        site=replace(part, platform=part.platform.with_magnetometers(sensors)),
         phase=np.tile(calibration.phase[first], len(every)),
         log_gain=np.tile(calibration.log_gain[first], len(every)),
     )

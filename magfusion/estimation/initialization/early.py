@@ -4,7 +4,7 @@ Its motion determines the hemisphere within a second or two, and clearly rejects
 Less clear cases wait as long as all other starts do.
 """
 
-from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE, DECIDED
+from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE, DECIDED
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
@@ -41,8 +41,8 @@ def open_start(start: OnlineStart) -> NoStart:
         "Hemisphere ambiguous; more data needed. Turn and move the receiver, or declare a"
         " hemisphere or a region."
     )
-    said = Finding("ambiguous", text, Verdict.DOUBTFUL)
-    return NoStart(text, Trust((said, *start.trust.reasons)))
+    findings = Finding("ambiguous", text, Verdict.DOUBTFUL)
+    return NoStart(text, Trust((findings, *start.trust.reasons)))
 
 
 def _is_mirrored(site: Site) -> bool:

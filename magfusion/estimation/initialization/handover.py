@@ -7,7 +7,7 @@ from gtsam.symbol_shorthand import B, V, X
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.graph.considered import responses
 from magfusion.estimation.graph.factors import CALIBRATION_KEY
-from magfusion.estimation.graph.graph import Estimate
+from magfusion.estimation.graph.graph import GraphEstimate
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.solve.bordered import eliminate_partial
 from magfusion.model.parameters import Block, dimension, placed
@@ -56,7 +56,7 @@ def last_state(result: Smoothed, considered: tuple[Block, ...] = ()) -> State:
 
 
 def _with_considered(
-    cov: Array, result: Smoothed, estimate: Estimate, considered: tuple[Block, ...]
+    cov: Array, result: Smoothed, estimate: GraphEstimate, considered: tuple[Block, ...]
 ) -> Array:
     """Return the joint covariance with parameters that the estimate assumed to be known."""
     uncertain = placed((*considered, *result.field_errors))

@@ -9,11 +9,11 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
+from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.batch.settings import EstimatorSettings
-from magfusion.estimation.data_checks.spectrum import beside_lines
+from magfusion.estimation.data_checks.spectrum import with_disturbing_lines
 from magfusion.estimation.data_checks.stream_buffer import Buffer
-from magfusion.estimation.demodulation.demodulated_apart import each_alone
+from magfusion.estimation.demodulation.separate_demodulation import each_alone
 from magfusion.estimation.demodulation.several_demodulation import demodulated_several, same_windows
 from magfusion.estimation.graph.state import POSITION, ROTATION, State
 from magfusion.estimation.initialization.among_many import among_all, score_among_all
@@ -21,7 +21,7 @@ from magfusion.estimation.initialization.handover import last_state
 from magfusion.estimation.integrity.judge import judged_with_score
 from magfusion.estimation.integrity.magnetometer_exclusion import agreed
 from magfusion.estimation.integrity.score import Score
-from magfusion.model.audibility import are_many
+from magfusion.model.detection_range import are_many
 from magfusion.model.marks import Marks
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
 from magfusion.model.site import Site
@@ -50,17 +50,17 @@ class OnlineStart:
         Test results of the smoothed beginning.
     score : Score, optional
         Of the estimates of the smoothed beginning.
-    beside : LockinSettings, optional
+    extra_lines : LockinSettings, optional
         Receiver settings where undeclared lines are to be fitted.
     lines : mapping
         The same of several magnetometers, by their names.
     excluded : tuple of str
         Magnetometers not used for the start, as they are inconsistent with the others.
-    said : tuple of Finding
+    findings : tuple of Finding
         Their findings, or that magnetometers are inconsistent and the cause is ambiguous.
     turn, shift : float
         Increase of the uncertainty of attitude (rad) and position (m), one sigma an axis.
-    borrowed : mapping of str to ndarray
+    shared_offsets : mapping of str to ndarray
         Variance of estimated parameters, by name, due to considered ones.
     """
 
@@ -71,11 +71,11 @@ class OnlineStart:
     score: Score | None = None
     turn: float = 0.0
     shift: float = 0.0
-    beside: LockinSettings | None = None
+    extra_lines: LockinSettings | None = None
     lines: Mapping[str, LockinSettings] = field(default_factory=dict)
-    borrowed: Mapping[str, Array] = field(default_factory=dict)
+    shared_offsets: Mapping[str, Array] = field(default_factory=dict)
     excluded: tuple[str, ...] = ()
-    said: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     @property
     def ambiguous(self) -> bool:
@@ -146,14 +146,14 @@ def find_online_start(
         waveforms=several,
     )
     try:
-        found = _smoothed(log, site, settings)
+        result = _smoothed(log, site, settings)
     except (EstimationError, InputError) as error:
         return NoStart(f"{error}.")
     except (RuntimeError, np.linalg.LinAlgError):
         return NoStart("The measurements do not determine the motion in one direction.")
-    if found.trust.verdict is Verdict.FAILED:
-        return NoStart(found.trust.reasons[0].text, found.trust)
-    return _start_of(found, log, site, settings.lockin)
+    if result.trust.verdict is Verdict.FAILED:
+        return NoStart(result.trust.reasons[0].text, result.trust)
+    return _start_of(result, log, site, settings.lockin)
 
 
 class _Beginning(NamedTuple):
@@ -185,44 +185,44 @@ def _smoothed(log: Log, site: Site, settings: EstimatorSettings) -> _Beginning:
         log = replace(log, fields=demodulated_several(log, site, settings.lockin).fields)
     if log.waveform is not None and has_schedule(site) and joins(site, log.waveform.marks):
         log = _of_cycles(log, log.waveform, site, settings)
-    asked = {f.name: getattr(settings, f.name) for f in fields_of(EstimatorSettings)}
-    how = SmootherSettings(loss="huber", **asked)
-    log, left, result, excluded = _agreed(smooth(log, site, how), log, site, how)
+    requested = {f.name: getattr(settings, f.name) for f in fields_of(EstimatorSettings)}
+    how = SmootherSettings(loss="huber", **requested)
+    log, remaining, result, excluded = _agreed(smooth(log, site, how), log, site, how)
     honest, trust, score = judged_with_score(result, log)
     state = last_state(result, result.considered)
-    if result.calibration.site.unheard or site.platform.further:
+    if result.calibration.site.undetected or site.platform.further:
         state, score = _among_all(state, score, result, site, settings)
-    return _Beginning(log, left, result, honest, state, trust, score, excluded)
+    return _Beginning(log, remaining, result, honest, state, trust, score, excluded)
 
 
 def _start_of(
-    found: _Beginning, heard: Log, site: Site, given: LockinSettings | None
+    estimate: _Beginning, detected: Log, site: Site, given: LockinSettings | None
 ) -> OnlineStart:
     """Return the start from a smoothed beginning.
 
     Parameters
     ----------
-    heard : Log
+    detected : Log
         The recorded beginning, of all magnetometers.
     given : LockinSettings, optional
         Requested lock-in settings.
     """
-    result = found.result
-    kept = [sensor.name for sensor in found.site.platform.magnetometers]
+    result = estimate.result
+    kept = [sensor.name for sensor in estimate.site.platform.magnetometers]
     lined = given is not None and len(given.lines_hz) > 0
-    beside = given if lined else beside_lines(found.log, site, given)
+    others = given if lined else with_disturbing_lines(estimate.log, site, given)
     return OnlineStart(
-        found.state,
-        heard.waveform,
+        estimate.state,
+        detected.waveform,
         result.rival_chi_square,
-        found.trust,
-        found.score,
-        *_wider(result, found.honest),
-        None if beside is given else beside,
-        _lines_of_each(heard, site, given) if heard.waveforms else {},
+        estimate.trust,
+        estimate.score,
+        *_wider(result, estimate.honest),
+        None if others is given else others,
+        _lines_of_each(detected, site, given) if detected.waveforms else {},
         {b.name: np.sum(result.calibration_response[b.columns] ** 2, 1) for b in result.blocks},
         tuple(sensor.name for sensor in site.platform.magnetometers if sensor.name not in kept),
-        found.excluded,
+        estimate.excluded,
     )
 
 
@@ -233,14 +233,14 @@ def _agreed(
     if not site.platform.further:
         return log, site, result, ()
     plain = replace(settings, tune=False)
-    found = agreed(
+    estimate = agreed(
         result,
         log,
         site,
         lambda log, site: smooth(log, site, settings),
         lambda log, site: smooth(log, site, plain),
     )
-    return found.log, found.site, found.result, found.findings
+    return estimate.log, estimate.site, estimate.result, estimate.findings
 
 
 def _among_all(
@@ -248,31 +248,31 @@ def _among_all(
 ) -> tuple[State, Score | None]:
     """Return a state and its score among all beacons and magnetometers, detected or not."""
     state = among_all(state, (*result.blocks, *result.considered), site, settings)
-    if score is not None and result.calibration.site.unheard:
+    if score is not None and result.calibration.site.undetected:
         score = score_among_all(score, result.blocks, site, settings)
     return state, score
 
 
 def _lines_of_each(log: Log, site: Site, given: LockinSettings | None) -> dict[str, LockinSettings]:
     """Return the receiver settings of the magnetometers that have undeclared lines to be fitted."""
-    lockin, found = same_windows(site, given), dict[str, LockinSettings]()
+    lockin, result = same_windows(site, given), dict[str, LockinSettings]()
     for name, own, alone in each_alone(log, site):
-        lined = beside_lines(own, alone, lockin)
+        lined = with_disturbing_lines(own, alone, lockin)
         if lined is not None and lined is not lockin:
-            found[name] = lined
-    return found
+            result[name] = lined
+    return result
 
 
 def _of_cycles(log: Log, waveform: Waveform, site: Site, settings: EstimatorSettings) -> Log:
     """Return the phasors of a slotted tracker, one epoch per cycle, limited to those of a start."""
     receiver = receiver_of(site, settings.lockin)
-    _, found = receiver.whole(waveform, log.imu)
+    _, result = receiver.whole(waveform, log.imu)
     if site.platform.magnetometer.lacking:  # its slots remain separate epochs
-        cycle = cycle_of(found, site)
-        every = _every(int(cycle[-1]) + 1, found.time)
-        return replace(log, waveform=None, fields=found.rows((cycle[-1] - cycle) % every == 0))
+        cycle = cycle_of(result, site)
+        every = _every(int(cycle[-1]) + 1, result.time)
+        return replace(log, waveform=None, fields=result.rows((cycle[-1] - cycle) % every == 0))
     known = on_clock(log.imu, site.platform.imu.time_offset)
-    epochs = cycles(found, turn_of(known, site), site)
+    epochs = cycles(result, turn_of(known, site), site)
     every = _every(len(epochs), epochs.time)
     rows = slice((len(epochs) - 1) % every, None, every)
     return replace(log, waveform=None, fields=epochs.rows(rows))
@@ -299,11 +299,11 @@ def _joined_steady(parts: list[SteadyFields], fields: list[FieldSamples]) -> Ste
     """Return the steady fields of the epochs; None where an epoch has none."""
     known = {float(part.time[0]): part for part in parts}
     wanted = [known.get(float(s.time[0])) for s in fields]
-    found = [part for part in wanted if part is not None]
-    if len(found) < len(wanted):
+    result = [part for part in wanted if part is not None]
+    if len(result) < len(wanted):
         return None
     return SteadyFields(
-        time=np.concatenate([p.time for p in found]),
-        measured_sensor=np.concatenate([p.measured_sensor for p in found]),
-        cov=np.concatenate([p.cov for p in found]),
+        time=np.concatenate([p.time for p in result]),
+        measured_sensor=np.concatenate([p.measured_sensor for p in result]),
+        cov=np.concatenate([p.cov for p in result]),
     )

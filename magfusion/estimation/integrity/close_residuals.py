@@ -2,28 +2,28 @@
 
 import numpy as np
 
-from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
+from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.snapshot.priors import NOTHING_EXPLAINED
 from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.windows import LONGEST_WINDOW
 
 EXPLAINED = 1.5  # mean square, one where noise and model are as declared
-LEAST = 3  # windows of which a mean is taken
+MIN_COUNT = 3  # windows of which a mean is taken
 
 
-def together(case: Case) -> Testimony:
+def together(case: Case) -> TestResult:
     """Judge the short windows, some seconds of them at a time."""
     graph = case.result.graph
     measured = next((m for m in graph.measurements if isinstance(m, JointPhasors)), None)
-    if measured is None or len(measured.time) < LEAST:
+    if measured is None or len(measured.time) < MIN_COUNT:
         return NOTHING
-    left = graph.residual(measured, case.result.estimate)
-    square = np.mean(left**2, axis=(1, 2))
+    residual = graph.residual(measured, case.result.estimate)
+    square = np.mean(residual**2, axis=(1, 2))
     piece = np.floor((measured.time - measured.time[0]) / LONGEST_WINDOW).astype(np.int64)
     count = np.bincount(piece)
     mean = np.bincount(piece, square) / np.maximum(count, 1)
-    mean = np.where(count >= LEAST, mean, np.mean(square))
+    mean = np.where(count >= MIN_COUNT, mean, np.mean(square))
     worst = float(np.max(mean))
     if worst <= EXPLAINED:
         return NOTHING
@@ -39,4 +39,4 @@ def together(case: Case) -> Testimony:
         Verdict.FAILED if rms > NOTHING_EXPLAINED else Verdict.DOUBTFUL,
         20.0 + rms,
     )
-    return Testimony((finding,), factor=factor)
+    return TestResult((finding,), factor=factor)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.estimation.snapshot.survey_error import whitened
-from magfusion.estimation.solve.batched import Normal, minimise
+from magfusion.estimation.solve.batched import NormalEquations, minimise
 from magfusion.model.noise import measurement_cov, stacked, whitening
 from magfusion.model.parameters import (
     Block,
@@ -38,7 +38,7 @@ class _Guess:
     calibration: Calibration
     turn: Array  # (n, 3, 3) world_from_body
     place: Array  # (n, 3)
-    found: Array  # (dimension,) of the shared parameters, so far
+    estimate: Array  # (dimension,) of the shared parameters, so far
 
     def moved(self, step: Array, blocks: tuple[Block, ...]) -> "_Guess":
         poses = step[: 6 * len(self.turn)].reshape(-1, 6)
@@ -47,7 +47,7 @@ class _Guess:
             retract(self.calibration, blocks, shared),
             self.turn @ Rotation.from_rotvec(poses[:, :3]).as_matrix(),
             self.place + (self.turn @ poses[:, 3:, None])[..., 0],
-            self.found + shared,
+            self.estimate + shared,
         )
 
 
@@ -113,18 +113,18 @@ class Snapshots:
         return whitening(cov, self.samples.there)
 
     def fitted(
-        self, free: Sequence[tuple[Parameter, str, float]], fixes: Fixes
+        self, parameters: Sequence[tuple[Parameter, str, float]], fixes: Fixes
     ) -> tuple[float, Calibration]:
         """Return chi square and calibration with some parameters found beside the poses.
 
         Parameters
         ----------
-        free : sequence of (Parameter, str, float)
+        parameters : sequence of (Parameter, str, float)
             With owner and a sigma that keeps what is open from running away.
         fixes : Fixes
             Where the poses begin.
         """
-        blocks = _blocks(self.site, free)
+        blocks = _blocks(self.site, parameters)
         start = _Guess(
             self.calibration,
             fixes.world_from_body[:, 0],
@@ -132,17 +132,17 @@ class Snapshots:
             np.zeros(dimension(blocks)),
         )
 
-        def model(_: IntArray, state: AnyArray) -> Normal:
+        def model(_: IntArray, state: AnyArray) -> NormalEquations:
             return self._normal(state[0], blocks)
 
         def move(state: AnyArray, step: Array) -> AnyArray:
             return _one(state[0].moved(step[0], blocks))
 
-        found = minimise(model, _one(start), move, passes=ITERATIONS, relative=1e-5)
-        guess: _Guess = found.state[0]
-        return float(found.cost[0]), guess.calibration
+        result = minimise(model, _one(start), move, max_iterations=ITERATIONS, relative=1e-5)
+        guess: _Guess = result.state[0]
+        return float(result.cost[0]), guess.calibration
 
-    def _normal(self, at: _Guess, blocks: tuple[Block, ...]) -> Normal:
+    def _normal(self, at: _Guess, blocks: tuple[Block, ...]) -> NormalEquations:
         """Return the normal equations of all poses, and of what they share."""
         time, n = self.samples.time, len(self.samples)
         value, by_pose, by_free = linearize_channels(
@@ -163,14 +163,14 @@ class Snapshots:
             gradient[own] = square[k, :6, -1]
         information[6 * n :, 6 * n :] = np.sum(square[:, 6:-1, 6:-1], axis=0)
         information[6 * n :, 6 * n :] += np.diag(1.0 / sigma**2)
-        gradient[6 * n :] = np.sum(square[:, 6:-1, -1], axis=0) + at.found / sigma**2
-        cost = np.sum(square[:, -1, -1]) + np.sum((at.found / sigma) ** 2)
-        return Normal(np.array([cost]), gradient[None], information[None])
+        gradient[6 * n :] = np.sum(square[:, 6:-1, -1], axis=0) + at.estimate / sigma**2
+        cost = np.sum(square[:, -1, -1]) + np.sum((at.estimate / sigma) ** 2)
+        return NormalEquations(np.array([cost]), gradient[None], information[None])
 
 
-def _blocks(site: Site, free: Sequence[tuple[Parameter, str, float]]) -> tuple[Block, ...]:
+def _blocks(site: Site, parameters: Sequence[tuple[Parameter, str, float]]) -> tuple[Block, ...]:
     out = []
-    for parameter, owner, sigma in free:
+    for parameter, owner, sigma in parameters:
         width = len(parameter.sigma(site, owner))
         out.append(Block(parameter, owner, slice(0), np.full(width, sigma)))
     return placed(out)
@@ -191,8 +191,8 @@ def calm_epochs(samples: FieldSamples, imu: ImuSamples, count: int = EPOCHS) -> 
         return samples
     rate = np.linalg.norm(imu.gyro_body, axis=1)
     nearest = np.clip(np.searchsorted(imu.time, samples.time), 0, len(imu) - 1)
-    most = np.sum(samples.valid, axis=1)
-    order = np.lexsort((rate[nearest], -most))  # as many beacons as there are, then calm
+    maximum = np.sum(samples.valid, axis=1)
+    order = np.lexsort((rate[nearest], -maximum))  # as many beacons as there are, then calm
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
     stretches = np.array_split(np.arange(len(samples)), count)

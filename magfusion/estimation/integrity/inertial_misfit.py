@@ -9,7 +9,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.estimation.batch.batch import Smoothed
-from magfusion.estimation.graph.graph import Estimate
+from magfusion.estimation.graph.graph import GraphEstimate
 from magfusion.estimation.graph.inertial import ROWS
 from magfusion.estimation.solve.bordered import eliminate
 from magfusion.units import Array
@@ -18,7 +18,7 @@ SAMPLED = 24  # intervals whose covariance is computed: they are much alike
 WIDTHS = {"x": 6, "v": 3, "b": 6}
 
 
-def inertial_errors(result: Smoothed, estimate: Estimate) -> Array:
+def inertial_errors(result: Smoothed, estimate: GraphEstimate) -> Array:
     """Return the whitened error of every inertial factor at an estimate, shape (intervals, 15)."""
     native, count = result.graph.native, result.graph.epochs - 1
     first, values = native.size() - count, estimate.values
@@ -38,7 +38,7 @@ def expected_squares(result: Smoothed) -> Array:
     tree = eliminate(graph.linearized(estimate), graph.ordering)
     first = linear.size() - count
     chosen = np.unique(np.linspace(0, count - 1, min(SAMPLED, count)).astype(int))
-    left = np.zeros((len(chosen), ROWS))
+    residual = np.zeros((len(chosen), ROWS))
     for row, k in enumerate(chosen.tolist()):
         factor = linear.at(first + k)
         assert isinstance(factor, gtsam.JacobianFactor)
@@ -53,5 +53,5 @@ def expected_squares(result: Smoothed) -> Array:
             width = WIDTHS[chr(gtsam.Symbol(key).chr())]
             matrix[:, columns[key]] = factor.getA()[:, begin : begin + width]
             begin += width
-        left[row] = 1.0 - np.einsum("ij,jk,ik->i", matrix, joint, matrix)
-    return np.median(left, axis=0)
+        residual[row] = 1.0 - np.einsum("ij,jk,ik->i", matrix, joint, matrix)
+    return np.median(residual, axis=0)

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.batch.joint import Known, Said, Shared, known_by
-from magfusion.estimation.data_checks.statistics import WITNESS_BUDGET, holm, sigmas
+from magfusion.estimation.batch.joint import LogReport, Shared, SharedCalibration, known_by
+from magfusion.estimation.data_checks.statistics import TEST_BUDGET, holm, sigmas
 from magfusion.estimation.integrity.priors_of_log import TOLERATED, distance
 from magfusion.model.parameters import BeaconParameter
 from magfusion.model.trust import Finding
@@ -15,7 +15,7 @@ from magfusion.units import Array
 NAMED = 3  # parameters in a sentence
 
 
-class Agreement(NamedTuple):
+class LogAgreement(NamedTuple):
     """What logs say of each other.
 
     Parameters
@@ -41,8 +41,8 @@ class _Distance(NamedTuple):
 
 
 def agreement(
-    shared: Shared, logs: Sequence[Said], names: Sequence[str], joint: Known
-) -> Agreement:
+    shared: Shared, logs: Sequence[LogReport], names: Sequence[str], joint: SharedCalibration
+) -> LogAgreement:
     """Test every log against the others; name those that contradict, the farthest first.
 
     A log that contradicts the others makes each of them contradict the rest: once it is named, the
@@ -52,33 +52,33 @@ def agreement(
     ----------
     names : sequence of str
         Of the logs, as findings have them.
-    joint : Known
+    joint : SharedCalibration
         By all logs.
     """
     pool, excess = list(range(len(logs))), 1.0
     findings: list[tuple[Finding, ...]] = [() for _ in logs]
     first = [_distance(shared, logs, pool, i, joint) for i in pool]
-    found = dict(zip(pool, first, strict=True))
+    result = dict(zip(pool, first, strict=True))
     while len(pool) > 1:
-        ratios = _contradictions(found)
+        ratios = _contradictions(result)
         if not ratios:
             break
-        worst = min(ratios, key=lambda i: _least(found[i]))
+        worst = min(ratios, key=lambda i: _least(result[i]))
         excess = max(excess, *ratios[worst])
         other = [names[i] for i in pool if i != worst]
-        findings[worst] = (_finding(shared, names[worst], other, found[worst]),)
+        findings[worst] = (_finding(shared, names[worst], other, result[worst]),)
         pool.remove(worst)
-        found = {i: _distance(shared, logs, pool, i, joint) for i in pool}
+        result = {i: _distance(shared, logs, pool, i, joint) for i in pool}
     far = np.array([float(sigmas(one.tests[-1][2])) for one in first])
-    return Agreement(tuple(findings), excess, far)
+    return LogAgreement(tuple(findings), excess, far)
 
 
-def _contradictions(found: dict[int, _Distance]) -> dict[int, list[float]]:
+def _contradictions(result: dict[int, _Distance]) -> dict[int, list[float]]:
     """Return of each log that contradicts the others by how much its chi squares are too large."""
-    tests = [(i, test) for i, one in found.items() for test in one.tests]
-    speaks = holm([log_p for _, (_, _, log_p) in tests], WITNESS_BUDGET)
+    tests = [(i, test) for i, one in result.items() for test in one.tests]
+    informative = holm([log_p for _, (_, _, log_p) in tests], TEST_BUDGET)
     out: dict[int, list[float]] = {}
-    for (i, (square, freedom, _)), yes in zip(tests, speaks, strict=True):
+    for (i, (square, freedom, _)), yes in zip(tests, informative, strict=True):
         if yes and square > TOLERATED * freedom:
             out.setdefault(i, []).append(square / freedom)
     return out
@@ -89,7 +89,7 @@ def _least(one: _Distance) -> float:
 
 
 def _distance(
-    shared: Shared, logs: Sequence[Said], pool: list[int], which: int, joint: Known
+    shared: Shared, logs: Sequence[LogReport], pool: list[int], which: int, joint: SharedCalibration
 ) -> _Distance:
     """Return how far a log takes the calibration from what the others of a pool make of it."""
     every = known_by(shared, [logs[i] for i in pool], joint.step)
@@ -97,13 +97,13 @@ def _distance(
     none = np.zeros((len(joint.step), joint.by_common.shape[1]))
     before = others.by_common if others.by_common.shape[1] else none
     moved = every.by_common - before
-    cov = others.cov - every.cov + moved @ moved.T + every.apart + others.apart
+    cov = others.cov - every.cov + moved @ moved.T + every.separate_errors + others.separate_errors
     scale = np.sqrt(np.diagonal(others.cov))
     change, cov = (every.step - others.step) / scale, cov / scale[:, None] / scale
     tests = [distance(change, cov, [block]) for block in shared.blocks]
     tests.append(distance(change, cov, list(shared.blocks)))
-    sure = np.abs(change) / np.sqrt(np.maximum(np.diagonal(cov), 1e-4))
-    return _Distance(tests, [float(np.max(sure[b.columns])) for b in shared.blocks])
+    certain = np.abs(change) / np.sqrt(np.maximum(np.diagonal(cov), 1e-4))
+    return _Distance(tests, [float(np.max(certain[b.columns])) for b in shared.blocks])
 
 
 def _finding(shared: Shared, name: str, others: list[str], one: _Distance) -> Finding:
@@ -117,9 +117,9 @@ def _finding(shared: Shared, name: str, others: list[str], one: _Distance) -> Fi
         if isinstance(first.parameter, BeaconParameter)
         else "the magnetometer, its mounting or what is about it changed"
     )
-    whom = f"log {others[0]}" if len(others) == 1 else "the other logs"
+    recipient = f"log {others[0]}" if len(others) == 1 else "the other logs"
     text = (
-        f"Log {name} contradicts {whom}: it takes {amounts} from where {whom} and the survey have"
+        f"Log {name} contradicts {recipient}: it takes {amounts} from where {recipient} and the survey have"
         f" them (all together a chi square of {square:.3g} on {freedom}). Probably {cause} between"
         " the logs: refine the site by the logs before and after apart."
     )

@@ -12,14 +12,14 @@ import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.data_checks.magnetometers import without_magnetometer
-from magfusion.estimation.demodulation.hearing import heard_site
+from magfusion.estimation.demodulation.beacon_selection import select_detected
 from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk
 
 SLACK = 3.0  # sigma; as of the separation of beacons
-PLAINLY = 2.0  # times the misfit of one is that of the other, before either is named
+MIN_MISFIT_RATIO = 2.0  # times the misfit of one is that of the other, before either is named
 
 Solve = Callable[[Log, Site], Smoothed]
 
@@ -49,8 +49,8 @@ def agreed(
     risk = Risk() if risk is None else risk
     findings: list[Finding] = []
     while site.platform.further:
-        found = separate_smoothed(result, by_magnetometer=True)
-        worst = 0.0 if found is None else float(np.max(found.excess(risk, SLACK)))
+        estimate = separate_smoothed(result, by_magnetometer=True)
+        worst = 0.0 if estimate is None else float(np.max(estimate.excess(risk, SLACK)))
         if worst <= 1.0:
             break
         sensors = site.platform.magnetometers
@@ -60,11 +60,11 @@ def agreed(
             misfits.append(_misfit(plain, *part))
         order = np.argsort(misfits)
         names = ", ".join(sensor.name for sensor in sensors)
-        if not misfits[order[1]] > PLAINLY * misfits[order[0]]:
+        if not misfits[order[1]] > MIN_MISFIT_RATIO * misfits[order[0]]:
             findings.append(_undecided(names, worst))
             break
         which = int(order[0])
-        log, site = heard_site(*without_magnetometer(log, site, which))
+        log, site = select_detected(*without_magnetometer(log, site, which))
         result = solve(log, site)
         findings.append(_excluded(sensors[which].name, names, worst))
     return Agreed(log, site, result, tuple(findings))

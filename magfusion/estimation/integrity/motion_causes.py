@@ -73,7 +73,7 @@ def motion_causes(known: Compared, site: Site) -> Iterator[Explanation]:
 
 def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
     """Yield what a lever arm, a mounting or a bias beyond its prior would explain."""
-    after, found = known.explained(EYE, EYE, free="lever")
+    after, found = known.explained(EYE, EYE, parameters="lever")
     lever = site.platform.magnetometer.position_body - found[SHARED["lever"]]
     yield Explanation(
         "lever_arm",
@@ -87,7 +87,7 @@ def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
     )
     turn, axes = Rotation.identity(), EYE
     for _ in range(4):
-        after, found = known.explained(axes, axes, free="mounting")
+        after, found = known.explained(axes, axes, parameters="mounting")
         turn = Rotation.from_rotvec(found[SHARED["mounting"]]) * turn
         axes = turn.as_matrix()
     yield Explanation(
@@ -101,7 +101,7 @@ def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
         3,
     )
     for sensor, unit in (("gyro", "rad/s"), ("accel", "m/s^2")):
-        after, found = known.explained(EYE, EYE, free=sensor)
+        after, found = known.explained(EYE, EYE, parameters=sensor)
         if np.max(np.abs(found[SHARED[sensor]])) > LARGEST_BIAS[sensor]:
             continue
         yield Explanation(

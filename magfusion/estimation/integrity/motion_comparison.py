@@ -54,7 +54,7 @@ class Compared:
 
     Parameters
     ----------
-    turned, gyro_turned : ndarray, shape (m, 3)
+    rotation, gyro_turned : ndarray, shape (m, 3)
         Rotation vectors (rad) over spans (s), in body axes.
     span : ndarray, shape (m,)
     turn_sigma : ndarray, shape (m,)
@@ -64,7 +64,7 @@ class Compared:
     force : ndarray, shape (n, 3, 3, 3)
         ``force[:, i, j, k]``: weighted mean of ``world_from_body[i, j]`` times axis k of the
         specific force, so that the axes may be exchanged afterwards (m/s^2).
-    carried : ndarray, shape (n, 3, 3)
+    predicted_velocity : ndarray, shape (n, 3, 3)
         Weighted mean of ``world_from_body``.
     bent : ndarray, shape (n, 3, 3)
         Second difference of ``world_from_body`` (1/s^2).
@@ -78,13 +78,13 @@ class Compared:
         What one sigma of each of the survey's errors does to the first of each.
     """
 
-    turned: Array
+    rotation: Array
     gyro_turned: Array
     span: Array
     turn_sigma: Array
     curve_world: Array
     force: Array
-    carried: Array
+    predicted_velocity: Array
     bent: Array
     curve_sigma: Array
     gravity: float
@@ -95,13 +95,13 @@ class Compared:
     @property
     def freedom(self) -> float:
         """Number of residuals."""
-        return float(self.turned.size + self.curve_world.size)
+        return float(self.rotation.size + self.curve_world.size)
 
     def explained(
         self,
         gyro_axes: Array,
         accel_axes: Array,
-        free: str | None = None,
+        parameters: str | None = None,
         gravity: float = 1.0,
     ) -> tuple[float, Array]:
         """Return chi square, and the shared parameters, if the axes are these.
@@ -110,7 +110,7 @@ class Compared:
         ----------
         gyro_axes, accel_axes : ndarray, shape (3, 3)
             Take a reading to body axes and SI units.
-        free : str, optional
+        parameters : str, optional
             What of `SHARED` is found without a prior.
         gravity : float
             Share of gravity that is in the specific force.
@@ -119,17 +119,17 @@ class Compared:
         turns = np.zeros((len(by_gyro), 3, WIDTH))
         turns[..., SHARED["gyro"]] = -self.span[:, None, None] * np.eye(3)
         turns[..., SHARED["mounting"]] = -skew(by_gyro)
-        turn_error = self.turned - by_gyro
+        turn_error = self.rotation - by_gyro
         force = np.einsum("nijk,jk->ni", self.force, accel_axes)
         curves = np.zeros((len(force), 3, WIDTH))
-        curves[..., SHARED["accel"]] = -self.carried
+        curves[..., SHARED["accel"]] = -self.predicted_velocity
         curves[..., SHARED["tilt"]] = (
             -self.gravity * gravity * skew(np.array([0.0, 0.0, 1.0]))[:, :2]
         )
         body_force = np.einsum("nijl,kl->nijk", self.force, accel_axes)
         for axis in range(3):
-            turned = np.einsum("nijk,jk->ni", body_force, skew(np.eye(3)[axis]))
-            curves[..., SHARED["mounting"].start + axis] = turned
+            rotated = np.einsum("nijk,jk->ni", body_force, skew(np.eye(3)[axis]))
+            curves[..., SHARED["mounting"].start + axis] = rotated
         curves[..., SHARED["lever"]] = -self.bent
         turns = np.concatenate([turns, self.turned_by_survey], axis=2)
         curves = np.concatenate([curves, self.curve_by_survey], axis=2)
@@ -148,12 +148,12 @@ class Compared:
             ]
         )
         prior = np.concatenate([self.prior, np.ones(self.curve_by_survey.shape[2])])
-        if free is not None:
-            prior[SHARED[free]] = WIDE[free]
+        if parameters is not None:
+            prior[SHARED[parameters]] = WIDE[parameters]
         information = rows.T @ rows + np.diag(1.0 / prior**2)
-        found = np.linalg.solve(information, rows.T @ error)
-        left = error - rows @ found
-        return float(left @ left + np.sum((found / prior) ** 2)), found[:WIDTH]
+        result = np.linalg.solve(information, rows.T @ error)
+        residual = error - rows @ result
+        return float(residual @ residual + np.sum((result / prior) ** 2)), result[:WIDTH]
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,8 +181,8 @@ def surveyed(samples: FieldSamples, calibration: Calibration) -> Surveyed:
     _, by_pose, by_blocks = linearize_channels(calibration, blocks, samples.time, at, place)
     weights = whitening(measurement_cov(site, samples, survey_error=False), samples.there)
     by_sigma = by_blocks @ prior_sqrt_covariance(site, blocks)
-    found = np.linalg.pinv(whitened(weights, by_pose)) @ whitened(weights, by_sigma)
-    return Surveyed(fixes, np.where(np.isfinite(found), found, 0.0))
+    result = np.linalg.pinv(whitened(weights, by_pose)) @ whitened(weights, by_sigma)
+    return Surveyed(fixes, np.where(np.isfinite(result), result, 0.0))
 
 
 def compared(known: Surveyed, imu: ImuSamples, site: Site, late: float = 0.0) -> Compared | None:
@@ -200,45 +200,45 @@ def compared(known: Surveyed, imu: ImuSamples, site: Site, late: float = 0.0) ->
         fixes.position_world[:, 0],
         fixes.pose_cov[:, 0],
     )
-    sure = fixes.determined[:, 0] & (fixes.probability[:, 0] > 0.99)
-    sure &= (time > stamps[0] + CURVE_SPAN) & (time < stamps[-1] - CURVE_SPAN)
+    certain = fixes.determined[:, 0] & (fixes.probability[:, 0] > 0.99)
+    certain &= (time > stamps[0] + CURVE_SPAN) & (time < stamps[-1] - CURVE_SPAN)
     rotation_sigma = np.sqrt(np.einsum("nii->n", cov[:, :3, :3]) / 3.0)
     place_sigma = np.sqrt(np.einsum("nii->n", cov[:, 3:, 3:]) / 3.0)
-    i, j = _pairs(time, sure, TURN_SPAN)
-    before, at, after = _triples(time, sure, CURVE_SPAN)
+    i, j = _pairs(time, certain, TURN_SPAN)
+    before, at, after = _triples(time, certain, CURVE_SPAN)
     if len(i) < 8 or len(at) < 8:
         return None
     relative = np.swapaxes(turn[i], 1, 2) @ turn[j]
     attitude = attitude_from_gyro(stamps, imu.gyro_body)
     by_gyro = attitude_at(attitude, stamps, imu.gyro_body, time)
     half = 0.5 * (time[after] - time[before])[:, None]
-    force, carried = _forces(fixes, stamps, imu, time[at])
-    turned = Rotation.from_matrix(relative).as_rotvec()
+    force, propagated = _forces(fixes, stamps, imu, time[at])
+    rotated = Rotation.from_matrix(relative).as_rotvec()
     by_turn, by_place = known.by_survey[:, :3], turn @ known.by_survey[:, 3:]
     tilted = turn @ by_turn
     mean_tilt = 0.25 * (tilted[before] + 2.0 * tilted[at] + tilted[after])
     upright = skew(np.array([0.0, 0.0, site.gravity]))
     bent_by_survey = by_place[after] - 2.0 * by_place[at] + by_place[before]
     return Compared(
-        turned=turned,
+        rotation=rotated,
         gyro_turned=(by_gyro[i].inv() * by_gyro[j]).as_rotvec(),
         span=time[j] - time[i],
         turn_sigma=np.sqrt(rotation_sigma[i] ** 2 + rotation_sigma[j] ** 2 + LOCAL_ROTATION**2),
         curve_world=(place[after] - 2.0 * place[at] + place[before]) / half**2,
         force=force,
-        carried=carried,
+        predicted_velocity=propagated,
         bent=(turn[after] - 2.0 * turn[at] + turn[before]) / half[..., None] ** 2,
         curve_sigma=np.sqrt(6.0 * (place_sigma[at] ** 2 + LOCAL_POSITION**2)) / half[:, 0] ** 2,
         gravity=site.gravity,
         prior=_prior(site),
-        turned_by_survey=_of_turns(turned, by_turn[j] - np.swapaxes(relative, 1, 2) @ by_turn[i]),
+        turned_by_survey=_of_turns(rotated, by_turn[j] - np.swapaxes(relative, 1, 2) @ by_turn[i]),
         curve_by_survey=bent_by_survey / half[..., None] ** 2 + upright @ mean_tilt,
     )
 
 
-def _of_turns(turned: Array, last: Array) -> Array:
+def _of_turns(rotated: Array, last: Array) -> Array:
     """Return what turns after rotation vectors (m, 3) do to those, up to their square."""
-    around = skew(turned)
+    around = skew(rotated)
     return np.asarray(last + 0.5 * around @ last + around @ (around @ last) / 12.0)
 
 
@@ -255,14 +255,14 @@ def _prior(site: Site) -> Array:
     )
 
 
-def _pairs(time: Array, sure: BoolArray, span: float) -> tuple[IntArray, IntArray]:
+def _pairs(time: Array, certain: BoolArray, span: float) -> tuple[IntArray, IntArray]:
     """Return epochs a span apart, one pair after the other."""
     out: list[tuple[int, int]] = []
     first = 0
     while first < len(time) - 1:
         last = int(np.argmin(np.abs(time - time[first] - span)))
         if last > first and abs(time[last] - time[first] - span) < EVEN * span:
-            if sure[first] and sure[last]:
+            if certain[first] and certain[last]:
                 out.append((first, last))
             first = last
         else:
@@ -271,7 +271,7 @@ def _pairs(time: Array, sure: BoolArray, span: float) -> tuple[IntArray, IntArra
     return pairs[:, 0], pairs[:, 1]
 
 
-def _triples(time: Array, sure: BoolArray, span: float) -> tuple[IntArray, IntArray, IntArray]:
+def _triples(time: Array, certain: BoolArray, span: float) -> tuple[IntArray, IntArray, IntArray]:
     """Return epochs with others a span before and after them, evenly."""
     out: list[tuple[int, int, int]] = []
     at = 0
@@ -280,7 +280,7 @@ def _triples(time: Array, sure: BoolArray, span: float) -> tuple[IntArray, IntAr
         after = int(np.argmin(np.abs(time - time[at] - span)))
         even = abs(time[after] + time[before] - 2.0 * time[at]) < 0.02 * span
         whole = abs(time[after] - time[before] - 2.0 * span) < EVEN * span
-        if even and whole and sure[before] and sure[at] and sure[after]:
+        if even and whole and certain[before] and certain[at] and certain[after]:
             out.append((before, at, after))
             at = max(at + 1, int(np.searchsorted(time, time[at] + 0.5 * span)))
         else:

@@ -35,7 +35,7 @@ def phase_causes(known: Snapshots, every: FieldSamples) -> Iterator[Explanation]
     """
     if not all(beacon.synchronised for beacon in known.site.beacons):
         return
-    loose = fix_epochs(known.samples, known.calibration, free=("phase",))
+    loose = fix_epochs(known.samples, known.calibration, free_parameters=("phase",))
     lower = float(np.sum(loose.cost[:, 0]))
     if known.chi_square - lower < LEAST_FALL or known.chi_square < CLEARLY * lower:
         return
@@ -103,7 +103,7 @@ def _rates(known: Snapshots, every: FieldSamples, tones_hz: Array) -> Array | No
     some = every.rows(chosen)
     if len(some) < 8:
         return None
-    loose = fix_epochs(some, known.calibration, free=("phase",))
+    loose = fix_epochs(some, known.calibration, free_parameters=("phase",))
     phase, elapsed = loose.phase[:, 0], some.time - some.time[0]
     trial = np.arange(-RATE_REACH, RATE_REACH, 0.25 / (elapsed[-1] * np.max(tones_hz)))
     out = []

@@ -4,23 +4,25 @@ import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.data_checks.statistics import (
-    WITNESS_BUDGET,
+    TEST_BUDGET,
     holm,
     log_p_chi_square,
     sigmas,
 )
-from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
+from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.model.parameters import Block, Parameter, difference
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
 
-SAID = 0.02  # of the prior's variance, below which the data said nothing along a direction
+MIN_INFORMATION_RATIO = (
+    0.02  # of the prior's variance, below which the data said nothing along a direction
+)
 TOLERATED = 2.0  # chi square per degree of freedom below which sigmas are right enough
 ABSURD = 50.0  # sigmas of a bias that no sensor has: the data are not what the site says
 
 
-def calibration_change(case: Case) -> Testimony:
+def calibration_change(case: Case) -> TestResult:
     """Judge by how much the calibration moved from its declared values."""
     result = case.result
     if not result.blocks:
@@ -42,16 +44,16 @@ def calibration_change(case: Case) -> Testimony:
         if kind in excess
     ]
     factor = np.full(len(case.pose_cov), max(excess.values()))
-    return Testimony(tuple(findings or [_of_all(*whole)]), factor=factor)
+    return TestResult(tuple(findings or [_of_all(*whole)]), factor=factor)
 
 
 def _too_far(
     tests: list[tuple[Parameter | None, tuple[float, int, float]]],
 ) -> dict[Parameter | None, float]:
     """Return the kinds of parameter of tests that fail, with the largest chi square per freedom."""
-    speaks = holm([log_p for _, (_, _, log_p) in tests], WITNESS_BUDGET)
+    informative = holm([log_p for _, (_, _, log_p) in tests], TEST_BUDGET)
     excess: dict[Parameter | None, float] = {}
-    for (kind, (square, freedom, _)), yes in zip(tests, speaks, strict=True):
+    for (kind, (square, freedom, _)), yes in zip(tests, informative, strict=True):
         if yes and square > TOLERATED * freedom:
             excess[kind] = max(square / freedom, excess.get(kind, 0.0))
     return excess
@@ -88,26 +90,26 @@ def distance(change: Array, cov: Array, blocks: list[Block]) -> tuple[float, int
     change : ndarray, shape (dimension,)
         In sigmas of the prior.
     cov : ndarray, shape (dimension, dimension)
-        Of it; directions of less than `SAID` say nothing.
+        Of it; directions of less than `MIN_INFORMATION_RATIO` say nothing.
     """
     rows = np.concatenate([np.arange(len(change))[block.columns] for block in blocks])
     own = cov[np.ix_(rows, rows)]
     value, vector = np.linalg.eigh(0.5 * (own + own.T))
-    said = value > SAID
-    if not np.any(said):
+    findings = value > MIN_INFORMATION_RATIO
+    if not np.any(findings):
         return 0.0, 1, 0.0
-    square = float(np.sum((vector[:, said].T @ change[rows]) ** 2 / value[said]))
-    freedom = int(np.sum(said))
+    square = float(np.sum((vector[:, findings].T @ change[rows]) ** 2 / value[findings]))
+    freedom = int(np.sum(findings))
     return square, freedom, float(log_p_chi_square(square, freedom))
 
 
 def _finding(
     kind: Parameter, blocks: list[Block], square: float, freedom: int, log_p: float, change: Array
 ) -> Finding:
-    unit = kind.spoken
+    unit = kind.display_unit
     moved = {b.name: float(np.max(np.abs(change[b.columns]))) for b in blocks}
-    most = sorted(blocks, key=lambda b: -moved[b.name])[:3]
-    amounts = ", ".join(f"{b.name} by {moved[b.name]:.1f} sigma" for b in most)
+    maximum = sorted(blocks, key=lambda b: -moved[b.name])[:3]
+    amounts = ", ".join(f"{b.name} by {moved[b.name]:.1f} sigma" for b in maximum)
     declared = float(np.max([np.max(b.sigma) for b in blocks])) / unit.size
     times = float(np.sqrt(max(square / freedom, max(moved.values()) ** 2 / 4.0)))
     sigma = f"{declared:.3g} {unit.text}".rstrip(), f"{times * declared:.2g} {unit.text}".rstrip()
@@ -121,7 +123,7 @@ def _finding(
     )
 
 
-def bias_change(case: Case) -> Testimony:
+def bias_change(case: Case) -> TestResult:
     """Judge whether the biases of the IMU are such as the site declares."""
     states, imu = case.result.states, case.result.declared.site.platform.imu
     assert states.accel_bias_body is not None
@@ -134,7 +136,7 @@ def bias_change(case: Case) -> Testimony:
     log_p = [float(log_p_chi_square(np.sum(d**2), 3)) for d in distances]
     findings, excess = [], 1.0
     for (name, bias, sigma, unit, key), d, p, yes in zip(
-        kinds, distances, log_p, holm(log_p, WITNESS_BUDGET), strict=True
+        kinds, distances, log_p, holm(log_p, TEST_BUDGET), strict=True
     ):
         if not yes:
             continue
@@ -151,4 +153,4 @@ def bias_change(case: Case) -> Testimony:
                 float(sigmas(p)),
             )
         )
-    return Testimony(tuple(findings), factor=np.full(len(states), excess)) if findings else NOTHING
+    return TestResult(tuple(findings), factor=np.full(len(states), excess)) if findings else NOTHING

@@ -12,16 +12,16 @@ import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.data_checks.statistics import (
-    WITNESS_BUDGET,
+    TEST_BUDGET,
     effective_number,
     holm,
     log_p_chi_square,
     sigmas,
 )
-from magfusion.estimation.graph.graph import Estimate
+from magfusion.estimation.graph.graph import GraphEstimate
 from magfusion.estimation.graph.state import states_in
 from magfusion.estimation.integrity.inertial_misfit import expected_squares, inertial_errors
-from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
+from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.pose_fix import PoseFix
 from magfusion.model.trust import Finding, Verdict
@@ -98,7 +98,7 @@ def misfits(name: str, residual: Array, blocks: list[BoolArray], numbers: float)
     return out
 
 
-def fields(case: Case, raw: Array, weighed: Array) -> Testimony:
+def fields(case: Case, raw: Array, weighed: Array) -> TestResult:
     """Judge what is left of the fields.
 
     Parameters
@@ -115,16 +115,18 @@ def fields(case: Case, raw: Array, weighed: Array) -> Testimony:
     for c, (name, tone) in enumerate(channels):
         called = f"beacon {name}" + (f", tone {tone}" if name in several else "")
         tests += misfits(called, raw[:, c], blocks, INDEPENDENT)
-    speaking = _speaking(tests, TOLERATED)
-    if not speaking:
+    informative = _significant(tests, TOLERATED)
+    if not informative:
         return NOTHING
     factor = _field_factor(case, weighed, blocks)
     verdict = Verdict.DOUBTFUL if np.max(factor) > TOLERATED else Verdict.TRUSTWORTHY
-    findings = tuple(_field_finding(result, named, time, verdict) for named in _by_name(speaking))
-    return Testimony(findings, factor=factor)
+    findings = tuple(
+        _field_finding(result, named, time, verdict) for named in _by_name(informative)
+    )
+    return TestResult(findings, factor=factor)
 
 
-def fixes(case: Case) -> Testimony:
+def fixes(case: Case) -> TestResult:
     """Judge the fixes of loose coupling, which are all that is left of the fields there."""
     graph = case.result.graph
     measured = next((m for m in graph.measurements if isinstance(m, PoseFix)), None)
@@ -132,35 +134,35 @@ def fixes(case: Case) -> Testimony:
         return NOTHING
     error = graph.residual(measured, case.result.estimate)
     time = case.result.states.time[measured.epoch]
-    speaking = _speaking(misfits("the fixes", error, blocks_of(time), INDEPENDENT), TOLERATED)
-    if not speaking:
+    informative = _significant(misfits("the fixes", error, blocks_of(time), INDEPENDENT), TOLERATED)
+    if not informative:
         return NOTHING
-    worst = float(max(one.square for one in speaking))
+    worst = float(max(one.square for one in informative))
     finding = Finding(
         "field_residuals",
-        f"The fixes of single epochs deviate {_when(speaking, time)} from the motion that the"
+        f"The fixes of single epochs deviate {_when(informative, time)} from the motion that the"
         f" inertial sensor tells of, by {np.sqrt(worst):.2g} times what they claim. Smooth with"
         " tight coupling, which can tell the cause.",
         Verdict.DOUBTFUL,
-        float(max(sigmas(one.log_p) for one in speaking)),
+        float(max(sigmas(one.log_p) for one in informative)),
     )
-    return Testimony((finding,), factor=np.full(len(case.pose_cov), worst))
+    return TestResult((finding,), factor=np.full(len(case.pose_cov), worst))
 
 
-def _speaking(tests: list[Misfit], tolerated: float) -> list[Misfit]:
-    speaks = holm([one.log_p for one in tests], WITNESS_BUDGET)
-    return [t for t, yes in zip(tests, speaks, strict=True) if yes and t.square > tolerated]
+def _significant(tests: list[Misfit], tolerated: float) -> list[Misfit]:
+    informative = holm([one.log_p for one in tests], TEST_BUDGET)
+    return [t for t, yes in zip(tests, informative, strict=True) if yes and t.square > tolerated]
 
 
-def _by_name(speaking: list[Misfit]) -> Iterator[list[Misfit]]:
-    for name in dict.fromkeys(one.name for one in speaking):
-        yield [one for one in speaking if one.name == name]
+def _by_name(informative: list[Misfit]) -> Iterator[list[Misfit]]:
+    for name in dict.fromkeys(one.name for one in informative):
+        yield [one for one in informative if one.name == name]
 
 
 def _field_finding(result: Smoothed, named: list[Misfit], time: Array, verdict: Verdict) -> Finding:
     rms = float(np.sqrt(max(one.square for one in named)))
     error = result.declared.site.model_error
-    sure = float(max(sigmas(one.log_p) for one in named))
+    certain = float(max(sigmas(one.log_p) for one in named))
     return Finding(
         "field_residuals",
         f"The field of {named[0].name} deviates {_when(named, time)} from the model by {rms:.2g}"
@@ -169,7 +171,7 @@ def _field_finding(result: Smoothed, named: list[Misfit], time: Array, verdict: 
         " (magfusion calibrate fieldmap), check the beacon, or declare a model_error of"
         f" {rms * error:.1g}.",
         verdict,
-        sure,
+        certain,
     )
 
 
@@ -241,7 +243,7 @@ def _persistence(residual: Array) -> float:
     return total
 
 
-def inertial(case: Case, estimate: Estimate) -> Testimony:
+def inertial(case: Case, estimate: GraphEstimate) -> TestResult:
     """Judge the inertial residuals at an estimate."""
     result = case.result
     if result.graph.epochs < 4 or not result.graph.measurements:
@@ -256,15 +258,15 @@ def inertial(case: Case, estimate: Estimate) -> Testimony:
     for row, name in AXES.items():
         if expected[row] > 1e-6:
             tests += misfits(name, error[:, row] / np.sqrt(expected[row]), blocks, 1.0)
-    speaking = _speaking(tests, TOLERATED_INERTIAL)
-    if not speaking:
+    informative = _significant(tests, TOLERATED_INERTIAL)
+    if not informative:
         return NOTHING
-    worst = max(speaking, key=lambda one: -one.log_p)
+    worst = max(informative, key=lambda one: -one.log_p)
     rms = float(np.sqrt(worst.square))
-    names = ", ".join(dict.fromkeys(one.name for one in speaking))
+    names = ", ".join(dict.fromkeys(one.name for one in informative))
     text = (
         f"The inertial data contradict the motion that the fields tell of"
-        f" {_when([one for one in speaking if one.name == worst.name], time)}: {names} deviate by"
+        f" {_when([one for one in informative if one.name == worst.name], time)}: {names} deviate by"
         f" up to {rms:.2g} times what the declared noise allows. Shocks, a false axis or scale,"
         " stamps, or declared noise that is too small: check the inertial sensor, or declare"
         " larger gyro_noise and accel_noise."
@@ -273,12 +275,12 @@ def inertial(case: Case, estimate: Estimate) -> Testimony:
     if not case.log.inertial:
         text = (
             f"The platform moves faster than its motion prior has it"
-            f" {_when([one for one in speaking if one.name == worst.name], time)}: up to {rms:.2g}"
+            f" {_when([one for one in informative if one.name == worst.name], time)}: up to {rms:.2g}"
             " times. Declare larger densities in platform.motion_prior."
         )
     finding = Finding(code, text, Verdict.DOUBTFUL, float(sigmas(worst.log_p)))
     factor = np.ones(len(result.states))
-    for one in speaking:
+    for one in informative:
         rows = np.append(one.rows, one.rows[-1]) | np.insert(one.rows, 0, one.rows[0])
         factor[rows] = np.maximum(factor[rows], one.square)
-    return Testimony((finding,), factor=factor)
+    return TestResult((finding,), factor=factor)

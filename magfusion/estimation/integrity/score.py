@@ -17,12 +17,12 @@ from gtsam.symbol_shorthand import B, V, X
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.graph.considered import steps_of_others
 from magfusion.estimation.graph.factors import CALIBRATION_KEY, CONSIDERED_KEY, NUISANCE_KEY
-from magfusion.estimation.graph.graph import Estimate
+from magfusion.estimation.graph.graph import GraphEstimate
 from magfusion.estimation.graph.measurement import Rows
 from magfusion.estimation.graph.state import MOTION
-from magfusion.estimation.integrity.held_columns import InertialColumns, inertial_columns
+from magfusion.estimation.integrity.fixed_parameter_columns import InertialColumns, inertial_columns
 from magfusion.estimation.integrity.score_chain import (
-    Left,
+    FixedParameterResidual,
     Responses,
     left_of_chain,
     responses_of_chain,
@@ -52,7 +52,7 @@ class Score:
 
     Parameters
     ----------
-    held : tuple of Block
+    fixed : tuple of Block
         Whose sigmas are those units.
     information : ndarray, shape (h, h)
         Of them, all that is estimated eliminated.
@@ -67,7 +67,7 @@ class Score:
         What a unit of them does to the calibration that is estimated.
     """
 
-    held: tuple[Block, ...]
+    fixed: tuple[Block, ...]
     information: Array
     gradient: Array
     spread: Array
@@ -88,30 +88,30 @@ class Score:
             Of what they may be wrong by beyond what is declared.
         gradient : ndarray, shape (h,)
         """
-        taken = self._taken(np.concatenate([self.spread, tolerance_of(self.held)], axis=1))
-        left = self.information - self.information @ taken @ self.information
-        gradient = self.gradient - self.information @ (taken @ self.gradient)
-        return 0.5 * (left + left.T), gradient
+        selected = self._applied(np.concatenate([self.spread, tolerance_of(self.fixed)], axis=1))
+        residual = self.information - self.information @ selected @ self.information
+        gradient = self.gradient - self.information @ (selected @ self.gradient)
+        return 0.5 * (residual + residual.T), gradient
 
     def within_tolerance(self) -> Array:
         """Return the information of what is held while all have their tolerance, shape (h, h)."""
-        taken = self._taken(tolerance_of(self.held))
-        left = self.information - self.information @ taken @ self.information
-        return np.asarray(0.5 * (left + left.T))
+        selected = self._applied(tolerance_of(self.fixed))
+        residual = self.information - self.information @ selected @ self.information
+        return np.asarray(0.5 * (residual + residual.T))
 
     def allowed(self, step: Array) -> Array:
         """Return a step with what all else then moves by, as far as its declared sigma allows."""
-        return step + self._taken(self.spread) @ (self.gradient - self.information @ step)
+        return step + self._applied(self.spread) @ (self.gradient - self.information @ step)
 
-    def _taken(self, spread: Array) -> Array:
+    def _applied(self, spread: Array) -> Array:
         spread = spread[:, spread.any(axis=0)]  # most of it is known
         inner = np.eye(spread.shape[1]) + spread.T @ self.information @ spread
         return np.asarray(spread @ np.linalg.solve(inner, spread.T))
 
 
-def tolerance_of(held: tuple[Block, ...]) -> Array:
+def tolerance_of(fixed: tuple[Block, ...]) -> Array:
     """Return a root of the covariance of what is held within its tolerance, in typical errors."""
-    own = [TOLERANCE.get(b.parameter, 0.0) / b.sigma for b in held]
+    own = [TOLERANCE.get(b.parameter, 0.0) / b.sigma for b in fixed]
     return np.diag(np.concatenate(own))
 
 
@@ -120,23 +120,23 @@ class Scores(NamedTuple):
 
     Parameters
     ----------
-    held : Score
+    fixed : Score
     every : Score
         Its responses may be those of the first of its parameters alone: see `answered`.
     """
 
-    held: Score
+    fixed: Score
     every: Score
 
 
-def scores_of(result: Smoothed, imu: ImuSamples, beside: Sequence[Block] = ()) -> Scores | None:
+def scores_of(result: Smoothed, imu: ImuSamples, columns: Sequence[Block] = ()) -> Scores | None:
     """Return the score of everything that a result holds; None where there is nothing to ask.
 
     Parameters
     ----------
     imu : ImuSamples
         As it was recorded.
-    beside : sequence of Block
+    columns : sequence of Block
         What else is asked, in the same sweep.
     """
     graph = result.graph
@@ -146,24 +146,24 @@ def scores_of(result: Smoothed, imu: ImuSamples, beside: Sequence[Block] = ()) -
     if not known.platform.inertial and len(known.beacons) == 1:
         return None  # nothing contradicts a lone beacon but that a path ought to be short
     steady = any(isinstance(m, EarthField) for m in graph.measurements)
-    held = held_blocks(known, result.blocks, steady=steady)
-    if not held:
+    fixed = held_blocks(known, result.blocks, steady=steady)
+    if not fixed:
         return None
-    every = placed((*held, *beside))
+    every = placed((*fixed, *columns))
     inertial = inertial_columns(result, every, imu)
-    found = _by_chain(result, held, every, inertial)
-    if found is None:
-        found = _by_elimination(result, every, inertial.of(slice(None)))
-    left, responses = found
-    wide = Score(every, *left, _declared(result, every), *responses)
-    return Scores(_first(wide, held), wide)
+    estimate = _by_chain(result, fixed, every, inertial)
+    if estimate is None:
+        estimate = _by_elimination(result, every, inertial.of(slice(None)))
+    residual, responses = estimate
+    wide = Score(every, *residual, _declared(result, every), *responses)
+    return Scores(_first(wide, fixed), wide)
 
 
-def _first(score: Score, held: tuple[Block, ...]) -> Score:
+def _first(score: Score, fixed: tuple[Block, ...]) -> Score:
     """Return the score of the first of its parameters."""
-    own = slice(0, dimension(held))
+    own = slice(0, dimension(fixed))
     return Score(
-        held,
+        fixed,
         score.information[own, own],
         score.gradient[own],
         score.spread[own],
@@ -173,57 +173,59 @@ def _first(score: Score, held: tuple[Block, ...]) -> Score:
 
 
 def _by_chain(
-    result: Smoothed, held: tuple[Block, ...], every: tuple[Block, ...], inertial: InertialColumns
-) -> tuple[Left, Responses] | None:
+    result: Smoothed, fixed: tuple[Block, ...], every: tuple[Block, ...], inertial: InertialColumns
+) -> tuple[FixedParameterResidual, Responses] | None:
     """Return what is left of all, and how the first move the states, of one chain of states."""
     if not is_chain(result.graph, every):
         return None
     native = NativeRows(result.graph, result.estimate)
-    left = left_of_chain(result, every, inertial, native)
-    if left is None:
+    residual = left_of_chain(result, every, inertial, native)
+    if residual is None:
         return None
-    own = inertial.part(slice(0, dimension(held)))
-    responses = responses_of_chain(result, held, own, native)
-    return None if responses is None else (left, responses)
+    own = inertial.part(slice(0, dimension(fixed)))
+    responses = responses_of_chain(result, fixed, own, native)
+    return None if responses is None else (residual, responses)
 
 
 def answered(result: Smoothed, score: Score, imu: ImuSamples) -> Score:
     """Return a score that tells of all its parameters how they move the poses."""
-    if score.by_calibration.shape[1] == dimension(score.held):
+    if score.by_calibration.shape[1] == dimension(score.fixed):
         return score
-    inertial = inertial_columns(result, score.held, imu)
+    inertial = inertial_columns(result, score.fixed, imu)
     native = NativeRows(result.graph, result.estimate)
     known = Responses(score.by_state, score.by_calibration)
-    responses = responses_of_chain(result, score.held, inertial, native, known)
+    responses = responses_of_chain(result, score.fixed, inertial, native, known)
     if responses is None:
-        left, responses = _by_elimination(result, score.held, inertial.of(slice(None)))
-        score = replace(score, information=left.information, gradient=left.gradient)
+        residual, responses = _by_elimination(result, score.fixed, inertial.of(slice(None)))
+        score = replace(score, information=residual.information, gradient=residual.gradient)
     by_state, by_calibration = responses
     return replace(score, by_state=by_state, by_calibration=by_calibration)
 
 
 def _by_elimination(
-    result: Smoothed, held: tuple[Block, ...], by_others: Array
-) -> tuple[Left, Responses]:
+    result: Smoothed, fixed: tuple[Block, ...], by_others: Array
+) -> tuple[FixedParameterResidual, Responses]:
     """Return the same of any graph."""
-    graph, estimate, size = result.graph, result.estimate, dimension(held)
-    unit = np.diag(prior_sigma(held))
+    graph, estimate, size = result.graph, result.estimate, dimension(fixed)
+    unit = np.diag(prior_sigma(fixed))
     # One system after the other: of a long log each of them is most of what there is.
-    left = None
+    residual = None
     if result.field_errors:
         # An error that is constant in place looks like some of them; what freeing them does to the
         # estimate, which weighs epochs as if there were none, stays the same.
         ordering = graph.ordering
         ordering.push_back(NUISANCE_KEY)
         errors = result.field_errors
-        _, left = eliminate_partial(
-            graph.beside(estimate, held, unit, by_others, explaining=True, nuisance=errors),
+        _, residual = eliminate_partial(
+            graph.with_fixed_columns(
+                estimate, fixed, unit, by_others, explaining=True, nuisance=errors
+            ),
             ordering,
         )
     conditional, rest = eliminate_partial(
-        graph.beside(estimate, held, unit, by_others, explaining=True), graph.ordering
+        graph.with_fixed_columns(estimate, fixed, unit, by_others, explaining=True), graph.ordering
     )
-    rest = rest if left is None else left
+    rest = rest if residual is None else residual
     order = gtsam.Ordering()
     order.push_back(CONSIDERED_KEY)
     information, gradient = rest.hessian(order)
@@ -234,7 +236,7 @@ def _by_elimination(
         by_state[:, :, k] = step.vector(keys).reshape(-1, MOTION)
         if result.blocks:
             by_calibration[:, k] = step.at(CALIBRATION_KEY)
-    return Left(information, gradient), Responses(by_state, by_calibration)
+    return FixedParameterResidual(information, gradient), Responses(by_state, by_calibration)
 
 
 def _without_error(net: gtsam.GaussianBayesNet) -> gtsam.GaussianBayesNet:
@@ -243,21 +245,21 @@ def _without_error(net: gtsam.GaussianBayesNet) -> gtsam.GaussianBayesNet:
     return net
 
 
-def _declared(result: Smoothed, held: tuple[Block, ...]) -> Array:
+def _declared(result: Smoothed, fixed: tuple[Block, ...]) -> Array:
     """Return a root of the covariance that the site declares of what is held, typical errors."""
-    size = dimension(held)
+    size = dimension(fixed)
     if not result.considered:
         return np.zeros((size, 0))
     spread = prior_sqrt_covariance(result.declared.site, result.considered)
-    at = {b.key: b.columns for b in held}
+    at = {b.key: b.columns for b in fixed}
     out = np.zeros((size, spread.shape[1]))
     for block in result.considered:
         if block.key in at:  # one from outside is not tried
             out[at[block.key]] = spread[block.columns]
-    return out / prior_sigma(held)[:, None]
+    return out / prior_sigma(fixed)[:, None]
 
 
-def moved_estimate(result: Smoothed, score: Score, step: Array) -> Estimate:
+def moved_estimate(result: Smoothed, score: Score, step: Array) -> GraphEstimate:
     """Return the estimate that a step of what is held leads to.
 
     Parameters
@@ -270,16 +272,16 @@ def moved_estimate(result: Smoothed, score: Score, step: Array) -> Estimate:
         for key, part in ((X(i), own[:6]), (V(i), own[6:9]), (B(i), own[9:])):
             change.insert(key, part)
     by_blocks = score.by_calibration @ step
-    own_step = prior_sigma(score.held) * step
+    own_step = prior_sigma(score.fixed) * step
 
     def moved(calibration: Calibration) -> Calibration:
-        return retract(retract(calibration, result.blocks, by_blocks), score.held, own_step)
+        return retract(retract(calibration, result.blocks, by_blocks), score.fixed, own_step)
 
     segments = tuple(moved(calibration) for calibration in estimate.segments)
-    return Estimate(estimate.values.retract(change), moved(estimate.calibration), segments)
+    return GraphEstimate(estimate.values.retract(change), moved(estimate.calibration), segments)
 
 
-def field_residual(result: Smoothed, estimate: Estimate, *, raw: bool = False) -> Array:
+def field_residual(result: Smoothed, estimate: GraphEstimate, *, raw: bool = False) -> Array:
     """Return the whitened residual of the fields at an estimate, NaN where missing.
 
     Shape (n, channels, 6); what a robust loss holds back is held back unless it is asked for raw.
@@ -291,4 +293,4 @@ def field_residual(result: Smoothed, estimate: Estimate, *, raw: bool = False) -
     alone = fields.alone()
     loss = None if raw else alone.loss
     error = Rows(graph.residual(alone, estimate)).weighed(loss)[0].error
-    return np.where(result.fields.told, error, np.nan)
+    return np.where(result.fields.is_measured, error, np.nan)

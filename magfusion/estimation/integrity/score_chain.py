@@ -6,10 +6,13 @@ import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.graph.state import MOTION
-from magfusion.estimation.integrity.held_columns import InertialColumns
-from magfusion.estimation.posterior.chain_left import left_over
-from magfusion.estimation.posterior.chain_system import column_groups, system_beside
+from magfusion.estimation.integrity.fixed_parameter_columns import InertialColumns
+from magfusion.estimation.posterior.block_tridiagonal_system import (
+    column_groups,
+    system_with_columns,
+)
 from magfusion.estimation.posterior.native_rows import Columns, NativeRows
+from magfusion.estimation.posterior.schur_complement import left_over
 from magfusion.estimation.solve.chain import solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.model.parameters import Block, dimension, placed, prior_sigma
@@ -33,7 +36,7 @@ class Responses(NamedTuple):
     by_calibration: Array
 
 
-class Left(NamedTuple):
+class FixedParameterResidual(NamedTuple):
     """What is left of parameters that are held, as of `magfusion.estimation.integrity.score.Score`.
 
     Parameters
@@ -47,29 +50,33 @@ class Left(NamedTuple):
 
 
 def left_of_chain(
-    result: Smoothed, held: tuple[Block, ...], inertial: InertialColumns, native: NativeRows
-) -> Left | None:
+    result: Smoothed, fixed: tuple[Block, ...], inertial: InertialColumns, native: NativeRows
+) -> FixedParameterResidual | None:
     """Return what is left; None where the chain is too badly conditioned for one sweep."""
-    graph, size = result.graph, dimension(held)
+    graph, size = result.graph, dimension(fixed)
     # An error that is constant in place looks like some of them; what freeing them does to the
     # estimate, which weighs epochs as if there were none, stays the same.
-    every = placed((*held, *result.field_errors))
+    every = placed((*fixed, *result.field_errors))
     wide = inertial._replace(number=dimension(every))
-    beside = Columns(every, np.diag(prior_sigma(every)), wide.of)
+    others = Columns(every, np.diag(prior_sigma(every)), wide.of)
     try:
-        left = left_over(graph, result.estimate, beside, native)
-        errors = left[1 + size :, 1 + size :] + np.eye(dimension(every) - size)
-        across = left[: 1 + size, 1 + size :]
-        left = left[: 1 + size, : 1 + size] - across @ np.linalg.solve(errors, across.T)
+        residual = left_over(graph, result.estimate, others, native)
+        errors = residual[1 + size :, 1 + size :] + np.eye(dimension(every) - size)
+        across = residual[: 1 + size, 1 + size :]
+        residual = residual[: 1 + size, : 1 + size] - across @ np.linalg.solve(errors, across.T)
     except np.linalg.LinAlgError:
         return None
-    information = 0.5 * (left[1:, 1:] + left[1:, 1:].T)
-    return Left(information, -left[1:, 0]) if np.all(np.isfinite(left)) else None
+    information = 0.5 * (residual[1:, 1:] + residual[1:, 1:].T)
+    return (
+        FixedParameterResidual(information, -residual[1:, 0])
+        if np.all(np.isfinite(residual))
+        else None
+    )
 
 
 def responses_of_chain(
     result: Smoothed,
-    held: tuple[Block, ...],
+    fixed: tuple[Block, ...],
     inertial: InertialColumns,
     native: NativeRows,
     known: Responses | None = None,
@@ -89,28 +96,30 @@ def responses_of_chain(
         by_state.append(known.by_state[:, :kept])
         by_calibration.append(known.by_calibration)
     inverse = None
-    new = tuple(b for b in held if b.columns.start >= sum(part.shape[1] for part in by_calibration))
+    new = tuple(
+        b for b in fixed if b.columns.start >= sum(part.shape[1] for part in by_calibration)
+    )
     for columns in _groups(new, graph.epochs):
         part = inertial.part(columns)
-        own = Columns(held, np.diag(prior_sigma(held))[:, columns], part.of)
-        normal, fields = system_beside(graph, result.estimate, own, native)
+        own = Columns(fixed, np.diag(prior_sigma(fixed))[:, columns], part.of)
+        normal, fields = system_with_columns(graph, result.estimate, own, native)
         if fields is not None:
             for piece in fields.pieces():
                 piece.added_to(normal)
-        found = solve_chain(normal.chain(), kept, inverse, covariance=False)
-        inverse = found.inverse
-        by_state.append(found.states[0, ..., 1:].copy())
-        by_calibration.append(found.border[0, :, 1:])
-        del normal, fields, found  # before the next group: of a long log they are much
+        estimate = solve_chain(normal.chain(), kept, inverse, covariance=False)
+        inverse = estimate.inverse
+        by_state.append(estimate.states[0, ..., 1:].copy())
+        by_calibration.append(estimate.border[0, :, 1:])
+        del normal, fields, estimate  # before the next group: of a long log they are much
         give_back_memory()
     responses = Responses(np.concatenate(by_state, axis=2), np.concatenate(by_calibration, axis=1))
     return responses if all(np.all(np.isfinite(part)) for part in responses) else None
 
 
-def _groups(held: tuple[Block, ...], epochs: int) -> list[slice]:
+def _groups(fixed: tuple[Block, ...], epochs: int) -> list[slice]:
     """Return columns of what is held, so many at once that their right sides fit memory."""
-    if not held:
+    if not fixed:
         return []
-    first = held[0].columns.start
-    groups = column_groups(placed(held), epochs)
+    first = fixed[0].columns.start
+    groups = column_groups(placed(fixed), epochs)
     return [slice(first + group.start, first + group.stop) for group in groups]

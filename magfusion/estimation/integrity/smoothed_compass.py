@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from magfusion.estimation.data_checks.compasses import SPAN, still_means
-from magfusion.estimation.data_checks.recording import beginning
+from magfusion.estimation.data_checks.data_quality import beginning
+from magfusion.estimation.data_checks.gravity_and_field_checks import SPAN, still_means
 from magfusion.estimation.data_checks.steady_field import OffEarth, off_earth
-from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
+from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -13,7 +13,7 @@ TOGETHER = 3  # spans, whose mean is judged; about the memory of the same test o
 NEAR = 0.5 * SPAN + 1.0  # s; as near the middle of a span a state must be
 
 
-def compass(case: Case) -> Testimony:
+def compass(case: Case) -> TestResult:
     """Judge the steady field by the poses, and doubt those of the spans where it is another."""
     site, states, log = case.result.declared.site, case.result.states, case.log
     if case.result.earth_residual is not None or site.earth_field_world is None:
@@ -26,25 +26,25 @@ def compass(case: Case) -> Testimony:
     if len(row) < TOGETHER or not np.all(np.isfinite(field_body)):
         return NOTHING
     attitude = states.world_from_body[row]
-    left = np.einsum("nij,nj->ni", attitude, field_body) - site.earth_field_world
+    residual = np.einsum("nij,nj->ni", attitude, field_body) - site.earth_field_world
     cov = attitude @ case.pose_cov[row, :3, :3] @ np.swapaxes(attitude, 1, 2)
-    found = [
-        off_earth(site, np.mean(left[k : k + TOGETHER], axis=0), cov[k])
+    result = [
+        off_earth(site, np.mean(residual[k : k + TOGETHER], axis=0), cov[k])
         for k in range(len(row) - TOGETHER + 1)
     ]
-    off = [one for one in found if one is not None]
+    off = [one for one in result if one is not None]
     if not off:
         return NOTHING
     worst = max(off, key=lambda one: one.score)
-    return Testimony((worst.finding,), spread=_spread(states, means.time[near], found))
+    return TestResult((worst.finding,), spread=_spread(states, means.time[near], result))
 
 
-def _spread(states: Trajectory, time: Array, found: list[OffEarth | None]) -> Array:
+def _spread(states: Trajectory, time: Array, result: list[OffEarth | None]) -> Array:
     """Return what the poses nearest to each span may be off by, shape (states, 6, 6)."""
     middle = time[TOGETHER // 2 : len(time) - TOGETHER // 2]
     nearest = np.argmin(np.abs(states.time[:, None] - middle), axis=1)
     spread = np.zeros((len(states), 6, 6))
-    for k, one in enumerate(found):
+    for k, one in enumerate(result):
         if one is None:
             continue
         for row in np.flatnonzero(nearest == k).tolist():

@@ -16,7 +16,7 @@ from magfusion.estimation.measurements.joint_phasors import JointPhasors, at_nea
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.posterior.separation import Separation, protection_levels, radii
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import Finding, Risk, StateTrust, Trust, Verdict, alike
+from magfusion.model.trust import Finding, Risk, StateTrust, Trust, Verdict, uniform_trust
 from magfusion.units import Array, BoolArray, IntArray
 
 SLACK = 3.0  # sigma; a step below it is covered, and no alarm
@@ -28,7 +28,7 @@ LEFT_OUT = 0.1  # robust weight of a field below which it has no say
 ROUNDS = 3  # of exclusions
 SPANS = 3  # in a sentence
 TOGETHER = 3.0  # s; stretches of a sentence that are nearer are told as one
-TOLD = 5  # field epochs of a beacon that are left out; fewer are outliers
+MIN_LEFT_OUT_EPOCHS = 5  # field epochs of a beacon that are left out; fewer are outliers
 OF_A_LOG = 5e-4  # false alarms of a whole log
 
 
@@ -54,38 +54,38 @@ def separated_smooth(result: Smoothed, risk: Risk | None = None) -> SeparatedSmo
     """Compare a smoothed trajectory with those without each beacon; leave out what is false."""
     risk = Risk() if risk is None else risk
     names = tuple(beacon.name for beacon in result.declared.site.beacons)
-    found = separate_smoothed(result)
-    if found is None or result.states.pose_cov is None:
+    estimate = separate_smoothed(result)
+    if estimate is None or result.states.pose_cov is None:
         return _without_level(result)
-    first = found
-    result, found, out = _without_false(result, found, names, risk)
-    excess = found.excess(risk, SLACK)
+    first = estimate
+    result, estimate, out = _without_false(result, estimate, names, risk)
+    excess = estimate.excess(risk, SLACK)
     alarmed = np.any(excess > 1.0, axis=1)
-    level_m, level_deg = protection_levels(found, risk, SLACK)
+    level_m, level_deg = protection_levels(estimate, risk, SLACK)
     level_m[alarmed] = level_deg[alarmed] = np.nan
-    out |= _without_say(result, names)
+    out |= _without_weight(result, names)
     trust = Trust(
         (
             *_excluded_findings(result, first, out, names),
-            *_alarm_findings(result, found, excess, names, risk),
+            *_alarm_findings(result, estimate, excess, names, risk),
             *_redundancy_findings(level_m, alarmed),
         )
     )
     if np.any(alarmed):
-        result = _covering(result, found, alarmed)
+        result = _covering(result, estimate, alarmed)
     verdict = tuple(Verdict.DOUBTFUL if a else Verdict.TRUSTWORTHY for a in alarmed.tolist())
     excluded = _names_by_state(result, out, names)
     return SeparatedSmooth(result, StateTrust(verdict, level_m, level_deg, excluded), trust)
 
 
 def _without_false(
-    result: Smoothed, found: Separation, names: tuple[str, ...], risk: Risk
+    result: Smoothed, separated: Separation, names: tuple[str, ...], risk: Risk
 ) -> tuple[Smoothed, Separation, BoolArray]:
     """Leave out stretches of beacons, one after the other, as long as that mends the separation.
 
     Returns
     -------
-    result, found : Smoothed, Separation
+    result, separated : Smoothed, Separation
         Without them.
     out : bool ndarray, shape (n, beacons)
         The fields that were left out.
@@ -93,20 +93,20 @@ def _without_false(
     out = np.zeros((len(result.fields.time), len(names)), dtype=bool)
     for _ in range(ROUNDS):
         # What is significant is looked for, whether or not it is covered.
-        before = float(np.max(found.excess(risk)))
+        before = float(np.max(separated.excess(risk)))
         if before <= 1.0:
             break
-        beacon = int(np.argmin(np.mean(found.cost + 2.0 * found.rows, axis=0)))
-        false = _false_stretches(result, found, beacon)
+        beacon = int(np.argmin(np.mean(separated.cost + 2.0 * separated.rows, axis=0)))
+        false = _false_stretches(result, separated, beacon)
         if not np.any(false & ~out[:, beacon]) or np.mean(false) > MOST_FALSE:
             break
         trial = _resolved(result, names[beacon], false)
         again = None if trial is None else separate_smoothed(trial)
         if trial is None or again is None or np.max(again.excess(risk)) > BETTER * before:
             break  # it was not this beacon, or not it alone
-        result, found = trial, again
+        result, separated = trial, again
         out[:, beacon] |= false
-    return result, found, out
+    return result, separated, out
 
 
 def states_judged(separated: SeparatedSmooth, result: Smoothed, whole: Verdict) -> StateTrust:
@@ -150,7 +150,7 @@ def _without_level(result: Smoothed) -> SeparatedSmooth:
         " together alone."
     )
     trust = Trust((Finding("no_redundancy", text, Verdict.TRUSTWORTHY, 0.0),))
-    return SeparatedSmooth(result, alike(len(result.states), Verdict.TRUSTWORTHY), trust)
+    return SeparatedSmooth(result, uniform_trust(len(result.states), Verdict.TRUSTWORTHY), trust)
 
 
 def _phasors(result: Smoothed) -> FieldPhasors:
@@ -161,7 +161,7 @@ def _owner(result: Smoothed, names: tuple[str, ...]) -> IntArray:
     return np.array([names.index(name) for name, _ in result.fields.channels])
 
 
-def _false_stretches(result: Smoothed, found: Separation, beacon: int) -> BoolArray:
+def _false_stretches(result: Smoothed, separated: Separation, beacon: int) -> BoolArray:
     """Return at which field epochs a beacon deviates from what the others predict, shape (m,)."""
     names = tuple(b.name for b in result.declared.site.beacons)
     own = _owner(result, names) == beacon
@@ -171,18 +171,18 @@ def _false_stretches(result: Smoothed, found: Separation, beacon: int) -> BoolAr
     jacobian = jacobian.reshape(len(phasors.epoch), -1, 6)
     error = rows.error[:, own].reshape(len(phasors.epoch), -1)
     at = phasors.epoch
-    error = error + (jacobian @ found.step[at, beacon][..., None])[..., 0]
-    cov = jacobian @ found.subset_cov[at, beacon] @ np.swapaxes(jacobian, 1, 2)
+    error = error + (jacobian @ separated.step[at, beacon][..., None])[..., 0]
+    cov = jacobian @ separated.subset_cov[at, beacon] @ np.swapaxes(jacobian, 1, 2)
     repeats = overlap(result.fields)
     spread = cov + np.eye(error.shape[1]) / repeats
     square = np.sum(error * np.linalg.solve(spread, error[..., None])[..., 0], axis=1)
-    heard = np.any(phasors.sqrt_information[:, own] != 0.0, axis=(1, 2, 3))
-    deviates = heard & (square > chdtri(error.shape[1], UNEXPECTED))
+    detected = np.any(phasors.sqrt_information[:, own] != 0.0, axis=(1, 2, 3))
+    deviates = detected & (square > chdtri(error.shape[1], UNEXPECTED))
     step = float(np.median(np.diff(result.fields.time)))
     near = np.ones(2 * int(np.ceil(JOINED / step)) + 1, dtype=bool)
     window = np.ones(2 * int(np.ceil(repeats)) + 1, dtype=bool)
     joined = binary_closing(np.pad(deviates, len(near)), near)[len(near) : -len(near)]
-    return np.asarray(binary_dilation(joined | deviates, window) & heard)
+    return np.asarray(binary_dilation(joined | deviates, window) & detected)
 
 
 def _resolved(result: Smoothed, name: str, false: BoolArray) -> Smoothed | None:
@@ -193,13 +193,14 @@ def _resolved(result: Smoothed, name: str, false: BoolArray) -> Smoothed | None:
     kept = replace(phasors, sqrt_information=np.where(left_out, 0.0, phasors.sqrt_information))
     try:
         return solved_again(
-            result, tuple(_left(m, phasors, kept, false, own) for m in result.graph.measurements)
+            result,
+            tuple(_without_beacon(m, phasors, kept, false, own) for m in result.graph.measurements),
         )
     except RuntimeError:  # GTSAM's own: without it the pose is open
         return None
 
 
-def _left(
+def _without_beacon(
     measurement: Measurement,
     phasors: FieldPhasors,
     kept: FieldPhasors,
@@ -213,7 +214,7 @@ def _left(
     return kept if measurement is phasors else measurement
 
 
-def _without_say(result: Smoothed, names: tuple[str, ...]) -> BoolArray:
+def _without_weight(result: Smoothed, names: tuple[str, ...]) -> BoolArray:
     """Return at which field epochs the robust loss leaves a beacon no say, (m, beacons)."""
     loss, owner = _phasors(result).loss, _owner(result, names)
     out = np.zeros((len(result.residual), len(names)), dtype=bool)
@@ -240,26 +241,26 @@ def _names_by_state(
     )
 
 
-def _covering(result: Smoothed, found: Separation, alarmed: BoolArray) -> Smoothed:
+def _covering(result: Smoothed, separated: Separation, alarmed: BoolArray) -> Smoothed:
     """Return the result with a covariance that covers those without each beacon."""
     assert result.states.pose_cov is not None
     cov = result.states.pose_cov.copy()
-    step = np.where(found.determined[..., None], found.step, 0.0)[alarmed]
+    step = np.where(separated.determined[..., None], separated.step, 0.0)[alarmed]
     cov[alarmed] += np.einsum("nbi,nbj->nij", step, step)
     return replace(result, states=replace(result.states, pose_cov=cov))
 
 
-def _largest(found: Separation, beacon: int | None = None) -> float:
-    shift = np.where(found.determined, found.shift[..., 1], 0.0)
+def _largest(separated: Separation, beacon: int | None = None) -> float:
+    shift = np.where(separated.determined, separated.shift[..., 1], 0.0)
     return float(np.max(shift if beacon is None else shift[:, beacon]))
 
 
 def _excluded_findings(
-    result: Smoothed, found: Separation, out: BoolArray, names: tuple[str, ...]
+    result: Smoothed, separated: Separation, out: BoolArray, names: tuple[str, ...]
 ) -> list[Finding]:
     findings = []
     time = result.fields.time
-    for j in np.flatnonzero(np.sum(out, axis=0) >= TOLD).tolist():
+    for j in np.flatnonzero(np.sum(out, axis=0) >= MIN_LEFT_OUT_EPOCHS).tolist():
         spans = [
             f"{time[a]:.1f} to {time[b]:.1f} s"
             for a, b in _stretches(np.flatnonzero(out[:, j]), time)
@@ -269,7 +270,7 @@ def _excluded_findings(
             Finding(
                 "beacon_excluded",
                 f"Beacon {names[j]} contradicts the others from {', '.join(spans[:SPANS])}{more}:"
-                f" the trajectory without it is up to {1e3 * _largest(found, j):.3g} mm away, so it"
+                f" the trajectory without it is up to {1e3 * _largest(separated, j):.3g} mm away, so it"
                 " was left out there. Check its drive current, and iron or a screen near it.",
                 Verdict.TRUSTWORTHY,
             )
@@ -279,32 +280,32 @@ def _excluded_findings(
 
 def _stretches(epochs: IntArray, time: Array) -> list[tuple[int, int]]:
     """Return first and last epoch of stretches, those joined that are near each other."""
-    apart = np.flatnonzero(np.diff(time[epochs]) > TOGETHER)
-    begins, ends = epochs[np.r_[0, apart + 1]], epochs[np.r_[apart, len(epochs) - 1]]
+    separate = np.flatnonzero(np.diff(time[epochs]) > TOGETHER)
+    begins, ends = epochs[np.r_[0, separate + 1]], epochs[np.r_[separate, len(epochs) - 1]]
     return list(zip(begins.tolist(), ends.tolist(), strict=True))
 
 
 def _alarm_findings(
-    result: Smoothed, found: Separation, excess: Array, names: tuple[str, ...], risk: Risk
+    result: Smoothed, separated: Separation, excess: Array, names: tuple[str, ...], risk: Risk
 ) -> list[Finding]:
     worst = float(np.max(excess))
-    if worst <= _of_a_whole_log(found, risk):
+    if worst <= _of_a_whole_log(separated, risk):
         return []
     state, beacon = np.unravel_index(np.argmax(excess), excess.shape)
     text = (
         f"The trajectory with and without beacon {names[int(beacon)]} differ by up to"
-        f" {1e3 * _largest(found, int(beacon)):.3g} mm, {worst:.3g} times what noise and survey"
+        f" {1e3 * _largest(separated, int(beacon)):.3g} mm, {worst:.3g} times what noise and survey"
         f" explain, most at {result.states.time[int(state)]:.1f} s: the beacons contradict each"
         " other. Check their positions and moments in the site, and iron in the room."
     )
     return [Finding("separation", text, weight=worst)]
 
 
-def _of_a_whole_log(found: Separation, risk: Risk) -> float:
+def _of_a_whole_log(separated: Separation, risk: Risk) -> float:
     """Return which excess of its threshold no more than one log in many has by chance."""
-    tests = 2 * found.step.shape[1]
-    alone = found.separation_sigma.beyond(risk.false_alarm / tests)
-    every = found.separation_sigma.beyond(OF_A_LOG / (tests * len(found.step)))
+    tests = 2 * separated.step.shape[1]
+    alone = separated.separation_sigma.beyond(risk.false_alarm / tests)
+    every = separated.separation_sigma.beyond(OF_A_LOG / (tests * len(separated.step)))
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = np.maximum(every / alone, 1.0)
     return float(np.nanmax(np.where(np.isfinite(ratio), ratio, 1.0)))

@@ -10,10 +10,14 @@ from magfusion.estimation.graph.graph import Graph
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.posterior import chain_system as chains
-from magfusion.estimation.posterior.chain_parts import Parts, parts_of
-from magfusion.estimation.posterior.chain_system import Piece, chain_system, column_groups
+from magfusion.estimation.posterior import block_tridiagonal_system as chains
+from magfusion.estimation.posterior.block_tridiagonal_system import (
+    EpochRows,
+    block_tridiagonal_system,
+    column_groups,
+)
 from magfusion.estimation.posterior.convergence import OPEN_ROTATION
+from magfusion.estimation.posterior.information_contributions import Parts, parts_of
 from magfusion.estimation.posterior.separation import Separation
 from magfusion.estimation.solve.chain import STRETCH, inverses, solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
@@ -44,7 +48,7 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
     tally = _Tally(len(owner))
     solved: list[_Variant] = []
     for columns in column_groups(result.uncertain, graph.epochs):
-        rest, rows = chain_system(graph, result.estimate, result.uncertain, columns)
+        rest, rows = block_tridiagonal_system(graph, result.estimate, result.uncertain, columns)
         assert rows is not None
         rest.diagonal += np.diag(1.0 / OPEN**2)
         pieces = rows.pieces() if solved else tally.over(rows.pieces())
@@ -54,12 +58,12 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
         solved = _without_each(parts, kept, solved)
         del parts  # before the next group: of a long log they are much
         give_back_memory()
-    heard, count = tally.heard, tally.count
+    detected, count = tally.detected, tally.count
     cost = kept @ tally.square - np.array([one.explained for one in solved])
-    numbers = np.array([6 * np.sum(heard & (owner == j)) * count for j in every])
-    others = np.array([np.any(heard & (owner != j)) for j in every])
+    numbers = np.array([6 * np.sum(detected & (owner == j)) * count for j in every])
+    others = np.array([np.any(detected & (owner != j)) for j in every])
     step, cov = (np.array([getattr(v, name) for v in solved]) for name in ("step", "cov"))
-    apart = np.array([v.apart for v in solved[1:]])
+    separate = np.array([v.separate_errors for v in solved[1:]])
     del solved
     variance = np.einsum("hnii->hni", cov[1:])
     shift = step[1:] - step[:1]
@@ -71,7 +75,7 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
         np.swapaxes(shift, 0, 1),
         cov[0],
         np.swapaxes(cov[1:], 0, 1),
-        np.swapaxes(apart, 0, 1),
+        np.swapaxes(separate, 0, 1),
         np.swapaxes(determined, 0, 1),
         np.broadcast_to(cost[1:], shape),
         np.broadcast_to(numbers, shape),
@@ -90,13 +94,13 @@ class _Tally:
     """Which channels are heard in any epoch, and the sum of squares of each."""
 
     def __init__(self, channels: int) -> None:
-        self.heard, self.count = np.zeros(channels, dtype=bool), 0
+        self.detected, self.count = np.zeros(channels, dtype=bool), 0
         self.square = np.zeros(channels)
 
-    def over(self, pieces: Iterator[Piece]) -> Iterator[Piece]:
+    def over(self, pieces: Iterator[EpochRows]) -> Iterator[EpochRows]:
         """Count pieces as they pass."""
         for piece in pieces:
-            self.heard |= np.any(piece.by_state != 0.0, axis=(0, 2, 3))
+            self.detected |= np.any(piece.by_state != 0.0, axis=(0, 2, 3))
             self.square += np.sum(piece.right[..., 0] ** 2, axis=(0, 2))
             self.count += len(piece.epoch)
             yield piece
@@ -109,7 +113,7 @@ class _Variant:
     Parameters
     ----------
     step : ndarray, shape (n, 6)
-    cov, apart : ndarray, shape (n, 6, 6)
+    cov, separate_errors : ndarray, shape (n, 6, 6)
         Of it, and of its difference from the first; both grow by what is considered.
     explained : float
         Of the sum of squares.
@@ -119,7 +123,7 @@ class _Variant:
 
     step: Array
     cov: Array
-    apart: Array
+    separate_errors: Array
     explained: float
     inverse: Array
 
@@ -136,28 +140,28 @@ def _without_each(parts: Parts, kept: BoolArray, before: list[_Variant]) -> list
     per_variant = 8.0 * 4.0 * count * MOTION * (MOTION + parts.count + size)
     group = max(1, int(chains.AT_ONCE / per_variant))
     known = [one.inverse for one in before] if before else _inverses(parts, kept)
-    parts.forget_diagonals()
+    parts.discard_diagonals()
     out, whole, alone = list(before), np.zeros((0, 6, 0)), np.zeros((0, 6, 6))
     for first in range(0, len(kept), group):
         some = slice(first, first + group)
-        found = solve_chain(
+        result = solve_chain(
             parts.chain(kept[some]), 6, np.array(known[some]), covariance=not before
         )
-        for k, states in enumerate(found.states):
+        for k, states in enumerate(result.states):
             response = states[..., 1:]
             if first + k == 0:
                 whole = response.copy()
-                alone = found.cov[k].copy()
+                alone = result.cov[k].copy()
             if not before:
-                own, explained = found.cov[k].copy(), float(found.explained[k])
+                own, explained = result.cov[k].copy(), float(result.explained[k])
                 step = states[..., 0].copy()
                 out.append(_Variant(step, own, own - alone, explained, known[first + k]))
             for begin in range(0, count, STRETCH):
                 here = slice(begin, begin + STRETCH)
                 own, moved = response[here], response[here] - whole[here]
                 out[first + k].cov[here] += own @ np.swapaxes(own, -1, -2)
-                out[first + k].apart[here] += moved @ np.swapaxes(moved, -1, -2)
-        del found, states, response  # before the next group, too
+                out[first + k].separate_errors[here] += moved @ np.swapaxes(moved, -1, -2)
+        del result, states, response  # before the next group, too
     return out
 
 

@@ -36,7 +36,7 @@ from magfusion.model.parameters import (
     candidates,
     placed,
 )
-from magfusion.model.parameters.parameter import AXES, Unit
+from magfusion.model.parameters.parameter import AXES, ParameterUnit
 from magfusion.model.perturbation import skew
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
@@ -71,7 +71,7 @@ class Inertial(Parameter):
 
 
 class _GyroScale(Inertial):
-    kind, components, spoken = "gyro_scale", AXES, PERCENT
+    kind, components, display_unit = "gyro_scale", AXES, PERCENT
     words = "the scale of the gyro's {axis}"
 
     def as_bias(self, stream: Stream) -> Array:
@@ -81,7 +81,7 @@ class _GyroScale(Inertial):
 
 
 class _AccelScale(Inertial):
-    kind, components, spoken = "accel_scale", AXES, PERCENT
+    kind, components, display_unit = "accel_scale", AXES, PERCENT
     words = "the scale of the accelerometer's {axis}"
 
     def as_bias(self, stream: Stream) -> Array:
@@ -91,7 +91,7 @@ class _AccelScale(Inertial):
 
 
 class _GyroAlignment(Inertial):
-    kind, components, spoken = "gyro_alignment", AXES, DEGREES
+    kind, components, display_unit = "gyro_alignment", AXES, DEGREES
     words = "the turn of the gyro against the accelerometer about {axis}"
 
     def as_bias(self, stream: Stream) -> Array:
@@ -100,7 +100,7 @@ class _GyroAlignment(Inertial):
 
 
 class _Gravity(Inertial):
-    owner, kind, spoken = "site", "gravity", Unit("m/s^2", 1.0)
+    owner, kind, display_unit = "site", "gravity", ParameterUnit("m/s^2", 1.0)
     words, size, of_states = "the size of gravity", 1, True
 
     def as_bias(self, stream: Stream) -> Array:

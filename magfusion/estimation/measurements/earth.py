@@ -196,7 +196,7 @@ def disturbed(residual: Array, repeats: float) -> BoolArray:
     return weight < DISTURBED
 
 
-def unheld(
+def unobserved_constraints(
     states: Trajectory, epoch: IntArray, detected: BoolArray, step: float, motion: MotionModel
 ) -> list[Measurement]:
     """Constrain what no beacon determines: the speed, and if necessary one position.
@@ -212,10 +212,10 @@ def unheld(
     step : float
         Time between epochs (s).
     """
-    free = epoch[~detected]
+    free_parameters = epoch[~detected]
     out: list[Measurement] = []
-    if len(free):
-        out.append(zero_velocity(free, speed_sigma(step, motion)))
+    if len(free_parameters):
+        out.append(zero_velocity(free_parameters, speed_sigma(step, motion)))
     if not np.any(detected):
         weight = np.diag(1.0 / np.repeat([ANY_ROTATION, ANYWHERE], 3))
         first = slice(0, 1)
@@ -265,5 +265,5 @@ class EarthWeight:
         if state.time - self.refused_at < AMBIENT_TIME:
             weight = 0.0
         weighed = np.sqrt(weight) * measurement.sqrt_information
-        taken = replace(measurement, sqrt_information=weighed, repeats=1.0, robust=False)
-        return taken, weight < DISTURBED
+        selected = replace(measurement, sqrt_information=weighed, repeats=1.0, robust=False)
+        return selected, weight < DISTURBED

@@ -82,9 +82,9 @@ def field_errors(site: Site, time: Array, poses: Trajectory) -> tuple[Block, ...
     sensors = site.platform.magnetometers
     relative = model_error(site, place) + np.zeros((len(time), channels))
     relative = relative.reshape(len(time), len(sensors), -1)
-    most = min(COLUMNS, int(AT_ONCE / (48.0 * channels * len(time))))
-    most //= MATRIX * len(site.beacons)
-    modes = modes_in_place(place.reshape(-1, 3), length, max(most, 1))
+    maximum = min(COLUMNS, int(AT_ONCE / (48.0 * channels * len(time))))
+    maximum //= MATRIX * len(site.beacons)
+    modes = modes_in_place(place.reshape(-1, 3), length, max(maximum, 1))
     modes = modes.reshape(len(time), len(sensors), -1)
     sensor_from_world = np.stack(
         [np.swapaxes(poses.world_from_body @ s.body_from_sensor, 1, 2) for s in sensors], axis=1
@@ -99,7 +99,7 @@ def field_errors(site: Site, time: Array, poses: Trajectory) -> tuple[Block, ...
     return placed(out)
 
 
-def modes_in_place(position_world: Array, length: float, most: int) -> Array:
+def modes_in_place(position_world: Array, length: float, maximum: int) -> Array:
     """Return the modes of an error of correlation exp(-d / length) at positions, shape (n, m).
 
     Parameters
@@ -108,18 +108,18 @@ def modes_in_place(position_world: Array, length: float, most: int) -> Array:
         (m)
     length : float
         (m)
-    most : int
+    maximum : int
         Maximum number of modes.
     """
     size, (owner, members, centre) = 1.0, cells(position_world, length)
     while len(centre) > MOST_CELLS:
         size *= 2.0
         owner, members, centre = cells(position_world, size * length)
-    apart = np.linalg.norm(centre[:, None] - centre, axis=2)
+    separate = np.linalg.norm(centre[:, None] - centre, axis=2)
     weight = np.sqrt(members)
-    value, vector = np.linalg.eigh(weight[:, None] * np.exp(-apart / length) * weight)
+    value, vector = np.linalg.eigh(weight[:, None] * np.exp(-separate / length) * weight)
     value, vector = value[::-1], vector[:, ::-1]
     enough = int(np.searchsorted(np.cumsum(value), SHARE * np.sum(value))) + 1
-    kept = min(enough, most)
+    kept = min(enough, maximum)
     shape = vector[:, :kept] * np.sqrt(np.maximum(value[:kept], 0.0)) / weight[:, None]
     return np.asarray(shape[owner])

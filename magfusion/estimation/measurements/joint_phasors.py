@@ -37,7 +37,7 @@ class JointPhasors(Measurement):
         As of `FieldPhasors`, as are the next two (rad/s).
     applied_offset : ndarray, shape (n,)
     moving : bool ndarray, shape (n,)
-    felt : bool ndarray, shape (n, channels)
+    is_predicted : bool ndarray, shape (n, channels)
         Channels that are predicted.
     robust : {None, 'huber', 'cauchy'}
         Loss of each window.
@@ -53,7 +53,7 @@ class JointPhasors(Measurement):
     rate_body: Array
     applied_offset: Array
     moving: BoolArray
-    felt: BoolArray
+    is_predicted: BoolArray
     robust: str | None = None
 
     @property
@@ -89,14 +89,14 @@ class JointPhasors(Measurement):
     def error(self, states: States, calibration: Calibration) -> Array:
         """Return the whitened error, shape (n, 1, 3 directions), without a derivative."""
         phasors, nodes = self._phasors, self._at_nodes(states)
-        unit = np.broadcast_to(np.eye(6), (len(nodes), self.felt.shape[1], 6, 6))
+        unit = np.broadcast_to(np.eye(6), (len(nodes), self.is_predicted.shape[1], 6, 6))
         value = replace(phasors, sqrt_information=unit).error(nodes, calibration)
         return self._error(value)[:, None]
 
     @property
     def _phasors(self) -> FieldPhasors:
         """Phasors at the nodes, from which the directions are computed."""
-        nothing = np.zeros((self.elapsed.size, self.felt.shape[1], 6))
+        nothing = np.zeros((self.elapsed.size, self.is_predicted.shape[1], 6))
         every = np.repeat(np.arange(len(self.time)), self.elapsed.shape[1])
         return FieldPhasors(
             epoch=self.epoch[every],
@@ -107,7 +107,7 @@ class JointPhasors(Measurement):
             by_time_offset=nothing,
             applied_offset=self.applied_offset[every],
             moving=self.moving[every],
-            heard=self.felt[every],
+            detected=self.is_predicted[every],
         )
 
     def _at_nodes(self, states: States) -> States:
@@ -143,14 +143,17 @@ class JointPhasors(Measurement):
         only partly separable, the worst beyond a gate is excluded before the others are
         evaluated, and so on.
         """
-        found, out = self._distances(state, blocks), np.zeros(self.felt.shape[1], dtype=bool)
-        worst = int(np.argmax(found))
-        while found[worst] > gate and 2 * np.sum(out) < np.sum(self.felt):
+        result, out = (
+            self._distances(state, blocks),
+            np.zeros(self.is_predicted.shape[1], dtype=bool),
+        )
+        worst = int(np.argmax(result))
+        while result[worst] > gate and 2 * np.sum(out) < np.sum(self.is_predicted):
             out[worst] = True
-            left = self.without(out)._distances(state, blocks)
-            found = np.where(out, found, left)
-            worst = int(np.argmax(np.where(out, 0.0, left)))
-        return found
+            remaining = self.without(out)._distances(state, blocks)
+            result = np.where(out, result, remaining)
+            worst = int(np.argmax(np.where(out, 0.0, remaining)))
+        return result
 
     def _distances(self, state: State, blocks: tuple[Block, ...]) -> Array:
         rows = self.linearize(states_of([state]), state.calibration, blocks)
@@ -159,16 +162,16 @@ class JointPhasors(Measurement):
         spread = jacobian @ state.cov @ jacobian.T + np.eye(len(error))
         solved = np.linalg.solve(spread, np.column_stack([error, *by]))
         own, across = solved[:, 0], solved[:, 1:].reshape(len(error), -1, 6)
-        told = np.swapaxes(by, 1, 2) @ np.swapaxes(across, 0, 1)
+        reported = np.swapaxes(by, 1, 2) @ np.swapaxes(across, 0, 1)
         seen = np.einsum("crk,r->ck", by, own)
-        size = np.trace(told, axis1=1, axis2=2)
+        size = np.trace(reported, axis1=1, axis2=2)
         least = NOTHING_LEFT * np.max(size, initial=0.0)
-        felt = self.felt[0] & (size > least)
+        affected = self.is_predicted[0] & (size > least)
         safe = np.where(
-            felt[:, None, None], told + 1e-9 * size[:, None, None] * np.eye(6), np.eye(6)
+            affected[:, None, None], reported + 1e-9 * size[:, None, None] * np.eye(6), np.eye(6)
         )
-        found = np.einsum("ck,ck->c", seen, np.linalg.solve(safe, seen[..., None])[..., 0])
-        return np.where(felt, found, 0.0)
+        result = np.einsum("ck,ck->c", seen, np.linalg.solve(safe, seen[..., None])[..., 0])
+        return np.where(affected, result, 0.0)
 
     def spanned(self, channels: BoolArray) -> Array:
         """Return an orthonormal basis of the whitened rows spanned by phasors of channels.
@@ -185,16 +188,16 @@ class JointPhasors(Measurement):
         by = np.where(channels[..., None, None], self.of_channels(), 0.0)
         by = np.moveaxis(by, 1, 2).reshape(len(by), by.shape[2], -1)
         basis, size, _ = np.linalg.svd(by, full_matrices=False)
-        told = (size > NOTHING_LEFT * size[:, :1]) & (size > 0.0)
-        return np.where(told[:, None], basis, 0.0)
+        reported = (size > NOTHING_LEFT * size[:, :1]) & (size > 0.0)
+        return np.where(reported[:, None], basis, 0.0)
 
     def without(self, rejected: BoolArray) -> "JointPhasors":
         """Return the measurement with arbitrary phasors for some channels, shape (channels,)."""
-        return self.leaving_out(np.broadcast_to(rejected, self.felt.shape))
+        return self.leaving_out(np.broadcast_to(rejected, self.is_predicted.shape))
 
     def leaving_out(self, rejected: BoolArray) -> "JointPhasors":
         """Return the measurement without some channels, shape (n, channels), at each epoch."""
-        rows = np.any(rejected & self.felt, axis=1)
+        rows = np.any(rejected & self.is_predicted, axis=1)
         if not np.any(rows):
             return self
         some = self.rows(rows)
@@ -224,5 +227,5 @@ def in_directions(basis: Array, by: Array) -> Array:
     n, directions, nodes, parts = basis.shape
     width = by.shape[-1]
     flat = by.reshape(n, nodes * parts, 3 * width)
-    found = basis.reshape(n, directions, nodes * parts) @ flat
-    return np.asarray(found.reshape(n, 3 * directions, width))
+    result = basis.reshape(n, directions, nodes * parts) @ flat
+    return np.asarray(result.reshape(n, 3 * directions, width))

@@ -11,7 +11,7 @@ from magfusion.units import Array
 # 6 (s / r)^2 of itself: at two sigma of a prediction with this uncertainty by .0024, about half of
 # the usual model error.  A rotation deviates by half of its square.
 WIDE_OF_DISTANCE, WIDE_ROTATION = 0.01, 0.03  # of the nearest beacon's distance; rad
-SETTLED = 0.001  # last step, of the distance, or rad: the remaining error is 6e-6 of a field
+CONVERGED_STEP = 0.001  # last step, of the distance, or rad: the remaining error is 6e-6 of a field
 MAX_ITERATIONS = 10
 
 
@@ -46,15 +46,15 @@ def relinearized(
     """
     pose, distance = predicted.pose, _nearest(predicted)
     for _ in range(MAX_ITERATIONS):
-        found = phasors.linearized_at(pose.rotation().matrix(), np.asarray(pose.translation()))
-        step = _step(found, predicted, blocks)
+        result = phasors.linearized_at(pose.rotation().matrix(), np.asarray(pose.translation()))
+        step = _step(result, predicted, blocks)
         if not np.all(np.isfinite(step)):
             return None
         before, pose = pose, predicted.pose.retract(step)
         moved = before.localCoordinates(pose)
-        turned, shifted = np.linalg.norm(moved[ROTATION]), np.linalg.norm(moved[POSITION])
-        if turned < SETTLED and shifted < SETTLED * distance:
-            return found
+        rotated, shifted = np.linalg.norm(moved[ROTATION]), np.linalg.norm(moved[POSITION])
+        if rotated < CONVERGED_STEP and shifted < CONVERGED_STEP * distance:
+            return result
     return None
 
 

@@ -23,7 +23,7 @@ CELLS = 4.0  # per length, in which epochs are counted together
 CHUNK = 1_000_000  # pairs at a time
 
 
-def alike_in_batch(position_world: Array, length: float) -> Array:
+def epochs_sharing_error(position_world: Array, length: float) -> Array:
     """Return how many epochs of a log share the model error of each, shape (n,).
 
     Parameters
@@ -37,11 +37,11 @@ def alike_in_batch(position_world: Array, length: float) -> Array:
     if length <= 0.0:
         return np.ones(count)
     _, members, centre = cells(position_world, length)
-    alike, step = np.empty(count), max(1, CHUNK // len(centre))
+    shared, step = np.empty(count), max(1, CHUNK // len(centre))
     for lo in range(0, count, step):
-        apart = position_world[lo : lo + step, None] - centre
-        alike[lo : lo + step] = np.exp(-np.linalg.norm(apart, axis=2) / length) @ members
-    return np.maximum(alike, 1.0)
+        separate = position_world[lo : lo + step, None] - centre
+        shared[lo : lo + step] = np.exp(-np.linalg.norm(separate, axis=2) / length) @ members
+    return np.maximum(shared, 1.0)
 
 
 def cells(position_world: Array, length: float) -> tuple[IntArray, IntArray, Array]:
@@ -67,7 +67,7 @@ def cells(position_world: Array, length: float) -> tuple[IntArray, IntArray, Arr
     return owner, members, total / members[:, None]
 
 
-def alike_online(speed: float, step: float, length: float) -> float:
+def epochs_sharing_error_online(speed: float, step: float, length: float) -> float:
     """Return the approximate number of epochs that share a model error, at a steady speed.
 
     Parameters
@@ -85,7 +85,7 @@ def alike_online(speed: float, step: float, length: float) -> float:
     return float(1.0 / np.tanh(0.5 * moved))
 
 
-def alike_at(state: State, step: float) -> float:
+def epochs_sharing_error_at(state: State, step: float) -> float:
     """Return the number of epochs in the estimator's memory that share a model error.
 
     Parameters
@@ -96,10 +96,10 @@ def alike_at(state: State, step: float) -> float:
         Time between epochs (s).
     """
     site, speed = state.calibration.site, float(np.linalg.norm(state.velocity_world))
-    alike = alike_online(speed, step, site.model_error_length)
-    if site.platform.replaced is None or alike == 1.0 or step <= 0.0:
-        return alike
-    return min(alike, held_by_prior(site, state.position_world, step))
+    shared = epochs_sharing_error_online(speed, step, site.model_error_length)
+    if site.platform.replaced is None or shared == 1.0 or step <= 0.0:
+        return shared
+    return min(shared, held_by_prior(site, state.position_world, step))
 
 
 def held_by_prior(site: Site, position_world: Array, step: float) -> float:
@@ -114,11 +114,11 @@ def held_by_prior(site: Site, position_world: Array, step: float) -> float:
     step : float
         Time between epochs (s).
     """
-    apart = np.array([beacon.position_world for beacon in site.beacons]) - position_world
+    separate = np.array([beacon.position_world for beacon in site.beacons]) - position_world
     relative = float(np.max(model_error(site)))
     # A relative field error rotates it by at most as many radians, and shifts by that share.
-    turn, shift = relative, relative * float(np.max(np.linalg.norm(apart, axis=1)))
+    turn, shift = relative, relative * float(np.max(np.linalg.norm(separate, axis=1)))
     imu = site.platform.imu
     pairs = ((turn, imu.gyro_bias_walk), (shift, imu.accel_noise))
-    held = [np.cbrt((error / density) ** 2 / (4.0 * step**3)) for error, density in pairs]
-    return float(max(1.0, *held))
+    fixed = [np.cbrt((error / density) ** 2 / (4.0 * step**3)) for error, density in pairs]
+    return float(max(1.0, *fixed))

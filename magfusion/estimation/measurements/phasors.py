@@ -10,7 +10,7 @@ import numpy as np
 from magfusion.estimation.graph.measurement import Loss, Measurement, Rows, group_distances
 from magfusion.estimation.graph.state import State, States, pose_steps, states_of
 from magfusion.estimation.measurements.signs import whitened_along
-from magfusion.model.audibility import are_many
+from magfusion.model.detection_range import are_many
 from magfusion.model.field import skew
 from magfusion.model.noise import (
     paired_whitening,
@@ -65,7 +65,7 @@ class FieldPhasors(Measurement):
     excess : ndarray, shape (n, channels), optional
         Ratio of the variance used to that of an independent epoch, as epochs close by share a
         model error.
-    heard : bool ndarray, shape (n, channels), optional
+    detected : bool ndarray, shape (n, channels), optional
         Channels that are predicted; None for all.
     world_from_body, position_world : ndarray, shape (n, 3, 3) and (n, 3), optional
         Pose at which the fields are linearised instead of the states': for an iterated update.
@@ -83,7 +83,7 @@ class FieldPhasors(Measurement):
     ahead: Array | None = None
     robust: str | None = None
     excess: Array | None = None
-    heard: BoolArray | None = None
+    detected: BoolArray | None = None
     world_from_body: Array | None = None
     position_world: Array | None = None
     predicted: "Predictions" = field(default_factory=lambda: Predictions(), compare=False)
@@ -97,7 +97,7 @@ class FieldPhasors(Measurement):
 
     def predicted_groups(self) -> BoolArray | None:
         """Return which channels are predicted, shape (n, channels); None for all."""
-        return self.heard
+        return self.detected
 
     def alone(self) -> "FieldPhasors":
         """Return the measurement whitened as if epochs shared no model error."""
@@ -160,9 +160,9 @@ class FieldPhasors(Measurement):
         if by_blocks.shape[-1] < MANY_COLUMNS:
             return np.asarray(self.sqrt_information @ by_blocks)
         out, root = np.zeros_like(by_blocks), self.sqrt_information
-        felt = _felt(blocks, {name for name, _ in site.channels})
+        affected = _affected_columns(blocks, {name for name, _ in site.channels})
         for k, (name, _) in enumerate(site.channels):
-            for begin, end in felt[name]:
+            for begin, end in affected[name]:
                 out[:, k, :, begin:end] = root[:, k] @ by_blocks[:, k, :, begin:end]
         return out
 
@@ -177,12 +177,12 @@ class FieldPhasors(Measurement):
         place = world_from_body, position_world, twist_body
         by_velocity = None
         if self.ahead is not None:
-            value, by_pose, by_velocity, by_calibration = self._apart(
+            value, by_pose, by_velocity, by_calibration = self._sequential_prediction(
                 self.ahead, calibration, blocks, *place
             )
         else:
             value, by_pose, by_calibration = linearize_channels(
-                calibration, blocks, self.time, *place, self.heard
+                calibration, blocks, self.time, *place, self.detected
             )
         value += lag[:, None, None] * self.by_time_offset
         if calibration.others and np.any(calibration.clock_offsets):
@@ -197,7 +197,7 @@ class FieldPhasors(Measurement):
                 by_calibration[..., block.columns.start] += run[:, None, None] * by_lag
         return value, by_pose, by_velocity, by_calibration
 
-    def _apart(
+    def _sequential_prediction(
         self,
         ahead: Array,
         calibration: Calibration,
@@ -215,7 +215,7 @@ class FieldPhasors(Measurement):
         velocity_body = twist_body[:, None, 3:] + swing_body
         velocity_world = (world_from_body[:, None] @ velocity_body[..., None])[..., 0]
         shift_world = ahead[..., None] * velocity_world
-        found = linearize_channels(
+        result = linearize_channels(
             calibration,
             blocks,
             np.repeat(self.time, channels),
@@ -225,7 +225,7 @@ class FieldPhasors(Measurement):
         )
         own = np.arange(count * channels), np.arange(count * channels) % channels
         value, by_pose, by_calibration = (
-            part[own].reshape(count, channels, *part.shape[2:]) for part in found
+            part[own].reshape(count, channels, *part.shape[2:]) for part in result
         )
         by_place = ahead[..., None, None] * by_pose[..., 3:]
         by_velocity = by_place @ np.swapaxes(world_from_body, 1, 2)[:, None]
@@ -256,16 +256,18 @@ class FieldPhasors(Measurement):
         )
 
 
-def _felt(blocks: tuple[Block, ...], names: set[str]) -> dict[str, list[tuple[int, int]]]:
+def _affected_columns(
+    blocks: tuple[Block, ...], names: set[str]
+) -> dict[str, list[tuple[int, int]]]:
     """Return ranges of columns that affect the phasors of each beacon."""
-    found: dict[str, list[tuple[int, int]]] = {name: [] for name in names}
-    every = list(found.values())
+    result: dict[str, list[tuple[int, int]]] = {name: [] for name in names}
+    every = list(result.values())
     for parameter, owner, columns, _ in blocks:
         alone = isinstance(parameter, BeaconParameter)
-        for own in [found[owner]] if alone and owner in found else () if alone else every:
+        for own in [result[owner]] if alone and owner in result else () if alone else every:
             begin = own.pop()[0] if own and own[-1][1] == columns.start else columns.start
             own.append((begin, columns.stop))
-    return found
+    return result
 
 
 class Predictions:
@@ -294,13 +296,13 @@ class Predictions:
         for known in self._kept:
             if at == known.at and all(a is b for a, b in zip(of, known.of, strict=True)):
                 if known.blocks is blocks:
-                    return known.found
+                    return known.unwhitened
                 if all(a is b for a, b in zip_longest(blocks, known.blocks[: len(blocks)])):
-                    value, by_pose, by_velocity, by_calibration = known.found
+                    value, by_pose, by_velocity, by_calibration = known.unwhitened
                     return value, by_pose, by_velocity, by_calibration[..., : dimension(blocks)]
-        found = phasors.unwhitened(states, calibration, blocks)
-        self._kept = [*self._kept[-1:], _Prediction(at, of, blocks, found)]
-        return found
+        result = phasors.unwhitened(states, calibration, blocks)
+        self._kept = [*self._kept[-1:], _Prediction(at, of, blocks, result)]
+        return result
 
 
 _Unwhitened = tuple[Array, Array, Array | None, Array]
@@ -312,7 +314,7 @@ class _Prediction(NamedTuple):
     at: tuple[bytes, ...]
     of: tuple[object, ...]
     blocks: tuple[Block, ...]
-    found: _Unwhitened
+    unwhitened: _Unwhitened
 
 
 def field_phasors(
@@ -324,9 +326,9 @@ def field_phasors(
     applied_offset: Array,
     repeats: float,
     by_time_offset: ComplexArray | None = None,
-    alike: Array | float = 1.0,
+    shared_by: Array | float = 1.0,
     standing: BoolArray | None = None,
-    beside: bool = True,
+    others: bool = True,
 ) -> FieldPhasors:
     """Return phasors as a measurement, weighted at approximate poses.
 
@@ -344,16 +346,16 @@ def field_phasors(
         Number of epochs that contain each sample of overlapping windows, to count it once.
     by_time_offset : complex ndarray, shape (n, channels, 3), optional
         As of `magfusion.estimation.demodulation.motion_compensation.WaveFields`.
-    alike : ndarray, shape (n,), or float
+    shared_by : ndarray, shape (n,), or float
         Number of epochs with the same model error; at least the number of windows of a sample.
     standing : bool ndarray, shape (n,), optional
         Where the platform is known to be stationary.
-    beside : bool
+    others : bool
         As of `magfusion.model.noise.measurement_cov`.
     """
     place = sensor_positions(site, poses)
-    together = np.maximum(alike, repeats)
-    cov, single = weighed_and_alone(site, samples, place, repeats, together, beside=beside)
+    together = np.maximum(shared_by, repeats)
+    cov, single = weighed_and_alone(site, samples, place, repeats, together, neighbours=others)
     more, own = (np.trace(c, axis1=2, axis2=3) for c in (cov, repeats * single))
     excess = np.divide(more, own, out=np.ones_like(own), where=samples.valid)
     measured = stacked(samples.phasor_sensor)
@@ -369,13 +371,13 @@ def field_phasors(
         moving=np.ones(len(epoch), dtype=bool) if standing is None else ~standing,
         ahead=samples.ahead,
         excess=excess,
-        heard=samples.valid if are_many(site) else None,
+        detected=samples.valid if are_many(site) else None,
     )
 
 
 def leaves_out(measurements: Sequence[Measurement]) -> bool:
     """Return whether some channels are not predicted, with zero rows."""
-    return any(isinstance(m, FieldPhasors) and m.heard is not None for m in measurements)
+    return any(isinstance(m, FieldPhasors) and m.detected is not None for m in measurements)
 
 
 def alone(measurement: Measurement) -> Measurement:

@@ -47,8 +47,8 @@ class PoseFix(Measurement):
         for i in range(len(states)):
             fix = gtsam.Pose3(gtsam.Rot3(self.world_from_body[i]), self.position_world[i])
             pose = gtsam.Pose3(gtsam.Rot3(states.world_from_body[i]), states.position_world[i])
-            apart = fix.between(pose)
-            error[i], by_pose[i] = gtsam.Pose3.Logmap(apart), _log_jacobian(apart)
+            separate = fix.between(pose)
+            error[i], by_pose[i] = gtsam.Pose3.Logmap(separate), _log_jacobian(separate)
         return Rows(
             error=(self.sqrt_information @ error[..., None])[:, None, :, 0],
             by_pose=(self.sqrt_information @ by_pose)[:, None],

@@ -84,7 +84,7 @@ def zero_rate(
     return ZeroRate(epoch[some], mean, noise / np.sqrt(count * step))
 
 
-def freed_of_bias(imu: ImuSamples, begin: Array, end: Array) -> ImuSamples:
+def without_bias(imu: ImuSamples, begin: Array, end: Array) -> ImuSamples:
     """Remove the mean rate of stationary intervals from inertial samples, interpolated between.
 
     Parameters

@@ -14,7 +14,7 @@ from magfusion.units import Array, BoolArray, IntArray
 
 REST_GATE = 30.7  # chi square of three components, one in a million: days have many rests
 LONGEST_SILENCE = 0.1  # s; a gap looks quiet
-FEWEST_SAMPLES = 10
+MIN_SAMPLES = 10
 REACH = 0.1  # s, beyond the span, that the samples should cover
 _EYE = np.eye(3)
 
@@ -59,11 +59,11 @@ def quiet_before(imu: ImuSamples, stamps: Array, motion: MotionModel) -> BoolArr
         On the IMU's clock (s).
     """
     time, count, span = imu.time, len(imu), motion.rest_span
-    if count < FEWEST_SAMPLES:
+    if count < MIN_SAMPLES:
         return np.zeros(len(stamps), dtype=bool)
     first = np.searchsorted(time, stamps - span - REACH)
     last = np.searchsorted(time, stamps + REACH, side="right")
-    enough = last - first >= FEWEST_SAMPLES
+    enough = last - first >= MIN_SAMPLES
     first, last = np.minimum(first, count - 1), np.maximum(np.minimum(last, count), 1)
     covered = (time[first] <= stamps - span) & (time[last - 1] >= stamps - REACH)
     silent = np.zeros(count, dtype=np.int64)

@@ -17,7 +17,7 @@ from magfusion.units import Array
 FAR_ITERATIONS = 3  # where the prediction is too uncertain to linearise at
 
 
-def telling_rows(
+def informative_rows(
     measurements: Sequence[Measurement], state: State, blocks: tuple[Block, ...]
 ) -> tuple[Array, Array]:
     """Return `measured_rows` without the rows of undetected ones of many beacons."""
@@ -99,7 +99,7 @@ class ErrorStateFilter(PartialUpdateFilter):
         state, cov = prior if point is None else replace(point, cov=prior.cov), self.P
         for _ in range((1 if point is None else FAR_ITERATIONS) if measurements else 0):
             self.x, self.P = np.zeros(len(cov)), cov
-            error, jacobian = telling_rows(measurements, state, self.blocks)
+            error, jacobian = informative_rows(measurements, state, self.blocks)
             if state is not prior:  # from the prediction, which contains the prior
                 error = error - jacobian @ between(prior, state, self.blocks)
             update = self.update_linear if point is None else self.update_from_far

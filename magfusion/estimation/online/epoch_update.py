@@ -10,7 +10,7 @@ from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.propagation import Propagated
 from magfusion.estimation.graph.state import POSITION, ROTATION, State
 from magfusion.estimation.initialization.online import OnlineStart
-from magfusion.estimation.integrity.place_witness import of_place
+from magfusion.estimation.integrity.region_test import of_place
 from magfusion.estimation.measurements.earth import EarthField, EarthWeight, speed_sigma
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.linearization import is_curved, relinearized
@@ -19,15 +19,15 @@ from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.estimation.online.ekf import ErrorStateFilter
 from magfusion.estimation.online.fixed_lag import SlidingWindow
 from magfusion.estimation.online.input_queue import Arrivals
-from magfusion.estimation.online.measured import Measured
+from magfusion.estimation.online.measured import EpochMeasurements
 from magfusion.estimation.online_integrity.bank import SubsetBank
+from magfusion.estimation.online_integrity.dead_reckoning_check import DeadReckoningCheck
 from magfusion.estimation.online_integrity.gate import Gate
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.estimation.online_integrity.magnetometer_watch import MagnetometerWatch
 from magfusion.estimation.online_integrity.near_metal import NearMetal
-from magfusion.estimation.online_integrity.online import Heard, OnlineWitness
+from magfusion.estimation.online_integrity.online import EpochSummary, OnlineMonitor
 from magfusion.estimation.online_integrity.open_roll import roll_findings
-from magfusion.estimation.online_integrity.reckoned import Reckoned
 from magfusion.estimation.online_integrity.recovery import (
     AgreedFix,
     Attempts,
@@ -68,10 +68,10 @@ class EpochUpdate:
     """
 
     gate: Gate
-    witness: OnlineWitness
+    monitor: OnlineMonitor
     score: OnlineScore
     metal: NearMetal
-    _reckoned: Reckoned
+    _dead_reckoning: DeadReckoningCheck
     _attempts: Attempts
     _pointing: Attempts
     _earth: EarthWeight | None
@@ -91,8 +91,8 @@ class EpochUpdate:
         self.gate = Gate(site.channels, blocks, MagnetometerWatch(site))
         self.of_currents: tuple[Finding, ...] = ()
         self._roll = roll_findings(site)
-        self.metal, self._reckoned = NearMetal(site, blocks), Reckoned(blocks)
-        self.witness = OnlineWitness(site, estimated)
+        self.metal, self._dead_reckoning = NearMetal(site, blocks), DeadReckoningCheck(blocks)
+        self.monitor = OnlineMonitor(site, estimated)
         self.score = OnlineScore(site, estimated, blocks[len(estimated) :], steady=earth)
         self._attempts, self._pointing = Attempts(), Attempts()
         self._earth = EarthWeight(blocks) if earth else None
@@ -100,14 +100,14 @@ class EpochUpdate:
 
     def begin(self, start: OnlineStart) -> Judgement:
         """Judge a first state."""
-        said = Judgement(start.trust.reasons, turn=start.turn, shift=start.shift)
-        self.gate.watch.begin(start.excluded, start.said)
-        self.witness.begin(start.state.time, said, start.borrowed)
+        findings = Judgement(start.trust.reasons, turn=start.turn, shift=start.shift)
+        self.gate.watch.begin(start.excluded, start.findings)
+        self.monitor.begin(start.state.time, findings, start.shared_offsets)
         self.score.begin(start.score, start.state.time)
-        fitted = [f for f in start.trust.remarks if f.code == "fitted_line" and start.beside]
-        return self._judged(start.state, None).beside(*fitted)
+        fitted = [f for f in start.trust.remarks if f.code == "fitted_line" and start.extra_lines]
+        return self._judge_state(start.state, None).with_findings(*fitted)
 
-    def take_in(
+    def process_epoch(
         self,
         estimator: Estimator,
         arrived: Arrivals,
@@ -122,63 +122,65 @@ class EpochUpdate:
             Of this epoch; None where it may have a window.
         """
         before, state = estimator.state, predicted.state
-        if predicted.bridged:
+        if predicted.gap_bridged:
             self.gate.counts["inertial gap bridged"] += 1
         step = max(state.time - arrived.last_epoch, 1e-6)
         earth, standing = self._earth is not None, arrived.rests(state)
-        lost = self._lost(state)
-        found = arrived.measured(
-            before, state, samples, step, earth=earth, standing=standing, lost=lost
+        lost_epochs = self._is_lost(state)
+        result = arrived.measured(
+            before, state, samples, step, earth=earth, standing=standing, is_lost=lost_epochs
         )
         measurements: list[Measurement] = arrived.others_at(state.time)
         if standing:
             measurements.append(zero_velocity(NOW, self.site.platform.motion.rest_speed_sigma))
         point = None
-        if found is None or not np.any(found.samples.valid):
+        if result is None or not np.any(result.samples.valid):
             self.gate.nothing_measured()
         else:
-            passed = self._passed(estimator, predicted, found, lost=lost)
+            passed = self._passed(estimator, predicted, result, is_lost=lost_epochs)
             if isinstance(passed, Judgement):  # nothing of it is to be used
                 return passed
-            found, point = passed
-        if found is not None:
+            result, point = passed
+        if result is not None:
             known = state if point is None else replace(point, cov=state.cov)
-            measurements += self._of_fields(found, known, step)
-        self._ask(arrived, before, predicted, measurements, point)
+            measurements += self._of_fields(result, known, step)
+        self._score_epoch(arrived, before, predicted, measurements, point)
         absorbed = self._absorbed(estimator, predicted, measurements, point)
         linear = predicted if absorbed and point is None else None
         self._separate(linear, measurements, estimator.state)
-        self._hear(before, predicted, estimator.state, found)
-        if found is not None and found.apart:
-            self._compare(found.samples, estimator.state)
-        judged = self._judged(estimator.state, self._lost_since(estimator.state))
-        return judged if found is None else replace(judged, heard=found.heard)
+        self._update_monitor(before, predicted, estimator.state, result)
+        if result is not None and result.is_sequential:
+            self._compare(result.samples, estimator.state)
+        verdicts = self._judge_state(estimator.state, self._lost_since(estimator.state))
+        return verdicts if result is None else replace(verdicts, detected=result.detected)
 
     def _without_the_last(self, estimator: Estimator, predicted: Propagated) -> Judgement:
         """Continue with a prediction without the measurements of an interference's onset."""
-        estimator.replace_state(self._reckoned.taken_back(predicted))
-        self._reckoned.forget()
+        estimator.replace_state(self._dead_reckoning.taken_back(predicted))
+        self._dead_reckoning.reset()
         self.score.end()
-        return self._judged(estimator.state, self._lost_since(estimator.state))
+        return self._judge_state(estimator.state, self._lost_since(estimator.state))
 
     # What was measured
 
     def _weighed_phasors(
-        self, found: Measured, explained: State, *, asked: bool
+        self, measured: EpochMeasurements, explained: State, *, requested: bool
     ) -> FieldPhasors | JointPhasors:
         """Weight phasors for nearby metal; all predictions that the score needs are shared."""
-        if isinstance(found.phasors, JointPhasors):  # of two beacons or more
-            return found.phasors
-        if asked:
-            self.score.foresee(found.phasors, explained)
-        return self.metal.weighed(found.phasors, explained, found.samples.valid[0])
+        if isinstance(measured.phasors, JointPhasors):  # of two beacons or more
+            return measured.phasors
+        if requested:
+            self.score.foresee(measured.phasors, explained)
+        return self.metal.weighed(measured.phasors, explained, measured.samples.valid[0])
 
-    def _of_fields(self, found: Measured, known: State, step: float) -> list[Measurement]:
-        measurements: list[Measurement] = [found.phasors]
-        if found.earth is not None:
-            measurements.append(self._weighed(found.earth, known))
-            if isinstance(found.phasors, FieldPhasors) and not np.any(
-                found.phasors.sqrt_information
+    def _of_fields(
+        self, measured: EpochMeasurements, known: State, step: float
+    ) -> list[Measurement]:
+        measurements: list[Measurement] = [measured.phasors]
+        if measured.earth is not None:
+            measurements.append(self._weighed(measured.earth, known))
+            if isinstance(measured.phasors, FieldPhasors) and not np.any(
+                measured.phasors.sqrt_information
             ):
                 sigma = speed_sigma(step, self.site.platform.motion)
                 measurements.append(zero_velocity(NOW, sigma))
@@ -192,7 +194,7 @@ class EpochUpdate:
 
     # Judgement
 
-    def _ask(
+    def _score_epoch(
         self,
         arrived: Arrivals,
         before: State,
@@ -209,18 +211,18 @@ class EpochUpdate:
         self.score.predict(before, state, predicted.transition, imu)
         self.score.measured(measurements, state)
 
-    def _hear(
-        self, before: State, predicted: Propagated, state: State, found: Measured | None
+    def _update_monitor(
+        self, before: State, predicted: Propagated, state: State, measured: EpochMeasurements | None
     ) -> None:
-        if self.metal.lone and not self.metal.near:
-            self._reckoned.hear(before, predicted, state)
+        if self.metal.single and not self.metal.near:
+            self._dead_reckoning.update(before, predicted, state)
         elapsed, accel = predicted.state.time - before.time, None
-        if elapsed > 0.0 and not predicted.bridged:
+        if elapsed > 0.0 and not predicted.gap_bridged:
             gained = predicted.state.velocity_world - before.velocity_world
             accel = gained / elapsed + before.world_from_body @ before.accel_bias_body
-        steady = None if found is None else found.steady
-        repeats = 1.0 if found is None else found.repeats
-        self.witness.hear(state, self.gate, Heard(accel, elapsed, steady, repeats))
+        steady = None if measured is None else measured.steady
+        repeats = 1.0 if measured is None else measured.repeats
+        self.monitor.update(state, self.gate, EpochSummary(accel, elapsed, steady, repeats))
 
     def _separate(
         self, predicted: Propagated | None, measurements: list[Measurement], state: State
@@ -229,21 +231,21 @@ class EpochUpdate:
         if self.bank is None:
             return
         if predicted is None:
-            self.bank.forget()
+            self.bank.reset()
         else:
             self.bank.absorb(predicted, measurements, state)
 
-    def _judged(self, state: State, since: float | None) -> Judgement:
-        held = self.score.said_of(state)
-        said = self.witness.judgement(state, self.gate, since, held)
-        said = said.beside(
-            *self.metal.said().findings,
+    def _judge_state(self, state: State, lost_since: float | None) -> Judgement:
+        fixed = self.score.judgement_of(state)
+        findings = self.monitor.judgement(state, self.gate, lost_since, fixed)
+        findings = findings.with_findings(
+            *self.metal.judgement().findings,
             *self.of_currents,
             *self.gate.watch.findings(),
             *_of_place(self.site, state),
             *self._roll,
         )
-        return said if self.bank is None else self.bank.heard(said, state)
+        return findings if self.bank is None else self.bank.with_levels(findings, state)
 
     def _compare(self, samples: FieldSamples, state: State) -> None:
         """Compare the state with a fix from time to time."""
@@ -252,7 +254,7 @@ class EpochUpdate:
         self._since_compared += 1
         due = state.time >= self._compared_at + COMPARED_EVERY
         due = due and self._since_compared >= COMPARED_EPOCHS
-        if not (due or self.witness.asks_for_a_fix):
+        if not (due or self.monitor.needs_second_fix):
             return
         self._compared_at, self._since_compared = state.time, 0
         fix = agreed_fix(samples, state.calibration)
@@ -260,42 +262,51 @@ class EpochUpdate:
         if fix is not None and lacking and not fix.fixes.determined[0, 0]:
             return  # an undetermined roll is equally far from any state
         if fix is not None and explains(fix, samples, state.calibration):
-            self.witness.compared(*_apart(state, fix))
+            self.monitor.compared(*_distance_to_fix(state, fix))
 
     # Loss and recovery
 
-    def asks_for_each(self, state: State) -> bool:
+    def needs_separate_beacons(self, state: State) -> bool:
         """Return whether jointly measured beacons do not suffice: each is needed separately."""
-        return self._lost(state) or _wide(state)
+        return self._is_lost(state) or _wide(state)
 
-    def _lost(self, state: State) -> bool:
-        return self.gate.lost or not _no_wider(state.cov[POSITION, POSITION], LOST_POSITION)
+    def _is_lost(self, state: State) -> bool:
+        return self.gate.is_lost or not _no_wider(state.cov[POSITION, POSITION], LOST_POSITION)
 
     def _passed(
-        self, estimator: Estimator, predicted: Propagated, found: Measured, *, lost: bool
-    ) -> tuple[Measured, State | None] | Judgement:
+        self,
+        estimator: Estimator,
+        predicted: Propagated,
+        measured: EpochMeasurements,
+        *,
+        is_lost: bool,
+    ) -> tuple[EpochMeasurements, State | None] | Judgement:
         """Return fields that pass the gate, and the fix where they are linearised, if any.
 
         If they restart the state, or the last epochs are undone, return the judgement instead.
 
         Parameters
         ----------
-        lost : bool
+        is_lost : bool
             Whether the state was lost before.
         """
         state = predicted.state
-        if lost and found.apart and self._found_again(estimator, found, predicted):
-            return self._judged(estimator.state, None)
-        found, point, refused = self._linearization_point(found, state)
-        explained, valid = state if point is None else point, found.samples.valid[0]
-        phasors = self._weighed_phasors(found, explained, asked=point is None)
+        if is_lost and measured.is_sequential and self._found_again(estimator, measured, predicted):
+            return self._judge_state(estimator.state, None)
+        measured, point, refused = self._linearization_point(measured, state)
+        explained, valid = state if point is None else point, measured.samples.valid[0]
+        phasors = self._weighed_phasors(measured, explained, requested=point is None)
         if self.metal.comes:
             return self._without_the_last(estimator, predicted)
         phasors = self.gate.passed(phasors, explained, valid, refused)
-        found = replace(found, phasors=phasors)
-        if self.gate.lost and found.apart and self._found_again(estimator, found, predicted):
-            return self._judged(estimator.state, None)
-        return found, point
+        measured = replace(measured, phasors=phasors)
+        if (
+            self.gate.is_lost
+            and measured.is_sequential
+            and self._found_again(estimator, measured, predicted)
+        ):
+            return self._judge_state(estimator.state, None)
+        return measured, point
 
     def _absorbed(
         self,
@@ -310,62 +321,64 @@ class EpochUpdate:
         except EstimationError:
             self.gate.counts["update failed"] += 1
             self.gate.refused_in_a_row += 1
-            self.witness.uncertain("update_failed", predicted.state.time)
+            self.monitor.uncertain("update_failed", predicted.state.time)
             self.score.end()
             estimator.replace_state(predicted.state)
             return False
         return True
 
     def _linearization_point(
-        self, found: Measured, state: State
-    ) -> tuple[Measured, State | None, BoolArray]:
+        self, measured: EpochMeasurements, state: State
+    ) -> tuple[EpochMeasurements, State | None, BoolArray]:
         """Return fields as linearised, the fix that this needs, if any, and rejected channels."""
-        samples = found.samples
+        samples = measured.samples
         nothing = np.zeros(len(samples.channels), dtype=bool)
         # Of a state that is near enough, or whose windows were not requested.
-        if not isinstance(found.phasors, FieldPhasors):
-            return found, None, nothing
+        if not isinstance(measured.phasors, FieldPhasors):
+            return measured, None, nothing
         if not _wide(state):
             self._pointing.over()
             if not is_curved(state):
-                return found, None, nothing
-            at = relinearized(found.phasors, state, self.blocks)
-            return found if at is None else replace(found, phasors=at), None, nothing
+                return measured, None, nothing
+            at = relinearized(measured.phasors, state, self.blocks)
+            return measured if at is None else replace(measured, phasors=at), None, nothing
         if not self._pointing.due(state.time):
-            return found, None, samples.valid[0]
+            return measured, None, samples.valid[0]
         fix = agreed_fix(samples, state.calibration, prior_of(state))
         if fix is None:
-            return found, None, nothing
+            return measured, None, nothing
         if not explains(fix, samples, state.calibration):
-            return found, None, samples.valid[0]
+            return measured, None, samples.valid[0]
         self.gate.counts["found by a fix"] += 1
         self._pointing.over()
-        return found, at_fix(state, fix), fix.refused
+        return measured, at_fix(state, fix), fix.refused
 
-    def _found_again(self, estimator: Estimator, found: Measured, predicted: Propagated) -> bool:
+    def _found_again(
+        self, estimator: Estimator, measured: EpochMeasurements, predicted: Propagated
+    ) -> bool:
         """Restart from a fix, if the pose explains no measurement any more."""
         state = predicted.state
         if not self._attempts.due(state.time):
             return False
-        if not corroborated(found.samples):
+        if not corroborated(measured.samples):
             return False
-        fix = agreed_fix(found.samples, state.calibration)
+        fix = agreed_fix(measured.samples, state.calibration)
         if fix is None or not fix.fixes.determined[0, 0]:
             return False
-        if not explains(fix, found.samples, state.calibration):
+        if not explains(fix, measured.samples, state.calibration):
             return False
         estimator.replace_state(restarted(state, fix))
-        self._reckoned.forget()
-        self.witness.forget_motion()
+        self._dead_reckoning.reset()
+        self.monitor.reset_motion()
         self.score.end()
         self._separate(None, [], estimator.state)
         self._end_loss(state.time)
         return True
 
     def _lost_since(self, state: State) -> float | None:
-        if self._lost(state):
+        if self._is_lost(state):
             return self._attempts.lost_at(state.time)
-        if self._attempts.since is not None:
+        if self._attempts.lost_since is not None:
             self._end_loss(state.time)
         return None
 
@@ -373,7 +386,7 @@ class EpochUpdate:
         self.gate.counts["lost and found again"] += 1
         self.gate.refused_in_a_row = 0
         self._attempts.over()
-        self.witness.uncertain("found_again", time)
+        self.monitor.uncertain("found_again", time)
 
 
 def _wide(state: State) -> bool:
@@ -395,7 +408,7 @@ def _of_place(site: Site, state: State) -> tuple[Finding, ...]:
     return of_place(site, *at, state.cov[None, :6, :6])
 
 
-def _apart(state: State, fix: AgreedFix) -> tuple[float, float]:
+def _distance_to_fix(state: State, fix: AgreedFix) -> tuple[float, float]:
     """Return squared distance and offset (m) of a state from the nearest likely hypothesis.
 
     A mirrored pose that explains the epoch equally well is no contradiction.

@@ -14,7 +14,7 @@ from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.errors import EstimationError
 from magfusion.estimation.graph.factors import CALIBRATION_KEY, empty_factor
-from magfusion.estimation.graph.graph import Estimate, Graph
+from magfusion.estimation.graph.graph import Graph, GraphEstimate
 from magfusion.estimation.graph.inertial import Link, inertial_factor
 from magfusion.estimation.graph.kalman import considered_share, partial_update
 from magfusion.estimation.graph.measurement import Measurement, joined
@@ -55,7 +55,7 @@ class Node:
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class WindowPrior:
     """``|sqrt_information @ step - right|^2``, steps from its point to the first node's state."""
 
     linearization_point: State
@@ -82,9 +82,9 @@ class SlidingWindow:
 
     state: State
     lagged: State
-    left: list[State]  # the window, in order of time
+    outgoing: list[State]  # the window, in order of time
     nodes: list[Node]
-    prior: Prior
+    prior: WindowPrior
     _considered_cov: Array
 
     def __init__(
@@ -98,7 +98,7 @@ class SlidingWindow:
         self._share, self._considered_cov = considered_share(len(state.cov), considered), state.cov
         self.blocks, self.lag, self.process_noise = blocks, lag, process_noise
         self.state = self.lagged = state
-        self.left, self.nodes = [], []
+        self.outgoing, self.nodes = [], []
         self.prior = _prior_of(state)
 
     def absorb(
@@ -126,7 +126,7 @@ class SlidingWindow:
         EstimationError
             If the window cannot be solved; it is then unchanged.
         """
-        kept = (self.nodes, self.prior, self.state, self.lagged, self.left)
+        kept = (self.nodes, self.prior, self.state, self.lagged, self.outgoing)
         nodes, passed = self.nodes or [Node(self.state, (), None)], self._has_passed(0)
         new = predicted.state if linearization_point is None else linearization_point
         self.nodes = [*nodes, Node(new, tuple(measurements), predicted.link)]
@@ -135,16 +135,19 @@ class SlidingWindow:
             self.nodes[-1] = _at_states(self.nodes[-1])
             for _ in range(0 if linearization_point is None else ITERATIONS_FAR - 1):
                 cov = self._iterate()
-            self._tell_passed(cov)
+            self._report_lagged(cov)
         except (RuntimeError, np.linalg.LinAlgError) as error:
-            self.nodes, self.prior, self.state, self.lagged, self.left = kept
+            self.nodes, self.prior, self.state, self.lagged, self.outgoing = kept
             reason = str(error).strip().splitlines()[0]
             raise EstimationError(f"the window could not be solved ({reason})") from error
 
     def replace_state(self, state: State) -> None:
         """Continue from another state, with its covariance for all that was known."""
-        untold = self.nodes[1:] if self._has_passed(0) else self.nodes
-        self.left = [*self.left, *(n.state for n in untold if n.state.time < state.time)]
+        unreported = self.nodes[1:] if self._has_passed(0) else self.nodes
+        self.outgoing = [
+            *self.outgoing,
+            *(n.state for n in unreported if n.state.time < state.time),
+        ]
         self.nodes, self.prior = [], _prior_of(state)
         self.state = self.lagged = state
 
@@ -176,8 +179,8 @@ class SlidingWindow:
         step, cov = partial_update(step, cov, self._considered_cov, self._share)
         if not np.all(np.isfinite(step)):
             raise EstimationError("the window's step is not finite")
-        left = vector[oldest] - information[oldest, newest] @ step
-        first = np.asarray(np.linalg.solve(information[oldest, oldest], left))
+        remaining = vector[oldest] - information[oldest, newest] @ step
+        first = np.asarray(np.linalg.solve(information[oldest, oldest], remaining))
         given = gtsam.VectorValues()
         for end, part in ((begin, first), (last, step[:MOTION])):
             for key, own in _split(part, end):
@@ -209,7 +212,7 @@ class SlidingWindow:
         acting = tuple(link for link in links if link.by_calibration is not None)
         graph = Graph(native, measured, None, self.blocks, len(nodes), acting)
         states = [n.state for n in nodes]
-        linear = graph.linearized(Estimate(values_of(states), states[0].calibration))
+        linear = graph.linearized(GraphEstimate(values_of(states), states[0].calibration))
         linear.push_back(self._prior_factor(states[0]))
         return linear
 
@@ -226,7 +229,7 @@ class SlidingWindow:
         factor.getb()[...] = right
         return factor
 
-    def _tell_passed(self, cov: Array) -> None:
+    def _report_lagged(self, cov: Array) -> None:
         """Output the states that are older than the lag; the last leaves with the next epoch.
 
         Then the whole window is linearised at its current states, and no node twice.
@@ -238,7 +241,7 @@ class SlidingWindow:
         """
         while self._has_passed(0):
             self.lagged = replace(self.nodes[0].state, cov=cov)
-            self.left = [*self.left, self.lagged]
+            self.outgoing = [*self.outgoing, self.lagged]
             if not self._has_passed(1):
                 return
             first, second = self.nodes[:2]
@@ -270,11 +273,13 @@ class SlidingWindow:
         sqrt_information, right = rest.jacobian(_keys([1], self.calibration_key))
         passed = second.state.time - first.state.time
         noise = self.process_noise.cov(second.state.calibration, second.state.time, passed)
-        sqrt_information, right = self._carried(sqrt_information, right, noise)
-        self.prior = Prior(second.state, sqrt_information, right)
+        sqrt_information, right = self._predicted_prior(sqrt_information, right, noise)
+        self.prior = WindowPrior(second.state, sqrt_information, right)
         self.nodes = self.nodes[1:]
 
-    def _carried(self, sqrt_information: Array, right: Array, noise: Array) -> tuple[Array, Array]:
+    def _predicted_prior(
+        self, sqrt_information: Array, right: Array, noise: Array
+    ) -> tuple[Array, Array]:
         """Return the prior with calibration drift added and considered parameters unlearnt."""
         triangular = np.asarray(np.linalg.qr(np.column_stack([sqrt_information, right])).R)
         size = sqrt_information.shape[1]
@@ -294,9 +299,9 @@ def _at_states(node: Node) -> Node:
     return replace(node, measurements=tuple(m.at_states() for m in node.measurements))
 
 
-def _prior_of(state: State) -> Prior:
+def _prior_of(state: State) -> WindowPrior:
     sqrt_information = np.linalg.inv(np.linalg.cholesky(state.cov))
-    return Prior(state, sqrt_information, np.zeros(len(sqrt_information)))
+    return WindowPrior(state, sqrt_information, np.zeros(len(sqrt_information)))
 
 
 def _keys(nodes: range | list[int], calibration: int | None) -> gtsam.Ordering:

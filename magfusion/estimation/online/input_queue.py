@@ -22,7 +22,7 @@ from magfusion.estimation.graph.preintegration import RATE_SPAN
 from magfusion.estimation.graph.state import MOTION, VELOCITY, State, as_trajectory
 from magfusion.estimation.initialization.online import NoStart, OnlineStart, find_online_start
 from magfusion.estimation.measurements.earth import earth_measurement
-from magfusion.estimation.measurements.model_error import alike_at
+from magfusion.estimation.measurements.model_error import epochs_sharing_error_at
 from magfusion.estimation.measurements.phasors import field_phasors
 from magfusion.estimation.measurements.signs import OPEN_SIGN, count_open, with_signs
 from magfusion.estimation.measurements.zero_velocity import (
@@ -30,9 +30,9 @@ from magfusion.estimation.measurements.zero_velocity import (
     may_stand,
     quiet_before,
 )
-from magfusion.estimation.online.measured import Measured
+from magfusion.estimation.online.imu_gap_filler import ImuGapFiller
+from magfusion.estimation.online.measured import EpochMeasurements
 from magfusion.estimation.online.short_windows import ShortWindows
-from magfusion.estimation.online.stand_in import StandIn
 from magfusion.files.named_records import magnetometer_number
 from magfusion.model.marks import Marks
 from magfusion.model.parameters import CLOCK_RATE, TIME_OFFSET, Block
@@ -80,7 +80,7 @@ class Arrivals:
         Amplitudes that are dropped because their sign is undetermined.
     frozen : int
         Inertial samples that are dropped because the IMU is frozen.
-    stand_in : StandIn
+    imu_filler : ImuGapFiller
         Substitutes for missing inertial samples.
     short : ShortWindows, optional
         Of tones that are close.
@@ -96,12 +96,14 @@ class Arrivals:
     others: list[tuple[float, Measurement]]
     windows: deque[int]
     usual: float | None
-    _heard_by: dict[str, float]  # time of the last samples of each of several magnetometers (s)
+    _last_sample_times: dict[
+        str, float
+    ]  # time of the last samples of each of several magnetometers (s)
     last_epoch: float
     unseen: int
     open_signs: int
     frozen: int
-    stand_in: StandIn
+    imu_filler: ImuGapFiller
     _gyro: Freeze
     _accel: Freeze
     _detection: DetectionFilter
@@ -122,10 +124,10 @@ class Arrivals:
         self.usual = self._window = None
         self.last_epoch = -np.inf
         self._detection = DetectionFilter()
-        self.unseen, self.stand_in, self.open_signs = 0, StandIn(), 0
+        self.unseen, self.imu_filler, self.open_signs = 0, ImuGapFiller(), 0
         self.frozen, self._gyro, self._accel = 0, Freeze(), Freeze()
         self._noise, self._noise_unseen = [], False
-        self._heard_by = {}
+        self._last_sample_times = {}
 
     # Input
 
@@ -153,12 +155,12 @@ class Arrivals:
     def add_marks(self, marks: Marks) -> None:
         """Add bursts of coils, as `Navigator.add_marks`."""
         check_clock("marks", marks.end, self._newest)
-        self.receiver.hear_marks(marks)
+        self.receiver.add_marks(marks)
 
     def add_slots(self, time: Array, slot: IntArray) -> None:
         """Add the slots of samples, as `Navigator.add_slots`."""
         check_clock("magnetometer", time, self._newest)
-        self.receiver.hear_slots(time, slot)
+        self.receiver.add_slots(time, slot)
 
     def add_fields(self, samples: FieldSamples, steady: SteadyFields | None, after: float) -> int:
         """Add phasors, as `Navigator.add_fields`; return how many are not after a time (s)."""
@@ -231,8 +233,8 @@ class Arrivals:
     @property
     def hung_since(self) -> float | None:
         """Stamp since which the IMU is frozen (s), on the log's clock; None where it is not."""
-        since = [one.since for one in (self._gyro, self._accel) if one.found]
-        return min(since) + self.applied_offset if since else None
+        start_time = [one.frozen_since for one in (self._gyro, self._accel) if one.is_frozen]
+        return min(start_time) + self.applied_offset if start_time else None
 
     @property
     def reached(self) -> float:
@@ -301,13 +303,13 @@ class Arrivals:
             self.receiver.marks,
         )
 
-    def forget_before_start(self, kept: float) -> None:
+    def limit_history(self, kept: float) -> None:
         """Keep only the last so many seconds of everything."""
         oldest = self.reached - kept
         for buffer in (self.imu, self.waveform):
-            buffer.forget(oldest, oldest)
+            buffer.discard_before(oldest, oldest)
         self.fields = [s for s in self.fields if s.time[0] >= oldest]
-        self.receiver.forget_marks(oldest)
+        self.receiver.discard_marks(oldest)
 
     def start(self, start: OnlineStart, delay: float) -> None:
         """Continue from a first state, and drop the data it used; the delay as of `receive`."""
@@ -320,13 +322,13 @@ class Arrivals:
         self.last_epoch = time
         if start.waveform is not None:
             if isinstance(self.receiver, LockinReceiver):
-                self.receiver.beside = start.beside
+                self.receiver.extra_lines = start.extra_lines
             self.receiver.begin(start.waveform, self.inertial_samples())
             if self.short is not None:
-                self.short.receiver.beside_lines(start.beside)
+                self.short.receiver.fit_extra_lines(start.extra_lines)
                 self.short.receiver.begin(start.waveform, self.inertial_samples())
             self.receive(start.state, delay)
-        self.forget(time)
+        self.discard_before(time)
 
     def receive(self, state: State, delay: float) -> None:
         """Check the windows that are complete and within a delay (s); demodulate slots.
@@ -348,23 +350,23 @@ class Arrivals:
             self.windows.extend(windows.number[windows.centre > after].tolist())
         else:
             offset = self.applied_offset
-            found = receiver.push(waveform, imu, until, state.gyro_bias_body, offset)
-            self.fields += found.rows(found.time > after).epochs()
+            result = receiver.push(waveform, imu, until, state.gyro_bias_body, offset)
+            self.fields += result.rows(result.time > after).epochs()
 
-    def next_window(self, state: State, *, lost: bool = False) -> float | None:
+    def next_window(self, state: State, *, is_lost: bool = False) -> float | None:
         """Advance to the next admitted window; return its centre (s), None for none.
 
         For close tones it is the next short window, as long as the state is certain enough.
 
         Parameters
         ----------
-        lost : bool
+        is_lost : bool
             Whether the tones must first be separated.
         """
         if self.short is not None:
             while self.windows and self.receiver.centre_of(self.windows[0]) <= state.time:
                 self.windows.popleft()
-            centre = None if lost else self.short.next_after(state.time)
+            centre = None if is_lost else self.short.next_after(state.time)
             if centre is not None:
                 return centre
         if not self.windows:
@@ -379,7 +381,7 @@ class Arrivals:
         short = self.short is not None and self.short.receiver.complete(newest)
         return short or self.receiver.complete(newest)
 
-    def apply_offset_anew(self, state: State, blocks: tuple[Block, ...]) -> float:
+    def reapply_time_offset(self, state: State, blocks: tuple[Block, ...]) -> float:
         """Apply the time offset learnt since to the inertial stream; return the change (s).
 
         A state belongs to its stamp on the IMU's clock; with another offset the same state is a
@@ -402,12 +404,12 @@ class Arrivals:
         self.applied_offset += lag
         return lag
 
-    def forget(self, time: float) -> None:
+    def discard_before(self, time: float) -> None:
         """Keep only the samples that are needed after a state (s)."""
         reach = 2.0 + self.receiver.history
-        self.imu.forget(time - reach, time - self.applied_offset - 1.0)
-        self.stand_in.forget(time - reach)
-        self.waveform.forget(time - reach, time - reach)
+        self.imu.discard_before(time - reach, time - self.applied_offset - 1.0)
+        self.imu_filler.discard_before(time - reach)
+        self.waveform.discard_before(time - reach, time - reach)
 
     # Output
 
@@ -418,7 +420,7 @@ class Arrivals:
 
     def motion_samples(self, begin: float, end: float) -> ImuSamples:
         """Return them, with substitutes for missing ones."""
-        return self.stand_in.among(self.inertial_samples(begin, end), begin, end)
+        return self.imu_filler.among(self.inertial_samples(begin, end), begin, end)
 
     def fill_silence(self, state: State, time: float) -> None:
         """Substitute missing inertial samples from a state to a time (s), from the fields."""
@@ -426,13 +428,13 @@ class Arrivals:
         if self.fields or not isinstance(receiver, LockinReceiver) or receiver.admission is None:
             return
         until, streams = time + receiver.settings.window / 2.0, (self.imu, self.waveform)
-        self.stand_in.fill(state, until, *streams, self.applied_offset, receiver.admission)
+        self.imu_filler.fill(state, until, *streams, self.applied_offset, receiver.admission)
 
     def others_at(self, time: float) -> list[Measurement]:
         """Return the other measurements at a time (s), and remove them."""
-        found = [measurement for when, measurement in self.others if when == time]
+        result = [measurement for when, measurement in self.others if when == time]
         self.others = [other for other in self.others if other[0] > time]
-        return found
+        return result
 
     def rests(self, state: State) -> bool:
         """Return whether the platform is stationary, as far as is known."""
@@ -452,8 +454,8 @@ class Arrivals:
         *,
         earth: bool,
         standing: bool,
-        lost: bool = False,
-    ) -> Measured | None:
+        is_lost: bool = False,
+    ) -> EpochMeasurements | None:
         """Return what was detected and measured at a prediction; None without a measurement.
 
         Parameters
@@ -474,16 +476,16 @@ class Arrivals:
         if samples is None and self.short is not None and self.short.at(time):
             return self._measured_together(self.short, before, predicted, standing=standing)
         if samples is None:
-            wave = self._demodulated(before, predicted, lost=lost)
+            wave = self._demodulated(before, predicted, is_lost=is_lost)
             if wave is None:
                 return None  # only the clock went on
             samples, steady, by_offset = wave.fields, wave.steady, wave.by_time_offset
         own = step if not samples.magnetometers else self._own_step(samples)
         samples = self._detection.of(samples, own)
         if not samples.signed:
-            here, found = as_trajectory([predicted]), samples
+            here, result = as_trajectory([predicted]), samples
             samples = with_signs(samples, here, predicted.calibration)
-            self.open_signs += count_open(found, samples)
+            self.open_signs += count_open(result, samples)
         if not np.any(samples.valid) and not (earth and steady is not None):
             return None
         self.last_epoch = time
@@ -499,18 +501,18 @@ class Arrivals:
             offset,
             repeats,
             by_offset,
-            alike_at(predicted, step),
+            epochs_sharing_error_at(predicted, step),
             np.array([standing]),
         )
         field = None
         if earth and steady is not None:
             site = predicted.calibration.site
             field = earth_measurement(site, steady, now, rate_body, offset, step)
-        return Measured(samples, phasors, field, steady, repeats)
+        return EpochMeasurements(samples, phasors, field, steady, repeats)
 
     def _measured_together(
         self, short: ShortWindows, before: State, predicted: State, *, standing: bool
-    ) -> Measured:
+    ) -> EpochMeasurements:
         """Return the joint measurement of a short window's tones."""
         half, time = 0.5 * short.length, predicted.time
         begin, end = min(before.time, time - half), time + half
@@ -532,12 +534,12 @@ class Arrivals:
         time, valid = float(samples.time[0]), samples.valid[0]
         named = zip(samples.magnetometers, valid.tolist(), strict=True)
         names = dict.fromkeys(name for name, there in named if there)
-        steps = [time - self._heard_by.get(name, -np.inf) for name in names]
-        self._heard_by |= dict.fromkeys(names, time)
+        steps = [time - self._last_sample_times.get(name, -np.inf) for name in names]
+        self._last_sample_times |= dict.fromkeys(names, time)
         return max(min(steps, default=np.inf), SHORTEST_STEP)
 
     def _demodulated(
-        self, before: State, predicted: State, *, lost: bool
+        self, before: State, predicted: State, *, is_lost: bool
     ) -> MotionCompensated | None:
         """Return the window at a prediction; None where there is none."""
         number, receiver = self._window, self.receiver
@@ -548,17 +550,19 @@ class Arrivals:
         begin, end = min(before.time, predicted.time - half), predicted.time + half
         imu = self.motion_samples(begin - MARGIN, end + MARGIN)
         wave, offset = self._waveform_samples(), self.applied_offset
-        blind = self.stand_in.covers(begin - offset, end - offset)
-        found = demodulate_predicted(
-            receiver, number, wave, imu, before, predicted, offset, blind=blind, lost=lost
+        blind = self.imu_filler.covers(begin - offset, end - offset)
+        result = demodulate_predicted(
+            receiver, number, wave, imu, before, predicted, offset, blind=blind, is_lost=is_lost
         )
-        unseen = found.unseen or blind
+        unseen = result.unseen or blind
         self.unseen += unseen
         if unseen != self._noise_unseen:
             self._noise, self._noise_unseen = [], unseen
         # The mean over neighbouring windows, as far as they are known.
-        self._noise = [*self._noise, found.fields.phasor_cov][-receiver.settings.noise_windows :]
-        return replace(found, fields=replace(found.fields, phasor_cov=np.mean(self._noise, axis=0)))
+        self._noise = [*self._noise, result.fields.phasor_cov][-receiver.settings.noise_windows :]
+        return replace(
+            result, fields=replace(result.fields, phasor_cov=np.mean(self._noise, axis=0))
+        )
 
     def _waveform_samples(self) -> Waveform:
         axes = self.receiver.site.platform.magnetometer.axes

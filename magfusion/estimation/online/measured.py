@@ -9,7 +9,7 @@ from magfusion.model.samples import FieldSamples, SteadyFields
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class EpochMeasurements:
     """Measurements of one epoch.
 
     Parameters
@@ -33,12 +33,12 @@ class Measured:
     repeats: float
 
     @property
-    def apart(self) -> bool:
+    def is_sequential(self) -> bool:
         """Whether each phasor was measured separately."""
         return isinstance(self.phasors, FieldPhasors)
 
     @property
-    def heard(self) -> tuple[str, ...]:
+    def detected(self) -> tuple[str, ...]:
         """Detected beacons."""
         channels = zip(self.samples.channels, self.samples.valid[0], strict=True)
         return tuple(dict.fromkeys(name for (name, _), valid in channels if valid))

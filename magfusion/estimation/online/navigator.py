@@ -13,8 +13,11 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.freeze import imu_remarks
 from magfusion.estimation.data_checks.inertial_noise import measured_noise, with_white_noise
-from magfusion.estimation.demodulation.as_heard import fields_heard, samples_heard
 from magfusion.estimation.demodulation.drive_reference import drive_findings
+from magfusion.estimation.demodulation.sensor_frame_samples import (
+    sensor_frame_phasors,
+    sensor_frame_samples,
+)
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.process_noise import calibration_process_noise
 from magfusion.estimation.graph.propagation import Propagated, propagate
@@ -23,24 +26,24 @@ from magfusion.estimation.initialization.early import first_try, is_clear, next_
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
 from magfusion.estimation.measurements.earth import check_earth
 from magfusion.estimation.online.arrivals import arrivals_of
-from magfusion.estimation.online.carried import Departure
 from magfusion.estimation.online.ekf import ErrorStateFilter
 from magfusion.estimation.online.epoch_update import EpochUpdate, Estimator
 from magfusion.estimation.online.fixed_lag import SlidingWindow
 from magfusion.estimation.online.input_queue import Arrivals
 from magfusion.estimation.online.navigator_data import navigator_rules
 from magfusion.estimation.online.navigator_settings import NavigatorSettings as NavigatorSettings
+from magfusion.estimation.online.propagated import PropagationStart
 from magfusion.estimation.online.short_windows import ShortWindows
-from magfusion.estimation.online.state_of_now import CarriedState, Said, StateOfNow
+from magfusion.estimation.online.state_of_now import EpochReport, PropagatedState, StateOfNow
 from magfusion.estimation.online.still_samples import StillSamples
 from magfusion.estimation.online_integrity.bank import SubsetBank
+from magfusion.estimation.online_integrity.discontinuity_counter import DiscontinuityCounter
 from magfusion.estimation.online_integrity.judgement import (
     JudgedState,
     Judgement,
-    Told,
+    TimedJudgement,
     judged_state,
 )
-from magfusion.estimation.online_integrity.resets import Resets
 from magfusion.estimation.online_integrity.summary import Summary
 from magfusion.files.blas_threads import warn_about_threads
 from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
@@ -74,10 +77,10 @@ class Navigator:
     _update: EpochUpdate
     _next_start: float
     _judgement: Judgement
-    _made: list[JudgedState]
-    _told: deque[Told]
+    _pending: list[JudgedState]
+    _timed_judgements: deque[TimedJudgement]
     _white: list[float]
-    _resets: Resets
+    _discontinuities: DiscontinuityCounter
     _now: StateOfNow
     _still: StillSamples
     _degrees: Temperatures
@@ -122,8 +125,8 @@ class Navigator:
         self._next_start = first_try(self.site, self.settings.start_duration)
         imu = site.platform.imu
         self._white = [imu.gyro_noise, imu.accel_noise]  # for the propagation
-        self._judgement, self._made, self._told = Judgement(), [], deque()
-        self._resets, self.summary = Resets(), Summary()
+        self._judgement, self._pending, self._timed_judgements = Judgement(), [], deque()
+        self._discontinuities, self.summary = DiscontinuityCounter(), Summary()
         self._now = StateOfNow(self.settings)
         self.why_no_start = NoStart()
         self.rival_chi_square = None
@@ -138,10 +141,10 @@ class Navigator:
         InputError
             If a number is not finite, the clock jumped, or the site describes no IMU.
         """
-        self.hear_imu(time, gyro_body, accel_body)
+        self.propagate_imu(time, gyro_body, accel_body)
         self.advance()
 
-    def hear_imu(self, time: Array, gyro_body: Array, accel_body: Array) -> None:
+    def propagate_imu(self, time: Array, gyro_body: Array, accel_body: Array) -> None:
         """Add inertial samples as `add_imu`, and only propagate the state to them.
 
         `advance` does what takes longer, so that the current state need not wait for it.
@@ -171,7 +174,7 @@ class Navigator:
         InputError
             If a number is not finite, the clock jumped, or the site has no such magnetometer.
         """
-        samples = samples_heard(self.site, time, measured_sensor)
+        samples = sensor_frame_samples(self.site, time, measured_sensor)
         self._arrived.add_magnetometer(time, samples, magnetometer)
         self._stand_still(np.atleast_1d(time), raw=True)
         self.advance()
@@ -185,7 +188,7 @@ class Navigator:
             As `magfusion.receiver.drive.DriveReceiver`.
         """
         self._currents.push(samples)
-        self._drives.forget()
+        self._drives.discard_old()
         self._update.of_currents = tuple(drive_findings(self._currents, self.site))
 
     def add_marks(self, marks: Marks) -> None:
@@ -202,7 +205,7 @@ class Navigator:
     def add_slots(self, time: Array, slot: IntArray) -> None:
         """Add the driven slot of each sample (k,), before the samples themselves.
 
-        ``magfusion.model.marks.SILENT`` where none is driven, ``UNTOLD`` where it is unknown.
+        ``magfusion.model.marks.SILENT`` where none is driven, ``UNKNOWN_SLOT`` where it is unknown.
 
         Raises
         ------
@@ -213,7 +216,7 @@ class Navigator:
 
     def add_temperature(self, part: str, time: float, degc: float) -> None:
         """Set the temperature of a beacon, or of the ``magnetometer``, for later samples."""
-        self._degrees.hear(part, time, degc)
+        self._degrees.add_reading(part, time, degc)
 
     def add_fields(self, samples: FieldSamples, steady: SteadyFields | None = None) -> None:
         """Add demodulated phasors, channels in the site's order, with their static fields.
@@ -223,13 +226,13 @@ class Navigator:
         InputError
             If the clock jumped.
         """
-        samples = fields_heard(self.site, samples)
+        samples = sensor_frame_phasors(self.site, samples)
         after = -np.inf if self._estimator is None else self._estimator.state.time
         late = self._arrived.add_fields(samples, steady if self.settings.earth else None, after)
         if late:
             self.counts["field too late"] += late
-        heard = np.append([s.time[0] for s in self._arrived.fields], samples.time)
-        self._stand_still(np.unique(heard), raw=False)
+        detected = np.append([s.time[0] for s in self._arrived.fields], samples.time)
+        self._stand_still(np.unique(detected), raw=False)
         self.advance()
 
     def add_measurement(self, time: float, measurement: Measurement) -> None:
@@ -251,10 +254,10 @@ class Navigator:
         """Advance a motion prior to the newest fields (s), where the site has no IMU."""
         if self.site.platform.inertial:
             return
-        made = self._still.stamps(time, raw=raw)
-        if len(made):
-            nothing = np.zeros((len(made), 3))
-            self._arrived.add_imu(made, nothing, nothing)
+        built = self._still.stamps(time, raw=raw)
+        if len(built):
+            nothing = np.zeros((len(built), 3))
+            self._arrived.add_imu(built, nothing, nothing)
             self._now.reach(self._arrived)
 
     # Output
@@ -274,13 +277,13 @@ class Navigator:
 
         The pose of a lost state is a guess and must not be used.
         """
-        made, self._made = self._made, []
-        return made
+        built, self._pending = self._pending, []
+        return built
 
-    def take_carried(self) -> list[CarriedState]:
+    def take_propagated(self) -> list[PropagatedState]:
         """Return the propagated states between epochs, at the rate of the settings."""
-        made, self._now.made = self._now.made, []
-        return made
+        built, self._now.pending = self._now.pending, []
+        return built
 
     def state(self, time: float | None = None) -> JudgedState:
         """Return the state at a time, propagated by the inertial stream from the last epoch.
@@ -300,7 +303,7 @@ class Navigator:
         last = self._estimator.state
         wanted = self._arrived.inertial if time is None else time
         if wanted <= last.time:
-            return judged_state(last, self._judgement, self._resets.counter)
+            return judged_state(last, self._judgement, self._discontinuities.counter)
         return self._now.at(self._arrived, wanted)
 
     @property
@@ -325,15 +328,19 @@ class Navigator:
         """
         if not isinstance(self._estimator, SlidingWindow):
             return []
-        left, self._estimator.left = self._estimator.left, []
-        told = [(state, self._told_at(state.time)) for state in left]
-        return [judged_state(state, t.judgement, t.reset_counter) for state, t in told]
+        outgoing, self._estimator.outgoing = self._estimator.outgoing, []
+        reported = [(state, self._judgement_at(state.time)) for state in outgoing]
+        return [judged_state(state, t.judgement, t.reset_counter) for state, t in reported]
 
-    def _told_at(self, time: float) -> Told:
+    def _judgement_at(self, time: float) -> TimedJudgement:
         """Return the judgement of a time, and discard earlier ones."""
-        while len(self._told) > 1 and self._told[1].time <= time:
-            self._told.popleft()
-        return self._told[0] if self._told else Told(time, Judgement())
+        while len(self._timed_judgements) > 1 and self._timed_judgements[1].time <= time:
+            self._timed_judgements.popleft()
+        return (
+            self._timed_judgements[0]
+            if self._timed_judgements
+            else TimedJudgement(time, Judgement())
+        )
 
     @property
     def counts(self) -> Counter[str]:
@@ -362,7 +369,7 @@ class Navigator:
             state = own.get("state") if isinstance(own, dict) else None
             self._start_at(from_plain(State, state, "estimator.state", rules))
             resume(self._estimator, own, "estimator", rules)
-            self._depart()
+            self._restart_propagation()
 
     # Processing
 
@@ -374,13 +381,13 @@ class Navigator:
         while self._step():
             changed = True
         if changed:
-            self._depart()
+            self._restart_propagation()
 
-    def _depart(self) -> None:
+    def _restart_propagation(self) -> None:
         """Propagate the newest estimate from here on."""
         assert self._estimator is not None
         assert self._arrived.usual is not None
-        departure = Departure(
+        start = PropagationStart(
             self._estimator.state,
             with_white_noise(self.site, *self._white),
             self.blocks,
@@ -388,8 +395,8 @@ class Navigator:
             self._arrived.applied_offset,
             self._arrived.usual,
         )
-        said = Said(self._judgement, self._resets.counter, self._update.bank)
-        self._now.depart(departure, said, self._arrived)
+        findings = EpochReport(self._judgement, self._discontinuities.counter, self._update.bank)
+        self._now.restart_from(start, findings, self._arrived)
 
     def _begin(self) -> bool:
         """Find the first state, once enough data have arrived."""
@@ -407,7 +414,7 @@ class Navigator:
         if isinstance(start, NoStart):
             self.why_no_start = start
             self._next_start *= 2.0 if start.trust.findings else 1.5
-            arrived.forget_before_start(longest)
+            arrived.limit_history(longest)
             return False
         if start.ambiguous and self._next_start < longest:
             self.why_no_start = open_start(start)
@@ -419,7 +426,7 @@ class Navigator:
         self.rival_chi_square = start.rival_chi_square
         self._start_at(start.state)
         self.summary.unverified = start.trust.unverified
-        self._tell(start.state, self._update.begin(start))
+        self._store(start.state, self._update.begin(start))
         return True
 
     def _start_at(self, state: State) -> None:
@@ -444,8 +451,8 @@ class Navigator:
         if other <= inertial and other < arrived.next_field:
             self._absorb(other, None)
             return True
-        apart = arrived.short is not None and self._update.asks_for_each(state)
-        centre = arrived.next_window(state, lost=apart)
+        separate = arrived.short is not None and self._update.needs_separate_beacons(state)
+        centre = arrived.next_window(state, is_lost=separate)
         if centre is not None:
             self._step_window(centre)
             return True
@@ -480,36 +487,38 @@ class Navigator:
         if samples is None:
             self._arrived.fill_silence(self._estimator.state, time)
         before, predicted = self._estimator.state.time, self._propagated(time)
-        judgement = self._update.take_in(self._estimator, self._arrived, predicted, samples)
-        hung_since, bridged = self._arrived.hung_since, predicted.bridged
-        judgement = judgement.beside(*imu_remarks(hung_since, before, time, bridged=bridged))
-        judgement = judgement.beside(*self._arrived.remarks)
+        judgement = self._update.process_epoch(self._estimator, self._arrived, predicted, samples)
+        hung_since, gap_bridged = self._arrived.hung_since, predicted.gap_bridged
+        judgement = judgement.with_findings(
+            *imu_remarks(hung_since, before, time, gap_bridged=gap_bridged)
+        )
+        judgement = judgement.with_findings(*self._arrived.remarks)
         state, counts = self._estimator.state, self.counts
         restarts = counts["lost and found again"]
         if self.site.platform.inertial:  # a motion prior may be uncertain, with regular fixes
             restarts += counts["found by a fix"]
-        self._resets.hear(predicted.state, state, self._judgement, judgement, restarts)
-        self._tell(state, judgement)
-        lag = self._arrived.apply_offset_anew(state, self.blocks)
+        self._discontinuities.update(predicted.state, state, self._judgement, judgement, restarts)
+        self._store(state, judgement)
+        lag = self._arrived.reapply_time_offset(state, self.blocks)
         if lag:
             self._estimator.replace_state(replace(state, time=state.time + lag))
             self.counts["time offset updated"] += 1
-        self._arrived.forget(self._estimator.state.time)
+        self._arrived.discard_before(self._estimator.state.time)
 
-    def _tell(self, state: State, judgement: Judgement) -> None:
+    def _store(self, state: State, judgement: Judgement) -> None:
         self._judgement = judgement
-        counter = self._resets.counter
-        self._made.append(judged_state(state, judgement, counter))
+        counter = self._discontinuities.counter
+        self._pending.append(judged_state(state, judgement, counter))
         self.summary.note(state.time, judgement)
         if self.settings.estimator == "smoother":
-            self._told.append(Told(state.time, judgement, counter))
+            self._timed_judgements.append(TimedJudgement(state.time, judgement, counter))
 
     def _propagated(self, time: float) -> Propagated:
         assert self._estimator is not None
         state = self._estimator.state
         offset, usual = self._arrived.applied_offset, self._arrived.usual
         imu = self._arrived.motion_samples(state.time - offset, time - offset)
-        blind = self._arrived.stand_in.covers(state.time - offset, time - offset)
+        blind = self._arrived.imu_filler.covers(state.time - offset, time - offset)
         noise, site = self._process_noise, with_white_noise(self.site, *self._white)
         blocks = self._of_imu
         return propagate(state, imu, time, site, offset, noise, usual, blocks, blind=blind)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from magfusion.estimation.batch.calibration_data import calibration_rules
-from magfusion.estimation.data_checks.running import Running
+from magfusion.estimation.data_checks.running import DecayingSums
 from magfusion.estimation.data_checks.stream_buffer import Buffer
 from magfusion.estimation.graph.inertial import ROWS, Link, Steps
 from magfusion.estimation.graph.measurement import Measurement
@@ -22,7 +22,7 @@ from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors, Predictions
 from magfusion.estimation.measurements.pose_fix import PoseFix
 from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
-from magfusion.estimation.online.fixed_lag import Node, Prior, SlidingWindow
+from magfusion.estimation.online.fixed_lag import Node, SlidingWindow, WindowPrior
 from magfusion.estimation.online_integrity.bank import SubsetBank
 from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
 from magfusion.estimation.online_integrity.levels import Levels
@@ -51,7 +51,7 @@ def _made_again(data: Any) -> Predictions:
 
 
 # What is only cached for sharing is rebuilt.
-_FORGOTTEN = Rules({Predictions: lambda _: None}, {Predictions: _made_again})
+_WITHOUT_PREDICTIONS = Rules({Predictions: lambda _: None}, {Predictions: _made_again})
 
 
 def navigator_rules(
@@ -76,7 +76,7 @@ def navigator_rules(
             Link: lambda link: _link_data(link, of_calibration),
             Measurement: _measurement_data,
             Verdict: str,
-            Levels: lambda levels: list(levels.found),
+            Levels: lambda levels: list(levels.values),
         },
         readers={
             **of_calibration.readers,
@@ -89,11 +89,11 @@ def navigator_rules(
             State: lambda state: _check_state(state, size),
             JudgedState: lambda state: _check_state(state, size),
             Judgement: _check_judgement,
-            Running: _check_running,
+            DecayingSums: _check_running,
             Sums: _check_sums,
             SubsetBank: lambda bank: bank.check(size),
             Node: lambda node: _check_node(node, blocks),
-            Prior: lambda prior: _check_prior(prior, size),
+            WindowPrior: lambda prior: _check_prior(prior, size),
             Buffer: _check_buffer,
             Bursts: _check_bursts,
             FieldSamples: lambda f: _check(f.channels == site.channels, "has other channels"),
@@ -133,8 +133,8 @@ def _check_state(state: State, size: int) -> None:
             _check(value.shape == shapes.get(name, (3,)), f"has a {name} of another shape")
             _check(np.all(np.isfinite(value)), f"has a {name} that is not finite")
     _check(np.isfinite(state.time), "has a time that is not finite")
-    turned = state.world_from_body @ state.world_from_body.T
-    _check(np.max(np.abs(turned - np.eye(3))) < ROUNDING, "has an invalid rotation")
+    rotated = state.world_from_body @ state.world_from_body.T
+    _check(np.max(np.abs(rotated - np.eye(3))) < ROUNDING, "has an invalid rotation")
     _check_cov(state.cov)
 
 
@@ -145,7 +145,7 @@ def _check_judgement(judgement: Judgement) -> None:
     _check(np.all(np.isfinite(values)) and judgement.inflation >= 1.0, "is not a valid judgement")
 
 
-def _check_running(running: Running) -> None:
+def _check_running(running: DecayingSums) -> None:
     sums = (*running.total, running.weight, running.squares)
     _check(running.total.ndim == 1 and np.all(np.isfinite(sums)), "is not finite")
 
@@ -175,7 +175,7 @@ def _check_node(node: Node, blocks: tuple[Block, ...]) -> None:
         _check(np.all(np.isfinite(rows.error)), "contains a measurement that is not finite")
 
 
-def _check_prior(prior: Prior, size: int) -> None:
+def _check_prior(prior: WindowPrior, size: int) -> None:
     matrix, right = prior.sqrt_information, prior.right
     _check(matrix.ndim == 2 and matrix.shape[1] == size, "has a matrix of another shape")
     _check(right.shape == matrix.shape[:1], "has a right-hand side of another shape")
@@ -197,14 +197,14 @@ def _check_window(window: SlidingWindow) -> None:
 def _measurement_data(measurement: Measurement) -> dict[str, Any]:
     return {
         "kind": type(measurement).__name__,
-        **{k: to_plain(v, _FORGOTTEN) for k, v in vars(measurement).items()},
+        **{k: to_plain(v, _WITHOUT_PREDICTIONS) for k, v in vars(measurement).items()},
     }
 
 
 def _measurement(data: Any, kinds: Mapping[str, type[Measurement]]) -> Measurement:
     _check(isinstance(data, dict) and str(data.get("kind")) in kinds, "is of an unknown kind")
     own = {name: value for name, value in data.items() if name != "kind"}
-    return from_plain(kinds[str(data["kind"])], own, str(data["kind"]), _FORGOTTEN)
+    return from_plain(kinds[str(data["kind"])], own, str(data["kind"]), _WITHOUT_PREDICTIONS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,11 +220,11 @@ def _link_data(link: Link, rules: Rules) -> Any:
 
 
 def _link(data: Any, site: Site, columns: int, rules: Rules) -> Link:
-    found = from_plain(_LinkData, data, "link", rules)
-    if (by := found.by_calibration) is not None:
+    result = from_plain(_LinkData, data, "link", rules)
+    if (by := result.by_calibration) is not None:
         _check(by.shape == (ROWS, columns) and np.all(np.isfinite(by)), "has a wrong derivative")
-    measurement = found.steps.preintegrated(site)
-    return Link(measurement, found.by_calibration, found.calibration, found.steps)
+    measurement = result.steps.preintegrated(site)
+    return Link(measurement, result.by_calibration, result.calibration, result.steps)
 
 
 def _check_steps(steps: Steps) -> None:
@@ -233,6 +233,6 @@ def _check_steps(steps: Steps) -> None:
     shapes = (own.gyro_body.shape, own.accel_body.shape, own.dt.shape)
     _check(shapes == ((count, 3), (count, 3), (count,)), "has steps of another shape")
     _check(biases[0].shape == biases[1].shape == (3,), "has biases of another shape")
-    _check(own.first.tolist() == [0, count] and len(own.bridged) == 1, "is not of one interval")
+    _check(own.first.tolist() == [0, count] and len(own.gap_bridged) == 1, "is not of one interval")
     values = np.concatenate([v.ravel() for v in (*vars(own).values(), *biases)])
     _check(np.all(np.isfinite(values)) and np.all(own.dt > 0.0), "has steps that are not finite")

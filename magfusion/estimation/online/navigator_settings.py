@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from magfusion.estimation.batch.prepared import LONGEST_STEP
+from magfusion.estimation.batch.preprocessed_log import LONGEST_STEP
 from magfusion.estimation.batch.settings import EstimatorSettings
 from magfusion.model.short_repr import short_repr
 from magfusion.model.trust import Risk
@@ -32,7 +32,7 @@ class NavigatorSettings(EstimatorSettings):
         at a rate (Hz); they are propagated from the newest epoch.
     horizon : float
         How far ahead they are predicted (s).
-    blend : float
+    correction_time : float
         Time in which a correction enters them (s); at once where it is zero.
     """
 
@@ -46,4 +46,4 @@ class NavigatorSettings(EstimatorSettings):
     risk: Risk | None = None
     rate: Rate = "field"
     horizon: float = 0.0
-    blend: float = 0.0
+    correction_time: float = 0.0

@@ -113,13 +113,13 @@ class SensorStream:
             self.windows.extend(windows.number[in_time].tolist())
             self.late += int(np.sum(~in_time))
             return None
-        found = receiver.push(wave, imu, until, state.gyro_bias_body, offset)
-        in_time = found.time > after
+        result = receiver.push(wave, imu, until, state.gyro_bias_body, offset)
+        in_time = result.time > after
         self.late += int(np.sum(~in_time))
-        return found.rows(in_time)
+        return result.rows(in_time)
 
     def demodulated(
-        self, before: State, predicted: State, imu: ImuSamples, offset: float, *, lost: bool
+        self, before: State, predicted: State, imu: ImuSamples, offset: float, *, is_lost: bool
     ) -> MotionCompensated:
         """Return the window at a prediction, by the calibration of this magnetometer.
 
@@ -131,12 +131,12 @@ class SensorStream:
         receiver = self.receiver
         assert isinstance(receiver, LockinReceiver)
         assert self.now is not None
-        found = demodulate_predicted(
-            receiver, self.now, self.waveform, imu, before, predicted, offset, lost=lost
+        result = demodulate_predicted(
+            receiver, self.now, self.waveform, imu, before, predicted, offset, is_lost=is_lost
         )
-        if found.unseen != self._noise_unseen:
-            self._noise, self._noise_unseen = [], found.unseen
+        if result.unseen != self._noise_unseen:
+            self._noise, self._noise_unseen = [], result.unseen
         # The mean over neighbouring windows, as far as they are known.
-        self._noise = [*self._noise, found.fields.phasor_cov][-receiver.settings.noise_windows :]
+        self._noise = [*self._noise, result.fields.phasor_cov][-receiver.settings.noise_windows :]
         cov = np.mean(self._noise, axis=0)
-        return replace(found, fields=replace(found.fields, phasor_cov=cov))
+        return replace(result, fields=replace(result.fields, phasor_cov=cov))

@@ -14,11 +14,11 @@ from magfusion.estimation.batch.settings import EstimatorSettings
 from magfusion.estimation.data_checks.stream_buffer import check_clock
 from magfusion.estimation.demodulation.motion_compensation import MotionCompensated
 from magfusion.estimation.demodulation.several_demodulation import same_windows
-from magfusion.estimation.demodulation.warming import refuse_warm
+from magfusion.estimation.demodulation.temperature_compensation import refuse_warm
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.initialization.online import NoStart, OnlineStart, find_online_start
 from magfusion.estimation.online.input_queue import LONGEST_WAIT, MARGIN, Arrivals
-from magfusion.estimation.online.measured import Measured
+from magfusion.estimation.online.measured import EpochMeasurements
 from magfusion.estimation.online.sensor_stream import SensorStream
 from magfusion.files.fields import SAME_TIME, side_by_side
 from magfusion.files.named_records import magnetometer_number
@@ -65,7 +65,7 @@ class SeveralArrivals(Arrivals):
         self._lockin = same_windows(site, lockin) if site.beacons else lockin
         self.streams = []
         for sensor in sensors:
-            alone = site.platform.carrying((replace(sensor, clock_offset=0.0),))
+            alone = site.platform.with_magnetometers((replace(sensor, clock_offset=0.0),))
             self.streams.append(SensorStream(replace(site, platform=alone), self._lockin))
         self.begun_at, self.without = np.inf, Counter()
         self._fields_to, self._longest = {}, 0.0
@@ -94,7 +94,7 @@ class SeveralArrivals(Arrivals):
         """Add bursts of coils, which every magnetometer receives."""
         check_clock("marks", marks.end, self._newest)
         for stream in self.streams:
-            stream.receiver.hear_marks(marks)
+            stream.receiver.add_marks(marks)
 
     def add_slots(self, time: Array, slot: IntArray) -> None:  # noqa: ARG002
         """Reject slots of samples: each magnetometer would have its own."""
@@ -117,7 +117,7 @@ class SeveralArrivals(Arrivals):
         check_clock("fields", samples.time, self._newest)
         late = 0
         for one in samples.epochs():
-            self._hear(one)
+            self._take_fields(one)
             if one.time[0] <= after:
                 late += 1
             else:
@@ -125,7 +125,7 @@ class SeveralArrivals(Arrivals):
         self.fields.sort(key=lambda s: float(s.time[0]))
         return late
 
-    def _hear(self, one: FieldSamples) -> None:
+    def _take_fields(self, one: FieldSamples) -> None:
         time = float(one.time[0])
         named = zip(one.magnetometers, one.valid[0].tolist(), strict=True)
         for name in dict.fromkeys(name for name, there in named if there):
@@ -136,8 +136,8 @@ class SeveralArrivals(Arrivals):
     def _put(self, one: FieldSamples) -> None:
         """Insert an epoch, or merge it with the one of the same time."""
         for k, known in enumerate(self.fields):
-            apart = not np.any(known.valid & one.valid)
-            if apart and abs(known.time[0] - one.time[0]) < SAME_TIME:
+            separate = not np.any(known.valid & one.valid)
+            if separate and abs(known.time[0] - one.time[0]) < SAME_TIME:
                 there = one.valid[..., None]
                 self.fields[k] = replace(
                     known,
@@ -150,7 +150,7 @@ class SeveralArrivals(Arrivals):
 
     # Times
 
-    def _heard_to(self) -> dict[str, float]:
+    def _last_times(self) -> dict[str, float]:
         """Return the time until which each magnetometer has sent samples (s)."""
         return {
             stream.name: max(stream.samples.newest, self._fields_to.get(stream.name, self.begun_at))
@@ -162,20 +162,20 @@ class SeveralArrivals(Arrivals):
         """Time until which all have sent samples, or are not awaited any more (s)."""
         if not np.isfinite(self.begun_at):
             return -np.inf
-        heard, silent = self._heard_to(), self._silent()
-        waited = min(to for name, to in heard.items() if name not in silent)
+        detected, silent = self._last_times(), self._silent()
+        waited = min(to for name, to in detected.items() if name not in silent)
         return max(waited, self.inertial - LONGEST_WAIT)
 
     def _silent(self) -> list[str]:
         """Return the magnetometers that are not awaited."""
-        heard = self._heard_to()
-        newest = max(heard.values())
-        return [n for n, to in heard.items() if newest - to > SILENCE + self._longest]
+        detected = self._last_times()
+        newest = max(detected.values())
+        return [n for n, to in detected.items() if newest - to > SILENCE + self._longest]
 
     @property
     def _newest(self) -> float:
-        heard = max(self._heard_to().values()) if np.isfinite(self.begun_at) else -np.inf
-        return max(self.imu.newest, heard)
+        detected = max(self._last_times().values()) if np.isfinite(self.begun_at) else -np.inf
+        return max(self.imu.newest, detected)
 
     @property
     def _newest_field(self) -> float:
@@ -219,11 +219,11 @@ class SeveralArrivals(Arrivals):
     @property
     def remarks(self) -> tuple[Finding, ...]:
         """Findings on silent magnetometers."""
-        heard = self._heard_to()
+        detected = self._last_times()
         return tuple(
             Finding(
                 "magnetometer_silent",
-                f"Magnetometer {name} has sent nothing since {heard[name]:.3f} s: the others are"
+                f"Magnetometer {name} has sent nothing since {detected[name]:.3f} s: the others are"
                 " used without it. Check its supply, its cable and its channel.",
                 Verdict.TRUSTWORTHY,
             )
@@ -233,15 +233,15 @@ class SeveralArrivals(Arrivals):
     @property
     def losses(self) -> dict[str, int]:
         """Numbers of unused windows and samples, by magnetometer and reason."""
-        found = super().losses
+        result = super().losses
         for stream in self.streams:
             name = stream.name
             counts = {f"window: {k}": v for k, v in stream.receiver.dropped.items()}
             counts["window too late"] = stream.late
             counts["sample too late"] = stream.samples.late
             counts["epoch while it was silent"] = self.without[name]
-            found |= {f"magnetometer {name}: {k}": v for k, v in counts.items() if v}
-        return found
+            result |= {f"magnetometer {name}: {k}": v for k, v in counts.items() if v}
+        return result
 
     # Processing
 
@@ -278,20 +278,20 @@ class SeveralArrivals(Arrivals):
             self.site, imu, self.waveform, self.fields, [], until, settings, None, waves
         )
 
-    def forget_before_start(self, kept: float) -> None:
+    def limit_history(self, kept: float) -> None:
         """Keep only so much before the last search (s)."""
         oldest = self._looked - kept
-        self.imu.forget(oldest, oldest)
+        self.imu.discard_before(oldest, oldest)
         self.fields = [s for s in self.fields if s.time[0] >= oldest]
         for stream in self.streams:
-            stream.samples.forget(oldest, oldest)
-            stream.receiver.forget_marks(oldest)
+            stream.samples.discard_before(oldest, oldest)
+            stream.receiver.discard_marks(oldest)
 
     def start(self, start: OnlineStart, delay: float) -> None:
         """Continue from a first state, each receiver by its own samples."""
         for stream in self.streams:
             if isinstance(stream.receiver, LockinReceiver):
-                stream.receiver.beside = start.lines.get(stream.name)
+                stream.receiver.extra_lines = start.lines.get(stream.name)
         super().start(start, delay)
         self.receive(start.state, delay)
 
@@ -301,19 +301,19 @@ class SeveralArrivals(Arrivals):
         imu = self.inertial_samples()
         for k, stream in enumerate(self.streams):
             until = min(self.awaited, stream.samples.newest) - delay
-            found = stream.receive(imu, until, self.last_epoch, state, self.applied_offset)
-            if found is None:
+            result = stream.receive(imu, until, self.last_epoch, state, self.applied_offset)
+            if result is None:
                 continue
-            for one in self._beside({k: found}).epochs():
+            for one in self._as_channels_of_all({k: result}).epochs():
                 self._put(one)
         self.fields.sort(key=lambda s: float(s.time[0]))
 
-    def _beside(self, found: dict[int, FieldSamples]) -> FieldSamples:
+    def _as_channels_of_all(self, result: dict[int, FieldSamples]) -> FieldSamples:
         """Return the fields of some magnetometers as channels of all."""
         none = FieldSamples.empty(self.streams[0].receiver.site.channels)
-        return side_by_side([found.get(k, none) for k in range(len(self.streams))], self.site)
+        return side_by_side([result.get(k, none) for k in range(len(self.streams))], self.site)
 
-    def next_window(self, state: State, *, lost: bool = False) -> float | None:  # noqa: ARG002
+    def next_window(self, state: State, *, is_lost: bool = False) -> float | None:  # noqa: ARG002
         """Advance to the next windows of all; return their centre (s), None where one may come."""
         centre = min(stream.next_admitted for stream in self.streams)
         grids = [s.receiver for s in self.streams if s.receiver.grid is not None]
@@ -330,12 +330,12 @@ class SeveralArrivals(Arrivals):
             stream.now = stream.windows.popleft() if mine else None
         return centre
 
-    def forget(self, time: float) -> None:
+    def discard_before(self, time: float) -> None:
         """Keep only the samples that are needed after a state (s)."""
         reach = 2.0 + max(stream.receiver.history for stream in self.streams)
-        self.imu.forget(time - reach, time - self.applied_offset - 1.0)
+        self.imu.discard_before(time - reach, time - self.applied_offset - 1.0)
         for stream in self.streams:
-            stream.samples.forget(time - reach, time - reach)
+            stream.samples.discard_before(time - reach, time - reach)
 
     def fill_silence(self, state: State, time: float) -> None:
         """Do nothing where the IMU is silent: no single magnetometer's samples replace it."""
@@ -351,16 +351,16 @@ class SeveralArrivals(Arrivals):
         *,
         earth: bool,
         standing: bool,
-        lost: bool = False,
-    ) -> Measured | None:
+        is_lost: bool = False,
+    ) -> EpochMeasurements | None:
         """Return the measurements at a prediction, as `Arrivals.measured`."""
         self.without.update(self._silent())
         return super().measured(
-            before, predicted, samples, step, earth=earth, standing=standing, lost=lost
+            before, predicted, samples, step, earth=earth, standing=standing, is_lost=is_lost
         )
 
     def _demodulated(
-        self, before: State, predicted: State, *, lost: bool
+        self, before: State, predicted: State, *, is_lost: bool
     ) -> MotionCompensated | None:
         """Return the windows at a prediction, each of its own magnetometer; None for none."""
         if self._centre != predicted.time:
@@ -368,17 +368,17 @@ class SeveralArrivals(Arrivals):
         half = 0.5 * max(s.receiver.grid.length for s in self.streams if s.receiver.grid)
         begin, end = min(before.time, predicted.time - half), predicted.time + half
         imu, offset = self.motion_samples(begin - MARGIN, end + MARGIN), self.applied_offset
-        found: dict[int, MotionCompensated] = {}
+        result: dict[int, MotionCompensated] = {}
         for k, stream in enumerate(self.streams):
             if stream.now is None:
                 continue
             mine = replace(predicted, calibration=seen_by(predicted.calibration, k))
-            found[k] = stream.demodulated(before, mine, imu, offset, lost=lost)
+            result[k] = stream.demodulated(before, mine, imu, offset, is_lost=is_lost)
             stream.now = None
-        fields = self._beside({k: one.fields for k, one in found.items()})
+        fields = self._as_channels_of_all({k: one.fields for k, one in result.items()})
         fields = replace(fields, time=np.array([predicted.time]))
         wave = MotionCompensated.of_slots(fields)
         by_offset = wave.by_time_offset.copy()
-        for k, one in found.items():
+        for k, one in result.items():
             by_offset[:, self.site.of_sensor(k)] = one.by_time_offset
         return replace(wave, by_time_offset=by_offset)

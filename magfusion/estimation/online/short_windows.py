@@ -9,8 +9,8 @@ from magfusion.estimation.demodulation.close_tones import joint_phasors
 from magfusion.estimation.demodulation.motion_compensation import taken_off
 from magfusion.estimation.graph.state import State, as_trajectory
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
-from magfusion.estimation.measurements.model_error import alike_at
-from magfusion.estimation.online.measured import Measured
+from magfusion.estimation.measurements.model_error import epochs_sharing_error_at
+from magfusion.estimation.online.measured import EpochMeasurements
 from magfusion.model.parameters import predict_channels
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site
@@ -46,9 +46,9 @@ class ShortWindows:
         self.window, self._noise = None, []
 
     @staticmethod
-    def of(site: Site, asked: LockinSettings | None) -> "ShortWindows | None":
+    def of(site: Site, requested: LockinSettings | None) -> "ShortWindows | None":
         """Return those of a site whose tones are close; None for any other."""
-        settings = joint_settings(site, asked)
+        settings = joint_settings(site, requested)
         return None if settings is None else ShortWindows(JointReceiver(site, settings))
 
     def receive(self, waveform: Waveform, imu: ImuSamples, until: float, after: float) -> None:
@@ -87,7 +87,7 @@ class ShortWindows:
         rate_body: Array,
         *,
         standing: bool,
-    ) -> Measured:
+    ) -> EpochMeasurements:
         """Return the measurement of the current window at a prediction.
 
         Parameters
@@ -113,7 +113,7 @@ class ShortWindows:
         wanted = predicted.time + receiver.nodes
         off = taken_off(samples, path, imu, calibration, offset, LONGEST_WINDOW, wanted)
         assert off.wanted is not None
-        found, shown = joint_phasors(
+        result, shown = joint_phasors(
             receiver.designs,
             windows,
             samples.time,
@@ -125,13 +125,13 @@ class ShortWindows:
             np.zeros(1, dtype=np.int64),
             rate_body[None],
             np.full(1, offset),
-            alike=alike_at(predicted, receiver.settings.step),
+            shared_by=epochs_sharing_error_at(predicted, receiver.settings.step),
             standing=np.array([standing]),
             noise=np.array(self._noise).reshape(-1, 3, 3),
         )
         self._noise = [*self._noise, shown[0]][-receiver.settings.noise_windows :]
-        heard = _foreseen(found, predicted, self.length)
-        return Measured(heard, found, None, None, 1.0)
+        detected = _foreseen(result, predicted, self.length)
+        return EpochMeasurements(detected, result, None, None, 1.0)
 
 
 def _foreseen(joint: JointPhasors, state: State, length: float) -> FieldSamples:
@@ -144,13 +144,13 @@ def _foreseen(joint: JointPhasors, state: State, length: float) -> FieldSamples:
     parts = np.concatenate([phasor.real, phasor.imag], axis=-1)[0]
     square = np.sum((by @ parts[..., None])[..., 0] ** 2, axis=1)
     information = np.sum(by**2, axis=(1, 2)) / 6.0
-    loud = square * (LONGEST_WINDOW / length) > DETECTION_CHI_SQUARE_ONLINE
-    heard = joint.felt[0] & loud & (information > 0.0)
-    variance = np.where(heard, 1.0 / np.where(heard, information, 1.0), 1.0)
+    strong = square * (LONGEST_WINDOW / length) > DETECTION_CHI_SQUARE_ONLINE
+    detected = joint.is_predicted[0] & strong & (information > 0.0)
+    variance = np.where(detected, 1.0 / np.where(detected, information, 1.0), 1.0)
     return FieldSamples(
         time=centre.time,
         window=np.full(1, length),
         channels=site.channels,
-        phasor_sensor=np.where(heard[:, None], phasor[0], np.nan)[None],
+        phasor_sensor=np.where(detected[:, None], phasor[0], np.nan)[None],
         phasor_cov=(variance[:, None, None] * np.eye(3))[None],
     )

@@ -5,20 +5,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magfusion.estimation.graph.state import State
-from magfusion.estimation.online.blend import Blend
-from magfusion.estimation.online.carried import (
-    Departure,
-    Passage,
-    ahead,
-    carried_states,
-    carry,
-    departing,
-    in_tangent,
-)
-from magfusion.estimation.online.held_motion import HeldMotion
+from magfusion.estimation.online.constant_motion_model import ConstantMotionModel
+from magfusion.estimation.online.correction_smoothing import CorrectionSmoother
 from magfusion.estimation.online.input_queue import Arrivals
+from magfusion.estimation.online.motion_prior_prediction import ahead_by_prior
 from magfusion.estimation.online.navigator_settings import NavigatorSettings
-from magfusion.estimation.online.prior_ahead import ahead_by_prior
+from magfusion.estimation.online.propagated import (
+    Passage,
+    PropagationStart,
+    ahead,
+    in_tangent,
+    initial_passage,
+    propagate_passage,
+    states_along,
+)
 from magfusion.estimation.online_integrity.bank import SubsetBank
 from magfusion.estimation.online_integrity.judgement import (
     JudgedState,
@@ -32,7 +32,7 @@ from magfusion.units import DEGREE, Array
 
 
 @dataclass(frozen=True, eq=False)
-class CarriedState(JudgedState):
+class PropagatedState(JudgedState):
     """A state that is propagated by inertial samples.
 
     Parameters
@@ -47,7 +47,7 @@ class CarriedState(JudgedState):
 
 
 @dataclass(frozen=True, eq=False)
-class Said:
+class EpochReport:
     """Judgement and levels that all states propagated from one epoch share.
 
     Parameters
@@ -66,48 +66,51 @@ class StateOfNow:
 
     Attributes
     ----------
-    made : list of CarriedState
+    pending : list of PropagatedState
         At the requested rate, in order of time.
     """
 
-    made: list[CarriedState]
+    pending: list[PropagatedState]
     _stamp: float  # of the newest sample, or instant, with a state
     _until: float  # time of the newest state (s)
-    _blend: Blend
-    _held: HeldMotion
+    _smoother: CorrectionSmoother
+    _motion_model: ConstantMotionModel
 
     def __init__(self, settings: NavigatorSettings) -> None:
         self.rate, self.horizon = settings.rate, settings.horizon
-        self.made, self._stamp, self._until = [], -np.inf, -np.inf
-        self._blend, self._held = Blend(settings.blend), HeldMotion(settings.horizon)
-        self._departure: Departure | None = None
-        self._said = Said(Judgement(), 0, None)
+        self.pending, self._stamp, self._until = [], -np.inf, -np.inf
+        self._smoother, self._motion_model = (
+            CorrectionSmoother(settings.correction_time),
+            ConstantMotionModel(settings.horizon),
+        )
+        self._start: PropagationStart | None = None
+        self._report = EpochReport(Judgement(), 0, None)
         self._last: Passage | None = None
-        self._told: State | None = None  # of the newest sample, before a correction
+        self._newest: State | None = None  # of the newest sample, before a correction
 
-    def depart(self, departure: Departure, said: Said, arrived: Arrivals) -> None:
+    def restart_from(self, start: PropagationStart, report: EpochReport, arrived: Arrivals) -> None:
         """Continue from the state of a new epoch, which may include a correction."""
-        jumped = said.reset_counter != self._said.reset_counter
-        before = self._told
-        self._departure, self._said, self._last = departure, said, None
+        jumped = report.reset_counter != self._report.reset_counter
+        before = self._newest
+        self._start, self._report, self._last = start, report, None
         if self.rate == "field":
             return
         if self._stamp == -np.inf:  # states start with the next sample
             self._stamp = self._reached(arrived)
         if self.horizon > 0.0:
-            self._held.hear(arrived.inertial_samples())
-        if self._blend.length == 0.0:
+            self._motion_model.update(arrived.inertial_samples())
+        if self._smoother.length == 0.0:
             return
         if jumped:
-            self._blend.forget()
-        elif before is not None and before.time - self.horizon > departure.state.time:
+            self._smoother.reset()
+        elif before is not None and before.time - self.horizon > start.state.time:
             passage = self._passage(arrived, np.array([before.time - self.horizon]))
-            (corrected,) = carried_states(departure, self._ahead(passage, self.horizon))
-            self._blend.take(before, corrected)
+            (corrected,) = states_along(start, self._ahead(passage, self.horizon))
+            self._smoother.take(before, corrected)
 
     def reach(self, arrived: Arrivals) -> None:
         """Propagate the state to the inertial samples that have arrived."""
-        if self.rate == "field" or self._departure is None:
+        if self.rate == "field" or self._start is None:
             return
         wanted = self._wanted(arrived)
         if len(wanted) == 0:
@@ -116,21 +119,21 @@ class StateOfNow:
         if self.rate == "imu":
             wanted = wanted + arrived.applied_offset
         # Another time offset may go back in time.
-        wanted = wanted[wanted > max(self._departure.state.time, self._until)]
+        wanted = wanted[wanted > max(self._start.state.time, self._until)]
         if len(wanted) == 0:
             return
         self._until = float(wanted[-1])
-        self.made += self._judged(self._passage(arrived, wanted), self.horizon)
-        self._told = self.made[-1]
+        self.pending += self._judge_states(self._passage(arrived, wanted), self.horizon)
+        self._newest = self.pending[-1]
 
     def at(self, arrived: Arrivals, time: float) -> JudgedState:
         """Return the state at any time since the epoch (s)."""
-        assert self._departure is not None
-        newest = max(arrived.inertial, self._departure.state.time)
+        assert self._start is not None
+        newest = max(arrived.inertial, self._start.state.time)
         passage = self._passage(arrived, np.array([min(time, newest)]))
         if time > newest:
-            self._held.hear(arrived.inertial_samples())
-        return self._judged(passage, max(time - newest, 0.0))[0]
+            self._motion_model.update(arrived.inertial_samples())
+        return self._judge_states(passage, max(time - newest, 0.0))[0]
 
     def _reached(self, arrived: Arrivals) -> float:
         return arrived.imu.newest if self.rate == "imu" else arrived.inertial
@@ -147,15 +150,17 @@ class StateOfNow:
 
     def _passage(self, arrived: Arrivals, wanted: Array) -> Passage:
         """Return the passage at some times, continued from the last propagation."""
-        departure, last = self._departure, self._last
-        assert departure is not None
+        start, last = self._start, self._last
+        assert start is not None
         if last is None or wanted[0] < last.time[0]:
-            last = departing(departure)
-        begin, offset = float(last.time[0]) - departure.time_offset, departure.time_offset
+            last = initial_passage(start)
+        begin, offset = float(last.time[0]) - start.time_offset, start.time_offset
         end = max(float(wanted[-1]) - offset, arrived.imu.newest)
         imu = arrived.motion_samples(begin, end)
-        blind = arrived.stand_in.covers(begin, end)
-        passage, newest = carry(departure, last, imu, np.maximum(wanted, last.time), blind=blind)
+        blind = arrived.imu_filler.covers(begin, end)
+        passage, newest = propagate_passage(
+            start, last, imu, np.maximum(wanted, last.time), blind=blind
+        )
         if self._last is None or newest.time[0] > self._last.time[0]:
             self._last = newest
         return passage
@@ -163,28 +168,30 @@ class StateOfNow:
     def _ahead(self, passage: Passage, horizon: float) -> Passage:
         if horizon == 0.0:
             return passage
-        assert self._departure is not None
-        site = self._departure.site
+        assert self._start is not None
+        site = self._start.site
         if not site.platform.inertial:
             return ahead_by_prior(passage, horizon, site.platform.imu)
-        return ahead(passage, horizon, site.gravity, self._held.cov(horizon))
+        return ahead(passage, horizon, site.gravity, self._motion_model.cov(horizon))
 
-    def _judged(self, passage: Passage, horizon: float) -> list[CarriedState]:
-        departure, said = self._departure, self._said
-        assert departure is not None
+    def _judge_states(self, passage: Passage, horizon: float) -> list[PropagatedState]:
+        start, report = self._start, self._report
+        assert start is not None
         passage = self._ahead(passage, horizon)
         grown = np.ones((len(passage), 2))
-        if said.bank is not None and said.judgement.protection_level_m is not None:
-            grown = said.bank.grown(*in_tangent(passage))
-        found = []
-        for state, more in zip(carried_states(departure, passage), grown.tolist(), strict=True):
+        if report.bank is not None and report.judgement.protection_level_m is not None:
+            grown = report.bank.grown(*in_tangent(passage))
+        result = []
+        for state, more in zip(states_along(start, passage), grown.tolist(), strict=True):
             own, step = (
-                self._blend.told(state) if self._blend.length > 0.0 else (state, np.zeros(9))
+                self._smoother.smoothed(state)
+                if self._smoother.length > 0.0
+                else (state, np.zeros(9))
             )
-            judgement = _wider(said.judgement, more, step)
-            told = judged_state(own, judgement, said.reset_counter)
-            found.append(CarriedState(**parts_of(told), epoch=departure.state.time))
-        return found
+            judgement = _wider(report.judgement, more, step)
+            reported = judged_state(own, judgement, report.reset_counter)
+            result.append(PropagatedState(**parts_of(reported), epoch=start.state.time))
+        return result
 
 
 def _wider(judgement: Judgement, grown: list[float], step: Array) -> Judgement:

@@ -44,6 +44,6 @@ class StillSamples:
         count = int(np.ceil((newest - self.until) / self.step)) + 1
         if newest <= self.until or count < 1:
             return np.zeros(0)
-        made = self.until + self.step * np.arange(1, count + 1)
-        self.until = float(made[-1])
-        return np.asarray(made)
+        built = self.until + self.step * np.arange(1, count + 1)
+        self.until = float(built[-1])
+        return np.asarray(built)

@@ -20,18 +20,18 @@ from magfusion.estimation.graph.state import MOTION, State, between
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors, leaves_out
 from magfusion.estimation.online_integrity.judgement import Judgement
-from magfusion.estimation.online_integrity.levels import Asked, Levels
-from magfusion.estimation.posterior.separation import LEAST, Separation, radii
+from magfusion.estimation.online_integrity.levels import Levels, LevelsQuery
+from magfusion.estimation.posterior.separation import MIN_COUNT, Separation, radii
 from magfusion.model.parameters import Block, dimension
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk, Verdict
 from magfusion.units import DEGREE, Array, IntArray
 
-MOST = 6  # filters; with more beacons some share one
+MAX_FILTERS = 6  # filters; with more beacons some share one
 SLACK = 3.0  # sigma; smaller deviations are covered
 # Initial uncertainty of a filter without a beacon, as the first state was estimated with all.
 WIDE = np.repeat([0.2, 0.3, 0.5], 3)  # rad, m, m/s
-NOBODY, TOGETHER = -1, -2  # groups of rows that belong to no beacon, or to all
+NO_OWNER, TOGETHER = -1, -2  # groups of rows that belong to no beacon, or to all
 OPEN_ROTATION, OPEN_POSITION = 0.3, 10.0  # rad, m; beyond, nothing else determines the pose
 
 
@@ -58,7 +58,7 @@ class SubsetBank:
         self._estimated = tuple(block for block in blocks if block.columns.stop <= last)
         self.risk = Risk() if risk is None else risk
         self.names = [beacon.name for beacon in site.beacons]
-        self.groups = min(len(self.names), MOST)
+        self.groups = min(len(self.names), MAX_FILTERS)
         members = np.bincount(np.arange(len(self.names)) % self.groups)
         self._prior = np.array(self.risk.fault * members[None], dtype=np.float64)
         self._step = self._cov = self._joint = None
@@ -81,7 +81,7 @@ class SubsetBank:
             if part is None or part.shape != shape or not np.all(np.isfinite(part)):
                 raise ValueError("has filters of another shape, or not finite")
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Discard all filters: the estimate has restarted."""
         self._step = self._cov = self._joint = None
 
@@ -112,30 +112,30 @@ class SubsetBank:
             part[:, :, :MOTION] = part @ motion.T
             part += noise
         error, jacobian, owner = self._rows(measurements, predicted.state)
-        taken = self._taken(jacobian, owner)
-        self._leave_out_together(measurements, owner, jacobian, taken)
+        selected = self._accepted_rows(jacobian, owner)
+        self._leave_out_together(measurements, owner, jacobian, selected)
         if leaves_out(measurements):
             kept = np.any(jacobian, axis=1)
-            error, jacobian, taken = error[kept], jacobian[kept], taken[:, kept]
+            error, jacobian, selected = error[kept], jacobian[kept], selected[:, kept]
         # Considered parameters have no gain: only rows and columns of all others are updated.
         count = cov.shape[1] - self.considered
         own, considered = slice(0, count), slice(count, None)
-        crossed, back = taken @ cov, np.swapaxes(taken, 1, 2)
+        crossed, back = selected @ cov, np.swapaxes(selected, 1, 2)
         gain = self._gains(crossed[:, :, own], crossed @ back)
-        turned = np.swapaxes(gain, 1, 2)
+        rotated = np.swapaxes(gain, 1, 2)
         innovation = error + step @ jacobian.T
         step[:, own] -= (gain[1:] @ innovation[..., None])[..., 0]
         step[:, own] -= between(predicted.state, after, self._estimated)
         # Joseph's form, as the gain is not optimal with considered parameters.
         half = cov[:, own] - gain @ crossed
-        whole = half[:, :, own] + (gain - half @ back) @ turned
+        whole = half[:, :, own] + (gain - half @ back) @ rotated
         cov[:, own, own] = 0.5 * (whole + np.swapaxes(whole, 1, 2))
         cov[:, own, considered] = half[:, :, considered]
         cov[:, considered, own] = np.swapaxes(half[:, :, considered], 1, 2)
-        joint[:, own] -= gain[1:] @ (taken[1:] @ joint)
+        joint[:, own] -= gain[1:] @ (selected[1:] @ joint)
         across = joint @ back[0]
-        joint[:, own, own] += gain[1:] @ turned[0]
-        joint[:, :, own] -= across @ turned[0]
+        joint[:, own, own] += gain[1:] @ rotated[0]
+        joint[:, :, own] -= across @ rotated[0]
         self._step, self._cov, self._joint = step, cov, joint
 
     def _begin(self, state: State) -> None:
@@ -157,20 +157,20 @@ class SubsetBank:
                 owner = np.repeat(self._owner, 6)
             else:
                 together = isinstance(measurement, JointPhasors)
-                owner = np.full(len(rows[0]), TOGETHER if together else NOBODY)
+                owner = np.full(len(rows[0]), TOGETHER if together else NO_OWNER)
             parts.append((rows, owner))
         error = np.concatenate([rows[0] for rows, _ in parts])
         jacobian = np.concatenate([rows[1] for rows, _ in parts])
         return error, jacobian, np.concatenate([owner for _, owner in parts])
 
-    def _taken(self, jacobian: Array, owner: IntArray) -> Array:
+    def _accepted_rows(self, jacobian: Array, owner: IntArray) -> Array:
         """Return the rows that each filter uses, zero for those it excludes."""
         # The first filter excludes no beacon.
         kept = np.arange(-1, self.groups)[:, None] != np.where(owner < 0, self.groups, owner)
         return np.where(kept[:, :, None], jacobian, 0.0)
 
     def _leave_out_together(
-        self, measurements: Sequence[Measurement], owner: IntArray, jacobian: Array, taken: Array
+        self, measurements: Sequence[Measurement], owner: IntArray, jacobian: Array, selected: Array
     ) -> None:
         """Project each group out of the rows of jointly measured tones."""
         rows = np.flatnonzero(owner == TOGETHER)
@@ -178,27 +178,27 @@ class SubsetBank:
             if isinstance(measurement, JointPhasors):
                 for group in range(self.groups):
                     basis = measurement.spanned((self._owner == group)[None])[0]
-                    taken[1 + group, rows] -= basis @ (basis.T @ jacobian[rows])
+                    selected[1 + group, rows] -= basis @ (basis.T @ jacobian[rows])
 
     def _gains(self, crossed: Array, spread: Array) -> Array:
         """Return the gain of every filter, shape (1 + groups, estimated, rows)."""
         innovation = spread + np.eye(spread.shape[1])
         return np.asarray(np.swapaxes(np.linalg.solve(innovation, crossed), 1, 2))
 
-    def heard(self, judgement: Judgement, state: State) -> Judgement:
+    def with_levels(self, judgement: Judgement, state: State) -> Judgement:
         """Return a judgement with the separation test, and with its protection levels."""
-        found = self.separation(state)
-        if found is None or judgement.verdict is Verdict.FAILED:
+        result = self.separation(state)
+        if result is None or judgement.verdict is Verdict.FAILED:
             return judgement
-        excess = self._excess(found)
+        excess = self._excess(result)
         if np.max(excess) <= 1.0:
             # Inflation by other monitors is unknown to the separation.
             wide, more = float(np.sqrt(judgement.inflation)), SLACK * float(np.sqrt(3.0))
             beyond = (more * judgement.shift, more * judgement.turn / DEGREE)
-            asked = Asked(found, SLACK, self.risk, self._prior, wide, beyond)
-            return replace(judgement, levels=Levels(asked=asked))
+            requested = LevelsQuery(result, SLACK, self.risk, self._prior, wide, beyond)
+            return replace(judgement, levels=Levels(query=requested))
         worst = int(np.argmax(excess))
-        turn, shift = np.max(np.where(found.determined[0, :, None], found.shift[0], 0.0), axis=0)
+        turn, shift = np.max(np.where(result.determined[0, :, None], result.shift[0], 0.0), axis=0)
         text = (
             f"The state with and without {self._called(worst)} differs by {1e3 * shift:.3g} mm,"
             f" {excess[worst]:.3g} times what noise and survey explain: the beacons contradict each"
@@ -214,13 +214,13 @@ class SubsetBank:
             shift=max(judgement.shift, float(shift)),
         )
 
-    def _excess(self, found: Separation) -> Array:
+    def _excess(self, result: Separation) -> Array:
         """Return the ratio of each filter's step to its threshold; zeros if all are far below."""
-        step = np.add.reduceat(found.step[0] ** 2, (0, 3), axis=1)
-        own = np.add.reduceat(found.cov[0].diagonal(), (0, 3))
+        step = np.add.reduceat(result.step[0] ** 2, (0, 3), axis=1)
+        own = np.add.reduceat(result.cov[0].diagonal(), (0, 3))
         if (step <= SLACK**2 * own).all():
             return np.zeros(self.groups)
-        return found.excess(self.risk, SLACK)[0]
+        return result.excess(self.risk, SLACK)[0]
 
     def _called(self, group: int) -> str:
         names = self.names[group :: self.groups]
@@ -233,7 +233,7 @@ class SubsetBank:
         pose = np.s_[:, :6, :6]
         # A copy: a state whose levels are not yet computed must not reference the whole filters.
         subset, joint = self._cov[1:][pose].copy(), self._joint[pose]
-        apart = subset + self._cov[:1][pose] - joint - np.swapaxes(joint, 1, 2)
+        separate = subset + self._cov[:1][pose] - joint - np.swapaxes(joint, 1, 2)
         variance = np.einsum("gii->gi", subset)
         determined = (np.sum(variance[:, :3], axis=1) < OPEN_ROTATION**2) & (
             np.sum(variance[:, 3:], axis=1) < OPEN_POSITION**2
@@ -243,7 +243,7 @@ class SubsetBank:
             self._step[None, :, :6].copy(),
             state.cov[None, :6, :6].copy(),
             subset[None],
-            apart[None],
+            separate[None],
             determined[None],
             np.zeros(count),
             np.full(count, 6),
@@ -266,14 +266,15 @@ class SubsetBank:
             return np.ones((len(transition), 2))
         size = transition.shape[2]
         cov, joint = self._cov[:, :size, :size], self._joint[:, :size, :size]
-        apart = cov[1:] + cov[:1] - joint - np.swapaxes(joint, 1, 2)
+        separate = cov[1:] + cov[:1] - joint - np.swapaxes(joint, 1, 2)
         pose = transition[:, None, :6]
         back = np.swapaxes(pose, 2, 3)
-        later = pose @ np.concatenate([cov, apart]) @ back
+        later = pose @ np.concatenate([cov, separate]) @ back
         later[:, : len(cov)] += noise[:, None, :6, :6]
-        before, after = radii(np.concatenate([cov, apart])[:, :6, :6]), radii(later)
+        before, after = radii(np.concatenate([cov, separate])[:, :6, :6]), radii(later)
         # Parameters known exactly, or without separation, do not contribute to a level.
         shares = [
-            after[i] / np.where(before[i] > LEAST, before[i], np.inf) for i in range(len(before))
+            after[i] / np.where(before[i] > MIN_COUNT, before[i], np.inf)
+            for i in range(len(before))
         ]
         return np.asarray(np.maximum(np.max(shares, axis=(0, 2)), 1.0))

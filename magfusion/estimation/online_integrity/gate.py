@@ -29,7 +29,7 @@ class Gate:
         By beacon, running mean of the squared innovation in units of its expectation.
     refused_in_a_row : int
         Consecutive epochs with most channels rejected, up to now.
-    taken, refused : dict of str to float
+    accepted, refused : dict of str to float
         Of the last epoch, by beacon, the mean squared innovation of the accepted and of the
         rejected channels, in the same units.
     """
@@ -37,7 +37,7 @@ class Gate:
     counts: Counter[str]
     distortion: dict[str, float]
     refused_in_a_row: int
-    taken: dict[str, float]
+    accepted: dict[str, float]
     refused: dict[str, float]
 
     def __init__(
@@ -53,10 +53,10 @@ class Gate:
         self.counts = Counter()
         self.distortion = {}
         self.refused_in_a_row = 0
-        self.taken, self.refused = {}, {}
+        self.accepted, self.refused = {}, {}
 
     @property
-    def lost(self) -> bool:
+    def is_lost(self) -> bool:
         """Whether the state is probably wrong rather than the measurements."""
         return self.refused_in_a_row >= LOST_EPOCHS
 
@@ -73,20 +73,20 @@ class Gate:
             Channels that the epoch contains, and those that are already rejected.
         """
         distance = measurements.alone().distances(state, self.blocks, GATE)
-        false = self.watch.heard(distance > GATE, valid)
+        false = self.watch.update(distance > GATE, valid)
         rejected: BoolArray = np.asarray((distance > GATE) | refused | false) & valid
         self._note(distance, valid)
-        self.taken = self._by_beacon(distance, valid & ~rejected)
+        self.accepted = self._by_beacon(distance, valid & ~rejected)
         self.refused = self._by_beacon(distance, rejected)
         for name in self.owner[rejected]:
             self.counts[f"outlier of {name}"] += 1
-        most = np.sum(rejected & ~false) > 0.5 * np.sum(valid & ~false)
-        self.refused_in_a_row = self.refused_in_a_row + 1 if most else 0
+        maximum = np.sum(rejected & ~false) > 0.5 * np.sum(valid & ~false)
+        self.refused_in_a_row = self.refused_in_a_row + 1 if maximum else 0
         return measurements.without(rejected) if np.any(rejected) else measurements
 
     def nothing_measured(self) -> None:
         """Record an epoch without field."""
-        self.taken, self.refused = {}, {}
+        self.accepted, self.refused = {}, {}
 
     def _by_beacon(self, distance: Array, chosen: BoolArray) -> dict[str, float]:
         own = self._number[chosen]

@@ -29,7 +29,7 @@ class Judgement:
         Additional error of attitude (rad) and position (m), one sigma per axis.
     levels : Levels, optional
         None where there are none.
-    heard : tuple of str
+    detected : tuple of str
         Beacons that are detected there, with the motion inside the window compensated.
     """
 
@@ -39,17 +39,17 @@ class Judgement:
     turn: float = 0.0
     shift: float = 0.0
     levels: Levels | None = None
-    heard: tuple[str, ...] = ()
+    detected: tuple[str, ...] = ()
 
     @property
     def protection_level_m(self) -> float | None:
         """Radius that bounds the position error (m), if there is one."""
-        return None if self.levels is None else self.levels.found[0]
+        return None if self.levels is None else self.levels.values[0]
 
     @property
     def protection_level_deg(self) -> float | None:
         """Angle that bounds the attitude error (deg), if there is one."""
-        return None if self.levels is None else self.levels.found[1]
+        return None if self.levels is None else self.levels.values[1]
 
     @property
     def verdict(self) -> Verdict:
@@ -66,7 +66,7 @@ class Judgement:
         """Findings that cast no doubt: the estimator handles them."""
         return Trust(self.findings).remarks
 
-    def beside(self, *findings: Finding) -> "Judgement":
+    def with_findings(self, *findings: Finding) -> "Judgement":
         """Return the judgement with more findings."""
         return replace(self, findings=(*self.findings, *findings)) if findings else self
 
@@ -90,7 +90,7 @@ class Judgement:
 
 
 @dataclass(frozen=True)
-class Told:
+class TimedJudgement:
     """Judgement of the state at a time (s)."""
 
     time: float
@@ -107,7 +107,7 @@ class JudgedState(State):
     judgement : Judgement
     reset_counter : int
         Number of pose jumps up to here, as counted by
-        `magfusion.estimation.online_integrity.resets`; users of pose increments must restart where
+        `magfusion.estimation.online_integrity.discontinuity_counter`; users of pose increments must restart where
         it rises.
     """
 
@@ -122,25 +122,25 @@ class JudgedState(State):
         return self.judgement.verdict
 
     @property
-    def lost(self) -> bool:
+    def is_lost(self) -> bool:
         """Whether the pose is a guess that must not be used."""
         return self.verdict is Verdict.FAILED
 
 
-def told_cov(state: State, judgement: Judgement) -> Array:
+def reported_cov(state: State, judgement: Judgement) -> Array:
     """Return the output covariance of a state: with any roll that is undetermined."""
     cov, site = judgement.honest(state.cov), state.calibration.site
     if not roll_is_open(site):
         return cov
-    turned = state.world_from_body, state.gyro_bias_body, site.platform.imu.gyro_bias_sigma
-    return opened_state(site, cov, *turned)
+    rotated = state.world_from_body, state.gyro_bias_body, site.platform.imu.gyro_bias_sigma
+    return opened_state(site, cov, *rotated)
 
 
 def judged_state(state: State, judgement: Judgement, reset_counter: int = 0) -> JudgedState:
     """Return the output state for an estimator's state."""
-    told = {"cov": told_cov(state, judgement), "judgement": judgement}
+    reported = {"cov": reported_cov(state, judgement), "judgement": judgement}
     own = {name: getattr(state, name) for name in _OF_STATE}
-    return JudgedState(**own | told | {"reset_counter": reset_counter})
+    return JudgedState(**own | reported | {"reset_counter": reset_counter})
 
 
 def parts_of(state: JudgedState) -> dict[str, Any]:

@@ -13,11 +13,11 @@ from magfusion.estimation.posterior.separation import Separation, protection_lev
 from magfusion.model.trust import Risk
 from magfusion.units import Array
 
-Found = tuple[float | None, float | None]
+ProtectionLevels = tuple[float | None, float | None]
 _PARTS = tuple(part.name for part in fields(Separation))
 
 
-class Asked(NamedTuple):
+class LevelsQuery(NamedTuple):
     """Arguments from which the levels of a state are computed.
 
     Parameters
@@ -47,60 +47,62 @@ class Levels:
 
     Parameters
     ----------
-    found : tuple of float, optional
+    values : tuple of float, optional
         Position (m) and attitude (deg); None for a level that does not exist.
-    asked : Asked, optional
+    query : LevelsQuery, optional
         Arguments of levels that are not computed yet.
     """
 
-    def __init__(self, found: Found | None = None, asked: Asked | None = None) -> None:
-        self._found, self._asked = found, asked
+    def __init__(
+        self, result: ProtectionLevels | None = None, query: LevelsQuery | None = None
+    ) -> None:
+        self._values, self._query = result, query
 
     @property
-    def found(self) -> Found:
+    def values(self) -> ProtectionLevels:
         """Position (m) and attitude (deg); None where a level does not exist."""
-        if self._found is None:
+        if self._values is None:
             find([self])
-        return self._found or (None, None)
+        return self._values or (None, None)
 
     @property
-    def asked(self) -> Asked | None:
+    def query(self) -> LevelsQuery | None:
         """Arguments of the computation; None once it is done."""
-        return self._asked
+        return self._query
 
-    def take(self, found: Found) -> None:
+    def take(self, result: ProtectionLevels) -> None:
         """Store computed levels."""
-        self._found, self._asked = found, None
+        self._values, self._query = result, None
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Levels) and self.found == other.found
+        return isinstance(other, Levels) and self.values == other.values
 
     def __hash__(self) -> int:
-        return hash(self.found)
+        return hash(self.values)
 
     def __repr__(self) -> str:
-        return f"Levels({self.found})"
+        return f"Levels({self.values})"
 
 
 def find(levels: Iterable[Levels]) -> None:
     """Compute missing levels together; each result is as computed separately."""
-    waiting: dict[tuple[float, Risk, int], list[tuple[Levels, Asked]]] = {}
+    waiting: dict[tuple[float, Risk, int], list[tuple[Levels, LevelsQuery]]] = {}
     for one in levels:
-        asked = one.asked
-        if asked is not None:
-            key = asked.slack, asked.risk, asked.prior.shape[1]
-            waiting.setdefault(key, []).append((one, asked))
+        query = one.query
+        if query is not None:
+            key = query.slack, query.risk, query.prior.shape[1]
+            waiting.setdefault(key, []).append((one, query))
     for (slack, risk, _), group in waiting.items():
-        parts = [asked.separation for _, asked in group]
+        parts = [query.separation for _, query in group]
         whole = parts[0]
         if len(parts) > 1:
             each = [np.concatenate([getattr(part, name) for part in parts]) for name in _PARTS]
             whole = Separation(*each)
-        prior = np.concatenate([asked.prior for _, asked in group])
+        prior = np.concatenate([query.prior for _, query in group])
         both = np.stack(protection_levels(whole, risk, slack, prior), axis=1)
-        for (one, asked), values in zip(group, both.tolist(), strict=True):
+        for (one, query), values in zip(group, both.tolist(), strict=True):
             position_m, degrees = (
-                asked.factor * value + more if np.isfinite(value) else None
-                for value, more in zip(values, asked.more, strict=True)
+                query.factor * value + more if np.isfinite(value) else None
+                for value, more in zip(values, query.more, strict=True)
             )
             one.take((position_m, degrees))

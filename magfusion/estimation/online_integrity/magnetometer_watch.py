@@ -7,8 +7,11 @@ from magfusion.model.trust import Finding
 from magfusion.units import BoolArray
 
 MEMORY = 0.95  # of the running share of rejected phasors, per epoch of its own
-MOSTLY, SELDOM = 0.5, 0.2  # shares of rejections: of a faulty one, and of another that is right
-FEWEST = 20  # epochs of its own, before one is assessed
+MAJORITY_SHARE, MINORITY_SHARE = (
+    0.5,
+    0.2,
+)  # shares of rejections: of a faulty one, and of another that is right
+MIN_EPOCHS = 20  # epochs of its own, before one is assessed
 
 
 class MagnetometerWatch:
@@ -27,7 +30,7 @@ class MagnetometerWatch:
     share: dict[str, float]
     epochs: dict[str, int]
     excluded: list[str]
-    _said: list[Finding]
+    _findings: list[Finding]
 
     def __init__(self, site: Site) -> None:
         sensors = site.platform.magnetometers
@@ -35,21 +38,21 @@ class MagnetometerWatch:
         self._names = tuple(sensor.name for sensor in sensors) if several else ()
         self._sensor = site.sensor
         self.share, self.epochs = {}, {}
-        self.excluded, self._said = [], []
+        self.excluded, self._findings = [], []
 
-    def begin(self, excluded: tuple[str, ...], said: tuple[Finding, ...]) -> None:
+    def begin(self, excluded: tuple[str, ...], findings: tuple[Finding, ...]) -> None:
         """Exclude those that the first state excludes, and keep the findings on them."""
-        self.excluded, self._said = list(excluded), list(said)
+        self.excluded, self._findings = list(excluded), list(findings)
 
     @property
     def false(self) -> tuple[str, ...]:
         """Excluded ones: mostly rejected, while another seldom is."""
-        asked = [name for name in self._names if self.epochs.get(name, 0) >= FEWEST]
-        right = [name for name in asked if self.share[name] < SELDOM]
-        late = [name for name in asked if right and self.share[name] > MOSTLY]
+        requested = [name for name in self._names if self.epochs.get(name, 0) >= MIN_EPOCHS]
+        right = [name for name in requested if self.share[name] < MINORITY_SHARE]
+        late = [name for name in requested if right and self.share[name] > MAJORITY_SHARE]
         return tuple(dict.fromkeys([*self.excluded, *late]))
 
-    def heard(self, refused: BoolArray, valid: BoolArray) -> BoolArray:
+    def update(self, refused: BoolArray, valid: BoolArray) -> BoolArray:
         """Process the channels that a state does not explain; return the excluded ones.
 
         Returns
@@ -72,7 +75,7 @@ class MagnetometerWatch:
     def findings(self) -> tuple[Finding, ...]:
         """Return the findings on excluded magnetometers."""
         late = [name for name in self.false if name not in self.excluded]
-        return *self._said, *(
+        return *self._findings, *(
             Finding(
                 "magnetometer_excluded",
                 f"Magnetometer {name} contradicts the others: {100.0 * self.share[name]:.0f} % of"

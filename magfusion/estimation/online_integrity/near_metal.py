@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.estimation.data_checks.running import Running, nothing
+from magfusion.estimation.data_checks.running import DecayingSums, nothing
 from magfusion.estimation.graph.state import MOTION, State, states_of
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.online_integrity.judgement import Judgement
@@ -27,33 +27,33 @@ RELEASE = 1.0  # s; time constant of its decay, as a passing object may return
 COMMON = 2.0  # s; correlation time of the error of a hand-held object
 QUIET = 1.0  # s; undisturbed time before an onset can be detected
 BEYOND = 2.0  # times the declared model error
-SURE = 5.0  # sigma
+DETECTION_SIGMAS = 5.0  # sigma
 
 
 class NearMetal:
     """The share of a single beacon's field that is caused by nearby metal."""
 
-    _heard: Running  # squared share, and its variance without metal
+    _squared_share: DecayingSums  # squared share, and its variance without metal
     _kept: float  # squared share that is used
     _time: float
     _quiet: float  # s
-    _since: float | None
+    _metal_since: float | None
 
     def __init__(self, site: Site, blocks: tuple[Block, ...]) -> None:
         self.site, self.blocks = site, blocks
-        self.lone = len(site.beacons) == 1
-        self._heard, self._kept = nothing(2), 0.0
-        self._time, self._quiet, self._since = -np.inf, 0.0, None
+        self.single = len(site.beacons) == 1
+        self._squared_share, self._kept = nothing(2), 0.0
+        self._time, self._quiet, self._metal_since = -np.inf, 0.0, None
 
     @property
     def comes(self) -> bool:
         """Whether the last epoch is the onset: earlier epochs are partly disturbed."""
-        return self._since == self._time
+        return self._metal_since == self._time
 
     @property
     def near(self) -> bool:
         """Whether metal is near."""
-        return self._since is not None
+        return self._metal_since is not None
 
     def weighed(self, phasors: FieldPhasors, state: State, valid: BoolArray) -> FieldPhasors:
         """Return the phasors of an epoch, weighted for nearby metal.
@@ -64,19 +64,21 @@ class NearMetal:
             The prediction, with its own covariance.
         valid : bool ndarray, shape (channels,)
         """
-        if not self.lone or not np.any(valid):
+        if not self.single or not np.any(valid):
             return phasors
         step = state.time - self._time if np.isfinite(self._time) else 0.0
         self._time = state.time
         power = np.sum(phasors.measured[0] ** 2, axis=1) / 3.0
-        self._hear(phasors, state, valid, power)
-        self._believe(min(step, COMMON))
+        self._update_share(phasors, state, valid, power)
+        self._update_verdict(min(step, COMMON))
         if not self.near:
             return phasors
-        alike = max(1.0, 2.0 * COMMON / max(step, 1e-6))
-        return _with_share(phasors, valid, self._kept * power, alike)
+        shared = max(1.0, 2.0 * COMMON / max(step, 1e-6))
+        return _with_share(phasors, valid, self._kept * power, shared)
 
-    def _hear(self, phasors: FieldPhasors, state: State, valid: BoolArray, power: Array) -> None:
+    def _update_share(
+        self, phasors: FieldPhasors, state: State, valid: BoolArray, power: Array
+    ) -> None:
         """Estimate the squared share of one epoch, by the score of its likelihood."""
         own = phasors.alone()
         rows = own.linearize(states_of([state]), state.calibration, self.blocks)
@@ -94,30 +96,30 @@ class NearMetal:
         shared, seen = weight[:, :-1], weight[:, -1]
         information = float(np.sum(shared * shared.T))
         share = (float(seen @ along @ seen) - float(np.trace(shared))) / information
-        found = np.array([share, 2.0 / information])
-        self._heard = self._heard.with_sample(found, state.time, MEMORY)
+        result = np.array([share, 2.0 / information])
+        self._squared_share = self._squared_share.with_sample(result, state.time, MEMORY)
 
-    def _believe(self, step: float) -> None:
-        share, variance = self._heard.mean
-        sigma = np.sqrt(variance / max(self._heard.count, 1.0))
+    def _update_verdict(self, step: float) -> None:
+        share, variance = self._squared_share.mean
+        sigma = np.sqrt(variance / max(self._squared_share.count, 1.0))
         usual = BEYOND * float(np.max(model_error(self.site)))
         self._kept *= float(np.exp(-2.0 * step / RELEASE))
-        if share > max(usual**2, SURE * sigma) and self._heard.count > 3.0:
-            if self._since is None and self._quiet >= QUIET:
-                self._since = self._time
+        if share > max(usual**2, DETECTION_SIGMAS * sigma) and self._squared_share.count > 3.0:
+            if self._metal_since is None and self._quiet >= QUIET:
+                self._metal_since = self._time
             self._kept = max(self._kept, min(share, EXPLAINED**2))
             self._quiet = 0.0
         elif self._kept < usual**2:
-            self._quiet, self._since = self._quiet + step, None
+            self._quiet, self._metal_since = self._quiet + step, None
 
-    def said(self) -> Judgement:
+    def judgement(self) -> Judgement:
         """Return the judgement on nearby metal."""
-        if self._since is None:
+        if self._metal_since is None:
             return Judgement()
         name, share = self.site.beacons[0].name, 100.0 * np.sqrt(self._kept)
         text = (
             f"The field of beacon {name} deviates by {share:.2g} % from the prediction by site and"
-            f" motion since {self._since:.1f} s: metal or iron is near it or the sensor. Remove it,"
+            f" motion since {self._metal_since:.1f} s: metal or iron is near it or the sensor. Remove it,"
             " or wait until it is gone; the sigmas account for it."
         )
         return Judgement((Finding("metal_near", text, weight=share),))
@@ -132,7 +134,7 @@ def _in_phase(measured: Array) -> Array:
 
 
 def _with_share(
-    phasors: FieldPhasors, valid: BoolArray, variance: Array, alike: float
+    phasors: FieldPhasors, valid: BoolArray, variance: Array, common: float
 ) -> FieldPhasors:
     """Return phasors with an additional error that a number of epochs share.
 
@@ -148,7 +150,7 @@ def _with_share(
     cov = inverse @ np.swapaxes(inverse, 1, 2) * (some[:, :, None] & some[:, None])
     more = variance[:, None, None] * np.eye(3) * some[:, None]
     before = np.ones(len(valid)) if phasors.excess is None else phasors.excess[0]
-    own, wide = cov / before[:, None, None] + more, cov + alike * more
+    own, wide = cov / before[:, None, None] + more, cov + common * more
     less, more_wide = (np.trace(part, axis1=1, axis2=2) for part in (own, wide))
     excess = np.divide(more_wide, less, out=np.ones_like(less), where=less > 0.0)
     whitening = paired_whitening(wide[None], some[None])

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtri
 
-from magfusion.estimation.data_checks.running import Running, nothing
+from magfusion.estimation.data_checks.running import DecayingSums, nothing
 from magfusion.estimation.data_checks.steady_field import DOUBT, off_earth
 from magfusion.estimation.graph.state import MOTION, ROTATION, State
 from magfusion.estimation.online_integrity.gate import Gate
@@ -35,9 +35,9 @@ FADES = 20.0  # s; after which findings of the beginning that may have passed ar
 PASSING = {"not_converged", "diverged", "field_residuals", "geometry", "gap", "separation"}
 RESTARTS_MEMORY = 60.0  # s
 LEAST_EXCESS = 2.5  # mean square; the noise is tuned on only a few seconds of the start
-SURE = 6.0
+DETECTION_SIGMAS = 6.0
 BEYOND_HELP = 0.2  # rad; a bias that tilts the vertical more makes inflation useless
-TURNED = 1.0  # s; of a gyro bias, before the fields correct it
+TURN_INTERVAL = 1.0  # s; of a gyro bias, before the fields correct it
 LEAST_GAIN = 0.05  # of a prior variance; a barely determined parameter does not move by itself
 OFTEN_REFUSED = 0.5  # of a beacon's epochs
 MANY_RESTARTS = 3.0
@@ -47,7 +47,7 @@ PROBATION = 2.0  # s; after a recovery or a failed update
 
 
 @dataclass(frozen=True, eq=False)
-class Heard:
+class EpochSummary:
     """Data of an epoch besides the state.
 
     Parameters
@@ -69,7 +69,7 @@ class Heard:
     repeats: float = 1.0
 
 
-class OnlineWitness:
+class OnlineMonitor:
     """Monitors of a running estimate.
 
     Parameters
@@ -78,18 +78,18 @@ class OnlineWitness:
         Calibration parameters that are estimated, first in the state's tangent.
     """
 
-    _level: dict[str, Running]
-    _refused: dict[str, Running]
+    _level: dict[str, DecayingSums]
+    _refused: dict[str, DecayingSums]
     _repeats: float
-    _gravity: Running
-    _earth: Running
-    _restarts: Running
+    _gravity: DecayingSums
+    _earth: DecayingSums
+    _restarts: DecayingSums
     _uncertain_until: dict[str, float]
     _elsewhere: float | None
     _elsewhere_times: int
     _began: float
     _beginning: Judgement
-    _borrowed: dict[str, Array]
+    _shared_offsets: dict[str, Array]
     _prior_at: float
     _prior: Judgement
 
@@ -103,40 +103,40 @@ class OnlineWitness:
         self._began, self._prior_at, self._prior = 0.0, -np.inf, Judgement()
         self._beginning = Judgement()
         self._declared: Calibration | None = None
-        self._borrowed = {}
-        self._borrowed_variance: Array | None = None
+        self._shared_offsets = {}
+        self._shared_variance: Array | None = None
 
     # Input
 
-    def begin(self, time: float, said: Judgement, borrowed: Mapping[str, Array]) -> None:
+    def begin(self, time: float, findings: Judgement, shared_offsets: Mapping[str, Array]) -> None:
         """Start at a first state (s), with the judgement of the smoothed beginning.
 
         Parameters
         ----------
-        borrowed : mapping of str to ndarray
+        shared_offsets : mapping of str to ndarray
             Variance of estimated parameters that is due to considered ones.
         """
-        self._began, self._beginning, self._borrowed = time, said, dict(borrowed)
-        self._borrowed_variance = None
+        self._began, self._beginning, self._shared_offsets = time, findings, dict(shared_offsets)
+        self._shared_variance = None
 
-    def hear(self, state: State, gate: Gate, heard: Heard) -> None:
+    def update(self, state: State, gate: Gate, epoch: EpochSummary) -> None:
         """Process an epoch: the state after it, and its gate."""
         time = state.time
-        for name, level in gate.taken.items():
+        for name, level in gate.accepted.items():
             before = self._level.get(name, nothing())
             self._level[name] = before.with_sample(np.array([level]), time, MEMORY)
-        for name in {**gate.taken, **gate.refused}:
-            share = np.array([float(name in gate.refused and name not in gate.taken)])
+        for name in {**gate.accepted, **gate.refused}:
+            share = np.array([float(name in gate.refused and name not in gate.accepted)])
             before = self._refused.get(name, nothing())
             self._refused[name] = before.with_sample(share, time, MEMORY)
-        self._repeats = heard.repeats
-        if heard.accel_world is not None:
-            accel, weight = heard.accel_world, heard.elapsed
+        self._repeats = epoch.repeats
+        if epoch.accel_world is not None:
+            accel, weight = epoch.accel_world, epoch.elapsed
             self._gravity = self._gravity.with_sample(accel, time, MEMORY, weight)
-        if heard.steady is not None:
-            self._hear_steady(state, heard.steady)
+        if epoch.steady is not None:
+            self._update_steady(state, epoch.steady)
 
-    def _hear_steady(self, state: State, steady: SteadyFields) -> None:
+    def _update_steady(self, state: State, steady: SteadyFields) -> None:
         measured, earth = steady.measured_sensor[0], self.site.earth_field_world
         if earth is None or not np.all(np.isfinite(measured)):
             return
@@ -151,7 +151,7 @@ class OnlineWitness:
         if code == "found_again":
             self._restarts = self._restarts.with_sample(np.ones(1), time, RESTARTS_MEMORY)
 
-    def forget_motion(self) -> None:
+    def reset_motion(self) -> None:
         """Discard the history of a pose that was given up."""
         self._level, self._refused = {}, {}
         self._gravity, self._earth = nothing(3), nothing(3)
@@ -171,18 +171,18 @@ class OnlineWitness:
             self._elsewhere, self._elsewhere_times = off, self._elsewhere_times + 1
 
     @property
-    def asks_for_a_fix(self) -> bool:
+    def needs_second_fix(self) -> bool:
         """Whether a fix that disagrees requests another at once."""
         return self._elsewhere is not None
 
     # Output
 
     def judgement(
-        self, state: State, gate: Gate, lost_since: float | None, held: Judgement
+        self, state: State, gate: Gate, lost_since: float | None, fixed: Judgement
     ) -> Judgement:
         """Return the judgement of a state, including that of its fixed parameters."""
         parts = [
-            held,
+            fixed,
             self._of_the_beginning(state.time),
             self._of_being_lost(gate, lost_since),
             self._of_fields(),
@@ -203,21 +203,21 @@ class OnlineWitness:
 
     def _of_the_beginning(self, time: float) -> Judgement:
         """Return the judgement of the beginning; temporary findings are dropped with time."""
-        said, findings = self._beginning, self._beginning.findings
+        messages, findings = self._beginning, self._beginning.findings
         if time >= self._began + FADES:
             findings = tuple(f for f in findings if f.code not in PASSING)
-        return replace(said, findings=findings) if findings else Judgement()
+        return replace(messages, findings=findings) if findings else Judgement()
 
-    def _of_being_lost(self, gate: Gate, since: float | None) -> Judgement:
-        if since is not None:
+    def _of_being_lost(self, gate: Gate, lost_since: float | None) -> Judgement:
+        if lost_since is not None:
             text = (
-                f"Lost since {since:.1f} s: neither a fix nor the state explains the fields. Check"
+                f"Lost since {lost_since:.1f} s: neither a fix nor the state explains the fields. Check"
                 " the frequencies, phases and positions of the beacons in the site."
             )
             return Judgement((Finding("lost", text, Verdict.FAILED, 10.0),))
         if gate.refused_in_a_row == 0 or not gate.refused:
             return Judgement()
-        levels = [*gate.refused.values(), *gate.taken.values()]
+        levels = [*gate.refused.values(), *gate.accepted.values()]
         excess = max(1.0, float(np.mean(levels)) if levels else 1.0)
         text = (
             f"The fields of {_listed(gate.refused)} were rejected together for"
@@ -226,7 +226,7 @@ class OnlineWitness:
         return Judgement((Finding("field_innovations", text, weight=excess),), inflation=excess)
 
     def _of_fields(self) -> Judgement:
-        found, inflation = [], 1.0
+        result, inflation = [], 1.0
         for name, level in self._level.items():
             mean, worth = float(level.mean[0]), level.count / self._repeats
             limit = 1.0 + DOUBT * np.sqrt(2.0 / (6.0 * self.channels[name] * max(worth, 0.2)))
@@ -238,7 +238,7 @@ class OnlineWitness:
                     f" {np.sqrt(mean):.2g} times its sigma over the last {MEMORY:g} s: iron nearby,"
                     " a wrong survey of it, or motion that the IMU did not measure."
                 )
-                found.append(Finding("field_innovations", text, weight=mean / limit))
+                result.append(Finding("field_innovations", text, weight=mean / limit))
         for name, share in self._refused.items():
             often = float(share.mean[0])
             if often > OFTEN_REFUSED and share.count > 4.0:
@@ -246,14 +246,14 @@ class OnlineWitness:
                     f"The field of beacon {name} was rejected in {100 * often:.0f} % of the last"
                     f" {MEMORY:g} s: it is moved, disturbed, or declared wrongly in the site."
                 )
-                found.append(Finding("beacon_excluded", text, weight=often / OFTEN_REFUSED))
-        return Judgement(tuple(found), inflation=inflation)
+                result.append(Finding("beacon_excluded", text, weight=often / OFTEN_REFUSED))
+        return Judgement(tuple(result), inflation=inflation)
 
     def _of_biases(self, state: State) -> Judgement:
         if not self.site.platform.inertial:
             return Judgement()
         imu, elapsed = self.site.platform.imu, state.time - self._began
-        found, inflation, turn, variance = [], 1.0, 0.0, state.cov.diagonal()
+        result, inflation, turn, variance = [], 1.0, 0.0, state.cov.diagonal()
         for code, name, bias, sigma, walk, first, unit in (
             ("accel_bias", "accelerometer", state.accel_bias_body, imu.accel_bias_sigma,
              imu.accel_bias_walk, 9, "m/s^2"),
@@ -268,16 +268,20 @@ class OnlineWitness:
             if worst < DOUBT:
                 continue
             size = float(np.linalg.norm(bias))
-            off = size / self.site.gravity if code == "accel_bias" else size * TURNED
-            verdict = Verdict.FAILED if worst > SURE and off > BEYOND_HELP else Verdict.DOUBTFUL
+            off = size / self.site.gravity if code == "accel_bias" else size * TURN_INTERVAL
+            verdict = (
+                Verdict.FAILED
+                if worst > DETECTION_SIGMAS and off > BEYOND_HELP
+                else Verdict.DOUBTFUL
+            )
             text = (
                 f"The bias of the {name}'s {'xyz'[axis]} axis is {bias[axis]:.3g} {unit},"
                 f" {worst:.0f} times what is declared: axes, signs or units of the IMU, its"
                 " mounting to the magnetometer, or a declared sigma that is too small."
             )
-            found.append(Finding("imu_bias", text, verdict, worst / DOUBT))
+            result.append(Finding("imu_bias", text, verdict, worst / DOUBT))
             inflation, turn = max(inflation, worst**2), max(turn, off)
-        return Judgement(tuple(found), inflation=inflation, turn=turn)
+        return Judgement(tuple(result), inflation=inflation, turn=turn)
 
     def _of_calibration(self, state: State) -> Judgement:
         if not self.estimated:
@@ -290,17 +294,17 @@ class OnlineWitness:
             declared = initial_calibration(self.site, state.calibration.reference_time)
             self._declared = declared
         change = difference(declared, state.calibration, self.estimated)
-        left = np.diagonal(state.cov)[MOTION : MOTION + len(change)]
+        remaining = np.diagonal(state.cov)[MOTION : MOTION + len(change)]
         walk = self._walk * (state.time - self._began) / 3600.0
         prior = self._declared_variance + walk
-        if self._borrowed_variance is None:  # also after a checkpoint
-            own = (self._borrowed.get(b.name, np.zeros(len(b.sigma))) for b in self.estimated)
-            self._borrowed_variance = np.concatenate(list(own))
+        if self._shared_variance is None:  # also after a checkpoint
+            own = (self._shared_offsets.get(b.name, np.zeros(len(b.sigma))) for b in self.estimated)
+            self._shared_variance = np.concatenate(list(own))
         # Considered parameters shift estimate and error alike: their variance counts in both.
-        both = 2.0 * np.minimum(self._borrowed_variance, left)
-        gained = np.maximum(prior - left + both, LEAST_GAIN * prior)
+        both = 2.0 * np.minimum(self._shared_variance, remaining)
+        gained = np.maximum(prior - remaining + both, LEAST_GAIN * prior)
         scores, usual = np.abs(change) / np.sqrt(gained), np.maximum(prior, gained)
-        of_site, found, inflation = self._of_site, [], 1.0
+        of_site, result, inflation = self._of_site, [], 1.0
         total = float((change**2 / usual)[of_site].sum())
         number = int(np.count_nonzero(of_site))
         for block in self.estimated if scores[of_site].max(initial=0.0) > DOUBT else ():
@@ -310,16 +314,16 @@ class OnlineWitness:
                     f"{block.name} deviates from its declared value by {score:.1f} times what the"
                     " declared sigma allows: the value is wrong, or the sigma is too small."
                 )
-                found.append(Finding("prior", text, weight=score / DOUBT))
+                result.append(Finding("prior", text, weight=score / DOUBT))
                 inflation = max(inflation, score**2)
         if number and total > (limit := float(chdtri(number, 1e-5))):
             text = (
                 f"Together the {number} calibration parameters deviate from their declared values"
                 f" by {np.sqrt(total / number):.2g} times their declared sigmas."
             )
-            found.append(Finding("prior", text, weight=total / limit))
+            result.append(Finding("prior", text, weight=total / limit))
             inflation = max(inflation, total / number)
-        self._prior = Judgement(tuple(found), inflation=inflation)
+        self._prior = Judgement(tuple(result), inflation=inflation)
         return self._prior
 
     @cached_property
@@ -343,16 +347,16 @@ class OnlineWitness:
         span = self._gravity.weight  # s of data, without the gaps of the IMU
         if span < LEAST_SPAN or not self.site.platform.inertial:
             return Judgement()
-        left = float(np.linalg.norm(self._gravity.mean))
+        remaining = float(np.linalg.norm(self._gravity.mean))
         motion, imu = self.site.platform.motion, self.site.platform.imu
         sigma = np.hypot(np.sqrt(2.0) * motion.speed_sigma / span, imu.accel_bias_sigma)
-        score = left / sigma
+        score = remaining / sigma
         if score < DOUBT:
             return Judgement()
-        angle = left / self.site.gravity
+        angle = remaining / self.site.gravity
         verdict = Verdict.FAILED if angle > 2.0 * BEYOND_HELP else Verdict.DOUBTFUL
         text = (
-            f"The mean specific force of the last {MEMORY:g} s deviates by {left:.2g} m/s^2 from"
+            f"The mean specific force of the last {MEMORY:g} s deviates by {remaining:.2g} m/s^2 from"
             " gravity at the estimated attitude: axes or signs of the IMU, its mounting to the"
             " magnetometer, or gravity removed from its data."
         )
@@ -368,10 +372,10 @@ class OnlineWitness:
         return Judgement((off.finding,), turn=off.turn, shift=off.shift(state.position_world))
 
     def _of_what_happened(self, time: float) -> Judgement:
-        found = []
+        result = []
         for code, until in self._uncertain_until.items():
             if time < until:
-                found.append(Finding(code, _PASSED[code], weight=0.5))
+                result.append(Finding(code, _PASSED[code], weight=0.5))
         restarts = self._restarts
         kept = np.exp(-max(0.0, time - restarts.time) / RESTARTS_MEMORY) * restarts.weight
         if kept > MANY_RESTARTS - 1.0:
@@ -380,8 +384,8 @@ class OnlineWitness:
                 " inertial data are inconsistent. Check axes, signs, units and stamps of the IMU."
             )
             verdict = Verdict.FAILED if kept > 2.0 * MANY_RESTARTS else Verdict.DOUBTFUL
-            found.append(Finding("restarts", text, verdict, weight=kept / MANY_RESTARTS))
-        return Judgement(tuple(found))
+            result.append(Finding("restarts", text, verdict, weight=kept / MANY_RESTARTS))
+        return Judgement(tuple(result))
 
     def _of_fixes(self) -> Judgement:
         if self._elsewhere is None:

@@ -49,23 +49,23 @@ class Attempts:
 
     Attributes
     ----------
-    since : float, optional
+    lost_since : float, optional
         When the platform was lost (s); None where it is not.
     """
 
-    since: float | None
+    lost_since: float | None
     _next: float
     _wait: float
 
     def __init__(self) -> None:
-        self.since = None
+        self.lost_since = None
         self._next, self._wait = -np.inf, FIRST_WAIT
 
     def lost_at(self, time: float) -> float:
         """Record that the platform is lost at a time (s); return since when it is."""
-        if self.since is None:
-            self.since, self._next, self._wait = time, time, FIRST_WAIT
-        return self.since
+        if self.lost_since is None:
+            self.lost_since, self._next, self._wait = time, time, FIRST_WAIT
+        return self.lost_since
 
     def due(self, time: float) -> bool:
         """Record that the platform is lost at a time (s); return whether to try a fix."""
@@ -77,7 +77,7 @@ class Attempts:
 
     def over(self) -> None:
         """Record that the platform is recovered."""
-        self.since = None
+        self.lost_since = None
 
 
 def prior_of(state: State) -> Trajectory:
@@ -109,17 +109,17 @@ def restarted(state: State, fix: AgreedFix) -> State:
     cov[:9] = cov[:, :9] = 0.0
     cov[:6, :6] = 4.0 * fix.excess * best.pose_cov[0]
     cov[6:9, 6:9] = site.platform.motion.speed_sigma**2 * np.eye(3)
-    found = replace(at_fix(state, fix), velocity_world=np.zeros(3), cov=cov)
+    result = replace(at_fix(state, fix), velocity_world=np.zeros(3), cov=cov)
     if np.max(np.abs(state.accel_bias_body)) > BIAS_LIMIT * site.platform.imu.accel_bias_sigma:
-        found = replace(found, accel_bias_body=np.zeros(3))
-        _begin_anew(cov, ACCEL_BIAS, site.platform.imu.accel_bias_sigma)
+        result = replace(result, accel_bias_body=np.zeros(3))
+        _reset_covariance(cov, ACCEL_BIAS, site.platform.imu.accel_bias_sigma)
     if np.max(np.abs(state.gyro_bias_body)) > BIAS_LIMIT * site.platform.imu.gyro_bias_sigma:
-        found = replace(found, gyro_bias_body=np.zeros(3))
-        _begin_anew(cov, GYRO_BIAS, site.platform.imu.gyro_bias_sigma)
-    return found
+        result = replace(result, gyro_bias_body=np.zeros(3))
+        _reset_covariance(cov, GYRO_BIAS, site.platform.imu.gyro_bias_sigma)
+    return result
 
 
-def _begin_anew(cov: Array, columns: slice, sigma: float) -> None:
+def _reset_covariance(cov: Array, columns: slice, sigma: float) -> None:
     cov[columns] = cov[:, columns] = 0.0
     cov[columns, columns] = sigma**2 * np.eye(3)
 
@@ -134,8 +134,8 @@ def explains(fix: AgreedFix, samples: FieldSamples, calibration: Calibration) ->
     phasor = predict_channels(calibration, best.time, best.world_from_body, best.position_world)
     measured = np.nan_to_num(samples.phasor_sensor[0, kept])
     there = samples.there[0, kept]
-    left = np.linalg.norm(np.where(there, measured - phasor[0, kept], 0.0), axis=1)
-    share = left / np.linalg.norm(measured, axis=1)
+    remaining = np.linalg.norm(np.where(there, measured - phasor[0, kept], 0.0), axis=1)
+    share = remaining / np.linalg.norm(measured, axis=1)
     return bool(np.sqrt(np.mean(share**2)) < EXPLAINED)
 
 
@@ -145,8 +145,10 @@ def corroborated(samples: FieldSamples) -> bool:
     A contradicting beacon loses a state: alone, it may be the Earth's field in a rotation.
     """
     beacons = {name for name, _ in samples.channels}
-    heard = {name for (name, _), on in zip(samples.channels, samples.valid[0], strict=True) if on}
-    return len(heard) > 1 or len(beacons) == 1
+    detected = {
+        name for (name, _), on in zip(samples.channels, samples.valid[0], strict=True) if on
+    }
+    return len(detected) > 1 or len(beacons) == 1
 
 
 def agreed_fix(
@@ -207,9 +209,9 @@ def _repeated(prior: Trajectory, count: int) -> Trajectory:
     """Return the pose of a prediction, repeated."""
     assert prior.pose_cov is not None
     # Times must increase; they do not matter for a prior pose.
-    apart = np.spacing(prior.time[0]) * np.arange(count)
+    separate = np.spacing(prior.time[0]) * np.arange(count)
     return Trajectory(
-        time=prior.time[0] + apart,
+        time=prior.time[0] + separate,
         world_from_body=np.repeat(prior.world_from_body, count, axis=0),
         position_world=np.repeat(prior.position_world, count, axis=0),
         pose_cov=np.repeat(prior.pose_cov, count, axis=0),

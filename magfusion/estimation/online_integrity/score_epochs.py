@@ -16,7 +16,7 @@ from magfusion.estimation.measurements.earth import EarthField
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
-from magfusion.estimation.online_integrity.asked import Asked
+from magfusion.estimation.online_integrity.score_targets import ScoreTargets
 from magfusion.model.parameters import Calibration
 from magfusion.model.samples import ImuSamples
 from magfusion.units import Array
@@ -44,7 +44,7 @@ class Sums:
     time: float
 
 
-class Passed(NamedTuple):
+class EpochTransition(NamedTuple):
     """Propagation to an epoch.
 
     Parameters
@@ -69,31 +69,34 @@ class Epoch(NamedTuple):
     Parameters
     ----------
     predicted : State
-    passed : Passed, optional
+    passed : EpochTransition, optional
         None where the state was not propagated.
     measurements : tuple of Measurement
         After the gate.
     """
 
     predicted: State
-    passed: Passed | None
+    passed: EpochTransition | None
     measurements: tuple[Measurement, ...] = ()
 
 
-def passed(before: State, after: State, transition: Array, imu: ImuSamples) -> Passed:
+def passed(before: State, after: State, transition: Array, imu: ImuSamples) -> EpochTransition:
     """Return the propagation to a prediction, from the inertial samples of the interval."""
     gyro = accel = np.zeros(3)
     if len(imu):
         share = np.full(len(imu), 1.0 / len(imu))
         gyro, accel = share @ imu.gyro_body, share @ imu.accel_body
-    return Passed(transition, (before.world_from_body, after.world_from_body), gyro, accel)
+    return EpochTransition(transition, (before.world_from_body, after.world_from_body), gyro, accel)
 
 
-def heard(sums: Sums, epochs: Sequence[Epoch], asked: Asked) -> Sums:
+def add_epochs(sums: Sums, epochs: Sequence[Epoch], targets: ScoreTargets) -> Sums:
     """Return the sums with the innovations of some consecutive epochs."""
-    own, rest = slice(0, asked.size), asked.rest
-    error, jacobian = _rows(epochs, asked)
-    by_state, by_held = jacobian[..., : asked.whole], jacobian[..., asked.whole :] * asked.unit
+    own, rest = slice(0, targets.size), targets.rest
+    error, jacobian = _rows(epochs, targets)
+    by_state, by_held = (
+        jacobian[..., : targets.whole],
+        jacobian[..., targets.whole :] * targets.unit,
+    )
     cov = np.array([epoch.predicted.cov for epoch in epochs])
     by_own, across, noise = by_state[..., own], by_state @ cov, np.eye(error.shape[1])
     innovation = across @ np.swapaxes(by_state, 1, 2) + noise
@@ -104,8 +107,8 @@ def heard(sums: Sums, epochs: Sequence[Epoch], asked: Asked) -> Sums:
         alone = alone - np.swapaxes(considered[:, :, own], 1, 2) @ learnt
     known = by_own @ alone @ np.swapaxes(by_own, 1, 2) + noise
     gain = np.swapaxes(np.linalg.solve(innovation, across[..., own]), 1, 2)
-    pushed, response = _pushed(epochs, asked), sums.response
-    shown = np.empty((*error.shape, len(asked.unit)))
+    pushed, response = _pushed(epochs, targets), sums.response
+    shown = np.empty((*error.shape, len(targets.unit)))
     for k, epoch in enumerate(epochs):
         if epoch.passed is not None:
             response = epoch.passed.transition[own, own] @ response
@@ -114,10 +117,10 @@ def heard(sums: Sums, epochs: Sequence[Epoch], asked: Asked) -> Sums:
         response = response - gain[k] @ shown[k]
     symmetric = 0.5 * (known + np.swapaxes(known, 1, 2))
     solved = np.linalg.solve(symmetric, np.concatenate([shown, error[..., None]], axis=2))
-    told = np.swapaxes(shown, 1, 2) @ solved
+    reported = np.swapaxes(shown, 1, 2) @ solved
     time = np.maximum.accumulate([sums.time, *(epoch.predicted.time for epoch in epochs)])
     kept = np.exp((time - time[-1]) / MEMORY)
-    whole = np.einsum("k,kij->ij", kept[1:], told)
+    whole = np.einsum("k,kij->ij", kept[1:], reported)
     return Sums(
         kept[0] * sums.information + whole[:, :-1],
         kept[0] * sums.gradient + whole[:, -1],
@@ -126,9 +129,9 @@ def heard(sums: Sums, epochs: Sequence[Epoch], asked: Asked) -> Sums:
     )
 
 
-def _pushed(epochs: Sequence[Epoch], asked: Asked) -> Array:
+def _pushed(epochs: Sequence[Epoch], targets: ScoreTargets) -> Array:
     """Return the effect of a unit error of the inertial sensors, to subtract, (epochs, 9, h)."""
-    out = np.zeros((len(epochs), 9, len(asked.unit)))
+    out = np.zeros((len(epochs), 9, len(targets.unit)))
     rows = [k for k, epoch in enumerate(epochs) if epoch.passed is not None]
     led = [epoch.passed for epoch in epochs if epoch.passed is not None]
     if not led:
@@ -139,43 +142,46 @@ def _pushed(epochs: Sequence[Epoch], asked: Asked) -> Array:
     turns = np.array([turn for p in led for turn in p.world_from_body])
     stream = Stream(ImuSamples(np.arange(len(led), dtype=np.float64), gyro, accel), turns)
     by_bias = np.array([p.transition[:9, 9:MOTION] for p in led])
-    for block in asked.held:
+    for block in targets.fixed_blocks:
         if isinstance(block.parameter, Inertial):
             bias = block.parameter.as_bias(stream)
             bias = bias[::2] if block.parameter.of_states else bias
-            out[rows, :, block.columns] = by_bias @ (bias * asked.unit[block.columns])
+            out[rows, :, block.columns] = by_bias @ (bias * targets.unit[block.columns])
     return out
 
 
-def _rows(epochs: Sequence[Epoch], asked: Asked) -> tuple[Array, Array]:
+def _rows(epochs: Sequence[Epoch], targets: ScoreTargets) -> tuple[Array, Array]:
     """Return errors (epochs, m) and Jacobians (epochs, m, whole + h), padded with zeros.
 
     Rows without information on the state are zero.
     """
-    width, parts = asked.whole - MOTION + len(asked.unit), [list[_Row]() for _ in epochs]
-    alike: dict[object, list[tuple[int, Measurement]]] = {}
+    width, parts = targets.whole - MOTION + len(targets.unit), [list[_Row]() for _ in epochs]
+    shared: dict[object, list[tuple[int, Measurement]]] = {}
     for k, epoch in enumerate(epochs):
         for number, measurement in enumerate(epoch.measurements):
-            key = _alike(measurement, epoch.predicted.calibration, (k, number))
-            alike.setdefault(key, []).append((k, measurement))
-    for group in alike.values():
+            key = _linearization_key(measurement, epoch.predicted.calibration, (k, number))
+            shared.setdefault(key, []).append((k, measurement))
+    for group in shared.values():
         numbers = [k for k, _ in group]
         states = [epochs[k].predicted for k in numbers]
-        rows = _linearized([measurement for _, measurement in group], states, asked)
+        rows = _linearized([measurement for _, measurement in group], states, targets)
         jacobian = rows.jacobian(width).reshape(len(group), -1, MOTION + width)
         error = rows.error.reshape(len(group), -1)
         for k, *row in zip(numbers, error, jacobian, strict=True):
             parts[k].append(_Row(*row))
-    most = max((sum(len(one.error) for one in own) for own in parts), default=0)
-    errors, jacobians = np.zeros((len(epochs), most)), np.zeros((len(epochs), most, MOTION + width))
+    maximum = max((sum(len(one.error) for one in own) for own in parts), default=0)
+    errors, jacobians = (
+        np.zeros((len(epochs), maximum)),
+        np.zeros((len(epochs), maximum, MOTION + width)),
+    )
     for k, own in enumerate(parts):
         begin = 0
         for one in own:
             end = begin + len(one.error)
             errors[k, begin:end], jacobians[k, begin:end] = one
             begin = end
-    untold = ~np.any(jacobians[..., : asked.whole], axis=2)
-    errors[untold], jacobians[untold] = 0.0, 0.0
+    unreported = ~np.any(jacobians[..., : targets.whole], axis=2)
+    errors[unreported], jacobians[unreported] = 0.0, 0.0
     return errors, jacobians
 
 
@@ -187,7 +193,9 @@ class _Row(NamedTuple):
 _OFFSET = (FieldPhasors, JointPhasors, EarthField)  # that depend on the applied IMU time offset
 
 
-def _alike(measurement: Measurement, calibration: Calibration, alone: tuple[int, int]) -> object:
+def _linearization_key(
+    measurement: Measurement, calibration: Calibration, alone: tuple[int, int]
+) -> object:
     """Return a key of the measurements that can be linearised together."""
     if isinstance(measurement, ZeroVelocity):  # independent of the calibration
         return kind_of(measurement)
@@ -197,7 +205,7 @@ def _alike(measurement: Measurement, calibration: Calibration, alone: tuple[int,
     return kind_of(measurement), *map(id, own), id(calibration.others), calibration.imu_begin
 
 
-def _linearized(parts: list[Measurement], states: list[State], asked: Asked) -> Rows:
+def _linearized(parts: list[Measurement], states: list[State], targets: ScoreTargets) -> Rows:
     """Return the weighted rows of measurements of one kind, one epoch each."""
     calibration = states[0].calibration
     (whole,) = parts if len(parts) == 1 else joined(parts, range(len(parts)))
@@ -206,5 +214,5 @@ def _linearized(parts: list[Measurement], states: list[State], asked: Asked) -> 
         own = (s.calibration.imu_offset(t) for s, t in zip(states, whole.time, strict=True))
         more = calibration.imu_offset(whole.time) - np.array(list(own))
         whole = replace(whole, applied_offset=whole.applied_offset + more)
-    rows = whole.linearize(states_of(states), calibration, asked.asked)
+    rows = whole.linearize(states_of(states), calibration, targets.parameters)
     return rows.weighed(whole.loss)[0]

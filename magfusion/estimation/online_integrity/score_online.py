@@ -11,22 +11,37 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from magfusion.estimation.data_checks.statistics import SURE
+from magfusion.estimation.data_checks.statistics import P_CERTAIN
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, State, states_of
-from magfusion.estimation.integrity.held import COVERED, Freed, finding_of, freed_by
+from magfusion.estimation.integrity.fixed_parameter_test import (
+    COVERED,
+    ReleasedFault,
+    finding_of,
+    release_fault,
+)
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.online_integrity.asked import Asked, heard_in, of_beacons_named
 from magfusion.estimation.online_integrity.judgement import Judgement
-from magfusion.estimation.online_integrity.score_epochs import MEMORY, Epoch, Sums, heard, passed
-from magfusion.model.audibility import are_many
+from magfusion.estimation.online_integrity.score_epochs import (
+    MEMORY,
+    Epoch,
+    Sums,
+    add_epochs,
+    passed,
+)
+from magfusion.estimation.online_integrity.score_targets import (
+    ScoreTargets,
+    beacons_in,
+    of_beacons_named,
+)
+from magfusion.model.detection_range import are_many
 from magfusion.model.parameters import CLOCK_RATE, TIME_OFFSET, BeaconParameter, Block
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.units import Array
 
-ASKED_EVERY, ASKED_AFTER = 2.0, 20.0  # s; shortest and longest interval of results
+MIN_SCORE_INTERVAL, MAX_SCORE_INTERVAL = 2.0, 20.0  # s; shortest and longest interval of results
 ENOUGH = 5  # epochs for the shortest interval
 MOST_WAITING = 10  # epochs; larger batches would delay an update
 
@@ -43,10 +58,10 @@ class OnlineScore:
     """
 
     _sums: Sums | None
-    _heard_at: dict[str, float]
-    _asked_at: float
-    _unasked: int  # epochs since the last result
-    _said: Judgement
+    _detected_at: dict[str, float]
+    _scored_at: float
+    _epochs_since_score: int  # epochs since the last result
+    _judgement: Judgement
 
     def __init__(
         self,
@@ -58,34 +73,34 @@ class OnlineScore:
     ) -> None:
         self.site, self._tangent, self._steady = site, (estimated, considered), steady
         self._each_alone = any(b.parameter not in (TIME_OFFSET, CLOCK_RATE) for b in estimated)
-        self._sums, self._asked_at, self._said = None, -np.inf, Judgement()
+        self._sums, self._scored_at, self._judgement = None, -np.inf, Judgement()
         self._waiting: list[Epoch] = []
-        self._unasked = 0
-        self._heard_at = {}
-        self._made = self._asked_of(() if are_many(site) else [b.name for b in site.beacons])
+        self._epochs_since_score = 0
+        self._detected_at = {}
+        self._targets = self._targets_of(() if are_many(site) else [b.name for b in site.beacons])
 
     @property
-    def asked(self) -> Asked:
+    def targets(self) -> ScoreTargets:
         """Parameters that are tested at present."""
-        if are_many(self.site) and self._made.names != tuple(self._heard_at):
-            self._made = self._asked_of(self._heard_at)
-        return self._made
+        if are_many(self.site) and self._targets.names != tuple(self._detected_at):
+            self._targets = self._targets_of(self._detected_at)
+        return self._targets
 
-    def _asked_of(self, names: Iterable[str]) -> Asked:
+    def _targets_of(self, names: Iterable[str]) -> ScoreTargets:
         estimated, considered = self._tangent
         site = of_beacons_named(self.site, names)
-        return Asked(site, estimated, considered, steady=self._steady)
+        return ScoreTargets(site, estimated, considered, steady=self._steady)
 
     def begin(self, score: Score | None, time: float) -> None:
         """Continue from the score of the smoothed beginning, at its last state (s)."""
         if score is None:
             return
         if are_many(self.site):
-            names = {b.owner for b in score.held if isinstance(b.parameter, BeaconParameter)}
-            self._heard_at = {b.name: time for b in self.site.beacons if b.name in names}
-        asked = self.asked
-        alike = [b.key for b in score.held] == [b.key for b in asked.held]
-        if not alike or not asked.held:
+            names = {b.owner for b in score.fixed if isinstance(b.parameter, BeaconParameter)}
+            self._detected_at = {b.name: time for b in self.site.beacons if b.name in names}
+        targets = self.targets
+        shared = [b.key for b in score.fixed] == [b.key for b in targets.fixed_blocks]
+        if not shared or not targets.fixed_blocks:
             return
         response = -np.concatenate([score.by_state[-1], score.by_calibration])
         self._sums, self._waiting = Sums(score.information, score.gradient, response, time), []
@@ -104,30 +119,30 @@ class OnlineScore:
         """
         if self._sums is None or not (self._each_alone or are_many(self.site)):
             return
-        self._hear([measurement], predicted.time)
-        at = states_of([predicted]), predicted.calibration, self.asked.asked
+        self._select_beacons([measurement], predicted.time)
+        at = states_of([predicted]), predicted.calibration, self.targets.parameters
         if isinstance(measurement, FieldPhasors):
             measurement.predicted.of(measurement, *at)
         else:
             measurement.linearize(*at)
 
-    def _hear(self, measurements: Sequence[Measurement], time: float) -> None:
+    def _select_beacons(self, measurements: Sequence[Measurement], time: float) -> None:
         """Test the detected ones among many beacons, and drop those long undetected."""
         if self._sums is None or not are_many(self.site):
             return
-        known = self._heard_at | dict.fromkeys(heard_in(measurements, self.site), time)
+        known = self._detected_at | dict.fromkeys(beacons_in(measurements, self.site), time)
         kept = {name: known[name] for name in known if known[name] > time - MEMORY}
-        if kept.keys() <= self._heard_at.keys():  # no new beacon: keeping the others is as cheap
-            self._heard_at = {name: known[name] for name in self._heard_at}
+        if kept.keys() <= self._detected_at.keys():  # no new beacon: keeping the others is as cheap
+            self._detected_at = {name: known[name] for name in self._detected_at}
             return
-        sums, before = self.settle(), self.asked
+        sums, before = self.settle(), self.targets
         if sums is None:
             return
-        self._heard_at = {b.name: kept[b.name] for b in self.site.beacons if b.name in kept}
-        asked = self.asked
-        here, there = asked.among(before)
-        information = np.zeros((len(asked.unit),) * 2)
-        gradient, response = information[0].copy(), np.zeros((asked.size, len(asked.unit)))
+        self._detected_at = {b.name: kept[b.name] for b in self.site.beacons if b.name in kept}
+        targets = self.targets
+        here, there = targets.among(before)
+        information = np.zeros((len(targets.unit),) * 2)
+        gradient, response = information[0].copy(), np.zeros((targets.size, len(targets.unit)))
         information[np.ix_(here, here)] = sums.information[np.ix_(there, there)]
         gradient[here], response[:, here] = sums.gradient[there], sums.response[:, there]
         self._sums = Sums(information, gradient, response, sums.time)
@@ -147,14 +162,14 @@ class OnlineScore:
 
     def measured(self, measurements: Sequence[Measurement], predicted: State) -> None:
         """Process the innovations of an epoch, after the gate."""
-        self._hear(measurements, predicted.time)
+        self._select_beacons(measurements, predicted.time)
         if self._sums is None or not measurements:
             return
         led = None
         if self._waiting and self._waiting[-1].predicted is predicted:
             led = self._waiting.pop().passed
         self._waiting.append(Epoch(predicted, led, tuple(measurements)))
-        self._unasked += 1
+        self._epochs_since_score += 1
         if are_many(self.site) or len(self._waiting) >= MOST_WAITING:
             self.settle()
 
@@ -162,39 +177,48 @@ class OnlineScore:
         """Process the pending epochs, and return the sums, which a checkpoint stores."""
         waiting, self._waiting = self._waiting, []
         if self._sums is not None and waiting:
-            found = heard(self._sums, waiting, self.asked)
-            finite = all(np.all(np.isfinite(v)) for v in (found.information, found.response))
-            self._sums = found if finite else None
+            result = add_epochs(self._sums, waiting, self.targets)
+            finite = all(np.all(np.isfinite(v)) for v in (result.information, result.response))
+            self._sums = result if finite else None
         return self._sums
 
-    def said_of(self, state: State) -> Judgement:
+    def judgement_of(self, state: State) -> Judgement:
         """Return the judgement of a state by the test, updated now and then."""
-        wait = ASKED_EVERY if self._unasked >= ENOUGH else ASKED_AFTER
-        if state.time >= self._asked_at + wait and (sums := self.settle()) is not None:
-            self._asked_at, self._unasked, self._said = state.time, 0, self._ask(sums, state)
-        return self._said
+        wait = MIN_SCORE_INTERVAL if self._epochs_since_score >= ENOUGH else MAX_SCORE_INTERVAL
+        if state.time >= self._scored_at + wait and (sums := self.settle()) is not None:
+            self._scored_at, self._epochs_since_score, self._judgement = (
+                state.time,
+                0,
+                self._evaluate(sums, state),
+            )
+        return self._judgement
 
-    def _ask(self, sums: Sums, state: State) -> Judgement:
-        pose_cov, asked = state.cov[None, :6, :6], self.asked
+    def _evaluate(self, sums: Sums, state: State) -> Judgement:
+        pose_cov, targets = state.cov[None, :6, :6], self.targets
         information = 0.5 * (sums.information + sums.information.T)
         by = -sums.response
         score = Score(
-            asked.held, information, sums.gradient, asked.spread, by[None, :MOTION], by[MOTION:]
+            targets.fixed_blocks,
+            information,
+            sums.gradient,
+            targets.spread,
+            by[None, :MOTION],
+            by[MOTION:],
         )
         information, gradient = score.with_declared()
-        told = np.flatnonzero(asked.gains(information, gradient) > 0.0)
-        found = (
-            freed_by(pose_cov, score, asked.suspects[k], information, gradient)
-            for k in told.tolist()
+        reported = np.flatnonzero(targets.gains(information, gradient) > 0.0)
+        result = (
+            release_fault(pose_cov, score, targets.fault_candidates[k], information, gradient)
+            for k in reported.tolist()
         )
-        likely = [one for one in found if one is not None and _speaks(one)]
+        likely = [one for one in result if one is not None and _is_significant(one)]
         if not likely:
             return Judgement()
         cause = max(likely, key=lambda one: one.gain)
         turn, shift = np.linalg.norm(cause.moved[0].reshape(2, 3), axis=1)
-        finding = finding_of(asked.site, score, cause)
+        finding = finding_of(targets.site, score, cause)
         return Judgement((finding,), turn=float(turn), shift=float(shift))
 
 
-def _speaks(one: Freed) -> bool:
-    return one.gain > 0.0 and float(one.distance[0]) > COVERED and one.log_p < np.log(SURE)
+def _is_significant(one: ReleasedFault) -> bool:
+    return one.gain > 0.0 and float(one.distance[0]) > COVERED and one.log_p < np.log(P_CERTAIN)

@@ -79,12 +79,12 @@ class Summary:
     @property
     def trust(self) -> Trust:
         """The worst findings of all states; a loss that was recovered only leaves a doubt."""
-        found = []
+        result = []
         for noted in self._noted.values():
             finding = noted.finding
             if finding.verdict is Verdict.FAILED and self._lost_since is None:
                 finding = replace(finding, verdict=Verdict.DOUBTFUL)
             share = f" ({noted.states} of {self._states} states,"
             share += f" {noted.first:.1f} to {noted.last:.1f} s)"
-            found.append(replace(finding, text=finding.text + share))
-        return Trust(tuple(found), self.unverified)
+            result.append(replace(finding, text=finding.text + share))
+        return Trust(tuple(result), self.unverified)

@@ -28,7 +28,12 @@ from magfusion.estimation.orientation.layout import (
     TURN,
     Orientation,
 )
-from magfusion.estimation.orientation.stretch import Stretch, Turned, body_from_end, turned
+from magfusion.estimation.orientation.stretch import (
+    OrientationStretch,
+    StretchMotion,
+    body_from_end,
+    integrate_stretch,
+)
 from magfusion.model.field import observe_earth, skew
 from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.site import Site
@@ -37,7 +42,7 @@ from magfusion.units import Array
 
 GYRO_SCALE = 0.003  # usual error of a gyroscope's scale and axes
 AMBIENT = 0.02  # of the field's size: usual disturbance of each component, indoors
-SETTLED, MOVED = 10.0, 2.0  # s; its correlation time, at rest and in motion
+SETTLING_TIME, MOVED = 10.0, 2.0  # s; its correlation time, at rest and in motion
 WAY = 0.5  # m; distance after which it is independent, however short the time
 MEMORY = 5.0  # s; over which its size is estimated, and that of the speed
 NOISE_MEMORY, NOISE_FACTOR = 10.0, 20.0  # s; samples of the field are not independent
@@ -47,7 +52,7 @@ LEAKAGE = 1.0  # s; decay time of the speed for the estimate of its size
 LEAST_SPEED = 0.3  # m/s
 REST_RATE = np.deg2rad(0.03)  # rad/s, of one second
 GATE = 25.0  # chi square of three components
-LEAST_CHANGE, FREED = 3.0, 4.0  # uT; factor of the variance after a change
+LEAST_CHANGE, VARIANCE_INCREASE = 3.0, 4.0  # uT; factor of the variance after a change
 TILT, HEADING = 0.05, 0.3  # rad; of the first attitude
 FAR_STRENGTH = 0.04  # of the field's size: error of the declared one everywhere
 OFFSET_WALK = 0.01  # uT per square root of second
@@ -73,7 +78,7 @@ class Update:
         Whether the field was inconsistent with the model, and its disturbance was estimated again.
     """
 
-    stretch: Stretch
+    stretch: OrientationStretch
     predicted: Orientation
     state: Orientation
     transition: Array
@@ -138,13 +143,13 @@ class OrientationFilter:
         """Present usual deviation of the field (uT)."""
         return float(np.sqrt(self._deviation))
 
-    def take(self, stretch: Stretch) -> Update:
+    def take(self, stretch: OrientationStretch) -> Update:
         """Process a segment."""
         if self.state is None or np.isnan(stretch.begin):
             self.state = self._started(stretch)
             self._before = None
         before = self.state
-        turn = turned(stretch, before)
+        turn = integrate_stretch(stretch, before)
         predicted, transition = self._predicted(before, stretch, turn)
         rows = [self._of_speed(predicted, stretch)]
         if stretch.rests and self._may_rest(predicted, turn):
@@ -158,7 +163,7 @@ class OrientationFilter:
             stretch, predicted, self.state, transition, turn.attitude, self.disturbance, changed
         )
 
-    def _started(self, stretch: Stretch) -> Orientation:
+    def _started(self, stretch: OrientationStretch) -> Orientation:
         """Return the attitude by gravity and field, with the known errors of the instruments."""
         imu, sensor, size = self.site.platform.imu, self.sensor, float(np.linalg.norm(self.earth))
         time = float(stretch.time[0])
@@ -209,13 +214,13 @@ class OrientationFilter:
         )
 
     def _predicted(
-        self, state: Orientation, stretch: Stretch, turn: Turned
+        self, state: Orientation, stretch: OrientationStretch, turn: StretchMotion
     ) -> tuple[Orientation, Array]:
         imu, length = self.site.platform.imu, float(np.sum(stretch.steps))
         begin, whole = state.world_from_body, turn.attitude[-1]
         gained = begin @ turn.push - np.array([0.0, 0.0, self.site.gravity]) * length
         moved = min(MOVED, WAY / float(np.sqrt(3.0 * self._speed)))
-        kept = float(np.exp(-length / (SETTLED if stretch.rests else moved)))
+        kept = float(np.exp(-length / (SETTLING_TIME if stretch.rests else moved)))
         transition = np.eye(SIZE)
         transition[TURN, GYRO_BIAS] = begin @ turn.by_bias
         transition[TURN, GYRO_MATRIX] = begin @ turn.by_matrix
@@ -249,7 +254,7 @@ class OrientationFilter:
         )
         return predicted, transition
 
-    def _of_speed(self, state: Orientation, stretch: Stretch) -> Row:
+    def _of_speed(self, state: Orientation, stretch: OrientationStretch) -> Row:
         by_state = np.zeros((3, SIZE))
         by_state[:, SPEED] = np.eye(3)
         if stretch.rests:
@@ -262,12 +267,12 @@ class OrientationFilter:
             share[ACCEL_BIAS] = SWUNG
         return Row(by_state, -state.velocity_world, np.full(3, variance), share)
 
-    def _may_rest(self, state: Orientation, turn: Turned) -> bool:
+    def _may_rest(self, state: Orientation, turn: StretchMotion) -> bool:
         """Return whether the rate may be a bias, and no slow and even turn: larger ones are not."""
         sigma = np.sqrt(np.diag(state.cov)[GYRO_BIAS]) + self.site.platform.imu.gyro_bias_walk
         return bool(np.all(np.abs(np.mean(turn.rate, axis=0)) < 4.0 * sigma + 3.0 * REST_RATE))
 
-    def _of_rest(self, state: Orientation, stretch: Stretch) -> Row:
+    def _of_rest(self, state: Orientation, stretch: OrientationStretch) -> Row:
         rate = np.mean(stretch.gyro_body, axis=0)
         by_state = np.zeros((3, SIZE))
         by_state[:, GYRO_BIAS] = -np.eye(3)
@@ -277,7 +282,7 @@ class OrientationFilter:
         return Row(by_state, -still, np.full(3, REST_RATE**2 / length), np.ones(SIZE))
 
     def _of_field(
-        self, state: Orientation, stretch: Stretch, turn: Turned
+        self, state: Orientation, stretch: OrientationStretch, turn: StretchMotion
     ) -> tuple[Row, bool, Orientation]:
         mean, by_lag = body_from_end(stretch, turn, state.lag)
         world_from_seen = state.world_from_body @ mean.T
@@ -296,39 +301,41 @@ class OrientationFilter:
         error = np.mean(stretch.field, axis=0) - seen.measured_sensor
         variance = self._field_variance(stretch, turn)
         innovation = by_state @ state.cov @ by_state.T + variance * np.eye(3)
-        apart = float(error @ np.linalg.solve(innovation, error))
+        separate = float(error @ np.linalg.solve(innovation, error))
         off_world = world_from_seen @ np.linalg.solve(
             measured_from_seen, error + seen.earth_world @ state.near
         )
         self._learn_deviation(off_world, variance, stretch)
         row = Row(by_state, error, np.full(3, variance), np.ones(SIZE))
-        if apart <= GATE:
+        if separate <= GATE:
             return row, False, state
         change = max(float(error @ error), LEAST_CHANGE**2)
         self._deviation = max(self._deviation, change)
         cov = state.cov.copy()
-        cov[OFFSET, OFFSET] += FREED * change * np.eye(3)
-        cov[NEAR, NEAR] += FREED * change * np.eye(3)
+        cov[OFFSET, OFFSET] += VARIANCE_INCREASE * change * np.eye(3)
+        cov[NEAR, NEAR] += VARIANCE_INCREASE * change * np.eye(3)
         return row, True, replace(state, cov=cov)
 
-    def _field_variance(self, stretch: Stretch, turn: Turned) -> float:
+    def _field_variance(self, stretch: OrientationStretch, turn: StretchMotion) -> float:
         """Return the variance of a component of the mean field, from its scatter (uT^2)."""
         length = max(float(np.sum(stretch.steps)), 1e-3)
         now = turn.attitude[-1] @ (self.sensor.body_from_sensor @ np.mean(stretch.field, axis=0))
         if self._noise is None and len(stretch.field) > 3:  # of samples: more than of their mean
             self._noise = float(np.mean(np.var(stretch.field, axis=0)))
         if self._before is not None:
-            found = float(np.sum((now - self._before) ** 2)) / 6.0
+            result = float(np.sum((now - self._before) ** 2)) / 6.0
             share = min(1.0, length / NOISE_MEMORY)
-            old = found if self._noise is None else self._noise
-            self._noise = old + share * (min(found, 9.0 * max(old, 1e-8)) - old)
+            old = result if self._noise is None else self._noise
+            self._noise = old + share * (min(result, 9.0 * max(old, 1e-8)) - old)
         self._before = self.sensor.body_from_sensor @ np.mean(stretch.field, axis=0)
         declared = (self.sensor.noise_density / MICROTESLA) ** 2 / (2.0 * length)
         rate = float(np.linalg.norm(np.mean(turn.rate, axis=0)))
         skewed = SYNCHRONY * rate * float(np.linalg.norm(self.earth))
         return NOISE_FACTOR * max(declared, self._noise or 0.0) + skewed**2
 
-    def _learn_deviation(self, off_world: Array, variance: float, stretch: Stretch) -> None:
+    def _learn_deviation(
+        self, off_world: Array, variance: float, stretch: OrientationStretch
+    ) -> None:
         """Estimate the field's disturbance from size and dip, which do not depend on heading."""
         if self._begun is None:
             self._begun = stretch.time[0]
@@ -336,10 +343,10 @@ class OrientationFilter:
             return
         field = self.earth
         north = field[:2] / max(float(np.hypot(field[0], field[1])), 1e-9)
-        found = (float(off_world[:2] @ north) ** 2 + float(off_world[2]) ** 2) / 2.0
+        result = (float(off_world[:2] @ north) ** 2 + float(off_world[2]) ** 2) / 2.0
         share = min(1.0, float(np.sum(stretch.steps)) / MEMORY)
-        found = max(0.0, found - variance)
-        self._deviation += share * (found - self._deviation)
+        result = max(0.0, result - variance)
+        self._deviation += share * (result - self._deviation)
 
 
 def updated(state: Orientation, rows: list[Row], measured_from_body: Array) -> Orientation:

@@ -16,8 +16,8 @@ from magfusion.estimation.orientation.layout import (
     TURN,
     Orientation,
 )
-from magfusion.estimation.orientation.remarks import doubts, position_open, told_now
-from magfusion.estimation.orientation.stretch import GAP, STEP, Stretch, stretches
+from magfusion.estimation.orientation.remarks import current_findings, doubts, position_open
+from magfusion.estimation.orientation.stretch import GAP, STEP, OrientationStretch, stretches
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import MotionModel, Site
 from magfusion.units import Array
@@ -51,10 +51,10 @@ class OrientationNavigator:
         self._recent = np.zeros((0, 7))
         self._field = np.zeros((0, 4))
         self._edge = float("nan")
-        self._heard = -np.inf
-        self._carried: Array | None = None
-        self._carried_to = float("nan")
-        self._made: list[JudgedState] = []
+        self._last_field_time = -np.inf
+        self._propagated: Array | None = None
+        self._propagated_to = float("nan")
+        self._pending: list[JudgedState] = []
         self._calibration = initial_calibration(site, 0.0)
 
     @property
@@ -69,21 +69,21 @@ class OrientationNavigator:
         newest = self._newest_inertial
         _refuse_unsorted(rows[:, 0], newest, "inertial samples")
         self._imu = np.concatenate([self._imu, rows])
-        self._carry(rows)
+        self._propagate(rows)
         self._advance()
 
     def add_magnetometer(self, time: Array, measured_sensor: Array) -> None:
         """Add raw samples of the magnetometer: times (k,), fields (k, 3) (T)."""
-        _refuse_unsorted(time, self._heard, "samples of the magnetometer")
+        _refuse_unsorted(time, self._last_field_time, "samples of the magnetometer")
         rows = np.column_stack([time, measured_sensor])
         self._field = np.concatenate([self._field, rows])
-        self._heard = float(time[-1])
+        self._last_field_time = float(time[-1])
         self._advance()
 
     def take(self) -> list[JudgedState]:
         """Return the states made since the last call, one per sample."""
-        made, self._made = self._made, []
-        return made
+        built, self._pending = self._pending, []
+        return built
 
     @property
     def _newest_inertial(self) -> float:
@@ -97,7 +97,7 @@ class OrientationNavigator:
             broken = not np.isnan(self._edge) and first - self._edge > GAP
             start = first if np.isnan(self._edge) or broken else self._edge
             end, newest = start + STEP, float(self._imu[-1, 0])
-            if newest <= end or (self._heard < end and newest < end + WAIT):
+            if newest <= end or (self._last_field_time < end and newest < end + WAIT):
                 return
             count = max(int(np.searchsorted(self._imu[:, 0], end + 1e-9, side="right")), 1)
             self._work_in(count, float("nan") if broken else self._edge)
@@ -114,40 +114,40 @@ class OrientationNavigator:
         self._edge = float(rows[-1, 0])
         self._field = self._field[np.searchsorted(self._field[:, 0], self._edge, side="right") :]
 
-    def _take(self, stretch: Stretch) -> None:
+    def _take(self, stretch: OrientationStretch) -> None:
         update = self.filter.take(stretch)
         if update.changed:
             self.changed.append(update.state.time)
-        first = self._carried is None
-        self._carried, self._carried_to = update.state.world_from_body, update.state.time
+        first = self._propagated is None
+        self._propagated, self._propagated_to = update.state.world_from_body, update.state.time
         if first:
-            self._tell(update.state, update.state.world_from_body, update.state.time)
+            self._store(update.state, update.state.world_from_body, update.state.time)
         for row in self._imu:
             self._turn(row)
 
-    def _carry(self, rows: Array) -> None:
-        if self._carried is None or self.filter.state is None:
+    def _propagate(self, rows: Array) -> None:
+        if self._propagated is None or self.filter.state is None:
             return
         for row in rows:
             self._turn(row)
-            assert self._carried is not None
-            self._tell(self.filter.state, self._carried, float(row[0]))
+            assert self._propagated is not None
+            self._store(self.filter.state, self._propagated, float(row[0]))
 
     def _turn(self, row: Array) -> None:
         state = self.filter.state
         assert state is not None
-        assert self._carried is not None
+        assert self._propagated is not None
         rate = (np.eye(3) + state.gyro_matrix) @ row[1:4] - state.gyro_bias
-        step = rate * min(float(row[0]) - self._carried_to, GAP)
-        self._carried = self._carried @ Rotation.from_rotvec(step).as_matrix()
-        self._carried_to = float(row[0])
+        step = rate * min(float(row[0]) - self._propagated_to, GAP)
+        self._propagated = self._propagated @ Rotation.from_rotvec(step).as_matrix()
+        self._propagated_to = float(row[0])
 
-    def _tell(self, state: Orientation, attitude: Array, time: float) -> None:
+    def _store(self, state: Orientation, attitude: Array, time: float) -> None:
         cov = motion_cov(state, attitude, time - state.time, self.site.platform.imu.gyro_noise)
         findings = (*doubts(cov[ROTATION, ROTATION], attitude), position_open())
-        since = self.changed[-1] if self.changed else None
-        findings += told_now(self.filter, time, since)
-        self._made.append(
+        start_time = self.changed[-1] if self.changed else None
+        findings += current_findings(self.filter, time, start_time)
+        self._pending.append(
             JudgedState(
                 time=time,
                 world_from_body=attitude,

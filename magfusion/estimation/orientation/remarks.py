@@ -11,7 +11,7 @@ from magfusion.units import DEGREE, Array, BoolArray
 
 OPEN = 20.0 * DEGREE  # rad; sigma above which a heading is undetermined
 DISTURBED = 0.05  # of the field's size
-TOLD = 2.0  # s; duration for which a change is reported online
+REPORT_TIME = 2.0  # s; duration for which a change is reported online
 MOVED = 3.0  # sigma of an offset that has changed, all components: one in a hundred thousand
 LATE = 4.0  # sigma of a lag that is reported
 
@@ -37,12 +37,12 @@ def doubts(cov_body: Array, world_from_body: Array) -> tuple[Finding, ...]:
     return (Finding("few_data", text, weight=sigma / OPEN),)
 
 
-def told_now(
+def current_findings(
     estimator: OrientationFilter, time: float, changed: float | None
 ) -> tuple[Finding, ...]:
     """Return the findings of an online state on the field."""
     out = []
-    if changed is not None and time - changed < TOLD:
+    if changed is not None and time - changed < REPORT_TIME:
         out.append(_change(np.array([changed])))
     size = float(np.linalg.norm(estimator.earth))
     if estimator.disturbance > DISTURBED * size:
@@ -65,13 +65,13 @@ def remarks(
         Declared (uT).
     """
     time, size = np.array([s.time for s in states]), float(np.linalg.norm(earth))
-    found = [position_open(), *_attached(states, changed)]
-    if len(changed) and not any(f.code == "body_iron" for f in found):
-        found.append(_change(changed))
+    result = [position_open(), *_attached(states, changed)]
+    if len(changed) and not any(f.code == "body_iron" for f in result):
+        result.append(_change(changed))
     bad = disturbance > DISTURBED * size
     if np.any(bad):
         spans = ", ".join(f"{a:.0f} to {b:.0f} s" for a, b in _spans(time, bad)[:6])
-        found.append(_disturbed(float(np.max(disturbance)), size, f" from {spans}"))
+        result.append(_disturbed(float(np.max(disturbance)), size, f" from {spans}"))
     last = states[-1]
     sigma = float(np.sqrt(last.cov[LAG, LAG][0, 0]))
     if abs(last.lag) > max(LATE * sigma, 1e-3):
@@ -80,13 +80,13 @@ def remarks(
             f"The {which} lags {1e3 * abs(last.lag):.1f} ms ({1e3 * sigma:.1f}) behind the other;"
             " this is compensated."
         )
-        found.append(Finding("time_offset", text, Verdict.TRUSTWORTHY))
-    return tuple(found)
+        result.append(Finding("time_offset", text, Verdict.TRUSTWORTHY))
+    return tuple(result)
 
 
 def _attached(states: tuple[Orientation, ...], changed: Array) -> list[Finding]:
     """Return the findings of steps of the magnetometer's offset where the field changed."""
-    found = []
+    result = []
     time = np.array([s.time for s in states])
     for first in _onsets(changed):
         before = states[max(0, int(np.searchsorted(time, first)) - 1)]
@@ -99,8 +99,8 @@ def _attached(states: tuple[Orientation, ...], changed: Array) -> list[Finding]:
                 f"At {first:.1f} s the magnetometer's offset changed by {size:.1f} uT: a magnet or"
                 " iron was attached to the body. It is estimated from then on."
             )
-            found.append(Finding("body_iron", text, Verdict.TRUSTWORTHY, weight=2.0))
-    return found
+            result.append(Finding("body_iron", text, Verdict.TRUSTWORTHY, weight=2.0))
+    return result
 
 
 def _change(changed: Array) -> Finding:
@@ -124,7 +124,7 @@ def _disturbed(deviation: float, size: float, when: str) -> Finding:
 
 def _onsets(changed: Array) -> list[float]:
     """Return the first of each series of changes (s)."""
-    return [float(t) for k, t in enumerate(changed) if k == 0 or t - changed[k - 1] > TOLD]
+    return [float(t) for k, t in enumerate(changed) if k == 0 or t - changed[k - 1] > REPORT_TIME]
 
 
 def _spans(time: Array, bad: BoolArray) -> list[tuple[float, float]]:

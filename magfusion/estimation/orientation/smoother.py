@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.estimation.orientation.filter import OrientationFilter, Update
 from magfusion.estimation.orientation.layout import SIZE, Orientation
-from magfusion.estimation.orientation.stretch import Stretch, stretches
+from magfusion.estimation.orientation.stretch import OrientationStretch, stretches
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
@@ -50,7 +50,7 @@ class Oriented:
         return np.array([state.time for state in self.states])
 
 
-def pieces(log: Log, site: Site) -> list[Stretch]:
+def pieces(log: Log, site: Site) -> list[OrientationStretch]:
     """Return the segments of a log, on its clock.
 
     Raises
@@ -106,17 +106,17 @@ def oriented(log: Log, site: Site, *, back: bool = True, report: Report = quiet)
     if back:
         assert last is not None
         states = []
-        for k, state, turned in _smoothed(cut, snapshots, estimator.measured_from_body):
+        for k, state, rotated in _smoothed(cut, snapshots, estimator.measured_from_body):
             states.append(state)
             own = slice(samples[k], samples[k + 1])
-            attitude[own] = turned
+            attitude[own] = rotated
         states.reverse()
     time = np.concatenate([s.time for s in cut])
     return Oriented(time, attitude, tuple(states), disturbance, np.array(changed))
 
 
 def _smoothed(
-    cut: list[Stretch], snapshots: list[OrientationFilter], measured_from_body: Array
+    cut: list[OrientationStretch], snapshots: list[OrientationFilter], measured_from_body: Array
 ) -> Iterator[tuple[int, Orientation, Array]]:
     """Yield the segments from the last to the first: state at the end, attitudes at samples."""
     after: Orientation | None = None
@@ -156,7 +156,7 @@ def _between(before: Orientation | None, update: Update, after: Orientation) -> 
     if before is None or np.isnan(update.stretch.begin):
         begin = after.world_from_body @ update.attitude[-1].T
         return np.asarray(begin @ update.attitude[1:])
-    carried = before.world_from_body @ update.attitude
-    missed = Rotation.from_matrix(carried[-1].T @ after.world_from_body).as_rotvec()
+    propagated = before.world_from_body @ update.attitude
+    missed = Rotation.from_matrix(propagated[-1].T @ after.world_from_body).as_rotvec()
     share = np.arange(1, count + 1)[:, None] / count
-    return np.asarray(carried[1:] @ Rotation.from_rotvec(share * missed).as_matrix())
+    return np.asarray(propagated[1:] @ Rotation.from_rotvec(share * missed).as_matrix())

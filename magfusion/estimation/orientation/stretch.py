@@ -16,7 +16,7 @@ GAP = 0.5  # s; a longer pause of the inertial samples interrupts propagation
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
+class OrientationStretch:
     """Samples after one time, up to another.
 
     A sample is assumed to be the mean over the step that ends at its stamp, as for an instrument
@@ -54,7 +54,7 @@ class Stretch:
 
 
 @dataclass(frozen=True, eq=False)
-class Turned:
+class StretchMotion:
     """Rotation and velocity change of a segment, given the instruments' errors.
 
     Parameters
@@ -79,7 +79,7 @@ class Turned:
     rate: Array
 
 
-def turned(stretch: Stretch, state: Orientation) -> Turned:
+def integrate_stretch(stretch: OrientationStretch, state: Orientation) -> StretchMotion:
     """Integrate a segment."""
     dt = stretch.steps
     rate = stretch.gyro_body @ (np.eye(3) + state.gyro_matrix).T - state.gyro_bias
@@ -90,7 +90,7 @@ def turned(stretch: Stretch, state: Orientation) -> Turned:
         attitude[i + 1] = attitude[i] @ step
     middle = 0.5 * (attitude[1:] + attitude[:-1])
     weighted = middle * dt[:, None, None]
-    return Turned(
+    return StretchMotion(
         attitude=attitude,
         by_bias=-np.sum(weighted, axis=0),
         by_matrix=np.einsum("nij,nk->ijk", weighted, stretch.gyro_body).reshape(3, 9),
@@ -100,7 +100,9 @@ def turned(stretch: Stretch, state: Orientation) -> Turned:
     )
 
 
-def body_from_end(stretch: Stretch, turn: Turned, lag: float) -> tuple[Array, Array]:
+def body_from_end(
+    stretch: OrientationStretch, turn: StretchMotion, lag: float
+) -> tuple[Array, Array]:
     """Return the mean rotation from the axes of the end to those of the field samples.
 
     Parameters
@@ -130,7 +132,7 @@ def stretches(
     field_time: Array,
     field_t: Array,
     begin: float,
-) -> Iterator[Stretch]:
+) -> Iterator[OrientationStretch]:
     """Cut streams into segments; the last one may be shorter.
 
     Parameters
@@ -153,7 +155,7 @@ def stretches(
         own = slice(first, last)
         end = time[last - 1]
         lo, hi = np.searchsorted(field_time, [start, end], side="right")
-        yield Stretch(
+        yield OrientationStretch(
             edge,
             time[own],
             gyro_body[own],

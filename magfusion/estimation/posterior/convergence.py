@@ -5,7 +5,7 @@ from gtsam.symbol_shorthand import X
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import UNOBSERVABLE, EstimationError
-from magfusion.estimation.graph.graph import Estimate, Graph
+from magfusion.estimation.graph.graph import Graph, GraphEstimate
 from magfusion.estimation.solve.bordered import eliminate
 from magfusion.model.parameters import Calibration
 from magfusion.model.trajectory import Trajectory
@@ -17,7 +17,7 @@ OPEN_ROTATION = 0.3  # rad; beyond, linearisation fails and the sigma itself is 
 
 
 def last_move(
-    before: Trajectory, after: Trajectory, unfinished: tuple[Graph, Estimate] | None = None
+    before: Trajectory, after: Trajectory, unfinished: tuple[Graph, GraphEstimate] | None = None
 ) -> float:
     """Return the rms pose change of the last pass, in sigmas, including an unfinished step.
 
@@ -27,7 +27,7 @@ def last_move(
     ----------
     after : Trajectory
         With a covariance.
-    unfinished : Graph and Estimate, optional
+    unfinished : Graph and GraphEstimate, optional
         State of an unconverged loop of the last pass.
     """
     cov, moves = after.pose_cov, [pose_steps(before, after)]

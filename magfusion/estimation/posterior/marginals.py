@@ -11,10 +11,14 @@ from gtsam.symbol_shorthand import X
 
 from magfusion.estimation.graph.considered import responses
 from magfusion.estimation.graph.factors import CALIBRATION_KEY
-from magfusion.estimation.graph.graph import Estimate, Graph
+from magfusion.estimation.graph.graph import Graph, GraphEstimate
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.measurements.phasors import leaves_out
-from magfusion.estimation.posterior.chain_system import AT_ONCE, chain_system, column_groups
+from magfusion.estimation.posterior.block_tridiagonal_system import (
+    AT_ONCE,
+    block_tridiagonal_system,
+    column_groups,
+)
 from magfusion.estimation.solve.bordered import eliminate, last_marginal
 from magfusion.estimation.solve.chain import solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
@@ -22,7 +26,7 @@ from magfusion.model.parameters import Block, dimension
 from magfusion.units import Array
 
 POSE = 6
-VOUCHED = 5  # poses at which the tree is used too
+CHECKED_POSES = 5  # poses at which the tree is used too
 AGREED = 1e-6  # of a sigma; rounding of a well-posed log is far below
 
 
@@ -54,7 +58,7 @@ class _Marginals:
 
 
 def marginals(
-    graph: Graph, estimate: Estimate, considered: tuple[Block, ...] = ()
+    graph: Graph, estimate: GraphEstimate, considered: tuple[Block, ...] = ()
 ) -> tuple[Array, Array, Array]:
     """Return the posterior covariance of every pose and of the calibration.
 
@@ -76,14 +80,14 @@ def marginals(
     linear, ordering = graph.linearized(estimate), graph.ordering
     tree = eliminate(linear, ordering)
     if is_chain(graph, considered):
-        rows = np.unique(np.linspace(0, graph.epochs - 1, VOUCHED).astype(int)).tolist()
-        vouched = {i: np.array(tree.marginalCovariance(X(i))) for i in rows}
+        rows = np.unique(np.linspace(0, graph.epochs - 1, CHECKED_POSES).astype(int)).tolist()
+        checked = {i: np.array(tree.marginalCovariance(X(i))) for i in rows}
         calibration = last_marginal(tree, linear, ordering) if graph.blocks else None
         del tree, linear  # as large again as the arrays below
         give_back_memory()
-        found = _of_chain(graph, estimate, considered)
-        if _agrees(found, vouched, calibration):
-            return found.whole
+        result = _of_chain(graph, estimate, considered)
+        if _agrees(result, checked, calibration):
+            return result.whole
         linear = graph.linearized(estimate)
         tree = eliminate(linear, ordering)
     poses = np.array([tree.marginalCovariance(X(i)) for i in range(graph.epochs)])
@@ -107,42 +111,42 @@ def marginals(
 def is_chain(graph: Graph, considered: tuple[Block, ...]) -> bool:
     """Return whether one sweep gives all covariances: one calibration, not many hours."""
     columns = [group.stop - group.start for group in column_groups(considered, graph.epochs)]
-    most = 1 + max(columns) + dimension(graph.blocks)
-    too_long = 8.0 * graph.epochs * MOTION * most > AT_ONCE
+    maximum = 1 + max(columns) + dimension(graph.blocks)
+    too_long = 8.0 * graph.epochs * MOTION * maximum > AT_ONCE
     if graph.declared is None or len(graph.segments) > 1 or graph.shift is not None:
         return False
     return not too_long and not leaves_out(graph.measurements)
 
 
-def _of_chain(graph: Graph, estimate: Estimate, considered: tuple[Block, ...]) -> _Marginals:
+def _of_chain(graph: Graph, estimate: GraphEstimate, considered: tuple[Block, ...]) -> _Marginals:
     """Return all covariances in one sweep."""
     considered = considered if graph.measurements else ()
     added, responses, solved = np.zeros((graph.epochs, POSE, POSE)), [], None
     for columns in column_groups(considered, graph.epochs):
-        normal, fields = chain_system(graph, estimate, considered, columns)
+        normal, fields = block_tridiagonal_system(graph, estimate, considered, columns)
         if fields is not None:
             for piece in fields.pieces():
                 piece.added_to(normal)
         known: Array | None = None if solved is None else solved.inverse
-        found = solve_chain(normal.chain(), POSE, known, covariance=known is None)
+        result = solve_chain(normal.chain(), POSE, known, covariance=known is None)
         del normal, fields  # before the next group, to limit memory
-        response = found.states[0, ..., 1:]
+        response = result.states[0, ..., 1:]
         added += response @ np.swapaxes(response, 1, 2)
-        responses.append(found.border[0, :, 1:])
-        solved = found._replace(states=added[None]) if solved is None else solved
-        del response, found
+        responses.append(result.border[0, :, 1:])
+        solved = result._replace(states=added[None]) if solved is None else solved
+        del response, result
         give_back_memory()
     assert solved is not None
     return _Marginals(solved.cov[0], added, solved.border_cov[0], np.concatenate(responses, axis=1))
 
 
-def _agrees(found: _Marginals, vouched: dict[int, Array], calibration: Array | None) -> bool:
+def _agrees(result: _Marginals, checked: dict[int, Array], calibration: Array | None) -> bool:
     """Return whether the tree agrees: rounding along an ill-conditioned chain may grow."""
-    if not all(np.all(np.isfinite(part)) for part in vars(found).values()):
+    if not all(np.all(np.isfinite(part)) for part in vars(result).values()):
         return False
-    pairs = [(found.pose_cov[i], cov) for i, cov in vouched.items()]
+    pairs = [(result.pose_cov[i], cov) for i, cov in checked.items()]
     if calibration is not None:
-        pairs.append((found.calibration_cov, calibration))
+        pairs.append((result.calibration_cov, calibration))
     for one, other in pairs:
         sigma = np.sqrt(np.diagonal(other))
         if not np.all(np.abs(one - other) < AGREED * sigma[:, None] * sigma):

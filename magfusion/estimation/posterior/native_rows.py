@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from magfusion.estimation.graph.factors import PIECE
-from magfusion.estimation.graph.graph import Estimate, Graph
+from magfusion.estimation.graph.graph import Graph, GraphEstimate
 from magfusion.estimation.graph.state import MOTION
 from magfusion.model.parameters import Block, difference, dimension
 from magfusion.units import Array, IntArray
@@ -61,17 +61,17 @@ class NativeRows:
     Parameters
     ----------
     graph : Graph
-    estimate : Estimate
+    estimate : GraphEstimate
     """
 
     graph: Graph
-    estimate: Estimate
+    estimate: GraphEstimate
     kinds: list[_Kind] = field(init=False)
 
     def __post_init__(self) -> None:
         linear = self.graph.native.linearize(self.estimate.values)
-        found: dict[tuple[tuple[tuple[str, int], ...], bool], list[tuple[int, Array, Array]]]
-        found, links = defaultdict(list), linear.size() - (self.graph.epochs - 1)
+        result: dict[tuple[tuple[tuple[str, int], ...], bool], list[tuple[int, Array, Array]]]
+        result, links = defaultdict(list), linear.size() - (self.graph.epochs - 1)
         for i in range(linear.size()):
             factor = linear.at(i)
             assert isinstance(factor, gtsam.JacobianFactor)
@@ -79,7 +79,7 @@ class NativeRows:
             names = [(chr(symbol.chr()), symbol.index()) for symbol in symbols]
             first = min(index for _, index in names)
             kind = tuple((name, index - first) for name, index in names), i >= links
-            found[kind].append((first, factor.getA(), factor.getb()))
+            result[kind].append((first, factor.getA(), factor.getb()))
         self.kinds = [
             _Kind(
                 *kind,
@@ -87,7 +87,7 @@ class NativeRows:
                 np.array([by for _, by, _ in every]),
                 np.array([b for _, _, b in every]),
             )
-            for kind, every in found.items()
+            for kind, every in result.items()
         ]
 
     def of(self, columns: Columns, begin: int = 0, end: int | None = None) -> Iterator[NativePiece]:
@@ -120,8 +120,8 @@ class NativeRows:
         rows = jacobian.shape[:2]
         own, after = np.zeros((*rows, MOTION)), np.zeros((*rows, MOTION))
         border = np.zeros((*rows, dimension(self.graph.blocks)))
-        beside = kind.inertial and columns.inertial is not None
-        right = np.zeros((*rows, 1 + (columns.number if beside else 0)))
+        extra_columns = kind.inertial and columns.inertial is not None
+        right = np.zeros((*rows, 1 + (columns.number if extra_columns else 0)))
         right[..., 0], column = kind.right[some], 0
         for name, later in kind.names:
             target, width = own if later == 0 else after, _WIDTH[name]
@@ -150,8 +150,8 @@ class NativeRows:
 
 def each_once(epoch: IntArray) -> Iterator[IntArray]:
     """Yield rows in groups without repeated states."""
-    left = np.arange(len(epoch))
-    while len(left):
-        _, first = np.unique(epoch[left], return_index=True)
-        yield left[first]
-        left = np.delete(left, first)
+    residual = np.arange(len(epoch))
+    while len(residual):
+        _, first = np.unique(epoch[residual], return_index=True)
+        yield residual[first]
+        residual = np.delete(residual, first)

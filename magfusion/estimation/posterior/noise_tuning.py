@@ -14,16 +14,20 @@ from typing import Any
 
 import numpy as np
 
-from magfusion.estimation.graph.graph import Estimate, Graph
-from magfusion.estimation.posterior.residual_shares import ChannelErrors, Leavings
-from magfusion.estimation.posterior.variance_components import BeaconErrors, likeliest, parts_of
+from magfusion.estimation.graph.graph import Graph, GraphEstimate
+from magfusion.estimation.posterior.residual_redundancy import ChannelErrors, ResidualProjection
+from magfusion.estimation.posterior.variance_components import (
+    BeaconErrors,
+    maximize_likelihood,
+    parts_of,
+)
 from magfusion.model.parameters import Block, Calibration
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray
 
-SETTLED = 0.05  # of a logarithm; a smaller change is negligible
+CONVERGED_STEP = 0.05  # of a logarithm; a smaller change is negligible
 GYRO, ACCEL = slice(0, 3), slice(6, 9)  # rows of an inertial factor that each determines
 FAULT = 3.0  # times a declared model error; more is no error of that kind, and not covered by it
 OF_IMU = ("gyro_noise", "accel_noise")  # a beacon may be called "imu", too
@@ -31,7 +35,7 @@ OF_IMU = ("gyro_noise", "accel_noise")  # a beacon may be called "imu", too
 OF_MOTION = {"angular_accel_density": "gyro_bias_walk", "accel_density": "accel_noise"}
 WALK = slice(12, 15)
 PLAUSIBLE = 6.0  # by a larger factor, either way, white noise is a fault
-LEFT = 1e-3  # of an error; a smaller remainder is not informative
+MIN_REMAINING = 1e-3  # of an error; a smaller remainder is not informative
 # Of a beacon's noise; with a smaller remainder no IMU constrains the pose, but the beacon alone,
 # whose own residuals, which it absorbs, would seem to improve from pass to pass.
 SELF_MADE = 0.5
@@ -46,30 +50,30 @@ class Tuned:
     owner : str
         Beacon, "imu" or "motion_prior".
     key : {'noise_factor', 'model_error', 'gyro_noise', 'accel_noise', or of `OF_MOTION`}
-    declared, found : float
+    declared, estimated : float
         In the unit of the site's file.
     """
 
     owner: str
     key: str
     declared: float
-    found: float
+    estimated: float
 
     @property
     def factor(self) -> float:
         """Estimated over declared."""
-        return self.found / self.declared
+        return self.estimated / self.declared
 
 
 def tuned_site(site: Site, tuned: Sequence[Tuned]) -> Site:
     """Return a site with the estimated noise."""
-    of_imu: dict[str, Any] = {t.key: t.found for t in tuned if t.key in OF_IMU}
-    of_imu |= {OF_MOTION[t.key]: t.found for t in tuned if t.key in OF_MOTION}
+    of_imu: dict[str, Any] = {t.key: t.estimated for t in tuned if t.key in OF_IMU}
+    of_imu |= {OF_MOTION[t.key]: t.estimated for t in tuned if t.key in OF_MOTION}
     platform = replace(site.platform, imu=replace(site.platform.imu, **of_imu))
     beacons = []
     for beacon in site.beacons:
         named = (t for t in tuned if t.owner == beacon.name and t.key not in (*OF_IMU, *OF_MOTION))
-        own: dict[str, Any] = {t.key: t.found for t in named}
+        own: dict[str, Any] = {t.key: t.estimated for t in named}
         beacons.append(replace(beacon, **own))
     return replace(site, platform=platform, beacons=tuple(beacons))
 
@@ -87,25 +91,26 @@ def plausible(tuned: Sequence[Tuned]) -> bool:
 
 def as_declared(tuned: Sequence[Tuned]) -> tuple[Tuned, ...]:
     """Return the noise with its declared values."""
-    return tuple(replace(t, found=t.declared) for t in tuned)
+    return tuple(replace(t, estimated=t.declared) for t in tuned)
 
 
-def settled(before: Sequence[Tuned], after: Sequence[Tuned]) -> bool:
+def has_converged(before: Sequence[Tuned], after: Sequence[Tuned]) -> bool:
     """Return whether two tunings differ by a negligible amount."""
-    old = {(t.owner, t.key): t.found for t in before}
+    old = {(t.owner, t.key): t.estimated for t in before}
     return all(
-        abs(np.log(t.found / old.get((t.owner, t.key), t.declared))) < SETTLED for t in after
+        abs(np.log(t.estimated / old.get((t.owner, t.key), t.declared))) < CONVERGED_STEP
+        for t in after
     )
 
 
 def tune(
     graph: Graph,
-    estimate: Estimate,
+    estimate: GraphEstimate,
     samples: FieldSamples,
     poses: Trajectory,
     declared: Site,
     windows: float,
-    alike: Array,
+    shared_by: Array,
     blind: BoolArray | None = None,
     considered: tuple[Block, ...] = (),
 ) -> tuple[Tuned, ...]:
@@ -121,25 +126,25 @@ def tune(
         Whose noise is the prior.
     windows : float
         Number of windows that contain each sample.
-    alike : ndarray, shape (n,)
+    shared_by : ndarray, shape (n,)
         Number of epochs with the same model error.
     blind : bool ndarray, shape (n,), optional
         Epochs with other noise: of a motion estimated without an IMU.
     considered : tuple of Block
         Parameters that are not estimated: the effect of their errors on residuals is no noise.
     """
-    system = Leavings(graph, estimate, samples, poses, windows, considered)
+    system = ResidualProjection(graph, estimate, samples, poses, windows, considered)
     now = estimate.calibration.site
     lag = max(1, round(windows))
     prior = declared.beacons
     errors = [_errors_of(system, i, now, declared, blind) for i in range(len(now.beacons))]
-    found = parts_of(errors, alike, lag)
-    parts = {i: part for i, part in enumerate(found) if part is not None}
+    result = parts_of(errors, shared_by, lag)
+    parts = {i: part for i, part in enumerate(result) if part is not None}
     modelled = [part for part in parts.values() if part.model is not None]
     less, smooth = 1.0, 0.0
     if modelled:
         # Rare large errors have little weight, so that those of a whole log seem too small.
-        less = float(np.exp(np.mean(np.log([part.taken for part in modelled]))))
+        less = float(np.exp(np.mean(np.log([part.accepted_factor for part in modelled]))))
         smooth = float(np.mean([part.smooth for part in modelled]))
     out: list[Tuned] = []
     for i, part in parts.items():
@@ -157,7 +162,7 @@ def tune(
 
 
 def _errors_of(
-    system: Leavings, beacon: int, now: Site, declared: Site, blind: BoolArray | None
+    system: ResidualProjection, beacon: int, now: Site, declared: Site, blind: BoolArray | None
 ) -> BeaconErrors:
     """Return the errors of a beacon, with the noise that the sites declare and have now."""
     prior = declared.beacons[beacon]
@@ -171,20 +176,22 @@ def _without(own: ChannelErrors, blind: BoolArray | None) -> ChannelErrors:
     if blind is None:
         return own
     kept = ~blind[own.epoch]
-    noise, rough, smooth, inertial = (part[kept] for part in own.left)
+    noise, rough, smooth, inertial = (part[kept] for part in own.residuals)
     variance = own.variance[0][kept], own.variance[1][kept]
-    left = noise, rough, smooth, inertial
-    return replace(own, epoch=own.epoch[kept], seen=own.seen[kept], left=left, variance=variance)
+    residual = noise, rough, smooth, inertial
+    return replace(
+        own, epoch=own.epoch[kept], seen=own.seen[kept], residuals=residual, variance=variance
+    )
 
 
 def _left_of_noise(channels: list[ChannelErrors]) -> float:
     """Return the share of a beacon's noise that remains in its residuals."""
-    left = sum(float(np.sum(own.left[0] ** 2)) for own in channels)
+    residual = sum(float(np.sum(own.residuals[0] ** 2)) for own in channels)
     given = sum(float(np.sum(own.variance[0])) * own.size[0] ** 2 for own in channels)
-    return left / given if given > 0.0 else 1.0
+    return residual / given if given > 0.0 else 1.0
 
 
-def _tuned_imu(system: Leavings, now: Site, declared: Site, smooth: float) -> list[Tuned]:
+def _tuned_imu(system: ResidualProjection, now: Site, declared: Site, smooth: float) -> list[Tuned]:
     """Return the densities of gyro and accelerometer.
 
     Parameters
@@ -193,7 +200,7 @@ def _tuned_imu(system: Leavings, now: Site, declared: Site, smooth: float) -> li
         Share of the model error's variance that is smooth.
     """
     plain = system.inertial()
-    found = []
+    result = []
     owner, of_turn, names = "imu", GYRO, {name: name for name in OF_IMU}
     if not declared.platform.inertial:
         owner, of_turn, names = "motion_prior", WALK, OF_MOTION
@@ -204,14 +211,14 @@ def _tuned_imu(system: Leavings, now: Site, declared: Site, smooth: float) -> li
         before, usual = getattr(declared.platform.imu, key), getattr(now.platform.imu, key)
         here = system.ordinary
         every = [float(np.mean(p[here])) / 3.0 for p in (noise, bent, own)]
-        if not np.any(here) or every[2] < LEFT:
+        if not np.any(here) or every[2] < MIN_REMAINING:
             continue
         count = int(np.sum(here))
         known = np.full((1, 1, count), every[2] * (before / usual) ** 2)
         fixed = np.full((1, count), every[0] + every[1])
         # Successive residuals are correlated.
         weight = np.full((1, count), min(1.0, (every[2] + fixed[0, 0]) ** 2 / every[2]))
-        log = likeliest(square[here][None], known, fixed, weight, 3)[0]
+        log = maximize_likelihood(square[here][None], known, fixed, weight, 3)[0]
         # Declared values below these include scale and vibration too, which are not white.
-        found.append(Tuned(owner, name, before, float(before * np.exp(max(log[0], 0.0)))))
-    return found
+        result.append(Tuned(owner, name, before, float(before * np.exp(max(log[0], 0.0)))))
+    return result

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from magfusion.estimation.graph.factors import CONSIDERED_KEY
-from magfusion.estimation.graph.graph import Estimate, Graph
+from magfusion.estimation.graph.graph import Graph, GraphEstimate
 from magfusion.estimation.graph.inertial import ROWS
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.solve.bordered import eliminate, eliminate_in_sequence
@@ -17,43 +17,45 @@ from magfusion.units import Array, IntArray
 
 def left_by_tree(
     graph: Graph,
-    estimate: Estimate,
+    estimate: GraphEstimate,
     considered: tuple[Block, ...],
     fields: Sequence[Array],
     inertial: Sequence[Array],
 ) -> tuple[Array, Array]:
-    """Return the same as `magfusion.estimation.posterior.residual_chain.left_by_chain`."""
+    """Return the same as `magfusion.estimation.posterior.residual_covariance_chain.left_by_chain`."""
     system = _System(graph, estimate, considered)
     shape = next(
         (len(m.epoch), m.measured.shape[1], 6)
         for m in graph.measurements
         if isinstance(m, FieldPhasors)
     )
-    left = [system.left()]
-    for own, beside in zip(fields, inertial, strict=True):
-        system.put(own.reshape(len(own), -1), beside)
-        left.append(system.left())
+    residual = [system.residuals()]
+    for own, columns in zip(fields, inertial, strict=True):
+        system.put(own.reshape(len(own), -1), columns)
+        residual.append(system.residuals())
     return (
-        np.array([field.reshape(shape) for field, _ in left]),
-        np.array([own for _, own in left]),
+        np.array([field.reshape(shape) for field, _ in residual]),
+        np.array([own for _, own in residual]),
     )
 
 
 class _System:
     """The linear system of a solved graph, with variable right-hand sides."""
 
-    def __init__(self, graph: Graph, estimate: Estimate, considered: tuple[Block, ...]) -> None:
+    def __init__(
+        self, graph: Graph, estimate: GraphEstimate, considered: tuple[Block, ...]
+    ) -> None:
         self._linear, self._ordering, begin = _linear(graph, estimate, considered)
         every = _jacobians(self._linear)
         last = graph.native.size()
         self._every, self._inertial = every, every[last - graph.epochs + 1 : last]
         self._fields: list[gtsam.JacobianFactor] = []
-        self._told: list[slice | IntArray] = []
+        self._informative_rows: list[slice | IntArray] = []
         for factors in graph.factors:
             end = begin + len(factors.measurement.epoch)
             if isinstance(factors.measurement, FieldPhasors):
                 self._fields += every[begin:end]
-                self._told += factors.told
+                self._informative_rows += factors.informative_rows
                 self._width = factors.measurement.measured[0].size
             begin = end
         self._net = eliminate_in_sequence(self._linear, self._ordering)
@@ -62,18 +64,18 @@ class _System:
         """Set right-hand sides: of fields (n, rows), and of inertial factors."""
         for factor in self._every:
             factor.getb()[...] = 0.0
-        for factor, own, told in zip(self._fields, fields, self._told, strict=True):
-            part = own[told]
+        for factor, own, reported in zip(self._fields, fields, self._informative_rows, strict=True):
+            part = own[reported]
             factor.getb()[: part.size] = part
         for factor, own in zip(self._inertial, inertial, strict=True):
             factor.getb()[: own.size] = own
 
-    def left(self) -> tuple[Array, Array]:
+    def residuals(self) -> tuple[Array, Array]:
         """Return the remainders of the right-hand sides."""
         step = self._step()
         rows = np.zeros((len(self._fields), self._width))
-        for row, factor, told in zip(rows, self._fields, self._told, strict=True):
-            row[told] = factor.error_vector(step)[: row[told].size]
+        for row, factor, reported in zip(rows, self._fields, self._informative_rows, strict=True):
+            row[reported] = factor.error_vector(step)[: row[reported].size]
         own = [factor.error_vector(step)[:ROWS] for factor in self._inertial]
         return rows, np.array(own).reshape(-1, ROWS)
 
@@ -88,7 +90,7 @@ class _System:
 
 
 def _linear(
-    graph: Graph, estimate: Estimate, considered: tuple[Block, ...]
+    graph: Graph, estimate: GraphEstimate, considered: tuple[Block, ...]
 ) -> tuple[gtsam.GaussianFactorGraph, gtsam.Ordering, int]:
     """Return a linear graph that estimates considered parameters, and its first field factor."""
     ordering = graph.ordering
@@ -96,7 +98,7 @@ def _linear(
         return graph.linearized(estimate), ordering, graph.native.size()
     spread = prior_sqrt_covariance(graph.declared.site, considered)
     by_inertial = graph.by_considered(spread)
-    linear = graph.beside(estimate, considered, spread, by_inertial, explaining=True)
+    linear = graph.with_fixed_columns(estimate, considered, spread, by_inertial, explaining=True)
     fields = linear.size() - sum(len(part.measurement.epoch) for part in graph.factors)
     count = spread.shape[1]
     unit = gtsam.noiseModel.Unit.Create(count)

@@ -27,8 +27,8 @@ ROOT_2, ROOT_2_PI = float(np.sqrt(2.0)), float(np.sqrt(2.0 / np.pi))
 POSE = 6  # axes: rotation, then position
 PRECISE, MOST_STEPS = 1e-7, 60  # of a level
 MOST_DEG = 180.0  # an attitude level beyond it is not informative
-SINGLE_HOLDS = 0.215  # probability of a tail below which a single number bounds it
-LEAST = 1e-30  # rad, m; a deviation below it is zero
+SINGLE_FAULT_TAIL = 0.215  # probability of a tail below which a single number bounds it
+MIN_COUNT = 1e-30  # rad, m; a deviation below it is zero
 PARTS = (slice(0, 3), slice(3, 6))  # rotation, position
 ROWS = np.arange(POSE).reshape(2, 3, 1)  # of the blocks of both, shape (2, 3, 3) with
 COLUMNS = np.arange(POSE).reshape(2, 1, 3)
@@ -51,14 +51,14 @@ class Radius(NamedTuple):
 
     def tail(self, radius: Array) -> Array:
         """Return an upper bound of the probability that a norm exceeds a radius."""
-        single = erfc(radius / (ROOT_2 * np.maximum(self.whole, LEAST)))
-        share = np.minimum(np.maximum(radius / np.maximum(self.largest, LEAST), 0.0), 1e3)
+        single = erfc(radius / (ROOT_2 * np.maximum(self.whole, MIN_COUNT)))
+        share = np.minimum(np.maximum(radius / np.maximum(self.largest, MIN_COUNT), 0.0), 1e3)
         three = erfc(share / ROOT_2) + ROOT_2_PI * share * np.exp(-0.5 * share**2)
-        return np.minimum(three, np.where(single < SINGLE_HOLDS, single, 1.0))
+        return np.minimum(three, np.where(single < SINGLE_FAULT_TAIL, single, 1.0))
 
     def beyond(self, probability: Array | float) -> Array:
         """Return a radius that a norm exceeds with at most a given probability."""
-        single = -ndtri(0.5 * np.minimum(probability, 0.999 * SINGLE_HOLDS))
+        single = -ndtri(0.5 * np.minimum(probability, 0.999 * SINGLE_FAULT_TAIL))
         with np.errstate(invalid="ignore"):  # where the value is exactly known
             bounds = (
                 single * self.whole,
@@ -170,7 +170,7 @@ class Separation:
         """
         limit = self.thresholds(risk, slack)
         known = (self.determined & (self.rows > 0))[..., None]
-        return np.max(np.where(known, self.shift / np.maximum(limit, LEAST), 0.0), axis=2)
+        return np.max(np.where(known, self.shift / np.maximum(limit, MIN_COUNT), 0.0), axis=2)
 
     def likely(self, prior: Array) -> Array:
         """Return the probability of each beacon, given that one is faulty, shape (n, beacons).
@@ -210,8 +210,8 @@ def linear_separation(
     for beacon in range(beacons):
         kept = np.where((owner == beacon)[:, None], 0.0, jacobian)
         other, other_gain, determined = _estimate(kept, error)
-        left = np.where(owner == beacon, 0.0, error)
-        cost = np.sum((left + (kept @ other[..., None])[..., 0]) ** 2, axis=1)
+        residual = np.where(owner == beacon, 0.0, error)
+        cost = np.sum((residual + (kept @ other[..., None])[..., 0]) ** 2, axis=1)
         moved, difference = other[:, :POSE] - step[:, :POSE], other_gain - gain
         count = np.sum(known & (owner == beacon), axis=1)
         covs = spread(other_gain, covariance), spread(difference, covariance)
@@ -229,8 +229,8 @@ def spread(gain: Array, covariance: Array | None) -> Array:
     covariance : ndarray, shape (n, rows, rows), optional
         The identity by default.
     """
-    carried = gain if covariance is None else gain @ covariance
-    return carried @ np.swapaxes(gain, -1, -2)
+    propagated = gain if covariance is None else gain @ covariance
+    return propagated @ np.swapaxes(gain, -1, -2)
 
 
 def _estimate(jacobian: Array, error: Array) -> tuple[Array, Array, BoolArray]:
@@ -300,11 +300,11 @@ def _levels(sigma: Radius, without: Radius, threshold: Array, prior: Array, risk
 
     def more(level: Array) -> Array:
         total = (prior * each.tail(level[:, None] - threshold)).sum(axis=1)
-        return np.asarray(np.log(np.maximum(total, LEAST)) - goal)
+        return np.asarray(np.log(np.maximum(total, MIN_COUNT)) - goal)
 
     # A single one has all of the risk at the lower end, and at most its part at the upper.
     reach, part = threshold + each.beyond(np.minimum(own, 1.0)), own / prior.shape[1]
-    low = np.max(np.where((prior > 0.0) & (own < SINGLE_HOLDS), reach, 0.0), axis=1)
+    low = np.max(np.where((prior > 0.0) & (own < SINGLE_FAULT_TAIL), reach, 0.0), axis=1)
     reach = threshold + each.beyond(np.minimum(part, 1.0))
     high = np.max(np.where(prior > 0.0, reach, 0.0), axis=1)
     return _crossing(more, np.maximum(low - PRECISE * high, 0.0), high)
@@ -324,17 +324,17 @@ def _crossing(falling: Callable[[Array], Array], low: Array, high: Array) -> Arr
             wide = high - low > width
             if not wide.any():
                 break
-            middle = low + (high - low) * (at_low / np.maximum(at_low - at_high, LEAST))
+            middle = low + (high - low) * (at_low / np.maximum(at_low - at_high, MIN_COUNT))
             # Not nearer to an end than requested: a step beyond the crossing closes in on it.
             middle = np.maximum(low + 0.4 * width, np.minimum(middle, high - 0.4 * width))
-            found = falling(middle)
-            rises = found > 0.0
+            result = falling(middle)
+            rises = result > 0.0
             half = np.where(rises == rose, 0.5, 1.0)
             low = np.where(rises & wide, middle, low)
             high = np.where(rises | ~wide, high, middle)
             at_low, at_high = (
-                np.where(rises, found, half * at_low),
-                np.where(rises, half * at_high, found),
+                np.where(rises, result, half * at_low),
+                np.where(rises, half * at_high, result),
             )
             rose = rises
     return high

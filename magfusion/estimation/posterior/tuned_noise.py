@@ -54,4 +54,4 @@ def _listed(tuned: Sequence[Tuned]) -> str:
 def _words(tuned: Tuned) -> str:
     words, unit = WORDS[tuned.key]
     what = words.format(owner=f"beacon {tuned.owner}")
-    return f"{what} is {tuned.found:.2g}{unit}, declared {tuned.declared:.2g}{unit}"
+    return f"{what} is {tuned.estimated:.2g}{unit}, declared {tuned.declared:.2g}{unit}"

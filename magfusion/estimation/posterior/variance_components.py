@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.posterior.residual_shares import ChannelErrors
+from magfusion.estimation.posterior.residual_redundancy import ChannelErrors
 from magfusion.estimation.solve.bounded import minimise_curved
 from magfusion.units import Array
 
 PRIOR = float(np.log(2.0))  # of the logarithm of a declared sigma
-LEAST, MOST = 0.1, 1e3  # of a factor; no log can determine a smaller noise
+MIN_FACTOR, MAX_FACTOR = 0.1, 1e3  # of a factor; no log can determine a smaller noise
 STUDENT = 4.0  # degrees of freedom: faults have little weight
 # Gain, by components, with which that distribution finds the variance of normal residuals.
 NORMAL = {3: 1.322946, 6: 1.224631}
@@ -41,7 +41,7 @@ class BeaconParts(NamedTuple):
         Factor of the declared model error; None where it was not estimated.
     smooth : float
         Share of its variance that is smooth.
-    taken : float
+    accepted_factor : float
         Ratio of the factor estimated from errors drawn with the estimated sizes to the true one.
     """
 
@@ -49,7 +49,7 @@ class BeaconParts(NamedTuple):
     white: float
     model: float | None = None
     smooth: float = 0.0
-    taken: float = 1.0
+    accepted_factor: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,29 +70,31 @@ class BeaconErrors:
     bent: bool
 
 
-def parts_of(beacons: Sequence[BeaconErrors], alike: Array, lag: int) -> list[BeaconParts | None]:
+def parts_of(
+    beacons: Sequence[BeaconErrors], shared_by: Array, lag: int
+) -> list[BeaconParts | None]:
     """Return the components of each beacon's residuals; None where there are too few.
 
     Parameters
     ----------
-    alike : ndarray, shape (n,)
+    shared_by : ndarray, shape (n,)
         Number of epochs with the same model error.
     lag : int
         Number of epochs that share samples.
     """
-    fitted = _fitted(beacons, alike, lag)
+    fitted = _fitted(beacons, shared_by, lag)
     bent = [k for k, (log, _) in enumerate(fitted) if len(log) and beacons[k].bent]
     drawn = [_drawn(beacons[k], *fitted[k]) for k in bent]
-    again = dict(zip(bent, _fitted(drawn, alike, lag), strict=True))
-    found: list[BeaconParts | None] = []
+    again = dict(zip(bent, _fitted(drawn, shared_by, lag), strict=True))
+    result: list[BeaconParts | None] = []
     for k, (log, white) in enumerate(fitted):
         if k in again:
             model, smooth = _total(log), float(np.exp(2.0 * (log[2] - _logarithm(log[1:3]))))
-            taken = _total(again[k][0]) / model
-            found.append(BeaconParts(beacons[k].sizes, white, model, smooth, taken))
+            selected = _total(again[k][0]) / model
+            result.append(BeaconParts(beacons[k].sizes, white, model, smooth, selected))
         else:
-            found.append(BeaconParts(beacons[k].sizes, white) if len(log) else None)
-    return found
+            result.append(BeaconParts(beacons[k].sizes, white) if len(log) else None)
+    return result
 
 
 def _total(log: Array) -> float:
@@ -110,28 +112,30 @@ def _drawn(beacon: BeaconErrors, log: Array, white: float) -> BeaconErrors:
     of_rough, of_smooth = np.exp(log[1:3]) * usual
     drawn = []
     for own in beacon.channels:
-        noise, rough, smooth, inertial = own.left
+        noise, rough, smooth, inertial = own.residuals
         size, model = own.size
         bent = (of_rough * rough + of_smooth * smooth) / model
         drawn.append(replace(own, seen=of_noise / size * noise + bent + inertial))
     return replace(beacon, channels=drawn)
 
 
-def _fitted(beacons: Sequence[BeaconErrors], alike: Array, lag: int) -> list[tuple[Array, float]]:
+def _fitted(
+    beacons: Sequence[BeaconErrors], shared_by: Array, lag: int
+) -> list[tuple[Array, float]]:
     """Return logarithms of the factors of all parts, and the factor of all white parts."""
-    scaled = [by_scale(beacon.channels, alike, lag) for beacon in beacons]
-    found = [(np.zeros(0), 1.0)] * len(beacons)
+    scaled = [by_scale(beacon.channels, shared_by, lag) for beacon in beacons]
+    result = [(np.zeros(0), 1.0)] * len(beacons)
     for bent in (False, True):
         chosen = [k for k, b in enumerate(beacons) if b.bent == bent and len(scaled[k][0])]
         if chosen:
             sizes = np.array([beacons[k].sizes for k in chosen])
-            several = _fitted_alike([scaled[k] for k in chosen], sizes, lag, bent)
+            several = _fitted_same_parts([scaled[k] for k in chosen], sizes, lag, bent)
             for k, one in zip(chosen, several, strict=True):
-                found[k] = one
-    return found
+                result[k] = one
+    return result
 
 
-def _fitted_alike(
+def _fitted_same_parts(
     scaled: list[tuple[Array, Array, Array]], sizes: Array, lag: int, bent: bool
 ) -> list[tuple[Array, float]]:
     """Return the result of `_fitted` for beacons that have the same parts.
@@ -142,9 +146,9 @@ def _fitted_alike(
         From `by_scale`, one per beacon.
     sizes : ndarray, shape (k, 2)
     """
-    most = max(len(square) for square, _, _ in scaled)
-    square, near = np.zeros((len(scaled), most)), np.ones((len(scaled), most))
-    expected, weighed = np.zeros((len(scaled), 5, most)), np.zeros((len(scaled), most))
+    maximum = max(len(square) for square, _, _ in scaled)
+    square, near = np.zeros((len(scaled), maximum)), np.ones((len(scaled), maximum))
+    expected, weighed = np.zeros((len(scaled), 5, maximum)), np.zeros((len(scaled), maximum))
     expected[:, 4] = 1.0  # of missing rows, with zero weight
     for k, (seen, parts, close) in enumerate(scaled):
         rows = slice(0, len(seen))
@@ -159,7 +163,9 @@ def _fitted_alike(
         known, fixed = known[:, :1], fixed + known[:, 1]
     log: Array | None = None
     for _ in range(WEIGHINGS):
-        log = likeliest(square, known, fixed, weight, 6, KINDS if bent else KINDS[:1], log)
+        log = maximize_likelihood(
+            square, known, fixed, weight, 6, KINDS if bent else KINDS[:1], log
+        )
         parts = np.exp(2.0 * log)[:, :, None] * known
         of_model = np.sum(parts[:, 1:3], axis=1) if bent else fixed
         of_model = of_model / (np.sum(parts, axis=1) + fixed)
@@ -168,13 +174,15 @@ def _fitted_alike(
     usual = np.sum(known[:, 0], axis=1)
     white = np.sum(parts[:, ::3], axis=(1, 2)) / usual
     # For a strong beacon less noise than declared cannot be distinguished from a small model error.
-    unsure = LEAST**2 * np.sum(known[:, 3:], axis=(1, 2)) / usual
+    unsure = MIN_FACTOR**2 * np.sum(known[:, 3:], axis=(1, 2)) / usual
     assert log is not None
     white = np.sqrt(np.maximum(white, np.minimum(white + unsure, 1.0)))
     return list(zip(log, white.tolist(), strict=True))
 
 
-def by_scale(channels: list[ChannelErrors], alike: Array, lag: int) -> tuple[Array, Array, Array]:
+def by_scale(
+    channels: list[ChannelErrors], shared_by: Array, lag: int
+) -> tuple[Array, Array, Array]:
     """Return squares of a beacon's residuals on several scales of time, and their expectation.
 
     Noise is equal on all scales; an error that is constant in place is mostly in the longest.  Its
@@ -190,25 +198,25 @@ def by_scale(channels: list[ChannelErrors], alike: Array, lag: int) -> tuple[Arr
     near : ndarray, shape (m,)
         Share that is independent, where model error prevails.
     """
-    every, seen, left, given, near = _haar(SCALES), [], [], [], []
+    every, seen, residual, given, near = _haar(SCALES), [], [], [], []
     for own in channels:
         used = len(own.seen) // (SCALES * lag) * SCALES * lag
         shape = (-1, SCALES, lag)
         squares = []
-        for v in (own.seen, *own.left):
+        for v in (own.seen, *own.residuals):
             rows = np.einsum("hs,bslk->hblk", every, v[:used].reshape(*shape, 6))
             squares.append(np.sum(rows**2, axis=3).reshape(SCALES, -1))
         seen.append(squares[0])
-        left.append(np.stack(squares[1:]))
+        residual.append(np.stack(squares[1:]))
         given.append([np.mean(v[:used].reshape(shape), axis=1).ravel() for v in own.variance])
-        close = np.mean(alike[own.epoch][:used].reshape(shape), axis=1).ravel()
+        close = np.mean(shared_by[own.epoch][:used].reshape(shape), axis=1).ravel()
         near.append(np.minimum(SCALES * lag / close, 1.0))
     drawn = np.concatenate(given, axis=1)
     # The effect of a wrong motion increases with the field, too.
     drawn = np.stack([*drawn, drawn[1], drawn[1]])
     noise, model = channels[0].size
     total = np.array([noise, model, model, 1.0]) ** 2 * np.sum(drawn, axis=1)
-    kept = np.sum(np.concatenate(left, axis=2), axis=2)
+    kept = np.sum(np.concatenate(residual, axis=2), axis=2)
     share = np.divide(kept, total[:, None], out=np.ones((4, SCALES)), where=total[:, None] > 0.0)
     parts = share[:, :, None] * drawn[:, None] / 6.0
     white = share[0][:, None] * drawn[1] / 6.0
@@ -226,7 +234,7 @@ def _haar(size: int) -> Array:
     return np.concatenate([means, steps]) / np.sqrt(2.0)
 
 
-def likeliest(
+def maximize_likelihood(
     square: Array,
     parts: Array,
     fixed: Array,
@@ -283,13 +291,13 @@ def likeliest(
         by = squares[:, :, None] * parts
         variance = by.sum(axis=1) + fixed
         heavy = STUDENT * variance + scaled
-        left = (components - constant / heavy) / variance
-        bend = (STUDENT * constant / heavy**2 - left) / variance
+        residual = (components - constant / heavy) / variance
+        bend = (STUDENT * constant / heavy**2 - residual) / variance
         curvature = (by * (doubled * bend)[:, None]) @ by.transpose(0, 2, 1)
         total = squares @ of_kind
         share = squares * ((1.0 / total) @ of_kind.T)
         off = (0.5 / PRIOR**2 * np.log(total)) @ of_kind.T
-        slope = (by @ (weight * left)[:, :, None])[:, :, 0] + off * share
+        slope = (by @ (weight * residual)[:, :, None])[:, :, 0] + off * share
         outer = ((1.0 / PRIOR**2 - 2.0 * off) * share)[:, :, None] * share[:, None]
         curvature += together * outer
         curvature.reshape(len(log), -1)[:, :: count + 1] += 2.0 * slope
@@ -297,19 +305,19 @@ def likeliest(
 
     start = np.tile(first, (len(parts), 1))
     if near is not None:
-        little = np.log(LEAST)
+        little = np.log(MIN_FACTOR)
         stays = (near < little) & (curved(near)[0] > 0.0)
         start = np.where(stays, near, np.maximum(near, little))
-    limits = np.log(np.stack([least, np.full(count, MOST)], axis=1))
+    limits = np.log(np.stack([least, np.full(count, MAX_FACTOR)], axis=1))
     return minimise_curved(cost, curved, start, limits)
 
 
 def _of_kinds(count: int, kinds: Sequence[slice]) -> tuple[Array, Array, Array]:
     """Return start and lower bound of each part, and which parts are of each kind."""
-    first, least = np.full(count, np.log(LEAST)), np.full(count, NONE)
+    first, least = np.full(count, np.log(MIN_FACTOR)), np.full(count, NONE)
     of_kind = np.zeros((count, len(kinds)))
     for k, kind in enumerate(kinds):
         first[kind] = -0.5 * np.log(kind.stop - kind.start)
-        least[kind.start] = LEAST
+        least[kind.start] = MIN_FACTOR
         of_kind[kind, k] = 1.0
     return first, least, of_kind

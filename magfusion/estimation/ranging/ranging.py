@@ -8,7 +8,7 @@ from magfusion.estimation.ranging.ranging_data import POSE, RangingWindows
 from magfusion.estimation.ranging.ranging_model import RangingModel
 from magfusion.estimation.ranging.ranging_starts import starts
 from magfusion.estimation.solve.batched import (
-    Normal,
+    NormalEquations,
     Solution,
     minimise,
     moved_poses,
@@ -18,7 +18,7 @@ from magfusion.model.field import skew
 from magfusion.model.site import Site
 from magfusion.units import Array, BoolArray, IntArray
 
-PASSES, PASSES_OF_BEST, FOLLOWED = 40, 60, 3
+MAX_ITERATIONS, BEST_ITERATIONS, FOLLOWED = 40, 60, 3
 THINNED = 24  # approximate number of windows for the comparison of starts
 KEPT = 24  # starts that are refined
 
@@ -83,14 +83,14 @@ def find_range(site: Site, windows: RangingWindows) -> Ranged:
     """
     every = max(len(windows.fields) // THINNED, 1)
     thin = RangingModel(site, windows.rows(slice(every // 2, None, every)))
-    tried = _solved(thin, starts(thin)[:KEPT], PASSES)
-    found = _solved(RangingModel(site, windows), tried.state[:FOLLOWED], PASSES_OF_BEST)
+    tried = _solved(thin, starts(thin)[:KEPT], MAX_ITERATIONS)
+    result = _solved(RangingModel(site, windows), tried.state[:FOLLOWED], BEST_ITERATIONS)
     # Weighted at the most probable: its rivals by the same weights, as a likelihood requires.
-    model = RangingModel(site, windows, about=found.state[0])
-    found = _solved(model, found.state, PASSES_OF_BEST)
-    best = found.state[:1]
+    model = RangingModel(site, windows, about=result.state[0])
+    result = _solved(model, result.state, BEST_ITERATIONS)
+    best = result.state[:1]
     error, _ = model.residuals(best)
-    rival = found.cost[_elsewhere(model, found.state, windows)]
+    rival = result.cost[_elsewhere(model, result.state, windows)]
     used = 2 * 3 * int(np.sum(windows.fields.valid))
     used -= 0 if windows.angle_known else len(windows.fields) + POSE - 5
     return Ranged(
@@ -99,26 +99,26 @@ def find_range(site: Site, windows: RangingWindows) -> Ranged:
         names=model.names,
         values=best[0, 12:],
         prior_sigma=model.prior,
-        cov=np.linalg.pinv(found.information[0], hermitian=True),
+        cov=np.linalg.pinv(result.information[0], hermitian=True),
         chi_square=float(np.sum(error**2)),
         freedom=max(used - POSE, 1),
-        rival_chi_square=float(np.min(rival - found.cost[0], initial=np.inf)),
+        rival_chi_square=float(np.min(rival - result.cost[0], initial=np.inf)),
         residual=error[0],
-        converged=bool(found.converged[0]),
+        converged=bool(result.converged[0]),
     )
 
 
-def _solved(model: RangingModel, starts: Array, passes: int) -> Solution:
+def _solved(model: RangingModel, starts: Array, max_iterations: int) -> Solution:
     """Return the solutions of starts, the most probable first."""
 
-    def normal(rows: IntArray, state: Array) -> Normal:
+    def normal(rows: IntArray, state: Array) -> NormalEquations:
         del rows
         return normal_equations(*model.with_priors(state))
 
-    found = minimise(normal, starts, _moved, passes=passes)
-    order = np.argsort(np.where(np.isfinite(found.cost), found.cost, np.inf))
+    result = minimise(normal, starts, _moved, max_iterations=max_iterations)
+    order = np.argsort(np.where(np.isfinite(result.cost), result.cost, np.inf))
     return Solution(
-        found.state[order], found.cost[order], found.information[order], found.converged[order]
+        result.state[order], result.cost[order], result.information[order], result.converged[order]
     )
 
 

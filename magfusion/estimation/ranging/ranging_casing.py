@@ -9,7 +9,7 @@ import numpy as np
 from magfusion.estimation.ranging.ranging_data import FIRST, POSE, RangingWindows
 from magfusion.model.field import observe
 from magfusion.model.physics.casing import (
-    MOST,
+    MAX_LOG_ERROR,
     STEEL,
     Casing,
     Response,
@@ -28,15 +28,15 @@ PER_REACH, REACHES = (
 
 def casing_unknowns(casing: Casing) -> tuple[tuple[str, float], ...]:
     """Return names and sigmas of a casing's estimated parameters."""
-    found = list[tuple[str, float]]()
+    result = list[tuple[str, float]]()
     for kind in ("gather", "across", "along"):
-        found.append((f"log_{kind}", casing.log_gain_sigma))
-        found.append((f"phase_{kind}", casing.phase_sigma))
+        result.append((f"log_{kind}", casing.log_gain_sigma))
+        result.append((f"phase_{kind}", casing.phase_sigma))
     steel = zip(LOGS, casing.steel_sigma.tolist(), strict=True)
-    return (*found, *((name, sigma) for name, sigma in steel if sigma))
+    return (*result, *((name, sigma) for name, sigma in steel if sigma))
 
 
-class Gathered(NamedTuple):
+class CasingResponse(NamedTuple):
     """Field gathered by a casing: phasors (k, n, 1, tones, 3), and derivatives.
 
     ``by_strength`` is that by the logarithm of the tube's strength, a complex number.
@@ -75,7 +75,7 @@ class CasingModel:
         position: Array,
         extra: Mapping[str, Array],
         responses: list[Response],
-    ) -> Gathered:
+    ) -> CasingResponse:
         """Return the field of a casing's poles along it, outside its wall.
 
         Parameters
@@ -83,7 +83,9 @@ class CasingModel:
         attitude, position : ndarray, shape (k, n, 1, 3, 3) and (k, n, 1, 3)
             Of the sensor in the middle of windows.
         """
-        factor = np.exp(np.clip(extra["log_gather"], -MOST, MOST) + 1j * extra["phase_gather"])
+        factor = np.exp(
+            np.clip(extra["log_gather"], -MAX_LOG_ERROR, MAX_LOG_ERROR) + 1j * extra["phase_gather"]
+        )
         both = [
             gathering_weights(factor * own.strength, self._casing.radius, self._place)
             for own in responses
@@ -103,9 +105,11 @@ class CasingModel:
             if seen.log_conductivity is not None:
                 has_ground = True
                 by_ground = by_ground + own * (along @ seen.log_conductivity[..., None])[..., 0]
-        return Gathered(whole, by_pose, by_ground if has_ground else None, by_strength)
+        return CasingResponse(whole, by_pose, by_ground if has_ground else None, by_strength)
 
-    def column(self, name: str, bend: Gathered, responses: list[Response]) -> ComplexArray | None:
+    def column(
+        self, name: str, bend: CasingResponse, responses: list[Response]
+    ) -> ComplexArray | None:
         """Return the derivative of the gathered field (k, n, tones, 3) by a casing parameter."""
         by = bend.by_strength[:, :, 0]
         if name in {"log_gather", "phase_gather"}:

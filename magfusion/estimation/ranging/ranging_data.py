@@ -11,7 +11,7 @@ from magfusion.units import Array
 WITHIN, SHARE = np.sqrt(0.6) * np.array([-0.5, 0.0, 0.5]), np.array([5.0, 8.0, 5.0]) / 18.0
 FIRST = np.array([1.0, 0.0, 0.0])  # axis of the sensor's body, down its hole
 POSE = 6
-BESIDE = 1.0  # m; places of the sensor that are closer count as one
+SAME_PLACE_M = 1.0  # m; places of the sensor that are closer count as one
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +64,8 @@ class RangingWindows:
         """
         half = 0.5 * (self.magnet[:, 2] - self.magnet[:, 0])
         wider = np.hypot(half, WITHIN[2] * length) - np.abs(half)
-        aside = np.where(half < 0.0, -wider, wider)[:, None] * np.sign(WITHIN)
-        return replace(self, magnet=self.magnet + aside) if length else self
+        lateral = np.where(half < 0.0, -wider, wider)[:, None] * np.sign(WITHIN)
+        return replace(self, magnet=self.magnet + lateral) if length else self
 
     @property
     def seen(self) -> Array:
@@ -82,7 +82,7 @@ class RangingWindows:
         size, out = self.seen, []
         for own in size.T:
             strongest = int(np.argmax(own))
-            beside = np.abs(self.sensor - self.sensor[strongest]) < BESIDE
-            heard = self.magnet[beside & (own > 0.5 * own[strongest]), 1]
-            out.append(max(float(np.ptp(heard)) if len(heard) else 0.0, 0.1))
+            others = np.abs(self.sensor - self.sensor[strongest]) < SAME_PLACE_M
+            detected = self.magnet[others & (own > 0.5 * own[strongest]), 1]
+            out.append(max(float(np.ptp(detected)) if len(detected) else 0.0, 0.1))
         return np.array(out)

@@ -13,9 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.ranging.ranging_casing import CasingModel, Gathered, casing_unknowns
+from magfusion.estimation.ranging.ranging_casing import CasingModel, CasingResponse, casing_unknowns
 from magfusion.estimation.ranging.ranging_data import FIRST, POSE, SHARE, RangingWindows
-from magfusion.estimation.ranging.ranging_noise import Course, apart, whitening, window_weight
+from magfusion.estimation.ranging.ranging_noise import (
+    WindowPrediction,
+    real_and_imaginary,
+    whitening,
+    window_weight,
+)
 from magfusion.model.field import observe, skew
 from magfusion.model.physics.casing import Response
 from magfusion.model.receive_coils import Observation
@@ -63,8 +68,8 @@ class RangingModel:
         self.unknowns = tuple(_unknowns(site, windows))
         self.names = tuple(one.name for one in self.unknowns)
         self.prior = np.array([one.sigma for one in self.unknowns])
-        turned = windows.roll
-        cosine, sine, one = np.cos(turned), np.sin(turned), np.ones_like(turned)
+        rotated = windows.roll
+        cosine, sine, one = np.cos(rotated), np.sin(rotated), np.ones_like(rotated)
         zero = 0.0 * one
         rows = [[one, zero, zero], [zero, cosine, -sine], [zero, sine, cosine]]
         self.side_from_body = np.moveaxis(np.array(rows), -1, 0)  # (n, 3, 3)
@@ -78,14 +83,14 @@ class RangingModel:
         course = None if about is None else self._course(about)
         self._whitening = whitening(site, windows, course)
 
-    def _course(self, state: Array) -> Course:
+    def _course(self, state: Array) -> WindowPrediction:
         phasor, by = self.predicted(state[None])
         way = -state[:9].reshape(3, 3).T @ self.axis  # of the sensor from the magnet, side's axes
         slope, gathered = by[0, ..., 3:POSE] @ way, np.zeros(phasor.shape[1:3])
         if self.casing is not None:
             column = by[0, ..., POSE + self.names.index("log_gather")]
             gathered = np.linalg.norm(column, axis=-1) / np.linalg.norm(phasor[0], axis=-1)
-        return Course(phasor[0], slope, gathered)
+        return WindowPrediction(phasor[0], slope, gathered)
 
     def predicted(self, state: Array) -> tuple[ComplexArray, ComplexArray]:
         """Return phasors (k, n, tones, 3) of states (k, 12 + unknowns), and their Jacobian."""
@@ -116,7 +121,7 @@ class RangingModel:
             sources.append((part, against))
         whole = sum((part * one.phasor_sensor for part, one in sources), start=_NONE)
         each_pose = sum((_wide(part) * one.platform_pose for part, one in sources), start=_NONE)
-        bend: Gathered | None = None
+        bend: CasingResponse | None = None
         steel: list[Response] = []
         if self.casing is not None:
             steel = self.casing.responses(extra, len(state))
@@ -147,7 +152,7 @@ class RangingModel:
         return self.casing.through(phasor, jacobian, extra, self.names, steel)
 
     def _of_steel(
-        self, name: str, bend: Gathered | None, steel: list[Response]
+        self, name: str, bend: CasingResponse | None, steel: list[Response]
     ) -> ComplexArray | None:
         """Return the derivative by an unknown of the casing; None for any other."""
         if self.casing is None or bend is None:
@@ -165,25 +170,31 @@ class RangingModel:
         # Windows are independent: a window's whitening does not depend on its phase.
         phase = self.phase(phasor)[..., None, None] * self.orders[:, None]
         error = self.white(phasor - self.seen * np.exp(-1j * phase))
-        free = self.white(1j * self.orders[:, None] * phasor)
+        free_parameters = self.white(1j * self.orders[:, None] * phasor)
         rows = np.concatenate([error[..., None], by], axis=2)
         rows = rows.reshape(size, len(self.seen), -1, n + 1)
-        free = free.reshape(size, len(self.seen), -1)
-        free = free / np.maximum(np.linalg.norm(free, axis=-1, keepdims=True), 1e-300)
-        rows = rows - free[..., None] * np.einsum("kwd,kwdn->kwn", free, rows)[:, :, None]
+        free_parameters = free_parameters.reshape(size, len(self.seen), -1)
+        free_parameters = free_parameters / np.maximum(
+            np.linalg.norm(free_parameters, axis=-1, keepdims=True), 1e-300
+        )
+        rows = (
+            rows
+            - free_parameters[..., None]
+            * np.einsum("kwd,kwdn->kwn", free_parameters, rows)[:, :, None]
+        )
         rows = rows.reshape(size, -1, n + 1)
         return rows[..., 0], rows[..., 1:]
 
-    def white(self, left: ComplexArray) -> Array:
+    def white(self, residual: ComplexArray) -> Array:
         """Return whitened parts (k, d) of phasors (k, n, tones, 3)."""
-        parts = np.where(self._kept, apart(left).reshape(len(left), -1), 0.0)
+        parts = np.where(self._kept, real_and_imaginary(residual).reshape(len(residual), -1), 0.0)
         return np.asarray(parts @ self._whitening.T)
 
     def with_priors(self, state: Array) -> tuple[Array, Array]:
         """Return the same with the rows of the priors."""
         error, by = self.residuals(state)
         size, n = len(state), by.shape[-1]
-        told = state[:, 12:] / self.prior
+        reported = state[:, 12:] / self.prior
         rows = np.zeros((size, len(self.prior), n))
         rows[:, np.arange(len(self.prior)), POSE + np.arange(len(self.prior))] = 1.0 / self.prior
         if not self.windows.angle_known:
@@ -191,8 +202,8 @@ class RangingModel:
             rows = np.concatenate(
                 [rows, np.concatenate([about, np.zeros((size, 1, n - POSE))], 2)], 1
             )
-            told = np.concatenate([told, np.zeros((size, 1))], 1)
-        return np.concatenate([error, told], 1), np.concatenate([by, rows], 1)
+            reported = np.concatenate([reported, np.zeros((size, 1))], 1)
+        return np.concatenate([error, reported], 1), np.concatenate([by, rows], 1)
 
     def about_axis(self, state: Array) -> Array:
         """Return the unit step of a rotation about the magnet's axis, shape (k, 6)."""
@@ -211,7 +222,7 @@ class RangingModel:
 
 
 def _column(
-    name: str, sources: _Sources, bend: Gathered | None, phasor: ComplexArray, share: Array
+    name: str, sources: _Sources, bend: CasingResponse | None, phasor: ComplexArray, share: Array
 ) -> ComplexArray:
     """Return the derivative of phasors by one parameter, zero for those of the casing."""
     if name == "log_moment":
@@ -223,8 +234,8 @@ def _column(
             ground = ground + bend.by_ground
         return np.asarray(np.sum(share * ground, axis=2))
     if name.startswith("ellipse"):
-        turned = 1.0 if name == "ellipse_cos" else -1j
-        return np.asarray(turned * np.sum(share * sources[1][1].phasor_sensor, axis=2))
+        rotated = 1.0 if name == "ellipse_cos" else -1j
+        return np.asarray(rotated * np.sum(share * sources[1][1].phasor_sensor, axis=2))
     return np.zeros_like(phasor)
 
 
@@ -245,17 +256,17 @@ def _in_other_ground(beacon: Beacon, log_change: float) -> Beacon:
 
 def _unknowns(site: Site, windows: RangingWindows) -> list[_Unknown]:
     beacon, casing = site.beacons[0], site.platform.magnetometer.casing
-    found = []
+    result = []
     moment = float(np.sqrt(np.mean(beacon.sigma.log_moment[:2] ** 2)))
     if moment:
-        found.append(_Unknown("log_moment", moment))
+        result.append(_Unknown("log_moment", moment))
     if beacon.rotor is not None and beacon.rotor.ellipse_sigma:
-        found.append(_Unknown("ellipse_cos", beacon.rotor.ellipse_sigma))
-        found.append(_Unknown("ellipse_sin", beacon.rotor.ellipse_sigma))
+        result.append(_Unknown("ellipse_cos", beacon.rotor.ellipse_sigma))
+        result.append(_Unknown("ellipse_sin", beacon.rotor.ellipse_sigma))
     if windows.depth_scale_sigma:
-        found.append(_Unknown("depth_scale", windows.depth_scale_sigma))
+        result.append(_Unknown("depth_scale", windows.depth_scale_sigma))
     if site.log_conductivity_sigma:
-        found.append(_Unknown("log_conductivity", site.log_conductivity_sigma))
+        result.append(_Unknown("log_conductivity", site.log_conductivity_sigma))
     if casing is not None:
-        found += [_Unknown(name, sigma) for name, sigma in casing_unknowns(casing)]
-    return found
+        result += [_Unknown(name, sigma) for name, sigma in casing_unknowns(casing)]
+    return result

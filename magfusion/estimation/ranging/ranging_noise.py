@@ -18,7 +18,7 @@ GATHERED_ERROR = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class WindowPrediction:
     """Predicted phasors of windows, and their slope along the magnet's path.
 
     Parameters
@@ -34,7 +34,7 @@ class Course:
     gathered: Array
 
 
-def apart(phasor: ComplexArray) -> Array:
+def real_and_imaginary(phasor: ComplexArray) -> Array:
     """Return real and imaginary parts, shape (..., 6)."""
     return np.concatenate([phasor.real, phasor.imag], axis=-1)
 
@@ -48,18 +48,18 @@ def window_weight(site: Site, windows: RangingWindows) -> Array:
     return np.where(fields.valid[..., None, None], root, 0.0)
 
 
-def whitening(site: Site, windows: RangingWindows, course: Course | None = None) -> Array:
+def whitening(site: Site, windows: RangingWindows, course: WindowPrediction | None = None) -> Array:
     """Return the inverse root of the covariance of all parts of all windows.
 
     Parameters
     ----------
-    course : Course, optional
+    course : WindowPrediction, optional
         Linearisation point; by default the slope is bounded by the measurements, equal in all axes.
 
     Returns
     -------
     ndarray, shape (m, m)
-        ``m`` is windows by tones by `apart`.
+        ``m`` is windows by tones by `real_and_imaginary`.
     """
     fields, valid = windows.fields, windows.fields.valid
     n, tones = valid.shape
@@ -67,12 +67,12 @@ def whitening(site: Site, windows: RangingWindows, course: Course | None = None)
     at, size = np.arange(n), windows.seen / np.sqrt(2.0)
     if course is not None:
         size = np.linalg.norm(course.phasor, axis=-1) / np.sqrt(2.0)
-    alike = _alike(site, windows)
+    shared = _model_error_correlation(site, windows)
     for t in range(tones):
-        left = _model_error(site) * size[:, t]
+        residual = _model_error(site) * size[:, t]
         if course is not None:
-            left = np.hypot(left, GATHERED_ERROR * course.gathered[:, t] * size[:, t])
-        error = alike * np.outer(left, left) / 3.0
+            residual = np.hypot(residual, GATHERED_ERROR * course.gathered[:, t] * size[:, t])
+        error = shared * np.outer(residual, residual) / 3.0
         for part in range(6):
             cov[:, t, part, :, t, part] = error
         for own in (slice(0, 3), slice(3, 6)):
@@ -85,7 +85,9 @@ def whitening(site: Site, windows: RangingWindows, course: Course | None = None)
             power = (windows.depth_sigma * slope) ** 2 / 3.0
             cov[at, t, :, at, t, :] += power[:, None, None] * np.eye(6)
     if course is not None and windows.angle_known:
-        shift = windows.depth_sigma * apart(course.slope)  # one depth affects all tones
+        shift = windows.depth_sigma * real_and_imaginary(
+            course.slope
+        )  # one depth affects all tones
         cov[at, :, :, at] += shift[:, :, :, None, None] * shift[:, None, None]
     silent = np.repeat(~valid.ravel(), 6)
     whole = cov.reshape(n * tones * 6, -1)
@@ -100,7 +102,7 @@ def _model_error(site: Site) -> float:
     return site.model_error if own is None else own
 
 
-def _alike(site: Site, windows: RangingWindows) -> Array:
+def _model_error_correlation(site: Site, windows: RangingWindows) -> Array:
     """Return the correlation of the model's errors between windows (n, n).
 
     Windows with unknown phases are independent, with a larger error each, equivalent to one

@@ -3,7 +3,7 @@
 import numpy as np
 
 from magfusion.estimation.ranging.ranging_model import RangingModel
-from magfusion.estimation.ranging.ranging_noise import apart
+from magfusion.estimation.ranging.ranging_noise import real_and_imaginary
 from magfusion.model.field import skew
 from magfusion.units import Array, ComplexArray
 
@@ -13,9 +13,9 @@ DIRECTIONS, DISTANCES = 12, 10  # of starts: about the axis, and outwards
 def starts(model: RangingModel) -> Array:
     """Return poses over all directions and distances, the most probable first."""
     windows, size = model.windows, np.linalg.norm(model.seen[:, 0], axis=-1)
-    beside = windows.sensor == windows.sensor[np.argmax(size)]
-    abreast = float(windows.magnet[np.argmax(np.where(beside, size, 0.0)), 1])
-    abreast_from = float(windows.sensor[np.argmax(size)])
+    others = windows.sensor == windows.sensor[np.argmax(size)]
+    simultaneous = float(windows.magnet[np.argmax(np.where(others, size, 0.0)), 1])
+    simultaneous_from = float(windows.sensor[np.argmax(size)])
     span = max(float(np.ptp(windows.magnet)), 1.0)
     assert model.beacon.rotor is not None
     zero, axis = model.beacon.rotor.zero_beacon, model.axis
@@ -27,7 +27,7 @@ def starts(model: RangingModel) -> Array:
             x = sign * axis
             rotation = np.stack([x, np.cross(up, x), up], axis=1)
             for distance in np.geomspace(0.02 * span, 2.0 * span, DISTANCES):
-                place = distance * zero + abreast * axis - abreast_from * x
+                place = distance * zero + simultaneous * axis - simultaneous_from * x
                 out.append(np.concatenate([rotation.ravel(), place, 0.0 * model.prior]))
     states = _turned_to_phase(model, np.array(out))
     cost = np.sum(_scaled(model, states) ** 2, axis=1)
@@ -48,7 +48,7 @@ def _scaled(model: RangingModel, states: Array) -> Array:
 def _weighed(model: RangingModel, phasor: ComplexArray) -> Array:
     """Return whitened parts (k, d), independent for each window."""
     whitened: ComplexArray = (model.weight @ phasor[..., None])[..., 0]
-    return apart(whitened).reshape(len(phasor), -1)
+    return real_and_imaginary(whitened).reshape(len(phasor), -1)
 
 
 def _turned_to_phase(model: RangingModel, states: Array) -> Array:

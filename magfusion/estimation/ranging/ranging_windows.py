@@ -96,12 +96,12 @@ def ranging_log(
             " (time_ns, part, depth_m)"
         )
     angle, measured = _angle(log, beacon)
-    found = demodulate_rotor(log.waveform, angle, beacon, site, window, mains_hz)
-    fields = found.fields
+    result = demodulate_rotor(log.waveform, angle, beacon, site, window, mains_hz)
+    fields = result.fields
     inside = (fields.time - 0.5 * window >= known[0, 0] - 1.0) & (
         fields.time + 0.5 * window <= known[0, -1] + 1.0
     )
-    fields, speed = fields.rows(inside), found.speed_hz[inside]
+    fields, speed = fields.rows(inside), result.speed_hz[inside]
     if len(fields) < LEAST_WINDOWS:
         raise InputError(
             f"only {len(fields)} windows of {window:g} s have samples, depths and a rotating"
@@ -130,7 +130,7 @@ def ranging_log(
         speed_hz=speed,
         high_side=roll is not None,
         inclination=inclination,
-        dropped=found.dropped,
+        dropped=result.dropped,
     )
 
 

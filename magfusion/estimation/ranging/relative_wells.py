@@ -29,7 +29,7 @@ class Places:
 
 
 @dataclass(frozen=True)
-class Abreast:
+class WellPair:
     """The two wells at the depth of the sensor.
 
     Parameters
@@ -72,24 +72,24 @@ class Wells:
     """
 
     def __init__(
-        self, found: Ranged, windows: RangingWindows, axis: Array, excess: float = 1.0
+        self, result: Ranged, windows: RangingWindows, axis: Array, excess: float = 1.0
     ) -> None:
-        self._windows, self._back = windows, found.world_from_body.T
-        self._along, self._place = self._back @ axis, self._back @ found.position_world
-        names = found.names
+        self._windows, self._back = windows, result.world_from_body.T
+        self._along, self._place = self._back @ axis, self._back @ result.position_world
+        names = result.names
         self._scale = names.index("depth_scale") if "depth_scale" in names else None
-        self._factor = 1.0 if self._scale is None else 1.0 + float(found.values[self._scale])
-        self._cov = excess * found.cov
+        self._factor = 1.0 if self._scale is None else 1.0 + float(result.values[self._scale])
+        self._cov = excess * result.cov
 
     def _side(self, magnet: float, sensor: float) -> tuple[Array, Array]:
         """Return the magnet in the high side's frame (3,) (m), and its derivatives (3, n)."""
         travel = magnet - self._windows.magnet_from
-        turned = self._factor * travel * self._along - self._place
+        rotated = self._factor * travel * self._along - self._place
         by = np.zeros((3, len(self._cov)))
-        by[:, :3], by[:, 3:POSE] = skew(turned), -np.eye(3)
+        by[:, :3], by[:, 3:POSE] = skew(rotated), -np.eye(3)
         if self._scale is not None:
             by[:, POSE + self._scale] = travel * self._along
-        return turned - (sensor - self._windows.sensor_from) * FIRST, by
+        return rotated - (sensor - self._windows.sensor_from) * FIRST, by
 
     def places(self, magnet: Array, sensor: Array) -> Places:
         """Return the magnet relative to the sensor at measured depths of both (n,) (m)."""
@@ -101,26 +101,26 @@ class Wells:
             slopes @ self._cov @ np.swapaxes(slopes, 1, 2),
         )
 
-    def abreast(self, sensor: float) -> Abreast:
+    def wells_at(self, sensor: float) -> WellPair:
         """Return the wells at a depth of the sensor."""
         start, _ = self._side(self._windows.magnet_from, sensor)
         travel = -float(start @ self._along)
         magnet = self._windows.magnet_from + travel / self._factor
         place, by = self._side(magnet, sensor)
-        turned = np.zeros_like(by)
-        turned[:, :3] = skew(self._along)
+        rotated = np.zeros_like(by)
+        rotated[:, :3] = skew(self._along)
         distance = float(np.linalg.norm(place))
         right, up = LATERAL @ place
         across = float(np.hypot(right, up))
         slope = (place / distance) @ by
         # The nearest point moves along the line as that rotates and shifts.
-        along = self._along @ by + place @ turned
+        along = self._along @ by + place @ rotated
         moved = by - np.outer(self._along, along)
         turning = (np.array([up, -right]) @ LATERAL / across**2) @ moved
         depth = -along / self._factor
         if self._scale is not None:
             depth[POSE + self._scale] = -travel / self._factor**2
-        return Abreast(
+        return WellPair(
             distance,
             self._sigma(slope),
             float(np.arctan2(right, up) % (2.0 * np.pi)),

@@ -17,9 +17,9 @@ def piece_length(
     site: Site, usual: LockinSettings, lockin: LockinSettings | None, duration: float
 ) -> float | None:
     """Return the length of pieces for a rest (s); None where it is too short for any."""
-    most = duration / LEAST_LENGTHS
+    maximum = duration / LEAST_LENGTHS
     if lockin is not None and lockin.window != usual.window:
-        return lockin.window if lockin.window <= most else None
+        return lockin.window if lockin.window <= maximum else None
     lines = np.sort(np.append(sent_frequencies_hz(site), 0.0))
     spacing = float(np.min(np.diff(lines)))
     wanted = min(max(PIECE_TURNS / spacing, usual.window), LONGEST_PIECE)
@@ -27,7 +27,7 @@ def piece_length(
         if not beacon.synchronised:
             highest = float(np.max(beacon.tone_frequencies_hz))
             wanted = min(wanted, UNKNOWN_TURN / (site.clock.drift_largest * highest))
-    length = min(max(wanted, usual.window), most)
+    length = min(max(wanted, usual.window), maximum)
     return length if length >= usual.window else None
 
 

@@ -12,17 +12,20 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.estimation.data_checks.stream_buffer import Buffer, check_clock
 from magfusion.estimation.demodulation.demodulation import gravity_at_rest
-from magfusion.estimation.rests.at_rest import (
+from magfusion.estimation.rests.reference_noise_cancellation import (
+    ReferenceHistory,
+    reference_findings,
+)
+from magfusion.estimation.rests.rest_lengths import coherent, piece_length
+from magfusion.estimation.rests.running_stationary_mean import RunningMean
+from magfusion.estimation.rests.stationary_integration import (
     Rest,
-    believed,
+    assumed_stationary,
     check_tones,
     rest_epoch,
     rests,
-    unheard_in,
+    undetected_in_rests,
 )
-from magfusion.estimation.rests.rest_lengths import coherent, piece_length
-from magfusion.estimation.rests.rest_running import Running
-from magfusion.estimation.rests.rest_witness import Known, witnessed
 from magfusion.estimation.snapshot.explained_fixes import ExplainedFixes, explained_fixes
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
@@ -33,7 +36,7 @@ from magfusion.units import Array, BoolArray
 
 FIRST, LATER = 60.0, 120.0  # s; of the first segment of a rest, and of those after it
 LOOK = 2.0  # s; interval of the checks for rest
-PATIENCE = 10.0  # s; timeout of the reference
+MAX_WAIT = 10.0  # s; timeout of the reference
 SAME_REST = 0.5  # of the span of rest: maximum gap between two segments of one rest
 MARGIN = 4.0  # s; of inertial samples that are kept before a segment
 
@@ -52,8 +55,8 @@ class RestState:
         Of the rest as far as it is integrated (s).
     samples : FieldSamples, optional
         Its phasors, one epoch.
-    heard : bool ndarray, shape (channels,)
-    found : ExplainedFixes, optional
+    detected : bool ndarray, shape (channels,)
+    fixes : ExplainedFixes, optional
         None while no beacon is detected.
     trust : Trust
     gain : ndarray, shape (channels,)
@@ -65,8 +68,8 @@ class RestState:
     standing: bool
     duration: float
     samples: FieldSamples | None
-    heard: BoolArray
-    found: ExplainedFixes | None
+    detected: BoolArray
+    fixes: ExplainedFixes | None
     trust: Trust
     gain: Array
 
@@ -99,15 +102,15 @@ class RestNavigator:
         check_tones(site)
         if site.platform.further or site.platform.magnetometer.lacking:
             raise InputError("--at-rest requires one magnetometer of three axes; omit --at-rest")
-        self.site, self._asked, self._risk = site, false_alarm, risk
+        self.site, self._false_alarm, self._risk = site, false_alarm, risk
         self._usual, self._lockin = default_settings(site), lockin
         self._longest = coherent(site)
         self._imu, self._wave = Buffer("imu", 6), Buffer("magnetometer", 3)
         self._reference = Buffer("reference", 3)
         self._looked = self._done = -np.inf
-        self._running: Running | None = None
-        self._known = Known()
-        self._made: list[RestState] = []
+        self._running: RunningMean | None = None
+        self._known = ReferenceHistory()
+        self._pending: list[RestState] = []
         self.too_short = 0
 
     # Input
@@ -136,8 +139,8 @@ class RestNavigator:
 
     def take(self) -> list[RestState]:
         """Return the states made since the last call."""
-        made, self._made = self._made, []
-        return made
+        built, self._pending = self._pending, []
+        return built
 
     @property
     def kept(self) -> int:
@@ -157,7 +160,7 @@ class RestNavigator:
         if inertial:
             newest = min(newest, self._imu.newest + self.site.platform.imu.time_offset)
         if not last and np.isfinite(self._reference.newest):
-            newest = min(newest, max(self._reference.newest, newest - PATIENCE))
+            newest = min(newest, max(self._reference.newest, newest - MAX_WAIT))
         if not (last or newest >= self._looked + LOOK) or len(self._wave) < 2:
             return
         self._looked = newest
@@ -168,19 +171,19 @@ class RestNavigator:
                 continue
             moved = inertial and until < newest - 2.0 * span
             until = min(until, newest)
-            self._stand(log, max(begin, self._done), until, over=moved or last)
+            self._integrate(log, max(begin, self._done), until, over=moved or last)
             if moved and self._running is not None:
-                self._made.append(_moved(until, self._running, len(self.site.channels)))
+                self._pending.append(_moved(until, self._running, len(self.site.channels)))
                 self._running = None
         if self._running is None:
             self._done = max(self._done, newest - LATER)
-        self._forget(self._done - MARGIN - span)
+        self._discard_before(self._done - MARGIN - span)
 
-    def _stand(self, log: Log, begin: float, until: float, *, over: bool) -> None:
+    def _integrate(self, log: Log, begin: float, until: float, *, over: bool) -> None:
         """Integrate the complete segments of a rest."""
         running, gap = self._running, SAME_REST * self.site.platform.motion.rest_span
         if running is None or begin > running.end + gap:
-            running = self._running = Running.begun(begin, len(self.site.channels))
+            running = self._running = RunningMean.begun(begin, len(self.site.channels))
         begin = max(begin, running.end)
         while until - begin > 0.0:
             wanted = LATER if running.looks else FIRST
@@ -192,54 +195,59 @@ class RestNavigator:
             begin = end
         self._running, self._done = running, begin
 
-    def _stretch(self, log: Log, running: Running, span: tuple[float, float]) -> Running:
+    def _stretch(self, log: Log, running: RunningMean, span: tuple[float, float]) -> RunningMean:
         length = piece_length(self.site, self._usual, self._lockin, span[1] - span[0])
         if length is None:
             self.too_short += 1
             return replace(running, end=span[1])
         mains_hz = (self._lockin or self._usual).mains_hz
-        parts = (log, span, self.site, length, mains_hz, self._asked, self._known)
+        parts = (log, span, self.site, length, mains_hz, self._false_alarm, self._known)
         rest = rest_epoch(*parts)
         self._known = rest.known or self._known
-        running = running.beside(rest, self.site, span[1], self._longest, self._asked)
-        self._made.append(self._state(log, running, rest))
+        running = running.with_stretch(rest, self.site, span[1], self._longest, self._false_alarm)
+        self._pending.append(self._state(log, running, rest))
         return running
 
-    def _state(self, log: Log, running: Running, rest: Rest) -> RestState:
+    def _state(self, log: Log, running: RunningMean, rest: Rest) -> RestState:
         """Return the estimate after a segment."""
         samples = running.fields(self.site, self._longest)
-        heard = running.chance(self.site) < self._asked
+        detected = running.chance(self.site) < self._false_alarm
         # The gravity of a rest's last moment lies before it.
         shown = replace(samples, time=samples.time - self.site.platform.motion.rest_span)
-        findings = (*believed(log), *unheard_in(samples, heard[None], self.site, self._asked))
+        findings = (
+            *assumed_stationary(log),
+            *undetected_in_rests(samples, detected[None], self.site, self._false_alarm),
+        )
         gain = np.array([tone.gain for tone in rest.tones])
         if np.isfinite(self._reference.newest):
-            findings += witnessed([rest.tones], self.site)
-        found = None
-        if np.any(heard):
+            findings += reference_findings([rest.tones], self.site)
+        result = None
+        if np.any(detected):
             calibration = initial_calibration(self.site, float(shown.time[0]))
             gravity = gravity_at_rest(log.imu, self.site, shown.time) if log.inertial else None
-            found = explained_fixes(shown, calibration, gravity=gravity, risk=self._risk)
-        trust = Trust(tuple(findings)) | (Trust() if found is None else found.trust)
-        return RestState(running.end, True, running.duration, samples, heard, found, trust, gain)
+            result = explained_fixes(shown, calibration, gravity=gravity, risk=self._risk)
+        trust = Trust(tuple(findings)) | (Trust() if result is None else result.trust)
+        return RestState(
+            running.end, True, running.duration, samples, detected, result, trust, gain
+        )
 
     def _log(self) -> Log:
         imu, rows = self._imu.rows()
         wave, field = self._wave.rows()
-        other, heard = self._reference.rows()
-        reference = Waveform(other, heard) if len(other) > 1 else None
+        other, detected = self._reference.rows()
+        reference = Waveform(other, detected) if len(other) > 1 else None
         samples = ImuSamples(imu, rows[:, :3], rows[:, 3:])
         inertial = self.site.platform.inertial
         whole = Log("stream", 0, "stream", samples, Waveform(wave, field), inertial=inertial)
         return replace(whole, reference=reference)
 
-    def _forget(self, before: float) -> None:
-        self._imu.forget(before - self.site.platform.imu.time_offset, -np.inf)
-        self._wave.forget(before, -np.inf)
-        self._reference.forget(before - PATIENCE, -np.inf)
+    def _discard_before(self, before: float) -> None:
+        self._imu.discard_before(before - self.site.platform.imu.time_offset, -np.inf)
+        self._wave.discard_before(before, -np.inf)
+        self._reference.discard_before(before - MAX_WAIT, -np.inf)
 
 
-def _moved(time: float, running: Running, channels: int) -> RestState:
+def _moved(time: float, running: RunningMean, channels: int) -> RestState:
     none = np.zeros(channels, dtype=bool)
     nothing: tuple[Finding, ...] = ()
     gain = np.full(channels, np.nan)

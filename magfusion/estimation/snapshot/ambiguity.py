@@ -22,7 +22,9 @@ Words = NDArray[np.str_]
 OPEN = 9.0  # chi square, three sigma: an alternative closer than this explains the epoch as well
 NEAR = 0.25  # largest distance to the exact image of the best pose, relative to the offset
 SAME_PLACE = 0.05  # of the distance from the nearest beacon
-TURNED = 0.35  # rad, within which two attitudes are equal; noise and survey move alternatives
+SAME_ATTITUDE_RAD = (
+    0.35  # rad, within which two attitudes are equal; noise and survey move alternatives
+)
 FLAT, PARALLEL = 0.1, 0.1  # m, rad; tolerances for beacons in a common plane
 
 
@@ -82,7 +84,7 @@ class Relations:
         The beacon of the symmetry; empty for the plane of several, and if there is none.
     is_open : bool ndarray, shape (n, hypotheses)
         An alternative that explains the epoch as well, within three sigma.
-    settled : ndarray of str, shape (n, hypotheses)
+    resolved : ndarray of str, shape (n, hypotheses)
         Information that excluded an alternative, for messages; empty if none did or it is open.
     azimuth : ndarray of str, shape (n,)
         The beacon about which the azimuth is open; empty if it is not.
@@ -91,7 +93,7 @@ class Relations:
     kind: Words
     owner: Words
     is_open: BoolArray
-    settled: Words
+    resolved: Words
     azimuth: Words
 
     @property
@@ -103,11 +105,11 @@ class Relations:
 def _axis(beacon: Beacon) -> Array | None:
     """Return the symmetry axis (world) of a beacon's moments; None for three axes."""
     drive = beacon.moments_beacon.T @ beacon.excitation
-    left, size, _ = np.linalg.svd(np.concatenate([drive.real, drive.imag], axis=1))
+    residual, size, _ = np.linalg.svd(np.concatenate([drive.real, drive.imag], axis=1))
     rank = int(np.sum(size > 1e-3 * size[0]))
     if rank == 3:
         return None
-    return beacon.world_from_beacon @ left[:, 0 if rank == 1 else 2]
+    return beacon.world_from_beacon @ residual[:, 0 if rank == 1 else 2]
 
 
 def _common_plane(site: Site) -> Array | None:
@@ -182,19 +184,19 @@ def relations(fixes: Fixes, site: Site) -> Relations:
     parts = [part - part[:, :1] for part in (fixes.gravity_cost, fixes.prior_cost)]
     others = "the other beacons" if len(site.beacons) > 1 else "the field itself"
     by = np.array(["gravity", "the prior", others])
-    settled = by[np.argmax(np.stack([*parts, added - parts[0] - parts[1]]), axis=0)]
-    settled[added <= OPEN] = ""
-    return Relations(kind, owner, rival & (added <= OPEN), settled, azimuth)
+    converged = by[np.argmax(np.stack([*parts, added - parts[0] - parts[1]]), axis=0)]
+    converged[added <= OPEN] = ""
+    return Relations(kind, owner, rival & (added <= OPEN), converged, azimuth)
 
 
 def _related(
     fixes: Fixes, site: Site, sensor: Array, images: list[_Image], h: int
 ) -> tuple[Words, Words]:
     """Return kind and owner of one hypothesis of each epoch."""
-    apart = np.stack([np.linalg.norm(sensor[:, h] - i.position, axis=1) for i in images], axis=1)
-    nearest = np.argmin(apart, axis=1)
+    separate = np.stack([np.linalg.norm(sensor[:, h] - i.position, axis=1) for i in images], axis=1)
+    nearest = np.argmin(separate, axis=1)
     way = np.linalg.norm(sensor[:, h] - sensor[:, 0], axis=1)
-    found = np.min(apart, axis=1) < NEAR * way
+    result = np.min(separate, axis=1) < NEAR * way
     kind = np.array([str(i.kind) for i in images], dtype="<U16")[nearest]
     owner = np.array([i.owner for i in images])[nearest]
     turn = fixes.world_from_body[:, h] @ np.swapaxes(fixes.world_from_body[:, 0], 1, 2)
@@ -203,7 +205,7 @@ def _related(
     if normal is not None and not any(b.synchronised for b in site.beacons):
         reversed_heading = _is_half_turn(turn, normal)
         kind[(kind == Kind.PLANE) & reversed_heading] = str(Kind.POLARITY)
-    kind[~found], owner[~found] = str(Kind.ELSEWHERE), ""
+    kind[~result], owner[~result] = str(Kind.ELSEWHERE), ""
     centres = np.stack([b.position_world for b in site.beacons])
     reach = np.min(np.linalg.norm(sensor[:, :1] - centres, axis=2), axis=1)
     heading = (way < SAME_PLACE * reach) & _is_half_turn(turn, np.array([0.0, 0.0, 1.0]))
@@ -213,7 +215,7 @@ def _related(
 
 def _is_half_turn(turn_world: Array, axis_world: Array) -> BoolArray:
     half = Rotation.from_rotvec(np.pi * axis_world).as_matrix()
-    return Rotation.from_matrix(half.T @ turn_world).magnitude() < TURNED
+    return Rotation.from_matrix(half.T @ turn_world).magnitude() < SAME_ATTITUDE_RAD
 
 
 def _about_azimuth(
@@ -224,24 +226,24 @@ def _about_azimuth(
         rows, axis = azimuth == beacon.name, _axis(beacon)
         if axis is None or not np.any(rows):
             continue
-        ours, theirs = (s[rows] - beacon.position_world for s in (best, rival))
-        heights, distances = (ours @ axis, theirs @ axis), np.linalg.norm(ours, axis=1)
-        near = np.abs(np.linalg.norm(theirs, axis=1) - distances) < NEAR * distances
-        alike = near & (np.abs(heights[0] - heights[1]) < NEAR * distances)
-        across = near & ~alike & (np.abs(heights[0] + heights[1]) < NEAR * distances)
+        ours, others = (s[rows] - beacon.position_world for s in (best, rival))
+        heights, distances = (ours @ axis, others @ axis), np.linalg.norm(ours, axis=1)
+        near = np.abs(np.linalg.norm(others, axis=1) - distances) < NEAR * distances
+        shared = near & (np.abs(heights[0] - heights[1]) < NEAR * distances)
+        across = near & ~shared & (np.abs(heights[0] + heights[1]) < NEAR * distances)
         across_kind = np.where(across, str(Kind.MIRROR), kind[rows])
-        kind[rows] = np.where(alike, str(Kind.AZIMUTH), across_kind)
-        owner[rows] = np.where(alike | across, beacon.name, owner[rows])
+        kind[rows] = np.where(shared, str(Kind.AZIMUTH), across_kind)
+        owner[rows] = np.where(shared | across, beacon.name, owner[rows])
 
 
 def _counted(relation: Relations, chosen: BoolArray) -> dict[tuple[Kind, str], int]:
     """Return in how many epochs each symmetry has a chosen hypothesis."""
-    found: dict[tuple[Kind, str], int] = {}
+    result: dict[tuple[Kind, str], int] = {}
     for kind in SYMMETRIES:
         mine = chosen & (relation.kind == kind)
         for owner in np.unique(relation.owner[mine]):
-            found[kind, str(owner)] = int(np.sum(np.any(mine & (relation.owner == owner), axis=1)))
-    return found
+            result[kind, str(owner)] = int(np.sum(np.any(mine & (relation.owner == owner), axis=1)))
+    return result
 
 
 def _pose(kind: Kind, owner: str) -> str:
@@ -255,13 +257,13 @@ class Ambiguities(NamedTuple):
     ----------
     epochs : dict of Kind to int
         Number of epochs that each symmetry leaves open; only those with any.
-    open, settled : list of str
+    open, resolved : list of str
         Sentences.
     """
 
     epochs: dict[Kind, int]
     open: list[str]
-    settled: list[str]
+    resolved: list[str]
 
 
 def ambiguities(related: Relations) -> Ambiguities:
@@ -271,20 +273,20 @@ def ambiguities(related: Relations) -> Ambiguities:
     sentences: list[str] = []
     continuum = related.azimuth != ""
     rivals = related.is_open & ~((related.kind == Kind.AZIMUTH) & continuum[:, None])
-    found = _counted(related, rivals)
+    result = _counted(related, rivals)
     for owner in np.unique(related.azimuth[continuum]):
-        found[Kind.AZIMUTH, str(owner)] = int(np.sum(related.azimuth == owner))
-    for (kind, owner), epochs in found.items():
+        result[Kind.AZIMUTH, str(owner)] = int(np.sum(related.azimuth == owner))
+    for (kind, owner), epochs in result.items():
         by_kind[kind] = epochs + by_kind.get(kind, 0)
         sentences.append(
             f"In {epochs} of {count} epochs {_pose(kind, owner)} explains the measurements as well;"
             f" {_REMEDY[kind]} would resolve this."
         )
-    settled = []
-    for decided in np.unique(related.settled[related.settled != ""]):
-        chosen = (related.settled == decided) & (related.kind != Kind.ELSEWHERE)
+    converged = []
+    for decided in np.unique(related.resolved[related.resolved != ""]):
+        chosen = (related.resolved == decided) & (related.kind != Kind.ELSEWHERE)
         poses = ", ".join(_pose(*key) for key in _counted(related, chosen))
         epochs = int(np.sum(np.any(chosen, axis=1)))
         if epochs:
-            settled.append(f"In {epochs} of {count} epochs {decided} ruled out {poses}.")
-    return Ambiguities(by_kind, sentences, settled)
+            converged.append(f"In {epochs} of {count} epochs {decided} ruled out {poses}.")
+    return Ambiguities(by_kind, sentences, converged)

@@ -16,13 +16,13 @@ from magfusion.estimation.snapshot.coil_starts import (
     FLOOR,
     LIKELY,
     SOFT,
-    Grid,
+    CoilGrid,
     at_point,
     grid_about,
     mirror,
     roots,
 )
-from magfusion.estimation.snapshot.problem import Problem, State
+from magfusion.estimation.snapshot.problem import FixProblem, FixState
 from magfusion.model.one_axis import least_turn
 from magfusion.model.parameters import predict_channels
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
@@ -33,12 +33,12 @@ LEAST_TURN = 1e-6  # weight of the world's axes, to select the smallest of the o
 _TINY = 1e-300
 
 
-def starts_on_grid(problem: Problem) -> tuple[State, int]:
+def starts_on_grid(problem: FixProblem) -> tuple[FixState, int]:
     """Return the most probable states of epochs that lack components, so many rows an epoch.
 
     Parameters
     ----------
-    problem : Problem
+    problem : FixProblem
         Its whitening is zero where a component is missing.
 
     Raises
@@ -46,22 +46,22 @@ def starts_on_grid(problem: Problem) -> tuple[State, int]:
     EstimationError
         Where no grid can be built around the beacons.
     """
-    asked = _Asked.of(problem)
-    found = [asked.starts(row) for row in range(len(problem.time))]
-    rotation, place = (np.stack(part) for part in zip(*found, strict=True))
+    requested = _AxisGrid.of(problem)
+    result = [requested.starts(row) for row in range(len(problem.time))]
+    rotation, place = (np.stack(part) for part in zip(*result, strict=True))
     position = place - rotation @ problem.calibration.site.platform.magnetometer.position_body
     if problem.prior is not None:
         rotation = np.concatenate([problem.prior.rotation[:, None], rotation], axis=1)
         position = np.concatenate([problem.prior.position[:, None], position], axis=1)
     n, count = rotation.shape[:2]
     state = problem.start(rotation.reshape(-1, 3, 3), position.reshape(-1, 3))
-    if np.any(asked.free):
+    if np.any(requested.free_parameters):
         own = problem.rows(np.repeat(np.arange(n), count))
-        state = state._replace(phase=phases_of(own, state, asked.free))
+        state = state._replace(phase=phases_of(own, state, requested.free_parameters))
     return state, count
 
 
-def mirrored(problem: Problem, state: State) -> State:
+def mirrored(problem: FixProblem, state: FixState) -> FixState:
     """Return states mirrored in the plane that the beacons are nearest to."""
     middle, turn = mirror(problem.calibration.site)
     lever = problem.calibration.site.platform.magnetometer.position_body
@@ -70,25 +70,25 @@ def mirrored(problem: Problem, state: State) -> State:
     return state._replace(rotation=rotation, position=position)
 
 
-def with_least_roll(problem: Problem, state: State) -> State:
+def with_least_roll(problem: FixProblem, state: FixState) -> FixState:
     """Return states with the smallest rotation if the roll about the received axis is open.
 
     Equal epochs then have equal poses, whatever the start.
 
     Parameters
     ----------
-    problem : Problem
+    problem : FixProblem
         For the same rows.
     """
     informed = problem.prior is not None and problem.prior.sqrt_information is not None
-    heard = np.any(np.einsum("...ii->...i", problem.sqrt_information) > 0.0, axis=1)
-    rows = np.sum(heard, axis=1) == 1
+    detected = np.any(np.einsum("...ii->...i", problem.sqrt_information) > 0.0, axis=1)
+    rows = np.sum(detected, axis=1) == 1
     if problem.gravity is not None:
         rows &= ~np.isfinite(problem.gravity.sigma)
     if informed or not np.any(rows):
         return state
     sensor = problem.calibration.site.platform.magnetometer
-    axes = (sensor.matrix @ sensor.body_from_sensor.T)[np.argmax(heard[rows], axis=1)]
+    axes = (sensor.matrix @ sensor.body_from_sensor.T)[np.argmax(detected[rows], axis=1)]
     axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     rotation, position = state.rotation.copy(), state.position.copy()
     rotation[rows] = least_turn(axes, (state.rotation[rows] @ axes[..., None])[..., 0])
@@ -96,17 +96,17 @@ def with_least_roll(problem: Problem, state: State) -> State:
     return state._replace(rotation=rotation, position=position)
 
 
-def phases_of(problem: Problem, state: State, free: BoolArray) -> Array:
+def phases_of(problem: FixProblem, state: FixState, free_parameters: BoolArray) -> Array:
     """Return the drive phases that fit the phasors best at each state, (m, channels)."""
     seen = predict_channels(problem.at(state), problem.time, state.rotation, state.position)
     measured = problem.measured[..., :3] + 1j * problem.measured[..., 3:]
     there = np.einsum("...ii->...i", problem.sqrt_information) > 0.0
     lag = np.angle(np.sum(np.where(there, np.conj(seen) * measured, 0.0), axis=-1))
-    return np.where(free, lag, 0.0)
+    return np.where(free_parameters, lag, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
-class _Asked:
+class _AxisGrid:
     """Grid, and the measurements of each axis at every epoch.
 
     Parameters
@@ -118,42 +118,44 @@ class _Asked:
         Of the real and of the imaginary part (T).
     axes_body : ndarray, shape (3, 3)
         The receiver's axes, row by row, each times its gain.
-    free : bool ndarray, shape (channels,)
+    free_parameters : bool ndarray, shape (channels,)
         Channels of unknown drive phase: with any, the grid ignores signs.
     """
 
-    problem: Problem
-    grid: Grid
+    problem: FixProblem
+    grid: CoilGrid
     phasor: ComplexArray
     there: BoolArray
     sigma: Array
     axes_body: Array
-    free: BoolArray
+    free_parameters: BoolArray
     bases: dict[bytes, tuple[Array, Array]] = field(default_factory=dict)
 
     @staticmethod
-    def of(problem: Problem) -> "_Asked":
+    def of(problem: FixProblem) -> "_AxisGrid":
         """Return the grid and measurements of a problem."""
         site, known = problem.calibration.site, at_point(problem.calibration)
         sensor = site.platform.magnetometer
-        free = np.concatenate([np.full(len(b.tones), not b.synchronised) for b in site.beacons])
+        free_parameters = np.concatenate(
+            [np.full(len(b.tones), not b.synchronised) for b in site.beacons]
+        )
         places, time = grid_about(site), float(np.mean(problem.time))
         inverse = np.einsum("...ii->...i", problem.sqrt_information)
         there = inverse > 0.0
-        return _Asked(
+        return _AxisGrid(
             problem,
-            Grid.of(known, time, places, signed=not np.any(free)),
+            CoilGrid.of(known, time, places, signed=not np.any(free_parameters)),
             problem.measured[..., :3] + 1j * problem.measured[..., 3:],
             there,
             np.divide(1.0, inverse, out=np.ones_like(inverse), where=there),
             sensor.matrix @ sensor.body_from_sensor.T,
-            free,
+            free_parameters,
         )
 
     @property
     def signed(self) -> bool:
         """Whether phases determine signs."""
-        return not np.any(self.free)
+        return not np.any(self.free_parameters)
 
     def starts(self, row: int) -> tuple[Array, Array]:
         """Return the most probable attitudes of the body and receiver positions at an epoch."""
@@ -195,10 +197,12 @@ class _Asked:
         """Return the weights of rows at each position, and a basis of all predictions there."""
         if there.tobytes() not in self.bases:
             scale = np.where(there, self.grid.scale, 0.0)
-            left, size, _ = np.linalg.svd(self.grid.design * scale[..., None], full_matrices=False)
-            felt = (size > FLAT * size[:, :1])[:, None]
+            residual, size, _ = np.linalg.svd(
+                self.grid.design * scale[..., None], full_matrices=False
+            )
+            affected = (size > FLAT * size[:, :1])[:, None]
             self.bases.clear()  # cache the latest pattern only
-            self.bases[there.tobytes()] = scale, np.where(felt, left, 0.0)
+            self.bases[there.tobytes()] = scale, np.where(affected, residual, 0.0)
         return self.bases[there.tobytes()]
 
     def _axes(self, row: int, k: int, best: IntArray) -> tuple[Array, Array]:
@@ -210,18 +214,18 @@ class _Asked:
         soft = np.concatenate([soft, soft]) if self.signed else 2.0 * soft * np.maximum(size, soft)
         weight = np.where(there, 1.0 / soft, 0.0)
         design, target = self.grid.design[best] * weight[:, None], np.where(there, given, 0.0)
-        found = np.linalg.pinv(design, rcond=1e-6) @ (target * weight)
-        left = (design @ found[..., None])[..., 0] - target * weight
-        axes = found if self.signed else roots(found)
-        return axes, np.sum(left**2, axis=1)
+        result = np.linalg.pinv(design, rcond=1e-6) @ (target * weight)
+        residual = (design @ result[..., None])[..., 0] - target * weight
+        axes = result if self.signed else roots(result)
+        return axes, np.sum(residual**2, axis=1)
 
     def _one_sign(self, row: int, own: IntArray, axes: Array, places: IntArray) -> Array:
         """Return axes with signs consistent with the first: their phasors have equal phase."""
         seen = np.einsum("gcx,gax->gac", self.grid.field[places], axes)
         measured = np.where(self.there[row], self.phasor[row], 0.0).T[own]
         ours = np.real(seen[:, :1] * np.conj(seen))
-        theirs = np.real(measured[:1] * np.conj(measured))
-        sign = np.where(np.sum(ours * theirs, axis=-1) < 0.0, -1.0, 1.0)
+        others = np.real(measured[:1] * np.conj(measured))
+        sign = np.where(np.sum(ours * others, axis=-1) < 0.0, -1.0, 1.0)
         return np.asarray(sign[..., None] * axes)
 
     def _turns(self, row: int, own: IntArray, axes: Array) -> Array:

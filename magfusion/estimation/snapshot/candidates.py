@@ -39,8 +39,8 @@ def beacon_directions(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Arra
         return _directions_in_ground(beacon, phasor)
     if beacon.synchronised or len(beacon.tones) == 1:
         return _directions(beacon, phasor)
-    found = [_directions(beacon, one) for one in _polarities(beacon, phasor)]
-    return np.concatenate([f[0] for f in found], 1), np.concatenate([f[1] for f in found], 1)
+    result = [_directions(beacon, one) for one in _polarities(beacon, phasor)]
+    return np.concatenate([f[0] for f in result], 1), np.concatenate([f[1] for f in result], 1)
 
 
 def _polarities(beacon: Beacon, phasor: ComplexArray) -> list[ComplexArray]:
@@ -50,16 +50,16 @@ def _polarities(beacon: Beacon, phasor: ComplexArray) -> list[ComplexArray]:
     """
     declared = np.angle(np.sum(beacon.excitation, axis=0))
     lag = 0.5 * np.angle(np.sum(phasor**2, axis=-1)) - declared
-    undone = phasor * np.exp(-1j * lag)[..., None]
+    reverted = phasor * np.exp(-1j * lag)[..., None]
     signs = product((1.0, -1.0), repeat=len(beacon.tones) - 1)
-    return [undone * np.array([1.0, *others])[:, None] for others in signs]
+    return [reverted * np.array([1.0, *others])[:, None] for others in signs]
 
 
 def _directions(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Array]:
     drive = beacon.moments_beacon.T @ beacon.excitation  # (3, tones)
     moments = np.concatenate([drive.real, drive.imag], axis=1)
     measured = np.concatenate([phasor.real, phasor.imag], axis=1)  # (n, 2 tones, 3)
-    left, size, right = np.linalg.svd(moments, full_matrices=True)
+    residual, size, right = np.linalg.svd(moments, full_matrices=True)
     rank = int(np.sum(size > 1e-3 * size[0]))
     if rank == 1:
         direction = np.broadcast_to(sphere(48), (len(phasor), 48, 3))
@@ -69,10 +69,10 @@ def _directions(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Array]:
         gram = np.swapaxes(unit, 1, 2) @ unit
         power, axes = np.linalg.eigh(gram)
         if rank == 3:
-            along = axes[:, :, -1] @ left.T
+            along = axes[:, :, -1] @ residual.T
             direction = np.stack([along, -along], axis=1)
         else:
-            direction = _planar_directions(beacon, power, axes, left)
+            direction = _planar_directions(beacon, power, axes, residual)
     seen = 3.0 * direction[..., None] * (direction @ moments)[..., None, :] - moments
     strength = np.sqrt(np.sum(seen**2, axis=(-1, -2)))
     total = np.sqrt(np.sum(measured**2, axis=(1, 2)))[:, None] + _TINY
@@ -90,7 +90,7 @@ def _directions_in_ground(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, 
     return np.broadcast_to(direction, (*distance.shape, 3)), distance
 
 
-def _planar_directions(beacon: Beacon, power: Array, axes: Array, left: Array) -> Array:
+def _planar_directions(beacon: Beacon, power: Array, axes: Array, residual: Array) -> Array:
     """Return the directions consistent with a two-axis beacon's Gram matrix.
 
     Its eigenvalues are ``(K/r^3)^2 {1, 1 + 3 s^2}``, s the sine of the angle from the normal.
@@ -104,8 +104,8 @@ def _planar_directions(beacon: Beacon, power: Array, axes: Array, left: Array) -
         azimuth = 2.0 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
         circle = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
         within = np.broadcast_to(circle, (len(power), AZIMUTHS, 2))
-    flat = sine * (within @ left[:, :2].T)
-    up = cosine * left[:, 2]
+    flat = sine * (within @ residual[:, :2].T)
+    up = cosine * residual[:, 2]
     return np.concatenate([flat + up, flat - up], axis=1)
 
 
@@ -127,7 +127,7 @@ def positions(calibration: Calibration, phasor: ComplexArray, weight: Array, kee
         Of the sensor, world (m).
     """
     site = calibration.site
-    found, start = [], 0
+    result, start = [], 0
     for beacon in site.beacons:
         rows = slice(start, start + len(beacon.tones))
         direction, distance = beacon_directions(beacon, phasor[:, rows])
@@ -136,9 +136,9 @@ def positions(calibration: Calibration, phasor: ComplexArray, weight: Array, kee
         )
         missing = ~np.all(weight[:, rows] > 0, axis=1)
         spot[missing] = np.nan
-        found.append(spot)
+        result.append(spot)
         start = rows.stop
-    candidates = np.concatenate(found, axis=1)
+    candidates = np.concatenate(result, axis=1)
     usable = np.asarray(np.isfinite(candidates).all(axis=2))
     spots = np.where(usable[..., None], candidates, 1e3)
     score = np.where(usable, _invariant_cost(calibration, spots, phasor, weight), np.inf)
@@ -156,11 +156,11 @@ def _invariant_cost(
     calibration: Calibration, sensor_world: Array, phasor: ComplexArray, weight: Array
 ) -> Array:
     predicted = _predicted_at(calibration, sensor_world)
-    ours, theirs = _invariants(predicted), _invariants(phasor)[:, None]
+    ours, others = _invariants(predicted), _invariants(phasor)[:, None]
     # Relative to amplitude the error of a squared axis is twice that of the phasor.
-    variance = 1.0 / np.maximum(weight, _TINY)[:, None] * 4.0 * (theirs[..., 0] + _TINY)
-    floor = 0.05**2 * theirs[..., 0] ** 2  # candidates are coarse
-    relative = np.sum((ours - theirs) ** 2, axis=-1) / (floor + variance)
+    variance = 1.0 / np.maximum(weight, _TINY)[:, None] * 4.0 * (others[..., 0] + _TINY)
+    floor = 0.05**2 * others[..., 0] ** 2  # candidates are coarse
+    relative = np.sum((ours - others) ** 2, axis=-1) / (floor + variance)
     return np.sum(np.where(weight[:, None] > 0, np.log1p(relative), 0.0), axis=-1)
 
 
@@ -179,10 +179,10 @@ def _predicted_at(calibration: Calibration, sensor_world: Array) -> ComplexArray
 
 def wahba(correlation: Array) -> Array:
     """Return the rotations that maximise ``trace(R^T correlation)``, shape (..., 3, 3)."""
-    left, _, right = np.linalg.svd(correlation)
+    residual, _, right = np.linalg.svd(correlation)
     sign = np.ones(correlation.shape[:-1])
-    sign[..., 2] = np.linalg.det(left) * np.linalg.det(right)
-    return (left * sign[..., None, :]) @ right
+    sign[..., 2] = np.linalg.det(residual) * np.linalg.det(right)
+    return (residual * sign[..., None, :]) @ right
 
 
 def attitudes(
@@ -190,7 +190,7 @@ def attitudes(
     sensor_world: Array,
     phasor: ComplexArray,
     weight: Array,
-    free: BoolArray,
+    free_parameters: BoolArray,
     up_sensor: Array | None,
     up_weight: Array | None,
 ) -> tuple[Array, Array]:
@@ -204,7 +204,7 @@ def attitudes(
         (T), calibrated axes.
     weight : ndarray, shape (n, channels)
         (1/T^2)
-    free : bool ndarray, shape (channels,)
+    free_parameters : bool ndarray, shape (channels,)
         Channels whose drive phase is unknown.
     up_sensor, up_weight : ndarray, shape (n, 3) and (n,), optional
         Direction of the specific force at rest, and its weight (1/rad^2).
@@ -220,11 +220,11 @@ def attitudes(
     base = np.zeros((*sensor_world.shape[:2], 3, 3))
     if up_sensor is not None and up_weight is not None:
         base[..., 2, :] += (up_weight[:, None] * up_sensor)[:, None]
-    base = base + _correlation(world, measured, np.where(free, 0.0, share))
-    phase = np.zeros((*sensor_world.shape[:2], len(free)))
-    if not np.any(free):
+    base = base + _correlation(world, measured, np.where(free_parameters, 0.0, share))
+    phase = np.zeros((*sensor_world.shape[:2], len(free_parameters)))
+    if not np.any(free_parameters):
         return wahba(base), phase
-    power = np.where(free, share * np.sum(np.abs(measured) ** 2, axis=-1), 0.0)
+    power = np.where(free_parameters, share * np.sum(np.abs(measured) ** 2, axis=-1), 0.0)
     # The ellipse's normal does not depend on the drive phase; a flat ellipse has none.
     normals = [_normal(b) for b in (world, np.broadcast_to(measured, world.shape))]
     spread = np.broadcast_to(power, world.shape[:-1])
@@ -234,9 +234,9 @@ def attitudes(
         rotation = wahba(aligned)
         seen = world @ rotation
         lag = np.angle(np.sum(np.conj(seen) * measured, axis=-1))
-        phase = np.where(free, lag, 0.0)
-        turned = world * np.exp(1j * phase)[..., None]
-        aligned = base + _correlation(turned, measured, np.where(free, share, 0.0))
+        phase = np.where(free_parameters, lag, 0.0)
+        rotated = world * np.exp(1j * phase)[..., None]
+        aligned = base + _correlation(rotated, measured, np.where(free_parameters, share, 0.0))
     return wahba(aligned), phase
 
 
@@ -251,9 +251,9 @@ def _between_tones(site: Site, world: ComplexArray, measured: ComplexArray, powe
     one_coil = np.concatenate([np.count_nonzero(b.excitation, axis=0) == 1 for b in site.beacons])
     out = np.zeros((*world.shape[:2], 3, 3))
     for pair in combinations(np.flatnonzero(one_coil & np.any(power > 0, axis=(0, 1))), 2):
-        ours, theirs = (_plane(_long_axis(p[..., list(pair), :])) for p in (world, measured))
+        ours, others = (_plane(_long_axis(p[..., list(pair), :])) for p in (world, measured))
         weight = np.sqrt(np.prod(power[..., list(pair)], axis=-1))
-        out += weight[..., None, None] * ours[..., :, None] * theirs[..., None, :]
+        out += weight[..., None, None] * ours[..., :, None] * others[..., None, :]
     return out
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from magfusion.estimation.snapshot.coil_starts import (
     CoilEpochs,
-    Grid,
+    CoilGrid,
     at_point,
     grid_about,
     middle_of,
@@ -20,7 +20,7 @@ from magfusion.estimation.snapshot.coil_starts import (
 )
 from magfusion.estimation.solve.batched import (
     Model,
-    Normal,
+    NormalEquations,
     minimise,
     normal_equations,
     open_inverse,
@@ -31,14 +31,14 @@ from magfusion.model.parameters import Calibration, linearize_channels, predict_
 from magfusion.model.site import Magnetometer, Site
 from magfusion.units import Array, BoolArray, IntArray
 
-ALIKE = 1e-3  # of the distance; hypotheses closer to one another are one
+DUPLICATE_DISTANCE = 1e-3  # of the distance; hypotheses closer to one another are one
 RIVAL = 25.0  # chi square above the best, from which a hypothesis is dropped
 SOFT_EDGE = 0.02  # of the distance; uncertainty of a declared plane
 LEAST_GAIN_SIGMA = 1e-4  # lower bound of a declared sigma
 UNKNOWNS = 6  # of position, direction and gain
 CHUNK = 200  # epochs refined at once
 REFINED, MIRRORED = 12, 3  # rough starts that are refined, and results whose mirrors are tried
-ROUGH_PASSES = 20
+ROUGH_ITERATIONS = 20
 ROUGH = 1e-4  # relative decrease of the cost below which a start has converged
 
 
@@ -56,12 +56,12 @@ class Gain(NamedTuple):
     sigma: float = np.inf
 
     @staticmethod
-    def of(sensor: Magnetometer, *, free: bool) -> "Gain":
+    def of(sensor: Magnetometer, *, free_parameters: bool) -> "Gain":
         """Return the gain of the one axis of a magnetometer, as declared or unknown."""
         row = "xyz".index(sensor.axes)
         nominal = float(np.linalg.norm(sensor.matrix[row]))
         sigma = float(sensor.sigma.matrix[row, row]) / nominal
-        return Gain(nominal, np.inf if free else max(sigma, LEAST_GAIN_SIGMA))
+        return Gain(nominal, np.inf if free_parameters else max(sigma, LEAST_GAIN_SIGMA))
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ def fix_coil(epochs: CoilEpochs, calibration: Calibration, gain: Gain) -> CoilFi
     """
     known = at_point(calibration)
     places = grid_about(known.site)
-    grid = Grid.of(known, float(epochs.time[0]), places, signed=epochs.signed)
+    grid = CoilGrid.of(known, float(epochs.time[0]), places, signed=epochs.signed)
     parts = [
         _refined(epochs.rows(slice(start, start + CHUNK)), known, gain, grid)
         for start in range(0, len(epochs), CHUNK)
@@ -129,7 +129,7 @@ class _Refined(NamedTuple):
     determined: BoolArray  # (n, starts)
     freedom: Array  # (n,)
 
-    def beside(self, other: "_Refined") -> "_Refined":
+    def joined_with(self, other: "_Refined") -> "_Refined":
         """Return these results and others of the same epochs."""
         return _Refined(
             np.concatenate([self.state, other.state], axis=1),
@@ -141,7 +141,7 @@ class _Refined(NamedTuple):
         )
 
 
-def _refined(epochs: CoilEpochs, known: Calibration, gain: Gain, grid: Grid) -> _Refined:
+def _refined(epochs: CoilEpochs, known: Calibration, gain: Gain, grid: CoilGrid) -> _Refined:
     place, axis = grid.starts(epochs)
     count = place.shape[1]
     if np.isfinite(gain.sigma):
@@ -152,19 +152,19 @@ def _refined(epochs: CoilEpochs, known: Calibration, gain: Gain, grid: Grid) -> 
     # Grid positions are approximate: with full weights some converge to the wrong minimum, and
     # there dipoles are as good as coils of finite size.
     soft = points.of(owner, softened(epochs)[owner])
-    rough = minimise(soft, start, relative=ROUGH, passes=ROUGH_PASSES)
+    rough = minimise(soft, start, relative=ROUGH, max_iterations=ROUGH_ITERATIONS)
     order = np.argsort(rough.cost.reshape(-1, count), axis=1, kind="stable")[:, :REFINED]
     best = np.take_along_axis(rough.state.reshape(-1, count, 6), order[..., None], axis=1)
-    found = _solved(problem, best)
-    order = np.argsort(found.cost, axis=1, kind="stable")[:, :MIRRORED]
-    best = np.take_along_axis(found.state, order[..., None], axis=1)
+    result = _solved(problem, best)
+    order = np.argsort(result.cost, axis=1, kind="stable")[:, :MIRRORED]
+    best = np.take_along_axis(result.state, order[..., None], axis=1)
     # An amplitude with a wrong sign keeps it in a false minimum, which is shallow.
     owner = np.repeat(np.arange(len(epochs)), best.shape[1])
     soft = problem.of(owner, softened(epochs)[owner])
-    eased = minimise(soft, best.reshape(-1, 6), relative=ROUGH, passes=ROUGH_PASSES)
-    best = eased.state.reshape(best.shape)
+    relaxed = minimise(soft, best.reshape(-1, 6), relative=ROUGH, max_iterations=ROUGH_ITERATIONS)
+    best = relaxed.state.reshape(best.shape)
     other = _solved(problem, np.concatenate([best, _mirrored(best, known.site)], axis=1))
-    return found.beside(other)
+    return result.joined_with(other)
 
 
 def _solved(problem: "_Problem", start: Array) -> _Refined:
@@ -189,7 +189,7 @@ def _solved(problem: "_Problem", start: Array) -> _Refined:
         sign = np.ones_like(state)
         sign[..., 3:] = np.where(state[..., 5:] < 0.0, -1.0, 1.0)
         state, cov = sign * state, sign[..., :, None] * cov * sign[..., None, :]
-    there = epochs.heard * (2.0 if epochs.signed else 1.0)
+    there = epochs.channel_count * (2.0 if epochs.signed else 1.0)
     freedom = np.asarray(there - UNKNOWNS + float(np.isfinite(problem.gain.sigma)))
     return _Refined(state, cov, cost, chi_square, determined.reshape(-1, count), freedom)
 
@@ -232,7 +232,7 @@ class _Problem:
     def of(self, owner: IntArray, sigma: Array) -> Model:
         """Return the model of starts, each of an epoch, with the errors of its channels."""
 
-        def model(rows: IntArray, state: Array) -> Normal:
+        def model(rows: IntArray, state: Array) -> NormalEquations:
             return self.normal(owner[rows], state, sigma[rows])
 
         return model
@@ -255,7 +255,7 @@ class _Problem:
             error = np.hypot(error, 3.0 * self.epochs.shift[epoch] / away * size / np.sqrt(3.0))
         return np.asarray(np.where(there, np.hypot(noise, error), 1.0))
 
-    def normal(self, epoch: IntArray, state: Array, sigma: Array) -> Normal:
+    def normal(self, epoch: IntArray, state: Array, sigma: Array) -> NormalEquations:
         """Return the normal equations at states of position and axis, shape (k, 6)."""
         place, axis, count = state[:, :3], state[:, 3:], len(state)
         attitude = np.broadcast_to(np.eye(3), (count, 3, 3))
@@ -270,10 +270,10 @@ class _Problem:
         there = np.isfinite(measured)
         weight = np.where(there, 1.0 / sigma, 0.0)
         jacobian = np.concatenate([by_place, field], axis=2)
-        left = seen - np.where(there, measured, 0.0)
+        remaining = seen - np.where(there, measured, 0.0)
         if self.epochs.signed:
             rows = np.concatenate([jacobian.real, jacobian.imag], axis=1)
-            residual = np.concatenate([left.real, left.imag], axis=1)
+            residual = np.concatenate([remaining.real, remaining.imag], axis=1)
             weight = np.concatenate([weight, weight], axis=1)
         else:
             size = np.abs(seen)
@@ -296,28 +296,28 @@ class _Problem:
         return np.hypot(model_error(site, place[:, None]), survey)
 
 
-def _ranked(found: _Refined, middle: Array) -> CoilFixes:
+def _ranked(result: _Refined, middle: Array) -> CoilFixes:
     """Return the distinct hypotheses that are not much less probable than the best."""
     kept: list[list[int]] = []
-    for row, costs in zip(found.state, found.cost, strict=True):
+    for row, costs in zip(result.state, result.cost, strict=True):
         own: list[int] = []
         for k in np.argsort(costs, kind="stable").tolist():
-            near = ALIKE * float(np.linalg.norm(row[k, :3] - middle))
-            apart = all(np.linalg.norm(row[k, :3] - row[o, :3]) > near for o in own)
-            if apart and (not own or costs[k] <= costs[own[0]] + RIVAL):
+            near = DUPLICATE_DISTANCE * float(np.linalg.norm(row[k, :3] - middle))
+            separate = all(np.linalg.norm(row[k, :3] - row[o, :3]) > near for o in own)
+            if separate and (not own or costs[k] <= costs[own[0]] + RIVAL):
                 own.append(k)
         kept.append(own)
-    most = max(map(len, kept))
-    index = np.array([[*own, *[own[0]] * (most - len(own))] for own in kept])
-    there = np.arange(most) < np.array([len(own) for own in kept])[:, None]
+    maximum = max(map(len, kept))
+    index = np.array([[*own, *[own[0]] * (maximum - len(own))] for own in kept])
+    there = np.arange(maximum) < np.array([len(own) for own in kept])[:, None]
     rows = np.arange(len(index))[:, None]
-    cost = found.cost[rows, index]
-    cost = cost - cost[:, :1] + found.chi_square[rows, index[:, :1]]
+    cost = result.cost[rows, index]
+    cost = cost - cost[:, :1] + result.chi_square[rows, index[:, :1]]
     return CoilFixes(
-        position_world=found.state[rows, index, :3],
-        axis_world=found.state[rows, index, 3:],
-        cov=found.cov[rows, index],
+        position_world=result.state[rows, index, :3],
+        axis_world=result.state[rows, index, 3:],
+        cov=result.cov[rows, index],
         cost=np.where(there, cost, np.inf),
-        determined=found.determined[rows, index] & there,
-        freedom=found.freedom,
+        determined=result.determined[rows, index] & there,
+        freedom=result.freedom,
     )

@@ -11,8 +11,8 @@ from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 
-ASKED = 60  # epochs, spread over a log
-LEAST = 5  # of them, that determine a gain
+MAX_EPOCHS = 60  # epochs, spread over a log
+MIN_COUNT = 5  # of them, that determine a gain
 LEAST_SIGMA = 0.01  # of the logarithm; model errors are common to all epochs
 TO_SIGMA = 1.4826  # of the median deviation
 
@@ -34,20 +34,20 @@ def with_found_gain(fields: FieldSamples, site: Site) -> Site:
     """
     sensor = site.platform.magnetometer
     epochs = CoilEpochs.of(fields, site)
-    enough = np.flatnonzero(epochs.told >= UNKNOWNS)
+    enough = np.flatnonzero(epochs.number_count >= UNKNOWNS)
     log_gain = np.zeros(0)
     if len(enough):
         kept = np.zeros(len(epochs), dtype=bool)
-        kept[enough[:: max(1, len(enough) // ASKED)]] = True
+        kept[enough[:: max(1, len(enough) // MAX_EPOCHS)]] = True
         some = epochs.rows(kept)
         calibration = initial_calibration(site, float(np.mean(some.time)))
-        found = fix_coil(some, calibration, Gain())
-        size = np.linalg.norm(found.axis_world[:, 0], axis=1)
-        log_gain = np.log(size[found.determined[:, 0]])
-    if len(log_gain) < LEAST:
+        result = fix_coil(some, calibration, Gain())
+        size = np.linalg.norm(result.axis_world[:, 0], axis=1)
+        log_gain = np.log(size[result.determined[:, 0]])
+    if len(log_gain) < MIN_COUNT:
         raise EstimationError(
             f"{len(log_gain)} epochs determine the gain of the coil together with its position and"
-            f" direction; {LEAST} are needed: add beacons, or declare the gain as"
+            f" direction; {MIN_COUNT} are needed: add beacons, or declare the gain as"
             " magnetometer.matrix"
         )
     middle = float(np.median(log_gain))

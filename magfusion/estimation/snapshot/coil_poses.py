@@ -7,7 +7,7 @@ import numpy as np
 from magfusion.estimation.data_checks.statistics import FALSE_ALARMS, log_p_chi_square
 from magfusion.estimation.snapshot.coil_fix import CoilFixes
 from magfusion.estimation.snapshot.fix import Fixes
-from magfusion.estimation.snapshot.fix_witness import rival_spread
+from magfusion.estimation.snapshot.fix_consistency import rival_spread
 from magfusion.estimation.snapshot.priors import unexplained
 from magfusion.model.field import skew
 from magfusion.model.one_axis import ANY_ROLL, CIRCLE, axis_of, coil_lever, least_turn
@@ -21,7 +21,7 @@ FEW = 0.1  # share of the epochs; a larger one casts doubt
 LONGEST_STEP = 0.1  # s; of a truth that is interpolated
 
 
-def poses_of(found: CoilFixes, time: Array, site: Site, *, signed: bool) -> Fixes:
+def poses_of(result: CoilFixes, time: Array, site: Site, *, signed: bool) -> Fixes:
     """Return the poses for a coil's positions and directions, with an arbitrary, open roll.
 
     The smallest rotation that aligns the axis is selected, so that equal epochs have equal
@@ -36,8 +36,8 @@ def poses_of(found: CoilFixes, time: Array, site: Site, *, signed: bool) -> Fixe
     """
     sensor = site.platform.magnetometer
     lever_body, sigma = coil_lever(sensor), sensor.sigma
-    gain = np.linalg.norm(found.axis_world, axis=-1)
-    towards = found.axis_world / gain[..., None]
+    gain = np.linalg.norm(result.axis_world, axis=-1)
+    towards = result.axis_world / gain[..., None]
     rotation = least_turn(axis_of(sensor), towards)
     back = np.swapaxes(rotation, -1, -2)
     lever = rotation @ lever_body
@@ -46,7 +46,7 @@ def poses_of(found: CoilFixes, time: Array, site: Site, *, signed: bool) -> Fixe
     by_axis[..., :3, 3:] = skew(towards) / gain[..., None, None]
     by_axis[..., 3:, :3] = np.eye(3)
     by_axis[..., 3:, 3:] = skew(lever) @ by_axis[..., :3, 3:]
-    cov = by_axis @ found.cov @ np.swapaxes(by_axis, -1, -2)
+    cov = by_axis @ result.cov @ np.swapaxes(by_axis, -1, -2)
     cov += ANY_ROLL**2 * _outer(np.concatenate([towards, np.cross(lever, towards)], axis=-1))
     along = np.sum(lever * towards, axis=-1, keepdims=True) * towards
     cov[..., 3:, 3:] += CIRCLE * _outer(lever - along)  # about the coil on a circle, not a tangent
@@ -59,14 +59,14 @@ def poses_of(found: CoilFixes, time: Array, site: Site, *, signed: bool) -> Fixe
     cov[..., :3, :3] += turn @ turn.T
     cov[..., 3:, 3:] += np.diag(sigma.position_body**2)
     shape = (*gain.shape, len(site.channels))
-    freedom = np.maximum(found.freedom, 1.0)[:, None]
+    freedom = np.maximum(result.freedom, 1.0)[:, None]
     return Fixes(
         time=time,
         world_from_body=rotation,
-        position_world=found.position_world - lever,
+        position_world=result.position_world - lever,
         pose_cov=cov,
-        cost=found.cost,
-        residual_rms=np.sqrt(found.cost / freedom),
+        cost=result.cost,
+        residual_rms=np.sqrt(result.cost / freedom),
         phase=np.zeros(shape),
         determined=np.zeros(gain.shape, dtype=bool),  # the roll is never determined
         log_gain=np.broadcast_to(np.log(gain)[..., None], shape).copy(),
@@ -79,11 +79,11 @@ def _outer(vector: Array) -> Array:
     return np.asarray(vector[..., :, None] * vector[..., None, :])
 
 
-def axis_sigma(found: CoilFixes) -> Array:
+def axis_sigma(result: CoilFixes) -> Array:
     """Return the standard deviation of the axis' direction, shape (n, hypotheses) (rad)."""
-    gain = np.linalg.norm(found.axis_world, axis=-1)
-    across = skew(found.axis_world / gain[..., None]) / gain[..., None, None]
-    square = across @ found.cov[..., 3:, 3:] @ np.swapaxes(across, -1, -2)
+    gain = np.linalg.norm(result.axis_world, axis=-1)
+    across = skew(result.axis_world / gain[..., None]) / gain[..., None, None]
+    square = across @ result.cov[..., 3:, 3:] @ np.swapaxes(across, -1, -2)
     return np.asarray(np.sqrt(0.5 * np.trace(square, axis1=-2, axis2=-1)))
 
 
@@ -98,14 +98,14 @@ def nearest_truth(truth: Trajectory, poses: Trajectory, site: Site, *, signed: b
     sensor, chosen = site.platform.magnetometer, poses.world_from_body[there]
     lever, axis = coil_lever(sensor), axis_of(sensor)
     coil = true.position_world + true.world_from_body @ lever
-    found, actual = chosen @ axis, true.world_from_body @ axis
+    result, actual = chosen @ axis, true.world_from_body @ axis
     if not signed:
-        actual = actual * np.where(np.sum(found * actual, axis=1) < 0.0, -1.0, 1.0)[:, None]
-    turned = least_turn(found, actual) @ chosen
-    return Trajectory(true.time, turned, coil - turned @ lever)
+        actual = actual * np.where(np.sum(result * actual, axis=1) < 0.0, -1.0, 1.0)[:, None]
+    rotated = least_turn(result, actual) @ chosen
+    return Trajectory(true.time, rotated, coil - rotated @ lever)
 
 
-def nearest_told(fixes: Fixes, truth: Trajectory, site: Site) -> tuple[Trajectory, BoolArray]:
+def nearest_reported(fixes: Fixes, truth: Trajectory, site: Site) -> tuple[Trajectory, BoolArray]:
     """Return the hypothesis nearest to the truth at each epoch, and where it is not the first.
 
     Parameters
@@ -118,11 +118,11 @@ def nearest_told(fixes: Fixes, truth: Trajectory, site: Site) -> tuple[Trajector
     chosen = np.zeros(len(fixes), dtype=np.int64)
     lever = coil_lever(site.platform.magnetometer)
     coil = true.position_world + true.world_from_body @ lever
-    found = fixes.position_world[there] + fixes.world_from_body[there] @ lever
-    away = np.linalg.norm(found - coil[:, None], axis=2)
-    told = fixes.probability[there] > AMBIGUOUS
-    told[:, 0] = True
-    chosen[there] = np.argmin(np.where(told, away, np.inf), axis=1)
+    result = fixes.position_world[there] + fixes.world_from_body[there] @ lever
+    away = np.linalg.norm(result - coil[:, None], axis=2)
+    reported = fixes.probability[there] > AMBIGUOUS
+    reported[:, 0] = True
+    chosen[there] = np.argmin(np.where(reported, away, np.inf), axis=1)
     nearest = Trajectory(
         fixes.time,
         fixes.world_from_body[rows, chosen],
@@ -148,7 +148,7 @@ class JudgedPoses:
     trust: Trust
 
 
-def judged_poses(fixes: Fixes, found: CoilFixes, left_out: int, *, signed: bool) -> JudgedPoses:
+def judged_poses(fixes: Fixes, result: CoilFixes, left_out: int, *, signed: bool) -> JudgedPoses:
     """Return the verdict on each pose and on all.
 
     Parameters
@@ -157,24 +157,24 @@ def judged_poses(fixes: Fixes, found: CoilFixes, left_out: int, *, signed: bool)
         Epochs with too few channels.
     """
     count = len(fixes)
-    log_p = log_p_chi_square(found.cost[:, 0], np.maximum(found.freedom, 1.0))
-    odd = (found.freedom >= 1.0) & (log_p < np.log(FALSE_ALARMS / count))
-    share, open_ = fixes.probability, ~found.determined[:, 0]
+    log_p = log_p_chi_square(result.cost[:, 0], np.maximum(result.freedom, 1.0))
+    odd = (result.freedom >= 1.0) & (log_p < np.log(FALSE_ALARMS / count))
+    share, open_ = fixes.probability, ~result.determined[:, 0]
     rival = share[:, 1] > AMBIGUOUS if share.shape[1] > 1 else np.zeros(count, dtype=bool)
     roll = (
         "A receiver of one axis does not determine the roll about it: an arbitrary roll is given,"
         " with the sigma of an unknown one. Only errors of position and direction are meaningful."
     )
-    turned = "" if signed else " Amplitudes have no sign: the axis may point the other way."
-    median = float(np.median(found.cost[:, 0])), float(np.median(found.freedom))
+    rotated = "" if signed else " Amplitudes have no sign: the axis may point the other way."
+    median = float(np.median(result.cost[:, 0])), float(np.median(result.freedom))
     remedy = "Check the beacons, or if the common gain is not as declared, use --free gain."
     whole = unexplained("the median epoch", *median, remedy)
-    excess = np.where(odd, found.cost[:, 0] / np.maximum(found.freedom, 1.0), 1.0)
+    excess = np.where(odd, result.cost[:, 0] / np.maximum(result.freedom, 1.0), 1.0)
     enlarged = fixes.pose_cov * np.maximum(excess, whole.excess)[:, None, None, None]
     cov = enlarged.copy()
     cov[:, 0] += rival_spread(fixes, rival)
     alone, fixes = replace(fixes, pose_cov=enlarged), replace(fixes, pose_cov=cov)
-    findings = [Finding("roll_open", roll + turned, Verdict.TRUSTWORTHY), *whole.findings]
+    findings = [Finding("roll_open", roll + rotated, Verdict.TRUSTWORTHY), *whole.findings]
     for code, rows, what in (
         (
             "ambiguous",

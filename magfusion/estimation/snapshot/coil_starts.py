@@ -80,12 +80,12 @@ class CoilEpochs:
         return CoilEpochs(*own, self.signed, self.parts, *motion)
 
     @property
-    def heard(self) -> IntArray:
+    def channel_count(self) -> IntArray:
         """Number of channels in each row, shape (n,)."""
         return np.asarray(np.sum(np.isfinite(self.measured), axis=1))
 
     @property
-    def told(self) -> IntArray:
+    def number_count(self) -> IntArray:
         """Number of real values in each row, shape (n,)."""
         parts = 1 if self.parts is None else self.parts
         return np.asarray(np.sum(np.isfinite(self.measured) * parts, axis=1))
@@ -93,10 +93,10 @@ class CoilEpochs:
 
 def _swing(fields: FieldSamples, sensor: Magnetometer) -> Array | None:
     """Return the rotation of the one axis until the time of the epoch."""
-    if fields.turned is None:
+    if fields.channel_rotation is None:
         return None
     axis = axis_of(sensor)
-    return np.asarray(np.linalg.norm(fields.turned @ axis - axis, axis=-1))
+    return np.asarray(np.linalg.norm(fields.channel_rotation @ axis - axis, axis=-1))
 
 
 def _turning(beacon: Beacon) -> IntArray:
@@ -162,7 +162,7 @@ def grid_about(site: Site) -> Array:
     return places
 
 
-class Grid(NamedTuple):
+class CoilGrid(NamedTuple):
     """Positions, and the response of a coil at each to every axis, or pair of axes.
 
     Parameters
@@ -183,7 +183,9 @@ class Grid(NamedTuple):
     scale: Array
 
     @staticmethod
-    def of(calibration: Calibration, time: float, places_world: Array, *, signed: bool) -> "Grid":
+    def of(
+        calibration: Calibration, time: float, places_world: Array, *, signed: bool
+    ) -> "CoilGrid":
         """Return the grid of a receiver whose axes are the world's."""
         attitude = np.broadcast_to(np.eye(3), (len(places_world), 3, 3))
         at = np.full(len(places_world), time)
@@ -192,10 +194,10 @@ class Grid(NamedTuple):
         scale = np.where(size > 0.0, 1.0 / np.maximum(size, _TINY), 0.0)
         if signed:
             parts = np.concatenate([field.real, field.imag], axis=1)
-            return Grid(places_world, field, parts, np.concatenate([scale, scale], axis=1))
+            return CoilGrid(places_world, field, parts, np.concatenate([scale, scale], axis=1))
         square = np.einsum("gcx,gcy->gcxy", field, field.conj()).real
         twice = np.where(_PAIRS[0] == _PAIRS[1], 1.0, 2.0)
-        return Grid(places_world, field, square[:, :, *_PAIRS] * twice, scale**2)
+        return CoilGrid(places_world, field, square[:, :, *_PAIRS] * twice, scale**2)
 
     def starts(self, epochs: CoilEpochs) -> tuple[Array, Array]:
         """Return the most probable positions of each epoch, and axes, shapes (n, kept, 3)."""
@@ -209,18 +211,18 @@ class Grid(NamedTuple):
         for pattern in np.unique(there, axis=0):
             scale = np.where(pattern, self.scale, 0.0)
             design = self.design * scale[..., None]
-            left, size, right = np.linalg.svd(design, full_matrices=False)
-            felt = size > FLAT * size[:, :1]
-            left = np.where(felt[:, None], left, 0.0)
-            inverse = np.where(felt, 1.0 / np.where(felt, size, 1.0), 0.0)[..., None]
+            residual, size, right = np.linalg.svd(design, full_matrices=False)
+            affected = size > FLAT * size[:, :1]
+            residual = np.where(affected[:, None], residual, 0.0)
+            inverse = np.where(affected, 1.0 / np.where(affected, size, 1.0), 0.0)[..., None]
             for row in np.flatnonzero(np.all(there == pattern, axis=1)).tolist():
                 target = np.where(pattern, given[row], 0.0) * scale
-                along = (target[:, None] @ left)[:, 0]
+                along = (target[:, None] @ residual)[:, 0]
                 total = np.sum(target**2, axis=1)
                 cost = 1.0 - np.sum(along**2, axis=1) / np.maximum(total, _TINY)
                 best = np.argsort(cost, kind="stable")[:LIKELY]
-                found = np.swapaxes(right[best], 1, 2) @ (inverse[best] * along[best, :, None])
-                axes = found[..., 0] if epochs.signed else roots(found[..., 0])
+                result = np.swapaxes(right[best], 1, 2) @ (inverse[best] * along[best, :, None])
+                axes = result[..., 0] if epochs.signed else roots(result[..., 0])
                 misfit, axes = self._misfit(best, axes, epochs, row, soft[row])
                 again = np.argsort(misfit, kind="stable")[:count]
                 place[row], axis[row] = self.places_world[best[again]], axes[again]
@@ -238,8 +240,8 @@ class Grid(NamedTuple):
         measured = np.where(there, epochs.measured[row], 0.0) / sigma
         size = np.sum(np.abs(seen) ** 2, axis=1)
         factor = np.sum(seen.conj() * measured, axis=1).real / np.maximum(size, _TINY)
-        left = measured - factor[:, None] * seen
-        return np.sum(np.abs(left) ** 2, axis=1), axes * factor[:, None]
+        residual = measured - factor[:, None] * seen
+        return np.sum(np.abs(residual) ** 2, axis=1), axes * factor[:, None]
 
 
 def softened(epochs: CoilEpochs) -> Array:

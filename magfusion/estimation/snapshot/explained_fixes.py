@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
+from magfusion.estimation.snapshot.fix_consistency import judged_fixes
 from magfusion.estimation.snapshot.fix_separation import separate_fixes, separation_trust
-from magfusion.estimation.snapshot.fix_witness import judged_fixes
-from magfusion.estimation.snapshot.gain_spread import FEWEST, gain_spread
-from magfusion.estimation.snapshot.gain_witness import gains_of
+from magfusion.estimation.snapshot.gain_consistency import gains_of
+from magfusion.estimation.snapshot.gain_spread import MIN_EPOCHS, gain_spread
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.estimation.snapshot.problem import GAIN_SIGMA
 from magfusion.model.parameters import Calibration
@@ -53,7 +53,7 @@ def explained_fixes(
     *,
     gravity: Gravity | None = None,
     survey_error: bool = True,
-    free: tuple[str, ...] = (),
+    free_parameters: tuple[str, ...] = (),
     risk: Risk | None = None,
     report: Report = quiet,
 ) -> ExplainedFixes:
@@ -79,26 +79,31 @@ def explained_fixes(
         Where there is no epoch.
     """
     how = _How(samples, calibration, gravity, survey_error, Risk() if risk is None else risk)
-    held = tuple(part for part in free if part != "gain")
-    asked = "gain" in free
-    fixes = how.fixed(held, 0.0)
+    fixed = tuple(part for part in free_parameters if part != "gain")
+    requested = "gain" in free_parameters
+    fixes = how.fixed(fixed, 0.0)
     report("fixing without each beacon", 2, 3)
-    found = None if asked else how.judged(fixes, held, 0.0)
-    if found is not None and (
-        _explained(found.trust)
-        or np.sum(fixes.determined[:, 0]) < FEWEST
-        or np.median(_beacons_heard(samples, calibration)) < 2
+    result = None if requested else how.judge(fixes, fixed, 0.0)
+    if result is not None and (
+        _explained(result.trust)
+        or np.sum(fixes.determined[:, 0]) < MIN_EPOCHS
+        or np.median(_beacon_counts(samples, calibration)) < 2
     ):
-        return found
+        return result
     spread = gain_spread(
-        samples, calibration, fixes, gravity=gravity, survey_error=survey_error, free=held
+        samples,
+        calibration,
+        fixes,
+        gravity=gravity,
+        survey_error=survey_error,
+        free_parameters=fixed,
     )
     if not spread:
-        return found or how.judged(fixes, held, 0.0)
-    loose = how.judged(how.fixed((*held, "gain"), spread), (*held, "gain"), spread)
-    if found is None or not _said(loose.trust):
+        return result or how.judge(fixes, fixed, 0.0)
+    loose = how.judge(how.fixed((*fixed, "gain"), spread), (*fixed, "gain"), spread)
+    if result is None or not _codes(loose.trust):
         return loose
-    return found
+    return result
 
 
 @dataclass(frozen=True)
@@ -111,18 +116,20 @@ class _How:
     survey_error: bool
     risk: Risk
 
-    def fixed(self, free: tuple[str, ...], spread: float) -> Fixes:
+    def fixed(self, free_parameters: tuple[str, ...], spread: float) -> Fixes:
         """Return the fixes with all beacons."""
         return fix_epochs(
             self.samples,
             self.calibration,
             gravity=self.gravity,
             survey_error=self.survey_error,
-            free=free,
+            free_parameters=free_parameters,
             gain_sigma=spread or GAIN_SIGMA,
         )
 
-    def judged(self, fixes: Fixes, free: tuple[str, ...], spread: float) -> ExplainedFixes:
+    def judge(
+        self, fixes: Fixes, free_parameters: tuple[str, ...], spread: float
+    ) -> ExplainedFixes:
         """Exclude faulty beacons, and return the fixes with their findings."""
         separated = separate_fixes(
             self.samples,
@@ -130,7 +137,7 @@ class _How:
             fixes,
             gravity=self.gravity,
             survey_error=self.survey_error,
-            free=free,
+            free_parameters=free_parameters,
             gain_sigma=spread or GAIN_SIGMA,
             risk=self.risk,
         )
@@ -143,14 +150,14 @@ class _How:
         return ExplainedFixes(final, states, trust, spread)
 
 
-def _beacons_heard(samples: FieldSamples, calibration: Calibration) -> IntArray:
+def _beacon_counts(samples: FieldSamples, calibration: Calibration) -> IntArray:
     """Return how many beacons each epoch has, shape (n,)."""
     site = calibration.site
     each = [np.any(samples.valid[:, site.owner == k], axis=1) for k in range(len(site.beacons))]
     return np.sum(each, axis=0)
 
 
-def _said(trust: Trust) -> list[str]:
+def _codes(trust: Trust) -> list[str]:
     """Return the codes of all findings of inconsistent fields."""
     return [
         finding.code
@@ -162,4 +169,4 @@ def _said(trust: Trust) -> list[str]:
 
 def _explained(trust: Trust) -> bool:
     """Return whether one faulty beacon, or none, explains all fields."""
-    return _said(trust) in ([], ["beacon_excluded"])
+    return _codes(trust) in ([], ["beacon_excluded"])

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from magfusion.estimation.data_checks.magnetometers import of_sensors
-from magfusion.estimation.data_checks.statistics import SURE
+from magfusion.estimation.data_checks.statistics import P_CERTAIN
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.files.fields import SAME_TIME
@@ -21,7 +21,7 @@ from magfusion.model.trust import Finding
 from magfusion.units import Array
 
 AS_LIKELY = 20.0  # difference of chi square to the best hypothesis
-FEWEST = 5  # common epochs needed to test a pair
+MIN_EPOCHS = 5  # common epochs needed to test a pair
 
 
 def contradicting_magnetometers(
@@ -40,19 +40,19 @@ def contradicting_magnetometers(
     if len(sensors) == 1:
         return ()
     alone = [_alone(samples, calibration, k) for k in range(len(sensors))]
-    limit = float(chi2.isf(SURE, 6))
+    limit = float(chi2.isf(P_CERTAIN, 6))
     false: dict[tuple[int, int], float] = {}
     for i, j in combinations(range(len(sensors)), 2):
-        apart = _apart(alone[i], alone[j])
-        if len(apart) >= FEWEST and float(np.median(apart)) > limit:
-            false[i, j] = float(np.median(apart)) / limit
+        separate = _squared_distances(alone[i], alone[j])
+        if len(separate) >= MIN_EPOCHS and float(np.median(separate)) > limit:
+            false[i, j] = float(np.median(separate)) / limit
     if not false:
         return ()
     names = ", ".join(sensor.name for sensor in sensors)
     worst = max(false.values())
-    guilty = [k for k in range(len(sensors)) if all(k in pair for pair in false)]
-    if len(guilty) == 1:
-        return (_named(sensors[guilty[0]].name, names, worst),)
+    faulty = [k for k in range(len(sensors)) if all(k in pair for pair in false)]
+    if len(faulty) == 1:
+        return (_named(sensors[faulty[0]].name, names, worst),)
     return (_open(names, worst),)
 
 
@@ -61,7 +61,7 @@ def _alone(samples: FieldSamples, calibration: Calibration, which: int) -> Fixes
     return fix_epochs(own, seen_by(calibration, which)) if len(own) else None
 
 
-def _apart(one: Fixes | None, other: Fixes | None) -> Array:
+def _squared_distances(one: Fixes | None, other: Fixes | None) -> Array:
     """Return the squared distances of two fixes where both are determined, of six numbers."""
     if one is None or other is None:
         return np.zeros(0)
@@ -79,12 +79,12 @@ def _least(one: Fixes, i: int, other: Fixes, j: int) -> float:
     for a in np.flatnonzero(one.cost[i] < one.cost[i, 0] + AS_LIKELY):
         for b in np.flatnonzero(other.cost[j] < other.cost[j, 0] + AS_LIKELY):
             body_from_world = one.world_from_body[i, a].T
-            turned = body_from_world @ other.world_from_body[j, b]
+            rotated = body_from_world @ other.world_from_body[j, b]
             shift = other.position_world[j, b] - one.position_world[i, a]
             offset = np.concatenate(
-                [Rotation.from_matrix(turned).as_rotvec(), body_from_world @ shift]
+                [Rotation.from_matrix(rotated).as_rotvec(), body_from_world @ shift]
             )
-            into = np.kron(np.eye(2), turned)
+            into = np.kron(np.eye(2), rotated)
             cov = one.pose_cov[i, a] + into @ other.pose_cov[j, b] @ into.T
             least = min(least, float(offset @ np.linalg.solve(cov, offset)))
     return least

@@ -15,18 +15,18 @@ from magfusion.estimation.posterior.separation import (
 )
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.likelihood import fix_epochs
-from magfusion.estimation.snapshot.many import by_beacon, parts_heard, some_fixes, whole_fixes
-from magfusion.estimation.snapshot.problem import GAIN_SIGMA, State, epochs_of
+from magfusion.estimation.snapshot.many import by_beacon, parts_detected, some_fixes, whole_fixes
+from magfusion.estimation.snapshot.problem import GAIN_SIGMA, FixState, epochs_of
 from magfusion.estimation.snapshot.refine import joined, rows_at
-from magfusion.model.audibility import are_many
+from magfusion.model.detection_range import are_many
 from magfusion.model.parameters import Calibration, channels_of
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trust import Finding, Risk, StateTrust, Trust, Verdict
 from magfusion.units import DEGREE, Array, BoolArray, IntArray
 
-SURE = 0.9  # probability of the fault hypothesis for which a beacon is excluded
+MIN_PROBABILITY = 0.9  # probability of the fault hypothesis for which a beacon is excluded
 MISFIT = 1e-6  # probability of a larger residual, after the faulty beacon has been excluded
-LEAST_HEARD = 3  # beacons; of two that contradict each other either may be faulty
+MIN_DETECTED = 3  # beacons; of two that contradict each other either may be faulty
 
 
 class SeparatedFixes(NamedTuple):
@@ -58,7 +58,7 @@ class _How:
     calibration: Calibration
     gravity: Gravity | None
     survey_error: bool
-    free: tuple[str, ...]
+    free_parameters: tuple[str, ...]
     gain_sigma: float
 
     @property
@@ -84,7 +84,7 @@ class _How:
             self.calibration,
             gravity=self.gravity,
             survey_error=self.survey_error,
-            free=self.free,
+            free_parameters=self.free_parameters,
             gain_sigma=self.gain_sigma,
         )
 
@@ -128,7 +128,7 @@ def separate_fixes(
     *,
     gravity: Gravity | None = None,
     survey_error: bool = True,
-    free: tuple[str, ...] = (),
+    free_parameters: tuple[str, ...] = (),
     gain_sigma: float = GAIN_SIGMA,
     risk: Risk | None = None,
 ) -> SeparatedFixes:
@@ -142,22 +142,22 @@ def separate_fixes(
         Those of the fixes, as in `magfusion.estimation.snapshot.likelihood.fix_epochs`.
     """
     risk = Risk() if risk is None else risk
-    how = _How(samples, calibration, gravity, survey_error, free, gain_sigma)
+    how = _How(samples, calibration, gravity, survey_error, free_parameters, gain_sigma)
     if are_many(calibration.site) and len(samples):
         return _among_many(how, fixes, risk)
     return _separated(how, fixes, risk)
 
 
 def _separated(how: _How, fixes: Fixes, risk: Risk) -> SeparatedFixes:
-    found = _separation(how, fixes)
-    prior, excess = found.prior(risk), found.excess(risk)
-    first = _levels(found, fixes, risk, prior)
+    estimate = _separation(how, fixes)
+    prior, excess = estimate.prior(risk), estimate.excess(risk)
+    first = _levels(estimate, fixes, risk, prior)
     nothing = np.zeros(prior.shape, dtype=bool)
     result = _Result(fixes, *first[:2], nothing, np.any(excess > 1.0, axis=1))
-    tried = result.bad & (np.sum(prior > 0.0, axis=1) >= LEAST_HEARD)
+    tried = result.bad & (np.sum(prior > 0.0, axis=1) >= MIN_DETECTED)
     rows = np.flatnonzero(tried)
     if len(rows):
-        _leave_out(how, result, rows, found.likely(prior)[rows], prior[rows], risk)
+        _leave_out(how, result, rows, estimate.likely(prior)[rows], prior[rows], risk)
     rows = np.flatnonzero(tried & result.bad)
     if len(rows):
         # Too large a deviation for a linearisation to identify the faulty beacon.
@@ -175,20 +175,20 @@ def _separated(how: _How, fixes: Fixes, risk: Risk) -> SeparatedFixes:
             for row in result.excluded.tolist()
         ),
     )
-    return SeparatedFixes(result.fixes, states, excess, found.shift[..., 1])
+    return SeparatedFixes(result.fixes, states, excess, estimate.shift[..., 1])
 
 
 def _among_many(how: _How, fixes: Fixes, risk: Risk) -> SeparatedFixes:
     """Compare the fixes of each stretch with those without each beacon that it detects."""
-    site, parts, found = how.calibration.site, [], []
-    for rows, beacons, some, known, up in parts_heard(how.samples, how.calibration, how.gravity):
+    site, parts, result = how.calibration.site, [], []
+    for rows, beacons, some, known, up in parts_detected(how.samples, how.calibration, how.gravity):
         channels = channels_of(site, beacons)
         own = some_fixes(fixes, rows, channels)
         here = replace(how, samples=some, calibration=known, gravity=up)
         part = _separated(here, own, risk)
         parts.append(whole_fixes(part.fixes, how.calibration, channels))
-        found.append((part, beacons))
-    states, count = [part.states for part, _ in found], len(site.beacons)
+        result.append((part, beacons))
+    states, count = [part.states for part, _ in result], len(site.beacons)
     return SeparatedFixes(
         joined(parts),
         StateTrust(
@@ -197,8 +197,8 @@ def _among_many(how: _How, fixes: Fixes, risk: Risk) -> SeparatedFixes:
             np.concatenate([state.protection_level_deg for state in states]),
             tuple(names for state in states for names in state.excluded),
         ),
-        by_beacon([(part.excess, beacons) for part, beacons in found], count),
-        by_beacon([(part.shift_m, beacons) for part, beacons in found], count),
+        by_beacon([(part.excess, beacons) for part, beacons in result], count),
+        by_beacon([(part.shift_m, beacons) for part, beacons in result], count),
     )
 
 
@@ -208,8 +208,8 @@ def _leave_out(
     """Fix epochs again without the probably faulty beacon, if that is certain."""
     chosen = np.argmax(likely, axis=1)
     each = np.arange(len(rows))
-    sure = likely[each, chosen] >= SURE
-    rows, chosen, likely, prior = rows[sure], chosen[sure], likely[sure], prior[sure]
+    certain = likely[each, chosen] >= MIN_PROBABILITY
+    rows, chosen, likely, prior = rows[certain], chosen[certain], likely[certain], prior[certain]
     if not len(rows):
         return
     excluded = chosen[:, None] == np.arange(likely.shape[1])
@@ -217,9 +217,9 @@ def _leave_out(
     again = part.fixed()
     # The remaining beacons may be faulty, or the wrong one was excluded.
     known = np.where((prior > 0.0) & ~excluded, np.maximum(prior, likely), 0.0)
-    found = _separation(part, again)
-    levels = _levels(found, again, risk, known)
-    bad = np.any(found.excess(risk) > 1.0, axis=1) | ~part.fits(again)
+    estimate = _separation(part, again)
+    levels = _levels(estimate, again, risk, known)
+    bad = np.any(estimate.excess(risk) > 1.0, axis=1) | ~part.fits(again)
     result.take(rows, chosen, again, levels._replace(bad=bad))
 
 
@@ -228,12 +228,12 @@ def _likely_by_fixes(how: _How, rows: IntArray, prior: Array) -> Array:
     cost = np.full(prior.shape, np.inf)
     own = np.bincount(how.calibration.site.owner, minlength=prior.shape[1])
     for beacon in range(prior.shape[1]):
-        heard = np.flatnonzero(prior[:, beacon] > 0.0)
-        if len(heard):
-            excluded = np.zeros((len(heard), prior.shape[1]), dtype=bool)
+        detected = np.flatnonzero(prior[:, beacon] > 0.0)
+        if len(detected):
+            excluded = np.zeros((len(detected), prior.shape[1]), dtype=bool)
             excluded[:, beacon] = True
-            found = how.without(rows[heard], excluded).fixed()
-            cost[heard, beacon] = found.cost[:, 0] + 2.0 * 6 * own[beacon]
+            result = how.without(rows[detected], excluded).fixed()
+            cost[detected, beacon] = result.cost[:, 0] + 2.0 * 6 * own[beacon]
     weight = prior * np.exp(-0.5 * (cost - np.min(cost, axis=1, keepdims=True)))
     return weight / np.sum(weight, axis=1, keepdims=True)
 
@@ -249,12 +249,12 @@ def _separation(how: _How, fixes: Fixes) -> Separation:
         gravity=how.gravity,
         prior=None,
         survey_error=how.survey_error,
-        free=how.free,
+        free_parameters=how.free_parameters,
         gain_sigma=how.gain_sigma,
     ):
         rows = slice(first, first + len(epochs.samples))
         first = rows.stop
-        at = State(
+        at = FixState(
             fixes.world_from_body[rows, 0],
             fixes.position_world[rows, 0],
             fixes.phase[rows, 0],
@@ -270,9 +270,9 @@ def _separation(how: _How, fixes: Fixes) -> Separation:
     )
 
 
-def _levels(found: Separation, fixes: Fixes, risk: Risk, prior: Array) -> _Levels:
+def _levels(result: Separation, fixes: Fixes, risk: Risk, prior: Array) -> _Levels:
     """Return the levels of position (m) and attitude (deg), including alternative poses."""
-    position, degrees = protection_levels(found, risk, prior=prior)
+    position, degrees = protection_levels(result, risk, prior=prior)
     weight = fixes.probability[:, 1:]
     way = np.linalg.norm(fixes.position_world[:, 1:] - fixes.position_world[:, :1], axis=2)
     turn = np.swapaxes(fixes.world_from_body[:, :1], 2, 3) @ fixes.world_from_body[:, 1:]
@@ -287,14 +287,14 @@ def _levels(found: Separation, fixes: Fixes, risk: Risk, prior: Array) -> _Level
 
 def _replaced(fixes: Fixes, rows: IntArray, new: Fixes) -> Fixes:
     """Replace some epochs of fixes, keeping the number of hypotheses."""
-    count, found = fixes.cost.shape[1], new.cost.shape[1]
-    chosen = np.minimum(np.arange(count), found - 1)
+    count, result = fixes.cost.shape[1], new.cost.shape[1]
+    chosen = np.minimum(np.arange(count), result - 1)
     changed = {}
     for name, value in vars(fixes).items():
         own = getattr(new, name)
         changed[name] = value.copy()
         changed[name][rows] = own if own.ndim == 1 else own[:, chosen]
-    changed["cost"][np.ix_(rows, np.arange(count) >= found)] = np.inf
+    changed["cost"][np.ix_(rows, np.arange(count) >= result)] = np.inf
     return Fixes(**changed)
 
 
@@ -303,13 +303,13 @@ def _covering(fixes: Fixes, how: _How, alarmed: BoolArray) -> Fixes:
     rows = np.flatnonzero(alarmed)
     some = Fixes(**{name: value[rows] for name, value in vars(fixes).items()})
     nothing = np.zeros((len(rows), len(how.names)), dtype=bool)
-    found = _separation(how.without(rows, nothing), some)
-    known = np.flatnonzero(np.any(found.determined, axis=0))
+    result = _separation(how.without(rows, nothing), some)
+    known = np.flatnonzero(np.any(result.determined, axis=0))
     cov = fixes.pose_cov.copy()
     for beacon in known:
-        step = found.step[:, beacon]
-        other = found.separation_cov[:, beacon] + step[:, :, None] * step[:, None, :]
-        cov[rows, 0] += np.where(found.determined[:, beacon, None, None], other, 0.0)
+        step = result.step[:, beacon]
+        other = result.separation_cov[:, beacon] + step[:, :, None] * step[:, None, :]
+        cov[rows, 0] += np.where(result.determined[:, beacon, None, None], other, 0.0)
     return replace(fixes, pose_cov=cov)
 
 
@@ -317,11 +317,11 @@ def separation_trust(separated: SeparatedFixes, names: tuple[str, ...], risk: Ri
     """Return the findings for a whole log of fixes."""
     states, n = separated.states, len(separated.fixes)
     by_chance = risk.false_alarm * n
-    most = by_chance + 3.0 * np.sqrt(by_chance) + 1.0
+    maximum = by_chance + 3.0 * np.sqrt(by_chance) + 1.0
     findings = []
     for i, name in enumerate(names):
         rows = np.flatnonzero([name in left_out for left_out in states.excluded])
-        if len(rows) <= most:
+        if len(rows) <= maximum:
             continue
         shift, excess = np.max(separated.shift_m[rows, i]), np.max(separated.excess[rows, i])
         findings.append(
@@ -335,7 +335,7 @@ def separation_trust(separated: SeparatedFixes, names: tuple[str, ...], risk: Ri
             )
         )
     doubtful = np.array([v is not Verdict.TRUSTWORTHY for v in states.verdict])
-    if np.sum(doubtful) > most:
+    if np.sum(doubtful) > maximum:
         shift, excess = (np.max(part[doubtful]) for part in (separated.shift_m, separated.excess))
         findings.append(
             Finding(

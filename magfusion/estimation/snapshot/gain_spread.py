@@ -17,10 +17,10 @@ from magfusion.model.samples import FieldSamples
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
-LEAST, MOST = 0.003, 1.0  # of a log-gain; less is no spread, and more no beacon
+MIN_LOG_GAIN, MAX_LOG_GAIN = 0.003, 1.0  # of a log-gain; less is no spread, and more no beacon
 ENOUGH = 200  # epochs used, spread over a log
 TOLERANCE = 0.1  # of the logarithm of a spread
-FEWEST = 10  # epochs needed to estimate a spread
+MIN_EPOCHS = 10  # epochs needed to estimate a spread
 
 
 def gain_spread(
@@ -30,7 +30,7 @@ def gain_spread(
     *,
     gravity: Gravity | None = None,
     survey_error: bool = True,
-    free: tuple[str, ...] = (),
+    free_parameters: tuple[str, ...] = (),
 ) -> float:
     """Return the standard deviation of the log-gains that maximises the evidence.
 
@@ -46,7 +46,7 @@ def gain_spread(
         Of these epochs, with fixed gains.
     gravity, survey_error
         As in `magfusion.estimation.snapshot.likelihood.fix_epochs`.
-    free : tuple of str
+    free_parameters : tuple of str
         Other parameters estimated with the pose.
 
     Returns
@@ -55,27 +55,31 @@ def gain_spread(
         Zero if no spread is accepted; `GAIN_SIGMA` if there are too few epochs.
     """
     rows = np.flatnonzero(fixes.determined[:, 0])
-    if len(rows) < FEWEST:
+    if len(rows) < MIN_EPOCHS:
         return GAIN_SIGMA
     rows = rows[:: max(1, -(-len(rows) // ENOUGH))]
-    asked = _Asked(samples.rows(rows), calibration, _poses(fixes, rows), survey_error, free)
+    requested = _GainLikelihood(
+        samples.rows(rows), calibration, _poses(fixes, rows), survey_error, free_parameters
+    )
     own = None if gravity is None else gravity.rows(rows)
-    widest, determined = asked.evidence(MOST, own)
-    if np.sum(determined) < FEWEST:
+    widest, determined = requested.evidence(MAX_LOG_GAIN, own)
+    if np.sum(determined) < MIN_EPOCHS:
         return GAIN_SIGMA
 
     def cost(log_spread: float) -> float:
-        return float(np.sum(asked.evidence(float(np.exp(log_spread)), own)[0][determined]))
+        return float(np.sum(requested.evidence(float(np.exp(log_spread)), own)[0][determined]))
 
-    held = float(np.sum(asked.evidence(0.0, own)[0][determined]))
-    log_spread, told = minimise_between(cost, np.log(LEAST), np.log(MOST), TOLERANCE)
+    fixed = float(np.sum(requested.evidence(0.0, own)[0][determined]))
+    log_spread, reported = minimise_between(
+        cost, np.log(MIN_LOG_GAIN), np.log(MAX_LOG_GAIN), TOLERANCE
+    )
     at_most = float(np.sum(widest[determined]))
-    if held - min(told, at_most) <= np.log(np.sum(determined)):
+    if fixed - min(reported, at_most) <= np.log(np.sum(determined)):
         return 0.0
-    return MOST if at_most < told else float(np.exp(log_spread))
+    return MAX_LOG_GAIN if at_most < reported else float(np.exp(log_spread))
 
 
-class _Asked:
+class _GainLikelihood:
     """Epochs, and the information on each beacon's gain at the poses."""
 
     def __init__(
@@ -84,10 +88,10 @@ class _Asked:
         calibration: Calibration,
         poses: Trajectory,
         survey_error: bool,
-        free: tuple[str, ...],
+        free_parameters: tuple[str, ...],
     ) -> None:
         self.samples, self.calibration, self.poses = samples, calibration, poses
-        self.survey_error, self.free = survey_error, free
+        self.survey_error, self.free_parameters = survey_error, free_parameters
         site = calibration.site
         cov = measurement_cov(site, samples, survey_error=survey_error)
         white = whitening(cov, samples.there) @ np.nan_to_num(samples.phasor_sensor)[..., None]
@@ -98,18 +102,20 @@ class _Asked:
 
     def evidence(self, spread: float, gravity: Gravity | None) -> tuple[Array, BoolArray]:
         """Return minus twice the log evidence of each epoch, and which are determined."""
-        found = refine(
+        result = refine(
             self.samples,
             self.calibration,
             self.poses,
             gravity=gravity,
             survey_error=self.survey_error,
-            free=(*self.free, "gain") if spread > 0.0 else self.free,
-            gain_sigma=spread if spread > 0.0 else MOST,
+            free_parameters=(*self.free_parameters, "gain")
+            if spread > 0.0
+            else self.free_parameters,
+            gain_sigma=spread if spread > 0.0 else MAX_LOG_GAIN,
         )
-        volume = np.linalg.slogdet(found.pose_cov[:, 0])[1]
+        volume = np.linalg.slogdet(result.pose_cov[:, 0])[1]
         gains = np.sum(np.log1p(spread**2 * self.known), axis=1)
-        return found.cost[:, 0] - volume + gains, found.determined[:, 0]
+        return result.cost[:, 0] - volume + gains, result.determined[:, 0]
 
 
 def _poses(fixes: Fixes, rows: IntArray) -> Trajectory:

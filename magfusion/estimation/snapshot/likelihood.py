@@ -12,16 +12,22 @@ from scipy.spatial.transform import Rotation
 from magfusion.estimation.snapshot.axis_starts import mirrored, starts_on_grid, with_least_roll
 from magfusion.estimation.snapshot.candidates import attitudes, positions
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
-from magfusion.estimation.snapshot.lone_starts import stands_alone, starts_about_one
-from magfusion.estimation.snapshot.many import fix_parts, parts_heard
+from magfusion.estimation.snapshot.many import fix_parts, parts_detected
 from magfusion.estimation.snapshot.place import outside
-from magfusion.estimation.snapshot.problem import GAIN_SIGMA, Epochs, Problem, State, epochs_of
-from magfusion.estimation.snapshot.refine import Solved, as_fixes, cost, joined, solved_from
-from magfusion.estimation.snapshot.within_cycle import FEWEST, fixed_in_motion, velocities
+from magfusion.estimation.snapshot.problem import (
+    GAIN_SIGMA,
+    FixEpochs,
+    FixProblem,
+    FixState,
+    epochs_of,
+)
+from magfusion.estimation.snapshot.refine import RefinedFixes, as_fixes, cost, joined, solved_from
+from magfusion.estimation.snapshot.single_source_starts import is_single_source, starts_about_one
+from magfusion.estimation.snapshot.within_cycle import MIN_EPOCHS, fixed_in_motion, velocities
 from magfusion.model.arguments import check_arguments
-from magfusion.model.audibility import are_many
 from magfusion.model.channel_effects import of_all_sensors
 from magfusion.model.coil_field import is_sized
+from magfusion.model.detection_range import are_many
 from magfusion.model.parameters import Calibration, seen_by, without_response
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trajectory import Trajectory
@@ -43,7 +49,7 @@ def fix_epochs(
     gravity: Gravity | None = None,
     prior: Trajectory | None = None,
     survey_error: bool = True,
-    free: tuple[str, ...] = (),
+    free_parameters: tuple[str, ...] = (),
     gain_sigma: float = GAIN_SIGMA,
 ) -> Fixes:
     """Fix the pose at every epoch, without a guess.
@@ -56,7 +62,7 @@ def fix_epochs(
         With ``pose_cov``, at the same times: one more candidate, and a term of the posterior.
     survey_error : bool
         Include the site's calibration sigmas in the weights.
-    free : tuple of str
+    free_parameters : tuple of str
         Parameters estimated with the pose: ``phase``, including the drive phase of synchronised
         beacons; ``gain``, one of each beacon.
     gain_sigma : float
@@ -86,13 +92,13 @@ def fix_epochs(
                         gravity=up,
                         prior=None,
                         survey_error=survey_error,
-                        free=free,
+                        free_parameters=free_parameters,
                         gain_sigma=gain_sigma,
                     )
                 ]
             )
 
-        return fix_parts(parts_heard(samples, calibration, gravity), calibration, fixed)
+        return fix_parts(parts_detected(samples, calibration, gravity), calibration, fixed)
     parts = list(
         epochs_of(
             samples,
@@ -100,36 +106,36 @@ def fix_epochs(
             gravity=gravity,
             prior=prior,
             survey_error=survey_error,
-            free=free,
+            free_parameters=free_parameters,
             gain_sigma=gain_sigma,
         )
     )
-    found = joined([_solve(epochs) for epochs in parts])
-    if samples.ahead is None or prior is not None or len(found) < FEWEST:
-        return found
-    return _in_motion(parts, found)
+    result = joined([_solve(epochs) for epochs in parts])
+    if samples.ahead is None or prior is not None or len(result) < MIN_EPOCHS:
+        return result
+    return _in_motion(parts, result)
 
 
-def _in_motion(parts: list[Epochs], fixes: Fixes) -> Fixes:
+def _in_motion(parts: list[FixEpochs], fixes: Fixes) -> Fixes:
     """Repeat fixes of coils driven in turn, with the platform's position at each measurement."""
-    turned = parts[0].samples.turned is not None
-    velocity, sigma = velocities(fixes, parts[0].problem.calibration.site, turned=turned)
-    found, first = [], 0
+    rotated = parts[0].samples.channel_rotation is not None
+    velocity, sigma = velocities(fixes, parts[0].problem.calibration.site, rotated=rotated)
+    result, first = [], 0
     for epochs in parts:
         rows = slice(first, first + len(epochs.samples))
-        found.append(fixed_in_motion(epochs, fixes.rows(rows), velocity[rows], sigma[rows]))
+        result.append(fixed_in_motion(epochs, fixes.rows(rows), velocity[rows], sigma[rows]))
         first = rows.stop
-    return joined(found)
+    return joined(result)
 
 
-def _solve(epochs: Epochs) -> Fixes:
+def _solve(epochs: FixEpochs) -> Fixes:
     lacking = _lacking(epochs.samples)
     if not np.any(lacking):
         return _solved(epochs)
     parts = [(rows, _solved(epochs.rows(rows))) for rows in (lacking, ~lacking) if np.any(rows)]
     order = np.argsort(np.concatenate([np.flatnonzero(rows) for rows, _ in parts]))
-    most = max(part.cost.shape[1] for _, part in parts)
-    return joined([part.padded(most) for _, part in parts]).rows(order)
+    maximum = max(part.cost.shape[1] for _, part in parts)
+    return joined([part.padded(maximum) for _, part in parts]).rows(order)
 
 
 def _lacking(samples: FieldSamples) -> BoolArray:
@@ -138,7 +144,7 @@ def _lacking(samples: FieldSamples) -> BoolArray:
     return np.asarray(partial > np.sum(samples.valid, axis=1) - partial)
 
 
-def _solved(epochs: Epochs) -> Fixes:
+def _solved(epochs: FixEpochs) -> Fixes:
     problem = epochs.problem
     if _lacking(epochs.samples)[0]:
         start, count = _starts_of_axes(epochs)
@@ -162,14 +168,14 @@ def _solved(epochs: Epochs) -> Fixes:
         solved.cost.reshape(-1, count) + outside(problem, solved, count),
     )
     kept = (order + count * np.arange(len(order))[:, None]).ravel()
-    found = Solved(solved.state.rows(kept), solved.cost[kept], solved.information[kept])
-    return replace(as_fixes(problem.rows(epoch[kept]), found, order.shape[1]), cost=ranked)
+    result = RefinedFixes(solved.state.rows(kept), solved.cost[kept], solved.information[kept])
+    return replace(as_fixes(problem.rows(epoch[kept]), result, order.shape[1]), cost=ranked)
 
 
-def _starts_of_axes(epochs: Epochs) -> tuple[State, int]:
+def _starts_of_axes(epochs: FixEpochs) -> tuple[FixState, int]:
     """Return the most likely states of epochs that lack components, so many rows an epoch."""
-    if stands_alone(epochs.problem.calibration.site):
-        return _lone_starts(epochs.problem)
+    if is_single_source(epochs.problem.calibration.site):
+        return _single_source_starts(epochs.problem)
     start, count = starts_on_grid(epochs.problem)
     n = len(epochs.samples)
     epoch = np.repeat(np.arange(n), count)
@@ -181,10 +187,10 @@ def _starts_of_axes(epochs: Epochs) -> tuple[State, int]:
     behind = mirrored(epochs.problem, ahead)
     again = solved_from(soft.rows(np.repeat(np.arange(n), order.shape[1])), behind).state
     both = (np.stack(pair, axis=1) for pair in zip(ahead, again, strict=True))
-    return State(*(part.reshape(-1, *part.shape[2:]) for part in both)), 2 * order.shape[1]
+    return FixState(*(part.reshape(-1, *part.shape[2:]) for part in both)), 2 * order.shape[1]
 
 
-def _lone_starts(problem: Problem) -> tuple[State, int]:
+def _single_source_starts(problem: FixProblem) -> tuple[FixState, int]:
     """Return the distinct states consistent with a single source."""
     start, count = starts_about_one(problem)
     n = len(problem.time)
@@ -196,7 +202,7 @@ def _lone_starts(problem: Problem) -> tuple[State, int]:
     return rough.state.rows(kept), order.shape[1]
 
 
-def _softened(problem: Problem) -> Problem:
+def _softened(problem: FixProblem) -> FixProblem:
     """Return the problem with an error of `SOFT` in each phasor, relative to its magnitude."""
     parts = np.stack([problem.measured[..., :3], problem.measured[..., 3:]], axis=-1)
     square = np.sum((problem.sqrt_information @ parts) ** 2, axis=(-1, -2))[..., None, None]
@@ -204,12 +210,12 @@ def _softened(problem: Problem) -> Problem:
     return replace(problem, sqrt_information=share * problem.sqrt_information)
 
 
-def _starts(problem: Problem) -> tuple[State, int]:
+def _starts(problem: FixProblem) -> tuple[FixState, int]:
     """Return the most probable candidates of any magnetometer, so many rows an epoch."""
     site = problem.calibration.site
-    found = [_candidates(problem, k) for k in range(len(site.platform.magnetometers))]
+    result = [_candidates(problem, k) for k in range(len(site.platform.magnetometers))]
     rotation, position, phase = (
-        np.concatenate(parts, axis=1) for parts in zip(*found, strict=True)
+        np.concatenate(parts, axis=1) for parts in zip(*result, strict=True)
     )
     phase = of_all_sensors(site, phase)
     if problem.prior is not None:
@@ -226,7 +232,7 @@ def _starts(problem: Problem) -> tuple[State, int]:
     return every.rows(best), order.shape[1]
 
 
-def _candidates(problem: Problem, which: int) -> tuple[Array, Array, Array]:
+def _candidates(problem: FixProblem, which: int) -> tuple[Array, Array, Array]:
     """Return poses (n, candidates) and drive phases consistent with one magnetometer."""
     calibration, mine = (
         seen_by(problem.calibration, which),
@@ -240,16 +246,22 @@ def _candidates(problem: Problem, which: int) -> tuple[Array, Array, Array]:
     phasor = raw @ np.linalg.inv(sensor.matrix).T
     weight = np.sum(problem.sqrt_information[:, mine] ** 2, axis=(-1, -2)) / 3.0
     beacons = {b.name: b.synchronised for b in site.beacons}
-    free = np.array([not beacons[name] for name, _ in site.channels])
+    free_parameters = np.array([not beacons[name] for name, _ in site.channels])
     up = up_weight = None
     if problem.gravity is not None:
         up = problem.gravity.up_body @ sensor.body_from_sensor
         up_weight = 1.0 / problem.gravity.sigma**2
     spots = positions(calibration, phasor, weight, CANDIDATES)
-    world_from_sensor, phase = attitudes(calibration, spots, phasor, weight, free, up, up_weight)
+    world_from_sensor, phase = attitudes(
+        calibration, spots, phasor, weight, free_parameters, up, up_weight
+    )
     rotation = world_from_sensor @ sensor.body_from_sensor.T
     position = spots - rotation @ sensor.position_body
-    return rotation, position, phase - calibration.drive_phase(problem.time)[:, None] * free
+    return (
+        rotation,
+        position,
+        phase - calibration.drive_phase(problem.time)[:, None] * free_parameters,
+    )
 
 
 def _ranked(rotation: Array, position: Array, cost: Array) -> tuple[IntArray, Array]:

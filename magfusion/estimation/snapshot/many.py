@@ -13,13 +13,13 @@ from magfusion.units import Array, IntArray
 Part = tuple[slice, IntArray, FieldSamples, Calibration, Gravity | None]
 
 
-def parts_heard(
+def parts_detected(
     samples: FieldSamples, calibration: Calibration, gravity: Gravity | None
 ) -> list[Part]:
     """Return stretches of epochs: rows, beacons, and the arguments restricted to them."""
     site, out = calibration.site, []
-    for rows, heard in stretches(site, samples.valid):
-        beacons = heard if len(heard) else np.zeros(1, dtype=np.int64)
+    for rows, detected in stretches(site, samples.valid):
+        beacons = detected if len(detected) else np.zeros(1, dtype=np.int64)
         some = samples_of(samples.rows(rows), channels_of(site, beacons))
         known = of_beacons(calibration, beacons)
         out.append((rows, beacons, some, known, None if gravity is None else gravity.rows(rows)))
@@ -32,13 +32,13 @@ def fix_parts(
     fixed: Callable[[slice, FieldSamples, Calibration, Gravity | None], Fixes],
 ) -> Fixes:
     """Return the fixes of all stretches, with all channels of the site."""
-    site, found = calibration.site, []
+    site, result = calibration.site, []
     for rows, beacons, some, known, up in parts:
-        found.append(
+        result.append(
             whole_fixes(fixed(rows, some, known, up), calibration, channels_of(site, beacons))
         )
-    most = max(fixes.cost.shape[1] for fixes in found)
-    return joined([_with_hypotheses(fixes, most) for fixes in found])
+    maximum = max(fixes.cost.shape[1] for fixes in result)
+    return joined([_with_hypotheses(fixes, maximum) for fixes in result])
 
 
 def whole_fixes(fixes: Fixes, calibration: Calibration, channels: IntArray) -> Fixes:
@@ -59,10 +59,10 @@ def some_fixes(fixes: Fixes, rows: slice, channels: IntArray) -> Fixes:
     return Fixes(**values)
 
 
-def by_beacon(found: list[tuple[Array, IntArray]], beacons: int) -> Array:
+def by_beacon(result: list[tuple[Array, IntArray]], beacons: int) -> Array:
     """Expand values of some beacons at each stretch to all, zero for others, (n, beacons)."""
     out = []
-    for own, numbers in found:
+    for own, numbers in result:
         every = np.zeros((len(own), beacons))
         every[:, numbers] = own
         out.append(every)

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.special import log_ndtr
 
-from magfusion.estimation.snapshot.problem import Problem
-from magfusion.estimation.snapshot.refine import Solved
+from magfusion.estimation.snapshot.problem import FixProblem
+from magfusion.estimation.snapshot.refine import RefinedFixes
 from magfusion.estimation.solve.batched import open_inverse
 from magfusion.model.site import Site
 from magfusion.units import Array
@@ -13,7 +13,7 @@ SOFT_EDGE = 0.02  # of the distance from the nearest beacon; uncertainty of a de
 DROPPED = 25.0  # chi square of a position outside, from which a pose is excluded
 
 
-def outside(problem: Problem, solved: Solved, count: int) -> Array:
+def outside(problem: FixProblem, solved: RefinedFixes, count: int) -> Array:
     """Return the cost of each hypothesis for being outside, shape (epochs, count).
 
     Minus twice the logarithm of its probability to be inside, by its own covariance; infinite

@@ -13,7 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import log_ndtr
 
-from magfusion.estimation.data_checks.statistics import FALSE_ALARMS, SURE, holm, log_p_chi_square
+from magfusion.estimation.data_checks.statistics import (
+    FALSE_ALARMS,
+    P_CERTAIN,
+    holm,
+    log_p_chi_square,
+)
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.units import Array
 
@@ -63,29 +68,29 @@ def contradiction(
     scaled = change[kept] / prior[kept]
     cov = change_cov[np.ix_(kept, kept)] / prior[kept, None] / prior[kept]
     value, vector = np.linalg.eigh(0.5 * (cov + cov.T))
-    said = value > MOVED
-    square = float(np.sum((vector[:, said].T @ scaled) ** 2 / value[said]))
-    freedom = int(np.sum(said))
+    findings = value > MOVED
+    square = float(np.sum((vector[:, findings].T @ scaled) ** 2 / value[findings]))
+    freedom = int(np.sum(findings))
     if freedom == 0:
         return Contradiction((), 1.0)
     sigma = np.sqrt(np.maximum(np.diagonal(cov), 0.0))
-    told = sigma**2 > MOVED
-    deviation = np.where(told, np.abs(scaled) / np.where(told, sigma, 1.0), 0.0)
-    single = np.where(told, np.log(2.0) + log_ndtr(-deviation), 0.0)
+    reported = sigma**2 > MOVED
+    deviation = np.where(reported, np.abs(scaled) / np.where(reported, sigma, 1.0), 0.0)
+    single = np.where(reported, np.log(2.0) + log_ndtr(-deviation), 0.0)
     chance = np.append(single, log_p_chi_square(square, freedom))
-    speaks, least = holm(chance), float(np.min(chance))
-    if not np.any(speaks):
+    informative, least = holm(chance), float(np.min(chance))
+    if not np.any(informative):
         return Contradiction((), 1.0)
-    order = np.argsort(single)[: max(1, min(NAMED, int(np.sum(speaks[:-1]))))]
-    most = ", ".join(f"{names[kept[i]]} by {deviation[i]:.1f}" for i in order)
+    order = np.argsort(single)[: max(1, min(NAMED, int(np.sum(informative[:-1]))))]
+    maximum = ", ".join(f"{names[kept[i]]} by {deviation[i]:.1f}" for i in order)
     text = (
-        f"{of} contradicts the site: largest deviations {most} sigmas; joint chi square"
+        f"{of} contradicts the site: largest deviations {maximum} sigmas; joint chi square"
         f" {square:.3g} where {freedom} is expected. {remedy}"
     )
-    verdict = Verdict.FAILED if least < np.log(2.0 * SURE) else Verdict.DOUBTFUL
+    verdict = Verdict.FAILED if least < np.log(2.0 * P_CERTAIN) else Verdict.DOUBTFUL
     weight = least / np.log(FALSE_ALARMS / len(chance))
-    found = Finding("prior", text, verdict, float(weight))
-    return Contradiction((found,), max(1.0, square / freedom, float(np.max(deviation)) ** 2))
+    result = Finding("prior", text, verdict, float(weight))
+    return Contradiction((result,), max(1.0, square / freedom, float(np.max(deviation)) ** 2))
 
 
 TOLERATED = 1.5  # root mean square of whitened residuals, up to which sigmas are acceptable

@@ -15,43 +15,43 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
-FREE = ("phase", "gain")  # parameters that may be estimated with the pose, whatever the site
+ESTIMABLE = ("phase", "gain")  # parameters that may be estimated with the pose, whatever the site
 GAIN_SIGMA = 0.2  # of a log-gain; smooth errors of real installations (paper 004, Table 1)
 CHUNK = 1000  # epochs solved at once: they fit into the cache
 Chosen = IntArray | BoolArray | slice
 
 
-class Prior(NamedTuple):
+class PosePrior(NamedTuple):
     """Prior of the body's pose."""
 
     rotation: Array  # (m, 3, 3) world_from_body
     position: Array  # (m, 3)
     sqrt_information: Array | None  # (m, 6, 6) whitening; None if it is only a candidate
 
-    def rows(self, chosen: Chosen) -> "Prior":
+    def rows(self, chosen: Chosen) -> "PosePrior":
         """Return selected rows, possibly repeated."""
         sqrt_information = None if self.sqrt_information is None else self.sqrt_information[chosen]
-        return Prior(self.rotation[chosen], self.position[chosen], sqrt_information)
+        return PosePrior(self.rotation[chosen], self.position[chosen], sqrt_information)
 
 
-class Motion(NamedTuple):
+class CycleMotion(NamedTuple):
     """Displacement of a platform until each channel of a cycle is measured."""
 
     shift_world: Array  # (m, channels, 3) (m)
     spread: Array  # (m, channels); one sigma of it along each axis, fully correlated (m)
 
-    def rows(self, chosen: Chosen) -> "Motion":
+    def rows(self, chosen: Chosen) -> "CycleMotion":
         """Return selected rows, possibly repeated."""
-        return Motion(self.shift_world[chosen], self.spread[chosen])
+        return CycleMotion(self.shift_world[chosen], self.spread[chosen])
 
 
-def _prior(prior: Trajectory) -> Prior:
+def _prior(prior: Trajectory) -> PosePrior:
     cov = prior.pose_cov
     sqrt_information = None if cov is None else np.linalg.inv(np.linalg.cholesky(cov))
-    return Prior(prior.world_from_body, prior.position_world, sqrt_information)
+    return PosePrior(prior.world_from_body, prior.position_world, sqrt_information)
 
 
-class State(NamedTuple):
+class FixState(NamedTuple):
     """Estimated quantities of each row."""
 
     rotation: Array  # (m, 3, 3) world_from_body
@@ -59,13 +59,13 @@ class State(NamedTuple):
     phase: Array  # (m, channels), beyond the calibration's
     log_gain: Array  # (m, channels), beyond the calibration's
 
-    def rows(self, chosen: IntArray | BoolArray) -> "State":
+    def rows(self, chosen: IntArray | BoolArray) -> "FixState":
         """Return a subset of the rows."""
-        return State(*(part[chosen] for part in self))
+        return FixState(*(part[chosen] for part in self))
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class FixProblem:
     """Phasors with their weights, and other information; a row for each pose to estimate.
 
     Parameters
@@ -81,9 +81,9 @@ class Problem:
         Nuisances estimated with the pose.
     prior : optional
         Poses with their whitening.
-    turned : ndarray, shape (m, channels, 3, 3), optional
+    channel_rotation : ndarray, shape (m, channels, 3, 3), optional
         As of `magfusion.model.samples.FieldSamples`.
-    motion : Motion, optional
+    motion : CycleMotion, optional
         If channels are measured in turn by a moving platform.
     """
 
@@ -94,11 +94,11 @@ class Problem:
     noise: Array | None
     blocks: tuple[Block, ...]
     gravity: Gravity | None
-    prior: Prior | None
-    turned: Array | None = None
-    motion: Motion | None = None
+    prior: PosePrior | None
+    channel_rotation: Array | None = None
+    motion: CycleMotion | None = None
 
-    def rows(self, chosen: Chosen) -> "Problem":
+    def rows(self, chosen: Chosen) -> "FixProblem":
         """Return selected rows, possibly repeated."""
         return replace(
             self,
@@ -108,7 +108,9 @@ class Problem:
             noise=None if self.noise is None else self.noise[chosen],
             gravity=None if self.gravity is None else self.gravity.rows(chosen),
             prior=None if self.prior is None else self.prior.rows(chosen),
-            turned=None if self.turned is None else self.turned[chosen],
+            channel_rotation=None
+            if self.channel_rotation is None
+            else self.channel_rotation[chosen],
             motion=None if self.motion is None else self.motion.rows(chosen),
         )
 
@@ -124,12 +126,12 @@ class Problem:
             + gains
         )
 
-    def start(self, rotation: Array, position: Array, phase: Array | None = None) -> State:
+    def start(self, rotation: Array, position: Array, phase: Array | None = None) -> FixState:
         """Return the state at given poses."""
         none = np.zeros((len(position), self.sqrt_information.shape[1]))
-        return State(rotation, position, none if phase is None else phase, none)
+        return FixState(rotation, position, none if phase is None else phase, none)
 
-    def at(self, state: State) -> Calibration:
+    def at(self, state: FixState) -> Calibration:
         """Return the calibration with each row's own phases and gains."""
         known = self.calibration
         return replace(
@@ -137,18 +139,18 @@ class Problem:
         )
 
 
-class Epochs(NamedTuple):
+class FixEpochs(NamedTuple):
     """A row for each epoch, and the inputs of its weights."""
 
-    problem: Problem
+    problem: FixProblem
     samples: FieldSamples
     survey_error: bool
 
-    def rows(self, chosen: Chosen) -> "Epochs":
+    def rows(self, chosen: Chosen) -> "FixEpochs":
         """Return a subset of the epochs."""
-        return Epochs(self.problem.rows(chosen), self.samples.rows(chosen), self.survey_error)
+        return FixEpochs(self.problem.rows(chosen), self.samples.rows(chosen), self.survey_error)
 
-    def reweighed(self, rotation: Array, position: Array) -> Problem | None:
+    def reweighed(self, rotation: Array, position: Array) -> FixProblem | None:
         """Return the problem weighted at poses (n, ...); None if weights do not depend on them.
 
         The uncertainty of a field map depends on position, as does the magnitude of a field of
@@ -191,9 +193,9 @@ def epochs_of(
     gravity: Gravity | None,
     prior: Trajectory | None,
     survey_error: bool,
-    free: tuple[str, ...],
+    free_parameters: tuple[str, ...],
     gain_sigma: float,
-) -> Iterator[Epochs]:
+) -> Iterator[FixEpochs]:
     """Yield the weighted epochs of a log in chunks.
 
     Raises
@@ -203,19 +205,21 @@ def epochs_of(
     """
     if len(samples) == 0:
         raise EstimationError("no epoch to fix: every window was dropped")
-    if not set(free) <= set(FREE):
-        raise ValueError(f"free must be among {FREE}; got {sorted(set(free) - set(FREE))}")
-    if "phase" in free or not samples.signed:  # an unknown sign is an unknown phase
+    if not set(free_parameters) <= set(ESTIMABLE):
+        raise ValueError(
+            f"free must be among {ESTIMABLE}; got {sorted(set(free_parameters) - set(ESTIMABLE))}"
+        )
+    if "phase" in free_parameters or not samples.signed:  # an unknown sign is an unknown phase
         site = calibration.site
         loose = tuple(replace(b, synchronised=False) for b in site.beacons)
         calibration = replace(calibration, site=replace(site, beacons=loose))
-    blocks = nuisance_blocks(calibration.site, gain_sigma if "gain" in free else None)
+    blocks = nuisance_blocks(calibration.site, gain_sigma if "gain" in free_parameters else None)
     known = None if prior is None else _prior(prior)
     for start in range(0, len(samples), CHUNK):
         rows = slice(start, start + CHUNK)
         some = samples.rows(rows)
         sqrt_information, noise = _weights(calibration.site, some, survey_error, None)
-        problem = Problem(
+        problem = FixProblem(
             calibration=calibration,
             time=some.time,
             measured=stacked(some.phasor_sensor),
@@ -224,9 +228,9 @@ def epochs_of(
             blocks=blocks,
             gravity=None if gravity is None else gravity.rows(rows),
             prior=None if known is None else known.rows(rows),
-            turned=some.turned,
+            channel_rotation=some.channel_rotation,
         )
-        yield Epochs(problem, some, survey_error)
+        yield FixEpochs(problem, some, survey_error)
 
 
 def _weights(

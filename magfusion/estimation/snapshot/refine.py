@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.snapshot.apart import by_motion, linearized, predicted
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
-from magfusion.estimation.snapshot.problem import GAIN_SIGMA, Problem, State, epochs_of
+from magfusion.estimation.snapshot.problem import GAIN_SIGMA, FixProblem, FixState, epochs_of
+from magfusion.estimation.snapshot.sequential_channels import by_motion, linearized, predicted
 from magfusion.estimation.snapshot.survey_error import honest_covariance, survey_jacobians, whitened
-from magfusion.estimation.solve.batched import Normal, minimise, open_inverse
+from magfusion.estimation.solve.batched import NormalEquations, minimise, open_inverse
 from magfusion.model.field import skew
 from magfusion.model.field_map import block_diagonal
 from magfusion.model.parameters import (
@@ -27,10 +27,10 @@ from magfusion.units import Array, BoolArray, IntArray
 Columns = tuple[Array, Array]  # Jacobian (m, rows, 6 + nuisances) and residual (m, rows)
 
 
-class Solved(NamedTuple):
+class RefinedFixes(NamedTuple):
     """Converged rows."""
 
-    state: State
+    state: FixState
     cost: Array  # (m,)
     information: Array  # (m, 6 + nuisances, 6 + nuisances)
 
@@ -43,7 +43,7 @@ def refine(
     gravity: Gravity | None = None,
     prior: Trajectory | None = None,
     survey_error: bool = True,
-    free: tuple[str, ...] = (),
+    free_parameters: tuple[str, ...] = (),
     gain_sigma: float = GAIN_SIGMA,
 ) -> Fixes:
     """Refine the pose at every epoch from an initial guess.
@@ -76,7 +76,7 @@ def refine(
         gravity=gravity,
         prior=prior,
         survey_error=survey_error,
-        free=free,
+        free_parameters=free_parameters,
         gain_sigma=gain_sigma,
     ):
         problem, rows = epochs.problem, slice(first, first + len(epochs.samples))
@@ -97,12 +97,12 @@ def joined(parts: list[Fixes]) -> Fixes:
     )
 
 
-def as_fixes(problem: Problem, solved: Solved, count: int) -> Fixes:
+def as_fixes(problem: FixProblem, solved: RefinedFixes, count: int) -> Fixes:
     """Return rows as fixes of so many hypotheses each, in the given order.
 
     Parameters
     ----------
-    problem : Problem
+    problem : FixProblem
         Every epoch repeated for each of its hypotheses.
     """
     state = solved.state
@@ -126,11 +126,11 @@ def as_fixes(problem: Problem, solved: Solved, count: int) -> Fixes:
     )
 
 
-def _cost_of(known: Columns | None, problem: Problem) -> Array:
+def _cost_of(known: Columns | None, problem: FixProblem) -> Array:
     return np.zeros(len(problem.time)) if known is None else np.sum(known[1] ** 2, axis=1)
 
 
-def cost(problem: Problem, state: State) -> Array:
+def cost(problem: FixProblem, state: FixState) -> Array:
     """Return the squared residual of each row, shape (m,), in units of its sigma."""
     error = whitened(
         problem.sqrt_information, (predicted(problem, state) - problem.measured)[..., None]
@@ -141,7 +141,7 @@ def cost(problem: Problem, state: State) -> Array:
     return total
 
 
-def _gravity(problem: Problem, state: State) -> Columns | None:
+def _gravity(problem: FixProblem, state: FixState) -> Columns | None:
     if problem.gravity is None:
         return None
     up, share = state.rotation[:, 2], 1.0 / problem.gravity.sigma
@@ -150,7 +150,7 @@ def _gravity(problem: Problem, state: State) -> Columns | None:
     return block, share[:, None] * (up - problem.gravity.up_body)
 
 
-def _prior_pose(problem: Problem, state: State) -> Columns | None:
+def _prior_pose(problem: FixProblem, state: FixState) -> Columns | None:
     prior = problem.prior
     if prior is None or prior.sqrt_information is None:
         return None
@@ -160,7 +160,7 @@ def _prior_pose(problem: Problem, state: State) -> Columns | None:
     return block, (prior.sqrt_information @ step[..., None])[..., 0]
 
 
-def _known(problem: Problem, state: State) -> Iterator[Columns]:
+def _known(problem: FixProblem, state: FixState) -> Iterator[Columns]:
     """Yield Jacobian and residual of gravity and prior."""
     for known in (_gravity(problem, state), _prior_pose(problem, state)):
         if known is not None:
@@ -182,7 +182,7 @@ def _pose_difference(rotation0: Array, position0: Array, rotation: Array, positi
     return np.concatenate([turn, shift], axis=-1)
 
 
-def _columns(problem: Problem, state: State) -> Array:
+def _columns(problem: FixProblem, state: FixState) -> Array:
     """Return the whitened rows of the field: Jacobian, then residual as the last column."""
     value, by_pose, by_nuisance = linearized(problem, state)
     error = (value - problem.measured)[..., None]
@@ -191,16 +191,16 @@ def _columns(problem: Problem, state: State) -> Array:
     )
 
 
-def _normal(problem: Problem, state: State) -> Normal:
+def _normal(problem: FixProblem, state: FixState) -> NormalEquations:
     columns = _columns(problem, state)
     normal = np.swapaxes(columns, 1, 2) @ columns
     for block, known in _known(problem, state):
         rows = np.concatenate([block, known[..., None]], axis=-1)
         normal += np.swapaxes(rows, 1, 2) @ rows
-    return Normal(normal[:, -1, -1], normal[:, :-1, -1], normal[:, :-1, :-1])
+    return NormalEquations(normal[:, -1, -1], normal[:, :-1, -1], normal[:, :-1, :-1])
 
 
-def rows_at(problem: Problem, state: State) -> tuple[Array, Array, Array | None]:
+def rows_at(problem: FixProblem, state: FixState) -> tuple[Array, Array, Array | None]:
     """Return every whitened row at a state, six of each channel, then gravity and prior.
 
     Returns
@@ -223,7 +223,7 @@ def rows_at(problem: Problem, state: State) -> tuple[Array, Array, Array | None]
     return columns[..., :-1], columns[..., -1], covariance
 
 
-def _spread(problem: Problem, kind: Parameter) -> Array:
+def _spread(problem: FixProblem, kind: Parameter) -> Array:
     """Return the channels affected by a nuisance's column, shape (nuisances, channels)."""
     names = np.array([name for name, _ in problem.calibration.site.channels])
     out = np.zeros((dimension(problem.blocks), len(names)))
@@ -235,19 +235,19 @@ def _spread(problem: Problem, kind: Parameter) -> Array:
     return out
 
 
-def solved_from(problem: Problem, start: State) -> Solved:
+def solved_from(problem: FixProblem, start: FixState) -> RefinedFixes:
     """Move every row to the minimum next to its start.
 
     Parameters
     ----------
-    start : State
+    start : FixState
         Of the same rows.
     """
     spread = _spread(problem, PHASE), _spread(problem, GAIN)
     count = start.phase.shape[1]
     kept, narrowed = np.arange(len(problem.time)), problem
 
-    def model(rows: IntArray, flat: Array) -> Normal:
+    def model(rows: IntArray, flat: Array) -> NormalEquations:
         nonlocal kept, narrowed
         if len(rows) < len(kept):  # rows only ever converge
             narrowed, kept = narrowed.rows(np.isin(kept, rows)), rows
@@ -256,24 +256,24 @@ def solved_from(problem: Problem, start: State) -> Solved:
     def moved(flat: Array, step: Array) -> Array:
         return _flat(_moved(_state(flat, count), step, *spread))
 
-    found = minimise(model, _flat(start), moved, relative=1e-7, absolute=1e-4)
-    return Solved(_state(found.state, count), found.cost, found.information)
+    result = minimise(model, _flat(start), moved, relative=1e-7, absolute=1e-4)
+    return RefinedFixes(_state(result.state, count), result.cost, result.information)
 
 
-def _flat(state: State) -> Array:
+def _flat(state: FixState) -> Array:
     return np.concatenate([part.reshape(len(part), -1) for part in state], axis=1)
 
 
-def _state(flat: Array, channels: int) -> State:
+def _state(flat: Array, channels: int) -> FixState:
     rotation, position, phase, log_gain = np.split(flat, [9, 12, 12 + channels], axis=1)
-    return State(rotation.reshape(-1, 3, 3), position, phase, log_gain)
+    return FixState(rotation.reshape(-1, 3, 3), position, phase, log_gain)
 
 
-def _moved(state: State, step: Array, by_phase: Array, by_gain: Array) -> State:
+def _moved(state: FixState, step: Array, by_phase: Array, by_gain: Array) -> FixState:
     """Return the state moved by a step, limited to one radian."""
     angle = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
     step = step * np.minimum(1.0, 1.0 / np.maximum(angle, 1e-12))
-    return State(
+    return FixState(
         rotation=state.rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix(),
         position=state.position + (state.rotation @ step[:, 3:6, None])[..., 0],
         phase=state.phase + step[:, 6:] @ by_phase,
@@ -281,20 +281,20 @@ def _moved(state: State, step: Array, by_phase: Array, by_gain: Array) -> State:
     )
 
 
-def posterior(problem: Problem, solved: Solved) -> tuple[Array, BoolArray]:
+def posterior(problem: FixProblem, solved: RefinedFixes) -> tuple[Array, BoolArray]:
     """Return the covariance of each row's pose, (m, 6, 6), and whether it is determined."""
     inverse, determined = open_inverse(solved.information)
     if problem.noise is not None:
-        carried = _with_survey(problem, solved, inverse)
+        propagated = _with_survey(problem, solved, inverse)
         # The survey error has no effect on an open direction.
-        inverse = np.where(determined[..., None, None], carried, inverse)
+        inverse = np.where(determined[..., None, None], propagated, inverse)
     if problem.motion is not None:
         moved = _by_motion(problem, solved)
         inverse = inverse + np.where(determined[..., None, None], moved, 0.0)
     return inverse[..., :6, :6], determined
 
 
-def _by_motion(problem: Problem, solved: Solved) -> Array:
+def _by_motion(problem: FixProblem, solved: RefinedFixes) -> Array:
     """Return the covariance due to motion within the cycle, (m, found, found)."""
     _, by_pose, by_nuisance = linearized(problem, solved.state)
     by_found = np.concatenate([by_pose, by_nuisance], axis=-1)
@@ -305,7 +305,7 @@ def _by_motion(problem: Problem, solved: Solved) -> Array:
     return np.asarray(moved @ np.swapaxes(moved, 1, 2))
 
 
-def _with_survey(problem: Problem, solved: Solved, inverse: Array) -> Array:
+def _with_survey(problem: FixProblem, solved: RefinedFixes, inverse: Array) -> Array:
     """Return the covariance with the survey error propagated, rather than treated as noise."""
     assert problem.noise is not None
     by_found, by_survey = _survey(problem, solved.state)
@@ -313,7 +313,7 @@ def _with_survey(problem: Problem, solved: Solved, inverse: Array) -> Array:
     return honest_covariance(by_found, by_survey, noise, inverse, solved.information)
 
 
-def _survey(problem: Problem, state: State) -> tuple[Array, Array]:
+def _survey(problem: FixProblem, state: FixState) -> tuple[Array, Array]:
     return survey_jacobians(
         problem.at(state),
         problem.blocks,

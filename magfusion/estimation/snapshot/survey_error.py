@@ -51,14 +51,14 @@ def survey_jacobians(
         With respect to each column of the survey prior's square root: one sigma of each parameter,
         if these are independent.
     """
-    site, found = calibration.site, dimension(nuisances)
+    site, result = calibration.site, dimension(nuisances)
     clocks = choose_blocks(site, (CLOCK_OFFSET.group,), parameters=(CLOCK_OFFSET,))
     survey = placed((*choose_blocks(site, SURVEY_GROUPS), *clocks))
     _, by_pose, by_calibration = linearize_channels(
         calibration, placed((*nuisances, *survey)), time, world_from_body, position_world
     )
-    by_found = np.concatenate([by_pose, by_calibration[..., :found]], axis=-1)
-    by_survey = by_calibration[..., found:] @ prior_sqrt_covariance(site, survey)
+    by_found = np.concatenate([by_pose, by_calibration[..., :result]], axis=-1)
+    by_survey = by_calibration[..., result:] @ prior_sqrt_covariance(site, survey)
     return whitened(sqrt_information, by_found), whitened(sqrt_information, by_survey)
 
 

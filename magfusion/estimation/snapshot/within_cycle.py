@@ -10,16 +10,16 @@ import numpy as np
 
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.place import outside
-from magfusion.estimation.snapshot.problem import Epochs, Motion
+from magfusion.estimation.snapshot.problem import CycleMotion, FixEpochs
 from magfusion.estimation.snapshot.refine import as_fixes, solved_from
 from magfusion.model.site import Site
 from magfusion.units import Array, BoolArray
 
-FEWEST = 3  # epochs needed for neighbours on both sides
+MIN_EPOCHS = 3  # epochs needed for neighbours on both sides
 LONGEST = 1.0  # s; more distant fixes are not used
 
 
-def fixed_in_motion(epochs: Epochs, fixes: Fixes, velocity: Array, sigma: Array) -> Fixes:
+def fixed_in_motion(epochs: FixEpochs, fixes: Fixes, velocity: Array, sigma: Array) -> Fixes:
     """Repeat fixes with each channel predicted at the platform's position of its measurement.
 
     Parameters
@@ -37,29 +37,29 @@ def fixed_in_motion(epochs: Epochs, fixes: Fixes, velocity: Array, sigma: Array)
     spread = ahead[:, None] * sigma[..., None]
     rows = replace(
         problem.rows(np.repeat(np.arange(n), count)),
-        motion=Motion(shift.reshape(-1, *shift.shape[2:]), spread.reshape(n * count, -1)),
+        motion=CycleMotion(shift.reshape(-1, *shift.shape[2:]), spread.reshape(n * count, -1)),
     )
     start = rows.start(fixes.world_from_body.reshape(-1, 3, 3), fixes.position_world.reshape(-1, 3))
     start = start._replace(
         phase=fixes.phase.reshape(n * count, -1), log_gain=fixes.log_gain.reshape(n * count, -1)
     )
     solved = solved_from(rows, start)
-    found = as_fixes(rows, solved, count)
-    cost = np.where(np.isfinite(fixes.cost), found.cost + outside(problem, solved, count), np.inf)
+    result = as_fixes(rows, solved, count)
+    cost = np.where(np.isfinite(fixes.cost), result.cost + outside(problem, solved, count), np.inf)
     order = np.argsort(cost, axis=1, kind="stable")
     parts = {
         name: part if part.ndim == 1 else part[np.arange(n)[:, None], order]
-        for name, part in vars(replace(found, cost=cost)).items()
+        for name, part in vars(replace(result, cost=cost)).items()
     }
     return Fixes(**parts)
 
 
-def velocities(fixes: Fixes, site: Site, *, turned: bool) -> tuple[Array, Array]:
+def velocities(fixes: Fixes, site: Site, *, rotated: bool) -> tuple[Array, Array]:
     """Return the velocity of each hypothesis from the nearest ones of neighbouring epochs.
 
     Parameters
     ----------
-    turned : bool
+    rotated : bool
         Whether phasors are in the axes of their own times: then the velocity is that of the body,
         else that of its magnetometer with its lever arm.
 
@@ -71,21 +71,21 @@ def velocities(fixes: Fixes, site: Site, *, turned: bool) -> tuple[Array, Array]
         Standard deviation of each component (m/s); with the usual speed as a prior.
     """
     sensor, motion = site.platform.magnetometer, site.platform.motion
-    lever = np.zeros(3) if turned else sensor.position_body
+    lever = np.zeros(3) if rotated else sensor.position_body
     place = fixes.position_world + fixes.world_from_body @ lever
     variance = np.trace(fixes.pose_cov[..., 3:, 3:], axis1=2, axis2=3) / 3.0
     there = np.isfinite(fixes.cost) & fixes.determined
     here, unsure = np.arange(len(fixes)), np.full(variance.shape, np.inf)
     sides = []
-    for beside in (np.maximum(here - 1, 0), np.minimum(here + 1, len(here) - 1)):
-        known = (beside != here) & (np.abs(fixes.time[beside] - fixes.time) < LONGEST)
-        found, own = _nearest(place, variance, there, beside)
+    for others in (np.maximum(here - 1, 0), np.minimum(here + 1, len(here) - 1)):
+        known = (others != here) & (np.abs(fixes.time[others] - fixes.time) < LONGEST)
+        result, own = _nearest(place, variance, there, others)
         use = known[:, None] & np.isfinite(own)
         sides.append(
             (
-                np.where(use[..., None], found, place),
+                np.where(use[..., None], result, place),
                 np.where(use, own, variance),
-                np.where(use, fixes.time[beside][:, None], fixes.time[:, None]),
+                np.where(use, fixes.time[others][:, None], fixes.time[:, None]),
             )
         )
     (before, of_before, begin), (after, of_after, end) = sides
@@ -100,11 +100,11 @@ def velocities(fixes: Fixes, site: Site, *, turned: bool) -> tuple[Array, Array]
     return share[..., None] * velocity, np.sqrt(usual * (1.0 - share))
 
 
-def _nearest(place: Array, variance: Array, there: BoolArray, beside: Array) -> tuple[Array, Array]:
+def _nearest(place: Array, variance: Array, there: BoolArray, others: Array) -> tuple[Array, Array]:
     """Return the nearest hypothesis of another epoch, and its variance; infinite if none."""
-    away = np.linalg.norm(place[beside][:, None] - place[:, :, None], axis=3)
-    away = np.where(there[beside][:, None], away, np.inf)
+    away = np.linalg.norm(place[others][:, None] - place[:, :, None], axis=3)
+    away = np.where(there[others][:, None], away, np.inf)
     best = np.argmin(away, axis=2)
     rows = np.arange(len(place))[:, None]
     there_is = np.isfinite(np.min(away, axis=2))
-    return place[beside][rows, best], np.where(there_is, variance[beside][rows, best], np.inf)
+    return place[others][rows, best], np.where(there_is, variance[others][rows, best], np.inf)

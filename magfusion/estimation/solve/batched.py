@@ -12,18 +12,23 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.units import Array, BoolArray, IntArray
 
-PASSES = 100  # a bound; the few that creep along a valley need more than 25
-SETTLED = 1e-11  # relative decrease of the cost below which a problem is solved
+MAX_ITERATIONS = 100  # a bound; the few that creep along a valley need more than 25
+MIN_COST_DECREASE = 1e-11  # relative decrease of the cost below which a problem is solved
 ROUNDING = 1e-13  # relative increase of the cost that is rounding
 DAMPING_START, DAMPING_LEAST, DAMPING_STOP = 1e-3, 1e-12, 1e9
-EASED, TIGHTENED = 0.2, 10.0  # factors of the damping after a good step and after a bad one
-UNFELT = 1e-15  # of the largest column of a Jacobian: no residual depends on this direction
+DAMPING_DECREASE, TIGHTENED = (
+    0.2,
+    10.0,
+)  # factors of the damping after a good step and after a bad one
+ZERO_COLUMN_RATIO = (
+    1e-15  # of the largest column of a Jacobian: no residual depends on this direction
+)
 # Smallest over largest singular value of a Jacobian of unit columns.  Rounding makes 1e-16 of a
 # zero, whatever the processor; noise of a thousandth makes 1e-3 of it.
 SINGULAR = 1e-7
 
 
-class Normal(NamedTuple):
+class NormalEquations(NamedTuple):
     """Normal equations at some states; priors are residuals like any other.
 
     A method with better curvature than Gauss-Newton's returns it as ``information``, which must be
@@ -44,13 +49,13 @@ class Solution(NamedTuple):
     converged: BoolArray  # (problems,) False where the passes ran out or nothing is finite
 
 
-Model = Callable[[IntArray, Array], Normal]
+Model = Callable[[IntArray, Array], NormalEquations]
 
 
-def normal_equations(residual: Array, jacobian: Array) -> Normal:
+def normal_equations(residual: Array, jacobian: Array) -> NormalEquations:
     """Return the normal equations of residuals (k, d) and their Jacobian (k, d, n)."""
     transposed = np.swapaxes(jacobian, -1, -2)
-    return Normal(
+    return NormalEquations(
         np.sum(residual**2, axis=-1),
         (transposed @ residual[..., None])[..., 0],
         transposed @ jacobian,
@@ -62,8 +67,8 @@ def minimise(
     start: Array,
     move: Callable[[Array, Array], Array] = np.add,
     *,
-    passes: int = PASSES,
-    relative: float = SETTLED,
+    max_iterations: int = MAX_ITERATIONS,
+    relative: float = MIN_COST_DECREASE,
     absolute: float = 0.0,
 ) -> Solution:
     """Minimise the sum of squares of each problem.
@@ -77,7 +82,7 @@ def minimise(
         Of any type, also objects: only ``model`` and ``move`` use it.
     move : callable
         Takes states (k, ...) and steps (k, n) and returns the moved states; addition by default.
-    passes : int
+    max_iterations : int
         Maximum number.
     relative, absolute : float
         A step that decreases the cost by less than this share, or by less than this amount, is
@@ -86,44 +91,51 @@ def minimise(
     state = start.copy()
     rows = np.arange(len(state))
     normal = model(rows, state)
-    found = Solution(
+    result = Solution(
         state, normal.cost.copy(), normal.information.copy(), np.zeros(len(state), dtype=bool)
     )
     damping = np.full(len(rows), DAMPING_START)
-    for _ in range(passes):
+    for _ in range(max_iterations):
         if not len(rows):
             break
         trial = move(state[rows], _step(normal, damping))
         new = model(rows, trial)
         fall = normal.cost - new.cost
         better = fall > 0.0  # False for a cost that is not finite
-        settled = fall <= relative * new.cost + absolute
-        settled &= fall >= -ROUNDING * normal.cost
+        converged = fall <= relative * new.cost + absolute
+        converged &= fall >= -ROUNDING * normal.cost
         state[rows[better]] = trial[better]
-        normal = Normal(
+        normal = NormalEquations(
             *(
                 np.where(better.reshape(-1, *[1] * (now.ndim - 1)), now, before)
                 for now, before in zip(new, normal, strict=True)
             )
         )
-        damping = np.maximum(damping * np.where(better, EASED, TIGHTENED), DAMPING_LEAST)
-        ended = settled | (damping > DAMPING_STOP)
+        damping = np.maximum(damping * np.where(better, DAMPING_DECREASE, TIGHTENED), DAMPING_LEAST)
+        ended = converged | (damping > DAMPING_STOP)
         if np.any(ended):
             # Where no step decreases the cost, however short, it is minimal to rounding.
-            solved = settled | np.isfinite(normal.cost)
-            _keep(found, rows[ended], Normal(*(part[ended] for part in normal)), solved[ended])
+            solved = converged | np.isfinite(normal.cost)
+            _keep(
+                result,
+                rows[ended],
+                NormalEquations(*(part[ended] for part in normal)),
+                solved[ended],
+            )
             rows, damping = rows[~ended], damping[~ended]
-            normal = Normal(*(part[~ended] for part in normal))
-    _keep(found, rows, normal, False)
-    return found
+            normal = NormalEquations(*(part[~ended] for part in normal))
+    _keep(result, rows, normal, False)
+    return result
 
 
-def _keep(found: Solution, rows: IntArray, normal: Normal, settled: BoolArray | bool) -> None:
-    found.cost[rows], found.information[rows] = normal.cost, normal.information
-    found.converged[rows] = settled
+def _keep(
+    result: Solution, rows: IntArray, normal: NormalEquations, converged: BoolArray | bool
+) -> None:
+    result.cost[rows], result.information[rows] = normal.cost, normal.information
+    result.converged[rows] = converged
 
 
-def _step(normal: Normal, damping: Array) -> Array:
+def _step(normal: NormalEquations, damping: Array) -> Array:
     """Return the damped step of each problem, shape (k, n), whatever the units of its unknowns."""
     scale = _scale(np.sqrt(np.einsum("kii->ki", normal.information)))
     scaled = normal.information / (scale[:, :, None] * scale[:, None, :])
@@ -134,15 +146,15 @@ def _step(normal: Normal, damping: Array) -> Array:
 
 def _scale(size: Array) -> Array:
     largest = np.max(size, axis=-1, keepdims=True)
-    return np.maximum(size, np.where(largest > 0.0, UNFELT * largest, 1.0))
+    return np.maximum(size, np.where(largest > 0.0, ZERO_COLUMN_RATIO * largest, 1.0))
 
 
 def moved_poses(pose: Array, step: Array) -> Array:
     """Return poses (k, 12), rotation then position, moved by steps (k, 6) in their own axes."""
     rotation = pose[:, :9].reshape(-1, 3, 3)
-    turned = rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
+    rotated = rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
     position = pose[:, 9:] + (rotation @ step[:, 3:, None])[..., 0]
-    return np.concatenate([turned.reshape(-1, 9), position], axis=1)
+    return np.concatenate([rotated.reshape(-1, 9), position], axis=1)
 
 
 def conditioning(jacobian: Array) -> Array:

@@ -21,7 +21,7 @@ STALLED = 1e-9  # relative increase of the cost that is rounding
 UNDETERMINED = 1e12  # variance of a variable that is too badly determined to invert
 
 
-class Problem(Protocol[S]):
+class BorderedProblem(Protocol[S]):
     """A sum of squares as a function of an estimate ``S``."""
 
     @property
@@ -144,7 +144,7 @@ def last_marginal(
 
 
 def optimise(
-    problem: Problem[S],
+    problem: BorderedProblem[S],
     estimate: S,
     *,
     iterations: int = 30,
@@ -179,7 +179,7 @@ def optimise(
             if new_cost <= cost:
                 break
             rounding = tolerance * (1.0 + cost)
-            if damping == 0.0 and step is not None and _promised(graph, step) <= rounding:
+            if damping == 0.0 and step is not None and _predicted_decrease(graph, step) <= rounding:
                 return Optimised(estimate, cost, done, converged=True)
             if new_cost <= cost * (1 + STALLED) or damping > DAMPING_STOP:
                 return Optimised(estimate, cost, done, converged=damping <= DAMPING_STOP)
@@ -195,7 +195,7 @@ def optimise(
 
 
 def _tried(
-    problem: Problem[S], estimate: S, system: gtsam.GaussianFactorGraph
+    problem: BorderedProblem[S], estimate: S, system: gtsam.GaussianFactorGraph
 ) -> tuple[S, float, gtsam.VectorValues | None]:
     """Return the estimate after a linear solve, its cost and the step; infinite on failure."""
     try:
@@ -206,13 +206,13 @@ def _tried(
         return estimate, np.inf, None
 
 
-def _promised(graph: gtsam.GaussianFactorGraph, step: gtsam.VectorValues) -> float:
+def _predicted_decrease(graph: gtsam.GaussianFactorGraph, step: gtsam.VectorValues) -> float:
     """Return the decrease of the linear graph's cost by a step."""
     return float(graph.error(gtsam.VectorValues.Zero(step)) - graph.error(step))
 
 
 def _damped(
-    problem: Problem[S], graph: gtsam.GaussianFactorGraph, damping: float
+    problem: BorderedProblem[S], graph: gtsam.GaussianFactorGraph, damping: float
 ) -> gtsam.GaussianFactorGraph:
     out = gtsam.GaussianFactorGraph()
     out.push_back(graph)

@@ -14,7 +14,7 @@ LONGEST = 2.0  # of the steps of `minimise_curved`: beyond, a curvature is not v
 SUFFICIENT = 1e-4  # share of the decrease that the slope predicts
 FLATTEST = 1e-10  # of the largest curvature
 LINEAR = 0.05  # share of a slope by which a curvature may differ from that of a pure variance
-FOUND = 1e-2  # of a logarithm; a smaller step is near the minimum
+MIN_STEP = 1e-2  # of a logarithm; a smaller step is near the minimum
 SHORTEST = 1e-9  # of a step; if that does not decrease the cost, the rest is rounding
 DIFFERENCE = 1e-3  # of an unknown: rounding of a cost that solves large systems is far below it
 
@@ -43,15 +43,15 @@ def minimise_bounded(
     decrease : float
         Of the cost, relative; a step that decreases it by less is the last.
     """
-    aside = DIFFERENCE * np.eye(len(start))
+    lateral = DIFFERENCE * np.eye(len(start))
 
     def sloped(at: Array) -> tuple[float, Array]:
-        slopes = [(cost(at + one) - cost(at - one)) / (2.0 * DIFFERENCE) for one in aside]
+        slopes = [(cost(at + one) - cost(at - one)) / (2.0 * DIFFERENCE) for one in lateral]
         return cost(at), np.array(slopes)
 
     options = {"maxiter": steps, "ftol": decrease}
-    found = minimize(sloped, start, jac=True, method="L-BFGS-B", bounds=limits, options=options)
-    return np.asarray(found.x)
+    result = minimize(sloped, start, jac=True, method="L-BFGS-B", bounds=limits, options=options)
+    return np.asarray(result.x)
 
 
 def minimise_curved(
@@ -82,30 +82,36 @@ def minimise_curved(
     here, going = cost(at), np.ones(len(at), dtype=bool)
     for _ in range(MOST_STEPS):
         slope, curvature = curved(at)
-        free = ~((at <= low) & (slope > 0.0) | (at >= high) & (slope < 0.0))
-        going &= free.any(axis=1)
+        free_parameters = ~((at <= low) & (slope > 0.0) | (at >= high) & (slope < 0.0))
+        going &= free_parameters.any(axis=1)
         if not going.any():
             break
-        step = _downhill(free * slope, curvature * (free[:, :, None] & free[:, None])) * free
+        step = (
+            _downhill(
+                free_parameters * slope,
+                curvature * (free_parameters[:, :, None] & free_parameters[:, None]),
+            )
+            * free_parameters
+        )
         step *= LONGEST / np.maximum(np.abs(step).max(axis=1, keepdims=True), LONGEST)
-        promised = -0.5 * (slope * step).sum(axis=1)
-        last = promised < DECREASE_CURVED * np.maximum(np.abs(here), 1.0)
+        predicted = -0.5 * (slope * step).sum(axis=1)
+        last = predicted < DECREASE_CURVED * np.maximum(np.abs(here), 1.0)
         # In the logarithm of a vanishing variance every step is a half, again and again.
         # Before the others converge it may yet be needed, and cannot return from there.
-        falling = free & (slope > 0.0)
+        falling = free_parameters & (slope > 0.0)
         diagonal = curvature.reshape(len(at), -1)[:, :: at.shape[1] + 1]
         falling &= np.abs(diagonal - 2.0 * slope) < LINEAR * slope
         fallen = falling.any(axis=1)
         if fallen.any():
-            fallen &= (falling | (np.abs(step) < FOUND)).all(axis=1)
+            fallen &= (falling | (np.abs(step) < MIN_STEP)).all(axis=1)
             step = np.where(falling & fallen[:, None], low - at, step)
             last &= ~fallen
-        at, here, going = _gone(cost, at, here, step, slope, low, high, going)
+        at, here, going = _line_search_step(cost, at, here, step, slope, low, high, going)
         going &= ~last
     return at
 
 
-def _gone(
+def _line_search_step(
     cost: Callable[[Array], Array],
     at: Array,
     here: Array,
@@ -116,17 +122,17 @@ def _gone(
     going: BoolArray,
 ) -> tuple[Array, Array, BoolArray]:
     """Return searches after the longest decreasing part of a step, the cost, and which moved."""
-    left, gone = going.copy(), np.zeros(len(at), dtype=bool)
+    remaining, elapsed = going.copy(), np.zeros(len(at), dtype=bool)
     while True:
-        left &= (np.abs(step) > SHORTEST).any(axis=1)
-        if not left.any():
-            return at, here, gone
+        remaining &= (np.abs(step) > SHORTEST).any(axis=1)
+        if not remaining.any():
+            return at, here, elapsed
         tried = np.minimum(np.maximum(at + step, low), high)
         there = cost(tried)
-        promised = SUFFICIENT * np.minimum((slope * step).sum(axis=1), 0.0)
-        found = left & (there <= here + promised)
-        at, here = np.where(found[:, None], tried, at), np.where(found, there, here)
-        left, gone, step = left & ~found, gone | found, 0.5 * step
+        predicted = SUFFICIENT * np.minimum((slope * step).sum(axis=1), 0.0)
+        result = remaining & (there <= here + predicted)
+        at, here = np.where(result[:, None], tried, at), np.where(result, there, here)
+        remaining, elapsed, step = remaining & ~result, elapsed | result, 0.5 * step
 
 
 def _downhill(slope: Array, curvature: Array) -> Array:
@@ -150,5 +156,5 @@ def minimise_between(
         Of the unknown.
     """
     options = {"xatol": tolerance}
-    found = minimize_scalar(cost, bounds=(low, high), method="bounded", options=options)
-    return float(found.x), float(found.fun)
+    result = minimize_scalar(cost, bounds=(low, high), method="bounded", options=options)
+    return float(result.x), float(result.fun)

@@ -102,10 +102,10 @@ def solve_chain(
         states = alone[:, :, :kept]
         return ChainSolution(states, chain.right_border, own, chain.corner, explained, inverse)
     # Schur complement of the border.
-    left = np.swapaxes(outer.reshape(len(outer), n * size, -1), 1, 2)
-    taken = left @ solved.reshape(len(outer), n * size, -1)
-    corner = _inverse(chain.corner - taken[..., count:])
-    rest = chain.right_border - taken[..., :count]
+    remaining = np.swapaxes(outer.reshape(len(outer), n * size, -1), 1, 2)
+    selected = remaining @ solved.reshape(len(outer), n * size, -1)
+    corner = _inverse(chain.corner - selected[..., count:])
+    rest = chain.right_border - selected[..., :count]
     border = corner @ rest
     part = by_border[..., :kept, :]
     states = alone[:, :, :kept] - part @ border[:, None]
@@ -125,7 +125,7 @@ def inverses(diagonal: Array, following: Array) -> Array:
     diagonal, following : ndarray
         As of `Chain`.
     """
-    out, count, taken = np.empty_like(diagonal), diagonal.shape[1], np.zeros(1)
+    out, count, selected = np.empty_like(diagonal), diagonal.shape[1], np.zeros(1)
     # In units in which all components of a state are about one.
     size = np.sqrt(np.maximum(np.einsum("hnii->hni", diagonal), np.finfo(np.float64).tiny))
     for begin in range(0, count, STRETCH):
@@ -136,10 +136,10 @@ def inverses(diagonal: Array, following: Array) -> Array:
         between = size[:, begin:last, :, None] * size[:, begin + 1 : last + 1, None]
         after = following[:, begin:last] / between
         for k in range(own.shape[1]):
-            inverse = _inverted(own[:, k] - taken)
+            inverse = _inverted(own[:, k] - selected)
             out[:, begin + k] = inverse
             if k < after.shape[1]:
-                taken = np.swapaxes(inverse @ after[:, k], 1, 2) @ after[:, k]
+                selected = np.swapaxes(inverse @ after[:, k], 1, 2) @ after[:, k]
         out[:, here] /= square
     return out
 

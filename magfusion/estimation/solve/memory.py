@@ -36,10 +36,10 @@ def give_back_memory() -> None:
 
 def _of_glibc(name: str) -> Callable[..., int] | None:
     try:
-        found: Callable[..., int] = getattr(ctypes.CDLL(None), name)
+        result: Callable[..., int] = getattr(ctypes.CDLL(None), name)
     except (AttributeError, OSError, TypeError):  # another system's library
         return None
-    return found
+    return result
 
 
 def _resident() -> float:

@@ -12,7 +12,7 @@ import pyarrow.parquet
 from scipy.io import loadmat, wavfile
 
 from magfusion.errors import InputError
-from magfusion.files.foreign.source import ROWS, Column, Part, Source
+from magfusion.files.foreign.source import ROWS, RowBlock, Source, SourceColumn
 from magfusion.files.foreign.units import Raw
 from magfusion.units import AnyArray
 
@@ -25,7 +25,7 @@ ARRAYS = (".npy", ".npz", ".wav", ".mat", ".h5", ".hdf5", ".hdf", ".parquet")
 class _Field:
     """One column of an array: how its values are taken of some rows."""
 
-    column: Column
+    column: SourceColumn
     array: Any
     rows: int
     block: Callable[[Any, int, int], AnyArray]
@@ -98,9 +98,9 @@ def fields_of(name: str, array: Any, unit: str = "", by_column: bool = False) ->
     if len(shape) == 1 or 1 in shape:
         if max(shape) < 2:
             return []
-        lone = len(shape) == 2 and shape[0] == 1
-        block = _turned_rows if lone else _rows
-        return [_Field(Column(name or "0", unit), array, max(shape), block, np.ravel)]
+        single = len(shape) == 2 and shape[0] == 1
+        block = _turned_rows if single else _rows
+        return [_Field(SourceColumn(name or "0", unit), array, max(shape), block, np.ravel)]
     return _matrix_columns(name, array, unit, by_column)
 
 
@@ -108,7 +108,7 @@ def _named_parts(name: str, array: Any, unit: str) -> list[_Field]:
     """Return the columns of an array of records, shape (n,)."""
     return [
         _Field(
-            Column(f"{name}:{part}" if name else part, unit),
+            SourceColumn(f"{name}:{part}" if name else part, unit),
             *(array, array.shape[0], _rows, _part(part)),
         )
         for part in array.dtype.names
@@ -119,14 +119,14 @@ def _named_parts(name: str, array: Any, unit: str) -> list[_Field]:
 def _matrix_columns(name: str, array: Any, unit: str, by_column: bool) -> list[_Field]:
     """Return the columns of a matrix, the longer side down."""
     shape = array.shape
-    turned = shape[0] < shape[1] if not by_column else shape[0] <= MOST_COLUMNS
-    rows, width = (shape[1], shape[0]) if turned else shape
+    rotated = shape[0] < shape[1] if not by_column else shape[0] <= MOST_COLUMNS
+    rows, width = (shape[1], shape[0]) if rotated else shape
     if width > MOST_COLUMNS:
         return []
     return [
         _Field(
-            Column(f"{name}:{k}" if name else str(k), unit),
-            *(array, rows, _turned_rows if turned else _rows),
+            SourceColumn(f"{name}:{k}" if name else str(k), unit),
+            *(array, rows, _turned_rows if rotated else _rows),
             _component(k),
         )
         for k in range(width)
@@ -136,7 +136,7 @@ def _matrix_columns(name: str, array: Any, unit: str, by_column: bool) -> list[_
 def _source(
     place: str, fields: list[_Field], rate_hz: float | None = None, form: str = ""
 ) -> Source:
-    def read(wanted: Sequence[int], _texts: Collection[int]) -> Iterator[Part]:
+    def read(wanted: Sequence[int], _texts: Collection[int]) -> Iterator[RowBlock]:
         chosen = [fields[k] for k in wanted]
         for begin in range(0, max((f.rows for f in chosen), default=0), ROWS):
             blocks: dict[int, AnyArray] = {}
@@ -145,7 +145,7 @@ def _source(
                 if id(one.array) not in blocks:
                     blocks[id(one.array)] = one.block(one.array, begin, begin + ROWS)
                 columns.append(one.take(blocks[id(one.array)]))
-            yield Part(columns, begin + np.arange(len(columns[0])))
+            yield RowBlock(columns, begin + np.arange(len(columns[0])))
 
     lengths = tuple(f.rows for f in fields)
     return Source(place, tuple(f.column for f in fields), read, rate_hz, lengths, form)
@@ -172,7 +172,7 @@ def _wav(path: Path) -> Source:
         return lambda block: (block[:, k].astype(np.float64) - middle) / full
 
     fields = [
-        _Field(Column(str(k)), samples, len(samples), _rows, share(k))
+        _Field(SourceColumn(str(k)), samples, len(samples), _rows, share(k))
         for k in range(samples.shape[1])
     ]
     form = f"{rate} Hz, samples as shares of full scale"
@@ -230,7 +230,7 @@ def _parquet(path: Path) -> Source:
     file = pa.parquet.ParquetFile(path, memory_map=True, pre_buffer=False)
     schema = file.schema_arrow
 
-    def read(wanted: Sequence[int], texts: Collection[int]) -> Iterator[Part]:
+    def read(wanted: Sequence[int], texts: Collection[int]) -> Iterator[RowBlock]:
         names = [schema.names[k] for k in wanted]
         row = 0
         for batch in file.iter_batches(ROWS, columns=names):
@@ -244,11 +244,12 @@ def _parquet(path: Path) -> Source:
                     columns.append(column)
                 else:
                     columns.append(column.cast(pa.float64()).to_numpy(zero_copy_only=False))
-            yield Part(columns, row + np.arange(len(batch)))
+            yield RowBlock(columns, row + np.arange(len(batch)))
             row += len(batch)
 
     columns = tuple(
-        Column(field.name, ((field.metadata or {}).get(b"unit", b"")).decode()) for field in schema
+        SourceColumn(field.name, ((field.metadata or {}).get(b"unit", b"")).decode())
+        for field in schema
     )
     return Source(str(path), columns, read)
 

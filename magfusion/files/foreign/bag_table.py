@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files.bag_rows import Messages, Wanted, read_parts
-from magfusion.files.foreign.columns import STREAMS, TIME, VELOCITY, Entry, Term
-from magfusion.files.foreign.plan import Findings, Plan, Terms
-from magfusion.files.foreign.source import ROWS, Column, Part, Source
-from magfusion.files.foreign.units import Unit, accepted, parse_unit
+from magfusion.files.foreign.columns import STREAMS, TIME, VELOCITY, ColumnMapping, Term
+from magfusion.files.foreign.plan import Findings, ImportPlan, Terms
+from magfusion.files.foreign.source import ROWS, RowBlock, Source, SourceColumn
+from magfusion.files.foreign.units import SourceUnit, accepted, parse_unit
 from magfusion.files.messages import (
     FORMER_TRANSFORMS,
     ODOMETRY,
@@ -92,15 +92,15 @@ def first_stamp(path: Path, topic: str) -> int:
 
 def plan_bag(
     path: Path,
-    entries: Mapping[str, Sequence[Entry]],
+    entries: Mapping[str, Sequence[ColumnMapping]],
     others: Collection[str],
-    told: Findings,
-) -> list[Plan]:
-    """Return how the topics of a bag become streams; what is undecided is added to ``told``.
+    declared: Findings,
+) -> list[ImportPlan]:
+    """Return how the topics of a bag become streams; what is undecided is added to ``declared``.
 
     Parameters
     ----------
-    entries : mapping of sequence of Entry
+    entries : mapping of sequence of ColumnMapping
         What the user says of each stream: a topic, and frames or a unit behind it.
     others : collection of str
         Streams that come from elsewhere.
@@ -112,15 +112,15 @@ def plan_bag(
     """
     plans = []
     with _opened(path) as reader:
-        found = sorted({(c.topic, c.msgtype) for c in reader.connections})
+        result = sorted({(c.topic, c.msgtype) for c in reader.connections})
         for role in _COLUMNS:
             if role in others:
                 continue
-            topic = _chosen(path, role, entries.get(role, ()), found, reader, told)
+            topic = _chosen(path, role, entries.get(role, ()), result, reader, declared)
             if topic is not None:
                 unit = parse_unit(topic.unit or "T", STREAMS["magnetometer"]["field_x"])
                 if unit is None:
-                    told.problems.append(
+                    declared.problems.append(
                         f"{path}: --map '{role}={topic.name}[{topic.unit}]': write one of"
                         f" {accepted(STREAMS['magnetometer']['field_x'])}."
                     )
@@ -134,115 +134,115 @@ def plan_bag(
 def _chosen(
     path: Path,
     role: str,
-    entries: Sequence[Entry],
-    found: Sequence[tuple[str, str]],
+    entries: Sequence[ColumnMapping],
+    result: Sequence[tuple[str, str]],
     reader: AnyReader,
-    told: Findings,
+    declared: Findings,
 ) -> Topic | None:
     for column in (entry for entry in entries if entry.column):
-        told.problems.append(
+        declared.problems.append(
             f"{path}: --map '{column}': a bag's columns are known; name the topic, as"
             f" {role}=/topic."
         )
         return None
     if entries:
-        return _asked(path, role, entries[0], found, reader, told)
-    fitting = _fitting(found, role)
+        return _selected_topic(path, role, entries[0], result, reader, declared)
+    fitting = _fitting(result, role)
     if len(fitting) == 1:
         return Topic(*fitting[0])
     if fitting:
         names = ", ".join(name for name, _ in fitting)
-        told.problems.append(f"{path}: several topics may be {role}: {names}; name one.")
-        told.proposals.append(f"{role}={fitting[0][0]}")
+        declared.problems.append(f"{path}: several topics may be {role}: {names}; name one.")
+        declared.proposals.append(f"{role}={fitting[0][0]}")
     elif role == "magnetometer":
-        names = ", ".join(f"{name} ({kind})" for name, kind in found) or "none"
+        names = ", ".join(f"{name} ({kind})" for name, kind in result) or "none"
         kinds = " or ".join(ROW_OF[role])
-        told.problems.append(f"{path}: no topic is of {kinds}, for {role} (found {names}).")
+        declared.problems.append(f"{path}: no topic is of {kinds}, for {role} (found {names}).")
     return None
 
 
-def _fitting(found: Sequence[tuple[str, str]], role: str) -> list[tuple[str, str]]:
+def _fitting(result: Sequence[tuple[str, str]], role: str) -> list[tuple[str, str]]:
     """Return the topics of a type for a role: of the usual ones, if there are such."""
-    fitting = [one for one in found if one[1] in ROW_OF[role]]
+    fitting = [one for one in result if one[1] in ROW_OF[role]]
     return [one for one in fitting if one[1] in USUAL] or fitting
 
 
-def _asked(
+def _selected_topic(
     path: Path,
     role: str,
-    entry: Entry,
-    found: Sequence[tuple[str, str]],
+    entry: ColumnMapping,
+    result: Sequence[tuple[str, str]],
     reader: AnyReader,
-    told: Findings,
+    declared: Findings,
 ) -> Topic | None:
     read = re.fullmatch(
         r"(?P<name>[^:\[\]]+?)(:(?P<parent>.+?)->(?P<child>.+?))?(\[(?P<unit>.*)\])?", entry.value
     )
     name = entry.value if read is None else read["name"]
-    kind = dict(reversed(found)).get(name)  # of two of a name the first
+    kind = dict(reversed(result)).get(name)  # of two of a name the first
     if read is None or kind is None:
-        names = ", ".join(topic for topic, _ in found)
-        told.problems.append(f"{path}: has no topic {name} for {role} (found {names}).")
+        names = ", ".join(topic for topic, _ in result)
+        declared.problems.append(f"{path}: has no topic {name} for {role} (found {names}).")
         return None
     unit = read["unit"] or ""
     if role == "truth" and kind in _TRANSFORMS:
         frames = (read["parent"] or "", read["child"] or "")
-        there = _has_transform(path, name, frames, reader, told)
+        there = _has_transform(path, name, frames, reader, declared)
         return Topic(name, kind, frames) if there else None
     if kind not in ROW_OF[role]:
-        told.problems.append(
+        declared.problems.append(
             f"{path}: topic {name} is of {kind}, which is none of {', '.join(ROW_OF[role])} for"
             f" {role}; name another."
         )
         return None
     if unit and role != "magnetometer":
-        told.problems.append(f"{path}: --map '{entry}': messages of {kind} are in SI units.")
+        declared.problems.append(f"{path}: --map '{entry}': messages of {kind} are in SI units.")
         return None
     return Topic(name, kind, None, unit)
 
 
 def _has_transform(
-    path: Path, name: str, frames: tuple[str, str], reader: AnyReader, told: Findings
+    path: Path, name: str, frames: tuple[str, str], reader: AnyReader, declared: Findings
 ) -> bool:
     """Tell whether a topic has a transform; what it has instead is proposed."""
     pairs = _pairs(reader, name)
     if frames in pairs:
         return True
     shown = ", ".join(f"{a}->{b}" for a, b in pairs)
-    told.problems.append(
+    declared.problems.append(
         f"{path}: topic {name} has no transform {'->'.join(frames)} (found {shown});"
         " write world and body as truth=TOPIC:PARENT->CHILD."
     )
-    told.proposals += [f"truth={name}:{a}->{b}" for a, b in pairs[:5]]
+    declared.proposals += [f"truth={name}:{a}->{b}" for a, b in pairs[:5]]
     return False
 
 
 def _pairs(reader: AnyReader, name: str) -> list[tuple[str, str]]:
     connections = [c for c in reader.connections if c.topic == name]
-    found: dict[tuple[str, str], None] = {}
+    result: dict[tuple[str, str], None] = {}
     for count, (_, _, raw) in enumerate(reader.messages(connections)):
         message: Any = reader.deserialize(raw, connections[0].msgtype)
-        found |= dict.fromkeys(
+        result |= dict.fromkeys(
             (_frame(t.header.frame_id), _frame(t.child_frame_id)) for t in message.transforms
         )
         if count > ROWS:
             break
-    return list(found)
+    return list(result)
 
 
 def _frame(name: str) -> str:
     return name.lstrip("/")
 
 
-def _plan(path: Path, role: str, topic: Topic, field_unit: Unit, count: int) -> Plan:
+def _plan(path: Path, role: str, topic: Topic, field_unit: SourceUnit, count: int) -> ImportPlan:
     place = f"{path} topic {topic.name}"
     columns = _COLUMNS[role]
 
-    def read(wanted: Sequence[int], _texts: Collection[int]) -> Iterator[Part]:
+    def read(wanted: Sequence[int], _texts: Collection[int]) -> Iterator[RowBlock]:
         row = 0
         for stamps, values in _rows(path, place, role, topic):
             table = [stamps, *values.T]
-            yield Part([table[k] for k in wanted], row + np.arange(len(stamps)))
+            yield RowBlock([table[k] for k in wanted], row + np.arange(len(stamps)))
             row += len(stamps)
 
     usual: Terms = {TIME: (Term(0, _unit("ns", role, TIME)),)}
@@ -252,13 +252,13 @@ def _plan(path: Path, role: str, topic: Topic, field_unit: Unit, count: int) -> 
         usual[name] = (Term(k, unit),)
     if role == "truth" and not _moves(path, place, topic):
         usual = {name: terms for name, terms in usual.items() if name not in VELOCITY}
-    known = (Column(TIME), *map(Column, columns))
+    known = (SourceColumn(TIME), *map(SourceColumn, columns))
     source = Source(place, known, read, form=topic.msgtype, count=count)
-    return Plan(role, source, usual)
+    return ImportPlan(role, source, usual)
 
 
-def _unit(name: str, role: str, target: str) -> Unit:
-    return Unit(name, STREAMS[role][target])
+def _unit(name: str, role: str, target: str) -> SourceUnit:
+    return SourceUnit(name, STREAMS[role][target])
 
 
 def _moves(path: Path, place: str, topic: Topic) -> bool:

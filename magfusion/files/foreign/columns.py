@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 
 from magfusion.errors import InputError
-from magfusion.files.foreign.source import Column
-from magfusion.files.foreign.units import Dimension, Unit, accepted, parse_unit
+from magfusion.files.foreign.source import SourceColumn
+from magfusion.files.foreign.units import Dimension, SourceUnit, accepted, parse_unit
 
 TIME = "time"
 _AXES = "xyz"
@@ -40,7 +40,7 @@ STREAMS: dict[str, dict[str, Dimension]] = {
 }
 OPTIONAL = frozenset(VELOCITY)
 # What is taken only where it is said, and may be missing in any row.
-BESIDE: dict[str, dict[str, Dimension]] = {"magnetometer": {"slot": Dimension.NUMBER}}
+OPTIONAL_COLUMNS: dict[str, dict[str, Dimension]] = {"magnetometer": {"slot": Dimension.NUMBER}}
 # What stands for several columns.
 GROUPS = {
     **{stem: tuple(f"{stem}_{a}" for a in _AXES) for stem in ("gyro", "accel", "field")},
@@ -52,7 +52,7 @@ ORDERS = {"wxyz": (0, 1, 2, 3), "xyzw": (3, 0, 1, 2)}  # where w, x, y and z sta
 
 
 @dataclass(frozen=True)
-class Entry:
+class ColumnMapping:
     """One ``STREAM.COLUMN=NAME[unit]``, or ``STREAM=TOPIC`` with an empty column.
 
     Parameters
@@ -81,7 +81,7 @@ class Term:
     """
 
     place: int
-    unit: Unit
+    unit: SourceUnit
     sign: float = 1.0
 
 
@@ -101,7 +101,7 @@ class Undecided(ValueError):
         self.place, self.sign = place, sign
 
 
-def parse_entry(text: str) -> list[Entry]:
+def parse_entry(text: str) -> list[ColumnMapping]:
     """Read one option; what stands for several columns becomes several entries.
 
     Raises
@@ -118,8 +118,8 @@ def parse_entry(text: str) -> list[Entry]:
         )
     if stream not in STREAMS:
         raise InputError(f"--map {text!r}: {stream} is no table; write one of {', '.join(STREAMS)}")
-    if not column or column in STREAMS[stream] or column in BESIDE.get(stream, {}):
-        return [Entry(stream, column, value)]
+    if not column or column in STREAMS[stream] or column in OPTIONAL_COLUMNS.get(stream, {}):
+        return [ColumnMapping(stream, column, value)]
     if column not in GROUPS or GROUPS[column][0] not in STREAMS[stream]:
         known = [*STREAMS[stream]]
         known += [group for group, names in GROUPS.items() if names[0] in known]
@@ -129,17 +129,17 @@ def parse_entry(text: str) -> list[Entry]:
     return _split(stream, column, value, text)
 
 
-def _split(stream: str, group: str, value: str, text: str) -> list[Entry]:
-    found = re.fullmatch(r"(?P<names>.*?)\s*(?P<unit>\[[^\[\]]*\])?", value)
-    assert found is not None
-    unit, targets = found["unit"] or "", GROUPS[group]
-    names = [name.strip() for name in found["names"].split(",")]
+def _split(stream: str, group: str, value: str, text: str) -> list[ColumnMapping]:
+    result = re.fullmatch(r"(?P<names>.*?)\s*(?P<unit>\[[^\[\]]*\])?", value)
+    assert result is not None
+    unit, targets = result["unit"] or "", GROUPS[group]
+    names = [name.strip() for name in result["names"].split(",")]
     order: Sequence[int] = range(len(targets))
     if group == "quaternion":
         if unit.strip("[]") not in ORDERS:
             raise InputError(
                 f"--map {text!r}: say the order of the quaternion, as"
-                f" '{stream}.quaternion={found['names']}[wxyz]' or [xyzw]"
+                f" '{stream}.quaternion={result['names']}[wxyz]' or [xyzw]"
             )
         order, unit = ORDERS[unit.strip("[]")], "[1]"
     if len(names) == 1:
@@ -150,16 +150,17 @@ def _split(stream: str, group: str, value: str, text: str) -> list[Entry]:
             f" {len(names)}"
         )
     return [
-        Entry(stream, target, f"{names[k]}{unit}") for target, k in zip(targets, order, strict=True)
+        ColumnMapping(stream, target, f"{names[k]}{unit}")
+        for target, k in zip(targets, order, strict=True)
     ]
 
 
 def dimension_of(stream: str, column: str) -> Dimension:
     """Return what a column of a stream is."""
-    return (STREAMS[stream] | BESIDE.get(stream, {}))[column]
+    return (STREAMS[stream] | OPTIONAL_COLUMNS.get(stream, {}))[column]
 
 
-def resolve(entry: Entry, columns: Sequence[Column]) -> tuple[Term, ...]:
+def resolve(entry: ColumnMapping, columns: Sequence[SourceColumn]) -> tuple[Term, ...]:
     """Return the columns of the file that an entry means; stamps may be a sum of several.
 
     Raises
@@ -174,7 +175,9 @@ def resolve(entry: Entry, columns: Sequence[Column]) -> tuple[Term, ...]:
     return tuple(_term(part.strip(), columns, dimension, entry) for part in parts)
 
 
-def _term(text: str, columns: Sequence[Column], dimension: Dimension, entry: Entry) -> Term:
+def _term(
+    text: str, columns: Sequence[SourceColumn], dimension: Dimension, entry: ColumnMapping
+) -> Term:
     for sign, lead in ((1.0, ""), (1.0, "+"), (-1.0, "-")):
         if not text.startswith(lead):
             continue
@@ -196,7 +199,7 @@ def _term(text: str, columns: Sequence[Column], dimension: Dimension, entry: Ent
     raise Undecided(_not_there(text, columns, entry))
 
 
-def place_of(name: str, columns: Sequence[Column]) -> int | None:
+def place_of(name: str, columns: Sequence[SourceColumn]) -> int | None:
     """Return the place of the column that a name means, or None.
 
     Raises
@@ -207,15 +210,15 @@ def place_of(name: str, columns: Sequence[Column]) -> int | None:
     exact = [k for k, column in enumerate(columns) if column.name == name]
     bare = [k for k, c in enumerate(columns) if _loose(c.name) == _loose(name)]
     untagged = [k for k, c in enumerate(columns) if _loose(_untagged(c.name)) == _loose(name)]
-    for found in (exact, bare, untagged):
-        if len(found) > 1:
-            places = ", ".join(map(str, found))
+    for result in (exact, bare, untagged):
+        if len(result) > 1:
+            places = ", ".join(map(str, result))
             raise Undecided(
-                f"column {name} is there {len(found)} times; name it by its place (counted from"
+                f"column {name} is there {len(result)} times; name it by its place (counted from"
                 f" 0), one of #{places.replace(', ', ', #')}"
             )
-        if found:
-            return found[0]
+        if result:
+            return result[0]
     number = re.fullmatch(r"#?(\d+)", name)
     if number and int(number[1]) < len(columns):
         return int(number[1])
@@ -230,20 +233,20 @@ def _untagged(name: str) -> str:
     return re.sub(r"\s*[\[(][^\[\]()]*[\])]\s*$", "", name)
 
 
-def _own_unit(column: Column, place: int, dimension: Dimension, sign: float) -> Unit:
+def _own_unit(column: SourceColumn, place: int, dimension: Dimension, sign: float) -> SourceUnit:
     """Return the unit that the file names; a number has none."""
     tag = re.search(r"[\[(]([^\[\]()]*[^\[\]()\d][^\[\]()]*)[\])]\s*$", column.name)
-    said = column.unit or (tag[1] if tag else "")
-    unit = parse_unit(said, dimension) if said or dimension is Dimension.NUMBER else None
+    declared = column.unit or (tag[1] if tag else "")
+    unit = parse_unit(declared, dimension) if declared or dimension is Dimension.NUMBER else None
     if unit is None and dimension is Dimension.NUMBER:
         unit = parse_unit("1", dimension)
     if unit is None:
-        said = f" ({said!r} is none)" if said else ""
-        raise Undecided(f"the unit of column {column.name} is not said{said}", place, sign)
+        declared = f" ({declared!r} is none)" if declared else ""
+        raise Undecided(f"the unit of column {column.name} is not said{declared}", place, sign)
     return unit
 
 
-def _not_there(text: str, columns: Sequence[Column], entry: Entry) -> str:
+def _not_there(text: str, columns: Sequence[SourceColumn], entry: ColumnMapping) -> str:
     names = [column.name for column in columns]
     bare = re.sub(r"\s*\[[^\[\]]*\]$", "", text).lstrip("+-")
     near = get_close_matches(bare, names, 1, 0.6)

@@ -10,9 +10,9 @@ import pyarrow.parquet
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.files.foreign.columns import BESIDE, EULER, QUATERNION, TIME, Term
-from magfusion.files.foreign.plan import Plan
-from magfusion.files.foreign.source import Part
+from magfusion.files.foreign.columns import EULER, OPTIONAL_COLUMNS, QUATERNION, TIME, Term
+from magfusion.files.foreign.plan import ImportPlan
+from magfusion.files.foreign.source import RowBlock
 from magfusion.files.foreign.units import NO_STAMP, Raw, to_nanoseconds
 from magfusion.files.lost_rows import MOST_MISSING, MOST_TWICE
 from magfusion.files.plausible import SHORTEST_STEP
@@ -59,7 +59,7 @@ class Counts:
 
 
 def write_stream(
-    plan: Plan, path: Path, shared: bool = False, report: Callable[[int], None] | None = None
+    plan: ImportPlan, path: Path, shared: bool = False, report: Callable[[int], None] | None = None
 ) -> Counts:
     """Write the table of a stream as Parquet, sorted by time.
 
@@ -109,7 +109,7 @@ def write_stream(
     return counts
 
 
-def _stamps(plan: Plan, raw: dict[int, Raw], part: Part) -> IntArray:
+def _stamps(plan: ImportPlan, raw: dict[int, Raw], part: RowBlock) -> IntArray:
     if plan.rate is not None:
         start = plan.shift_ns + round(plan.rate.start_s * 10**9)
         step = float(10**9 / plan.rate.hz)
@@ -119,10 +119,10 @@ def _stamps(plan: Plan, raw: dict[int, Raw], part: Part) -> IntArray:
     for term in plan.terms[TIME]:
         try:
             stamps = to_nanoseconds(raw[term.place], term.unit)
-        except ValueError as found:
+        except ValueError as result:
             name = plan.source.columns[term.place].name
             raise InputError(
-                f"{plan.source.place}: column {name}: found {str(found)!r}, which is no time in"
+                f"{plan.source.place}: column {name}: found {str(result)!r}, which is no time in"
                 f" {term.unit}; name another unit by --map '{plan.stream}.time={name}[unit]'"
                 " (iso for dates as 2024-05-01T12:00:00.5)."
             ) from None
@@ -136,19 +136,19 @@ def _written(name: str) -> tuple[str, ...]:
     return QUATERNION if name in EULER else (name,)
 
 
-def _values(plan: Plan, raw: dict[int, Raw], names: list[str]) -> Array:
-    found = {
+def _values(plan: ImportPlan, raw: dict[int, Raw], names: list[str]) -> Array:
+    result = {
         name: _si(raw[terms[0].place], terms[0])
         for name, terms in plan.terms.items()
         if name != TIME
     }
-    if EULER[0] in found:
-        angles = np.stack([found.pop(name) for name in reversed(EULER)], axis=1)
+    if EULER[0] in result:
+        angles = np.stack([result.pop(name) for name in reversed(EULER)], axis=1)
         known = np.isfinite(angles).all(axis=1)
-        turned = np.full((len(angles), 4), np.nan)
-        turned[known] = Rotation.from_euler("ZYX", angles[known]).as_quat(scalar_first=True)
-        found |= dict(zip(QUATERNION, turned.T, strict=True))
-    values = np.stack([found[name] for name in names], axis=1)
+        rotated = np.full((len(angles), 4), np.nan)
+        rotated[known] = Rotation.from_euler("ZYX", angles[known]).as_quat(scalar_first=True)
+        result |= dict(zip(QUATERNION, rotated.T, strict=True))
+    values = np.stack([result[name] for name in names], axis=1)
     values[~(np.abs(values) < LARGEST_NUMBER)] = np.nan
     return values
 
@@ -160,7 +160,7 @@ def _si(raw: Raw, term: Term) -> AnyArray:
 
 
 def _kept(
-    plan: Plan,
+    plan: ImportPlan,
     names: list[str],
     stamps: IntArray,
     values: Array,
@@ -171,7 +171,7 @@ def _kept(
     counts.read += len(stamps)
     keep: BoolArray = stamps != NO_STAMP
     counts.leave_out("without a time", int(np.sum(~keep)))
-    needed = [name not in BESIDE.get(plan.stream, {}) for name in names]
+    needed = [name not in OPTIONAL_COLUMNS.get(plan.stream, {}) for name in names]
     missing: BoolArray = np.asarray(np.isnan(values[:, needed]).any(axis=1))
     if plan.stream == "truth":
         # A truth has no use for rows that hold no pose; a stream of samples knows that one is lost.
@@ -200,7 +200,7 @@ def _kept(
     return stamps, values
 
 
-def _refuse_jumps(plan: Plan, stamps: IntArray, rows: IntArray, counts: Counts) -> None:
+def _refuse_jumps(plan: ImportPlan, stamps: IntArray, rows: IntArray, counts: Counts) -> None:
     before = counts.last if counts.written else int(stamps[0])
     steps = np.diff(stamps.astype(np.float64), prepend=float(before)) * NANOSECOND
     far = np.abs(stamps) > LARGEST_TIME_NS
@@ -241,12 +241,12 @@ def _sort(path: Path, counts: Counts) -> None:
     )
 
 
-def _check(plan: Plan, counts: Counts) -> None:
+def _check(plan: ImportPlan, counts: Counts) -> None:
     place, stream = plan.source.place, plan.stream
     if not counts.written:
         reasons = ", ".join(f"{n} {reason}" for reason, n in counts.left_out.items())
-        found = f"none of {counts.read} rows can be used ({reasons})" if counts.read else "no rows"
-        raise InputError(f"{place}: {found} for {stream}; record it again, or map other columns.")
+        result = f"none of {counts.read} rows can be used ({reasons})" if counts.read else "no rows"
+        raise InputError(f"{place}: {result} for {stream}; record it again, or map other columns.")
     twice = counts.left_out.get("with the stamp of another", 0)
     if twice > MOST_TWICE * (counts.written + twice):
         raise InputError(
@@ -255,9 +255,9 @@ def _check(plan: Plan, counts: Counts) -> None:
             f" {stream}=HZ."
         )
     step = (counts.last - counts.first) * NANOSECOND / max(1, counts.written - 1)
-    least, most = STEPS.get(stream, (0.0, np.inf))
-    if counts.written > 1 and not least <= step <= most:
-        kind = "slow" if step > most else "fast"
+    least, maximum = STEPS.get(stream, (0.0, np.inf))
+    if counts.written > 1 and not least <= step <= maximum:
+        kind = "slow" if step > maximum else "fast"
         raise InputError(
             f"{place}: the rows of {stream} are {step:.3g} s apart (mean), which is too {kind} for"
             f" such a sensor: {stream}.time is probably in another unit; write it by --map"

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from magfusion.errors import InputError
-from magfusion.files.foreign.source import Column
+from magfusion.files.foreign.source import SourceColumn
 from magfusion.files.foreign.units import MISSING, Dimension, parse_unit
 
 HEAD = 1 << 18  # bytes that are looked at
@@ -48,7 +48,7 @@ class Dialect:
     encoding: str
     offset: int
     line: int
-    columns: tuple[Column, ...]
+    columns: tuple[SourceColumn, ...]
 
     def __str__(self) -> str:
         words = {sign: word for word, sign in WORDS.items()}
@@ -78,17 +78,19 @@ def find_dialect(path: Path, delimiter: str | None = None) -> Dialect:
     if len(content) == HEAD and len(lines) > 1:
         lines.pop()  # cut
     bare = [line.strip() for line in lines]
-    asked = None if delimiter is None else WORDS.get(delimiter, delimiter)
-    if asked is not None and len(asked) != 1:
+    requested = None if delimiter is None else WORDS.get(delimiter, delimiter)
+    if requested is not None and len(requested) != 1:
         raise InputError(
             f"--delimiter {delimiter!r}: write one character, or one of {', '.join(WORDS)}"
         )
-    sign, decimal, width = _way_of_writing(bare, DELIMITERS if asked is None else (asked,), path)
+    sign, decimal, width = _way_of_writing(
+        bare, DELIMITERS if requested is None else (requested,), path
+    )
     begin = next(k for k, line in enumerate(bare) if _is_data(line, sign, decimal, width))
     offset = mark + len("".join(lines[:begin]).encode(encoding))
     names, units = _header(bare[:begin], sign, width)
     columns = tuple(
-        Column(name or str(k), unit)
+        SourceColumn(name or str(k), unit)
         for k, (name, unit) in enumerate(zip(names, units, strict=True))
     )
     return Dialect(sign, decimal, encoding, offset, begin + 1, columns)
@@ -147,7 +149,7 @@ def _way_of_writing(
     """Return delimiter, decimal sign and number of columns that make most cells numbers."""
     filled = [line for line in lines if line and not line.startswith(COMMENTS)]
     sample = filled[len(filled) // 3 :][-SAMPLE:]  # the first are names, if there are any
-    best, found = 0.0, None
+    best, result = 0.0, None
     for sign in delimiters:
         rows = [cells_of(line, sign) for line in sample]
         width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
@@ -156,14 +158,14 @@ def _way_of_writing(
         for decimal in ".,":
             score = _share_of_numbers(rows, width, decimal)
             if score > best:
-                best, found = score, (sign, decimal, width)
-    if found is None or best < LEAST_SCORE:
+                best, result = score, (sign, decimal, width)
+    if result is None or best < LEAST_SCORE:
         shown = next((line for line in lines if line), "")[:60]
         raise InputError(
             f"{path}: holds no table of numbers (first line: {shown!r}); write a row of names and"
             " rows of numbers, or name the --delimiter."
         )
-    return found
+    return result
 
 
 def _share_of_numbers(rows: Sequence[Sequence[str]], width: int, decimal: str) -> float:
@@ -211,8 +213,8 @@ def _row_of_names(line: str, sign: str, width: int) -> list[str] | None:
 
 
 def _unbracketed(cell: str) -> str:
-    found = re.fullmatch(r"[\[(](.*)[\])]", cell)
-    return found[1].strip() if found else cell
+    result = re.fullmatch(r"[\[(](.*)[\])]", cell)
+    return result[1].strip() if result else cell
 
 
 def _is_unit(text: str) -> bool:

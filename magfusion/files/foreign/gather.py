@@ -11,12 +11,12 @@ from magfusion.files.foreign.arrays import ARRAYS, array_source
 from magfusion.files.foreign.bag_table import plan_bag
 from magfusion.files.foreign.columns import EULER, STREAMS, TIME, Term, Undecided, place_of
 from magfusion.files.foreign.guess import streams_of
-from magfusion.files.foreign.map_file import Asked
-from magfusion.files.foreign.plan import Findings, Plan, Terms, plan_stream
+from magfusion.files.foreign.map_file import ImportRequest
+from magfusion.files.foreign.plan import Findings, ImportPlan, Terms, plan_stream
 from magfusion.files.foreign.rows import rows_where
 from magfusion.files.foreign.source import Source
 from magfusion.files.foreign.text import text_source
-from magfusion.files.foreign.units import Dimension, Unit, parse_unit
+from magfusion.files.foreign.units import Dimension, SourceUnit, parse_unit
 from magfusion.files.log import is_log
 from magfusion.files.table import find_table
 
@@ -34,7 +34,7 @@ _SI = {
 
 
 @dataclass(eq=False)
-class Gathered:
+class GatheredStreams:
     """Streams of one recording.
 
     Parameters
@@ -46,141 +46,149 @@ class Gathered:
         Whether the formats have their own convention of an epoch: the first inertial sample.
     """
 
-    told: Findings
-    plans: dict[str, Plan] = field(default_factory=dict)
+    findings: Findings
+    plans: dict[str, ImportPlan] = field(default_factory=dict)
     bags: list[Path] = field(default_factory=list)
     stamped: bool = False
     opened: dict[Path, Source] = field(default_factory=dict)
     passed_over: list[str] = field(default_factory=list)
 
-    def add(self, plan: Plan | None) -> None:
+    def add(self, plan: ImportPlan | None) -> None:
         """Add a stream, of which there may be one."""
         if plan is not None and plan.stream in self.plans:
             places = f"{self.plans[plan.stream].source.place} and {plan.source.place}"
-            self.told.problems.append(
+            self.findings.problems.append(
                 f"{places} both hold the {plan.stream}; name one by --{plan.stream} FILE."
             )
         elif plan is not None:
             self.plans[plan.stream] = plan
 
 
-def gather(paths: Sequence[Path], wanted: Asked, told: Findings) -> Gathered:
-    """Return how files become the streams of a log; ``told`` has what stands against it."""
-    found = Gathered(told)
+def gather(paths: Sequence[Path], wanted: ImportRequest, declared: Findings) -> GatheredStreams:
+    """Return how files become the streams of a log; ``declared`` has what stands against it."""
+    result = GatheredStreams(declared)
     attempted = set(wanted.files)
     for stream, path in wanted.files.items():
-        if (source := _opened(path, wanted, found)) is not None:
-            found.add(_table(stream, path, source, wanted, told))
+        if (source := _opened(path, wanted, result)) is not None:
+            result.add(_table(stream, path, source, wanted, declared))
     for path in paths:
         try:
-            attempted |= _add(path, wanted, found)
+            attempted |= _add(path, wanted, result)
         except InputError as error:
-            told.problems.append(str(error))
+            declared.problems.append(str(error))
             attempted |= set(STREAMS)
-    attempted |= _halves(found, attempted, set(wanted.files))
+    attempted |= _halves(result, attempted, set(wanted.files))
     if "magnetometer" not in attempted:
-        told.problems.append("No table is given for the magnetometer; give --magnetometer FILE.")
-    elif "magnetometer" in found.plans and not {"imu", "gyro", "accel"} & set(found.plans):
-        found.passed_over.append(
+        declared.problems.append(
+            "No table is given for the magnetometer; give --magnetometer FILE."
+        )
+    elif "magnetometer" in result.plans and not {"imu", "gyro", "accel"} & set(result.plans):
+        result.passed_over.append(
             "the imu, of which no table is given (--imu FILE): the log has no inertial samples"
         )
-    _refuse_unused(found, wanted)
-    told.problems += found.passed_over if told.problems else []  # what is lacking may be there
-    for stream, plan in found.plans.items():
-        found.plans[stream] = replace(plan, shift_ns=wanted.shifts_ns.get(stream, 0))
+    _refuse_unused(result, wanted)
+    declared.problems += (
+        result.passed_over if declared.problems else []
+    )  # what is lacking may be there
+    for stream, plan in result.plans.items():
+        result.plans[stream] = replace(plan, shift_ns=wanted.shifts_ns.get(stream, 0))
     for stream in wanted.entries:
         if stream not in attempted:
-            told.problems.append(
+            declared.problems.append(
                 f"--map '{wanted.entries[stream][0]}': no file is given for {stream}; give"
                 f" --{stream} FILE."
             )
-    return found
+    return result
 
 
-def _refuse_unused(found: Gathered, wanted: Asked) -> None:
+def _refuse_unused(result: GatheredStreams, wanted: ImportRequest) -> None:
     """Refuse options of tables that are not read: a clock that is not moved would pass silently."""
-    if found.told.problems:
+    if result.findings.problems:
         return
     for option, streams in (("offset", wanted.shifts_ns), ("rows", wanted.rows)):
         for stream in streams:
-            of_format = option == "rows" and found.stamped and stream not in wanted.files
-            if stream in found.plans and not of_format:
+            of_format = option == "rows" and result.stamped and stream not in wanted.files
+            if stream in result.plans and not of_format:
                 continue
-            read = ", ".join(found.plans)
-            found.told.problems.append(
+            read = ", ".join(result.plans)
+            result.findings.problems.append(
                 f"--{option} {stream}: no table of {stream} is read (there are {read}); name one"
                 f" of these, or give --{stream} FILE."
             )
 
 
-def _halves(found: Gathered, attempted: set[str], named: set[str]) -> set[str]:
+def _halves(result: GatheredStreams, attempted: set[str], named: set[str]) -> set[str]:
     """Return whether gyro and accelerometer of two tables make the inertial stream."""
     halves = {"gyro", "accel"}
     if "imu" in attempted:
-        for stream in halves & set(found.plans):
+        for stream in halves & set(result.plans):
             if stream in named and "imu" in named:
-                found.told.problems.append(
+                result.findings.problems.append(
                     f"--imu and --{stream} are given; leave out one of them."
                 )
             elif stream in named:
-                place = found.plans["imu"].source.place if "imu" in found.plans else "another table"
-                found.told.problems.append(
+                place = (
+                    result.plans["imu"].source.place if "imu" in result.plans else "another table"
+                )
+                result.findings.problems.append(
                     f"--{stream} is given, and {place} holds a whole imu; leave out one of them."
                 )
-            del found.plans[stream]
+            del result.plans[stream]
         return set()
     for stream in halves - attempted if halves & attempted else ():
-        found.told.problems.append(
+        result.findings.problems.append(
             f"The {stream} is lacking beside the other half of the inertial sensor; give --{stream}"
             " FILE."
         )
     return {"imu"} if halves & attempted else set()
 
 
-def _add(path: Path, wanted: Asked, found: Gathered) -> set[str]:
+def _add(path: Path, wanted: ImportRequest, result: GatheredStreams) -> set[str]:
     """Add a positional source; return the streams that were looked for in it."""
     if not path.exists():
         raise InputError(f"{path}: there is no such file or directory; give the path of a source.")
     if path.is_dir() and is_log(path):
         raise InputError(f"{path}: is a log of magfusion already; nothing is to import.")
     if is_bag(path):
-        return _add_bag(path, wanted, found)
+        return _add_bag(path, wanted, result)
     if path.is_dir() and is_euroc(path):
-        return _add_euroc(path, wanted, found)
+        return _add_euroc(path, wanted, result)
     files = _tables_in(path) if path.is_dir() else [path]
     if not files:
         raise InputError(
             f"{path}: holds no table ({', '.join((*TEXTS, *ARRAYS))}), no bag and no folder mav0;"
             " give the path of a source."
         )
-    return {stream for file in files for stream in _add_table(file, wanted, found, path.is_dir())}
+    return {stream for file in files for stream in _add_table(file, wanted, result, path.is_dir())}
 
 
-def _add_bag(path: Path, wanted: Asked, found: Gathered) -> set[str]:
-    found.bags.append(path)
-    found.stamped = True
+def _add_bag(path: Path, wanted: ImportRequest, result: GatheredStreams) -> set[str]:
+    result.bags.append(path)
+    result.stamped = True
     entries = {s: e for s, e in wanted.entries.items() if s not in wanted.files}
-    for plan in plan_bag(path, entries, tuple(wanted.files), found.told):
-        found.add(plan)
+    for plan in plan_bag(path, entries, tuple(wanted.files), result.findings):
+        result.add(plan)
     return set(STREAMS)
 
 
-def _add_table(file: Path, wanted: Asked, found: Gathered, among_others: bool) -> set[str]:
-    before = len(found.told.problems)
-    source = _opened(file, wanted, found)
+def _add_table(
+    file: Path, wanted: ImportRequest, result: GatheredStreams, among_others: bool
+) -> set[str]:
+    before = len(result.findings.problems)
+    source = _opened(file, wanted, result)
     if source is None and among_others:
-        found.passed_over += found.told.problems[before:]
-        del found.told.problems[before:]
+        result.passed_over += result.findings.problems[before:]
+        del result.findings.problems[before:]
         return set()
     if source is None:
         return set(STREAMS)
     streams = {"truth"} if file.suffix.lower() == ".tum" else streams_of(source.columns, file.stem)
     for stream in sorted(streams - set(wanted.files)):
-        found.add(_table(stream, file, source, wanted, found.told))
+        result.add(_table(stream, file, source, wanted, result.findings))
     if streams or among_others:
         return streams
     names = ", ".join(column.name for column in source.columns[:30])
-    found.told.problems.append(
+    result.findings.problems.append(
         f"{file}: its columns do not say what they are (found {names}); say whose table it is by"
         " --imu, --magnetometer or --truth."
     )
@@ -195,9 +203,9 @@ def _tables_in(directory: Path) -> list[Path]:
     )
 
 
-def _opened(path: Path, wanted: Asked, found: Gathered) -> Source | None:
-    if path in found.opened:
-        return found.opened[path]
+def _opened(path: Path, wanted: ImportRequest, result: GatheredStreams) -> Source | None:
+    if path in result.opened:
+        return result.opened[path]
     try:
         if not path.is_file():
             what = "is a directory" if path.is_dir() else "there is no such file"
@@ -207,23 +215,25 @@ def _opened(path: Path, wanted: Asked, found: Gathered) -> Source | None:
         else:
             source = text_source(path, wanted.delimiter)
     except InputError as error:
-        found.told.problems.append(str(error))
+        result.findings.problems.append(str(error))
         return None
-    found.opened[path] = source
+    result.opened[path] = source
     return source
 
 
-def _table(stream: str, path: Path, source: Source, wanted: Asked, told: Findings) -> Plan | None:
+def _table(
+    stream: str, path: Path, source: Source, wanted: ImportRequest, declared: Findings
+) -> ImportPlan | None:
     if stream in wanted.rows:
         column, value = wanted.rows[stream]
         try:
             place = place_of(column, source.columns)
         except Undecided as reason:
-            told.problems.append(f"{source.place}: --rows {stream}={column}:{value}: {reason}.")
+            declared.problems.append(f"{source.place}: --rows {stream}={column}:{value}: {reason}.")
             return None
         if place is None:
             names = ", ".join(one.name for one in source.columns[:30])
-            told.problems.append(
+            declared.problems.append(
                 f"{source.place}: --rows {stream}={column}:{value}: there is no column {column}"
                 f" (found {names})."
             )
@@ -233,7 +243,7 @@ def _table(stream: str, path: Path, source: Source, wanted: Asked, told: Finding
     if path.suffix.lower() == ".tum" and stream == "truth":
         usual = _by_place(stream, (TIME, *_TUM), source, {Dimension.TIME: "s"})
     entries, rate = wanted.entries.get(stream, ()), wanted.rates.get(stream)
-    return plan_stream(stream, source, entries, rate, told, usual)
+    return plan_stream(stream, source, entries, rate, declared, usual)
 
 
 def _by_place(
@@ -245,7 +255,7 @@ def _by_place(
         dimension = STREAMS[stream][name]
         tag = column.name.partition("[")[2].rstrip("] ")
         unit = parse_unit(tag, dimension) if tag else None
-        usual = Unit((_SI | (units or {}))[dimension], dimension)
+        usual = SourceUnit((_SI | (units or {}))[dimension], dimension)
         terms[name] = (Term(place, unit or usual),)
     return terms
 
@@ -261,22 +271,22 @@ def _euroc_tables(path: Path) -> Iterator[tuple[str, Path]]:
         yield "truth", truth
 
 
-def _add_euroc(path: Path, wanted: Asked, found: Gathered) -> set[str]:
+def _add_euroc(path: Path, wanted: ImportRequest, result: GatheredStreams) -> set[str]:
     streams: set[str] = set()
-    found.stamped = True
+    result.stamped = True
     for stream, table in _euroc_tables(path):
         streams.add(stream)
-        if stream in wanted.files or (source := _opened(table, wanted, found)) is None:
+        if stream in wanted.files or (source := _opened(table, wanted, result)) is None:
             continue
         names = [name for name in STREAMS[stream] if name not in EULER]
         usual = _by_place(stream, names, source)
         if len(usual) < len(names):
             usual = {name: terms for name, terms in usual.items() if "velocity" not in name}
         entries, rate = wanted.entries.get(stream, ()), wanted.rates.get(stream)
-        found.add(plan_stream(stream, source, entries, rate, found.told, usual))
+        result.add(plan_stream(stream, source, entries, rate, result.findings, usual))
     if "magnetometer" not in streams | set(wanted.files):
         folders = ", ".join(sorted(entry.name for entry in (path / "mav0").iterdir()))
-        found.told.problems.append(
+        result.findings.problems.append(
             f"{path}: mav0 holds no folder of a magnetometer (found {folders}); call it mag0, or"
             " give --magnetometer FILE."
         )

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.files.foreign.columns import EULER, STREAMS, TIME, Term
-from magfusion.files.foreign.source import Column
+from magfusion.files.foreign.source import SourceColumn
 from magfusion.files.foreign.units import (
     ISO,
     UNITS,
     Dimension,
     Raw,
-    Unit,
+    SourceUnit,
     parse_unit,
 )
 from magfusion.units import STANDARD_GRAVITY, Array
@@ -88,35 +88,35 @@ class Named:
 
     Parameters
     ----------
-    unit : Unit, optional
+    unit : SourceUnit, optional
         That the name, or the file, says.
     """
 
     place: int
     target: str
-    unit: Unit | None
+    unit: SourceUnit | None
 
 
-def named_columns(columns: Sequence[Column], stream: str) -> dict[str, list[Named]]:
+def named_columns(columns: Sequence[SourceColumn], stream: str) -> dict[str, list[Named]]:
     """Return for each column of a stream those of a file whose names say that they are it."""
-    found: dict[str, list[Named]] = {target: [] for target in STREAMS[stream]}
+    result: dict[str, list[Named]] = {target: [] for target in STREAMS[stream]}
     for place, column in enumerate(columns):
         if (one := _named(place, column, stream)) is not None:
-            found[one.target].append(one)
-    return {target: _nearest(named, columns, stream) for target, named in found.items()}
+            result[one.target].append(one)
+    return {target: _nearest(named, columns, stream) for target, named in result.items()}
 
 
-def parted_stamp(columns: Sequence[Column]) -> tuple[Term, ...]:
+def two_column_stamp(columns: Sequence[SourceColumn]) -> tuple[Term, ...]:
     """Return seconds and nanoseconds of stamps that are in two columns, if there are such."""
     whole = [k for k, column in enumerate(columns) if _WHOLE.search(column.name)]
     rest = [k for k, column in enumerate(columns) if _REST.search(column.name)]
     if len(whole) != 1 or len(rest) != 1:
         return ()
-    units = [Unit(name, Dimension.TIME) for name in ("s", "ns")]
+    units = [SourceUnit(name, Dimension.TIME) for name in ("s", "ns")]
     return tuple(Term(*one) for one in zip((whole[0], rest[0]), units, strict=True))
 
 
-def _named(place: int, column: Column, stream: str) -> Named | None:
+def _named(place: int, column: SourceColumn, stream: str) -> Named | None:
     if _NOT_MEASURED.search(column.name.casefold()):
         return None
     for name, text in _readings(column):
@@ -132,12 +132,12 @@ def _named(place: int, column: Column, stream: str) -> Named | None:
     return None if target is None else Named(place, target, None)
 
 
-def _readings(column: Column) -> list[tuple[str, str]]:
+def _readings(column: SourceColumn) -> list[tuple[str, str]]:
     """Return the ways to part a name from its unit, the surest first."""
     indexed = re.fullmatch(r"(.*)(?:\[([012])\]|:([012]))", column.name)
     if indexed is not None:
         axis = "xyz"[int(indexed[2] or indexed[3])]
-        parts = _readings(Column(indexed[1], column.unit))
+        parts = _readings(SourceColumn(indexed[1], column.unit))
         return [(f"{name}_{axis}", unit) for name, unit in parts]
     name = column.name
     tag = re.fullmatch(r"(.*?)\s*[\[(]([^\[\]()]*)[\])]\s*", name)
@@ -181,7 +181,7 @@ def _is(norm: str, stem: str, axis: str, stream: str) -> bool:
     )
 
 
-def _nearest(named: list[Named], columns: Sequence[Column], stream: str) -> list[Named]:
+def _nearest(named: list[Named], columns: Sequence[SourceColumn], stream: str) -> list[Named]:
     """Return, of several, the ones whose name says of which stream they are."""
     if len(named) < 2:
         return named
@@ -196,10 +196,10 @@ def _nearest(named: list[Named], columns: Sequence[Column], stream: str) -> list
     return [one for one in named if score(one) == best]
 
 
-def streams_of(columns: Sequence[Column], file_stem: str) -> set[str]:
+def streams_of(columns: Sequence[SourceColumn], file_stem: str) -> set[str]:
     """Return the streams that the names of a file and of its columns make whole."""
-    found = set()
-    said = {name for name, text in _OF_FILE.items() if text.search(file_stem.casefold())}
+    result = set()
+    declared = {name for name, text in _OF_FILE.items() if text.search(file_stem.casefold())}
     for stream, needed in (
         ("imu", ("gyro_x", "accel_x")),
         ("gyro", ("gyro_x",)),
@@ -209,35 +209,39 @@ def streams_of(columns: Sequence[Column], file_stem: str) -> set[str]:
         ("truth", ("position_x", "roll")),
     ):
         named = named_columns(columns, stream)
-        if all(any(_sure(n, columns, stream, said) for n in named[one]) for one in needed):
-            found.add(stream)
-    return found - {"gyro", "accel"} if "imu" in found else found
+        if all(
+            any(_is_certain(n, columns, stream, declared) for n in named[one]) for one in needed
+        ):
+            result.add(stream)
+    return result - {"gyro", "accel"} if "imu" in result else result
 
 
-def _sure(named: Named, columns: Sequence[Column], stream: str, said: set[str]) -> bool:
+def _is_certain(
+    named: Named, columns: Sequence[SourceColumn], stream: str, declared: set[str]
+) -> bool:
     """Tell whether a column is of a stream; of an x alone its file or its unit has to say so."""
     bare, _ = _readings(columns[named.place])[0]
     if stream == "truth" or bare.strip().casefold() != "x":
         return True
-    return stream in said if said else named.unit is not None
+    return stream in declared if declared else named.unit is not None
 
 
-def likely_unit(dimension: Dimension, values: Array) -> Unit:
+def likely_unit(dimension: Dimension, values: Array) -> SourceUnit:
     """Return the unit in which the sizes of vectors, shape (n,), would be plausible."""
     known = np.abs(values[np.isfinite(values)])
     size = float(np.median(known)) if len(known) else 0.0
     if dimension in _TYPICAL and size > 0.0:
         typical = _TYPICAL[dimension]
         names = {name: abs(np.log(size * si / typical)) for name, si in UNITS[dimension].items()}
-        return Unit(min(names, key=lambda name: names[name]), dimension)
+        return SourceUnit(min(names, key=lambda name: names[name]), dimension)
     if dimension is Dimension.RATE:
-        return Unit("deg/s" if np.sqrt(np.mean(known**2)) > FAST else "rad/s", dimension)
+        return SourceUnit("deg/s" if np.sqrt(np.mean(known**2)) > FAST else "rad/s", dimension)
     if dimension is Dimension.LENGTH:
-        return Unit("mm" if size > FAR else "m", dimension)
-    return Unit(next(iter(UNITS[dimension])), dimension)
+        return SourceUnit("mm" if size > FAR else "m", dimension)
+    return SourceUnit(next(iter(UNITS[dimension])), dimension)
 
 
-def likely_time_unit(raw: Raw) -> Unit:
+def likely_time_unit(raw: Raw) -> SourceUnit:
     """Return the unit in which stamps would have a plausible rate."""
     try:
         values = np.asarray(
@@ -245,7 +249,7 @@ def likely_time_unit(raw: Raw) -> Unit:
         )
         steps = np.diff(values.astype(np.float64))
     except (ValueError, TypeError):
-        return Unit(ISO, Dimension.TIME)
+        return SourceUnit(ISO, Dimension.TIME)
     steps = steps[steps > 0]
     step = float(np.median(steps)) if len(steps) else 0.0
     for name in ("s", "ms", "us", "ns"):
@@ -253,13 +257,13 @@ def likely_time_unit(raw: Raw) -> Unit:
             step > 0.0
             and _RATES_HZ[0] <= 1.0 / (step * UNITS[Dimension.TIME][name]) <= _RATES_HZ[1]
         ):
-            return Unit(name, Dimension.TIME)
-    return Unit("s", Dimension.TIME)
+            return SourceUnit(name, Dimension.TIME)
+    return SourceUnit("s", Dimension.TIME)
 
 
 def by_place(
-    stream: str, columns: Sequence[Column], samples: Sequence[Array], dates: Sequence[bool]
-) -> dict[str, tuple[int, Unit]]:
+    stream: str, columns: Sequence[SourceColumn], samples: Sequence[Array], dates: Sequence[bool]
+) -> dict[str, tuple[int, SourceUnit]]:
     """Return what columns of unknown names may be, by their units, places and sizes.
 
     Parameters
@@ -269,49 +273,53 @@ def by_place(
     dates : sequence of bool
         Whether a column holds dates.
     """
-    found = _first_clock(samples, dates)
-    clocks = [place for place, _ in found.values()]
-    free = [k for k in range(len(columns)) if k not in clocks and len(samples[k])]
+    result = _first_clock(samples, dates)
+    clocks = [place for place, _ in result.values()]
+    open_terms = [k for k in range(len(columns)) if k not in clocks and len(samples[k])]
     dimensions = {stem: STREAMS[stream][f"{stem}_x"] for stem in _VECTORS.get(stream, ())}
     for stem in list(dimensions):
-        triple = _by_unit(columns, free, dimensions[stem])
+        triple = _by_unit(columns, open_terms, dimensions[stem])
         if triple:
-            found |= _along_axes(stem, triple)
-            free = [k for k in free if k not in dict(triple)]
+            result |= _along_axes(stem, triple)
+            open_terms = [k for k in open_terms if k not in dict(triple)]
             del dimensions[stem]
-    for stem, triple in _by_size(samples, free, dimensions).items():
-        found |= _along_axes(stem, triple)
-    return found
+    for stem, triple in _by_size(samples, open_terms, dimensions).items():
+        result |= _along_axes(stem, triple)
+    return result
 
 
-def _first_clock(samples: Sequence[Array], dates: Sequence[bool]) -> dict[str, tuple[int, Unit]]:
+def _first_clock(
+    samples: Sequence[Array], dates: Sequence[bool]
+) -> dict[str, tuple[int, SourceUnit]]:
     """Return the first column that holds dates, or that rises as stamps do."""
     for place, (values, dated) in enumerate(zip(samples, dates, strict=True)):
         if dated:
-            return {TIME: (place, Unit(ISO, Dimension.TIME))}
+            return {TIME: (place, SourceUnit(ISO, Dimension.TIME))}
         if len(values) > 1 and _is_clock(values):
             return {TIME: (place, likely_time_unit(values))}
     return {}
 
 
-def _along_axes(stem: str, triple: list[tuple[int, Unit]]) -> dict[str, tuple[int, Unit]]:
+def _along_axes(
+    stem: str, triple: list[tuple[int, SourceUnit]]
+) -> dict[str, tuple[int, SourceUnit]]:
     return {f"{stem}_{axis}": one for axis, one in zip("xyz", triple, strict=True)}
 
 
 def _by_unit(
-    columns: Sequence[Column], free: list[int], dimension: Dimension
-) -> list[tuple[int, Unit]]:
+    columns: Sequence[SourceColumn], open_terms: list[int], dimension: Dimension
+) -> list[tuple[int, SourceUnit]]:
     """Return the three columns whose units are of a dimension; none where there are not three."""
-    units = ((k, _unit_in(columns[k], dimension)) for k in free)
+    units = ((k, _unit_in(columns[k], dimension)) for k in open_terms)
     tagged = [(k, unit) for k, unit in units if unit is not None]
     return tagged if len(tagged) == 3 else []
 
 
 def _by_size(
-    samples: Sequence[Array], free: list[int], dimensions: dict[str, Dimension]
-) -> dict[str, list[tuple[int, Unit]]]:
+    samples: Sequence[Array], open_terms: list[int], dimensions: dict[str, Dimension]
+) -> dict[str, list[tuple[int, SourceUnit]]]:
     """Return, three columns after the other, vectors with the units that their sizes suggest."""
-    triples = [free[k : k + 3] for k in range(0, len(free) - len(free) % 3, 3)]
+    triples = [open_terms[k : k + 3] for k in range(0, len(open_terms) - len(open_terms) % 3, 3)]
     if not dimensions or len(triples) < len(dimensions):
         return {}
     sizes = [_sizes([samples[k] for k in triple]) for triple in triples]
@@ -326,7 +334,7 @@ def _by_size(
     }
 
 
-def _unit_in(column: Column, dimension: Dimension) -> Unit | None:
+def _unit_in(column: SourceColumn, dimension: Dimension) -> SourceUnit | None:
     """Return the unit of a dimension that a column of unknown name has."""
     units = (parse_unit(text, dimension) for _, text in _readings(column) if text)
     return next((unit for unit in units if unit is not None), None)

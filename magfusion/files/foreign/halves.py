@@ -16,7 +16,7 @@ from magfusion.units import NANOSECOND, Array, IntArray
 
 HALVES = ("gyro", "accel")
 UNCOVERED = "outside of the other half's table"
-ALIKE = 0.9  # of a rate; where both are alike, the gyro's samples are kept
+MIN_RATE_RATIO = 0.9  # of a rate; where both are alike, the gyro's samples are kept
 MOST_STEPS = 3.5  # of the slower half, between which it is interpolated; farther is missing
 
 
@@ -45,31 +45,31 @@ def join_halves(directory: Path, counts: dict[str, Counts]) -> Joined:
     InputError
         Where they have no moment in common.
     """
-    gyro_leads = _rate(counts["gyro"]) > ALIKE * _rate(counts["accel"])
+    gyro_leads = _rate(counts["gyro"]) > MIN_RATE_RATIO * _rate(counts["accel"])
     fast, slow = HALVES if gyro_leads else HALVES[::-1]
     paths = {half: directory / f"{half}.parquet" for half in HALVES}
     begin, end = _in_common(counts)
     names = [f"{half}_{axis}" for half in HALVES for axis in "xyz"]
     schema = pa.schema([(TIME, pa.int64()), *((name, pa.float64()) for name in names)])
-    made = Counts(read=counts[fast].read)
+    built = Counts(read=counts[fast].read)
     reach = round(MOST_STEPS * 1e9 / _rate(counts[slow]))  # ns
     exact = True
     options = {"compression": "zstd", "write_page_checksum": True}
     with pa.parquet.ParquetWriter(directory / "imu.parquet", schema, **options) as writer:
         for stamps, own in _parts(paths[fast], fast):
             inside = (stamps >= begin) & (stamps <= end)
-            made.leave_out(UNCOVERED, int(np.sum(~inside)))
+            built.leave_out(UNCOVERED, int(np.sum(~inside)))
             stamps, own = stamps[inside], own[inside]
             if not len(stamps):
                 continue
-            other, same = _beside(paths[slow], slow, stamps, reach)
+            other, same = _interpolated_half(paths[slow], slow, stamps, reach)
             exact &= same
             halves = {fast: own, slow: other}
             values = np.concatenate([halves[half] for half in HALVES], axis=1)
-            made.missing += int(np.sum(np.isnan(values).any(axis=1)))
-            made.written += len(stamps)
-            made.first = min(made.first, int(stamps[0]))
-            made.last = max(made.last, int(stamps[-1]))
+            built.missing += int(np.sum(np.isnan(values).any(axis=1)))
+            built.written += len(stamps)
+            built.first = min(built.first, int(stamps[0]))
+            built.last = max(built.last, int(stamps[-1]))
             columns = dict(zip(schema.names, [stamps, *values.T], strict=True))
             writer.write_table(pa.table(columns), row_group_size=ROWS_PER_GROUP)
     for path in paths.values():
@@ -78,7 +78,7 @@ def join_halves(directory: Path, counts: dict[str, Counts]) -> Joined:
         f"The {slow} was interpolated linearly to the times of the {fast}: they are of two tables,"
         " and sampled apart."
     )
-    return Joined(made, "" if exact else note)
+    return Joined(built, "" if exact else note)
 
 
 def _in_common(counts: dict[str, Counts]) -> tuple[int, int]:
@@ -114,7 +114,7 @@ def _arrays(table: pa.Table, half: str) -> tuple[IntArray, Array]:
     return table[TIME].to_numpy(), values
 
 
-def _beside(path: Path, half: str, stamps: IntArray, reach: int) -> tuple[Array, bool]:
+def _interpolated_half(path: Path, half: str, stamps: IntArray, reach: int) -> tuple[Array, bool]:
     """Return a half at other stamps, and whether all of them are its own."""
     low, high = int(stamps[0]) - reach, int(stamps[-1]) + reach
     near = (pc.field(TIME) >= low) & (pc.field(TIME) <= high)
@@ -127,10 +127,10 @@ def _beside(path: Path, half: str, stamps: IntArray, reach: int) -> tuple[Array,
     same = known[after] == stamps
     before = np.where(same, after, np.maximum(after - 1, 0))
     # Differences of stamps first: doubles do not hold them since 1970.
-    found = np.stack(
+    result = np.stack(
         [np.interp((stamps - low).astype(float), (known - low).astype(float), v) for v in values.T],
         axis=1,
     )
     outside = (known[after] < stamps) | (known[before] > stamps)
-    found[outside | (known[after] - known[before] > reach)] = np.nan
-    return found, bool(np.all(same))
+    result[outside | (known[after] - known[before] > reach)] = np.nan
+    return result, bool(np.all(same))

@@ -9,7 +9,7 @@ from pathlib import Path
 from pydantic import Field
 
 from magfusion.errors import InputError
-from magfusion.files.foreign.columns import STREAMS, Entry, parse_entry
+from magfusion.files.foreign.columns import STREAMS, ColumnMapping, parse_entry
 from magfusion.files.foreign.plan import Findings, Rate
 from magfusion.files.yaml_files import StrictModel, read_yaml
 
@@ -33,7 +33,7 @@ class MapFile(StrictModel):
 
 
 @dataclass(frozen=True)
-class Asked:
+class ImportRequest:
     """What an import is asked for.
 
     Parameters
@@ -49,7 +49,7 @@ class Asked:
     """
 
     files: dict[str, Path]
-    entries: dict[str, list[Entry]]
+    entries: dict[str, list[ColumnMapping]]
     rates: dict[str, Rate] = field(default_factory=dict)
     delimiter: str | None = None
     epoch: str | None = None
@@ -57,7 +57,7 @@ class Asked:
     rows: dict[str, tuple[str, str]] = field(default_factory=dict)
 
 
-def asked(
+def read_request(
     files: Mapping[str, Path | None],
     maps: Sequence[str],
     rates: Sequence[str],
@@ -66,8 +66,8 @@ def asked(
     delimiter: str | None,
     epoch: str | None,
     map_file: Path | None,
-    told: Findings,
-) -> Asked:
+    declared: Findings,
+) -> ImportRequest:
     """Return what options ask for, and what a file asks for beside them.
 
     Raises
@@ -82,15 +82,15 @@ def asked(
         name = getattr(model, stream)
         if name is not None and stream not in named:
             named[stream] = root / name
-    entries = _by_stream((_as_options(model.map), maps), told)
-    return Asked(
+    entries = _by_stream((_as_options(model.map), maps), declared)
+    return ImportRequest(
         named,
         entries,
-        _rates([*_as_options(model.rate_hz), *rates], told),
+        _rates([*_as_options(model.rate_hz), *rates], declared),
         model.delimiter if delimiter is None else delimiter,
         epoch if epoch is not None or model.epoch is None else str(model.epoch),
-        _shifts([*_as_options(model.offset), *offsets], told),
-        _rows([*_as_options(model.rows), *rows], told),
+        _shifts([*_as_options(model.offset), *offsets], declared),
+        _rows([*_as_options(model.rows), *rows], declared),
     )
 
 
@@ -99,31 +99,33 @@ def _as_options(entries: Mapping[str, object]) -> list[str]:
     return [f"{name}={value}" for name, value in entries.items()]
 
 
-def _by_stream(sources: Iterable[Sequence[str]], told: Findings) -> dict[str, list[Entry]]:
+def _by_stream(
+    sources: Iterable[Sequence[str]], declared: Findings
+) -> dict[str, list[ColumnMapping]]:
     """Return what columns of each stream are, by the last source that says so."""
-    entries: dict[str, dict[str, Entry]] = defaultdict(dict)
+    entries: dict[str, dict[str, ColumnMapping]] = defaultdict(dict)
     for lines in sources:
         seen: set[tuple[str, str]] = set()
-        for entry in _entries(lines, told):
+        for entry in _entries(lines, declared):
             if (entry.stream, entry.column) in seen:
-                told.problems.append(f"--map {entry.stream}.{entry.column} is given twice.")
+                declared.problems.append(f"--map {entry.stream}.{entry.column} is given twice.")
             seen.add((entry.stream, entry.column))
             entries[entry.stream][entry.column] = entry
     return {stream: list(those.values()) for stream, those in entries.items()}
 
 
-def _entries(lines: Sequence[str], told: Findings) -> list[Entry]:
-    found = []
+def _entries(lines: Sequence[str], declared: Findings) -> list[ColumnMapping]:
+    result = []
     for line in lines:
         try:
-            found += parse_entry(line)
+            result += parse_entry(line)
         except InputError as error:
-            told.problems.append(f"{error}.")
-    return found
+            declared.problems.append(f"{error}.")
+    return result
 
 
-def _rates(lines: Sequence[str], told: Findings) -> dict[str, Rate]:
-    found = {}
+def _rates(lines: Sequence[str], declared: Findings) -> dict[str, Rate]:
+    result = {}
     for line in lines:
         stream, _, value = (part.strip() for part in line.partition("="))
         number, _, start = value.partition("@")
@@ -132,17 +134,17 @@ def _rates(lines: Sequence[str], told: Findings) -> dict[str, Rate]:
         except (ValueError, ZeroDivisionError):
             rate = None
         if stream not in STREAMS or rate is None or rate.hz <= 0:
-            told.problems.append(
+            declared.problems.append(
                 f"--rate-hz {line!r}: write TABLE=HZ with a table of {', '.join(STREAMS)}, or"
                 " TABLE=HZ@SECONDS where its first row is later than the log's zero."
             )
         else:
-            found[stream] = rate
-    return found
+            result[stream] = rate
+    return result
 
 
-def _shifts(lines: Sequence[str], told: Findings) -> dict[str, int]:
-    found = {}
+def _shifts(lines: Sequence[str], declared: Findings) -> dict[str, int]:
+    result = {}
     for line in lines:
         stream, _, value = (part.strip() for part in line.partition("="))
         try:
@@ -150,25 +152,25 @@ def _shifts(lines: Sequence[str], told: Findings) -> dict[str, int]:
         except (ValueError, ZeroDivisionError):
             seconds = None
         if stream not in STREAMS or seconds is None or abs(seconds) > MOST_SHIFT:
-            told.problems.append(
+            declared.problems.append(
                 f"--offset {line!r}: write TABLE=SECONDS with a table of {', '.join(STREAMS)};"
                 " the seconds are added to its times."
             )
         else:
-            found[stream] = round(seconds * 10**9)
-    return found
+            result[stream] = round(seconds * 10**9)
+    return result
 
 
-def _rows(lines: Sequence[str], told: Findings) -> dict[str, tuple[str, str]]:
-    found = {}
+def _rows(lines: Sequence[str], declared: Findings) -> dict[str, tuple[str, str]]:
+    result = {}
     for line in lines:
         stream, _, value = (part.strip() for part in line.partition("="))
         column, _, wanted = (part.strip() for part in value.rpartition(":"))
         if stream not in STREAMS or not column or not wanted:
-            told.problems.append(
+            declared.problems.append(
                 f"--rows {line!r}: write TABLE=COLUMN:VALUE with a table of {', '.join(STREAMS)},"
                 " as 'gyro=sensor:gyroscope'."
             )
         else:
-            found[stream] = (column, wanted)
-    return found
+            result[stream] = (column, wanted)
+    return result

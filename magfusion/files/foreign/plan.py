@@ -9,14 +9,14 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.files.foreign.columns import (
-    BESIDE,
     EULER,
     GROUPS,
     OPTIONAL,
+    OPTIONAL_COLUMNS,
     QUATERNION,
     STREAMS,
     TIME,
-    Entry,
+    ColumnMapping,
     Term,
     Undecided,
     dimension_of,
@@ -28,14 +28,14 @@ from magfusion.files.foreign.guess import (
     likely_time_unit,
     likely_unit,
     named_columns,
-    parted_stamp,
+    two_column_stamp,
 )
 from magfusion.files.foreign.source import Source
 from magfusion.files.foreign.units import (
     ISO,
     Dimension,
     Raw,
-    Unit,
+    SourceUnit,
     is_date,
 )
 from magfusion.units import Array
@@ -59,7 +59,7 @@ class Rate:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class ImportPlan:
     """How a table becomes a stream.
 
     Parameters
@@ -93,13 +93,13 @@ def shown(source: Source, terms: Sequence[Term]) -> str:
     parts = []
     for term in terms:
         name = source.columns[term.place].name
-        known = term.unit.dimension is Dimension.NUMBER or _says(name, str(term.unit))
+        known = term.unit.dimension is Dimension.NUMBER or _is_unit_declared(name, str(term.unit))
         unit = "" if known else f"[{term.unit}]"
         parts.append(f"{'-' if term.sign < 0.0 else ''}{name}{unit}")
     return "+".join(parts)
 
 
-def _says(name: str, unit: str) -> bool:
+def _is_unit_declared(name: str, unit: str) -> bool:
     return name.endswith((f"[{unit}]", f"({unit})"))
 
 
@@ -123,32 +123,34 @@ def _as_vector(group: str, source: Source, terms: Terms) -> str | None:
     """Return the components of a vector in one option's value, where that says the same."""
     every = [terms[name][0] for name in GROUPS[group] if name in terms]
     names = [source.columns[term.place].name for term in every]
-    alike = len({term.unit for term in every}) == 1 and "," not in "".join(names)
-    if len(every) < len(GROUPS[group]) or not alike:
+    shared = len({term.unit for term in every}) == 1 and "," not in "".join(names)
+    if len(every) < len(GROUPS[group]) or not shared:
         return None
     tag = "wxyz" if group == "quaternion" else str(every[0].unit)
     signed = [("-" if t.sign < 0.0 else "") + n for t, n in zip(every, names, strict=True)]
-    return ",".join(signed) + ("" if all(_says(name, tag) for name in names) else f"[{tag}]")
+    return ",".join(signed) + (
+        "" if all(_is_unit_declared(name, tag) for name in names) else f"[{tag}]"
+    )
 
 
 def plan_stream(
     stream: str,
     source: Source,
-    entries: Sequence[Entry],
+    entries: Sequence[ColumnMapping],
     rate: Rate | None,
-    told: Findings,
+    declared: Findings,
     usual: Mapping[str, tuple[Term, ...]] | None = None,
-) -> Plan | None:
-    """Return how a table becomes a stream, or None with the reasons in ``told``.
+) -> ImportPlan | None:
+    """Return how a table becomes a stream, or None with the reasons in ``declared``.
 
     Parameters
     ----------
-    entries : sequence of Entry
+    entries : sequence of ColumnMapping
         What the user says, of this stream.
     usual : mapping, optional
         Columns that the format itself defines.
     """
-    own = _Planning(stream, source, told, rate)
+    own = _Planning(stream, source, declared, rate)
     given = {entry.column: entry for entry in entries}
     named = named_columns(source.columns, stream)
     velocity = any(name in given for name in OPTIONAL)
@@ -157,33 +159,33 @@ def plan_stream(
         if target in without:
             continue
         if target in given:
-            own.say(given[target])
+            own.declare(given[target])
         elif usual is not None:
             own.terms |= {target: usual[target]} if target in usual else {}
         elif target != TIME or rate is None:
             own.guess(target, named[target], target in OPTIONAL and not velocity)
-    for target in BESIDE.get(stream, {}):
+    for target in OPTIONAL_COLUMNS.get(stream, {}):
         if target in given:
-            own.say(given[target])
+            own.declare(given[target])
     return own.plan(velocity)
 
 
 def _other_rotation(
-    given: Mapping[str, Entry], named: Mapping[str, Sequence[Named]]
+    given: Mapping[str, ColumnMapping], named: Mapping[str, Sequence[Named]]
 ) -> tuple[str, ...]:
     """Return the columns of the form of an attitude, quaternion or angles, that is not used."""
-    said = {name for names in (given, named) for name in names if name in given or named[name]}
+    declared = {name for names in (given, named) for name in names if name in given or named[name]}
     if any(name in given for name in EULER):
         return QUATERNION
-    angles = said.issuperset(EULER) and said.isdisjoint(QUATERNION)
+    angles = declared.issuperset(EULER) and declared.isdisjoint(QUATERNION)
     return QUATERNION if angles else EULER
 
 
 class _Planning:
     """One stream while its columns are looked for."""
 
-    def __init__(self, stream: str, source: Source, told: Findings, rate: Rate | None) -> None:
-        self.stream, self.source, self.told, self.rate = stream, source, told, rate
+    def __init__(self, stream: str, source: Source, declared: Findings, rate: Rate | None) -> None:
+        self.stream, self.source, self.declared, self.rate = stream, source, declared, rate
         self.terms: Terms = {}
         self.open: dict[str, tuple[int, float, str]] = {}
         self.absent: list[str] = []
@@ -192,9 +194,9 @@ class _Planning:
 
     def problem(self, text: str) -> None:
         self.failed = True
-        self.told.problems.append(f"{self.source.place}: {text}.")
+        self.declared.problems.append(f"{self.source.place}: {text}.")
 
-    def say(self, entry: Entry) -> None:
+    def declare(self, entry: ColumnMapping) -> None:
         if entry.column == TIME and self.rate is not None:
             self.problem(f"{self.stream}.time and --rate-hz {self.stream} are given; keep one")
             return
@@ -204,12 +206,12 @@ class _Planning:
             if reason.place is None or "is no unit" in str(reason):
                 self.problem(f"--map '{entry}': {reason}")
             if reason.place is not None:
-                said = "" if "is no unit" in str(reason) else "is not said"
-                self.open[entry.column] = (reason.place, reason.sign, said)
+                declared = "" if "is no unit" in str(reason) else "is not said"
+                self.open[entry.column] = (reason.place, reason.sign, declared)
 
     def guess(self, target: str, named: Sequence[Named], optional: bool) -> None:
-        if target == TIME and (parted := parted_stamp(self.source.columns)):
-            self.terms[target] = parted
+        if target == TIME and (separated := two_column_stamp(self.source.columns)):
+            self.terms[target] = separated
             self.guessed.append(target)
             return
         if not named:
@@ -220,21 +222,21 @@ class _Planning:
             return
         if len(named) > 1:
             if not optional:
-                self._tell_several(target, named)
+                self._report_several(target, named)
             return
         (one,) = named
         unit = one.unit
         if unit is None and target == TIME and is_date(_sample(self.source, one.place, True)):
-            unit = Unit(ISO, Dimension.TIME)
+            unit = SourceUnit(ISO, Dimension.TIME)
         if unit is not None:
             self.terms[target] = (Term(one.place, unit),)
             self.guessed.append(target)
         elif not optional:
             self.open[target] = (one.place, 1.0, "is not said")
 
-    def plan(self, velocity: bool) -> Plan | None:
-        self._tell_absent()
-        self._tell_open()
+    def plan(self, velocity: bool) -> ImportPlan | None:
+        self._report_absent()
+        self._report_open()
         parts = [name for name in OPTIONAL if name in self.terms]
         if len(parts) not in (0, len(OPTIONAL)):
             if velocity:
@@ -242,14 +244,14 @@ class _Planning:
             for name in parts:
                 del self.terms[name]
         self._check_lengths()
-        known = (*STREAMS[self.stream], *BESIDE.get(self.stream, {}))
+        known = (*STREAMS[self.stream], *OPTIONAL_COLUMNS.get(self.stream, {}))
         ordered = {t: self.terms[t] for t in known if t in self.terms}
-        plan = Plan(self.stream, self.source, ordered, self.rate)
-        sure = {target: self.terms[target] for target in self.guessed if target in self.terms}
-        self.told.guessed += as_options(self.stream, self.source, sure)
+        plan = ImportPlan(self.stream, self.source, ordered, self.rate)
+        certain = {target: self.terms[target] for target in self.guessed if target in self.terms}
+        self.declared.guessed += as_options(self.stream, self.source, certain)
         return None if self.failed else plan
 
-    def _tell_absent(self) -> None:
+    def _report_absent(self) -> None:
         if not self.absent:
             return
         names = ", ".join(column.name for column in self.source.columns[:30])
@@ -260,34 +262,34 @@ class _Planning:
             remedy += f", or give --rate-hz {self.stream}=HZ"
         self.problem(f"{what} (found {names}); {remedy}")
 
-    def _tell_several(self, target: str, named: Sequence[Named]) -> None:
+    def _report_several(self, target: str, named: Sequence[Named]) -> None:
         """Tell that several columns may be one, and propose the first."""
         names = " and ".join(self.source.columns[n.place].name for n in named)
         self.problem(f"columns {names} may both be {self.stream}.{target}; name one")
         first = named[0]
         term = self._likely(target, first.place, 1.0)
         term = term if first.unit is None else Term(first.place, first.unit)
-        self.told.proposals += as_options(self.stream, self.source, {target: (term,)})
+        self.declared.proposals += as_options(self.stream, self.source, {target: (term,)})
 
     def _propose_by_place(self) -> None:
         """Propose what columns that nothing is known of may be, by their sizes."""
         used = {term.place for terms in self.terms.values() for term in terms}
         used |= {place for place, _, _ in self.open.values()}
-        free = [k for k in range(len(self.source.columns)) if k not in used]
-        columns = [self.source.columns[k] for k in free]
-        samples = [_numbers(self.source, k) for k in free]
-        dates = [is_date(_sample(self.source, k, True)) for k in free]
+        open_terms = [k for k in range(len(self.source.columns)) if k not in used]
+        columns = [self.source.columns[k] for k in open_terms]
+        samples = [_numbers(self.source, k) for k in open_terms]
+        dates = [is_date(_sample(self.source, k, True)) for k in open_terms]
         terms: Terms = {
-            target: (Term(free[place], unit),)
+            target: (Term(open_terms[place], unit),)
             for target, (place, unit) in by_place(self.stream, columns, samples, dates).items()
             if target in self.absent
         }
-        self.told.proposals += as_options(self.stream, self.source, terms)
+        self.declared.proposals += as_options(self.stream, self.source, terms)
 
-    def _tell_open(self) -> None:
+    def _report_open(self) -> None:
         groups: dict[str, list[str]] = defaultdict(list)
-        for target, (_, _, said) in self.open.items():
-            if said:
+        for target, (_, _, declared) in self.open.items():
+            if declared:
                 groups[target.rpartition("_")[0] or target].append(target)
         for stem, targets in groups.items():
             names = [self.source.columns[self.open[t][0]].name for t in targets]
@@ -298,7 +300,7 @@ class _Planning:
             named = f"the unit of {lead} {', '.join(names)}"
             self.problem(f"{named} is not said, for {self.stream}.{stem}{sized}")
         terms: Terms = {t: (self._likely(t, p, sign),) for t, (p, sign, _) in self.open.items()}
-        self.told.proposals += as_options(self.stream, self.source, terms)
+        self.declared.proposals += as_options(self.stream, self.source, terms)
 
     def _likely(self, target: str, place: int, sign: float) -> Term:
         dimension = dimension_of(self.stream, target)
@@ -312,14 +314,14 @@ class _Planning:
 
     def _check_lengths(self) -> None:
         lengths = self.source.lengths
-        found = {
+        result = {
             lengths[term.place]: self.source.columns[term.place].name
             for terms in self.terms.values()
             for term in terms
             if lengths
         }
-        if len(found) > 1:
-            rows = ", ".join(f"{name} has {count} rows" for count, name in found.items())
+        if len(result) > 1:
+            rows = ", ".join(f"{name} has {count} rows" for count, name in result.items())
             self.problem(f"columns of {self.stream} are not of one length: {rows}; map others")
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from magfusion.files.foreign.source import Part, Source
+from magfusion.files.foreign.source import RowBlock, Source
 from magfusion.files.foreign.units import Raw
 from magfusion.units import BoolArray
 
@@ -23,12 +23,12 @@ def rows_where(source: Source, place: int, value: str) -> Source:
         As it is written in the file.
     """
 
-    def read(wanted: Sequence[int], texts: Collection[int]) -> Iterator[Part]:
+    def read(wanted: Sequence[int], texts: Collection[int]) -> Iterator[RowBlock]:
         places = sorted({*wanted, place})
         for part in source.read(places, {*texts, place}):
             columns = dict(zip(places, part.columns, strict=True))
             own = _equal(columns[place], value)
-            kept: list[Raw] = [_taken(columns[k], own) for k in wanted]
+            kept: list[Raw] = [_own_rows(columns[k], own) for k in wanted]
             yield replace(part, columns=kept, rows=part.rows[own])
 
     name = source.columns[place].name
@@ -40,14 +40,14 @@ def _equal(raw: Raw, value: str) -> BoolArray:
         text = pc.utf8_trim_whitespace(raw.cast(pa.string()))
         same = pc.fill_null(pc.equal(text, value), False)
         return np.asarray(same.to_numpy(zero_copy_only=False), dtype=bool)
-    found = np.asarray(raw)
-    if found.dtype.kind not in "biuf":
-        return np.asarray(found.astype(str) == value)
+    result = np.asarray(raw)
+    if result.dtype.kind not in "biuf":
+        return np.asarray(result.astype(str) == value)
     try:
-        return np.asarray(found == float(value))
+        return np.asarray(result == float(value))
     except ValueError:
-        return np.zeros(len(found), dtype=bool)
+        return np.zeros(len(result), dtype=bool)
 
 
-def _taken(raw: Raw, own: BoolArray) -> Raw:
+def _own_rows(raw: Raw, own: BoolArray) -> Raw:
     return raw.filter(pa.array(own)) if isinstance(raw, pa.Array | pa.ChunkedArray) else raw[own]

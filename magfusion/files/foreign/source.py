@@ -10,7 +10,7 @@ ROWS = 1 << 17  # of a part
 
 
 @dataclass(frozen=True)
-class Column:
+class SourceColumn:
     """A column of a table.
 
     Parameters
@@ -26,7 +26,7 @@ class Column:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class RowBlock:
     """Some rows: the columns that were asked for, in that order.
 
     Parameters
@@ -42,7 +42,7 @@ class Part:
     left_out: dict[str, int] = field(default_factory=dict)
 
 
-Read = Callable[[Sequence[int], Collection[int]], Iterator[Part]]
+Read = Callable[[Sequence[int], Collection[int]], Iterator[RowBlock]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class Source:
         What a refusal calls it.
     read : callable
         Takes the places of the columns to read and, of these, the ones that hold stamps and are
-        given as they are written; yields `Part`.
+        given as they are written; yields `RowBlock`.
     rate_hz : float, optional
         That the format itself declares.
     lengths : tuple of int
@@ -67,7 +67,7 @@ class Source:
     """
 
     place: str
-    columns: tuple[Column, ...]
+    columns: tuple[SourceColumn, ...]
     read: Read
     rate_hz: float | None = None
     lengths: tuple[int, ...] = ()

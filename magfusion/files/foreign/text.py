@@ -14,7 +14,7 @@ import pyarrow.csv
 
 from magfusion.errors import InputError
 from magfusion.files.foreign.dialect import COMMENTS, SPACES, Dialect, find_dialect
-from magfusion.files.foreign.source import Part, Source
+from magfusion.files.foreign.source import RowBlock, Source
 from magfusion.files.foreign.units import MISSING, Raw
 
 BLOCK = 1 << 22  # bytes
@@ -31,7 +31,7 @@ def text_source(path: Path, delimiter: str | None = None) -> Source:
     """
     dialect = find_dialect(path, delimiter)
 
-    def read(wanted: Sequence[int], texts: Collection[int]) -> Iterator[Part]:
+    def read(wanted: Sequence[int], texts: Collection[int]) -> Iterator[RowBlock]:
         return _read(path, dialect, wanted, texts)
 
     return Source(str(path), dialect.columns, read, form=str(dialect))
@@ -43,7 +43,7 @@ class _AsUtf8(io.RawIOBase):
     def __init__(self, stream: Any, encoding: str, squeeze: bool) -> None:
         self._stream, self._squeeze, self._rest, self._ended = stream, squeeze, b"", False
         self._decoder = codecs.getincrementaldecoder(encoding)("replace")
-        self._held = ""  # a line that is not whole
+        self._partial_line = ""  # a line that is not whole
 
     def readable(self) -> bool:
         return True
@@ -56,9 +56,9 @@ class _AsUtf8(io.RawIOBase):
         while not self._rest and not self._ended:
             block = self._stream.read(BLOCK)
             self._ended = not block
-            text = self._held + self._decoder.decode(block, final=self._ended)
+            text = self._partial_line + self._decoder.decode(block, final=self._ended)
             whole = len(text) if self._ended else text.rfind("\n") + 1
-            text, self._held = text[:whole], text[whole:]
+            text, self._partial_line = text[:whole], text[whole:]
             if self._squeeze:
                 text = re.sub(r"(?m)^[ \t]+|[ \t]+(?=\r?$)", "", text)
                 text = re.sub(r"[ \t]+", " ", text)
@@ -126,7 +126,7 @@ def _of_arrow(content: bytes) -> pa.Buffer:
 
 def _read(
     path: Path, dialect: Dialect, wanted: Sequence[int], texts: Collection[int]
-) -> Iterator[Part]:
+) -> Iterator[RowBlock]:
     kinds = {f"c{k}": pa.string() if k in texts else pa.float64() for k in wanted}
     counts: dict[str, int] = {}
     row = 0
@@ -138,7 +138,7 @@ def _read(
                 columns.append(column if k in texts else column.to_numpy(zero_copy_only=False))
             left_out = dict(counts)
             counts.clear()
-            yield Part(columns, row + np.arange(len(batch)), left_out)
+            yield RowBlock(columns, row + np.arange(len(batch)), left_out)
             row += len(batch)
     except pa.ArrowInvalid as error:
         raise InputError(_no_number(path, dialect, wanted, str(error))) from error

@@ -104,7 +104,7 @@ _SCALED = re.compile(r"(?P<factor>[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?)\*(?P<unit>
 
 
 @dataclass(frozen=True)
-class Unit:
+class SourceUnit:
     """A unit, perhaps with a factor before it: ``0.5*nT``.
 
     Parameters
@@ -128,7 +128,7 @@ class Unit:
         return self.name if self.factor == "1" else f"{self.factor}*{self.name}"
 
 
-def parse_unit(text: str, dimension: Dimension) -> Unit | None:
+def parse_unit(text: str, dimension: Dimension) -> SourceUnit | None:
     """Return the unit that a text names, or None."""
     plain = text.strip().translate({0x00B5: "u", 0x03BC: "u", 0x00B2: "^2", 0x00B0: "deg"})
     plain = (
@@ -143,13 +143,13 @@ def parse_unit(text: str, dimension: Dimension) -> Unit | None:
         return None
     known = UNITS[dimension]
     if plain in known:
-        return Unit(plain, dimension, factor)
+        return SourceUnit(plain, dimension, factor)
     folded = {name.casefold(): name for name in known}
     short = plain.casefold().replace("^", "").replace("*", "").replace("·", "")
-    found = folded.get(plain.casefold()) or _SPELLINGS[dimension].get(short)
+    result = folded.get(plain.casefold()) or _SPELLINGS[dimension].get(short)
     if dimension is Dimension.TIME and short == ISO:
-        found = ISO
-    return None if found is None else Unit(found, dimension, factor)
+        result = ISO
+    return None if result is None else SourceUnit(result, dimension, factor)
 
 
 def accepted(dimension: Dimension) -> str:
@@ -158,7 +158,7 @@ def accepted(dimension: Dimension) -> str:
     return f"{', '.join(names)}, or a factor before one of them, as 0.5*{next(iter(names))}"
 
 
-def to_nanoseconds(raw: Raw, unit: Unit) -> IntArray:
+def to_nanoseconds(raw: Raw, unit: SourceUnit) -> IntArray:
     """Return stamps as whole nanoseconds, `NO_STAMP` where there is none.
 
     Integers and decimal fractions are scaled without rounding on the way: a double resolves the
@@ -191,8 +191,8 @@ _NANOSECONDS = {
 
 
 def _scaled_integers(values: IntArray, scale: Fraction) -> IntArray:
-    most = float(np.max(np.abs(values.astype(np.float64)), initial=0.0))
-    if most * scale.numerator < 2.0**62:
+    maximum = float(np.max(np.abs(values.astype(np.float64)), initial=0.0))
+    if maximum * scale.numerator < 2.0**62:
         return np.asarray((values * scale.numerator + scale.denominator // 2) // scale.denominator)
     return _rounded(values.astype(np.float64) * float(scale))
 

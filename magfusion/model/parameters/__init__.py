@@ -27,8 +27,8 @@ from magfusion.model.parameters.parameter import PERCENT as PERCENT
 from magfusion.model.parameters.parameter import Block as Block
 from magfusion.model.parameters.parameter import Calibration as Calibration
 from magfusion.model.parameters.parameter import Parameter as Parameter
+from magfusion.model.parameters.parameter import ParameterUnit as ParameterUnit
 from magfusion.model.parameters.parameter import SteadyView as SteadyView
-from magfusion.model.parameters.parameter import Unit as Unit
 from magfusion.model.parameters.parameter import dimension as dimension
 from magfusion.model.parameters.platform import CLOCK_OFFSET as CLOCK_OFFSET
 from magfusion.model.parameters.platform import CLOCK_RATE as CLOCK_RATE
@@ -45,7 +45,7 @@ from magfusion.model.parameters.subset import channels_of as channels_of
 from magfusion.model.parameters.subset import of_beacons as of_beacons
 from magfusion.model.parameters.subset import samples_of as samples_of
 from magfusion.model.parameters.subset import stretches as stretches
-from magfusion.model.parameters.subset import with_unheard as with_unheard
+from magfusion.model.parameters.subset import with_undetected as with_undetected
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.units import Array, ComplexArray
@@ -112,7 +112,7 @@ def seen_by(calibration: Calibration, sensor: int) -> Calibration:
     frequencies_hz = site.tone_frequencies_hz
     return replace(
         calibration,
-        site=replace(site, platform=site.platform.carrying((one,))),
+        site=replace(site, platform=site.platform.with_magnetometers((one,))),
         phase=calibration.phase[..., mine] + 2.0 * np.pi * frequencies_hz * late,
         log_gain=calibration.log_gain[..., mine],
     )
@@ -130,7 +130,9 @@ def without_response(
         phasor = phasor / np.exp(answer[0] + 1j * answer[1])[:, None]
     phasor = phasor if factors is None else phasor / factors
     plain = tuple(replace(m, response=None) for m in site.platform.magnetometers)
-    return phasor, replace(calibration, site=replace(site, platform=site.platform.carrying(plain)))
+    return phasor, replace(
+        calibration, site=replace(site, platform=site.platform.with_magnetometers(plain))
+    )
 
 
 def candidates(

@@ -51,7 +51,7 @@ class BeaconParameter(Parameter):
 class _Rotation(BeaconParameter, SiteParameter):
     group, kind, components = "beacons", "rotation", AXES
     attribute, sigma_attribute, is_rotation = "world_from_beacon", "rotation_beacon", True
-    unit = spoken = DEGREES
+    unit = display_unit = DEGREES
     words = "the turn of beacon {owner} about its {axis}"
     negligible = 1.75e-3
     field_error = 2.0
@@ -63,7 +63,7 @@ class _Rotation(BeaconParameter, SiteParameter):
 class _Position(BeaconParameter, SiteParameter):
     group, kind, components = "beacons", "position", AXES
     attribute = sigma_attribute = "position_world"
-    unit, spoken = METRE, CENTIMETRE
+    unit, display_unit = METRE, CENTIMETRE
     words = ("x of beacon {owner}", "y of beacon {owner}", "the height of beacon {owner}")
     negligible = 2e-3
     field_error, falls = 9.0, 2  # the field falls with the cube of the distance
@@ -74,7 +74,7 @@ class _Position(BeaconParameter, SiteParameter):
 
 class _LogMoment(BeaconParameter, SiteParameter):
     group, kind, sigma_attribute = "moments", "log_moment", "log_moment"
-    spoken = PERCENT
+    display_unit = PERCENT
     negligible = 2e-3
     field_error = 1.0
     walk = "clock.log_moment_walk"
@@ -155,7 +155,7 @@ class _OfDrive(BeaconParameter):
 
 class _Phase(_OfDrive):
     group = kind = attribute = "phase"
-    unit = spoken = DEGREES
+    unit = display_unit = DEGREES
     words = "the drive phase of beacon {owner}"
     walk = "clock.phase_walk"
 
@@ -169,7 +169,7 @@ class _Phase(_OfDrive):
 
 class _Drift(_OfDrive):
     group, kind, attribute = "phase", "drift", "drift"
-    unit = spoken = PPM
+    unit = display_unit = PPM
     words = "the clock of beacon {owner}"
     walk = "clock.drift_walk"
 

@@ -44,7 +44,7 @@ class _Group(NamedTuple):
             }
             yield Observation(**own)
 
-    def parted(self, evaluated: ComplexArray) -> ComplexArray:
+    def with_axis(self, evaluated: ComplexArray) -> ComplexArray:
         """Return the result with a leading axis of beacons, also for a single one."""
         return evaluated if len(self.beacons) > 1 else evaluated[None]
 
@@ -56,16 +56,16 @@ def _side_by_side(site: Site) -> list[_Group]:
 
 @once_a_site
 def _each_alone(site: Site) -> list[_Group]:
-    return _groups(site, beside=False)
+    return _groups(site, neighbours=False)
 
 
-def _groups(site: Site, *, beside: bool = True) -> list[_Group]:
+def _groups(site: Site, *, neighbours: bool = True) -> list[_Group]:
     """Return the beacons of a site in as few groups as their forms allow, or one per group."""
     end = np.cumsum([len(beacon.tones) for beacon in site.beacons]).tolist()
     tones = [slice(*ends) for ends in pairwise([0, *end])]
     sources = (
         side_by_side(site)
-        if beside
+        if neighbours
         else [((k,), alone(beacon)) for k, beacon in enumerate(site.beacons)]
     )
     return [
@@ -84,13 +84,13 @@ def predict_channels(
         world_from_body.shape[:-2], position_world.shape[:-1], phase.shape[:-1]
     )
     out = np.empty((*shape, len(site.channels), 3), dtype=np.complex128)
-    beside = world_from_body.ndim == 3 and position_world.ndim == 2
-    groups = _side_by_side(site) if beside else _each_alone(site)
+    others = world_from_body.ndim == 3 and position_world.ndim == 2
+    groups = _side_by_side(site) if others else _each_alone(site)
     for sensor, magnetometer in enumerate(site.platform.magnetometers):
         mine = site.of_sensor(sensor)
         for group in groups:
             phasor = predict(group.source, magnetometer, *poses, group.of(phase[..., mine]))
-            for tones, own in zip(group.tones, group.parted(phasor), strict=True):
+            for tones, own in zip(group.tones, group.with_axis(phasor), strict=True):
                 out[..., mine, :][..., tones, :] = own
     factors = axis_factors(site)
     out = out if factors is None else factors * out
@@ -104,7 +104,7 @@ def linearize_channels(
     world_from_body: Array,
     position_world: Array,
     twist_body: Array | None = None,
-    heard: BoolArray | None = None,
+    detected: BoolArray | None = None,
 ) -> tuple[Array, Array, Array]:
     """Predict every channel as real numbers, with the Jacobian by pose and calibration.
 
@@ -117,7 +117,7 @@ def linearize_channels(
     position_world : ndarray, shape (n, 3)
     twist_body : ndarray, shape (n, 6), optional
         Needed where the time offset is among the blocks.
-    heard : bool ndarray, shape (n, channels), optional
+    detected : bool ndarray, shape (n, channels), optional
         Requested channels: a beacon without any is zero, if the epochs are close to each other.
 
     Returns
@@ -127,9 +127,9 @@ def linearize_channels(
     by_pose : ndarray, shape (n, channels, 6, 6)
     by_calibration : ndarray, shape (n, channels, 6, dimension)
     """
-    if heard is not None:
-        return _linearize_heard(
-            calibration, blocks, time, world_from_body, position_world, twist_body, heard
+    if detected is not None:
+        return _linearize_detected(
+            calibration, blocks, time, world_from_body, position_world, twist_body, detected
         )
     phase, site, n = calibration.drive_phase(time), calibration.site, len(time)
     channels = len(site.channels)
@@ -151,7 +151,7 @@ def linearize_channels(
         else:
             phasor, pose = observe_from(*place, group.of(phase[..., mine]))
             observations = [None] * len(group.beacons)
-        phasor, pose = group.parted(phasor), group.parted(pose)
+        phasor, pose = group.with_axis(phasor), group.with_axis(pose)
         values, poses = _stacked(phasor[..., None])[..., 0], _stacked(pose)
         for k, (beacon, tones) in enumerate(zip(group.beacons, group.tones, strict=True)):
             rows = slice(mine.start + tones.start, mine.start + tones.stop)
@@ -174,14 +174,14 @@ def linearize_channels(
 
 def _acting(blocks: tuple[Block, ...], site: Site) -> dict[str, list[Block]]:
     """Return the blocks that affect each beacon's phasors, by its name."""
-    found: dict[str, list[Block]] = {beacon.name: [] for beacon in site.beacons}
+    result: dict[str, list[Block]] = {beacon.name: [] for beacon in site.beacons}
     for block in blocks:
         if not isinstance(block.parameter, BeaconParameter):
-            for own in found.values():
+            for own in result.values():
                 own.append(block)
-        elif block.owner in found:
-            found[block.owner].append(block)
-    return found
+        elif block.owner in result:
+            result[block.owner].append(block)
+    return result
 
 
 def _answered(stacked: Array, factors: ComplexArray) -> Array:
@@ -191,25 +191,25 @@ def _answered(stacked: Array, factors: ComplexArray) -> Array:
     return np.concatenate([a * real - b * imaginary, b * real + a * imaginary], axis=-2)
 
 
-def _linearize_heard(
+def _linearize_detected(
     calibration: Calibration,
     blocks: tuple[Block, ...],
     time: Array,
     world_from_body: Array,
     position_world: Array,
     twist_body: Array | None,
-    heard: BoolArray,
+    detected: BoolArray,
 ) -> tuple[Array, Array, Array]:
     """Predict the channels of the detected beacons, as `linearize_channels`."""
     site, n, channels = calibration.site, len(time), len(calibration.site.channels)
     value, by_pose = np.zeros((n, channels, 6)), np.zeros((n, channels, 6, 6))
     by_calibration = np.zeros((n, channels, 6, dimension(blocks)))
-    for rows, beacons in stretches(site, heard):
+    for rows, beacons in stretches(site, detected):
         if not len(beacons):
             continue
         some = of_beacons(calibration, beacons)
         own, columns = _own_blocks(blocks, some.site)
-        found = linearize_channels(
+        result = linearize_channels(
             some,
             own,
             time[rows],
@@ -218,9 +218,9 @@ def _linearize_heard(
             None if twist_body is None else twist_body[rows],
         )
         into = channels_of(site, beacons)
-        value[rows, into], by_pose[rows, into] = found[:2]
-        spread = np.zeros((*found[2].shape[:-1], by_calibration.shape[-1]))
-        spread[..., columns] = found[2]
+        value[rows, into], by_pose[rows, into] = result[:2]
+        spread = np.zeros((*result[2].shape[:-1], by_calibration.shape[-1]))
+        spread[..., columns] = result[2]
         by_calibration[rows, into] = spread
     return value, by_pose, by_calibration
 

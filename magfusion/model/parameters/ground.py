@@ -14,7 +14,7 @@ class _Conductivity(Parameter):
     """Logarithm of the conductivity: additive for the estimators, a factor for the ground."""
 
     group, owner, kind = "ground", "ground", "conductivity"
-    spoken = PERCENT
+    display_unit = PERCENT
     words = "the ground's conductivity"
     negligible = 2e-3
     declared = True
@@ -34,8 +34,8 @@ class _Conductivity(Parameter):
         return replace(site, log_conductivity_sigma=float(sigma[0]))
 
     def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray | None:
-        found = view.whole.log_conductivity
-        return None if found is None else found[..., None]
+        result = view.whole.log_conductivity
+        return None if result is None else result[..., None]
 
 
 CONDUCTIVITY = _Conductivity()

@@ -112,16 +112,20 @@ class Calibration:
         return phase if current is None else phase + current[1]
 
 
-class Unit(NamedTuple):
+class ParameterUnit(NamedTuple):
     """Name of a unit, and its size in the unit of the tangent vector."""
 
     text: str
     size: float
 
 
-NO_UNIT, METRE, SECOND = Unit("", 1.0), Unit("m", 1.0), Unit("s", 1.0)
-DEGREES, PPM, PERCENT = Unit("deg", DEGREE), Unit("ppm", 1e-6), Unit("%", 1e-2)
-CENTIMETRE, MILLISECOND = Unit("cm", 1e-2), Unit("ms", 1e-3)
+NO_UNIT, METRE, SECOND = ParameterUnit("", 1.0), ParameterUnit("m", 1.0), ParameterUnit("s", 1.0)
+DEGREES, PPM, PERCENT = (
+    ParameterUnit("deg", DEGREE),
+    ParameterUnit("ppm", 1e-6),
+    ParameterUnit("%", 1e-2),
+)
+CENTIMETRE, MILLISECOND = ParameterUnit("cm", 1e-2), ParameterUnit("ms", 1e-3)
 
 
 class PhasorView(NamedTuple):
@@ -162,8 +166,8 @@ class Parameter:
     owner: ClassVar[str]  # the object it belongs to; ``kind`` is its name there
     kind: ClassVar[str]
     components: ClassVar[Sequence[str]] = ()  # names of its numbers; otherwise their indices
-    unit: ClassVar[Unit] = NO_UNIT  # in figures
-    spoken: ClassVar[Unit] = NO_UNIT  # in messages
+    unit: ClassVar[ParameterUnit] = NO_UNIT  # in figures
+    display_unit: ClassVar[ParameterUnit] = NO_UNIT  # in messages
     words: ClassVar[str | Sequence[str]] = "{owner}.{kind} {i}"  # in messages: for all or for each
     si: ClassVar[float] = 1.0  # scale, as numbers of all sizes in one covariance lose digits
     # A parameter surveyed this well is fixed at its declared value; its remaining error is
@@ -307,8 +311,8 @@ class SiteParameter(Parameter):
         """Return the attribute; None for a rotation."""
         if self.is_rotation or not hasattr(self, "attribute"):
             return None
-        found = getattr(self.part(calibration.site, owner), self.attribute)
-        return np.asarray(found / self.si).ravel()
+        result = getattr(self.part(calibration.site, owner), self.attribute)
+        return np.asarray(result / self.si).ravel()
 
     def refined(self, site: Site, calibration: Calibration, owner: str, sigma: Array) -> Site:
         """Return the site with the posterior sigma; it already has the value."""

@@ -17,10 +17,10 @@ from magfusion.model.parameters.parameter import (
     SECOND,
     Calibration,
     Parameter,
+    ParameterUnit,
     PhasorView,
     SiteParameter,
     SteadyView,
-    Unit,
 )
 from magfusion.model.site import Magnetometer, Site
 from magfusion.units import Array, ComplexArray
@@ -50,7 +50,7 @@ class MagnetometerParameter(SiteParameter):
         if not platform.further:
             return replace(site, platform=replace(platform, magnetometer=part))
         every = tuple(part if m.name == part.name else m for m in platform.magnetometers)
-        return replace(site, platform=platform.carrying(every))
+        return replace(site, platform=platform.with_magnetometers(every))
 
     def kept_to(self, site: Site) -> float:
         """Return the largest sigma with which it is fixed at its declared value.
@@ -83,7 +83,7 @@ class _Matrix(MagnetometerParameter):
     group, owner, kind = "magnetometer", "magnetometer", "matrix"
     attribute = sigma_attribute = "matrix"
     components = tuple(row + column for row in AXES for column in AXES)
-    spoken = PERCENT
+    display_unit = PERCENT
     words = tuple(
         f"the magnetometer's gain on {row}"
         if row == column
@@ -105,7 +105,7 @@ class _Matrix(MagnetometerParameter):
 class _Offset(MagnetometerParameter):
     group, owner, kind, components = "magnetometer", "magnetometer", "offset", AXES
     attribute = sigma_attribute = "offset"
-    unit, spoken, si = Unit("nt", 1e-3), Unit("nT", 1e-3), MICROTESLA
+    unit, display_unit, si = ParameterUnit("nt", 1e-3), ParameterUnit("nT", 1e-3), MICROTESLA
     words = "the magnetometer's offset on {axis}"
     negligible = 5e-3
     steady_only = True
@@ -118,7 +118,7 @@ class _Offset(MagnetometerParameter):
 class _Rotation(MagnetometerParameter):
     group, owner, kind, components = "extrinsics", "sensor", "rotation", AXES
     attribute, sigma_attribute, is_rotation = "body_from_sensor", "rotation_sensor", True
-    unit = spoken = DEGREES
+    unit = display_unit = DEGREES
     words = "the mounting's turn about the sensor's {axis}"
     negligible = 1.75e-3
     field_error = 2.0
@@ -134,7 +134,7 @@ class _Rotation(MagnetometerParameter):
 class _Position(MagnetometerParameter):
     group, owner, kind, components = "extrinsics", "sensor", "position", AXES
     attribute = sigma_attribute = "position_body"
-    unit, spoken = METRE, CENTIMETRE
+    unit, display_unit = METRE, CENTIMETRE
     words = "the lever arm along {axis}"
     negligible = 2e-3
     field_error, falls = 9.0, 2  # the field falls with the cube of the distance
@@ -152,7 +152,7 @@ class _ClockOffset(MagnetometerParameter):
     """
 
     group, owner, kind = "time-offset", "magnetometer", CLOCK
-    unit, spoken = SECOND, MILLISECOND
+    unit, display_unit = SECOND, MILLISECOND
     words = "the clock of the magnetometer"
     sigma_attribute = CLOCK
     each_log = True
@@ -167,8 +167,8 @@ class _ClockOffset(MagnetometerParameter):
         return Parameter.difference(self, old, new, owner)
 
     def value(self, calibration: Calibration, owner: str) -> Array | None:
-        found = calibration.others.get(f"{owner}.{self.kind}", np.zeros(1))
-        return self.part(calibration.site, owner).clock_offset + found
+        result = calibration.others.get(f"{owner}.{self.kind}", np.zeros(1))
+        return self.part(calibration.site, owner).clock_offset + result
 
     def refined(self, site: Site, calibration: Calibration, owner: str, sigma: Array) -> Site:
         part, value = self.part(site, owner), self.value(calibration, owner)
@@ -186,7 +186,7 @@ class _ClockOffset(MagnetometerParameter):
 
 class _TimeOffset(Parameter):
     group, owner, kind = "time-offset", "imu", "time_offset"
-    unit, spoken = SECOND, MILLISECOND
+    unit, display_unit = SECOND, MILLISECOND
     words = by_turning = "the IMU's time offset"
     negligible = 1e-4
     declared = each_log = True
@@ -221,7 +221,7 @@ class _ClockRate(Parameter):
     """Change of the time offset per second, from the IMU's first sample on."""
 
     group, owner, kind = "time-offset", "imu", "clock_rate"
-    unit = spoken = PPM
+    unit = display_unit = PPM
     words = by_turning = "the rate of the IMU's clock"
     negligible = 1e-7
     declared = each_log = True
@@ -274,9 +274,9 @@ class _EarthParameter(Parameter):
     coordinates: ClassVar[slice]
 
     def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
-        found = _cylindrical(calibration)
-        found[self.coordinates] += self.si * step
-        azimuth, level, up = found
+        result = _cylindrical(calibration)
+        result[self.coordinates] += self.si * step
+        azimuth, level, up = result
         field = np.array([level * np.cos(azimuth), level * np.sin(azimuth), up])
         return replace(calibration, site=replace(calibration.site, earth_field_world=field))
 
@@ -297,7 +297,7 @@ class _EarthParameter(Parameter):
 
 class _Declination(_EarthParameter):
     kind, coordinates = "declination", slice(0, 1)
-    unit = spoken = DEGREES
+    unit = display_unit = DEGREES
     words = "the declination of the Earth field"
     walk = "earth.declination_walk"
 
@@ -307,7 +307,7 @@ class _Declination(_EarthParameter):
 
 class _Strength(_EarthParameter):
     kind, coordinates = "strength", slice(1, 3)
-    unit, spoken, si = Unit("nt", 1e-3), Unit("nT", 1e-3), MICROTESLA
+    unit, display_unit, si = ParameterUnit("nt", 1e-3), ParameterUnit("nT", 1e-3), MICROTESLA
     words = ("the horizontal part of the Earth field", "the vertical part of the Earth field")
     walk = "earth.strength_walk"
 

@@ -35,15 +35,15 @@ def of_beacons(calibration: Calibration, beacons: IntArray) -> Calibration:
     )
 
 
-def with_unheard(calibration: Calibration) -> Calibration:
+def with_undetected(calibration: Calibration) -> Calibration:
     """Return the calibration including the undetected beacons, as the site declares them.
 
     For one magnetometer.
     """
     site = calibration.site
-    if not site.unheard:
+    if not site.undetected:
         return calibration
-    others = tuple(beacon for _, beacon in site.unheard)
+    others = tuple(beacon for _, beacon in site.undetected)
     tones = sum(len(beacon.tones) for beacon in others)
 
     def longer(values: Array, more: int) -> Array:
@@ -51,7 +51,7 @@ def with_unheard(calibration: Calibration) -> Calibration:
 
     return replace(
         calibration,
-        site=replace(site, beacons=(*site.beacons, *others), unheard=()),
+        site=replace(site, beacons=(*site.beacons, *others), undetected=()),
         phase=longer(calibration.phase, tones),
         drift=longer(calibration.drift, len(others)),
         log_gain=longer(calibration.log_gain, tones),
@@ -66,17 +66,19 @@ def samples_of(samples: FieldSamples, channels: IntArray) -> FieldSamples:
         phasor_sensor=samples.phasor_sensor[:, channels],
         phasor_cov=samples.phasor_cov[:, channels],
         ahead=None if samples.ahead is None else samples.ahead[:, channels],
-        turned=None if samples.turned is None else samples.turned[:, channels],
+        channel_rotation=None
+        if samples.channel_rotation is None
+        else samples.channel_rotation[:, channels],
     )
 
 
-def stretches(site: Site, heard: BoolArray) -> Iterator[tuple[slice, IntArray]]:
+def stretches(site: Site, detected: BoolArray) -> Iterator[tuple[slice, IntArray]]:
     """Yield successive epochs, with the beacons detected at any of them.
 
     Parameters
     ----------
-    heard : bool ndarray, shape (n, channels)
+    detected : bool ndarray, shape (n, channels)
     """
-    for begin in range(0, len(heard), TOGETHER):
+    for begin in range(0, len(detected), TOGETHER):
         rows = slice(begin, begin + TOGETHER)
-        yield rows, beacons_of(site, np.asarray(np.any(heard[rows], axis=0)))
+        yield rows, beacons_of(site, np.asarray(np.any(detected[rows], axis=0)))

@@ -15,7 +15,7 @@ from scipy.special import k0
 from magfusion.units import MU0_OVER_4PI, Array, ComplexArray
 
 STEEL = ("wall", "permeability", "conductivity")
-MOST = 2.0  # largest error of a logarithm; beyond, a search diverges
+MAX_LOG_ERROR = 2.0  # largest error of a logarithm; beyond, a search diverges
 WAVES = 128  # wave numbers in the sum of the response along a tube
 
 
@@ -88,7 +88,7 @@ def tube_response(casing: Casing, frequency_hz: float, change: Array) -> Respons
         Of the logarithms of `STEEL`.
     """
     wall, permeability, conductivity = (
-        np.exp(np.clip(change, -MOST, MOST))
+        np.exp(np.clip(change, -MAX_LOG_ERROR, MAX_LOG_ERROR))
         * [casing.wall, casing.permeability, casing.conductivity]
     ).T
     mu = 4.0 * np.pi * MU0_OVER_4PI * permeability
@@ -147,9 +147,9 @@ def gathering_weights(
     -------
     weights, by_log_strength : complex ndarray, shape (k, m)
     """
-    apart = float(place[1] - place[0])
+    separate = float(place[1] - place[0])
     node, share = leggauss(WAVES)
-    number = 0.5 * np.pi / apart * (1.0 + node)
+    number = 0.5 * np.pi / separate * (1.0 + node)
     wave = 0.5 * share * np.cos(np.outer(place, number))  # (m, waves)
     poles = strength[:, None] * number**2 * k0(number * radius)
     return (-poles / (1.0 + poles)) @ wave.T, (-poles / (1.0 + poles) ** 2) @ wave.T

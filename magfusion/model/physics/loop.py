@@ -113,11 +113,11 @@ def _loop(offset: Array, moment: Array, radius: Array) -> _Loop:
     y = np.maximum(np.sqrt(((rho - a) ** 2 + z * z) * ((rho + a) ** 2 + z * z)) / c, _WIRE)
     w, q = x / (1.0 + y) ** 2, 0.5 * (1.0 + y)
     first, second = _integrals(w, np.sqrt(y / q))
-    left = second * y / q  # D (1 - w)
+    remaining = second * y / q  # D (1 - w)
     root, both = np.sqrt(q), y * y
-    f0 = 2.0 / np.pi * root / both * ((1.0 + w) * first + left)
-    f1 = 8.0 / (3.0 * np.pi) / (root * both) * (first + 0.5 * left)
-    g = (3.0 + w * (10.0 + 3.0 * w)) * first + (3.0 + 5.0 * w) * left
+    f0 = 2.0 / np.pi * root / both * ((1.0 + w) * first + remaining)
+    f1 = 8.0 / (3.0 * np.pi) / (root * both) * (first + 0.5 * remaining)
+    g = (3.0 + w * (10.0 + 3.0 * w)) * first + (3.0 + 5.0 * w) * remaining
     g *= 2.0 / (3.0 * np.pi) * q * root / both**2
     power = 1.0 / (c * c * np.sqrt(c))
     radial = 3.0 * f1 * power
@@ -148,15 +148,15 @@ def _integrals(parameter: Array, complement: Array) -> tuple[Array, Array]:
         ``sqrt(1 - parameter)``, more accurate from the caller.
     """
     mean, other = 0.5 * (1.0 + complement), np.sqrt(complement)
-    apart = 0.5 * parameter / (1.0 + complement)  # half the difference of the previous means
-    added = 0.5 * apart / (1.0 + complement)  # its square over the parameter
+    separate = 0.5 * parameter / (1.0 + complement)  # half the difference of the previous means
+    added = 0.5 * separate / (1.0 + complement)  # its square over the parameter
     total, weight = added, 1.0
     for _ in range(_MOST_MEANS):
-        if np.all(apart <= 1e-9 * mean):  # the next is its square
+        if np.all(separate <= 1e-9 * mean):  # the next is its square
             break
         mean, other = 0.5 * (mean + other), np.sqrt(mean * other)
-        share = 0.25 * apart / mean
-        apart, added, weight = share * apart, share**2 * added, 2.0 * weight
+        share = 0.25 * separate / mean
+        separate, added, weight = share * separate, share**2 * added, 2.0 * weight
         total = total + weight * added
     whole = 0.5 * np.pi / mean
     return whole * (0.5 - total), whole * (0.5 + total)

@@ -8,7 +8,7 @@ import numpy as np
 from magfusion.model.physics.dipole import dipole_field
 from magfusion.units import MU0_OVER_4PI, Array
 
-_FEWEST_AZIMUTHS, _MOST_AZIMUTHS = 32, 4096
+_MIN_AZIMUTHS, _MOST_AZIMUTHS = 32, 4096
 _SLICES = 16
 _DIGITS = 26.0  # e-folds, eleven digits
 
@@ -83,8 +83,8 @@ def loop_field(offset: Array, moment: Array, radius: float) -> Array:
     angle = (2.0 * np.pi / count * np.arange(count))[:, None]
     outward = np.cos(angle) * across + np.sin(angle) * along
     element = np.cross(axis, outward)
-    turned = np.cross(element[:, None], np.eye(3))  # element x e_i in row i
-    for from_centre, by_element in zip(radius * outward, turned, strict=True):
+    rotated = np.cross(element[:, None], np.eye(3))  # element x e_i in row i
+    for from_centre, by_element in zip(radius * outward, rotated, strict=True):
         separation = offset - from_centre
         square = np.einsum("ni,ni->n", separation, separation)
         field += (separation @ by_element) / (square * np.sqrt(square))[:, None]
@@ -97,7 +97,7 @@ def _azimuths(offset: Array, axis: Array, radius: float) -> int:
     rho = np.sqrt(np.maximum(square - (offset @ axis) ** 2, 0.0))
     rate = np.arccosh(np.maximum((square + radius**2) / (2.0 * radius * rho + 1e-300), 1.0))
     nearest = float(np.min(rate, initial=np.inf))
-    return int(np.clip(np.ceil(_DIGITS / max(nearest, 1e-3)), _FEWEST_AZIMUTHS, _MOST_AZIMUTHS))
+    return int(np.clip(np.ceil(_DIGITS / max(nearest, 1e-3)), _MIN_AZIMUTHS, _MOST_AZIMUTHS))
 
 
 def _slices(length: float | None) -> tuple[Array, Array]:

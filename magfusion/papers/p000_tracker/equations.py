@@ -123,7 +123,7 @@ def eq_11_attitude_as_printed(
     """
     scale = np.linalg.norm(position_beacon, axis=-1)[..., None, None] ** 3 / gain
     bracket = -scale * correction.received(coupling) - correction.ambient
-    return _freed(bracket, position_beacon, drive, correction)
+    return _corrected_bracket(bracket, position_beacon, drive, correction)
 
 
 def eq_11_attitude_of_eq_10(
@@ -132,10 +132,12 @@ def eq_11_attitude_of_eq_10(
     """Invert Eq 10 exactly.  Corrected in its bracket; the model remains as printed."""
     scale = np.linalg.norm(position_beacon, axis=-1)[..., None, None] ** 3 / gain
     bracket = -scale * (correction.received(coupling) - correction.ambient)
-    return _freed(bracket, position_beacon, drive, correction)
+    return _corrected_bracket(bracket, position_beacon, drive, correction)
 
 
-def _freed(bracket: Array, position_beacon: Array, drive: Array, correction: Correction) -> Array:
+def _corrected_bracket(
+    bracket: Array, position_beacon: Array, drive: Array, correction: Correction
+) -> Array:
     driven, matrix = correction.driven(drive), position_matrix(position_beacon)
     return bracket @ np.linalg.inv(driven) @ np.linalg.inv(matrix)
 
@@ -148,11 +150,13 @@ def eq_11_attitude(
     Corrected; matrices as in `eq_09_whitened`, A one vector in all columns, as measured in the
     silent slot.  Only the direction of the position matters.
     """
-    free = eq_09_whitened(coupling - ambient, receiver, transmitter)
-    left, _, right = np.linalg.svd(-free @ np.linalg.inv(position_matrix(position_beacon)))
-    sign = np.linalg.det(left @ right)[..., None]
+    free_parameters = eq_09_whitened(coupling - ambient, receiver, transmitter)
+    residual, _, right = np.linalg.svd(
+        -free_parameters @ np.linalg.inv(position_matrix(position_beacon))
+    )
+    sign = np.linalg.det(residual @ right)[..., None]
     last = np.concatenate([np.ones_like(sign), np.ones_like(sign), sign], axis=-1)
-    return (left * last[..., None, :]) @ right
+    return (residual * last[..., None, :]) @ right
 
 
 # 3.3 Angles of H = Rx(roll) Ry(pitch) Rz(yaw) as turns of the axes ------------------------------
@@ -190,8 +194,8 @@ def euler_angles(attitude: Array) -> Array:
 
 def attitude_from_angles(angles: Array) -> Array:
     """Return the H of yaw, pitch and roll (..., 3) (rad): the inverse of `euler_angles`."""
-    turned = Rotation.from_euler("ZYX", angles.reshape(-1, 3)).as_matrix()
-    return np.swapaxes(turned, -1, -2).reshape(*angles.shape, 3)
+    rotated = Rotation.from_euler("ZYX", angles.reshape(-1, 3)).as_matrix()
+    return np.swapaxes(rotated, -1, -2).reshape(*angles.shape, 3)
 
 
 # 4 Calibration ----------------------------------------------------------------------------------

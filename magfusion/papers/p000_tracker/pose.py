@@ -11,7 +11,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.solve.batched import (
-    Normal,
+    NormalEquations,
     minimise,
     moved_poses,
     normal_equations,
@@ -92,8 +92,8 @@ def unit_coupling(
             f"beacon {beacon.name}: its moments lie in one plane; the closed form of a tracker"
             " requires three axes; `magfusion fix` works with fewer"
         )
-    undone = phasor_sensor if phase is None else phasor_sensor * np.exp(-1j * phase)[..., None]
-    measured = np.concatenate([undone.real, undone.imag], axis=-2)  # (..., 2 tones, 3)
+    reverted = phasor_sensor if phase is None else phasor_sensor * np.exp(-1j * phase)[..., None]
+    measured = np.concatenate([reverted.real, reverted.imag], axis=-2)  # (..., 2 tones, 3)
     in_sensor = measured @ np.linalg.inv(matrix).T
     return np.swapaxes(in_sensor, -1, -2) @ np.linalg.pinv(moments)
 
@@ -111,13 +111,13 @@ def locate_by_svd(unit: Array) -> TrackerFix:
         Where a determinant is not positive, which no pose of a right-handed tracker gives.
     """
     _refuse_mirrored(unit)
-    left, size, right = np.linalg.svd(unit)
+    residual, size, right = np.linalg.svd(unit)
     power = np.sum(size**2, axis=-1)
     distance = (6.0 * MU0_OVER_4PI**2 / power) ** (1.0 / 6.0)
     along = right[..., 0, :] * distance[..., None]
     ideal = np.sqrt(power / 6.0)[..., None] * [2.0, 1.0, 1.0]
     return TrackerFix(
-        sensor_from_beacon=(left * [1.0, -1.0, -1.0]) @ right,
+        sensor_from_beacon=(residual * [1.0, -1.0, -1.0]) @ right,
         position_beacon=np.stack([along, -along], axis=-2),
         distance=distance,
         residual=np.linalg.norm(size - ideal, axis=-1) / np.sqrt(power),
@@ -164,7 +164,7 @@ def refine_poses(
     coupling: Array,
     beacon_from_sensor: Array,
     position_beacon: Array,
-    passes: int = 20,
+    iterations: int = 20,
 ) -> tuple[Array, Array]:
     """Return the poses of maximum likelihood in white noise.
 
@@ -184,9 +184,9 @@ def refine_poses(
     vector, measured = vector.reshape(-1, vector.shape[-1]), coupling.reshape(-1, 3, 3)
     weight = 1.0 / np.linalg.norm(measured, axis=(1, 2))[:, None, None]
 
-    def model(rows: IntArray, pose: Array) -> Normal:
-        turned, position = pose[:, :9].reshape(-1, 3, 3), pose[:, 9:]
-        seen = observe_antenna(antenna_from_vector(vector[rows]), turned, position)
+    def model(rows: IntArray, pose: Array) -> NormalEquations:
+        rotated, position = pose[:, :9].reshape(-1, 3, 3), pose[:, 9:]
+        seen = observe_antenna(antenna_from_vector(vector[rows]), rotated, position)
         error = (seen.value - measured[rows]) * weight[rows]
         jacobian = seen.pose * weight[rows, ..., None]
         return normal_equations(error.reshape(-1, 9), jacobian.reshape(-1, 9, 6))
@@ -194,7 +194,7 @@ def refine_poses(
     start = np.concatenate(
         [beacon_from_sensor.reshape(-1, 9), position_beacon.reshape(-1, 3)], axis=1
     )
-    found = minimise(model, start, moved_poses, passes=passes, absolute=1e-18)
-    if not np.all(found.converged):
+    result = minimise(model, start, moved_poses, max_iterations=iterations, absolute=1e-18)
+    if not np.all(result.converged):
         raise EstimationError("a tracker's pose does not converge: inconsistent couplings")
-    return found.state[:, :9].reshape(*lead, 3, 3), found.state[:, 9:].reshape(*lead, 3)
+    return result.state[:, :9].reshape(*lead, 3, 3), result.state[:, 9:].reshape(*lead, 3)

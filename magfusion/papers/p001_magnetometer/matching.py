@@ -61,8 +61,8 @@ class Matches:
 def predict_field(rpy: Array, field_world: Array) -> Array:
     """Return the field in body axes at attitudes (..., 3) (rad)."""
     turn = Rotation.from_euler("xyz", np.reshape(rpy, (-1, 3)))
-    turned = turn.apply(field_world, inverse=True)
-    return turned.reshape(rpy.shape)
+    rotated = turn.apply(field_world, inverse=True)
+    return rotated.reshape(rpy.shape)
 
 
 def wrap(angle: Array) -> Array:
@@ -119,7 +119,7 @@ def match_roll_pitch(
     """
     along, _, down = _in_heading(yaw, field_world)
     size = float(np.linalg.norm(field_world))
-    in_plane, turned = np.hypot(along, down), np.arctan2(down, along)
+    in_plane, rotated = np.hypot(along, down), np.arctan2(down, along)
     if np.any(in_plane < LEAST_SHARE * size):
         raise InputError(
             "the field lies along the axis of pitch and cannot determine it; choose another"
@@ -129,7 +129,7 @@ def match_roll_pitch(
     # Noise moves the measured vector off the sphere and beyond the fold: use the nearest point.
     share = field_body[..., 0] * size / (np.linalg.norm(field_body, axis=-1) * in_plane)
     opening = np.arccos(np.clip(share, -1.0, 1.0))
-    pitch = wrap(first * opening - turned)
+    pitch = wrap(first * opening - rotated)
     roll = roll_about(field_body, pitch, yaw, field_world)
     rpy = np.stack([roll, pitch, np.broadcast_to(yaw, roll.shape)], axis=-1)
     return with_other_pitch(rpy, field_body, field_world, sigma, np.abs(share) <= 1.0)
@@ -152,8 +152,8 @@ def with_other_pitch(
     spread = roll_pitch_sigma(both, field_world, np.asarray(sigma)[..., None])
     # Distance of the pitch from the fold, where the two solutions coincide.
     to_fold = np.abs(np.arcsin(np.clip(np.sin(rpy[..., 1] + np.arctan2(down, along)), -1.0, 1.0)))
-    apart = to_fold[..., None] > 3.0 * spread[..., 1]
-    determined = known[..., None] & apart & (np.max(spread, axis=-1) < UNDETERMINED)
+    separate = to_fold[..., None] > 3.0 * spread[..., 1]
+    determined = known[..., None] & separate & (np.max(spread, axis=-1) < UNDETERMINED)
     there = np.nan_to_num(both)
     residual = np.linalg.norm(predict_field(there, field_world) - field_body[..., None, :], axis=-1)
     residual = np.where(np.isnan(both[..., 0]), np.nan, residual)

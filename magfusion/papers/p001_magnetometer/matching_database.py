@@ -133,9 +133,9 @@ def prepare(database: AttitudeDatabase) -> Index:
         name = ("roll", "pitch", "yaw")[axis]
         if np.ptp(wrap(database.rpy[:, axis] - database.rpy[0, axis])) > 1e-6:
             raise InputError(f"its {name} varies and must be fixed; {THREE_ANGLES}")
-    turned = np.stack([predict_field(database.rpy, axis) for axis in np.eye(3)], axis=-1)
-    field_world = np.einsum("nij,ni->j", turned, database.field_body) / len(database)
-    left = database.field_body - predict_field(database.rpy, field_world)
+    rotated = np.stack([predict_field(database.rpy, axis) for axis in np.eye(3)], axis=-1)
+    field_world = np.einsum("nij,ni->j", rotated, database.field_body) / len(database)
+    residual = database.field_body - predict_field(database.rpy, field_world)
     side = fold_side(database.rpy[:, 1], database.rpy[:, 2], field_world)
     if database.angles == "roll-pitch" and np.min(side) * np.max(side) <= 0.0:
         raise InputError(
@@ -148,7 +148,7 @@ def prepare(database: AttitudeDatabase) -> Index:
         database=database,
         tree=tree,
         field_world=field_world,
-        sigma=float(np.sqrt(np.mean(left**2))),
+        sigma=float(np.sqrt(np.mean(residual**2))),
         spacing=float(np.quantile(gap[:, 1], 0.95)),
         side=1 if float(np.mean(side)) >= 0.0 else -1,
     )
@@ -156,8 +156,8 @@ def prepare(database: AttitudeDatabase) -> Index:
 
 def nearest_entries(index: Index, field_body: Array, count: int = 1) -> tuple[Array, IntArray]:
     """Return distance (T) and row of the entries nearest to each field, shape (n, count)."""
-    asked = _compared(index.database.angles, field_body)
-    distance, row = index.tree.query(asked, k=np.arange(1, count + 1))
+    requested = _compared(index.database.angles, field_body)
+    distance, row = index.tree.query(requested, k=np.arange(1, count + 1))
     return distance, row
 
 
@@ -171,10 +171,10 @@ def match_interpolated(index: Index, field_body: Array, sigma: float) -> Matches
     """Return the attitude from an affine map fitted to the entries nearest to each field (n, 3)."""
     rows = [slice(k, k + _CHUNK) for k in range(0, len(field_body), _CHUNK)]
     parts = [_interpolated(index, field_body[part]) for part in rows]
-    rpy, distance, left = (np.concatenate(part) for part in zip(*parts, strict=True))
-    found = _matches(index, field_body, rpy, distance, sigma, interpolated=True)
-    found.sigma[:, 0] = np.hypot(found.sigma[:, 0], left)
-    return found
+    rpy, distance, residual = (np.concatenate(part) for part in zip(*parts, strict=True))
+    result = _matches(index, field_body, rpy, distance, sigma, interpolated=True)
+    result.sigma[:, 0] = np.hypot(result.sigma[:, 0], residual)
+    return result
 
 
 def _interpolated(index: Index, field_body: Array) -> tuple[Array, Array, Array]:
@@ -182,21 +182,21 @@ def _interpolated(index: Index, field_body: Array) -> tuple[Array, Array, Array]
     kind = index.database.angles
     distance, row = nearest_entries(index, field_body, NEIGHBOURS[kind])
     near = _unit(_compared(kind, index.database.field_body[row]))
-    asked = _unit(_compared(kind, field_body))
+    requested = _unit(_compared(kind, field_body))
     centre = np.mean(near, axis=1)
     # Only directions count; the length is noise.  The fit is in the plane across the centre.
     across = np.eye(near.shape[-1]) - _unit(centre)[:, :, None] * _unit(centre)[:, None, :]
     spread = (near - centre[:, None]) @ across
     known = index.database.rpy[row]
-    turned = wrap(known - known[:, :1])
-    mean = np.mean(turned, axis=1)
-    slope = np.linalg.pinv(spread, rcond=_FLAT) @ (turned - mean[:, None])
-    rpy = known[:, 0] + mean + ((asked - centre)[:, None] @ across @ slope)[:, 0]
+    rotated = wrap(known - known[:, :1])
+    mean = np.mean(rotated, axis=1)
+    slope = np.linalg.pinv(spread, rcond=_FLAT) @ (rotated - mean[:, None])
+    rpy = known[:, 0] + mean + ((requested - centre)[:, None] @ across @ slope)[:, 0]
     rpy[:, 0] = wrap(rpy[:, 0])
     # The residuals of an affine map at the neighbours are those between them too.
-    left = turned - mean[:, None] - spread @ slope
-    free = left.shape[1] - (2 if kind == "roll" else 3)
-    return rpy, distance[:, 0], np.sqrt(np.sum(left**2, axis=1) / free)
+    residual = rotated - mean[:, None] - spread @ slope
+    free_parameters = residual.shape[1] - (2 if kind == "roll" else 3)
+    return rpy, distance[:, 0], np.sqrt(np.sum(residual**2, axis=1) / free_parameters)
 
 
 def _matches(
@@ -213,9 +213,9 @@ def _matches(
     step = 0.0 if interpolated else index.spacing / np.sqrt(12.0)
     total = float(np.sqrt(sigma**2 + index.sigma**2 + step**2))
     if index.database.angles == "roll-pitch":
-        found = with_other_pitch(rpy, field_body, index.field_world, total, within)
-        found.residual[:, 0] = distance
-        return found
+        result = with_other_pitch(rpy, field_body, index.field_world, total, within)
+        result.residual[:, 0] = distance
+        return result
     spread = roll_sigma(rpy, index.field_world, total)
     return Matches(rpy[:, None], spread[:, None], distance[:, None], within[:, None])
 

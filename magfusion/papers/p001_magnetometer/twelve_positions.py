@@ -73,8 +73,8 @@ def least_squares(
     solution = np.linalg.pinv(design) @ measured
     matrix = np.swapaxes(solution[..., :3, :], -1, -2) / size
     if sigma is None:
-        left = measured - design @ solution
-        variance = np.sum(left**2, axis=(-1, -2)) / (3 * n - 12)
+        residual = measured - design @ solution
+        variance = np.sum(residual**2, axis=(-1, -2)) / (3 * n - 12)
     else:
         variance = np.full(measured.shape[:-2], sigma**2)
     scale = np.array([1.0 / size] * 3 + [1.0])

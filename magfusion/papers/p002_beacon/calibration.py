@@ -143,15 +143,15 @@ def consistent_centres(
     count = len(position_world)
     size = float(np.max(np.linalg.norm(position_world[:, None] - position_world, axis=-1)))
     starts = size * np.array(list(product((0.2, 0.6, 1.2), repeat=count)))
-    found: list[tuple[tuple[int, ...], Array]] = []
+    result: list[tuple[tuple[int, ...], Array]] = []
     for signs in product((1, -1), repeat=count - 1):
-        turned = np.broadcast_to(
+        rotated = np.broadcast_to(
             direction * np.array([1, *signs])[:, None], (len(starts), count, 3)
         )
-        distance, residual = distances_from_angles(turned, position_world, starts)
+        distance, residual = distances_from_angles(rotated, position_world, starts)
         fits = (np.max(np.abs(residual), axis=-1) < tolerance) & np.all(distance > 0.0, axis=-1)
-        for centre in centre_by_rays(turned[fits], distance[fits], position_world):
-            known = [c for s, c in found if s == (1, *signs)]
+        for centre in centre_by_rays(rotated[fits], distance[fits], position_world):
+            known = [c for s, c in result if s == (1, *signs)]
             if not any(np.linalg.norm(centre - other) < 1e-3 * size for other in known):
-                found.append(((1, *signs), centre))
-    return found
+                result.append(((1, *signs), centre))
+    return result

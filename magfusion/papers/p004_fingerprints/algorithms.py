@@ -38,7 +38,7 @@ from magfusion.units import Array, IntArray
 
 Method = Literal["paper-lines", "paper-knn", "paper-knn-nt", "paper-fingerprint"]
 LEAST_BEACONS = 3  # a position has three coordinates
-BLOCK_PASSES = 3  # between position and the block that it lies in
+BLOCK_ITERATIONS = 3  # between position and the block that it lies in
 
 TOO_FEW_BEACONS = "fewer than three beacons detected"
 TOO_FEW_POINTS = "too few fingerprints of the detected beacons"
@@ -152,7 +152,7 @@ def locate_by_lines(
     """
     _, point = nearest(known, amplitude, NEIGHBOURS)
     position = np.mean(known.position_world[point], axis=1)
-    for _ in range(BLOCK_PASSES if isinstance(lines, BlockLines) else 1):
+    for _ in range(BLOCK_ITERATIONS if isinstance(lines, BlockLines) else 1):
         here = lines.at(position) if isinstance(lines, BlockLines) else lines
         ranges = ranges_from_lines(here, amplitude)
         position = trilaterate_from_both_sides(ranges, known.beacons_world, position)

@@ -97,12 +97,12 @@ def locate_by_tensor(beacon: Beacon, phasor_beacon: ComplexArray) -> TensorFix:
         raise ValueError(f"beacon {beacon.name}: one axis does not determine a direction")
     stacked = np.concatenate([phasor_beacon.real, phasor_beacon.imag], axis=-2)
     measured = stacked.reshape(*stacked.shape[:-2], -1)
-    found = measured @ np.linalg.pinv(design).T
-    power, axes = np.linalg.eigh(np.einsum("...k,kij->...ij", found, _BASIS))
+    result = measured @ np.linalg.pinv(design).T
+    power, axes = np.linalg.eigh(np.einsum("...k,kij->...ij", result, _BASIS))
     direction = axes[..., -1]
     direction = np.where(direction[..., 2:] < 0.0, -direction, direction)
     return TensorFix(
         direction_beacon=direction,
         distance=np.cbrt(2.0 * MU0_OVER_4PI / power[..., -1]),
-        residual=np.linalg.norm(measured - found @ design.T, axis=-1),
+        residual=np.linalg.norm(measured - result @ design.T, axis=-1),
     )

@@ -110,10 +110,10 @@ def nearest(
     Euclidean, of logarithms or else in nT, where the nearest beacon outweighs all others; smallest
     first.  The database must be complete (`FingerprintDatabase.detecting`).
     """
-    ours, theirs = (
+    ours, others = (
         np.log(a) if logarithmic else a / NANOTESLA for a in (database.amplitude, amplitude)
     )
-    difference, point = KDTree(ours).query(theirs, np.arange(1, neighbours + 1))
+    difference, point = KDTree(ours).query(others, np.arange(1, neighbours + 1))
     return difference, point
 
 

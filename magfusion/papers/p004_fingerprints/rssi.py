@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.errors import EstimationError
-from magfusion.estimation.solve.batched import Normal, minimise
+from magfusion.estimation.solve.batched import NormalEquations, minimise
 from magfusion.papers.p004_fingerprints.equations import (
     distances,
     eq_15_log_amplitude,
@@ -169,8 +169,8 @@ def trilaterate_from_both_sides(ranges: Array, beacons_world: Array, start_world
     if flat:
         return here
     there = trilaterate(ranges, beacons_world, _mirrored(start_world, centre, normal))
-    ours, theirs = (eq_17_misfit(p, beacons_world, ranges) for p in (here, there))
-    return np.where((theirs < ours)[..., None], there, here)
+    ours, others = (eq_17_misfit(p, beacons_world, ranges) for p in (here, there))
+    return np.where((others < ours)[..., None], there, here)
 
 
 def _plane(beacons_world: Array) -> tuple[Array, Array, bool]:
@@ -185,7 +185,7 @@ def _mirrored(position: Array, centre: Array, normal: Array) -> Array:
 
 
 def _converged(start: Array, beacons: Array, ranges: Array) -> Array:
-    def model(rows: IntArray, position: Array) -> Normal:
+    def model(rows: IntArray, position: Array) -> NormalEquations:
         offset = position[:, None] - beacons
         length = np.maximum(np.linalg.norm(offset, axis=-1), _TINY)
         unit, excess = offset / length[..., None], length - ranges[rows]
@@ -194,14 +194,16 @@ def _converged(start: Array, beacons: Array, ranges: Array) -> Array:
         curvature = np.einsum("nb,nbi,nbj->nij", 1.0 - across, unit, unit)
         curvature += np.sum(across, axis=1)[:, None, None] * np.eye(3)
         size, axes = np.linalg.eigh(curvature)
-        return Normal(
+        return NormalEquations(
             np.sum(excess**2, axis=-1),
             np.einsum("nb,nbi->ni", excess, unit),
             (axes * np.abs(size)[:, None]) @ np.swapaxes(axes, -1, -2),
         )
 
-    found = minimise(model, start.astype(np.float64), passes=ITERATIONS, absolute=CONVERGED**2)
-    if not np.all(found.converged):
-        first = start[np.argmin(found.converged)]
+    result = minimise(
+        model, start.astype(np.float64), max_iterations=ITERATIONS, absolute=CONVERGED**2
+    )
+    if not np.all(result.converged):
+        first = start[np.argmin(result.converged)]
         raise EstimationError(f"trilateration does not converge from {first}")
-    return found.state
+    return result.state

@@ -45,29 +45,29 @@ class Candidates:
     Parameters
     ----------
     beacons : tuple of Beacon
-    apart : float
+    min_distance : float
         Minimum distance of two beacons (m).
     """
 
     beacons: tuple[Beacon, ...]
-    apart: float
+    min_distance: float
 
     @property
     def places(self) -> Array:
         """Their positions, shape (candidates, 3) (m)."""
         return np.array([beacon.position_world for beacon in self.beacons])
 
-    def beside(self, taken: Sequence[int]) -> BoolArray:
+    def far_from(self, selected: Sequence[int]) -> BoolArray:
         """Return which candidates keep the distance from the selected ones."""
         places = self.places
-        free = np.ones(len(places), dtype=bool)
-        for other in taken:
-            free &= np.linalg.norm(places - places[other], axis=1) >= self.apart
-        return free
+        allowed = np.ones(len(places), dtype=bool)
+        for other in selected:
+            allowed &= np.linalg.norm(places - places[other], axis=1) >= self.min_distance
+        return allowed
 
 
 @dataclass(frozen=True)
-class Found:
+class ExchangeResult:
     """A layout that no exchange improves.
 
     Parameters
@@ -86,7 +86,7 @@ class Found:
 
 
 @dataclass(eq=False)
-class Search:
+class LayoutSearch:
     """Candidates and the points at which they are compared, to which points can be added.
 
     Parameters
@@ -110,9 +110,9 @@ class Search:
 
     def __post_init__(self) -> None:
         """Select the first points: distributed evenly over all, or enough for a mean."""
-        most = FIRST_POINTS if self.objective == "worst" else 2 * FIRST_POINTS
+        maximum = FIRST_POINTS if self.objective == "worst" else 2 * FIRST_POINTS
         count = len(self.information.points)
-        self.add(np.unique(np.linspace(0, count - 1, min(most, count)).astype(int)))
+        self.add(np.unique(np.linspace(0, count - 1, min(maximum, count)).astype(int)))
 
     def add(self, points: IntArray) -> None:
         """Add points at which candidates are compared."""
@@ -140,7 +140,7 @@ class Search:
     def best_in_place_of(self, chosen: Sequence[int], slot: int, value: float) -> tuple[int, float]:
         """Return the best candidate in place of a beacon, and the objective with it."""
         others = [c for k, c in enumerate(chosen) if k != slot]
-        rows = np.flatnonzero(self.candidates.beside(others))
+        rows = np.flatnonzero(self.candidates.far_from(others))
         new = added(self.roots[others])
         rest = self.standing[0] + np.sum(new, axis=0)
         parts = [rest - self.standing[0] + kept for kept in self.standing[1:]]
@@ -150,8 +150,8 @@ class Search:
         base = np.stack([rest, *parts], axis=1)  # (points, 1 + beacons, size, size)
         alone = pose_covariance(rest)  # without the one that is exchanged
         if self.objective != "worst":
-            found = self._compared(rows, base[:, :1], alone, np.arange(len(self.active)))
-            means = np.mean(found, axis=1)
+            result = self._compared(rows, base[:, :1], alone, np.arange(len(self.active)))
+            means = np.mean(result, axis=1)
             best = int(np.argmin(means))
             return int(rows[best]), float(means[best])
         now = self._each(chosen)
@@ -159,8 +159,8 @@ class Search:
         worst = np.zeros(len(rows))
         starts = [0, *(s for s in STAGES if s < len(order)), len(order)]
         for start, end in pairwise(starts):
-            found = self._compared(rows, base, alone, order[start:end])
-            worst = np.maximum(worst, np.max(found, axis=1))
+            result = self._compared(rows, base, alone, order[start:end])
+            worst = np.maximum(worst, np.max(result, axis=1))
             kept = worst < value * (1.0 - LESS)
             rows, worst = rows[kept], worst[kept]
             if not len(rows):
@@ -172,7 +172,7 @@ class Search:
         """Return the objective per point with each candidate, (rows, points)."""
         size, parts = base.shape[-1], base.shape[1]
         step = max(AT_ONCE // (len(points) * parts), 1)
-        found = np.empty((len(rows), len(points)))
+        result = np.empty((len(rows), len(points)))
         for start in range(0, len(rows), step):
             some = rows[start : start + step]
             new = added(self.roots[some][:, points])
@@ -184,8 +184,8 @@ class Search:
                 own = np.tile(alone[points], (len(some), 1, 1))
                 subset = np.concatenate([cov[:, 1:], own[:, None]], axis=1)
                 each = self.information.levels_of(cov[:, 0], subset)
-            found[start : start + len(some)] = each.reshape(len(some), len(points))
-        return found
+            result[start : start + len(some)] = each.reshape(len(some), len(points))
+        return result
 
 
 def value_of(
@@ -235,35 +235,35 @@ def random_layout(
     """Return random candidates that keep their distance; None where none are found."""
     for _ in range(TRIES):
         drawn: list[int] = rng.choice(len(candidates.beacons), count, replace=False).tolist()
-        if all(candidates.beside(drawn[:k])[c] for k, c in enumerate(drawn)):
+        if all(candidates.far_from(drawn[:k])[c] for k, c in enumerate(drawn)):
             return tuple(drawn)
     return None
 
 
-def exchanged(search: Search, chosen: tuple[int, ...]) -> tuple[int, ...]:
+def exchanged(search: LayoutSearch, chosen: tuple[int, ...]) -> tuple[int, ...]:
     """Exchange one beacon after another, until there is no gain at the compared points."""
     value, unchanged, layout = search.value(chosen), 0, list(chosen)
     for turn in range(SWEEPS * len(layout)):
         if unchanged == len(layout) or not search.in_time():
             break
         slot = turn % len(layout)
-        taken, reached = search.best_in_place_of(layout, slot, value)
-        better = reached < value - LESS * abs(value) and taken != layout[slot]
+        selected, reached = search.best_in_place_of(layout, slot, value)
+        better = reached < value - LESS * abs(value) and selected != layout[slot]
         if better:
-            layout[slot], value = taken, reached
+            layout[slot], value = selected, reached
         unchanged = 0 if better else unchanged + 1
     return tuple(layout)
 
 
 def best_layout(
-    search: Search,
+    search: LayoutSearch,
     count: int,
     starts: int,
     rng: np.random.Generator,
     *,
     first: tuple[int, ...] | None = None,
     report: Report = quiet,
-) -> Found | None:
+) -> ExchangeResult | None:
     """Return the best layout of several starts; None where beacons cannot keep their distance.
 
     Parameters
@@ -271,7 +271,7 @@ def best_layout(
     first : tuple of int, optional
         An initial layout, before random ones.
     """
-    best: Found | None = None
+    best: ExchangeResult | None = None
     for start in range(starts):
         report("starts of the search", start, starts)
         if best is not None and not search.in_time():
@@ -279,16 +279,16 @@ def best_layout(
         layout = first if start == 0 and first is not None else _start(search, count, rng)
         if layout is None:
             return best
-        found = _settled(search, layout)
-        if best is None or found.value < best.value:
-            best = found
+        result = _exchange_until_converged(search, layout)
+        if best is None or result.value < best.value:
+            best = result
     report("starts of the search", starts, starts)
     if best is None:
         return None
-    return Found(best.chosen, best.value, search.in_time())
+    return ExchangeResult(best.chosen, best.value, search.in_time())
 
 
-def _start(search: Search, count: int, rng: np.random.Generator) -> tuple[int, ...] | None:
+def _start(search: LayoutSearch, count: int, rng: np.random.Generator) -> tuple[int, ...] | None:
     best: tuple[float, tuple[int, ...]] | None = None
     for _ in range(DRAWN):
         drawn = random_layout(search.candidates, count, rng)
@@ -300,14 +300,14 @@ def _start(search: Search, count: int, rng: np.random.Generator) -> tuple[int, .
     return None if best is None else best[1]
 
 
-def _settled(search: Search, layout: tuple[int, ...]) -> Found:
+def _exchange_until_converged(search: LayoutSearch, layout: tuple[int, ...]) -> ExchangeResult:
     """Exchange, and add the points where the layout is worse than at the compared points."""
-    best: Found | None = None
+    best: ExchangeResult | None = None
     for _ in range(ROUNDS):
         layout = exchanged(search, layout)
         value, each = search.value_everywhere(layout)
         if best is None or value < best.value:
-            best = Found(layout, value, complete=True)
+            best = ExchangeResult(layout, value, complete=True)
         enough = search.objective != "worst" or value <= search.value(layout) * (1.0 + LESS)
         full = len(search.active) + MORE_POINTS > MOST_COMPARED
         if enough or full or not search.in_time():
@@ -317,16 +317,16 @@ def _settled(search: Search, layout: tuple[int, ...]) -> Found:
     return best
 
 
-def _worst_apart(search: Search, each: Array) -> IntArray:
+def _worst_apart(search: LayoutSearch, each: Array) -> IntArray:
     """Return the worst points that are not compared yet, none close to another."""
     points = search.information.points
     near = 0.1 * float(np.linalg.norm(np.ptp(points, axis=0)))
-    taken: list[int] = []
+    selected: list[int] = []
     for point in np.argsort(-each, kind="stable").tolist():
         if point in search.active or each[point] < 0.9 * np.max(each):
             continue
-        if all(np.linalg.norm(points[point] - points[other]) > near for other in taken):
-            taken.append(point)
-        if len(taken) == MORE_POINTS:
+        if all(np.linalg.norm(points[point] - points[other]) > near for other in selected):
+            selected.append(point)
+        if len(selected) == MORE_POINTS:
             break
-    return np.array(taken, dtype=np.int64)
+    return np.array(selected, dtype=np.int64)

@@ -69,10 +69,10 @@ class LayoutInformation:
         """Return a root of one new beacon's information, shape (n, rows, size)."""
         site = replace(self.site, beacons=(beacon,), correlation=None)
         blocks = choose_blocks(site, SURVEY_GROUPS)
-        shared, free = _shared(blocks), is_free(blocks)
-        sigma = np.where(free, 1.0, prior_sigma(blocks))
+        shared, allowed = _shared(blocks), is_free(blocks)
+        sigma = np.where(allowed, 1.0, prior_sigma(blocks))
         own = len(sigma) - shared
-        prior = np.eye(len(sigma))[:own][~free[:own]]
+        prior = np.eye(len(sigma))[:own][~allowed[:own]]
         seen = self._seen(site, blocks)
         rows = seen.by_pose.shape[1] + len(prior) - own
         return root_information(seen, np.diag(sigma), prior, shared)[:, : max(rows, 1)]
@@ -89,9 +89,9 @@ class LayoutInformation:
             alone = replace(self.site, beacons=(self.template,))
             every = choose_blocks(alone, SURVEY_GROUPS)
             blocks = placed(b for b in every if not isinstance(b.parameter, BeaconParameter))
-        shared, free = _shared(blocks), is_free(blocks)
-        sigma = np.where(free, 1.0, prior_sigma(blocks))
-        prior = (prior_sqrt_information(self.site, blocks) * prior_sigma(blocks))[~free]
+        shared, allowed = _shared(blocks), is_free(blocks)
+        sigma = np.where(allowed, 1.0, prior_sigma(blocks))
+        prior = (prior_sqrt_information(self.site, blocks) * prior_sigma(blocks))[~allowed]
         if not self.site.beacons:
             count = len(self.points)
             empty = np.zeros((count, 0, POSE)), np.zeros((count, 0, len(sigma)))
@@ -137,7 +137,7 @@ def pose_covariance(information: Array) -> Array:
     """Return the pose's covariance, shared parameters marginalised, shape (..., 6, 6)."""
     size = np.diagonal(information, axis1=-2, axis2=-1)
     scale = 1.0 / np.sqrt(np.maximum(size, NOTHING))
-    alike = information * scale[..., :, None] * scale[..., None, :]
-    factor = np.linalg.cholesky(alike + FLOOR * np.eye(alike.shape[-1]))[..., -POSE:, -POSE:]
+    shared = information * scale[..., :, None] * scale[..., None, :]
+    factor = np.linalg.cholesky(shared + FLOOR * np.eye(shared.shape[-1]))[..., -POSE:, -POSE:]
     inverse = np.linalg.inv(factor) * scale[..., None, -POSE:]
     return np.asarray(np.swapaxes(inverse, -1, -2) @ inverse)

@@ -64,7 +64,7 @@ class Parameters:
         Change of the fields for one sigma, in sigmas of their noise.
     limit : ndarray, shape (k,)
         Relative to the declared sigma, after all possible stops.
-    `asked` : bool ndarray, shape (k,)
+    `requested` : bool ndarray, shape (k,)
         Whether stops can determine it, and it belongs to the site rather than to one log.
     """
 
@@ -72,7 +72,7 @@ class Parameters:
     sigma: Array
     weight: Array
     limit: Array
-    asked: BoolArray
+    requested: BoolArray
 
     def worst(self, ratio: Array) -> int:
         """Return the parameter with the largest possible gain in the fields.
@@ -82,12 +82,12 @@ class Parameters:
         ratio : ndarray, shape (k,)
             Each sigma relative to the declared one.
         """
-        return int(np.argmax(np.where(self.asked, self.excess(ratio), -1.0)))
+        return int(np.argmax(np.where(self.requested, self.excess(ratio), -1.0)))
 
     def excess(self, ratio: Array) -> Array:
         """Return the possible change of the fields from further stops, in sigmas of noise."""
-        left = np.maximum(ratio**2 - self.limit**2, 0.0)
-        return np.asarray(self.weight * np.sqrt(left))
+        remaining = np.maximum(ratio**2 - self.limit**2, 0.0)
+        return np.asarray(self.weight * np.sqrt(remaining))
 
     def sized(self, index: int, ratio: float) -> str:
         """Return a sigma with its unit, from its ratio to the declared one."""
@@ -115,7 +115,7 @@ class Stop:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class MotionPlan:
     """Stops in their order, and the remaining sigmas.
 
     Parameters
@@ -148,7 +148,7 @@ class Poses:
     root: Array
 
 
-def next_motion(site: Site, places: Array, count: int, stop: float, *, known: bool) -> Motion:
+def next_motion(site: Site, places: Array, count: int, stop: float, *, known: bool) -> MotionPlan:
     """Select stops one after another, each for the parameter that is then the worst.
 
     Parameters
@@ -173,11 +173,11 @@ def next_motion(site: Site, places: Array, count: int, stop: float, *, known: bo
     )
     stops: list[Stop] = []
     ratio, fresh = _ratio(information), np.ones(len(poses.root), dtype=bool)
-    for _ in range(count if np.any(parameters.asked) else 0):
+    for _ in range(count if np.any(parameters.requested) else 0):
         worst = parameters.worst(ratio)
         chosen, reached = _best(information, poses, worst, np.flatnonzero(fresh))
         information = information + poses.root[chosen].T @ poses.root[chosen]
-        fresh = fresh & ~_errs_alike(site, poses, chosen)
+        fresh = fresh & ~_shares_model_error(site, poses, chosen)
         fresh = fresh if np.any(fresh) else np.ones_like(fresh)
         stops.append(
             Stop(
@@ -189,14 +189,14 @@ def next_motion(site: Site, places: Array, count: int, stop: float, *, known: bo
             )
         )
         ratio = _ratio(information)
-    return Motion(tuple(stops), parameters, ratio)
+    return MotionPlan(tuple(stops), parameters, ratio)
 
 
 def prior_information(site: Site, blocks: tuple[Block, ...]) -> Array:
     """Return the site's prior information on the calibration, in units of its sigmas, (k, k)."""
-    free = is_free(blocks)
-    root = (prior_sqrt_information(site, blocks) * prior_sigma(blocks))[~free]
-    return np.asarray(root.T @ root + UNKNOWN * np.diag(free.astype(float)))
+    allowed = is_free(blocks)
+    root = (prior_sqrt_information(site, blocks) * prior_sigma(blocks))[~allowed]
+    return np.asarray(root.T @ root + UNKNOWN * np.diag(allowed.astype(float)))
 
 
 def candidate_poses(
@@ -205,8 +205,8 @@ def candidate_poses(
     """Return every place in every attitude, with the information of a stop there."""
     places = places[np.unique(np.linspace(0, len(places) - 1, MOST_PLACES).astype(int))]
     centres = np.array([b.position_world for b in site.beacons])
-    apart = np.linalg.norm(places[:, None] - centres, axis=2).min(axis=1)
-    places = places[apart > NEAREST + np.linalg.norm(site.platform.magnetometer.position_body)]
+    separate = np.linalg.norm(places[:, None] - centres, axis=2).min(axis=1)
+    places = places[separate > NEAREST + np.linalg.norm(site.platform.magnetometer.position_body)]
     variance, calibration = phasor_variance(site, stop), initial_calibration(site, 0.0)
     sigma = np.where(is_free(blocks), 1.0, prior_sigma(blocks))
     level = max(site.platform.imu.accel_bias_sigma / site.gravity, LEVEL_SIGMA)
@@ -249,21 +249,21 @@ def _ratio(information: Array) -> Array:
     return np.sqrt(np.diagonal(np.linalg.inv(information), axis1=-2, axis2=-1))
 
 
-def _errs_alike(site: Site, poses: Poses, chosen: int) -> BoolArray:
+def _shares_model_error(site: Site, poses: Poses, chosen: int) -> BoolArray:
     """Return where the model error is correlated with a stop's: a second one there adds less."""
     if site.model_error == 0.0:
         return np.zeros(len(poses.root), dtype=bool)
-    apart = np.linalg.norm(poses.position_world - poses.position_world[chosen], axis=1)
-    return np.asarray(apart <= site.model_error_length)
+    separate = np.linalg.norm(poses.position_world - poses.position_world[chosen], axis=1)
+    return np.asarray(separate <= site.model_error_length)
 
 
 def _best(information: Array, poses: Poses, worst: int, among: IntArray) -> tuple[int, float]:
     """Return the candidate that minimises the sigma of a parameter, and that sigma."""
-    found = []
+    result = []
     for start in range(0, len(among), AT_ONCE):
         root = poses.root[among[start : start + AT_ONCE]]
         ratio = _ratio(information + np.swapaxes(root, 1, 2) @ root)
-        found.append(ratio[:, worst])
-    each = np.concatenate(found)
+        result.append(ratio[:, worst])
+    each = np.concatenate(result)
     chosen = int(np.argmin(each))
     return int(among[chosen]), float(each[chosen])

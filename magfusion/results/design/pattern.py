@@ -16,7 +16,7 @@ AXES_OFFERED = (3, 7, 13)
 
 
 @dataclass(frozen=True, eq=False)
-class Band:
+class ToneBand:
     """Frequency band of tones, and their spacing.
 
     Parameters
@@ -39,19 +39,19 @@ class Band:
         """Minimum distance of tones from each other, from zero and from the mains (Hz)."""
         return max(2.0 / self.window, CLOSEST_TONES_HZ)
 
-    def free(self, taken: Array) -> Array:
+    def allowed(self, selected: Array) -> Array:
         """Return tones separable from the used ones and from each other (Hz)."""
         step = self.spacing / 5.0
         wanted = np.arange(self.low, self.high * (1.0 + 1e-9), step)
-        found: list[float] = []
+        result: list[float] = []
         for frequency in np.round(wanted, 6).tolist():
-            others = [0.0, *taken.tolist(), *found]
+            others = [0.0, *selected.tolist(), *result]
             if self.mains_hz:
                 others.append(self.mains_hz * max(round(frequency / self.mains_hz), 1))
             nearest = min(abs(frequency - other) for other in others)
             if nearest >= self.spacing * (1.0 - 1e-9):
-                found.append(frequency)
-        return np.array(found)
+                result.append(frequency)
+        return np.array(result)
 
 
 def pattern_axis(beacon: Beacon) -> Array | None:
@@ -65,7 +65,7 @@ def pattern_axis(beacon: Beacon) -> Array | None:
     return None if strong == 3 else np.asarray(axes[0] if strong == 1 else axes[2])
 
 
-def turned(beacon: Beacon, axis_world: Array) -> Beacon:
+def rotated_to(beacon: Beacon, axis_world: Array) -> Beacon:
     """Return a beacon whose axis points along a unit vector, by the smallest rotation."""
     axis = pattern_axis(beacon)
     if axis is None:
@@ -144,12 +144,12 @@ def template_of(site: Site, name: str | None) -> Beacon:
         raise InputError(
             f"--template {name}: the site has no such beacon; it has {', '.join(names)}"
         )
-    found = site.beacons[0 if name is None else names.index(name)]
-    return replace(found, field_map=None, hemisphere_beacon=None, unknown=None)
+    result = site.beacons[0 if name is None else names.index(name)]
+    return replace(result, field_map=None, hemisphere_beacon=None, unknown=None)
 
 
 def frequencies_for(
-    template: Beacon, count: int, band: Band, kept: tuple[Beacon, ...]
+    template: Beacon, count: int, band: ToneBand, kept: tuple[Beacon, ...]
 ) -> tuple[Array, Array]:
     """Return the frequencies of each new beacon, shape (count, tones), and the free ones.
 
@@ -158,11 +158,11 @@ def frequencies_for(
     InputError
         Where there is no room for so many.
     """
-    taken = np.concatenate([np.zeros(0), *(b.tone_frequencies_hz for b in kept)])
-    free, tones = band.free(taken), len(template.tones)
-    if len(free) < count * tones:
+    selected = np.concatenate([np.zeros(0), *(b.tone_frequencies_hz for b in kept)])
+    allowed, tones = band.allowed(selected), len(template.tones)
+    if len(allowed) < count * tones:
         raise InputError(
-            f"--band {band.low:g},{band.high:g} has {len(free)} tones {band.spacing:g} Hz apart,"
+            f"--band {band.low:g},{band.high:g} has {len(allowed)} tones {band.spacing:g} Hz apart,"
             f" and {count * tones} are needed; widen it, or give a longer --window"
         )
-    return free[: count * tones].reshape(count, tones), free[count * tones :]
+    return allowed[: count * tones].reshape(count, tones), allowed[count * tones :]

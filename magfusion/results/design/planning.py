@@ -12,22 +12,22 @@ from magfusion.model.site import Beacon, Site
 from magfusion.model.trust import Risk
 from magfusion.results.design.exchange import (
     Candidates,
+    LayoutSearch,
     Objective,
-    Search,
     best_layout,
     random_layout,
     value_of,
 )
 from magfusion.results.design.layout_information import LayoutInformation
 from magfusion.results.design.pattern import (
-    Band,
+    ToneBand,
     axes_offered,
     frequencies_for,
     pattern_axis,
     peak_moment,
+    rotated_to,
     stronger,
     tuned,
-    turned,
 )
 from magfusion.results.design.tuning import assigned, divided
 from magfusion.results.design.turns import all_in_turn, in_turn, is_in_turn
@@ -55,7 +55,7 @@ class Task:
         Points of use (m).
     axes : int
         Number of candidate directions of each.
-    apart, clearance : float
+    min_distance, clearance : float
         Minimum distance of two beacons, and of a beacon from points of use (m).
     budgeted : bool
         Whether the moments may be distributed unevenly.
@@ -66,11 +66,11 @@ class Task:
     count: int
     places: Array
     points: Array
-    band: Band
+    band: ToneBand
     risk: Risk
     objective: Objective = "worst"
     axes: int = 7
-    apart: float = 1.0
+    min_distance: float = 1.0
     clearance: float = 0.5
     budgeted: bool = False
 
@@ -128,11 +128,11 @@ def designed(
     InputError
         Where there are no mounting places, or too few at this distance.
     """
-    tones, free = np.zeros((0, 0)), np.zeros(0)
+    tones, allowed = np.zeros((0, 0)), np.zeros(0)
     if is_in_turn(task.template):
         plain = in_turn(task.template, task.count - 1, task.count)
     else:
-        tones, free = frequencies_for(task.template, task.count, task.band, task.site.beacons)
+        tones, allowed = frequencies_for(task.template, task.count, task.band, task.site.beacons)
         plain = tuned(task.template, tones[len(tones) // 2])
     candidates = candidates_of(task, plain)
     information = LayoutInformation(
@@ -144,16 +144,16 @@ def designed(
     )
     draw, search_rng = rng.spawn(2)
     drawn = [random_layout(candidates, task.count, draw) for _ in range(layouts)]
-    search = Search(information, candidates, task.objective, in_time)
+    search = LayoutSearch(information, candidates, task.objective, in_time)
     given = None if first is None else _nearest(candidates, first, task)
-    found = best_layout(search, task.count, starts, search_rng, first=given, report=report)
-    if found is None or any(layout is None for layout in drawn):
+    result = best_layout(search, task.count, starts, search_rng, first=given, report=report)
+    if result is None or any(layout is None for layout in drawn):
         raise InputError(
-            f"{task.count} beacons at a distance of at least --apart {task.apart:g} m do not fit on"
+            f"{task.count} beacons at a distance of at least --apart {task.min_distance:g} m do not fit on"
             f" {len(np.unique(candidates.places, axis=0))} mounting places; lower --apart or --grid"
         )
     new = _finished(
-        task, information, [candidates.beacons[c] for c in found.chosen], tones, free, in_time
+        task, information, [candidates.beacons[c] for c in result.chosen], tones, allowed, in_time
     )
     worst = []
     for k, layout in enumerate(drawn):
@@ -163,13 +163,13 @@ def designed(
     median = None
     if worst:
         middle = drawn[int(np.argsort(worst, kind="stable")[(len(worst) - 1) // 2])]
-        own = _apart(task, [candidates.beacons[c] for c in middle or ()], tones)
+        own = _with_own_channels(task, [candidates.beacons[c] for c in middle or ()], tones)
         median = with_beacons(task.site, _named(list(own), task.site))
     return Design(
         with_beacons(task.site, new),
         new,
         len(candidates.beacons),
-        found.complete,
+        result.complete,
         np.array(worst),
         median,
     )
@@ -188,13 +188,13 @@ def candidates_of(task: Task, beacon: Beacon) -> Candidates:
         gap = np.array([np.min(np.linalg.norm(task.points - p, axis=1)) for p in places])
         places = places[gap >= max(task.clearance, NEAREST)]
     for kept in task.site.beacons:
-        places = places[np.linalg.norm(places - kept.position_world, axis=1) >= task.apart]
+        places = places[np.linalg.norm(places - kept.position_world, axis=1) >= task.min_distance]
     axes = axes_offered(beacon, task.axes)
     if len(places) < task.count:
         raise InputError(
             f"{len(places)} mounting places remain, and {task.count} are needed: all others are"
             f" forbidden, closer than --clearance {task.clearance:g} m to the points of use, or"
-            f" closer than --apart {task.apart:g} m to a beacon that stays"
+            f" closer than --apart {task.min_distance:g} m to a beacon that stays"
         )
     if len(places) * len(axes) > MOST_CANDIDATES:
         raise InputError(
@@ -202,8 +202,8 @@ def candidates_of(task: Task, beacon: Beacon) -> Candidates:
             f" {MOST_CANDIDATES} candidates; choose a larger --grid, or fewer --axes"
         )
     return Candidates(
-        tuple(replace(turned(beacon, axis), position_world=p) for p in places for axis in axes),
-        task.apart,
+        tuple(replace(rotated_to(beacon, axis), position_world=p) for p in places for axis in axes),
+        task.min_distance,
     )
 
 
@@ -217,7 +217,7 @@ def with_moment(beacon: Beacon, moment: float) -> Beacon:
     return stronger(beacon, moment / peak_moment(beacon))
 
 
-def _apart(task: Task, chosen: list[Beacon], tones: Array) -> tuple[Beacon, ...]:
+def _with_own_channels(task: Task, chosen: list[Beacon], tones: Array) -> tuple[Beacon, ...]:
     """Return beacons with separate tones or time slots."""
     if is_in_turn(task.template):
         return all_in_turn(task.template, chosen)
@@ -229,25 +229,25 @@ def _finished(
     information: LayoutInformation,
     chosen: list[Beacon],
     tones: Array,
-    free: Array,
+    allowed: Array,
     in_time: Callable[[], bool],
 ) -> tuple[Beacon, ...]:
     """Return the selected beacons with their own frequencies, moments and names."""
-    beacons = _apart(task, chosen, tones)
+    beacons = _with_own_channels(task, chosen, tones)
     response = task.site.platform.magnetometer.response
     if is_in_turn(task.template):
         pass  # all have the template's carrier
     elif response is not None or task.template.conductivity or conductivity_of(task.site):
-        beacons = assigned(information, beacons, free, task.objective, in_time)
+        beacons = assigned(information, beacons, allowed, task.objective, in_time)
     if task.budgeted and len(beacons) > 1:
         beacons, _ = divided(information, beacons, task.objective, in_time)
     return _named(list(beacons), task.site)
 
 
 def _named(beacons: list[Beacon], site: Site) -> tuple[Beacon, ...]:
-    taken = {beacon.name for beacon in site.beacons}
-    free = (name for name in (f"B{i}" for i in range(1, 1000)) if name not in taken)
-    return tuple(replace(beacon, name=next(free)) for beacon in beacons)
+    selected = {beacon.name for beacon in site.beacons}
+    allowed = (name for name in (f"B{i}" for i in range(1, 1000)) if name not in selected)
+    return tuple(replace(beacon, name=next(allowed)) for beacon in beacons)
 
 
 def _nearest(candidates: Candidates, first: Site, task: Task) -> tuple[int, ...]:
@@ -262,10 +262,10 @@ def _nearest(candidates: Candidates, first: Site, task: Task) -> tuple[int, ...]
     chosen: list[int] = []
     for beacon in new:
         gap = np.linalg.norm(candidates.places - beacon.position_world, axis=1)
-        gap = np.where(candidates.beside(chosen), gap, np.inf)
+        gap = np.where(candidates.far_from(chosen), gap, np.inf)
         near = np.flatnonzero(gap <= np.min(gap) + 1e-6)
         axis = pattern_axis(beacon)
-        alike = [
+        shared = [
             0.0
             if axis is None
             else abs(
@@ -276,5 +276,5 @@ def _nearest(candidates: Candidates, first: Site, task: Task) -> tuple[int, ...]
             )
             for k in near
         ]
-        chosen.append(int(near[int(np.argmax(alike))]))
+        chosen.append(int(near[int(np.argmax(shared))]))
     return tuple(chosen)

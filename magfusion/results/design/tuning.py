@@ -46,17 +46,17 @@ def divided(
         gained = True
         while gained and in_time():
             gained = False
-            for giver, taker in permutations(range(len(beacons)), 2):
+            for donor, recipient in permutations(range(len(beacons)), 2):
                 other = share.copy()
-                other[giver] -= step
-                other[taker] += step
-                if other[giver] < LEAST_SHARE - 1e-9:
+                other[donor] -= step
+                other[recipient] += step
+                if other[donor] < LEAST_SHARE - 1e-9:
                     continue
                 reached = value(other)
                 if reached < best - LESS * abs(best):
                     share, best, gained = other, reached, True
-    found = tuple(stronger(b, s) for b, s in zip(beacons, share.tolist(), strict=True))
-    return found, share
+    result = tuple(stronger(b, s) for b, s in zip(beacons, share.tolist(), strict=True))
+    return result, share
 
 
 def assigned(
@@ -76,14 +76,14 @@ def assigned(
         Unused frequencies.
     """
     tones = [b.tone_frequencies_hz for b in beacons]
-    free = free_hz[: len(free_hz) // len(tones[0]) * len(tones[0])].reshape(-1, len(tones[0]))
-    sets = [*tones, *free]
+    allowed = free_hz[: len(free_hz) // len(tones[0]) * len(tones[0])].reshape(-1, len(tones[0]))
+    sets = [*tones, *allowed]
     order = list(range(len(beacons)))
 
-    def made(numbers: list[int]) -> tuple[Beacon, ...]:
+    def built(numbers: list[int]) -> tuple[Beacon, ...]:
         return tuple(tuned(b, sets[k]) for b, k in zip(beacons, numbers, strict=True))
 
-    best, gained = value_of(information, made(order), objective)[0], True
+    best, gained = value_of(information, built(order), objective)[0], True
     while gained and in_time():
         gained = False
         for slot in range(len(order)):
@@ -92,7 +92,7 @@ def assigned(
                 other[slot] = number
                 if other == order:
                     continue
-                reached = value_of(information, made(other), objective)[0]
+                reached = value_of(information, built(other), objective)[0]
                 if reached < best - LESS * abs(best):
                     order, best, gained = other, reached, True
-    return made(order)
+    return built(order)

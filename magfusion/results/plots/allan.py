@@ -21,13 +21,13 @@ def write_allan_plot(path: Path, instruments: Sequence[Plotted]) -> None:
     panels = figure.subplots(1, len(instruments), squeeze=False)[0]
     margin = 0.8 / (5.5 * len(instruments))
     figure.subplots_adjust(left=margin, right=1.0 - 0.2 * margin, top=0.93, bottom=0.1, wspace=0.22)
-    for panel, (name, unit, found, fits) in zip(panels, instruments, strict=True):
+    for panel, (name, unit, result, fits) in zip(panels, instruments, strict=True):
         for axis, (colour, fit) in enumerate(zip(COLOURS, fits, strict=True)):
-            deviation = np.sqrt(found.variance[:, axis])
+            deviation = np.sqrt(result.variance[:, axis])
             seen = deviation > 0.0
-            spread = np.minimum(deviation / np.sqrt(2.0 * found.clusters), 0.9 * deviation)
+            spread = np.minimum(deviation / np.sqrt(2.0 * result.clusters), 0.9 * deviation)
             panel.errorbar(
-                found.tau[seen],
+                result.tau[seen],
                 deviation[seen],
                 spread[seen],
                 fmt=".",
@@ -37,7 +37,7 @@ def write_allan_plot(path: Path, instruments: Sequence[Plotted]) -> None:
                 label="xyz"[axis],
             )
             if fit is not None:
-                tau = np.geomspace(fit.first_tau, found.tau[-1], 200)
+                tau = np.geomspace(fit.first_tau, result.tau[-1], 200)
                 panel.plot(tau, fit.deviation(tau), lw=1.0, color=colour)
         panel.set(xscale="log", yscale="log", title=name, xlabel="cluster time (s)")
         panel.set_ylabel(f"Allan deviation ({unit})")

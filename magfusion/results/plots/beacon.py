@@ -29,7 +29,7 @@ class BeaconPanel:
     """
 
     declared: Beacon
-    found: Beacon
+    estimated: Beacon
     centre_cov: Array
     point: Array
     residual: Array
@@ -50,7 +50,7 @@ def write_beacon_plot(path: Path, panels: list[BeaconPanel]) -> None:
 
 def _centre(axes: Axes, panel: BeaconPanel, view: tuple[int, int]) -> None:
     plane = list(view)
-    moved_mm = 1e3 * (panel.found.position_world - panel.declared.position_world)[plane]
+    moved_mm = 1e3 * (panel.estimated.position_world - panel.declared.position_world)[plane]
     spread, turn = np.linalg.eigh(panel.centre_cov[np.ix_(plane, plane)])
     angle = np.linspace(0.0, 2.0 * np.pi, 100)
     circle = np.stack([np.cos(angle), np.sin(angle)])

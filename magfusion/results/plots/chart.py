@@ -11,11 +11,11 @@ import numpy as np
 from magfusion.units import Array, IntArray
 
 MOST_POINTS = 1200  # of a line; more than a chart has pixels
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62.0, 10.0, 26.0, 38.0  # pixels around the axes
+_LEFT_MARGIN, _RIGHT, _TOP, _BOTTOM = 62.0, 10.0, 26.0, 38.0  # pixels around the axes
 _SMALLEST = 1e-300
 
 
-class Line(NamedTuple):
+class ChartLine(NamedTuple):
     """Points (n,) joined to a line, or dots; NaN interrupts it.  ``colour`` is a class of CSS."""
 
     x: Array
@@ -25,7 +25,7 @@ class Line(NamedTuple):
     dots: bool = False
 
 
-class Band(NamedTuple):
+class ChartBand(NamedTuple):
     """The area between two lines (n,)."""
 
     x: Array
@@ -34,7 +34,7 @@ class Band(NamedTuple):
     label: str = ""
 
 
-class Mark(NamedTuple):
+class ChartMark(NamedTuple):
     """A named point."""
 
     x: float
@@ -60,9 +60,9 @@ class Chart:
     title: str
     x_label: str
     y_label: str
-    lines: tuple[Line, ...]
-    bands: tuple[Band, ...] = ()
-    marks: tuple[Mark, ...] = ()
+    lines: tuple[ChartLine, ...]
+    bands: tuple[ChartBand, ...] = ()
+    marks: tuple[ChartMark, ...] = ()
     equal: bool = False
     log: bool = False
     y_limits: tuple[float, float] | None = None
@@ -79,7 +79,7 @@ class _Axes(NamedTuple):
 
     def x(self, value: Array | float) -> Array:
         along = (np.asarray(value) - self.low[0]) / (self.high[0] - self.low[0])
-        return np.asarray(_LEFT + self.size[0] * along)
+        return np.asarray(_LEFT_MARGIN + self.size[0] * along)
 
     def y(self, value: Array | float) -> Array:
         along = (np.asarray(value) - self.low[1]) / (self.high[1] - self.low[1])
@@ -91,18 +91,18 @@ def svg(chart: Chart) -> str:
     if chart.log:
         chart = _logarithmic(chart)
     axes = _axes(chart)
-    right, bottom = _LEFT + axes.size[0], _TOP + axes.size[1]
+    right, bottom = _LEFT_MARGIN + axes.size[0], _TOP + axes.size[1]
     height = bottom + _BOTTOM
     parts = [
         f'<svg viewBox="0 0 {chart.width:.0f} {height:.0f}" width="{chart.width:.0f}"'
         f' height="{height:.0f}" role="img" aria-label="{escape(chart.title)}">',
-        _text(_LEFT, 15.0, chart.title, "title"),
+        _text(_LEFT_MARGIN, 15.0, chart.title, "title"),
         *_grid(chart, axes),
         *(_band(band, axes) for band in chart.bands),
         *(_line(line, axes) for line in chart.lines),
         *(_mark(mark, axes) for mark in chart.marks),
-        f'<path class="frame" d="M{_LEFT},{_TOP}V{bottom:.1f}H{right:.1f}"/>',
-        _text(0.5 * (_LEFT + right), height - 6.0, chart.x_label, "middle"),
+        f'<path class="frame" d="M{_LEFT_MARGIN},{_TOP}V{bottom:.1f}H{right:.1f}"/>',
+        _text(0.5 * (_LEFT_MARGIN + right), height - 6.0, chart.x_label, "middle"),
         f'<text class="middle" transform="translate(12,{0.5 * (_TOP + bottom):.1f}) rotate(-90)">'
         f"{escape(chart.y_label)}</text>",
         "</svg>",
@@ -111,9 +111,9 @@ def svg(chart: Chart) -> str:
     return f"<figure>{''.join(parts)}</figure>"
 
 
-def ticks(low: float, high: float, most: int = 6) -> list[float]:
+def ticks(low: float, high: float, maximum: int = 6) -> list[float]:
     """Return round numbers between two values."""
-    raw = (high - low) / most
+    raw = (high - low) / maximum
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(power * m for m in (1.0, 2.0, 5.0, 10.0) if power * m >= raw * (1.0 - 1e-9))
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
@@ -137,11 +137,11 @@ def thinned(y: Array) -> IntArray:
 
 
 def _logarithmic(chart: Chart) -> Chart:
-    def taken(y: Array) -> Array:
+    def selected(y: Array) -> Array:
         return np.log10(np.where(y > 0.0, np.maximum(y, _SMALLEST), np.nan))
 
-    lines = tuple(line._replace(y=taken(line.y)) for line in chart.lines)
-    bands = tuple(b._replace(low=taken(b.low), high=taken(b.high)) for b in chart.bands)
+    lines = tuple(line._replace(y=selected(line.y)) for line in chart.lines)
+    bands = tuple(b._replace(low=selected(b.low), high=selected(b.high)) for b in chart.bands)
     return Chart(**{**vars(chart), "lines": lines, "bands": bands})
 
 
@@ -166,7 +166,7 @@ def _axes(chart: Chart) -> _Axes:
     (x0, x1), (y0, y1) = _extent(every_x, 1e-9), _extent(every_y, least)
     if chart.y_limits is not None:
         y0, y1 = chart.y_limits
-    width, height = chart.width - _LEFT - _RIGHT, chart.height - _TOP - _BOTTOM
+    width, height = chart.width - _LEFT_MARGIN - _RIGHT, chart.height - _TOP - _BOTTOM
     if chart.equal:
         x_span, y_span = max(x1 - x0, 1e-3), max(y1 - y0, 1e-3)
         height = min(max(width * y_span / x_span, 120.0), 1.2 * width)
@@ -177,7 +177,7 @@ def _axes(chart: Chart) -> _Axes:
 
 
 def _grid(chart: Chart, axes: _Axes) -> list[str]:
-    right, bottom = _LEFT + axes.size[0], _TOP + axes.size[1]
+    right, bottom = _LEFT_MARGIN + axes.size[0], _TOP + axes.size[1]
     out = []
     for value in ticks(axes.low[0], axes.high[0]):
         x = float(axes.x(value))
@@ -188,8 +188,8 @@ def _grid(chart: Chart, axes: _Axes) -> list[str]:
     for value in upright:
         y = float(axes.y(value))
         words = _number(10.0**value if chart.log else value)
-        out.append(f'<path class="grid" d="M{_LEFT},{y:.1f}H{right:.1f}"/>')
-        out.append(_text(_LEFT - 5.0, y + 4.0, words, "end"))
+        out.append(f'<path class="grid" d="M{_LEFT_MARGIN},{y:.1f}H{right:.1f}"/>')
+        out.append(_text(_LEFT_MARGIN - 5.0, y + 4.0, words, "end"))
     return out
 
 
@@ -198,15 +198,15 @@ def _decades(low: float, high: float) -> list[float]:
     steps = (1.0, 2.0, 5.0) if high - low < 2.5 else (1.0,)
     every = max(1, round((high - low) / 6.0))
     powers = range(math.floor(low), math.ceil(high) + 1, every)
-    found = [power + math.log10(step) for power in powers for step in steps]
-    return [value for value in found if low <= value <= high]
+    result = [power + math.log10(step) for power in powers for step in steps]
+    return [value for value in result if low <= value <= high]
 
 
 def _points(x: Array, y: Array) -> list[str]:
     return [f"{a:.1f},{b:.1f}" for a, b in zip(x.tolist(), y.tolist(), strict=True)]
 
 
-def _line(line: Line, axes: _Axes) -> str:
+def _line(line: ChartLine, axes: _Axes) -> str:
     rows = thinned(line.y)
     x, y = axes.x(line.x[rows]), axes.y(line.y[rows])
     broken = np.flatnonzero(~np.isfinite(y))
@@ -221,7 +221,7 @@ def _line(line: Line, axes: _Axes) -> str:
     return f'<path class="line {line.colour}" d="{path}"/>'
 
 
-def _band(band: Band, axes: _Axes) -> str:
+def _band(band: ChartBand, axes: _Axes) -> str:
     rows = thinned(band.high - band.low)
     known = np.isfinite(band.low[rows]) & np.isfinite(band.high[rows])
     rows = rows[known]
@@ -233,7 +233,7 @@ def _band(band: Band, axes: _Axes) -> str:
     return f'<path class="band" d="M{"L".join([*there, *back])}Z"/>'
 
 
-def _mark(mark: Mark, axes: _Axes) -> str:
+def _mark(mark: ChartMark, axes: _Axes) -> str:
     x, y = float(axes.x(mark.x)), float(axes.y(mark.y))
     shape = f'<circle class="mark {mark.colour}" cx="{x:.1f}" cy="{y:.1f}" r="4"/>'
     return shape + _text(x + 6.0, y - 5.0, mark.label, "name")

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from magfusion.estimation.integrity.first_look import Look
+from magfusion.estimation.integrity.quick_check import Look
 
 
 def write_check_plot(path: Path, look: Look) -> None:
@@ -21,10 +21,10 @@ def write_check_plot(path: Path, look: Look) -> None:
             size = f"{line.frequency_hz:.2f}"
             top.annotate(size, (line.frequency_hz, 1e9 * line.amplitude), fontsize=7)
     top.set(xlabel="frequency (Hz)", ylabel="amplitude (nT)")
-    if look.heard is not None:
-        for k, name in enumerate(look.heard.beacons):
-            snr = np.maximum(look.heard.snr[:, k], 1e-2)
-            middle.semilogy(look.heard.time, snr, ".-", ms=2, lw=0.6, label=name)
+    if look.detected is not None:
+        for k, name in enumerate(look.detected.beacons):
+            snr = np.maximum(look.detected.snr[:, k], 1e-2)
+            middle.semilogy(look.detected.time, snr, ".-", ms=2, lw=0.6, label=name)
         middle.legend(loc="upper right", fontsize="small", ncols=4)
     middle.set(xlabel="time (s)", ylabel="signal to noise")
     means = look.means

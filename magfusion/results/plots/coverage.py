@@ -15,28 +15,28 @@ from magfusion.results.coverage_colours import COLOURS, bounds, length
 SLICES = 3  # heights that are drawn where there are more
 
 
-def write_plot(path: Path, site: Site, found: Coverage, extra: Beacon | None) -> None:
+def write_plot(path: Path, site: Site, coverage: Coverage, extra: Beacon | None) -> None:
     """Write a PNG of the position sigma at the lowest, middle and highest heights.
 
     Parameters
     ----------
-    found : Coverage
+    coverage : Coverage
         On a regular grid.
     extra : Beacon, optional
         Best position of one more beacon; it is marked.
     """
-    heights = np.unique(found.position_world[:, 2])
+    heights = np.unique(coverage.position_world[:, 2])
     drawn = heights[np.unique(np.linspace(0, len(heights) - 1, SLICES).astype(int))]
     figure = Figure(figsize=(1.0 + 5.0 * len(drawn), 5.5), layout="constrained")
     FigureCanvasAgg(figure)
-    levels = bounds(found)
+    levels = bounds(coverage)
     colours = ListedColormap([tuple(c / 255 for c in colour) for colour in COLOURS.values()])
     norm = BoundaryNorm(levels, len(COLOURS), extend="both")
     panels = figure.subplots(1, len(drawn), squeeze=False)[0]
     for axes, height in zip(panels, drawn, strict=True):
-        here = found.position_world[:, 2] == height
-        x, y = (np.unique(found.position_world[here, i]) for i in (0, 1))
-        sigma = found.position_sigma[here].reshape(len(x), len(y)).T
+        here = coverage.position_world[:, 2] == height
+        x, y = (np.unique(coverage.position_world[here, i]) for i in (0, 1))
+        sigma = coverage.position_sigma[here].reshape(len(x), len(y)).T
         shown = np.ma.masked_invalid(sigma)
         axes.set_facecolor("0.8")
         mesh = axes.pcolormesh(x, y, shown, norm=norm, cmap=colours, shading="nearest")

@@ -26,13 +26,13 @@ class Panel:
 
     words: str
     site: Site
-    found: Coverage
+    coverage: Coverage
 
     @property
     def level(self) -> Array:
         """Protection levels of the position (m), infinite where there is none."""
-        level = self.found.protection_level_m
-        return np.full(len(self.found), np.inf) if level is None else level
+        level = self.coverage.protection_level_m
+        return np.full(len(self.coverage), np.inf) if level is None else level
 
 
 def write_plot(path: Path, hall: Hall, panels: list[Panel]) -> None:
@@ -43,7 +43,7 @@ def write_plot(path: Path, hall: Hall, panels: list[Panel]) -> None:
     panels : list of Panel
         Of the same points.
     """
-    points = panels[0].found.position_world
+    points = panels[0].coverage.position_world
     heights = np.unique(points[:, 2])
     drawn = heights[np.unique(np.linspace(0, len(heights) - 1, SLICES).astype(int))]
     size = np.ptp(hall.room.polygon, axis=0)
@@ -130,8 +130,8 @@ def _label(axes: Axes, site: Site, near: float) -> None:
     groups: list[list[Beacon]] = []
     for beacon in site.beacons:
         place = beacon.position_world[:2]
-        beside = (g for g in groups if np.linalg.norm(g[0].position_world[:2] - place) < near)
-        group = next(beside, None)
+        others = (g for g in groups if np.linalg.norm(g[0].position_world[:2] - place) < near)
+        group = next(others, None)
         if group is None:
             groups.append([beacon])
         else:

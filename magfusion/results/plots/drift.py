@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from magfusion.results.drift import (
     HOUR,
     QUANTITIES,
-    Course,
+    EstimatorPlot,
     Quantity,
     allan_deviation,
     in_windows,
@@ -20,7 +20,7 @@ from magfusion.results.drift import (
 _AXES = ("tab:red", "tab:green", "tab:blue")
 
 
-def write_plot(path: Path, courses: list[Course], figures: Mapping[str, object]) -> None:
+def write_plot(path: Path, courses: list[EstimatorPlot], figures: Mapping[str, object]) -> None:
     """Write a PNG, a column for each estimator."""
     rows = len(QUANTITIES) + 3
     figure = Figure(figsize=(1.0 + 6.5 * len(courses), 2.6 * rows), layout="constrained")
@@ -46,7 +46,7 @@ def write_plot(path: Path, courses: list[Course], figures: Mapping[str, object])
 
 
 def _draw_error(
-    axes: Axes, course: Course, quantity: Quantity, figures: Mapping[str, object]
+    axes: Axes, course: EstimatorPlot, quantity: Quantity, figures: Mapping[str, object]
 ) -> None:
     """Draw the components of an error, and three of their sigmas."""
     hours = course.errors.time / HOUR
@@ -63,14 +63,14 @@ def _draw_error(
         f" {figures[f'{key}_drift_stability']}",
         fontsize=9,
     )
-    settled = hours >= float(str(figures["settled_after_h"]))
-    shown = np.concatenate([np.abs(error[settled]).ravel(), sigma[settled]])
+    converged = hours >= float(str(figures["settled_after_h"]))
+    shown = np.concatenate([np.abs(error[converged]).ravel(), sigma[converged]])
     bound = 1.3 * float(np.quantile(shown, 0.999))
     axes.set(ylabel=f"({quantity.unit})", ylim=(-bound, bound), xlabel="time (h)")
     axes.legend(fontsize=7, ncols=4, loc="upper right")
 
 
-def write_stability(path: Path, courses: list[Course]) -> None:
+def write_stability(path: Path, courses: list[EstimatorPlot]) -> None:
     """Write figures 9 and 10 of paper 004 as a PNG: lengths of the errors, and their hourly means.
 
     The paper shows a stationary place; here the platform walks once an hour.
@@ -90,7 +90,7 @@ def write_stability(path: Path, courses: list[Course]) -> None:
     figure.savefig(path, dpi=100, metadata={"Software": None})
 
 
-def _draw_length(axes: Axes, course: Course, quantity: Quantity) -> None:
+def _draw_length(axes: Axes, course: EstimatorPlot, quantity: Quantity) -> None:
     time = np.concatenate([w.time for w in course.worlds])
     length = quantity.scale * np.concatenate([w.size(quantity.part) for w in course.worlds])
     for world in course.worlds:
@@ -102,7 +102,7 @@ def _draw_length(axes: Axes, course: Course, quantity: Quantity) -> None:
     axes.set_ylim(0.0, 1.5 * float(np.quantile(length, 0.999)))
 
 
-def _draw_consistency(axes: Axes, course: Course) -> None:
+def _draw_consistency(axes: Axes, course: EstimatorPlot) -> None:
     """Draw hourly means of squared errors and innovations relative to their expectation."""
     hours, levels = course.hourly()
     for name, level in levels.items():
@@ -112,7 +112,7 @@ def _draw_consistency(axes: Axes, course: Course) -> None:
     axes.legend(fontsize=7, ncols=3)
 
 
-def _draw_allan(axes: Axes, course: Course) -> None:
+def _draw_allan(axes: Axes, course: EstimatorPlot) -> None:
     """Draw the Allan deviation of each error."""
     for quantity in QUANTITIES:
         error = quantity.scale * course.errors.error[:, quantity.part]
@@ -125,9 +125,9 @@ def _draw_allan(axes: Axes, course: Course) -> None:
     axes.legend(fontsize=7)
 
 
-def _draw_pace(axes: Axes, course: Course) -> None:
-    made = course.pace[course.pace[:, 2] > 0.0]
-    axes.plot(made[:, 0] / HOUR, 1e3 * made[:, 1] / made[:, 2], ".", markersize=1, color="0.5")
+def _draw_pace(axes: Axes, course: EstimatorPlot) -> None:
+    built = course.pace[course.pace[:, 2] > 0.0]
+    axes.plot(built[:, 0] / HOUR, 1e3 * built[:, 1] / built[:, 2], ".", markersize=1, color="0.5")
     axes.set(xlabel="time (h)", ylabel="an update (ms)", yscale="log")
     other = axes.twinx()
     other.plot(course.pace[:, 0] / HOUR, course.pace[:, 3], color="tab:purple")

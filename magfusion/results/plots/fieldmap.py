@@ -21,12 +21,12 @@ def write_plot(path: Path, fit: MapFit) -> None:
     FigureCanvasAgg(figure)
     panels = figure.subplots(2, len(beacons), squeeze=False, sharex=True, sharey=True)
     sheets = [_sheet(beacon) for beacon in beacons]
-    most = max(float(np.max(np.abs(s.gain))) for s in sheets) or 1.0
+    maximum = max(float(np.max(np.abs(s.gain))) for s in sheets) or 1.0
     largest = max(float(np.max(s.turn_deg)) for s in sheets) or 1.0
     for column, (beacon, sheet) in enumerate(zip(beacons, sheets, strict=True)):
         upper, lower = panels[:, column]
         shown = (
-            (upper, sheet.gain, {"cmap": "RdBu_r", "vmin": -most, "vmax": most}),
+            (upper, sheet.gain, {"cmap": "RdBu_r", "vmin": -maximum, "vmax": maximum}),
             (lower, sheet.turn_deg, {"cmap": "viridis", "vmin": 0.0, "vmax": largest}),
         )
         for axes, values, scale in shown:
@@ -41,9 +41,9 @@ def write_plot(path: Path, fit: MapFit) -> None:
                 label = "stronger than modelled by (%)" if axes is upper else "rotated by (deg)"
                 figure.colorbar(mesh, ax=axes, label=label)
         lower.set_xlabel("x (m)")
-        without, left = (100.0 * e[beacon.name] for e in (fit.error_without, fit.error_with))
+        without, remaining = (100.0 * e[beacon.name] for e in (fit.error_without, fit.error_with))
         upper.set_title(
-            f"beacon {beacon.name}\nmodel error {without:.2g} %, with the map {left:.2g} %"
+            f"beacon {beacon.name}\nmodel error {without:.2g} %, with the map {remaining:.2g} %"
         )
     for axes in panels[:, 0]:
         axes.set_ylabel("y (m)")
@@ -68,18 +68,18 @@ class _Sheet(NamedTuple):
 
 
 def _sheet(beacon: Beacon) -> _Sheet:
-    found = beacon.field_map
-    assert found is not None
-    points = found.points_world
+    result = beacon.field_map
+    assert result is not None
+    points = result.points_world
     low, high = points.min(axis=0), points.max(axis=0)
-    margin = 0.5 * found.length_scale
+    margin = 0.5 * result.length_scale
     x, y = (np.linspace(low[i] - margin, high[i] + margin, _GRID) for i in (0, 1))
     height = float(np.median(points[:, 2]))
     mesh = np.meshgrid(x, y, [height], indexing="xy")
     spots = np.stack(mesh, axis=-1).reshape(-1, 3)
-    value, _ = found.mean(spots)
-    learnt = np.sqrt(np.mean(found.mean(points)[0][:, 0] ** 2))
-    left = np.sqrt(found.variance(spots)[:, 0]) / max(float(learnt), found.residual)
+    value, _ = result.mean(spots)
+    learnt = np.sqrt(np.mean(result.mean(points)[0][:, 0] ** 2))
+    remaining = np.sqrt(result.variance(spots)[:, 0]) / max(float(learnt), result.residual)
     square = (_GRID, _GRID)
     return _Sheet(
         points=points[:, :2],
@@ -87,6 +87,6 @@ def _sheet(beacon: Beacon) -> _Sheet:
         y=y,
         gain=100.0 * np.expm1(value[:, 0]).reshape(square),
         turn_deg=np.rad2deg(np.linalg.norm(value[:, 1:], axis=1)).reshape(square),
-        unknown=left.reshape(square),
+        unknown=remaining.reshape(square),
         height=height,
     )

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from magfusion.results.figures import Estimate
+from magfusion.results.figures import ParameterEstimate
 from magfusion.units import Array
 
 _PRIOR, _POSTERIOR, _REST = "0.75", "tab:blue", "tab:orange"
@@ -14,13 +14,16 @@ HIGHEST = 60.0  # inches; what libpng and a reader bear
 
 
 def write_log_calibration_plot(
-    path: Path, estimates: list[Estimate], ratio_but_for_gauge: Array, direction_ratio: Array
+    path: Path,
+    estimates: list[ParameterEstimate],
+    ratio_but_for_gauge: Array,
+    direction_ratio: Array,
 ) -> None:
     """Write a PNG: the ratio of posterior to prior sigma of each parameter and each direction.
 
     Parameters
     ----------
-    estimates : list of Estimate
+    estimates : list of ParameterEstimate
         Every parameter.
     ratio_but_for_gauge : ndarray, shape (parameters,)
         The same without gauges; NaN where nothing remains.
@@ -30,15 +33,15 @@ def write_log_calibration_plot(
     height = min(1.5 + 0.22 * len(estimates), HIGHEST)
     figure = Figure(figsize=(12.0, height), layout="constrained")
     FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
+    remaining, right = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
     rows = np.arange(len(estimates))
     ratio = np.array([e.sigma / e.prior_sigma for e in estimates])
-    left.barh(rows, np.ones(len(estimates)), color=_PRIOR, label="survey")
-    left.barh(rows, ratio, color=_POSTERIOR, height=0.55, label="after the log")
-    left.plot(ratio_but_for_gauge, rows, "o", ms=4, c=_REST, label="without the gauge")
+    remaining.barh(rows, np.ones(len(estimates)), color=_PRIOR, label="survey")
+    remaining.barh(rows, ratio, color=_POSTERIOR, height=0.55, label="after the log")
+    remaining.plot(ratio_but_for_gauge, rows, "o", ms=4, c=_REST, label="without the gauge")
     labels = [f"{e.key}   {e.prior_sigma:.2g} → {e.sigma:.2g}" for e in estimates]
-    left.set_yticks(rows, labels, fontsize=7)
-    left.set(xscale="log", xlabel="sigma over the survey's", ylim=(len(estimates) - 0.5, -0.5))
+    remaining.set_yticks(rows, labels, fontsize=7)
+    remaining.set(xscale="log", xlabel="sigma over the survey's", ylim=(len(estimates) - 0.5, -0.5))
     right.plot(direction_ratio, np.arange(len(direction_ratio)) + 1, ".-", c=_POSTERIOR)
     right.axvline(0.5, c="0.5", lw=0.8)
     right.set(xscale="log", xlabel="sigma over the survey's", ylabel="direction, best first")

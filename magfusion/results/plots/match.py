@@ -14,7 +14,7 @@ _NAMES = ("roll", "pitch", "yaw")
 
 
 def write_match_plot(
-    path: Path, time: Array, matches: Matches, found: tuple[int, ...], true_rpy: Array | None
+    path: Path, time: Array, matches: Matches, result: tuple[int, ...], true_rpy: Array | None
 ) -> None:
     """Write a PNG of the estimated angles over time, and of their errors where a truth is known.
 
@@ -24,30 +24,32 @@ def write_match_plot(
         (s)
     matches : Matches
         Shapes (n, hypotheses, ...).
-    found : tuple of int
+    result : tuple of int
         Which of roll, pitch and yaw are estimated, not given.
     true_rpy : ndarray, shape (n, 3), optional
         (rad); NaN where unknown.
     """
     columns = 1 if true_rpy is None else 2
-    figure = Figure(figsize=(6.5 * columns, 1.0 + 2.5 * len(found)), layout="constrained")
+    figure = Figure(figsize=(6.5 * columns, 1.0 + 2.5 * len(result)), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(len(found), columns, squeeze=False, sharex=True)
-    sure = matches.determined[:, 0]
-    for row, k in zip(panels, found, strict=True):
+    panels = figure.subplots(len(result), columns, squeeze=False, sharex=True)
+    certain = matches.determined[:, 0]
+    for row, k in zip(panels, result, strict=True):
         angle = matches.rpy[..., k] / DEGREE
         if matches.ambiguous.any():
             row[0].plot(time, angle[:, 1], ".", ms=2, color="0.75", label="other solution")
-        if not sure.all():
-            row[0].plot(time[~sure], angle[~sure, 0], "x", color="red", label="not determined")
-        row[0].plot(time[sure], angle[sure, 0], ".", ms=3, label="found")
+        if not certain.all():
+            row[0].plot(
+                time[~certain], angle[~certain, 0], "x", color="red", label="not determined"
+            )
+        row[0].plot(time[certain], angle[certain, 0], ".", ms=3, label="found")
         row[0].set(ylabel=f"{_NAMES[k]} (deg)")
         if true_rpy is not None:
             row[0].plot(time, true_rpy[:, k] / DEGREE, "-", lw=0.6, color="black", label="truth")
             error = wrap(matches.rpy[:, 0, k] - true_rpy[:, k]) / DEGREE
             bound = 3.0 * matches.sigma[:, 0, k] / DEGREE
-            row[1].fill_between(time[sure], -bound[sure], bound[sure], color="0.85", lw=0)
-            row[1].plot(time[sure], error[sure], ".", ms=3)
+            row[1].fill_between(time[certain], -bound[certain], bound[certain], color="0.85", lw=0)
+            row[1].plot(time[certain], error[certain], ".", ms=3)
             row[1].set(ylabel=f"error of {_NAMES[k]} (deg); grey: 3 sigma")
         row[0].legend(loc="upper right", fontsize="small")
     for axes in panels[-1]:

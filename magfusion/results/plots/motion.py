@@ -11,24 +11,24 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.model.hall import Hall
 from magfusion.model.site import Site
-from magfusion.results.design.motion import Motion
+from magfusion.results.design.motion import MotionPlan
 
 LISTED = 24  # parameters, worst first
 _AXES = (("x", "tab:red"), ("y", "tab:green"), ("z", "tab:blue"))
 
 
-def write_motion_plot(path: Path, site: Site, hall: Hall, found: Motion) -> None:
+def write_motion_plot(path: Path, site: Site, hall: Hall, result: MotionPlan) -> None:
     """Write a PNG of stops, numbered, with the axes of the body at each, and of the sigmas."""
     figure = Figure(figsize=(15.0, 7.5), layout="constrained")
     FigureCanvasAgg(figure)
     plan, bars = figure.subplots(1, 2, width_ratios=(1.2, 1.0))
-    _draw_plan(plan, site, hall, found)
-    _draw_sigmas(bars, found)
+    _draw_plan(plan, site, hall, result)
+    _draw_sigmas(bars, result)
     figure.suptitle("Next stops of the platform, and the parameters they determine")
     figure.savefig(path, dpi=100, metadata={"Software": None})
 
 
-def _draw_plan(axes: Axes, site: Site, hall: Hall, found: Motion) -> None:
+def _draw_plan(axes: Axes, site: Site, hall: Hall, result: MotionPlan) -> None:
     axes.add_patch(Polygon(hall.room.polygon, fill=False, edgecolor="0.6", linewidth=1.2))
     for beacon in site.beacons:
         x, y, z = beacon.position_world
@@ -45,13 +45,13 @@ def _draw_plan(axes: Axes, site: Site, hall: Hall, found: Motion) -> None:
     reach = 0.06 * float(np.max(np.ptp(places, axis=0)))
     middle = float(np.mean(hall.room.box_world[:, 0]))
     groups: dict[tuple[float, float], list[int]] = {}
-    for number, stop in enumerate(found.stops):
+    for number, stop in enumerate(result.stops):
         x, y, _ = stop.position_world.tolist()
         groups.setdefault((x, y), []).append(number)
     for (x, y), numbers in groups.items():
         lines = []
         for k, number in enumerate(numbers):
-            stop = found.stops[number]
+            stop = result.stops[number]
             turn = Rotation.from_euler("xyz", stop.rpy_deg, degrees=True).as_matrix()
             if k == 0:
                 for column, (_, colour) in enumerate(_AXES):
@@ -93,19 +93,19 @@ def _draw_plan(axes: Axes, site: Site, hall: Hall, found: Motion) -> None:
     )
 
 
-def _draw_sigmas(axes: Axes, found: Motion) -> None:
-    parameters = found.parameters
-    start = parameters.excess(np.ones(len(found.ratio)))
-    order = np.argsort(-np.where(parameters.asked, start, -1.0), kind="stable")
-    order = order[parameters.asked[order]][:LISTED]
+def _draw_sigmas(axes: Axes, result: MotionPlan) -> None:
+    parameters = result.parameters
+    start = parameters.excess(np.ones(len(result.ratio)))
+    order = np.argsort(-np.where(parameters.requested, start, -1.0), kind="stable")
+    order = order[parameters.requested[order]][:LISTED]
     rows = np.arange(len(order))
     axes.barh(rows, np.ones(len(order)), color="0.8", label="before")
-    axes.barh(rows, found.ratio[order], height=0.55, color="tab:blue", label="after these stops")
+    axes.barh(rows, result.ratio[order], height=0.55, color="tab:blue", label="after these stops")
     limit = parameters.limit[order]
     axes.plot(limit, rows, "|", color="tab:orange", markersize=9, label="after all possible stops")
     labels = [
         f"{parameters.names[k][0]}   {parameters.sized(k, 1.0)} → {parameters.sized(k, r)}"
-        for k, r in zip(order.tolist(), found.ratio[order].tolist(), strict=True)
+        for k, r in zip(order.tolist(), result.ratio[order].tolist(), strict=True)
     ]
     axes.set_yticks(rows, labels, fontsize=7)
     axes.set(xlabel="sigma over the site's", xlim=(0.0, 1.05), ylim=(len(order) - 0.5, -0.5))

@@ -34,7 +34,7 @@ class RangePicture(NamedTuple):
     cov: Array
 
 
-def write_range_plot(path: Path, told: RangePicture, *, high_side: bool) -> None:
+def write_range_plot(path: Path, reported: RangePicture, *, high_side: bool) -> None:
     """Write a PNG with a cross section and three curves by depth, one colour per sensor place.
 
     Parameters
@@ -45,23 +45,23 @@ def write_range_plot(path: Path, told: RangePicture, *, high_side: bool) -> None
     figure = Figure(figsize=(12.0, 8.6), layout="constrained")
     FigureCanvasAgg(figure)
     (section, across), (along, sigmas) = figure.subplots(2, 2)
-    rounded = np.round(told.sensor_depth, 2)
+    rounded = np.round(reported.sensor_depth, 2)
     for k, depth in enumerate(np.unique(rounded)):
         own = np.flatnonzero(rounded == depth)
-        own = own[np.argsort(told.magnet_depth[own])]
+        own = own[np.argsort(reported.magnet_depth[own])]
         colour, name = _COLOURS[k % len(_COLOURS)], f"sensor at {depth:g} m"
-        x, place, cov = told.magnet_depth[own], told.place[own], told.cov[own]
+        x, place, cov = reported.magnet_depth[own], reported.place[own], reported.cov[own]
         distance = np.hypot(place[:, 1], place[:, 2])
         outward = place[:, 1:] / distance[:, None]
         distance_sigma = _spread(outward, cov)
-        aside_sigma = _spread(outward[:, ::-1] * [1.0, -1.0], cov)
+        lateral_sigma = _spread(outward[:, ::-1] * [1.0, -1.0], cov)
         _section(section, place, cov, colour, name)
         _banded(across, x, distance, distance_sigma, colour, name)
-        beyond = place[:, 0] - (x - told.sensor_depth[own])
+        beyond = place[:, 0] - (x - reported.sensor_depth[own])
         _banded(along, x, beyond, np.sqrt(cov[:, 0, 0]), colour, name)
         for value, style, what in (
             (distance_sigma, "-", "distance"),
-            (aside_sigma, "--", "lateral, by direction"),
+            (lateral_sigma, "--", "lateral, by direction"),
             (np.sqrt(cov[:, 0, 0]), ":", "along the hole"),
         ):
             sigmas.plot(x, value, style, c=colour, label=what if k == 0 else None)

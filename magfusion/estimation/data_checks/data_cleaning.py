@@ -1,0 +1,63 @@
+"""Data cleaning: even clocks, and no false samples.
+
+What is corrected is reported and casts no doubt: neighbours bridge a dropped sample like a lost
+one, and the magnetic fields bridge a frozen IMU like a gap.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.data_checks.samples import (
+    false_rows,
+    false_samples,
+    frozen_rows,
+    frozen_samples,
+    streams,
+)
+from magfusion.model.samples import ImuSamples, Log
+from magfusion.model.site import Site
+from magfusion.model.trust import Verdict
+from magfusion.receiver.even_clocks import on_even_clocks
+
+
+def clean_log(log: Log, site: Site) -> Log:
+    """Return a log with single wrong stamps and samples corrected.
+
+    Its ``clocks`` and ``noticed`` report the corrections.
+    """
+    log = _without_freeze(on_even_clocks(log, site), site)
+    result = {stream.name: false_rows(stream, site) for stream in streams(log)}
+    if not any(len(rows) for rows in result.values()):
+        return log
+    noticed = [replace(f, verdict=Verdict.TRUSTWORTHY) for f in false_samples(log, site)]
+    noticed = [replace(f, text=f"{f.text} They are left out.") for f in noticed]
+    wave, imu = log.waveform, log.imu
+    inertial = np.union1d(result["gyroscope"], result["accelerometer"])
+    kept = np.delete(np.arange(len(imu)), inertial)
+    imu = ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept])
+    if wave is not None:
+        kept = np.delete(np.arange(len(wave)), result["magnetometer"])
+        wave = wave.rows(kept)
+    return replace(log, imu=imu, waveform=wave, noticed=(*log.noticed, *noticed))
+
+
+def _without_freeze(log: Log, site: Site) -> Log:
+    """Return a log without the inertial samples of a frozen IMU."""
+    hung = [frozen_rows(s) for s in streams(log) if s.name in ("gyroscope", "accelerometer")]
+    rows = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *hung]))
+    if len(rows) == 0 or len(rows) >= len(log.imu) - 1:
+        return log
+    noticed = [
+        replace(
+            f,
+            text=f"{f.text} Here it is left out; the magnetic fields bridge the gap.",
+            verdict=Verdict.TRUSTWORTHY,
+        )
+        for f in frozen_samples(log, site)
+        if f.code == "frozen_imu"
+    ]
+    kept = np.delete(np.arange(len(log.imu)), rows)
+    imu = log.imu
+    imu = ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept])
+    return replace(log, imu=imu, noticed=(*log.noticed, *noticed))

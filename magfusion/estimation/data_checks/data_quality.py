@@ -1,0 +1,162 @@
+"""Checks of the raw streams of a log, independent of the estimator."""
+
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.data_checks.body_iron import IRON_SPAN, iron_on_body
+from magfusion.estimation.data_checks.gravity_and_field_checks import (
+    gravity_and_field_findings,
+    still_means,
+)
+from magfusion.estimation.data_checks.inertial_noise import noisy_inertial
+from magfusion.estimation.data_checks.samples import (
+    clipped_samples,
+    false_samples,
+    frozen_samples,
+    repeated_samples,
+)
+from magfusion.estimation.data_checks.signal import (
+    BeaconDetection,
+    Detected,
+    detect_in_log,
+    undetected_findings,
+    with_motion_compensation,
+)
+from magfusion.estimation.data_checks.spectrum import undeclared_lines
+from magfusion.estimation.data_checks.stamps import uneven_stamps
+from magfusion.estimation.data_checks.turn_witness import turned_otherwise
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Finding, Trust, Verdict
+from magfusion.receiver.joint import long_windows
+from magfusion.receiver.windows import LockinSettings
+
+SampleTest = Callable[[Log, Site | None], Iterable[Finding]]
+
+SAMPLE_TESTS: tuple[SampleTest, ...] = (
+    uneven_stamps,
+    frozen_samples,
+    repeated_samples,
+    clipped_samples,
+    false_samples,
+    noisy_inertial,
+)
+LONGEST = 1200.0  # s; of a longer log, compasses and spectrum are checked on its beginning only
+# Of gyroscope and clocks: where they are wrong, the gyro-stabilized axes are wrong too.
+UNSTEADY = frozenset(
+    {"gyro_sign", "gyro_units", "gyro_scale", "imu_axes", "imu_clock", "stuck_axis"}
+)
+# What estimators bridge with an honest covariance is reported and casts no doubt.
+BRIDGED_CODES = frozenset({"gap", "samples_lost", "silent_beacon"})
+
+
+def recorded(
+    log: Log,
+    site: Site | None,
+    gap_bridged: Collection[str] = frozenset(),
+    poses: Trajectory | None = None,
+    *,
+    estimated: Trajectory | None = None,
+    beacons: bool = False,
+    detection: BeaconDetection | None = None,
+    lockin: LockinSettings | None = None,
+    compensated: Detected | None = None,
+) -> tuple[Finding, ...]:
+    """Return the findings on a recording; without a site, on the streams alone.
+
+    Parameters
+    ----------
+    gap_bridged : collection of str
+        Codes of the findings that the estimator handles.
+    poses : Trajectory, optional
+        By the beacons: they decide which of vertical and field is wrong.
+    estimated : Trajectory, optional
+        By an estimator that also used gravity; decides the cause of a reversed vertical.
+    beacons : bool
+        Whether the result depends on the beacons: if so, their reception and undeclared lines
+        are reported.
+    detection : BeaconDetection, optional
+        Their reception, if already known.
+    lockin : LockinSettings, optional
+        As requested.
+    compensated : Detected, optional
+        Their reception by a solution, with the motion inside the windows compensated.
+    """
+    result = [*log.noticed, *(one for monitor in SAMPLE_TESTS for one in monitor(log, site))]
+    log = beginning(log)
+    result += turned_otherwise(log, site) if log.inertial else []
+    if log.inertial and not any(finding.code in UNSTEADY for finding in result):
+        result += gravity_and_field_findings(log, site, poses, estimated)
+        if site is not None and log.vectors is not None:
+            result += iron_on_body(still_means(log, site, IRON_SPAN), site)
+    if beacons and site is not None and site.beacons:
+        result += _of_beacons(log, site, detection, lockin, compensated)
+    return tuple(
+        replace(f, verdict=Verdict.TRUSTWORTHY) if f.code in gap_bridged else f for f in result
+    )
+
+
+def _of_beacons(
+    log: Log,
+    site: Site,
+    detection: BeaconDetection | None,
+    lockin: LockinSettings | None,
+    compensated: Detected | None,
+) -> Iterator[Finding]:
+    """Yield findings on each beacon's reception and on other lines; parameters as `recorded`."""
+    yield from filter(_matters, undeclared_lines(log, site, lockin))
+    if log.waveform is not None or log.waveforms:
+        yield from long_windows(site, lockin)
+    detection = detect_in_log(log, site) if detection is None else detection
+    if detection is None:
+        return
+    yield from undetected_findings(
+        detection if compensated is None else with_motion_compensation(detection, compensated), site
+    )
+
+
+def _matters(line: Finding) -> bool:
+    return line.verdict is not Verdict.TRUSTWORTHY or line.code == "fitted_line"
+
+
+def beginning(log: Log, span: float = LONGEST) -> Log:
+    """Return the first part of a log, of a length (s)."""
+    end = float(log.imu.time[0]) + span if len(log.imu) else span
+    if len(log.imu) and log.imu.time[-1] > end:
+        kept = slice(0, int(np.searchsorted(log.imu.time, end)))
+        imu = replace(
+            log.imu,
+            time=log.imu.time[kept],
+            gyro_body=log.imu.gyro_body[kept],
+            accel_body=log.imu.accel_body[kept],
+        )
+        log = replace(log, imu=imu)
+    wave = log.waveform
+    if wave is not None and len(wave) and wave.time[-1] > end:
+        kept = slice(0, int(np.searchsorted(wave.time, end)))
+        short = wave.rows(kept)
+        log = replace(log, waveform=short)
+    return log
+
+
+def beyond(recording: Log, used: Log, site: Site) -> tuple[Finding, ...]:
+    """Return the findings on a recording that do not show in the log made of it."""
+    known = recorded(used, site, BRIDGED_CODES)
+    return tuple(f for f in recorded(recording, site, BRIDGED_CODES) if f not in known)
+
+
+def passed_on(log: Log, site: Site) -> Trust:
+    """Return the findings on a log whose fields are only converted to another form.
+
+    An estimator checks them again; what would fail its result is doubtful here.
+    """
+    result = recorded(log, site, BRIDGED_CODES)
+    return Trust(
+        tuple(
+            replace(f, verdict=Verdict.DOUBTFUL) if f.verdict is Verdict.FAILED else f
+            for f in result
+        )
+    )

@@ -1,0 +1,95 @@
+"""Where the estimator ended: did it converge, what else might it have found, how sure is it."""
+
+import numpy as np
+
+from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
+from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
+from magfusion.estimation.posterior.convergence import pose_steps
+from magfusion.model.trust import Finding, Verdict
+
+DIVERGED = 3.0  # whitened residual, one where noise and model are as declared
+MAX_FINAL_STEP_SIGMAS = 10.0  # sigmas that the last pass moved the poses by: it ended anywhere
+OPEN_DEG, OPEN_SHARE = 20.0, 0.25  # sigma of attitude, and of position by the nearest beacon's
+# distance, beyond which a covariance does not describe where the platform may be
+
+
+def convergence(case: Case) -> TestResult:
+    """Judge whether the loop ended where the cost is least."""
+    result = case.result
+    if result.converged:
+        return NOTHING
+    known, move = result.residual[np.isfinite(result.residual)], result.last_move
+    residual = float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
+    moved = f"its last pass still moved the poses by {move:.2g} of their sigmas"
+    if residual > DIVERGED:
+        finding = Finding(
+            "diverged",
+            f"The smoother did not converge: {moved}, and its residual is {residual:.3g} where"
+            " about 1 is expected. The log is not of this site: check places, frequencies and"
+            " drives of the beacons, the mounting, and the stamps.",
+            Verdict.FAILED,
+            residual / DIVERGED,
+        )
+    elif not result.start.determined.any():
+        # The start was arbitrary then: where the loop happened to stop, it still is.
+        finding = Finding(
+            "geometry",
+            "No epoch alone determines its pose, and the motion did not either (the smoother did"
+            " not converge). Add a beacon or a coil, or record more motion.",
+            Verdict.FAILED,
+            10.0,
+        )
+    else:
+        finding = Finding(
+            "not_converged",
+            f"The smoother did not converge: {moved}. Give it a better survey, or a shorter part"
+            " of the log (--start, --end).",
+            Verdict.FAILED if move > MAX_FINAL_STEP_SIGMAS else Verdict.DOUBTFUL,
+            1.0,
+        )
+    factor = np.full(len(case.pose_cov), 1.0 + min(move, MAX_FINAL_STEP_SIGMAS) ** 2)
+    return TestResult((finding,), factor=factor)
+
+
+def rivals(case: Case) -> TestResult:
+    """Judge whether another trajectory explains the log nearly as well."""
+    result = case.result
+    chi_square = result.rival_chi_square
+    if chi_square is None or chi_square >= AMBIGUOUS_CHI_SQUARE:
+        return NOTHING
+    finding = Finding(
+        "ambiguous",
+        "Another trajectory, of a mirrored start, explains the log nearly as well (its chi square"
+        f" is only {chi_square:.3g} larger). Add a beacon, or record more motion.",
+        Verdict.DOUBTFUL,
+        AMBIGUOUS_CHI_SQUARE / max(chi_square, 0.1),
+    )
+    if result.rival is None:
+        return TestResult((finding,))
+    away = pose_steps(result.states, result.rival)
+    likely = 1.0 / (1.0 + np.exp(0.5 * max(chi_square, 0.0)))
+    return TestResult((finding,), spread=likely * away[:, :, None] * away[:, None, :])
+
+
+def geometry(case: Case) -> TestResult:
+    """Judge whether the pose is known so badly that its covariance says little."""
+    site, states = case.result.declared.site, case.result.states
+    if not site.beacons:
+        return NOTHING
+    widest = [
+        np.sqrt(np.linalg.eigvalsh(case.pose_cov[:, k : k + 3, k : k + 3])[:, -1]) for k in (0, 3)
+    ]
+    places = np.array([beacon.position_world for beacon in site.beacons])
+    away = np.linalg.norm(states.position_world[:, None] - places, axis=2).min(axis=1)
+    share, turn = float(np.median(widest[1] / away)), float(np.rad2deg(np.median(widest[0])))
+    if share < OPEN_SHARE and turn < OPEN_DEG:
+        return NOTHING
+    text = (
+        f"The log hardly determines the pose: its sigma is {np.median(widest[1]):.2g} m at"
+        f" {np.median(away):.2g} m from the nearest beacon, and {turn:.2g} deg, along the worst"
+        " direction. Add a beacon, come nearer, or record for longer."
+    )
+    lost_epochs = share > 4.0 * OPEN_SHARE or turn > 4.0 * OPEN_DEG
+    verdict = Verdict.FAILED if lost_epochs else Verdict.DOUBTFUL
+    weight = max(share / OPEN_SHARE, turn / OPEN_DEG)
+    return TestResult((Finding("geometry", text, verdict, weight),))

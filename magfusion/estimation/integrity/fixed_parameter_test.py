@@ -1,0 +1,288 @@
+"""The verdict on what is held: which parameter the log contradicts, and which it cannot check.
+
+Significance is not consequence: a parameter is called in question where freeing it would lower the
+cost by more than chance does, and would move the poses beyond what their covariance covers.  The
+one that lowers it most names the cause; after it has moved, the next is asked.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.estimation.data_checks.statistics import (
+    TEST_BUDGET,
+    holm,
+    log_p_chi_square,
+    sigmas,
+)
+from magfusion.estimation.integrity.score import (
+    Score,
+    field_residual,
+    moved_estimate,
+)
+from magfusion.estimation.integrity.suspects import CODE, Suspect, suspects
+from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
+from magfusion.model.parameters import Block, prior_sigma
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Unverified, Verdict
+from magfusion.units import Array
+
+FARTHEST = 30.0  # typical errors; a direction that is known no better is not looked at
+PER_PARAMETER = 12.0  # chi square that one more parameter must gain to be the better explanation
+COVERED = 4.0  # mean squared Mahalanobis distance that a covariance of six still covers
+MAX_LINEAR_CHI_SQUARE = (
+    25.0**2
+)  # beyond which a linear step and its covariance say nothing of where it is
+MAX_CAUSES = 4  # causes that are named
+LEAST_SHARE = 0.03  # of the first cause's chi square; what is less may be its nonlinear rest
+UNCHECKED = 4.3**2  # chi square below which one of fifty suspects stays unnoticed
+
+
+class ReleasedFault(NamedTuple):
+    """A suspect, freed.
+
+    Parameters
+    ----------
+    step : ndarray, shape (h,)
+        In typical errors.
+    direction, information : ndarray, shape (h, k), (k,)
+        Orthogonal combinations of what is held, and what the log tells of each.
+    chi_square, freedom : float
+        By how much twice the cost falls.
+    moved : ndarray, shape (states, 6)
+        What it does to the poses.
+    distance : ndarray, shape (states,)
+        Squared, by the covariance of the poses.
+    """
+
+    fault: Suspect
+    step: Array
+    direction: Array
+    information: Array
+    chi_square: float
+    freedom: int
+    moved: Array
+    distance: Array
+
+    @property
+    def cov(self) -> Array:
+        """Covariance of the step, shape (h, h), in typical errors."""
+        return np.asarray((self.direction / self.information) @ self.direction.T)
+
+    @property
+    def known_cov(self) -> Array:
+        """The same of what the log determines better than those."""
+        known = self.information > 1.0
+        vector = self.direction[:, known]
+        return np.asarray((vector / self.information[known]) @ vector.T)
+
+    @property
+    def log_p(self) -> float:
+        """Logarithm of the probability that chance does as much."""
+        return float(log_p_chi_square(self.chi_square, self.freedom))
+
+    @property
+    def gain(self) -> float:
+        """What it explains, less what as many parameters would explain anyway."""
+        return self.chi_square - PER_PARAMETER * self.freedom
+
+
+def check_fixed_parameters(case: Case) -> TestResult:
+    """Ask everything that is held."""
+    if case.score is None:
+        return NOTHING
+    score, site = case.score, case.result.declared.site
+    unverified = tuple(_unverified(case, score))
+    information, gradient = score.with_declared()
+    findings: list[Finding] = []
+    named: list[Array] = []
+    spread = np.zeros_like(case.pose_cov)
+    total, first = np.zeros(len(gradient)), 0.0
+    while len(findings) < MAX_CAUSES:
+        released = [
+            result
+            for fault in suspects(site, score.fixed)
+            if (result := release_fault(case.pose_cov, score, fault, information, gradient))
+            is not None
+        ]
+        cause = _cause(case, score, released, total)
+        if cause is None or cause.chi_square < LEAST_SHARE * first:
+            break
+        first = max(first, cause.chi_square)
+        findings.append(finding_of(site, score, cause))
+        spread += cause.moved[:, :, None] * cause.moved[:, None, :]
+        spread += score.by_pose @ cause.known_cov @ np.swapaxes(score.by_pose, 1, 2)
+        total = total + cause.step
+        named.append(total)
+        selected = information @ cause.cov
+        gradient = gradient - information @ cause.step
+        information = information - selected @ information
+    return TestResult(
+        tuple(findings),
+        unverified,
+        spread=spread if findings else None,
+        named=tuple(named),
+    )
+
+
+def gains(combine: Array, information: Array, gradient: Array) -> Array:
+    """Return `Freed.gain` of many suspects at once, shape (suspects,); zero where nothing tells.
+
+    Parameters
+    ----------
+    combine : ndarray, shape (suspects, h, columns)
+        Of each, with columns of zeros where others have more.
+    information, gradient : ndarray, shape (h, h), (h,)
+        Or one of each suspect.
+    """
+    across = np.swapaxes(combine, 1, 2)
+    value, vector = np.linalg.eigh(across @ information @ combine)
+    along = (np.swapaxes(vector, 1, 2) @ (across @ gradient[..., None]))[..., 0]
+    kept = value > FARTHEST**-2
+    chi_square = np.where(kept, along**2, 0.0) / np.where(kept, value, 1.0)
+    return np.asarray(np.sum(chi_square - PER_PARAMETER * kept, axis=1))
+
+
+class ReleaseGain(NamedTuple):
+    """What a log tells of a suspect, as of `ReleasedFault`."""
+
+    step: Array
+    direction: Array
+    information: Array
+    chi_square: float
+    freedom: int
+
+    @property
+    def log_p(self) -> float:
+        """Logarithm of the probability that chance does as much."""
+        return float(log_p_chi_square(self.chi_square, self.freedom))
+
+
+def release_gain(fault: Suspect, information: Array, gradient: Array) -> ReleaseGain | None:
+    """Return what freeing a suspect gains; None where nothing tells of it."""
+    combine = fault.combine
+    value, vector = np.linalg.eigh(combine.T @ information @ combine)
+    kept = value > FARTHEST**-2
+    if not np.any(kept):
+        return None
+    vector, value = combine @ vector[:, kept], value[kept]
+    along = vector.T @ gradient
+    gained, freedom = float(np.sum(along**2 / value)), int(np.sum(kept))
+    return ReleaseGain(vector @ (along / value), vector, value, gained, freedom)
+
+
+def release_fault(
+    pose_cov: Array, score: Score, fault: Suspect, information: Array, gradient: Array
+) -> ReleasedFault | None:
+    """Free a suspect; None where nothing tells of it."""
+    reported = release_gain(fault, information, gradient)
+    if reported is None:
+        return None
+    moved = score.by_pose @ reported.step
+    solved = np.linalg.solve(pose_cov, moved[..., None])[..., 0]
+    return ReleasedFault(fault, *reported, moved, np.sum(moved * solved, axis=1))
+
+
+def _cause(
+    case: Case, score: Score, release: list[ReleasedFault], before: Array
+) -> ReleasedFault | None:
+    """Return what explains most of what chance and the claimed covariance do not."""
+    informative = holm([one.log_p for one in release], TEST_BUDGET)
+    likely = [
+        one
+        for one, significant in zip(release, informative, strict=True)
+        if significant and np.mean(one.distance) > COVERED
+    ]
+    for one in sorted(likely, key=lambda one: -one.gain)[:3]:
+        # Everything explains a part of what nothing explains.
+        rest = field_residual(
+            case.result, moved_estimate(case.result, score, score.allowed(before + one.step))
+        )
+        excess = max(1.0, float(np.nanmean(rest**2))) if np.any(np.isfinite(rest)) else 1.0
+        residual = float(log_p_chi_square(one.chi_square / excess, one.freedom))
+        if holm([residual, *(other.log_p for other in release if other is not one)], TEST_BUDGET)[
+            0
+        ]:
+            return one
+    return None
+
+
+def finding_of(site: Site, score: Score, cause: ReleasedFault) -> Finding:
+    """Return what is to be said of a cause."""
+    position = float(np.sqrt(np.mean(np.sum(cause.moved[:, 3:] ** 2, axis=1))))
+    rotation = float(np.rad2deg(np.sqrt(np.mean(np.sum(cause.moved[:, :3] ** 2, axis=1)))))
+    mean = float(np.mean(cause.distance))
+    if len(cause.fault.combine.T) == 1 and len(cause.fault.blocks) > 1:
+        block = cause.fault.blocks[0]
+        factor = float(np.exp((prior_sigma(score.fixed) * cause.step)[block.columns][0]))
+        result = f"all are {factor:.3g} times as large"
+        remedy = "correct them (peak, not rms; their unit), or declare their sigma"
+    else:
+        result = "; ".join(_amounts(site, score, cause, b) for b in _largest(cause))
+        remedy = "correct it by so much, or declare a sigma of that size so that it is estimated"
+    return Finding(
+        CODE[cause.fault.blocks[0].parameter],
+        f"The log contradicts {cause.fault.name} as declared: {result}"
+        f" ({float(sigmas(cause.log_p)):.0f} sigma), which moves the poses by"
+        f" {_length(position)} and {rotation:.2g} deg,"
+        f" {np.sqrt(mean):.1f} times what they claim. Remedy: {remedy}.",
+        Verdict.FAILED if mean > MAX_LINEAR_CHI_SQUARE else Verdict.DOUBTFUL,
+        float(sigmas(cause.log_p)),
+    )
+
+
+def _largest(cause: ReleasedFault) -> list[Block]:
+    """Return the blocks of a suspect that move, most first."""
+    size = {b.name: float(np.max(np.abs(cause.step[b.columns]))) for b in cause.fault.blocks}
+    moving = sorted(cause.fault.blocks, key=lambda b: -size[b.name])
+    return [b for b in moving if size[b.name] > 0.1 * size[moving[0].name]][:4]
+
+
+def _amounts(site: Site, score: Score, cause: ReleasedFault, block: Block) -> str:
+    """Return what the numbers of a block would change by, the largest first, in words."""
+    unit = block.parameter.display_unit
+    scale = prior_sigma(score.fixed)[block.columns] / unit.size
+    step = scale * cause.step[block.columns]
+    sigma = scale * np.sqrt(np.diagonal(cause.cov))[block.columns]
+    order = np.argsort(-np.abs(step), kind="stable")[:3]
+    return ", ".join(
+        f"{block.parameter.called(site, block.owner, i)}"
+        f" {step[i]:+.3g} ± {sigma[i]:.1g} {unit.text}".rstrip()
+        for i in order.tolist()
+    )
+
+
+def _length(metres: float) -> str:
+    return f"{100.0 * metres:.2g} cm"
+
+
+def _unverified(case: Case, score: Score) -> list[Unverified]:
+    """Return what nothing in the log would contradict, and what it does to the poses."""
+    out, information = [], score.within_tolerance()
+    for block in score.fixed:
+        rows = np.arange(len(score.information))[block.columns]
+        declared = score.spread[rows]
+        cov = declared @ declared.T
+        root = np.linalg.cholesky(cov) if np.all(np.diagonal(cov) > 1e-12) else np.eye(len(rows))
+        widest = np.where(np.diagonal(root) > 1.0, np.diagonal(root), 1.0)
+        value, vector = np.linalg.eigh(widest[:, None] * information[np.ix_(rows, rows)] * widest)
+        free_parameters = vector[:, value < UNCHECKED]
+        if not free_parameters.shape[1]:
+            continue
+        by_pose = score.by_pose[..., rows]
+        typical = by_pose @ (widest[:, None] * free_parameters)
+        solved = np.linalg.solve(case.pose_cov, typical)
+        if np.mean(np.sum(typical * solved, axis=(1, 2))) < COVERED:
+            continue
+        moved = by_pose @ root
+        unit = block.parameter.display_unit
+        largest = np.max(prior_sigma(score.fixed)[block.columns] * np.diagonal(root)) / unit.size
+        out.append(
+            Unverified(
+                block.name,
+                f"{largest:.3g} {unit.text}".rstrip(),
+                float(np.sqrt(np.mean(np.sum(moved[:, 3:] ** 2, axis=(1, 2))))),
+                float(np.rad2deg(np.sqrt(np.mean(np.sum(moved[:, :3] ** 2, axis=(1, 2)))))),
+            )
+        )
+    return out

@@ -1,0 +1,216 @@
+"""A first look at a log, in seconds: everything that can be judged without solving for it."""
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.data_checks.data_quality import recorded
+from magfusion.estimation.data_checks.gravity_and_field_checks import StillMeans, still_means
+from magfusion.estimation.data_checks.signal import BeaconDetection, detect_in_log, within_reach
+from magfusion.estimation.data_checks.spectrum import (
+    SpectralLine,
+    Spectrum,
+    judged_lines,
+    named_lines,
+    spectrum,
+    with_disturbing_lines,
+)
+from magfusion.estimation.data_checks.stamps import Timing, timings
+from magfusion.estimation.demodulation.beacon_selection import select_detected
+from magfusion.estimation.demodulation.burial_depth import depths_of
+from magfusion.estimation.demodulation.demodulation import phasors
+from magfusion.estimation.integrity.diagnosis import with_cause
+from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.detection_range import are_many
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import FieldSamples, Log
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import SYMPTOMS, Finding, Trust, Verdict
+from magfusion.receiver.cycles import whole_cycles
+from magfusion.receiver.receivers import usual_lockin
+from magfusion.receiver.slots import has_schedule
+from magfusion.receiver.windows import LockinSettings
+from magfusion.units import Array
+
+EPOCHS = 24  # that are fixed
+TOLERATED_CODES = frozenset({"samples_lost"})  # what every estimator copes with
+# What is the cause where no window can be demodulated.
+CORRUPTING_CODES = frozenset({"saturated", "jitter", "gap", "samples_lost", "frozen_magnetometer"})
+DOUBT = Verdict.DOUBTFUL
+LEAST_BAD = 3  # epochs without an explanation
+NOTHING_EXPLAINED = 30.0  # residual from which the fixes are none
+FIX_PROBABILITY = 0.95  # probability of a fix that is used against the compasses
+UNEXPLAINED = 3.0  # residual of the fixes, one where noise, model and survey are as declared
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What a first look found.
+
+    Parameters
+    ----------
+    detected : BeaconDetection, optional
+        None without a site, or where no window can be demodulated.
+    spectrum : Spectrum, optional
+    lines : tuple of SpectralLine, optional
+        Everything that stands out of it, tones too.
+    fixes : Fixes, optional
+        Of a few epochs.
+    depths : mapping
+        Range (m) and skin depths of each beacon that is detected; of none where nothing conducts.
+    """
+
+    trust: Trust
+    timings: tuple[Timing, ...]
+    means: StillMeans
+    detected: BeaconDetection | None = None
+    spectrum: Spectrum | None = None
+    lines: tuple[SpectralLine, ...] | None = None
+    fixes: Fixes | None = None
+    depths: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def fix_residual(self) -> float:
+        """Median residual of the fixes; NaN of none."""
+        if self.fixes is None or len(self.fixes) == 0:
+            return float("nan")
+        return float(np.median(self.fixes.residual_rms[:, 0]))
+
+    def detection_rows(self) -> list[tuple[str, float, float]]:
+        """Return name, median signal to noise and share of the epochs heard of each beacon."""
+        if self.detected is None or len(self.detected.time) == 0:
+            return []
+        snr = np.nan_to_num(self.detected.snr)
+        shares = np.mean(self.detected.strong, axis=0)
+        return [
+            (name, float(np.median(snr[:, k])), float(shares[k]))
+            for k, name in enumerate(self.detected.beacons)
+        ]
+
+
+def quick_check(log: Log, site: Site | None, lockin: LockinSettings | None = None) -> Look:
+    """Look at a log; without a site at the recording alone."""
+    result = spectrum(log, site)
+    seen = None if result is None else named_lines(result, site)
+    look = timings(log), still_means(log, site)
+    if site is None or not site.beacons:
+        return Look(Trust(recorded(log, site)), *look, None, result, seen)
+    findings: list[Finding] = []
+    many = are_many(site)
+    with suppress(InputError):  # what follows says why nothing is heard
+        log, site = select_detected(log, site, lockin)
+    try:
+        samples = phasors(log, site, lockin)[0]
+    except InputError as error:
+        findings.append(Finding("no_window", f"{error}.", Verdict.FAILED, 10.0))
+        samples = FieldSamples.empty(site.channels)
+    detection = detect_in_log(log, site, lockin)
+    if result is not None and not has_schedule(site):
+        findings += _harmless_lines(result, log, site, lockin)
+    fixes = _fixed(log, site, samples, look[1].time)
+    poses = None
+    if fixes is not None:
+        findings += findings_of_fit(fixes)
+        poses = _sure_poses(fixes)
+    if many and detection is not None:
+        detection = within_reach(detection, site, poses)
+    findings += recorded(log, site, TOLERATED_CODES, poses, beacons=True, detection=detection)
+    trust = Trust(tuple(_promoted(findings)))
+    if trust.reasons and trust.reasons[0].code in SYMPTOMS:
+        trust = with_cause(trust, log, site, lockin)
+    return Look(trust, *look, detection, result, seen, fixes, depths_of(samples, site))
+
+
+def _harmless_lines(
+    result: Spectrum, log: Log, site: Site, lockin: LockinSettings | None
+) -> list[Finding]:
+    """Return the lines that harm nothing; the others `recorded` tells of."""
+    settings = with_disturbing_lines(log, site, lockin) or usual_lockin(site)
+    return [
+        line
+        for line in judged_lines(result, site, settings)
+        if line.verdict is Verdict.TRUSTWORTHY and line.code != "fitted_line"
+    ]
+
+
+def _sure_poses(fixes: Fixes) -> Trajectory | None:
+    """Return the fixes that are decided, where all of them fit."""
+    certain = (fixes.probability[:, 0] > FIX_PROBABILITY) & fixes.determined[:, 0]
+    if not np.any(certain) or findings_of_fit(fixes):
+        return None
+    best = fixes.best()
+    return Trajectory(
+        best.time[certain], best.world_from_body[certain], best.position_world[certain]
+    )
+
+
+def _promoted(findings: list[Finding]) -> list[Finding]:
+    """Let what spoils every window be the cause of there being none."""
+    if not any(finding.code == "no_window" for finding in findings):
+        return findings
+    return [
+        replace(f, verdict=Verdict.FAILED)
+        if f.code in CORRUPTING_CODES and f.verdict is DOUBT
+        else f
+        for f in findings
+    ]
+
+
+def _fixed(log: Log, site: Site, samples: FieldSamples, near: Array) -> Fixes | None:
+    """Fix a few epochs, at times where the compasses are known, without gravity."""
+    if len(samples) == 0 or any(beacon.unknown is not None for beacon in site.beacons):
+        return None
+    strong = samples.valid.any(axis=1)
+    if has_schedule(site):
+        samples = whole_cycles(samples, log.imu, site)
+        strong = np.ones(len(samples), dtype=bool)
+    if not np.any(strong) or len(samples) == 0:
+        return None
+    usable = np.flatnonzero(strong)
+    wanted = near if len(near) else samples.time[usable]
+    wanted = wanted[np.unique(np.linspace(0, len(wanted) - 1, EPOCHS).astype(np.int64))]
+    at = np.clip(np.searchsorted(samples.time[usable], wanted), 0, len(usable) - 1)
+    chosen = np.zeros(len(samples), dtype=bool)
+    chosen[usable[at]] = True
+    some = samples.rows(chosen)
+    try:
+        return fix_epochs(some, initial_calibration(site, float(np.mean(samples.time))))
+    except EstimationError:
+        return None
+
+
+def findings_of_fit(fixes: Fixes) -> list[Finding]:
+    """Return what is to be said of fixes that do not explain the fields."""
+    residual = fixes.residual_rms[:, 0]
+    median, bad = float(np.median(residual)), residual > UNEXPLAINED
+    if median > UNEXPLAINED:
+        return [
+            Finding(
+                "field_residuals",
+                f"no pose explains the beacons' fields: at {len(fixes)} epochs the median residual"
+                f" is {median:.3g} where about 1 is expected. Positions, attitudes, frequencies,"
+                " moments or phases of the beacons are not as declared, or the epoch of the log is"
+                " not.",
+                Verdict.FAILED if median > NOTHING_EXPLAINED else DOUBT,
+                20.0 + median,
+            )
+        ]
+    if np.sum(bad) < LEAST_BAD:
+        return []
+    time = fixes.time[bad]
+    return [
+        Finding(
+            "field_residuals",
+            f"no pose explains the beacons' fields at {int(np.sum(bad))} of {len(fixes)} epochs"
+            f" between {time[0]:.1f} and {time[-1]:.1f} s: their residual is"
+            f" {float(np.median(residual[bad])):.3g} (median) where about 1 is expected. The field"
+            " of a beacon is false then, or iron is near.",
+            DOUBT,
+            20.0 + float(np.median(residual[bad])),
+        )
+    ]

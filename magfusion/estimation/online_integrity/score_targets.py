@@ -1,0 +1,135 @@
+"""Parameters of the online score test: all fixed ones; of many beacons, those of detected ones."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from magfusion.estimation.graph.measurement import Measurement
+from magfusion.estimation.graph.state import MOTION
+from magfusion.estimation.integrity.fixed_parameter_test import gains
+from magfusion.estimation.integrity.suspects import Suspect, held_blocks, suspects
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.model.parameters import BeaconParameter, Block, dimension, prior_sigma
+from magfusion.model.prior import prior_sqrt_covariance
+from magfusion.model.site import Site
+from magfusion.units import Array, IntArray
+
+
+class ScoreTargets:
+    """The fixed parameters that are tested, and their columns next to a state.
+
+    Parameters
+    ----------
+    site : Site
+        With the tested beacons.
+    estimated, considered : tuple of Block
+        Calibration parameters in the state's tangent, of all beacons.
+    steady : bool
+        Whether the static field is measured.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        estimated: tuple[Block, ...],
+        considered: tuple[Block, ...],
+        *,
+        steady: bool,
+    ) -> None:
+        self.site, self.fixed_blocks = site, held_blocks(site, estimated, steady=steady)
+        self.names = tuple(beacon.name for beacon in site.beacons)
+        self.unit, self.size = prior_sigma(self.fixed_blocks), MOTION + dimension(estimated)
+        at = MOTION + dimension((*estimated, *considered))
+        self.blocks = tuple(
+            b._replace(columns=slice(at - MOTION + b.columns.start, at - MOTION + b.columns.stop))
+            for b in self.fixed_blocks
+        )
+        self.parameters, self.whole = (*estimated, *considered, *self.blocks), at
+        among = [b for b in considered if _is_of(b, self.names)]
+        self.spread = self._declared(tuple(among))
+        # Columns of a state's tangent with the considered parameters of these beacons.
+        self.rest = _columns(among)
+
+    @cached_property
+    def fault_candidates(self) -> tuple[Suspect, ...]:
+        """Candidate faults of these parameters, created on demand."""
+        return tuple(suspects(self.site, self.fixed_blocks))
+
+    @cached_property
+    def _by_shape(self) -> list[tuple[list[int], IntArray, Array]]:
+        """Candidates by shape: their numbers, parameter rows, and combinations."""
+        shapes: dict[tuple[int, ...], list[tuple[int, IntArray, Array]]] = {}
+        for k, one in enumerate(self.fault_candidates):
+            rows = np.concatenate([np.arange(b.columns.start, b.columns.stop) for b in one.blocks])
+            combine = one.combine[rows]
+            shapes.setdefault(combine.shape, []).append((k, rows, combine))
+        result = []
+        for own in shapes.values():
+            numbers, rows_of, combines = zip(*own, strict=True)
+            result.append((list(numbers), np.stack(rows_of), np.stack(combines)))
+        return result
+
+    def gains(self, information: Array, gradient: Array) -> Array:
+        """Return the log-likelihood gain of estimating each candidate, shape (candidates,)."""
+        result = np.zeros(len(self.fault_candidates))
+        for numbers, rows, combine in self._by_shape:
+            own = information[rows[:, :, None], rows[:, None, :]]
+            result[numbers] = gains(combine, own, gradient[rows])
+        return result
+
+    def among(self, other: "ScoreTargets") -> tuple[IntArray, IntArray]:
+        """Return the columns of the parameters in both, here and there."""
+        there = {block.key: block.columns for block in other.fixed_blocks}
+        both = [(b.columns, there[b.key]) for b in self.fixed_blocks if b.key in there]
+        here, far = (
+            np.concatenate([np.arange(s.start, s.stop) for s in one] or [np.zeros(0, dtype=int)])
+            for one in ([pair[k] for pair in both] for k in (0, 1))
+        )
+        return here, far
+
+    def _declared(self, considered: tuple[Block, ...]) -> Array:
+        """Return a root of the declared covariance of the tested parameters."""
+        if not considered:
+            return np.zeros((len(self.unit), 0))
+        start, own = 0, []
+        for block in considered:
+            own.append(block._replace(columns=slice(start, start + len(block.sigma))))
+            start += len(block.sigma)
+        spread = prior_sqrt_covariance(self.site, tuple(own))
+        at, out = (
+            {b.key: b.columns for b in self.fixed_blocks},
+            np.zeros((len(self.unit), len(spread))),
+        )
+        for block in own:
+            if block.key in at:
+                out[at[block.key]] = spread[block.columns]
+        return out / self.unit[:, None]
+
+
+def beacons_in(measurements: Iterable[Measurement], site: Site) -> list[str]:
+    """Return the names of the beacons that contribute to some measurements."""
+    reported = np.zeros(len(site.channels), dtype=bool)
+    for one in measurements:
+        if isinstance(one, FieldPhasors):
+            reported |= np.any(one.sqrt_information != 0.0, axis=(0, 2, 3))
+        elif isinstance(one, JointPhasors):
+            reported |= np.any(one.is_predicted, axis=0)
+    return [site.beacons[k].name for k in np.unique(site.owner[reported]).tolist()]
+
+
+def of_beacons_named(site: Site, names: Iterable[str]) -> Site:
+    """Return a site with the named beacons only, in their order."""
+    wanted = set(names)
+    return replace(site, beacons=tuple(b for b in site.beacons if b.name in wanted))
+
+
+def _is_of(block: Block, names: tuple[str, ...]) -> bool:
+    return not isinstance(block.parameter, BeaconParameter) or block.owner in names
+
+
+def _columns(blocks: Iterable[Block]) -> IntArray:
+    own = [np.arange(MOTION + b.columns.start, MOTION + b.columns.stop) for b in blocks]
+    return np.concatenate([np.zeros(0, dtype=np.int64), *own])
