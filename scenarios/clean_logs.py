@@ -233,7 +233,8 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join(
         (
             *lines,
-            f"{result.logs} logs, {result.determined} of them with a pose that the bound determines:",
+            f"{result.logs} logs, {result.determined} of them with a pose that the bound"
+            " determines:",
             f"  doubtful {result.doubtful}, failed {result.failed}; median of the mean NEES"
             f" {result.nees_median:.2g} (6 is due)",
             f"  trusted with a mean NEES above {SILENT_NEES:g}, of all: {result.silent}",

@@ -171,7 +171,8 @@ def report(result: DesignOutcome) -> str:
     took = ", ".join(f"{s:.0f} s" for s in result.seconds)
     return "\n".join(
         [
-            f"worst protection level; {result.candidates} candidates, {result.points} points of use",
+            f"worst protection level; {result.candidates} candidates, {result.points} points of"
+            " use",
             f"  random layouts, median   {result.random_median:8.3f} m",
             f"  random layouts, best     {result.random_best:8.3f} m",
             f"  designed                 {result.designed[0]:8.3f} m:"

@@ -254,8 +254,8 @@ def report(result: Figures) -> str:
         (
             f"{result.epochs} epochs, {result.faulted} of them with a false beacon;"
             f" {result.detected:.1%} of these are noticed",
-            f"  beyond the level, unseen       {result.unseen}: at most {result.unseen_limit:.2g} of"
-            f" the faulty, {result.hazard_limit:.2g} an epoch",
+            f"  beyond the level, unseen       {result.unseen}: at most {result.unseen_limit:.2g}"
+            f" of the faulty, {result.hazard_limit:.2g} an epoch",
             f"  alarms without a fault         {result.false_alarm_rate:.2g} of the epochs, at most"
             f" {result.false_alarm_limit:.2g}",
             f"  level over the 3-sigma radius  {result.median_ratio:.2f} (median), finite in"

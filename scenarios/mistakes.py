@@ -261,7 +261,8 @@ def table(rows: Sequence[Row], texts: bool = False) -> str:
     result = summed(rows)
     lines += [
         f"{result.rows} rows with a mistake; silent: {len(result.silent)}",
-        f"right cause first in {100 * result.right_first:.0f} % of {result.diagnosable} diagnosable",
+        f"right cause first in {100 * result.right_first:.0f} % of {result.diagnosable}"
+        " diagnosable",
     ]
     for name in ("silent", "tracebacks", "slow", "false_alarms"):
         listed = getattr(result, name)

@@ -172,7 +172,8 @@ def report(result: Figures) -> str:
             f"{'turning, ' + format(result.turned_deg_s, '.0f') + ' deg/s':<32}"
             f"{result.turning_mm:8.3f} mm {result.turning_deg:7.3f} deg,"
             f" NEES {result.turning_nees:.2f}",
-            f"{'predicted to the display':<32}{result.ahead_mm:8.3f} mm {result.ahead_deg:7.3f} deg",
+            f"{'predicted to the display':<32}{result.ahead_mm:8.3f} mm {result.ahead_deg:7.3f}"
+            " deg",
             f"{'processor for a second':<32}{result.processor_share:8.2f} s"
             f" (a million empty turns: {result.python_ms:.0f} ms)",
         ]

@@ -193,10 +193,10 @@ def main() -> None:
             result["p99_ms"] > P99_AT_MOST * result["p50_ms"] or result["last_to_first"] > FLAT
         )
         print(
-            f"{estimator:<10}{result['seconds']:8.2f} s, {result['seconds'] / bare:6.1f} bare loops;"
-            f" update {result['p50_ms']:.2f} / {result['p99_ms']:.2f} / {result['max_ms']:.2f} ms"
-            f" (p50 / p99 / max), last to first {result['last_to_first']:.2f},"
-            f" memory +{result['memory_growth_mib']:.1f} MiB"
+            f"{estimator:<10}{result['seconds']:8.2f} s, {result['seconds'] / bare:6.1f} bare"
+            f" loops; update {result['p50_ms']:.2f} / {result['p99_ms']:.2f} /"
+            f" {result['max_ms']:.2f} ms (p50 / p99 / max), last to first"
+            f" {result['last_to_first']:.2f}, memory +{result['memory_growth_mib']:.1f} MiB"
         )
         figures |= {f"{estimator}_{key}": value for key, value in result.items()}
         figures[f"{estimator}_bare_loops"] = result["seconds"] / bare

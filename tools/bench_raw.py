@@ -96,7 +96,8 @@ def measured(goal: Goal, log: Path, site: Site, imu: ImuSamples, room: Path) -> 
 def reported(goal: Goal, result: dict[str, Any]) -> str:
     """Return a line of the table."""
     line = (
-        f"{goal.name:<10}{result['seconds']:8.1f} s{result['startup']:7.1f} s{result['bare']:7.2f} s"
+        f"{goal.name:<10}{result['seconds']:8.1f} s{result['startup']:7.1f} s"
+        f"{result['bare']:7.2f} s"
         f"{result['loops']:8.0f}{goal.loops:6.0f}"
         f"{result['startup_of_imports']:9.1f}{STARTUP_GOAL:5.1f}"
     )

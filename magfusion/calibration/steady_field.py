@@ -97,7 +97,8 @@ def steady_field(
 def steady_alone(waveform: Waveform, site: Site) -> SteadyField:
     """Average a waveform without a gyro, over windows that are as short as possible.
 
-    Windows in which the field rotates by more than `MIN_TURN_CHANGE` are omitted: their mean is too small.
+    Windows in which the field rotates by more than `MIN_TURN_CHANGE` are omitted: their mean is
+    too small.
 
     Raises
     ------

@@ -35,10 +35,10 @@ def warn_about_threads() -> None:
     maximum = max((one["num_threads"] for one in libraries), default=1)
     if maximum > 1:
         warnings.warn(
-            f"BLAS uses {maximum} threads, which costs up to twice the processor time and saves none:"
-            f" the matrices of magfusion are small. Set {THREADS[0]}=1 before NumPy is imported,"
-            " or call threadpoolctl.threadpool_limits(1, user_api='blas'). Any value of"
-            f" {THREADS[0]} silences this warning.",
+            f"BLAS uses {maximum} threads, which costs up to twice the processor time and saves"
+            f" none: the matrices of magfusion are small. Set {THREADS[0]}=1 before NumPy is"
+            " imported, or call threadpoolctl.threadpool_limits(1, user_api='blas'). Any value"
+            f" of {THREADS[0]} silences this warning.",
             RuntimeWarning,
             stacklevel=3,
         )

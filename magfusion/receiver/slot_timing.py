@@ -47,9 +47,9 @@ def check_timing_declared(site: Site) -> None:
     free_running = [beacon.name for beacon in site.beacons if not beacon.synchronised]
     if free_running and is_pulsed(site):
         raise InputError(
-            f"beacon {free_running[0]} sends direct-current pulses by its own clock (synchronised: false),"
-            " and the stream does not identify its slots; record when its cycles begin and give"
-            " that (synchronised: true, with start_s), or drive the coils with a carrier"
+            f"beacon {free_running[0]} sends direct-current pulses by its own clock (synchronised:"
+            " false), and the stream does not identify its slots; record when its cycles begin"
+            " and give that (synchronised: true, with start_s), or drive the coils with a carrier"
         )
 
 

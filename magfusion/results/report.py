@@ -304,8 +304,8 @@ def placement_figures(placed: tuple[Placement, ...], site: Site) -> Figures:
             else ""
         )
         remark = (
-            f"beacon {name} was placed at ({_listed(result, 3)}) m; {len(places)} place(s) explained"
-            " its field"
+            f"beacon {name} was placed at ({_listed(result, 3)}) m; {len(places)} place(s)"
+            " explained its field"
         )
         figures += [
             Figure("hypotheses_{beacon}", places, "", name, _REPORT, note=note, remark=remark),

@@ -1,11 +1,11 @@
 """The room of paper 004, and deviations of its field from that of known dipoles.
 
-A `Scenario` specifies the disturbances of a world, `draw_world` draws one, and a `SimulatedWorld` gives a
-sensor's measurements in it, anywhere and with a fingerprint survey.  The estimator's knowledge is
-`World.site`: dipoles, exactly surveyed.  The scenarios are those of the independent analysis of the
-paper: noise alone (S0), a smooth gain error (S1), two sets fitted to the printed errors (F1, F2),
-and physical causes: coils of finite size (P0), with iron drawn from the whole range of its effect
-(P1, P2) or close by (N1, N2).
+A `Scenario` specifies the disturbances of a world, `draw_world` draws one, and a `SimulatedWorld`
+gives a sensor's measurements in it, anywhere and with a fingerprint survey.  The estimator's
+knowledge is `SimulatedWorld.site`: dipoles, exactly surveyed.  The scenarios are noise alone (S0),
+a smooth gain error (S1), two sets fitted to the errors that the paper prints (F1, F2), and physical
+causes: coils of finite size (P0), with iron drawn from the whole range of its effect (P1, P2) or
+close by (N1, N2).
 """
 
 from dataclasses import dataclass, replace

@@ -105,8 +105,8 @@ def imu_remarks(
         Whether samples are missing there.
     """
     if start_time is not None and end > start_time:
-        text = f"all axes are frozen since {start_time:.2f} s: the sensor or its driver hangs. Repeated"
-        text += " samples are dropped; the magnetic fields bridge the gap."
+        text = f"all axes are frozen since {start_time:.2f} s: the sensor or its driver hangs."
+        text += " Repeated samples are dropped; the magnetic fields bridge the gap."
         return (Finding("frozen_imu", f"IMU: {text}", Verdict.TRUSTWORTHY),)
     if not gap_bridged:
         return ()

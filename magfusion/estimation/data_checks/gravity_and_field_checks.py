@@ -192,8 +192,8 @@ def wrong_force(means: StillMeans, site: Site | None) -> Iterator[Finding]:
     if size < MISSING * gravity:
         yield Finding(
             "gravity_missing",
-            f"{findings}: a driver has removed gravity ('linear acceleration'), or the platform is in"
-            " free fall. Record the raw specific force.",
+            f"{findings}: a driver has removed gravity ('linear acceleration'), or the platform"
+            " is in free fall. Record the raw specific force.",
             Verdict.FAILED,
             2e3,
         )

@@ -140,9 +140,9 @@ def _of_one(one: Timing) -> Iterator[Finding]:
     if one.lost_share > MAX_LOST_SHARE:
         yield Finding(
             "samples_lost",
-            f"{one.stream}: {100.0 * one.lost_share:.1f} % of the samples are missing, one or a few at a"
-            f" time: link or recorder are too slow for {one.rate_hz:.4g} Hz. Record with a larger"
-            " buffer or at a lower rate.",
+            f"{one.stream}: {100.0 * one.lost_share:.1f} % of the samples are missing, one or a"
+            f" few at a time: link or recorder are too slow for {one.rate_hz:.4g} Hz. Record with"
+            " a larger buffer or at a lower rate.",
             weight=one.lost_share / MAX_LOST_SHARE,
         )
     if one.jitter > JITTER * usual:

@@ -77,9 +77,9 @@ def off_earth(site: Site, left_world: Array, rotation_cov_world: Array) -> OffEa
     of_survey = rest < EXPLAINED * off
     if of_survey:
         text = (
-            f"{findings}, as if rotated by {heading / DEGREE:+.0f} deg about the vertical. Check the"
-            " axes of earth_field_t and of the beacons' survey (true, grid or magnetic north, east"
-            " for north), the magnetometer's mounting (heading), and iron near it."
+            f"{findings}, as if rotated by {heading / DEGREE:+.0f} deg about the vertical. Check"
+            " the axes of earth_field_t and of the beacons' survey (true, grid or magnetic north,"
+            " east for north), the magnetometer's mounting (heading), and iron near it."
         )
     else:
         text = (

@@ -1,9 +1,9 @@
 """What changed while a log ran: a gain, a clock, a bias, a mount or a beacon, from some time on.
 
 An estimator takes all of them for constant.  A step of any of them at a quarter, at half and at
-three quarters of the log is asked as `magfusion.estimation.integrity.fixed_parameter_test` asks what is held: by
-how much the cost would fall, and how far the poses would move, whatever constant errors there are
-beside it.
+three quarters of the log is asked as `magfusion.estimation.integrity.fixed_parameter_test` asks
+what is held: by how much the cost would fall, and how far the poses would move, whatever constant
+errors there are beside it.
 """
 
 from collections.abc import Iterator

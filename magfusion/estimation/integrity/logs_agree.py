@@ -119,8 +119,8 @@ def _finding(shared: Shared, name: str, others: list[str], one: _Distance) -> Fi
     )
     recipient = f"log {others[0]}" if len(others) == 1 else "the other logs"
     text = (
-        f"Log {name} contradicts {recipient}: it takes {amounts} from where {recipient} and the survey have"
-        f" them (all together a chi square of {square:.3g} on {freedom}). Probably {cause} between"
-        " the logs: refine the site by the logs before and after apart."
+        f"Log {name} contradicts {recipient}: it takes {amounts} from where {recipient} and the"
+        f" survey have them (all together a chi square of {square:.3g} on {freedom}). Probably"
+        f" {cause} between the logs: refine the site by the logs before and after apart."
     )
     return Finding("logs_disagree", text, weight=float(sigmas(_least(one))))

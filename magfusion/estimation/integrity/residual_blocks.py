@@ -266,8 +266,8 @@ def inertial(case: Case, estimate: GraphEstimate) -> TestResult:
     names = ", ".join(dict.fromkeys(one.name for one in informative))
     text = (
         f"The inertial data contradict the motion that the fields tell of"
-        f" {_when([one for one in informative if one.name == worst.name], time)}: {names} deviate by"
-        f" up to {rms:.2g} times what the declared noise allows. Shocks, a false axis or scale,"
+        f" {_when([one for one in informative if one.name == worst.name], time)}: {names} deviate"
+        f" by up to {rms:.2g} times what the declared noise allows. Shocks, a false axis or scale,"
         " stamps, or declared noise that is too small: check the inertial sensor, or declare"
         " larger gyro_noise and accel_noise."
     )
@@ -275,8 +275,8 @@ def inertial(case: Case, estimate: GraphEstimate) -> TestResult:
     if not case.log.inertial:
         text = (
             f"The platform moves faster than its motion prior has it"
-            f" {_when([one for one in informative if one.name == worst.name], time)}: up to {rms:.2g}"
-            " times. Declare larger densities in platform.motion_prior."
+            f" {_when([one for one in informative if one.name == worst.name], time)}: up to"
+            f" {rms:.2g} times. Declare larger densities in platform.motion_prior."
         )
     finding = Finding(code, text, Verdict.DOUBTFUL, float(sigmas(worst.log_p)))
     factor = np.ones(len(result.states))

@@ -270,8 +270,9 @@ def _excluded_findings(
             Finding(
                 "beacon_excluded",
                 f"Beacon {names[j]} contradicts the others from {', '.join(spans[:SPANS])}{more}:"
-                f" the trajectory without it is up to {1e3 * _largest(separated, j):.3g} mm away, so it"
-                " was left out there. Check its drive current, and iron or a screen near it.",
+                f" the trajectory without it is up to {1e3 * _largest(separated, j):.3g} mm away,"
+                " so it was left out there. Check its drive current, and iron or a screen near"
+                " it.",
                 Verdict.TRUSTWORTHY,
             )
         )

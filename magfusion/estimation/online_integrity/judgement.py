@@ -107,8 +107,8 @@ class JudgedState(State):
     judgement : Judgement
     reset_counter : int
         Number of pose jumps up to here, as counted by
-        `magfusion.estimation.online_integrity.discontinuity_counter`; users of pose increments must restart where
-        it rises.
+        `magfusion.estimation.online_integrity.discontinuity_counter`; users of pose increments
+        must restart where it rises.
     """
 
     __repr__ = short_repr

@@ -119,8 +119,8 @@ class NearMetal:
         name, share = self.site.beacons[0].name, 100.0 * np.sqrt(self._kept)
         text = (
             f"The field of beacon {name} deviates by {share:.2g} % from the prediction by site and"
-            f" motion since {self._metal_since:.1f} s: metal or iron is near it or the sensor. Remove it,"
-            " or wait until it is gone; the sigmas account for it."
+            f" motion since {self._metal_since:.1f} s: metal or iron is near it or the sensor."
+            " Remove it, or wait until it is gone; the sigmas account for it."
         )
         return Judgement((Finding("metal_near", text, weight=share),))
 

@@ -211,8 +211,8 @@ class OnlineMonitor:
     def _of_being_lost(self, gate: Gate, lost_since: float | None) -> Judgement:
         if lost_since is not None:
             text = (
-                f"Lost since {lost_since:.1f} s: neither a fix nor the state explains the fields. Check"
-                " the frequencies, phases and positions of the beacons in the site."
+                f"Lost since {lost_since:.1f} s: neither a fix nor the state explains the fields."
+                " Check the frequencies, phases and positions of the beacons in the site."
             )
             return Judgement((Finding("lost", text, Verdict.FAILED, 10.0),))
         if gate.refused_in_a_row == 0 or not gate.refused:
@@ -356,9 +356,9 @@ class OnlineMonitor:
         angle = remaining / self.site.gravity
         verdict = Verdict.FAILED if angle > 2.0 * BEYOND_HELP else Verdict.DOUBTFUL
         text = (
-            f"The mean specific force of the last {MEMORY:g} s deviates by {remaining:.2g} m/s^2 from"
-            " gravity at the estimated attitude: axes or signs of the IMU, its mounting to the"
-            " magnetometer, or gravity removed from its data."
+            f"The mean specific force of the last {MEMORY:g} s deviates by {remaining:.2g} m/s^2"
+            " from gravity at the estimated attitude: axes or signs of the IMU, its mounting to"
+            " the magnetometer, or gravity removed from its data."
         )
         return Judgement((Finding("gravity_direction", text, verdict, score / DOUBT),), turn=angle)
 

@@ -22,7 +22,7 @@ def left_by_tree(
     fields: Sequence[Array],
     inertial: Sequence[Array],
 ) -> tuple[Array, Array]:
-    """Return the same as `magfusion.estimation.posterior.residual_covariance_chain.left_by_chain`."""
+    """Return the same as `left_by_chain` of `residual_covariance_chain`."""
     system = _System(graph, estimate, considered)
     shape = next(
         (len(m.epoch), m.measured.shape[1], 6)

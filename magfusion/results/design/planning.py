@@ -149,8 +149,9 @@ def designed(
     result = best_layout(search, task.count, starts, search_rng, first=given, report=report)
     if result is None or any(layout is None for layout in drawn):
         raise InputError(
-            f"{task.count} beacons at a distance of at least --apart {task.min_distance:g} m do not fit on"
-            f" {len(np.unique(candidates.places, axis=0))} mounting places; lower --apart or --grid"
+            f"{task.count} beacons at a distance of at least --apart {task.min_distance:g} m do"
+            f" not fit on {len(np.unique(candidates.places, axis=0))} mounting places; lower"
+            " --apart or --grid"
         )
     new = _finished(
         task, information, [candidates.beacons[c] for c in result.chosen], tones, allowed, in_time
