@@ -1,9 +1,9 @@
-"""What changed while a log ran: a gain, a clock, a bias, a mount or a beacon, from some time on.
+"""Change detection: a gain, clock, bias, mounting or beacon that changes during the log.
 
-An estimator takes all of them for constant.  A step of any of them at a quarter, at half and at
-three quarters of the log is asked as `magfusion.estimation.integrity.fixed_parameter_test` asks
-what is held: by how much the cost would fall, and how far the poses would move, whatever constant
-errors there are beside it.
+An estimator assumes all of them constant.  A step of each at a quarter, at half and at three
+quarters of the log is tested as `magfusion.estimation.integrity.fixed_parameter_test` tests fixed
+parameters: by the decrease of the cost and the change of the poses, for any constant errors in
+addition.
 """
 
 from collections.abc import Iterator
@@ -39,15 +39,15 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import DEGREE, Array, ComplexArray
 
-PARTS = (0.25, 0.5, 0.75)  # of the log, after which something may be another
-MOST_BEACONS = 12  # of more, each has too many others to be asked so
-MIN_EPOCHS = 40  # epochs, of which a part tells anything
+PARTS = (0.25, 0.5, 0.75)  # of the log, times of the tested steps
+MOST_BEACONS = 12  # with more, the test is not made
+MIN_EPOCHS = 40  # epochs, for parts with enough information
 SHORTEST = 10.0  # s
-BUDGET = 1e-5  # of false alarms, beside half a per cent of all other witnesses together
+BUDGET = 1e-5  # of false alarms, besides half a per cent of all other tests together
 
 
 class StepChange(Parameter):
-    """What a parameter is more by from some time on (s)."""
+    """Step of a parameter at some time (s)."""
 
     group = kind = "change"
 
@@ -61,7 +61,7 @@ class StepChange(Parameter):
         return hash((self.of, self.begin))
 
     def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray | None:
-        """Return the columns of the parameter itself, zero before."""
+        """Return the columns of the parameter itself, zero before the step."""
         columns = self.of.phasor_jacobian(view, owner)
         if columns is None:
             return None
@@ -70,19 +70,19 @@ class StepChange(Parameter):
 
 
 class Stamps(Parameter):
-    """How late the magnetometer's stamps are (s), as its phases show it."""
+    """Delay of the magnetometer's stamps (s), as visible in its phases."""
 
     group, owner, kind = "change", "stamps", "delay"
     factor_of_phasor = True
 
     def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray:  # noqa: ARG002
-        """Return what a delay does to the phases of every beacon."""
+        """Return the derivative of the phases of every beacon by a delay."""
         turns = 2.0 * np.pi * view.beacon.tone_frequencies_hz
         return (-1j * view.phasor * turns[:, None])[..., None]
 
 
 class Bias(Inertial):
-    """A bias of the accelerometer or of the gyro, beside the one that walks."""
+    """Constant bias of the accelerometer or the gyro, in addition to the random walk."""
 
     def __init__(self, first: int) -> None:
         self.first = first
@@ -101,7 +101,7 @@ class Bias(Inertial):
 
 
 class SinceBias(Inertial):
-    """What a bias is more by from some time on (s)."""
+    """Step of a bias at some time (s)."""
 
     kind = "change"
 
@@ -115,13 +115,13 @@ class SinceBias(Inertial):
         return hash((SinceBias, self.of, self.begin))
 
     def as_bias(self, stream: Stream) -> Array:
-        """Return the bias itself, zero before."""
+        """Return the columns of the bias itself, zero before the step."""
         return self.of.as_bias(stream) * (stream.imu.time >= self.begin)[:, None, None]
 
 
 STAMPS = Stamps()
 ACCEL_BIAS, GYRO_BIAS = Bias(0), Bias(3)
-# What may change, its size in a unit of the tangent vector, and in words.
+# Tested parameters: size in a unit of the tangent vector, and words.
 TYPICAL: dict[Parameter, float] = {
     GAIN: 0.01,
     STAMPS: 1e-4,
@@ -136,19 +136,19 @@ TYPICAL: dict[Parameter, float] = {
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """A suspect, and since when it would be another."""
+    """A candidate fault, and the time of its step."""
 
     fault: Suspect
     begin: float
 
 
 def candidate_steps(result: Smoothed) -> list[Block]:
-    """Return the steps of parameters that a log is asked for; none of one that is too short."""
+    """Return the steps of parameters that are tested for a log; none if it is too short."""
     return [block for part in _steps_by_time(result).values() for block in part]
 
 
 def _steps_by_time(result: Smoothed) -> dict[float, list[Block]]:
-    """Return them by when they would be (s)."""
+    """Return them by time of the step (s)."""
     site, time = result.declared.site, result.fields.time
     if not 1 < len(site.beacons) <= MOST_BEACONS or len(time) < MIN_EPOCHS:
         return {}
@@ -159,7 +159,7 @@ def _steps_by_time(result: Smoothed) -> dict[float, list[Block]]:
 
 
 def changed(case: Case) -> TestResult:
-    """Ask what may have changed while the log ran."""
+    """Test for changes during the log."""
     result, wide, parts = case.result, case.wide, _steps_by_time(case.result)
     if wide is None or not parts:
         return NOTHING
@@ -189,14 +189,14 @@ def changed(case: Case) -> TestResult:
         return NOTHING
     change, cause = max(likely, key=lambda pair: pair[1].gain)
     if cause.gain < _throughout(case, information, gradient):
-        return NOTHING  # it was so from the beginning
+        return NOTHING  # it was wrong from the beginning
     moved = cause.moved[:, :, None] * cause.moved[:, None, :]
     certain = wide.by_pose @ cause.known_cov @ np.swapaxes(wide.by_pose, 1, 2)
     return TestResult((_finding(change, cause, prior_sigma(every)),), spread=moved + certain)
 
 
 def _changes(parts: dict[float, list[Block]], every: tuple[Block, ...]) -> list[Change]:
-    """Return what may have changed at each of some times, as columns behind those held."""
+    """Return the possible changes at each of some times, as columns after the fixed ones."""
     return [
         Change(fault, at)
         for at, part in zip(parts, _again(every, list(parts.values())), strict=True)
@@ -205,7 +205,7 @@ def _changes(parts: dict[float, list[Block]], every: tuple[Block, ...]) -> list[
 
 
 def _throughout(case: Case, information: Array, gradient: Array) -> float:
-    """Return the most that anything held explains which is wrong all along."""
+    """Return the largest gain of a fixed parameter that is wrong throughout."""
     assert case.score is not None
     own = slice(0, dimension(case.score.fixed))
     gains = [
@@ -250,14 +250,14 @@ def _width(kind: Parameter) -> int:
 
 
 def _again(every: tuple[Block, ...], parts: list[list[Block]]) -> Iterator[list[Block]]:
-    """Yield the blocks of each part where they were placed."""
+    """Yield the blocks of each part with their columns."""
     at = {block.key: block for block in every}
     for part in parts:
         yield [at[block.key] for block in part]
 
 
 def _fault_candidates(blocks: list[Block], size: int) -> Iterator[Suspect]:
-    """Yield what one event changes: a beacon, or what hears them all."""
+    """Yield the effects of single events: on a beacon, or on the reception of all."""
     gains = [block for block in blocks if _of(block) == GAIN]
     if len(gains) > 1:
         common = np.zeros((size, 1))
@@ -308,20 +308,20 @@ def _finding(change: Change, cause: ReleasedFault, sigma: Array) -> Finding:
     elif kind == GAIN:
         remedy = "its supply and its driver"
     elif kind in (STAMPS, TIME_OFFSET):
-        remedy = "what makes the stamps, and samples that were lost there"
+        remedy = "the source of the stamps, and samples lost there"
     elif isinstance(kind, Bias):
-        remedy = "how warm it became, and whether it was struck"
+        remedy = "its temperature, and whether it had a shock"
     elif kind == SENSOR_ROTATION:
-        remedy = "how it is fastened"
+        remedy = "its mounting"
     else:
         remedy = "whether it was moved"
     mean = float(np.mean(cause.distance))
     return Finding(
         "changed",
-        f"Something changed while the log ran: {change.fault.name} {amounts[kind]}, from about"
-        f" {change.begin:.0f} s on ({float(sigmas(cause.log_p)):.0f} sigma), which moves the poses"
-        f" by {np.sqrt(mean):.1f} times what they claim. Check {remedy}; smooth the parts before"
-        " and after apart, by --start and --end.",
+        f"A parameter changed during the log: {change.fault.name} {amounts[kind]}, from about"
+        f" {change.begin:.0f} s on ({float(sigmas(cause.log_p)):.0f} sigma). This moves the poses"
+        f" by {np.sqrt(mean):.1f} times their reported sigma. Check {remedy}. Smooth the parts"
+        " before and after separately (--start, --end).",
         Verdict.FAILED if mean > MAX_LINEAR_CHI_SQUARE else Verdict.DOUBTFUL,
         float(sigmas(cause.log_p)),
     )

@@ -1,4 +1,4 @@
-"""What an estimate leaves of the short windows in which close tones are told together."""
+"""Test of the residuals of short windows, in which close tones are measured jointly."""
 
 import numpy as np
 
@@ -9,11 +9,11 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.windows import LONGEST_WINDOW
 
 EXPLAINED = 1.5  # mean square, one where noise and model are as declared
-MIN_COUNT = 3  # windows of which a mean is taken
+MIN_COUNT = 3  # windows per mean
 
 
 def together(case: Case) -> TestResult:
-    """Judge the short windows, some seconds of them at a time."""
+    """Test the short windows, in pieces of some seconds."""
     graph = case.result.graph
     measured = next((m for m in graph.measurements if isinstance(m, JointPhasors)), None)
     if measured is None or len(measured.time) < MIN_COUNT:
@@ -33,9 +33,9 @@ def together(case: Case) -> TestResult:
     rms, share = np.sqrt(worst), 100.0 * float(np.mean(mean > EXPLAINED))
     finding = Finding(
         "field_residuals",
-        f"What the beacons send together deviates by up to {rms:.2g} times what noise and model"
-        f" error allow, in {share:.0f} % of the log. A beacon is not as declared, iron is near the"
-        " path, or the start was wrong: record longer, and see which beacon is named.",
+        f"The jointly measured fields deviate by up to {rms:.2g} times the noise and model error,"
+        f" in {share:.0f} % of the log. A beacon is not as declared, iron is near the path, or the"
+        " start is wrong. Record a longer log to identify the beacon.",
         Verdict.FAILED if rms > NOTHING_EXPLAINED else Verdict.DOUBTFUL,
         20.0 + rms,
     )

@@ -1,4 +1,4 @@
-"""Where the estimator ended: did it converge, what else might it have found, how sure is it."""
+"""Tests of the estimator's result: convergence, ambiguity and observability."""
 
 import numpy as np
 
@@ -8,42 +8,44 @@ from magfusion.estimation.posterior.convergence import pose_steps
 from magfusion.model.trust import Finding, Verdict
 
 DIVERGED = 3.0  # whitened residual, one where noise and model are as declared
-MAX_FINAL_STEP_SIGMAS = 10.0  # sigmas that the last pass moved the poses by: it ended anywhere
-OPEN_DEG, OPEN_SHARE = 20.0, 0.25  # sigma of attitude, and of position by the nearest beacon's
-# distance, beyond which a covariance does not describe where the platform may be
+MAX_FINAL_STEP_SIGMAS = (
+    10.0  # sigmas of the last step of the poses, beyond which the result is arbitrary
+)
+OPEN_DEG, OPEN_SHARE = 20.0, 0.25  # sigma of attitude, and of position over the distance of the
+# nearest beacon, beyond which a covariance does not describe where the platform may be
 
 
 def convergence(case: Case) -> TestResult:
-    """Judge whether the loop ended where the cost is least."""
+    """Test whether the iterations converged to a minimum of the cost."""
     result = case.result
     if result.converged:
         return NOTHING
     known, move = result.residual[np.isfinite(result.residual)], result.last_move
     residual = float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
-    moved = f"its last pass still moved the poses by {move:.2g} of their sigmas"
+    moved = f"its last iteration moved the poses by {move:.2g} of their sigmas"
     if residual > DIVERGED:
         finding = Finding(
             "diverged",
-            f"The smoother did not converge: {moved}, and its residual is {residual:.3g} where"
-            " about 1 is expected. The log is not of this site: check places, frequencies and"
-            " drives of the beacons, the mounting, and the stamps.",
+            f"The smoother did not converge: {moved}, and its residual is {residual:.3g} (1 is"
+            " expected). The log does not match the site: check positions, frequencies and drives"
+            " of the beacons, the mounting, and the stamps.",
             Verdict.FAILED,
             residual / DIVERGED,
         )
     elif not result.start.determined.any():
-        # The start was arbitrary then: where the loop happened to stop, it still is.
+        # The start was arbitrary, and so is the result.
         finding = Finding(
             "geometry",
-            "No epoch alone determines its pose, and the motion did not either (the smoother did"
-            " not converge). Add a beacon or a coil, or record more motion.",
+            "The pose is unobservable, per epoch and over the log: the smoother did not converge."
+            " Add a beacon or a coil, or record more motion.",
             Verdict.FAILED,
             10.0,
         )
     else:
         finding = Finding(
             "not_converged",
-            f"The smoother did not converge: {moved}. Give it a better survey, or a shorter part"
-            " of the log (--start, --end).",
+            f"The smoother did not converge: {moved}. Use a better survey, or a shorter part of"
+            " the log (--start, --end).",
             Verdict.FAILED if move > MAX_FINAL_STEP_SIGMAS else Verdict.DOUBTFUL,
             1.0,
         )
@@ -52,14 +54,14 @@ def convergence(case: Case) -> TestResult:
 
 
 def rivals(case: Case) -> TestResult:
-    """Judge whether another trajectory explains the log nearly as well."""
+    """Test whether another trajectory explains the log nearly as well."""
     result = case.result
     chi_square = result.rival_chi_square
     if chi_square is None or chi_square >= AMBIGUOUS_CHI_SQUARE:
         return NOTHING
     finding = Finding(
         "ambiguous",
-        "Another trajectory, of a mirrored start, explains the log nearly as well (its chi square"
+        "Another trajectory, from a mirrored start, explains the log nearly as well (its chi square"
         f" is only {chi_square:.3g} larger). Add a beacon, or record more motion.",
         Verdict.DOUBTFUL,
         AMBIGUOUS_CHI_SQUARE / max(chi_square, 0.1),
@@ -72,7 +74,7 @@ def rivals(case: Case) -> TestResult:
 
 
 def geometry(case: Case) -> TestResult:
-    """Judge whether the pose is known so badly that its covariance says little."""
+    """Test whether the pose is too poorly determined for its covariance to be meaningful."""
     site, states = case.result.declared.site, case.result.states
     if not site.beacons:
         return NOTHING
@@ -85,9 +87,9 @@ def geometry(case: Case) -> TestResult:
     if share < OPEN_SHARE and turn < OPEN_DEG:
         return NOTHING
     text = (
-        f"The log hardly determines the pose: its sigma is {np.median(widest[1]):.2g} m at"
+        f"The log barely determines the pose: its sigma is {np.median(widest[1]):.2g} m at"
         f" {np.median(away):.2g} m from the nearest beacon, and {turn:.2g} deg, along the worst"
-        " direction. Add a beacon, come nearer, or record for longer."
+        " direction. Add a beacon, reduce the distance, or record a longer log."
     )
     lost_epochs = share > 4.0 * OPEN_SHARE or turn > 4.0 * OPEN_DEG
     verdict = Verdict.FAILED if lost_epochs else Verdict.DOUBTFUL

@@ -1,4 +1,4 @@
-"""Fields of a few dozen calm epochs, and how well a site explains them whatever the motion."""
+"""Fields of a few dozen calm epochs, and how well a site explains them for any motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -33,12 +33,12 @@ ITERATIONS = 20
 
 @dataclass(frozen=True, eq=False)
 class _Guess:
-    """Poses of all epochs, and what they share."""
+    """Poses of all epochs, and shared parameters."""
 
     calibration: Calibration
     turn: Array  # (n, 3, 3) world_from_body
     place: Array  # (n, 3)
-    estimate: Array  # (dimension,) of the shared parameters, so far
+    estimate: Array  # (dimension,) sum of the shared parameters' steps
 
     def moved(self, step: Array, blocks: tuple[Block, ...]) -> "_Guess":
         poses = step[: 6 * len(self.turn)].reshape(-1, 6)
@@ -53,7 +53,7 @@ class _Guess:
 
 @dataclass(frozen=True, eq=False)
 class Snapshots:
-    """Phasors of some epochs with a site that may explain them.
+    """Phasors of some epochs, with a site that may explain them.
 
     Parameters
     ----------
@@ -71,17 +71,17 @@ class Snapshots:
 
     @property
     def freedom(self) -> float:
-        """Residuals less poses."""
+        """Number of residuals less that of pose parameters."""
         return float(np.sum(self.samples.numbers) - 6 * len(self.samples))
 
     @cached_property
     def fixes(self) -> Fixes:
-        """Poses, without a guess."""
+        """Poses, without an initial guess."""
         return fix_epochs(self.samples, self.calibration)
 
     @cached_property
     def chi_square(self) -> float:
-        """Of the fixes."""
+        """Chi square of the fixes."""
         return float(np.sum(self.fixes.cost[:, 0]))
 
     def of(self, site: Site) -> "Snapshots":
@@ -89,7 +89,7 @@ class Snapshots:
         return Snapshots(self.samples, replace(self.calibration, site=site))
 
     def some(self, count: int) -> "Snapshots":
-        """Return a few of the epochs."""
+        """Return a subset of the epochs."""
         chosen = np.zeros(len(self.samples), dtype=bool)
         chosen[np.linspace(0, len(self.samples) - 1, count).round().astype(np.int64)] = True
         return replace(self, samples=self.samples.rows(chosen))
@@ -115,14 +115,14 @@ class Snapshots:
     def fitted(
         self, parameters: Sequence[tuple[Parameter, str, float]], fixes: Fixes
     ) -> tuple[float, Calibration]:
-        """Return chi square and calibration with some parameters found beside the poses.
+        """Return chi square and calibration with some parameters estimated besides the poses.
 
         Parameters
         ----------
         parameters : sequence of (Parameter, str, float)
-            With owner and a sigma that keeps what is open from running away.
+            With owner, and a sigma that constrains undetermined ones.
         fixes : Fixes
-            Where the poses begin.
+            Initial poses.
         """
         blocks = _blocks(self.site, parameters)
         start = _Guess(
@@ -143,7 +143,7 @@ class Snapshots:
         return float(result.cost[0]), guess.calibration
 
     def _normal(self, at: _Guess, blocks: tuple[Block, ...]) -> NormalEquations:
-        """Return the normal equations of all poses, and of what they share."""
+        """Return the normal equations of all poses, and of the shared parameters."""
         time, n = self.samples.time, len(self.samples)
         value, by_pose, by_free = linearize_channels(
             at.calibration, blocks, time, at.turn, at.place
@@ -183,16 +183,16 @@ def _one(guess: _Guess) -> AnyArray:
 
 
 def calm_epochs(samples: FieldSamples, imu: ImuSamples, count: int = EPOCHS) -> FieldSamples:
-    """Return epochs spread over a log, of each stretch that with the least rate.
+    """Return epochs spread over a log, of each stretch the one with the least rate.
 
-    The size of the rate hangs on no axis and no sign; its unit does not matter either.
+    The size of the rate depends on no axis and no sign; its unit does not matter either.
     """
     if len(samples) <= count:
         return samples
     rate = np.linalg.norm(imu.gyro_body, axis=1)
     nearest = np.clip(np.searchsorted(imu.time, samples.time), 0, len(imu) - 1)
     maximum = np.sum(samples.valid, axis=1)
-    order = np.lexsort((rate[nearest], -maximum))  # as many beacons as there are, then calm
+    order = np.lexsort((rate[nearest], -maximum))  # by number of beacons, then by rate
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
     stretches = np.array_split(np.arange(len(samples)), count)

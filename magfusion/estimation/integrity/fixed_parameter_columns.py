@@ -1,4 +1,4 @@
-"""What parameters that are held do to the inertial factors, interval by interval."""
+"""Columns of fixed parameters in the inertial factors, interval by interval."""
 
 from typing import NamedTuple
 
@@ -13,22 +13,22 @@ from magfusion.model.parameters import Block, dimension
 from magfusion.model.samples import ImuSamples
 from magfusion.units import Array, IntArray
 
-STRETCH = 256  # intervals whose samples are looked at at once
+STRETCH = 256  # intervals that are processed at once
 
 
 class InertialColumns(NamedTuple):
-    """Columns of inertial factors, of which most are zero.
+    """Columns of inertial factors, most of which are zero.
 
     Parameters
     ----------
     of_bias : ndarray, shape (intervals, 15, 6)
-        What a bias does to the whitened error.
+        Derivative of the whitened error by a bias.
     bias : ndarray, shape (intervals, 6, k)
-        What a typical error of those columns that are not zero looks like.
+        Bias of a typical error, for the columns that are not zero.
     at : int ndarray, shape (k,)
-        Which those are.
+        Indices of these columns.
     number : int
-        Of all columns.
+        Number of all columns.
     """
 
     of_bias: Array
@@ -44,7 +44,7 @@ class InertialColumns(NamedTuple):
         return out
 
     def part(self, columns: slice) -> "InertialColumns":
-        """Return some of the columns."""
+        """Return a subset of the columns."""
         inside = (self.at >= columns.start) & (self.at < columns.stop)
         at, count = self.at[inside] - columns.start, columns.stop - columns.start
         return InertialColumns(self.of_bias, self.bias[..., inside], at, count)
@@ -53,7 +53,7 @@ class InertialColumns(NamedTuple):
 def inertial_columns(
     result: Smoothed, fixed: tuple[Block, ...], imu: ImuSamples
 ) -> InertialColumns:
-    """Return what typical errors of held parameters of the IMU do to its factors."""
+    """Return the effect of typical errors of fixed IMU parameters on the inertial factors."""
     states, calibration = result.states, result.calibration
     acting = [block for block in fixed if isinstance(block.parameter, Inertial)]
     time = calibration.on_log_rate(imu).time + calibration.time_offset
@@ -85,14 +85,14 @@ def inertial_columns(
 
 
 def _of_bias(graph: Graph, result: Smoothed) -> Array:
-    """Return what a bias does to each inertial factor, shape (intervals, 15, 6)."""
+    """Return the derivative of each inertial factor by a bias, shape (intervals, 15, 6)."""
     count = graph.epochs - 1
     first, linear = graph.native.size() - count, graph.native.linearize(result.estimate.values)
     out = np.zeros((count, ROWS, 6))
     for k in range(count):
         factor = linear.at(first + k)
         assert isinstance(factor, gtsam.JacobianFactor)
-        # A bias that is the same at both ends leaves its random walk alone.
+        # A bias that is equal at both ends does not affect its random walk.
         whole, column = factor.getA(), 0
         for key in factor.keys():  # noqa: SIM118
             symbol = gtsam.Symbol(key).chr()
@@ -104,7 +104,7 @@ def _of_bias(graph: Graph, result: Smoothed) -> Array:
 
 
 def _means(value: Array, at: IntArray) -> Array:
-    """Return the mean of samples between some of them; zero where there is none."""
+    """Return the means of samples between indices; zero without samples."""
     total = np.concatenate([np.zeros((1, *value.shape[1:])), np.cumsum(value, axis=0)])
     sums = total[at[1:]] - total[at[:-1]]
     return sums / np.maximum(np.diff(at), 1)[:, None, None]

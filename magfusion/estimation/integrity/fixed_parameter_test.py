@@ -1,8 +1,8 @@
-"""The verdict on what is held: which parameter the log contradicts, and which it cannot check.
+"""Fixed-parameter test: which fixed parameter a log contradicts, and which it cannot check.
 
-Significance is not consequence: a parameter is called in question where freeing it would lower the
-cost by more than chance does, and would move the poses beyond what their covariance covers.  The
-one that lowers it most names the cause; after it has moved, the next is asked.
+Significance is not consequence: a parameter fails if estimating it would lower the cost by more
+than chance does, and would move the poses beyond their covariance.  The one that lowers the cost
+most is the cause; after its step, the next is tested.
 """
 
 from typing import NamedTuple
@@ -27,32 +27,32 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Unverified, Verdict
 from magfusion.units import Array
 
-FARTHEST = 30.0  # typical errors; a direction that is known no better is not looked at
-PER_PARAMETER = 12.0  # chi square that one more parameter must gain to be the better explanation
+FARTHEST = 30.0  # typical errors; directions with a larger sigma are ignored
+PER_PARAMETER = 12.0  # chi square by which one more parameter must improve an explanation
 COVERED = 4.0  # mean squared Mahalanobis distance that a covariance of six still covers
 MAX_LINEAR_CHI_SQUARE = (
     25.0**2
-)  # beyond which a linear step and its covariance say nothing of where it is
-MAX_CAUSES = 4  # causes that are named
-LEAST_SHARE = 0.03  # of the first cause's chi square; what is less may be its nonlinear rest
-UNCHECKED = 4.3**2  # chi square below which one of fifty suspects stays unnoticed
+)  # beyond, a linear step and its covariance do not locate the solution
+MAX_CAUSES = 4  # reported causes
+LEAST_SHARE = 0.03  # of the first cause's chi square; less may be its nonlinear remainder
+UNCHECKED = 4.3**2  # chi square below which one of fifty candidates is not detected
 
 
 class ReleasedFault(NamedTuple):
-    """A suspect, freed.
+    """A candidate fault with its parameters estimated.
 
     Parameters
     ----------
     step : ndarray, shape (h,)
         In typical errors.
     direction, information : ndarray, shape (h, k), (k,)
-        Orthogonal combinations of what is held, and what the log tells of each.
+        Orthogonal combinations of the fixed parameters, and the log's information on each.
     chi_square, freedom : float
-        By how much twice the cost falls.
+        Twice the decrease of the cost.
     moved : ndarray, shape (states, 6)
-        What it does to the poses.
+        Change of the poses.
     distance : ndarray, shape (states,)
-        Squared, by the covariance of the poses.
+        Its square, by the covariance of the poses.
     """
 
     fault: Suspect
@@ -71,24 +71,24 @@ class ReleasedFault(NamedTuple):
 
     @property
     def known_cov(self) -> Array:
-        """The same of what the log determines better than those."""
+        """The same of the directions that the log determines better than typical errors."""
         known = self.information > 1.0
         vector = self.direction[:, known]
         return np.asarray((vector / self.information[known]) @ vector.T)
 
     @property
     def log_p(self) -> float:
-        """Logarithm of the probability that chance does as much."""
+        """Logarithm of the probability of this decrease by chance."""
         return float(log_p_chi_square(self.chi_square, self.freedom))
 
     @property
     def gain(self) -> float:
-        """What it explains, less what as many parameters would explain anyway."""
+        """Decrease of chi square, less what as many parameters gain anyway."""
         return self.chi_square - PER_PARAMETER * self.freedom
 
 
 def check_fixed_parameters(case: Case) -> TestResult:
-    """Ask everything that is held."""
+    """Test all fixed parameters."""
     if case.score is None:
         return NOTHING
     score, site = case.score, case.result.declared.site
@@ -126,14 +126,14 @@ def check_fixed_parameters(case: Case) -> TestResult:
 
 
 def gains(combine: Array, information: Array, gradient: Array) -> Array:
-    """Return `Freed.gain` of many suspects at once, shape (suspects,); zero where nothing tells.
+    """Return `Freed.gain` of many candidates, shape (candidates,); zero without information.
 
     Parameters
     ----------
-    combine : ndarray, shape (suspects, h, columns)
-        Of each, with columns of zeros where others have more.
+    combine : ndarray, shape (candidates, h, columns)
+        Of each, padded with columns of zeros.
     information, gradient : ndarray, shape (h, h), (h,)
-        Or one of each suspect.
+        Shared, or one per candidate.
     """
     across = np.swapaxes(combine, 1, 2)
     value, vector = np.linalg.eigh(across @ information @ combine)
@@ -144,7 +144,7 @@ def gains(combine: Array, information: Array, gradient: Array) -> Array:
 
 
 class ReleaseGain(NamedTuple):
-    """What a log tells of a suspect, as of `ReleasedFault`."""
+    """Estimate of a candidate fault from a log, as of `ReleasedFault`."""
 
     step: Array
     direction: Array
@@ -154,12 +154,12 @@ class ReleaseGain(NamedTuple):
 
     @property
     def log_p(self) -> float:
-        """Logarithm of the probability that chance does as much."""
+        """Logarithm of the probability of this decrease by chance."""
         return float(log_p_chi_square(self.chi_square, self.freedom))
 
 
 def release_gain(fault: Suspect, information: Array, gradient: Array) -> ReleaseGain | None:
-    """Return what freeing a suspect gains; None where nothing tells of it."""
+    """Return the gain of estimating a candidate fault; None without information on it."""
     combine = fault.combine
     value, vector = np.linalg.eigh(combine.T @ information @ combine)
     kept = value > FARTHEST**-2
@@ -174,7 +174,7 @@ def release_gain(fault: Suspect, information: Array, gradient: Array) -> Release
 def release_fault(
     pose_cov: Array, score: Score, fault: Suspect, information: Array, gradient: Array
 ) -> ReleasedFault | None:
-    """Free a suspect; None where nothing tells of it."""
+    """Estimate a candidate fault; None without information on it."""
     reported = release_gain(fault, information, gradient)
     if reported is None:
         return None
@@ -186,7 +186,7 @@ def release_fault(
 def _cause(
     case: Case, score: Score, release: list[ReleasedFault], before: Array
 ) -> ReleasedFault | None:
-    """Return what explains most of what chance and the claimed covariance do not."""
+    """Return the best explanation of what chance and the claimed covariance do not explain."""
     informative = holm([one.log_p for one in release], TEST_BUDGET)
     likely = [
         one
@@ -194,7 +194,7 @@ def _cause(
         if significant and np.mean(one.distance) > COVERED
     ]
     for one in sorted(likely, key=lambda one: -one.gain)[:3]:
-        # Everything explains a part of what nothing explains.
+        # Every candidate fits a part of a residual that none explains.
         rest = field_residual(
             case.result, moved_estimate(case.result, score, score.allowed(before + one.step))
         )
@@ -208,7 +208,7 @@ def _cause(
 
 
 def finding_of(site: Site, score: Score, cause: ReleasedFault) -> Finding:
-    """Return what is to be said of a cause."""
+    """Return the finding on a cause."""
     position = float(np.sqrt(np.mean(np.sum(cause.moved[:, 3:] ** 2, axis=1))))
     rotation = float(np.rad2deg(np.sqrt(np.mean(np.sum(cause.moved[:, :3] ** 2, axis=1)))))
     mean = float(np.mean(cause.distance))
@@ -216,30 +216,30 @@ def finding_of(site: Site, score: Score, cause: ReleasedFault) -> Finding:
         block = cause.fault.blocks[0]
         factor = float(np.exp((prior_sigma(score.fixed) * cause.step)[block.columns][0]))
         result = f"all are {factor:.3g} times as large"
-        remedy = "correct them (peak, not rms; their unit), or declare their sigma"
+        remedy = "Correct them (peak, not rms; their unit), or declare their sigma"
     else:
         result = "; ".join(_amounts(site, score, cause, b) for b in _largest(cause))
-        remedy = "correct it by so much, or declare a sigma of that size so that it is estimated"
+        remedy = "Correct it by this amount, or declare a sigma of this size to estimate it"
     return Finding(
         CODE[cause.fault.blocks[0].parameter],
         f"The log contradicts {cause.fault.name} as declared: {result}"
-        f" ({float(sigmas(cause.log_p)):.0f} sigma), which moves the poses by"
+        f" ({float(sigmas(cause.log_p)):.0f} sigma). This moves the poses by"
         f" {_length(position)} and {rotation:.2g} deg,"
-        f" {np.sqrt(mean):.1f} times what they claim. Remedy: {remedy}.",
+        f" {np.sqrt(mean):.1f} times their reported sigma. {remedy}.",
         Verdict.FAILED if mean > MAX_LINEAR_CHI_SQUARE else Verdict.DOUBTFUL,
         float(sigmas(cause.log_p)),
     )
 
 
 def _largest(cause: ReleasedFault) -> list[Block]:
-    """Return the blocks of a suspect that move, most first."""
+    """Return the blocks of a candidate that change, the largest change first."""
     size = {b.name: float(np.max(np.abs(cause.step[b.columns]))) for b in cause.fault.blocks}
     moving = sorted(cause.fault.blocks, key=lambda b: -size[b.name])
     return [b for b in moving if size[b.name] > 0.1 * size[moving[0].name]][:4]
 
 
 def _amounts(site: Site, score: Score, cause: ReleasedFault, block: Block) -> str:
-    """Return what the numbers of a block would change by, the largest first, in words."""
+    """Return the changes of a block's numbers in words, the largest first."""
     unit = block.parameter.display_unit
     scale = prior_sigma(score.fixed)[block.columns] / unit.size
     step = scale * cause.step[block.columns]
@@ -257,7 +257,7 @@ def _length(metres: float) -> str:
 
 
 def _unverified(case: Case, score: Score) -> list[Unverified]:
-    """Return what nothing in the log would contradict, and what it does to the poses."""
+    """Return fixed parameters that the log does not check, with their effect on the poses."""
     out, information = [], score.within_tolerance()
     for block in score.fixed:
         rows = np.arange(len(score.information))[block.columns]

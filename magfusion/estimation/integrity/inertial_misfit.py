@@ -1,7 +1,7 @@
-"""Inertial residuals: where rates and forces contradict the motion that the fields tell of.
+"""Inertial residuals: inconsistency of rates and forces with the magnetic-field solution.
 
-At the optimum the states have taken most of an inertial factor's error; what should be left is
-known from their covariance, of a sample of the intervals.
+At the optimum the states have absorbed most of an inertial factor's error; the expected residual
+follows from their covariance, computed for a sample of the intervals.
 """
 
 import gtsam
@@ -14,7 +14,7 @@ from magfusion.estimation.graph.inertial import ROWS
 from magfusion.estimation.solve.bordered import eliminate
 from magfusion.units import Array
 
-SAMPLED = 24  # intervals whose covariance is computed: they are much alike
+SAMPLED = 24  # intervals whose covariance is computed: most are similar
 WIDTHS = {"x": 6, "v": 3, "b": 6}
 
 
@@ -31,7 +31,7 @@ def inertial_errors(result: Smoothed, estimate: GraphEstimate) -> Array:
 
 
 def expected_squares(result: Smoothed) -> Array:
-    """Return the mean square that should be left of each row, shape (15,)."""
+    """Return the expected mean square residual of each row, shape (15,)."""
     graph, estimate = result.graph, result.estimate
     count = graph.epochs - 1
     linear = graph.native.linearize(estimate.values)

@@ -1,7 +1,7 @@
-"""The verdict on a smoothed log: every witness is heard, and the covariance made honest.
+"""Integrity of a smoothed log: all tests, and a covariance that accounts for them.
 
-A mistake leaves traces with several witnesses.  What freeing one parameter explains is its trace
-and is not said beside it; the covariance takes what all of them say.
+A fault shows in several tests.  What a single parameter explains is not reported again by the
+others; the covariance accounts for all of them.
 """
 
 from collections.abc import Iterator
@@ -37,16 +37,16 @@ from magfusion.model.trust import Trust, Verdict
 from magfusion.model.without_imu import logged
 from magfusion.units import Array
 
-EXPLAINED = 0.3  # of the residuals, left beside a cause that explains them
-FEW = 2  # causes at once
-STRONGER = 1.5  # than a trace is what leaves it
+EXPLAINED = 0.3  # of the residuals; remaining share with a cause that explains them
+FEW = 2  # simultaneous causes
+STRONGER = 1.5  # ratio above which a finding is no side effect of another
 
 
 R = TypeVar("R", bound=Smoothed)
 
 
 class JudgedResult(NamedTuple, Generic[R]):
-    """A result with a covariance that its witnesses allow, what they say, and what is held."""
+    """A result with an honest covariance, its findings, and the score of fixed parameters."""
 
     result: R
     trust: Trust
@@ -54,17 +54,17 @@ class JudgedResult(NamedTuple, Generic[R]):
 
 
 def judge_result(result: R, log: Log) -> tuple[R, Trust]:
-    """Return a result with a covariance that its witnesses allow, and what they say.
+    """Return a result with the covariance that its tests allow, and their findings.
 
     Parameters
     ----------
     log : Log
-        Of which the result is: its raw streams are witnesses too.
+        Of the result; its raw streams are tested too.
 
     Raises
     ------
     TypeError
-        Where the arguments are not a result and a log, in this order.
+        If the arguments are not a result and a log, in this order.
     """
     check_arguments("judged", result=(result, Smoothed), log=(log, Log))
     estimate = judged_with_score(result, log)
@@ -72,10 +72,10 @@ def judge_result(result: R, log: Log) -> tuple[R, Trust]:
 
 
 def judged_with_score(result: R, log: Log) -> JudgedResult[R]:
-    """Return the same, with the score of everything that the result holds."""
+    """Return the same, with the score of all fixed parameters of the result."""
     log, _ = logged(log, result.declared.site)
     alone = result.earth_residual is None
-    states = result.states if alone else None  # else the Earth field has had its say in them
+    states = result.states if alone else None  # else they depend on the Earth field
     streams = log, result.declared.site, BRIDGED_CODES
     released = detected_in(result.fields, result.declared.site)
     detected = recorded(*streams, estimated=states, beacons=alone, compensated=released)
@@ -100,7 +100,7 @@ def judged_with_score(result: R, log: Log) -> JudgedResult[R]:
 
 
 def _run_tests(case: Case) -> Iterator[TestResult]:
-    """Yield what every witness says: what is held first, since it may explain the others."""
+    """Yield all test results; that of fixed parameters first, as it may explain the others."""
     of_held, priors, biases = (
         check_fixed_parameters(case),
         calibration_change(case),
@@ -111,7 +111,7 @@ def _run_tests(case: Case) -> Iterator[TestResult]:
     ends = [field_residual(case.result, after, raw=raw) for raw in (True, False)]
     residuals = [fields(case, *ends), inertial(case, after)]
     cause, prior, rest = (_weight(findings) for findings in (of_held, priors, residuals[0]))
-    if causes < len(of_held.named) and rest:  # they share out what none of them explains
+    if causes < len(of_held.named) and rest:  # residuals that none of them explains
         of_held = replace(of_held, findings=of_held.findings[:causes])
     if causes and cause > prior:
         residuals = [_traces(findings, 10.0 * cause) for findings in residuals]
@@ -128,9 +128,9 @@ def _run_tests(case: Case) -> Iterator[TestResult]:
 
 
 def _explained(case: Case, named: tuple[Array, ...]) -> tuple[GraphEstimate, int]:
-    """Return the estimate at which residuals are judged, and how many causes lead to it.
+    """Return the estimate at which residuals are tested, and the number of causes it includes.
 
-    A cause or two explain residuals; where it takes more, the model itself is wrong.
+    One or two causes may explain residuals; if more are needed, the model itself is wrong.
     """
     result, score = case.result, case.score
     if score is None:
@@ -154,7 +154,7 @@ def _weight(tests: TestResult) -> float:
 
 
 def _traces(tests: TestResult, cause: float) -> TestResult:
-    """Return a testimony without what is only the trace of something stronger."""
+    """Return a test result without side effects of a stronger cause."""
     kept = tuple(
         f for f in tests.findings if STRONGER * f.weight > cause or f.verdict is Verdict.TRUSTWORTHY
     )

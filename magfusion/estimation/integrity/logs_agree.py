@@ -1,4 +1,4 @@
-"""Whether the logs of one site agree: each against what the survey and all the others say."""
+"""Consistency of the logs of one site: each against the survey and all other logs."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -16,16 +16,16 @@ NAMED = 3  # parameters in a sentence
 
 
 class LogAgreement(NamedTuple):
-    """What logs say of each other.
+    """Result of a comparison of logs.
 
     Parameters
     ----------
     of_log : tuple of tuple of Finding
-        Of each log: none, or that it contradicts the others.
+        Of each log: empty, or its contradiction of the others.
     excess : float
-        By what variances are too small, one where they agree.
+        Factor by which variances are too small, one where they agree.
     sigmas : ndarray, shape (logs,)
-        How far each log is from the others, all in all, in sigmas of chance.
+        Overall deviation of each log from the others, in sigmas of chance.
     """
 
     of_log: tuple[tuple[Finding, ...], ...]
@@ -43,17 +43,17 @@ class _Distance(NamedTuple):
 def agreement(
     shared: Shared, logs: Sequence[LogReport], names: Sequence[str], joint: SharedCalibration
 ) -> LogAgreement:
-    """Test every log against the others; name those that contradict, the farthest first.
+    """Test every log against the others; report those that contradict, the largest first.
 
-    A log that contradicts the others makes each of them contradict the rest: once it is named, the
-    others are tried without it.
+    A log that contradicts the others makes each of them contradict the rest: once it is reported,
+    the others are tested without it.
 
     Parameters
     ----------
     names : sequence of str
-        Of the logs, as findings have them.
+        Of the logs, for the findings.
     joint : SharedCalibration
-        By all logs.
+        From all logs.
     """
     pool, excess = list(range(len(logs))), 1.0
     findings: list[tuple[Finding, ...]] = [() for _ in logs]
@@ -74,7 +74,7 @@ def agreement(
 
 
 def _contradictions(result: dict[int, _Distance]) -> dict[int, list[float]]:
-    """Return of each log that contradicts the others by how much its chi squares are too large."""
+    """Return the excess chi squares of each log that contradicts the others."""
     tests = [(i, test) for i, one in result.items() for test in one.tests]
     informative = holm([log_p for _, (_, _, log_p) in tests], TEST_BUDGET)
     out: dict[int, list[float]] = {}
@@ -91,7 +91,7 @@ def _least(one: _Distance) -> float:
 def _distance(
     shared: Shared, logs: Sequence[LogReport], pool: list[int], which: int, joint: SharedCalibration
 ) -> _Distance:
-    """Return how far a log takes the calibration from what the others of a pool make of it."""
+    """Return the deviation of a log's calibration from that of the other logs of a pool."""
     every = known_by(shared, [logs[i] for i in pool], joint.step)
     others = known_by(shared, [logs[i] for i in pool if i != which], joint.step)
     none = np.zeros((len(joint.step), joint.by_common.shape[1]))
@@ -115,12 +115,12 @@ def _finding(shared: Shared, name: str, others: list[str], one: _Distance) -> Fi
     cause = (
         f"beacon {first.owner} was moved or its drive changed"
         if isinstance(first.parameter, BeaconParameter)
-        else "the magnetometer, its mounting or what is about it changed"
+        else "the magnetometer, its mounting or its surroundings changed"
     )
     recipient = f"log {others[0]}" if len(others) == 1 else "the other logs"
     text = (
-        f"Log {name} contradicts {recipient}: it takes {amounts} from where {recipient} and the"
-        f" survey have them (all together a chi square of {square:.3g} on {freedom}). Probably"
-        f" {cause} between the logs: refine the site by the logs before and after apart."
+        f"Log {name} contradicts {recipient}: it moves {amounts} from the estimate of {recipient}"
+        f" and the survey (a total chi square of {square:.3g} on {freedom}). Probably {cause}"
+        " between the logs. Refine the site separately by the logs before and after."
     )
     return Finding("logs_disagree", text, weight=float(sigmas(_least(one))))

@@ -1,8 +1,7 @@
-"""Which of several magnetometers is not as declared: it is named and left out, the others go on.
+"""Exclusion of one of several magnetometers that is not as declared.
 
-One that is mounted, placed or scaled otherwise makes the trajectory differ with and without it; the
-false one is that without which all fit far better to themselves, to the inertial samples and to
-gravity.
+A wrong mounting, position or scale changes the trajectory. The faulty one is that without which the
+solution fits far better to itself, to the inertial samples and to gravity.
 """
 
 from collections.abc import Callable
@@ -19,7 +18,7 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk
 
 SLACK = 3.0  # sigma; as of the separation of beacons
-MIN_MISFIT_RATIO = 2.0  # times the misfit of one is that of the other, before either is named
+MIN_MISFIT_RATIO = 2.0  # ratio of two misfits, from which one of them is reported
 
 Solve = Callable[[Log, Site], Smoothed]
 
@@ -42,9 +41,9 @@ def agreed(
     Parameters
     ----------
     solve : callable
-        Makes the solution of a log and its site.
+        Returns the solution of a log and its site.
     plain : callable
-        The same with noise and model error as declared, so that misfits compare.
+        The same with noise and model error as declared, so that misfits are comparable.
     """
     risk = Risk() if risk is None else risk
     findings: list[Finding] = []
@@ -71,10 +70,10 @@ def agreed(
 
 
 def _misfit(plain: Solve, log: Log, site: Site) -> float:
-    """Return the misfit of a solution by each of its numbers; infinite where there is none."""
+    """Return the misfit of a solution per number; infinite without a solution."""
     try:
         result = plain(log, site)
-    except RuntimeError:  # GTSAM's own, of a singular system, or an EstimationError
+    except RuntimeError:  # GTSAM's for a singular system, or an EstimationError
         return np.inf
     return float(2.0 * result.cost / np.sum(np.isfinite(result.residual)))
 
@@ -82,8 +81,8 @@ def _misfit(plain: Solve, log: Log, site: Site) -> float:
 def _excluded(name: str, names: str, worst: float) -> Finding:
     text = (
         f"Magnetometer {name} contradicts the others: with and without it the trajectory differs by"
-        f" {worst:.3g} times what noise and survey explain, and without it all fits. It is left"
-        f" out. Check its body_from_sensor, matrix, response and clock_offset_s (of {names})."
+        f" {worst:.3g} times what noise and survey explain, and without it all fits. It is not"
+        f" used. Check its body_from_sensor, matrix, response and clock_offset_s (of {names})."
     )
     return Finding("magnetometer_excluded", text, weight=worst)
 
@@ -91,7 +90,7 @@ def _excluded(name: str, names: str, worst: float) -> Finding:
 def _undecided(names: str, worst: float) -> Finding:
     text = (
         f"The magnetometers {names} contradict each other: the trajectory without one of them"
-        f" differs by {worst:.3g} times what noise and survey explain, and each alone fits alike."
-        " Check body_from_sensor, matrix, response and clock_offset_s of each; a third would tell."
+        f" differs by {worst:.3g} times what noise and survey explain; each fits equally well."
+        " Check body_from_sensor, matrix, response and clock_offset_s of each, or add a third."
     )
     return Finding("magnetometers_contradict", text, weight=worst)

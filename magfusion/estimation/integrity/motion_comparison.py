@@ -1,10 +1,10 @@
-"""Motion by the fields against motion by the inertial sensor, as two linear regressions.
+"""Motion from fields against motion from the IMU, as two linear regressions.
 
-Fixes give how the platform turned from one epoch to a later one, and by second differences how it
-accelerated; gyro and accelerometer say the same in their own axes, units and time.  What relates
-them is linear in the axes of either, in biases, lever arm and gravity, so that a mistake in any is
-tried at the price of a small least-squares problem.  So is what errors of the survey do to fixes,
-which bend a path as much as a wrong axis does, and would be taken for one.
+Fixes give the rotation from one epoch to a later one and, by second differences, the acceleration;
+gyro and accelerometer measure the same in their own axes, units and time.  The relation is linear
+in the axes of either, in biases, lever arm and gravity, so that a fault in any is tested by a small
+least-squares problem.  Survey errors are included: they distort a path as much as a wrong axis, and
+would be mistaken for one.
 """
 
 from dataclasses import dataclass
@@ -32,15 +32,15 @@ from magfusion.model.site import Site
 from magfusion.model.strapdown import attitude_at, attitude_from_gyro
 from magfusion.units import Array, BoolArray, IntArray
 
-TURN_SPAN = 0.4  # s, over which turns are compared
+TURN_SPAN = 0.4  # s, over which rotations are compared
 CURVE_SPAN = 0.6  # s, of each half of a second difference
 GRID = 0.01  # s, of the specific force
-EVEN = 0.25  # of a span, by which epochs may miss it
-LOCAL_ROTATION = 3e-3  # rad, what fixes err by that no noise tells of
+EVEN = 0.25  # of a span, largest deviation of an epoch from it
+LOCAL_ROTATION = 3e-3  # rad, error of fixes besides noise
 LOCAL_POSITION = 1e-3  # m
 LOCAL_TILT = 2e-3  # rad
 OF_SURVEY = ("beacons", "moments", "magnetometer")
-MOUNTED = (SENSOR_ROTATION, SENSOR_POSITION)  # which are found by themselves
+MOUNTED = (SENSOR_ROTATION, SENSOR_POSITION)  # which are estimated separately
 
 SHARED = {"gyro": slice(0, 3), "accel": slice(3, 6), "tilt": slice(6, 8)}
 SHARED |= {"mounting": slice(8, 11), "lever": slice(11, 14)}
@@ -50,7 +50,7 @@ WIDE = {"gyro": 10.0, "accel": 100.0, "tilt": 1.0, "mounting": 3.0, "lever": 10.
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """What fixes and inertial sensor say of the same turns and accelerations.
+    """Rotations and accelerations from fixes, and the same from the IMU.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class Compared:
     prior : ndarray, shape (14,)
         Sigmas of `SHARED`.
     turned_by_survey, curve_by_survey : ndarray, shape (m, 3, k), (n, 3, k)
-        What one sigma of each of the survey's errors does to the first of each.
+        Effect of one sigma of each survey error on the first of each.
     """
 
     rotation: Array
@@ -104,16 +104,16 @@ class Compared:
         parameters: str | None = None,
         gravity: float = 1.0,
     ) -> tuple[float, Array]:
-        """Return chi square, and the shared parameters, if the axes are these.
+        """Return chi square and the shared parameters for assumed axes.
 
         Parameters
         ----------
         gyro_axes, accel_axes : ndarray, shape (3, 3)
-            Take a reading to body axes and SI units.
+            From a reading to body axes and SI units.
         parameters : str, optional
-            What of `SHARED` is found without a prior.
+            Which of `SHARED` has no prior.
         gravity : float
-            Share of gravity that is in the specific force.
+            Share of gravity that the specific force contains.
         """
         by_gyro = self.gyro_turned @ gyro_axes.T
         turns = np.zeros((len(by_gyro), 3, WIDTH))
@@ -158,7 +158,7 @@ class Compared:
 
 @dataclass(frozen=True, eq=False)
 class Surveyed:
-    """Fixes, and what the errors of the survey do to all of them.
+    """Fixes, and the effect of survey errors on all of them.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ class Surveyed:
 
 
 def surveyed(samples: FieldSamples, calibration: Calibration) -> Surveyed:
-    """Return the fixes of all epochs, each alone, and what moves all of them."""
+    """Return the fixes of all epochs, each independent, and the effect of survey errors."""
     site, fixes = calibration.site, fix_epochs(samples, calibration, survey_error=False)
     at, place = fixes.world_from_body[:, 0], fixes.position_world[:, 0]
     blocks = choose_blocks(site, OF_SURVEY)
@@ -186,12 +186,12 @@ def surveyed(samples: FieldSamples, calibration: Calibration) -> Surveyed:
 
 
 def compared(known: Surveyed, imu: ImuSamples, site: Site, late: float = 0.0) -> Compared | None:
-    """Return what there is to compare; None where the log is too short.
+    """Return the data to compare; None if the log is too short.
 
     Parameters
     ----------
     late : float
-        What the inertial stamps are late by, beyond the declared offset (s).
+        Delay of the inertial stamps beyond the declared offset (s).
     """
     fixes, time = known.fixes, known.fixes.time
     stamps = imu.time + site.platform.imu.time_offset - late
@@ -237,7 +237,7 @@ def compared(known: Surveyed, imu: ImuSamples, site: Site, late: float = 0.0) ->
 
 
 def _of_turns(rotated: Array, last: Array) -> Array:
-    """Return what turns after rotation vectors (m, 3) do to those, up to their square."""
+    """Return the second-order effect on rotation vectors (m, 3) of rotations after them."""
     around = skew(rotated)
     return np.asarray(last + 0.5 * around @ last + around @ (around @ last) / 12.0)
 
@@ -256,7 +256,7 @@ def _prior(site: Site) -> Array:
 
 
 def _pairs(time: Array, certain: BoolArray, span: float) -> tuple[IntArray, IntArray]:
-    """Return epochs a span apart, one pair after the other."""
+    """Return pairs of epochs a span apart, in sequence."""
     out: list[tuple[int, int]] = []
     first = 0
     while first < len(time) - 1:
@@ -272,7 +272,7 @@ def _pairs(time: Array, certain: BoolArray, span: float) -> tuple[IntArray, IntA
 
 
 def _triples(time: Array, certain: BoolArray, span: float) -> tuple[IntArray, IntArray, IntArray]:
-    """Return epochs with others a span before and after them, evenly."""
+    """Return epochs with others a span before and after them, evenly spaced."""
     out: list[tuple[int, int, int]] = []
     at = 0
     while at < len(time):
@@ -290,9 +290,10 @@ def _triples(time: Array, certain: BoolArray, span: float) -> tuple[IntArray, In
 
 
 def _forces(fixes: Fixes, stamps: Array, imu: ImuSamples, wanted: Array) -> tuple[Array, Array]:
-    """Return the specific force in world axes as a second difference weighs it.
+    """Return the specific force in world axes, weighted as by a second difference.
 
-    The mean under a triangle of twice `CURVE_SPAN` is what acceleration makes of positions.
+    The second difference of positions is the mean acceleration under a triangle of twice
+    `CURVE_SPAN`.
     """
     time = fixes.time
     grid = np.linspace(time[0], time[-1], round((time[-1] - time[0]) / GRID) + 1)

@@ -1,4 +1,4 @@
-"""What a log's calibration and biases changed by, against what the site declares of them."""
+"""Test of a log's calibration and biases against their declared values."""
 
 import numpy as np
 
@@ -16,14 +16,14 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
 
 MIN_INFORMATION_RATIO = (
-    0.02  # of the prior's variance, below which the data said nothing along a direction
+    0.02  # of the prior's variance; below, a direction has no information from the data
 )
-TOLERATED = 2.0  # chi square per degree of freedom below which sigmas are right enough
-ABSURD = 50.0  # sigmas of a bias that no sensor has: the data are not what the site says
+TOLERATED = 2.0  # chi square per degree of freedom below which sigmas are acceptable
+ABSURD = 50.0  # sigmas of a bias that no sensor has: the data do not match the declaration
 
 
 def calibration_change(case: Case) -> TestResult:
-    """Judge by how much the calibration moved from its declared values."""
+    """Test the change of the calibration from its declared values."""
     result = case.result
     if not result.blocks:
         return NOTHING
@@ -33,7 +33,7 @@ def calibration_change(case: Case) -> TestResult:
         of_kind.setdefault(block.parameter, []).append(block)
     joint = {kind: distance(change, cov, blocks) for kind, blocks in of_kind.items()}
     whole = distance(change, cov, list(result.blocks))
-    # Of each block, of each kind of parameter, and of all.
+    # For each block, each kind of parameter, and all together.
     tests = [(block.parameter, distance(change, cov, [block])) for block in result.blocks]
     excess = _too_far([*tests, *joint.items(), (None, whole)])
     if not excess:
@@ -50,7 +50,7 @@ def calibration_change(case: Case) -> TestResult:
 def _too_far(
     tests: list[tuple[Parameter | None, tuple[float, int, float]]],
 ) -> dict[Parameter | None, float]:
-    """Return the kinds of parameter of tests that fail, with the largest chi square per freedom."""
+    """Return the kinds of parameter whose tests fail, with the largest chi square per freedom."""
     informative = holm([log_p for _, (_, _, log_p) in tests], TEST_BUDGET)
     excess: dict[Parameter | None, float] = {}
     for (kind, (square, freedom, _)), yes in zip(tests, informative, strict=True):
@@ -60,23 +60,23 @@ def _too_far(
 
 
 def _change_of(result: Smoothed) -> tuple[Array, Array]:
-    """Return by how much the calibration moved, in declared sigmas, and the covariance of that."""
+    """Return the change of the calibration in declared sigmas, and its covariance."""
     spread = prior_sqrt_covariance(result.declared.site, result.blocks)
     change = difference(result.declared, result.calibration, result.blocks)
     cov = spread @ spread.T - result.calibration_cov
-    moved = result.calibration_response  # what is not estimated disturbs the change as well
+    moved = result.calibration_response  # considered parameters disturb the change as well
     cov = cov + 2.0 * moved @ moved.T
     scale = np.sqrt(np.diagonal(spread @ spread.T))
     return change / scale, cov / scale[:, None] / scale
 
 
 def _of_all(square: float, freedom: int, log_p: float) -> Finding:
-    """Return that the calibration moved too far, though no kind of parameter alone did."""
+    """Return the finding that the calibration moved too far as a whole."""
     return Finding(
         "prior",
-        "All together, the calibration moved farther from its declared values than their"
-        f" sigmas allow: a chi square of {square:.3g} on {freedom}. Declare sigmas that are"
-        f" {np.sqrt(square / freedom):.2g} times as large.",
+        "Together, the calibration parameters deviate from their declared values by more than their"
+        f" sigmas allow: a chi square of {square:.3g} on {freedom}. Increase the declared sigmas by"
+        f" a factor of {np.sqrt(square / freedom):.2g}.",
         Verdict.DOUBTFUL,
         float(sigmas(log_p)),
     )
@@ -90,7 +90,7 @@ def distance(change: Array, cov: Array, blocks: list[Block]) -> tuple[float, int
     change : ndarray, shape (dimension,)
         In sigmas of the prior.
     cov : ndarray, shape (dimension, dimension)
-        Of it; directions of less than `MIN_INFORMATION_RATIO` say nothing.
+        Of the change; directions below `MIN_INFORMATION_RATIO` are ignored.
     """
     rows = np.concatenate([np.arange(len(change))[block.columns] for block in blocks])
     own = cov[np.ix_(rows, rows)]
@@ -115,16 +115,16 @@ def _finding(
     sigma = f"{declared:.3g} {unit.text}".rstrip(), f"{times * declared:.2g} {unit.text}".rstrip()
     return Finding(
         "prior",
-        f"The log moved {amounts}: farther from what the site declares than its sigmas allow (a chi"
-        f" square of {square:.3g} on {freedom}). Declare a sigma of {sigma[1]} where {sigma[0]} is"
-        f" declared for {kind.kind.replace('_', ' ')}, or measure it again.",
+        f"The log moves {amounts} from the declared values, more than their sigmas allow (a chi"
+        f" square of {square:.3g} on {freedom}). Declare a sigma of {sigma[1]} instead of"
+        f" {sigma[0]} for {kind.kind.replace('_', ' ')}, or measure it again.",
         Verdict.DOUBTFUL,
         float(sigmas(log_p)),
     )
 
 
 def bias_change(case: Case) -> TestResult:
-    """Judge whether the biases of the IMU are such as the site declares."""
+    """Test the biases of the IMU against the declared sigmas."""
     states, imu = case.result.states, case.result.declared.site.platform.imu
     assert states.accel_bias_body is not None
     assert states.gyro_bias_body is not None
@@ -146,9 +146,9 @@ def bias_change(case: Case) -> TestResult:
             Finding(
                 "imu_bias",
                 f"The bias of the {name} is {bias[worst]:+.3g} {unit} on {'xyz'[worst]},"
-                f" {abs(d[worst]):.0f} times the declared {key}_bias_sigma of {sigma:.2g}: the data"
-                " are in another unit or frame than declared, the sensor is uncalibrated, or a"
-                f" {key}_bias_sigma of {float(np.max(np.abs(bias))):.2g} is to be declared.",
+                f" {abs(d[worst]):.0f} times the declared {key}_bias_sigma of {sigma:.2g}. The data"
+                " are in another unit or frame than declared, or the sensor is uncalibrated."
+                f" Calibrate it, or declare {key}_bias_sigma: {float(np.max(np.abs(bias))):.2g}.",
                 Verdict.FAILED if float(np.max(np.abs(d))) > ABSURD else Verdict.DOUBTFUL,
                 float(sigmas(p)),
             )

@@ -1,4 +1,4 @@
-"""A first look at a log, in seconds: everything that can be judged without solving for it."""
+"""Quick check of a log in seconds: all tests that need no solution."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -37,20 +37,20 @@ from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array
 
-EPOCHS = 24  # that are fixed
-TOLERATED_CODES = frozenset({"samples_lost"})  # what every estimator copes with
-# What is the cause where no window can be demodulated.
+EPOCHS = 24  # number of fixes
+TOLERATED_CODES = frozenset({"samples_lost"})  # handled by every estimator
+# Causes of a log without any usable window.
 CORRUPTING_CODES = frozenset({"saturated", "jitter", "gap", "samples_lost", "frozen_magnetometer"})
 DOUBT = Verdict.DOUBTFUL
-LEAST_BAD = 3  # epochs without an explanation
-NOTHING_EXPLAINED = 30.0  # residual from which the fixes are none
-FIX_PROBABILITY = 0.95  # probability of a fix that is used against the compasses
+LEAST_BAD = 3  # unexplained epochs
+NOTHING_EXPLAINED = 30.0  # residual from which the fixes are useless
+FIX_PROBABILITY = 0.95  # probability of a fix that is compared with gravity and static field
 UNEXPLAINED = 3.0  # residual of the fixes, one where noise, model and survey are as declared
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What a first look found.
+    """Results of a quick check.
 
     Parameters
     ----------
@@ -58,11 +58,11 @@ class Look:
         None without a site, or where no window can be demodulated.
     spectrum : Spectrum, optional
     lines : tuple of SpectralLine, optional
-        Everything that stands out of it, tones too.
+        All its significant lines, including tones.
     fixes : Fixes, optional
         Of a few epochs.
     depths : mapping
-        Range (m) and skin depths of each beacon that is detected; of none where nothing conducts.
+        Range (m) and skin depths of each detected beacon; empty without a conductor.
     """
 
     trust: Trust
@@ -76,13 +76,13 @@ class Look:
 
     @property
     def fix_residual(self) -> float:
-        """Median residual of the fixes; NaN of none."""
+        """Median residual of the fixes; NaN without any."""
         if self.fixes is None or len(self.fixes) == 0:
             return float("nan")
         return float(np.median(self.fixes.residual_rms[:, 0]))
 
     def detection_rows(self) -> list[tuple[str, float, float]]:
-        """Return name, median signal to noise and share of the epochs heard of each beacon."""
+        """Return name, median signal-to-noise ratio and share of detected epochs per beacon."""
         if self.detected is None or len(self.detected.time) == 0:
             return []
         snr = np.nan_to_num(self.detected.snr)
@@ -94,7 +94,7 @@ class Look:
 
 
 def quick_check(log: Log, site: Site | None, lockin: LockinSettings | None = None) -> Look:
-    """Look at a log; without a site at the recording alone."""
+    """Check a log; without a site only the recording."""
     result = spectrum(log, site)
     seen = None if result is None else named_lines(result, site)
     look = timings(log), still_means(log, site)
@@ -102,7 +102,7 @@ def quick_check(log: Log, site: Site | None, lockin: LockinSettings | None = Non
         return Look(Trust(recorded(log, site)), *look, None, result, seen)
     findings: list[Finding] = []
     many = are_many(site)
-    with suppress(InputError):  # what follows says why nothing is heard
+    with suppress(InputError):  # later checks report why nothing is detected
         log, site = select_detected(log, site, lockin)
     try:
         samples = phasors(log, site, lockin)[0]
@@ -129,7 +129,7 @@ def quick_check(log: Log, site: Site | None, lockin: LockinSettings | None = Non
 def _harmless_lines(
     result: Spectrum, log: Log, site: Site, lockin: LockinSettings | None
 ) -> list[Finding]:
-    """Return the lines that harm nothing; the others `recorded` tells of."""
+    """Return the harmless lines; `recorded` reports the others."""
     settings = with_disturbing_lines(log, site, lockin) or usual_lockin(site)
     return [
         line
@@ -139,7 +139,7 @@ def _harmless_lines(
 
 
 def _sure_poses(fixes: Fixes) -> Trajectory | None:
-    """Return the fixes that are decided, where all of them fit."""
+    """Return the unambiguous fixes, if all of them fit."""
     certain = (fixes.probability[:, 0] > FIX_PROBABILITY) & fixes.determined[:, 0]
     if not np.any(certain) or findings_of_fit(fixes):
         return None
@@ -150,7 +150,7 @@ def _sure_poses(fixes: Fixes) -> Trajectory | None:
 
 
 def _promoted(findings: list[Finding]) -> list[Finding]:
-    """Let what spoils every window be the cause of there being none."""
+    """Promote a defect of every window to the cause where no window is usable."""
     if not any(finding.code == "no_window" for finding in findings):
         return findings
     return [
@@ -162,7 +162,7 @@ def _promoted(findings: list[Finding]) -> list[Finding]:
 
 
 def _fixed(log: Log, site: Site, samples: FieldSamples, near: Array) -> Fixes | None:
-    """Fix a few epochs, at times where the compasses are known, without gravity."""
+    """Fix a few epochs, at times with known gravity and static field, without using gravity."""
     if len(samples) == 0 or any(beacon.unknown is not None for beacon in site.beacons):
         return None
     strong = samples.valid.any(axis=1)
@@ -185,7 +185,7 @@ def _fixed(log: Log, site: Site, samples: FieldSamples, near: Array) -> Fixes | 
 
 
 def findings_of_fit(fixes: Fixes) -> list[Finding]:
-    """Return what is to be said of fixes that do not explain the fields."""
+    """Return the findings on fixes that do not explain the fields."""
     residual = fixes.residual_rms[:, 0]
     median, bad = float(np.median(residual)), residual > UNEXPLAINED
     if median > UNEXPLAINED:
@@ -193,9 +193,8 @@ def findings_of_fit(fixes: Fixes) -> list[Finding]:
             Finding(
                 "field_residuals",
                 f"no pose explains the beacons' fields: at {len(fixes)} epochs the median residual"
-                f" is {median:.3g} where about 1 is expected. Positions, attitudes, frequencies,"
-                " moments or phases of the beacons are not as declared, or the epoch of the log is"
-                " not.",
+                f" is {median:.3g} (1 is expected). Positions, attitudes, frequencies, moments or"
+                " phases of the beacons, or the epoch of the log, are not as declared.",
                 Verdict.FAILED if median > NOTHING_EXPLAINED else DOUBT,
                 20.0 + median,
             )
@@ -207,9 +206,9 @@ def findings_of_fit(fixes: Fixes) -> list[Finding]:
         Finding(
             "field_residuals",
             f"no pose explains the beacons' fields at {int(np.sum(bad))} of {len(fixes)} epochs"
-            f" between {time[0]:.1f} and {time[-1]:.1f} s: their residual is"
-            f" {float(np.median(residual[bad])):.3g} (median) where about 1 is expected. The field"
-            " of a beacon is false then, or iron is near.",
+            f" between {time[0]:.1f} and {time[-1]:.1f} s: their median residual is"
+            f" {float(np.median(residual[bad])):.3g} (1 is expected). The field of a beacon is"
+            " wrong there, or iron is near.",
             DOUBT,
             20.0 + float(np.median(residual[bad])),
         )

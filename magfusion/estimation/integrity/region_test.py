@@ -1,4 +1,4 @@
-"""What poses say of the place that was declared of them: outside of it, or near where it ends."""
+"""Test of poses against the declared region or hemisphere: outside, or near its boundary."""
 
 import numpy as np
 
@@ -8,13 +8,13 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array, IntArray
 
 BEYOND = 5.0  # sigmas outside of a plane; the declaration or the pose is wrong
-NEAR = 3.0  # sigmas inside of it, within which it no longer tells a pose from its mirror
+NEAR = 3.0  # sigmas inside, within which it does not distinguish a pose from its mirror image
 
 
 def of_place(
     site: Site, time: Array, world_from_body: Array, position_world: Array, pose_cov: Array
 ) -> tuple[Finding, ...]:
-    """Return what is to be said of poses of a site with a region or a hemisphere.
+    """Return the findings on poses of a site with a region or a hemisphere.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def of_place(
         return ()
     margin, sigma = margins(site, world_from_body, position_world, pose_cov[:, 3:, 3:])
     score = margin / sigma
-    if (score >= NEAR).all():  # as nearly always
+    if (score >= NEAR).all():  # the usual case
         return ()
     return (*_outside(site, time, margin, score), *_near(site, time, margin, score))
 
@@ -42,7 +42,7 @@ def _outside(site: Site, time: Array, margin: Array, score: Array) -> tuple[Find
         return ()
     row, plane = np.unravel_index(np.argmin(score), score.shape)
     text = (
-        f"The magnetometer is found {-margin[row, plane]:.2g} m outside of"
+        f"The magnetometer is {-margin[row, plane]:.2g} m outside of"
         f" {site.bounds.names[int(plane)]} {_when(time, rows, int(row))}: the declared hemisphere"
         " or region is wrong, or the pose is a mirrored one."
     )
@@ -58,8 +58,8 @@ def _near(site: Site, time: Array, margin: Array, score: Array) -> tuple[Finding
     row, plane = np.unravel_index(np.argmin(close), close.shape)
     text = (
         f"The magnetometer comes within {max(margin[row, plane], 0.0):.2g} m of"
-        f" {site.bounds.names[int(plane)]} {_when(time, rows, int(row))}: so near to it the"
-        " declared side does not tell a pose from its mirror; what came before does."
+        f" {site.bounds.names[int(plane)]} {_when(time, rows, int(row))}: here only previous data"
+        " distinguish a pose from its mirror image, not the declared side."
     )
     return (Finding("region_edge", text, Verdict.TRUSTWORTHY, 0.5),)
 

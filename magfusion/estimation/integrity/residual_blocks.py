@@ -1,8 +1,8 @@
-"""Residuals of fields and of inertial data, by beacon, by axis and by time.
+"""Tests of field and inertial residuals, by beacon, by axis and by time.
 
-Judged by a chi square whose degrees of freedom count what is independent: neighbours in time are
-not, by the autocorrelation that is measured.  What is left of the fields is taken after everything
-uncertain has moved as far as its declared sigma allows, and after the causes that were named.
+Each is a chi square with the effective number of independent residuals, from their measured
+autocorrelation.  Field residuals are taken after all uncertain parameters have moved as far as
+their declared sigmas allow, and after the reported causes.
 """
 
 from collections.abc import Iterator
@@ -27,14 +27,14 @@ from magfusion.estimation.measurements.pose_fix import PoseFix
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array, BoolArray
 
-BLOCK, MOST_BLOCKS = 10.0, 24  # s; stretches that are judged by themselves
-INDEPENDENT = 3.0  # numbers of a phasor's six: one model error bends several
-TOLERATED = 1.2**2  # mean square below which sigmas are right enough
+BLOCK, MOST_BLOCKS = 10.0, 24  # s; stretches that are tested separately
+INDEPENDENT = 3.0  # of a phasor's six numbers: one model error affects several
+TOLERATED = 1.2**2  # mean square below which sigmas are acceptable
 TOLERATED_INERTIAL = 1.5**2
-AXES = {0: "gyroscope, x", 1: "gyroscope, y", 2: "gyroscope, z"} | {
-    6: "accelerometer, x",
-    7: "accelerometer, y",
-    8: "accelerometer, z",
+AXES = {0: "gyroscope x", 1: "gyroscope y", 2: "gyroscope z"} | {
+    6: "accelerometer x",
+    7: "accelerometer y",
+    8: "accelerometer z",
 }
 
 
@@ -50,9 +50,9 @@ class Misfit(NamedTuple):
     square : float
         Mean, one where all is as declared.
     log_p : float
-        Logarithm of the probability that chance does as much.
+        Logarithm of the probability of this mean by chance.
     whole : bool
-        Whether the stretch is all of the log.
+        Whether the stretch is the whole log.
     """
 
     name: str
@@ -79,7 +79,7 @@ def misfits(name: str, residual: Array, blocks: list[BoolArray], numbers: float)
     residual : ndarray, shape (n, ...)
         NaN where missing.
     numbers : float
-        How many independent ones there are at a time.
+        Number of independent ones at a time.
     """
     flat = residual.reshape(len(residual), -1)
     known = np.isfinite(flat).any(axis=1)
@@ -99,12 +99,12 @@ def misfits(name: str, residual: Array, blocks: list[BoolArray], numbers: float)
 
 
 def fields(case: Case, raw: Array, weighed: Array) -> TestResult:
-    """Judge what is left of the fields.
+    """Test the residuals of the fields.
 
     Parameters
     ----------
     raw, weighed : ndarray, shape (n, channels, 6)
-        Whitened, NaN where missing: all of it, and what a robust loss has not held back.
+        Whitened, NaN where missing: without and with the weights of a robust loss.
     """
     result = case.result
     if not np.any(np.isfinite(raw)):
@@ -127,7 +127,7 @@ def fields(case: Case, raw: Array, weighed: Array) -> TestResult:
 
 
 def fixes(case: Case) -> TestResult:
-    """Judge the fixes of loose coupling, which are all that is left of the fields there."""
+    """Test the fixes of loose coupling, where they replace the fields."""
     graph = case.result.graph
     measured = next((m for m in graph.measurements if isinstance(m, PoseFix)), None)
     if measured is None or case.result.fix_response is None:
@@ -140,9 +140,9 @@ def fixes(case: Case) -> TestResult:
     worst = float(max(one.square for one in informative))
     finding = Finding(
         "field_residuals",
-        f"The fixes of single epochs deviate {_when(informative, time)} from the motion that the"
-        f" inertial sensor tells of, by {np.sqrt(worst):.2g} times what they claim. Smooth with"
-        " tight coupling, which can tell the cause.",
+        f"The fixes of single epochs are inconsistent with the inertial sensor"
+        f" {_when(informative, time)}, by {np.sqrt(worst):.2g} times their reported sigma. Smooth"
+        " with tight coupling to identify the cause.",
         Verdict.DOUBTFUL,
         float(max(sigmas(one.log_p) for one in informative)),
     )
@@ -166,8 +166,8 @@ def _field_finding(result: Smoothed, named: list[Misfit], time: Array, verdict: 
     return Finding(
         "field_residuals",
         f"The field of {named[0].name} deviates {_when(named, time)} from the model by {rms:.2g}"
-        f" times what its noise and the model error of {100.0 * error:.2g} % allow. Iron near the"
-        " beacon or the path, another drive than declared, or a disturbance: map the field"
+        f" times its noise and the model error of {100.0 * error:.2g} %. Iron is near the beacon or"
+        " the path, its drive is not as declared, or there is a disturbance. Map the field"
         " (magfusion calibrate fieldmap), check the beacon, or declare a model_error of"
         f" {rms * error:.1g}.",
         verdict,
@@ -184,13 +184,12 @@ def _when(named: list[Misfit], time: Array) -> str:
 
 
 def _field_factor(case: Case, rest: Array, blocks: list[BoolArray]) -> Array:
-    """Return what makes the covariance of every pose honest again.
+    """Return the factor that makes the covariance of every pose honest.
 
-    Errors that last weigh as many times as epochs are averaged, but no more: in a fix alone they
-    weigh once.
+    Correlated errors count as often as epochs are averaged, but no more: once in a single fix.
     """
     memory, result = _memory(case), case.result
-    # Weighed once: neighbouring windows share samples, which their covariance allows for.
+    # Counted once: neighbouring windows share samples, which their covariance accounts for.
     lasting = [min(_persistence(rest[:, c]), memory) for c in range(rest.shape[1])]
     out = np.ones(len(result.states))
     where = np.interp(result.states.time, result.fields.time, np.arange(len(rest)))
@@ -212,7 +211,7 @@ def _mean(values: Array) -> float:
 
 
 def _memory(case: Case) -> float:
-    """Return how many epochs of the fields the estimator averages at a time."""
+    """Return the number of field epochs that the estimator averages at a time."""
     graph, estimate = case.result.graph, case.result.estimate
     fields = next(m for m in graph.measurements if isinstance(m, FieldPhasors))
     states = states_in(estimate.values).rows(fields.epoch)
@@ -225,7 +224,7 @@ def _memory(case: Case) -> float:
 
 
 def _persistence(residual: Array) -> float:
-    """Return the sum of the autocorrelation of a series, as far as it is to be seen."""
+    """Return the sum of the autocorrelation of a series, as far as it is significant."""
     known = np.isfinite(residual)
     filled = np.where(known, residual, 0.0)
     count, square = int(np.sum(known)), float(np.sum(filled**2))
@@ -244,14 +243,14 @@ def _persistence(residual: Array) -> float:
 
 
 def inertial(case: Case, estimate: GraphEstimate) -> TestResult:
-    """Judge the inertial residuals at an estimate."""
+    """Test the inertial residuals at an estimate."""
     result = case.result
     if result.graph.epochs < 4 or not result.graph.measurements:
         return NOTHING
     time = 0.5 * (result.states.time[1:] + result.states.time[:-1])
     try:
         expected = expected_squares(result)
-    except RuntimeError:  # of an undetermined stretch, which others tell of
+    except RuntimeError:  # of an undetermined stretch, which other tests report
         return NOTHING
     error, blocks = inertial_errors(result, estimate), blocks_of(time)
     tests: list[Misfit] = []
@@ -265,18 +264,17 @@ def inertial(case: Case, estimate: GraphEstimate) -> TestResult:
     rms = float(np.sqrt(worst.square))
     names = ", ".join(dict.fromkeys(one.name for one in informative))
     text = (
-        f"The inertial data contradict the motion that the fields tell of"
-        f" {_when([one for one in informative if one.name == worst.name], time)}: {names} deviate"
-        f" by up to {rms:.2g} times what the declared noise allows. Shocks, a false axis or scale,"
-        " stamps, or declared noise that is too small: check the inertial sensor, or declare"
-        " larger gyro_noise and accel_noise."
+        f"IMU data are inconsistent with the magnetic-field solution"
+        f" {_when([one for one in informative if one.name == worst.name], time)} ({names}: up to"
+        f" {rms:.2g} times the declared noise). Check the inertial sensor for shocks, a wrong axis"
+        " or scale, and its mounting and time stamps, or increase gyro_noise and accel_noise."
     )
     code = "inertial_residuals"
     if not case.log.inertial:
         text = (
-            f"The platform moves faster than its motion prior has it"
+            f"The platform moves faster than its motion prior allows"
             f" {_when([one for one in informative if one.name == worst.name], time)}: up to"
-            f" {rms:.2g} times. Declare larger densities in platform.motion_prior."
+            f" {rms:.2g} times. Increase the densities in platform.motion_prior."
         )
     finding = Finding(code, text, Verdict.DOUBTFUL, float(sigmas(worst.log_p)))
     factor = np.ones(len(result.states))

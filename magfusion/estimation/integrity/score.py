@@ -1,9 +1,8 @@
-"""The score test: what freeing a parameter that is held would gain, and where it would go.
+"""Score test: the gain and the step of estimating a fixed parameter.
 
-At the optimum of all that is estimated, one elimination of the linear system leaves the information
-of everything held, and the gradient of the cost by it (the score).  A step of Gauss and Newton then
-says what each would change to, by how much the cost would fall, and how the poses would move; no
-system is solved again.
+At the optimum, one elimination of the linear system yields the information of all fixed parameters
+and the gradient of the cost by them (the score).  A Gauss-Newton step then gives the change of
+each, the decrease of the cost, and the change of the poses, without solving again.
 """
 
 from collections.abc import Sequence
@@ -48,23 +47,23 @@ from magfusion.units import Array
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Of everything that is held, in units of its typical error.
+    """Score of all fixed parameters, in units of their typical errors.
 
     Parameters
     ----------
     fixed : tuple of Block
-        Whose sigmas are those units.
+        Their sigmas are those units.
     information : ndarray, shape (h, h)
-        Of them, all that is estimated eliminated.
+        Of the fixed parameters, with all estimated ones eliminated.
     gradient : ndarray, shape (h,)
-        What they would gain, downhill: a step is the information's inverse times this.
+        Downhill: a step is the information's inverse times this.
     spread : ndarray, shape (h, k)
-        A root of the covariance of their errors that the site declares; zero where it takes them
-        as known.
+        A root of the covariance of their errors that the site declares; zero where it declares
+        them known.
     by_state : ndarray, shape (states, 15 or 6, h)
-        What a unit of them does to pose, velocity and biases; or to the pose alone.
+        Effect of a unit of them on pose, velocity and biases; or on the pose only.
     by_calibration : ndarray, shape (dimension, h)
-        What a unit of them does to the calibration that is estimated.
+        Effect of a unit of them on the estimated calibration.
     """
 
     fixed: tuple[Block, ...]
@@ -76,16 +75,16 @@ class Score:
 
     @property
     def by_pose(self) -> Array:
-        """What a unit of them does to the poses, shape (states, 6, h)."""
+        """Effect of a unit of them on the poses, shape (states, 6, h)."""
         return self.by_state[:, :6]
 
     def with_declared(self) -> tuple[Array, Array]:
-        """Let what is uncertain move as far as its declared sigma and its tolerance allow.
+        """Let uncertain parameters vary within their declared sigma and their tolerance.
 
         Returns
         -------
         information : ndarray, shape (h, h)
-            Of what they may be wrong by beyond what is declared.
+            Of errors beyond what is declared.
         gradient : ndarray, shape (h,)
         """
         selected = self._applied(np.concatenate([self.spread, tolerance_of(self.fixed)], axis=1))
@@ -94,35 +93,35 @@ class Score:
         return 0.5 * (residual + residual.T), gradient
 
     def within_tolerance(self) -> Array:
-        """Return the information of what is held while all have their tolerance, shape (h, h)."""
+        """Return the information with all tolerances applied, shape (h, h)."""
         selected = self._applied(tolerance_of(self.fixed))
         residual = self.information - self.information @ selected @ self.information
         return np.asarray(0.5 * (residual + residual.T))
 
     def allowed(self, step: Array) -> Array:
-        """Return a step with what all else then moves by, as far as its declared sigma allows."""
+        """Return a step with the changes of all others that their declared sigmas allow."""
         return step + self._applied(self.spread) @ (self.gradient - self.information @ step)
 
     def _applied(self, spread: Array) -> Array:
-        spread = spread[:, spread.any(axis=0)]  # most of it is known
+        spread = spread[:, spread.any(axis=0)]  # most parameters are known
         inner = np.eye(spread.shape[1]) + spread.T @ self.information @ spread
         return np.asarray(spread @ np.linalg.solve(inner, spread.T))
 
 
 def tolerance_of(fixed: tuple[Block, ...]) -> Array:
-    """Return a root of the covariance of what is held within its tolerance, in typical errors."""
+    """Return a root of the covariance of the tolerances, in typical errors."""
     own = [TOLERANCE.get(b.parameter, 0.0) / b.sigma for b in fixed]
     return np.diag(np.concatenate(own))
 
 
 class Scores(NamedTuple):
-    """The score of everything that is held, and with what else is asked.
+    """The score of all fixed parameters, and of additional ones.
 
     Parameters
     ----------
     fixed : Score
     every : Score
-        Its responses may be those of the first of its parameters alone: see `answered`.
+        Its responses may be those of the first of its parameters only: see `answered`.
     """
 
     fixed: Score
@@ -130,21 +129,21 @@ class Scores(NamedTuple):
 
 
 def scores_of(result: Smoothed, imu: ImuSamples, columns: Sequence[Block] = ()) -> Scores | None:
-    """Return the score of everything that a result holds; None where there is nothing to ask.
+    """Return the score of all fixed parameters of a result; None if there is nothing to test.
 
     Parameters
     ----------
     imu : ImuSamples
-        As it was recorded.
+        As recorded.
     columns : sequence of Block
-        What else is asked, in the same sweep.
+        Additional parameters to test in the same sweep.
     """
     graph = result.graph
     if not graph.measurements or result.fix_response is not None:
         return None
     known = result.declared.site
     if not known.platform.inertial and len(known.beacons) == 1:
-        return None  # nothing contradicts a lone beacon but that a path ought to be short
+        return None  # a single beacon is only contradicted by the smoothness of the path
     steady = any(isinstance(m, EarthField) for m in graph.measurements)
     fixed = held_blocks(known, result.blocks, steady=steady)
     if not fixed:
@@ -175,7 +174,7 @@ def _first(score: Score, fixed: tuple[Block, ...]) -> Score:
 def _by_chain(
     result: Smoothed, fixed: tuple[Block, ...], every: tuple[Block, ...], inertial: InertialColumns
 ) -> tuple[FixedParameterResidual, Responses] | None:
-    """Return what is left of all, and how the first move the states, of one chain of states."""
+    """Return the score of all, and the responses of the states to the first, for one chain."""
     if not is_chain(result.graph, every):
         return None
     native = NativeRows(result.graph, result.estimate)
@@ -188,7 +187,7 @@ def _by_chain(
 
 
 def answered(result: Smoothed, score: Score, imu: ImuSamples) -> Score:
-    """Return a score that tells of all its parameters how they move the poses."""
+    """Return a score with the responses of the poses to all its parameters."""
     if score.by_calibration.shape[1] == dimension(score.fixed):
         return score
     inertial = inertial_columns(result, score.fixed, imu)
@@ -205,14 +204,14 @@ def answered(result: Smoothed, score: Score, imu: ImuSamples) -> Score:
 def _by_elimination(
     result: Smoothed, fixed: tuple[Block, ...], by_others: Array
 ) -> tuple[FixedParameterResidual, Responses]:
-    """Return the same of any graph."""
+    """Return the same for any graph."""
     graph, estimate, size = result.graph, result.estimate, dimension(fixed)
     unit = np.diag(prior_sigma(fixed))
-    # One system after the other: of a long log each of them is most of what there is.
+    # One system after the other: for a long log each of them uses most of the memory.
     residual = None
     if result.field_errors:
-        # An error that is constant in place looks like some of them; what freeing them does to the
-        # estimate, which weighs epochs as if there were none, stays the same.
+        # A field error that is constant in place resembles some of them; their effect on the
+        # estimate, which ignores such errors, is unchanged.
         ordering = graph.ordering
         ordering.push_back(NUISANCE_KEY)
         errors = result.field_errors
@@ -246,7 +245,7 @@ def _without_error(net: gtsam.GaussianBayesNet) -> gtsam.GaussianBayesNet:
 
 
 def _declared(result: Smoothed, fixed: tuple[Block, ...]) -> Array:
-    """Return a root of the covariance that the site declares of what is held, typical errors."""
+    """Return a root of the declared covariance of the fixed parameters, in typical errors."""
     size = dimension(fixed)
     if not result.considered:
         return np.zeros((size, 0))
@@ -254,13 +253,13 @@ def _declared(result: Smoothed, fixed: tuple[Block, ...]) -> Array:
     at = {b.key: b.columns for b in fixed}
     out = np.zeros((size, spread.shape[1]))
     for block in result.considered:
-        if block.key in at:  # one from outside is not tried
+        if block.key in at:  # one from outside is not tested
             out[at[block.key]] = spread[block.columns]
     return out / prior_sigma(fixed)[:, None]
 
 
 def moved_estimate(result: Smoothed, score: Score, step: Array) -> GraphEstimate:
-    """Return the estimate that a step of what is held leads to.
+    """Return the estimate after a step of the fixed parameters.
 
     Parameters
     ----------
@@ -284,7 +283,7 @@ def moved_estimate(result: Smoothed, score: Score, step: Array) -> GraphEstimate
 def field_residual(result: Smoothed, estimate: GraphEstimate, *, raw: bool = False) -> Array:
     """Return the whitened residual of the fields at an estimate, NaN where missing.
 
-    Shape (n, channels, 6); what a robust loss holds back is held back unless it is asked for raw.
+    Shape (n, channels, 6); with the weights of a robust loss unless it is raw.
     """
     graph = result.graph
     fields = next((m for m in graph.measurements if isinstance(m, FieldPhasors)), None)

@@ -1,4 +1,4 @@
-"""The score of a log that is one chain of states: a sweep along it, in groups of columns."""
+"""Score of a log that is a single chain of states: one sweep, in groups of columns."""
 
 from typing import NamedTuple
 
@@ -22,14 +22,14 @@ POSE = 6
 
 
 class Responses(NamedTuple):
-    """What a unit of each parameter that is held does.
+    """Effect of a unit of each fixed parameter.
 
     Parameters
     ----------
     by_state : ndarray, shape (states, 15 or 6, h)
-        To pose, velocity and biases; or to the pose alone.
+        On pose, velocity and biases; or on the pose only.
     by_calibration : ndarray, shape (dimension, h)
-        To the calibration that is estimated.
+        On the estimated calibration.
     """
 
     by_state: Array
@@ -37,7 +37,7 @@ class Responses(NamedTuple):
 
 
 class FixedParameterResidual(NamedTuple):
-    """What is left of parameters that are held, as of `magfusion.estimation.integrity.score.Score`.
+    """Marginal of the fixed parameters, as of `magfusion.estimation.integrity.score.Score`.
 
     Parameters
     ----------
@@ -52,10 +52,10 @@ class FixedParameterResidual(NamedTuple):
 def left_of_chain(
     result: Smoothed, fixed: tuple[Block, ...], inertial: InertialColumns, native: NativeRows
 ) -> FixedParameterResidual | None:
-    """Return what is left; None where the chain is too badly conditioned for one sweep."""
+    """Return the marginal; None if the chain is too badly conditioned for one sweep."""
     graph, size = result.graph, dimension(fixed)
-    # An error that is constant in place looks like some of them; what freeing them does to the
-    # estimate, which weighs epochs as if there were none, stays the same.
+    # A field error that is constant in place resembles some of them; their effect on the
+    # estimate, which ignores such errors, is unchanged.
     every = placed((*fixed, *result.field_errors))
     wide = inertial._replace(number=dimension(every))
     others = Columns(every, np.diag(prior_sigma(every)), wide.of)
@@ -81,12 +81,12 @@ def responses_of_chain(
     native: NativeRows,
     known: Responses | None = None,
 ) -> Responses | None:
-    """Return what a unit of each does; None where rounding is all.
+    """Return the effect of a unit of each; None if rounding dominates.
 
     Parameters
     ----------
     known : Responses, optional
-        Of the first that are held; then of the others only poses are asked for.
+        Of the first fixed ones; then only poses are computed for the others.
     """
     graph = result.graph
     kept = MOTION if known is None else POSE
@@ -110,14 +110,14 @@ def responses_of_chain(
         inverse = estimate.inverse
         by_state.append(estimate.states[0, ..., 1:].copy())
         by_calibration.append(estimate.border[0, :, 1:])
-        del normal, fields, estimate  # before the next group: of a long log they are much
+        del normal, fields, estimate  # before the next group: for a long log they are large
         give_back_memory()
     responses = Responses(np.concatenate(by_state, axis=2), np.concatenate(by_calibration, axis=1))
     return responses if all(np.all(np.isfinite(part)) for part in responses) else None
 
 
 def _groups(fixed: tuple[Block, ...], epochs: int) -> list[slice]:
-    """Return columns of what is held, so many at once that their right sides fit memory."""
+    """Return groups of the fixed parameters' columns whose right-hand sides fit in memory."""
     if not fixed:
         return []
     first = fixed[0].columns.start

@@ -1,4 +1,4 @@
-"""The steady field by the poses of a smoothed log in which the Earth's has no part."""
+"""Test of the static field at the poses of a smoothed log that does not use the Earth field."""
 
 import numpy as np
 
@@ -9,12 +9,12 @@ from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
-TOGETHER = 3  # spans, whose mean is judged; about the memory of the same test online
-NEAR = 0.5 * SPAN + 1.0  # s; as near the middle of a span a state must be
+TOGETHER = 3  # spans, whose mean is tested; about the memory of the same test online
+NEAR = 0.5 * SPAN + 1.0  # s; largest distance of a state from the middle of a span
 
 
 def compass(case: Case) -> TestResult:
-    """Judge the steady field by the poses, and doubt those of the spans where it is another."""
+    """Test the static field at the poses, and doubt the poses of the spans where it differs."""
     site, states, log = case.result.declared.site, case.result.states, case.log
     if case.result.earth_residual is not None or site.earth_field_world is None:
         return NOTHING
@@ -40,7 +40,7 @@ def compass(case: Case) -> TestResult:
 
 
 def _spread(states: Trajectory, time: Array, result: list[OffEarth | None]) -> Array:
-    """Return what the poses nearest to each span may be off by, shape (states, 6, 6)."""
+    """Return the possible errors of the poses nearest to each span, shape (states, 6, 6)."""
     middle = time[TOGETHER // 2 : len(time) - TOGETHER // 2]
     nearest = np.argmin(np.abs(states.time[:, None] - middle), axis=1)
     spread = np.zeros((len(states), 6, 6))

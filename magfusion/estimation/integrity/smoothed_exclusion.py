@@ -1,4 +1,4 @@
-"""A smoothed trajectory without the stretches of time in which one beacon is false."""
+"""Exclusion of false beacons from a smoothed trajectory, by stretches of time."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -19,26 +19,26 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Risk, StateTrust, Trust, Verdict, uniform_trust
 from magfusion.units import Array, BoolArray, IntArray
 
-SLACK = 3.0  # sigma; a step below it is covered, and no alarm
-UNEXPECTED = 1e-4  # probability of a larger deviation of a field from what the others predict
-JOINED = 1.0  # s; what lies between two false stretches so near is false too
-BETTER = 0.8  # of the largest separation, above which leaving out has not explained it
-MOST_FALSE = 0.9  # share of a log; a beacon that is false for longer is false as it was declared
-LEFT_OUT = 0.1  # robust weight of a field below which it has no say
+SLACK = 3.0  # sigma; smaller steps are covered, and no alarm
+UNEXPECTED = 1e-4  # probability of a larger deviation of a field from the others' prediction
+JOINED = 1.0  # s; a shorter gap between two false stretches is false too
+BETTER = 0.8  # of the largest separation, above which an exclusion has not explained it
+MOST_FALSE = 0.9  # share of a log; a beacon that is false for longer is declared wrongly
+LEFT_OUT = 0.1  # robust weight below which a field does not count
 ROUNDS = 3  # of exclusions
 SPANS = 3  # in a sentence
-TOGETHER = 3.0  # s; stretches of a sentence that are nearer are told as one
-MIN_LEFT_OUT_EPOCHS = 5  # field epochs of a beacon that are left out; fewer are outliers
+TOGETHER = 3.0  # s; closer stretches are reported as one
+MIN_LEFT_OUT_EPOCHS = 5  # excluded field epochs of a beacon that are reported; fewer are outliers
 OF_A_LOG = 5e-4  # false alarms of a whole log
 
 
 class SeparatedSmooth(NamedTuple):
-    """A smoothed trajectory after what is false was left out.
+    """A smoothed trajectory after the exclusion of false fields.
 
     Parameters
     ----------
     result : Smoothed
-        Where an alarm remains, with a covariance that covers it.
+        Where an alarm remains, its covariance covers it.
     states : StateTrust
         Of each state.
     trust : Trust
@@ -51,7 +51,7 @@ class SeparatedSmooth(NamedTuple):
 
 
 def separated_smooth(result: Smoothed, risk: Risk | None = None) -> SeparatedSmooth:
-    """Compare a smoothed trajectory with those without each beacon; leave out what is false."""
+    """Compare a smoothed trajectory with those without each beacon; exclude false fields."""
     risk = Risk() if risk is None else risk
     names = tuple(beacon.name for beacon in result.declared.site.beacons)
     estimate = separate_smoothed(result)
@@ -81,18 +81,18 @@ def separated_smooth(result: Smoothed, risk: Risk | None = None) -> SeparatedSmo
 def _without_false(
     result: Smoothed, separated: Separation, names: tuple[str, ...], risk: Risk
 ) -> tuple[Smoothed, Separation, BoolArray]:
-    """Leave out stretches of beacons, one after the other, as long as that mends the separation.
+    """Exclude stretches of beacons, one after the other, while that reduces the separation.
 
     Returns
     -------
     result, separated : Smoothed, Separation
         Without them.
     out : bool ndarray, shape (n, beacons)
-        The fields that were left out.
+        The excluded fields.
     """
     out = np.zeros((len(result.fields.time), len(names)), dtype=bool)
     for _ in range(ROUNDS):
-        # What is significant is looked for, whether or not it is covered.
+        # Significant deviations count, whether covered or not.
         before = float(np.max(separated.excess(risk)))
         if before <= 1.0:
             break
@@ -103,14 +103,14 @@ def _without_false(
         trial = _resolved(result, names[beacon], false)
         again = None if trial is None else separate_smoothed(trial)
         if trial is None or again is None or np.max(again.excess(risk)) > BETTER * before:
-            break  # it was not this beacon, or not it alone
+            break  # it is not this beacon, or not only this one
         result, separated = trial, again
         out[:, beacon] |= false
     return result, separated, out
 
 
 def states_judged(separated: SeparatedSmooth, result: Smoothed, whole: Verdict) -> StateTrust:
-    """Return what is to be said of each state, after all witnesses were heard.
+    """Return the judgement of each state, after all tests.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def states_judged(separated: SeparatedSmooth, result: Smoothed, whole: Verdict) 
 
 
 def states_between(states: StateTrust, known: Trajectory, dense: Trajectory) -> StateTrust:
-    """Return what is to be said at other times: what is at the nearest state, as far as it goes.
+    """Return the judgement at other times: that of the nearest state, as far as it applies.
 
     Parameters
     ----------
@@ -143,11 +143,11 @@ def states_between(states: StateTrust, known: Trajectory, dense: Trajectory) -> 
 
 
 def _without_level(result: Smoothed) -> SeparatedSmooth:
-    """Return a result that nothing was compared with."""
+    """Return a result without a separation."""
     text = (
-        "There are no protection levels: they are made of the beacons' phasors in one solution,"
-        " which neither loose coupling nor a log of hours has, nor one of tones that are told"
-        " together alone."
+        "There are no protection levels: they need the phasors of all beacons in one solution."
+        " Loose coupling, logs of hours, and tones that are only measured jointly do not provide"
+        " this."
     )
     trust = Trust((Finding("no_redundancy", text, Verdict.TRUSTWORTHY, 0.0),))
     return SeparatedSmooth(result, uniform_trust(len(result.states), Verdict.TRUSTWORTHY), trust)
@@ -162,7 +162,7 @@ def _owner(result: Smoothed, names: tuple[str, ...]) -> IntArray:
 
 
 def _false_stretches(result: Smoothed, separated: Separation, beacon: int) -> BoolArray:
-    """Return at which field epochs a beacon deviates from what the others predict, shape (m,)."""
+    """Return at which field epochs a beacon deviates from the others' prediction, shape (m,)."""
     names = tuple(b.name for b in result.declared.site.beacons)
     own = _owner(result, names) == beacon
     phasors, states = _phasors(result).alone(), states_in(result.estimate.values)
@@ -186,7 +186,7 @@ def _false_stretches(result: Smoothed, separated: Separation, beacon: int) -> Bo
 
 
 def _resolved(result: Smoothed, name: str, false: BoolArray) -> Smoothed | None:
-    """Return the result without a beacon at some field epochs; None where that is none."""
+    """Return the result without a beacon at some field epochs; None if there is no solution."""
     own = np.array([owner == name for owner, _ in result.fields.channels])
     phasors = _phasors(result)
     left_out = (false[:, None] & own)[..., None, None]
@@ -196,7 +196,7 @@ def _resolved(result: Smoothed, name: str, false: BoolArray) -> Smoothed | None:
             result,
             tuple(_without_beacon(m, phasors, kept, false, own) for m in result.graph.measurements),
         )
-    except RuntimeError:  # GTSAM's own: without it the pose is open
+    except RuntimeError:  # GTSAM's: without it the pose is undetermined
         return None
 
 
@@ -207,7 +207,7 @@ def _without_beacon(
     false: BoolArray,
     own: BoolArray,
 ) -> Measurement:
-    """Return what is left of a measurement without a beacon."""
+    """Return a measurement without a beacon."""
     if isinstance(measurement, JointPhasors):
         out = at_nearest(phasors.time, false[:, None] & own, measurement.time)
         return measurement.leaving_out(out)
@@ -215,17 +215,17 @@ def _without_beacon(
 
 
 def _without_weight(result: Smoothed, names: tuple[str, ...]) -> BoolArray:
-    """Return at which field epochs the robust loss leaves a beacon no say, (m, beacons)."""
+    """Return at which field epochs the robust loss rejects a beacon, (m, beacons)."""
     loss, owner = _phasors(result).loss, _owner(result, names)
     out = np.zeros((len(result.residual), len(names)), dtype=bool)
     if loss is None:
         return out
-    # Each epoch as it is, not as it is weighed among those that are alike.
+    # By the residual of each epoch itself, not of correlated epochs together.
     square = np.sum(np.nan_to_num(result.residual) ** 2, axis=2)
     weight, _ = robust_weight(square, loss.kind)
     for j in range(len(names)):
         own = np.any(weight[:, owner == j] < LEFT_OUT, axis=1)
-        # What has no say all the time is declared wrong, and others say so.
+        # A beacon that is always rejected is declared wrongly, which other tests report.
         out[:, j] = own & (np.mean(own) <= MOST_FALSE)
     return out
 
@@ -271,8 +271,7 @@ def _excluded_findings(
                 "beacon_excluded",
                 f"Beacon {names[j]} contradicts the others from {', '.join(spans[:SPANS])}{more}:"
                 f" the trajectory without it is up to {1e3 * _largest(separated, j):.3g} mm away,"
-                " so it was left out there. Check its drive current, and iron or a screen near"
-                " it.",
+                " so it is excluded there. Check its drive current, and iron or a shield near it.",
                 Verdict.TRUSTWORTHY,
             )
         )
@@ -280,7 +279,7 @@ def _excluded_findings(
 
 
 def _stretches(epochs: IntArray, time: Array) -> list[tuple[int, int]]:
-    """Return first and last epoch of stretches, those joined that are near each other."""
+    """Return first and last epoch of stretches; close ones are joined."""
     separate = np.flatnonzero(np.diff(time[epochs]) > TOGETHER)
     begins, ends = epochs[np.r_[0, separate + 1]], epochs[np.r_[separate, len(epochs) - 1]]
     return list(zip(begins.tolist(), ends.tolist(), strict=True))
@@ -303,7 +302,7 @@ def _alarm_findings(
 
 
 def _of_a_whole_log(separated: Separation, risk: Risk) -> float:
-    """Return which excess of its threshold no more than one log in many has by chance."""
+    """Return the excess over the threshold that only one log in many exceeds by chance."""
     tests = 2 * separated.step.shape[1]
     alone = separated.separation_sigma.beyond(risk.false_alarm / tests)
     every = separated.separation_sigma.beyond(OF_A_LOG / (tests * len(separated.step)))
@@ -318,7 +317,7 @@ def _redundancy_findings(level_m: Array, alarmed: BoolArray) -> list[Finding]:
         return []
     text = (
         f"{int(np.sum(without))} of {len(level_m)} states have no protection level: without one of"
-        " the beacons nothing determines the pose, so that a false one would not be noticed. Add a"
+        " the beacons the pose is undetermined, so that a false one would not be detected. Add a"
         " beacon."
     )
     return [Finding("no_redundancy", text, Verdict.TRUSTWORTHY, 0.0)]

@@ -23,20 +23,20 @@ from magfusion.estimation.solve.chain import STRETCH, inverses, solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.units import Array, BoolArray
 
-# A prior that keeps what is open finite: far wider than anything that is of use.
+# A prior that keeps undetermined states finite: far wider than any useful covariance.
 OPEN = np.repeat([30.0, 300.0, 300.0, 30.0, 3.0], 3)  # rad, m, m/s, m/s^2, rad/s
 
 
 def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Separation | None:
-    """Return the separation at every state, in body axes; None where there is none to be had.
+    """Return the separation at every state, in body axes; None where it is not available.
 
-    That is with fixes in the graph (loose coupling), of a log so long that its calibration drifts,
-    and of close tones that count together.
+    That is with fixes in the graph (loose coupling), for logs so long that their calibration
+    drifts, and for close tones that are measured jointly.
 
     Parameters
     ----------
     by_magnetometer : bool
-        Whether it is of solutions without each magnetometer, rather than without each beacon.
+        Whether to exclude each magnetometer rather than each beacon.
     """
     graph = result.graph
     if not _can_separate(graph):
@@ -56,7 +56,7 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
         del rest, rows, pieces
         give_back_memory()
         solved = _without_each(parts, kept, solved)
-        del parts  # before the next group: of a long log they are much
+        del parts  # before the next group: for a long log they are large
         give_back_memory()
     detected, count = tally.detected, tally.count
     cost = kept @ tally.square - np.array([one.explained for one in solved])
@@ -83,7 +83,7 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
 
 
 def _can_separate(graph: Graph) -> bool:
-    """Return whether a graph has the fields of one calibration, each tone by itself."""
+    """Return whether a graph has the fields of one calibration, each tone separate."""
     fields = [f for f in graph.factors if isinstance(f.measurement, FieldPhasors)]
     together = any(isinstance(m, JointPhasors) for m in graph.measurements)
     one = len(fields) == 1 and len(graph.segments) <= 1
@@ -91,14 +91,14 @@ def _can_separate(graph: Graph) -> bool:
 
 
 class _Tally:
-    """Which channels are heard in any epoch, and the sum of squares of each."""
+    """Channels that are detected in any epoch, and the sum of squares of each."""
 
     def __init__(self, channels: int) -> None:
         self.detected, self.count = np.zeros(channels, dtype=bool), 0
         self.square = np.zeros(channels)
 
     def over(self, pieces: Iterator[EpochRows]) -> Iterator[EpochRows]:
-        """Count pieces as they pass."""
+        """Count pieces while passing them on."""
         for piece in pieces:
             self.detected |= np.any(piece.by_state != 0.0, axis=(0, 2, 3))
             self.square += np.sum(piece.right[..., 0] ** 2, axis=(0, 2))
@@ -114,11 +114,11 @@ class _Variant:
     ----------
     step : ndarray, shape (n, 6)
     cov, separate_errors : ndarray, shape (n, 6, 6)
-        Of it, and of its difference from the first; both grow by what is considered.
+        Of it, and of its difference from the first; both include considered parameters.
     explained : float
-        Of the sum of squares.
+        Part of the sum of squares.
     inverse : ndarray, shape (n, 15, 15)
-        As of `ChainSolution`.
+        As in `ChainSolution`.
     """
 
     step: Array
@@ -134,7 +134,7 @@ def _without_each(parts: Parts, kept: BoolArray, before: list[_Variant]) -> list
     Parameters
     ----------
     before : list of _Variant
-        Solved with other columns of what is considered.
+        Solved with other columns of the considered parameters.
     """
     count, _, size = parts.parts[0].sums.border.shape
     per_variant = 8.0 * 4.0 * count * MOTION * (MOTION + parts.count + size)
@@ -166,7 +166,7 @@ def _without_each(parts: Parts, kept: BoolArray, before: list[_Variant]) -> list
 
 
 def _inverses(parts: Parts, kept: BoolArray) -> list[Array]:
-    """Return `inverses` of each variant: together, since each is many small matrices."""
+    """Return `inverses` of all variants together, since each is many small matrices."""
     out: list[Array] = []
     group = max(1, int(chains.AT_ONCE / (8.0 * 4.0 * parts.parts[0].sums.diagonal.size)))
     for first in range(0, len(kept), group):

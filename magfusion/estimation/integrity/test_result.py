@@ -1,4 +1,4 @@
-"""What the witnesses of one result have before them, and what each of them says."""
+"""Input and result of the integrity tests of an estimate."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -11,18 +11,18 @@ from magfusion.units import Array
 
 
 class Case(NamedTuple):
-    """A result that is judged.
+    """A result to be tested.
 
     Parameters
     ----------
     log : Log
-        Of which it is.
+        Of the result.
     score : Score, optional
-        Of everything held; None where there is none.
+        Of all fixed parameters; None if there is none.
     pose_cov : ndarray, shape (states, 6, 6)
-        As the estimator claims it.
+        As claimed by the estimator.
     wide : Score, optional
-        With the steps that parameters may have made, as of `scores_of`.
+        Including possible steps of parameters, as of `scores_of`.
     """
 
     result: Smoothed
@@ -34,16 +34,16 @@ class Case(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TestResult:
-    """What one witness says.
+    """Result of one test.
 
     Parameters
     ----------
     factor : ndarray, shape (states,), optional
-        What the claimed covariance of the poses is to be multiplied by.
+        Factor for the claimed covariance of the poses.
     spread : ndarray, shape (states, 6, 6), optional
-        What is to be added to it.
+        Covariance to add to it.
     named : tuple of ndarray, shape (h,)
-        Steps of what is held: by the first cause that is named, by the first two, and so on.
+        Steps of the fixed parameters: by the first cause, by the first two, and so on.
     """
 
     findings: tuple[Finding, ...] = ()
