@@ -1,9 +1,11 @@
 """What a smoothed log says of parameters that are not estimated, against smoothing that does."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from small_problem import small_log
 
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
@@ -88,3 +90,38 @@ def test_a_moved_beacon_is_named_where_it_doubles_the_nees(
     assert cov is not None
     findings = check_fixed_parameters(Case(result, log, scores.fixed, cov)).findings
     assert [f.code for f in findings] == (["beacon_pose"] if named else [])
+
+
+def tilted(site: Site, turn_world: Array) -> Site:
+    turn = Rotation.from_rotvec(turn_world).as_matrix()
+    return replace(
+        site,
+        beacons=tuple(
+            replace(
+                b,
+                position_world=turn @ b.position_world,
+                world_from_beacon=turn @ b.world_from_beacon,
+            )
+            for b in site.beacons
+        ),
+    )
+
+
+@pytest.mark.parametrize("turn_deg", [(2.0, -1.0, 0.0), (0.0, 0.0, 0.0)])
+def test_a_survey_whose_vertical_is_off_is_named_with_its_tilt(
+    clean: tuple[Log, Site, Smoothed, float], turn_deg: tuple[float, float, float]
+) -> None:
+    """The fields agree with a survey that is rotated as a whole; gravity does not."""
+    log, site, _, _ = clean
+    turn = np.deg2rad(turn_deg)
+    result = smoothed(log, tilted(site, turn))
+    scores, cov = scores_of(result, log.imu), result.states.pose_cov
+    assert scores is not None
+    assert cov is not None
+    test = check_fixed_parameters(Case(result, log, scores.fixed, cov))
+    assert [f.code for f in test.findings] == (["survey_tilt"] if np.any(turn) else [])
+    if np.any(turn):
+        found = re.search(r"by (\S+) deg about x and (\S+) deg about y", test.findings[0].text)
+        assert found is not None
+        tilt_deg = [float(x) for x in found.groups()]
+        np.testing.assert_allclose(tilt_deg, turn_deg[:2], atol=0.3)  # deg

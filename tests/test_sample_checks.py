@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from spoiled_log import (
     RATE,
     Change,
@@ -32,6 +33,8 @@ from magfusion.estimation.data_checks.samples import clipped
 from magfusion.estimation.data_checks.spectrum import aliased, mains_of
 from magfusion.estimation.data_checks.stamps import timing
 from magfusion.estimation.integrity.quick_check import quick_check
+from magfusion.model.samples import ImuSamples, Log
+from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Verdict
 
 
@@ -176,6 +179,21 @@ def test_compasses_know_gravity_and_field_without_a_beacon() -> None:
     assert size == pytest.approx(np.linalg.norm(earth), rel=0.01)
     dip = np.arccos(earth[2] / np.linalg.norm(earth))
     assert np.median(means.angle) == pytest.approx(dip, abs=0.03)
+
+
+def test_means_are_rotated_to_the_poses_by_the_gyroscope() -> None:
+    """In a turn of 400 deg/s a pose 0.1 s away has another attitude, by 40 deg."""
+    time, rate = np.arange(0.0, 12.0, 0.005), np.array([0.0, 0.0, np.deg2rad(400.0)])
+    gyro, force = (np.tile(one, (len(time), 1)) for one in (rate, [0.0, 0.0, 9.81]))
+    means = still_means(Log("spin", 0, "test", ImuSamples(time, gyro, force)), None)
+    poses_at = np.arange(0.1, 12.0, 0.23)
+    turned = Rotation.from_rotvec(poses_at[:, None] * rate).as_matrix()
+    zero = np.zeros((len(poses_at), 3))
+    spans, rows, world_from_body = means.near(Trajectory(poses_at, turned, zero, zero), 0.2)
+    assert np.max(np.abs(poses_at[rows] - means.time[spans])) > 0.05  # s
+    true = Rotation.from_rotvec(means.time[spans, None] * rate)
+    off = (true.inv() * Rotation.from_matrix(world_from_body)).magnitude()
+    assert np.max(off) < np.deg2rad(0.01)
 
 
 @pytest.mark.parametrize("motion", ["walk", "turn"])

@@ -120,6 +120,7 @@ CODES = {
     "stuck_axis": "an axis is constant",
     "survey_axes": "the survey's axes are not those declared",
     "survey_overconfident": "the survey of the beacons is worse than its sigmas",
+    "survey_tilt": "the vertical of the survey differs from gravity",
     "temperature_missing": "a declared temperature dependence has no recorded temperature",
     "time_offset": "the IMU's time offset is not as declared",
     "transfer": "a calibration is not valid outside its own data",

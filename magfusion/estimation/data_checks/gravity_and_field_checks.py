@@ -6,7 +6,7 @@ angle between them to a degree or two.  Wrong units, missing gravity, wrong sign
 rotated by 90 deg, or iron on the body therefore show within the first seconds.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -17,10 +17,10 @@ from magfusion.model.platform_motion import A_HAND
 from magfusion.model.quaternion import inverse, matrices, rotate
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
-from magfusion.model.strapdown import turn_from_gyro
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Verdict
-from magfusion.units import DEGREE, STANDARD_GRAVITY, Array
+from magfusion.receiver.turn import body_turn_of
+from magfusion.units import DEGREE, STANDARD_GRAVITY, Array, IntArray
 
 SPAN = 4.0  # s; over which specific force and field are averaged
 FULL = 0.8  # share of a span's samples that must exist
@@ -53,12 +53,15 @@ class StillMeans:
         In body axes at that time (m/s^2, T); the field is NaN where none was measured.
     still_from_body : ndarray, shape (n, 3, 3)
         Attitude at that time, integrated from the gyroscope since the log's first sample.
+    attitude : callable
+        The same at other times, quaternions, as of `body_turn_of`.
     """
 
     time: Array
     force_body: Array
     field_body: Array
     still_from_body: Array
+    attitude: Callable[[Array], Array]
 
     def __len__(self) -> int:
         return len(self.time)
@@ -68,16 +71,43 @@ class StillMeans:
         """Between vertical and field (rad), shape (n,)."""
         return _angle(self.force_body, self.field_body)
 
+    def near(self, poses: Trajectory, limit: float) -> tuple[IntArray, IntArray, Array]:
+        """Return the spans with a pose nearer than a limit (s), these poses, and attitudes.
+
+        Returns
+        -------
+        spans, poses : ndarray, shape (m,)
+            Rows.
+        world_from_body : ndarray, shape (m, 3, 3)
+            At the middle of each span: that of the pose, rotated by the gyroscope.
+        """
+        nothing = np.zeros(0, dtype=np.int64)
+        if not len(poses) or not len(self):
+            return nothing, nothing, np.zeros((0, 3, 3))
+        after = np.clip(np.searchsorted(poses.time, self.time), 0, len(poses) - 1)
+        before = np.maximum(after - 1, 0)
+        closer = self.time - poses.time[before] < poses.time[after] - self.time
+        nearest = np.where(closer, before, after)
+        spans = np.flatnonzero(np.abs(poses.time[nearest] - self.time) < limit)
+        row = nearest[spans]
+        body_from_still = matrices(inverse(self.attitude(poses.time[row])))
+        return (
+            spans,
+            row,
+            poses.world_from_body[row] @ body_from_still @ self.still_from_body[spans],
+        )
+
 
 def still_means(log: Log, site: Site | None, span: float = SPAN) -> StillMeans:
     """Average specific force and field over spans of a log (s)."""
     imu = log.imu
     offset = 0.0 if site is None else site.platform.imu.time_offset
     time = imu.time + offset
-    nothing = StillMeans(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    attitude, none = body_turn_of(replace(imu, time=time)), np.zeros((0, 3))
+    nothing = StillMeans(np.zeros(0), none, none, np.zeros((0, 3, 3)), attitude)
     if len(time) < 2 or not log.inertial:
         return nothing
-    still_from_body = turn_from_gyro(imu.time, imu.gyro_body)
+    still_from_body = attitude(time)
     force = rotate(still_from_body, imu.accel_body.T).T
     field = np.full_like(force, np.nan)
     if log.vectors is not None:
@@ -97,7 +127,7 @@ def still_means(log: Log, site: Site | None, span: float = SPAN) -> StillMeans:
         total = np.stack([np.bincount(number, column) for column in value.T], axis=1)
         return rotate(inverse(still_from_body), (total[full] / count[full, None]).T).T
 
-    return StillMeans(time[nearest], mean(force), mean(field), matrices(still_from_body))
+    return StillMeans(time[nearest], mean(force), mean(field), matrices(still_from_body), attitude)
 
 
 def _angle(a: Array, b: Array) -> Array:
@@ -335,20 +365,13 @@ class _InWorld(NamedTuple):
 
 
 def _at(means: StillMeans, poses: Trajectory) -> _InWorld | None:
-    if len(poses) == 0:
+    spans, _, attitude = means.near(poses, NEAR)
+    if not len(spans):
         return None
-    after = np.clip(np.searchsorted(poses.time, means.time), 0, len(poses) - 1)
-    before = np.maximum(after - 1, 0)
-    closer = means.time - poses.time[before] < poses.time[after] - means.time
-    nearest = np.where(closer, before, after)
-    near = np.abs(poses.time[nearest] - means.time) < NEAR
-    if not np.any(near):
-        return None
-    attitude = poses.world_from_body[nearest[near]]
     return _InWorld(
-        _rotated(attitude, means.force_body[near]),
-        _rotated(attitude, means.field_body[near]),
-        means.force_body[near],
+        _rotated(attitude, means.force_body[spans]),
+        _rotated(attitude, means.field_body[spans]),
+        means.force_body[spans],
         attitude[:, 2],
     )
 

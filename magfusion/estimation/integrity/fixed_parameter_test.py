@@ -20,7 +20,7 @@ from magfusion.estimation.integrity.score import (
     field_residual,
     moved_estimate,
 )
-from magfusion.estimation.integrity.suspects import CODE, Suspect, suspects
+from magfusion.estimation.integrity.suspects import CODE, TILT, Suspect, suspects
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.model.parameters import Block, prior_sigma
 from magfusion.model.site import Site
@@ -126,7 +126,7 @@ def check_fixed_parameters(case: Case) -> TestResult:
 
 
 def gains(combine: Array, information: Array, gradient: Array) -> Array:
-    """Return `Freed.gain` of many candidates, shape (candidates,); zero without information.
+    """Return `ReleasedFault.gain` of many candidates; zero without information.
 
     Parameters
     ----------
@@ -217,16 +217,24 @@ def finding_of(site: Site, score: Score, cause: ReleasedFault) -> Finding:
         factor = float(np.exp((prior_sigma(score.fixed) * cause.step)[block.columns][0]))
         result = f"all are {factor:.3g} times as large"
         remedy = "Correct them (peak, not rms; their unit), or declare their sigma"
+    elif cause.fault.code == TILT:
+        combine = cause.fault.combine
+        tilt = -np.linalg.lstsq(combine, cause.step, rcond=None)[0]  # the step takes it back
+        result = f"it is tilted by {tilt[0]:+.2g} deg about x and {tilt[1]:+.2g} deg about y"
+        remedy = "Rotate positions and attitudes of all beacons back: world z is the plumb line"
     else:
         result = "; ".join(_amounts(site, score, cause, b) for b in _largest(cause))
         remedy = "Correct it by this amount, or declare a sigma of this size to estimate it"
     return Finding(
-        CODE[cause.fault.blocks[0].parameter],
+        cause.fault.code or CODE[cause.fault.blocks[0].parameter],
         f"The log contradicts {cause.fault.name} as declared: {result}"
         f" ({float(sigmas(cause.log_p)):.0f} sigma). This moves the poses by"
         f" {_length(position)} and {rotation:.2g} deg,"
         f" {np.sqrt(mean):.1f} times their reported sigma. {remedy}.",
-        Verdict.FAILED if mean > MAX_LINEAR_CHI_SQUARE else Verdict.DOUBTFUL,
+        # A tilt is a rotation of the frame, whatever its size.
+        Verdict.FAILED
+        if mean > MAX_LINEAR_CHI_SQUARE and cause.fault.code != TILT
+        else Verdict.DOUBTFUL,
         float(sigmas(cause.log_p)),
     )
 

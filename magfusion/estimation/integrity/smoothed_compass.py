@@ -7,7 +7,7 @@ from magfusion.estimation.data_checks.gravity_and_field_checks import SPAN, stil
 from magfusion.estimation.data_checks.steady_field import OffEarth, off_earth
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.model.trajectory import Trajectory
-from magfusion.units import Array, BoolArray, IntArray
+from magfusion.units import Array
 
 TOGETHER = 3  # spans, whose mean is tested; about the memory of the same test online
 NEAR = 0.5 * SPAN + 1.0  # s; largest distance of a state from the middle of a span
@@ -21,11 +21,10 @@ def compass(case: Case) -> TestResult:
     if log.vectors is None or len(site.platform.magnetometer.axes) < 3 or not len(states):
         return NOTHING
     means = still_means(beginning(log), site)
-    row, near = _nearest(states, means.time)
-    row, field_body = row[near], means.field_body[near]
+    near, row, attitude = means.near(states, NEAR)
+    field_body = means.field_body[near]
     if len(row) < TOGETHER or not np.all(np.isfinite(field_body)):
         return NOTHING
-    attitude = states.world_from_body[row]
     residual = np.einsum("nij,nj->ni", attitude, field_body) - site.earth_field_world
     cov = attitude @ case.pose_cov[row, :3, :3] @ np.swapaxes(attitude, 1, 2)
     result = [
@@ -51,11 +50,3 @@ def _spread(states: Trajectory, time: Array, result: list[OffEarth | None]) -> A
             spread[row, :3, :3] = one.turn**2 * np.eye(3)
             spread[row, 3:, 3:] = one.shift(states.position_world[row]) ** 2 * np.eye(3)
     return spread
-
-
-def _nearest(states: Trajectory, time: Array) -> tuple[IntArray, BoolArray]:
-    after = np.clip(np.searchsorted(states.time, time), 0, len(states) - 1)
-    before = np.maximum(after - 1, 0)
-    closer = time - states.time[before] < states.time[after] - time
-    row = np.where(closer, before, after)
-    return row, np.abs(states.time[row] - time) < NEAR

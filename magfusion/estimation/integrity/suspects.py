@@ -176,6 +176,8 @@ CODE: dict[Parameter, str] = {
     CONDUCTIVITY: "ground",
 }
 
+TILT = "survey_tilt"
+
 
 class Suspect(NamedTuple):
     """Parameters that one mistake would have wrong together.
@@ -188,11 +190,14 @@ class Suspect(NamedTuple):
         Among those that are held.
     combine : ndarray, shape (dimension, columns)
         Directions that are tried, of all that is held, in units of what is typical.
+    code : str
+        Of its finding; otherwise that of the first block's parameter.
     """
 
     name: str
     blocks: tuple[Block, ...]
     combine: Array
+    code: str = ""
 
 
 def held_blocks(site: Site, estimated: tuple[Block, ...], *, steady: bool) -> tuple[Block, ...]:
@@ -250,6 +255,27 @@ def suspects(site: Site, held: tuple[Block, ...]) -> Iterator[Suspect]:
         for block in moments:
             common[block.columns] = 1.0
         yield Suspect(f"the moments of {_beacons(site)}", tuple(moments), common)
+    if site.platform.inertial and len(surveyed) == 2 * len(site.beacons):
+        yield Suspect(
+            "the vertical of the survey", tuple(surveyed), survey_tilt(site, surveyed, size), TILT
+        )
+
+
+def survey_tilt(site: Site, surveyed: list[Block], size: int) -> Array:
+    """Return the effect of tilting the whole survey about world x and y, shape (size, 2).
+
+    A unit is a typical error of an attitude; gravity and the Earth field stay.
+    """
+    tilt_world, out = DEGREE * np.eye(3)[:, :2], np.zeros((size, 2))
+    beacons = {beacon.name: beacon for beacon in site.beacons}
+    for block in surveyed:
+        beacon = beacons[block.owner]
+        if block.parameter == BEACON_ROTATION:
+            change = beacon.world_from_beacon.T @ tilt_world
+        else:
+            change = -skew(beacon.position_world) @ tilt_world
+        out[block.columns] = change / block.sigma[:, None]
+    return out
 
 
 def _beacons(site: Site) -> str:
