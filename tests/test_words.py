@@ -7,7 +7,7 @@ import pytest
 import words
 from word_lists import ALLOWED, LATER
 
-RENAMES = pytest.mark.skip(reason="identifiers and sentences are being renamed")
+SENTENCES = pytest.mark.skip(reason="some sentences are still to be rewritten")
 
 
 @pytest.fixture(scope="module")
@@ -20,17 +20,15 @@ def _remaining(everything: Iterable[words.Finding], kind: str) -> str:
     return "\n".join(f"{f.place}:{f.line}: {f.name}: {f.instead}" for f in found)
 
 
-@RENAMES
+@SENTENCES
 def test_no_text_has_a_banned_word(everything: list[words.Finding]) -> None:
     assert not _remaining(everything, "text")
 
 
-@RENAMES
 def test_no_identifier_has_a_banned_part(everything: list[words.Finding]) -> None:
     assert not _remaining(everything, "part")
 
 
-@RENAMES
 def test_no_identifier_is_a_banned_word(everything: list[words.Finding]) -> None:
     assert not _remaining(everything, "whole")
 

@@ -4,9 +4,6 @@
 something is left; ``--counts`` lists only how often each word occurs.  The lists are in
 `word_lists.py`.  Names of options and keys of the site's file are a contract and are not looked at;
 neither are keys, columns and codes, which are texts of one word, or names in backticks.
-
-`renames.json` beside this file has the names that were chosen for what is still found, module by
-module ("" for anywhere); it goes with the commit that makes them.
 """
 
 import argparse

@@ -60,7 +60,7 @@ def joint_phasors(
         Angular rate without its bias (rad/s).
     applied_offset : ndarray, shape (n,)
         IMU time offset with which the inertial data were cut (s).
-    alike, standing
+    shared_by, standing
         As of `magfusion.estimation.measurements.phasors.field_phasors`.
     noise : ndarray, shape (k, 3, 3), optional
         Sample noise of the windows before, for the average.

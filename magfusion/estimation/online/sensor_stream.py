@@ -125,7 +125,7 @@ class SensorStream:
 
         Parameters
         ----------
-        before, predicted, imu, offset, lost
+        before, predicted, imu, offset, is_lost
             As of `magfusion.estimation.demodulation.motion_compensation.demodulate_predicted`.
         """
         receiver = self.receiver

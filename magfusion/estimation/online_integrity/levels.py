@@ -54,9 +54,9 @@ class Levels:
     """
 
     def __init__(
-        self, result: ProtectionLevels | None = None, query: LevelsQuery | None = None
+        self, values: ProtectionLevels | None = None, query: LevelsQuery | None = None
     ) -> None:
-        self._values, self._query = result, query
+        self._values, self._query = values, query
 
     @property
     def values(self) -> ProtectionLevels:

@@ -67,7 +67,7 @@ def explained_fixes(
     ----------
     samples : FieldSamples
         Channels in the site's order.
-    gravity, survey_error, free
+    gravity, survey_error, free_parameters
         As in `magfusion.estimation.snapshot.likelihood.fix_epochs`; with ``gain`` the spread is
         always estimated and used.
     risk : Risk, optional

@@ -138,7 +138,7 @@ def separate_fixes(
     ----------
     samples : FieldSamples
         Of the fixes.
-    gravity, survey_error, free, gain_sigma
+    gravity, survey_error, free_parameters, gain_sigma
         Those of the fixes, as in `magfusion.estimation.snapshot.likelihood.fix_epochs`.
     """
     risk = Risk() if risk is None else risk

@@ -56,7 +56,7 @@ def refine(
         Channels in the site's order.
     start : Trajectory
         Poses at the same times.
-    gravity, prior, survey_error, free, gain_sigma
+    gravity, prior, survey_error, free_parameters, gain_sigma
         As in `magfusion.estimation.snapshot.likelihood.fix_epochs`.
 
     Returns
