@@ -172,7 +172,7 @@ LATER = (
 
 # What stays, by "file: name or word", with the reason; at most 40.
 ALLOWED: dict[str, str] = {
-    "magfusion/receiver/admission.py: stands": "the reason is a key of the report's dropped windows",
-    "magfusion/receiver/receiver.py: beside": "the reason is a key of the report's dropped windows",
+    "magfusion/receiver/admission.py: stands": "a key of the report: why windows are dropped",
+    "magfusion/receiver/receiver.py: beside": "a key of the report, as that above",
     "magfusion/jobs/settings.py: most": "the upper bound of an option, with `least` and `above`",
 }
