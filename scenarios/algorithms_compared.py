@@ -1,8 +1,8 @@
-"""Paper 004's three algorithms beside maximum likelihood, in nine kinds of room (figures 7 and 8).
+"""Paper 004's three algorithms compared with maximum likelihood, in nine rooms (figures 7 and 8).
 
 Ten rooms of each kind (`magfusion.simulation.worlds`) with two hundred targets: noise alone (S0), a
 smooth gain error (S1), two sets of errors fitted to the printed figures (F1, F2), coils of the true
-size (P0) and iron beside them, as far as it is felt (P1, P2) or near (N1, N2).  The sensor is
+size (P0) and iron near them, as far as it has an effect (P1, P2) or near (N1, N2).  The sensor is
 level, as it was in the paper.
 
 1. Do the algorithms err as the paper prints?  Algorithms 1 and 3 do in F1, whose errors were fitted
@@ -10,12 +10,12 @@ level, as it was in the paper.
    three attitudes do not come out together in any room.
 2. Is maximum likelihood better?  In white noise it meets the Cramér-Rao bound, ten times below
    algorithm 3.  Where the model is wrong by more than the noise, it is **worse** than algorithm 3.
-   `magfusion fix` is not: it frees the gains as far as the targets themselves ask.
+   `magfusion fix` is not: it estimates the gains as far as the targets require.
 3. What is better still?  Weights that know how wrong the model is, and the very survey that
    algorithm 3 needs, made into a map of what the model misses: at most half its error.
 4. Does the attitude matter to the likelihood?  No: the same errors at any tilt.
 
-Our methods are held against algorithm 3, the paper's own, by a rule that was settled before any run
+Our methods are compared with algorithm 3, the paper's own, by a rule fixed before any run
 (`compared_with_algorithm_3`).
 
 The lines of algorithm 1 carry `World.line_bias`, a change since they were fitted.  It cancels in
@@ -106,7 +106,7 @@ def main() -> None:
     parser = scenario_parser(__doc__, Config.seed, quick, parallel=True)
     parser.add_argument("--worlds", type=int, help=f"of each scenario (default {Config.worlds})")
     parser.add_argument("--rooms", nargs="+", choices=SCENARIOS, help="kinds (default: all)")
-    parser.add_argument("--gain-length", type=float, help="over which gain errors are alike (m)")
+    parser.add_argument("--gain-length", type=float, help="correlation length of gain errors (m)")
     given = parser.parse_args()
     if given.worlds is not None and given.worlds < 2:
         parser.error("--worlds must be at least 2, for a standard error")

@@ -1,4 +1,4 @@
-"""What came out in rooms of each kind: means, verdicts beside algorithm 3, tables and pictures."""
+"""Results in rooms of each kind: means, verdicts against algorithm 3, tables and pictures."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -135,7 +135,7 @@ def by_free_gain(trial: Trial) -> Poses:
 
 
 def by_default(trial: Trial) -> Poses:
-    """Fix as `magfusion fix` does: beacons left out, or gains free, where the fields ask for it."""
+    """Fix as `magfusion fix` does: beacons omitted or gains estimated where required."""
     calibration = initial_calibration(trial.world.site, 0.0)
     result = explained_fixes(trial.samples, calibration, survey_error=False).fixes.best()
     return Poses(result.position_world, result.world_from_body)

@@ -1,4 +1,4 @@
-"""A tracker from its bench to its fixes: what the calibration reports, beside what fixes err by.
+"""A tracker from its bench to its fixes: what the calibration reports, and the errors of fixes.
 
 Files of a bench are made by code that shares nothing with the estimators: every turn of three
 windings by elliptic integrals, receiving coils by the mean over their discs, a probe of three axes
@@ -298,7 +298,7 @@ def ratios(outcomes: list[BenchOutcome]) -> Array:
 
 
 def passes_check(outcomes: list[BenchOutcome]) -> bool:
-    """Tell whether the rule is kept."""
+    """Return whether the rule is met."""
     each = np.array([np.divide(o.reported, o.estimate) for o in outcomes])
     whole = np.abs(np.log(ratios(outcomes))) < np.log1p(WITHIN)
     return bool(np.all(whole) and np.all(np.abs(np.log(each)) < np.log1p(SEED_WITHIN)))

@@ -123,7 +123,7 @@ def random_attitudes(count: int, yaw_free_deg: float, rng: np.random.Generator) 
 
 
 def database(config: Config, step_deg: float, rng: np.random.Generator) -> Index:
-    """Return the database of a grid of roll and pitch, two steps wider than what is asked."""
+    """Return the database of a grid of roll and pitch, two steps wider than required."""
     low, high = PITCH_NED_DEG
     pitch = np.arange(low - 2.0 * step_deg, high + 2.001 * step_deg, step_deg)
     roll = np.arange(-180.0, 180.0, step_deg)

@@ -1,7 +1,7 @@
-"""How well magnetometers at known places tell where a beacon's field has its centre: paper 002.
+"""How well magnetometers at known places determine the centre of a beacon's field: paper 002.
 
 The paper calibrates a rotating beacon with three or four magnetometers, 1000 times, and reports
-0.011 and 0.009 m, 0.17 and 0.13 degrees (figures 5 and 6; drawn here with -o).  The scenario asks:
+0.011 and 0.009 m, 0.17 and 0.13 degrees (figures 5 and 6; drawn here with -o).  Questions:
 
 1. Do its equations give its figures?  Only if the normals are measured in the beacon's own axes,
    which are not known yet, and each direction's hemisphere is given.  Then one percent of noise
@@ -16,8 +16,8 @@ The paper calibrates a rotating beacon with three or four magnetometers, 1000 ti
    the right minimum every time, and takes unequal coils that are not at right angles for what they
    are.
 
-What "signal to noise 100" means, and which mean of three angles is printed, the paper does not say:
-every reading is shown, with its verdict (`beacon_readings`).
+What "signal to noise 100" means, and which mean of three angles is printed, the paper does not
+state: every reading is shown, with its verdict (`beacon_readings`).
 """
 
 from dataclasses import dataclass, replace

@@ -1,7 +1,7 @@
 """What each further beacon is worth: the error with three to six (paper 004, figure 11).
 
-Three to six beacons stand evenly on a ring of 3.6 m radius around the square of 2 m in which the
-targets lie, in the fitted rooms of `algorithms_compared` (F1), whose lines are not aged here.
+Three to six beacons are evenly spaced on a ring of 3.6 m radius around the square of 2 m in which
+the targets lie, in the fitted rooms of `algorithms_compared` (F1), whose lines are not aged here.
 
 1. Do more beacons lower the error of algorithm 3 as the paper prints?  By the same share: to about
    two thirds from three to six.  The paper's own three beacons err by 0.069 m, 0.108 m and 0.110 m

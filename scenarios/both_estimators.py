@@ -37,7 +37,7 @@ def smoothed(log: Log, site: Site) -> tuple[Trajectory, str]:
 
 
 def filtered(log: Log, site: Site) -> tuple[Trajectory, str]:
-    """Navigate along a log by the filter; return its states and the worst that was said of them."""
+    """Navigate along a log by the filter; return its states and their worst verdict."""
     navigator, replayed = Navigator(site, NavigatorSettings("ekf")), Replay(log)
     states: list[JudgedState] = []
     for k in range(len(replayed)):

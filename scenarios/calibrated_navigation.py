@@ -1,10 +1,10 @@
 """What the calibration of the beacons is worth to who navigates by them: paper 002, second part.
 
-The paper fixes 200 targets with beacons that are taken to stand where their geometric centre is
+The paper fixes 200 targets with beacons whose magnetic centre is taken to be the geometric one
 and to point where their coils point, and with calibrated ones: 0.154 m and 3.5 degrees become
-0.110 m and 1.3 degrees (figures 9 and 10; drawn here with -o).  It does not tell how far off its
+0.110 m and 1.3 degrees (figures 9 and 10; drawn here with -o).  It does not state how far off its
 beacons were.  The scenario displaces three beacons by 3 cm and 3 degrees along each axis, which is
-the paper's gain (0.108 m and 3.25 degrees of what calibration takes away), and asks:
+the paper's gain (0.108 m and 3.25 degrees removed by calibration), and answers:
 
 1. What do such beacons do to trilateration where amplitudes are exact?  0.11 m and 2.9 degrees on
    average, with a spread from world to world of half of that: the paper saw one world.
@@ -65,7 +65,7 @@ class Config:
 
 
 def declared_site(config: Config) -> Site:
-    """Return the beacons as their geometry says, with the sigmas by which they are off."""
+    """Return the beacons as their geometry gives them, with the sigmas by which they are off."""
     plain = build(MOMENT)
     turn = np.full(3, config.turn_sigma_deg * DEGREE)
     sigma = BeaconSigma(np.full(3, config.place_sigma), turn, np.zeros(2))
@@ -171,7 +171,7 @@ def taken_off(geometric: Sequence[float], calibrated: Sequence[float]) -> tuple[
 
 
 def report(table: dict[str, dict[str, list[float]]]) -> str:
-    """Return one table, and what calibration takes off beside the paper's shares."""
+    """Return one table, and the reduction by calibration with the paper's shares."""
     lines = [f"{'site':<12}" + "".join(f"{m:>36}" for m in METHODS) + f"{'paper':>18}"]
     for site, own in table.items():
         cells = (own[m] for m in METHODS)

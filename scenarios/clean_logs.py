@@ -1,10 +1,10 @@
-"""Are good logs believed?  Logs of many kinds, each declared as it is.
+"""Rate of false alarms: good logs of many kinds, each correctly declared.
 
 Of every log a room, one to eight beacons, their survey (exact, or by hand), the motion and its
 speed are drawn; calibration, noise and motion are simulated as the site declares them.  `smooth`
 runs as a job, so that ``report.json`` is judged.
 
-1. Where the Cramér-Rao bound of single epochs says that the pose is determined, at most 2 % of the
+1. Where the Cramér-Rao bound of single epochs shows that the pose is determined, at most 2 % of the
    logs are doubtful and none has failed.
 2. Elsewhere a result is doubtful or failed, or its errors are what it claims.
 3. None is trusted with a mean NEES above 20.
@@ -62,7 +62,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Row:
-    """What `smooth` said of a log."""
+    """Verdict of `smooth` on a log."""
 
     beacons: int
     rough: bool
@@ -80,7 +80,7 @@ class Row:
 
     @property
     def determined(self) -> bool:
-        """Whether the bound says that the pose is."""
+        """Whether the pose is determined by the bound."""
         return self.bound_m < DETERMINED_M
 
     @property
@@ -147,7 +147,7 @@ def bound(drawn: Drawn, simulation: SimulatedLog) -> float:
 
 
 def judge(config: Config, rng: np.random.Generator) -> Row:
-    """Simulate a log, smooth it and return what was said."""
+    """Simulate a log, smooth it and return the verdict."""
     drawn = draw(config, rng)
     built = simulate_log(drawn.site, drawn.config, rng)
     code, findings = 0, ""
@@ -182,7 +182,7 @@ def judge(config: Config, rng: np.random.Generator) -> Row:
 
 
 def run(config: Config, scale: Scale | None = None) -> list[Row]:
-    """Return what was said of all logs."""
+    """Return the verdicts on all logs."""
     return run_many(judge, [config] * config.logs, seed=config.seed, **(scale or {}))
 
 
@@ -215,7 +215,7 @@ def figures(rows: Sequence[Row]) -> Figures:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Return what a reader sees: the logs that were not believed, and the sums."""
+    """Return the printed text: the logs that were doubted, and the sums."""
     lines = [
         f"{'log':>4}{'beacons':>8} {'survey':7}{'motion':7}{'m/s':>5}{'room m':>7}{'bound cm':>9}"
         f"  {'verdict':12}{'error cm':>9}{'deg':>7}{'NEES':>7}  first reason"

@@ -1,8 +1,8 @@
-"""What one epoch of a rotating beacon tells exactly, and how many poses it leaves.
+"""What one epoch of a rotating beacon determines exactly, and how many poses remain.
 
 The corrected equations of paper 004 hold to rounding: the direction survives its normal (Eq 5-7),
 and the ellipse's axes are those of theory, the minor one the same in all directions.  What the
-paper does not say is how many poses explain the same field: two for one beacon and a known
+paper does not state is how many poses explain the same field: two for one beacon and a known
 attitude, four where the attitude is unknown, one for three beacons, and again two for three
 beacons of unknown polarity, the second in the mirror of their plane and turned by half a turn.
 Near the beacon's plane Eq 7 loses the direction, the completed tensor does not: at 80 degrees from

@@ -3,7 +3,7 @@
 The paper simulates the variance of the direction that Eq 7 finds, sees it "grow quickly" beyond
 20 m and calls that the radius of coverage (14 m in its experiments).  It names 3 nT of white noise
 and neither the moment nor how many samples make a direction.  The scenario simulates the mean
-square of the angle between found and true direction, at a known attitude, and asks:
+square of the angle between found and true direction, at a known attitude, and answers:
 
 1. Where does it grow quickly?  Everywhere, with the sixth power of the range (the law, first
    order in the noise) until it nears a random direction's: there is no knee, only a threshold.
@@ -281,7 +281,7 @@ def report(outcomes: RadiusOutcome) -> str:
 
 
 def draw(path: Path, outcomes: RadiusOutcome) -> None:
-    """Write a PNG of the curves beside the paper's radii."""
+    """Write a PNG of the curves with the paper's radii."""
     figure = blank_figure(8.0, 5.5)
     axes = figure.subplots()
     for colour, result in zip(("tab:red", "tab:blue", "tab:green"), outcomes.curves, strict=True):

@@ -9,8 +9,8 @@ the walls and more.  Random layouts are drawn from the same candidates under the
 2. Does that hold at points it was not designed for, four times as many in plan, and by `coverage`?
 3. Do several searches find the same value?
 4. Are the protection levels those that fixes of simulated fields have there?
-5. What does it cost where no beacon is false?  The worst sigma of the position, beside that of the
-   median layout and of a design for the mean variance (A).
+5. What does it cost where no beacon is false?  The worst sigma of the position, compared with that
+   of the median layout and of a design for the mean variance (A).
 """
 
 import time

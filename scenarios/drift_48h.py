@@ -1,8 +1,8 @@
 """Do the online estimators drift in 48 hours?  `magfusion drift` in the three cases that matter.
 
 A platform mostly at rest, three minutes of walk an hour, 100 Hz inertial data, phasors each minute
-at rest and once a second about a walk; moments that fade with the coils' heat and wander, loud days
-and quiet nights, a magnetometer's scale that follows the day, biases that walk:
+at rest and once a second about a walk; moments that fade with the coils' heat and wander, noisy
+days and quiet nights, a magnetometer's scale that follows the day, biases that walk:
 
 1. free: beacons with clocks of their own, whose phase and rate the estimator finds.
 2. known: the drives are declared synchronised, and are.
@@ -14,7 +14,7 @@ time of an update (processor time, which other work on the machine disturbs litt
 
     python scenarios/drift_48h.py --hours 48 --worlds 8 --workers 8 -o drift_48h
 
-The default is a few minutes long, and tells less: slopes of a short run are mostly undecided.
+The default is a few minutes long, and determines less: slopes of a short run are mostly undecided.
 """
 
 import tempfile

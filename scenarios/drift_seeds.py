@@ -42,7 +42,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Row:
-    """What one run says."""
+    """Result of one run."""
 
     seed: int
     trap: bool
@@ -75,7 +75,7 @@ def judge(task: Task, _rng: np.random.Generator) -> Row:
 
 
 def run(config: Config, scale: Scale | None = None) -> list[Row]:
-    """Return what all runs say, the traps last."""
+    """Return the summary of all runs, the traps last."""
     first = config.seed
     tasks = [
         Task(first + i, config.hours, config.estimator, trap)

@@ -1,9 +1,9 @@
-"""Coils whose current wanders, recorded beside the field: what a reference is worth.
+"""Coils whose current wanders, recorded with the field: the value of a reference.
 
 A walk among the demo's beacons, whose amplifiers sag with the mains and hunt, and whose oscillators
 run apart from the log's clock.  Their currents are recorded by the instrument that records the
 field.  The walk is smoothed, and navigated by the filter, with the currents; then without them; and
-one of steady currents on the log's clock stands beside.
+one of steady currents on the log's clock is given for comparison.
 
 The rule, stated before the run: with the currents errors are within 1.3 of those of steady ones,
 and the verdict is trustworthy.

@@ -1,13 +1,14 @@
-"""Orientation without beacons, beside VQF: gyroscope, gravity and the Earth's field.
+"""Orientation without beacons, compared with VQF: gyroscope, gravity and the Earth's field.
 
 VQF (D. Laidig, T. Seel, Information Fusion 91, 2023) is what orientation filters are measured by.
 Both have the same samples: simulated ones of every kind of `earth_worlds`, of sensors as good as
 their site declares and ten times better, and real ones (BROAD, where they are at hand).  VQF knows
 no Earth field but its direction, and no calibration; what the site declares is its offset here,
-zero.  Errors are root mean squares against the truth, in its own frame; that of the heading stands
-beside its scatter about its own mean, since a constant part is a matter of the declared calibration
-and of how the frame of the truth was found (BROAD: by the uncalibrated field).  The last column is
-the squared error of the heading by its claimed variance, one where the claim is exact.
+zero.  Errors are root mean squares against the truth, in its own frame; that of the heading is
+listed with its scatter about its own mean, since a constant part is a matter of the declared
+calibration and of how the frame of the truth was found (BROAD: by the uncalibrated field).  The
+last column is the squared error of the heading by its claimed variance, one where the claim is
+exact.
 
 The filter's constants were chosen by the simulated logs alone.
 """

@@ -1,10 +1,10 @@
 """How good an attitude gyro, accelerometer and the Earth field give alone.
 
-Where no beacon is detected the Earth field still tells the heading, and gravity the tilt.  Two logs
-are navigated without any of their beacons' tones: a simulated one of turning by hand, and, where it
-is at hand, a real one (BROAD, slow rotation about all axes, hand-held; its magnetometer is
+Where no beacon is detected the Earth field still determines the heading, and gravity the tilt.  Two
+logs are navigated without any of their beacons' tones: a simulated one of turning by hand, and,
+where it is at hand, a real one (BROAD, slow rotation about all axes, hand-held; its magnetometer is
 simulated along the optical reference, in a field that nothing disturbs).  Each by the smoother and
-by the filter, with the magnetometer as it was declared, estimated beside the motion, and calibrated
+by the filter, with the magnetometer as it was declared, estimated with the motion, and calibrated
 before from the same turning.
 
 Errors are against the truth, in its own frame: heading about the vertical, tilt across it.  Filters
@@ -13,7 +13,7 @@ magnetometers, in places with disturbances that are part of the test, and so no 
 
 The answer: with a calibrated magnetometer 0.3 degrees by the smoother and 0.7 by the filter; as
 good where the smoother finds the calibration itself; 1 to 2.5 degrees where a wrong one is
-believed.  The estimated standard deviation (est. sd) is that of the field's declination in a
+trusted.  The estimated standard deviation (est. sd) is that of the field's declination in a
 building, 3 degrees, which no turning determines; in these logs the declared field is the true one.
 """
 
@@ -196,7 +196,7 @@ def report(rows: tuple[Row, ...]) -> str:
         for r in rows
     ]
     if not any(r.log == "real" for r in rows):
-        lines.append("the log with real inertial data is not beside the repository: left out")
+        lines.append("the log with real inertial data is not next to the repository: omitted")
     low, high = PUBLISHED_DEG
     lines.append(f"published filters on all of BROAD, real magnetometers: {low:g} to {high:g}")
     return "\n".join(lines)

@@ -1,7 +1,7 @@
 """Simulated logs of a hand-held sensor in the Earth's field alone, and what disturbs it indoors.
 
 Motions are turning, shaking to and fro (a hand that carries, with little turning), and both; slow
-and fast; at a stretch or with pauses.  The building's iron is dipoles far off, a magnet beside the
+and fast; at a stretch or with pauses.  The building's iron is dipoles far off, a magnet near the
 path is one near, and one on the sensor is a constant of its axes, from the beginning or from some
 time on.  The sensors err by what their site declares, or by a share of it, as those do whose maker
 is careful: rates are means over the step that ends at a stamp, the magnetometer lags, its samples
@@ -83,7 +83,7 @@ KINDS = {
     "fast carrying": Kind(wobble=0.08, shaking=8.0, hertz=0.9),
     "fast carrying, pauses": Kind(wobble=0.08, shaking=8.0, hertz=0.9, pauses=True),
     "both, pauses": Kind(turning=2.0, shaking=3.0, hertz=0.8, pauses=True),
-    "magnet beside": Kind(turning=0.8, shaking=1.0, hertz=0.3, magnet="near"),
+    "magnet near path": Kind(turning=0.8, shaking=1.0, hertz=0.3, magnet="near"),
     "magnet attached": Kind(turning=1.5, shaking=1.5, hertz=0.6, magnet="attached"),
     "magnet from the start": Kind(turning=1.5, shaking=1.5, hertz=0.6, magnet="from the start"),
     "violent carrying": Kind(
@@ -240,7 +240,7 @@ def _building(
 
 
 def _magnet_near(rng: np.random.Generator, place: Array) -> Array:
-    """Return the field of a magnet beside the path: tens of microteslas where it is closest."""
+    """Return the field of a magnet near the path: tens of microteslas where it is closest."""
     away = place[int(np.argmax(np.linalg.norm(place, axis=1)))]
     centre = away + rng.uniform(0.1, 0.2) * _some_way(rng)
     if np.linalg.norm(centre) < np.linalg.norm(away):  # it begins far from it

@@ -5,19 +5,19 @@ the whole log; the fixed-lag smoother and the error-state filter take it as it c
 they find themselves.  Where the survey is exact, the filter's position errs by a quarter more
 than the batch's, and what leaves the window by hardly more.
 
-Where the survey is wrong by centimetres the comparison asks for more than there is: the trajectory
-of a calibrated log stands in a frame that the log itself defines, and that frame moves by a
-centimetre while the calibration is still being learnt.  The row ``batch up to now`` shows it:
-it smooths the log anew up to each of some instants and keeps the last state alone: all that was
-known by then, in one solution.  An online estimator can be expected to come near it, not to beat it
-by much; one log is one draw, and on one of ours they err by less.  The rows ``..., then`` are the
+Where the survey is wrong by centimetres the comparison requires more than is observable: the
+trajectory of a calibrated log is in a frame that the log itself defines, and that frame moves by a
+centimetre while the calibration is still being learnt.  The row ``batch up to now`` shows it: it
+smooths the log again up to each of some instants and keeps the last state alone: all that was known
+by then, in one solution.  An online estimator can be expected to come near it, not to beat it by
+much; one log is one draw, and on one of ours they err by less.  The rows ``..., then`` are the
 online estimators' states of the same instants.
 
 Who calibrates once and navigates from then on has left that behind: ``..., calibrated`` are the
 estimators on the second half of the log, with the site that the smoother made of the first.
 
 Also in the table: the fixes alone, the batch smoother fed with fixes (loose), and every estimator
-with the surveyed calibration held.
+with the surveyed calibration fixed.
 """
 
 from collections.abc import Iterator
@@ -175,12 +175,12 @@ def compare(log: Log, site: Site, config: Config) -> Iterator[Row]:
         result = smooth(log, site, SmootherSettings(coupling=coupling))
         yield row(log, f"batch, {coupling}", result.states)
     fixed = smooth(log, site, SmootherSettings(estimate=HELD_CASES))
-    yield row(log, "batch, survey held", fixed.states)
+    yield row(log, "batch, survey fixed", fixed.states)
     instants = np.linspace(log.imu.time[0] + FIRST, log.imu.time[-1] - 1.0, config.instants)
     best = batch_up_to_now(log, site, instants)
     yield row(log, "batch up to now", best)
     for estimator, label in ONLINE.items():
-        for estimate, name in ((None, ""), (HELD_CASES, ", survey held")):
+        for estimate, name in ((None, ""), (HELD_CASES, ", survey fixed")):
             settings = NavigatorSettings(estimator=estimator, lag=config.lag, estimate=estimate)
             now, remaining = online(log, site, settings)
             yield row(log, label + name, now)

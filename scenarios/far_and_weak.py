@@ -1,14 +1,14 @@
-"""Beacons far below the noise, after an hour at rest: what integration and a witness are worth.
+"""Beacons far below the noise, after an hour at rest: integration and a reference magnetometer.
 
 A receiver rests 300 m from four beacons, through rock, and samples at 100 Hz.  Their fields are 14
 to 30 dB below the noise of a single sample.  ``--at-rest`` makes one epoch of the rest.
 
 1. An hour: errors of phasors against the bound of Cramer and Rao, the NEES of phasors and of the
    pose, with beacons on the log's clock and with clocks of their own.
-2. Noise alone: how often it is taken for a beacon, where one in a hundred was asked for.
+2. Noise alone: how often it is taken for a beacon, where one in a hundred is the required rate.
 3. Storms that fall with the root of the frequency, 40 dB above the instrument at 1 Hz, with a
-   second magnetometer whose clock is late and runs otherwise; one that hears other storms, and one
-   beside a beacon.
+   second magnetometer whose clock is late and runs otherwise; one that receives other storms, and
+   one next to a beacon.
 """
 
 from dataclasses import dataclass, replace
@@ -129,7 +129,7 @@ def monitored_log(
     late: float = 0.0,
     rate: float = 0.0,
 ) -> SimulatedLog:
-    """Return a log at rest with storms that a second magnetometer hears, too.
+    """Return a log at rest with storms that a second magnetometer receives, too.
 
     Parameters
     ----------
@@ -304,7 +304,7 @@ def run_storm(name: str, place_world: Array, config: Config, *, other: bool = Fa
 def report(hours: list[Hour], silences: list[Silence], storms: list[Storm]) -> str:
     """Return the three tables."""
     lines = [
-        "an hour                  tone/noise  heard  error/bound  NEES (6)  position  NEES (6)"
+        "an hour                  tone/noise  found  error/bound  NEES (6)  position  NEES (6)"
     ]
     for one in hours:
         detected = (
@@ -314,7 +314,7 @@ def report(hours: list[Hour], silences: list[Silence], storms: list[Storm]) -> s
         lines.append(f"{one.name:24}{detected}{pose}")
     for alone in silences:
         share = f"{alone.alarms} of {alone.tried}"
-        lines.append(f"noise alone, {alone.name}: {share} heard, {alone.requested:g} asked")
+        lines.append(f"noise alone, {alone.name}: {share} detected, {alone.requested:g} required")
     lines.append("second magnetometer      gain of sigma  at best  gain of error  NEES (6)")
     for storm in storms:
         gain = f"{storm.gain:13.2f}{storm.best_gain:9.2f}{storm.error_gain:15.2f}"
@@ -337,7 +337,7 @@ def main() -> None:
     others = far_site().beacons[0].position_world + np.array([60.0, 0.0, 0.0])
     storms = [
         run_storm("5 km away", FAR_AWAY, config),
-        run_storm("hears other storms", FAR_AWAY, config, other=True),
+        run_storm("receives other storms", FAR_AWAY, config, other=True),
         run_storm("60 m from beacon A", others, config),
     ]
     result = {"hours": hours, "silences": silences, "storms": storms}

@@ -1,16 +1,16 @@
 """A magnetometer of three axes, of two and of one on the same walks: what each axis is worth.
 
-Walks among the demo's beacons, calibration drawn from what the site declares, raw samples beside an
+Walks among the demo's beacons, calibration drawn from the declared sigmas, raw samples with an
 IMU.  Of the same samples all three axes are used, two, and one, by the batch smoother and by the
-filter.  Those of one axis are located epoch by epoch, too, as a coil whose roll nothing tells.
+filter.  Those of one axis are located epoch by epoch, too, as a coil whose roll is unobservable.
 
 The rule, stated before the run, of every set of axes:
 
 1. errors are consistent: the mean NEES over all seeds is at most 9 where 6 are expected (of a coil
    alone, place and direction, 7.5 of 5), and nine in ten epochs are within three sigma;
-2. no verdict fails, and none says that an axis is dead;
+2. no verdict fails, and none reports a dead axis;
 3. of one axis the roll is determined by the IMU (all sigmas of the smoothed attitude below 5 deg
-   in the median), and told to be open without it.
+   in the median), and reported as undetermined without it.
 """
 
 from dataclasses import dataclass, replace
@@ -154,7 +154,7 @@ def faults_of(rows: list[Row]) -> list[str]:
             if row.verdict == str(Verdict.FAILED) or false:
                 faults.append(f"{where}, seed {row.seed}: {row.verdict}, {', '.join(row.codes)}")
             if estimator == "fix" and "roll_open" not in row.codes:
-                faults.append(f"{where}, seed {row.seed}: the roll is not told to be open")
+                faults.append(f"{where}, seed {row.seed}: the roll is not reported as undetermined")
             if estimator == "smooth" and row.sigma_deg > ROLL:
                 faults.append(f"{where}, seed {row.seed}: sigma {row.sigma_deg:.1f} deg")
     return faults

@@ -1,9 +1,9 @@
-"""Coils in time slots, heard by three axes, by two and by one: batch, window and filter.
+"""Coils in time slots, received by three axes, by two and by one: batch, window and filter.
 
-Walks with raw samples beside an IMU: about one source of three coils, on a side that the site
-tells, and in a room with three such sources.  Calibrations are drawn from what the site declares.
-Of the same samples all three axes are used, two, and, in the room, one, by `smooth`, by the default
-fixed-lag smoother and by the filter.
+Walks with raw samples with an IMU: about one source of three coils, on a side that the site
+specifies, and in a room with three such sources.  Calibrations are drawn from what the site
+declares. Of the same samples all three axes are used, two, and, in the room, one, by `smooth`, by
+the default fixed-lag smoother and by the filter.
 
 The rule, stated before the run: of every world, axes and estimator the mean NEES over all seeds is
 at most 9 where 6 are expected, nine in ten epochs are within three sigma, and no verdict fails.

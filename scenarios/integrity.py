@@ -1,6 +1,6 @@
 """Is the protection level kept?  Single epochs with one false beacon, a million of them.
 
-In every epoch four beacons are heard at a pose of its own, in a room that is surveyed as well as
+In every epoch four beacons are received at a pose of its own, in a room that is surveyed as well as
 it declares.  In half of the epochs one beacon's field is false by up to 20 % of either sign.
 
 1. How often is position or attitude beyond its level without an alarm?  The upper 95 % limit, times
@@ -10,7 +10,7 @@ it declares.  In half of the epochs one beacon's field is false by up to 20 % of
    in 99 % of the epochs.
 
 An epoch is solved in closed form from the Jacobian at its true pose, which a test compares with the
-full fix; ``--full`` makes the full fix, with what is left out of it, of fewer epochs.
+full fix; ``--full`` makes the full fix, with its exclusions, for fewer epochs.
 The workers of a ``--cluster`` need this directory on their PYTHONPATH.
 """
 
@@ -98,7 +98,7 @@ class CaseOutcome:
 
 
 class Figures(NamedTuple):
-    """What is asked."""
+    """Size of the run."""
 
     epochs: int
     faulted: int
@@ -222,7 +222,7 @@ def run(config: Config, scale: Scale | None = None) -> CaseOutcome:
 
 
 def figures(outcomes: CaseOutcome, config: Config, risk: Risk | None = None) -> Figures:
-    """Return what is asked of all epochs."""
+    """Return the figures of all epochs."""
     risk = Risk() if risk is None else risk
     faulted, clean = outcomes.faulted, ~outcomes.faulted
     unseen = int(np.sum(outcomes.beyond & ~outcomes.alarm & faulted))

@@ -91,7 +91,7 @@ class OnlineOutcome:
 
 
 class Figures(NamedTuple):
-    """What is asked."""
+    """Size of the run."""
 
     runs: int
     unseen_runs: int
@@ -222,7 +222,7 @@ def run(config: Config, scale: Scale | None = None) -> list[OnlineOutcome]:
 
 
 def figures(result: Sequence[OnlineOutcome], risk: Risk | None = None) -> Figures:
-    """Return what is asked of all runs."""
+    """Return the figures of all runs."""
     risk = Risk() if risk is None else risk
     missed = sum(one.unseen > 0 for one in result)
     clean, onsets = sum(one.clean for one in result), sum(one.onsets for one in result)

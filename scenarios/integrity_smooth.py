@@ -72,7 +72,7 @@ class SmoothOutcome:
 
 
 class Figures(NamedTuple):
-    """What is asked."""
+    """Size of the run."""
 
     runs: int
     ratio_trusted: float
@@ -121,7 +121,7 @@ def run(config: Config, scale: Scale | None = None) -> list[SmoothOutcome]:
 
 
 def figures(result: Sequence[SmoothOutcome]) -> Figures:
-    """Return what is asked of all walks."""
+    """Return the figures of all walks."""
     trusted = [one for one in result if one.verdict == Verdict.TRUSTWORTHY]
     ratios = [one.ratio for one in trusted]
     return Figures(

@@ -1,7 +1,7 @@
 """What each way of calibrating a magnetometer leaves, on turntable and by hand, and what it needs.
 
 Paper 001 calibrates on a turntable in twelve positions by closed formulas.  The scenario draws 200
-sensors (scale 8 %, misalignment 0.02, offset 60 mG) and asks for the error of the direction of the
+sensors (scale 8 %, misalignment 0.02, offset 60 mG) and measures the error of the direction of the
 field that the calibrated sensor gives, all round the sphere:
 
 1. How much do noise, a tilted table, a wrong reference field and a wrong heading cost?  Reference
@@ -9,7 +9,7 @@ field that the calibrated sensor gives, all round the sphere:
 2. Least squares over the same readings takes a tenth off.  A graph that lets each position be off,
    and reads an accelerometer in each, takes half off at half a degree and more beyond.
 3. Without a turntable, by turning the sensor by hand: the ellipsoid alone leaves a degree, because
-   it does not see by which rotation it became a sphere; with the vertical beside each reading a
+   it does not see by which rotation it became a sphere; with the vertical at each reading a
    tenth of that; the graph, which weighs the two by the noise they share, half of it again.
 """
 

@@ -4,11 +4,11 @@ After a real recording: an RM3100 on a robot arm at 100 Hz, steps of 13 nT, in 9
 stamped by a host whose intervals are 2 to 17 ms, or by bursts of a bus that repeat stamps.  The
 arm turns it by 20 to 180 degrees about one, two or three axes.  The site declares the Earth's field
 there, or a location's where steel in a building left 30 uT of 48, or none; and of the sensor's
-offset what the sheet says (2 uT), room for iron (60 uT), or nothing.
+offset of the data sheet (2 uT), room for iron (60 uT), or nothing.
 
 The rule, stated before the runs: what the job calls determined is within 3 uT of the truth, and all
 that it writes without refusing within 3.5 of its sigmas.  `wrong` counts what breaks it.  How many
-are refused is told, not judged: twenty degrees about one axis cannot tell 90 uT.
+are refused is reported, not judged: twenty degrees about one axis do not determine 90 uT.
 
 The simulation shares nothing with the calibration: angles of joints in, samples out.
 """
@@ -108,7 +108,7 @@ def joint_angles(case: Case, time: Array, rng: np.random.Generator) -> Array:
 
 
 def stamps(selected: Array, host: Host, rng: np.random.Generator) -> Array:
-    """Return when a host says that samples arrived (s); equal ones where a bus hands over many."""
+    """Return when samples arrived by the host's clock (s), equal within a packet of the bus."""
     step = float(np.median(np.diff(selected)))
     if host == "bursts":
         poll = 0.02 + 0.02 * rng.random()
@@ -198,7 +198,7 @@ def _sampled(time: Array, values: Array, wanted: Array) -> Array:
 
 
 def _as_logged(arrived: Array, values: Array) -> tuple[Array, Array]:
-    """Return the samples as a log has them: of a stamp that stands twice the first."""
+    """Return the samples as a log has them: the first of repeated stamps."""
     fresh = np.diff(arrived, prepend=-np.inf) > 0.0
     return arrived[fresh], values[fresh]
 

@@ -1,14 +1,14 @@
-"""Hundreds of beacons in a building: those that are heard are used, and frequencies again.
+"""Hundreds of beacons in a building: only detected ones are used, and frequencies are reused.
 
-1. Of 200 beacons in a building of 100 by 60 m, on forty frequencies, a walk in one wing hears some.
-   Does it err as with those alone, and what does it cost beside them?  Both are smoothed, and both
-   are navigated as they come; what is heard is what is above the noise of a window anywhere on the
-   true path.
-2. Tones 0.5 Hz apart need windows of four seconds to be told apart, in which somebody walks past a
-   beacon; short ones tell them together.  Do 60 beacons so close err more than the same 60 with
+1. Of 200 beacons in a building of 100 by 60 m, on forty frequencies, a walk in one wing receives
+   some. Does it err as with those alone, and what does it cost compared with them?  Both are
+   smoothed, and both are navigated as they come; a beacon is detected if it is above the noise of a
+   window anywhere on the true path.
+2. Tones 0.5 Hz apart need windows of four seconds to be separated, in which a platform passes a
+   beacon; short ones fit them together.  Do 60 beacons so close err more than the same 60 with
    5 Hz between them (``--spacing``)?
 
-``--minutes`` says how long the walk is::
+``--minutes`` sets the length of the walk::
 
     python scenarios/many_beacons.py --minutes 20
     python scenarios/many_beacons.py --minutes 2 --spacing
@@ -195,12 +195,12 @@ def _errors(log: Log, at: Array, position_world: Array) -> Array:
 
 
 def compared_detection(minutes: float, seed: int) -> dict[str, Run]:
-    """Return what 200 beacons come to, and those alone that are heard."""
+    """Return the result with 200 beacons, and with only the detected ones."""
     whole = building(np.random.default_rng(seed), 20, 10, reused_hz)
     log = walked(whole, minutes, WING_WORLD, 600.0, seed + 1)
     alone = detected_alone(whole, log)
     return {
-        "heard alone": tried(alone, walked(alone, minutes, WING_WORLD, 600.0, seed + 1)),
+        "detected only": tried(alone, walked(alone, minutes, WING_WORLD, 600.0, seed + 1)),
         "all": tried(whole, log),
     }
 

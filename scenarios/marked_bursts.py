@@ -3,9 +3,9 @@
 The world of `tracker_samples`: turns of windings by elliptic integrals, a drive that drifts, steps
 of a 16-bit converter, mains, and a head that turns at 100 deg/s.  A host switches the coils: bursts
 of 1.6 to 2.4 ms, pauses of 0.2 to 1.3 ms, and now and then 10 to 60 ms in which it was busy.  The
-current takes 0.05 ms to rise and to fall, and 0.2 ms of it are marked as nothing.  Told are
+current takes 0.05 ms to rise and to fall, and 0.2 ms of it are marked as nothing.  Reported are
 
-1. how far `magfusion fix` and `smooth` are from the truth while the head turns, with a slot beside
+1. how far `magfusion fix` and `smooth` are from the truth while the head turns, with a slot next to
    each sample and with a table of marks, for a tone and for pulses of direct current;
 2. how far the states of the pipe are, by records with a slot for each sample and by marks;
 3. the same of slots that keep to a clock, 120 cycles a second: what the pauses cost.
@@ -66,7 +66,7 @@ class Bursts:
         return self.begin + SETTLING, self.end, self.slot
 
     def between(self, time: Array) -> IntArray:
-        """Return the slot of each sample, -2 where nothing is said."""
+        """Return the slot of each sample, -2 where none is declared."""
         start, end, slot = self.marked()
         row = np.searchsorted(start, time, side="right") - 1
         inside = (row >= 0) & (time < end[row])
@@ -117,7 +117,7 @@ class Recording:
         return text.replace(line, "    slots: marked")
 
     def write(self, path: Path, reported: Declared) -> None:
-        """Write it as a log, whose site is beside it."""
+        """Write it as a log, with its site next to it."""
         time, field = self.wave
         at = self.imu[0]
         turn, place = self.head.turn(at).as_matrix(), self.head.place(at)

@@ -1,8 +1,8 @@
 """What mines do to a weak tone: mains that wander, vehicles that pass, motors and switches.
 
-A receiver at rest hears four tones among 50 Hz and its harmonics, 10 dB below the white noise of a
-sample.  Each kind of interference is thousands of times as strong as a tone.  Beside ``--at-rest``
-stands the mean of the windows of the ordinary lock-in, by their weights.
+A receiver at rest receives four tones among 50 Hz and its harmonics, 10 dB below the white noise of
+a sample.  Each kind of interference is thousands of times as strong as a tone.  For comparison with
+``--at-rest`` the table has the mean of the windows of the ordinary lock-in, by their weights.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """A log, the site that is declared of it, and how a mistake changes either.
 
 Three logs: moving with an exact survey, moving with a rough one, and at rest.  A mistake takes a
-`Case` and returns another; those of the world simulate the same motion anew.
+`Case` and returns another; those of the world simulate the same motion again.
 """
 
 from collections.abc import Callable
@@ -73,10 +73,10 @@ class Mistake:
     name : str
     group : str
         Where it is made: in the site's file, in the data, in the world, by an instrument; or when:
-        midway.
+        during the log.
     change : callable
     codes : tuple of str
-        Of `magfusion.model.trust.CODES`: the right diagnoses; none where nothing is to be said.
+        Of `magfusion.model.trust.CODES`: the right diagnoses; none where none is expected.
     unseen : tuple of str
         Logs in which it leaves no trace, so that its parameter is to be listed as unverified.
     parameter : str
@@ -84,7 +84,7 @@ class Mistake:
     harmless : bool
         Whether a trustworthy verdict is right, as the error stays covered.
     unknowable : bool
-        Whether nothing in any log could tell it: what all poses share.
+        Whether no log could reveal it: what all poses share.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What people get wrong, and what is said about it: verdict, cause, error, claim.
+"""Common mistakes, and how they are reported: verdict, cause, error, claim.
 
 Each mistake of `mistake_list` is made on three logs of 40 s from the package's own simulator:
 moving with an exact survey, moving with a rough one, and at rest.  `smooth` and both online
@@ -74,7 +74,7 @@ class Row:
 
     @property
     def silent(self) -> bool:
-        """Whether a wrong result passes as a right one, and nothing is said."""
+        """Whether a wrong result passes as a right one, without a finding."""
         wrong = self.nees is not None and self.nees > SILENT_NEES
         reported = self.listed or self.known.unknowable
         return self.verdict == "trustworthy" and wrong and not reported
@@ -117,7 +117,7 @@ def run(config: Config, scale: Scale | None = None) -> list[Row]:
 
 
 def judge(task: Task, _rng: np.random.Generator) -> list[Row]:
-    """Make a mistake, and return what the estimators say."""
+    """Make a mistake, and return the estimators' results."""
     from magfusion.files.log import write_log
     from magfusion.files.site import save_site
 

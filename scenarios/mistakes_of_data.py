@@ -50,7 +50,7 @@ def _without_gravity(case: Case, time: Array, rate: Array, force: Array) -> tupl
 
 
 def _frozen(axis: int | slice, begin: float, end: float) -> Change:
-    """Return both triads held at the last value, from one time to another (s)."""
+    """Return both triads frozen at the last value, from one time to another (s)."""
 
     def changed(_: Case, time: Array, rate: Array, force: Array) -> tuple[Array, Array, Array]:
         fixed = (time >= begin) & (time < end)
@@ -95,7 +95,7 @@ def _saturated(measured: Array) -> Array:
 
 
 def _body_iron(measured: Array) -> Array:
-    """Return the readings beside undeclared iron on the body: matrix 5 %, offset 5 uT."""
+    """Return the readings near undeclared iron on the body: matrix 5 %, offset 5 uT."""
     iron = np.eye(3) + 0.05 * np.array([[0.6, 0.8, -0.3], [0.8, -1.0, 0.5], [-0.3, 0.5, 0.9]])
     return measured @ iron.T + np.array([3e-6, -4e-6, 1e-6])
 

@@ -1,6 +1,6 @@
 """What an instrument, its driver or its logger does to samples: order, steps, ranges, filters.
 
-And what is easily confused in a site beside these: rates of 1 %, a survey that is moved or turned.
+And what is easily confused in a site with these: rates of 1 %, a survey that is moved or turned.
 """
 
 from collections.abc import Callable
@@ -153,7 +153,7 @@ def _line(frequency_hz: float, amplitude: float) -> Change:
 
 
 def _beacon_at_mains(case: Case) -> Case:
-    """Return a beacon at 50 Hz beside mains of 49.98 Hz, both declared and true."""
+    """Return a beacon at 50 Hz next to mains of 49.98 Hz, both declared and true."""
     beacons = tuple(
         replace(b, frequency_hz=50.0) if b.name == "B" else b for b in case.site.beacons
     )
@@ -164,7 +164,7 @@ def _beacon_at_mains(case: Case) -> Case:
 
 
 def _names_swapped(case: Case) -> Case:
-    """Return a site in which two beacons stand under each other's names: nothing else."""
+    """Return a site in which two beacons are declared under each other's names: nothing else."""
     first, second, *rest = case.site.beacons
     named = (replace(second, name=first.name), replace(first, name=second.name))
     return declared(case, replace(case.site, beacons=(*named, *rest)))

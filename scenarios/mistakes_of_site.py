@@ -161,7 +161,7 @@ def _other_room(case: Case) -> Case:
 
 
 def _overconfident(case: Case) -> Case:
-    """Return beacons declared to 1 cm that stand 5 cm off."""
+    """Return beacons declared to 1 cm that are 5 cm off."""
     rng = case.rng
     beacons = []
     for beacon in case.site.beacons:

@@ -1,4 +1,4 @@
-"""Mistakes of the world: something is there, or happens, of which the site's file says nothing."""
+"""Mistakes of the world: something is there, or happens, that the site's file does not declare."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -65,7 +65,7 @@ def _magnet_transits(_: Case, time: Array, measured: Array) -> tuple[Array, Arra
 
 
 def _free_running(case: Case) -> Case:
-    """Return drives that run on crystals of their own, where the file says that they do not."""
+    """Return drives that run on crystals of their own, where the file declares that they do not."""
     beacons = tuple(replace(b, synchronised=False) for b in case.site.beacons)
     return again(case, replace(case.site, beacons=beacons))
 
@@ -76,7 +76,7 @@ def _far_away(case: Case) -> Case:
 
 
 def _at_a_coil(case: Case) -> Case:
-    """Return a platform that works beside one coil, of which nobody said that it has a size."""
+    """Return a platform that works next to one coil, whose size is not declared."""
     first, *rest = case.site.beacons
     coils = tuple(replace(coil, radius=0.15) for coil in first.coils)
     box = first.position_world + np.array([[0.15, 0.15, 0.15], [0.6, 0.6, 0.6]])
@@ -85,7 +85,7 @@ def _at_a_coil(case: Case) -> Case:
 
 
 def _all_silent(case: Case) -> Case:
-    """Return beacons that nobody switched on."""
+    """Return beacons that are not switched on."""
 
     def off(beacon: Beacon) -> Beacon:
         coils = (replace(coil, moment_beacon=1e-9 * coil.moment_beacon) for coil in beacon.coils)

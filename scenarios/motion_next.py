@@ -1,13 +1,13 @@
-"""What `design --motion` promises of where to hold the sensor next, and what is found there.
+"""Next stops proposed by `design --motion`: predicted and achieved sigmas.
 
-A site is known to centimetres and degrees.  `design --motion` proposes stops, and says what sigma
-they leave of each parameter; for a poor motion, stops close together without a turn, the same
-information says what it leaves.  Both motions are then simulated, each several times with a survey
-that errs as declared and fields that are bent as declared, and the logs go through what `calibrate
-log` does.  Compared are, of the parameters that stops can determine,
+A site is known to centimetres and degrees.  `design --motion` proposes stops, and predicts what
+sigma they leave of each parameter; for a poor motion, stops close together without a turn, the same
+information predicts what remains.  Both motions are then simulated, each several times with a
+survey that errs as declared and fields that are bent as declared, and the logs go through what
+`calibrate log` does.  Compared are, of the parameters that stops can determine,
 
-- the predicted sigma over the one that is found: above one by what the ways between the stops tell,
-  which the prediction leaves out; below one it promises too much;
+- the predicted sigma over the one that is found: above one by the information of the paths between
+  stops, which the prediction leaves out; below one it predicts too much;
 - the error in units of the predicted and of the found sigma: no more than one is right.
 
 The rule, set before the first run: seeds 0 to 4; of each motion, the rms error is at most 1.2
@@ -197,7 +197,7 @@ def recorded(site: Site, motion: SimulatedMotion, config: Config, seed: int) -> 
 
 
 def calibrated(log: Log, site: Site, true: Site) -> tuple[Array, Array, Verdict]:
-    """Return error and found sigma of the survey's parameters, as `calibrate log` tells them."""
+    """Return error and found sigma of the survey's parameters, as reported by `calibrate log`."""
     result = smooth(log, site, SmootherSettings())
     honest, trust = judge_result(result, log)
     result, moved = against_site(honest, grown(result, honest))

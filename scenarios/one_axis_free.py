@@ -1,12 +1,12 @@
 """A coil of one axis, moved by hand over sixteen coils in a floor, and no IMU.
 
-Nothing tells the roll about the coil, which stands 6 cm beside the body's origin.  `smooth` and the
+The roll about the coil, 6 cm from the body's origin, is unobservable.  `smooth` and the
 filter follow the coil by a motion prior, and of every state they open the roll, and with it the
 body's place on its circle about the coil.
 
 The rule, stated before the run: the mean NEES of place and direction over all seeds is at most 7.5
-where 5 are expected, nine in ten epochs are within three sigma, no verdict fails, the roll is said
-to be open, and no state calls it known to better than 1.5 rad.
+where 5 are expected, nine in ten epochs are within three sigma, no verdict fails, the roll is
+reported to be open, and no state calls it known to better than 1.5 rad.
 """
 
 from dataclasses import replace
@@ -59,7 +59,7 @@ def moved(site: Site, seed: int, duration: float) -> Log:
 
 
 def reported(log: Log, site: Site, estimator: str) -> tuple[Trajectory, Trust]:
-    """Return what an estimator tells of a log."""
+    """Return an estimator's result on a log."""
     if estimator == "ekf":
         return filtered(log, site)
     states, trust = smoothed(log, site)

@@ -2,14 +2,15 @@
 
 The fields come from code that shares nothing with the estimators: every turn of every winding by
 elliptic integrals.  A converter that knows no phase gives amplitudes with noise, all larger by one
-factor that nobody measured.  `magfusion fix --free gain` reads them with and without a hemisphere.
-It passes where, for every seed,
+factor that was never measured.  `magfusion fix --free gain` reads them with and without a
+hemisphere. It passes where, for every seed,
 
 1. each place is within 1 % of its range (from the middle of the coils) of the truth, and each axis
-   within 0.01 rad, up to the sign that amplitudes do not tell: of the hypotheses the nearer one
-   without a hemisphere, the first with it;
+   within 0.01 rad, up to the sign that amplitudes do not determine: of the hypotheses the nearer
+   one without a hemisphere, the first with it;
 2. without a hemisphere each epoch has both mirrors, with it nine in ten have one place alone;
-3. the mean NEES of places is within 1.5 and 6 (3 expected), and the roll is said to be open.
+3. the mean NEES of places is within 1.5 and 6 (3 expected), and the roll is reported as
+   undetermined.
 """
 
 import json
@@ -56,7 +57,7 @@ class ReceiverResult:
     alone : float
         Share of the epochs that have one place with it.
     roll_open : bool
-        Whether the roll is said to be open.
+        Whether the roll is reported as undetermined.
     passed : bool
     """
 
@@ -73,7 +74,7 @@ class ReceiverResult:
 
 
 def coil_places() -> Array:
-    """Return where the coils stand, shape (16, 3) (m)."""
+    """Return the positions of the coils, shape (16, 3) (m)."""
     line = PITCH * (np.arange(ACROSS) - 0.5 * (ACROSS - 1))
     return np.array([[x, y, 0.0] for x in line for y in line])
 

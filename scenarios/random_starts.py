@@ -1,4 +1,4 @@
-"""Is the first trajectory found wherever there is one?  Random logs, and what is said of each.
+"""Success of the initialization on random logs, with the verdict on each.
 
 Of every log a site of one to eight beacons, synchronised or not, and the speed of a walk are drawn.
 At least 99 % should have a start that is right at 95 % of the epochs.  Where none is, the log is

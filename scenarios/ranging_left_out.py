@@ -1,4 +1,4 @@
-"""What rails and layers do to the field of a magnet that goes by, which ranging leaves out.
+"""What rails and layers do to the field of a passing magnet, which ranging neglects.
 
 Calculated over draws of ``rotating_magnet_ranging.py`` of other seeds, without any estimate: its
 root mean square over all places of the magnet, and the length over which its correlation falls to
@@ -47,9 +47,9 @@ def left_out(case: Case) -> LeftOut:
 
 
 def main() -> None:
-    """Print what is left out of both cases."""
+    """Print what is neglected in both cases."""
     for one in (left_out(CROSSING), left_out(PAIR)):
-        print(f"{one.case}: {100.0 * one.share:.3f} %, alike over {one.length_m:.1f} m")
+        print(f"{one.case}: {100.0 * one.share:.3f} %, correlated over {one.length_m:.1f} m")
 
 
 if __name__ == "__main__":

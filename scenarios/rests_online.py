@@ -3,11 +3,12 @@
 A receiver rests 300 m from four beacons, as in `far_and_weak`, and what comes is given to the
 estimator second by second.
 
-1. How the pose sharpens while the platform stands: error, NEES, and how many times the sigma of a
-   phasor is that of the whole rest integrated at once (`--at-rest` of a log).  How much is kept.
+1. How the pose sharpens while the platform is at rest: error, NEES, and how many times the sigma of
+   a phasor is that of the whole rest integrated at once (`--at-rest` of a log).  How much is kept.
 2. Storms, and a reference in the stream whose clock is late and runs otherwise: what it takes off,
-   beside what it takes off the whole rest at once; one that ends halfway.
-3. What mines do: mains that wander, steel, motors and switches, beside the whole rest at once.
+   compared with the estimate of the whole rest at once; one that ends halfway.
+3. What mines do: mains that wander, steel, motors and switches, compared with the whole rest at
+   once.
 """
 
 from dataclasses import dataclass, replace
@@ -191,7 +192,7 @@ def report(
     sharpened: list[Sharpened], whole: float, monitored: list[MonitoredRest], mines: list[Mine]
 ) -> str:
     """Return the tables."""
-    lines = ["at rest  heard  position  its sigma  NEES (6)  of phasors  sigma by all at once"]
+    lines = ["at rest  found  position  its sigma  NEES (6)  of phasors  sigma by all at once"]
     for one in sharpened:
         detected = f"{one.after_s:5.0f} s{100.0 * one.detected:6.0f} %{one.position_m:8.2f} m"
         certain = f"{one.sigma_m:9.2f} m{one.pose_nees:10.2f}{one.phasor_nees:12.2f}"

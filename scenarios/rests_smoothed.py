@@ -1,7 +1,7 @@
 """Three rests of five minutes far from the beacons: one by one, as they last, and all in one.
 
 A receiver rests 300 m from four beacons, as in `far_and_weak`, whose survey errs as declared.  It
-stands in three places, and is carried from one to the next within ten seconds.  Compared are
+rests in three places, and is carried from one to the next within ten seconds.  Compared are
 
 - ``fix --at-rest``: each rest an epoch of its own, when the log is over;
 - ``navigate --at-rest``: each rest as it lasts; its last state counts;
@@ -10,7 +10,7 @@ stands in three places, and is carried from one to the next within ten seconds. 
 
 Of each: the error of the position, and the mean NEES of the pose (six are due).  The rule, set
 before the first run: seeds 0 to 9; a mean NEES between 4 and 8 is right, and `smooth` errs by no
-more than `fix`.  A log of which a method has no result is counted and said.
+more than `fix`.  A log of which a method has no result is counted and reported.
 """
 
 from collections.abc import Callable
@@ -102,7 +102,7 @@ def fixed(log: Log, site: Site) -> Poses:
 
 
 def navigated(log: Log, site: Site) -> Poses:
-    """Return the last pose that is told of each rest as it lasts."""
+    """Return the last pose that is reported of each rest as it lasts."""
     last, newest = [], None
     for state in replayed(log, RestNavigator(site)):
         if not state.standing and newest is not None:
@@ -112,7 +112,7 @@ def navigated(log: Log, site: Site) -> Poses:
             newest = state
     last += [] if newest is None else [newest]
     if not last:
-        raise EstimationError("no rest is told of")
+        raise EstimationError("no rest is reported")
     fixes = [state.fixes.fixes.best() for state in last if state.fixes is not None]
     trust = Trust()
     for state in last:
@@ -128,7 +128,7 @@ def navigated(log: Log, site: Site) -> Poses:
 
 
 def smoothed(log: Log, site: Site) -> Poses:
-    """Return the poses of rests in one solution, with the covariance that the job tells."""
+    """Return the poses of rests in one solution, with the covariance that the job reports."""
     rested = integrate_rests(log, site, least=2)
     own = rested.log(log)
     honest, trust = judge_result(smooth(own, site, SmootherSettings()), own)
@@ -204,7 +204,7 @@ def run(config: Config) -> list[RestsResult]:
 def report(result: list[RestsResult]) -> str:
     """Return the table."""
     lines = [
-        f"{'':20}rests told  logs failed, doubted   position  attitude  NEES (6)   of the logs"
+        f"{'':20}rests kept  logs failed, doubted   position  attitude  NEES (6)   of the logs"
     ]
     for one in result:
         spread = f"{min(one.nees_each):.1f} to {max(one.nees_each):.1f}" if one.nees_each else "-"

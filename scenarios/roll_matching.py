@@ -2,7 +2,7 @@
 
 The paper records the field of an MTi over a turn about one axis as a database, and finds the roll
 of another magnetometer by the nearest entry (Eq 17 and 19).  It prints neither noise nor step.  The
-scenario calibrates that magnetometer in twelve positions (section 1.1), turns it and asks:
+scenario calibrates that magnetometer in twelve positions (section 1.1), rotates it and answers:
 
 1. What noise and step give the printed 3 degrees?  A database every degree and some 3 mG.
 2. What does the paper's proposal to interpolate in a coarser database cost?  Nothing: up to a step

@@ -1,16 +1,16 @@
 """Two wells, a magnet that turns in one and a sensor at rest in the other: how far, and where.
 
 Rotating magnet ranging as it is practised (A. F. Kuckes, US patent 5 589 775): a magnet across a
-shaft near the bit goes by a sensor in a cased well, twice, the sensor elsewhere the second time.
-Published systems are told to be good for about 3 % of the distance at 25 m.
+shaft near the bit passes a sensor in a cased well, twice, the sensor elsewhere the second time.
+Published systems reach about 3 % of the distance at 25 m.
 
 Two cases.  ``crossing``: about 25 m apart, any direction, wells that converge by some degrees.
 ``pair``: a steam-assisted pair, 5 m apart over 80 m.  The field of the magnet is that of a stack
 that is turned sample by sample, with tilt, whirl and slip, at a speed that drifts; in layers of
 ground (empymod); through the steel of a casing that is not as declared, which is magnetised along
-as well; with a rail beside each place of the sensor; at depths that scatter and stretch.
+as well; with a rail next to each place of the sensor; at depths that scatter and stretch.
 
-What is declared is what is drawn, otherwise no NEES says anything: the moment, the scale of the
+What is declared is what is drawn, otherwise no NEES is meaningful: the moment, the scale of the
 depths, the shaft's slip and the casing's wall, permeability and conductivity are drawn with their
 declared sigmas.  That of a window's depth follows from that of a reading.  The thin wall's formula
 errs by about the wall over its radius, 0.1.  What rails and layers do is calculated without any

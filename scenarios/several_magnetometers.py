@@ -5,8 +5,8 @@ metre.  The magnetometers' matrices, mountings, places and the second one's cloc
 what the site declares of them.  Smoothed and filtered with both, and with each as if the other were
 not there, with noise and model error as found in the log, or as declared; fixed with the clock
 known, at instants that they share.  Then the second is mounted eight degrees otherwise than the
-site says: who is named?  At last the raw samples of both (`several_piped`), smoothed, navigated,
-and through the pipe.
+site declares: which is named?  Last, the raw samples of both (`several_piped`), smoothed,
+navigated, and through the pipe.
 """
 
 from dataclasses import dataclass, replace
@@ -192,7 +192,7 @@ def run_raw(walks: int, duration: float, seed: int) -> tuple[list[Row], float]:
 
 
 def named(duration: float, seed: int) -> list[str]:
-    """Return what is said where the second is not mounted as the site says."""
+    """Return the findings where the second is not mounted as declared."""
     site = declared()
     log, _, _ = walked(site, duration, seed)
     remaining, right = site.platform.magnetometers

@@ -1,10 +1,11 @@
 """How good the state of now is: each estimate carried by the inertial samples until the next.
 
-A state of an epoch tells of the middle of its window: of a quarter of a second ago and more.  Held
-until now it errs by what the platform has moved; carried by every inertial sample it errs by what
-these drift.  Along logs as they came, replayed in pieces of 50 ms: errors of the states that are a
-quarter of a second from their epoch, held and carried, the mean NEES of all that are carried, what
-one of them costs, and, with ``--pipe``, how old it is when ``magfusion navigate -`` has written it.
+A state of an epoch is that of the middle of its window: of a quarter of a second ago and more.
+Kept until now it errs by what the platform has moved; carried by every inertial sample it errs by
+what these drift.  Along logs as they came, replayed in pieces of 50 ms: errors of the states that
+are a quarter of a second from their epoch, kept and propagated, the mean NEES of all propagated
+ones, what one of them costs, and, with ``--pipe``, how old it is when ``magfusion navigate -`` has
+written it.
 """
 
 import json
@@ -90,7 +91,7 @@ def errors_at(states: list[PropagatedState], truth: Trajectory) -> dict[str, flo
 
 
 def held_errors(states: list[PropagatedState], truth: Trajectory) -> dict[str, float]:
-    """Return by how much the truth moved since the epoch (mm, deg), as a held state would err."""
+    """Return the motion of the truth since the epoch (mm, deg): the error of a constant state."""
     at = np.array([s.time for s in states])
     inside = (at > truth.time[0]) & (at < truth.time[-1])
     before = np.array([s.epoch for s in states])[inside]
@@ -209,7 +210,7 @@ def run(config: Config) -> dict[str, object]:
 
 def report(figures: dict[str, object]) -> str:
     """Return the table that a reader sees."""
-    lines = ["carried 0.25 s from the epoch (held); mean NEES of all; cost of a state"]
+    lines = ["propagated 0.25 s from the epoch (kept); mean NEES of all; cost of a state"]
     names = dict.fromkeys(key.rpartition(", ")[0] for key in figures if key.count(", ") == 2)
     for name in names:
         own = {key: figures[f"{name}, {key}"] for key in _SHOWN}

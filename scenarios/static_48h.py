@@ -1,19 +1,19 @@
 """Does the error grow with time?  Paper 004, figures 9 and 10: 48 hours at one place.
 
 The paper fixes a platform at rest once a minute for 48 hours and sees an error that is "basically
-stable": each fix stands alone, so that only what is measured can drift.  The scenario lets all of
+stable": each fix is separate, so that only what is measured can drift.  The scenario lets all of
 it drift: coils that warm up by 20 K (driven by a constant current, or by a constant voltage, whose
 current copper's resistance takes with it), gains that wander by 0.3 % over four hours, a
-magnetometer's scale that follows the day, noise that is louder by day, hum of the mains beside the
+magnetometer's scale that follows the day, noise that is stronger by day, hum of the mains near the
 tones, and the clock of the drives.  Eight worlds (F1: fields as disturbed as the paper's errors
-say), surveyed cold.  It asks, of the slope of the error after the first twelve hours:
+known), surveyed cold.  Tested, on the slope of the error after the first twelve hours:
 
 1. Does heat make it grow?  No: a voltage's loss of seven per cent of the moment moves all fixes in
    the first hours, and there they stay.  By how much is another matter: a third of a metre for the
    paper's algorithm 3, six centimetres for maximum likelihood with a map, and less than one where
-   each beacon's gain is found beside the pose.
+   each beacon's gain is estimated with the pose.
 2. A clock that is 0.01 ppm off?  It turns what maximum likelihood takes for the attitude by
-   6.4 degrees a day where it believes the drive phase (6.0 to 6.7 elsewhere in the room), and moves
+   6.4 degrees a day where it trusts the drive phase (6.0 to 6.7 elsewhere in the room), and moves
    the position by two centimetres a day; the paper's normals do not see it.
 3. And with the phase of each beacon free?  It is gone.
 
@@ -141,7 +141,7 @@ class Components:
     probability: float
 
     def drifts(self, tests: int) -> bool:
-        """Tell whether it is beyond chance among so many tests."""
+        """Return whether it is beyond chance among so many tests."""
         return self.probability < THREE_SIGMA / tests
 
 
@@ -187,7 +187,7 @@ def hum(config: Config, frequencies_hz: Array, rng: np.random.Generator) -> Comp
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What disturbs the epochs of one world, in all cases alike."""
+    """What disturbs the epochs of one world, equally in all cases."""
 
     relative_gain: Array  # (n, beacons, 1)
     added: ComplexArray  # (n, beacons, 3), T

@@ -3,7 +3,7 @@
 Which model locates best, and do the printed figures follow from the printed rows?  The paper
 carried one two-axis beacon to three places and measured its amplitude at seven points of a 0.6 m
 grid, 0.5 m above the beacons' plane, sensor level.  The scenario writes the table as a survey,
-reads it back, and asks four questions of it:
+reads it back, and answers four questions:
 
 1. Does the table support the averages that the paper prints?  Its attitudes do; the mean position
    error of its rows is 0.095 m, not the printed 0.108 m.
@@ -189,7 +189,7 @@ def _mean_distance(result: Array, true: Array) -> float:
 
 
 def report(result: Result) -> str:
-    """Return the table that a reader sees: our figure beside the paper's."""
+    """Return the table: our figure and the paper's."""
     angles = " ".join(f"{a:.3f}" for a in result.printed_rows_attitude_deg)
     printed_angles = " ".join(f"{a:.2f}" for a in PRINTED_ATTITUDE_ERROR_DEG)
     rows = (

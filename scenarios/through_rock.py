@@ -1,4 +1,4 @@
-"""Beacons heard through rock and water that conduct: what an estimated conductivity is worth.
+"""Beacons received through rock and water that conduct: the value of an estimated conductivity.
 
 Four beacons about a cave or a wreck, a platform that walks among them for 24 s, and ground whose
 conductivity is declared three times too high, with as much for its sigma, or not at all.  The
@@ -39,7 +39,7 @@ ESTIMATED = "threefold, estimated"
 
 @dataclass(frozen=True)
 class Place:
-    """Where it is heard, and to what it should be."""
+    """Where it is received, and the required accuracy."""
 
     name: str
     distance: float  # m, of each beacon from the middle
@@ -137,7 +137,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What the rule says of a place."""
+    """Result of the rule at a place."""
 
     place: str
     worst_m: float

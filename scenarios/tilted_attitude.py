@@ -5,7 +5,7 @@ the sensor's axes for the true direction, rotated (Eq 18).  But Eq 7 knows the b
 of a rotated normal is not the rotated f of the normal, unless the rotation is about that axis.  The
 printed attitudes are all zero, so that the paper could not see it.  The scenario tilts a sensor at
 the seven points of the paper's Table 1, gives both methods its true position and no noise at all,
-and asks:
+and answers:
 
 1. How wrong is Eq 18, solved as printed (Eq 21 and 23, mean of three angles) and by the nearest
    rotation (SVD, angle of the rotation between estimate and truth)?  Three degrees for the first

@@ -8,7 +8,7 @@ demodulates it in every way that `magfusion.receiver` knows:
    5.1 dB larger in the worst slot, and the attitude is wrong by 14 degrees instead of 8.
 2. Slots of 20 ms average the mains out, and are of no use to a head that turns.
 3. A straight line between the silent slots helps where the cycle is short; an ambient state with
-   the mains in it takes them off wherever the cycle lets it tell them from a drift.
+   the mains in it removes them wherever the cycle separates them from a drift.
 4. A carrier of 10 kHz puts 45 dB between hum and tracker, with a tapered window 115 dB, for slots
    of any length; so do three carriers at once, through the ordinary lock-in.
 5. Where there is no hum each way costs noise: least of all the state over many cycles.
@@ -393,9 +393,7 @@ def draw(path: Path, config: Config, rows: list[Row]) -> None:
         remaining.plot(1e3 * length, np.maximum(gain, -40.0), label=f"slot {k + 1}, minus slot 4")
     none = [decibel(abs(np.sinc(50.0 * tau))) for tau in length]
     remaining.plot(1e3 * length, np.maximum(none, -40.0), "k--", label="nothing subtracted")
-    remaining.set(
-        xlabel="slot (ms)", ylabel="what is left of 50 Hz, worst phase (dB)", ylim=(-40, 8)
-    )
+    remaining.set(xlabel="slot (ms)", ylabel="residual of 50 Hz, worst phase (dB)", ylim=(-40, 8))
     remaining.legend(fontsize="small")
     for removal in REMOVALS:
         own = [r for r in rows if r.removal == removal and r.mains_hz == config.mains_hz[-1]]

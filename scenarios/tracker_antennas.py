@@ -1,7 +1,7 @@
 """Trackers' antennas with errors, their bench and their surveys: what `tracker_table1` draws.
 
 Coils have their true size: the couplings are Neumann's double integral over the wires, the bench
-reads the field of the wire by Biot and Savart.  The estimators have dipoles, and one term beside.
+reads the field of the wire by Biot and Savart.  The estimators have dipoles, and one further term.
 """
 
 from dataclasses import dataclass, replace
@@ -187,7 +187,7 @@ def random_poses(
 
 
 def draw_survey(antenna: Antenna, config: Config, rng: np.random.Generator) -> AntennaSurvey:
-    """Return surveys of all antennas, whose stated poses err by what the configuration says."""
+    """Return surveys of all antennas, whose stated poses have the configured errors."""
     shape = (len(antenna.moments_beacon), config.poses)
     attitude, position = random_poses(shape, rng)
     sigma = noise_sigma(config.snr_db, np.linalg.norm(position, axis=-1))

@@ -35,11 +35,11 @@ class Config:
         Of the display's instant (s).
     source_ppm : float, optional
         By how much the clock of the source runs fast, which is then its own: when a cycle begins
-        the site does not say, a fourth slot is silent, and the stream must tell.
+        the site does not declare, a fourth slot is silent, and the stream determines it.
     plate : bool
-        Whether a plate of aluminium is brought beside the head, held there, and taken away.
+        Whether a plate of aluminium is brought near the head, kept there, and removed.
     hemisphere : bool
-        Whether the site says on which side of the source the head is.
+        Whether the site specifies on which side of the source the head is.
     inertial : bool
         Whether there is an IMU; else the site has a motion prior.
     rate_hz : float

@@ -3,12 +3,12 @@
 Raw samples at 20 kHz come from code that shares nothing with the estimators: every turn of every
 winding by elliptic integrals, a drive that drifts, steps of a 16-bit converter, mains, the Earth
 field, and a head that turns at 100 deg/s, rests and turns again.  `magfusion navigate -` reads
-them with an inertial stream as records of 10 ms, and the scenario tells
+them with an inertial stream as records of 10 ms, and the scenario reports
 
 1. how far its states are from the truth at rest and turning, and how many there are a second;
 2. how far those are that it predicts to the instant of a display, 20 ms ahead of the samples;
-3. what a second of data takes of a processor once it has begun, beside the start;
-4. with ``--plate``, how soon a plate of aluminium that is moved beside the head is said, and
+3. what a second of data takes of a processor once it has begun, and of the start;
+4. with ``--plate``, how soon a plate of aluminium that is moved near the head is reported, and
    whether the sigmas hold meanwhile.
 
 ``--cycles 480`` has the source drive its coils so often a second; from 625 on, of an own clock, the
@@ -54,7 +54,7 @@ class Figures:
 
 @dataclass(frozen=True)
 class SideFigures:
-    """What the states say of the side of the source, where nobody told it."""
+    """Side of the source in the states, where it is not declared."""
 
     first_s: float  # of the states
     ambiguous: float  # share of the states that say so
@@ -78,7 +78,7 @@ class PlateFigures:
 
 
 def run_near_plate(config: Config) -> PlateFigures:
-    """Simulate a head beside which a plate is moved, and navigate it through the pipe."""
+    """Simulate a head near which a plate is moved, and navigate it through the pipe."""
     given, head = records(config), Head(config)
     with tempfile.TemporaryDirectory() as directory:
         site = Path(directory) / "site.yaml"
@@ -104,7 +104,7 @@ def run_near_plate(config: Config) -> PlateFigures:
 
 
 def run_without_hemisphere(config: Config) -> SideFigures:
-    """Navigate a head through the pipe where no side of the source is told."""
+    """Navigate a head through the pipe where no side of the source is declared."""
     given, head = records(replace(config, hemisphere=False)), Head(config)
     with tempfile.TemporaryDirectory() as directory:
         site = Path(directory) / "site.yaml"
@@ -181,12 +181,12 @@ def report(result: Figures) -> str:
 
 
 def report_of_plate(result: PlateFigures) -> str:
-    """Return what a reader sees of the run beside a plate."""
+    """Return the printed text of the run near a plate."""
     return "\n".join(
         [
             f"a plate of aluminium makes up to {100 * result.largest_share:.1f} % of the fields",
-            f"said {result.detected_after_s:.2f} s after it made {100 * PLATE_NEAR:g} %;"
-            f" before it came, {result.false_detections} states said so",
+            f"reported {result.detected_after_s:.2f} s after it made {100 * PLATE_NEAR:g} %;"
+            f" before it came, {result.false_detections} states reported so",
             f"{'while it is there':<32}{result.error_mm:8.3f} mm {result.error_deg:7.3f} deg,"
             f" NEES {result.nees:.1f}, poses in {100 * result.poses:.0f} %",
             f"{'after it':<32}{result.after_mm:8.3f} mm, NEES {result.after_nees:.1f}",
@@ -197,8 +197,8 @@ def report_of_plate(result: PlateFigures) -> str:
 def main() -> None:
     """Print the table and one JSON line."""
     parser = scenario_parser(__doc__, Config.seed, quick="four seconds of turning")
-    parser.add_argument("--plate", action="store_true", help="beside a moving plate alone")
-    parser.add_argument("--no-hemisphere", action="store_true", help="no side is told, alone")
+    parser.add_argument("--plate", action="store_true", help="only near a moving plate")
+    parser.add_argument("--no-hemisphere", action="store_true", help="only without a declared side")
     parser.add_argument("--no-imu", action="store_true", help="without an IMU")
     parser.add_argument("--cycles", type=float, help="of the source, a second; 120 or 60 (1/s)")
     parser.add_argument("--rate", type=float, default=Config.rate_deg_s, help="of turning (deg/s)")

@@ -169,7 +169,7 @@ def head_motion(config: Config) -> SimulatedMotion:
 
 
 def head_site(config: Config) -> Site:
-    """Return the tracker with the noise that the SNR says, and an Earth field."""
+    """Return the tracker with the noise of the given SNR, and an Earth field."""
     duration = config.slot_ms * 1e-3
     sigma = 10.0 ** (-config.snr_db / 20.0) * UNIT
     density = sigma * np.sqrt(duration / HANN)

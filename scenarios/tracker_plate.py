@@ -1,4 +1,4 @@
-"""A plate of aluminium that is brought beside a head, held there, and taken away."""
+"""A plate of aluminium that is brought near a head, kept there, and removed."""
 
 from functools import partial
 

@@ -53,7 +53,7 @@ def waveform(
     Parameters
     ----------
     gates : ndarray, shape (n, 3), optional
-        Share of its current that each coil has at each sample, where no clock tells.
+        Share of its current that each coil has at each sample, where no clock determines it.
     """
     time = sample_times(config)
     knots = np.arange(0.0, config.duration + 2.0 / FIELD_KNOTS_HZ, 1.0 / FIELD_KNOTS_HZ)

@@ -1,9 +1,9 @@
 """What calibrating a tracker's antennas is worth: paper 000, Table 1, over two hundred antennas.
 
 The paper calibrates a rigid rotation and shift of each antenna and prints thirteen attitudes before
-and after: five times better.  The scenario asks which errors and which calibration that takes.
+and after: five times better.  The scenario finds which errors and which calibration that takes.
 
-The coils have 4 and 2 cm, as in a helmet; the paper prints no sizes, and `OTHERS` says what some
+The coils have 4 and 2 cm, as in a helmet; the paper prints no sizes, and `OTHERS` lists what some
 others give, and errors of one kind alone.  The errors in A and F2 were chosen by an independent
 analysis so that antennas which are not calibrated err as the table does.
 
@@ -17,7 +17,7 @@ analysis so that antennas which are not calibrated err as the table does.
 
 One antenna's ratio varies between two and eight: only pooled figures mean anything.  The verdict
 was settled before any run: a calibration can be the paper's where the ratio that Table 1 prints is
-among the middle nine tenths of the antennas' ratios, with antennas that err alike before.
+among the middle nine tenths of the antennas' ratios, with antennas of equal errors before.
 
 Errors are angles of the rotation between estimate and truth; the paper's row 4 (pitch 90 degrees)
 cannot come out of its own Eq 13, and its rows 8 to 10 repeat uncalibrated values.
@@ -108,7 +108,7 @@ def one_of(survey: AntennaSurvey, index: int) -> AntennaSurvey:
 
 
 def fit_graphs(survey: AntennaSurvey, config: Config) -> list[AntennaFit]:
-    """Return the fits of all antennas at poses as uncertain as the configuration says."""
+    """Return the fits of all antennas at poses of the configured uncertainty."""
     prior = usual_prior(config.errors, sized=config.is_sized)
     start, rotation = nominal(sized=config.is_sized), config.pose_deg * DEGREE
     return [

@@ -84,7 +84,7 @@ def exactness(rng: np.random.Generator, count: int = 200) -> list[float]:
 
 
 def misprint(ezy: float = 0.02) -> tuple[float, float]:
-    """Return what Eq 16 finds for ``ezy`` in readings by Eq 2 as printed, and as mended."""
+    """Return what Eq 16 finds for ``ezy`` in readings by Eq 2 as printed, and as corrected."""
     result = []
     for column in (1, 2):  # of the field: y as printed, z as meant
         misalignment = np.zeros((3, 3))

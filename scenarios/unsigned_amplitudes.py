@@ -1,4 +1,4 @@
-"""A coil that tells amplitudes without sign, over sixteen coils in a floor: what signs are worth.
+"""A coil that measures amplitudes without sign, over sixteen coils in a floor: the value of signs.
 
 Walks with an IMU over a floor of 4 x 4 coils, 1 m apart; of one axis the phasors are given as they
 are, or their amplitudes alone.  The same walk is smoothed, and followed by the filter, with both.

@@ -1,8 +1,8 @@
 """Two days of raw samples through the online filter: memory and pace, hour by hour.
 
 Walks among the demo's beacons and rests between them, both instruments at one rate, a field epoch a
-second; samples are made a minute at a time and forgotten, so that what grows is the navigator's.
-A checkpoint is written every hour, and the run goes on from it with ``--resume``.
+second; samples are simulated a minute at a time and discarded, so that what grows is the
+navigator's. A checkpoint is written every hour, and the run goes on from it with ``--resume``.
 """
 
 import argparse
@@ -35,7 +35,7 @@ GOAL_MIB = 4096.0
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """What a run keeps beside its navigator: the squared errors (m^2) of the hour, and of all."""
+    """What a run stores with its navigator: the squared errors (m^2) of the hour, and of all."""
 
     biases: Biases
     seconds: float = 0.0

@@ -139,7 +139,7 @@ class Epoch:
 
 
 def turned_by(rotvec: Array) -> Array:
-    """Return the right Jacobian of the rotation that a rotation vector stands for."""
+    """Return the right Jacobian of the rotation of a rotation vector."""
     angle = np.sqrt(rotvec @ rotvec)
     cross = skew(rotvec)
     if angle < 1e-6:
@@ -182,7 +182,7 @@ def models(scene: Scene) -> dict[str, Model]:
 
 
 def declare(text: str) -> None:
-    """Tell the progress, apart from the result."""
+    """Report progress, separately from the result."""
     print(text, file=sys.stderr, flush=True)
 
 

@@ -188,7 +188,7 @@ def run_ours(scene: Scene, repeats: int) -> Ours:
 
 
 def run_native(scene: Scene) -> dict[str, float]:
-    """Run GTSAM's optimizer to convergence, telling each iteration; return its figures."""
+    """Run GTSAM's optimizer to convergence, reporting each iteration; return its figures."""
     parts = (scene.declared, scene.start, scene.preintegrated, scene.measurements)
     (graph, values, ordering), build_seconds = timed(partial(native_graph, *parts))
     started = time.process_time()
@@ -213,7 +213,7 @@ def run_native(scene: Scene) -> dict[str, float]:
 
 
 def declare(text: str) -> None:
-    """Tell the progress, apart from the result."""
+    """Report progress, separately from the result."""
     print(text, file=sys.stderr, flush=True)
 
 

@@ -1,9 +1,9 @@
-"""Processor time and memory of long logs, at several lengths, beside reading everything at once.
+"""Processor time and memory of long logs, compared with reading everything at once.
 
 A walk among the demo's beacons is simulated with both instruments at 500 Hz and recorded as MCAP,
-as ROS 2 records it: half a gigabyte in half an hour.  Of its first minutes, as many as asked for,
-each command tells its processor time, that a sample of the IMU took beyond start-up (the time of
-the same command on the first ten seconds), and the largest memory that it held.  The last column
+as ROS 2 records it: half a gigabyte in half an hour.  Of its first minutes, as many as requested,
+each command reports its processor time, that a sample of the IMU took beyond start-up (the time of
+the same command on the first ten seconds), and the largest memory that it used.  The last column
 is by how many MiB it grew with each minute since the length before.
 
 - ``reading all`` makes an object of each message and lists of numbers, as an importer does that

@@ -3,13 +3,13 @@
 A platform walks among the demo's four beacons; 100 Hz inertial data and one field epoch a second
 are fed as they come.  For each estimator: time of an update (median, 99th percentile, worst; and
 of the last thousand updates against the first), inertial samples and field epochs in a second of
-processor time, and what the process's memory grew by.  Beside them, on the same data:
+processor time, and what the process's memory grew by.  For comparison, on the same data:
 
 - a bare Python loop over GTSAM's ``integrateMeasurement``, which an estimator cannot do without;
 - filterpy used plainly: an error-state prediction at every inertial sample, 15 states.
 
 The state of now is timed last: what carrying it to every inertial sample costs, samples arriving
-ten at a time, beside a bare step of the same sample.
+ten at a time, compared with a bare step of the same sample.
 
 Times are of the processor, which other work on the machine disturbs less than those of the clock.
 """
@@ -168,7 +168,7 @@ def memory_mib() -> float:
 
 
 def timed(name: str, run: Callable[[], Array | float]) -> float:
-    """Run, tell and return a time."""
+    """Run, report and return a time."""
     value = float(run())
     print(f"{name:<34}{value:9.2f} s")
     return value

@@ -1,7 +1,7 @@
-"""Time the way from raw samples to states in bare loops, beside what it should take.
+"""Time the way from raw samples to states in bare loops, compared with its goal.
 
 `magfusion smooth` and `navigate`, by both estimators, are run on a log of raw samples as a user
-runs them, and their processor time is taken.  What is left of it without start-up, the processor
+runs them, and their processor time is taken.  The rest without start-up, the processor
 time of the same command with ``--end 10``, is divided by that of a bare loop over GTSAM's
 ``integrateMeasurement`` on as many of the log's inertial samples, timed before and after each
 command: other work on the machine slows down both.  Start-up is divided by the time of importing

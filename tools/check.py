@@ -21,7 +21,7 @@ TESTS = {"tests": ["pytest", "-q"]}
 
 
 def run_check(name: str, command: list[str]) -> bool:
-    """Run one check; show what it says only where it fails."""
+    """Run one check; show its output only where it fails."""
     started = time.monotonic()
     process = subprocess.run(
         [sys.executable, "-m", *command], cwd=ROOT, capture_output=True, text=True, check=False

@@ -126,7 +126,7 @@ def _gains(site: Site, declared: Site) -> dict[str, float]:
 
 
 def score(figure: Figure) -> None:
-    """Draw what freeing what is held would take off the cost, for each degree of freedom."""
+    """Draw the fall of the cost by estimating each fixed parameter, for each degree of freedom."""
     site = demo_site(coil_radius=None)
     magnetometer = site.platform.magnetometer
     off = replace(magnetometer, position_body=magnetometer.position_body + np.array([0.03, 0, 0]))
@@ -140,12 +140,12 @@ def score(figure: Figure) -> None:
     axes.set_yticks(rows, names, fontsize=8)
     axes.set_xscale("log")
     axes.set_xlim(left=0.1)
-    _titled(axes, "what freeing it would gain (1: chance)", "fall of cost, each degree", "")
+    _titled(axes, "gain of estimating it (1: chance)", "fall of cost, each degree", "")
     axes.legend(fontsize=8, loc="center right")
 
 
 def separation(figure: Figure) -> None:
-    """Draw the error of fixes where one beacon is false, and what is left without it."""
+    """Draw the error of fixes where one beacon is false, and without it."""
     samples, truth, site = _walk(120, np.random.default_rng(2))
     owner = np.array([name for name, _ in samples.channels]) == site.beacons[0].name
     calibration = initial_calibration(site, 0.0)

@@ -1,6 +1,6 @@
 """What the pages of the documentation have from the code: tables of options and of codes.
 
-A page says where: ``<!-- options: smooth -->``, ``<!-- codes -->``, ``<!-- papers -->`` and
+A page marks where: ``<!-- options: smooth -->``, ``<!-- codes -->``, ``<!-- papers -->`` and
 ``<!-- paper: 004 -->``; a heading that is the code of a finding is followed by what it means.
 Formulas become MathML, which needs no script.  `mkdocs` calls the hook.
 """
@@ -79,7 +79,7 @@ def option_table(path: str) -> str:
 def code_table() -> str:
     """Return every code of `reasons` and `remarks`, what it means, and where its remedy is."""
     rows = ((f"[`{code}`](troubleshooting.md#{code})", meaning) for code, meaning in CODES.items())
-    return _table(("code", "what it says"), rows)
+    return _table(("code", "meaning"), rows)
 
 
 def papers_table() -> str:

@@ -1,4 +1,4 @@
-"""Inputs that nobody would write, through the real command line: what breaks is kept.
+"""Malformed inputs through the real command line: what breaks is stored.
 
     python tools/fuzz.py --examples 10000
     python tools/fuzz.py --seconds 180 --seed 7
@@ -213,7 +213,7 @@ def fuzz(examples: int, seconds: float, seed: int, workplace: Path) -> tuple[int
 
 
 def main() -> int:
-    """Fuzz as the command line asks; return how many finds there were."""
+    """Fuzz as the command line requests; return the number of failures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--examples", type=int, default=10_000)
     parser.add_argument("--seconds", type=float, default=float("inf"))

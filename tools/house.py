@@ -2,7 +2,7 @@
 
 ``python tools/house.py`` prints one JSON object: the figures of the whole tree and those of
 `estimation`.  A room of the tree is a wing of the package, a loose file of it, `scenarios` or
-`tools`; a room of a wing is a folder in it, or a loose file.  An arrow says that at least one file
+`tools`; a room of a wing is a folder in it, or a loose file.  An arrow means that at least one file
 of a room imports from another; it runs up where `house_order` has them the other way round.
 Imports inside functions and under ``TYPE_CHECKING`` count.
 """
@@ -43,7 +43,7 @@ def parsed(path: Path) -> ast.Module:
 
 @cache
 def imports_of(path: Path) -> tuple[str, ...]:
-    """Return the dotted names that a file imports, wherever the import stands."""
+    """Return the dotted names that a file imports, wherever the import is."""
     result: list[str] = []
     for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
@@ -141,7 +141,7 @@ def room_circles() -> list[list[str]]:
 
 
 def files_by_folder(wing: str | None = None) -> Counter[Path]:
-    """Return how many files each folder holds, beside its ``__init__.py``."""
+    """Return how many files each folder holds, besides its ``__init__.py``."""
     place = PACKAGE if wing is None else PACKAGE / wing
     return Counter(p.parent for p in place.rglob("*.py") if p.name != "__init__.py")
 

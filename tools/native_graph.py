@@ -2,8 +2,8 @@
 
 It holds the same inertial factors and priors; the calibration has variables of its own, so that
 GTSAM retracts it; the ordering is nested dissection, calibration last, as ours; and its callbacks
-only hand out rows of one vectorised call of the measurement model a linearisation.  What is left is
-GTSAM's own work: it copies all values into every callback.
+only hand out rows of one vectorised call of the measurement model a linearisation.  The remainder
+is GTSAM's own work: it copies all values into every callback.
 """
 
 from dataclasses import replace
@@ -30,7 +30,7 @@ class BatchedModel:
     """Residuals of all epochs, computed at once and handed out to the factors row by row.
 
     A row holds for the platform pose and the calibration at which it was computed; where a factor
-    comes with others, all are computed anew.
+    comes with others, all are computed again.
     """
 
     def __init__(self, site: Site, measurements: FieldPhasors) -> None:
