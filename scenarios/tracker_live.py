@@ -210,7 +210,7 @@ def main() -> None:
         side = run_without_hemisphere(replace(config, duration=TURNING + 2.0))
         hemisphere_reported = (
             f"first state {side.first_s:.1f} s after the data begin; {100 * side.ambiguous:.0f} %"
-            f" say ambiguous, {100 * side.wrong:.1f} % are wrong and do not; the others err by"
+            f" are ambiguous, {100 * side.wrong:.1f} % wrong without it; the others err by"
             f" {side.mm:.2f} mm"
         )
         conclude(hemisphere_reported, side)
