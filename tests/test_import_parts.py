@@ -117,7 +117,7 @@ def test_halves_without_a_moment_in_common_and_a_half_alone_are_refused(tmp_path
         InputError, match=r"gyro and accel have no moment in common.*--offset TABLE"
     ):
         imported(tmp_path / "log", one, two, field)
-    with pytest.raises(InputError, match=r"accel is lacking beside the other half.*--accel FILE"):
+    with pytest.raises(InputError, match=r"accel is missing for the other half.*--accel FILE"):
         imported(tmp_path / "log", one, field)
     assert not (tmp_path / "log").exists()
     log, _ = imported(tmp_path / "log", one, two, field, offset=("accel=-90",))

@@ -291,7 +291,7 @@ def _spoil(part: str, name: str, value: float) -> Callable[[Any], object]:
 @pytest.mark.parametrize(
     ("topics", "sentence"),
     [
-        ({}, "holds no messages of sensor_msgs/msg/Imu or sensor_msgs/msg/MagneticField"),
+        ({}, "has no messages of sensor_msgs/msg/Imu or sensor_msgs/msg/MagneticField"),
         (
             {"/imu": (IMU, _changed(imu_message, _spoil("angular_velocity", "y", float("inf"))))},
             f"topic /imu: the message stamped {STAMPS[7]} ns holds a number that is not finite",

@@ -263,7 +263,7 @@ def test_questions_are_asked_again_until_the_answer_can_be_read(
         ("A frequency_hz=20 frequency_hz=30", "given twice"),
         ("A frequency_hz=20 axes=xx", "beacon axis of each coil once"),
         ("A frequency_hz=20,30 axes=x", "2 numbers for 1 axes"),
-        ("A frequency_hz=20 axes=xyz", "cannot be told apart"),
+        ("A frequency_hz=20 axes=xyz", "cannot be separated"),
         ("A frequency_hz=20 synchronised=maybe", "write yes or no"),
     ],
 )

@@ -368,7 +368,7 @@ def test_a_site_of_marked_slots_is_checked(
 
 def test_pulses_have_their_coils_sign(tmp_path: Path) -> None:
     save_site(_site(0.0, synchronised=False), tmp_path / "site.yaml")
-    with pytest.raises(InputError, match="synchronised: found False; write true: marks say"):
+    with pytest.raises(InputError, match="synchronised: found False; write true: marks give"):
         load_site(tmp_path / "site.yaml")
 
 

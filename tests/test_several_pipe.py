@@ -171,7 +171,7 @@ def test_one_that_comes_again_is_heard_again(site: Site, demodulated: Log, tmp_p
         ),
         (
             {"magnetometer": {"time": 0.0, "field": [0.0, 0.0, 0.0]}},
-            r"line 1: the samples do not say which .*left, right",
+            r"line 1: the samples do not specify which .*left, right",
         ),
         (
             {
@@ -187,7 +187,7 @@ def test_one_that_comes_again_is_heard_again(site: Site, demodulated: Log, tmp_p
         ),
         (
             {"fields": {"time": 0.0, "window": 0.1, "phasors": {}, "sigma": 1e-9}},
-            r"line 1: the fields do not say which",
+            r"line 1: the fields do not specify which",
         ),
         (
             {

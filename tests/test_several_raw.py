@@ -206,7 +206,7 @@ def test_a_sample_without_a_name_is_refused(directory: Path) -> None:
 def test_currents_beside_are_refused(directory: Path) -> None:
     count = parquet.read_metadata(directory / "magnetometer.parquet").num_rows
     rewritten(directory, drive_A=pa.array(np.ones(count)))
-    with pytest.raises(InputError, match="drive_A: beside the samples of several"):
+    with pytest.raises(InputError, match="drive_A: with the samples of several"):
         read_log(directory)
 
 
@@ -226,7 +226,7 @@ def test_check_judges_each_by_its_name(directory: Path, walk: SimulatedLog) -> N
     assert np.isclose(float(str(result["right_gap_s"])), 1.0, rtol=0.0, atol=0.02)
     assert {"left_rate_hz", "right_rate_hz", "left_heard_A", "right_snr_D"} <= set(result)
     assert "imu_rate_hz" in result
-    assert "Of right:" in json.dumps(dict(result))
+    assert "Magnetometer right:" in json.dumps(dict(result))
     (directory / "site.yaml").unlink()
     assert run_check(CheckSettings(log=directory))["right_gaps"] == 1
 

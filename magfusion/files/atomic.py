@@ -40,7 +40,7 @@ def real(path: Path) -> Path:
 
 @contextmanager
 def naming(path: Path, unfinished: Path | None = None) -> Iterator[None]:
-    """Name the path in errors of a system that does not say of which file they are.
+    """Name the path in errors of a system that do not name the file.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def naming(path: Path, unfinished: Path | None = None) -> Iterator[None]:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary name beside ``path`` that takes its place only if nothing fails."""
+    """Yield a temporary name next to ``path`` that replaces it only on success."""
     clear_abandoned(path)
     unfinished = _temporary_path(path, UNFINISHED)
     try:
@@ -71,7 +71,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def clear_abandoned(path: Path) -> None:
-    """Remove what a run that was killed left beside ``path``; give back what it had moved away."""
+    """Remove files of a killed run next to ``path``; restore those that it had moved."""
     own = re.compile(abandoned_pattern(re.escape(path.name)))
     for remaining in _entries(path.parent):
         result = own.fullmatch(remaining.name)
@@ -86,7 +86,7 @@ def clear_abandoned(path: Path) -> None:
 
 
 def abandoned_pattern(name: str) -> str:
-    """Return the regular expression of names beside one that is being written, itself one."""
+    """Return the regular expression of temporary names of a path, itself one."""
     kinds = f"{UNFINISHED}|{FORMER}"
     return rf"\.{name}\.(?P<machine>[0-9a-f]{{8}})-(?P<process>\d+)\.(?P<kind>{kinds})"
 
@@ -118,7 +118,7 @@ def _runs(process: int) -> bool:
 
 @contextmanager
 def whole_directory(path: Path, replaces: Callable[[Path], bool]) -> Iterator[Path]:
-    """Yield a temporary directory beside ``path`` that takes its place only if nothing fails.
+    """Yield a temporary directory next to ``path`` that replaces it only on success.
 
     Parameters
     ----------

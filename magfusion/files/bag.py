@@ -64,13 +64,13 @@ def read_bag(
     start, end : float, optional
         Seconds since the first inertial sample.
     report : callable
-        Told how many messages have been read.
+        Called with the number of messages read.
 
     Returns
     -------
     Log
         Without the streams for which the bag has no topic, and without messages that hold NaN or
-        the stamp of another; ``noticed`` says how many these are.
+        the stamp of another; ``noticed`` has their number.
 
     Raises
     ------
@@ -83,8 +83,8 @@ def read_bag(
     first = field if imu is None else imu
     if first is None:
         raise InputError(
-            f"{path}: holds no messages of {IMU} or {FIELD}; record the magnetometer, and the"
-            " inertial sensor beside it."
+            f"{path}: has no messages of {IMU} or {FIELD}; record the magnetometer, and the"
+            " inertial sensor with it."
         )
     span = Span(int(first.time_ns[0]), start, end)
     declared: list[Finding] = []
@@ -182,7 +182,7 @@ def _sorted(place: str, msgtype: str, stamps: IntArray, values: Array) -> _Strea
 
 
 def _measured(stream: _Stream, role: str, declared: list[Finding]) -> _Stream:
-    """Return the messages that hold a sample, and tell of the others."""
+    """Return the messages that have a sample, and report the others."""
     lost_epochs = LostRows.of(stream.time_ns, stream.values)
     for too_many, rows, remedy in zip(
         lost_epochs.too_many,

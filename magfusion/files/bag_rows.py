@@ -1,9 +1,9 @@
 """Messages of a bag as columns of numbers, thousands at a time.
 
 Making an object of each message takes most of the time of reading a bag.  The messages of sensors
-end with nothing but doubles, and their stamps stand in the same place in all of them: both are cut
+end with nothing but doubles, with their stamps at the same offset in all of them: both are cut
 out of the bytes.  One message of every part is read by the library, too; where the numbers are not
-the same to the last bit, or messages are not alike, the library reads them all.
+the same to the last bit, or messages differ in size, the library reads them all.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Tail(NamedTuple):
     read_rows : tuple of int
         Which make a row.
     absent : tuple of int
-        Which say by -1 that something was not measured.
+        In which -1 marks a missing measurement.
     """
 
     numbers: int

@@ -1,8 +1,8 @@
-"""One thread for BLAS, unless somebody asks for more by its environment.
+"""One thread for BLAS, unless its environment requests more.
 
 The matrices of an estimate are small: threads that wait for each other's part of them took two
 fifths more processor and nothing off the time, of `calibrate fieldmap` half as long again.  BLAS
-asks its environment when it is imported.
+reads its environment when it is imported.
 """
 
 import os
@@ -14,7 +14,7 @@ OF_ALL = "OMP_NUM_THREADS"  # for others, too: Arrow reads by so many
 
 
 def use_one_thread() -> None:
-    """Let BLAS have one thread, where its environment does not say how many."""
+    """Limit BLAS to one thread, where its environment does not set the number."""
     if OF_ALL in os.environ:
         return
     for name in THREADS:
@@ -23,7 +23,7 @@ def use_one_thread() -> None:
 
 @cache
 def warn_about_threads() -> None:
-    """Warn once that BLAS has several threads, where its environment does not say how many.
+    """Warn once that BLAS has several threads, where its environment does not set the number.
 
     To be called by a function that a user calls: the warning names the line that called it.
     """

@@ -1,4 +1,4 @@
-"""The state of a run in a file: a header that says whose it is, then plain data.
+"""The state of a run in a file: a header that identifies the run, then plain data.
 
 Plain data are numbers, texts, lists, mappings of them by text, and arrays; they name no type and
 hold no code, so that reading them builds nothing else.  The header is 100 bytes, little-endian:
@@ -121,7 +121,7 @@ def read_position(path: Path, key: str | None = None) -> int:
     Parameters
     ----------
     key : str, optional
-        Of the run that asks.
+        Of the reading run.
 
     Raises
     ------
@@ -137,7 +137,7 @@ def read_checkpoint(path: Path, key: str | None = None) -> Checkpoint | None:
     Parameters
     ----------
     key : str, optional
-        Of the run that asks.
+        Of the reading run.
 
     Raises
     ------

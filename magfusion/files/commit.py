@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def commit() -> str | None:
-    """Return the short name of the commit; None where nothing tells it.
+    """Return the short name of the commit; None if unknown.
 
     A wheel has it from `hatch_build.py`; it ends in ``-dirty`` where files had been changed since.
     """

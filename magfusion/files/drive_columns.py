@@ -17,7 +17,7 @@ _OF = f"{COLUMN}_"
 
 
 def beacon_of(column: str) -> str:
-    """Return the beacon of a column; an empty name stands for all without one of their own."""
+    """Return the beacon of a column; an empty name means all without one of their own."""
     return column.removeprefix(_OF) if column != COLUMN else ""
 
 
@@ -44,7 +44,7 @@ def column_names(path: Path) -> list[str]:
 
 
 def read_drive(path: Path | None, span: Span) -> DriveSamples | None:
-    """Read the currents beside a magnetometer's samples; None where there are none.
+    """Read the currents recorded with a magnetometer's samples; None where there are none.
 
     Raises
     ------

@@ -63,7 +63,7 @@ def read_fields(path: Path, span: Span) -> FieldSamples:
     Channels are in the order in which the file first names them, and of several magnetometers each
     has its own; the covariance is
     ``sigma**2`` times the identity where the file does not hold one.  A receiver of fewer axes
-    leaves columns out, which are NaN; one that tells no sign gives amplitudes, here along x.
+    leaves columns out, which are NaN; one without signs gives amplitudes, here along x.
 
     Raises
     ------
@@ -111,8 +111,8 @@ def order_channels(fields: FieldSamples, site: Site) -> FieldSamples:
     Raises
     ------
     InputError
-        Where a channel, or a magnetometer, is unknown to the site, or the fields do not say which
-        of several measured them.
+        Where a channel, or a magnetometer, is unknown to the site, or the fields do not specify
+        which of several measured them.
     """
     sensors = site.platform.magnetometers
     names = tuple(dict.fromkeys(fields.magnetometers))
@@ -129,7 +129,7 @@ def order_channels(fields: FieldSamples, site: Site) -> FieldSamples:
         return on_log_clock(_ordered(replace(alone, magnetometers=()), site), site)
     if not names:
         raise InputError(
-            f"The fields do not say which of the site's magnetometers measured them"
+            f"The fields do not specify which of the site's magnetometers measured them"
             f" ({', '.join(known)}); add a column magnetometer with its name."
         )
     parts = []
@@ -215,12 +215,12 @@ def _ordered(fields: FieldSamples, site: Site) -> FieldSamples:
 
 
 def _measured(table: Table, path: Path) -> tuple[str, bool]:
-    """Return the axes that a table has, and whether it tells their signs."""
+    """Return the axes that a table has, and whether it has their signs."""
     axes = "".join(axis for axis, names in _PARTS.items() if table.has(names))
     if table.has((_AMPLITUDE,)):
         if axes or table.has(_COV):
             raise InputError(
-                f"{path}: holds amplitude beside re, im or a covariance; keep the one or the other"
+                f"{path}: has both amplitude and re, im or a covariance; keep one of them"
             )
         return "x", False
     if not axes:

@@ -45,7 +45,7 @@ def write_hypotheses(
     trust : StateTrust, optional
         Of each epoch, as in `magfusion.files.trajectory_table.write_trajectory`.
     columns : mapping of str to ndarray, shape (n, hypotheses), optional
-        More that is said of each.
+        Further columns of each.
     """
     more = {} if columns is None else columns
     epoch, rank = np.nonzero(np.isfinite(cost))

@@ -123,7 +123,7 @@ class MountEntry(StrictModel):
 
 
 class UseEntry(StrictModel):
-    """Where it is to be navigated; all of the hall where nothing else is said."""
+    """Where it is to be navigated; all of the hall by default."""
 
     polygon_m: _Polygon | None = None
     height_m: _Heights | None = None

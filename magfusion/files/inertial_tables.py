@@ -37,7 +37,7 @@ def read_imu(
     Returns
     -------
     ImuSamples, tuple of Finding
-        Without rows that hold NaN or whose time stands twice, and how many these are.
+        Without rows that hold NaN or of repeated time, and their number.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def write_waveform(
     drive: DriveSamples | None = None,
     rotation: RotorAngles | None = None,
 ) -> None:
-    """Write magnetometer samples, and currents and angles beside them, as Parquet."""
+    """Write magnetometer samples, with their currents and angles, as Parquet."""
     columns: dict[str, object] = {TIME: Span(epoch_ns).stamps(waveform.time)}
     values = dict(zip(FIELD, waveform.measured_sensor.T, strict=True))
     columns |= {name: value for name, value in values.items() if name[-1] in waveform.axes}

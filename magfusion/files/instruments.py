@@ -1,11 +1,11 @@
-"""Instruments by their names: what their data sheets say, as keys of a site.
+"""Instruments by name: figures of their data sheets, as keys of a site.
 
 A site's ``gyro_noise`` and ``accel_noise`` are what an Allan deviation shows at one second; the
-noise density of a sheet is one-sided, and larger by sqrt(2).  The density is taken as it stands:
+noise density of a sheet is one-sided, and larger by sqrt(2).  The density is taken as printed:
 that margin is the difference between a typical piece on a bench and yours.  A sheet's random walk
 is brought up to the same.
 
-What a sheet does not say is how the bias walks.  A walk ``k`` beside white noise ``n`` has its
+A sheet does not give the bias walk.  A walk ``k`` with white noise ``n`` has its
 least Allan variance, ``2 n k / sqrt(3)``, at ``sqrt(3) n / k``: ``k`` is such that this is the
 stability in run, and that the least is reached within `TURNS` (within `DEFAULT_TURNS` where the
 sheet has none).
@@ -244,7 +244,7 @@ def _named(known: Mapping[str, _Sheet], name: str, option: str, listing: str) ->
     meant = f"did you mean {', '.join(close)}? " if close else ""
     raise InputError(
         f"{option} {name}: no such instrument in the table; {meant}{listing} lists them all, and"
-        f" {UNNAMED} stands for any of its kind"
+        f" {UNNAMED} is any of its kind"
     )
 
 

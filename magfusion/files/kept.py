@@ -1,4 +1,4 @@
-"""What a job keeps of a part that is done, for another run that asks for the same."""
+"""Stored results of a finished part, for another run of the same request."""
 
 import hashlib
 import json

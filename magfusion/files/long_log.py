@@ -1,4 +1,4 @@
-"""A log that is too long to be held: its raw streams are read while they are used."""
+"""A log too long for memory: its raw streams are read while they are used."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

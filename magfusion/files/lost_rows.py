@@ -11,7 +11,7 @@ MOST_MISSING, MOST_TWICE = 0.5, 0.1  # of the rows; more is a mistake of the rec
 
 
 class LostRows(NamedTuple):
-    """Which rows hold no sample, shape (n,): of a stamp that stands twice, the later ones."""
+    """Rows without a sample, shape (n,): of repeated stamps, the later ones."""
 
     twice: BoolArray
     absent: BoolArray
@@ -29,7 +29,7 @@ class LostRows(NamedTuple):
 
     @property
     def too_many(self) -> tuple[bool, bool]:
-        """Whether stamps that stand twice, and rows of NaN, are no accident any more."""
+        """Whether repeated stamps and rows of NaN are too many for an accident."""
         if not len(self.twice):
             return False, False
         return bool(np.mean(self.twice) > MOST_TWICE), bool(np.mean(self.absent) > MOST_MISSING)

@@ -1,7 +1,7 @@
-"""When which coil was driven: a slot beside each sample, or a table of bursts.
+"""When which coil was driven: a slot with each sample, or a table of bursts.
 
-Beside samples, -1 says that no coil is driven, and a missing slot that nothing is said: the current
-settles.  In a table of bursts nothing is said of what no row covers.
+With samples, -1 means that no coil is driven, and a missing slot that none is known: the current
+settles.  In a table of bursts times that no row covers are unknown.
 """
 
 from pathlib import Path
@@ -30,7 +30,7 @@ _REMEDY = f"write the number of a coil's slot, or {SILENT} where none is driven"
 
 
 def read_marks(magnetometer: Path | None, bursts: Path | None, span: Span) -> Marks | None:
-    """Read the bursts of a log, by whichever way they are told; None where they are not.
+    """Read the bursts of a log, in either form; None where there are none.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def read_marks(magnetometer: Path | None, bursts: Path | None, span: Span) -> Ma
 
 
 def slots_of(values: Array) -> IntArray:
-    """Return the slots that numbers beside samples mean, NaN where nothing is said."""
+    """Return the slots of numbers with samples, NaN where unknown."""
     return np.where(np.isnan(values), UNKNOWN_SLOT, values).astype(np.int64)
 
 

@@ -28,7 +28,7 @@ def magnetometer_number(site: Site, name: str | None, what: str) -> int:
         return 0
     if name is None:
         raise InputError(
-            f"the {what} do not say which of the site's magnetometers took them"
+            f"the {what} do not specify which of the site's magnetometers took them"
             f" ({', '.join(names)}); add its name as magnetometer"
         )
     if name not in names:

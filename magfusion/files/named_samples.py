@@ -1,4 +1,4 @@
-"""The samples of several magnetometers in one table, whose column says which took each."""
+"""The samples of several magnetometers in one table, with a column of their names."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -23,7 +23,7 @@ _LAYOUT = TableLayout(numbers=FIELD, texts=(MAGNETOMETER,), repeats=True)
 
 
 def names_magnetometers(path: Path | None) -> bool:
-    """Return whether a table of samples says which magnetometer took each."""
+    """Return whether a table of samples has the magnetometer of each."""
     return path is not None and MAGNETOMETER in column_names(path)
 
 
@@ -41,14 +41,14 @@ def read_waveforms(
     Raises
     ------
     InputError
-        As `read_table` and `check_field`; or where currents, slots or angles stand beside them.
+        As `read_table` and `check_field`; or where currents, slots or angles are in the same table.
     """
     assert path is not None
     others = [n for n in column_names(path) if n == SLOT]
     others = [*others, *drive_columns(path), *rotor_columns(path)]
     if others:
         raise InputError(
-            f"{path}: {', '.join(others)}: beside the samples of several magnetometers nothing else"
+            f"{path}: {', '.join(others)}: with the samples of several magnetometers nothing else"
             " is recorded yet; give bursts in marks.parquet, and leave the rest out."
         )
     table = read_table(path, _LAYOUT, span)

@@ -54,7 +54,7 @@ def write_bag(
     Parameters
     ----------
     report : callable
-        Is told from time to time how many states were written.
+        Called from time to time with the number of states written.
 
     Raises
     ------

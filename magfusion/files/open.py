@@ -27,7 +27,7 @@ def open_log(
     topics : Topics, optional
         Of a bag that has several of one type.
     report : callable
-        Told how much of a bag has been read.
+        Called with the part of a bag that has been read.
 
     Raises
     ------

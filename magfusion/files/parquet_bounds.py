@@ -1,4 +1,4 @@
-"""How much of a Parquet file is held at once: a small one may hold billions of rows."""
+"""Bounds on rows in memory of a Parquet file: a small one may have billions."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -49,7 +49,7 @@ def read_batches(
     path: Path,
     skipped: int,
 ) -> tuple[pa.Table, int]:
-    """Return the rows of a span of a file that has more rows than are held at once.
+    """Return the rows of a span of a file with more rows than are kept in memory.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Objects as plain data and back: what a checkpoint holds, checked against the types of the fields.
 
-The types come from the annotations of the code that asks, never from the data, so that data can
-build nothing but what was asked for.  Plain data are as in `magfusion.files.checkpoint`.
+The types come from the annotations of the calling code, never from the data, so that data can
+build nothing but what was requested.  Plain data are as in `magfusion.files.checkpoint`.
 """
 
 import types
@@ -19,16 +19,16 @@ Kind = TypeVar("Kind")
 
 @dataclass(frozen=True)
 class Rules:
-    """What holds for some types beside what their annotations say.
+    """Rules for some types in addition to their annotations.
 
     Parameters
     ----------
     writers : mapping
         By type, of which the own may be derived, how its plain data are made of it.
     readers : mapping
-        By type, how it is made of its plain data; a `ValueError` says why not.
+        By type, how it is made of its plain data; a `ValueError` has the reason.
     checks : mapping
-        By type, what is to be seen when one was made; a `ValueError` says what is wrong.
+        By type, what is to be seen when one was made; a `ValueError` has the reason.
     """
 
     writers: Mapping[type, Callable[[Any], Any]] = field(default_factory=dict)
@@ -63,7 +63,7 @@ def to_plain(value: object, rules: Rules | None = None) -> Any:
 
 
 def from_plain(kind: type[Kind], data: Any, place: str, rules: Rules | None = None) -> Kind:
-    """Return the value that plain data stand for.
+    """Return the value of plain data.
 
     Parameters
     ----------

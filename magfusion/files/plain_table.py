@@ -73,7 +73,7 @@ def refuse_rows(bad: np.ndarray, path: Path, place: str, value: np.ndarray, want
 
 
 def has_angles(names: list[str]) -> bool:
-    """Tell whether attitudes are roll, pitch and yaw rather than quaternions."""
+    """Return whether attitudes are roll, pitch and yaw rather than quaternions."""
     return bool(set(ANGLES) & set(names)) and not set(QUATERNION) & set(names)
 
 

@@ -69,8 +69,8 @@ def check_imu(imu: ImuSamples, place: str) -> None:
 def _keeps_its_direction(imu: ImuSamples) -> bool:
     """Return whether the specific force points one way in the world, as gravity does.
 
-    Over spans so short that the gyroscope tells how the body turned in them: without gravity an
-    acceleration of a g's tenth turns with the motion that makes it.
+    Over spans so short that the gyroscope gives the rotation of the body in them: without gravity
+    an acceleration of a g's tenth turns with the motion that makes it.
     """
     step = np.diff(imu.time, append=imu.time[-1:])
     step[step > CHECKED_DURATION] = 0.0

@@ -29,7 +29,7 @@ def read_probe(path: Path) -> dict[Side, ProbeReadings]:
     Returns
     -------
     dict
-        Readings of the antennas that it was held to.
+        Readings of the antennas next to which it was placed.
 
     Raises
     ------
@@ -44,7 +44,7 @@ def read_probe(path: Path) -> dict[Side, ProbeReadings]:
     refuse_rows(sigma <= 0.0, path, "column sigma", sigma, "a positive number")
     position = np.stack([numbers(table, name, path) for name in POSITION], axis=1)
     reach = np.linalg.norm(position, axis=1)
-    refuse_rows(reach == 0.0, path, "columns position_x to position_z", reach, "a place beside it")
+    refuse_rows(reach == 0.0, path, "columns position_x to position_z", reach, "another place")
     result = ProbeReadings(coil, position, *_readings(table, path), sigma)
     if result.axis.ndim == 3:
         result = _each_axis(result)

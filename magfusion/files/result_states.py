@@ -1,4 +1,4 @@
-"""The states of a result with all that is said of each, for those who hand them on."""
+"""The states of a result with the verdict on each, for exports."""
 
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -58,7 +58,7 @@ def read_result_states(path: Path) -> ResultStates:
     if not kept.any():
         raise InputError(
             f"{path}: its {len(stamps)} states have all failed, so that none has a pose; its"
-            " report.json says why"
+            " report.json has the reasons"
         )
     parts = {f.name: getattr(trajectory, f.name) for f in fields(trajectory)}
     own = {name: part[kept] for name, part in parts.items() if part is not None}

@@ -19,7 +19,7 @@ def rotor_columns(path: Path) -> tuple[str, ...]:
 
 
 def read_rotation(path: Path | None, span: Span) -> RotorAngles | None:
-    """Read the angles beside a magnetometer's samples (rad); None where there are none.
+    """Read the angles recorded with a magnetometer's samples (rad); None where there are none.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Rows with named columns, appended to a file while a long run goes on: an Arrow IPC stream.
 
-A run that is killed leaves whole batches, then perhaps part of one; its checkpoint says how far the
-file goes that belongs to it, and what follows is made again.
+A run that is killed leaves whole batches, then perhaps part of one; its checkpoint has the length
+of the file goes that belongs to it, and what follows is made again.
 """
 
 import hashlib
@@ -65,12 +65,12 @@ class RowFile:
     columns : mapping of str to int
         Name of each column and how many numbers it has in a row; one without any is left out.
     mark : RowPosition, optional
-        From which to go on; None begins anew.
+        From which to go on; None begins again.
 
     Raises
     ------
     InputError
-        Where the file is not as the mark says, or, without one, is no file of rows.
+        Where the file does not match the mark, or, without one, is no file of rows.
     """
 
     def __init__(
@@ -138,8 +138,8 @@ class RowFile:
         self._stream.flush()
 
     def _checked(self, mark: RowPosition) -> "hashlib._Hash":
-        """Return the digest of what the mark says is there, after a look at all of it."""
-        wrong = InputError(f"{self.path}: is not as its checkpoint says; run without --resume")
+        """Return the digest of the part given by the mark, after reading all of it."""
+        wrong = InputError(f"{self.path}: does not match its checkpoint; run without --resume")
         digest, remaining = hashlib.sha256(), mark.size
         try:
             with self.path.open("rb") as stream:

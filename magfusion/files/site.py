@@ -1,4 +1,4 @@
-"""A site as one YAML file: `load_site` believes nothing unchecked, `save_site` loses nothing."""
+"""A site as one YAML file: `load_site` validates it, `save_site` round-trips."""
 
 import datetime
 from dataclasses import replace
@@ -164,7 +164,7 @@ def save_site(site: Site, path: Path | str) -> None:
     Parameters
     ----------
     path : Path
-        Replaced as a whole, or left as it was if anything fails.  Field maps are written beside
+        Replaced as a whole, or left as it was if anything fails.  Field maps are written next to
         it, as ``<stem>_field_map.parquet``, a correlation as ``<stem>_correlation.parquet``.
 
     Raises

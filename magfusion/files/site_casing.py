@@ -1,4 +1,4 @@
-"""What a site's file says of the steel tube that a magnetometer is in."""
+"""Keys of the steel tube around a magnetometer."""
 
 from typing import Annotated, Any
 
@@ -28,7 +28,7 @@ class CasingEntry(StrictModel):
     conductivity_sigma: _Share = Casing.conductivity_sigma
 
     def casing(self) -> Casing:
-        """Return what the entry says."""
+        """Return the casing of the entry."""
         return Casing(
             self.radius_m,
             self.wall_m,
@@ -43,7 +43,7 @@ class CasingEntry(StrictModel):
 
 
 def casing_entry(casing: Casing | None) -> dict[str, Any]:
-    """Return what a site's file says of it."""
+    """Return its entry of a site's file."""
     if casing is None:
         return {}
     return {

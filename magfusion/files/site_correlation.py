@@ -1,4 +1,4 @@
-"""The correlation of a site's sigmas beside its file; it holds only for what was left as it was."""
+"""The correlation of a site's sigmas next to its file; valid only for unchanged entries."""
 
 from dataclasses import replace
 from pathlib import Path

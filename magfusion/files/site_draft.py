@@ -1,4 +1,4 @@
-"""A site that is being described: what its author said, before what is assumed of the rest."""
+"""A site that is being described: values given by its author, without assumptions for the rest."""
 
 import math
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ Numbers = tuple[float, ...]
 
 @dataclass(frozen=True)
 class BeaconDraft:
-    """What is said of a beacon; None of what is not.
+    """Given values of a beacon; None for others.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class Place:
 
 
 def beacon_draft(text: str, place: str = "--beacon") -> BeaconDraft:
-    """Read what is said of a beacon: its name, and ``key=value`` with the keys of a site.
+    """Read the given values of a beacon: its name, and ``key=value`` with the keys of a site.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def _check_coils(where: str, draft: BeaconDraft) -> None:
             )
     if axes is not None and len(axes) == 3 and len(draft.frequency_hz or (0,)) == 1:
         raise InputError(
-            f"{where}: three coils of one frequency cannot be told apart; give frequency_hz for"
+            f"{where}: three coils of one frequency cannot be separated; give frequency_hz for"
             " each, as in frequency_hz=20,25,30"
         )
 

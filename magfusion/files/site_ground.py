@@ -16,7 +16,7 @@ def log_sigma(conductivity: float, sigma: float) -> float:
 
 
 def ground_entry(site: Site) -> dict[str, Any]:
-    """Return what a site's file says of it; nothing where nothing conducts."""
+    """Return its entry of a site's file; empty where nothing conducts."""
     result = conductivity_of(site)
     if not result:
         return {}

@@ -1,4 +1,4 @@
-"""What a site's file says of magnetometers."""
+"""Keys of magnetometers in a site's file."""
 
 from typing import Annotated, Any, Literal
 
@@ -99,7 +99,7 @@ class MagnetometerEntry(StrictModel):
 def check_magnetometers(
     one: MagnetometerEntry | None, several: list[MagnetometerEntry] | None
 ) -> None:
-    """Refuse none, both forms, and magnetometers that names do not tell apart."""
+    """Refuse none, both forms, and magnetometers of equal names."""
     if several is None:
         _check_single(one)
         return
@@ -116,7 +116,7 @@ def check_magnetometers(
             remedy = f"give it another name than magnetometers[{names.index(sensor.name)}]"
             raise refusal_at((*at, "name"), sensor.name, remedy)
         if len(several) > 1 and sensor.axes is not None and len(set(sensor.axes)) < 3:
-            remedy = "give all three axes: beside others a receiver of fewer is not taken yet"
+            remedy = "give all three axes: with others a receiver of fewer is not supported"
             raise refusal_at((*at, "axes"), sensor.axes, remedy)
     if several[0].clock_offset_s or several[0].sigma.clock_offset_s:
         remedy = "give it to the others: the clock of the first magnetometer is that of the log"
@@ -138,7 +138,7 @@ def check_tones(sensor: MagnetometerEntry, tones_hz: Array, at: tuple[str | int,
     Parameters
     ----------
     at : tuple
-        Where the magnetometer stands in the site's file.
+        Place of the magnetometer in the site's file.
     """
     if sensor.response is not None and sensor.axis_responses is not None:
         raise refusal_at((*at, "response"), "both", "remove it, or axis_responses")

@@ -57,7 +57,7 @@ class MotionPriorEntry(StrictModel):
     rate_sigma_rad_s: Annotated[_AboveZero, between(1e-6, 1e3)] = _PRIOR.rate_sigma
 
     def prior(self) -> MotionPrior:
-        """Return what it says."""
+        """Return the motion prior of the entry."""
         return MotionPrior(
             self.accel_density_m_s2_rthz,
             self.angular_accel_density_rad_s2_rthz,

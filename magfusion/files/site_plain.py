@@ -70,7 +70,7 @@ def rpy_deg(matrix: Array) -> Any:
 
 
 def sigma_entry(sigma: Array) -> Any:
-    """Return standard deviations, one number where all are alike."""
+    """Return standard deviations, one number where all are equal."""
     return plain(sigma.flat[0] if np.all(sigma == sigma.flat[0]) else sigma)
 
 

@@ -58,7 +58,7 @@ class RegionEntry(StrictModel):
         return self
 
     def region(self) -> Region:
-        """Return what it says."""
+        """Return the region of the entry."""
         half = self.half_space
         side = None if half is None else HalfSpace(half.normal, half.through_m)
         return Region(self.box_m, side)

@@ -1,4 +1,4 @@
-"""What a site's file says of a magnetometer's response by frequency."""
+"""Keys of a magnetometer's frequency response."""
 
 from typing import Annotated, Any
 
@@ -45,14 +45,14 @@ class AxisResponsesEntry(StrictModel):
 def responses_of(
     shared_by: list[ResponseEntry] | None, separately: AxisResponsesEntry | None
 ) -> FrequencyResponse | AxisResponses | None:
-    """Return what entries say of all axes, or of each."""
+    """Return the entries of all axes, or of each."""
     if separately is not None:
         return AxisResponses(*(_response(entries) for entries in separately.axes.values()))
     return _response(shared_by) if shared_by else None
 
 
 def _response(entries: list[ResponseEntry]) -> FrequencyResponse:
-    """Return what entries say, in order of frequency."""
+    """Return the entries in order of frequency."""
     rows = sorted((e.frequency_hz, e.gain, e.phase_deg * DEGREE) for e in entries)
     return FrequencyResponse(*np.array(rows).T)
 
@@ -60,12 +60,12 @@ def _response(entries: list[ResponseEntry]) -> FrequencyResponse:
 def check_response(
     entries: list[ResponseEntry], tones_hz: Array, at: tuple[str | int, ...]
 ) -> None:
-    """Refuse a frequency that stands twice, and tones beyond those that are given.
+    """Reject a repeated frequency, and tones beyond those that are given.
 
     Parameters
     ----------
     at : tuple
-        Where they stand in the site's file.
+        Their place in the site's file.
     """
     given = [entry.frequency_hz for entry in entries]
     for k, frequency in enumerate(given):
@@ -79,7 +79,7 @@ def check_response(
 
 
 def response_entry(response: FrequencyResponse | AxisResponses | None) -> dict[str, Any]:
-    """Return what a site's file says of it."""
+    """Return its entry of a site's file."""
     if response is None:
         return {}
     if isinstance(response, AxisResponses):

@@ -1,4 +1,4 @@
-"""What a site's file says of a magnet on a shaft."""
+"""Keys of a magnet on a shaft."""
 
 from typing import Annotated, Any, Self
 
@@ -61,7 +61,7 @@ class RotorEntry(StrictModel):
         return self
 
     def rotor(self) -> Rotor:
-        """Return what the entry says."""
+        """Return the rotor of the entry."""
         axis = self.axis / np.linalg.norm(self.axis)
         zero = self.zero - (self.zero @ axis) * axis
         return Rotor(
@@ -80,7 +80,7 @@ class RotorEntry(StrictModel):
 
 
 def rotor_entry(rotor: Rotor, log_scale: float) -> dict[str, Any]:
-    """Return what a site's file says of it; the moment grew by a factor since it was declared."""
+    """Return its entry of a site's file; the moment grew by a factor since it was declared."""
     factor = float(np.exp(log_scale))
     entry: dict[str, Any] = {
         "moment_a_m2": factor * rotor.moment,

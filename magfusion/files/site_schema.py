@@ -152,12 +152,12 @@ class WindingEntry(StrictModel):
     @model_validator(mode="after")
     def _check_turns_fit(self) -> Self:
         if self.pitch_m is not None and self.pitch_m < self.wire_m:
-            remedy = "give at least wire_m, or remove it: turns lie beside each other"
+            remedy = "give at least wire_m, or remove it: turns lie next to each other"
             raise refusal_at(("pitch_m",), self.pitch_m, remedy)
         return self
 
     def coil(self) -> "WoundCoil":
-        """Return the coil that stands for it."""
+        """Return the equivalent coil."""
         pitch = self.wire_m if self.pitch_m is None else self.pitch_m
         size = (self.inner_radius_m, self.wire_m, pitch)
         return wound_coil(Winding(self.current_a, self.layers, self.rows, *size))
@@ -197,7 +197,7 @@ class CoilEntry(StrictModel):
         return self
 
     def coil(self) -> Coil:
-        """Return the coil; of windings that which stands for them."""
+        """Return the coil; of windings the equivalent one."""
         moment, radius, length = self.moment_a_m2, self.radius_m, self.length_m
         current = self.current_a
         if moment is None:
@@ -244,7 +244,7 @@ def _slots(value: object) -> object:
     if value == MARKED:
         return MARKED
     if not isinstance(value, dict):
-        raise refusal(f"write {{duration_s, count}}, or {MARKED} where the log says when")
+        raise refusal(f"write {{duration_s, count}}, or {MARKED} where the log has the times")
     return SlotsEntry.model_validate(value)
 
 
@@ -282,7 +282,7 @@ class BeaconEntry(StrictModel):
                 detail = InitErrorDetails(type="missing", loc=(key,), input=None)
                 raise ValidationError.from_exception_data("site", [detail])
             if value is not None and unknown:
-                remedy = f"remove it or unknown: {self.unknown}, which says that it is not known"
+                remedy = f"remove it or unknown: {self.unknown}, which means that it is not known"
                 raise refusal_at((key,), value.tolist(), remedy)
         return self
 
@@ -306,7 +306,7 @@ class BeaconEntry(StrictModel):
 
     @property
     def coil_count(self) -> int:
-        """Coils of it, or that stand for its rotor."""
+        """Its coils, or those equivalent to its rotor."""
         if self.rotor is not None:
             return 2 + len(self.rotor.harmonics)
         return len(self.coils or [])
@@ -335,12 +335,12 @@ class BeaconEntry(StrictModel):
             if coil.slot is None or coil.slot >= MOST_SLOTS:
                 raise refusal_at(("coils", i, "slot"), coil.slot, "give the number in the marks")
             if not self.synchronised and not (coil.frequency_hz or self.frequency_hz):
-                remedy = "write true: marks say when a pulse is driven, and its sign is its coil's"
+                remedy = "write true: marks give the times of a pulse, and its sign is its coil's"
                 raise refusal_at(("synchronised",), False, remedy)
         return self
 
     def _slots_are_unique(self) -> bool:
-        """Return whether a stream can tell when a cycle begins."""
+        """Return whether a stream determines the begin of a cycle."""
         assert isinstance(self.slots, SlotsEntry)
         driven = {coil.slot for coil in self.coils or []}
         count = self.slots.count
@@ -383,7 +383,7 @@ class PlatformEntry(StrictModel):
 
 
 class ReferenceEntry(StrictModel):
-    """A second magnetometer, which witnesses the noise."""
+    """A reference magnetometer for the noise."""
 
     position_m: Position
 

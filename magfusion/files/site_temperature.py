@@ -1,4 +1,4 @@
-"""What a site's file says of temperature: how moments, matrix and offset change with it."""
+"""Keys of temperature: how moments, matrix and offset change with it."""
 
 from typing import Annotated, Any
 
@@ -24,7 +24,7 @@ class MomentTemperatureEntry(StrictModel):
     reference_degc: _Celsius = MomentTemperatureModel.reference_degc
 
     def temperature_model(self) -> MomentTemperatureModel:
-        """Return what the entry says."""
+        """Return the model of the entry."""
         return MomentTemperatureModel(self.log_moment_per_k, self.reference_degc)
 
 
@@ -40,14 +40,14 @@ class SensorTemperatureEntry(StrictModel):
     reference_degc: _Celsius = SensorTemperatureModel.reference_degc
 
     def temperature_model(self) -> SensorTemperatureModel:
-        """Return what the entry says."""
+        """Return the model of the entry."""
         return SensorTemperatureModel(self.matrix_per_k, self.offset_t_per_k, self.reference_degc)
 
 
 def temperature_entry(
     temperature_model: MomentTemperatureModel | SensorTemperatureModel | None,
 ) -> dict[str, Any]:
-    """Return what a site's file says of it."""
+    """Return its entry of a site's file."""
     if temperature_model is None:
         return {}
     reference = {"reference_degc": float(temperature_model.reference_degc)}

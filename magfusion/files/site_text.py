@@ -46,8 +46,8 @@ def site_text(draft: SiteDraft) -> str:
     """Return the YAML of a site, which `load_site` reads."""
     lines = [
         "# Site of magfusion: what is installed, and how well it is known.",
-        "# SI units, or as the key's name says. Each sigma is one standard deviation: rather too",
-        f"# large than too small. What was assumed, because nobody said it, is marked {TO_DO}.",
+        "# SI units, or as in the key's name. Each sigma is one standard deviation: rather too",
+        f"# large than too small. Assumed values are marked {TO_DO}.",
         "magfusion_site: 1",
         *_world(draft),
         "beacons:" if draft.beacons else "beacons: []",
@@ -87,7 +87,7 @@ def _assumed(beacon: BeaconDraft) -> list[str]:
         missing = _MISSING[beacon.unknown]
         out.append(
             f"unknown: {beacon.unknown}, for want of {missing}, which only smooth and calibrate log"
-            " take, and only beside two beacons that are known"
+            " estimate, and only with two known beacons"
         )
     if beacon.moment_a_m2 is None:
         out.append(f"a moment of {GUESSED_MOMENT:g} A m^2, a mere guess, for want of moment_a_m2")

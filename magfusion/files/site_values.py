@@ -1,4 +1,4 @@
-"""What single values of a site's file may be: types, bounds, and what is said of others."""
+"""Single values of a site's file: types, bounds, and errors of others."""
 
 import datetime
 import math

@@ -84,7 +84,7 @@ def _series(value: object) -> Array:
 
 
 def _slots(value: object) -> IntArray:
-    """Return slots beside samples; null and NaN say nothing."""
+    """Return slots with samples; null and NaN mean unknown."""
     result = _series(value)
     if not np.all(is_slot(result)):
         what = "for each sample null, -1 where no coil is driven, or the number of a slot"
@@ -147,7 +147,7 @@ class ImuRecord(_Arrays):
 class MagnetometerRecord(_Arrays):
     """Raw samples of the magnetometer: stamps (k,), fields (k, 3) (T); NaN where missing.
 
-    ``slot`` is that of the coil that is driven: -1 where none is, null where nothing is said;
+    ``slot`` is that of the coil that is driven: -1 where none is, null where unknown;
     ``magnetometer`` the name of the one of several that took them.
     """
 
@@ -321,7 +321,7 @@ def _noise(entry: FieldsRecord, name: str, tone: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class NumberedRecord:
-    """A record with its place in the stream, or the sentence that says why it is none."""
+    """A record with its place in the stream, or the sentence with the reason why it is none."""
 
     number: int
     record: Record | None

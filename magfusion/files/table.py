@@ -1,4 +1,4 @@
-"""One table of a log, Parquet or CSV: the columns asked for, checked, within a span of time."""
+"""One table of a log, Parquet or CSV: the requested columns, checked, within a span of time."""
 
 import csv
 import itertools

@@ -1,4 +1,4 @@
-"""What a file says of two wells that are to be simulated."""
+"""File of two wells to be simulated."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +14,7 @@ Separation = Annotated[float, between(-60.0, 60.0)]
 
 
 class WellsEntry(StrictModel):
-    """Two wells, a sensor at rest in one and a magnet that goes by in the other.
+    """Two wells, a sensor at rest in one and a magnet that passes in the other.
 
     All but the depths' sigma is true; the sensor's well leads down by its inclination from the
     vertical.

@@ -1,4 +1,4 @@
-"""YAML is checked against a model before it is believed."""
+"""YAML files, validated against a model."""
 
 import re
 from functools import lru_cache
@@ -120,7 +120,7 @@ def _text(path: Path) -> str:
 
 @lru_cache(maxsize=2)
 def _parse(text: str, path: Path) -> object:
-    """Return what a text says; a site is read by a job and before it is known which job it is."""
+    """Return the content of a text, cached, as a site is read more than once."""
     try:
         return yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:

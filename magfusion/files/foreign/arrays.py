@@ -33,7 +33,7 @@ class _Field:
 
 
 def array_source(path: Path) -> Source:
-    """Return a table whose file holds arrays; the suffix says which format it is.
+    """Return a table whose file holds arrays; the suffix gives the format.
 
     Raises
     ------

@@ -101,7 +101,7 @@ def plan_bag(
     Parameters
     ----------
     entries : mapping of sequence of ColumnMapping
-        What the user says of each stream: a topic, and frames or a unit behind it.
+        The user's choice for each stream: a topic, and frames or a unit behind it.
     others : collection of str
         Streams that come from elsewhere.
 
@@ -204,7 +204,7 @@ def _selected_topic(
 def _has_transform(
     path: Path, name: str, frames: tuple[str, str], reader: AnyReader, declared: Findings
 ) -> bool:
-    """Tell whether a topic has a transform; what it has instead is proposed."""
+    """Check that a topic has a transform; what it has instead is proposed."""
     pairs = _pairs(reader, name)
     if frames in pairs:
         return True

@@ -1,4 +1,4 @@
-"""What a log's streams are made of, and how a user says it: ``imu.gyro_x=-GyrY[deg/s]``."""
+"""Columns of a log's streams, and how a user maps them: ``imu.gyro_x=-GyrY[deg/s]``."""
 
 import re
 from collections.abc import Sequence
@@ -86,7 +86,7 @@ class Term:
 
 
 class Undecided(ValueError):
-    """Why an entry cannot be resolved, and what could stand in its place.
+    """Why an entry cannot be resolved, and possible replacements.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ class Undecided(ValueError):
 
 
 def parse_entry(text: str) -> list[ColumnMapping]:
-    """Read one option; what stands for several columns becomes several entries.
+    """Read one option; an entry for several columns becomes several entries.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def _split(stream: str, group: str, value: str, text: str) -> list[ColumnMapping
     if group == "quaternion":
         if unit.strip("[]") not in ORDERS:
             raise InputError(
-                f"--map {text!r}: say the order of the quaternion, as"
+                f"--map {text!r}: give the order of the quaternion, as"
                 f" '{stream}.quaternion={result['names']}[wxyz]' or [xyzw]"
             )
         order, unit = ORDERS[unit.strip("[]")], "[1]"
@@ -166,7 +166,7 @@ def resolve(entry: ColumnMapping, columns: Sequence[SourceColumn]) -> tuple[Term
     Raises
     ------
     Undecided
-        With the reason, for a column that is not there or a unit that is not said.
+        With the reason, for a column that is not there or a unit that is not given.
     """
     dimension = dimension_of(entry.stream, entry.column)
     parts = [entry.value]
@@ -242,7 +242,7 @@ def _own_unit(column: SourceColumn, place: int, dimension: Dimension, sign: floa
         unit = parse_unit("1", dimension)
     if unit is None:
         declared = f" ({declared!r} is none)" if declared else ""
-        raise Undecided(f"the unit of column {column.name} is not said{declared}", place, sign)
+        raise Undecided(f"the unit of column {column.name} is not given{declared}", place, sign)
     return unit
 
 

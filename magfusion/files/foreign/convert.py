@@ -68,7 +68,7 @@ def write_stream(
     shared : bool
         Whether the table holds other streams, too: rows without any number of this one are theirs.
     report : callable, optional
-        Told after each part how many rows have been read.
+        Called after each part with the number of rows read.
 
     Raises
     ------

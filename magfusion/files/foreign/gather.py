@@ -1,4 +1,4 @@
-"""From what lies on the disk to the plans of a log's streams, every problem told at once."""
+"""From files to the plans of a log's streams, with all problems reported together."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -41,7 +41,7 @@ class GatheredStreams:
     ----------
     bags : list of Path
     passed_over : list of str
-        Files beside the tables of a folder that are none, and why.
+        Files in the folder that are no tables, and why.
     stamped : bool
         Whether the formats have their own convention of an epoch: the first inertial sample.
     """
@@ -65,7 +65,7 @@ class GatheredStreams:
 
 
 def gather(paths: Sequence[Path], wanted: ImportRequest, declared: Findings) -> GatheredStreams:
-    """Return how files become the streams of a log; ``declared`` has what stands against it."""
+    """Return how files become the streams of a log; ``declared`` has the problems."""
     result = GatheredStreams(declared)
     attempted = set(wanted.files)
     for stream, path in wanted.files.items():
@@ -137,7 +137,7 @@ def _halves(result: GatheredStreams, attempted: set[str], named: set[str]) -> se
         return set()
     for stream in halves - attempted if halves & attempted else ():
         result.findings.problems.append(
-            f"The {stream} is lacking beside the other half of the inertial sensor; give --{stream}"
+            f"The {stream} is missing for the other half of the inertial sensor; give --{stream}"
             " FILE."
         )
     return {"imu"} if halves & attempted else set()
@@ -189,7 +189,7 @@ def _add_table(
         return streams
     names = ", ".join(column.name for column in source.columns[:30])
     result.findings.problems.append(
-        f"{file}: its columns do not say what they are (found {names}); say whose table it is by"
+        f"{file}: its columns are not recognised (found {names}); select the stream of the table by"
         " --imu, --magnetometer or --truth."
     )
     return set(STREAMS)

@@ -1,4 +1,4 @@
-"""What the names of columns say of themselves, and which unit would make their values plausible."""
+"""Streams and units recognised from column names, and units that make values plausible."""
 
 import re
 from collections.abc import Sequence
@@ -84,12 +84,12 @@ _RATES_HZ = (5.0, 30_000.0)
 
 @dataclass(frozen=True)
 class Named:
-    """A column whose name says what it is.
+    """A column recognised by its name.
 
     Parameters
     ----------
     unit : SourceUnit, optional
-        That the name, or the file, says.
+        Given by the name, or the file.
     """
 
     place: int
@@ -98,7 +98,7 @@ class Named:
 
 
 def named_columns(columns: Sequence[SourceColumn], stream: str) -> dict[str, list[Named]]:
-    """Return for each column of a stream those of a file whose names say that they are it."""
+    """Return for each column of a stream those of a file whose names match it."""
     result: dict[str, list[Named]] = {target: [] for target in STREAMS[stream]}
     for place, column in enumerate(columns):
         if (one := _named(place, column, stream)) is not None:
@@ -182,7 +182,7 @@ def _is(norm: str, stem: str, axis: str, stream: str) -> bool:
 
 
 def _nearest(named: list[Named], columns: Sequence[SourceColumn], stream: str) -> list[Named]:
-    """Return, of several, the ones whose name says of which stream they are."""
+    """Return those of several whose names give their stream."""
     if len(named) < 2:
         return named
     own = "imu" if stream in ("gyro", "accel") else stream
@@ -219,7 +219,7 @@ def streams_of(columns: Sequence[SourceColumn], file_stem: str) -> set[str]:
 def _is_certain(
     named: Named, columns: Sequence[SourceColumn], stream: str, declared: set[str]
 ) -> bool:
-    """Tell whether a column is of a stream; of an x alone its file or its unit has to say so."""
+    """Return whether a column is of a stream; for an x alone its file or its unit decides."""
     bare, _ = _readings(columns[named.place])[0]
     if stream == "truth" or bare.strip().casefold() != "x":
         return True

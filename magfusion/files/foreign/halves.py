@@ -38,7 +38,7 @@ def join_halves(directory: Path, counts: dict[str, Counts]) -> Joined:
     """Write ``imu.parquet`` from ``gyro.parquet`` and ``accel.parquet``, and remove these.
 
     The samples are those of the faster half; the slower one is interpolated linearly, which keeps
-    what it says of frequencies that it can tell.
+    its response at frequencies that it resolves.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What an import asks for: tables, maps of columns, rates; by options or a small YAML file."""
+"""Requests of an import: tables, maps of columns, rates; by options or a small YAML file."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,7 +34,7 @@ class MapFile(StrictModel):
 
 @dataclass(frozen=True)
 class ImportRequest:
-    """What an import is asked for.
+    """Request of an import.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def read_request(
     map_file: Path | None,
     declared: Findings,
 ) -> ImportRequest:
-    """Return what options ask for, and what a file asks for beside them.
+    """Return the requests of the options, and those of a file.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def _as_options(entries: Mapping[str, object]) -> list[str]:
 def _by_stream(
     sources: Iterable[Sequence[str]], declared: Findings
 ) -> dict[str, list[ColumnMapping]]:
-    """Return what columns of each stream are, by the last source that says so."""
+    """Return the columns of each stream, by the last source that gives them."""
     entries: dict[str, dict[str, ColumnMapping]] = defaultdict(dict)
     for lines in sources:
         seen: set[tuple[str, str]] = set()

@@ -1,4 +1,4 @@
-"""Which columns of a table make a stream: as the user says, or as their names say for certain."""
+"""Which columns of a table make a stream: as mapped by the user, or unambiguous by their names."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -81,7 +81,7 @@ class ImportPlan:
 
 @dataclass(eq=False)
 class Findings:
-    """What stands against an import: sentences, and options that would decide it."""
+    """Problems of an import: sentences, and options that would resolve them."""
 
     problems: list[str] = field(default_factory=list)
     proposals: list[str] = field(default_factory=list)
@@ -104,7 +104,7 @@ def _is_unit_declared(name: str, unit: str) -> bool:
 
 
 def as_options(stream: str, source: Source, terms: Terms) -> list[str]:
-    """Return terms as options, the components of a vector in one where that says the same."""
+    """Return terms as options, the components of a vector in one where that is equivalent."""
     options, done = [], set[str]()
     for target, own in terms.items():
         if target in done:
@@ -120,7 +120,7 @@ def as_options(stream: str, source: Source, terms: Terms) -> list[str]:
 
 
 def _as_vector(group: str, source: Source, terms: Terms) -> str | None:
-    """Return the components of a vector in one option's value, where that says the same."""
+    """Return the components of a vector in one option's value, where that is equivalent."""
     every = [terms[name][0] for name in GROUPS[group] if name in terms]
     names = [source.columns[term.place].name for term in every]
     shared = len({term.unit for term in every}) == 1 and "," not in "".join(names)
@@ -146,7 +146,7 @@ def plan_stream(
     Parameters
     ----------
     entries : sequence of ColumnMapping
-        What the user says, of this stream.
+        The user's mapping of this stream.
     usual : mapping, optional
         Columns that the format itself defines.
     """
@@ -206,7 +206,7 @@ class _Planning:
             if reason.place is None or "is no unit" in str(reason):
                 self.problem(f"--map '{entry}': {reason}")
             if reason.place is not None:
-                declared = "" if "is no unit" in str(reason) else "is not said"
+                declared = "" if "is no unit" in str(reason) else "is not given"
                 self.open[entry.column] = (reason.place, reason.sign, declared)
 
     def guess(self, target: str, named: Sequence[Named], optional: bool) -> None:
@@ -232,7 +232,7 @@ class _Planning:
             self.terms[target] = (Term(one.place, unit),)
             self.guessed.append(target)
         elif not optional:
-            self.open[target] = (one.place, 1.0, "is not said")
+            self.open[target] = (one.place, 1.0, "is not given")
 
     def plan(self, velocity: bool) -> ImportPlan | None:
         self._report_absent()
@@ -263,7 +263,7 @@ class _Planning:
         self.problem(f"{what} (found {names}); {remedy}")
 
     def _report_several(self, target: str, named: Sequence[Named]) -> None:
-        """Tell that several columns may be one, and propose the first."""
+        """Report that several columns match one, and propose the first."""
         names = " and ".join(self.source.columns[n.place].name for n in named)
         self.problem(f"columns {names} may both be {self.stream}.{target}; name one")
         first = named[0]
@@ -298,7 +298,7 @@ class _Planning:
             size = size[np.isfinite(size)]
             sized = f" (median size {np.median(size):.4g})" if len(size) and stem != TIME else ""
             named = f"the unit of {lead} {', '.join(names)}"
-            self.problem(f"{named} is not said, for {self.stream}.{stem}{sized}")
+            self.problem(f"{named} is not given, for {self.stream}.{stem}{sized}")
         terms: Terms = {t: (self._likely(t, p, sign),) for t, (p, sign, _) in self.open.items()}
         self.declared.proposals += as_options(self.stream, self.source, terms)
 

@@ -16,7 +16,7 @@ class SourceColumn:
     Parameters
     ----------
     name : str
-        As it stands in the file; its place, counted from 0, where it has none.
+        As written in the file; its place, counted from 0, where it has none.
     unit : str
         That the file names outside of the name: in a row of units, or as an attribute.
     """
@@ -27,7 +27,7 @@ class SourceColumn:
 
 @dataclass(frozen=True, eq=False)
 class RowBlock:
-    """Some rows: the columns that were asked for, in that order.
+    """Some rows: the requested columns, in that order.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class Source:
     form : str
         How the table was understood, for the report.
     count : int
-        Rows, as far as the format says how many; else 0.
+        Rows, if the format gives their number; else 0.
     """
 
     place: str
