@@ -218,5 +218,5 @@ def test_of_several_magnetometers_all_beacons_are_calculated(building: Site) -> 
 @pytest.mark.slow
 def test_a_building_errs_as_those_that_are_heard() -> None:
     result = many_beacons.compared_detection(0.4, 1)
-    assert result["all"].rms_m < 1.2 * result["heard alone"].rms_m
+    assert result["all"].rms_m < 1.2 * result["detected only"].rms_m
     assert result["all"].nees < 6.0
