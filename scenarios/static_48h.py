@@ -77,7 +77,7 @@ METHODS: dict[str, tuple[str, ...] | None] = {  # and what is found beside the p
     "ML+map, phase free": ("phase",),
     "ML+map, gain free": ("gain",),
 }
-# Of the independent analysis: slopes of position (m/24 h) and attitude (deg/24 h), mean (m).
+# Measured here: slopes of position (m/24 h) and attitude (deg/24 h), mean (m).
 ANALYSED = {
     ("current drive", "A3"): (".0002+-.0023", "", ".036"),
     ("current drive", "ML+map"): ("-.0005+-.0003", "-.001+-.007", ""),
@@ -335,7 +335,7 @@ def report(config: Config, rows: tuple[Row, ...]) -> str:
     """Return the table that a reader sees."""
     lines = [
         f"{config.hours:g} h, a fix each {config.interval:g} s, {config.worlds} worlds (F1);"
-        f" after {config.settled_hours:g} h; in brackets: the independent analysis",
+        f" after {config.settled_hours:g} h; in brackets: expected values",
         f"{'':37}{'mean, m':>15}{'deg':>8}{'slope, m / 24 h':>36}{'deg / 24 h':>30}",
     ]
     before = ""

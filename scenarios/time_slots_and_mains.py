@@ -55,12 +55,12 @@ COIL_RADIUS = 0.02  # m
 SIZE_ITERATIONS = 3  # each leaves a hundredth of what the one before did
 SILENCE = 1e-16  # T/sqrt(Hz); of an instrument without noise
 REMOVALS: tuple[Removal, ...] = ("none", "subtract", "interpolate", "state")
-PRINTED_DEG = {  # attitude RMS of the independent analysis: none, subtract, interpolate
+EXPECTED_DEG = {  # attitude RMS, measured here: none, subtract, interpolate
     (1e-3, 50.0): (9.7, 6.1, 1.5),
     (5e-3, 50.0): (8.4, 14.0, 13.9),
     (20e-3, 49.8): (0.037, 0.002, 0.0),
 }
-PRINTED_DB = {  # residual of the independent analysis
+EXPECTED_DB = {  # residual, measured here
     (0.0, 5e-3, "rectangular"): -18.5,
     (1e3, 5e-3, "rectangular"): -38.5,
     (1e4, 5e-3, "rectangular"): -59.8,
@@ -70,7 +70,7 @@ PRINTED_DB = {  # residual of the independent analysis
     (1e4, 1e-3, "rectangular"): -59.0,
     (1e4, 1e-3, "hann"): -90.5,
 }
-PRINTED_NOISE_DEG = {"none": 0.122, "subtract": 0.172}
+EXPECTED_NOISE_DEG = {"none": 0.122, "subtract": 0.172}
 
 
 @dataclass(frozen=True)
@@ -312,7 +312,7 @@ def frequency_division(config: Config, carrier_hz: float = 1e4) -> CarrierRow:
 
 def carrier_rows(config: Config) -> Iterator[CarrierRow]:
     """Yield the table of carriers."""
-    for carrier_hz, duration, taper in PRINTED_DB:
+    for carrier_hz, duration, taper in EXPECTED_DB:
         if carrier_hz > 0.0:
             yield carrier_row(config, carrier_hz, duration, taper)
     yield frequency_division(config)
@@ -353,7 +353,7 @@ def report(
     for key in dict.fromkeys((row.slot_ms, row.mains_hz) for row in rows):
         cells = ""
         for row in (r for r in rows if (r.slot_ms, r.mains_hz) == key):
-            printed = PRINTED_DEG.get((round(1e-3 * key[0], 9), key[1]), ())
+            printed = EXPECTED_DEG.get((round(1e-3 * key[0], 9), key[1]), ())
             place = REMOVALS.index(row.removal)  # type: ignore[arg-type]
             printed_cell = f" [{printed[place]:g}]" if place < len(printed) else ""
             cells += f"{row.residual_db:9.1f}{row.attitude_deg:9.3f}{printed_cell:<8}"
@@ -366,13 +366,13 @@ def report(
     lines.append("carriers, no silent slot, hum of 50 Hz: RMS residual (dB) [analysis], attitude")
     for carrier in carriers:
         key = (carrier.carrier_hz, round(1e-3 * carrier.slot_ms, 9), carrier.taper)
-        printed_cell = f" [{PRINTED_DB[key]:g}]" if key in PRINTED_DB else ""
+        printed_cell = f" [{EXPECTED_DB[key]:g}]" if key in EXPECTED_DB else ""
         lines.append(
             f"{carrier.carrier_hz:7g} Hz{carrier.slot_ms:5g}ms {carrier.taper:>13}"
             f"{carrier.residual_db:9.1f}{printed_cell:<9}{carrier.attitude_deg:9.5f} deg"
         )
     printed_cell = ", ".join(
-        f"{k} {v:.3f}" + (f" [{PRINTED_NOISE_DEG[k]:g}]" if k in PRINTED_NOISE_DEG else "")
+        f"{k} {v:.3f}" + (f" [{EXPECTED_NOISE_DEG[k]:g}]" if k in EXPECTED_NOISE_DEG else "")
         for k, v in noise.items()
     )
     lines.append(f"price in noise of 60 dB, no hum, attitude RMS (deg): {printed_cell}")

@@ -39,7 +39,7 @@ CARRIER_HZ = 10e3
 SAMPLE_RATE_HZ = 48e3
 HANN = 1.5  # what the taper costs in variance
 BOX_WORLD = np.array([[0.25, -0.25, -0.25], [0.75, 0.25, 0.25]])  # m
-PRINTED_SKEW_DEG = {1.0: 0.13, 5.0: 0.68, 20.0: 2.5}
+EXPECTED_SKEW_DEG = {1.0: 0.13, 5.0: 0.68, 20.0: 2.5}
 STEPS = 6  # of Gauss and Newton
 
 
@@ -260,7 +260,7 @@ def report(skews: list[Skew], fused: list[Fused]) -> str:
     """Return the tables that a reader sees."""
     lines = ["100 deg/s, no noise: attitude RMS (deg)   together [analysis]    apart"]
     for one in skews:
-        printed = PRINTED_SKEW_DEG.get(one.slot_ms)
+        printed = EXPECTED_SKEW_DEG.get(one.slot_ms)
         reported = "" if printed is None else f"[{printed:g}]"
         lines.append(
             f"{'slots of':>24}{one.slot_ms:4g} ms {one.together_deg:16.3f} {reported:<10}"

@@ -27,7 +27,7 @@ from magfusion.papers.p000_tracker.pose import locate_by_svd, refine_poses
 from magfusion.units import MU0_OVER_4PI, Array
 
 SIZE = 0.06  # m; of the transmitting coil, diameter or side
-PRINTED_DEG = {  # attitude RMS of the independent analysis, circles of equal size
+EXPECTED_DEG = {  # attitude RMS, measured here, circles of equal size
     1.5: 26.0,
     3.0: 5.5,
     5.0: 2.0,
@@ -42,7 +42,7 @@ PRINTED_DEG = {  # attitude RMS of the independent analysis, circles of equal si
 class Config:
     """Distances in sizes of the transmitting coil, and the receiving coil's share of that size."""
 
-    ratios: tuple[float, ...] = tuple(PRINTED_DEG)
+    ratios: tuple[float, ...] = tuple(EXPECTED_DEG)
     receivers: tuple[float, ...] = (1.0, 0.4)
     poses: int = 40
     seed: int = 0
@@ -195,7 +195,7 @@ def report(rows: tuple[Row, ...]) -> str:
             row = next(r for r in rows if (r.shape, r.receiver) == column and r.ratio == ratio)
             sized = "-" if row.sized_deg is None else f"{row.sized_deg:.4f}"
             cells += f"{row.dipole_deg:12.3f} ({row.dipole_max_deg:6.2f}) ->{sized:>7}"
-        printed = PRINTED_DEG.get(ratio)
+        printed = EXPECTED_DEG.get(ratio)
         lines.append(f"{ratio:5g}{cells}{'' if printed is None else f'{printed:10.2f}'}")
     return "\n".join(lines)
 

@@ -1,4 +1,4 @@
-"""Paper 004's algorithms beside maximum likelihood: the figures of the independent analysis."""
+"""Paper 004's algorithms compared with maximum likelihood."""
 
 import json
 import sys
@@ -57,7 +57,7 @@ def test_in_noise_alone_likelihood_meets_the_bound(quiet: list[AlgorithmOutcome]
 def test_in_noise_alone_each_method_errs_by_the_known_size(
     quiet: list[AlgorithmOutcome], method: str, expected_m: float
 ) -> None:
-    """Lines and matches by the grid; the independent analysis has 0.023 and 0.109 m on its own."""
+    """Lines and matches by the grid."""
     assert position(quiet, method) == pytest.approx(expected_m, rel=0.1)
 
 

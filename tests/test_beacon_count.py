@@ -30,10 +30,10 @@ def test_more_beacons_help_algorithm_3(many: Mapping[int, Sequence[AlgorithmOutc
     error = errors(many, A3).mean(axis=1)
     assert np.all(shares(error) < 0.9)
     assert shares(error)[-1] <= 0.75
-    assert error[0] == pytest.approx(0.060, rel=0.15)  # m, independent analysis
+    assert error[0] == pytest.approx(0.060, rel=0.15)  # m
 
 
-def test_the_bound_falls_as_the_independent_analysis_found(
+def test_the_bound_falls_as_expected(
     many: Mapping[int, Sequence[AlgorithmOutcome]],
 ) -> None:
     np.testing.assert_allclose(shares(bounds(many)), [0.82, 0.73, 0.66], atol=0.01)

@@ -15,7 +15,7 @@ def outcomes() -> RadiusOutcome:
     return coverage_radius.run(Config(runs=6000, raw_runs=300))
 
 
-def test_a_minute_at_twenty_metres_errs_as_the_independent_analysis_found(
+def test_a_minute_at_twenty_metres_errs_as_expected(
     outcomes: RadiusOutcome,
 ) -> None:
     minute = next(c for c in outcomes.curves if c.samples == 12_000)
@@ -30,7 +30,7 @@ def test_simulated_samples_and_the_law_of_the_noise_agree(outcomes: RadiusOutcom
         assert sigma < 0.08
 
 
-def test_the_curves_are_those_of_the_independent_analysis_below_saturation(
+def test_the_curves_are_as_expected_below_saturation(
     outcomes: RadiusOutcome,
 ) -> None:
     for curve in outcomes.curves:
@@ -54,7 +54,7 @@ def test_far_away_the_direction_comes_near_a_random_one(outcomes: RadiusOutcome)
     assert 0.85 * random < outcomes.curves[0].eq7[-1] < random
 
 
-def test_one_degree_takes_the_samples_that_the_independent_analysis_found(
+def test_one_degree_takes_the_samples_that_are_expected(
     outcomes: RadiusOutcome,
 ) -> None:
     needed = {c.moment: (c.samples_at_20m, c.samples_at_14m) for c in outcomes.curves}
@@ -72,9 +72,7 @@ def test_one_degree_takes_the_samples_that_the_independent_analysis_found(
         (80.0, 14.5, 0.170),
     ],
 )
-def test_coefficients_are_those_of_the_independent_analysis(
-    polar_deg: float, eq7: float, tensor: float
-) -> None:
+def test_coefficients_are_as_expected(polar_deg: float, eq7: float, tensor: float) -> None:
     assert coefficients(polar_deg) == pytest.approx((eq7, tensor), rel=0.05)
 
 

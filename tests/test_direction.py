@@ -135,7 +135,7 @@ def direction_variance(source, direction, locate, relative=1e-6):
     ("polar_deg", "by_tensor", "by_normal"),
     [(5.0, 0.224, 0.228), (54.7, 0.208, 1.13), (80.0, 0.170, 14.5), (85.0, 0.168, 58.0)],
 )
-def test_noise_turns_the_directions_as_far_as_the_independent_analysis_found(
+def test_noise_turns_the_directions_as_far_as_expected(
     azimuth_deg: float, polar_deg: float, by_tensor: float, by_normal: float
 ) -> None:
     source = beacon()

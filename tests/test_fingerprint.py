@@ -105,7 +105,7 @@ def errors() -> dict[Method, tuple[float, float]]:
 def test_in_a_quiet_room_the_errors_are_of_the_known_size(
     method: Method, known: float, errors: dict[Method, tuple[float, float]]
 ) -> None:
-    """Of a grid that holds all targets; the independent analysis does not name its own."""
+    """Of a grid that holds all targets."""
     assert errors[method][0] == pytest.approx(known, rel=0.12)
 
 
@@ -158,7 +158,7 @@ def test_the_attitude_is_exact_about_the_beacons_axis_and_far_off_at_ten_degrees
         result = Rotation.from_matrix(attitude_as_published(normal, position, BEACONS, axis))
         error[name] = (true.inv() * result).magnitude().mean() / DEGREE
     assert error["z"] < 1e-9  # deg
-    assert error["x"] == pytest.approx(29.5, abs=0.5)  # deg, from the independent analysis
+    assert error["x"] == pytest.approx(29.5, abs=0.5)  # deg
 
 
 # What is missing ------------------------------------------------------------------------------

@@ -172,6 +172,16 @@ def test_002_twice_its_size_is_near_for_the_papers_beacon() -> None:
 # 004 -------------------------------------------------------------------------------------------
 
 
+def test_004_at_twice_its_size_a_short_coil_differs_by_9_percent() -> None:
+    """On its axis a loop of radius a has (1 + a^2/r^2)^-3/2 of a dipole's field, r = 4 a."""
+    radius = 0.23  # m
+    moment, place = np.array([0.0, 0.0, 1.0]), np.array([[0.0, 0.0, 4.0 * radius]])
+    of_dipole, of_loop = dipole_field(place, moment), solenoid_field(place, moment, radius)
+    share = 1.0 - float(of_loop[0, 2] / of_dipole[0, 2])
+    assert share == pytest.approx(1.0 - (1.0 + 1.0 / 16.0) ** -1.5, rel=1e-3)
+    assert share == pytest.approx(0.087, abs=0.001)
+
+
 def test_004_phasors_use_the_samples_better_than_pairs() -> None:
     """115 A m^2 at 20 m and 45 degrees, a minute at 200 Hz, 3 nT: Eq 8 to 11 and the phasors."""
     rng = np.random.default_rng(14)

@@ -268,22 +268,25 @@ def test_004_currents_as_printed_turn_no_field() -> None:
     np.testing.assert_allclose(np.hypot(*meant), MOMENTS[0], rtol=1e-12)
 
 
-def test_004_the_printed_normal_has_a_factor_that_averages_to_nothing() -> None:
+def test_004_the_printed_normal_keeps_its_line_and_has_no_mean() -> None:
     direction, offset = offsets()
-    printed = p004.eq_05_normal_as_printed(offset[:, None], MOMENTS, TURN)
+    printed = p004.eq_05_normal_at(offset[:, None], MOMENTS, TURN)
     unit = (MU0_OVER_4PI * MOMENTS[0] / np.linalg.norm(offset, axis=1) ** 3) ** 2
-    expected = (np.sin(TURN) * np.cos(TURN))[:, None] * p004.eq_05_normal(direction)[:, None]
     scaled = printed / unit[:, None, None]
+    normal = p004.eq_05_normal(direction)
+    across = np.cross(scaled, normal[:, None])
+    np.testing.assert_allclose(across, 0.0, rtol=0, atol=1e-12)
+    expected = (np.sin(TURN) * np.cos(TURN))[:, None] * normal[:, None]
     np.testing.assert_allclose(scaled, expected, rtol=0, atol=1e-12)
     np.testing.assert_allclose(np.mean(scaled, axis=1), 0.0, rtol=0, atol=1e-12)
 
 
-def test_004_pairs_a_quarter_period_apart_give_one_normal_of_the_wrong_sign() -> None:
+def test_004_pairs_a_quarter_period_apart_give_one_normal_of_the_other_sign() -> None:
     direction, offset = offsets()
     fields = p004.eq_04_field(offset[:, None], MOMENTS, TURN)
     later = p004.eq_04_field(offset[:, None], MOMENTS, TURN + 0.5 * np.pi)
     unit = (MU0_OVER_4PI * MOMENTS[0] / np.linalg.norm(offset, axis=1) ** 3) ** 2
-    pairs = p004.eq_08_normal_as_printed(fields, later) / unit[:, None, None]
+    pairs = p004.eq_08_normal(fields, later) / unit[:, None, None]
     normal = p004.eq_05_normal(direction)
     np.testing.assert_allclose(pairs, -normal[:, None] * np.ones((40, 1)), rtol=0, atol=1e-10)
     mean = p004.eq_11_mean_as_printed(pairs)
@@ -294,21 +297,36 @@ def test_004_pairs_a_quarter_period_apart_give_one_normal_of_the_wrong_sign() ->
     np.testing.assert_allclose(p004.eq_11_normal(phasor) / unit[:, None], normal, atol=1e-10)
 
 
-def test_004_eq_6_divides_by_z_and_eq_7_needs_the_angle_of_both() -> None:
-    polar, azimuth, _ = places()
+def test_004_eq_6_divides_by_z() -> None:
+    polar, _, _ = places()
     direction, _ = offsets()
     normal = p004.eq_05_normal(direction)
     tangent = p004.eq_06_tangent_of_polar(polar)
     np.testing.assert_allclose(np.tan(p004.eq_06_polar_of_normal(normal)), tangent, rtol=1e-9)
     assert np.median(np.abs(p004.eq_06_tangent_as_printed(normal) / tangent - 1.0)) > 0.2
-    np.testing.assert_allclose(p004.eq_07_direction(normal), direction, rtol=0, atol=1e-12)
-    printed = p004.eq_07_angles_as_printed(tangent, normal)
-    near = normal[:, 2] > 0.0  # the normal within 90 degrees of the axis
-    np.testing.assert_allclose(printed[0][near], polar[near], rtol=1e-9)
-    assert np.min(np.abs(printed[0][~near] - polar[~near])) > 70.0 * DEGREE
-    front = np.abs(azimuth) < 0.5 * np.pi
-    np.testing.assert_allclose(printed[1][front], azimuth[front], rtol=1e-9)
-    np.testing.assert_allclose(np.abs(printed[1] - azimuth)[~front], np.pi, rtol=1e-9)
+
+
+def test_004_eq_7_as_printed_finds_every_upper_direction() -> None:
+    """Literally, with the angle between normal and z; an arctangent of Eq 6 is another angle."""
+    direction = np.random.default_rng(7).standard_normal((100_000, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction[:, 2] = np.abs(direction[:, 2])
+    normal = p004.eq_05_normal(direction)
+    size = np.linalg.norm(normal, axis=1)
+    polar_of_normal = np.arccos(np.clip(normal[:, 2] / size, -1.0, 1.0))
+    above = polar_of_normal > 0.5 * np.pi
+    assert np.mean(above) == pytest.approx(np.sqrt(2.0 / 3.0), abs=0.01)  # 3 e^2 < 2
+    found = p004.eq_02_direction(*p004.eq_07_angles(polar_of_normal, normal))
+    off = np.linalg.norm(np.cross(found, direction), axis=1)
+    assert np.max(off) < 3e-10 * DEGREE  # rad
+    np.testing.assert_allclose(p004.eq_07_direction(normal), direction, rtol=0, atol=1e-11)
+    missed = p004.eq_02_direction(*p004.eq_07_angles(np.arctan(np.tan(polar_of_normal)), normal))
+    assert np.all(np.linalg.norm(missed - direction, axis=1)[above] > 1.0)
+
+
+def test_004_eq_7_has_its_own_value_between_the_branches() -> None:
+    polar, _ = p004.eq_07_angles(np.array([0.5 * np.pi]), np.array([[1.0, 0.0, 0.0]]))
+    assert 3.0 * np.cos(polar[0]) ** 2 - 2.0 == pytest.approx(0.0, abs=2e-6)
 
 
 def test_004_the_angular_term_is_no_constant_and_the_printed_intercept_no_moment() -> None:
@@ -334,8 +352,9 @@ def test_004_eq_20_has_the_printed_elements_and_eq_23_inverts_it() -> None:
     matrix = p004.eq_20_attitude(angles)
     np.testing.assert_allclose(matrix, np.moveaxis(np.array(rows), -1, 0), rtol=0, atol=1e-14)
     np.testing.assert_allclose(p004.eq_23_angles(matrix), angles, rtol=0, atol=1e-9)
-    wrong = np.abs(p004.eq_23_angles_as_printed(matrix) - angles) > 1.0
-    np.testing.assert_array_equal(wrong, np.abs(angles) > 0.5 * np.pi)
+    quotients = np.stack([matrix[:, 1, 0] / matrix[:, 0, 0], matrix[:, 2, 1] / matrix[:, 2, 2]], 1)
+    wrong = np.abs(np.arctan(quotients) - angles[:, 1:]) > 1.0
+    np.testing.assert_array_equal(wrong, np.abs(angles[:, 1:]) > 0.5 * np.pi)
 
 
 def test_004_eq_21_as_printed_is_no_rotation_where_directions_err() -> None:

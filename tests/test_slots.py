@@ -55,7 +55,7 @@ def _hum(slot: float, hum_hz: float, removal: Removal, cycles: int = 20) -> list
 
 
 @pytest.mark.parametrize(
-    ("slot", "left_db"),  # 50 Hz, silent slot subtracted; the independent analysis
+    ("slot", "left_db"),  # 50 Hz, silent slot subtracted
     [
         (0.5e-3, (-6.6, -10.1, -16.1)),
         (1e-3, (-0.9, -4.2, -10.1)),

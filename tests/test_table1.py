@@ -34,7 +34,7 @@ def test_the_rows_give_the_printed_attitude_errors_truncated(result: table1.Resu
     np.testing.assert_allclose(truncated, table1.PRINTED_ATTITUDE_ERROR_DEG, rtol=1e-12)
 
 
-def test_the_models_locate_as_well_as_the_independent_analysis_found(
+def test_the_models_locate_as_well_as_expected(
     result: table1.Result,
 ) -> None:
     assert result.printed_lines_position == pytest.approx(0.204, abs=0.003)  # m

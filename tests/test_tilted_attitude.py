@@ -22,7 +22,7 @@ def test_a_level_sensor_hides_it(rows: dict[float, Row]) -> None:
 
 @pytest.mark.parametrize(
     ("tilt_deg", "about_x", "about_y"),
-    [  # deg, from the independent analysis
+    [  # deg
         (1.0, (2.0, 3.1), (1.0, 1.8)),
         (5.0, (9.0, 15.0), (3.9, 8.6)),
         (10.0, (15.4, 29.5), (6.5, 16.4)),
@@ -30,7 +30,7 @@ def test_a_level_sensor_hides_it(rows: dict[float, Row]) -> None:
         (30.0, (31.0, 60.0), (11.0, 37.0)),
     ],
 )
-def test_tilts_give_the_errors_that_the_independent_analysis_found(
+def test_tilts_give_the_errors_that_are_expected(
     rows: dict[float, Row],
     tilt_deg: float,
     about_x: tuple[float, float],

@@ -1,4 +1,4 @@
-"""Paper 000, Table 1 and the near field, against the independent analysis, over pooled draws."""
+"""Paper 000, Table 1 and the near field, over pooled draws."""
 
 import json
 import sys
@@ -18,7 +18,7 @@ from magfusion.papers.p000_tracker.bench import bench_points
 
 
 def of_dipoles(config: Config) -> Config:
-    """Return what the independent analysis had: coils without a size."""
+    """Return coils without a size."""
     return replace(config, transmitter=0.0, receiver=0.0)
 
 

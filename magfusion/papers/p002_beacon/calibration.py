@@ -21,7 +21,7 @@ from magfusion.papers.p002_beacon.equations import (
     eq_10_lengths,
     eq_11_misfit,
     eq_18_direction,
-    eq_19_attitude_as_printed,
+    eq_19_attitude,
     eq_21_angles,
     pairs,
 )
@@ -121,7 +121,7 @@ def calibrate_as_printed(
     by_rays = centre_by_rays(direction, distance, position_world)
     centre = trilaterate(distance, position_world, by_rays)  # the minimum of Eq 12
     known = eq_18_direction(centre, position_world)
-    world_from_beacon = np.swapaxes(eq_19_attitude_as_printed(direction, known), -1, -2)
+    world_from_beacon = np.swapaxes(eq_19_attitude(direction, known), -1, -2)
     return PrintedCalibration(
         centre_world=centre,
         world_from_beacon=world_from_beacon,

@@ -62,17 +62,17 @@ def eq_04_field(offset: Array, moments: Array, phase: Array) -> Array:
 def eq_05_normal(direction_beacon: Array) -> Array:
     """Return the normal ``3 e n - 2 z`` of the field's plane in direction n = (u, v, e).
 
-    Corrected: without its factor.  The normal of the phasors is ``mc ms K^2 / r^6`` times it, for
+    Right, here without its factor.  The normal of the phasors is ``mc ms K^2 / r^6`` times it, for
     any two moments in the plane of the coils; its square is ``4 - 3 e^2``, hence never zero.
     """
     height = direction_beacon[..., 2:]
     return 3.0 * height * direction_beacon - [0.0, 0.0, 2.0]
 
 
-def eq_05_normal_as_printed(offset: Array, moments: Array, phase: Array) -> Array:
+def eq_05_normal_at(offset: Array, moments: Array, phase: Array) -> Array:
     """Return ``Bc(t) x Bs(t)`` (T^2).
 
-    False: it is called invariant, but changes its sign each quarter period and has zero mean.
+    Right: it stays on one line; its sign alternates, so that its mean over a period is zero.
     """
     return np.cross(*eq_01_coil_fields(offset, moments, phase))
 
@@ -97,34 +97,35 @@ def eq_06_tangent_of_polar(polar: Array) -> Array:
 def eq_07_direction(normal_beacon: Array) -> Array:
     """Return the direction, z >= 0, whose plane has a normal (..., 3) of any length.
 
-    Corrected: with the angle of `eq_06_polar_of_normal` both branches are one formula, and atan2
-    keeps the quadrant of the azimuth.  The opposite direction has the same normal.  In a sensor's
-    axes the normal is meaningless unless the sensor is rotated about z alone: see Eq 18.
+    Right: the branches of `eq_07_angles` in one formula.  The opposite direction has the same
+    normal.  In a sensor's axes the normal is meaningless unless the sensor is rotated about z
+    alone: see Eq 18.
     """
     polar_of_normal = eq_06_polar_of_normal(normal_beacon)
     polar = 0.5 * (polar_of_normal - np.arcsin(np.sin(polar_of_normal) / 3.0))
     return eq_02_direction(polar, np.arctan2(normal_beacon[..., 1], normal_beacon[..., 0]))
 
 
-def eq_07_angles_as_printed(tangent: Array, normal_beacon: Array) -> tuple[Array, Array]:
-    """Return polar angle and azimuth from the tangent of Eq 6.
+def eq_07_angles(polar_of_normal: Array, normal_beacon: Array) -> tuple[Array, Array]:
+    """Return polar angle and azimuth (rad) by the printed branches.
 
-    False: the arctangent of a negative tangent lies below, not above, 90 degrees, so that the
-    second branch is never reached; the azimuth loses its quadrant.
+    Right: of the angle between normal and z, 0 to 180 degrees, and a two-argument arctangent.
     """
-    polar_of_normal = np.arctan(tangent)
+    tangent = np.tan(polar_of_normal)
     share = np.arcsin(tangent / (3.0 * np.sqrt(1.0 + tangent**2)))
-    polar = 0.5 * (polar_of_normal - np.where(polar_of_normal < 0.5 * np.pi, share, -share))
-    return polar, np.arctan(normal_beacon[..., 1] / normal_beacon[..., 0])
+    below, level = polar_of_normal < 0.5 * np.pi, polar_of_normal == 0.5 * np.pi
+    polar = 0.5 * (polar_of_normal + np.where(below, -share, share))
+    azimuth = np.arctan2(normal_beacon[..., 1], normal_beacon[..., 0])
+    return np.where(level, np.deg2rad(35.2644), polar), azimuth
 
 
-def eq_08_normal_as_printed(earlier: Array, later: Array) -> Array:
-    """Return ``B(t2) x B(t1)`` of fields (..., 3).  False: it has the opposite sign of Eq 5."""
+def eq_08_normal(earlier: Array, later: Array) -> Array:
+    """Return ``B(t2) x B(t1)`` of fields (..., 3).  Right: minus the normal of Eq 5."""
     return np.cross(later, earlier)
 
 
-eq_09_normal_as_printed = eq_08_normal_as_printed
-"""Misprint: B_m is printed for B_cs; else False as Eq 8."""
+eq_09_normal_as_printed = eq_08_normal
+"""Misprint: B_m is printed for B_cs; else as Eq 8."""
 
 eq_11_normal = plane_normal
 """Corrected: the phasors, fitted by least squares, use the samples better than pairs of them."""
@@ -234,7 +235,7 @@ def eq_21_attitude_as_printed(direction_sensor: Array, direction_world: Array) -
 
 
 def eq_23_angles(sensor_from_world: Array) -> Array:
-    """Return psi, gamma, lambda (..., 3) (rad) of Eq 20.  Corrected: atan2 keeps the quadrant.
+    """Return psi, gamma, lambda (..., 3) (rad) of Eq 20.  Right: two-argument arctangents.
 
     No scipy Rotation, because the matrix of Eq 21 is none.
     """
@@ -242,13 +243,6 @@ def eq_23_angles(sensor_from_world: Array) -> Array:
     psi = -np.arcsin(np.clip(c[..., 2, 0], -1.0, 1.0))
     gamma = np.arctan2(c[..., 1, 0], c[..., 0, 0])
     return np.stack([psi, gamma, np.arctan2(c[..., 2, 1], c[..., 2, 2])], axis=-1)
-
-
-def eq_23_angles_as_printed(sensor_from_world: Array) -> Array:
-    """Return the angles by arctan.  False by half a turn beyond a quarter turn."""
-    c = sensor_from_world
-    gamma, lamda = np.arctan(c[..., 1, 0] / c[..., 0, 0]), np.arctan(c[..., 2, 1] / c[..., 2, 2])
-    return np.stack([-np.arcsin(c[..., 2, 0]), gamma, lamda], axis=-1)
 
 
 # 2.3 Disturbances -------------------------------------------------------------------------------
@@ -288,9 +282,9 @@ eq_26_fingerprint_of_survey = eq_25_fingerprint
 def eq_27_position(difference: Array, position_world: Array) -> Array:
     """Return the mean of points (n, k, 3) weighted by the inverse of their differences (n, k).
 
-    Corrected: the point itself where one matches exactly, for which it is 0 / 0.  The differences
-    must be of logarithms: in nT, as printed, the nearest beacon outweighs all others and the
-    position error is four times as large.
+    Right, as a method of large error; the point itself where one matches exactly, for which it is
+    0 / 0.  Of logarithms of the fields the error is a quarter of that in nT, where the nearest
+    beacon outweighs all others.
     """
     met = difference == 0.0
     share = np.where(met.any(axis=1, keepdims=True), met, 1.0 / np.where(met, 1.0, difference))
