@@ -150,7 +150,7 @@ def test_eq_11_corrected_is_exact() -> None:
 
 
 def test_printed_rotations_make_it_worse_and_corrected_ones_better() -> None:
-    """Known rigid errors of one degree about each axis of both antennas, other ones at each pose."""
+    """Rigid errors of one degree about each axis of both antennas, other ones at each pose."""
     attitude, position, coupling = ideal(20_000)
     rng = np.random.default_rng(4)
     turns = [DEGREE * rng.standard_normal((len(position), 3)) for _ in range(2)]
