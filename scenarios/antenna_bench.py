@@ -293,7 +293,7 @@ def run_seed(config: Config) -> BenchOutcome:
 
 def ratios(outcomes: list[BenchOutcome]) -> Array:
     """Return reported over found, of all seeds together, of attitude and position."""
-    reported, result = ([getattr(o, name) for o in outcomes] for name in ("reported", "found"))
+    reported, result = ([getattr(o, name) for o in outcomes] for name in ("reported", "estimate"))
     return np.array([rms(np.array(reported)[:, k]) / rms(np.array(result)[:, k]) for k in range(2)])
 
 

@@ -246,7 +246,7 @@ def test_rows_made_after_the_checkpoint_are_forgotten(tmp_path: Path) -> None:
     shorter = RowFile(tmp_path / "rows", columns, mark)
     assert len(shorter.rows()["time"]) == 4
     shorter.close()
-    with pytest.raises(InputError, match="is not as its checkpoint says"):
+    with pytest.raises(InputError, match="does not match its checkpoint"):
         RowFile(tmp_path / "rows", columns, further)
 
 

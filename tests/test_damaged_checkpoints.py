@@ -179,7 +179,7 @@ def refused(residual: Interrupted, file: Path, content: bytes, tmp_path: Path) -
     assert not (tmp_path / "sentinel").exists()
     sentence = str(reported.value)
     assert "\n" not in sentence
-    assert str(file) in sentence or "not as its checkpoint says" in sentence
+    assert str(file) in sentence or "does not match its checkpoint" in sentence
     assert len(sentence) < 400 + len(str(file))
     return sentence
 
