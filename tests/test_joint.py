@@ -276,6 +276,6 @@ def test_a_log_that_says_otherwise_is_named_with_its_beacon(together: Together) 
     assert result.of_log[:2] == ((), ())
     (finding,) = result.of_log[2]
     assert finding.code == "logs_disagree"
-    assert "Log c contradicts the other logs: it takes C." in finding.text
+    assert "Log c contradicts the other logs: it moves C." in finding.text
     assert "beacon C was moved" in finding.text
     assert result.excess > 2.0
