@@ -153,7 +153,7 @@ def test_the_pipe_hears_what_the_log_has(warm: Log, tmp_path: Path) -> None:
     given, reported = io.BytesIO(), io.StringIO()
     run_replay(read_log(tmp_path / "log", None, 9.0), given, "json", realtime=False)
     assert given.getvalue().count(b'"temperature"') > 10
-    states = {}
+    worst = {}
     for name, records in (
         ("heard", given.getvalue()),
         ("deaf", b"".join(r for r in given.getvalue().splitlines(True) if b"degc" not in r)),
@@ -162,11 +162,13 @@ def test_the_pipe_hears_what_the_log_has(warm: Log, tmp_path: Path) -> None:
         settings = StreamSettings(NavigatorSettings("ekf"))
         run_stream(tmp_path / "site.yaml", settings, io.BytesIO(records), sink, reported)
         lines = [json.loads(line) for line in sink.getvalue().splitlines()]
-        last = [line for line in lines if line["started"]][-1]
-        where = warm.truth.position_world[np.argmin(np.abs(warm.truth.time - last["time"]))]
-        states[name] = float(np.linalg.norm(np.array(last["position"]) - where))
-    assert states["heard"] < 0.005  # m
-    assert states["deaf"] > 0.02  # m
+        states = [line for line in lines if line["started"]]
+        nearest = [np.argmin(np.abs(warm.truth.time - state["time"])) for state in states]
+        errors = [state["position"] for state in states] - warm.truth.position_world[nearest]
+        worst[name] = np.max(np.linalg.norm(errors, axis=1))
+    assert worst["heard"] < 0.01  # m
+    # Coils that fade by a tenth of their moment seem 3 % farther than they are: 3 m away, 9 cm.
+    assert worst["deaf"] > 0.05  # m
 
 
 def test_demodulated_phasors_lack_no_temperature(warm: Log, tmp_path: Path) -> None:
