@@ -29,7 +29,7 @@ from magfusion.units import DEGREE, MU0_OVER_4PI, NANOTESLA, Array, ComplexArray
 PAPER_RADIUS = 20.0  # m, figure 6
 PAPER_RADIUS_MEASURED = 14.0  # m, section 3.1
 METHODS = ("Eq 7", "tensor")
-# Measured here (deg^2), at RANGES and 45 degrees from the axis.
+# Reference (deg^2), not measured here, at RANGES and 45 degrees from the axis.
 RANGES = (10.0, 12.0, 14.0, 16.0, 18.0, 20.0, 22.0, 25.0, 30.0, 40.0)
 ANALYSED = {
     (65.0, 200): (4.7, 14, 36, 82, 175, 360, 663, 1370, 2330, 3000),

@@ -219,7 +219,7 @@ def run(config: Config) -> dict[str, dict[str, float]]:
     return out
 
 
-PAPER_ANALYSIS = {  # deg, measured here, in the order of the columns
+PAPER_ANALYSIS = {  # deg; reference, not measured here, in the order of the columns
     "noise 1 mG": {"paper": 0.099, "least_squares": 0.089},
     "tilt 0.1 deg": {"paper": 0.074, "least_squares": 0.069},
     "tilt 1 deg": {"paper": 0.741, "least_squares": 0.688},

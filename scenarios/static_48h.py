@@ -77,7 +77,7 @@ METHODS: dict[str, tuple[str, ...] | None] = {  # and what is found beside the p
     "ML+map, phase free": ("phase",),
     "ML+map, gain free": ("gain",),
 }
-# Measured here: slopes of position (m/24 h) and attitude (deg/24 h), mean (m).
+# Reference, not measured here: slopes of position (m/24 h) and attitude (deg/24 h), mean (m).
 ANALYSED = {
     ("current drive", "A3"): (".0002+-.0023", "", ".036"),
     ("current drive", "ML+map"): ("-.0005+-.0003", "-.001+-.007", ""),

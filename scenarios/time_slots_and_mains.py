@@ -55,12 +55,12 @@ COIL_RADIUS = 0.02  # m
 SIZE_ITERATIONS = 3  # each leaves a hundredth of what the one before did
 SILENCE = 1e-16  # T/sqrt(Hz); of an instrument without noise
 REMOVALS: tuple[Removal, ...] = ("none", "subtract", "interpolate", "state")
-EXPECTED_DEG = {  # attitude RMS, measured here: none, subtract, interpolate
+EXPECTED_DEG = {  # attitude RMS; reference, not measured here: none, subtract, interpolate
     (1e-3, 50.0): (9.7, 6.1, 1.5),
     (5e-3, 50.0): (8.4, 14.0, 13.9),
     (20e-3, 49.8): (0.037, 0.002, 0.0),
 }
-EXPECTED_DB = {  # residual, measured here
+EXPECTED_DB = {  # residual; reference, not measured here
     (0.0, 5e-3, "rectangular"): -18.5,
     (1e3, 5e-3, "rectangular"): -38.5,
     (1e4, 5e-3, "rectangular"): -59.8,

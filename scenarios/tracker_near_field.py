@@ -27,7 +27,7 @@ from magfusion.papers.p000_tracker.pose import locate_by_svd, refine_poses
 from magfusion.units import MU0_OVER_4PI, Array
 
 SIZE = 0.06  # m; of the transmitting coil, diameter or side
-EXPECTED_DEG = {  # attitude RMS, measured here, circles of equal size
+EXPECTED_DEG = {  # attitude RMS; reference, not measured here, circles of equal size
     1.5: 26.0,
     3.0: 5.5,
     5.0: 2.0,

@@ -75,7 +75,7 @@ def test_what_coils_of_true_size_turn_the_closed_form_by_is_taken_off(
     monkeypatch.setattr(mains, "COIL_RADIUS", 0.5 * mains.COIL_RADIUS)
     smaller = mains.taken_for_dipoles_deg(CONFIG)
     assert result["dipoles"] / smaller["dipoles"] == pytest.approx(4.0, rel=0.01)
-    noise_deg = mains.EXPECTED_NOISE_DEG["none"]  # at 60 dB; as measured here
+    noise_deg = mains.EXPECTED_NOISE_DEG["none"]  # at 60 dB; reference, not measured here
     assert mains.COIL_RADIUS == 0.01  # halved
     assert result["dipoles"] == pytest.approx(2.0 * noise_deg, rel=0.1)
     assert result["coils"] < 1e-6
