@@ -8,7 +8,7 @@ import tilted_attitude
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.model.samples import FieldSamples
+from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site
 from magfusion.papers.p004_fingerprints.algorithms import (
     TOO_FEW_BEACONS,
@@ -26,7 +26,12 @@ from magfusion.papers.p004_fingerprints.fingerprint import (
     locate_by_differential_range,
     locate_by_neighbours,
 )
-from magfusion.papers.p004_fingerprints.rotating import rotating_fields, rotation_axis_world
+from magfusion.papers.p004_fingerprints.rotating import (
+    MAX_TILT,
+    attitude_is_valid,
+    rotating_fields,
+    rotation_axis_world,
+)
 from magfusion.papers.p004_fingerprints.rssi import RssiLines
 from magfusion.receiver.ellipse import plane_normal
 from magfusion.simulation.field import phasors_world
@@ -162,6 +167,25 @@ def test_the_attitude_is_exact_about_the_beacons_axis_and_far_off_at_ten_degrees
 
 
 # What is missing ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axis", [[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]])
+def test_an_attitude_is_valid_about_the_shared_axis_alone(axis: list[float]) -> None:
+    """The accelerometer decides where the axes are parallel, whatever their signs."""
+    shared = np.array(axis)
+    axes = np.array([shared, -shared, shared])
+    time = np.array([1.0, 3.0, 9.0])  # s; no sample near the last
+    stamps = np.arange(0.0, 4.0, 0.01)
+    about = Rotation.from_rotvec(np.where(stamps[:, None] < 2.0, 1.5, 0.7) * shared)
+    across = np.cross(shared, [0.0, 1.0, 0.0])
+    for tilt, expected in ((0.8 * MAX_TILT, True), (1.2 * MAX_TILT, False)):
+        tilted = Rotation.from_rotvec((stamps[:, None] >= 2.0) * tilt * np.array([0.0, 1.0, 0.0]))
+        force = about.apply((tilted).apply([0.0, 0.0, 9.81]))  # about the axis, and tilted later
+        imu = ImuSamples(stamps, np.zeros_like(force), force)
+        np.testing.assert_array_equal(attitude_is_valid(axes, time, imu), [True, expected, True])
+    bent = np.array([shared, shared, shared + np.tan(2.0 * MAX_TILT) * across])
+    bent /= np.linalg.norm(bent, axis=1, keepdims=True)
+    assert not np.any(attitude_is_valid(bent, time, imu))
 
 
 def test_an_epoch_is_located_by_the_beacons_that_it_hears_or_dropped_with_its_reason() -> None:

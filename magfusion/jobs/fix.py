@@ -17,7 +17,6 @@ from magfusion.estimation.snapshot.explained_fixes import explained_fixes
 from magfusion.estimation.snapshot.fix_magnetometers import contradicting_magnetometers
 from magfusion.estimation.snapshot.problem import ESTIMABLE
 from magfusion.files.fix_table import write_hypotheses
-from magfusion.files.survey import read_survey
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
 from magfusion.jobs.region import RegionSettings
@@ -26,10 +25,7 @@ from magfusion.jobs.settings import Command, RiskSettings, WindowSettings, optio
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.progress import Report, quiet
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import Finding, Trust, uniform_trust
-from magfusion.papers.p004_fingerprints.algorithms import fix_as_published
-from magfusion.papers.p004_fingerprints.fingerprint import fingerprint_database
-from magfusion.papers.p004_fingerprints.rotating import rotating_beacons, rotating_fields
+from magfusion.model.trust import Finding, Trust
 from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.rest_figures import rest_figures
 from magfusion.results.verdict import level_figures, trust_figures
@@ -104,7 +100,12 @@ def run(settings: FixSettings, output: Path, report: Report = quiet) -> Figures:
     """Fix the pose at every epoch by the selected method."""
     job = settings.job(output)
     if settings.method != "likelihood":
-        return run_published_fix(job, settings)
+        from magfusion.jobs.published_fix import run_published_fix
+
+        assert settings.survey is not None
+        return run_published_fix(
+            job, settings.method, settings.survey, settings.block, settings.lockin(job)
+        )
     free_parameters = _read_free_parameters(settings.free)
     lockin = settings.lockin(job)
     return run_fix(
@@ -337,76 +338,6 @@ def write_fix_result(
     motion = MotionPage(site, best, log.truth, errors, trust=states, residual=residual)
     write_report(directory, figures | compared, motion)
     return figures | compared
-
-
-def run_published_fix(job: Job, settings: FixSettings) -> Figures:
-    """Fix every epoch on its own by an algorithm of paper 004.
-
-    The poses have no covariance, because the algorithms give none.
-
-    Raises
-    ------
-    InputError
-        Where the survey has a beacon that is not in the site, both share fewer than three rotating
-        beacons, or as many are detected in no epoch.
-    EstimationError
-    """
-    from magfusion.estimation.demodulation.demodulation import phasors
-    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
-    from magfusion.results.page_motion import MotionPage
-    from magfusion.results.recording import write_recording
-    from magfusion.results.report import compared_with_truth, dropped_figures, write_report
-
-    method, survey_path, lockin = settings.method, settings.survey, settings.lockin(job)
-    assert method != "likelihood"
-    assert survey_path is not None
-    claimed = claim(job.output, "smooth", "fix")
-    log, site = read_job(job)
-    table = survey_path / "survey.parquet" if survey_path.is_dir() else survey_path
-    with named(table):
-        database, axis_world = rotating_beacons(
-            fingerprint_database(read_survey(table), site), site
-        )
-    began = time.perf_counter()
-    with named(job.log_path):
-        samples, windows_dropped = phasors(log, site, lockin)
-    fields = rotating_fields(samples, site, database.beacons, axis_world)
-    fixes = fix_as_published(database, fields, method, settings.block)
-    if len(fixes.epoch) == 0:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in fixes.dropped.items())
-        raise InputError(
-            f"{job.log_path}: none of its {len(samples)} epochs can be located with {table}"
-            f" ({reasons}); make the survey where the log was recorded"
-        )
-    lever_world = fixes.world_from_body @ site.platform.magnetometer.position_body
-    result = Trajectory(
-        samples.time[fixes.epoch], fixes.world_from_body, fixes.position_world - lever_world
-    )
-    errors, compared = compared_with_truth(result, log)
-    text = f"--method {settings.method} has no covariance: the accuracy of a pose is unknown."
-    trust = Trust((Finding("no_covariance", text), *recorded(log, site, BRIDGED_CODES)))
-    figures = (
-        heading("fix", log.name)
-        | trust_figures(trust)
-        | Figures(
-            Figure("method", settings.method),
-            Figure("epochs", len(result)),
-            Figure("fingerprints", len(database)),
-        )
-    )
-    figures |= dropped_figures(fixes.dropped, "epochs")
-    figures |= dropped_figures(windows_dropped) | compared
-    figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
-    with claimed as whole:
-        directory = found_in(whole, trust)
-        write_tum(result, directory / "trajectory.tum", log.epoch_ns)
-        rows = uniform_trust(len(result), trust.verdict)
-        write_trajectory(result, directory / "trajectory.parquet", log.epoch_ns, rows)
-        recording = directory / "run.rrd"
-        write_recording(recording, site, result, truth=log.truth, errors=errors, trust=trust)
-        write_report(whole, figures, MotionPage(site, result, log.truth, errors))
-    refuse_failed(job.log_path, job.output, trust)
-    return figures
 
 
 COMMAND = Command(FixSettings, run, example="magfusion fix log -o fixes")

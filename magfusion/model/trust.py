@@ -21,6 +21,7 @@ CODES = {
     "angle_convention": "the attitudes of beacons follow another convention",
     "angle_units": "the attitudes of beacons are in another unit",
     "assumed": "an undeclared property was assumed",
+    "attitude_refused": "the attitude of a paper's algorithm cannot be valid, and is omitted",
     "beacon_clock": "a beacon's clock is not as declared",
     "beacon_excluded": "a beacon is inconsistent with the others and was excluded meanwhile",
     "beacon_fault": "the field of a beacon is faulty, temporarily or throughout",

@@ -3,7 +3,7 @@
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.model.samples import FieldSamples
+from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Beacon, Site
 from magfusion.papers.p004_fingerprints.algorithms import (
     LEAST_BEACONS,
@@ -16,9 +16,12 @@ from magfusion.papers.p004_fingerprints.fingerprint import (
     calibrated,
 )
 from magfusion.receiver.ellipse import plane_normal
-from magfusion.units import Array, BoolArray
+from magfusion.units import DEGREE, Array, BoolArray
 
 ROUND = 1e-3  # least ratio of a rotating moment's axes
+# Largest angle by which Eq 18 may be violated: two degrees of tilt make six of attitude error.
+MAX_TILT = 2.0 * DEGREE
+GRAVITY_WINDOW = 1.0  # s, over which the specific force is averaged
 
 
 def rotating_beacons(
@@ -80,3 +83,36 @@ def rotating_fields(
         amplitude=eq_25_fingerprint(phasor[:, :, None]),
         normal_body=plane_normal(phasor) @ body_from_sensor.T,
     )
+
+
+def axis_spread(axis_world: Array) -> float:
+    """Return the largest angle between the lines of axes (beacons, 3) and their mean line (rad)."""
+    mean = _mean_line(axis_world)
+    return float(np.arccos(np.clip(np.min(np.abs(axis_world @ mean)), 0.0, 1.0)))
+
+
+def _mean_line(axis_world: Array) -> Array:
+    """Return the unit vector (3,) along the mean line of axes whose signs do not matter."""
+    return np.asarray(np.linalg.eigh(axis_world.T @ axis_world)[1][:, -1])
+
+
+def attitude_is_valid(axis_world: Array, time: Array, imu: ImuSamples) -> BoolArray:
+    """Return at which times (n,) (s) Eq 18 may hold, as far as axes and accelerometer show.
+
+    Eq 18 holds for rotations about one axis that all beacons share.  The beacons' axes must
+    therefore be parallel, and the mean specific force as far from that axis in the body as the
+    vertical is in the world, both within `MAX_TILT`.  Without inertial samples nearby only the
+    axes are checked.
+    """
+    if axis_spread(axis_world) > MAX_TILT:
+        return np.zeros(len(time), dtype=bool)
+    axis = _mean_line(axis_world)
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.accel_body, axis=0)])
+    first, last = (
+        np.searchsorted(imu.time, time + sign * 0.5 * GRAVITY_WINDOW) for sign in (-1.0, 1.0)
+    )
+    mean = total[last] - total[first]
+    size = np.linalg.norm(mean, axis=1)
+    cosine = mean @ axis / np.where(size > 0.0, size, 1.0)
+    tilt = np.abs(np.arccos(np.clip(cosine, -1.0, 1.0)) - np.arccos(np.clip(axis[2], -1.0, 1.0)))
+    return np.asarray((size == 0.0) | (tilt <= MAX_TILT))
