@@ -119,6 +119,30 @@ def test_roll_is_found_by_its_database_and_in_closed_form(logs: Path, tmp_path: 
     assert report(tmp_path / "raw")["epochs"] == 20.0 * RATE
 
 
+def test_roll_is_found_at_twenty_turns_a_second_with_the_gyroscope_clipped(tmp_path: Path) -> None:
+    """The "large dynamic" of paper 001: each sample alone, and no beacon near."""
+    rng, site = np.random.default_rng(8), demo_site()
+    time = np.arange(2.0 * RATE) / RATE
+    turn = Rotation.from_euler("x", 2.0 * np.pi * 20.0 * time[:, None])
+    sensor = site.platform.magnetometer
+    assert site.earth_field_world is not None
+    field_body = turn.apply(np.tile(site.earth_field_world, (len(time), 1)), inverse=True)
+    measured = field_body @ sensor.body_from_sensor @ sensor.matrix.T + sensor.offset
+    measured += rng.normal(0.0, NOISE, measured.shape)
+    clipped = np.deg2rad(2000.0) * np.tile([1.0, 0.0, 0.0], (len(time), 1))
+    force = turn.apply([0.0, 0.0, site.gravity], inverse=True)
+    truth = Trajectory(time, turn.as_matrix(), np.zeros((len(time), 3)))
+    imu = ImuSamples(time, clipped, force)
+    log = Log("spinning", 0, "test", imu, Waveform(time, measured), None, truth)
+    write_log(log, tmp_path / "spin")
+    save_site(site, tmp_path / "spin" / "site.yaml")
+    given = ("--yaw-deg", 0.0, "--pitch-deg", 0.0, "--raw")
+    run_command("match", tmp_path / "spin", *given, "-o", tmp_path / "out")
+    reported = report(tmp_path / "out")
+    assert reported["epochs"] == len(time)
+    assert reported["roll_rms_deg"] == pytest.approx(0.003, abs=0.001)
+
+
 def test_gravity_adds_the_third_angle(logs: Path, tmp_path: Path) -> None:
     run_command("match", logs / "rests", "--gravity", "-o", tmp_path / "out")
     reported = report(tmp_path / "out")

@@ -10,6 +10,8 @@ import pytest
 import roll_matching
 from scipy.spatial.transform import Rotation
 
+from magfusion.papers.register import paper
+
 
 @pytest.fixture(scope="module")
 def rolls() -> dict[tuple[str, float, float], roll_matching.Row]:
@@ -47,6 +49,33 @@ def test_the_error_of_the_nearest_entry_is_that_of_the_closed_form_and_of_the_st
         row = rolls["vertical", step, 3]
         expected = np.hypot(row.rms["closed form"], step / np.sqrt(12.0))
         assert row.rms["nearest"] == pytest.approx(expected, rel=0.03)
+
+
+def test_a_roll_at_twenty_turns_a_second_errs_as_at_rest() -> None:
+    result = roll_matching.spin(roll_matching.Config())
+    assert result.spin_rms_deg == pytest.approx(result.rest_rms_deg, rel=0.15)
+    assert result.clipped_gyro_deg > 360.0
+    reported = paper("001").select("claim 13")[0].entry.figures
+    for value in (result.spin_rms_deg, result.rest_rms_deg):
+        assert f"{value:.2f}" in reported
+
+
+def test_the_register_has_the_figures_of_the_scenarios(
+    rolls: dict[tuple[str, float, float], roll_matching.Row], attitudes: attitude_matching.Result
+) -> None:
+    figure_4, figure_6, yaw, coarse = (
+        paper("001").select(words)[0].entry.figures
+        for words in ("fig 4", "fig 6", "claim 2", "claim 9")
+    )
+    fine, step_10 = rolls["vertical", 1, 3], rolls["vertical", 10, 3]
+    assert f"largest error of 2000 rolls {fine.median_max['nearest']:.2f}" in figure_4
+    assert f"rms {fine.rms['nearest']:.2f}" in figure_4
+    within = {row.yaw_deg: row.within_paper for row in attitudes.free_yaw}
+    for angle, share in (("10 degrees", within[10.0]), ("a half turn", within[180.0])):
+        assert f"by {angle} {100.0 * share:.1f} %" in figure_6
+    assert f"median {attitudes.all_attitudes_median_deg:.1f} degrees" in yaw
+    assert f"{step_10.rms['interpolated']:.2f} degrees rms interpolated" in coarse
+    assert f"{step_10.rms['nearest']:.2f} by the nearest" in coarse
 
 
 def test_a_level_axis_has_more_field_across_it(

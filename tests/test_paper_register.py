@@ -80,6 +80,23 @@ def test_what_is_wrong_is_shown_to_be_so() -> None:
     assert not bare
 
 
+def test_what_is_false_or_right_has_a_test_and_what_is_unclear_names_what_is_missing() -> None:
+    """A finding of false without a test is an opinion."""
+    untested = [_id(one) for one in ALL if one.entry.finding == "false" and not one.entry.tests]
+    assert not untested
+    missing = re.compile(r"\blost|not printed|missing|does not (?:state|specify)")
+    open_rows = [one for one in ALL if one.entry.finding == "unclear"]
+    assert not [_id(one) for one in open_rows if not missing.search(one.entry.why)]
+
+
+def test_lost_equations_have_no_other_finding_than_unclear() -> None:
+    """In our copy of paper 002 every equation is a picture that is lost."""
+    assert {one.entry.finding for one in paper("002").of("equation")} == {"unclear"}
+    of_eq_4 = [one for one in paper("002").of("claim") if "Eq 4" in one.entry.why]
+    assert of_eq_4
+    assert {one.entry.finding for one in of_eq_4} == {"unclear"}
+
+
 @pytest.mark.parametrize("number", ROOMS)
 def test_an_equation_is_called_in_its_own_room_what_the_register_calls_it(number: str) -> None:
     """A docstring tells what is known of its function; the register, of the printed equation."""
