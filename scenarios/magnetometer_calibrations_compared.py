@@ -219,47 +219,25 @@ def run(config: Config) -> dict[str, dict[str, float]]:
     return out
 
 
-PAPER_ANALYSIS = {  # deg; reference, not measured here, in the order of the columns
-    "noise 1 mG": {"paper": 0.099, "least_squares": 0.089},
-    "tilt 0.1 deg": {"paper": 0.074, "least_squares": 0.069},
-    "tilt 1 deg": {"paper": 0.741, "least_squares": 0.688},
-    "noise 2 mG, tilt 0.2 deg": {"paper": 0.250, "least_squares": 0.225},
-    "noise 2 mG, setting 0.5 deg": {
-        "paper": 0.436,
-        "least_squares": 0.397,
-        "graph": 0.328,
-        "graph_accel": 0.218,
-    },
-    "noise 2 mG, setting 1 deg": {
-        "paper": 0.79,
-        "least_squares": 0.73,
-        "graph": 0.52,
-        "graph_accel": 0.24,
-    },
-    "by hand, 50 readings": {"ellipsoid_gravity": 0.195, "graph": 0.128},
-    "by hand, 200 readings": {"ellipsoid": 1.1, "ellipsoid_gravity": 0.102, "graph": 0.057},
-}
 _COLUMNS = ("paper", "least_squares", "ellipsoid", "ellipsoid_gravity", "graph", "graph_accel")
 
 
 def report(rows: dict[str, dict[str, float]]) -> str:
     """Return the table that a reader sees."""
     lines = [
-        "RMS angle (deg) of the calibrated field; in brackets the expected values",
+        "RMS angle (deg) of the calibrated field",
         f"{'':26}" + "".join(f"{name.replace('_', ' '):>19}" for name in _COLUMNS),
     ]
     for name, row in rows.items():
-        expected = PAPER_ANALYSIS.get(name, {})
-        cells = [_cell(row.get(column), expected.get(column)) for column in _COLUMNS]
+        cells = [_cell(row.get(column)) for column in _COLUMNS]
         lines.append(f"{name:26}" + "".join(f"{cell:>19}" for cell in cells))
     return "\n".join(lines)
 
 
-def _cell(value: float | None, expected: float | None) -> str:
+def _cell(value: float | None) -> str:
     if value is None:
         return ""
-    shown = f"{value:.3f}" if value > 1e-6 else f"{value:.0e}"
-    return shown if expected is None else f"{shown} ({expected:.3f})"
+    return f"{value:.3f}" if value > 1e-6 else f"{value:.0e}"
 
 
 def draw(path: Path, rows: dict[str, dict[str, float]]) -> None:

@@ -77,15 +77,6 @@ METHODS: dict[str, tuple[str, ...] | None] = {  # and what is found beside the p
     "ML+map, phase free": ("phase",),
     "ML+map, gain free": ("gain",),
 }
-# Reference, not measured here: slopes of position (m/24 h) and attitude (deg/24 h), mean (m).
-ANALYSED = {
-    ("current drive", "A3"): (".0002+-.0023", "", ".036"),
-    ("current drive", "ML+map"): ("-.0005+-.0003", "-.001+-.007", ""),
-    ("voltage drive", "A3"): ("-.004+-.002", "", ".284"),
-    ("voltage drive", "ML+map"): ("-.0008+-.0005", "-.017+-.010", ""),
-    ("0.01 ppm clock", "A3"): (".0002+-.0023", "", ".036"),
-    ("0.01 ppm clock", "ML+map"): (".0078+-.0008", "6.43+-.01", ""),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,20 +326,18 @@ def report(config: Config, rows: tuple[Row, ...]) -> str:
     """Return the table that a reader sees."""
     lines = [
         f"{config.hours:g} h, a fix each {config.interval:g} s, {config.worlds} worlds (F1);"
-        f" after {config.settled_hours:g} h; in brackets: expected values",
+        f" after {config.settled_hours:g} h",
         f"{'':37}{'mean, m':>15}{'deg':>8}{'slope, m / 24 h':>36}{'deg / 24 h':>30}",
     ]
     before = ""
     for row in rows:
         name = row.case if row.case != before else ""
         before = row.case
-        printed = ANALYSED.get((row.case, row.method), ("", "", ""))
-        by_position, by_attitude, mean = (f"({cell})" if cell else "" for cell in printed)
         position = f"{row.position_slope:+.5f} +-{row.position_slope_se:.5f}"
         attitude = f"{row.attitude_slope:+.4f} +-{row.attitude_slope_se:.4f}"
         lines.append(
-            f" {name:16}{row.method:20}{row.position_mean:8.4f}{mean:>7}{row.attitude_mean:8.3f}"
-            f"{position:>20}{by_position:>16}{attitude:>17}{by_attitude:>13}"
+            f" {name:16}{row.method:20}{row.position_mean:8.4f}{'':7}{row.attitude_mean:8.3f}"
+            f"{position:>28}{attitude:>30}"
         )
     lines.append('Paper, figures 9 and 10: "basically stable, not growing with time"; no figures')
     lines += by_components(rows)
