@@ -182,8 +182,8 @@ def spin(config: Config, noise_mg: float = 3.0, rate_hz: float = 1000.0) -> Spin
         true = on_axis(wrap(start + 2.0 * np.pi * turns * time), "vertical")
         measured = measure(true, left_over, noise_mg, rng)
         sigma = noise_mg * MILLIGAUSS
-        found = match_roll(measured, true[0, 1], true[0, 2], FIELD_WORLD, sigma).rpy[:, 0, 0]
-        errors.append(rms(wrap(found - true[:, 0]) / DEGREE))
+        matched = match_roll(measured, true[0, 1], true[0, 2], FIELD_WORLD, sigma).rpy[:, 0, 0]
+        errors.append(rms(wrap(matched - true[:, 0]) / DEGREE))
     clipped = 360.0 * SPIN - GYRO_RANGE_DEG_S  # deg/s of each second
     return Spin(errors[0], errors[1], clipped)
 

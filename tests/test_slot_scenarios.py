@@ -8,6 +8,8 @@ import pytest
 import time_slots_and_mains as mains
 import tracker_motion_skew as moving
 
+from magfusion.papers.register import paper
+
 CONFIG = mains.Config(runs=40)
 
 
@@ -86,6 +88,14 @@ def test_slots_at_their_own_times_have_no_skew(slot_ms: float, skew_deg: float) 
     result = moving.skew(moving.Config(), slot_ms)
     assert result.together_deg == pytest.approx(skew_deg, rel=0.01)
     assert result.apart_deg < 1e-6
+
+
+def test_the_register_has_the_figures_of_slots() -> None:
+    reported = paper("000").select("claim 5")[0].entry.why
+    noise = mains.noise_deg(mains.Config())
+    skew = moving.skew(moving.Config(), 5.0).together_deg
+    assert f"{noise['subtract']:.3f} instead of {noise['none']:.3f} degrees" in reported
+    assert f"by {skew:.2f} degrees at 100 deg/s and 5 ms" in reported
 
 
 def test_the_scenario_prints_its_figures_as_the_last_line(

@@ -15,6 +15,7 @@ from tracker_table1 import SCENARIO_A, SCENARIO_COMMON, SCENARIO_E, SCENARIO_F2,
 
 from magfusion.model.physics.solenoid import loop_field
 from magfusion.papers.p000_tracker.bench import bench_points
+from magfusion.papers.register import paper
 
 
 def of_dipoles(config: Config) -> Config:
@@ -142,6 +143,30 @@ def test_the_dipole_errs_with_the_square_of_the_size(
     assert tracker_near_field.slope(near) == pytest.approx(-2.0, abs=0.15)
     closest = [r.dipole_deg for r in near if r.ratio == 1.5]
     assert min(closest) > 10.0
+
+
+@pytest.mark.slow
+def test_the_register_has_the_figures_of_single_causes() -> None:
+    reported = paper("000").select("claim 6")[0].entry.figures
+    ratios = []
+    for name in ("A, 1 % of gain alone", "A, 0.3 deg of tilt alone"):
+        rows = tracker_table1.run_levels(tracker_table1.OTHERS[name], graph=False)
+        ratios.append({row.level: f"{row.ratio:.2f}" for row in rows})
+    gain, tilt = ratios
+    assert f"gain alone {gain['P1']}, tilt alone {tilt['P1']} times" in reported
+    assert f"general matrices {gain['P3']} and {tilt['P3']}" in reported
+    assert f"the joint fit {gain['J']} and {tilt['J']}" in reported
+
+
+def test_the_register_has_the_figures_of_the_near_field(
+    near: tuple[tracker_near_field.Row, ...],
+) -> None:
+    reported = paper("000").select("claim 2")[0].entry.figures
+    close, ten = ([r.dipole_deg for r in near if r.ratio == ratio] for ratio in (1.5, 10.0))
+    sized = [r.sized_deg for r in near if r.ratio == 5.0 and r.sized_deg is not None]
+    assert f"at 1.5 sizes {min(close):.0f} to {max(close):.0f} degrees" in reported
+    assert f"at 10 {min(ten):.2f} to {max(ten):.2f}" in reported
+    assert f"at 5 sizes {min(sized):.3f} to {max(sized):.3f}" in reported
 
 
 def test_one_term_repairs_it(near: tuple[tracker_near_field.Row, ...]) -> None:

@@ -48,7 +48,7 @@ MAX_GAP = 0.1  # s, of the truth, across which it is interpolated
 
 
 def run_published_fix(
-    job: Job, method: Method, survey: Path, block: float | None, lockin: LockinSettings
+    job: Job, method: Method, survey: Path, block: float | None, lockin: LockinSettings | None
 ) -> Figures:
     """Fix every epoch on its own by an algorithm of paper 004.
 
