@@ -12,7 +12,7 @@ from magfusion.files.field_map import read_field_maps, write_field_maps
 from magfusion.files.site_correlation import load_correlation, save_correlation
 from magfusion.files.site_ground import ground_entry, log_sigma
 from magfusion.files.site_magnetometer import magnetometer_entries, magnetometer_of, with_left_out
-from magfusion.files.site_motion import MotionEntry, imu_entry, prior_entry
+from magfusion.files.site_motion import MotionEntry, imu_entry, intrinsics_entry, prior_entry
 from magfusion.files.site_plain import (
     degree_sigma_entry,
     degrees,
@@ -118,6 +118,9 @@ def load_site(
             model_of(MotionModel, entry.platform.motion),
             None if entry.platform.motion_prior is None else entry.platform.motion_prior.prior(),
             further=sensors[1:],
+            imu_intrinsics=None
+            if entry.platform.imu_intrinsics is None
+            else entry.platform.imu_intrinsics.intrinsics(),
         ),
         earth_field_world=field_world,
         location=location,
@@ -182,6 +185,7 @@ def save_site(site: Site, path: Path | str) -> None:
         "beacons": [_beacon_entry(b) for b in site.every_beacon],
         "platform": {
             **imu_entry(site.platform.imu),
+            **intrinsics_entry(site.platform.imu_intrinsics),
             **magnetometer_entries(with_left_out(site.platform)),
             **_model_entry("motion", site.platform.motion, MotionEntry),
             **prior_entry(site.platform.motion_prior),

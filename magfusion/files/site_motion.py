@@ -3,16 +3,19 @@
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
-from magfusion.files.site_values import between
+from magfusion.files.site_values import array, between, not_singular
 from magfusion.files.yaml_files import StrictModel
+from magfusion.model.imu_intrinsics import ImuIntrinsics
 from magfusion.model.platform_motion import NO_IMU, ImuModel, MotionModel, MotionPrior
+from magfusion.units import Array
 
 _AboveZero = Annotated[float, Field(gt=0.0)]
 _FromZero = Annotated[float, Field(ge=0.0)]
 _Positive = Annotated[_AboveZero, between(1e-12, 1e6)]
 _NotNegative = Annotated[_FromZero, between(0.0, 1e6)]
+_Matrix = Annotated[Array, array(3, 3, largest=10.0), AfterValidator(not_singular)]
 _MOTION, _PRIOR = MotionModel(), MotionPrior()
 MILLION = 1e6  # ppm in one
 
@@ -49,6 +52,20 @@ class ImuEntry(StrictModel):
     clock_rate_sigma_ppm: Annotated[_FromZero, between(0.0, 1e4)] = 50.0  # of quartz
 
 
+class ImuIntrinsicsEntry(StrictModel):
+    """`magfusion.model.imu_intrinsics.ImuIntrinsics`, field by field in its order."""
+
+    gyro_matrix: _Matrix = Field(default_factory=lambda: np.eye(3))
+    accel_matrix: _Matrix = Field(default_factory=lambda: np.eye(3))
+    gyro_g_sensitivity: Annotated[Array, array(3, 3, largest=1.0)] = Field(
+        default_factory=lambda: np.zeros((3, 3))
+    )
+
+    def intrinsics(self) -> ImuIntrinsics:
+        """Return the intrinsics of the entry."""
+        return ImuIntrinsics(self.gyro_matrix, self.accel_matrix, self.gyro_g_sensitivity)
+
+
 class MotionPriorEntry(StrictModel):
     """`magfusion.model.platform_motion.MotionPrior`, field by field in its order."""
 
@@ -76,6 +93,13 @@ def imu_entry(imu: ImuModel) -> dict[str, Any]:
     keys = zip(ImuEntry.model_fields, vars(imu).values(), strict=True)
     entry = {k: _ppm(v) if k.endswith("_ppm") else float(v) for k, v in keys if usual.get(k) != v}
     return {"imu": entry}
+
+
+def intrinsics_entry(intrinsics: ImuIntrinsics | None) -> dict[str, Any]:
+    """Return the entry of an IMU's intrinsics under its key; nothing where it is ideal."""
+    if intrinsics is None:
+        return {}
+    return {"imu_intrinsics": {key: value.tolist() for key, value in vars(intrinsics).items()}}
 
 
 def prior_entry(prior: MotionPrior | None) -> dict[str, Any]:

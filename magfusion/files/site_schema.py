@@ -18,7 +18,12 @@ from magfusion.files.site_magnetometer import (
     check_magnetometers,
     check_tones,
 )
-from magfusion.files.site_motion import ImuEntry, MotionEntry, MotionPriorEntry
+from magfusion.files.site_motion import (
+    ImuEntry,
+    ImuIntrinsicsEntry,
+    MotionEntry,
+    MotionPriorEntry,
+)
 from magfusion.files.site_region import RegionEntry
 from magfusion.files.site_rotor import RotorEntry
 from magfusion.files.site_temperature import MomentTemperatureEntry
@@ -364,6 +369,7 @@ class PlatformEntry(StrictModel):
     """What moves."""
 
     imu: ImuEntry | None = None
+    imu_intrinsics: ImuIntrinsicsEntry | None = None
     magnetometer: MagnetometerEntry | None = None
     magnetometers: Annotated[list[MagnetometerEntry], at_least_one("magnetometer")] | None = None
     motion: MotionEntry = MotionEntry()

@@ -27,7 +27,7 @@ from magfusion.jobs.state_rows import CURRENT, LAGGED, PROPAGATED, StateRows, ro
 from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Site
 from magfusion.model.trust import Trust
-from magfusion.model.without_imu import require_motion_prior
+from magfusion.model.without_imu import as_recorded, require_motion_prior
 from magfusion.results.figures import heading
 from magfusion.results.verdict import trust_figures
 
@@ -136,7 +136,8 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
         select_beacons=False,
         report=report,
     )
-    if log.waveforms:  # of which the navigator makes phasors, as it does of a stream
+    log = as_recorded(log)  # the navigator corrects the samples, as it does those of a stream
+    if log.waveforms:  # of which it makes the phasors, too
         log = replace(log, fields=None)
     refuse_rate(job.log_path, log, settings.rates)
     with named(job.log_path):

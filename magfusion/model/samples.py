@@ -317,7 +317,8 @@ class Log:
     recorded currents of coils, ``reference`` the samples of a remote second magnetometer by its own
     stamps, ``rotation`` the angles of rotors, ``depths`` those of wells, for ranging.
     ``waveforms`` are the samples of several magnetometers, by name and each by its own stamps; then
-    ``waveform`` is None.
+    ``waveform`` is None.  ``recorded_imu`` has the inertial samples as recorded where ``imu`` is
+    without the errors that the site declares (`magfusion.model.without_imu.logged`).
     """
 
     __repr__ = short_repr
@@ -339,6 +340,7 @@ class Log:
     rotation: RotorAngles | None = None
     depths: Depths | None = None
     waveforms: Mapping[str, Waveform] = field(default_factory=dict)
+    recorded_imu: ImuSamples | None = None
 
     @property
     def vectors(self) -> Waveform | None:

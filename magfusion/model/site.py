@@ -10,6 +10,7 @@ import numpy as np
 from magfusion.model.correlation import Correlation
 from magfusion.model.drive import DriveShares
 from magfusion.model.field_map import FieldMap
+from magfusion.model.imu_intrinsics import ImuIntrinsics
 from magfusion.model.magnetometer import Magnetometer as Magnetometer
 from magfusion.model.magnetometer import MagnetometerSigma as MagnetometerSigma
 from magfusion.model.platform_motion import A_HAND, MotionPrior, Replaced
@@ -242,6 +243,8 @@ class Platform:
         The other magnetometers.
     left_out : tuple of (int, Magnetometer)
         Magnetometers excluded for a log, each with its index at that time.
+    imu_intrinsics : ImuIntrinsics, optional
+        Scale factors, axes and g-sensitivity of the IMU; None if it is ideal.
     motion_prior : MotionPrior, optional
         Assumed motion if a log has no inertial samples.
     replaced : Replaced, optional
@@ -258,6 +261,7 @@ class Platform:
     replaced: Replaced | None = None
     further: tuple[Magnetometer, ...] = ()
     left_out: tuple[tuple[int, Magnetometer], ...] = ()
+    imu_intrinsics: ImuIntrinsics | None = None
 
     @property
     def inertial(self) -> bool:

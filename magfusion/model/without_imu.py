@@ -107,8 +107,25 @@ def without_imu(log: Log, site: Site) -> tuple[Log, Site]:
 
 
 def logged(log: Log, site: Site) -> tuple[Log, Site]:
-    """Return a log and its site unchanged, or as `without_imu` if it has no inertial samples."""
-    return (log, site) if len(log.imu) else without_imu(log, site)
+    """Return a log and its site as the estimators use them.
+
+    As `without_imu` if the log has no inertial samples; otherwise these are corrected by the
+    declared `ImuIntrinsics`, unless they are already.
+    """
+    if not len(log.imu):
+        return without_imu(log, site)
+    intrinsics = site.platform.imu_intrinsics
+    if intrinsics is None or not log.inertial or log.recorded_imu is not None:
+        return log, site
+    gyro, accel = intrinsics.corrected(log.imu.gyro_body, log.imu.accel_body)
+    return replace(log, imu=ImuSamples(log.imu.time, gyro, accel), recorded_imu=log.imu), site
+
+
+def as_recorded(log: Log) -> Log:
+    """Return a log with its inertial samples as recorded."""
+    if log.recorded_imu is None:
+        return log
+    return replace(log, imu=log.recorded_imu, recorded_imu=None)
 
 
 def require_motion_prior(site: Site) -> None:

@@ -19,6 +19,7 @@ from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Verdict
 from magfusion.receiver.even_clocks import on_even_clocks
+from magfusion.units import IntArray
 
 
 def clean_log(log: Log, site: Site) -> Log:
@@ -32,14 +33,25 @@ def clean_log(log: Log, site: Site) -> Log:
         return log
     noticed = [replace(f, verdict=Verdict.TRUSTWORTHY) for f in false_samples(log, site)]
     noticed = [replace(f, text=f"{f.text} They are left out.") for f in noticed]
-    wave, imu = log.waveform, log.imu
-    inertial = np.union1d(result["gyroscope"], result["accelerometer"])
-    kept = np.delete(np.arange(len(imu)), inertial)
-    imu = ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept])
+    wave = log.waveform
+    log = _without_inertial(log, np.union1d(result["gyroscope"], result["accelerometer"]))
     if wave is not None:
         kept = np.delete(np.arange(len(wave)), result["magnetometer"])
         wave = wave.rows(kept)
-    return replace(log, imu=imu, waveform=wave, noticed=(*log.noticed, *noticed))
+    return replace(log, waveform=wave, noticed=(*log.noticed, *noticed))
+
+
+def _without_inertial(log: Log, rows: IntArray) -> Log:
+    """Return a log without some inertial samples."""
+    kept = np.delete(np.arange(len(log.imu)), rows)
+    imu, recorded = (
+        None
+        if samples is None
+        else ImuSamples(log.imu.time[kept], samples.gyro_body[kept], samples.accel_body[kept])
+        for samples in (log.imu, log.recorded_imu)
+    )
+    assert imu is not None
+    return replace(log, imu=imu, recorded_imu=recorded)
 
 
 def _without_freeze(log: Log, site: Site) -> Log:
@@ -57,7 +69,4 @@ def _without_freeze(log: Log, site: Site) -> Log:
         for f in frozen_samples(log, site)
         if f.code == "frozen_imu"
     ]
-    kept = np.delete(np.arange(len(log.imu)), rows)
-    imu = log.imu
-    imu = ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept])
-    return replace(log, imu=imu, noticed=(*log.noticed, *noticed))
+    return replace(_without_inertial(log, rows), noticed=(*log.noticed, *noticed))

@@ -59,8 +59,9 @@ def streams(log: Log) -> tuple[InstrumentStream, ...]:
     """Return the raw streams of a log."""
     result = []
     if log.inertial:
-        result.append(InstrumentStream("gyroscope", log.imu.time, log.imu.gyro_body, "rad/s"))
-        result.append(InstrumentStream("accelerometer", log.imu.time, log.imu.accel_body, "m/s^2"))
+        imu = log.imu if log.recorded_imu is None else log.recorded_imu
+        result.append(InstrumentStream("gyroscope", log.imu.time, imu.gyro_body, "rad/s"))
+        result.append(InstrumentStream("accelerometer", log.imu.time, imu.accel_body, "m/s^2"))
     if log.waveform is not None:
         wave = log.waveform
         own = [AXES.index(axis) for axis in wave.axes]

@@ -164,7 +164,7 @@ def changed(case: Case) -> TestResult:
     if wide is None or not parts:
         return NOTHING
     every = wide.fixed
-    information, gradient = wide.with_declared()
+    information, gradient = wide.with_declared(tolerance=True)
     known = [
         (one, estimate.log_p)
         for one in _changes(parts, every)

@@ -5,13 +5,12 @@ than chance does, and would move the poses beyond their covariance.  The one tha
 most is the cause; after its step, the next is tested.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from magfusion.estimation.data_checks.statistics import (
-    TEST_BUDGET,
-    holm,
     log_p_chi_square,
     sigmas,
 )
@@ -20,7 +19,15 @@ from magfusion.estimation.integrity.score import (
     field_residual,
     moved_estimate,
 )
-from magfusion.estimation.integrity.suspects import CODE, TILT, Suspect, suspects
+from magfusion.estimation.integrity.suspects import (
+    CODE,
+    STRETCH,
+    TILT,
+    TOLERANCE,
+    Inertial,
+    Suspect,
+    suspects,
+)
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.model.parameters import Block, prior_sigma
 from magfusion.model.site import Site
@@ -28,7 +35,9 @@ from magfusion.model.trust import Finding, Unverified, Verdict
 from magfusion.units import Array
 
 FARTHEST = 30.0  # typical errors; directions with a larger sigma are ignored
-PER_PARAMETER = 12.0  # chi square by which one more parameter must improve an explanation
+PRIOR_WIDTH = 3.0  # typical errors, one sigma of what people get wrong: the price of a parameter
+LEAST_EVIDENCE = 20.0  # of -2 log likelihood, above which a cause is named
+MARGIN = 10.0  # of the same, by which a cause must be better than another
 COVERED = 4.0  # mean squared Mahalanobis distance that a covariance of six still covers
 MAX_LINEAR_CHI_SQUARE = (
     25.0**2
@@ -45,8 +54,9 @@ class ReleasedFault(NamedTuple):
     ----------
     step : ndarray, shape (h,)
         In typical errors.
-    direction, information : ndarray, shape (h, k), (k,)
-        Orthogonal combinations of the fixed parameters, and the log's information on each.
+    direction, information, along : ndarray, shape (h, k), (k,), (k,)
+        Orthogonal combinations of the fixed parameters, the log's information on each, and the
+        gradient along it.
     chi_square, freedom : float
         Twice the decrease of the cost.
     moved : ndarray, shape (states, 6)
@@ -59,6 +69,7 @@ class ReleasedFault(NamedTuple):
     step: Array
     direction: Array
     information: Array
+    along: Array
     chi_square: float
     freedom: int
     moved: Array
@@ -82,9 +93,18 @@ class ReleasedFault(NamedTuple):
         return float(log_p_chi_square(self.chi_square, self.freedom))
 
     @property
+    def is_notable(self) -> bool:
+        """Whether it is an IMU that is farther off than usual, whatever the poses err by it."""
+        return any(
+            isinstance(b.parameter, Inertial)
+            and float(np.max(np.abs(b.sigma * self.step[b.columns]))) > TOLERANCE[b.parameter]
+            for b in self.fault.blocks
+        )
+
+    @property
     def gain(self) -> float:
-        """Decrease of chi square, less what as many parameters gain anyway."""
-        return self.chi_square - PER_PARAMETER * self.freedom
+        """Decrease of -2 log likelihood of the log, the parameters having their prior."""
+        return float(np.sum(_evidence(self.along, self.information)))
 
 
 def check_fixed_parameters(case: Case) -> TestResult:
@@ -93,27 +113,25 @@ def check_fixed_parameters(case: Case) -> TestResult:
         return NOTHING
     score, site = case.score, case.result.declared.site
     unverified = tuple(_unverified(case, score))
-    information, gradient = score.with_declared()
+    information, gradient = score.with_declared(tolerance=False)
     findings: list[Finding] = []
     named: list[Array] = []
     spread = np.zeros_like(case.pose_cov)
     total, first = np.zeros(len(gradient)), 0.0
-    while len(findings) < MAX_CAUSES:
-        released = [
-            result
-            for fault in suspects(site, score.fixed)
-            if (result := release_fault(case.pose_cov, score, fault, information, gradient))
-            is not None
-        ]
-        cause = _cause(case, score, released, total)
-        if cause is None or cause.chi_square < LEAST_SHARE * first:
+    for _ in range(MAX_CAUSES):
+        released = ranked_faults(case, score, information, gradient)
+        if not released or not _is_cause(case, score, released[0], total):
             break
-        first = max(first, cause.chi_square)
-        findings.append(finding_of(site, score, cause))
-        spread += cause.moved[:, :, None] * cause.moved[:, None, :]
-        spread += score.by_pose @ cause.known_cov @ np.swapaxes(score.by_pose, 1, 2)
+        cause = released[0]
+        if cause.gain < LEAST_SHARE * first:
+            break
+        first = max(first, cause.gain)
         total = total + cause.step
-        named.append(total)
+        if cause.is_notable or np.mean(cause.distance) > COVERED:
+            findings.append(finding_of(site, score, cause, rivals_of(released)))
+            spread += cause.moved[:, :, None] * cause.moved[:, None, :]
+            spread += score.by_pose @ cause.known_cov @ np.swapaxes(score.by_pose, 1, 2)
+            named.append(total)
         selected = information @ cause.cov
         gradient = gradient - information @ cause.step
         information = information - selected @ information
@@ -138,9 +156,16 @@ def gains(combine: Array, information: Array, gradient: Array) -> Array:
     across = np.swapaxes(combine, 1, 2)
     value, vector = np.linalg.eigh(across @ information @ combine)
     along = (np.swapaxes(vector, 1, 2) @ (across @ gradient[..., None]))[..., 0]
-    kept = value > FARTHEST**-2
-    chi_square = np.where(kept, along**2, 0.0) / np.where(kept, value, 1.0)
-    return np.asarray(np.sum(chi_square - PER_PARAMETER * kept, axis=1))
+    return np.asarray(np.sum(_evidence(along, np.maximum(value, 0.0)), axis=1))
+
+
+def _evidence(along: Array, information: Array) -> Array:
+    """Return the decrease of -2 log likelihood by each parameter, marginalised over its prior.
+
+    The prior is normal, of `PRIOR_WIDTH` typical errors: it is the price of the parameter.
+    """
+    prior = PRIOR_WIDTH**-2
+    return along**2 / (information + prior) - np.log1p(information / prior)
 
 
 class ReleaseGain(NamedTuple):
@@ -149,6 +174,7 @@ class ReleaseGain(NamedTuple):
     step: Array
     direction: Array
     information: Array
+    along: Array
     chi_square: float
     freedom: int
 
@@ -168,7 +194,7 @@ def release_gain(fault: Suspect, information: Array, gradient: Array) -> Release
     vector, value = combine @ vector[:, kept], value[kept]
     along = vector.T @ gradient
     gained, freedom = float(np.sum(along**2 / value)), int(np.sum(kept))
-    return ReleaseGain(vector @ (along / value), vector, value, gained, freedom)
+    return ReleaseGain(vector @ (along / value), vector, value, along, gained, freedom)
 
 
 def release_fault(
@@ -183,36 +209,54 @@ def release_fault(
     return ReleasedFault(fault, *reported, moved, np.sum(moved * solved, axis=1))
 
 
-def _cause(
-    case: Case, score: Score, release: list[ReleasedFault], before: Array
-) -> ReleasedFault | None:
-    """Return the best explanation of what chance and the claimed covariance do not explain."""
-    informative = holm([one.log_p for one in release], TEST_BUDGET)
-    likely = [
-        one
-        for one, significant in zip(release, informative, strict=True)
-        if significant and np.mean(one.distance) > COVERED
-    ]
-    for one in sorted(likely, key=lambda one: -one.gain)[:3]:
-        # Every candidate fits a part of a residual that none explains.
-        rest = field_residual(
-            case.result, moved_estimate(case.result, score, score.allowed(before + one.step))
-        )
-        excess = max(1.0, float(np.nanmean(rest**2))) if np.any(np.isfinite(rest)) else 1.0
-        residual = float(log_p_chi_square(one.chi_square / excess, one.freedom))
-        if holm([residual, *(other.log_p for other in release if other is not one)], TEST_BUDGET)[
-            0
-        ]:
-            return one
-    return None
+def ranked_faults(
+    case: Case, score: Score, information: Array, gradient: Array
+) -> list[ReleasedFault]:
+    """Return all candidate faults, estimated one at a time, by their evidence."""
+    released = (
+        release_fault(case.pose_cov, score, fault, information, gradient)
+        for fault in suspects(case.result.declared.site, score.fixed)
+    )
+    return sorted((one for one in released if one is not None), key=lambda one: -one.gain)
 
 
-def finding_of(site: Site, score: Score, cause: ReleasedFault) -> Finding:
-    """Return the finding on a cause."""
+def rivals_of(ranked: list[ReleasedFault]) -> list[ReleasedFault]:
+    """Return what explains a log as well as the first, other than as a part of it."""
+    best = ranked[0]
+    own = {block.key for block in best.fault.blocks}
+
+    def is_other(one: ReleasedFault) -> bool:
+        keys = {block.key for block in one.fault.blocks}
+        return one.fault.code != best.fault.code or not (keys <= own or own <= keys)
+
+    return [one for one in ranked[1:] if one.gain > best.gain - MARGIN and is_other(one)]
+
+
+def _is_cause(case: Case, score: Score, one: ReleasedFault, before: Array) -> bool:
+    """Return whether the evidence for a fault is more than any residual would give.
+
+    Every candidate fits a part of a residual that none explains.
+    """
+    if one.gain < LEAST_EVIDENCE:
+        return False
+    after = moved_estimate(case.result, score, score.allowed(before + one.step))
+    rest = field_residual(case.result, after)
+    excess = max(1.0, float(np.nanmean(rest**2))) if np.any(np.isfinite(rest)) else 1.0
+    return one.gain / excess > LEAST_EVIDENCE
+
+
+def finding_of(
+    site: Site, score: Score, cause: ReleasedFault, rivals: Sequence[ReleasedFault] = ()
+) -> Finding:
+    """Return the finding on a cause, and on others that explain the log as well."""
     position = float(np.sqrt(np.mean(np.sum(cause.moved[:, 3:] ** 2, axis=1))))
     rotation = float(np.rad2deg(np.sqrt(np.mean(np.sum(cause.moved[:, :3] ** 2, axis=1)))))
     mean = float(np.mean(cause.distance))
-    if len(cause.fault.combine.T) == 1 and len(cause.fault.blocks) > 1:
+    if cause.fault.code == STRETCH:
+        stretch = -float(np.linalg.lstsq(cause.fault.combine, cause.step, rcond=None)[0][0])
+        result = f"all positions are {stretch:+.2g} % too far from the origin"
+        remedy = "Multiply all positions by a common factor: check the tape, or the unit"
+    elif len(cause.fault.combine.T) == 1 and len(cause.fault.blocks) > 1:
         block = cause.fault.blocks[0]
         factor = float(np.exp((prior_sigma(score.fixed) * cause.step)[block.columns][0]))
         result = f"all are {factor:.3g} times as large"
@@ -230,13 +274,18 @@ def finding_of(site: Site, score: Score, cause: ReleasedFault) -> Finding:
         f"The log contradicts {cause.fault.name} as declared: {result}"
         f" ({float(sigmas(cause.log_p)):.0f} sigma). This moves the poses by"
         f" {_length(position)} and {rotation:.2g} deg,"
-        f" {np.sqrt(mean):.1f} times their reported sigma. {remedy}.",
+        f" {np.sqrt(mean):.1f} times their reported sigma.{_alternatives(rivals)} {remedy}.",
         # A tilt is a rotation of the frame, whatever its size.
         Verdict.FAILED
         if mean > MAX_LINEAR_CHI_SQUARE and cause.fault.code != TILT
         else Verdict.DOUBTFUL,
         float(sigmas(cause.log_p)),
     )
+
+
+def _alternatives(rivals: Sequence[ReleasedFault]) -> str:
+    names = " or ".join(one.fault.name for one in rivals[:2])
+    return f" An error of {names} would explain it as well." if names else ""
 
 
 def _largest(cause: ReleasedFault) -> list[Block]:

@@ -29,6 +29,7 @@ from magfusion.estimation.integrity.motion_comparison import compared, surveyed
 from magfusion.estimation.integrity.phase_causes import phase_causes
 from magfusion.model.samples import FieldSamples, ImuSamples, Log
 from magfusion.model.site import Site
+from magfusion.model.without_imu import logged
 from magfusion.receiver.cycles import whole_cycles
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
@@ -51,6 +52,7 @@ def cause_of(
     InputError, EstimationError
         Where the log holds no field that is usable.
     """
+    log, site = logged(log, site)
     part = _part(log)
     samples = _demodulated(part, site, settings)
     samples = samples.rows(np.asarray(samples.valid.any(axis=1)))

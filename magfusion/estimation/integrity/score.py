@@ -78,16 +78,24 @@ class Score:
         """Effect of a unit of them on the poses, shape (states, 6, h)."""
         return self.by_state[:, :6]
 
-    def with_declared(self) -> tuple[Array, Array]:
-        """Let uncertain parameters vary within their declared sigma and their tolerance.
+    def with_declared(self, *, tolerance: bool) -> tuple[Array, Array]:
+        """Let uncertain parameters vary within their declared sigma.
+
+        Parameters
+        ----------
+        tolerance : bool
+            Whether all of them vary within their tolerance, too.
 
         Returns
         -------
         information : ndarray, shape (h, h)
-            Of errors beyond what is declared.
+            Of errors beyond that.
         gradient : ndarray, shape (h,)
         """
-        selected = self._applied(np.concatenate([self.spread, tolerance_of(self.fixed)], axis=1))
+        spread = self.spread
+        if tolerance:
+            spread = np.concatenate([spread, tolerance_of(self.fixed)], axis=1)
+        selected = self._applied(spread)
         residual = self.information - self.information @ selected @ self.information
         gradient = self.gradient - self.information @ (selected @ self.gradient)
         return 0.5 * (residual + residual.T), gradient

@@ -5,11 +5,14 @@ sensors: for those the score of `magfusion.estimation.integrity.score` is the on
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.model.ground import conductivity_of
+from magfusion.model.imu_intrinsics import ImuIntrinsics
 from magfusion.model.parameters import (
     BEACON_POSITION,
     BEACON_ROTATION,
@@ -34,12 +37,13 @@ from magfusion.model.parameters import (
     MagnetometerParameter,
     Parameter,
     candidates,
+    initial_calibration,
     placed,
 )
 from magfusion.model.parameters.parameter import AXES, ParameterUnit
 from magfusion.model.perturbation import skew
 from magfusion.model.samples import ImuSamples
-from magfusion.model.site import Site
+from magfusion.model.site import Beacon, Site
 from magfusion.units import DEGREE, Array
 
 
@@ -69,6 +73,24 @@ class Inertial(Parameter):
         """
         raise NotImplementedError
 
+    def corrected(self, site: Site, step: Array) -> Site:
+        """Return a site that declares this error."""
+        raise NotImplementedError
+
+
+def _with_intrinsics(
+    site: Site, gyro: Array | None = None, accel: Array | None = None, g: Array | None = None
+) -> Site:
+    """Return a site whose IMU has further errors: factors of both matrices, and g-sensitivity."""
+    known = site.platform.imu_intrinsics or ImuIntrinsics()
+    eye = np.eye(3)
+    changed = ImuIntrinsics(
+        (eye if gyro is None else gyro) @ known.gyro_matrix,
+        (eye if accel is None else accel) @ known.accel_matrix,
+        known.gyro_g_sensitivity + (0.0 if g is None else g),
+    )
+    return replace(site, platform=replace(site.platform, imu_intrinsics=changed))
+
 
 class _GyroScale(Inertial):
     kind, components, display_unit = "gyro_scale", AXES, PERCENT
@@ -78,6 +100,9 @@ class _GyroScale(Inertial):
         return _stacked(
             np.zeros((len(stream.imu), 3, 3)), stream.imu.gyro_body[:, :, None] * np.eye(3)
         )
+
+    def corrected(self, site: Site, step: Array) -> Site:
+        return _with_intrinsics(site, gyro=np.diag(1.0 + step))
 
 
 class _AccelScale(Inertial):
@@ -89,6 +114,9 @@ class _AccelScale(Inertial):
             stream.imu.accel_body[:, :, None] * np.eye(3), np.zeros((len(stream.imu), 3, 3))
         )
 
+    def corrected(self, site: Site, step: Array) -> Site:
+        return _with_intrinsics(site, accel=np.diag(1.0 + step))
+
 
 class _GyroAlignment(Inertial):
     kind, components, display_unit = "gyro_alignment", AXES, DEGREES
@@ -97,6 +125,23 @@ class _GyroAlignment(Inertial):
     def as_bias(self, stream: Stream) -> Array:
         # Each unit turn across the rate is a column.
         return _stacked(np.zeros((len(stream.imu), 3, 3)), -skew(stream.imu.gyro_body))
+
+    def corrected(self, site: Site, step: Array) -> Site:
+        return _with_intrinsics(site, gyro=Rotation.from_rotvec(step).as_matrix())
+
+
+class _GyroGSensitivity(Inertial):
+    kind, components = "gyro_g_sensitivity", tuple(a + b for a in AXES for b in AXES)
+    display_unit = ParameterUnit("rad/s per m/s^2", 1.0)
+    words = tuple(f"the gyro's {a} per specific force along {b}" for a in AXES for b in AXES)
+    size = 9
+
+    def as_bias(self, stream: Stream) -> Array:
+        force = stream.imu.accel_body[:, None, None, :] * np.eye(3)[:, :, None]
+        return _stacked(np.zeros((len(force), 3, 9)), force.reshape(len(force), 3, 9))
+
+    def corrected(self, site: Site, step: Array) -> Site:
+        return _with_intrinsics(site, g=step.reshape(3, 3))
 
 
 class _Gravity(Inertial):
@@ -108,14 +153,23 @@ class _Gravity(Inertial):
         # More gravity than declared is a specific force upwards, as a bias of it would be.
         return _stacked(up_body[:, :, None], np.zeros((len(up_body), 3, 1)))
 
+    def corrected(self, site: Site, step: Array) -> Site:
+        return replace(site, gravity=site.gravity + float(step[0]))
+
 
 def _stacked(accel: Array, gyro: Array) -> Array:
     return np.concatenate([accel, gyro], axis=1)
 
 
 GYRO_SCALE, ACCEL_SCALE, GYRO_ALIGNMENT = _GyroScale(), _AccelScale(), _GyroAlignment()
-GRAVITY = _Gravity()
-INERTIAL: tuple[Inertial, ...] = (GYRO_SCALE, ACCEL_SCALE, GYRO_ALIGNMENT, GRAVITY)
+GYRO_G_SENSITIVITY, GRAVITY = _GyroGSensitivity(), _Gravity()
+INERTIAL: tuple[Inertial, ...] = (
+    GYRO_SCALE,
+    ACCEL_SCALE,
+    GYRO_ALIGNMENT,
+    GYRO_G_SENSITIVITY,
+    GRAVITY,
+)
 
 # Typical error of an installation that nobody measured, in the unit of the tangent vector.
 TYPICAL: dict[Parameter, float] = {
@@ -134,19 +188,20 @@ TYPICAL: dict[Parameter, float] = {
     GYRO_SCALE: 0.01,
     ACCEL_SCALE: 0.01,
     GYRO_ALIGNMENT: DEGREE,
+    GYRO_G_SENSITIVITY: 2e-4,
     GRAVITY: 0.01,
     CLOCK_OFFSET: 1e-4,
     CLOCK_RATE: 1e-5,
     CONDUCTIVITY: 0.1,
 }
 
-# What no site declares and every instrument has, one sigma: scales and axes of a MEMS, where in its
-# case the accelerometer is and how it is turned there.  It is no mistake, and no poses err by it
-# that are judged by the case.
+# What no site declares and every instrument has: scales and axes of a MEMS, where in its case the
+# accelerometer is and how it is turned there.  It is no mistake unless the poses err by it.
 TOLERANCE: dict[Parameter, float] = {
     GYRO_SCALE: 0.01,
     ACCEL_SCALE: 0.01,
     GYRO_ALIGNMENT: DEGREE,
+    GYRO_G_SENSITIVITY: 3e-4,
     GRAVITY: 0.01,
     CLOCK_RATE: 2e-6,
     SENSOR_ROTATION: 0.1 * DEGREE,
@@ -170,13 +225,14 @@ CODE: dict[Parameter, str] = {
     GYRO_SCALE: "gyro_scale",
     ACCEL_SCALE: "accel_scale",
     GYRO_ALIGNMENT: "imu_axes",
+    GYRO_G_SENSITIVITY: "gyro_g_sensitivity",
     GRAVITY: "gravity",
     CLOCK_OFFSET: "magnetometer_clock",
     CLOCK_RATE: "imu_clock",
     CONDUCTIVITY: "ground",
 }
 
-TILT = "survey_tilt"
+TILT, STRETCH = "survey_tilt", "survey_scale"
 
 
 class Suspect(NamedTuple):
@@ -256,12 +312,15 @@ def suspects(site: Site, held: tuple[Block, ...]) -> Iterator[Suspect]:
             common[block.columns] = 1.0
         yield Suspect(f"the moments of {_beacons(site)}", tuple(moments), common)
     if site.platform.inertial and len(surveyed) == 2 * len(site.beacons):
-        yield Suspect(
-            "the vertical of the survey", tuple(surveyed), survey_tilt(site, surveyed, size), TILT
-        )
+        blocks = tuple(surveyed)
+        yield Suspect("the vertical of the survey", blocks, survey_tilt(site, blocks, size), TILT)
+    places = tuple(b for b in surveyed if b.parameter == BEACON_POSITION)
+    if len(places) == len(site.beacons) > 1:
+        stretch = survey_scale(site, places, size)
+        yield Suspect("the scale of the survey", places, stretch, STRETCH)
 
 
-def survey_tilt(site: Site, surveyed: list[Block], size: int) -> Array:
+def survey_tilt(site: Site, surveyed: tuple[Block, ...], size: int) -> Array:
     """Return the effect of tilting the whole survey about world x and y, shape (size, 2).
 
     A unit is a typical error of an attitude; gravity and the Earth field stay.
@@ -276,6 +335,52 @@ def survey_tilt(site: Site, surveyed: list[Block], size: int) -> Array:
             change = -skew(beacon.position_world) @ tilt_world
         out[block.columns] = change / block.sigma[:, None]
     return out
+
+
+def survey_scale(site: Site, places: tuple[Block, ...], size: int) -> Array:
+    """Return the effect of stretching all positions by one per cent, shape (size, 1)."""
+    out = np.zeros((size, 1))
+    beacons = {beacon.name: beacon for beacon in site.beacons}
+    for block in places:
+        out[block.columns, 0] = PERCENT.size * beacons[block.owner].position_world / block.sigma
+    return out
+
+
+def corrected_site(site: Site, fault: Suspect, step: Array) -> Site:
+    """Return a site with the parameters of a suspect moved.
+
+    Parameters
+    ----------
+    step : ndarray, shape (h,)
+        Of all fixed parameters, in typical errors.
+    """
+    if fault.code in (TILT, STRETCH):
+        value = np.linalg.lstsq(fault.combine, step, rcond=None)[0]
+        change = (
+            Rotation.from_rotvec(DEGREE * np.append(value, 0.0)).as_matrix()
+            if fault.code == TILT
+            else (1.0 + PERCENT.size * float(value[0])) * np.eye(3)
+        )
+        return replace(site, beacons=tuple(_placed(b, change, fault.code) for b in site.beacons))
+    for block in fault.blocks:
+        own = block.sigma * step[block.columns]
+        if isinstance(block.parameter, Inertial):
+            site = block.parameter.corrected(site, own)
+            continue
+        sigma = block.parameter.sigma(site, block.owner)
+        moved = block.parameter.moved(initial_calibration(site, 0.0), block.owner, own)
+        site = block.parameter.refined(moved.site, moved, block.owner, sigma)
+    return site
+
+
+def _placed(beacon: Beacon, change: Array, code: str) -> Beacon:
+    """Return a beacon of a survey that is turned or stretched about the origin."""
+    attitude = beacon.world_from_beacon
+    return replace(
+        beacon,
+        position_world=change @ beacon.position_world,
+        world_from_beacon=change @ attitude if code == TILT else attitude,
+    )
 
 
 def _beacons(site: Site) -> str:
@@ -300,6 +405,7 @@ def spoken_name(block: Block) -> str:
         GYRO_SCALE: "the scale of the gyro",
         ACCEL_SCALE: "the scale of the accelerometer",
         GYRO_ALIGNMENT: "the axes of the gyro",
+        GYRO_G_SENSITIVITY: "the g-sensitivity of the gyro",
         GRAVITY: "the size of gravity",
         CLOCK_OFFSET: "the clock of the magnetometer",
         CLOCK_RATE: "the rate of the IMU's clock",

@@ -154,6 +154,11 @@ class Navigator:
                 "imu: the site declares a motion prior instead of an IMU; describe platform.imu, or"
                 " drop the inertial samples"
             )
+        intrinsics = self.site.platform.imu_intrinsics
+        if intrinsics is not None:
+            gyro_body, accel_body = intrinsics.corrected(
+                np.atleast_2d(gyro_body), np.atleast_2d(accel_body)
+            )
         self._arrived.add_imu(time, gyro_body, accel_body)
         self._now.reach(self._arrived)
 

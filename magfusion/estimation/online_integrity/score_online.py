@@ -11,7 +11,6 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from magfusion.estimation.data_checks.statistics import P_CERTAIN
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, State, states_of
 from magfusion.estimation.integrity.fixed_parameter_test import (
@@ -43,6 +42,7 @@ from magfusion.units import Array
 
 MIN_SCORE_INTERVAL, MAX_SCORE_INTERVAL = 2.0, 20.0  # s; shortest and longest interval of results
 ENOUGH = 5  # epochs for the shortest interval
+ONLINE_EVIDENCE = 30.0  # of -2 log likelihood: `LEAST_EVIDENCE`, and the price of many tests
 MOST_WAITING = 10  # epochs; larger batches would delay an update
 
 
@@ -205,7 +205,7 @@ class OnlineScore:
             by[None, :MOTION],
             by[MOTION:],
         )
-        information, gradient = score.with_declared()
+        information, gradient = score.with_declared(tolerance=False)
         reported = np.flatnonzero(targets.gains(information, gradient) > 0.0)
         result = (
             release_fault(pose_cov, score, targets.fault_candidates[k], information, gradient)
@@ -221,4 +221,4 @@ class OnlineScore:
 
 
 def _is_significant(one: ReleasedFault) -> bool:
-    return one.gain > 0.0 and float(one.distance[0]) > COVERED and one.log_p < np.log(P_CERTAIN)
+    return one.gain > ONLINE_EVIDENCE and (one.is_notable or float(one.distance[0]) > COVERED)

@@ -1,0 +1,33 @@
+"""Scale factors, axes and g-sensitivity of an IMU."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from magfusion.units import Array
+
+
+@dataclass(frozen=True, eq=False)
+class ImuIntrinsics:
+    """Deterministic errors of an IMU, besides its biases.
+
+    ``measured gyro = gyro_matrix @ rate + gyro_g_sensitivity @ force + bias`` and
+    ``measured accel = accel_matrix @ force + bias``, in body axes.
+
+    Parameters
+    ----------
+    gyro_matrix, accel_matrix : ndarray, shape (3, 3)
+        Scale factors and directions of the axes.
+    gyro_g_sensitivity : ndarray, shape (3, 3)
+        Rate (rad/s) that each m/s^2 of specific force causes.
+    """
+
+    gyro_matrix: Array = field(default_factory=lambda: np.eye(3))
+    accel_matrix: Array = field(default_factory=lambda: np.eye(3))
+    gyro_g_sensitivity: Array = field(default_factory=lambda: np.zeros((3, 3)))
+
+    def corrected(self, gyro_body: Array, accel_body: Array) -> tuple[Array, Array]:
+        """Return rates (rad/s) and specific forces (m/s^2), shape (n, 3), without these errors."""
+        accel = np.linalg.solve(self.accel_matrix, accel_body.T).T
+        caused = accel @ self.gyro_g_sensitivity.T
+        return np.linalg.solve(self.gyro_matrix, (gyro_body - caused).T).T, accel
