@@ -330,7 +330,7 @@ def test_the_scenario_prints_a_table_and_one_object(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["earth_field_attitude", "--quick"])
     scenario.main()
     lines = capsys.readouterr().out.splitlines()
-    assert any("left out" in line for line in lines)
+    assert any("omitted" in line for line in lines)
     by_way = {row["magnetometer"]: row for row in json.loads(lines[-1])["rows"]}
     assert by_way["calibrated"]["total_deg"] < 0.8
     assert by_way["calibrated"]["total_deg"] < by_way["declared"]["total_deg"]

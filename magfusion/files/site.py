@@ -179,9 +179,22 @@ def save_site(site: Site, path: Path | str) -> None:
     path, site = Path(path), as_declared(site)
     maps = {b.name: b.field_map for b in site.every_beacon if b.field_map is not None}
     others = path.with_name(f"{path.stem}_field_map.parquet")
+    content = _content(site)
+    if maps:
+        content["world"]["field_map"] = others.name
+        write_field_maps(maps, others)
+    if site.correlation is not None:
+        correlation = path.with_name(f"{path.stem}_correlation.parquet")
+        content["correlation"] = correlation.name
+        save_correlation(site, correlation)
+    write_yaml(content, path)
+
+
+def _content(site: Site) -> dict[str, Any]:
+    """Return what a site's file holds, without the names of other files."""
     content = {
         "magfusion_site": 1,
-        "world": _world_entry(site) | ({"field_map": others.name} if maps else {}),
+        "world": _world_entry(site),
         "beacons": [_beacon_entry(b) for b in site.every_beacon],
         "platform": {
             **imu_entry(site.platform.imu),
@@ -197,13 +210,32 @@ def save_site(site: Site, path: Path | str) -> None:
         content["reference"] = {"position_m": site.reference_world.tolist()}
     if site.calibration is not None:
         content["calibration"] = plain(site.calibration)
-    if maps:
-        write_field_maps(maps, others)
-    if site.correlation is not None:
-        correlation = path.with_name(f"{path.stem}_correlation.parquet")
-        content["correlation"] = correlation.name
-        save_correlation(site, correlation)
-    write_yaml(content, path)
+    return content
+
+
+def changed_keys(before: Site, after: Site) -> dict[str, Any]:
+    """Return the keys of a site's file whose values differ, as ``beacons[0].position_m``.
+
+    Returns
+    -------
+    dict
+        With the values of the second site.
+    """
+    old, new = (_flat(_content(as_declared(site))) for site in (before, after))
+    return {key: value for key, value in new.items() if old.get(key) != value}
+
+
+def _flat(entry: Any, key: str = "") -> dict[str, Any]:
+    """Return the values of nested mappings, and of lists of mappings, by their key."""
+    if isinstance(entry, dict):
+        parts = {f"{key}.{name}" if key else name: value for name, value in entry.items()}
+    elif isinstance(entry, list) and entry and isinstance(entry[0], dict):
+        parts = {f"{key}[{i}]": value for i, value in enumerate(entry)}
+    else:
+        return {key: entry}
+    return {
+        name: value for part, inner in parts.items() for name, value in _flat(inner, part).items()
+    }
 
 
 def _field_maps(entry: SiteEntry, path: Path) -> dict[str, FieldMap]:

@@ -7,6 +7,7 @@ from pydantic import AfterValidator, Field, ValidationError
 from pydantic_core import InitErrorDetails
 
 from magfusion.files.site_casing import CasingEntry, casing_entry
+from magfusion.files.site_motion import MILLION, ppm
 from magfusion.files.site_plain import (
     degree_sigma_entry,
     model_of,
@@ -93,6 +94,7 @@ class MagnetometerEntry(StrictModel):
     axes: Annotated[list[Literal["x", "y", "z"]], Field(min_length=1, max_length=3)] | None = None
     name: Annotated[str, Field(min_length=1)] | None = None
     clock_offset_s: Annotated[float, between(-1e3, 1e3)] = Magnetometer.clock_offset
+    clock_rate_ppm: Annotated[float, between(-1e4, 1e4)] = Magnetometer.clock_rate
     sigma: MagnetometerSigmaEntry = Field(default_factory=MagnetometerSigmaEntry)
 
 
@@ -118,6 +120,10 @@ def check_magnetometers(
         if len(several) > 1 and sensor.axes is not None and len(set(sensor.axes)) < 3:
             remedy = "give all three axes: with others a receiver of fewer is not supported"
             raise refusal_at((*at, "axes"), sensor.axes, remedy)
+    for i, sensor in enumerate(several):
+        if sensor.clock_rate_ppm and len(several) > 1:
+            remedy = "remove it: of several magnetometers no rate of a clock is known"
+            raise refusal_at(("magnetometers", i, "clock_rate_ppm"), sensor.clock_rate_ppm, remedy)
     if several[0].clock_offset_s or several[0].sigma.clock_offset_s:
         remedy = "give it to the others: the clock of the first magnetometer is that of the log"
         raise refusal_at(("magnetometers", 0, "clock_offset_s"), several[0].clock_offset_s, remedy)
@@ -175,6 +181,7 @@ def magnetometer_of(entry: MagnetometerEntry) -> Magnetometer:
         axes="".join(sorted(set(entry.axes or Magnetometer.axes))),
         name=entry.name or Magnetometer.name,
         clock_offset=entry.clock_offset_s,
+        clock_rate=entry.clock_rate_ppm / MILLION,
     )
 
 
@@ -206,6 +213,8 @@ def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
     own |= {} if magnetometer.axes == Magnetometer.axes else {"axes": list(magnetometer.axes)}
     if magnetometer.clock_offset != Magnetometer.clock_offset:
         own["clock_offset_s"] = float(magnetometer.clock_offset)
+    if magnetometer.clock_rate != Magnetometer.clock_rate:
+        own["clock_rate_ppm"] = ppm(magnetometer.clock_rate)
     clock = {"clock_offset_s": float(sigma.clock_offset)} if sigma.clock_offset else {}
     return (
         own

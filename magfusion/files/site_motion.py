@@ -91,7 +91,7 @@ def imu_entry(imu: ImuModel) -> dict[str, Any]:
         "clock_rate_sigma_ppm": ImuModel.clock_rate_sigma,
     }
     keys = zip(ImuEntry.model_fields, vars(imu).values(), strict=True)
-    entry = {k: _ppm(v) if k.endswith("_ppm") else float(v) for k, v in keys if usual.get(k) != v}
+    entry = {k: ppm(v) if k.endswith("_ppm") else float(v) for k, v in keys if usual.get(k) != v}
     return {"imu": entry}
 
 
@@ -110,7 +110,7 @@ def prior_entry(prior: MotionPrior | None) -> dict[str, Any]:
     return {"motion_prior": {key: float(value) for key, value in keys}}
 
 
-def _ppm(value: float) -> float:
+def ppm(value: float) -> float:
     """Return the number that is read back as the same, where there is one."""
     near = value * MILLION
     around = (near, np.nextafter(near, np.inf), np.nextafter(near, -np.inf))

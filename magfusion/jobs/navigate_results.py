@@ -11,7 +11,7 @@ from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorde
 from magfusion.estimation.data_checks.signal import Detected
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.initialization.online import NoStart
-from magfusion.estimation.integrity.diagnosis import with_cause
+from magfusion.estimation.integrity.diagnosis import diagnosed, with_cause
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online_integrity.open_roll import comparable
 from magfusion.files.site import save_site
@@ -154,7 +154,8 @@ def navigated(
         log, site, BRIDGED_CODES, estimated=poses, beacons=True, compensated=released
     )
     findings = _without_repeated(navigator.summary.trust, detected)
-    trust = with_cause(findings | Trust(detected), log, site, settings.lockin)
+    trust = findings | Trust(detected)
+    trust = with_cause(trust, diagnosed(log, site, trust, settings.lockin))
     own = _chosen(rows, trust, CURRENT)
     current, lagged = _part(rows, own, site), None
     assert current is not None

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from magfusion.errors import UNOBSERVABLE, EstimationError, InputError
-from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, beyond, recorded
+from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.data_checks.data_quality import beyond
 from magfusion.estimation.snapshot.coil_gain import with_found_gain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
 from magfusion.jobs.failure import reason_of
-from magfusion.jobs.fix import write_fix_result
 from magfusion.jobs.rates import RateSettings, refuse_rate
 from magfusion.jobs.region import RegionSettings
 from magfusion.jobs.rest_settings import RestSettings
@@ -28,12 +27,10 @@ from magfusion.jobs.settings import (
     WindowSettings,
     option,
 )
-from magfusion.model.parameters import initial_calibration
 from magfusion.model.progress import Report, quiet
-from magfusion.model.trust import Finding, Trust, Verdict
-from magfusion.results.figures import Figure, Figures, Section, heading
+from magfusion.model.trust import Finding
+from magfusion.results.figures import Figure, Figures
 from magfusion.results.rest_figures import rest_figures
-from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.estimation.batch.batch import Smoothed, SmootherSettings
@@ -44,9 +41,6 @@ if TYPE_CHECKING:
     from magfusion.model.site import Site
     from magfusion.model.trust import Finding, Risk
     from magfusion.units import Rate
-
-
-CONTRADICTION = "the inconsistency of fields and inertial data is too large for a solution"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,7 +175,10 @@ def run_smooth(
         In the latter case the single-epoch fixes are saved in the output directory.
     """
     from magfusion.estimation.batch.self_survey import smooth_and_place
+    from magfusion.estimation.integrity.correction import corrections
     from magfusion.jobs.inputs import claim, named, refuse_failed
+    from magfusion.jobs.smooth_correction import corrected
+    from magfusion.jobs.smooth_failure import failure_of, save_failure
     from magfusion.jobs.smooth_result import finished, with_errors, write_finished
     from magfusion.results.report import FAILED
 
@@ -205,17 +202,30 @@ def run_smooth(
         reason = reason_of(error)
         if _has_unknown(site):
             raise EstimationError(f"{job.log_path}: {reason}") from error
-        with claimed as whole:
-            reported = _save_fixes_instead(whole, settings, log, site, reason)
-        raise EstimationError(
-            f"{job.log_path}: {reported}; the single-epoch fixes are saved in {job.output / FAILED}"
-        ) from error
-    give_back_memory()
-    findings += () if rested is None else beyond(recording, log, site)
-    done = finished(log, site, settings, result, risk, findings=findings)
+        failure = failure_of(log, site, settings, reason)
+        possible = corrections(site, (), (), failure.cause)
+        again = corrected(log, site, settings, risk, possible, failure.trust.reasons, report=report)
+        if again is None:
+            with claimed as whole:
+                save_failure(whole, failure, log, site)
+            raise EstimationError(
+                f"{job.log_path}: {failure.reason}; the single-epoch fixes are saved in"
+                f" {job.output / FAILED}"
+            ) from error
+        done, placed = again, ()
+    else:
+        give_back_memory()
+        findings += () if rested is None else beyond(recording, log, site)
+        done = finished(log, site, settings, result, risk, findings=findings)
+        reasons = done.trust.reasons
+        done = (
+            corrected(log, site, settings, risk, done.corrections, reasons, findings, report)
+            or done
+        )
     figures = done.figures | Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     figures |= Figures() if rested is None else rest_figures(rested)
-    done = with_errors(replace(done, figures=figures), log, placed, (site, settings))
+    used = done.result.declared.site
+    done = with_errors(replace(done, figures=figures), log, placed, (used, settings))
     with claimed as whole:
         write_finished(whole, log, done, rate=rate)
     if iterations_file is not None:
@@ -330,38 +340,6 @@ def _agreed(
         risk,
     )
     return estimate.log, estimate.site, estimate.result, estimate.findings
-
-
-def _save_fixes_instead(
-    whole: Path, settings: SmootherSettings, log: Log, site: Site, reason: str
-) -> str:
-    """Write the fixes where there is no trajectory, to the failed directory; return the reason."""
-    from magfusion.estimation.demodulation.demodulation import first_fixes, phasors
-    from magfusion.estimation.integrity.diagnosis import OF_CATCH_ALL, with_cause
-    from magfusion.jobs.inputs import found_in
-    from magfusion.results.report import dropped_figures, fix_figures
-
-    samples, dropped = phasors(log, site, settings.lockin)
-    fixes = first_fixes(samples, log, initial_calibration(site, float(np.mean(samples.time))))
-    code = "no_solution"
-    if reason.startswith(UNOBSERVABLE):
-        code = "geometry" if np.mean(fixes.determined[:, 0]) < 0.5 else "diverged"
-        what = f"{UNOBSERVABLE}: add a beacon or a coil"
-        reason = what if code == "geometry" else CONTRADICTION
-    text = f"There is no trajectory: {reason}."
-    none = Finding(code, text, Verdict.FAILED, weight=0.0)
-    trust = Trust((none, *recorded(log, site, BRIDGED_CODES, beacons=True)))
-    if code != "geometry":  # of poses that no epoch determines nothing can be tried
-        trust = with_cause(trust, log, site, settings.lockin)
-    if trust.ordered[0].weight >= OF_CATCH_ALL:
-        reason = trust.ordered[0].text.rstrip(".")
-    figures = heading("smooth", log.name) | trust_figures(trust)
-    figures |= Figures(Figure("failed", reason, section=Section.REPORT))
-    figures |= fix_figures(fixes, site) | dropped_figures(dropped)
-    directory = found_in(whole, trust)
-    write_fix_result(directory, log, site, fixes, figures)
-    (directory / "report.json").rename(whole / "report.json")
-    return reason
 
 
 COMMAND = Command(

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.batch.self_survey import Placement
-from magfusion.estimation.integrity.diagnosis import with_cause
-from magfusion.estimation.integrity.judge import judge_result
+from magfusion.estimation.integrity.correction import (
+    Correction,
+    continued,
+    corrections,
+    is_clear,
+    spread_of,
+)
+from magfusion.estimation.integrity.diagnosis import diagnosed, with_cause
+from magfusion.estimation.integrity.judge import judged_with_score
+from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.smoothed_exclusion import (
     separated_smooth,
     states_between,
@@ -59,6 +67,10 @@ class Finished:
     figures : Figures
         Without those of the truth.
     errors : TrajectoryErrors, optional
+    corrections : list of Correction
+        What may be wrong with the site, where something is.
+    continued : Correction, optional
+        That of a corrected site, which is not large enough.
     """
 
     result: Smoothed
@@ -66,6 +78,8 @@ class Finished:
     states: StateTrust
     figures: Figures
     errors: TrajectoryErrors | None
+    corrections: list[Correction] = field(default_factory=list)
+    continued: Correction | None = None
 
 
 def finished(
@@ -77,6 +91,7 @@ def finished(
     *,
     excess: float = 1.0,
     findings: tuple[Finding, ...] = (),
+    correction: Correction | None = None,
 ) -> Finished:
     """Assess a smoothed log.
 
@@ -86,16 +101,27 @@ def finished(
         Factor on the variances of its poses, from other logs.
     `findings` : tuple of Finding
         From other logs.
+    correction : Correction, optional
+        By which the site was corrected: it is the reason why the result is doubtful.
     """
     separated = separated_smooth(result, risk)
     give_back_memory()
-    result, trust = judge_result(separated.result, log)
+    result, trust, score, causes = judged_with_score(separated.result, log)
+    if correction is not None:
+        result = _with_uncertainty(result, correction, score)
     trust |= Trust((*open_signs(result), *roll_findings(site)))
     result = replace(result, states=with_open_roll(result.states, site))
     if excess > 1.0 and result.states.pose_cov is not None:
         wider = excess * result.states.pose_cov
         result = replace(result, states=replace(result.states, pose_cov=wider))
-    trust = with_cause(trust | separated.trust | Trust(findings), log, site, settings.lockin)
+    trust |= separated.trust | Trust(findings)
+    cause = diagnosed(log, site, trust, settings.lockin)
+    excluded = any(f.code == "beacon_excluded" for f in trust.reasons)
+    possible = corrections(site, trust.reasons, () if excluded else causes, cause)
+    found = bool(causes) or any(f.code == "changed" for f in trust.reasons)
+    trust = with_cause(trust, None if found and not is_clear(cause) else cause)
+    if correction is not None:
+        trust |= Trust((correction.finding,))
     by_state = states_judged(separated, result, trust.verdict)
     figures = (
         heading("smooth", log.name)
@@ -103,7 +129,19 @@ def finished(
         | Figures(where_found("coupling", settings.coupling != "tight", settings.coupling))
     )
     figures |= smoothed_figures(result) | level_figures(by_state) | open_figures(site)
-    return Finished(result, trust, by_state, figures, None)
+    further = None if correction is None else continued(correction, score)
+    return Finished(result, trust, by_state, figures, None, possible, further)
+
+
+def _with_uncertainty(result: Smoothed, correction: Correction, score: Score | None) -> Smoothed:
+    """Return a corrected result whose covariance has the uncertainty of the correction."""
+    cov = result.states.pose_cov
+    if cov is None:
+        return result
+    if correction.spread is not None and len(correction.spread) not in (1, len(cov)):
+        correction = correction._replace(spread=None)
+    cov = cov + spread_of(correction, score)
+    return replace(result, states=replace(result.states, pose_cov=cov))
 
 
 def open_signs(result: Smoothed) -> tuple[Finding, ...]:

@@ -30,4 +30,5 @@ class ImuIntrinsics:
         """Return rates (rad/s) and specific forces (m/s^2), shape (n, 3), without these errors."""
         accel = np.linalg.solve(self.accel_matrix, accel_body.T).T
         caused = accel @ self.gyro_g_sensitivity.T
-        return np.linalg.solve(self.gyro_matrix, (gyro_body - caused).T).T, accel
+        gyro = np.linalg.solve(self.gyro_matrix, (gyro_body - caused).T).T
+        return np.asarray(gyro, dtype=np.float64), np.asarray(accel, dtype=np.float64)

@@ -67,6 +67,9 @@ class Magnetometer:
         Identifies it in data and reports where there are several.
     clock_offset : float
         A sample stamped t was taken at t + clock_offset on the log's clock (s).
+    clock_rate : float
+        Of a single magnetometer: a sample stamped t was taken at t (1 + clock_rate) on the clock
+        of the drives.
     """
 
     __repr__ = short_repr
@@ -86,6 +89,7 @@ class Magnetometer:
     casing: Casing | None = None
     name: str = "magnetometer"
     clock_offset: float = 0.0
+    clock_rate: float = 0.0
 
     @property
     def lacking(self) -> tuple[int, ...]:

@@ -318,7 +318,8 @@ class Log:
     stamps, ``rotation`` the angles of rotors, ``depths`` those of wells, for ranging.
     ``waveforms`` are the samples of several magnetometers, by name and each by its own stamps; then
     ``waveform`` is None.  ``recorded_imu`` has the inertial samples as recorded where ``imu`` is
-    without the errors that the site declares (`magfusion.model.without_imu.logged`).
+    without the errors that the site declares (`magfusion.model.without_imu.logged`), ``clock_rate``
+    the rate by which the stamps of ``waveform`` are corrected.
     """
 
     __repr__ = short_repr
@@ -341,6 +342,7 @@ class Log:
     depths: Depths | None = None
     waveforms: Mapping[str, Waveform] = field(default_factory=dict)
     recorded_imu: ImuSamples | None = None
+    clock_rate: float = 0.0
 
     @property
     def vectors(self) -> Waveform | None:

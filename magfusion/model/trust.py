@@ -4,7 +4,7 @@
 with the reason; `failed` that there is no result.  No ground truth is used.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -75,6 +75,7 @@ CODES = {
     "logs_disagree": "a log is inconsistent with the others about the shared site",
     "long_windows": "tones are separated in long windows where short ones could not be used",
     "lost": "no solution near the estimated position explains the fields",
+    "low_pass": "the magnetometer has a low-pass filter that is not declared",
     "low_signal": "beacons are below the noise",
     "magnetometer_axes": "the magnetometer's axes are left-handed",
     "magnetometer_clock": "the clock of one of several magnetometers is not as declared",
@@ -165,12 +166,18 @@ class Finding:
         Least severe verdict that it implies; trustworthy for a mere remark.
     weight : float
         Test statistic in units of its limit; the largest comes first.
+    remedy : mapping, optional
+        Keys of the site's file, with the values that undo the mistake.
+    explained : tuple of str
+        Codes of the findings that it explains.
     """
 
     code: str
     text: str
     verdict: Verdict = Verdict.DOUBTFUL
     weight: float = 1.0
+    remedy: Mapping[str, object] | None = field(default=None, compare=False)
+    explained: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "weight", float(self.weight))

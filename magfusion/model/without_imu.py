@@ -110,22 +110,36 @@ def logged(log: Log, site: Site) -> tuple[Log, Site]:
     """Return a log and its site as the estimators use them.
 
     As `without_imu` if the log has no inertial samples; otherwise these are corrected by the
-    declared `ImuIntrinsics`, unless they are already.
+    declared `ImuIntrinsics`.  The magnetometer's stamps are corrected by the declared rate of its
+    clock.  A corrected log can be corrected again, by the same or another site.
     """
+    log = _at_clock_rate(log, site.platform.magnetometer.clock_rate)
     if not len(log.imu):
         return without_imu(log, site)
     intrinsics = site.platform.imu_intrinsics
-    if intrinsics is None or not log.inertial or log.recorded_imu is not None:
-        return log, site
-    gyro, accel = intrinsics.corrected(log.imu.gyro_body, log.imu.accel_body)
-    return replace(log, imu=ImuSamples(log.imu.time, gyro, accel), recorded_imu=log.imu), site
+    recorded = log.imu if log.recorded_imu is None else log.recorded_imu
+    if intrinsics is None or not log.inertial:
+        return log if recorded is log.imu else as_recorded(log), site
+    gyro, accel = intrinsics.corrected(recorded.gyro_body, recorded.accel_body)
+    return replace(log, imu=ImuSamples(log.imu.time, gyro, accel), recorded_imu=recorded), site
 
 
 def as_recorded(log: Log) -> Log:
-    """Return a log with its inertial samples as recorded."""
+    """Return a log with its samples and stamps as recorded."""
+    log = _at_clock_rate(log, 0.0)
     if log.recorded_imu is None:
         return log
     return replace(log, imu=log.recorded_imu, recorded_imu=None)
+
+
+def _at_clock_rate(log: Log, rate: float) -> Log:
+    """Return a log whose magnetometer's stamps are corrected by a rate of its clock."""
+    wave = log.waveform
+    if wave is None or rate == log.clock_rate:
+        return log
+    time = wave.time * ((1.0 + rate) / (1.0 + log.clock_rate))
+    marks = None if wave.marks is None else wave.marks.on_clock(wave.time, time)
+    return replace(log, waveform=replace(wave, time=time, marks=marks), clock_rate=rate)
 
 
 def require_motion_prior(site: Site) -> None:

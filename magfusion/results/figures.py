@@ -10,8 +10,9 @@ All other names are written unchanged.
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Any
 
-Value = float | int | str | bool | list[str] | list[dict[str, str | float]] | None
+Value = float | int | str | bool | list[str] | list[dict[str, Any]] | None
 
 OWNERS = frozenset({"earth", "imu", "magnetometer", "sensor"})  # of parameters, beside beacons
 DETERMINED_RATIO = 0.5  # posterior over prior sigma below which the data, not the prior, spoke

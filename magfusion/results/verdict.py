@@ -1,5 +1,7 @@
 """The verdict on a result, as figures: first on the screen and in ``report.json``."""
 
+from typing import Any
+
 import numpy as np
 
 from magfusion.model.trust import Finding, StateTrust, Trust, Unverified
@@ -25,11 +27,19 @@ def notes_of(trust: Trust) -> Figures:
     return Figures(Figure("notes", sentences, section=Section.REPORT))
 
 
-def _finding_rows(findings: tuple[Finding, ...]) -> list[dict[str, str | float]]:
-    return [{"code": f.code, "text": f.text} for f in findings]
+def _finding_rows(findings: tuple[Finding, ...]) -> list[dict[str, Any]]:
+    rows = []
+    for finding in findings:
+        row: dict[str, Any] = {"code": finding.code, "text": finding.text}
+        if finding.remedy is not None:
+            row["remedy"] = dict(finding.remedy)
+        if finding.explained:
+            row["explains"] = list(finding.explained)
+        rows.append(row)
+    return rows
 
 
-def _unverified(one: Unverified) -> dict[str, str | float]:
+def _unverified(one: Unverified) -> dict[str, Any]:
     return {
         "parameter": one.name,
         "sigma": one.sigma,

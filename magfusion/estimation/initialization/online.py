@@ -188,7 +188,7 @@ def _smoothed(log: Log, site: Site, settings: EstimatorSettings) -> _Beginning:
     requested = {f.name: getattr(settings, f.name) for f in fields_of(EstimatorSettings)}
     how = SmootherSettings(loss="huber", **requested)
     log, remaining, result, excluded = _agreed(smooth(log, site, how), log, site, how)
-    honest, trust, score = judged_with_score(result, log)
+    honest, trust, score, _ = judged_with_score(result, log)
     state = last_state(result, result.considered)
     if result.calibration.site.undetected or site.platform.further:
         state, score = _among_all(state, score, result, site, settings)

@@ -76,6 +76,7 @@ def matrix_causes(known: Snapshots, steady: float | None) -> Iterator[Explanatio
         f"the magnetometer's matrix is off by up to {100.0 * float(np.max(np.abs(even))):.2g} %,"
         " as by iron on the body",
         "Calibrate the magnetometer on the body (magfusion calibrate magnetometer).",
+        found.site,
     )
 
 
@@ -139,7 +140,8 @@ def _scales(known: Snapshots, scale: float, steady: float | None) -> Iterator[Ex
         cause = f"all moments are {best:.4g} times those declared"
         cause += f": {words[0]}" if words else " (or the magnetometer's scale is)"
         remedy = "Give moment_a_m2 as amplitudes in A m^2."
-    yield _explained(known, after, 1, code, cause, remedy)
+    undone = _stronger(known.site, best) if code != "field_scale" else None
+    yield _explained(known, after, 1, code, cause, remedy, undone)
 
 
 def _stronger(site: Site, factor: float) -> Site:
@@ -178,6 +180,7 @@ def _steady_causes(known: Snapshots, left: Snapshots, name: str) -> Iterator[Exp
             "coil_reversed",
             f"of beacon {name} {cause}",
             "Check the wires of its coils, and the sign of phase_deg.",
+            trial(other).site,
         )
         for cause, other in _rewired(beacon)
     ]
@@ -193,6 +196,7 @@ def _steady_causes(known: Snapshots, left: Snapshots, name: str) -> Iterator[Exp
         "moments",
         f"the moments of beacon {name} are {_listed(factors, 3)} times those declared",
         f"Measure the current of beacon {name}, or calibrate it (magfusion calibrate beacon).",
+        found.site,
     )
     if beacon.synchronised:
         after, found = known.fitted([(PHASE, name, WIDE[3])], fixes)
@@ -231,6 +235,7 @@ def _moved(
         f"beacon {name} is not where it was surveyed, but off by"
         f" ({_listed(100.0 * step, 2)}) cm and {angle:.2g} degrees",
         "Survey it anew, or declare larger sigmas for it.",
+        at.site,
     )
 
 
@@ -320,9 +325,17 @@ def _turns() -> Iterator[Array]:
 
 
 def _explained(
-    known: Snapshots, after: float, found: int, code: str, cause: str, remedy: str
+    known: Snapshots,
+    after: float,
+    found: int,
+    code: str,
+    cause: str,
+    remedy: str,
+    site: Site | None = None,
 ) -> Explanation:
-    return Explanation(code, cause, remedy, known.chi_square, after, known.freedom, found)
+    return Explanation(
+        code, cause, remedy, known.chi_square, after, known.freedom, found, site=site
+    )
 
 
 def _listed(values: Array, digits: int) -> str:

@@ -13,9 +13,9 @@ import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.data_checks.statistics import holm, sigmas
-from magfusion.estimation.integrity.fixed_parameter_test import (
+from magfusion.estimation.integrity.fixed_parameter_test import MAX_LINEAR_CHI_SQUARE
+from magfusion.estimation.integrity.released_fault import (
     COVERED,
-    MAX_LINEAR_CHI_SQUARE,
     ReleasedFault,
     release_fault,
     release_gain,
@@ -180,14 +180,10 @@ def changed(case: Case) -> TestResult:
         if (cause := release_fault(case.pose_cov, wide, one.fault, information, gradient))
         is not None
     ]
-    likely = [
-        pair
-        for pair, significant in zip(released, informative, strict=True)
-        if significant and np.mean(pair[1].distance) > COVERED
-    ]
-    if not likely:
+    significant = [pair for pair, yes in zip(released, informative, strict=True) if yes]
+    if not any(np.mean(cause.distance) > COVERED for _, cause in significant):
         return NOTHING
-    change, cause = max(likely, key=lambda pair: pair[1].gain)
+    change, cause = max(significant, key=lambda pair: pair[1].gain)
     if cause.gain < _throughout(case, information, gradient):
         return NOTHING  # it was wrong from the beginning
     moved = cause.moved[:, :, None] * cause.moved[:, None, :]

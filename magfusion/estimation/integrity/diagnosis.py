@@ -5,6 +5,7 @@ usual mistakes are tried; see `likely_cause`.
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,9 +44,25 @@ OF_SEEN = FIRST / 2.0  # and before what the streams show, which may be beside i
 OF_CATCH_ALL = FIRST / 4.0  # but what only says where something is wrong may be of what they show
 
 
+class Diagnosis(NamedTuple):
+    """The mistake that explains a log.
+
+    Parameters
+    ----------
+    site : Site, optional
+        In which it is undone, where it can be.
+    ratio : float
+        Of chi square before to that after.
+    """
+
+    finding: Finding
+    site: Site | None
+    ratio: float
+
+
 def diagnosed(
     log: Log, site: Site, trust: Trust, settings: LockinSettings | None = None
-) -> Finding | None:
+) -> Diagnosis | None:
     """Return the cause of what the witnesses say, where one explains the log.
 
     Parameters
@@ -61,6 +78,8 @@ def diagnosed(
         return None
     if not site.beacons or any(beacon.unknown is not None for beacon in site.beacons):
         return None
+    several = bool(site.platform.further)
+    log, site = first_magnetometer(log, site)
     # Of all that can be wrong nothing is needed where nothing is.
     try:
         said = cause_of(log, site, settings)
@@ -68,8 +87,11 @@ def diagnosed(
         return None  # a log of which nothing can be tried
     if said is None:
         return None
-    weight = OF_CATCH_ALL if said[0].catch_all else FIRST
-    return Finding(said[0].code, said[1], trust.verdict, weight)
+    one, text = said
+    weight = OF_CATCH_ALL if one.catch_all else FIRST
+    finding = Finding(one.code, text, trust.verdict, weight)
+    ratio = one.before / max(one.after, 1e-9)
+    return Diagnosis(finding, None if several else one.site, ratio)
 
 
 def seen_in_streams(trust: Trust) -> bool:
@@ -81,9 +103,8 @@ def seen_in_streams(trust: Trust) -> bool:
     )
 
 
-def with_cause(trust: Trust, log: Log, site: Site, settings: LockinSettings | None = None) -> Trust:
-    """Return what is to be said of a result, the cause first where it is known; see `diagnosed`."""
-    cause = diagnosed(*first_magnetometer(log, site), trust, settings)
+def with_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
+    """Return what is to be said of a result, the cause first where it is known."""
     diverged = any(finding.code == "diverged" for finding in trust.findings)
 
     def placed(finding: Finding) -> Finding:
@@ -95,4 +116,4 @@ def with_cause(trust: Trust, log: Log, site: Site, settings: LockinSettings | No
         return finding
 
     found = tuple(placed(finding) for finding in trust.findings)
-    return Trust(found if cause is None else (*found, cause), trust.unverified)
+    return Trust(found if cause is None else (*found, cause.finding), trust.unverified)

@@ -3,6 +3,8 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from magfusion.model.site import Site
+
 LEAST_FALL = 60.0  # of chi square, that an explanation must bring
 CLEARLY = 2.5  # times smaller than before must chi square be, and than with any other cause
 SIGNIFICANT = 60.0  # fall for each parameter found, in units of the mean square that is left
@@ -34,6 +36,8 @@ class Explanation:
     catch_all : bool
         Whether it says what contradicts the rest, and not why: so it explains whatever is wrong
         there, and is no rival of what does say why.
+    site : Site, optional
+        In which the mistake is undone, where it can be.
     """
 
     code: str
@@ -45,6 +49,7 @@ class Explanation:
     found: int = 0
     beacon: str = ""
     catch_all: bool = False
+    site: Site | None = None
 
     @property
     def score(self) -> float:

@@ -7,16 +7,20 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.integrity.explanation import Explanation
 from magfusion.estimation.integrity.field_snapshots import Snapshots
+from magfusion.model.response import FrequencyResponse
 from magfusion.model.site import Beacon, Coil, Site
 from magfusion.units import DEGREE, Array
 
 GROSS = 4.0  # chi square over its freedom, below which no mistake in all beacons is sought
 SCREENED = 6  # epochs on which each is tried
 KEPT = 4  # of them, tried on all epochs
+CORNERS = 12  # corner frequencies of a low-pass that are tried
+REACH = 2.0  # factor by which the best of them is refined
 # What the declared moments are too large by: a unit or a convention.
 MOMENT_FACTORS = {
     "amplitudes were declared as rms values": np.sqrt(0.5),
@@ -41,6 +45,23 @@ LENGTH_FACTORS = {
 }
 
 
+class Way(NamedTuple):
+    """A site in which a mistake is undone.
+
+    Parameters
+    ----------
+    by_size, size : callable and float, optional
+        The same for another size of the mistake, where it has one.
+    """
+
+    code: str
+    cause: str
+    remedy: str
+    site: Site
+    by_size: "Callable[[float], Way] | None" = None
+    size: float = 0.0
+
+
 def global_causes(known: Snapshots) -> Iterator[Explanation]:
     """Yield what a mistake in all beacons at once would explain.
 
@@ -53,15 +74,37 @@ def global_causes(known: Snapshots) -> Iterator[Explanation]:
     tried = [(few.of(way.site), way) for way in _ways(known.site)]
     tried.append((replace(few, samples=inverted), Way(*left_handed(), known.site)))
     for one, way in sorted(tried, key=lambda pair: pair[0].chi_square)[:KEPT]:
-        whole = replace(one, samples=known.samples)
+        way = _refined(few, way)
+        whole = replace(known.of(way.site), samples=known.samples)
         if one.samples is inverted:
             whole = replace(
                 one,
                 samples=replace(known.samples, phasor_sensor=-known.samples.phasor_sensor),
             )
         yield Explanation(
-            way.code, way.cause, way.remedy, known.chi_square, whole.chi_square, known.freedom
+            way.code,
+            way.cause,
+            way.remedy,
+            known.chi_square,
+            whole.chi_square,
+            known.freedom,
+            0 if way.by_size is None else 1,
+            site=None if one.samples is inverted else way.site,
         )
+
+
+def _refined(few: Snapshots, way: Way) -> Way:
+    """Return a mistake of the size that explains some epochs best."""
+    if way.by_size is None:
+        return way
+    by_size = way.by_size
+
+    def cost(log_size: float) -> float:
+        return few.of(by_size(float(np.exp(log_size))).site).chi_square
+
+    middle, reach = np.log(way.size), np.log(REACH)
+    found = minimize_scalar(cost, bounds=(middle - reach, middle + reach), options={"xatol": 1e-4})
+    return by_size(float(np.exp(found.x)))
 
 
 def length_cause(words: str) -> tuple[str, str, str]:
@@ -71,15 +114,6 @@ def length_cause(words: str) -> tuple[str, str, str]:
         f"the positions of the beacons have another unit: {words}",
         "Give position_m in metres.",
     )
-
-
-class Way(NamedTuple):
-    """A site in which a mistake is undone."""
-
-    code: str
-    cause: str
-    remedy: str
-    site: Site
 
 
 def left_handed() -> tuple[str, str, str]:
@@ -146,6 +180,14 @@ def _ways(site: Site) -> Iterator[Way]:
             *length_cause(words),
             _every(site, partial(_placed, axes=factor * np.eye(3))),
         )
+    for axis, name in enumerate(("roll", "pitch", "yaw")):
+        yield Way(
+            "angle_convention",
+            f"the sign of the {name} of all beacons is reversed",
+            "Give rpy_deg as R = Rz(yaw) Ry(pitch) Rx(roll), right-handed angles.",
+            _every(site, partial(_sign_changed, axis=axis)),
+        )
+    yield from _low_passes(site)
     for name, change in _other_axes():
         yield Way(
             "survey_axes",
@@ -154,6 +196,35 @@ def _ways(site: Site) -> Iterator[Way]:
             _every(site, partial(_placed, axes=change)),
         )
     yield from _exchanges(site)
+
+
+def _low_passes(site: Site) -> Iterator[Way]:
+    """Yield sites whose magnetometer has a low-pass of first order."""
+    platform = site.platform
+    if platform.further or platform.magnetometer.response is not None:
+        return
+    tones_hz = np.unique(site.tone_frequencies_hz)
+    tones_hz = tones_hz[tones_hz > 0.0]
+    if not len(tones_hz):
+        return
+    for corner_hz in np.geomspace(0.2 * tones_hz[0], 10.0 * tones_hz[-1], CORNERS).tolist():
+        yield low_pass(site, tones_hz, corner_hz)
+
+
+def low_pass(site: Site, tones_hz: Array, corner_hz: float) -> Way:
+    """Return a site whose magnetometer has a low-pass of first order with a corner (Hz)."""
+    response = FrequencyResponse(
+        tones_hz, 1.0 / np.hypot(1.0, tones_hz / corner_hz), -np.arctan(tones_hz / corner_hz)
+    )
+    magnetometer = replace(site.platform.magnetometer, response=response)
+    return Way(
+        "low_pass",
+        f"the magnetometer has a low-pass filter with a corner at {corner_hz:.3g} Hz",
+        "Declare platform.magnetometer.response, or record without the filter.",
+        replace(site, platform=replace(site.platform, magnetometer=magnetometer)),
+        partial(low_pass, site, tones_hz),
+        corner_hz,
+    )
 
 
 def _other_axes() -> Iterator[tuple[str, Array]]:
@@ -178,6 +249,7 @@ def _exchanges(site: Site) -> Iterator[Way]:
                 "world_from_beacon",
             ),
             f"the positions of {pair} are exchanged": ("position_world",),
+            f"the attitudes of {pair} are exchanged": ("world_from_beacon",),
         }
         for cause, fields in ways.items():
             beacons = list(site.beacons)
@@ -232,6 +304,12 @@ def _angles(beacon: Beacon, factor: float) -> Beacon:
     angles = Rotation.from_matrix(beacon.world_from_beacon).as_euler("xyz")
     turned = Rotation.from_euler("xyz", factor * angles).as_matrix()
     return replace(beacon, world_from_beacon=turned)
+
+
+def _sign_changed(beacon: Beacon, axis: int) -> Beacon:
+    angles = Rotation.from_matrix(beacon.world_from_beacon).as_euler("xyz")
+    angles[axis] = -angles[axis]
+    return replace(beacon, world_from_beacon=Rotation.from_euler("xyz", angles).as_matrix())
 
 
 def _other_order(beacon: Beacon) -> Beacon:

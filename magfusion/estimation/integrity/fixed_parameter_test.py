@@ -6,26 +6,21 @@ most is the cause; after its step, the next is tested.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from magfusion.estimation.data_checks.statistics import (
-    log_p_chi_square,
     sigmas,
 )
+from magfusion.estimation.integrity.released_fault import COVERED, ReleasedFault, release_fault
 from magfusion.estimation.integrity.score import (
     Score,
     field_residual,
     moved_estimate,
 )
 from magfusion.estimation.integrity.suspects import (
-    CODE,
     STRETCH,
     TILT,
-    TOLERANCE,
-    Inertial,
-    Suspect,
     suspects,
 )
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
@@ -34,77 +29,14 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Unverified, Verdict
 from magfusion.units import Array
 
-FARTHEST = 30.0  # typical errors; directions with a larger sigma are ignored
-PRIOR_WIDTH = 3.0  # typical errors, one sigma of what people get wrong: the price of a parameter
 LEAST_EVIDENCE = 20.0  # of -2 log likelihood, above which a cause is named
 MARGIN = 10.0  # of the same, by which a cause must be better than another
-COVERED = 4.0  # mean squared Mahalanobis distance that a covariance of six still covers
 MAX_LINEAR_CHI_SQUARE = (
     25.0**2
 )  # beyond, a linear step and its covariance do not locate the solution
 MAX_CAUSES = 4  # reported causes
 LEAST_SHARE = 0.03  # of the first cause's chi square; less may be its nonlinear remainder
 UNCHECKED = 4.3**2  # chi square below which one of fifty candidates is not detected
-
-
-class ReleasedFault(NamedTuple):
-    """A candidate fault with its parameters estimated.
-
-    Parameters
-    ----------
-    step : ndarray, shape (h,)
-        In typical errors.
-    direction, information, along : ndarray, shape (h, k), (k,), (k,)
-        Orthogonal combinations of the fixed parameters, the log's information on each, and the
-        gradient along it.
-    chi_square, freedom : float
-        Twice the decrease of the cost.
-    moved : ndarray, shape (states, 6)
-        Change of the poses.
-    distance : ndarray, shape (states,)
-        Its square, by the covariance of the poses.
-    """
-
-    fault: Suspect
-    step: Array
-    direction: Array
-    information: Array
-    along: Array
-    chi_square: float
-    freedom: int
-    moved: Array
-    distance: Array
-
-    @property
-    def cov(self) -> Array:
-        """Covariance of the step, shape (h, h), in typical errors."""
-        return np.asarray((self.direction / self.information) @ self.direction.T)
-
-    @property
-    def known_cov(self) -> Array:
-        """The same of the directions that the log determines better than typical errors."""
-        known = self.information > 1.0
-        vector = self.direction[:, known]
-        return np.asarray((vector / self.information[known]) @ vector.T)
-
-    @property
-    def log_p(self) -> float:
-        """Logarithm of the probability of this decrease by chance."""
-        return float(log_p_chi_square(self.chi_square, self.freedom))
-
-    @property
-    def is_notable(self) -> bool:
-        """Whether it is an IMU that is farther off than usual, whatever the poses err by it."""
-        return any(
-            isinstance(b.parameter, Inertial)
-            and float(np.max(np.abs(b.sigma * self.step[b.columns]))) > TOLERANCE[b.parameter]
-            for b in self.fault.blocks
-        )
-
-    @property
-    def gain(self) -> float:
-        """Decrease of -2 log likelihood of the log, the parameters having their prior."""
-        return float(np.sum(_evidence(self.along, self.information)))
 
 
 def check_fixed_parameters(case: Case) -> TestResult:
@@ -116,6 +48,7 @@ def check_fixed_parameters(case: Case) -> TestResult:
     information, gradient = score.with_declared(tolerance=False)
     findings: list[Finding] = []
     named: list[Array] = []
+    causes: tuple[ReleasedFault, ...] = ()
     spread = np.zeros_like(case.pose_cov)
     total, first = np.zeros(len(gradient)), 0.0
     for _ in range(MAX_CAUSES):
@@ -127,8 +60,10 @@ def check_fixed_parameters(case: Case) -> TestResult:
             break
         first = max(first, cause.gain)
         total = total + cause.step
-        if cause.is_notable or np.mean(cause.distance) > COVERED:
-            findings.append(finding_of(site, score, cause, rivals_of(released)))
+        if cause.is_mistake:
+            rivals = rivals_of(released)
+            findings.append(finding_of(site, score, cause, rivals))
+            causes = causes or (cause, *rivals)
             spread += cause.moved[:, :, None] * cause.moved[:, None, :]
             spread += score.by_pose @ cause.known_cov @ np.swapaxes(score.by_pose, 1, 2)
             named.append(total)
@@ -140,73 +75,8 @@ def check_fixed_parameters(case: Case) -> TestResult:
         unverified,
         spread=spread if findings else None,
         named=tuple(named),
+        causes=causes,
     )
-
-
-def gains(combine: Array, information: Array, gradient: Array) -> Array:
-    """Return `ReleasedFault.gain` of many candidates; zero without information.
-
-    Parameters
-    ----------
-    combine : ndarray, shape (candidates, h, columns)
-        Of each, padded with columns of zeros.
-    information, gradient : ndarray, shape (h, h), (h,)
-        Shared, or one per candidate.
-    """
-    across = np.swapaxes(combine, 1, 2)
-    value, vector = np.linalg.eigh(across @ information @ combine)
-    along = (np.swapaxes(vector, 1, 2) @ (across @ gradient[..., None]))[..., 0]
-    return np.asarray(np.sum(_evidence(along, np.maximum(value, 0.0)), axis=1))
-
-
-def _evidence(along: Array, information: Array) -> Array:
-    """Return the decrease of -2 log likelihood by each parameter, marginalised over its prior.
-
-    The prior is normal, of `PRIOR_WIDTH` typical errors: it is the price of the parameter.
-    """
-    prior = PRIOR_WIDTH**-2
-    return along**2 / (information + prior) - np.log1p(information / prior)
-
-
-class ReleaseGain(NamedTuple):
-    """Estimate of a candidate fault from a log, as of `ReleasedFault`."""
-
-    step: Array
-    direction: Array
-    information: Array
-    along: Array
-    chi_square: float
-    freedom: int
-
-    @property
-    def log_p(self) -> float:
-        """Logarithm of the probability of this decrease by chance."""
-        return float(log_p_chi_square(self.chi_square, self.freedom))
-
-
-def release_gain(fault: Suspect, information: Array, gradient: Array) -> ReleaseGain | None:
-    """Return the gain of estimating a candidate fault; None without information on it."""
-    combine = fault.combine
-    value, vector = np.linalg.eigh(combine.T @ information @ combine)
-    kept = value > FARTHEST**-2
-    if not np.any(kept):
-        return None
-    vector, value = combine @ vector[:, kept], value[kept]
-    along = vector.T @ gradient
-    gained, freedom = float(np.sum(along**2 / value)), int(np.sum(kept))
-    return ReleaseGain(vector @ (along / value), vector, value, along, gained, freedom)
-
-
-def release_fault(
-    pose_cov: Array, score: Score, fault: Suspect, information: Array, gradient: Array
-) -> ReleasedFault | None:
-    """Estimate a candidate fault; None without information on it."""
-    reported = release_gain(fault, information, gradient)
-    if reported is None:
-        return None
-    moved = score.by_pose @ reported.step
-    solved = np.linalg.solve(pose_cov, moved[..., None])[..., 0]
-    return ReleasedFault(fault, *reported, moved, np.sum(moved * solved, axis=1))
 
 
 def ranked_faults(
@@ -270,7 +140,7 @@ def finding_of(
         result = "; ".join(_amounts(site, score, cause, b) for b in _largest(cause))
         remedy = "Correct it by this amount, or declare a sigma of this size to estimate it"
     return Finding(
-        cause.fault.code or CODE[cause.fault.blocks[0].parameter],
+        cause.code,
         f"The log contradicts {cause.fault.name} as declared: {result}"
         f" ({float(sigmas(cause.log_p)):.0f} sigma). This moves the poses by"
         f" {_length(position)} and {rotation:.2g} deg,"

@@ -20,6 +20,7 @@ from magfusion.estimation.integrity.convergence_report import convergence, geome
 from magfusion.estimation.integrity.fixed_parameter_test import check_fixed_parameters
 from magfusion.estimation.integrity.priors_of_log import bias_change, calibration_change
 from magfusion.estimation.integrity.region_test import of_place
+from magfusion.estimation.integrity.released_fault import ReleasedFault
 from magfusion.estimation.integrity.residual_blocks import fields, fixes, inertial
 from magfusion.estimation.integrity.score import (
     Score,
@@ -46,11 +47,18 @@ R = TypeVar("R", bound=Smoothed)
 
 
 class JudgedResult(NamedTuple, Generic[R]):
-    """A result with an honest covariance, its findings, and the score of fixed parameters."""
+    """A result with an honest covariance, its findings, and the score of fixed parameters.
+
+    Parameters
+    ----------
+    causes : tuple of ReleasedFault
+        The fixed parameter that is wrong, and what explains the log as well.
+    """
 
     result: R
     trust: Trust
     score: Score | None
+    causes: tuple[ReleasedFault, ...] = ()
 
 
 def judge_result(result: R, log: Log) -> tuple[R, Trust]:
@@ -91,12 +99,14 @@ def judged_with_score(result: R, log: Log) -> JudgedResult[R]:
     score, wide = (None, None) if scores is None else scores
     case = Case(result, log, score, pose_cov, wide)
     factor, spread = np.ones(len(pose_cov)), np.zeros_like(pose_cov)
+    causes: tuple[ReleasedFault, ...] = ()
     for findings in _run_tests(case):
+        causes = causes or (findings.causes if findings.findings else ())
         trust |= Trust(findings.findings, findings.unverified)
         factor = factor if findings.factor is None else np.maximum(factor, findings.factor)
         spread = spread if findings.spread is None else spread + findings.spread
     widened = replace(result.states, pose_cov=factor[:, None, None] * pose_cov + spread)
-    return JudgedResult(replace(result, states=widened, trust=trust), trust, score)
+    return JudgedResult(replace(result, states=widened, trust=trust), trust, score, causes)
 
 
 def _run_tests(case: Case) -> Iterator[TestResult]:
@@ -107,20 +117,24 @@ def _run_tests(case: Case) -> Iterator[TestResult]:
         bias_change(case),
     )
     biases = biases if case.log.inertial else NOTHING
+    change = changed(case)
+    if change.findings:  # it explains more than whatever is wrong throughout
+        of_held = TestResult(unverified=of_held.unverified)
     after, causes = _explained(case, of_held.named)
     ends = [field_residual(case.result, after, raw=raw) for raw in (True, False)]
     residuals = [fields(case, *ends), inertial(case, after)]
     cause, prior, rest = (_weight(findings) for findings in (of_held, priors, residuals[0]))
+    cause = max(cause, _weight(change))
     if causes < len(of_held.named) and rest:  # residuals that none of them explains
         of_held = replace(of_held, findings=of_held.findings[:causes])
-    if causes and cause > prior:
+    if (causes or change.findings) and cause > prior:
         residuals = [_traces(findings, 10.0 * cause) for findings in residuals]
     if prior > STRONGER * cause:
         of_held = _traces(of_held, prior)
     yield of_held
     yield from residuals
     yield _traces(compass(case), cause)
-    yield _traces(changed(case), cause)
+    yield change
     yield _traces(priors, cause)
     yield _traces(biases, cause)
     for monitor in (fixes, together, convergence, geometry, rivals):

@@ -16,7 +16,7 @@ from magfusion.estimation.integrity.beacon_causes import (
     matrix_causes,
     survey_causes,
 )
-from magfusion.estimation.integrity.explanation import Explanation, clearly_best
+from magfusion.estimation.integrity.explanation import ENOUGH, Explanation, clearly_best
 from magfusion.estimation.integrity.field_causes import global_causes
 from magfusion.estimation.integrity.field_snapshots import Snapshots, snapshots_of
 from magfusion.estimation.integrity.motion_causes import (
@@ -133,7 +133,8 @@ def _steady(log: Log, site: Site) -> float | None:
 
 def _of_fields(known: Snapshots, samples: FieldSamples, steady: float | None) -> list[Explanation]:
     tried = [*matrix_causes(known, steady), *beacon_causes(known), *phase_causes(known, samples)]
-    if clearly_best(tried) is None:
+    best = clearly_best(tried)
+    if best is None or best.after > ENOUGH * best.expected:
         tried += global_causes(known)
     # Where the platform stands, and of one beacon that may be wrong in two ways, no more is told.
     if _moves(known) and not any(one.clear and one.after < known.freedom for one in tried):

@@ -1,7 +1,9 @@
 """What people get wrong of the inertial sensor and of how the magnetometer is mounted beside it."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import pairwise, permutations, product
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,6 +15,7 @@ from magfusion.estimation.integrity.motion_comparison import (
     Surveyed,
     compared,
 )
+from magfusion.estimation.integrity.suspects import with_intrinsics
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
@@ -52,7 +55,9 @@ def motion_causes(known: Compared, site: Site) -> Iterator[Explanation]:
         gravity: float = 1.0,
     ) -> Explanation:
         after, _ = known.explained(gyro_axes, accel_axes, gravity=gravity)
-        return Explanation(code, cause, remedy, before, after, known.freedom)
+        inverse = [np.asarray(np.linalg.inv(axes), dtype=float) for axes in (gyro_axes, accel_axes)]
+        undone = with_intrinsics(site, *inverse) if gravity else None
+        return Explanation(code, cause, remedy, before, after, known.freedom, site=undone)
 
     yield from _axes(tried)
     imu = "Check gyro_x/y/z and accel_x/y/z: right-handed axes, rad/s, m/s^2, +g on z at rest."
@@ -66,8 +71,8 @@ def motion_causes(known: Compared, site: Site) -> Iterator[Explanation]:
         EYE,
         gravity=0.0,
     )
-    yield _scaled(known, before)
-    yield from _accel_scaled(known, before)
+    yield _scaled(known, before, site)
+    yield from _accel_scaled(known, before, site)
     yield from _freed(known, before, site)
 
 
@@ -84,6 +89,7 @@ def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
         after,
         known.freedom,
         3,
+        site=_with_magnetometer(site, position_body=lever),
     )
     turn, axes = Rotation.identity(), EYE
     for _ in range(4):
@@ -99,6 +105,9 @@ def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
         after,
         known.freedom,
         3,
+        site=_with_magnetometer(
+            site, body_from_sensor=axes.T @ site.platform.magnetometer.body_from_sensor
+        ),
     )
     for sensor, unit in (("gyro", "rad/s"), ("accel", "m/s^2")):
         after, found = known.explained(EYE, EYE, parameters=sensor)
@@ -114,6 +123,16 @@ def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
             known.freedom,
             3,
         )
+
+
+def _with_magnetometer(site: Site, **changed: Any) -> Site:
+    magnetometer = replace(site.platform.magnetometer, **changed)
+    return replace(site, platform=replace(site.platform, magnetometer=magnetometer))
+
+
+def _with_imu(site: Site, **changed: float) -> Site:
+    imu = replace(site.platform.imu, **changed)
+    return replace(site, platform=replace(site.platform, imu=imu))
 
 
 def _mounting_remedy(site: Site, axes: Array) -> str:
@@ -134,7 +153,7 @@ def _listed(values: Array) -> str:
     return ", ".join(f"{value:.3g}" for value in np.round(values, 6) + 0.0)
 
 
-def _scaled(known: Compared, before: float) -> Explanation:
+def _scaled(known: Compared, before: float, site: Site) -> Explanation:
     trials = np.linspace(0.8, 1.25, 46)
     costs = [known.explained(scale * EYE, EYE)[0] for scale in trials]
     best = int(np.argmin(costs))
@@ -146,10 +165,11 @@ def _scaled(known: Compared, before: float) -> Explanation:
         costs[best],
         known.freedom,
         1,
+        site=with_intrinsics(site, gyro=EYE / trials[best]),
     )
 
 
-def _accel_scaled(known: Compared, before: float) -> Iterator[Explanation]:
+def _accel_scaled(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
     trials = np.linspace(0.9, 1.1, 41)
     costs = [known.explained(EYE, scale * EYE)[0] for scale in trials]
     best = int(np.argmin(costs))
@@ -161,6 +181,7 @@ def _accel_scaled(known: Compared, before: float) -> Iterator[Explanation]:
         costs[best],
         known.freedom,
         1,
+        site=with_intrinsics(site, accel=EYE / trials[best]),
     )
 
 
@@ -221,6 +242,7 @@ def gyro_unit_causes(
                 before,
                 tried.explained(EYE, EYE)[0],
                 freedom,
+                site=with_intrinsics(site, gyro=EYE / unit),
             )
 
 
@@ -256,6 +278,7 @@ def timing_causes(
             offset * freedom / steady.freedom,
             freedom,
             1,
+            site=_with_imu(site, time_offset=site.platform.imu.time_offset - middle),
         )
     if len(told) < 3:
         return

@@ -132,9 +132,15 @@ def _of_clocks(
     names = [name for name, _ in known.samples.channels]
     usual = max(float(np.median(np.abs(rate))), STILL)
     strays = [n for n, r in zip(names, rate, strict=True) if abs(r) > 10.0 * usual]
-    beacon = ""
+    beacon, site = "", None
     if np.all(alike):
         code, found = "sample_rate", 2
+        magnetometer = known.site.platform.magnetometer
+        slower = (1.0 + magnetometer.clock_rate) * (1.0 + common) - 1.0
+        if not known.site.platform.further:
+            magnetometer = replace(magnetometer, clock_rate=slower)
+            platform = replace(known.site.platform, magnetometer=magnetometer)
+            site = replace(known.site, platform=platform)
         cause = f"the magnetometer's stamps run {1e6 * -common:.4g} ppm fast against the drives"
         remedy = "Check the sample rate with which the stamps were made."
     elif len(set(strays)) == 1:
@@ -147,7 +153,7 @@ def _of_clocks(
         cause = "the drives run on clocks of their own"
         remedy = "Declare synchronised: false for the beacons."
     explained = known.chi_square, tried.chi_square, known.freedom
-    yield Explanation(code, cause, remedy, *explained, found, beacon)
+    yield Explanation(code, cause, remedy, *explained, found, beacon, site=site)
 
 
 def _shift(phase: Array, tones_hz: Array) -> float:

@@ -22,7 +22,7 @@ from magfusion.estimation.data_checks.stamps import Timing, timings
 from magfusion.estimation.demodulation.beacon_selection import select_detected
 from magfusion.estimation.demodulation.burial_depth import depths_of
 from magfusion.estimation.demodulation.demodulation import phasors
-from magfusion.estimation.integrity.diagnosis import with_cause
+from magfusion.estimation.integrity.diagnosis import diagnosed, with_cause
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.detection_range import are_many
@@ -122,7 +122,7 @@ def quick_check(log: Log, site: Site | None, lockin: LockinSettings | None = Non
     findings += recorded(log, site, TOLERATED_CODES, poses, beacons=True, detection=detection)
     trust = Trust(tuple(_promoted(findings)))
     if trust.reasons and trust.reasons[0].code in SYMPTOMS:
-        trust = with_cause(trust, log, site, lockin)
+        trust = with_cause(trust, diagnosed(log, site, trust, lockin))
     return Look(trust, *look, detection, result, seen, fixes, depths_of(samples, site))
 
 

@@ -29,6 +29,8 @@ ROUNDS = 3  # of exclusions
 SPANS = 3  # in a sentence
 TOGETHER = 3.0  # s; closer stretches are reported as one
 MIN_LEFT_OUT_EPOCHS = 5  # excluded field epochs of a beacon that are reported; fewer are outliers
+LONGEST_EXCLUSION = 5.0  # s of a beacon, above which the site is in doubt
+EXCLUDED_FIRST = 1e5  # weight: what is left beside an excluded beacon is its trace
 OF_A_LOG = 5e-4  # false alarms of a whole log
 
 
@@ -265,6 +267,7 @@ def _excluded_findings(
             f"{time[a]:.1f} to {time[b]:.1f} s"
             for a, b in _stretches(np.flatnonzero(out[:, j]), time)
         ]
+        lasting = float(np.sum(out[:, j]) * np.median(np.diff(time))) > LONGEST_EXCLUSION
         more = f" and {len(spans) - SPANS} more times" if len(spans) > SPANS else ""
         findings.append(
             Finding(
@@ -272,7 +275,8 @@ def _excluded_findings(
                 f"Beacon {names[j]} contradicts the others from {', '.join(spans[:SPANS])}{more}:"
                 f" the trajectory without it is up to {1e3 * _largest(separated, j):.3g} mm away,"
                 " so it is excluded there. Check its drive current, and iron or a shield near it.",
-                Verdict.TRUSTWORTHY,
+                Verdict.DOUBTFUL if lasting else Verdict.TRUSTWORTHY,
+                EXCLUDED_FIRST if lasting else 1.0,
             )
         )
     return findings

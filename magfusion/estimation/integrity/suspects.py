@@ -78,7 +78,7 @@ class Inertial(Parameter):
         raise NotImplementedError
 
 
-def _with_intrinsics(
+def with_intrinsics(
     site: Site, gyro: Array | None = None, accel: Array | None = None, g: Array | None = None
 ) -> Site:
     """Return a site whose IMU has further errors: factors of both matrices, and g-sensitivity."""
@@ -102,7 +102,7 @@ class _GyroScale(Inertial):
         )
 
     def corrected(self, site: Site, step: Array) -> Site:
-        return _with_intrinsics(site, gyro=np.diag(1.0 + step))
+        return with_intrinsics(site, gyro=np.diag(1.0 + step))
 
 
 class _AccelScale(Inertial):
@@ -115,7 +115,7 @@ class _AccelScale(Inertial):
         )
 
     def corrected(self, site: Site, step: Array) -> Site:
-        return _with_intrinsics(site, accel=np.diag(1.0 + step))
+        return with_intrinsics(site, accel=np.diag(1.0 + step))
 
 
 class _GyroAlignment(Inertial):
@@ -127,7 +127,7 @@ class _GyroAlignment(Inertial):
         return _stacked(np.zeros((len(stream.imu), 3, 3)), -skew(stream.imu.gyro_body))
 
     def corrected(self, site: Site, step: Array) -> Site:
-        return _with_intrinsics(site, gyro=Rotation.from_rotvec(step).as_matrix())
+        return with_intrinsics(site, gyro=Rotation.from_rotvec(step).as_matrix())
 
 
 class _GyroGSensitivity(Inertial):
@@ -141,7 +141,7 @@ class _GyroGSensitivity(Inertial):
         return _stacked(np.zeros((len(force), 3, 9)), force.reshape(len(force), 3, 9))
 
     def corrected(self, site: Site, step: Array) -> Site:
-        return _with_intrinsics(site, g=step.reshape(3, 3))
+        return with_intrinsics(site, g=step.reshape(3, 3))
 
 
 class _Gravity(Inertial):
@@ -207,6 +207,9 @@ TOLERANCE: dict[Parameter, float] = {
     SENSOR_ROTATION: 0.1 * DEGREE,
     SENSOR_POSITION: 0.004,
 }
+
+# Largest error that is no mistake: of the last two, the size of a housing and its mounting.
+USUAL: dict[Parameter, float] = TOLERANCE | {SENSOR_ROTATION: 0.4 * DEGREE, SENSOR_POSITION: 0.015}
 
 # Of the finding that calls it in question; as in `magfusion.model.trust.CODES`.
 CODE: dict[Parameter, str] = {

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.integrity.released_fault import ReleasedFault
 from magfusion.estimation.integrity.score import Score
 from magfusion.model.samples import Log
 from magfusion.model.trust import Finding, Unverified
@@ -44,6 +45,8 @@ class TestResult:
         Covariance to add to it.
     named : tuple of ndarray, shape (h,)
         Steps of the fixed parameters: by the first cause, by the first two, and so on.
+    causes : tuple of ReleasedFault
+        The first cause, and what explains the log as well.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -51,6 +54,7 @@ class TestResult:
     factor: Array | None = field(default=None)
     spread: Array | None = field(default=None)
     named: tuple[Array, ...] = ()
+    causes: tuple[ReleasedFault, ...] = ()
 
 
 NOTHING = TestResult()

@@ -179,6 +179,8 @@ class Navigator:
         InputError
             If a number is not finite, the clock jumped, or the site has no such magnetometer.
         """
+        rate = self.site.platform.magnetometer.clock_rate
+        time = time if rate == 0.0 else np.asarray(time) * (1.0 + rate)
         samples = sensor_frame_samples(self.site, time, measured_sensor)
         self._arrived.add_magnetometer(time, samples, magnetometer)
         self._stand_still(np.atleast_1d(time), raw=True)

@@ -13,12 +13,8 @@ import numpy as np
 
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, State, states_of
-from magfusion.estimation.integrity.fixed_parameter_test import (
-    COVERED,
-    ReleasedFault,
-    finding_of,
-    release_fault,
-)
+from magfusion.estimation.integrity.fixed_parameter_test import finding_of
+from magfusion.estimation.integrity.released_fault import ReleasedFault, release_fault
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.online_integrity.judgement import Judgement
@@ -221,4 +217,4 @@ class OnlineScore:
 
 
 def _is_significant(one: ReleasedFault) -> bool:
-    return one.gain > ONLINE_EVIDENCE and (one.is_notable or float(one.distance[0]) > COVERED)
+    return one.gain > ONLINE_EVIDENCE and one.is_mistake

@@ -8,7 +8,7 @@ import numpy as np
 
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION
-from magfusion.estimation.integrity.fixed_parameter_test import gains
+from magfusion.estimation.integrity.released_fault import gains
 from magfusion.estimation.integrity.suspects import Suspect, held_blocks, suspects
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors

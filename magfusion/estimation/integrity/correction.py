@@ -1,0 +1,130 @@
+"""Corrections: mistakes that explain a log, each with the site in which it is undone."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.integrity.diagnosis import Diagnosis
+from magfusion.estimation.integrity.released_fault import ReleasedFault, ReleaseGain, release_gain
+from magfusion.estimation.integrity.score import Score
+from magfusion.estimation.integrity.suspects import Suspect, corrected_site, suspects
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding
+from magfusion.units import Array
+
+LITTLE = 2.0  # chi square for each parameter, below which a correction is not continued
+CLEAR = 30.0  # ratio of chi square by which snapshots decide before the score, which is linear
+
+
+class Correction(NamedTuple):
+    """A mistake that explains a log.
+
+    Parameters
+    ----------
+    finding : Finding
+        What is wrong.
+    site : Site
+        In which it is undone.
+    fault : Suspect, optional
+        The fixed parameter that is wrong, where it is one.
+    spread : ndarray, shape (states or 1, 6, 6), optional
+        Covariance of the poses by other mistakes that would explain the log as well.
+    clear : bool
+        Whether snapshots of the fields alone are sure of it.
+    """
+
+    finding: Finding
+    site: Site
+    fault: Suspect | None = None
+    spread: Array | None = None
+    clear: bool = False
+
+
+def corrections(
+    site: Site,
+    findings: tuple[Finding, ...],
+    causes: tuple[ReleasedFault, ...],
+    diagnosis: Diagnosis | None,
+) -> list[Correction]:
+    """Return what may be corrected, the most likely first.
+
+    Parameters
+    ----------
+    findings : tuple of Finding
+        That of the first cause is among them.
+    causes : tuple of ReleasedFault
+        The cause by the score of fixed parameters, and what explains the log as well.
+    diagnosis : Diagnosis, optional
+        By snapshots of the fields and by the motion.
+    """
+    result: list[Correction] = []
+    if causes:
+        best, *rivals = causes
+        finding = next(f for f in findings if f.code == best.code)
+        weight = np.exp([0.5 * (rival.gain - best.gain) for rival in rivals])
+        spread = np.zeros((len(best.moved), 6, 6))
+        for rival, share in zip(rivals, weight / (1.0 + np.sum(weight)), strict=True):
+            spread += share * _outer(rival.moved - best.moved)
+        undone = corrected_site(site, best.fault, best.step)
+        result.append(Correction(finding, undone, best.fault, spread))
+    if diagnosis is not None and diagnosis.site is not None:
+        clear = is_clear(diagnosis)
+        found = Correction(diagnosis.finding, diagnosis.site, clear=clear)
+        result.insert(0 if clear else len(result), found)
+    return [one._replace(spread=_with_turned_imu(site, one)) for one in result]
+
+
+def is_clear(diagnosis: Diagnosis | None) -> bool:
+    """Return whether snapshots decide, whatever the score says, which is linear."""
+    return diagnosis is not None and diagnosis.ratio > CLEAR
+
+
+def _with_turned_imu(site: Site, correction: Correction) -> Array | None:
+    """Return the spread of a correction, of a mounting with that of an IMU that is turned instead.
+
+    Nothing but the frame of the result distinguishes them: either is as likely.
+    """
+    before, after = (one.platform.magnetometer.body_from_sensor for one in (site, correction.site))
+    turn_body = Rotation.from_matrix(after @ before.T).as_rotvec()
+    if not turn_body.any():
+        return correction.spread
+    step = np.concatenate([turn_body, np.zeros(3)])[None]
+    return 0.5 * _outer(step) + (0.0 if correction.spread is None else correction.spread)
+
+
+def _outer(step: Array) -> Array:
+    return np.asarray(step[:, :, None] * step[:, None, :])
+
+
+def _remaining(correction: Correction, score: Score | None) -> ReleaseGain | None:
+    """Return the estimate of what a corrected parameter is still wrong by."""
+    if correction.fault is None or score is None:
+        return None
+    name, every = correction.fault.name, suspects(correction.site, score.fixed)
+    fault = next((one for one in every if one.name == name), None)
+    return None if fault is None else release_gain(fault, *score.with_declared(tolerance=False))
+
+
+def continued(correction: Correction, score: Score | None) -> Correction | None:
+    """Return a correction with what the corrected result still asks for; None if it is little.
+
+    Parameters
+    ----------
+    score : Score, optional
+        Of the corrected result.
+    """
+    left = _remaining(correction, score)
+    if left is None or left.chi_square < LITTLE * left.freedom:
+        return None
+    assert correction.fault is not None
+    return correction._replace(site=corrected_site(correction.site, correction.fault, left.step))
+
+
+def spread_of(correction: Correction, score: Score | None) -> Array:
+    """Return the covariance of the poses by the uncertainty of a correction."""
+    spread = np.zeros((1, 6, 6)) if correction.spread is None else correction.spread
+    left = _remaining(correction, score)
+    if left is None or score is None:
+        return spread
+    return np.asarray(spread + score.by_pose @ left.known_cov @ np.swapaxes(score.by_pose, 1, 2))

@@ -1,0 +1,159 @@
+"""Estimates of candidate faults from the score: step, evidence, and effect on the poses."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.estimation.data_checks.statistics import log_p_chi_square
+from magfusion.estimation.integrity.score import Score
+from magfusion.estimation.integrity.suspects import CODE, USUAL, Inertial, Suspect
+from magfusion.units import Array
+
+FARTHEST = 30.0  # typical errors; directions with a larger sigma are ignored
+COVERED = 4.0  # mean squared Mahalanobis distance that a covariance of six still covers
+PRIOR_WIDTH = 3.0  # typical errors, one sigma of what people get wrong: the price of a parameter
+
+
+class ReleasedFault(NamedTuple):
+    """A candidate fault with its parameters estimated.
+
+    Parameters
+    ----------
+    step : ndarray, shape (h,)
+        In typical errors.
+    direction, information, along : ndarray, shape (h, k), (k,), (k,)
+        Orthogonal combinations of the fixed parameters, the log's information on each, and the
+        gradient along it.
+    chi_square, freedom : float
+        Twice the decrease of the cost.
+    moved : ndarray, shape (states, 6)
+        Change of the poses.
+    distance : ndarray, shape (states,)
+        Its square, by the covariance of the poses.
+    """
+
+    fault: Suspect
+    step: Array
+    direction: Array
+    information: Array
+    along: Array
+    chi_square: float
+    freedom: int
+    moved: Array
+    distance: Array
+
+    @property
+    def cov(self) -> Array:
+        """Covariance of the step, shape (h, h), in typical errors."""
+        return np.asarray((self.direction / self.information) @ self.direction.T)
+
+    @property
+    def known_cov(self) -> Array:
+        """The same of the directions that the log determines better than typical errors."""
+        return _known_cov(self.direction, self.information)
+
+    @property
+    def code(self) -> str:
+        """Code of its finding."""
+        return self.fault.code or CODE[self.fault.blocks[0].parameter]
+
+    @property
+    def log_p(self) -> float:
+        """Logarithm of the probability of this decrease by chance."""
+        return float(log_p_chi_square(self.chi_square, self.freedom))
+
+    @property
+    def is_mistake(self) -> bool:
+        """Whether the poses err by it more than they claim, or an IMU is farther off than usual.
+
+        What is no farther off than instruments usually are is no mistake.
+        """
+        blocks = self.fault.blocks
+        unusual = any(
+            float(np.linalg.norm(b.sigma * self.step[b.columns])) > USUAL.get(b.parameter, 0.0)
+            for b in blocks
+        )
+        of_imu = all(isinstance(b.parameter, Inertial) for b in blocks)
+        return unusual and (of_imu or float(np.mean(self.distance)) > COVERED)
+
+    @property
+    def gain(self) -> float:
+        """Decrease of -2 log likelihood of the log, the parameters having their prior."""
+        return float(np.sum(_evidence(self.along, self.information)))
+
+
+def gains(combine: Array, information: Array, gradient: Array) -> Array:
+    """Return `ReleasedFault.gain` of many candidates; zero without information.
+
+    Parameters
+    ----------
+    combine : ndarray, shape (candidates, h, columns)
+        Of each, padded with columns of zeros.
+    information, gradient : ndarray, shape (h, h), (h,)
+        Shared, or one per candidate.
+    """
+    across = np.swapaxes(combine, 1, 2)
+    value, vector = np.linalg.eigh(across @ information @ combine)
+    along = (np.swapaxes(vector, 1, 2) @ (across @ gradient[..., None]))[..., 0]
+    return np.asarray(np.sum(_evidence(along, np.maximum(value, 0.0)), axis=1))
+
+
+def _evidence(along: Array, information: Array) -> Array:
+    """Return the decrease of -2 log likelihood by each parameter, marginalised over its prior.
+
+    The prior is normal, of `PRIOR_WIDTH` typical errors: it is the price of the parameter.
+    """
+    prior = PRIOR_WIDTH**-2
+    return along**2 / (information + prior) - np.log1p(information / prior)
+
+
+class ReleaseGain(NamedTuple):
+    """Estimate of a candidate fault from a log, as of `ReleasedFault`."""
+
+    step: Array
+    direction: Array
+    information: Array
+    along: Array
+    chi_square: float
+    freedom: int
+
+    @property
+    def log_p(self) -> float:
+        """Logarithm of the probability of this decrease by chance."""
+        return float(log_p_chi_square(self.chi_square, self.freedom))
+
+    @property
+    def known_cov(self) -> Array:
+        """Covariance of the directions that the log determines better than typical errors."""
+        return _known_cov(self.direction, self.information)
+
+
+def _known_cov(direction: Array, information: Array) -> Array:
+    known = information > 1.0
+    vector = direction[:, known]
+    return np.asarray((vector / information[known]) @ vector.T)
+
+
+def release_gain(fault: Suspect, information: Array, gradient: Array) -> ReleaseGain | None:
+    """Return the gain of estimating a candidate fault; None without information on it."""
+    combine = fault.combine
+    value, vector = np.linalg.eigh(combine.T @ information @ combine)
+    kept = value > FARTHEST**-2
+    if not np.any(kept):
+        return None
+    vector, value = combine @ vector[:, kept], value[kept]
+    along = vector.T @ gradient
+    gained, freedom = float(np.sum(along**2 / value)), int(np.sum(kept))
+    return ReleaseGain(vector @ (along / value), vector, value, along, gained, freedom)
+
+
+def release_fault(
+    pose_cov: Array, score: Score, fault: Suspect, information: Array, gradient: Array
+) -> ReleasedFault | None:
+    """Estimate a candidate fault; None without information on it."""
+    reported = release_gain(fault, information, gradient)
+    if reported is None:
+        return None
+    moved = score.by_pose @ reported.step
+    solved = np.linalg.solve(pose_cov, moved[..., None])[..., 0]
+    return ReleasedFault(fault, *reported, moved, np.sum(moved * solved, axis=1))

@@ -1,0 +1,108 @@
+"""A log is smoothed again with the mistake in its site undone, where that explains everything.
+
+A correction is accepted only if no test contradicts the corrected result: the remedy that a report
+gives is the one with which this result was made.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from magfusion.errors import InputError
+from magfusion.estimation.batch.batch import smooth
+from magfusion.estimation.integrity.correction import Correction
+from magfusion.files.site import changed_keys
+from magfusion.jobs.smooth_result import Finished, finished
+from magfusion.model.progress import Report, quiet
+from magfusion.model.trust import Finding, Verdict
+
+if TYPE_CHECKING:
+    from magfusion.estimation.batch.batch import SmootherSettings
+    from magfusion.model.samples import Log
+    from magfusion.model.site import Site
+    from magfusion.model.trust import Risk
+
+MOST_CORRECTIONS = 2  # that are tried
+MOST_STEPS = 3  # of one correction, whose size is found by linear steps
+CORRECTED = " The result is corrected for it."
+CAUSE_FIRST = 1e6  # weight
+
+
+def corrected(
+    log: Log,
+    site: Site,
+    settings: SmootherSettings,
+    risk: Risk | None,
+    possible: list[Correction],
+    reasons: tuple[Finding, ...],
+    findings: tuple[Finding, ...] = (),
+    report: Report = quiet,
+) -> Finished | None:
+    """Return the result with a corrected site; None where no correction explains the log.
+
+    Parameters
+    ----------
+    possible : list of Correction
+        The most likely first.
+    reasons : tuple of Finding
+        Why the result without a correction is not trustworthy.
+    findings : tuple of Finding
+        As of `finished`.
+    """
+    if site.platform.further or any(beacon.unknown is not None for beacon in site.beacons):
+        return None
+    for correction in possible[:MOST_CORRECTIONS]:
+        done = _tried(log, site, settings, risk, correction, reasons, findings, report)
+        if done is not None:
+            return done
+    return None
+
+
+def _tried(
+    log: Log,
+    site: Site,
+    settings: SmootherSettings,
+    risk: Risk | None,
+    correction: Correction,
+    reasons: tuple[Finding, ...],
+    findings: tuple[Finding, ...],
+    report: Report,
+) -> Finished | None:
+    """Return the result with a correction, which is repeated while its size still changes."""
+    accepted = None
+    for _ in range(MOST_STEPS):
+        finding = _finding(correction, site, reasons)
+        try:
+            result = smooth(log, correction.site, settings, report)
+        except (RuntimeError, InputError):
+            return None
+        trial = correction._replace(finding=finding)
+        done = finished(
+            log, correction.site, settings, result, risk, findings=findings, correction=trial
+        )
+        clean = done.trust.reasons == (finding,)
+        accepted = done if clean or _explains_most(correction, done) else None
+        if done.continued is None:
+            break
+        correction = done.continued
+    return accepted
+
+
+def _explains_most(correction: Correction, done: Finished) -> bool:
+    """Return whether a gross mistake is undone, and something small is left beside it."""
+    return correction.clear and done.trust.verdict is not Verdict.FAILED
+
+
+def _finding(correction: Correction, site: Site, reasons: tuple[Finding, ...]) -> Finding:
+    """Return the reason of a corrected result: with its remedy, and what it explains."""
+    known = correction.finding
+    explained = dict.fromkeys(f.code for f in reasons if f.code != known.code)
+    return replace(
+        known,
+        text=known.text + CORRECTED,
+        verdict=Verdict.DOUBTFUL,
+        weight=CAUSE_FIRST,
+        remedy=changed_keys(site, correction.site),
+        explained=tuple(explained),
+    )
