@@ -127,8 +127,10 @@ def test_nothing_is_tried_of_what_is_trustworthy_or_explains_itself() -> None:
     doubt = Trust((Finding("not_converged", "It did not converge."),))
     result = diagnosed(case.log, case.site, doubt)
     assert result is not None
-    assert result.verdict is Verdict.DOUBTFUL
-    assert (doubt | Trust((result,))).ordered[0].code == "gyro_sign"
+    assert result.finding.verdict is Verdict.DOUBTFUL
+    assert (doubt | Trust((result.finding,))).ordered[0].code == "gyro_sign"
+    assert result.site is not None
+    assert cause_of(case.log, result.site) is None  # the site undoes it
 
 
 def test_of_two_causes_that_explain_alike_none_is_named() -> None:
@@ -156,7 +158,8 @@ def test_what_says_why_comes_before_what_only_says_where() -> None:
 def test_a_line_that_is_seen_comes_before_a_beacon_that_is_only_false() -> None:
     case = MISTAKES["line_on_tone"].change(_short())
     line = Finding("undeclared_line", "A line beside the tone of beacon B.")
-    trust = with_cause(Trust((line,)), case.log, case.site)
+    trust = Trust((line,))
+    trust = with_cause(trust, diagnosed(case.log, case.site, trust))
     assert [finding.code for finding in trust.reasons] == ["undeclared_line", "beacon_fault"]
 
 

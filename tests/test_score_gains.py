@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from magfusion.estimation.integrity.fixed_parameter_test import gains, release_fault
+from magfusion.estimation.integrity.released_fault import gains, release_fault
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.online_integrity.score_targets import ScoreTargets
 from magfusion.simulation.demo_site import demo_site

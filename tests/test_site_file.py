@@ -187,7 +187,7 @@ OUT_OF_RANGE: list[tuple[Key, Any, str]] = [
     ((*COIL, "frequency_hz"), 0.0, "greater than 0"),
     ((*COIL, "slot"), -1, "greater than or equal to 0"),
     ((*COIL, "slot"), 0.5, "integer"),
-    (("platform",), None, "mapping with the keys imu, magnetometer"),
+    (("platform",), None, "mapping with the keys imu, imu_intrinsics, magnetometer"),
     ((*IMU, "gyro_noise"), 0.0, "greater than 0"),
     ((*IMU, "accel_noise"), "2e-2 m", "number"),
     ((*IMU, "gyro_bias_walk"), -1e-5, "greater than or equal to 0"),

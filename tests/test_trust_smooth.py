@@ -138,8 +138,9 @@ def test_a_disturbed_beacon_is_said_with_its_time() -> None:
     phasor[now, 1] *= 1.1
     false = replace(log, fields=replace(log.fields, phasor_sensor=phasor))
     _, honest, trust = verdict_on(false, site)
-    findings = next(f for f in trust.findings if f.code == "field_residuals")
-    assert f"beacon {site.beacons[1].name}" in findings.text
+    first = trust.reasons[0]
+    assert first.code == "changed"
+    assert f"the strength of beacon {site.beacons[1].name} by" in first.text
     assert nees(honest, log) < COVERED
 
 

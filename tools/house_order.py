@@ -25,9 +25,9 @@ ROOMS = {
     wing: rooms.split()
     for wing, rooms in {
         "model": """
-            arguments correlation drive field_map fixed_axes groups hall hermite marks
-            perturbation physics platform_motion probe progress quaternion region response rotor
-            short_repr temperature time_division trust
+            arguments correlation drive field_map fixed_axes groups hall hermite imu_intrinsics
+            marks perturbation physics platform_motion probe progress quaternion region response
+            rotor short_repr temperature time_division trust
             magnetometer
             site trajectory
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
@@ -106,10 +106,11 @@ ROOMS = {
             allan_noise checkpoint failure orientation settings without_beacons
             allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
             calibrate_magnetometer check design_settings drift_world evaluate export init_settings
-            live papers range_wells rates region replay rest_settings simulate_ranging smooth_result
-            survey view
+            live papers published_fix range_wells rates region replay rest_settings
+            simulate_ranging smooth_result survey view
             antenna_fit demodulate design_motion drift_figures fix import_log init_questions
-            joint_tasks match_trust navigate_settings simulate stream
+            joint_tasks match_trust navigate_settings simulate smooth_correction smooth_failure
+            stream
             antenna_report antenna_trust coverage drift init joint_run match navigate_rests
             calibrate_antenna design_figures joint_result navigate
             calibrate_log design smooth

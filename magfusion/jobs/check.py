@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magfusion.jobs.settings import Command, LogSettings, WindowSettings
+from magfusion.errors import InputError
+from magfusion.jobs.settings import Command, LogSettings, WindowSettings, option
 from magfusion.model.progress import Report, quiet
 from magfusion.model.trust import Trust
 from magfusion.results.figures import Figure, Figures, Section, heading
@@ -19,11 +20,16 @@ from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.estimation.integrity.quick_check import Look
+    from magfusion.model.site import Site
 
 
 @dataclass(frozen=True, kw_only=True)
 class CheckSettings(LogSettings, WindowSettings):
     """Settings of a check; without a site only the recording is checked."""
+
+    correct: Path | None = option(
+        None, "File for the site with the most likely mistake undone", metavar="SITE.yaml"
+    )
 
 
 def run_check(
@@ -46,6 +52,8 @@ def run_check(
     from magfusion.results.plots.check import write_check_plot
     from magfusion.results.report import write_report
 
+    if settings.correct is not None and settings.correct.exists():
+        raise InputError(f"{settings.correct}: exists; give --correct another path, or remove it")
     claimed = nullcontext(None) if output is None else claim(output, "check")
     job = settings.job(Path() if output is None else output)
     began = time.perf_counter()
@@ -63,6 +71,8 @@ def run_check(
     else:
         look = quick_check(log, site, lockin)
         figures = heading("check", log.name) | trust_figures(look.trust) | check_figures(look)
+        if settings.correct is not None:
+            figures |= _corrected(settings.correct, look, site)
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     with claimed as whole:
         if whole is not None:
@@ -70,6 +80,17 @@ def run_check(
             write_report(whole, figures)
     report("done", 3, 3)
     return figures
+
+
+def _corrected(place: Path, look: Look, site: Site | None) -> Figures:
+    """Write the site with the most likely mistake undone, where one explains the log."""
+    from magfusion.files.site import changed_keys, save_site
+
+    if site is None or look.cause is None or look.cause.site is None:
+        return Figures(Figure("corrected", "nothing: no mistake of the site explains the log"))
+    save_site(look.cause.site, place)
+    keys = ", ".join(changed_keys(site, look.cause.site))
+    return Figures(Figure("corrected", f"{keys} in {place}"))
 
 
 def _of_several(looks: Mapping[str, Look]) -> Figures:

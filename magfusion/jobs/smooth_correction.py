@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from magfusion.model.site import Site
     from magfusion.model.trust import Risk
 
-MOST_CORRECTIONS = 2  # that are tried
-MOST_STEPS = 3  # of one correction, whose size is found by linear steps
+MOST_SOLUTIONS = 2  # beside the first: a wrong log takes three times as long as a good one
 CORRECTED = " The result is corrected for it."
 CAUSE_FIRST = 1e6  # weight
 
@@ -52,45 +51,30 @@ def corrected(
     """
     if site.platform.further or any(beacon.unknown is not None for beacon in site.beacons):
         return None
-    for correction in possible[:MOST_CORRECTIONS]:
-        done = _tried(log, site, settings, risk, correction, reasons, findings, report)
-        if done is not None:
-            return done
-    return None
-
-
-def _tried(
-    log: Log,
-    site: Site,
-    settings: SmootherSettings,
-    risk: Risk | None,
-    correction: Correction,
-    reasons: tuple[Finding, ...],
-    findings: tuple[Finding, ...],
-    report: Report,
-) -> Finished | None:
-    """Return the result with a correction, which is repeated while its size still changes."""
-    accepted = None
-    for _ in range(MOST_STEPS):
+    waiting, best = list(possible), None
+    for _ in range(MOST_SOLUTIONS):
+        if not waiting:
+            break
+        correction = waiting.pop(0)
         finding = _finding(correction, site, reasons)
         try:
             result = smooth(log, correction.site, settings, report)
         except (RuntimeError, InputError):
-            return None
+            continue
         trial = correction._replace(finding=finding)
-        done = finished(
-            log, correction.site, settings, result, risk, findings=findings, correction=trial
-        )
-        clean = done.trust.reasons == (finding,)
-        accepted = done if clean or _explains_most(correction, done) else None
-        if done.continued is None:
-            break
-        correction = done.continued
-    return accepted
+        used = correction.site, settings, result, risk
+        done = finished(log, *used, findings=findings, correction=trial)
+        if done.trust.reasons == (finding,) or _explains_most(correction, done):
+            best = done
+            if done.continued is None:
+                break
+        if done.continued is not None:
+            waiting.insert(0, done.continued._replace(finding=correction.finding))
+    return best
 
 
 def _explains_most(correction: Correction, done: Finished) -> bool:
-    """Return whether a gross mistake is undone, and something small is left beside it."""
+    """Return whether a gross mistake is undone, with a small remainder."""
     return correction.clear and done.trust.verdict is not Verdict.FAILED
 
 

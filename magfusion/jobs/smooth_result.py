@@ -23,6 +23,7 @@ from magfusion.estimation.integrity.smoothed_exclusion import (
     separated_smooth,
     states_between,
     states_judged,
+    with_long_exclusions,
 )
 from magfusion.estimation.online_integrity.open_roll import (
     comparable,
@@ -114,12 +115,12 @@ def finished(
     if excess > 1.0 and result.states.pose_cov is not None:
         wider = excess * result.states.pose_cov
         result = replace(result, states=replace(result.states, pose_cov=wider))
-    trust |= separated.trust | Trust(findings)
-    cause = diagnosed(log, site, trust, settings.lockin)
+    trust = with_long_exclusions(trust | separated.trust | Trust(findings))
+    cause = diagnosed(log, site, trust, settings.lockin) if correction is None else None
     excluded = any(f.code == "beacon_excluded" for f in trust.reasons)
     possible = corrections(site, trust.reasons, () if excluded else causes, cause)
-    found = bool(causes) or any(f.code == "changed" for f in trust.reasons)
-    trust = with_cause(trust, None if found and not is_clear(cause) else cause)
+    is_named = bool(causes) or any(f.code == "changed" for f in trust.reasons)
+    trust = with_cause(trust, None if is_named and not is_clear(cause) else cause)
     if correction is not None:
         trust |= Trust((correction.finding,))
     by_state = states_judged(separated, result, trust.verdict)

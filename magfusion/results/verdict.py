@@ -1,5 +1,6 @@
 """The verdict on a result, as figures: first on the screen and in ``report.json``."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -7,12 +8,14 @@ import numpy as np
 from magfusion.model.trust import Finding, StateTrust, Trust, Unverified
 from magfusion.results.figures import Figure, Figures, Section
 
+MOST_TEXTS = 3  # of findings of one code; more are counted
+
 
 def trust_figures(trust: Trust) -> Figures:
     """Return verdict, reasons, remarks and unverified parameters, for the head of a report."""
     return Figures(
         Figure("verdict", str(trust.verdict), section=Section.VERDICT),
-        Figure("reasons", _finding_rows(trust.reasons), section=Section.VERDICT),
+        Figure("reasons", _finding_rows(_one_of_each(trust.reasons)), section=Section.VERDICT),
         Figure("remarks", _finding_rows(trust.remarks), section=Section.VERDICT),
         Figure("unverified", [_unverified(u) for u in trust.unverified], section=Section.VERDICT),
     )
@@ -25,6 +28,20 @@ def notes_of(trust: Trust) -> Figures:
     """
     sentences = [finding.text for finding in trust.ordered]
     return Figures(Figure("notes", sentences, section=Section.REPORT))
+
+
+def _one_of_each(findings: tuple[Finding, ...]) -> tuple[Finding, ...]:
+    """Return the findings with those of one code, as of several axes or beacons, in one text."""
+    of_code: dict[str, list[Finding]] = {}
+    for finding in findings:
+        of_code.setdefault(finding.code, []).append(finding)
+    result = []
+    for first, *others in of_code.values():
+        texts = [one.text for one in (first, *others[: MOST_TEXTS - 1])]
+        more = len(others) - (MOST_TEXTS - 1)
+        texts += [f"And {more} more of this kind."] if more > 0 else []
+        result.append(replace(first, text=" ".join(texts)))
+    return tuple(result)
 
 
 def _finding_rows(findings: tuple[Finding, ...]) -> list[dict[str, Any]]:

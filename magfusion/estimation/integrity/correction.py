@@ -26,8 +26,8 @@ class Correction(NamedTuple):
         What is wrong.
     site : Site
         In which it is undone.
-    fault : Suspect, optional
-        The fixed parameter that is wrong, where it is one.
+    fault : named tuple, optional
+        The candidate fault, if it is an incorrect fixed parameter.
     spread : ndarray, shape (states or 1, 6, 6), optional
         Covariance of the poses by other mistakes that would explain the log as well.
     clear : bool
@@ -66,17 +66,17 @@ def corrections(
         spread = np.zeros((len(best.moved), 6, 6))
         for rival, share in zip(rivals, weight / (1.0 + np.sum(weight)), strict=True):
             spread += share * _outer(rival.moved - best.moved)
-        undone = corrected_site(site, best.fault, best.step)
-        result.append(Correction(finding, undone, best.fault, spread))
+        new_site = corrected_site(site, best.fault, best.step)
+        result.append(Correction(finding, new_site, best.fault, spread))
     if diagnosis is not None and diagnosis.site is not None:
         clear = is_clear(diagnosis)
-        found = Correction(diagnosis.finding, diagnosis.site, clear=clear)
-        result.insert(0 if clear else len(result), found)
+        by_snapshots = Correction(diagnosis.finding, diagnosis.site, clear=clear)
+        result.insert(0 if clear else len(result), by_snapshots)
     return [one._replace(spread=_with_turned_imu(site, one)) for one in result]
 
 
 def is_clear(diagnosis: Diagnosis | None) -> bool:
-    """Return whether snapshots decide, whatever the score says, which is linear."""
+    """Return whether snapshots decide, whatever the linear score."""
     return diagnosis is not None and diagnosis.ratio > CLEAR
 
 
@@ -107,24 +107,24 @@ def _remaining(correction: Correction, score: Score | None) -> ReleaseGain | Non
 
 
 def continued(correction: Correction, score: Score | None) -> Correction | None:
-    """Return a correction with what the corrected result still asks for; None if it is little.
+    """Return a correction with the rest that the corrected result shows; None if it is small.
 
     Parameters
     ----------
     score : Score, optional
         Of the corrected result.
     """
-    left = _remaining(correction, score)
-    if left is None or left.chi_square < LITTLE * left.freedom:
+    rest = _remaining(correction, score)
+    if rest is None or rest.chi_square < LITTLE * rest.freedom:
         return None
     assert correction.fault is not None
-    return correction._replace(site=corrected_site(correction.site, correction.fault, left.step))
+    return correction._replace(site=corrected_site(correction.site, correction.fault, rest.step))
 
 
 def spread_of(correction: Correction, score: Score | None) -> Array:
     """Return the covariance of the poses by the uncertainty of a correction."""
     spread = np.zeros((1, 6, 6)) if correction.spread is None else correction.spread
-    left = _remaining(correction, score)
-    if left is None or score is None:
+    rest = _remaining(correction, score)
+    if rest is None or score is None:
         return spread
-    return np.asarray(spread + score.by_pose @ left.known_cov @ np.swapaxes(score.by_pose, 1, 2))
+    return np.asarray(spread + score.by_pose @ rest.known_cov @ np.swapaxes(score.by_pose, 1, 2))

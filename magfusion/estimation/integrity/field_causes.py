@@ -7,11 +7,11 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.integrity.explanation import Explanation
 from magfusion.estimation.integrity.field_snapshots import Snapshots
+from magfusion.estimation.solve.bounded import minimise_bounded
 from magfusion.model.response import FrequencyResponse
 from magfusion.model.site import Beacon, Coil, Site
 from magfusion.units import DEGREE, Array
@@ -20,7 +20,8 @@ GROSS = 4.0  # chi square over its freedom, below which no mistake in all beacon
 SCREENED = 6  # epochs on which each is tried
 KEPT = 4  # of them, tried on all epochs
 CORNERS = 12  # corner frequencies of a low-pass that are tried
-REACH = 2.0  # factor by which the best of them is refined
+REACH = 1.0  # of the logarithm of a corner frequency, and of a delay in its radians
+REFINED = 1e-4  # of the logarithm of chi square; a step that decreases it by less is the last
 # What the declared moments are too large by: a unit or a convention.
 MOMENT_FACTORS = {
     "amplitudes were declared as rms values": np.sqrt(0.5),
@@ -50,16 +51,15 @@ class Way(NamedTuple):
 
     Parameters
     ----------
-    by_size, size : callable and float, optional
-        The same for another size of the mistake, where it has one.
+    by_size : callable, optional
+        The same for another size (2,) of the mistake, relative to this one.
     """
 
     code: str
     cause: str
     remedy: str
     site: Site
-    by_size: "Callable[[float], Way] | None" = None
-    size: float = 0.0
+    by_size: "Callable[[Array], Way] | None" = None
 
 
 def global_causes(known: Snapshots) -> Iterator[Explanation]:
@@ -88,7 +88,7 @@ def global_causes(known: Snapshots) -> Iterator[Explanation]:
             known.chi_square,
             whole.chi_square,
             known.freedom,
-            0 if way.by_size is None else 1,
+            0 if way.by_size is None else 2,
             site=None if one.samples is inverted else way.site,
         )
 
@@ -99,12 +99,11 @@ def _refined(few: Snapshots, way: Way) -> Way:
         return way
     by_size = way.by_size
 
-    def cost(log_size: float) -> float:
-        return few.of(by_size(float(np.exp(log_size))).site).chi_square
+    def cost(size: Array) -> float:
+        return float(np.log(few.of(by_size(size).site).chi_square))
 
-    middle, reach = np.log(way.size), np.log(REACH)
-    found = minimize_scalar(cost, bounds=(middle - reach, middle + reach), options={"xatol": 1e-4})
-    return by_size(float(np.exp(found.x)))
+    limits = np.array([[-REACH, REACH]] * 2)
+    return by_size(minimise_bounded(cost, np.zeros(2), limits, decrease=REFINED))
 
 
 def length_cause(words: str) -> tuple[str, str, str]:
@@ -208,22 +207,30 @@ def _low_passes(site: Site) -> Iterator[Way]:
     if not len(tones_hz):
         return
     for corner_hz in np.geomspace(0.2 * tones_hz[0], 10.0 * tones_hz[-1], CORNERS).tolist():
-        yield low_pass(site, tones_hz, corner_hz)
+        yield low_pass(site, tones_hz, corner_hz, np.zeros(2))
 
 
-def low_pass(site: Site, tones_hz: Array, corner_hz: float) -> Way:
-    """Return a site whose magnetometer has a low-pass of first order with a corner (Hz)."""
-    response = FrequencyResponse(
-        tones_hz, 1.0 / np.hypot(1.0, tones_hz / corner_hz), -np.arctan(tones_hz / corner_hz)
-    )
+def low_pass(site: Site, tones_hz: Array, near_hz: float, size: Array) -> Way:
+    """Return a site whose magnetometer has a low-pass of first order, and a delay.
+
+    Parameters
+    ----------
+    near_hz : float
+        Corner frequency (Hz) that the size refers to.
+    size : ndarray, shape (2,)
+        Logarithm of the corner's ratio to that, and the delay in its radians.
+    """
+    corner_hz = near_hz * float(np.exp(size[0]))
+    share = tones_hz / corner_hz
+    phase = -np.arctan(share) - float(size[1]) * tones_hz / near_hz
+    response = FrequencyResponse(tones_hz, 1.0 / np.hypot(1.0, share), phase)
     magnetometer = replace(site.platform.magnetometer, response=response)
     return Way(
         "low_pass",
         f"the magnetometer has a low-pass filter with a corner at {corner_hz:.3g} Hz",
         "Declare platform.magnetometer.response, or record without the filter.",
         replace(site, platform=replace(site.platform, magnetometer=magnetometer)),
-        partial(low_pass, site, tones_hz),
-        corner_hz,
+        partial(low_pass, site, tones_hz, near_hz),
     )
 
 

@@ -22,7 +22,7 @@ from magfusion.estimation.data_checks.stamps import Timing, timings
 from magfusion.estimation.demodulation.beacon_selection import select_detected
 from magfusion.estimation.demodulation.burial_depth import depths_of
 from magfusion.estimation.demodulation.demodulation import phasors
-from magfusion.estimation.integrity.diagnosis import diagnosed, with_cause
+from magfusion.estimation.integrity.diagnosis import Diagnosis, diagnosed, with_cause
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.detection_range import are_many
@@ -63,6 +63,8 @@ class Look:
         Of a few epochs.
     depths : mapping
         Range (m) and skin depths of each detected beacon; empty without a conductor.
+    cause : Diagnosis, optional
+        The mistake that explains the log.
     """
 
     trust: Trust
@@ -73,6 +75,7 @@ class Look:
     lines: tuple[SpectralLine, ...] | None = None
     fixes: Fixes | None = None
     depths: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    cause: Diagnosis | None = None
 
     @property
     def fix_residual(self) -> float:
@@ -121,9 +124,12 @@ def quick_check(log: Log, site: Site | None, lockin: LockinSettings | None = Non
         detection = within_reach(detection, site, poses)
     findings += recorded(log, site, TOLERATED_CODES, poses, beacons=True, detection=detection)
     trust = Trust(tuple(_promoted(findings)))
+    cause = None
     if trust.reasons and trust.reasons[0].code in SYMPTOMS:
-        trust = with_cause(trust, diagnosed(log, site, trust, lockin))
-    return Look(trust, *look, detection, result, seen, fixes, depths_of(samples, site))
+        cause = diagnosed(log, site, trust, lockin)
+        trust = with_cause(trust, cause)
+    depths = depths_of(samples, site)
+    return Look(trust, *look, detection, result, seen, fixes, depths, cause)
 
 
 def _harmless_lines(

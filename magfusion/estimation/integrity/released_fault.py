@@ -69,12 +69,12 @@ class ReleasedFault(NamedTuple):
         What is no farther off than instruments usually are is no mistake.
         """
         blocks = self.fault.blocks
-        unusual = any(
+        exceeds = any(
             float(np.linalg.norm(b.sigma * self.step[b.columns])) > USUAL.get(b.parameter, 0.0)
             for b in blocks
         )
         of_imu = all(isinstance(b.parameter, Inertial) for b in blocks)
-        return unusual and (of_imu or float(np.mean(self.distance)) > COVERED)
+        return exceeds and (of_imu or float(np.mean(self.distance)) > COVERED)
 
     @property
     def gain(self) -> float:
@@ -95,7 +95,8 @@ def gains(combine: Array, information: Array, gradient: Array) -> Array:
     across = np.swapaxes(combine, 1, 2)
     value, vector = np.linalg.eigh(across @ information @ combine)
     along = (np.swapaxes(vector, 1, 2) @ (across @ gradient[..., None]))[..., 0]
-    return np.asarray(np.sum(_evidence(along, np.maximum(value, 0.0)), axis=1))
+    kept = value > FARTHEST**-2
+    return np.asarray(np.sum(np.where(kept, _evidence(along, np.maximum(value, 0.0)), 0.0), axis=1))
 
 
 def _evidence(along: Array, information: Array) -> Array:

@@ -29,8 +29,8 @@ ROUNDS = 3  # of exclusions
 SPANS = 3  # in a sentence
 TOGETHER = 3.0  # s; closer stretches are reported as one
 MIN_LEFT_OUT_EPOCHS = 5  # excluded field epochs of a beacon that are reported; fewer are outliers
-LONGEST_EXCLUSION = 5.0  # s of a beacon, above which the site is in doubt
-EXCLUDED_FIRST = 1e5  # weight: what is left beside an excluded beacon is its trace
+LONGEST_EXCLUSION = 5.0  # s of a beacon; after more, other findings are its traces
+EXCLUDED_FIRST = 1e5  # weight
 OF_A_LOG = 5e-4  # false alarms of a whole log
 
 
@@ -275,11 +275,27 @@ def _excluded_findings(
                 f"Beacon {names[j]} contradicts the others from {', '.join(spans[:SPANS])}{more}:"
                 f" the trajectory without it is up to {1e3 * _largest(separated, j):.3g} mm away,"
                 " so it is excluded there. Check its drive current, and iron or a shield near it.",
-                Verdict.DOUBTFUL if lasting else Verdict.TRUSTWORTHY,
+                Verdict.TRUSTWORTHY,
                 EXCLUDED_FIRST if lasting else 1.0,
             )
         )
     return findings
+
+
+def with_long_exclusions(trust: Trust) -> Trust:
+    """Return findings in which a long exclusion precedes all others: they are its traces.
+
+    An exclusion that explains everything remains a remark.
+    """
+    if not trust.reasons:
+        return trust
+    findings = tuple(
+        replace(f, verdict=Verdict.DOUBTFUL)
+        if f.code == "beacon_excluded" and f.weight >= EXCLUDED_FIRST
+        else f
+        for f in trust.findings
+    )
+    return replace(trust, findings=findings)
 
 
 def _stretches(epochs: IntArray, time: Array) -> list[tuple[int, int]]:

@@ -1,0 +1,110 @@
+"""What is wrong with a site is found, undone and used; its remedy, followed, is trustworthy."""
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+Mistake = Callable[[dict[str, Any]], None]
+SECONDS = 24
+
+
+def lever_arm(site: dict[str, Any]) -> None:
+    site["platform"]["magnetometer"]["body_from_sensor"]["position_m"][0] += 0.05
+
+
+def tilt(site: dict[str, Any]) -> None:
+    turn = Rotation.from_rotvec(np.deg2rad([2.0, -1.5, 0.0]))
+    for beacon in site["beacons"]:
+        attitude = Rotation.from_euler("xyz", beacon["rpy_deg"], degrees=True)
+        beacon["position_m"] = turn.apply(beacon["position_m"]).tolist()
+        beacon["rpy_deg"] = (turn * attitude).as_euler("xyz", degrees=True).tolist()
+
+
+def yaw_sign(site: dict[str, Any]) -> None:
+    for k, beacon in enumerate(site["beacons"]):
+        beacon["rpy_deg"][2] = -beacon["rpy_deg"][2] + 20.0 * (k + 1)
+
+
+def coil_reversed(site: dict[str, Any]) -> None:
+    coil = site["beacons"][0]["coils"][0]
+    coil["moment_a_m2"] = [-value for value in coil["moment_a_m2"]]
+
+
+def attitudes_exchanged(site: dict[str, Any]) -> None:
+    one, other = site["beacons"][:2]
+    one["rpy_deg"], other["rpy_deg"] = other["rpy_deg"], one["rpy_deg"]
+
+
+def magfusion(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "magfusion", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def report(directory: Path) -> dict[str, Any]:
+    return dict(json.loads((directory / "report.json").read_text(encoding="utf-8")))
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("correction") / "log"
+    made = magfusion("simulate", "-o", path, "--duration", SECONDS, "--seed", 4)
+    assert made.returncode == 0, made.stderr
+    site = yaml.safe_load((path / "site.yaml").read_text(encoding="utf-8"))
+    for k, beacon in enumerate(site["beacons"]):  # attitudes that differ
+        assert len(beacon["rpy_deg"]) == 3, k
+    return path
+
+
+def put(site: Any, key: str, value: object) -> None:
+    """Set a key of a site as ``beacons[0].position_m``."""
+    *path, last = re.findall(r"[^.\[\]]+", key)
+    for name in path:
+        site = site[int(name)] if isinstance(site, list) else site.setdefault(name, {})
+    site[int(last) if isinstance(site, list) else last] = value
+
+
+@pytest.mark.parametrize(
+    ("mistake", "code"),
+    [
+        pytest.param(lever_arm, "lever_arm", id="lever arm"),
+        pytest.param(coil_reversed, "coil_reversed", id="coil", marks=pytest.mark.slow),
+        pytest.param(tilt, "survey_tilt", id="tilt", marks=pytest.mark.slow),
+        pytest.param(
+            attitudes_exchanged, "beacons_swapped", id="attitudes", marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_a_mistake_is_undone_and_its_remedy_works(
+    log: Path, tmp_path: Path, mistake: Mistake, code: str
+) -> None:
+    site = yaml.safe_load((log / "site.yaml").read_text(encoding="utf-8"))
+    mistake(site)
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text(yaml.safe_dump(site), encoding="utf-8")
+    run = magfusion("smooth", log, "--site", wrong, "-o", tmp_path / "found")
+    assert run.returncode == 0, run.stderr
+    found = report(tmp_path / "found")
+    assert found["verdict"] == "doubtful"
+    first = found["reasons"][0]
+    assert first["code"] == code
+    assert first["text"].endswith("The result is corrected for it.")
+    assert found["ate_m"] < 0.02  # m
+
+    for key, value in first["remedy"].items():
+        put(site, key, value)
+    right = tmp_path / "right.yaml"
+    right.write_text(yaml.safe_dump(site), encoding="utf-8")
+    run = magfusion("smooth", log, "--site", right, "-o", tmp_path / "again")
+    assert run.returncode == 0, run.stderr
+    again = report(tmp_path / "again")
+    assert again["verdict"] == "trustworthy"
+    assert again["ate_m"] < 0.02  # m
