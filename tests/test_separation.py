@@ -1,5 +1,6 @@
 """Solution separation: alarms as often as promised, levels that hold, the right beacon found."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.stats import binom
 from magfusion.estimation.posterior.separation import (
     Separation,
     linear_separation,
+    pair_modes,
     protection_levels,
     radii,
     with_rivals,
@@ -108,10 +110,52 @@ def test_what_a_false_beacon_does_unseen_stays_within_the_level(size):
     assert np.sum(unseen) <= binom.isf(1e-4, count, maximum)
 
 
-def test_two_beacons_that_may_be_false_at_once_leave_no_level():
-    result = _separated(_linear(np.random.default_rng(6), 3), np.zeros((3, len(OWNER))))
+def test_a_pair_deviates_as_the_least_squares_without_both_do():
+    rng = np.random.default_rng(6)
+    jacobian, noise = _linear(rng, 5), rng.standard_normal((5, len(OWNER)))
+    result, prior = _separated(jacobian, noise), np.full((5, BEACONS), 1e-3)
+    modes, determined = pair_modes(result, prior, 0.5)  # the observed deviation where it is larger
+    assert np.all(determined)
+    for k, (i, j) in enumerate(itertools.combinations(range(BEACONS), 2)):
+        kept = (i != OWNER) & (j != OWNER)
+        without = _error(jacobian[:, kept], noise[:, kept]) - _error(jacobian, noise)
+        cov = np.linalg.inv(np.swapaxes(jacobian[:, kept], 1, 2) @ jacobian[:, kept])
+        np.testing.assert_allclose(modes.sigma.whole[:, k], radii(cov).whole, rtol=1e-6)
+        away = np.linalg.norm(without[:, 3:6], axis=1)
+        assert np.all(modes.threshold[:, k, 1] >= away - 1e-9)
+    np.testing.assert_allclose(modes.prior, 1e-6)
+
+
+@pytest.mark.parametrize("size", [3.0, 6.0, 20.0])
+def test_what_two_false_beacons_do_unseen_stays_within_the_level(size):
+    """Biases of two beacons in the direction that moves the position most, of so many sigma."""
+    rng, count = np.random.default_rng(8), 4_000
+    risk = Risk(total=2e-3, fault=0.1, false_alarm=5e-3, mirrors=0.0)
+    jacobian = _linear(rng, count)
+    false = OWNER < 2
+    noise = rng.standard_normal((count, len(OWNER)))
+    gain = np.linalg.pinv(jacobian)
+    noise[:, false] += size * np.linalg.svd(gain[:, 3:6, false])[2][:, 0]
+    result = _separated(jacobian, noise)
+    prior = np.where(np.arange(BEACONS) < 2, risk.fault, 0.0) * np.ones((count, 1))
+    position_m, _ = protection_levels(result, risk, prior=prior)
+    assert np.all(np.isfinite(position_m))
+    error = np.linalg.norm(_error(jacobian, noise)[:, 3:6], axis=1)
+    unseen = (error > position_m) & ~np.any(result.excess(risk) > 1.0, axis=1)
+    assert np.sum(unseen) <= binom.isf(1e-4, count, risk.total / 2.0 / risk.fault**2)
+
+
+def test_sixteen_beacons_have_levels_and_two_of_three_none():
+    """By the default risk two of sixteen are false too often to be ignored."""
+    rng = np.random.default_rng(9)
+    jacobian = _linear(rng, 3, 16)
+    owner = np.repeat(np.arange(16), PER_BEACON)
+    result = linear_separation(jacobian, np.zeros((3, len(owner))), None, owner, 16)
+    assert np.all(np.isfinite(protection_levels(result, Risk())[0]))
+    jacobian[:, owner > 2] = 0.0
+    jacobian[:, owner < 3, 5] *= owner[owner < 3] == 2  # one axis is seen by the third alone
+    result = linear_separation(jacobian, np.zeros((3, len(owner))), None, owner, 16)
     assert np.all(np.isnan(protection_levels(result, Risk(total=1e-6))[0]))
-    assert np.all(np.isfinite(protection_levels(result, Risk(total=1e-6, fault=1e-4))[0]))
 
 
 def test_a_beacon_that_is_not_heard_is_no_risk():

@@ -28,6 +28,8 @@ POSE = 6  # axes: rotation, then position
 PRECISE, MOST_STEPS = 1e-7, 60  # of a level
 MOST_DEG = 180.0  # an attitude level beyond it is not informative
 SINGLE_FAULT_TAIL = 0.215  # probability of a tail below which a single number bounds it
+PAIRS_MATTER = 0.5  # share of the risk, above which two faulty beacons are monitored
+AT_ONCE = 256  # states whose pairs are computed together
 MIN_COUNT = 1e-30  # rad, m; a deviation below it is zero
 PARTS = (slice(0, 3), slice(3, 6))  # rotation, position
 ROWS = np.arange(POSE).reshape(2, 3, 1)  # of the blocks of both, shape (2, 3, 3) with
@@ -241,16 +243,87 @@ def _estimate(jacobian: Array, error: Array) -> tuple[Array, Array, BoolArray]:
     return (gain @ error[..., None])[..., 0], gain[:, :POSE], determined
 
 
-def unmonitored(prior: Array) -> Array:
-    """Return the probability that more than one beacon is faulty, shape (n,).
+def unmonitored(prior: Array, monitored: int = 1) -> Array:
+    """Return the probability that more than one beacon, or two, are faulty, shape (n,).
 
     Parameters
     ----------
     prior : ndarray, shape (n, beacons)
+    monitored : int
+        Number of faulty beacons that are monitored: 1 or 2.
     """
     none = np.prod(1.0 - prior, axis=1)
-    one = none * np.sum(prior / np.maximum(1.0 - prior, np.finfo(np.float64).tiny), axis=1)
-    return np.maximum(1.0 - none - one, 0.0)
+    odds = prior / np.maximum(1.0 - prior, np.finfo(np.float64).tiny)
+    one = np.sum(odds, axis=1)
+    two = 0.5 * (one**2 - np.sum(odds**2, axis=1)) if monitored > 1 else 0.0
+    return np.maximum(1.0 - none * (1.0 + one + two), 0.0)
+
+
+class FaultModes(NamedTuple):
+    """Hypotheses of faulty beacons at each state.
+
+    Parameters
+    ----------
+    sigma : Radius, shape (n, modes, 2)
+        Of the estimates without their beacons.
+    threshold : ndarray, shape (n, modes, 2)
+        Largest deviation from these estimates (rad, m).
+    prior : ndarray, shape (n, modes)
+    """
+
+    sigma: Radius
+    threshold: Array
+    prior: Array
+
+    def __or__(self, other: "FaultModes") -> "FaultModes":
+        sigma = zip(self.sigma, other.sigma, strict=True)
+        return FaultModes(
+            Radius(*(np.concatenate(pair, axis=1) for pair in sigma)),
+            np.concatenate([self.threshold, other.threshold], axis=1),
+            np.concatenate([self.prior, other.prior], axis=1),
+        )
+
+
+def pair_modes(
+    separation: Separation, prior: Array, false_alarm: float
+) -> tuple[FaultModes, BoolArray]:
+    """Return the modes of two faulty beacons, and whether the pose is determined without both.
+
+    The information of the beacons is taken to be additive, as it is in least squares.  There is
+    no alarm for a pair: its deviation bounds the error, the observed one or, if that is larger,
+    the one that is exceeded with the probability of a false alarm.
+    """
+    count, beacons = separation.step.shape[:2]
+    first, second = np.triu_indices(beacons, 1)
+    chance = false_alarm / (len(PARTS) * max(len(first), 1))
+    parts = [
+        _pairs_of(separation, first, second, slice(begin, begin + AT_ONCE), chance)
+        for begin in range(0, count, AT_ONCE)
+    ]
+    shift, whole, largest, determined = (np.concatenate(p) for p in zip(*parts, strict=True))
+    both = prior[:, first] * prior[:, second]
+    return FaultModes(Radius(whole, largest), shift, np.where(determined, both, 0.0)), determined
+
+
+def _pairs_of(
+    separation: Separation, first: IntArray, second: IntArray, rows: slice, chance: float
+) -> tuple[Array, Array, Array, BoolArray]:
+    """Return deviation, sigmas and observability of the estimates without two beacons."""
+    eye = np.eye(POSE)
+    alone = separation.determined[rows]
+    without = np.linalg.inv(np.where(alone[..., None, None], separation.subset_cov[rows], eye))
+    each = np.where(alone[..., None], separation.step[rows], 0.0)
+    pulled = (without @ each[..., None])[..., 0]
+    joint = without[:, first] + without[:, second]
+    joint = joint - np.linalg.inv(separation.cov[rows])[:, None]
+    determined = alone[:, first] & alone[:, second]
+    determined &= np.linalg.eigvalsh(np.where(determined[..., None, None], joint, eye))[..., 0] > 0
+    cov = np.linalg.inv(np.where(determined[..., None, None], joint, eye))
+    step = (cov @ (pulled[:, first] + pulled[:, second])[..., None])[..., 0]
+    sigma = radii(cov)
+    shift = np.stack([np.linalg.norm(step[..., part], axis=-1) for part in PARTS], axis=-1)
+    usual = radii(cov - separation.cov[rows][:, None]).beyond(chance)
+    return np.fmax(shift, usual), sigma.whole, sigma.largest, determined
 
 
 def protection_levels(
@@ -259,7 +332,7 @@ def protection_levels(
     """Return the protection levels of position (m) and attitude (deg), each of shape (n,).
 
     Each has half of the risk.  NaN where there is none: the pose is not determined without some
-    beacon that may be faulty, or two may be faulty too often.
+    beacon that may be faulty, or without two that are faulty too often.
 
     Parameters
     ----------
@@ -269,13 +342,21 @@ def protection_levels(
         Probability that each beacon is faulty, where more is known than `Risk.fault`.
     """
     prior = separation.prior(risk) if prior is None else prior
-    share = (1.0 - risk.mirrors) * risk.total - unmonitored(np.minimum(prior, risk.fault))
+    modes = FaultModes(separation.subset_sigma, separation.thresholds(risk, slack), prior)
+    whole, bounded = (1.0 - risk.mirrors) * risk.total, np.minimum(prior, risk.fault)
+    several = unmonitored(bounded)
+    if np.any(several > PAIRS_MATTER * whole):
+        pairs, determined = pair_modes(separation, bounded, risk.false_alarm)
+        first, second = np.triu_indices(prior.shape[1], 1)
+        lost = np.where(determined, 0.0, bounded[:, first] * bounded[:, second])
+        modes, several = modes | pairs, unmonitored(bounded, 2) + np.sum(lost, axis=1)
+    share = whole - several
     covered = np.all(separation.determined | (prior == 0.0), axis=1) & (share > 0.0)
     level = _levels(
         separation.sigma,
-        separation.subset_sigma,
-        separation.thresholds(risk, slack),
-        prior[..., None],
+        modes.sigma,
+        modes.threshold,
+        modes.prior[..., None],
         np.where(covered, share, 1.0)[:, None] / len(PARTS),
     )
     level = np.where(covered[:, None], level, np.nan)
