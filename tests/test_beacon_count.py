@@ -78,3 +78,12 @@ def test_the_scenario_draws_prints_and_ends_with_one_json_line(
     np.testing.assert_allclose(printed[A3], errors(full, A3).mean(axis=1), rtol=1e-12)
     assert any(line.split()[:2] == ["paper", "0.1100"] for line in lines[:-1])
     assert (tmp_path / "figure_11.png").stat().st_size > 10_000
+
+
+def test_more_beacons_lower_the_large_errors_as_well(
+    many: Mapping[int, Sequence[AlgorithmOutcome]],
+) -> None:
+    every = [np.concatenate([room.position[A3] for room in rooms]) for rooms in many.values()]
+    large = np.array([np.quantile(error, 0.95) for error in every])
+    assert np.all(shares(large) < 0.9)
+    assert shares(large)[-1] < 0.75

@@ -114,10 +114,10 @@ def test_in_a_quiet_room_the_errors_are_of_the_known_size(
     assert errors[method][0] == pytest.approx(known, rel=0.12)
 
 
-def test_matching_in_nanotesla_as_printed_is_four_times_worse(
+def test_matching_in_nanotesla_as_printed_is_five_times_worse(
     errors: dict[Method, tuple[float, float]],
 ) -> None:
-    assert errors["paper-knn-nt"][0] > 3.5 * errors["paper-knn"][0]
+    assert errors["paper-knn-nt"][0] > 5.0 * errors["paper-knn"][0]
 
 
 def test_the_attitude_of_a_level_sensor_follows_the_position(

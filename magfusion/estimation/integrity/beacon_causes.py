@@ -138,7 +138,13 @@ def _scales(known: Snapshots, scale: float, steady: float | None) -> Iterator[Ex
         words = [w for w, factor in MOMENT_FACTORS.items() if abs(best * factor - 1.0) < near]
         code = "moment_units" if words else "field_scale"
         cause = f"all moments are {best:.4g} times those declared"
-        cause += f": {words[0]}" if words else " (or the magnetometer's scale is)"
+        longer = 100.0 * (best ** (1.0 / 3.0) - 1.0)  # the field falls with the cube
+        cause += (
+            f": {words[0]}"
+            if words
+            else f" (or all distances of the survey are {longer:+.2g} % too long, or the"
+            " magnetometer's scale is wrong)"
+        )
         remedy = "Give moment_a_m2 as amplitudes in A m^2."
     undone = _stronger(known.site, best) if code != "field_scale" else None
     yield _explained(known, after, 1, code, cause, remedy, undone)

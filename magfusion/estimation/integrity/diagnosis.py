@@ -104,7 +104,10 @@ def seen_in_streams(trust: Trust) -> bool:
 
 
 def with_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
-    """Return what is to be said of a result, the cause first where it is known."""
+    """Return the findings on a result, the cause first where it is known.
+
+    Reasons that a mistake explains are listed with it, not beside it.
+    """
     diverged = any(finding.code == "diverged" for finding in trust.findings)
 
     def placed(finding: Finding) -> Finding:
@@ -115,5 +118,13 @@ def with_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
             return replace(finding, weight=min(finding.weight, 1.0))
         return finding
 
-    found = tuple(placed(finding) for finding in trust.findings)
-    return Trust(found if cause is None else (*found, cause.finding), trust.unverified)
+    findings = tuple(placed(finding) for finding in trust.findings)
+    if cause is None:
+        return Trust(findings, trust.unverified)
+    if cause.finding.weight < FIRST:  # it states where something is wrong, and explains nothing
+        return Trust((*findings, cause.finding), trust.unverified)
+    kept = tuple(f for f in findings if f.code in SEEN or f.verdict is Verdict.TRUSTWORTHY)
+    codes = (f.code for f in Trust(findings).ordered if f not in kept)
+    explained = tuple(dict.fromkeys(code for code in codes if code != cause.finding.code))
+    first = replace(cause.finding, explained=explained)
+    return Trust((*kept, first), trust.unverified)

@@ -13,7 +13,7 @@ import numpy as np
 
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, State, states_of
-from magfusion.estimation.integrity.fixed_parameter_test import finding_of
+from magfusion.estimation.integrity.fixed_parameter_test import LEAST_EVIDENCE, finding_of
 from magfusion.estimation.integrity.released_fault import ReleasedFault, release_fault
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.measurements.phasors import FieldPhasors
@@ -38,7 +38,6 @@ from magfusion.units import Array
 
 MIN_SCORE_INTERVAL, MAX_SCORE_INTERVAL = 2.0, 20.0  # s; shortest and longest interval of results
 ENOUGH = 5  # epochs for the shortest interval
-ONLINE_EVIDENCE = 30.0  # of -2 log likelihood: `LEAST_EVIDENCE`, and the price of many tests
 MOST_WAITING = 10  # epochs; larger batches would delay an update
 
 
@@ -217,4 +216,4 @@ class OnlineScore:
 
 
 def _is_significant(one: ReleasedFault) -> bool:
-    return one.gain > ONLINE_EVIDENCE and one.is_mistake
+    return one.gain > LEAST_EVIDENCE and one.is_mistake

@@ -348,8 +348,8 @@ def protection_levels(
     if np.any(several > PAIRS_MATTER * whole):
         pairs, determined = pair_modes(separation, bounded, risk.false_alarm)
         first, second = np.triu_indices(prior.shape[1], 1)
-        lost = np.where(determined, 0.0, bounded[:, first] * bounded[:, second])
-        modes, several = modes | pairs, unmonitored(bounded, 2) + np.sum(lost, axis=1)
+        undetermined = np.where(determined, 0.0, bounded[:, first] * bounded[:, second])
+        modes, several = modes | pairs, unmonitored(bounded, 2) + np.sum(undetermined, axis=1)
     share = whole - several
     covered = np.all(separation.determined | (prior == 0.0), axis=1) & (share > 0.0)
     level = _levels(

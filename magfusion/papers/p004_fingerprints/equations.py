@@ -15,7 +15,7 @@ from magfusion.receiver.ellipse import plane_normal, rms_amplitude
 from magfusion.units import MU0_OVER_4PI, Array, ComplexArray
 
 NOT_FUNCTIONS = {
-    10: "states that Eq 8 gives one normal from all pairs; Right of pairs a quarter period apart",
+    10: "states that Eq 8 gives one normal from all pairs; Right of pairs equally far apart",
     22: "names the matrices of Eq 21, whose columns are the directions of Eq 19",
 }
 
@@ -120,12 +120,12 @@ def eq_07_angles(polar_of_normal: Array, normal_beacon: Array) -> tuple[Array, A
 
 
 def eq_08_normal(earlier: Array, later: Array) -> Array:
-    """Return ``B(t2) x B(t1)`` of fields (..., 3).  Right: minus the normal of Eq 5."""
+    """Return ``B(t2) x B(t1)`` of fields (..., 3).  Misprint: Eq 7 requires B(t1) x B(t2)."""
     return np.cross(later, earlier)
 
 
 eq_09_normal_as_printed = eq_08_normal
-"""Misprint: B_m is printed for B_cs; else as Eq 8."""
+"""Misprint: as Eq 8."""
 
 eq_11_normal = plane_normal
 """Corrected: the phasors, fitted by least squares, use the samples better than pairs of them."""
@@ -164,7 +164,7 @@ def eq_14_angular_term(direction_beacon: Array, moment: Array) -> Array:
 def eq_15_log_amplitude(distance: Array, slope: Array | float, intercept: Array) -> Array:
     """Return the logarithm of the amplitude (T), linear in that of the distance (m).
 
-    Right for the minor semi-axis alone, which is ``K m / r^3`` in all directions.
+    Unclear: right for the minor semi-axis alone, which is ``K m / r^3`` in all directions.
     """
     return slope * np.log(distance) + intercept
 
@@ -251,16 +251,16 @@ def eq_23_angles(sensor_from_world: Array) -> Array:
 def eq_24_ring_moment(turns: float, area: float, resistance: float, field_rate: Array) -> Array:
     """Return the moment (A m^2) of a ring of an area (m^2) in a field's rate of change (T/s).
 
-    Corrected: against the change (Lenz), and each turn adds to the voltage as well.  A ring has
+    Corrected: against the change (Lenz), and turns in series: each adds to the voltage.  A ring has
     no inductance; a body is `magfusion.model.physics.disturbance.sphere_polarizability`.
     """
-    return -turns * eq_24_ring_moment_as_printed(turns, area, resistance, field_rate)
+    return -turns * eq_24_moment_of_closed_rings(turns, area, resistance, field_rate)
 
 
-def eq_24_ring_moment_as_printed(
+def eq_24_moment_of_closed_rings(
     turns: float, area: float, resistance: float, field_rate: Array
 ) -> Array:
-    """Return ``N S^2 / R dB/dt``.  False: wrong sign, and the turns count once."""
+    """Return ``N S^2 / R dB/dt``.  Unclear: right for N closed rings of R each, n against it."""
     return turns * area**2 / resistance * field_rate
 
 
@@ -283,8 +283,8 @@ def eq_27_position(difference: Array, position_world: Array) -> Array:
     """Return the mean of points (n, k, 3) weighted by the inverse of their differences (n, k).
 
     Right, as a method of large error; the point itself where one matches exactly, for which it is
-    0 / 0.  Of logarithms of the fields the error is a quarter of that in nT, where the nearest
-    beacon outweighs all others.
+    0 / 0.  Of logarithms of the fields the error is less than a fifth of that in nT, where the
+    nearest beacon outweighs all others.
     """
     met = difference == 0.0
     share = np.where(met.any(axis=1, keepdims=True), met, 1.0 / np.where(met, 1.0, difference))
@@ -303,7 +303,7 @@ def eq_28_range(reach: Array, amplitude: Array, fingerprint: Array, slope: Array
 def eq_28_range_as_printed(
     amplitude: Array, fingerprint: Array, slope: Array, intercept: Array
 ) -> Array:
-    """Return "the distance to the fingerprint".  False: some 20 m, wherever the two are."""
+    """Return "the distance to the fingerprint".  False: 20 to 23 m times r_j/r_t."""
     return np.exp((np.log(fingerprint) - np.log(amplitude) - intercept) / slope)
 
 
