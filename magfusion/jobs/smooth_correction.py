@@ -81,7 +81,8 @@ def _explains_most(correction: Correction, done: Finished) -> bool:
 def _finding(correction: Correction, site: Site, reasons: tuple[Finding, ...]) -> Finding:
     """Return the reason of a corrected result: with its remedy, and what it explains."""
     known = correction.finding
-    explained = dict.fromkeys(f.code for f in reasons if f.code != known.code)
+    codes = (code for f in reasons for code in (f.code, *f.explained))
+    explained = dict.fromkeys(code for code in codes if code != known.code)
     return replace(
         known,
         text=known.text + CORRECTED,

@@ -184,7 +184,7 @@ def _steady_causes(known: Snapshots, left: Snapshots, name: str) -> Iterator[Exp
             trial(other).chi_square,
             0,
             "coil_reversed",
-            f"of beacon {name} {cause}",
+            cause,
             "Check the wires of its coils, and the sign of phase_deg.",
             trial(other).site,
         )
@@ -314,12 +314,13 @@ def _rewired(beacon: Beacon) -> Iterator[tuple[str, Beacon]]:
     count = len(beacon.coils)
     for i in range(count if count > 1 else 0):
         yield (
-            f"the wires of coil {i} (or the sign of a phase) are reversed, that is",
+            f"coil {i} of beacon {beacon.name} is wired in reverse (or the sign of a phase is)",
             reversed_({i}),
         )
-    yield "the wires of every coil are reversed", reversed_(set(range(count)))
+    every = set(range(count))
+    yield f"every coil of beacon {beacon.name} is wired in reverse", reversed_(every)
     if count > 1:
-        yield "the coils are exchanged", coils_exchanged(beacon)
+        yield f"the coils of beacon {beacon.name} are exchanged", coils_exchanged(beacon)
 
 
 def _turns() -> Iterator[Array]:
