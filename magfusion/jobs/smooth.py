@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from magfusion.estimation.batch.outer_iterations import PassFile
     from magfusion.estimation.rests.stationary_integration import IntegratedRests
     from magfusion.jobs.inputs import Job
+    from magfusion.jobs.smooth_failure import Failure
+    from magfusion.jobs.smooth_result import Finished
     from magfusion.model.samples import Log
     from magfusion.model.site import Site
     from magfusion.model.trust import Finding, Risk
@@ -175,10 +177,9 @@ def run_smooth(
         In the latter case the single-epoch fixes are saved in the output directory.
     """
     from magfusion.estimation.batch.self_survey import smooth_and_place
-    from magfusion.estimation.integrity.correction import corrections
     from magfusion.jobs.inputs import claim, named, refuse_failed
     from magfusion.jobs.smooth_correction import corrected
-    from magfusion.jobs.smooth_failure import failure_of, save_failure
+    from magfusion.jobs.smooth_failure import Failure, save_failure
     from magfusion.jobs.smooth_result import finished, with_errors, write_finished
     from magfusion.results.report import FAILED
 
@@ -199,29 +200,19 @@ def run_smooth(
             result, placed = smooth_and_place(log, site, settings, report, iterations_file)
             log, site, result, findings = _agreed(log, site, settings, result, risk)
     except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
-        reason = reason_of(error)
-        if _has_unknown(site):
-            raise EstimationError(f"{job.log_path}: {reason}") from error
-        failure = failure_of(log, site, settings, reason)
-        possible = corrections(site, (), (), failure.cause)
-        again = corrected(log, site, settings, risk, possible, failure.trust.reasons, report=report)
-        if again is None:
+        outcome = _without_result(job, log, site, settings, risk, error, report)
+        if isinstance(outcome, Failure):
             with claimed as whole:
-                save_failure(whole, failure, log, site)
-            raise EstimationError(
-                f"{job.log_path}: {failure.reason}; the single-epoch fixes are saved in"
-                f" {job.output / FAILED}"
-            ) from error
-        done, placed = again, ()
+                save_failure(whole, outcome, log, site)
+            saved = f"the single-epoch fixes are saved in {job.output / FAILED}"
+            raise EstimationError(f"{job.log_path}: {outcome.reason}; {saved}") from error
+        done, placed = outcome, ()
     else:
         give_back_memory()
         findings += () if rested is None else beyond(recording, log, site)
         done = finished(log, site, settings, result, risk, findings=findings)
-        reasons = done.trust.reasons
-        done = (
-            corrected(log, site, settings, risk, done.corrections, reasons, findings, report)
-            or done
-        )
+        parts = done.corrections, done.trust.reasons, findings, report
+        done = corrected(log, site, settings, risk, *parts) or done
     figures = done.figures | Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     figures |= Figures() if rested is None else rest_figures(rested)
     used = done.result.declared.site
@@ -232,6 +223,32 @@ def run_smooth(
         iterations_file.place.unlink(missing_ok=True)
     refuse_failed(job.log_path, output=job.output, trust=done.trust)
     return done.figures
+
+
+def _without_result(
+    job: Job,
+    log: Log,
+    site: Site,
+    settings: SmootherSettings,
+    risk: Risk | None,
+    error: RuntimeError,
+    report: Report,
+) -> Finished | Failure:
+    """Return the result with a corrected site where there is none with the declared one.
+
+    Otherwise the reason, with the single-epoch fixes.
+    """
+    from magfusion.estimation.integrity.correction import corrections
+    from magfusion.jobs.smooth_correction import corrected
+    from magfusion.jobs.smooth_failure import failure_of
+
+    reason = reason_of(error)
+    if _has_unknown(site):
+        raise EstimationError(f"{job.log_path}: {reason}") from error
+    failure = failure_of(log, site, settings, reason)
+    possible = corrections(site, (), (), failure.cause)
+    reasons = failure.trust.reasons
+    return corrected(log, site, settings, risk, possible, reasons, report=report) or failure
 
 
 def _has_unknown(site: Site) -> bool:
