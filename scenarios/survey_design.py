@@ -78,11 +78,11 @@ def by_differential_range(spacing: float, count: int) -> Locate:
     return lambda room: locate_by_differential_range(room.surveys[spacing], room.amplitude, count)
 
 
-def by_lines(block: float | None) -> Locate:
+def by_lines(block: float | None, spacing: float = PAPER_SPACING) -> Locate:
     """Return algorithm 1 with a line for each block, or one for all."""
 
     def locate(room: SurveyedRoom) -> Array:
-        known = room.surveys[PAPER_SPACING]
+        known = room.surveys[spacing]
         place, beacons = known.position_world, known.beacons_world
         if block is None:
             lines = fit_lines(distances(place, beacons), known.amplitude)

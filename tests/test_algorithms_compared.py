@@ -78,6 +78,21 @@ def test_with_a_smooth_gain_error_plain_likelihood_loses_to_algorithm_3() -> Non
     assert position(kept, ML) > 1.5 * position(kept, A3)
 
 
+def test_the_size_of_the_coils_costs_the_published_algorithms_nothing_and_likelihood_much() -> None:
+    small = Config(worlds=4, targets=100, scenarios=("S0", "P0"))
+    kept = run(small, {"workers": 1}, (*PUBLISHED, ML))
+    for name in PUBLISHED:
+        assert position(kept["P0"], name) < position(kept["S0"], name) + 0.002  # m
+    assert position(kept["P0"], ML) > 10.0 * position(kept["S0"], ML)
+
+
+def test_a_fitted_room_does_not_give_the_printed_attitudes() -> None:
+    kept = run(Config(worlds=10, targets=200, scenarios=("F1",)), {"workers": 1}, PUBLISHED)["F1"]
+    euler = [float(np.mean(means(kept, "euler", name))) for name in PUBLISHED]
+    np.testing.assert_allclose(euler, [3.0, 1.5, 1.4], rtol=0.1)  # deg
+    assert np.all(np.array(euler) < 0.65 * np.array([5.62, 3.91, 2.37]))
+
+
 @pytest.mark.slow
 def test_the_report_tells_where_plain_likelihood_is_worse_and_draws_both_figures(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -184,18 +199,3 @@ def test_plain_likelihood_loses_to_algorithm_3_where_the_model_is_wrong(
 @pytest.mark.parametrize("scenario", ["S0", "S1", "F1", "F2", "P0", "P1", "P2"])
 def test_fix_beats_algorithm_3_without_its_survey(full: Trajectories, scenario: str) -> None:
     assert compared_with_algorithm_3(full[scenario], FIX)[1] == "better"
-
-
-def test_the_size_of_the_coils_costs_published_algorithms_nothing_and_likelihood_much() -> None:
-    small = Config(worlds=4, targets=100, scenarios=("S0", "P0"))
-    kept = run(small, {"workers": 1}, (*PUBLISHED, ML))
-    for name in PUBLISHED:
-        assert position(kept["P0"], name) < position(kept["S0"], name) + 0.002  # m
-    assert position(kept["P0"], ML) > 10.0 * position(kept["S0"], ML)
-
-
-def test_a_fitted_room_does_not_give_the_printed_attitudes() -> None:
-    kept = run(Config(worlds=10, targets=200, scenarios=("F1",)), {"workers": 1}, PUBLISHED)["F1"]
-    euler = [float(np.mean(means(kept, "euler", name))) for name in PUBLISHED]
-    np.testing.assert_allclose(euler, [3.0, 1.5, 1.4], rtol=0.1)  # deg
-    assert np.all(np.array(euler) < 0.65 * np.array([5.62, 3.91, 2.37]))

@@ -306,6 +306,20 @@ def test_004_two_beacons_are_too_few_for_this_algorithm() -> None:
     assert np.linalg.matrix_rank(direction[:2].T @ direction[:2]) == 2  # no inverse of A A^T
 
 
+def test_004_no_error_of_angle_or_current_takes_the_field_out_of_its_plane() -> None:
+    """B(t) = Ic(t) a + Is(t) b has the normal a x b, whatever the coils' angle and currents are."""
+    rng = np.random.default_rng(16)
+    time = np.linspace(0.0, 1.0, 500)
+    offset = np.array([1.2, 2.4, 0.5])
+    along = dipole_field(offset, 65.0 * np.array([[1.0, 0.0, 0.02], [0.1, 0.99, -0.03]]))
+    currents = np.stack([np.cos(157.0 * time), 0.9 * np.sin(158.0 * time + 0.1) ** 3])  # distorted
+    field = currents.T @ along
+    size = np.linalg.svd(field, compute_uv=False)
+    assert size[2] < 1e-12 * size[0]
+    third = field + rng.standard_normal(field.shape) * 1e-3 * np.max(np.abs(field))  # noise does
+    assert np.linalg.svd(third, compute_uv=False)[2] > 1e-4 * size[0]
+
+
 def test_004_the_mean_over_beacons_of_eq_29_costs_its_gain() -> None:
     """Algorithm 3 with Eq 28 put right, and Eq 29 as it is printed, in noise alone."""
     errors = []
@@ -334,17 +348,3 @@ def test_004_the_mean_over_beacons_of_eq_29_costs_its_gain() -> None:
     printed, right = np.mean(errors, axis=0)
     assert printed > 0.08  # m
     assert right == pytest.approx(0.008, rel=0.3)
-
-
-def test_004_no_error_of_angle_or_current_takes_the_field_out_of_its_plane() -> None:
-    """B(t) = Ic(t) a + Is(t) b has the normal a x b, whatever the coils' angle and currents are."""
-    rng = np.random.default_rng(16)
-    time = np.linspace(0.0, 1.0, 500)
-    offset = np.array([1.2, 2.4, 0.5])
-    along = dipole_field(offset, 65.0 * np.array([[1.0, 0.0, 0.02], [0.1, 0.99, -0.03]]))
-    currents = np.stack([np.cos(157.0 * time), 0.9 * np.sin(158.0 * time + 0.1) ** 3])  # distorted
-    field = currents.T @ along
-    size = np.linalg.svd(field, compute_uv=False)
-    assert size[2] < 1e-12 * size[0]
-    third = field + rng.standard_normal(field.shape) * 1e-3 * np.max(np.abs(field))  # noise does
-    assert np.linalg.svd(third, compute_uv=False)[2] > 1e-4 * size[0]

@@ -297,6 +297,36 @@ def test_004_pairs_a_quarter_period_apart_give_one_normal_of_the_other_sign() ->
     np.testing.assert_allclose(p004.eq_11_normal(phasor) / unit[:, None], normal, atol=1e-10)
 
 
+def test_004_pairs_equally_far_apart_give_one_normal_and_any_two_instants_do_not() -> None:
+    direction, offset = offsets()
+    unit = (MU0_OVER_4PI * MOMENTS[0] / np.linalg.norm(offset, axis=1) ** 3) ** 2
+    fields = p004.eq_04_field(offset[:, None], MOMENTS, TURN)
+    for step in (0.3, 0.5 * np.pi, 4.0):  # rad
+        later = p004.eq_04_field(offset[:, None], MOMENTS, TURN + step)
+        pairs = p004.eq_08_normal(fields, later) / unit[:, None, None]
+        expected = -np.sin(step) * p004.eq_05_normal(direction)[:, None] * np.ones((len(TURN), 1))
+        np.testing.assert_allclose(pairs, expected, rtol=0, atol=1e-10)
+
+
+def test_004_eq_8_as_printed_makes_eq_7_return_another_direction() -> None:
+    """In the rotation of Eq 1, off by 90 degrees less asin(sin(phi_cs) / 3)."""
+    direction, offset = offsets()
+    earlier, later = (p004.eq_04_field(offset, MOMENTS, phase) for phase in (0.7, 0.7 + np.pi / 2))
+    printed = p004.eq_08_normal(earlier, later)
+    polar_of_normal = p004.eq_06_polar_of_normal(p004.eq_05_normal(direction))
+    expected = 0.5 * np.pi - np.arcsin(np.sin(polar_of_normal) / 3.0)
+
+    def off(normal: np.ndarray) -> np.ndarray:
+        found = p004.eq_02_direction(*p004.eq_07_angles(p004.eq_06_polar_of_normal(normal), normal))
+        return np.arctan2(
+            np.linalg.norm(np.cross(found, direction), axis=1), np.sum(found * direction, axis=1)
+        )
+
+    np.testing.assert_allclose(off(printed), expected, rtol=0, atol=1e-7)
+    assert np.min(off(printed)) > 70.5 * DEGREE
+    np.testing.assert_allclose(off(-printed), 0.0, rtol=0, atol=1e-7)  # B(t1) x B(t2)
+
+
 def test_004_eq_6_divides_by_z() -> None:
     polar, _, _ = places()
     direction, _ = offsets()
@@ -341,6 +371,17 @@ def test_004_the_angular_term_is_no_constant_and_the_printed_intercept_no_moment
         assert intercept == pytest.approx(printed, abs=2e-3)
 
 
+def test_004_the_directions_of_eq_19_lead_from_the_beacons_to_the_target() -> None:
+    beacons = np.array([[0.0, 0.0, 0.0], [6.2, 0.54, 0.0], [3.2, 4.28, 0.0]])
+    place = np.array([[1.2, 2.4, 0.5], [0.6, 1.8, 0.5]])
+    direction = p004.eq_19_direction(place, beacons)
+    along = beacons + p004.distances(place, beacons)[..., None] * direction
+    np.testing.assert_allclose(along, place[:, None] * np.ones((3, 1)), rtol=0, atol=1e-12)
+    polar = np.arccos(direction[..., 2])
+    azimuth = np.arctan2(direction[..., 1], direction[..., 0])
+    np.testing.assert_allclose(p004.eq_02_direction(polar, azimuth), direction, atol=1e-12)
+
+
 def test_004_eq_20_has_the_printed_elements_and_eq_23_inverts_it() -> None:
     angles = np.random.default_rng(5).uniform(-1.5, 1.5, (50, 3)) * [1.0, 2.0, 2.0]
     (sp, sg, sl), (cp, cg, cl) = np.sin(angles.T), np.cos(angles.T)
@@ -355,6 +396,15 @@ def test_004_eq_20_has_the_printed_elements_and_eq_23_inverts_it() -> None:
     quotients = np.stack([matrix[:, 1, 0] / matrix[:, 0, 0], matrix[:, 2, 1] / matrix[:, 2, 2]], 1)
     wrong = np.abs(np.arctan(quotients) - angles[:, 1:]) > 1.0
     np.testing.assert_array_equal(wrong, np.abs(angles[:, 1:]) > 0.5 * np.pi)
+
+
+def test_004_the_angles_of_eq_23_are_those_of_the_world_in_the_sensors_axes() -> None:
+    yaw, turn = Rotation.from_euler("z", 30.0, degrees=True), Rotation.random(rng=3)
+    found = p004.eq_23_angles(yaw.inv().as_matrix()) / DEGREE  # sensor_from_world, Eq 18
+    np.testing.assert_allclose(found, [0.0, -30.0, 0.0], atol=1e-9)
+    of_sensor = p004.eq_23_angles(turn.as_matrix())
+    inverse = p004.eq_23_angles(turn.inv().as_matrix())
+    assert np.max(np.abs(inverse + of_sensor)) > 0.1  # not the same with the other sign
 
 
 def test_004_eq_21_as_printed_is_no_rotation_where_directions_err() -> None:
@@ -387,9 +437,18 @@ def test_004_rings_make_up_a_conducting_sphere_only_with_lenz_sign() -> None:
     sphere = sphere_polarizability(radius, 1.0, conductivity, omega)
     assert np.sum(p004.eq_24_ring_moment(*ring)).imag == pytest.approx(sphere.imag, rel=1e-6)
     assert np.sum(p004.eq_24_moment_of_closed_rings(*ring)).imag > 0.0
-    # Two turns in the room of one: half the section and twice the length, each; the same copper.
-    two, one = (p004.eq_24_ring_moment(n, 0.1, 1e-3 * n**2, 1.0) for n in (2.0, 1.0))
-    assert two == pytest.approx(one, rel=1e-12)
+
+
+def test_004_closed_rings_count_once_and_turns_in_series_twice() -> None:
+    """The same copper as one ring, in two of half the section: each closed, or both in series."""
+    area, resistance, rate = 0.1, 1e-3, 1.0
+    one = p004.eq_24_ring_moment(1.0, area, resistance, rate)
+    closed = -p004.eq_24_moment_of_closed_rings(2.0, area, 2.0 * resistance, rate)  # R_m of one
+    series = p004.eq_24_ring_moment(2.0, area, 4.0 * resistance, rate)  # R_m of both
+    assert closed == pytest.approx(one, rel=1e-12)
+    assert series == pytest.approx(one, rel=1e-12)
+    once = -p004.eq_24_moment_of_closed_rings(2.0, area, 4.0 * resistance, rate)
+    assert once == pytest.approx(0.5 * one, rel=1e-12)
 
 
 def test_004_the_fingerprint_is_the_mean_square_over_time_of_all_tones() -> None:
@@ -419,6 +478,17 @@ def test_004_ranges_by_fingerprints_are_exact_where_the_line_is_and_as_printed_n
     assert p004.eq_29_misfit_as_printed(place, points, np.abs(ranges - reach)) > 0.01  # m^2
 
 
+def test_004_eq_28_as_printed_is_22_m_times_a_ratio_of_ranges() -> None:
+    beacons = np.array([[0.0, 0.0, 0.0], [6.2, 0.54, 0.0], [3.2, 4.28, 0.0]])
+    slope, intercept = np.full(3, -3.0), np.array([9.353, 9.217, 9.057])  # ln(nT), Table 1
+    reach = p004.distances(np.array([[1.5, 2.0, 0.5], [1.0, 1.5, 0.5]]), beacons)
+    at, known = np.exp(p004.eq_15_log_amplitude(reach, slope, intercept))
+    printed = p004.eq_28_range_as_printed(at, known, slope, intercept)
+    expected = np.exp(-intercept / slope) * reach[1] / reach[0]
+    np.testing.assert_allclose(printed, expected, rtol=1e-12)
+    np.testing.assert_allclose(np.exp(-intercept / slope), [22.6, 21.6, 20.5], rtol=5e-3)
+
+
 def test_004_the_mean_over_fingerprints_meets_one_exactly() -> None:
     place = np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0]]])
     result = p004.eq_27_position(np.array([[0.2, 0.1, 0.4]]), place)
@@ -431,76 +501,3 @@ def test_004_errors_are_means_of_sizes() -> None:
     error = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, -1.0]])
     assert p004.eq_30_mean_position_error(error, np.zeros((2, 3))) == pytest.approx(3.0)
     np.testing.assert_allclose(p004.eq_31_mean_angle_error(error), [7.0 / 3.0, 1.0 / 3.0])
-
-
-def test_004_eq_8_as_printed_makes_eq_7_return_another_direction() -> None:
-    """In the rotation of Eq 1, off by 90 degrees less asin(sin(phi_cs) / 3)."""
-    direction, offset = offsets()
-    earlier, later = (p004.eq_04_field(offset, MOMENTS, phase) for phase in (0.7, 0.7 + np.pi / 2))
-    printed = p004.eq_08_normal(earlier, later)
-    polar_of_normal = p004.eq_06_polar_of_normal(p004.eq_05_normal(direction))
-    expected = 0.5 * np.pi - np.arcsin(np.sin(polar_of_normal) / 3.0)
-
-    def off(normal: np.ndarray) -> np.ndarray:
-        found = p004.eq_02_direction(*p004.eq_07_angles(p004.eq_06_polar_of_normal(normal), normal))
-        return np.arctan2(
-            np.linalg.norm(np.cross(found, direction), axis=1), np.sum(found * direction, axis=1)
-        )
-
-    np.testing.assert_allclose(off(printed), expected, rtol=0, atol=1e-7)
-    assert np.min(off(printed)) > 70.5 * DEGREE
-    np.testing.assert_allclose(off(-printed), 0.0, rtol=0, atol=1e-7)  # B(t1) x B(t2)
-
-
-def test_004_closed_rings_count_once_and_turns_in_series_twice() -> None:
-    """The same copper as one ring, in two of half the section: each closed, or both in series."""
-    area, resistance, rate = 0.1, 1e-3, 1.0
-    one = p004.eq_24_ring_moment(1.0, area, resistance, rate)
-    closed = -p004.eq_24_moment_of_closed_rings(2.0, area, 2.0 * resistance, rate)  # R_m of one
-    series = p004.eq_24_ring_moment(2.0, area, 4.0 * resistance, rate)  # R_m of both
-    assert closed == pytest.approx(one, rel=1e-12)
-    assert series == pytest.approx(one, rel=1e-12)
-    once = -p004.eq_24_moment_of_closed_rings(2.0, area, 4.0 * resistance, rate)
-    assert once == pytest.approx(0.5 * one, rel=1e-12)
-
-
-def test_004_pairs_equally_far_apart_give_one_normal_and_any_two_instants_do_not() -> None:
-    direction, offset = offsets()
-    unit = (MU0_OVER_4PI * MOMENTS[0] / np.linalg.norm(offset, axis=1) ** 3) ** 2
-    fields = p004.eq_04_field(offset[:, None], MOMENTS, TURN)
-    for step in (0.3, 0.5 * np.pi, 4.0):  # rad
-        later = p004.eq_04_field(offset[:, None], MOMENTS, TURN + step)
-        pairs = p004.eq_08_normal(fields, later) / unit[:, None, None]
-        expected = -np.sin(step) * p004.eq_05_normal(direction)[:, None] * np.ones((len(TURN), 1))
-        np.testing.assert_allclose(pairs, expected, rtol=0, atol=1e-10)
-
-
-def test_004_the_angles_of_eq_23_are_those_of_the_world_in_the_sensors_axes() -> None:
-    yaw, turn = Rotation.from_euler("z", 30.0, degrees=True), Rotation.random(rng=3)
-    found = p004.eq_23_angles(yaw.inv().as_matrix()) / DEGREE  # sensor_from_world, Eq 18
-    np.testing.assert_allclose(found, [0.0, -30.0, 0.0], atol=1e-9)
-    of_sensor = p004.eq_23_angles(turn.as_matrix())
-    inverse = p004.eq_23_angles(turn.inv().as_matrix())
-    assert np.max(np.abs(inverse + of_sensor)) > 0.1  # not the same with the other sign
-
-
-def test_004_eq_28_as_printed_is_22_m_times_a_ratio_of_ranges() -> None:
-    beacons = np.array([[0.0, 0.0, 0.0], [6.2, 0.54, 0.0], [3.2, 4.28, 0.0]])
-    slope, intercept = np.full(3, -3.0), np.array([9.353, 9.217, 9.057])  # ln(nT), Table 1
-    reach = p004.distances(np.array([[1.5, 2.0, 0.5], [1.0, 1.5, 0.5]]), beacons)
-    at, known = np.exp(p004.eq_15_log_amplitude(reach, slope, intercept))
-    printed = p004.eq_28_range_as_printed(at, known, slope, intercept)
-    expected = np.exp(-intercept / slope) * reach[1] / reach[0]
-    np.testing.assert_allclose(printed, expected, rtol=1e-12)
-    np.testing.assert_allclose(np.exp(-intercept / slope), [22.6, 21.6, 20.5], rtol=5e-3)
-
-
-def test_004_the_directions_of_eq_19_lead_from_the_beacons_to_the_target() -> None:
-    beacons = np.array([[0.0, 0.0, 0.0], [6.2, 0.54, 0.0], [3.2, 4.28, 0.0]])
-    place = np.array([[1.2, 2.4, 0.5], [0.6, 1.8, 0.5]])
-    direction = p004.eq_19_direction(place, beacons)
-    along = beacons + p004.distances(place, beacons)[..., None] * direction
-    np.testing.assert_allclose(along, place[:, None] * np.ones((3, 1)), rtol=0, atol=1e-12)
-    polar = np.arccos(direction[..., 2])
-    azimuth = np.arctan2(direction[..., 1], direction[..., 0])
-    np.testing.assert_allclose(p004.eq_02_direction(polar, azimuth), direction, atol=1e-12)

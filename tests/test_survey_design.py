@@ -7,10 +7,7 @@ import pytest
 import survey_design
 from survey_design import Config, run
 
-from magfusion.papers.p004_fingerprints.algorithms import locate_by_lines
-from magfusion.papers.p004_fingerprints.rssi import fit_block_lines
 from magfusion.papers.register import paper
-from magfusion.units import Array
 
 Figures = dict[str, dict[str, float]]
 
@@ -50,6 +47,31 @@ def test_smaller_blocks_help_until_they_have_too_few_points(
         assert error["1"] > error["1.5"]
 
 
+def test_algorithm_3_gains_nothing_from_the_third_and_fourth_neighbour() -> None:
+    for seed in (0, 3):
+        rooms = [survey_design.draw_room(survey_design.Config(seed=seed), i) for i in range(6)]
+        error = {
+            n: survey_design.mean_error(rooms, survey_design.by_differential_range(0.5, n))
+            for n in (1, 2, 4)
+        }
+        assert error[2] < 0.9 * error[1]
+        assert error[4] > 0.97 * error[2]
+
+
+def test_with_a_denser_survey_still_smaller_blocks_help() -> None:
+    """The further work of section 3.3; on a grid of 0.5 m, 1 m is no better than 2 m."""
+    rooms = [survey_design.draw_room(Config(), index) for index in range(6)]
+    dense, sparse = (
+        [
+            survey_design.mean_error(rooms, survey_design.by_lines(block, spacing))
+            for block in (1, 2)
+        ]
+        for spacing in (0.25, 0.5)
+    )
+    assert dense[0] < 0.85 * dense[1]
+    assert sparse[0] > 0.85 * sparse[1]
+
+
 def test_the_register_has_the_figures_of_the_scenario(figures: Figures) -> None:
     (by_block, by_n, by_spacing) = (
         paper("004").select(f"claim {number}")[0].entry.figures for number in (15, 21, 23)
@@ -74,31 +96,3 @@ def test_the_scenario_ends_with_one_json_line(
         json.loads(capsys.readouterr().out.splitlines()[-1]).keys()
         == run(Config(rooms=1, targets=5)).keys()
     )
-
-
-def test_with_a_denser_survey_still_smaller_blocks_help() -> None:
-    """The further work of section 3.3; on a grid of 0.5 m, 1 m is no better than 2 m."""
-    rooms = [survey_design.draw_room(survey_design.Config(), index) for index in range(6)]
-
-    def error(spacing: float, block: float) -> float:
-        def locate(room: survey_design.SurveyedRoom) -> Array:
-            known = room.surveys[spacing]
-            place, beacons = known.position_world, known.beacons_world
-            blocks = fit_block_lines(place, beacons, known.amplitude, block)
-            return locate_by_lines(known, room.amplitude, blocks)
-
-        return survey_design.mean_error(rooms, locate)
-
-    assert error(0.25, 1.0) < 0.85 * error(0.25, 2.0)
-    assert error(0.5, 1.0) > 0.85 * error(0.5, 2.0)
-
-
-def test_algorithm_3_gains_nothing_from_the_third_and_fourth_neighbour() -> None:
-    for seed in (0, 3):
-        rooms = [survey_design.draw_room(survey_design.Config(seed=seed), i) for i in range(6)]
-        error = {
-            n: survey_design.mean_error(rooms, survey_design.by_differential_range(0.5, n))
-            for n in (1, 2, 4)
-        }
-        assert error[2] < 0.9 * error[1]
-        assert error[4] > 0.97 * error[2]

@@ -200,13 +200,13 @@ def run_smooth(
             result, placed = smooth_and_place(log, site, settings, report, iterations_file)
             log, site, result, findings = _agreed(log, site, settings, result, risk)
     except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
-        outcome = _without_result(job, log, site, settings, risk, error, report)
-        if isinstance(outcome, Failure):
+        estimate = _without_result(job, log, site, settings, risk, error, report)
+        if isinstance(estimate, Failure):
             with claimed as whole:
-                save_failure(whole, outcome, log, site)
+                save_failure(whole, estimate, log, site)
             saved = f"the single-epoch fixes are saved in {job.output / FAILED}"
-            raise EstimationError(f"{job.log_path}: {outcome.reason}; {saved}") from error
-        done, placed = outcome, ()
+            raise EstimationError(f"{job.log_path}: {estimate.reason}; {saved}") from error
+        done, placed = estimate, ()
     else:
         give_back_memory()
         findings += () if rested is None else beyond(recording, log, site)

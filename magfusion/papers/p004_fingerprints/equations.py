@@ -125,7 +125,7 @@ def eq_08_normal(earlier: Array, later: Array) -> Array:
 
 
 eq_09_normal_as_printed = eq_08_normal
-"""Misprint: as Eq 8."""
+"""Misprint: the factors are interchanged, as in Eq 8."""
 
 eq_11_normal = plane_normal
 """Corrected: the phasors, fitted by least squares, use the samples better than pairs of them."""
@@ -251,8 +251,9 @@ def eq_23_angles(sensor_from_world: Array) -> Array:
 def eq_24_ring_moment(turns: float, area: float, resistance: float, field_rate: Array) -> Array:
     """Return the moment (A m^2) of a ring of an area (m^2) in a field's rate of change (T/s).
 
-    Corrected: against the change (Lenz), and turns in series: each adds to the voltage.  A ring has
-    no inductance; a body is `magfusion.model.physics.disturbance.sphere_polarizability`.
+    Corrected: against the change (Lenz), and turns in series: each adds to the voltage as well.  A
+    ring has no inductance; a body is
+    `magfusion.model.physics.disturbance.sphere_polarizability`.
     """
     return -turns * eq_24_moment_of_closed_rings(turns, area, resistance, field_rate)
 
@@ -260,7 +261,10 @@ def eq_24_ring_moment(turns: float, area: float, resistance: float, field_rate: 
 def eq_24_moment_of_closed_rings(
     turns: float, area: float, resistance: float, field_rate: Array
 ) -> Array:
-    """Return ``N S^2 / R dB/dt``.  Unclear: right for N closed rings of R each, n against it."""
+    """Return ``N S^2 / R dB/dt``.
+
+    Unclear: right for N closed rings of R each and n against the field.
+    """
     return turns * area**2 / resistance * field_rate
 
 
@@ -303,7 +307,10 @@ def eq_28_range(reach: Array, amplitude: Array, fingerprint: Array, slope: Array
 def eq_28_range_as_printed(
     amplitude: Array, fingerprint: Array, slope: Array, intercept: Array
 ) -> Array:
-    """Return "the distance to the fingerprint".  False: 20 to 23 m times r_j/r_t."""
+    """Return "the distance to the fingerprint".
+
+    False: some 22 m times the ratio of the two ranges to the beacon.
+    """
     return np.exp((np.log(fingerprint) - np.log(amplitude) - intercept) / slope)
 
 
