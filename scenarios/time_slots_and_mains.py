@@ -5,7 +5,7 @@ scenario simulates the waveform of a tracker at rest, 0.5 m away, in a room with
 demodulates it in every way that `magfusion.receiver` knows:
 
 1. Subtracting makes hum worse, not better, for slots of 2 to 18 ms: with slots of 5 ms 50 Hz are
-   5.1 dB larger in the worst slot, and the attitude is wrong by 14 degrees instead of 8.
+   6.0 dB larger in the worst slot, and the attitude is wrong by 14 degrees instead of 8.
 2. Slots of 20 ms average the mains out, and are of no use to a head that turns.
 3. A straight line between the silent slots helps where the cycle is short; an ambient state with
    the mains in it removes them wherever the cycle separates them from a drift.

@@ -5,7 +5,7 @@ each pose; nothing else is wrong, and there is no noise.
 
 1. Not corrected, the attitude errs by 2.4 degrees.
 2. Corrected as printed, it errs by 4.8: T is on the side of the transmitter, and Q and T are
-   the inverses of what is needed.
+   taken as the inverse of the coils' rotation; as the rotation itself they leave 2.7.
 3. With T on the left and both the right way round, by a hundredth of a degree, which is what
    ``1 + [w]x`` lacks of a rotation.
 """

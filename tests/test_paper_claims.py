@@ -3,8 +3,10 @@
 import json
 import sys
 
+import attitude_matching
 import numpy as np
 import pytest
+import roll_matching
 import tracker_as_printed
 from scipy.spatial.transform import Rotation
 from tracker_table1 import TABLE
@@ -14,6 +16,7 @@ from magfusion.model.physics.dipole import dipole_field
 from magfusion.model.physics.solenoid import solenoid_field
 from magfusion.papers.p000_tracker.bench import bench_points, helmert, measure
 from magfusion.papers.p001_magnetometer import equations as p001
+from magfusion.papers.p001_magnetometer.matching import match_roll, predict_field, wrap
 from magfusion.papers.p002_beacon import equations as p002
 from magfusion.papers.p004_fingerprints import equations as p004
 from magfusion.papers.p004_fingerprints.fingerprint import (
@@ -23,9 +26,10 @@ from magfusion.papers.p004_fingerprints.fingerprint import (
     nearest,
 )
 from magfusion.papers.p004_fingerprints.rssi import fit_lines, trilaterate
+from magfusion.receiver.ambient import subtraction_gain
 from magfusion.receiver.ellipse import plane_normal
 from magfusion.simulation.worlds import S0, draw_world
-from magfusion.units import DEGREE, NANOTESLA, Array
+from magfusion.units import DEGREE, MU0_OVER_4PI, NANOTESLA, Array
 
 # 000 -------------------------------------------------------------------------------------------
 
@@ -43,16 +47,6 @@ def test_000_one_silent_slot_does_not_determine_nine_entries() -> None:
     one, other = columns(1.0), columns(-1.0)
     assert one[3] == pytest.approx(other[3], abs=1e-12)
     assert np.max(np.abs(one[:3] - other[:3])) > 0.5  # of the hum's amplitude
-
-
-def test_000_ambient_readings_of_axes_are_not_those_of_slots() -> None:
-    """As defined A1 to A3 belong to axes (rows); as Eq 2 to 4 use them, to slots (columns)."""
-    readings = np.array([1.0, -2.0, 0.5])
-    by_axis, by_slot = np.tile(readings[:, None], 3), np.tile(readings, (3, 1))
-    coupling = np.random.default_rng(9).standard_normal((3, 3))
-    measured = coupling + by_axis  # a steady field is the same in all slots
-    np.testing.assert_allclose(measured - by_axis, coupling, rtol=0, atol=1e-15)
-    assert np.max(np.abs(measured - by_slot - coupling)) > 1.0
 
 
 def test_000_the_printed_correction_makes_known_errors_worse() -> None:
@@ -132,22 +126,6 @@ def test_001_eq_14_alone_determines_no_parameter() -> None:
     assert p001.eq_12_y_at_1(NED, *other) != pytest.approx(p001.eq_12_y_at_1(NED, *sensor))
 
 
-def test_001_scale_and_misalignment_are_the_sensors_and_soft_iron_is_one_with_them() -> None:
-    rng = np.random.default_rng(11)
-    instrument, offset = from_paper(BIAS, SCALE, E)
-    assert np.max(np.abs(to_paper(instrument, offset)[2])) > 0.01  # far from any iron
-    soft_iron = np.eye(3) + 0.1 * rng.standard_normal((3, 3))
-    field = 5e-5 * rng.standard_normal((40, 3))  # T
-    measured = (field @ soft_iron.T) @ instrument.T + offset
-    one_sensor = to_paper(instrument @ soft_iron, offset)  # which has no iron about it
-    voltage = np.stack(
-        [v(field, *one_sensor) for v in (p001.eq_01_voltage_x, p001.eq_02_voltage_y)]
-        + [p001.eq_03_voltage_z(field, *one_sensor)],
-        axis=1,
-    )
-    np.testing.assert_allclose(voltage, measured, rtol=0, atol=1e-18)
-
-
 # 002 -------------------------------------------------------------------------------------------
 
 
@@ -186,24 +164,6 @@ def test_002_the_three_places_are_those_of_the_four_without_the_last() -> None:
     assert len(dict(three)) == 2
     meant = dict([three[0], ("P2", three[1][1]), three[2]])
     assert meant == {name: four[name] for name in ("P1", "P2", "P3")}
-
-
-def test_002_an_offset_of_the_centre_is_not_smaller_far_away() -> None:
-    """Ranges to three beacons whose true centres are 3 cm from the assumed ones, by distance."""
-    rng = np.random.default_rng(16)
-    assumed = np.array([[0.0, 0.0, 0.0], [6.2, 0.54, 0.0], [3.2, 4.28, 0.0]])
-    mean = []
-    for scale in (1.0, 4.0, 16.0):  # of the whole room
-        beacons, errors = scale * assumed, []
-        for _ in range(40):
-            place = scale * rng.uniform([0.5, 0.5, 0.5], [5.0, 4.0, 2.0])
-            offset = rng.standard_normal((3, 3))
-            offset *= 0.03 / np.linalg.norm(offset, axis=1, keepdims=True)
-            reach = p004.distances(place, beacons + offset)
-            errors.append(np.linalg.norm(trilaterate(reach[None], beacons, place)[0] - place))
-        mean.append(np.median(errors))
-    assert min(mean) > 0.02  # m
-    assert max(mean) < 1.5 * min(mean)
 
 
 def test_beacons_one_after_the_other_measure_what_all_at_once_do() -> None:
@@ -348,3 +308,187 @@ def test_004_the_mean_over_beacons_of_eq_29_costs_its_gain() -> None:
     printed, right = np.mean(errors, axis=0)
     assert printed > 0.08  # m
     assert right == pytest.approx(0.008, rel=0.3)
+
+
+def test_000_mains_become_stronger_between_1_6_and_18_4_ms() -> None:
+    """Of slots 1 to 3, rms, against the same slots with nothing subtracted."""
+
+    def stronger_db(slot: float) -> Array:
+        gains = np.array([subtraction_gain(50.0, slot, n) for n in (1, 2, 3)])
+        return np.asarray(20.0 * np.log10(gains / np.sinc(50.0 * slot)))
+
+    def rms_db(slot: float) -> float:
+        return float(10.0 * np.log10(np.mean(10.0 ** (0.1 * stronger_db(slot)))))
+
+    assert all(rms_db(1e-3 * slot) > 0.0 for slot in np.arange(1.6, 18.45, 0.1))
+    assert all(rms_db(1e-3 * slot) < 0.0 for slot in (0.5, 1.0, 1.5, 18.5, 19.0, 19.5))
+    assert rms_db(5e-3) == pytest.approx(4.3, abs=0.05)
+    assert np.max(stronger_db(5e-3)) == pytest.approx(6.0, abs=0.05)
+
+
+def test_000_neither_ambient_field_is_as_strong_as_that_of_1_a_m2_at_half_a_metre() -> None:
+    field = np.linalg.norm(dipole_field(np.array([0.5, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])))
+    other = np.array([0.01e-6, 0.15e-6, 30e-6, 70e-6])  # T: mains and the Earth's, as printed
+    result = 20.0 * np.log10(other / field)
+    assert result == pytest.approx([-38.1, -14.5, 31.5, 38.8], abs=0.1)  # dB
+
+
+def test_000_an_ambient_field_goes_into_the_antenna_that_the_bench_measures() -> None:
+    """40 dB below what the probe reads: axes and gains take it in, the offsets do not."""
+    distance, rng = 0.3, np.random.default_rng(6)  # m
+    field = np.moveaxis(dipole_field(bench_points(distance)[:, :, None], np.eye(3)), 2, 0)
+    ambient = rng.standard_normal((500, 1, 1, 1, 3))
+    ambient *= 0.01 * MU0_OVER_4PI / distance**3 / np.linalg.norm(ambient, axis=-1, keepdims=True)
+    seen = measure(field + ambient, distance, on_axis=False)
+    turn_deg = np.linalg.norm(helmert(seen.moments), axis=-1) / DEGREE
+    gain = np.linalg.norm(seen.moments, axis=-1) - 1.0
+    assert np.sqrt(np.mean(turn_deg**2)) == pytest.approx(0.080, abs=0.004)
+    assert np.sqrt(np.mean(gain**2)) == pytest.approx(0.01 / np.sqrt(3.0), rel=0.05)
+    np.testing.assert_allclose(seen.centres, 0.0, rtol=0, atol=1e-12)
+    reversed_too = 0.5 * (field + ambient) - 0.5 * (ambient - field)  # which needs no shield
+    clean = measure(reversed_too, distance, on_axis=False).moments
+    np.testing.assert_allclose(clean, np.tile(np.eye(3), (500, 1, 1)), rtol=0, atol=1e-12)
+
+
+def test_001_a_turn_is_an_ellipse_off_the_centre_and_calibrated_a_circle() -> None:
+    """About z as in figure 2, and about x as in section 1.2."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
+    matrix, offset = from_paper(BIAS, SCALE, E)
+    for axis, pair in (("z", [0, 1]), ("x", [1, 2])):
+        field = Rotation.from_euler(axis, angle[:, None]).apply(NED, inverse=True)
+        measured = np.stack(
+            [v(field, BIAS, SCALE, E) for v in (p001.eq_01_voltage_x, p001.eq_02_voltage_y)]
+            + [p001.eq_03_voltage_z(field, BIAS, SCALE, E)],
+            axis=1,
+        )
+        calibrated = np.linalg.solve(matrix, (measured - offset).T).T
+        for readings, is_circle in ((measured, False), (calibrated, True)):
+            seen = readings[:, pair]
+            centre = np.mean(seen, axis=0)
+            size = np.linalg.svd(seen - centre, compute_uv=False) / np.sqrt(36.0)  # semi-axes
+            assert bool(np.linalg.norm(centre) < 1e-9 * size[0]) is is_circle
+            assert bool(size[0] / size[1] - 1.0 < 1e-9) is is_circle
+            if not is_circle:
+                assert np.linalg.norm(centre) > 0.05 * size[0]
+                assert size[0] > 1.1 * size[1]
+
+
+def test_001_hard_iron_is_in_b_and_soft_iron_in_k_and_e() -> None:
+    rng = np.random.default_rng(11)
+    instrument, offset = from_paper(BIAS, SCALE, E)
+    soft_iron = np.eye(3) + 0.1 * rng.standard_normal((3, 3))
+    hard_iron = 1e-5 * rng.standard_normal(3)  # T
+    field = 5e-5 * rng.standard_normal((40, 3))  # T
+    measured = (field @ soft_iron.T + hard_iron) @ instrument.T + offset
+    one_sensor = to_paper(instrument @ soft_iron, instrument @ hard_iron + offset)
+    voltage = np.stack(
+        [v(field, *one_sensor) for v in (p001.eq_01_voltage_x, p001.eq_02_voltage_y)]
+        + [p001.eq_03_voltage_z(field, *one_sensor)],
+        axis=1,
+    )
+    np.testing.assert_allclose(voltage, measured, rtol=0, atol=1e-18)
+    bare = to_paper(instrument, offset)
+    assert np.max(np.abs(bare[2])) > 0.01  # far from any iron
+    np.testing.assert_allclose(one_sensor[0] - bare[0], instrument @ hard_iron, rtol=0, atol=1e-18)
+
+
+def test_001_the_largest_component_gives_the_scale_with_the_least_noise() -> None:
+    """Eq 11 with the downward field, and with the northward one in its place."""
+    rng = np.random.default_rng(23)
+    assert NED[2] == np.max(np.abs(NED))
+    sigma = []
+    for reference in (NED[2], NED[0]):
+        readings = BIAS[2] + SCALE[2] * reference * np.array([1.0, 1.0, -1.0, -1.0])
+        drawn = readings + 1e-7 * rng.standard_normal((20_000, 4))
+        sigma.append(np.std([p001.eq_11_scale(one, reference) for one in drawn]))
+    assert sigma[1] / sigma[0] == pytest.approx(NED[2] / NED[0], rel=0.03)
+
+
+def test_001_a_coarse_database_interpolated_is_smaller_and_as_good() -> None:
+    """Section 4: 10 degrees interpolated against a degree by the nearest entry."""
+    config = roll_matching.Config(seeds=5)
+    coarse, fine = (
+        roll_matching.once(config, "vertical", step, 3.0, np.random.default_rng(1))
+        for step in (10.0, 1.0)
+    )
+    assert np.std(coarse["interpolated"]) < 1.05 * np.std(fine["nearest"])  # of 36 and 360 entries
+    pairs = attitude_matching.Config(seeds=2)
+    small, large = (attitude_matching.by_step(pairs, step) for step in (10.0, 1.0))
+    assert (small.entries, large.entries) == (432, 28_800)
+    assert small.rms["interpolated"] < 1.05 * large.rms["nearest"]
+
+
+def test_001_each_reading_is_matched_alone() -> None:
+    """No reading changes what is found of another, and the last err as the first."""
+    rng = np.random.default_rng(21)
+    true = roll_matching.on_axis(rng.uniform(-3.0, 3.0, 8000), "vertical")
+    field = roll_matching.measure(true, roll_matching.ideal(), 3.0, rng)
+    known = (true[0, 1], true[0, 2], roll_matching.FIELD_WORLD, 3.0 * roll_matching.MILLIGAUSS)
+
+    def rolls(fields: Array) -> Array:
+        return match_roll(fields, *known).rpy[:, 0, 0]
+
+    order = rng.permutation(len(field))
+    np.testing.assert_array_equal(rolls(field[order]), rolls(field)[order])
+    error = wrap(rolls(field) - true[:, 0])
+    first, last = (np.sqrt(np.mean(part**2)) for part in (error[:2000], error[-2000:]))
+    assert last == pytest.approx(first, rel=0.1)
+
+
+def test_001_a_late_time_stamp_costs_the_turn_in_between() -> None:
+    time = np.arange(1000.0) / 1000.0
+    for late, error_deg in ((0.0, 0.0), (1e-4, 0.72), (1e-3, 7.2)):  # s
+        true, stamped = (
+            roll_matching.on_axis(wrap(2.0 * np.pi * roll_matching.SPIN * t), "vertical")
+            for t in (time, time + late)
+        )
+        field = predict_field(true, roll_matching.FIELD_WORLD)
+        result = match_roll(field, true[0, 1], true[0, 2], roll_matching.FIELD_WORLD, NANOTESLA)
+        off_deg = wrap(result.rpy[:, 0, 0] - stamped[:, 0]) / DEGREE
+        np.testing.assert_allclose(np.abs(off_deg), error_deg, rtol=0, atol=1e-6)
+
+
+def test_002_eq_8_is_the_direction_of_its_two_angles() -> None:
+    direction = np.random.default_rng(17).standard_normal((50, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    polar, azimuth = np.arccos(direction[:, 2]), np.arctan2(direction[:, 1], direction[:, 0])
+    np.testing.assert_allclose(p002.eq_08_direction(polar, azimuth), direction, rtol=0, atol=1e-12)
+
+
+def test_002_a_coil_of_35_cm_at_twice_its_size_costs_14_mm() -> None:
+    direction = np.random.default_rng(13).standard_normal((4000, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    moment = np.array([0.0, 0.0, 1.0])
+    range_error = []
+    for distance in (0.7, 1.2, 2.0):  # m
+        dipole = dipole_field(distance * direction, moment)
+        coil = solenoid_field(distance * direction, moment, 0.075, 0.35)
+        ratio = np.linalg.norm(coil, axis=1) / np.linalg.norm(dipole, axis=1)
+        range_error.append(distance / 3.0 * np.sqrt(np.mean(np.log(ratio) ** 2)))
+    assert range_error == pytest.approx([14.2e-3, 8.3e-3, 5.0e-3], rel=0.05)  # m
+
+
+def test_002_an_offset_of_the_centre_stays_and_noise_outgrows_it() -> None:
+    """Ranges to three beacons whose true centres are 3 cm from the assumed ones, by distance."""
+    rng = np.random.default_rng(16)
+    assumed = np.array([[0.0, 0.0, 0.0], [6.2, 0.54, 0.0], [3.2, 4.28, 0.0]])
+    of_offset, of_noise = [], []
+    for scale in (1.0, 4.0, 16.0):  # of the whole room
+        beacons, errors = scale * assumed, []
+        for _ in range(100):
+            place = scale * rng.uniform([0.5, 0.5, 0.5], [5.0, 4.0, 2.0])
+            offset = rng.standard_normal((3, 3))
+            offset *= 0.03 / np.linalg.norm(offset, axis=1, keepdims=True)
+            exact = p004.distances(place, beacons)
+            # 65 A m^2 in 0.3 nT: the range errs by a third of the field's relative error.
+            relative = 3e-10 * exact**3 / (65.0 * MU0_OVER_4PI)
+            noisy = exact * (1.0 + relative / 3.0 * rng.standard_normal(3))
+            reach = np.stack([p004.distances(place, beacons + offset), noisy])
+            found = [trilaterate(one[None], beacons, place)[0] for one in reach]
+            errors.append(np.linalg.norm(np.array(found) - place, axis=1))
+        offset_m, noise_m = np.median(errors, axis=0)
+        of_offset.append(offset_m)
+        of_noise.append(noise_m)
+    assert of_offset == pytest.approx([0.033] * 3, rel=0.2)  # m; 1.1 times the offset
+    assert of_noise[0] < 0.5 * of_offset[0]
+    assert of_noise[1] > 30.0 * of_offset[1]

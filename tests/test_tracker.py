@@ -20,6 +20,7 @@ from magfusion.papers.p000_tracker.equations import (
     attitude_from_angles,
     bursa_wolf_matrix,
     eq_01_coupling,
+    eq_05_coupling,
     eq_09_whitened,
     eq_10_coupling_as_printed,
     eq_11_attitude,
@@ -288,3 +289,72 @@ def test_a_runaway_is_no_pose() -> None:
     wrong = np.broadcast_to(np.eye(3), (3, 3, 3))
     with pytest.raises(EstimationError, match="does not converge"):
         refine_poses(antenna, coupling, wrong, 3.0 * position[::-1], iterations=2)
+
+
+def test_eq_2_to_5_are_what_is_measured_with_one_vector_in_all_columns() -> None:
+    """Each slot has the field of its coil and the ambient one, in the receiver's axes."""
+    attitude, position, coupling = ideal(50)
+    ambient = 2e-8 * np.array([1.0, -2.0, 0.5])  # T, three axes
+    slots = [coupling[:, :, k] + ambient for k in range(3)]
+    measured = np.stack(slots, axis=2)
+    by_axis, by_slot = np.tile(ambient[:, None], 3), np.tile(ambient, (3, 1))
+    drive = np.eye(3)
+    meant = eq_05_coupling(MU0_OVER_4PI, attitude, position, drive, by_axis)
+    np.testing.assert_allclose(meant, measured, rtol=0, atol=1e-13 * np.max(measured))
+    # As printed: A1 is what the first axis reads, and is in the first slot, on all axes.
+    printed = eq_05_coupling(MU0_OVER_4PI, attitude, position, drive, by_slot)
+    assert np.max(np.abs(printed - measured)) > np.max(np.abs(ambient))
+    for removed, is_right in ((by_axis, True), (by_slot, False), (NONE, False)):
+        found = locate_by_svd(measured - removed).sensor_from_beacon
+        assert bool(rms(between_deg(found, attitude)) < 1e-6) is is_right
+
+
+@pytest.mark.parametrize("cause", ["receiver turned", "transmitter off its centre"])
+def test_no_matrices_of_eq_9_and_10_hold_what_they_are_for(cause: str) -> None:
+    """Of ideal couplings Y Eq 10 makes Y Z + D, Z and D constant, at one distance."""
+    attitude, position, _ = ideal(300)
+    position *= 0.4 / np.linalg.norm(position, axis=1, keepdims=True)  # m
+
+    def coupling(moved: np.ndarray) -> np.ndarray:
+        fields = dipole_field((position - moved)[:, None], np.eye(3)) / MU0_OVER_4PI
+        return attitude @ np.swapaxes(fields, 1, 2)
+
+    plain = coupling(np.zeros(3))
+    turn = Rotation.from_rotvec([0.0, 0.0, 1.0 * DEGREE]).as_matrix()
+    if cause == "receiver turned":
+        measured = turn @ plain
+        np.testing.assert_allclose(turn.T @ measured, plain, rtol=0, atol=1e-12)  # T on the left
+    else:
+        measured = coupling(np.array([3e-3, 0.0, 0.0]))
+
+    def share_left(wanted: np.ndarray) -> float:
+        """Return what the best Z and D leave of the change from ideal couplings."""
+        design = np.concatenate([plain, np.tile(np.eye(3), (len(plain), 1, 1))], axis=2)
+        rows, values = design.reshape(-1, 6), wanted.reshape(-1, 3)
+        best = np.linalg.lstsq(rows, values, rcond=None)[0]
+        return float(np.linalg.norm(rows @ best - values) / np.linalg.norm(wanted - plain))
+
+    rng = np.random.default_rng(5)
+    anything = Correction(*(np.eye(3) + 0.1 * rng.standard_normal((5, 3, 3))))
+    printed = eq_10_coupling_as_printed(1.0, attitude, position, np.eye(3), anything)
+    assert share_left(printed) < 1e-9
+    assert share_left(measured) > 0.9
+
+
+def test_the_printed_correction_helps_in_neither_sense_of_its_rotations() -> None:
+    """The paper does not say how R_x, R_y and R_z are counted: Q and T, or their inverses."""
+    attitude, position, coupling = ideal(20_000)
+    rng = np.random.default_rng(4)
+    turns = [DEGREE * rng.standard_normal((len(position), 3)) for _ in range(2)]
+    sent, seen = (Rotation.from_rotvec(turn).as_matrix() for turn in turns)
+    measured = np.swapaxes(seen, 1, 2) @ coupling @ sent
+    before = rms(between_deg(locate_by_svd(measured).sensor_from_beacon, attitude))
+    after = []
+    for sign in (1.0, -1.0):
+        q, t = (np.linalg.inv(bursa_wolf_matrix(sign * turn)) for turn in turns)
+        known = Correction(q, NONE, t, NONE, NONE)
+        printed = eq_11_attitude_as_printed(measured, position, MU0_OVER_4PI, np.eye(3), known)
+        after.append(rms(between_deg(polar(printed), attitude)))
+    assert before == pytest.approx(2.45, abs=0.1)
+    assert after == pytest.approx([4.84, 2.68], rel=0.05)
+    assert min(after) > before

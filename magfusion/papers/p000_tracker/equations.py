@@ -102,8 +102,7 @@ def eq_10_coupling_as_printed(
 ) -> Array:
     """Return ``Y = [-(K / R^3) H M (X - C) Q + A] T^-1 + B``, which is Eq 9 solved for Y.
 
-    False: T mixes transmitting coils, as Q does already; B and C are lengths, added to voltages;
-    Q and T of Eq 20 are the inverses of what is needed.
+    False: T mixes transmitting coils, as Q does already; B and C are lengths, added to voltages.
     """
     driven = correction.driven(drive)
     received = eq_05_coupling(gain, attitude, position_beacon, driven, correction.ambient)
@@ -241,8 +240,7 @@ def eq_18_point_as_printed(ideal: Array, scale: float, rotation: Array, shift: A
 def eq_20_ideal_point_as_printed(actual: Array, rotation: Array, shift: Array) -> Array:
     """Return the ideal of an actual point (..., 3): the inverse of Eq 19.
 
-    Right as that.  False: that this inverse is Q and the shift C of Eq 9, which turns moments, not
-    coordinates, and has no place for a length.
+    Right as that.  False: that the shift is C of Eq 9, which has no place for a length.
     """
     inverse = np.linalg.inv(bursa_wolf_matrix(rotation))
     return (inverse @ (actual - shift)[..., None])[..., 0]
