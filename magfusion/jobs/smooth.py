@@ -215,8 +215,7 @@ def run_smooth(
         done = corrected(log, site, settings, risk, *parts) or done
     figures = done.figures | Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     figures |= Figures() if rested is None else rest_figures(rested)
-    used = done.result.declared.site
-    done = with_errors(replace(done, figures=figures), log, placed, (used, settings))
+    done = with_errors(replace(done, figures=figures), log, placed, (done.site, settings))
     with claimed as whole:
         write_finished(whole, log, done, rate=rate)
     if iterations_file is not None:

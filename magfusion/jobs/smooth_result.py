@@ -63,6 +63,8 @@ class Finished:
 
     Parameters
     ----------
+    site : Site
+        As declared, or corrected.
     states : StateTrust
         Of each of its states.
     figures : Figures
@@ -74,6 +76,7 @@ class Finished:
         That of a corrected site, which is not large enough.
     """
 
+    site: Site
     result: Smoothed
     trust: Trust
     states: StateTrust
@@ -131,7 +134,7 @@ def finished(
     )
     figures |= smoothed_figures(result) | level_figures(by_state) | open_figures(site)
     further = None if correction is None else continued(correction, score)
-    return Finished(result, trust, by_state, figures, None, possible, further)
+    return Finished(site, result, trust, by_state, figures, None, possible, further)
 
 
 def _with_uncertainty(result: Smoothed, correction: Correction, score: Score | None) -> Smoothed:
