@@ -23,7 +23,8 @@ from harness import Scale, chosen_scale, conclude, scenario_parser
 from scipy.spatial.transform import Rotation
 from scipy.stats import beta
 
-from magfusion.estimation.posterior.separation import linear_separation, protection_levels
+from magfusion.estimation.posterior.protection_levels import protection_levels
+from magfusion.estimation.posterior.separation import linear_separation
 from magfusion.estimation.snapshot.fix_separation import separate_fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.estimation.snapshot.problem import GAIN_SIGMA, epochs_of

@@ -8,14 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
-from magfusion.estimation.posterior.separation import (
-    Separation,
-    linear_separation,
+from magfusion.estimation.posterior.protection_levels import (
     pair_modes,
     protection_levels,
-    radii,
     with_rivals,
 )
+from magfusion.estimation.posterior.separation import Separation, linear_separation, radii
 from magfusion.estimation.snapshot.fix_separation import separate_fixes, separation_trust
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.parameters import initial_calibration

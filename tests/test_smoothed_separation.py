@@ -12,7 +12,7 @@ from magfusion.estimation.graph import considered, factors
 from magfusion.estimation.integrity.smoothed_exclusion import SLACK, separated_smooth
 from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
 from magfusion.estimation.posterior import block_tridiagonal_system, marginals, native_rows
-from magfusion.estimation.posterior.separation import protection_levels
+from magfusion.estimation.posterior.protection_levels import protection_levels
 from magfusion.estimation.solve.chain import Chain, solve_chain
 from magfusion.model.trust import Risk, Verdict
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site

@@ -219,10 +219,10 @@ def changed_keys(before: Site, after: Site) -> dict[str, Any]:
     Returns
     -------
     dict
-        With the values of the second site.
+        With the values of the second site; None for a key that it does not have.
     """
     old, new = (_flat(_content(as_declared(site))) for site in (before, after))
-    return {key: value for key, value in new.items() if old.get(key) != value}
+    return {key: new.get(key) for key in {**old, **new} if old.get(key) != new.get(key)}
 
 
 def _flat(entry: Any, key: str = "") -> dict[str, Any]:

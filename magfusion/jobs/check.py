@@ -61,6 +61,8 @@ def run_check(
     log, site = read_recording(job, report)
     report("checking", 1, 3)
     lockin = None if site is None or not site.beacons else settings.lockin(job)
+    if log.waveforms and settings.correct is not None:
+        raise InputError("--correct takes a site of one magnetometer; omit it")
     if log.waveforms:
         looks = {
             name: quick_check(own, alone, lockin) for name, own, alone in each_recorded(log, site)

@@ -185,14 +185,15 @@ def _refuse_phasors(path: Path, log: Log, settings: NavigateSettings) -> None:
 
 def _results(run: NavigateRun) -> tuple[Figures, Trust, NavigateResults | None]:
     """Return figures and verdict of a run, and its results if it has a state."""
-    from magfusion.estimation.integrity.diagnosis import diagnosed, with_cause
+    from magfusion.estimation.integrity.diagnosis import diagnosed, with_explaining_cause
     from magfusion.jobs.navigate_results import navigated, no_start
 
     log, navigator = run.replay.log, run.navigator
     if not navigator.started:
         trust = no_start(len(run.replay) * PIECE, navigator.why_no_start)
         trust |= Trust(recorded(log, navigator.site, BRIDGED_CODES, beacons=True))
-        trust = with_cause(trust, diagnosed(log, run.site, trust, navigator.settings.lockin))
+        cause = diagnosed(log, run.site, trust, navigator.settings.lockin)
+        trust = with_explaining_cause(trust, cause)
         return heading("navigate", log.name) | trust_figures(trust), trust, None
     figures, results = navigated(log, navigator, run.rows.rows(), run.elapsed)
     return figures, results.trust, results

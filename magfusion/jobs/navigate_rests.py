@@ -260,15 +260,16 @@ def run_rests_stream(
 
 
 def _process_record(navigator: RestNavigator, record: Record) -> None:
+    platform = navigator.site.platform
     if record.imu is not None:
         time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
-        navigator.add_imu(time, gyro, accel)
+        navigator.add_imu(time, *platform.corrected_imu(gyro, accel))
     if record.reference is not None:
         time, field = whole_rows(record.reference.time, record.reference.field)
         navigator.add_reference(time, field)
     if record.magnetometer is not None:
         time, field = whole_rows(record.magnetometer.time, record.magnetometer.field)
-        navigator.add_magnetometer(time, field)
+        navigator.add_magnetometer(platform.on_drive_clock(time), field)
     if record.fields is not None:
         raise InputError("--at-rest integrates samples of the magnetometer; omit fields")
 

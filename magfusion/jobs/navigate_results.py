@@ -11,7 +11,7 @@ from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorde
 from magfusion.estimation.data_checks.signal import Detected
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.initialization.online import NoStart
-from magfusion.estimation.integrity.diagnosis import diagnosed, with_cause
+from magfusion.estimation.integrity.diagnosis import diagnosed, with_explaining_cause
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online_integrity.open_roll import comparable
 from magfusion.files.site import save_site
@@ -155,7 +155,7 @@ def navigated(
     )
     findings = _without_repeated(navigator.summary.trust, detected)
     trust = findings | Trust(detected)
-    trust = with_cause(trust, diagnosed(log, site, trust, settings.lockin))
+    trust = with_explaining_cause(trust, diagnosed(log, site, trust, settings.lockin))
     own = _chosen(rows, trust, CURRENT)
     current, lagged = _part(rows, own, site), None
     assert current is not None

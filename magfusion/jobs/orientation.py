@@ -217,11 +217,11 @@ def _process_record(navigator: OrientationNavigator, record: Any) -> None:
     if record.imu is not None:
         time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
         if len(time):
-            navigator.add_imu(time, gyro, accel)
+            navigator.add_imu(time, *navigator.site.platform.corrected_imu(gyro, accel))
     if record.magnetometer is not None:
         time, field = whole_rows(record.magnetometer.time, record.magnetometer.field)
         if len(time):
-            navigator.add_magnetometer(time, field)
+            navigator.add_magnetometer(navigator.site.platform.on_drive_clock(time), field)
     if record.fields is not None:
         raise InputError("phasors of beacons that are not in the site; describe them there")
 

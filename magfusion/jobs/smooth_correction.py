@@ -51,7 +51,9 @@ def corrected(
     """
     if site.platform.further or any(beacon.unknown is not None for beacon in site.beacons):
         return None
-    waiting, best = list(possible), None
+    # What no key of the site's file describes cannot be corrected.
+    waiting = [one for one in possible if changed_keys(site, one.site)]
+    best = None
     for _ in range(MOST_SOLUTIONS):
         if not waiting:
             break
@@ -64,7 +66,7 @@ def corrected(
         trial = correction._replace(finding=finding)
         used = correction.site, settings, result, risk
         done = finished(log, *used, findings=findings, correction=trial)
-        if done.trust.reasons == (finding,) or _explains_most(correction, done):
+        if len(done.trust.reasons) == 1 or _explains_most(correction, done):
             best = done
             if done.continued is None:
                 break

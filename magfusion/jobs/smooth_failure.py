@@ -12,7 +12,12 @@ from magfusion.errors import UNOBSERVABLE
 from magfusion.estimation.batch.batch import SmootherSettings
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.estimation.demodulation.demodulation import first_fixes, phasors
-from magfusion.estimation.integrity.diagnosis import OF_CATCH_ALL, Diagnosis, diagnosed, with_cause
+from magfusion.estimation.integrity.diagnosis import (
+    OF_CATCH_ALL,
+    Diagnosis,
+    diagnosed,
+    with_explaining_cause,
+)
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.jobs.fix import write_fix_result
 from magfusion.jobs.inputs import found_in
@@ -61,7 +66,7 @@ def failure_of(log: Log, site: Site, settings: SmootherSettings, reason: str) ->
     cause = None
     if code != "geometry":  # of poses that no epoch determines nothing can be tried
         cause = diagnosed(log, site, trust, settings.lockin)
-        trust = with_cause(trust, cause)
+        trust = with_explaining_cause(trust, cause)
     if trust.ordered[0].weight >= OF_CATCH_ALL:
         reason = trust.ordered[0].text.rstrip(".")
     return Failure(reason, trust, cause, fixes, dropped)

@@ -125,7 +125,7 @@ def finished(
     is_named = bool(causes) or any(f.code == "changed" for f in trust.reasons)
     trust = with_cause(trust, None if is_named and not is_clear(cause) else cause)
     if correction is not None:
-        trust |= Trust((correction.finding,))
+        trust |= Trust((_explaining(correction.finding, trust),))
     by_state = states_judged(separated, result, trust.verdict)
     figures = (
         heading("smooth", log.name)
@@ -137,15 +137,20 @@ def finished(
     return Finished(site, result, trust, by_state, figures, None, possible, further)
 
 
+def _explaining(finding: Finding, trust: Trust) -> Finding:
+    """Return the reason of a corrected result, without what is a reason still."""
+    remaining = {reason.code for reason in trust.reasons}
+    explained = tuple(code for code in finding.explained if code not in remaining)
+    return replace(finding, explained=explained)
+
+
 def _with_uncertainty(result: Smoothed, correction: Correction, score: Score | None) -> Smoothed:
     """Return a corrected result whose covariance has the uncertainty of the correction."""
     cov = result.states.pose_cov
     if cov is None:
         return result
-    if correction.spread is not None and len(correction.spread) not in (1, len(cov)):
-        correction = correction._replace(spread=None)
-    cov = cov + spread_of(correction, score)
-    return replace(result, states=replace(result.states, pose_cov=cov))
+    states = replace(result.states, pose_cov=cov + spread_of(correction, score))
+    return replace(result, states=states)
 
 
 def open_signs(result: Smoothed) -> tuple[Finding, ...]:

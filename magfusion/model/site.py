@@ -273,6 +273,17 @@ class Platform:
         """Every magnetometer."""
         return (self.magnetometer, *self.further)
 
+    def corrected_imu(self, gyro_body: Array, accel_body: Array) -> tuple[Array, Array]:
+        """Return inertial samples (n, 3) without the declared errors of the IMU."""
+        if self.imu_intrinsics is None:
+            return gyro_body, accel_body
+        return self.imu_intrinsics.corrected(gyro_body, accel_body)
+
+    def on_drive_clock(self, time: Array) -> Array:
+        """Return stamps of the magnetometer on the clock of the drives (s)."""
+        rate = self.magnetometer.clock_rate
+        return time if rate == 0.0 else time * (1.0 + rate)
+
     def with_magnetometers(self, magnetometers: tuple[Magnetometer, ...]) -> "Platform":
         """Return the platform with other magnetometers."""
         return replace(self, magnetometer=magnetometers[0], further=magnetometers[1:])

@@ -116,20 +116,18 @@ def logged(log: Log, site: Site) -> tuple[Log, Site]:
     log = _at_clock_rate(log, site.platform.magnetometer.clock_rate)
     if not len(log.imu):
         return without_imu(log, site)
-    intrinsics = site.platform.imu_intrinsics
     recorded = log.imu if log.recorded_imu is None else log.recorded_imu
-    if intrinsics is None or not log.inertial:
-        return log if recorded is log.imu else as_recorded(log), site
-    gyro, accel = intrinsics.corrected(recorded.gyro_body, recorded.accel_body)
-    return replace(log, imu=ImuSamples(log.imu.time, gyro, accel), recorded_imu=recorded), site
+    if site.platform.imu_intrinsics is None or not log.inertial:
+        return replace(log, imu=recorded, recorded_imu=None), site
+    samples = site.platform.corrected_imu(recorded.gyro_body, recorded.accel_body)
+    return replace(log, imu=ImuSamples(recorded.time, *samples), recorded_imu=recorded), site
 
 
 def as_recorded(log: Log) -> Log:
     """Return a log with its samples and stamps as recorded."""
     log = _at_clock_rate(log, 0.0)
-    if log.recorded_imu is None:
-        return log
-    return replace(log, imu=log.recorded_imu, recorded_imu=None)
+    recorded = log.imu if log.recorded_imu is None else log.recorded_imu
+    return replace(log, imu=recorded, recorded_imu=None)
 
 
 def _at_clock_rate(log: Log, rate: float) -> Log:

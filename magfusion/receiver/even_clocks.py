@@ -59,7 +59,9 @@ def _clock(stamps: Array, site: Site) -> SamplingClock | None:
 def _at(log: Log, clocks: Mapping[str, SamplingClock]) -> Log:
     """Replace the stamps of some streams by their clocks."""
     if "imu" in clocks:
-        log = replace(log, imu=replace(log.imu, time=clocks["imu"].time))
+        time, recorded = clocks["imu"].time, log.recorded_imu
+        recorded = None if recorded is None else replace(recorded, time=time)
+        log = replace(log, imu=replace(log.imu, time=time), recorded_imu=recorded)
     if "magnetometer" in clocks:
         assert log.waveform is not None
         time, wave = clocks["magnetometer"].time, log.waveform

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.estimation.posterior.separation import Separation, protection_levels
+from magfusion.estimation.posterior.protection_levels import protection_levels
+from magfusion.estimation.posterior.separation import Separation
 from magfusion.model.detection_range import owned_at
 from magfusion.model.field import model_error_cov
 from magfusion.model.noise import (

@@ -5,10 +5,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.integrity.corrected_site import corrected_site
 from magfusion.estimation.integrity.diagnosis import Diagnosis
 from magfusion.estimation.integrity.released_fault import ReleasedFault, ReleaseGain, release_gain
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.suspects import Suspect, corrected_site, suspects
+from magfusion.estimation.integrity.suspects import Suspect, suspects
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding
 from magfusion.units import Array
@@ -59,9 +60,9 @@ def corrections(
         By snapshots of the fields and by the motion.
     """
     result: list[Correction] = []
-    if causes:
+    finding = next((f for f in findings if causes and f.code == causes[0].code), None)
+    if finding is not None:
         best, *rivals = causes
-        finding = next(f for f in findings if f.code == best.code)
         weight = np.exp([0.5 * (rival.gain - best.gain) for rival in rivals])
         spread = np.zeros((len(best.moved), 6, 6))
         for rival, share in zip(rivals, weight / (1.0 + np.sum(weight)), strict=True):
@@ -122,9 +123,15 @@ def continued(correction: Correction, score: Score | None) -> Correction | None:
 
 
 def spread_of(correction: Correction, score: Score | None) -> Array:
-    """Return the covariance of the poses by the uncertainty of a correction."""
+    """Return the covariance of the poses by the uncertainty of a correction, and its remainder."""
     spread = np.zeros((1, 6, 6)) if correction.spread is None else correction.spread
     rest = _remaining(correction, score)
     if rest is None or score is None:
         return spread
-    return np.asarray(spread + score.by_pose @ rest.known_cov @ np.swapaxes(score.by_pose, 1, 2))
+    by_pose = score.by_pose
+    if len(spread) not in (1, len(by_pose)):  # of the states before the correction
+        spread = np.mean(spread, axis=0, keepdims=True)
+    spread = spread + by_pose @ rest.known_cov @ np.swapaxes(by_pose, 1, 2)
+    if rest.chi_square < LITTLE * rest.freedom:
+        return np.asarray(spread)
+    return np.asarray(spread + _outer(by_pose @ rest.step))

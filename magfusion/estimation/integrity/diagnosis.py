@@ -104,10 +104,7 @@ def seen_in_streams(trust: Trust) -> bool:
 
 
 def with_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
-    """Return the findings on a result, the cause first where it is known.
-
-    Reasons that a mistake explains are listed with it, not beside it.
-    """
+    """Return the findings on a result, the cause first where it is known."""
     diverged = any(finding.code == "diverged" for finding in trust.findings)
 
     def placed(finding: Finding) -> Finding:
@@ -119,12 +116,18 @@ def with_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
         return finding
 
     findings = tuple(placed(finding) for finding in trust.findings)
-    if cause is None:
-        return Trust(findings, trust.unverified)
-    if cause.finding.weight < FIRST:  # it states where something is wrong, and explains nothing
-        return Trust((*findings, cause.finding), trust.unverified)
-    kept = tuple(f for f in findings if f.code in SEEN or f.verdict is Verdict.TRUSTWORTHY)
-    codes = (f.code for f in Trust(findings).ordered if f not in kept)
+    return Trust(findings if cause is None else (*findings, cause.finding), trust.unverified)
+
+
+def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
+    """Return the findings on a result that is not solved again with its cause undone.
+
+    Reasons that a mistake explains are listed with it, not beside it.
+    """
+    trust = with_cause(trust, cause)
+    if cause is None or cause.finding.weight < FIRST:  # it states where something is wrong
+        return trust
+    kept = tuple(f for f in trust.findings if f.code in SEEN or f.verdict is Verdict.TRUSTWORTHY)
+    codes = (f.code for f in trust.ordered if f not in kept and f is not cause.finding)
     explained = tuple(dict.fromkeys(code for code in codes if code != cause.finding.code))
-    first = replace(cause.finding, explained=explained)
-    return Trust((*kept, first), trust.unverified)
+    return Trust((*kept, replace(cause.finding, explained=explained)), trust.unverified)

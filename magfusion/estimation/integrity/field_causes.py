@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.integrity.corrected_site import with_magnetometer
 from magfusion.estimation.integrity.explanation import Explanation
 from magfusion.estimation.integrity.field_snapshots import Snapshots
 from magfusion.estimation.solve.bounded import minimise_bounded
@@ -75,7 +76,7 @@ def global_causes(known: Snapshots) -> Iterator[Explanation]:
     tried.append((replace(few, samples=inverted), Way(*left_handed(), known.site)))
     for one, way in sorted(tried, key=lambda pair: pair[0].chi_square)[:KEPT]:
         way = _refined(few, way)
-        whole = replace(known.of(way.site), samples=known.samples)
+        whole = known.of(way.site)
         if one.samples is inverted:
             whole = replace(
                 one,
@@ -224,12 +225,11 @@ def low_pass(site: Site, tones_hz: Array, near_hz: float, size: Array) -> Way:
     share = tones_hz / corner_hz
     phase = -np.arctan(share) - float(size[1]) * tones_hz / near_hz
     response = FrequencyResponse(tones_hz, 1.0 / np.hypot(1.0, share), phase)
-    magnetometer = replace(site.platform.magnetometer, response=response)
     return Way(
         "low_pass",
         f"the magnetometer has a low-pass filter with a corner at {corner_hz:.3g} Hz",
         "Declare platform.magnetometer.response, or record without the filter.",
-        replace(site, platform=replace(site.platform, magnetometer=magnetometer)),
+        with_magnetometer(site, response=response),
         partial(low_pass, site, tones_hz, near_hz),
     )
 

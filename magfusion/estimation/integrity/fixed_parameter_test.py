@@ -1,8 +1,8 @@
 """Fixed-parameter test: which fixed parameter a log contradicts, and which it cannot check.
 
-Significance is not consequence: a parameter fails if estimating it would lower the cost by more
-than chance does, and would move the poses beyond their covariance.  The one that lowers the cost
-most is the cause; after its step, the next is tested.
+Significance is not consequence: a parameter fails if its evidence is large, and if it would move
+the poses beyond their covariance or is of an IMU that is farther off than usual.  The one with the
+most evidence is the cause; after its step, the next is tested.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ MAX_LINEAR_CHI_SQUARE = (
     25.0**2
 )  # beyond, a linear step and its covariance do not locate the solution
 MAX_CAUSES = 4  # reported causes
-LEAST_SHARE = 0.03  # of the first cause's chi square; less may be its nonlinear remainder
+LEAST_SHARE = 0.03  # of the first cause's evidence; less may be its nonlinear remainder
 UNCHECKED = 4.3**2  # chi square below which one of fifty candidates is not detected
 
 

@@ -1,13 +1,16 @@
 """What people get wrong of the inertial sensor and of how the magnetometer is mounted beside it."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from itertools import pairwise, permutations, product
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.integrity.corrected_site import (
+    with_imu,
+    with_intrinsics,
+    with_magnetometer,
+)
 from magfusion.estimation.integrity.explanation import Explanation
 from magfusion.estimation.integrity.motion_comparison import (
     SHARED,
@@ -15,7 +18,6 @@ from magfusion.estimation.integrity.motion_comparison import (
     Surveyed,
     compared,
 )
-from magfusion.estimation.integrity.suspects import with_intrinsics
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
@@ -89,7 +91,7 @@ def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
         after,
         known.freedom,
         3,
-        site=_with_magnetometer(site, position_body=lever),
+        site=with_magnetometer(site, position_body=lever),
     )
     turn, axes = Rotation.identity(), EYE
     for _ in range(4):
@@ -105,7 +107,7 @@ def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
         after,
         known.freedom,
         3,
-        site=_with_magnetometer(
+        site=with_magnetometer(
             site, body_from_sensor=axes.T @ site.platform.magnetometer.body_from_sensor
         ),
     )
@@ -123,16 +125,6 @@ def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
             known.freedom,
             3,
         )
-
-
-def _with_magnetometer(site: Site, **changed: Any) -> Site:
-    magnetometer = replace(site.platform.magnetometer, **changed)
-    return replace(site, platform=replace(site.platform, magnetometer=magnetometer))
-
-
-def _with_imu(site: Site, **changed: float) -> Site:
-    imu = replace(site.platform.imu, **changed)
-    return replace(site, platform=replace(site.platform, imu=imu))
 
 
 def _mounting_remedy(site: Site, axes: Array) -> str:
@@ -278,7 +270,7 @@ def timing_causes(
             offset * freedom / steady.freedom,
             freedom,
             1,
-            site=_with_imu(site, time_offset=site.platform.imu.time_offset - middle),
+            site=with_imu(site, time_offset=site.platform.imu.time_offset - middle),
         )
     if len(told) < 3:
         return

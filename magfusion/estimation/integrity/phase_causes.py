@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from magfusion.estimation.integrity.corrected_site import with_magnetometer
 from magfusion.estimation.integrity.explanation import CLEARLY, LEAST_FALL, Explanation
 from magfusion.estimation.integrity.field_causes import left_handed
 from magfusion.estimation.integrity.field_snapshots import Snapshots
@@ -135,12 +136,9 @@ def _of_clocks(
     beacon, site = "", None
     if np.all(alike):
         code, found = "sample_rate", 2
-        magnetometer = known.site.platform.magnetometer
-        slower = (1.0 + magnetometer.clock_rate) * (1.0 + common) - 1.0
+        slower = (1.0 + known.site.platform.magnetometer.clock_rate) * (1.0 + common) - 1.0
         if not known.site.platform.further:
-            magnetometer = replace(magnetometer, clock_rate=slower)
-            platform = replace(known.site.platform, magnetometer=magnetometer)
-            site = replace(known.site, platform=platform)
+            site = with_magnetometer(known.site, clock_rate=slower)
         cause = f"the magnetometer's stamps run {1e6 * -common:.4g} ppm fast against the drives"
         remedy = "Check the sample rate with which the stamps were made."
     elif len(set(strays)) == 1:

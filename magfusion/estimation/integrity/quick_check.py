@@ -22,7 +22,7 @@ from magfusion.estimation.data_checks.stamps import Timing, timings
 from magfusion.estimation.demodulation.beacon_selection import select_detected
 from magfusion.estimation.demodulation.burial_depth import depths_of
 from magfusion.estimation.demodulation.demodulation import phasors
-from magfusion.estimation.integrity.diagnosis import Diagnosis, diagnosed, with_cause
+from magfusion.estimation.integrity.diagnosis import Diagnosis, diagnosed, with_explaining_cause
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.detection_range import are_many
@@ -127,7 +127,7 @@ def quick_check(log: Log, site: Site | None, lockin: LockinSettings | None = Non
     cause = None
     if trust.reasons and trust.reasons[0].code in SYMPTOMS:
         cause = diagnosed(log, site, trust, lockin)
-        trust = with_cause(trust, cause)
+        trust = with_explaining_cause(trust, cause)
     depths = depths_of(samples, site)
     return Look(trust, *look, detection, result, seen, fixes, depths, cause)
 

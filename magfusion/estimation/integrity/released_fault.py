@@ -1,6 +1,6 @@
 """Estimates of candidate faults from the score: step, evidence, and effect on the poses."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,7 +14,8 @@ COVERED = 4.0  # mean squared Mahalanobis distance that a covariance of six stil
 PRIOR_WIDTH = 3.0  # typical errors, one sigma of what people get wrong: the price of a parameter
 
 
-class ReleasedFault(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class ReleaseGain:
     """A candidate fault with its parameters estimated.
 
     Parameters
@@ -26,10 +27,6 @@ class ReleasedFault(NamedTuple):
         gradient along it.
     chi_square, freedom : float
         Twice the decrease of the cost.
-    moved : ndarray, shape (states, 6)
-        Change of the poses.
-    distance : ndarray, shape (states,)
-        Its square, by the covariance of the poses.
     """
 
     fault: Suspect
@@ -39,8 +36,6 @@ class ReleasedFault(NamedTuple):
     along: Array
     chi_square: float
     freedom: int
-    moved: Array
-    distance: Array
 
     @property
     def cov(self) -> Array:
@@ -50,7 +45,9 @@ class ReleasedFault(NamedTuple):
     @property
     def known_cov(self) -> Array:
         """The same of the directions that the log determines better than typical errors."""
-        return _known_cov(self.direction, self.information)
+        known = self.information > 1.0
+        vector = self.direction[:, known]
+        return np.asarray((vector / self.information[known]) @ vector.T)
 
     @property
     def code(self) -> str:
@@ -61,6 +58,27 @@ class ReleasedFault(NamedTuple):
     def log_p(self) -> float:
         """Logarithm of the probability of this decrease by chance."""
         return float(log_p_chi_square(self.chi_square, self.freedom))
+
+    @property
+    def gain(self) -> float:
+        """Decrease of -2 log likelihood of the log, the parameters having their prior."""
+        return float(np.sum(_evidence(self.along, self.information)))
+
+
+@dataclass(frozen=True, eq=False)
+class ReleasedFault(ReleaseGain):
+    """The same with its effect on the poses.
+
+    Parameters
+    ----------
+    moved : ndarray, shape (states, 6)
+        Change of the poses.
+    distance : ndarray, shape (states,)
+        Its square, by the covariance of the poses.
+    """
+
+    moved: Array
+    distance: Array
 
     @property
     def is_mistake(self) -> bool:
@@ -75,11 +93,6 @@ class ReleasedFault(NamedTuple):
         )
         of_imu = all(isinstance(b.parameter, Inertial) for b in blocks)
         return exceeds and (of_imu or float(np.mean(self.distance)) > COVERED)
-
-    @property
-    def gain(self) -> float:
-        """Decrease of -2 log likelihood of the log, the parameters having their prior."""
-        return float(np.sum(_evidence(self.along, self.information)))
 
 
 def gains(combine: Array, information: Array, gradient: Array) -> Array:
@@ -108,33 +121,6 @@ def _evidence(along: Array, information: Array) -> Array:
     return along**2 / (information + prior) - np.log1p(information / prior)
 
 
-class ReleaseGain(NamedTuple):
-    """Estimate of a candidate fault from a log, as of `ReleasedFault`."""
-
-    step: Array
-    direction: Array
-    information: Array
-    along: Array
-    chi_square: float
-    freedom: int
-
-    @property
-    def log_p(self) -> float:
-        """Logarithm of the probability of this decrease by chance."""
-        return float(log_p_chi_square(self.chi_square, self.freedom))
-
-    @property
-    def known_cov(self) -> Array:
-        """Covariance of the directions that the log determines better than typical errors."""
-        return _known_cov(self.direction, self.information)
-
-
-def _known_cov(direction: Array, information: Array) -> Array:
-    known = information > 1.0
-    vector = direction[:, known]
-    return np.asarray((vector / information[known]) @ vector.T)
-
-
 def release_gain(fault: Suspect, information: Array, gradient: Array) -> ReleaseGain | None:
     """Return the gain of estimating a candidate fault; None without information on it."""
     combine = fault.combine
@@ -145,7 +131,7 @@ def release_gain(fault: Suspect, information: Array, gradient: Array) -> Release
     vector, value = combine @ vector[:, kept], value[kept]
     along = vector.T @ gradient
     gained, freedom = float(np.sum(along**2 / value)), int(np.sum(kept))
-    return ReleaseGain(vector @ (along / value), vector, value, along, gained, freedom)
+    return ReleaseGain(fault, vector @ (along / value), vector, value, along, gained, freedom)
 
 
 def release_fault(
@@ -157,4 +143,4 @@ def release_fault(
         return None
     moved = score.by_pose @ reported.step
     solved = np.linalg.solve(pose_cov, moved[..., None])[..., 0]
-    return ReleasedFault(fault, *reported, moved, np.sum(moved * solved, axis=1))
+    return ReleasedFault(**vars(reported), moved=moved, distance=np.sum(moved * solved, axis=1))

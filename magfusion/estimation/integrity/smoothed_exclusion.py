@@ -14,7 +14,8 @@ from magfusion.estimation.graph.state import states_in
 from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
 from magfusion.estimation.measurements.joint_phasors import JointPhasors, at_nearest
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.posterior.separation import Separation, protection_levels, radii
+from magfusion.estimation.posterior.protection_levels import protection_levels
+from magfusion.estimation.posterior.separation import Separation, radii
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Risk, StateTrust, Trust, Verdict, uniform_trust
 from magfusion.units import Array, BoolArray, IntArray

@@ -5,14 +5,11 @@ sensors: for those the score of `magfusion.estimation.integrity.score` is the on
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.model.ground import conductivity_of
-from magfusion.model.imu_intrinsics import ImuIntrinsics
 from magfusion.model.parameters import (
     BEACON_POSITION,
     BEACON_ROTATION,
@@ -37,13 +34,12 @@ from magfusion.model.parameters import (
     MagnetometerParameter,
     Parameter,
     candidates,
-    initial_calibration,
     placed,
 )
 from magfusion.model.parameters.parameter import AXES, ParameterUnit
 from magfusion.model.perturbation import skew
 from magfusion.model.samples import ImuSamples
-from magfusion.model.site import Beacon, Site
+from magfusion.model.site import Site
 from magfusion.units import DEGREE, Array
 
 
@@ -73,24 +69,6 @@ class Inertial(Parameter):
         """
         raise NotImplementedError
 
-    def corrected(self, site: Site, step: Array) -> Site:
-        """Return a site that declares this error."""
-        raise NotImplementedError
-
-
-def with_intrinsics(
-    site: Site, gyro: Array | None = None, accel: Array | None = None, g: Array | None = None
-) -> Site:
-    """Return a site whose IMU has further errors: factors of both matrices, and g-sensitivity."""
-    known = site.platform.imu_intrinsics or ImuIntrinsics()
-    eye = np.eye(3)
-    changed = ImuIntrinsics(
-        (eye if gyro is None else gyro) @ known.gyro_matrix,
-        (eye if accel is None else accel) @ known.accel_matrix,
-        known.gyro_g_sensitivity + (0.0 if g is None else g),
-    )
-    return replace(site, platform=replace(site.platform, imu_intrinsics=changed))
-
 
 class _GyroScale(Inertial):
     kind, components, display_unit = "gyro_scale", AXES, PERCENT
@@ -100,9 +78,6 @@ class _GyroScale(Inertial):
         return _stacked(
             np.zeros((len(stream.imu), 3, 3)), stream.imu.gyro_body[:, :, None] * np.eye(3)
         )
-
-    def corrected(self, site: Site, step: Array) -> Site:
-        return with_intrinsics(site, gyro=np.diag(1.0 + step))
 
 
 class _AccelScale(Inertial):
@@ -114,9 +89,6 @@ class _AccelScale(Inertial):
             stream.imu.accel_body[:, :, None] * np.eye(3), np.zeros((len(stream.imu), 3, 3))
         )
 
-    def corrected(self, site: Site, step: Array) -> Site:
-        return with_intrinsics(site, accel=np.diag(1.0 + step))
-
 
 class _GyroAlignment(Inertial):
     kind, components, display_unit = "gyro_alignment", AXES, DEGREES
@@ -125,9 +97,6 @@ class _GyroAlignment(Inertial):
     def as_bias(self, stream: Stream) -> Array:
         # Each unit turn across the rate is a column.
         return _stacked(np.zeros((len(stream.imu), 3, 3)), -skew(stream.imu.gyro_body))
-
-    def corrected(self, site: Site, step: Array) -> Site:
-        return with_intrinsics(site, gyro=Rotation.from_rotvec(step).as_matrix())
 
 
 class _GyroGSensitivity(Inertial):
@@ -140,9 +109,6 @@ class _GyroGSensitivity(Inertial):
         force = stream.imu.accel_body[:, None, None, :] * np.eye(3)[:, :, None]
         return _stacked(np.zeros((len(force), 3, 9)), force.reshape(len(force), 3, 9))
 
-    def corrected(self, site: Site, step: Array) -> Site:
-        return with_intrinsics(site, g=step.reshape(3, 3))
-
 
 class _Gravity(Inertial):
     owner, kind, display_unit = "site", "gravity", ParameterUnit("m/s^2", 1.0)
@@ -152,9 +118,6 @@ class _Gravity(Inertial):
         up_body = 0.5 * (stream.world_from_body[1:, 2] + stream.world_from_body[:-1, 2])
         # More gravity than declared is a specific force upwards, as a bias of it would be.
         return _stacked(up_body[:, :, None], np.zeros((len(up_body), 3, 1)))
-
-    def corrected(self, site: Site, step: Array) -> Site:
-        return replace(site, gravity=site.gravity + float(step[0]))
 
 
 def _stacked(accel: Array, gyro: Array) -> Array:
@@ -347,43 +310,6 @@ def survey_scale(site: Site, places: tuple[Block, ...], size: int) -> Array:
     for block in places:
         out[block.columns, 0] = PERCENT.size * beacons[block.owner].position_world / block.sigma
     return out
-
-
-def corrected_site(site: Site, fault: Suspect, step: Array) -> Site:
-    """Return a site with the parameters of a suspect moved.
-
-    Parameters
-    ----------
-    step : ndarray, shape (h,)
-        Of all fixed parameters, in typical errors.
-    """
-    if fault.code in (TILT, STRETCH):
-        value = np.linalg.lstsq(fault.combine, step, rcond=None)[0]
-        change = (
-            Rotation.from_rotvec(DEGREE * np.append(value, 0.0)).as_matrix()
-            if fault.code == TILT
-            else (1.0 + PERCENT.size * float(value[0])) * np.eye(3)
-        )
-        return replace(site, beacons=tuple(_placed(b, change, fault.code) for b in site.beacons))
-    for block in fault.blocks:
-        own = block.sigma * step[block.columns]
-        if isinstance(block.parameter, Inertial):
-            site = block.parameter.corrected(site, own)
-            continue
-        sigma = block.parameter.sigma(site, block.owner)
-        moved = block.parameter.moved(initial_calibration(site, 0.0), block.owner, own)
-        site = block.parameter.refined(moved.site, moved, block.owner, sigma)
-    return site
-
-
-def _placed(beacon: Beacon, change: Array, code: str) -> Beacon:
-    """Return a beacon of a survey that is turned or stretched about the origin."""
-    attitude = beacon.world_from_beacon
-    return replace(
-        beacon,
-        position_world=change @ beacon.position_world,
-        world_from_beacon=change @ attitude if code == TILT else attitude,
-    )
 
 
 def _beacons(site: Site) -> str:

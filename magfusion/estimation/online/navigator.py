@@ -154,11 +154,7 @@ class Navigator:
                 "imu: the site declares a motion prior instead of an IMU; describe platform.imu, or"
                 " drop the inertial samples"
             )
-        intrinsics = self.site.platform.imu_intrinsics
-        if intrinsics is not None:
-            gyro_body, accel_body = intrinsics.corrected(
-                np.atleast_2d(gyro_body), np.atleast_2d(accel_body)
-            )
+        gyro_body, accel_body = self.site.platform.corrected_imu(gyro_body, accel_body)
         self._arrived.add_imu(time, gyro_body, accel_body)
         self._now.reach(self._arrived)
 
@@ -179,8 +175,7 @@ class Navigator:
         InputError
             If a number is not finite, the clock jumped, or the site has no such magnetometer.
         """
-        rate = self.site.platform.magnetometer.clock_rate
-        time = time if rate == 0.0 else np.asarray(time) * (1.0 + rate)
+        time = self.site.platform.on_drive_clock(time)
         samples = sensor_frame_samples(self.site, time, measured_sensor)
         self._arrived.add_magnetometer(time, samples, magnetometer)
         self._stand_still(np.atleast_1d(time), raw=True)
@@ -206,7 +201,8 @@ class Navigator:
         InputError
             If they do not follow the previous ones, a slot is of no coil, or the clock jumped.
         """
-        self._arrived.add_marks(marks)
+        clock = self.site.platform.on_drive_clock
+        self._arrived.add_marks(Marks(clock(marks.begin), clock(marks.end), marks.slot))
         self.advance()
 
     def add_slots(self, time: Array, slot: IntArray) -> None:
@@ -219,7 +215,7 @@ class Navigator:
         InputError
             As `add_marks`.
         """
-        self._arrived.add_slots(time, slot)
+        self._arrived.add_slots(self.site.platform.on_drive_clock(time), slot)
 
     def add_temperature(self, part: str, time: float, degc: float) -> None:
         """Set the temperature of a beacon, or of the ``magnetometer``, for later samples."""

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.posterior.separation import Separation, protection_levels
+from magfusion.estimation.posterior.protection_levels import protection_levels
+from magfusion.estimation.posterior.separation import Separation
 from magfusion.model.trust import Risk
 from magfusion.units import Array
 
@@ -25,7 +26,7 @@ class LevelsQuery(NamedTuple):
     separation : Separation
         Of one epoch.
     slack : float
-        As of `magfusion.estimation.posterior.separation.protection_levels`, as are
+        As of `magfusion.estimation.posterior.protection_levels.protection_levels`, as are
     risk : Risk
     prior : ndarray, shape (1, beacons)
     factor : float

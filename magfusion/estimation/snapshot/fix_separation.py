@@ -7,12 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from magfusion.estimation.posterior.separation import (
-    Separation,
-    linear_separation,
-    protection_levels,
-    with_rivals,
-)
+from magfusion.estimation.posterior.protection_levels import protection_levels, with_rivals
+from magfusion.estimation.posterior.separation import Separation, linear_separation
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.estimation.snapshot.many import by_beacon, parts_detected, some_fixes, whole_fixes

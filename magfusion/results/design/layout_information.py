@@ -10,7 +10,8 @@ from functools import cached_property
 
 import numpy as np
 
-from magfusion.estimation.posterior.separation import Separation, protection_levels
+from magfusion.estimation.posterior.protection_levels import protection_levels
+from magfusion.estimation.posterior.separation import Separation
 from magfusion.model.parameters import (
     BeaconParameter,
     Block,

@@ -1,0 +1,117 @@
+"""Sites in which a mistake is undone."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.integrity.suspects import (
+    ACCEL_SCALE,
+    GRAVITY,
+    GYRO_ALIGNMENT,
+    GYRO_G_SENSITIVITY,
+    GYRO_SCALE,
+    STRETCH,
+    TILT,
+    Suspect,
+)
+from magfusion.model.imu_intrinsics import ImuIntrinsics
+from magfusion.model.parameters import PHASE, Block, Parameter, initial_calibration
+from magfusion.model.site import Beacon, Site
+from magfusion.units import DEGREE, Array
+
+PER_CENT = 0.01
+EYE, NOTHING = np.eye(3), np.zeros((3, 3))
+
+
+def with_intrinsics(
+    site: Site, gyro: Array = EYE, accel: Array = EYE, g_sensitivity: Array = NOTHING
+) -> Site:
+    """Return a site whose IMU has further errors: matrices, and g-sensitivity of the gyro."""
+    known = site.platform.imu_intrinsics or ImuIntrinsics()
+    further = ImuIntrinsics(
+        known.gyro_matrix @ gyro,
+        known.accel_matrix @ accel,
+        known.gyro_g_sensitivity + known.gyro_matrix @ g_sensitivity,
+    )
+    return replace(site, platform=replace(site.platform, imu_intrinsics=further))
+
+
+def with_magnetometer(site: Site, **changed: Any) -> Site:
+    """Return a site with other attributes of its first magnetometer."""
+    magnetometer = replace(site.platform.magnetometer, **changed)
+    return replace(site, platform=replace(site.platform, magnetometer=magnetometer))
+
+
+def with_imu(site: Site, **changed: float) -> Site:
+    """Return a site with other attributes of its IMU's noise and clock."""
+    imu = replace(site.platform.imu, **changed)
+    return replace(site, platform=replace(site.platform, imu=imu))
+
+
+# Those of the inertial sensors, which no estimated parameter describes.
+_OF_IMU: dict[Parameter, Callable[[Site, Array], Site]] = {
+    GYRO_SCALE: lambda site, step: with_intrinsics(site, np.diag(1.0 + step)),
+    ACCEL_SCALE: lambda site, step: with_intrinsics(site, accel=np.diag(1.0 + step)),
+    GYRO_ALIGNMENT: lambda site, step: with_intrinsics(
+        site, Rotation.from_rotvec(step).as_matrix()
+    ),
+    GYRO_G_SENSITIVITY: lambda site, step: with_intrinsics(site, g_sensitivity=step.reshape(3, 3)),
+    GRAVITY: lambda site, step: replace(site, gravity=site.gravity + float(step[0])),
+}
+
+
+def corrected_site(site: Site, fault: Suspect, step: Array) -> Site:
+    """Return a site with the parameters of a candidate fault moved.
+
+    Parameters
+    ----------
+    step : ndarray, shape (h,)
+        Of all fixed parameters, in typical errors.
+    """
+    if fault.code in (TILT, STRETCH):
+        size = np.linalg.lstsq(fault.combine, step, rcond=None)[0]
+        turn = stretch = EYE
+        if fault.code == TILT:
+            turn = Rotation.from_rotvec(DEGREE * np.append(size, 0.0)).as_matrix()
+        else:
+            stretch = (1.0 + PER_CENT * float(size[0])) * EYE
+        beacons = tuple(
+            replace(
+                beacon,
+                position_world=turn @ stretch @ beacon.position_world,
+                world_from_beacon=turn @ beacon.world_from_beacon,
+            )
+            for beacon in site.beacons
+        )
+        return replace(site, beacons=beacons)
+    for block in fault.blocks:
+        site = _moved(site, block, block.sigma * step[block.columns])
+    return site
+
+
+def _moved(site: Site, block: Block, step: Array) -> Site:
+    """Return a site with one block moved; unchanged where no key describes the block."""
+    parameter, owner = block.parameter, block.owner
+    if parameter in _OF_IMU:
+        return _OF_IMU[parameter](site, step)
+    if parameter == PHASE:
+        beacons = tuple(_in_phase(b, step) if b.name == owner else b for b in site.beacons)
+        return replace(site, beacons=beacons)
+    moved = parameter.moved(initial_calibration(site, 0.0), owner, step)
+    return parameter.refined(moved.site, moved, owner, parameter.sigma(site, owner))
+
+
+def _in_phase(beacon: Beacon, step: Array) -> Beacon:
+    """Return a beacon with steps (rad) of the drive phase of each tone."""
+    tones = [
+        beacon.tones.index((coil.frequency_hz or beacon.frequency_hz, coil.slot))
+        for coil in beacon.coils
+    ]
+    coils = (
+        replace(coil, phase=coil.phase + float(step[tone]))
+        for coil, tone in zip(beacon.coils, tones, strict=True)
+    )
+    return replace(beacon, coils=tuple(coils))

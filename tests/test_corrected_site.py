@@ -1,0 +1,82 @@
+"""A corrected site predicts what the moved parameters of the declared one do."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.integrity.corrected_site import corrected_site, with_intrinsics
+from magfusion.estimation.integrity.suspects import (
+    GYRO_ALIGNMENT,
+    GYRO_G_SENSITIVITY,
+    GYRO_SCALE,
+    TILT,
+    held_blocks,
+    suspects,
+)
+from magfusion.files.site import changed_keys
+from magfusion.model.parameters import initial_calibration, placed, predict_channels, retract
+from magfusion.model.site import Location
+from magfusion.simulation.demo_site import demo_site
+
+SITE = demo_site()
+FIXED = held_blocks(SITE, (), steady=True)
+KINDS = ("position", "rotation", "log_moment", "phase", "matrix")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_one_parameter_moves_fields_as_a_step_of_the_calibration_does(kind: str) -> None:
+    rng = np.random.default_rng(3)
+    time, place = np.zeros(4), rng.uniform([1.0, 0.5, 0.0], [3.0, 2.5, 2.0], (4, 3))
+    turn = Rotation.random(4, rng=rng).as_matrix()
+    chosen = [f for f in suspects(SITE, FIXED) if len(f.blocks) == 1 and f.blocks[0].kind == kind]
+    assert chosen
+    for fault in chosen:
+        block = fault.blocks[0]
+        step = np.zeros(FIXED[-1].columns.stop)
+        step[block.columns] = rng.standard_normal(len(block.sigma))
+        moved = retract(
+            initial_calibration(SITE, 0.0),
+            placed([block]),
+            block.sigma * step[block.columns],
+        )
+        by_site = initial_calibration(corrected_site(SITE, fault, step), 0.0)
+        expected = predict_channels(moved, time, turn, place)
+        np.testing.assert_allclose(predict_channels(by_site, time, turn, place), expected)
+
+
+def test_a_tilt_turns_places_and_attitudes_together() -> None:
+    fault = next(one for one in suspects(SITE, FIXED) if one.code == TILT)
+    tilted = corrected_site(SITE, fault, fault.combine @ [2.0, -1.0])
+    turn = Rotation.from_rotvec(np.deg2rad([2.0, -1.0, 0.0])).as_matrix()
+    for before, after in zip(SITE.beacons, tilted.beacons, strict=True):
+        np.testing.assert_allclose(after.position_world, turn @ before.position_world, atol=1e-9)
+        np.testing.assert_allclose(
+            after.world_from_beacon, turn @ before.world_from_beacon, atol=1e-9
+        )
+
+
+def test_errors_of_an_imu_add_to_those_that_are_declared() -> None:
+    """A gyro of two errors, one after the other: both are taken off."""
+    rng = np.random.default_rng(5)
+    rate, force = rng.standard_normal((2, 20, 3))
+    site = with_intrinsics(SITE, g_sensitivity=1e-3 * rng.standard_normal((3, 3)))
+    for kind in (GYRO_SCALE, GYRO_ALIGNMENT, GYRO_G_SENSITIVITY):
+        fault = next(one for one in suspects(SITE, FIXED) if one.blocks[0].parameter == kind)
+        step = np.zeros(FIXED[-1].columns.stop)
+        step[fault.blocks[0].columns] = rng.standard_normal(fault.blocks[0].parameter.size)
+        site = corrected_site(site, fault, step)
+    known = site.platform.imu_intrinsics
+    assert known is not None
+    measured = rate @ known.gyro_matrix.T + force @ known.gyro_g_sensitivity.T
+    np.testing.assert_allclose(site.platform.corrected_imu(measured, force)[0], rate, atol=1e-12)
+
+
+def test_a_key_that_goes_is_told_too() -> None:
+    """A corrected Earth field replaces the location's, of which a file may have but one."""
+    place = Location(50.9, 13.3, 400.0, "2026-11-26")
+    declared = replace(SITE, location=place, earth_field_world=None)
+    changed = changed_keys(declared, replace(SITE, location=None))
+    assert "world.earth_field_t" in changed
+    assert changed["world.location.latitude_deg"] is None
