@@ -13,6 +13,7 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.estimation.data_checks.spectrum import with_disturbing_lines
+from magfusion.estimation.online.corrected import corrected
 from magfusion.files.checkpoint import claim_checkpoint, run_key
 from magfusion.files.row_file import RowFile, claim_rows
 from magfusion.files.site import load_site
@@ -278,6 +279,7 @@ def _advance(run: NavigateRun, settings: NavigateSettings, report: Report) -> No
         running = run.navigator.started
         before = time.perf_counter()
         feed(run.navigator, piece)
+        run.navigator = corrected(run.navigator)
         states = run.navigator.take()
         spent = (time.perf_counter() - before) / max(len(states), 1)
         for propagated in run.navigator.take_propagated():

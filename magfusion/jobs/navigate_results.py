@@ -11,7 +11,11 @@ from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorde
 from magfusion.estimation.data_checks.signal import Detected
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.initialization.online import NoStart
-from magfusion.estimation.integrity.diagnosis import diagnosed, with_explaining_cause
+from magfusion.estimation.integrity.diagnosis import (
+    diagnosed,
+    with_corrected,
+    with_explaining_cause,
+)
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online_integrity.open_roll import comparable
 from magfusion.files.site import save_site
@@ -23,6 +27,7 @@ from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, StateTrust, Trust, Verdict
+from magfusion.model.without_imu import logged
 from magfusion.results.errors import TrajectoryErrors
 from magfusion.results.figures import (
     ErrorColumn,
@@ -147,6 +152,7 @@ def navigated(
         (s)
     """
     site, settings = navigator.site, navigator.settings
+    log, _ = logged(log, site)
     trusted = _part(rows, _chosen(rows, navigator.summary.trust, CURRENT), site)
     poses = None if trusted is None or settings.earth else trusted.states
     released = _motion_compensated(rows, site)
@@ -155,7 +161,10 @@ def navigated(
     )
     findings = _without_repeated(navigator.summary.trust, detected)
     trust = findings | Trust(detected)
-    trust = with_explaining_cause(trust, diagnosed(log, site, trust, settings.lockin))
+    if navigator.corrected:
+        trust = with_corrected(trust, navigator.corrected)
+    else:
+        trust = with_explaining_cause(trust, diagnosed(log, site, trust, settings.lockin))
     own = _chosen(rows, trust, CURRENT)
     current, lagged = _part(rows, own, site), None
     assert current is not None

@@ -6,26 +6,25 @@ gives is the one with which this result was made.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import smooth
-from magfusion.estimation.integrity.correction import Correction
+from magfusion.estimation.integrity.correction import (
+    MOST_SOLUTIONS,
+    Correction,
+    corrected_finding,
+)
 from magfusion.files.site import changed_keys
 from magfusion.jobs.smooth_result import Finished, finished
 from magfusion.model.progress import Report, quiet
-from magfusion.model.trust import Finding, Verdict
+from magfusion.model.trust import Verdict
 
 if TYPE_CHECKING:
     from magfusion.estimation.batch.batch import SmootherSettings
     from magfusion.model.samples import Log
     from magfusion.model.site import Site
-    from magfusion.model.trust import Risk
-
-MOST_SOLUTIONS = 2  # beside the first: a wrong log takes three times as long as a good one
-CORRECTED = " The result is corrected for it."
-CAUSE_FIRST = 1e6  # weight
+    from magfusion.model.trust import Finding, Risk
 
 
 def corrected(
@@ -58,7 +57,7 @@ def corrected(
         if not waiting:
             break
         correction = waiting.pop(0)
-        finding = _finding(correction, site, reasons)
+        finding = corrected_finding(correction, site, reasons)
         try:
             result = smooth(log, correction.site, settings, report)
         except (RuntimeError, InputError):
@@ -78,18 +77,3 @@ def corrected(
 def _explains_most(correction: Correction, done: Finished) -> bool:
     """Return whether a gross mistake is undone, with a small remainder."""
     return correction.clear and done.trust.verdict is not Verdict.FAILED
-
-
-def _finding(correction: Correction, site: Site, reasons: tuple[Finding, ...]) -> Finding:
-    """Return the reason of a corrected result: with its remedy, and what it explains."""
-    known = correction.finding
-    codes = (code for f in reasons for code in (f.code, *f.explained))
-    explained = dict.fromkeys(code for code in codes if code != known.code)
-    return replace(
-        known,
-        text=known.text + CORRECTED,
-        verdict=Verdict.DOUBTFUL,
-        weight=CAUSE_FIRST,
-        remedy=changed_keys(site, correction.site),
-        explained=tuple(explained),
-    )

@@ -32,3 +32,8 @@ class ImuIntrinsics:
         caused = accel @ self.gyro_g_sensitivity.T
         gyro = np.linalg.solve(self.gyro_matrix, (gyro_body - caused).T).T
         return np.asarray(gyro, dtype=np.float64), np.asarray(accel, dtype=np.float64)
+
+    def recorded(self, gyro_body: Array, accel_body: Array) -> tuple[Array, Array]:
+        """Return the measured values of `corrected` ones."""
+        gyro = gyro_body @ self.gyro_matrix.T + accel_body @ self.gyro_g_sensitivity.T
+        return np.asarray(gyro), np.asarray(accel_body @ self.accel_matrix.T)

@@ -18,8 +18,11 @@ from magfusion.estimation.demodulation.several_demodulation import demodulated_s
 from magfusion.estimation.graph.state import POSITION, ROTATION, State
 from magfusion.estimation.initialization.among_many import among_all, score_among_all
 from magfusion.estimation.initialization.handover import last_state
+from magfusion.estimation.integrity.correction import Correction, corrections
+from magfusion.estimation.integrity.diagnosis import diagnosed
 from magfusion.estimation.integrity.judge import judged_with_score
 from magfusion.estimation.integrity.magnetometer_exclusion import agreed
+from magfusion.estimation.integrity.released_fault import ReleasedFault
 from magfusion.estimation.integrity.score import Score
 from magfusion.model.detection_range import are_many
 from magfusion.model.marks import Marks
@@ -33,6 +36,7 @@ from magfusion.receiver.turn import on_clock, turn_of
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array
 
+LEAST_DIAGNOSED = 5.0  # s; of data, about a whole start: in less, every cause is as likely
 START_RATE_HZ = 20.0  # of the cycles of a slotted tracker that a start uses
 
 
@@ -62,6 +66,8 @@ class OnlineStart:
         Increase of the uncertainty of attitude (rad) and position (m), one sigma an axis.
     shared_offsets : mapping of str to ndarray
         Variance of estimated parameters, by name, due to considered ones.
+    corrections : tuple of Correction
+        What may be wrong with the site, the most likely first.
     """
 
     state: State
@@ -76,6 +82,7 @@ class OnlineStart:
     shared_offsets: Mapping[str, Array] = field(default_factory=dict)
     excluded: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
+    corrections: tuple[Correction, ...] = ()
 
     @property
     def ambiguous(self) -> bool:
@@ -94,10 +101,13 @@ class NoStart:
         One or more sentences.
     trust : Trust
         Test results of the smoothed beginning, where these are the reason.
+    corrections : tuple of Correction
+        As of `OnlineStart`.
     """
 
     reason: str = "Record longer."
     trust: Trust = field(default_factory=Trust)
+    corrections: tuple[Correction, ...] = ()
 
 
 def find_online_start(
@@ -139,6 +149,8 @@ def find_online_start(
         epoch_ns=0,
         source="online",
         imu=imu,
+        recorded_imu=_recorded(site, imu),
+        clock_rate=site.platform.magnetometer.clock_rate,
         waveform=None if fields or several else wave.rows(wave.time <= until),
         fields=FieldSamples.joined(whole) if whole else None,
         steady=_joined_steady(steady, whole) if whole and steady else None,
@@ -148,12 +160,44 @@ def find_online_start(
     try:
         result = _smoothed(log, site, settings)
     except (EstimationError, InputError) as error:
-        return NoStart(f"{error}.")
+        return _no_start(f"{error}.", log, site, settings)
     except (RuntimeError, np.linalg.LinAlgError):
-        return NoStart("The measurements do not determine the motion in one direction.")
+        text = "The measurements do not determine the motion in one direction."
+        return _no_start(text, log, site, settings)
+    possible = _possible(log, site, settings, result.trust, result.causes)
     if result.trust.verdict is Verdict.FAILED:
-        return NoStart(result.trust.reasons[0].text, result.trust)
-    return _start_of(result, log, site, settings.lockin)
+        return NoStart(result.trust.reasons[0].text, result.trust, possible)
+    return replace(_start_of(result, log, site, settings.lockin), corrections=possible)
+
+
+def _recorded(site: Site, imu: ImuSamples) -> ImuSamples | None:
+    """Return inertial samples with the errors that the site declares; None if it has none."""
+    intrinsics = site.platform.imu_intrinsics
+    if intrinsics is None:
+        return None
+    return ImuSamples(imu.time, *intrinsics.recorded(imu.gyro_body, imu.accel_body))
+
+
+def _no_start(reason: str, log: Log, site: Site, settings: EstimatorSettings) -> NoStart:
+    """Return why there is no state, and what may be wrong with the site."""
+    failed = Trust((Finding("no_solution", reason, Verdict.FAILED),))
+    return NoStart(reason, corrections=_possible(log, site, settings, failed))
+
+
+def _possible(
+    log: Log,
+    site: Site,
+    settings: EstimatorSettings,
+    trust: Trust,
+    causes: tuple[ReleasedFault, ...] = (),
+) -> tuple[Correction, ...]:
+    """Return what may be wrong with the site, the most likely first."""
+    span = float(np.ptp(log.imu.time)) if len(log.imu) else 0.0
+    if trust.verdict is Verdict.TRUSTWORTHY or span < LEAST_DIAGNOSED or site.platform.further:
+        return ()
+    return tuple(
+        corrections(site, trust.reasons, causes, diagnosed(log, site, trust, settings.lockin))
+    )
 
 
 class _Beginning(NamedTuple):
@@ -167,6 +211,8 @@ class _Beginning(NamedTuple):
         Of the estimator, and with sigmas increased by the tests.
     excluded : tuple of Finding
         Reasons of excluded magnetometers.
+    causes : tuple of ReleasedFault
+        As of `magfusion.estimation.integrity.judge.JudgedResult`.
     """
 
     log: Log
@@ -177,6 +223,7 @@ class _Beginning(NamedTuple):
     trust: Trust
     score: Score | None
     excluded: tuple[Finding, ...]
+    causes: tuple[ReleasedFault, ...]
 
 
 def _smoothed(log: Log, site: Site, settings: EstimatorSettings) -> _Beginning:
@@ -188,11 +235,11 @@ def _smoothed(log: Log, site: Site, settings: EstimatorSettings) -> _Beginning:
     requested = {f.name: getattr(settings, f.name) for f in fields_of(EstimatorSettings)}
     how = SmootherSettings(loss="huber", **requested)
     log, remaining, result, excluded = _agreed(smooth(log, site, how), log, site, how)
-    honest, trust, score, _ = judged_with_score(result, log)
+    honest, trust, score, causes = judged_with_score(result, log)
     state = last_state(result, result.considered)
     if result.calibration.site.undetected or site.platform.further:
         state, score = _among_all(state, score, result, site, settings)
-    return _Beginning(log, remaining, result, honest, state, trust, score, excluded)
+    return _Beginning(log, remaining, result, honest, state, trust, score, excluded, causes)
 
 
 def _start_of(

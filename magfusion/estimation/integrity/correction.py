@@ -1,5 +1,7 @@
 """Corrections: mistakes that explain a log, each with the site in which it is undone."""
 
+from collections.abc import Iterable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +12,15 @@ from magfusion.estimation.integrity.diagnosis import Diagnosis
 from magfusion.estimation.integrity.released_fault import ReleasedFault, ReleaseGain, release_gain
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.suspects import Suspect, suspects
+from magfusion.files.site import changed_keys
 from magfusion.model.site import Site
-from magfusion.model.trust import Finding
+from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
 
 LITTLE = 2.0  # chi square for each parameter, below which a correction is not continued
+MOST_SOLUTIONS = 2  # beside the first: a wrong log takes three times as long as a good one
+CAUSE_FIRST = 1e6  # weight
+CORRECTED = " The result is corrected for it."
 CLEAR = 30.0  # ratio of chi square by which snapshots decide before the score, which is linear
 
 
@@ -74,6 +80,31 @@ def corrections(
         by_snapshots = Correction(diagnosis.finding, diagnosis.site, clear=clear)
         result.insert(0 if clear else len(result), by_snapshots)
     return [one._replace(spread=_with_turned_imu(site, one)) for one in result]
+
+
+def corrected_finding(
+    correction: Correction, declared: Site, reasons: Iterable[Finding]
+) -> Finding:
+    """Return the reason of a corrected result: with its remedy, and what it explains.
+
+    Parameters
+    ----------
+    declared : Site
+        As given by the user.
+    reasons : iterable of Finding
+        Why the result without the correction is not trustworthy.
+    """
+    known = correction.finding
+    codes = (code for f in reasons for code in (f.code, *f.explained))
+    explained = dict.fromkeys(code for code in codes if code != known.code)
+    return replace(
+        known,
+        text=known.text + CORRECTED,
+        verdict=Verdict.DOUBTFUL,
+        weight=CAUSE_FIRST,
+        remedy=changed_keys(declared, correction.site),
+        explained=tuple(explained),
+    )
 
 
 def is_clear(diagnosis: Diagnosis | None) -> bool:

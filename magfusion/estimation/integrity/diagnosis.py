@@ -131,3 +131,9 @@ def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
     codes = (f.code for f in trust.ordered if f not in kept and f is not cause.finding)
     explained = tuple(dict.fromkeys(code for code in codes if code != cause.finding.code))
     return Trust((*kept, replace(cause.finding, explained=explained)), trust.unverified)
+
+
+def with_corrected(trust: Trust, corrected: tuple[Finding, ...]) -> Trust:
+    """Return the findings on a result of a corrected site, without what its states say of it."""
+    codes = {finding.code for finding in corrected}
+    return replace(trust, findings=tuple(f for f in trust.findings if f.remedy or f.code not in codes))

@@ -21,14 +21,21 @@ from magfusion.estimation.demodulation.sensor_frame_samples import (
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.process_noise import calibration_process_noise
 from magfusion.estimation.graph.propagation import Propagated, propagate
-from magfusion.estimation.graph.state import State
+from magfusion.estimation.graph.state import POSITION, ROTATION, State
 from magfusion.estimation.initialization.early import first_try, is_clear, next_try, open_start
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
+from magfusion.estimation.integrity.correction import (
+    Correction,
+    continued,
+    corrected_finding,
+    spread_of,
+)
 from magfusion.estimation.measurements.earth import check_earth
 from magfusion.estimation.online.arrivals import arrivals_of
 from magfusion.estimation.online.ekf import ErrorStateFilter
 from magfusion.estimation.online.epoch_update import EpochUpdate, Estimator
 from magfusion.estimation.online.fixed_lag import SlidingWindow
+from magfusion.estimation.online.input_history import KEPT, InputHistory
 from magfusion.estimation.online.input_queue import Arrivals
 from magfusion.estimation.online.navigator_data import navigator_rules
 from magfusion.estimation.online.navigator_settings import NavigatorSettings as NavigatorSettings
@@ -60,6 +67,8 @@ from magfusion.model.without_imu import on_motion_prior, require_motion_prior
 from magfusion.receiver.drive import DriveReceiver
 from magfusion.units import Array, IntArray
 
+MARGIN = 0.5  # s; of a span that a start uses
+
 
 class Navigator:
     """A running estimate of the platform's motion.
@@ -89,6 +98,11 @@ class Navigator:
     summary: Summary
     why_no_start: NoStart
     rival_chi_square: float | None
+    _corrected: tuple[Finding, ...]
+    _turn: float
+    _shift: float
+    _taken: float
+    _next_correction: float
 
     def __init__(self, site: Site, settings: NavigatorSettings | None = None) -> None:
         check_arguments("Navigator", site=(site, Site))
@@ -130,6 +144,11 @@ class Navigator:
         self._now = StateOfNow(self.settings)
         self.why_no_start = NoStart()
         self.rival_chi_square = None
+        self.declared, self._history = site, InputHistory()
+        self._correction: Correction | None = None
+        self._possible: tuple[Correction, ...] = ()
+        self._corrected, self._turn, self._shift = (), 0.0, 0.0
+        self._taken, self._next_correction = -np.inf, -np.inf
 
     # Input
 
@@ -154,8 +173,9 @@ class Navigator:
                 "imu: the site declares a motion prior instead of an IMU; describe platform.imu, or"
                 " drop the inertial samples"
             )
-        gyro_body, accel_body = self.site.platform.corrected_imu(gyro_body, accel_body)
-        self._arrived.add_imu(time, gyro_body, accel_body)
+        samples = self.site.platform.corrected_imu(gyro_body, accel_body)
+        self._arrived.add_imu(time, *samples)
+        self._history.add(time, "propagate_imu", time, gyro_body, accel_body)
         self._now.reach(self._arrived)
 
     def add_magnetometer(
@@ -175,9 +195,11 @@ class Navigator:
         InputError
             If a number is not finite, the clock jumped, or the site has no such magnetometer.
         """
+        given = time, measured_sensor, magnetometer
         time = self.site.platform.on_drive_clock(time)
         samples = sensor_frame_samples(self.site, time, measured_sensor)
         self._arrived.add_magnetometer(time, samples, magnetometer)
+        self._history.add(time, "add_magnetometer", *given)
         self._stand_still(np.atleast_1d(time), raw=True)
         self.advance()
 
@@ -203,6 +225,7 @@ class Navigator:
         """
         clock = self.site.platform.on_drive_clock
         self._arrived.add_marks(Marks(clock(marks.begin), clock(marks.end), marks.slot))
+        self._history.add(marks.end, "add_marks", marks)
         self.advance()
 
     def add_slots(self, time: Array, slot: IntArray) -> None:
@@ -216,6 +239,7 @@ class Navigator:
             As `add_marks`.
         """
         self._arrived.add_slots(self.site.platform.on_drive_clock(time), slot)
+        self._history.add(time, "add_slots", time, slot)
 
     def add_temperature(self, part: str, time: float, degc: float) -> None:
         """Set the temperature of a beacon, or of the ``magnetometer``, for later samples."""
@@ -229,7 +253,8 @@ class Navigator:
         InputError
             If the clock jumped.
         """
-        samples = sensor_frame_phasors(self.site, samples)
+        given, samples = samples, sensor_frame_phasors(self.site, samples)
+        self._history.add(samples.time, "add_fields", given, steady)
         after = -np.inf if self._estimator is None else self._estimator.state.time
         late = self._arrived.add_fields(samples, steady if self.settings.earth else None, after)
         if late:
@@ -251,6 +276,7 @@ class Navigator:
         after = -np.inf if self._estimator is None else self._estimator.state.time
         if not self._arrived.add_measurement(time, measurement, after):
             self.counts["measurement too late"] += 1
+        self._history.add(time, "add_measurement", time, measurement)
         self.advance()
 
     def _stand_still(self, time: Array, *, raw: bool) -> None:
@@ -281,6 +307,7 @@ class Navigator:
         The pose of a lost state is a guess and must not be used.
         """
         built, self._pending = self._pending, []
+        self._taken = built[-1].time if built else self._taken
         return built
 
     def take_propagated(self) -> list[PropagatedState]:
@@ -345,6 +372,50 @@ class Navigator:
             else TimedJudgement(time, Judgement())
         )
 
+    # Corrections
+
+    @property
+    def corrected(self) -> tuple[Finding, ...]:
+        """Mistakes of the declared site that are undone in this one."""
+        return self._corrected
+
+    @property
+    def remainder(self) -> Correction | None:
+        """Correction by what a corrected parameter still seems to be wrong."""
+        return next(iter(self._possible), None) if self._correction is not None else None
+
+    def take_corrections(self) -> tuple[Correction, ...]:
+        """Return what may be wrong with the site, the most likely first; seldom, as each costs."""
+        possible, self._possible = self._possible, ()
+        if not possible or self._history.newest < self._next_correction:
+            return ()
+        self._next_correction = self._history.newest + KEPT
+        return possible
+
+    def with_correction(self, correction: Correction) -> "Navigator":
+        """Return a navigator of a corrected site that has processed the newest input again.
+
+        It returns no state that this one has returned.
+        """
+        result = Navigator(correction.site, self.settings)
+        reasons = (*self.judgement.reasons, *self.why_no_start.trust.reasons)
+        result.declared, result._correction = self.declared, correction
+        result._corrected = (corrected_finding(correction, self.declared, reasons),)
+        result._discontinuities.counter = self._discontinuities.counter + self.started
+        result._next_start = max(result._next_start, self._history.span - MARGIN)
+        result._next_correction = self._next_correction
+        self._history.replay(result)
+        result._pending = [state for state in result._pending if state.time > self._taken]
+        return result
+
+    def _with_corrected(self, judgement: Judgement) -> Judgement:
+        """Return a judgement with the doubt that a correction leaves."""
+        if not self._corrected:
+            return judgement
+        turn, shift = np.hypot(judgement.turn, self._turn), np.hypot(judgement.shift, self._shift)
+        judgement = judgement.with_findings(*self._corrected)
+        return replace(judgement, turn=float(turn), shift=float(shift))
+
     @property
     def counts(self) -> Counter[str]:
         """Numbers of rejections, losses and recoveries, by reason."""
@@ -408,6 +479,7 @@ class Navigator:
         if until is None:
             return False
         start = arrived.first_state(until, self.settings)
+        self._possible = start.corrections
         longest = 4.0 * self.settings.start_duration
         if self._next_start < self.settings.start_duration and not is_clear(start):
             if isinstance(start, OnlineStart) and start.ambiguous:
@@ -428,9 +500,19 @@ class Navigator:
         self._arrived.start(start, self.settings.delay)
         self.rival_chi_square = start.rival_chi_square
         self._start_at(start.state)
+        if self._correction is not None:
+            self._apply(self._correction, start)
         self.summary.unverified = start.trust.unverified
         self._store(start.state, self._update.begin(start))
         return True
+
+    def _apply(self, correction: Correction, start: OnlineStart) -> None:
+        """Take over the uncertainty of a correction, and its remainder."""
+        spread = spread_of(correction, start.score)[-1]
+        largest = [np.linalg.eigvalsh(spread[part, part])[-1] for part in (ROTATION, POSITION)]
+        self._turn, self._shift = np.sqrt(np.maximum(largest, 0.0)).tolist()
+        remaining = continued(correction, start.score)
+        self._possible = () if remaining is None else (remaining,)
 
     def _start_at(self, state: State) -> None:
         if self.settings.estimator == "ekf":
@@ -496,6 +578,8 @@ class Navigator:
             *imu_remarks(hung_since, before, time, gap_bridged=gap_bridged)
         )
         judgement = judgement.with_findings(*self._arrived.remarks)
+        if (found := self._update.score.correction) is not None:
+            self._possible = (found,)
         state, counts = self._estimator.state, self.counts
         restarts = counts["lost and found again"]
         if self.site.platform.inertial:  # a motion prior may be uncertain, with regular fixes
@@ -509,6 +593,7 @@ class Navigator:
         self._arrived.discard_before(self._estimator.state.time)
 
     def _store(self, state: State, judgement: Judgement) -> None:
+        judgement = self._with_corrected(judgement)
         self._judgement = judgement
         counter = self._discontinuities.counter
         self._pending.append(judged_state(state, judgement, counter))

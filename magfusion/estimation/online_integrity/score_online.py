@@ -13,7 +13,12 @@ import numpy as np
 
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, State, states_of
-from magfusion.estimation.integrity.fixed_parameter_test import LEAST_EVIDENCE, finding_of
+from magfusion.estimation.integrity.correction import Correction, corrections
+from magfusion.estimation.integrity.fixed_parameter_test import (
+    LEAST_EVIDENCE,
+    finding_of,
+    rivals_of,
+)
 from magfusion.estimation.integrity.released_fault import ReleasedFault, release_fault
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.measurements.phasors import FieldPhasors
@@ -50,6 +55,11 @@ class OnlineScore:
         Calibration parameters in the state's tangent.
     steady : bool
         Whether the static field is measured.
+
+    Attributes
+    ----------
+    correction : Correction, optional
+        Of the cause in the last result, if there is one.
     """
 
     _sums: Sums | None
@@ -72,6 +82,7 @@ class OnlineScore:
         self._waiting: list[Epoch] = []
         self._epochs_since_score = 0
         self._detected_at = {}
+        self.correction: Correction | None = None
         self._targets = self._targets_of(() if are_many(site) else [b.name for b in site.beacons])
 
     @property
@@ -206,12 +217,19 @@ class OnlineScore:
             release_fault(pose_cov, score, targets.fault_candidates[k], information, gradient)
             for k in reported.tolist()
         )
-        likely = [one for one in result if one is not None and _is_significant(one)]
-        if not likely:
+        ranked = sorted((one for one in result if one is not None), key=lambda one: -one.gain)
+        while ranked and not _is_significant(ranked[0]):
+            ranked.pop(0)
+        self.correction = None
+        if not ranked:
             return Judgement()
-        cause = max(likely, key=lambda one: one.gain)
+        cause, rivals = ranked[0], rivals_of(ranked)
         turn, shift = np.linalg.norm(cause.moved[0].reshape(2, 3), axis=1)
-        finding = finding_of(targets.site, score, cause)
+        finding = finding_of(targets.site, score, cause, rivals)
+        (correction,) = corrections(self.site, (finding,), (cause, *rivals), None)
+        uncertainty = score.by_pose @ cause.known_cov @ np.swapaxes(score.by_pose, 1, 2)
+        spread = uncertainty if correction.spread is None else correction.spread + uncertainty
+        self.correction = correction._replace(spread=spread)
         return Judgement((finding,), turn=float(turn), shift=float(shift))
 
 
