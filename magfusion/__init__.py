@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from magfusion.errors import InputError as InputError
     from magfusion.estimation.batch.settings import SmootherSettings as SmootherSettings
     from magfusion.estimation.integrity.judge import judge_result as judge_result
+    from magfusion.estimation.online.corrected import corrected as corrected
     from magfusion.estimation.online.navigator import Navigator as Navigator
     from magfusion.estimation.online.navigator_settings import (
         NavigatorSettings as NavigatorSettings,
@@ -78,6 +79,7 @@ _HOMES = {
     "Trust": "model.trust",
     "Verdict": "model.trust",
     "collect_states": "results.trajectory",
+    "corrected": "estimation.online.corrected",
     "dipole_field": "model.physics.dipole",
     "fix_epochs": "estimation.snapshot.likelihood",
     "initial_calibration": "model.parameters",

@@ -33,9 +33,17 @@ from magfusion.results.figures import Figures
 from magfusion.results.provenance import Run, recorded_as
 
 DEBUG = "--debug"
+TERMINATED = (
+    "terminated, and unfinished files are removed; repeat the command, with --resume where it had a"
+    " checkpoint"
+)
 LONGEST_REASON = 200  # characters, of an error that was not foreseen
 _NAMED_BY_LOG = "; default: the log's name and the job's"
 _NOT_WRITTEN = "; default: nothing is written"
+
+
+class _Terminated(BaseException):
+    """SIGTERM ended the process."""
 
 
 class Invocation(NamedTuple):
@@ -49,8 +57,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line.
 
     Exits with 0 and the result; with 2 and one sentence for bad input or usage; with 1 and one
-    sentence for a failed estimator or an internal error; with 130 if interrupted by the user or
-    SIGTERM.  ``--debug``, anywhere, shows the traceback of any of them.
+    sentence for a failed estimator or an internal error; with 130 if interrupted by the user, with
+    143 and one sentence by SIGTERM.  ``--debug``, anywhere, shows the traceback of any of them.
     """
     given = sys.argv[1:] if arguments is None else arguments
     debug, status = DEBUG in given, 0
@@ -69,6 +77,8 @@ def main(arguments: list[str] | None = None) -> None:
                 standalone_mode=False,
                 obj=Invocation(given, is_process=arguments is None),
             )
+    except _Terminated:
+        _fail(143, TERMINATED)
     except KeyboardInterrupt:
         raise SystemExit(130) from None
     except Exception as error:
@@ -105,10 +115,14 @@ def _error_report(error: Exception) -> tuple[int, str]:
 @contextmanager
 def _terminated_as_interrupted() -> Iterator[None]:
     """Let SIGTERM end a command as Ctrl-C does: unfinished files are removed."""
+
+    def end(*_: object) -> NoReturn:
+        raise _Terminated
+
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    former = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    former = signal.signal(signal.SIGTERM, end)
     try:
         yield
     finally:

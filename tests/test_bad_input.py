@@ -226,7 +226,7 @@ def test_debug_shows_where_an_error_came_from(
     assert err.splitlines()[-1].startswith("magfusion: ")
 
 
-def test_sigterm_ends_as_an_interrupt_does(worked: Worked) -> None:
+def test_sigterm_ends_with_143_and_tells_how_to_go_on(worked: Worked) -> None:
     site = str(worked.log / "site.yaml")
     command = [*MAGFUSION, "navigate", "-", "--site", site]
     with subprocess.Popen(
@@ -239,8 +239,10 @@ def test_sigterm_ends_as_an_interrupt_does(worked: Worked) -> None:
         assert run.stdout.readline().startswith(b'{"time": 0.0')  # it is at work
         run.send_signal(signal.SIGTERM)
         _, findings = run.communicate()
-    assert run.returncode == 130
-    assert findings == b""
+    assert run.returncode == 143
+    assert findings.startswith(b"magfusion: terminated")
+    assert b"--resume" in findings
+    assert findings.count(b"\n") == 1
 
 
 def test_a_refused_drift_leaves_nothing(tmp_path: Path, refuse: Refuse) -> None:

@@ -15,7 +15,7 @@ from magfusion.estimation.integrity.suspects import (
     held_blocks,
     suspects,
 )
-from magfusion.files.site import changed_keys
+from magfusion.files.site_changes import changed_keys
 from magfusion.model.parameters import initial_calibration, placed, predict_channels, retract
 from magfusion.model.site import Location
 from magfusion.simulation.demo_site import demo_site

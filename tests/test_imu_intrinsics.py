@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from small_problem import small_log
 
 from magfusion.estimation.online.navigator import Navigator
-from magfusion.files.site import changed_keys, load_site, save_site
+from magfusion.files.site import load_site, save_site
+from magfusion.files.site_changes import changed_keys
 from magfusion.model.imu_intrinsics import ImuIntrinsics
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.site import Site

@@ -1,5 +1,6 @@
 """Recordings say what they were given, read back with rerun's own reader."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from rerun.chunk import Chunk, RrdReader
 from scipy.spatial.transform import Rotation
 
-from magfusion.errors import InputError
+from magfusion.errors import EstimationError, InputError
 from magfusion.model.physics.dipole import dipole_field
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Trust, Verdict
@@ -257,3 +258,15 @@ def test_the_verdict_stands_above_all_with_the_figures(tmp_path: Path) -> None:
     assert f"{N} poses in 39.8 s; 3 sigma {sigma:.2g} mm" in figures
     assert f"errors {ate:.2g} mm" in figures
     assert doubt.text in reason
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a display is always there")
+def test_without_a_display_the_remedy_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    path = tmp_path / "run.rrd"
+    path.touch()
+    with pytest.raises(EstimationError, match="serve it to a browser"):
+        open_viewer(path)

@@ -48,7 +48,7 @@ ROOMS = {
             trajectory_formats
             euroc named_records named_samples site_schema stream_contents
             log site
-            foreign open
+            foreign open site_changes
             table_stream
             long_log
         """,

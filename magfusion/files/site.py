@@ -100,6 +100,11 @@ def load_site(
             f"{path}: platform.magnetometers: this job takes one magnetometer; give a site that has"
             f" but one of {', '.join(str(m.name) for m in entry.platform.every)}."
         )
+    return site_of_entry(entry, path)
+
+
+def site_of_entry(entry: SiteEntry, path: Path) -> Site:
+    """Return the site that a file describes."""
     location, field_world = _location_and_field(entry, path)
     maps, ground = _field_maps(entry, path), entry.world.conductivity_s_m
     sensors = tuple(map(magnetometer_of, entry.platform.every))
@@ -179,7 +184,7 @@ def save_site(site: Site, path: Path | str) -> None:
     path, site = Path(path), as_declared(site)
     maps = {b.name: b.field_map for b in site.every_beacon if b.field_map is not None}
     others = path.with_name(f"{path.stem}_field_map.parquet")
-    content = _content(site)
+    content = site_content(site)
     if maps:
         content["world"]["field_map"] = others.name
         write_field_maps(maps, others)
@@ -190,8 +195,9 @@ def save_site(site: Site, path: Path | str) -> None:
     write_yaml(content, path)
 
 
-def _content(site: Site) -> dict[str, Any]:
+def site_content(site: Site) -> dict[str, Any]:
     """Return what a site's file holds, without the names of other files."""
+    site = as_declared(site)
     content = {
         "magfusion_site": 1,
         "world": _world_entry(site),
@@ -211,31 +217,6 @@ def _content(site: Site) -> dict[str, Any]:
     if site.calibration is not None:
         content["calibration"] = plain(site.calibration)
     return content
-
-
-def changed_keys(before: Site, after: Site) -> dict[str, Any]:
-    """Return the keys of a site's file whose values differ, as ``beacons[0].position_m``.
-
-    Returns
-    -------
-    dict
-        With the values of the second site; None for a key that it does not have.
-    """
-    old, new = (_flat(_content(as_declared(site))) for site in (before, after))
-    return {key: new.get(key) for key in {**old, **new} if old.get(key) != new.get(key)}
-
-
-def _flat(entry: Any, key: str = "") -> dict[str, Any]:
-    """Return the values of nested mappings, and of lists of mappings, by their key."""
-    if isinstance(entry, dict):
-        parts = {f"{key}.{name}" if key else name: value for name, value in entry.items()}
-    elif isinstance(entry, list) and entry and isinstance(entry[0], dict):
-        parts = {f"{key}[{i}]": value for i, value in enumerate(entry)}
-    else:
-        return {key: entry}
-    return {
-        name: value for part, inner in parts.items() for name, value in _flat(inner, part).items()
-    }
 
 
 def _field_maps(entry: SiteEntry, path: Path) -> dict[str, FieldMap]:

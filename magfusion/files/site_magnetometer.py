@@ -38,6 +38,7 @@ from magfusion.files.site_values import (
     array,
     between,
     not_singular,
+    plain_name,
     refusal_at,
     sigma_array,
     tesla,
@@ -92,7 +93,7 @@ class MagnetometerEntry(StrictModel):
     axis_responses: AxisResponsesEntry | None = None
     casing: CasingEntry | None = None
     axes: Annotated[list[Literal["x", "y", "z"]], Field(min_length=1, max_length=3)] | None = None
-    name: Annotated[str, Field(min_length=1)] | None = None
+    name: Annotated[str, Field(min_length=1), AfterValidator(plain_name)] | None = None
     clock_offset_s: Annotated[float, between(-1e3, 1e3)] = Magnetometer.clock_offset
     clock_rate_ppm: Annotated[float, between(-1e4, 1e4)] = Magnetometer.clock_rate
     sigma: MagnetometerSigmaEntry = Field(default_factory=MagnetometerSigmaEntry)

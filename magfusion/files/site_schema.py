@@ -51,6 +51,7 @@ from magfusion.files.site_values import (
     coil_sigma,
     first_version,
     iso_date,
+    plain_name,
     refusal,
     refusal_at,
     tesla,
@@ -264,7 +265,7 @@ def _direct_current_only_in_slots(value: float, info: ValidationInfo) -> float:
 class BeaconEntry(StrictModel):
     """One beacon with its coils."""
 
-    name: Annotated[str, Field(min_length=1)]
+    name: Annotated[str, Field(min_length=1), AfterValidator(plain_name)]
     position_m: Annotated[Array | None, array(3, largest=LARGEST_DISTANCE, unit="m")] = None
     rpy_deg: Annotated[Array | None, array(3, largest=LARGEST_ANGLE, unit="degrees")] = None
     unknown: Literal["pose", "position", "attitude"] | None = None

@@ -22,6 +22,7 @@ LOWEST_FREQUENCY, HIGHEST_FREQUENCY = 1e-2, 1e6  # Hz
 LARGEST_MOMENT, SMALLEST_MOMENT = 1e9, 1e-9  # A m^2
 LARGEST_CONDUCTIVITY, SMALLEST_CONDUCTIVITY = 1e3, 1e-9  # S/m; the sea has 5, dry rock 1e-6
 LARGEST_LOG_MOMENT = 10.0  # a factor of 22,000
+FORMULA = ("=", "+", "-", "@")  # how a spreadsheet's formula begins
 LEAST_SIGMA = 1e-15  # in any unit; what is known better is known, which is zero
 SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e3  # of a magnetometer matrix
 LARGEST_CONDITION = 1e6  # of a magnetometer matrix that can be undone to any use
@@ -136,6 +137,15 @@ def tesla(largest: float, unit: str = "T") -> AfterValidator:
         return value
 
     return AfterValidator(check)
+
+
+def plain_name(value: str) -> str:
+    """Refuse a name that a terminal or a spreadsheet takes for a command."""
+    if not value.isprintable():
+        raise refusal("write it with printable characters")
+    if value[:1] in FORMULA:
+        raise refusal("begin it with a letter or a digit; a spreadsheet takes it for a formula")
+    return value
 
 
 def at_least_one(what: str) -> AfterValidator:

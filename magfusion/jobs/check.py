@@ -86,7 +86,8 @@ def run_check(
 
 def _corrected(place: Path, look: Look, site: Site | None) -> Figures:
     """Write the site with the most likely mistake undone, where one explains the log."""
-    from magfusion.files.site import changed_keys, save_site
+    from magfusion.files.site import save_site
+    from magfusion.files.site_changes import changed_keys
 
     if site is None or look.cause is None or look.cause.site is None:
         return Figures(Figure("corrected", "nothing: no mistake of the site explains the log"))

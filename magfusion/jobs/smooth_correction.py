@@ -15,7 +15,7 @@ from magfusion.estimation.integrity.correction import (
     Correction,
     corrected_finding,
 )
-from magfusion.files.site import changed_keys
+from magfusion.files.site_changes import changed_keys
 from magfusion.jobs.smooth_result import Finished, finished
 from magfusion.model.progress import Report, quiet
 from magfusion.model.trust import Verdict

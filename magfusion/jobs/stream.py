@@ -12,6 +12,7 @@ from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.graph.state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
 from magfusion.estimation.initialization.online import NoStart
 from magfusion.estimation.measurements.signs import along_axis
+from magfusion.estimation.online.corrected import corrected
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online.state_of_now import PropagatedState
 from magfusion.estimation.online_integrity.judgement import JudgedState
@@ -117,7 +118,7 @@ def _navigate(
     output, angles = _StateWriter(navigator, sink, others), AwaitedAngles(site)
     for numbered in read_records(source, settings.form):
         try:
-            newest = _process_record(navigator, site, numbered, missing, output)
+            newest = _process_record(output.navigator, site, numbered, missing, output)
         except InputError as error:
             sentence = f"standard input, {_PLACE[settings.form]} {numbered.number}: {error}"
             if not settings.keep_going:
@@ -126,6 +127,7 @@ def _navigate(
             messages.write(f"magfusion: {sentence} (skipped)\n")
             continue
         angles.see(numbered.record)
+        navigator = output.navigator = corrected(output.navigator)
         output.epochs()
         if not navigator.started and -np.inf < newest >= reached + WAITING:
             output.write(None, _waiting(navigator, newest))
@@ -153,12 +155,13 @@ class _StateWriter:
 
     Attributes
     ----------
+    navigator : Navigator
     reference : bool
         Whether samples of a reference sensor have arrived, which are not used here.
     """
 
     def __init__(self, navigator: Navigator, sink: BinaryIO, others: tuple[StateSink, ...]) -> None:
-        self._navigator, self._sink, self._others = navigator, sink, others
+        self.navigator, self._sink, self._others = navigator, sink, others
         self._newest = -np.inf
         self.reference = False
 
@@ -170,17 +173,17 @@ class _StateWriter:
 
     def now(self) -> None:
         """Write the current states, before any other processing."""
-        for state in self._navigator.take_propagated():
-            self.write(state, state_content(self._navigator, state))
+        for state in self.navigator.take_propagated():
+            self.write(state, state_content(self.navigator, state))
             self._newest = state.time
         self._sink.flush()
 
     def epochs(self) -> None:
         """Write the states of the epochs, except those older than a written current one."""
-        for state in self._navigator.take():
+        for state in self.navigator.take():
             if state.time > self._newest:
-                self.write(state, state_content(self._navigator, state))
-        self._navigator.take_lagged()
+                self.write(state, state_content(self.navigator, state))
+        self.navigator.take_lagged()
 
 
 def _process_record(

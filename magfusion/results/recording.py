@@ -1,5 +1,6 @@
 """Recordings for the rerun viewer: the scene in three dimensions with the error plots."""
 
+import os
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -11,7 +12,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from scipy.spatial.transform import Rotation
 
-from magfusion.errors import InputError
+from magfusion.errors import EstimationError, InputError
 from magfusion.files.atomic import real
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -153,9 +154,16 @@ def open_viewer(path: Path) -> None:
     ------
     InputError
         Where there is no such file.
+    EstimationError
+        Where there is no display.
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; give the path of a recording (.rrd).")
+    if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
+        raise EstimationError(
+            f"{path}: there is no display to show it on; copy it to a computer with one and run"
+            " magfusion view there, or serve it to a browser: rerun --serve-web run.rrd"
+        )
     subprocess.Popen([sys.executable, "-m", "rerun", str(path)], start_new_session=True)
 
 

@@ -120,6 +120,8 @@ def find_online_start(
     settings: EstimatorSettings,
     marks: Marks | None = None,
     waveforms: Mapping[str, Waveform] | None = None,
+    *,
+    diagnose: bool = True,
 ) -> OnlineStart | NoStart:
     """Return the state at the last epoch before a time; or the reason why there is none.
 
@@ -135,6 +137,8 @@ def find_online_start(
         Times at which each coil was driven, where the site's slots are marked.
     waveforms : mapping, optional
         The samples of several magnetometers until then, each on its own clock.
+    diagnose : bool
+        Whether to look for mistakes of the site where a start is doubtful.
     """
     if not fields:
         receiver = receiver_of(site, settings.lockin)
@@ -160,14 +164,17 @@ def find_online_start(
     try:
         result = _smoothed(log, site, settings)
     except (EstimationError, InputError) as error:
-        return _no_start(f"{error}.", log, site, settings)
+        reason = f"{error}."
     except (RuntimeError, np.linalg.LinAlgError):
-        text = "The measurements do not determine the motion in one direction."
-        return _no_start(text, log, site, settings)
-    possible = _possible(log, site, settings, result.trust, result.causes)
-    if result.trust.verdict is Verdict.FAILED:
-        return NoStart(result.trust.reasons[0].text, result.trust, possible)
-    return replace(_start_of(result, log, site, settings.lockin), corrections=possible)
+        reason = "The measurements do not determine the motion in one direction."
+    else:
+        given = result.trust, result.causes
+        possible = _possible(log, site, settings, *given) if diagnose else ()
+        if result.trust.verdict is Verdict.FAILED:
+            return NoStart(result.trust.reasons[0].text, result.trust, possible)
+        return replace(_start_of(result, log, site, settings.lockin), corrections=possible)
+    failed = Trust((Finding("no_solution", reason, Verdict.FAILED),))
+    return NoStart(reason, corrections=_possible(log, site, settings, failed) if diagnose else ())
 
 
 def _recorded(site: Site, imu: ImuSamples) -> ImuSamples | None:
@@ -176,12 +183,6 @@ def _recorded(site: Site, imu: ImuSamples) -> ImuSamples | None:
     if intrinsics is None:
         return None
     return ImuSamples(imu.time, *intrinsics.recorded(imu.gyro_body, imu.accel_body))
-
-
-def _no_start(reason: str, log: Log, site: Site, settings: EstimatorSettings) -> NoStart:
-    """Return why there is no state, and what may be wrong with the site."""
-    failed = Trust((Finding("no_solution", reason, Verdict.FAILED),))
-    return NoStart(reason, corrections=_possible(log, site, settings, failed))
 
 
 def _possible(

@@ -12,7 +12,7 @@ from magfusion.estimation.integrity.diagnosis import Diagnosis
 from magfusion.estimation.integrity.released_fault import ReleasedFault, ReleaseGain, release_gain
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.suspects import Suspect, suspects
-from magfusion.files.site import changed_keys
+from magfusion.files.site_changes import changed_keys
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array

@@ -31,6 +31,15 @@ OF_SAMPLES = {
 # What the streams show themselves, which comes before what follows of it.
 # What gravity, field and gyroscope are sure of where they fail a log, whatever follows of it.
 OF_COMPASSES = {"accel_units", "gravity_missing", "gravity_sign", "gyro_sign", "gyro_units"}
+# What follows of a field that is not as declared, wherever it comes from.
+OF_FIELDS = {
+    "beacon_excluded",
+    "field_innovations",
+    "field_residuals",
+    "found_again",
+    "restarts",
+    "separation",
+}
 SEEN = OF_SAMPLES | {
     "changed",
     "low_signal",
@@ -125,15 +134,25 @@ def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
     Reasons that a mistake explains are listed with it, not beside it.
     """
     trust = with_cause(trust, cause)
-    if cause is None or cause.finding.weight < FIRST:  # it states where something is wrong
+    of_samples = (f for f in trust.reasons if f.code in OF_SAMPLES)
+    first = next(of_samples, None) if cause is None else cause.finding
+    if first is None:
         return trust
-    kept = tuple(f for f in trust.findings if f.code in SEEN or f.verdict is Verdict.TRUSTWORTHY)
-    codes = (f.code for f in trust.ordered if f not in kept and f is not cause.finding)
-    explained = tuple(dict.fromkeys(code for code in codes if code != cause.finding.code))
-    return Trust((*kept, replace(cause.finding, explained=explained)), trust.unverified)
+    # What only says where something is wrong explains no more than what follows of it there.
+    every = cause is None or first.weight >= FIRST
+
+    def is_explained(finding: Finding) -> bool:
+        doubts = finding.verdict is not Verdict.TRUSTWORTHY and finding is not first
+        return doubts and finding.code not in SEEN and (every or finding.code in OF_FIELDS)
+
+    codes = (f.code for f in trust.ordered if is_explained(f) and f.code != first.code)
+    kept = tuple(f for f in trust.findings if f is not first and not is_explained(f))
+    explained = tuple(dict.fromkeys((*first.explained, *codes)))
+    return Trust((*kept, replace(first, explained=explained)), trust.unverified)
 
 
 def with_corrected(trust: Trust, corrected: tuple[Finding, ...]) -> Trust:
     """Return the findings on a result of a corrected site, without what its states say of it."""
     codes = {finding.code for finding in corrected}
-    return replace(trust, findings=tuple(f for f in trust.findings if f.remedy or f.code not in codes))
+    kept = tuple(f for f in trust.findings if f.remedy or f.code not in codes)
+    return replace(trust, findings=kept)

@@ -5,7 +5,8 @@ the poses beyond their covariance or is of an IMU that is farther off than usual
 most evidence is the cause; after its step, the next is tested.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from magfusion.estimation.integrity.score import (
 from magfusion.estimation.integrity.suspects import (
     STRETCH,
     TILT,
+    Suspect,
     suspects,
 )
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
@@ -45,49 +47,82 @@ def check_fixed_parameters(case: Case) -> TestResult:
         return NOTHING
     score, site = case.score, case.result.declared.site
     unverified = tuple(_unverified(case, score))
-    information, gradient = score.with_declared(tolerance=False)
-    findings: list[Finding] = []
-    named: list[Array] = []
-    causes: tuple[ReleasedFault, ...] = ()
+    candidates = list(suspects(site, score.fixed))
+    causes = list(
+        causes_of(
+            case.pose_cov,
+            score,
+            lambda *_: candidates,
+            lambda one, before: _exceeds_residuals(case, score, one, before),
+        )
+    )
+    if not causes:
+        return TestResult(unverified=unverified)
     spread = np.zeros_like(case.pose_cov)
+    for one in causes:
+        moved, known_cov = one.cause.moved, one.cause.known_cov
+        spread += moved[:, :, None] * moved[:, None, :]
+        spread += score.by_pose @ known_cov @ np.swapaxes(score.by_pose, 1, 2)
+    return TestResult(
+        tuple(finding_of(site, score, one.cause, one.rivals) for one in causes),
+        unverified,
+        spread=spread,
+        named=tuple(one.total for one in causes),
+        causes=(causes[0].cause, *causes[0].rivals),
+    )
+
+
+class NamedCause(NamedTuple):
+    """A fixed parameter that a log contradicts.
+
+    Parameters
+    ----------
+    rivals : list of ReleasedFault
+        What explains the log as well.
+    total : ndarray, shape (h,)
+        Its step with those of the causes before it.
+    """
+
+    cause: ReleasedFault
+    rivals: list[ReleasedFault]
+    total: Array
+
+
+def causes_of(
+    pose_cov: Array,
+    score: Score,
+    candidates: Callable[[Array, Array], Sequence[Suspect]],
+    holds: Callable[[ReleasedFault, Array], bool] = lambda *_: True,
+) -> Iterator[NamedCause]:
+    """Yield the causes, that with most evidence first; the next is of what remains after its step.
+
+    Parameters
+    ----------
+    candidates : callable
+        Candidate faults by information and gradient.
+    holds : callable
+        Whether a fault is a cause after a total step.
+    """
+    information, gradient = score.with_declared(tolerance=False)
     total, first = np.zeros(len(gradient)), 0.0
     for _ in range(MAX_CAUSES):
-        released = ranked_faults(case, score, information, gradient)
-        if not released or not _is_cause(case, score, released[0], total):
-            break
-        cause = released[0]
-        if cause.gain < LEAST_SHARE * first:
-            break
+        released = (
+            release_fault(pose_cov, score, fault, information, gradient)
+            for fault in candidates(information, gradient)
+        )
+        ranked = sorted((one for one in released if one is not None), key=lambda one: -one.gain)
+        if not ranked or ranked[0].gain < max(LEAST_EVIDENCE, LEAST_SHARE * first):
+            return
+        cause = ranked[0]
+        if not holds(cause, total):
+            return
         first = max(first, cause.gain)
         total = total + cause.step
         if cause.is_mistake:
-            rivals = rivals_of(released)
-            findings.append(finding_of(site, score, cause, rivals))
-            causes = causes or (cause, *rivals)
-            spread += cause.moved[:, :, None] * cause.moved[:, None, :]
-            spread += score.by_pose @ cause.known_cov @ np.swapaxes(score.by_pose, 1, 2)
-            named.append(total)
+            yield NamedCause(cause, rivals_of(ranked), total)
         selected = information @ cause.cov
         gradient = gradient - information @ cause.step
         information = information - selected @ information
-    return TestResult(
-        tuple(findings),
-        unverified,
-        spread=spread if findings else None,
-        named=tuple(named),
-        causes=causes,
-    )
-
-
-def ranked_faults(
-    case: Case, score: Score, information: Array, gradient: Array
-) -> list[ReleasedFault]:
-    """Return all candidate faults, estimated one at a time, by their evidence."""
-    released = (
-        release_fault(case.pose_cov, score, fault, information, gradient)
-        for fault in suspects(case.result.declared.site, score.fixed)
-    )
-    return sorted((one for one in released if one is not None), key=lambda one: -one.gain)
 
 
 def rivals_of(ranked: list[ReleasedFault]) -> list[ReleasedFault]:
@@ -102,13 +137,11 @@ def rivals_of(ranked: list[ReleasedFault]) -> list[ReleasedFault]:
     return [one for one in ranked[1:] if one.gain > best.gain - MARGIN and is_other(one)]
 
 
-def _is_cause(case: Case, score: Score, one: ReleasedFault, before: Array) -> bool:
+def _exceeds_residuals(case: Case, score: Score, one: ReleasedFault, before: Array) -> bool:
     """Return whether the evidence for a fault is more than any residual would give.
 
     Every candidate fits a part of a residual that none explains.
     """
-    if one.gain < LEAST_EVIDENCE:
-        return False
     after = moved_estimate(case.result, score, score.allowed(before + one.step))
     rest = field_residual(case.result, after)
     excess = max(1.0, float(np.nanmean(rest**2))) if np.any(np.isfinite(rest)) else 1.0

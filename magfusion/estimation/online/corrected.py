@@ -8,7 +8,7 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.estimation.integrity.correction import MOST_SOLUTIONS, Correction
 from magfusion.estimation.online.navigator import Navigator
-from magfusion.files.site import changed_keys
+from magfusion.files.site_changes import changed_keys
 from magfusion.model.trust import Verdict
 
 

@@ -1,18 +1,12 @@
 """The newest input of a navigator, which another one can process again."""
 
-from __future__ import annotations
-
 from collections import deque
 from operator import methodcaller
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from magfusion.estimation.online.navigator import Navigator
-    from magfusion.units import Array
+from magfusion.units import Array
 
 KEPT = 12.0  # s; two durations of a start
 
@@ -21,7 +15,7 @@ class InputHistory:
     """Input of the last `KEPT` seconds, as it was given."""
 
     def __init__(self) -> None:
-        self._calls: deque[tuple[float, Callable[[Navigator], None]]] = deque()
+        self._calls: deque[tuple[float, methodcaller]] = deque()
         self._newest = -np.inf
 
     def add(self, time: Array | float, method: str, *given: Any) -> None:
@@ -43,7 +37,7 @@ class InputHistory:
         """Duration (s)."""
         return self._newest - self._calls[0][0] if self._calls else 0.0
 
-    def replay(self, navigator: Navigator) -> None:
+    def replay(self, navigator: object) -> None:
         """Give the input to another navigator."""
         for _, call in self._calls:
             call(navigator)

@@ -289,7 +289,9 @@ class Arrivals:
         reached = self.reached - delay
         return reached if reached - self.first >= span else None
 
-    def first_state(self, until: float, settings: EstimatorSettings) -> OnlineStart | NoStart:
+    def first_state(
+        self, until: float, settings: EstimatorSettings, *, diagnose: bool
+    ) -> OnlineStart | NoStart:
         """Return the first state from the data so far, or why there is none."""
         steady = list(self.steady.values())
         return find_online_start(
@@ -301,6 +303,7 @@ class Arrivals:
             until,
             settings,
             self.receiver.marks,
+            diagnose=diagnose,
         )
 
     def limit_history(self, kept: float) -> None:

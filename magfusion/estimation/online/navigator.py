@@ -4,6 +4,7 @@
 epoch, and on request at any later time.
 """
 
+import json
 from collections import Counter, deque
 from dataclasses import replace
 from typing import Any
@@ -54,6 +55,7 @@ from magfusion.estimation.online_integrity.judgement import (
 from magfusion.estimation.online_integrity.summary import Summary
 from magfusion.files.blas_threads import warn_about_threads
 from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
+from magfusion.files.site import site_content
 from magfusion.model.arguments import check_arguments
 from magfusion.model.drive import DriveSamples, DriveShares
 from magfusion.model.marks import Marks
@@ -68,6 +70,8 @@ from magfusion.receiver.drive import DriveReceiver
 from magfusion.units import Array, IntArray
 
 MARGIN = 0.5  # s; of a span that a start uses
+LONGEST_WAIT = 600.0  # s; between corrections, doubled each time: a hundredth of the processor
+MOST_MISTAKES = 2  # undone together; with more, the site is another one
 
 
 class Navigator:
@@ -103,6 +107,8 @@ class Navigator:
     _shift: float
     _taken: float
     _next_correction: float
+    _wait: float
+    _site: str | None  # as corrected, JSON
 
     def __init__(self, site: Site, settings: NavigatorSettings | None = None) -> None:
         check_arguments("Navigator", site=(site, Site))
@@ -148,7 +154,8 @@ class Navigator:
         self._correction: Correction | None = None
         self._possible: tuple[Correction, ...] = ()
         self._corrected, self._turn, self._shift = (), 0.0, 0.0
-        self._taken, self._next_correction = -np.inf, -np.inf
+        self._taken, self._next_correction, self._wait = -np.inf, -np.inf, KEPT
+        self._site = None
 
     # Input
 
@@ -387,9 +394,11 @@ class Navigator:
     def take_corrections(self) -> tuple[Correction, ...]:
         """Return what may be wrong with the site, the most likely first; seldom, as each costs."""
         possible, self._possible = self._possible, ()
-        if not possible or self._history.newest < self._next_correction:
+        now = self._history.newest
+        if not possible or now < self._next_correction or len(self._corrected) >= MOST_MISTAKES:
             return ()
-        self._next_correction = self._history.newest + KEPT
+        self._next_correction = now + self._wait
+        self._wait = min(2.0 * self._wait, LONGEST_WAIT)
         return possible
 
     def with_correction(self, correction: Correction) -> "Navigator":
@@ -400,10 +409,13 @@ class Navigator:
         result = Navigator(correction.site, self.settings)
         reasons = (*self.judgement.reasons, *self.why_no_start.trust.reasons)
         result.declared, result._correction = self.declared, correction
-        result._corrected = (corrected_finding(correction, self.declared, reasons),)
+        finding = corrected_finding(correction, self.declared, reasons)
+        known = (f for f in self._corrected if f.code != finding.code)
+        result._corrected = (*known, finding)
         result._discontinuities.counter = self._discontinuities.counter + self.started
         result._next_start = max(result._next_start, self._history.span - MARGIN)
-        result._next_correction = self._next_correction
+        result._next_correction, result._wait = self._next_correction, self._wait
+        result._site = json.dumps(site_content(correction.site))
         self._history.replay(result)
         result._pending = [state for state in result._pending if state.time > self._taken]
         return result
@@ -478,7 +490,8 @@ class Navigator:
         until = arrived.gathered(self.settings.delay, self._next_start)
         if until is None:
             return False
-        start = arrived.first_state(until, self.settings)
+        trial = self._correction is not None
+        start = arrived.first_state(until, self.settings, diagnose=not trial)
         self._possible = start.corrections
         longest = 4.0 * self.settings.start_duration
         if self._next_start < self.settings.start_duration and not is_clear(start):

@@ -5,8 +5,9 @@ Calibrations are stored as differences from the declared one, GTSAM's preintegra
 their inertial steps.
 """
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ from magfusion.files.plain_data import Rules, from_plain, to_plain
 from magfusion.model.parameters import Block, Calibration, dimension, initial_calibration
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
-from magfusion.model.trust import Verdict
+from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.marked_bursts import OVERLAP, Bursts
 from magfusion.units import Array
 
@@ -76,6 +77,7 @@ def navigator_rules(
             Link: lambda link: _link_data(link, of_calibration),
             Measurement: _measurement_data,
             Verdict: str,
+            Finding: _finding_data,
             Levels: lambda levels: list(levels.values),
         },
         readers={
@@ -83,6 +85,7 @@ def navigator_rules(
             Link: lambda data: _link(data, site, size - MOTION, of_calibration),
             Measurement: lambda data: _measurement(data, kinds),
             Verdict: Verdict,
+            Finding: _finding,
             Levels: _levels,
         },
         checks={
@@ -100,6 +103,23 @@ def navigator_rules(
             SlidingWindow: lambda window: _check_window(window),
         },
     )
+
+
+def _finding_data(finding: Finding) -> dict[str, Any]:
+    """Return a finding, its remedy as JSON: of it, any key of a site's file may be a part."""
+    own = vars(finding) | {"verdict": str(finding.verdict)}
+    return own | {"remedy": json.dumps(finding.remedy), "explained": list(finding.explained)}
+
+
+def _finding(data: Any) -> Finding:
+    names = {field.name for field in fields(Finding)}
+    _check(isinstance(data, dict) and data.keys() == names, "is no finding")
+    texts = ("code", "text", "verdict", "remedy", *data["explained"])
+    _check(all(isinstance(data.get(t, t), str) for t in texts), "has a text that is none")
+    remedy = json.loads(data["remedy"])
+    _check(remedy is None or isinstance(remedy, dict), "has a remedy that is none")
+    own = {"verdict": Verdict(data["verdict"]), "remedy": remedy}
+    return Finding(**(data | own | {"explained": tuple(data["explained"])}))
 
 
 def _levels(data: Any) -> Levels:

@@ -9,6 +9,7 @@ from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.online.navigator import Navigator
 from magfusion.estimation.online.navigator_data import navigator_rules
 from magfusion.estimation.online.navigator_settings import NavigatorSettings
+from magfusion.files.site_changes import with_content
 from magfusion.model.site import Site
 
 
@@ -34,7 +35,12 @@ def restored(
     InputError
         If it is no checkpoint, or does not fit the site.
     """
-    navigator = Navigator(site, settings)
+    parts = checkpoint.get("parts") if isinstance(checkpoint, dict) else None
+    corrected = parts.get("_site") if isinstance(parts, dict) else None
+    declared = Navigator(site, settings).declared
+    own = with_content(site, corrected) if isinstance(corrected, str) else site
+    navigator = Navigator(own, settings)
+    navigator.declared = declared
     rules = navigator_rules(navigator.site, navigator.blocks, measurements)
     try:
         navigator.go_on_from(checkpoint, rules)

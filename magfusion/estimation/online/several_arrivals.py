@@ -259,7 +259,9 @@ class SeveralArrivals(Arrivals):
         self._looked = until
         return until
 
-    def first_state(self, until: float, settings: EstimatorSettings) -> OnlineStart | NoStart:
+    def first_state(
+        self, until: float, settings: EstimatorSettings, *, diagnose: bool
+    ) -> OnlineStart | NoStart:
         """Return the first state from the measurements up to a time (s)."""
         late = {sensor.name: sensor.clock_offset for sensor in self.site.platform.magnetometers}
         waves = {}
@@ -275,7 +277,16 @@ class SeveralArrivals(Arrivals):
         kept = imu.time <= known
         imu = ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept])
         return find_online_start(
-            self.site, imu, self.waveform, self.fields, [], until, settings, None, waves
+            self.site,
+            imu,
+            self.waveform,
+            self.fields,
+            [],
+            until,
+            settings,
+            None,
+            waves,
+            diagnose=diagnose,
         )
 
     def limit_history(self, kept: float) -> None:

@@ -15,12 +15,11 @@ from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, State, states_of
 from magfusion.estimation.integrity.correction import Correction, corrections
 from magfusion.estimation.integrity.fixed_parameter_test import (
-    LEAST_EVIDENCE,
+    causes_of,
     finding_of,
-    rivals_of,
 )
-from magfusion.estimation.integrity.released_fault import ReleasedFault, release_fault
 from magfusion.estimation.integrity.score import Score
+from magfusion.estimation.integrity.suspects import Suspect
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.estimation.online_integrity.score_epochs import (
@@ -41,8 +40,8 @@ from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.units import Array
 
-MIN_SCORE_INTERVAL, MAX_SCORE_INTERVAL = 2.0, 20.0  # s; shortest and longest interval of results
-ENOUGH = 5  # epochs for the shortest interval
+MIN_SCORE_INTERVAL, MAX_SCORE_INTERVAL = 1.0, 20.0  # s; shortest and longest interval of results
+ENOUGH = 4  # epochs for the shortest interval
 MOST_WAITING = 10  # epochs; larger batches would delay an update
 
 
@@ -211,19 +210,15 @@ class OnlineScore:
             by[None, :MOTION],
             by[MOTION:],
         )
-        information, gradient = score.with_declared(tolerance=False)
-        reported = np.flatnonzero(targets.gains(information, gradient) > 0.0)
-        result = (
-            release_fault(pose_cov, score, targets.fault_candidates[k], information, gradient)
-            for k in reported.tolist()
-        )
-        ranked = sorted((one for one in result if one is not None), key=lambda one: -one.gain)
-        while ranked and not _is_significant(ranked[0]):
-            ranked.pop(0)
-        self.correction = None
-        if not ranked:
+
+        def candidates(information: Array, gradient: Array) -> list[Suspect]:
+            gained = np.flatnonzero(targets.gains(information, gradient) > 0.0)
+            return [targets.fault_candidates[k] for k in gained.tolist()]
+
+        self.correction, found = None, next(causes_of(pose_cov, score, candidates), None)
+        if found is None:
             return Judgement()
-        cause, rivals = ranked[0], rivals_of(ranked)
+        cause, rivals = found.cause, found.rivals
         turn, shift = np.linalg.norm(cause.moved[0].reshape(2, 3), axis=1)
         finding = finding_of(targets.site, score, cause, rivals)
         (correction,) = corrections(self.site, (finding,), (cause, *rivals), None)
@@ -231,7 +226,3 @@ class OnlineScore:
         spread = uncertainty if correction.spread is None else correction.spread + uncertainty
         self.correction = correction._replace(spread=spread)
         return Judgement((finding,), turn=float(turn), shift=float(shift))
-
-
-def _is_significant(one: ReleasedFault) -> bool:
-    return one.gain > LEAST_EVIDENCE and one.is_mistake
