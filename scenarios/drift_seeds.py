@@ -68,7 +68,7 @@ def judge(task: Task, _rng: np.random.Generator) -> Row:
     return Row(
         seed=task.seed,
         trap=task.trap,
-        stability=str(result["stability"]),
+        stability=str(result["verdict"]),
         by_quantity={q.name: str(result[f"{q.name}_stability"]) for q in QUANTITIES},
         blamed=tuple(str(note) for note in notes if str(note).startswith("FAIL")),
     )

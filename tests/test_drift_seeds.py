@@ -23,5 +23,5 @@ def test_verdicts_are_counted_by_quantity() -> None:
 def test_the_trap_fails_and_a_good_seed_does_not() -> None:
     config = drift_seeds.Config(seeds=2, hours=4.0, trap_seeds=1, seed=3)
     rows = drift_seeds.run(config)
-    assert [row.stability for row in rows if row.trap] == ["fail"]
-    assert "fail" not in [row.stability for row in rows if not row.trap]
+    assert [row.stability for row in rows if row.trap] == ["unstable"]
+    assert "unstable" not in [row.stability for row in rows if not row.trap]

@@ -101,7 +101,7 @@ ROOMS = {
         """,
         "jobs": """
             antenna_inputs fix_coil joint_kept receiver_axes region_option rotor_inputs state_rows
-            written
+            stream_clocks written
             inputs navigate_results
             allan_noise checkpoint failure orientation settings without_beacons
             allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap

@@ -1,8 +1,11 @@
 """A navigator resumed from a checkpoint, with other state of the job."""
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Generic, TextIO, TypeVar
+
+import numpy as np
 
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.checkpoint import (
@@ -17,6 +20,7 @@ from magfusion.jobs.inputs import named
 from magfusion.model.site import Site
 
 Extra = TypeVar("Extra")
+REPORT_INTERVAL = 60.0  # s; that a checkpoint cannot be written
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,28 @@ def begin(
     return ResumedRun(navigator, result.position, extra)
 
 
-def save(navigator: Navigator, position: int, extra: object, place: Path, key: str) -> None:
-    """Write a checkpoint of a navigator, with the other state of the run."""
-    content = {"navigator": navigator.checkpoint(), "beside": to_plain(extra)}
-    write_checkpoint(Checkpoint(key, position, content), place)
+class CheckpointWriter:
+    """Writes the checkpoints of a run; a failure is reported, and the run goes on.
+
+    Parameters
+    ----------
+    messages : file
+    """
+
+    def __init__(self, place: Path, key: str, messages: TextIO) -> None:
+        self._place, self._key, self._messages = place, key, messages
+        self._reported_at = -np.inf
+
+    def save(self, navigator: Navigator, position: int, extra: object) -> None:
+        """Write a checkpoint of a navigator, with the other state of the run."""
+        content = {"navigator": navigator.checkpoint(), "beside": to_plain(extra)}
+        try:
+            write_checkpoint(Checkpoint(self._key, position, content), self._place)
+        except OSError as error:
+            now = time.monotonic()
+            if now >= self._reported_at + REPORT_INTERVAL:
+                self._reported_at = now
+                self._messages.write(
+                    f"magfusion: {self._place}: the checkpoint cannot be written"
+                    f" ({error.strerror or error}); navigation goes on, and tries again\n"
+                )

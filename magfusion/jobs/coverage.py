@@ -12,7 +12,7 @@ from magfusion.errors import InputError
 from magfusion.files.site import load_site
 from magfusion.files.table import write_table
 from magfusion.jobs.receiver_axes import three_axes
-from magfusion.jobs.settings import Command, RiskSettings, argument, option
+from magfusion.jobs.settings import Command, NeedSettings, argument, option
 from magfusion.jobs.simulate import box_option
 from magfusion.model.site import Site
 from magfusion.model.trust import Trust
@@ -37,7 +37,7 @@ MOST_POINTS = 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class CoverageSettings(RiskSettings):
+class CoverageSettings(NeedSettings):
     """Volume and grid of the bounds; None selects defaults from the site."""
 
     site: Path = argument("Site file of the installation")
@@ -86,7 +86,8 @@ def run_coverage(settings: CoverageSettings, output: Path) -> Figures:
     extra = None
     if settings.extra_beacon:
         extra = best_extra_beacon(site, box, lambda s, p: coverage(s, p, window), points)
-    figures = _figures(site_path, site, window, spacing, result, extra)
+    figures = heading("coverage", site_path.stem) | need_figures(result, settings.limits)
+    figures |= _figures(site, window, spacing, result, extra)
     beacon = None if extra is None else extra.beacon
     with claimed as directory:
         write_points(directory / "coverage.parquet", result)
@@ -127,7 +128,6 @@ def _spacing(box: Array, settings: CoverageSettings) -> float:
 
 
 def _figures(
-    site_path: Path,
     site: Site,
     window: float,
     spacing: float,
@@ -168,7 +168,29 @@ def _figures(
             Figure("median_without_extra_m", finite(extra.before), "m"),
             Figure("median_with_extra_m", finite(extra.after), "m"),
         ]
-    return heading("coverage", site_path.stem) | trust_figures(Trust()) | Figures(*figures)
+    return Figures(*figures)
+
+
+def need_figures(coverage: Coverage, limits: tuple[float, ...]) -> Figures:
+    """Return whether the protection levels that are needed are reached; nothing without a need.
+
+    Parameters
+    ----------
+    limits : tuple of float
+        None, that of position (m), or also that of attitude (deg).
+    """
+    level_m, level_deg = coverage.protection_level_m, coverage.protection_level_deg
+    if not limits or level_m is None or level_deg is None:
+        return Figures()
+    levels = (level_m, level_deg)[: len(limits)]
+    within = np.all([level <= limit for level, limit in zip(levels, limits, strict=True)], axis=0)
+    answer = "reached" if np.all(within) else "not reached"
+    needed = (
+        Figure(f"need_{unit}", limit, unit)
+        for limit, unit in zip(limits, ("m", "deg"), strict=False)
+    )
+    share = Figure("share_reached", float(np.mean(within)), label="share of points that reach it")
+    return trust_figures(Trust(), answer) | Figures(*needed, share)
 
 
 def level_figures(coverage: Coverage) -> list[Figure]:
@@ -190,7 +212,7 @@ def level_figures(coverage: Coverage) -> list[Figure]:
     ]
     if coverage.protection_level_m is not None:
         share = float(np.mean(np.isfinite(coverage.protection_level_m)))
-        figures.append(Figure("share_protected", share))
+        figures.append(Figure("share_with_level", share))
     return figures
 
 

@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magfusion.jobs.coverage import finite, level_figures
-from magfusion.model.trust import Trust
+from magfusion.jobs.coverage import finite, level_figures, need_figures
 from magfusion.results.design.pattern import pattern_axis, peak_moment
 from magfusion.results.figures import Figure, Figures, Section, heading
-from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.jobs.design_settings import DesignSettings
@@ -61,7 +59,8 @@ def design_figures(
         *(figure for beacon in result.new for figure in _of_beacon(beacon)),
         Figure("notes", notes, section=Section.NOTES),
     ]
-    return heading("design", settings.site.stem) | trust_figures(Trust()) | Figures(*figures)
+    head = heading("design", settings.site.stem) | need_figures(after, settings.limits)
+    return head | Figures(*figures)
 
 
 _OUT_OF_TIME = (

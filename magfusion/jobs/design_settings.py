@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Literal
 
 from magfusion.errors import InputError
-from magfusion.jobs.settings import RandomSettings, RiskSettings, argument, option
+from magfusion.jobs.settings import NeedSettings, RandomSettings, argument, option
 
 ALL = "all"
 
 
 @dataclass(frozen=True, kw_only=True)
-class DesignSettings(RiskSettings, RandomSettings):
+class DesignSettings(NeedSettings, RandomSettings):
     """Hall, number and kind of beacons, and search time."""
 
     site: Path = argument("Site file: its platform, and a beacon of which copies are placed")

@@ -146,7 +146,7 @@ def run_drift(settings: DriftSettings, output: Path, report: Report | None = Non
 def summarise(settings: DriftSettings, runs: list[WorldRun]) -> Figures:
     """Return the figures of all runs, the verdict first, and the judgements as sentences.
 
-    A detected instability makes the estimates doubtful; a run too short to decide does not.
+    Stable, unstable, or inconclusive where the run is too short to decide.
     """
     from magfusion.jobs.drift_figures import STABILITY, judge_runs
 
@@ -168,8 +168,8 @@ def summarise(settings: DriftSettings, runs: list[WorldRun]) -> Figures:
         for quantity in QUANTITIES
     }
     head = heading("drift", f"{settings.hours:g} h in {settings.worlds} world(s)")
-    head |= trust_figures(trust) | Figures(
-        Figure("stability", STABILITY[overall([one.verdict for one in judgements])]),
+    answer = STABILITY[overall([one.verdict for one in judgements])]
+    head |= trust_figures(trust, answer) | Figures(
         *(
             Figure(f"{name}_stability", STABILITY[overall(verdicts)], section=Section.REPORT)
             for name, verdicts in by_quantity.items()
@@ -186,7 +186,7 @@ def summarise(settings: DriftSettings, runs: list[WorldRun]) -> Figures:
     return head | figures | Figures(Figure("notes", notes, section=Section.NOTES))
 
 
-_WORD = {"pass": "PASS", "fail": "FAIL", "undecided": "INCONCLUSIVE"}
+_WORD = {"pass": "PASS", "fail": "FAIL", "undecided": "INCONCLUSIVE"}  # of one criterion
 
 
 def overall(verdicts: list[Verdict]) -> Verdict:

@@ -62,7 +62,7 @@ class Criterion:
     sentence: str
 
 
-STABILITY = {"pass": "pass", "fail": "fail", "undecided": "inconclusive"}  # in the report
+STABILITY = {"pass": "stable", "fail": "unstable", "undecided": "inconclusive"}
 
 
 def judge_runs(name: str, runs: list[WorldRun]) -> tuple[Figures, list[Criterion]]:

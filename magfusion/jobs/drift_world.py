@@ -3,6 +3,7 @@
 import os
 import re
 import resource
+import sys
 import time
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.atomic import abandoned_pattern
 from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
 from magfusion.files.row_file import RowFile, RowPosition, claim_rows
-from magfusion.jobs.checkpoint import begin, save
+from magfusion.jobs.checkpoint import CheckpointWriter, begin
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import ImuModel, Site
 from magfusion.model.trajectory import Trajectory
@@ -180,6 +181,7 @@ def run_world(task: WorldTask, _rng: np.random.Generator | None = None) -> World
     unmoved = _Progress(world.start(), 0.0)
     begun = begin(task.progress, task.key, world.site, settings, unmoved, resume=True)
     navigator, progress = begun.navigator, begun.extra
+    kept = CheckpointWriter(task.progress, task.key, sys.stderr)
     with (
         closing(RowFile(task.progress.with_name(_ERROR_ROWS), _ERRORS, progress.errors)) as errors,
         closing(RowFile(task.progress.with_name(_PACE_ROWS), _PACE, progress.pace)) as pace,
@@ -193,7 +195,7 @@ def run_world(task: WorldTask, _rng: np.random.Generator | None = None) -> World
             pace.extend(dict(zip(PACE, own_pace.T, strict=True)))
             bare = progress.bare + sample * len(built.imu)
             progress = _Progress(built.after, bare, errors.settle(), pace.settle())
-            save(navigator, stretch + 1, progress, task.progress, task.key)
+            kept.save(navigator, stretch + 1, progress)
         series, every = _series(errors.rows()), np.column_stack(list(pace.rows().values()))
     if not navigator.started:
         raise EstimationError(

@@ -35,6 +35,7 @@ from magfusion.results.verdict import trust_figures
 if TYPE_CHECKING:
     from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
     from magfusion.estimation.online_integrity.judgement import JudgedState
+    from magfusion.jobs.checkpoint import CheckpointWriter
     from magfusion.jobs.live import StateSink
     from magfusion.jobs.navigate_results import NavigateResults
     from magfusion.jobs.replay import Replay
@@ -209,7 +210,7 @@ class NavigateRun:
     navigator: Navigator
     rows: StateRows
     place: Path
-    key: str
+    kept: CheckpointWriter
     position: int
     elapsed: float
     sinks: tuple[StateSink, ...]
@@ -250,7 +251,7 @@ def _open_run(
     place: Path,
     sinks: tuple[StateSink, ...],
 ) -> NavigateRun:
-    from magfusion.jobs.checkpoint import RunProgress, begin
+    from magfusion.jobs.checkpoint import CheckpointWriter, RunProgress, begin
 
     known = (log.imu, log.waveform, log.fields, *log.waveforms.values())
     streams = [stream for stream in known if stream is not None]
@@ -262,7 +263,7 @@ def _open_run(
         navigator=begun.navigator,
         rows=StateRows(RowFile(_rows_path(place), row_columns(site), begun.extra.rows)),
         place=place,
-        key=key,
+        kept=CheckpointWriter(place, key, sys.stderr),
         position=begun.position,
         elapsed=begun.extra.elapsed,
         sinks=sinks,
@@ -314,9 +315,9 @@ def _publish(run: NavigateRun, state: JudgedState) -> None:
 
 
 def _save(run: NavigateRun, position: int, elapsed: float) -> None:
-    from magfusion.jobs.checkpoint import RunProgress, save
+    from magfusion.jobs.checkpoint import RunProgress
 
-    save(run.navigator, position, RunProgress(run.rows.settle(), elapsed), run.place, run.key)
+    run.kept.save(run.navigator, position, RunProgress(run.rows.settle(), elapsed))
 
 
 COMMAND = Command(

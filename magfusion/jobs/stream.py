@@ -1,7 +1,7 @@
 """Navigation in a pipe: records in, a state out at every epoch, or current states at any rate."""
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
 
@@ -28,10 +28,11 @@ from magfusion.files.stream import (
     read_records,
     whole_rows,
 )
-from magfusion.jobs.checkpoint import begin, save
+from magfusion.jobs.checkpoint import CheckpointWriter, begin
 from magfusion.jobs.live import LiveSettings, StateSink, state_sinks
 from magfusion.jobs.region_option import ANYWHERE, Where
 from magfusion.jobs.rotor_inputs import AwaitedAngles, check_streamed_rotors
+from magfusion.jobs.stream_clocks import ClockJump, StreamClocks
 from magfusion.model.marks import Marks
 from magfusion.model.quaternion import of_matrices
 from magfusion.model.site import Site
@@ -116,25 +117,33 @@ def _navigate(
     refused, saved, reached = 0, -np.inf, -np.inf
     missing: Counter[str] = Counter()
     output, angles = _StateWriter(navigator, sink, others), AwaitedAngles(site)
+    kept = None if place is None else CheckpointWriter(place, key, messages)
+    clocks, resumed = StreamClocks(settings.navigator.delay), navigator.time
     for numbered in read_records(source, settings.form):
         try:
+            numbered = _on_clock(numbered, clocks, output, messages)
             newest = _process_record(output.navigator, site, numbered, missing, output)
         except InputError as error:
             sentence = f"standard input, {_PLACE[settings.form]} {numbered.number}: {error}"
-            if not settings.keep_going:
+            if not (settings.keep_going or isinstance(error, ClockJump)):
                 raise InputError(sentence) from error
             refused += 1
             messages.write(f"magfusion: {sentence} (skipped)\n")
             continue
+        if newest < resumed:
+            at = f"{resumed:.3f} s"
+            messages.write(f"magfusion: data before the checkpoint ({at}) are not used\n")
+            resumed = -np.inf
         angles.see(numbered.record)
         navigator = output.navigator = corrected(output.navigator)
         output.epochs()
-        if not navigator.started and -np.inf < newest >= reached + WAITING:
+        waited = -np.inf < newest and not reached <= newest < reached + WAITING
+        if not navigator.started and waited:
             output.write(None, _waiting(navigator, newest))
             reached = newest
         sink.flush()
-        if place is not None and newest >= saved + settings.every:
-            save(navigator, numbered.number, None, place, key)
+        if kept is not None and not saved <= newest < saved + settings.every:
+            kept.save(output.navigator, numbered.number, None)
             saved = newest
     if output.reference:
         messages.write(f"magfusion: reference: {NOT_ONLINE}\n")
@@ -171,6 +180,10 @@ class _StateWriter:
         for other in self._others:
             other.take(state, output)
 
+    def restart(self) -> None:
+        """Navigate on another clock."""
+        self.navigator, self._newest = self.navigator.restarted(), -np.inf
+
     def now(self) -> None:
         """Write the current states, before any other processing."""
         for state in self.navigator.take_propagated():
@@ -184,6 +197,30 @@ class _StateWriter:
             if state.time > self._newest:
                 self.write(state, state_content(self.navigator, state))
         self.navigator.take_lagged()
+
+
+def _on_clock(
+    numbered: NumberedRecord, clocks: StreamClocks, output: _StateWriter, messages: TextIO
+) -> NumberedRecord:
+    """Return a record on the clock of the others; after a step, navigation restarts.
+
+    Raises
+    ------
+    InputError
+        Where its stamps are far from the others', and no further record follows it.
+    """
+    if numbered.record is None:
+        return numbered
+    record = clocks.unwrapped(numbered.record)
+    step = clocks.step_in(record)
+    if step is not None:
+        messages.write(
+            f"magfusion: {step.stream}: its clock stepped by {step.seconds:+.4g} s; navigation"
+            f" restarts at {step.time:.3f} s\n"
+        )
+        output.restart()
+    clocks.check(record)
+    return replace(numbered, record=record)
 
 
 def _process_record(

@@ -30,6 +30,7 @@ from magfusion.results.shown import (
     sentences,
     summary_rows,
 )
+from magfusion.results.verdict import look_of
 
 PAGE = "report.html"
 LARGEST = 4_500_000  # bytes, of which a mail takes one
@@ -39,6 +40,11 @@ _MEANING = {
     "doubtful": "Use with care, for these reasons; the reported accuracy of a pose is enlarged to"
     " cover them.",
     "failed": "Do not use: the content below is for diagnosis only.",
+    "stable": "No drift within the resolution of the run, and errors within their covariance.",
+    "inconclusive": "The run is too short, or its worlds are too few, for an answer.",
+    "unstable": "It drifts, or its errors exceed their covariance.",
+    "reached": "The protection level is within the limit at every point.",
+    "not reached": "The protection level exceeds the limit at some points.",
 }
 NO_JUDGE = "This job has no verdict."
 _CAPTIONS = {
@@ -142,7 +148,7 @@ def _verdict(figures: Figures, unjudged: str) -> str:
     reasons += [f"Noticed: {_finding(one)}" for one in findings(figures, "remarks")]
     listed = "".join(f"<li>{reason}</li>" for reason in reasons)
     return (
-        f'<div class="verdict {escape(verdict)}"><strong>{escape(verdict.upper())}</strong>'
+        f'<div class="verdict {look_of(verdict)}"><strong>{escape(verdict.upper())}</strong>'
         f"<p>{_MEANING.get(verdict, '')}</p>{f'<ul>{listed}</ul>' if listed else ''}</div>"
     )
 

@@ -7,7 +7,6 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from magfusion.model.trust import Verdict
 from magfusion.results.drift import HOUR, QUANTITIES, EstimatorPlot, Quantity
 from magfusion.results.recording_file import whole_recording
 from magfusion.results.recording_layout import about_zero, layout, plot, readable_range, span_of
@@ -44,11 +43,10 @@ def _write(recording: rr.RecordingStream, place: str, text: str) -> None:
 
 
 def _banner(figures: Mapping[str, object], notes: list[str]) -> str:
-    verdict = Verdict(str(figures["verdict"]))
-    run = f"{figures['hours']:g} h, {figures['worlds']} world(s): {figures['stability']}"
+    run = f"{figures['hours']:g} h, {figures['worlds']} world(s)"
     lines = [f"- {run}; errors of the first world, all judgements on the right"]
     failed = [note for note in notes if note.startswith("FAIL")]
-    return banner_text(verdict, [*lines, *(f"- **{note}**" for note in failed)])
+    return banner_text(str(figures["verdict"]), [*lines, *(f"- **{note}**" for note in failed)])
 
 
 def _log_errors(recording: rr.RecordingStream, course: EstimatorPlot) -> None:

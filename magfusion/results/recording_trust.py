@@ -9,6 +9,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import StateTrust, Trust, Verdict
 from magfusion.results.errors import TrajectoryErrors
 from magfusion.results.recording_plots import AXES, SIGMA, log_series, rows_of
+from magfusion.results.verdict import look_of
 from magfusion.units import Array
 
 BANNER = "verdict"  # entity
@@ -47,9 +48,9 @@ LEVELS = (
 )
 
 
-def banner_text(verdict: Verdict, lines: list[str]) -> str:
+def banner_text(verdict: str, lines: list[str]) -> str:
     """Return the verdict as a heading, and lines below it."""
-    return "\n".join([f"## {_MARK[verdict]} {str(verdict).upper()}", "", *lines])
+    return "\n".join([f"## {_MARK[look_of(verdict)]} {verdict.upper()}", "", *lines])
 
 
 def log_verdict(recording: rr.RecordingStream, trust: Trust, summary: str) -> tuple[str, str]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from magfusion.model.trust import Verdict
 from magfusion.results.figures import Figure, Figures, ParameterEstimate, Section
 from magfusion.results.shown import (
     as_sure,
@@ -18,8 +19,13 @@ from magfusion.results.shown import (
     sentences,
     summary_rows,
 )
+from magfusion.results.verdict import look_of
 
-_STYLES = {"trustworthy": "bold green", "doubtful": "bold yellow", "failed": "bold red"}
+_STYLES = {
+    Verdict.TRUSTWORTHY: "bold green",
+    Verdict.DOUBTFUL: "bold yellow",
+    Verdict.FAILED: "bold red",
+}
 
 
 def show(figures: Figures, output: Path | None, console: Console | None = None) -> None:
@@ -63,7 +69,9 @@ def _show_verdict(figures: Figures, console: Console) -> None:
     if "verdict" not in figures:
         return
     verdict = figures["verdict"]
-    console.print(f"{verdict}".upper(), style=_STYLES[str(verdict)], soft_wrap=True, markup=False)
+    console.print(
+        f"{verdict}".upper(), style=_STYLES[look_of(str(verdict))], soft_wrap=True, markup=False
+    )
     for key, lead in (("reasons", ""), ("remarks", "noticed: ")):
         for one in findings(figures, key):
             console.print(f"  {lead}{one['text']}", soft_wrap=True, markup=False)

@@ -5,16 +5,36 @@ from typing import Any
 
 import numpy as np
 
-from magfusion.model.trust import Finding, StateTrust, Trust, Unverified
+from magfusion.model.trust import Finding, StateTrust, Trust, Unverified, Verdict
 from magfusion.results.figures import Figure, Figures, Section
 
+# Answers of jobs that judge no estimate, in the colours of those that do.
+_LOOKS = {
+    "stable": Verdict.TRUSTWORTHY,
+    "inconclusive": Verdict.DOUBTFUL,
+    "unstable": Verdict.FAILED,
+    "reached": Verdict.TRUSTWORTHY,
+    "not reached": Verdict.FAILED,
+}
 MOST_TEXTS = 3  # of findings of one code; more are counted
 
 
-def trust_figures(trust: Trust) -> Figures:
-    """Return verdict, reasons, remarks and unverified parameters, for the head of a report."""
+def look_of(answer: str) -> Verdict:
+    """Return the verdict in whose colours an answer is shown."""
+    return _LOOKS[answer] if answer in _LOOKS else Verdict(answer)
+
+
+def trust_figures(trust: Trust, answer: str | None = None) -> Figures:
+    """Return verdict, reasons, remarks and unverified parameters, for the head of a report.
+
+    Parameters
+    ----------
+    answer : str, optional
+        In place of the verdict, of a job that does not judge an estimate.
+    """
+    verdict = str(trust.verdict) if answer is None else answer
     return Figures(
-        Figure("verdict", str(trust.verdict), section=Section.VERDICT),
+        Figure("verdict", verdict, section=Section.VERDICT),
         Figure("reasons", _finding_rows(_one_of_each(trust.reasons)), section=Section.VERDICT),
         Figure("remarks", _finding_rows(trust.remarks), section=Section.VERDICT),
         Figure("unverified", [_unverified(u) for u in trust.unverified], section=Section.VERDICT),

@@ -92,7 +92,7 @@ def causes_of(
     pose_cov: Array,
     score: Score,
     candidates: Callable[[Array, Array], Sequence[Suspect]],
-    holds: Callable[[ReleasedFault, Array], bool] = lambda *_: True,
+    is_cause: Callable[[ReleasedFault, Array], bool] = lambda *_: True,
 ) -> Iterator[NamedCause]:
     """Yield the causes, that with most evidence first; the next is of what remains after its step.
 
@@ -100,7 +100,7 @@ def causes_of(
     ----------
     candidates : callable
         Candidate faults by information and gradient.
-    holds : callable
+    is_cause : callable
         Whether a fault is a cause after a total step.
     """
     information, gradient = score.with_declared(tolerance=False)
@@ -114,7 +114,7 @@ def causes_of(
         if not ranked or ranked[0].gain < max(LEAST_EVIDENCE, LEAST_SHARE * first):
             return
         cause = ranked[0]
-        if not holds(cause, total):
+        if not is_cause(cause, total):
             return
         first = max(first, cause.gain)
         total = total + cause.step

@@ -105,7 +105,7 @@ class Navigator:
     _corrected: tuple[Finding, ...]
     _turn: float
     _shift: float
-    _taken: float
+    _reported_until: float
     _next_correction: float
     _wait: float
     _site: str | None  # as corrected, JSON
@@ -154,7 +154,7 @@ class Navigator:
         self._correction: Correction | None = None
         self._possible: tuple[Correction, ...] = ()
         self._corrected, self._turn, self._shift = (), 0.0, 0.0
-        self._taken, self._next_correction, self._wait = -np.inf, -np.inf, KEPT
+        self._reported_until, self._next_correction, self._wait = -np.inf, -np.inf, KEPT
         self._site = None
 
     # Input
@@ -304,6 +304,11 @@ class Navigator:
         return self._estimator is not None
 
     @property
+    def time(self) -> float:
+        """Time of the newest estimate (s); minus infinity before the first."""
+        return -np.inf if self._estimator is None else self._estimator.state.time
+
+    @property
     def judgement(self) -> Judgement:
         """Judgement of the newest state."""
         return self._judgement
@@ -314,7 +319,7 @@ class Navigator:
         The pose of a lost state is a guess and must not be used.
         """
         built, self._pending = self._pending, []
-        self._taken = built[-1].time if built else self._taken
+        self._reported_until = built[-1].time if built else self._reported_until
         return built
 
     def take_propagated(self) -> list[PropagatedState]:
@@ -379,6 +384,12 @@ class Navigator:
             else TimedJudgement(time, Judgement())
         )
 
+    def restarted(self) -> "Navigator":
+        """Return a navigator that starts again, as where the clock of the data has stepped."""
+        result = Navigator(self.declared, self.settings)
+        result._discontinuities.counter = self._discontinuities.counter + self.started
+        return result
+
     # Corrections
 
     @property
@@ -417,7 +428,7 @@ class Navigator:
         result._next_correction, result._wait = self._next_correction, self._wait
         result._site = json.dumps(site_content(correction.site))
         self._history.replay(result)
-        result._pending = [state for state in result._pending if state.time > self._taken]
+        result._pending = [state for state in result._pending if state.time > self._reported_until]
         return result
 
     def _with_corrected(self, judgement: Judgement) -> Judgement:
@@ -591,8 +602,8 @@ class Navigator:
             *imu_remarks(hung_since, before, time, gap_bridged=gap_bridged)
         )
         judgement = judgement.with_findings(*self._arrived.remarks)
-        if (found := self._update.score.correction) is not None:
-            self._possible = (found,)
+        if (correction := self._update.score.correction) is not None:
+            self._possible = (correction,)
         state, counts = self._estimator.state, self.counts
         restarts = counts["lost and found again"]
         if self.site.platform.inertial:  # a motion prior may be uncertain, with regular fixes

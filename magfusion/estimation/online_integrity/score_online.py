@@ -215,10 +215,10 @@ class OnlineScore:
             gained = np.flatnonzero(targets.gains(information, gradient) > 0.0)
             return [targets.fault_candidates[k] for k in gained.tolist()]
 
-        self.correction, found = None, next(causes_of(pose_cov, score, candidates), None)
-        if found is None:
+        self.correction, first = None, next(causes_of(pose_cov, score, candidates), None)
+        if first is None:
             return Judgement()
-        cause, rivals = found.cause, found.rivals
+        cause, rivals = first.cause, first.rivals
         turn, shift = np.linalg.norm(cause.moved[0].reshape(2, 3), axis=1)
         finding = finding_of(targets.site, score, cause, rivals)
         (correction,) = corrections(self.site, (finding,), (cause, *rivals), None)

@@ -40,7 +40,7 @@ def write_plot(path: Path, courses: list[EstimatorPlot], figures: Mapping[str, o
             axes.set_ylim(limits[:, 0].min(), limits[:, 1].max())
     figure.suptitle(
         f"{figures['hours']:g} h, {figures['worlds']} world(s), {figures['drive']} drive, phase"
-        f" {figures['phase']}, clock {figures['clock_ppm']:g} ppm: {figures['stability']}"
+        f" {figures['phase']}, clock {figures['clock_ppm']:g} ppm: {figures['verdict']}"
     )
     figure.savefig(path, dpi=100, metadata={"Software": None})
 

@@ -1,0 +1,116 @@
+"""Clocks in a pipe: counters that wrap, steps, and single stamps that are wrong."""
+
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from online_log import OnlineLog, online_log
+from test_navigate_stream import answered, records
+
+from magfusion.estimation.online.navigator import Navigator
+from magfusion.files.site import save_site
+from magfusion.jobs.checkpoint import REPORT_INTERVAL, CheckpointWriter
+
+WRAP = 2.0**32 * 1e-6  # s; of a 32-bit counter of microseconds
+SECONDS = 22.0
+
+
+@pytest.fixture(scope="module")
+def walk() -> OnlineLog:
+    return online_log(3, SECONDS)
+
+
+@pytest.fixture(scope="module")
+def site(walk: OnlineLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("clocks") / "site.yaml"
+    save_site(walk.site, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def lines(walk: OnlineLog) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in records(walk).splitlines()]
+
+
+def newest(line: dict[str, Any]) -> float:
+    (part,) = line.values()
+    return float(np.max(part["time"]))
+
+
+def stamped(line: dict[str, Any], change: Any) -> dict[str, Any]:
+    ((kind, part),) = line.items()
+    return {kind: part | {"time": change(np.asarray(part["time"], dtype=float)).tolist()}}
+
+
+def sent(lines: list[dict[str, Any]]) -> bytes:
+    return b"".join(json.dumps(line).encode() + b"\n" for line in lines)
+
+
+def errors(walk: OnlineLog, states: list[dict[str, Any]], later: float = 0.0) -> np.ndarray:
+    """Return the distances of states from the truth (m), whose clock was so much later (s)."""
+    time = np.array([s["time"] for s in states]) + later
+    truth = walk.motion.trajectory(time).position_world
+    return np.linalg.norm(np.array([s["position"] for s in states]) - truth, axis=1)
+
+
+def test_a_counter_of_microseconds_goes_on_where_it_wraps(
+    walk: OnlineLog, site: Path, lines: list[dict[str, Any]]
+) -> None:
+    ahead = WRAP - 0.5 * SECONDS
+    given = [stamped(one, lambda t: (t + ahead) % WRAP) for one in lines]
+    states, reported = answered(site, sent(given))
+    started = [s for s in states if s["started"]]
+    assert reported == ""
+    assert np.all(np.diff([s["time"] for s in started]) > 0.0)
+    assert len(started) > 25
+    assert np.max(errors(walk, started, -ahead)) < 0.05  # m
+
+
+@pytest.mark.parametrize("step", [-5.0, -40.0, 3600.0])
+def test_after_a_step_navigation_starts_anew(
+    walk: OnlineLog, site: Path, lines: list[dict[str, Any]], step: float
+) -> None:
+    later = [newest(one) > 9.0 for one in lines]
+    given = [
+        stamped(one, lambda t: t + step) if new else one
+        for one, new in zip(lines, later, strict=True)
+    ]
+    states, reported = answered(site, sent(given))
+    (told,) = re.findall(r"imu: its clock stepped by (\S+) s; navigation restarts", reported)
+    assert float(told) == pytest.approx(step, abs=0.1)  # s, two pieces of the stream
+    first = next(k for k, s in enumerate(states) if s["started"])
+    stepped = next(k for k in range(first, len(states)) if not states[k]["started"])
+    anew = [s for s in states[stepped:] if s["started"]]
+    assert len(anew) > 5
+    assert np.max(errors(walk, anew, -step)) < 0.05  # m
+    assert all(s["reset_counter"] == 1 for s in anew)
+
+
+def test_a_single_wrong_stamp_is_left_out_and_said(site: Path, lines: list[dict[str, Any]]) -> None:
+    wrong = next(k for k, one in enumerate(lines) if "imu" in one and newest(one) > 8.0)
+    spoiled = [*lines]
+    spoiled[wrong] = stamped(lines[wrong], lambda t: t + 1e6)
+    expected, _ = answered(site, sent([*lines[:wrong], *lines[wrong + 1 :]]))
+    states, reported = answered(site, sent(spoiled))
+    assert [s for s in states if s["started"]] == [s for s in expected if s["started"]]
+    assert f"line {wrong + 1}: imu: its clock jumped ahead by" in reported
+    assert reported.count("\n") == 2  # it, and the count
+
+
+def test_a_checkpoint_that_cannot_be_written_is_said_once_a_minute(
+    walk: OnlineLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr("magfusion.jobs.checkpoint.time.monotonic", lambda: now[0])
+    writer = CheckpointWriter(tmp_path / "gone" / "state", "ab" * 32, sys.stderr)
+    navigator = Navigator(walk.site)
+    for _ in range(13):  # every ten seconds
+        writer.save(navigator, 1, None)
+        now[0] += REPORT_INTERVAL / 6.0
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 3
+    assert all("the checkpoint cannot be written" in line for line in said)
