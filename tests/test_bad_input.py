@@ -245,5 +245,21 @@ def test_sigterm_ends_with_143_and_tells_how_to_go_on(worked: Worked) -> None:
     assert findings.count(b"\n") == 1
 
 
+def test_an_interrupt_while_the_command_is_imported_shows_no_traceback() -> None:
+    program = """
+import sys
+class Interrupt:
+    def find_spec(self, name, *_):
+        if name == "magfusion.cli":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupt())
+from magfusion.__main__ import run
+run()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
+    assert done.returncode == 130
+    assert done.stderr == b""
+
+
 def test_a_refused_drift_leaves_nothing(tmp_path: Path, refuse: Refuse) -> None:
     assert "--workers" in refuse("drift", "-o", tmp_path / "run", "--hours", 0.1, "--workers", 0)

@@ -68,6 +68,13 @@ class NavigateSettings(
         most=10.0,
         note="0: immediate",
     )
+    lost_beyond: float = option(
+        1.0,
+        "Position sigma beyond which a platform that detects no beacon is lost",
+        unit="m",
+        above=0.0,
+        most=1e4,
+    )
     checkpoint: Path | None = option(
         None, "Checkpoint file", note="default: in the output while the job runs"
     )
@@ -97,4 +104,5 @@ class NavigateSettings(
             rate=self.rates,
             horizon=self.horizon,
             correction_time=self.blend,
+            lost_beyond=self.lost_beyond,
         )

@@ -46,7 +46,8 @@ from magfusion.model.trust import Finding
 from magfusion.units import Array, BoolArray
 
 WIDE_POSITION, WIDE_ROTATION = 0.3, 0.2  # m, rad; beyond, the prediction is no linearization point
-LOST_POSITION = 10.0  # m; a larger sigma means that the state is lost
+LOST_POSITION = 10.0  # m; a larger sigma means that the state is lost, whatever is measured
+UNDETECTED = 1.0  # s without a beacon, longer than any window, before the sigma alone decides
 NOW = np.zeros(1, dtype=np.int64)  # the single epoch of a measurement
 AS_LIKELY = 20.0  # difference of chi square to the best hypothesis
 COMPARED_EVERY, COMPARED_EPOCHS = 30.0, 150  # s, epochs; between fixes without a request
@@ -63,6 +64,8 @@ class EpochUpdate:
         Calibration parameters that are estimated, and all in the states' tangent.
     earth : bool
         Whether the static field is a measurement.
+    lost_beyond : float
+        As of `magfusion.estimation.online.navigator_settings.NavigatorSettings` (m).
     bank : SubsetBank, optional
         Filters that exclude each beacon; without it there are no protection levels.
     """
@@ -78,6 +81,7 @@ class EpochUpdate:
     bank: SubsetBank | None
     _compared_at: float
     _since_compared: int
+    _detected_at: float
 
     def __init__(
         self,
@@ -85,9 +89,11 @@ class EpochUpdate:
         estimated: tuple[Block, ...],
         blocks: tuple[Block, ...],
         earth: bool,
+        lost_beyond: float,
         bank: SubsetBank | None = None,
     ) -> None:
-        self.site, self.blocks, self.bank = site, blocks, bank
+        self.site, self.blocks, self.bank, self._lost_beyond = site, blocks, bank, lost_beyond
+        self._detected_at = -np.inf
         self.gate = Gate(site.channels, blocks, MagnetometerWatch(site))
         self.of_currents: tuple[Finding, ...] = ()
         self._roll = roll_findings(site)
@@ -104,6 +110,7 @@ class EpochUpdate:
         self.gate.watch.begin(start.excluded, start.findings)
         self.monitor.begin(start.state.time, findings, start.shared_offsets)
         self.score.begin(start.score, start.state.time)
+        self._detected_at = start.state.time
         fitted = [f for f in start.trust.remarks if f.code == "fitted_line" and start.extra_lines]
         return self._judge_state(start.state, None).with_findings(*fitted)
 
@@ -141,6 +148,7 @@ class EpochUpdate:
             if isinstance(passed, Judgement):  # nothing of it is to be used
                 return passed
             result, point = passed
+            self._detected_at = state.time
         if result is not None:
             known = state if point is None else replace(point, cov=state.cov)
             measurements += self._of_fields(result, known, step)
@@ -271,7 +279,9 @@ class EpochUpdate:
         return self._is_lost(state) or _wide(state)
 
     def _is_lost(self, state: State) -> bool:
-        return self.gate.is_lost or not _no_wider(state.cov[POSITION, POSITION], LOST_POSITION)
+        undetected = state.time > self._detected_at + UNDETECTED
+        limit = self._lost_beyond if undetected else LOST_POSITION
+        return self.gate.is_lost or not _no_wider(state.cov[POSITION, POSITION], limit)
 
     def _passed(
         self,

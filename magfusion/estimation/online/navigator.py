@@ -136,7 +136,9 @@ class Navigator:
         # Without its only beacon nothing can be compared.
         if risk is not None and len(site.beacons) > 1:
             bank = SubsetBank(site, self.blocks, self._considered, risk)
-        self._update = EpochUpdate(site, estimated, self.blocks, self.settings.earth, bank)
+        self._update = EpochUpdate(
+            site, estimated, self.blocks, self.settings.earth, self.settings.lost_beyond, bank
+        )
         self._process_noise = calibration_process_noise(site, self.blocks, self._considered)
         self._arrived = arrivals_of(site, self.settings.lockin)
         if not self.settings.earth:  # short windows contain no static field

@@ -32,6 +32,8 @@ class NavigatorSettings(EstimatorSettings):
         at a rate (Hz); they are propagated from the newest epoch.
     horizon : float
         How far ahead they are predicted (s).
+    lost_beyond : float
+        Sigma of the position (m) beyond which a platform that detects no beacon is lost.
     correction_time : float
         Time in which a correction enters them (s); at once where it is zero.
     """
@@ -47,3 +49,4 @@ class NavigatorSettings(EstimatorSettings):
     rate: Rate = "field"
     horizon: float = 0.0
     correction_time: float = 0.0
+    lost_beyond: float = 1.0

@@ -210,6 +210,12 @@ class OnlineMonitor:
 
     def _of_being_lost(self, gate: Gate, lost_since: float | None) -> Judgement:
         if lost_since is not None:
+            if not gate.is_lost:
+                text = (
+                    f"Lost since {lost_since:.1f} s: no beacon is detected for longer than the IMU"
+                    " can replace them. The next fix of the beacons ends this."
+                )
+                return Judgement((Finding("lost", text, Verdict.FAILED, 10.0),))
             text = (
                 f"Lost since {lost_since:.1f} s: neither a fix nor the state explains the fields."
                 " Check the frequencies, phases and positions of the beacons in the site."
