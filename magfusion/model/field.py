@@ -167,12 +167,6 @@ def observe(
     if twist_body is not None:
         twist = twist_body.astype(np.complex128)[..., None, :, None]
         by_time_offset = -(platform_pose @ twist)[..., 0]
-    by_ground = coil_fields_by_log_conductivity(_source(beacon), seen.offset_beacon)
-    if by_ground is not None:
-        if seen.mapped is not None:
-            by_ground = (seen.mapped.correction @ by_ground[..., None])[..., 0]
-        by_ground = seen.tones_from_coils @ by_ground
-        by_ground = by_ground @ np.swapaxes(sensor_from_body @ seen.body_from_beacon, -1, -2)
     return Observation(
         phasor_sensor=phasor,
         platform_pose=platform_pose,
@@ -182,7 +176,7 @@ def observe(
         matrix=by_matrix(in_sensor),
         body_from_sensor=np.concatenate([matrix @ skew(in_sensor), by_body @ mounting], axis=-1),
         time_offset=by_time_offset,
-        log_conductivity=by_ground,
+        log_conductivity=_by_log_conductivity(_source(beacon), seen, sensor_from_body),
     )
 
 
@@ -211,6 +205,19 @@ class _Seen(NamedTuple):
     tones_from_coils: ComplexArray  # (..., tones, coils)
     body_from_beacon: Array
     mapped: _Mapped | None
+
+
+def _by_log_conductivity(
+    source: Sources, seen: _Seen, measured_from_body: Array
+) -> ComplexArray | None:
+    """Return the derivative by the ground's conductivity; None without any."""
+    by_coil = coil_fields_by_log_conductivity(source, seen.offset_beacon)
+    if by_coil is None:
+        return None
+    if seen.mapped is not None:
+        by_coil = (seen.mapped.correction @ by_coil[..., None])[..., 0]
+    measured_from_beacon = np.swapaxes(measured_from_body @ seen.body_from_beacon, -1, -2)
+    return np.asarray(seen.tones_from_coils @ by_coil @ measured_from_beacon)
 
 
 def _times(left_factor: AnyArray, right: Array) -> AnyArray:

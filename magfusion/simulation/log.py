@@ -188,17 +188,7 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
     drives = replace(draw_drives(among, calibration_rng), turning=turning)
     motion = _motion(config, motion_rng)
     ambient = _with_bending(true_site, config, field_rng, _with_iron(true_site, config, iron_rng))
-    imu = simulate_imu(
-        motion,
-        true_site.platform.imu,
-        true_site.gravity,
-        config.imu_rate_hz,
-        config.duration,
-        imu_rng,
-        true_site.platform.imu.time_offset,
-        config.instability,
-        true_site.platform.imu.clock_rate,
-    )
+    imu = _imu(motion, true_site, config, imu_rng)
     marks = None
     if is_multiplexed(site):
         marks = draw_marks(site, config.multiplexer, config.duration, rng.spawn(1)[0])
@@ -239,6 +229,23 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         rotation=rotation,
     )
     return SimulatedLog(log, true_site, drives, motion, ambient)
+
+
+def _imu(
+    motion: SimulatedMotion, site: Site, config: SimulationConfig, rng: np.random.Generator
+) -> SimulatedImu:
+    model = site.platform.imu
+    return simulate_imu(
+        motion,
+        model,
+        site.gravity,
+        config.imu_rate_hz,
+        config.duration,
+        rng,
+        model.time_offset,
+        config.instability,
+        model.clock_rate,
+    )
 
 
 def _truth(motion: SimulatedMotion, imu: SimulatedImu, site: Site) -> Trajectory:

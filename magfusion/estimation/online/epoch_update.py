@@ -133,7 +133,7 @@ class EpochUpdate:
             self.gate.counts["inertial gap bridged"] += 1
         step = max(state.time - arrived.last_epoch, 1e-6)
         earth, standing = self._earth is not None, arrived.rests(state)
-        lost_epochs = self._is_lost(state)
+        lost_epochs = self._needs_fix(state)
         result = arrived.measured(
             before, state, samples, step, earth=earth, standing=standing, is_lost=lost_epochs
         )
@@ -276,12 +276,17 @@ class EpochUpdate:
 
     def needs_separate_beacons(self, state: State) -> bool:
         """Return whether jointly measured beacons do not suffice: each is needed separately."""
-        return self._is_lost(state) or _wide(state)
+        return self._needs_fix(state) or _wide(state)
+
+    def _needs_fix(self, state: State) -> bool:
+        """Return whether only a fix that is independent of the state can replace it."""
+        return self.gate.is_lost or not _no_wider(state.cov[POSITION, POSITION], LOST_POSITION)
 
     def _is_lost(self, state: State) -> bool:
         undetected = state.time > self._detected_at + UNDETECTED
-        limit = self._lost_beyond if undetected else LOST_POSITION
-        return self.gate.is_lost or not _no_wider(state.cov[POSITION, POSITION], limit)
+        if undetected and not _no_wider(state.cov[POSITION, POSITION], self._lost_beyond):
+            return True
+        return self._needs_fix(state)
 
     def _passed(
         self,
