@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.files.bag_reader import open_bag, refuse_overlap
 from magfusion.files.bag_rows import Messages, Wanted, read_parts
 from magfusion.files.bag_topics import Topics
 from magfusion.files.lost_rows import LostRows
@@ -60,7 +59,8 @@ def read_bag(
     Parameters
     ----------
     path : Path
-        Directory of a bag, or its file (``.mcap``, ``.db3``, ``.bag`` of ROS 1).
+        Directory of a bag, with its metadata or without, or its file (``.mcap``, ``.db3``,
+        ``.bag`` of ROS 1).
     start, end : float, optional
         Seconds since the first inertial sample.
     report : callable
@@ -78,7 +78,8 @@ def read_bag(
         Where the bag cannot be read, has no topic of a sensor or several of one kind of which
         none was named, or holds messages that no instrument gives.
     """
-    result = _opened(path, topics or Topics(), report)
+    with open_bag([path]) as reader:
+        result = _read(reader, path, topics or Topics(), report)
     imu, field, truth = (result.get(role) for role in ("imu", "magnetometer", "truth"))
     first = field if imu is None else imu
     if first is None:
@@ -103,24 +104,13 @@ def read_bag(
     )
 
 
-def _opened(path: Path, topics: Topics, report: Report) -> dict[str, _Stream]:
-    """Return the streams of a bag by their roles; refuse one that cannot be read."""
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            return _read(reader, path, topics, report)
-    except InputError:
-        raise
-    except Exception as error:  # a damaged bag makes the library fail in any way whatever
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{path}: cannot be read ({reason}); record the bag again.") from error
-
-
 def _read(reader: AnyReader, path: Path, topics: Topics, report: Report) -> dict[str, _Stream]:
     """Return the streams by their roles, of one pass over the bag."""
     wanted: dict[str, Wanted] = {}
     for role, rows in ROWS.items():
         connections = _chosen(reader, path, getattr(topics, role), role, tuple(rows))
         if connections:
+            refuse_overlap(reader, connections[0].topic)
             row, place = rows[connections[0].msgtype], f"{path} topic {connections[0].topic}"
             wanted[role] = Wanted(place, connections, row)
     parts: dict[str, list[Messages]] = {role: [] for role in wanted}

@@ -15,6 +15,18 @@ class Topics:
     truth: str | None = None
 
 
+def bag_files(path: Path) -> list[Path]:
+    """Return what the library opens of a bag; nothing of what is none.
+
+    A directory with its metadata is opened as such, one without by the files in it.
+    """
+    if not path.is_dir():
+        return [path] if path.suffix in BAG_SUFFIXES else []
+    if (path / "metadata.yaml").is_file():
+        return [path]
+    return sorted(p for p in path.iterdir() if p.is_file() and p.suffix in BAG_SUFFIXES)
+
+
 def is_bag(path: Path) -> bool:
-    """Return whether a path is a bag: a directory with its metadata, or a single file."""
-    return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix in BAG_SUFFIXES
+    """Return whether a path is a bag: a directory of one, or a single file."""
+    return bool(bag_files(path))
