@@ -25,9 +25,9 @@ ROOMS = {
     wing: rooms.split()
     for wing, rooms in {
         "model": """
-            arguments correlation drive field_map fixed_axes groups hall hermite imu_intrinsics
-            marks perturbation physics platform_motion probe progress quaternion region response
-            rotor short_repr temperature time_division trust
+            arguments batches correlation drive field_map fixed_axes groups hall hermite
+            imu_intrinsics marks perturbation physics platform_motion probe progress quaternion
+            region response rotor short_repr temperature time_division trust
             magnetometer
             site trajectory
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
@@ -37,7 +37,8 @@ ROOMS = {
         """,
         "files": """
             atomic bag_topics blas_threads commit lost_rows messages parquet_bounds plain_data
-            plain_table plausible row_table site_draft site_ground site_values standard_streams
+            plain_table plausible row_stamps row_table site_draft site_ground site_values
+            standard_streams
             bag_reader bag_rows checkpoint correlation field_map kept probe row_file survey table
             yaml_files
             attitude_table drive_columns fields hall instruments readings_table site_casing

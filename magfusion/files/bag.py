@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,7 @@ from magfusion.files.bag_topics import Topics
 from magfusion.files.lost_rows import LostRows
 from magfusion.files.messages import FIELD, IMU, ROWS, USUAL
 from magfusion.files.plausible import check_field, check_imu
+from magfusion.files.row_stamps import batches_finding, separate_stamps
 from magfusion.files.table import LARGEST_NUMBER, Span
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.model.progress import Report, quiet
@@ -29,18 +30,28 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 
+_NAMES = {"imu": "IMU", "magnetometer": "magnetometer", "truth": "truth"}  # of the roles
+
+
 @dataclass(frozen=True, eq=False)
 class _Stream:
-    """Messages of one topic as numbers, sorted by the stamps of their headers."""
+    """Messages of one topic as numbers, sorted by the stamps of their headers.
 
+    Parameters
+    ----------
+    name : str
+        Of its role in reports.
+    """
+
+    name: str
     place: str
-    msgtype: str
     time_ns: IntArray
     values: Array
+    noticed: tuple[Finding, ...] = ()
 
     def within(self, span: Span) -> _Stream:
         begin, end = np.searchsorted(self.time_ns, span.bounds_ns)
-        return _Stream(self.place, self.msgtype, self.time_ns[begin:end], self.values[begin:end])
+        return replace(self, time_ns=self.time_ns[begin:end], values=self.values[begin:end])
 
 
 def read_bag(
@@ -90,8 +101,8 @@ def read_bag(
     span = Span(int(first.time_ns[0]), start, end)
     declared: list[Finding] = []
     imu, field, truth = (
-        None if one is None else _measured(one.within(span), role, declared)
-        for one, role in ((imu, "IMU"), (field, "magnetometer"), (truth, "truth"))
+        None if one is None else _measured(one.within(span), declared)
+        for one in (imu, field, truth)
     )
     return Log(
         name=path.resolve().stem,
@@ -121,7 +132,7 @@ def _read(reader: AnyReader, path: Path, topics: Topics, report: Report) -> dict
         if not parts[role]:
             raise InputError(f"{one.place}: holds no messages; record it, or leave it out.")
         stamps, values = (np.concatenate(column) for column in zip(*parts.pop(role), strict=True))
-        result[role] = _sorted(one.place, one.connections[0].msgtype, stamps, values)
+        result[role] = _own_times(_sorted(_NAMES[role], one.place, stamps, values))
     return result
 
 
@@ -156,7 +167,7 @@ def _refuse_several_types(connections: list[Connection], path: Path) -> None:
         raise InputError(f"{path}: topic {topic} has several types; record it with one.")
 
 
-def _sorted(place: str, msgtype: str, stamps: IntArray, values: Array) -> _Stream:
+def _sorted(name: str, place: str, stamps: IntArray, values: Array) -> _Stream:
     if np.any(np.diff(stamps) < 0):
         # A bag keeps the order of arrival, which the network may have changed.
         order = np.argsort(stamps, kind="stable")
@@ -168,11 +179,21 @@ def _sorted(place: str, msgtype: str, stamps: IntArray, values: Array) -> _Strea
             f"{place}: the message stamped {stamp} ns holds a number that is not finite; remove the"
             " message."
         )
-    return _Stream(place, msgtype, stamps, values)
+    return _Stream(name, place, stamps, values)
 
 
-def _measured(stream: _Stream, role: str, declared: list[Finding]) -> _Stream:
+def _own_times(stream: _Stream) -> _Stream:
+    """Return a stream with the times of its samples, where the stamps are others."""
+    separate = separate_stamps(stream.time_ns, stream.values)
+    if separate is None:
+        return stream
+    noticed = batches_finding(stream.name, stream.time_ns)
+    return replace(stream, time_ns=separate, noticed=(*stream.noticed, noticed))
+
+
+def _measured(stream: _Stream, declared: list[Finding]) -> _Stream:
     """Return the messages that have a sample, and report the others."""
+    declared += stream.noticed
     lost_epochs = LostRows.of(stream.time_ns, stream.values)
     for too_many, rows, remedy in zip(
         lost_epochs.too_many,
@@ -188,9 +209,9 @@ def _measured(stream: _Stream, role: str, declared: list[Finding]) -> _Stream:
                 f"{stream.place}: {np.sum(rows)} of {len(rows)} messages {remedy} (the first is"
                 f" stamped {stream.time_ns[np.argmax(rows)]} ns)."
             )
-    declared += lost_epochs.findings(role)
+    declared += lost_epochs.findings(stream.name)
     kept = lost_epochs.kept
-    return _Stream(stream.place, stream.msgtype, stream.time_ns[kept], stream.values[kept])
+    return replace(stream, time_ns=stream.time_ns[kept], values=stream.values[kept])
 
 
 def _imu(stream: _Stream, span: Span) -> ImuSamples:

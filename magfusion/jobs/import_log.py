@@ -296,6 +296,7 @@ def _figures(
     )
     notes = [f"Skipped: {reason}" for reason in result.passed_over]
     notes += [note] if note else []
+    notes += [f"{stream}: {one.batches}" for stream, one in counts.items() if one.batches]
     begin = (_first(counts) - epoch_ns) * 1e-9
     if not is_first and abs(begin) > LATE:
         notes.append(

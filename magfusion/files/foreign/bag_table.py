@@ -2,7 +2,8 @@
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from magfusion.errors import InputError
 from magfusion.files.bag_reader import open_bag, place_of, refuse_overlap
 from magfusion.files.bag_rows import Messages, Wanted, read_parts
 from magfusion.files.foreign.columns import STREAMS, TIME, VELOCITY, ColumnMapping, Term
-from magfusion.files.foreign.plan import Findings, ImportPlan, Terms
+from magfusion.files.foreign.plan import Findings, ImportPlan, Rate, Terms
 from magfusion.files.foreign.source import ROWS, RowBlock, Source, SourceColumn
 from magfusion.files.foreign.units import SourceUnit, accepted, parse_unit
 from magfusion.files.messages import (
@@ -80,6 +81,7 @@ def first_stamp(paths: Sequence[Path], topic: str) -> int:
 def plan_bag(
     paths: Sequence[Path],
     entries: Mapping[str, Sequence[ColumnMapping]],
+    rates: Mapping[str, Rate],
     others: Collection[str],
     declared: Findings,
 ) -> list[ImportPlan]:
@@ -91,6 +93,8 @@ def plan_bag(
         Bags of one recording.
     entries : mapping of sequence of ColumnMapping
         The user's choice for each stream: a topic, and frames or a unit behind it.
+    rates : mapping of Rate
+        Of streams whose messages are counted, whatever their stamps.
     others : collection of str
         Streams that come from elsewhere.
 
@@ -117,7 +121,7 @@ def plan_bag(
                 else:
                     own = [c for c in reader.connections if c.topic == topic.name]
                     count = sum(connection.msgcount for connection in own)
-                    plans.append(_plan(paths, role, topic, unit, count))
+                    plans.append(_plan(paths, role, topic, unit, count, rates.get(role)))
     return plans
 
 
@@ -225,7 +229,12 @@ def _frame(name: str) -> str:
 
 
 def _plan(
-    paths: Sequence[Path], role: str, topic: Topic, field_unit: SourceUnit, count: int
+    paths: Sequence[Path],
+    role: str,
+    topic: Topic,
+    field_unit: SourceUnit,
+    count: int,
+    rate: Rate | None,
 ) -> ImportPlan:
     place = f"{place_of(paths)} topic {topic.name}"
     columns = _COLUMNS[role]
@@ -246,7 +255,18 @@ def _plan(
         usual = {name: terms for name, terms in usual.items() if name not in VELOCITY}
     known = (SourceColumn(TIME), *map(SourceColumn, columns))
     source = Source(place, known, read, form=topic.msgtype, count=count)
-    return ImportPlan(role, source, usual)
+    if rate is not None:
+        del usual[TIME]
+        if rate.start_s is None:
+            rate = replace(rate, start_s=_first_sample(_rows(paths, place, role, topic), rate.hz))
+    return ImportPlan(role, source, usual, rate)
+
+
+def _first_sample(rows: Iterator[tuple[IntArray, Array]], hz: Fraction) -> Fraction:
+    """Return the time of the first sample (s); of a batch with one stamp the last keeps it."""
+    stamps = next((stamps for stamps, _ in rows), np.zeros(1, dtype=np.int64))
+    before = int(np.sum(stamps == stamps[0])) - 1
+    return Fraction(int(stamps[0]), 10**9) - before / hz
 
 
 def _unit(name: str, role: str, target: str) -> SourceUnit:

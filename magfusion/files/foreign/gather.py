@@ -189,7 +189,7 @@ def _add_bag(bags: Sequence[Path], wanted: ImportRequest, result: GatheredStream
     ]
     result.stamped = True
     entries = {s: e for s, e in wanted.entries.items() if s not in wanted.files}
-    for plan in plan_bag(bags, entries, tuple(wanted.files), result.findings):
+    for plan in plan_bag(bags, entries, wanted.rates, tuple(wanted.files), result.findings):
         result.add(plan)
     return set(STREAMS)
 

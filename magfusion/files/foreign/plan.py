@@ -50,12 +50,12 @@ class Rate:
     Parameters
     ----------
     hz : fraction
-    start_s : fraction
-        Of the first row.
+    start_s : fraction, optional
+        Of the first row; by default 0, and of a bag the stamp of the first message.
     """
 
     hz: Fraction
-    start_s: Fraction = Fraction(0)
+    start_s: Fraction | None = None
 
 
 @dataclass(frozen=True, eq=False)
