@@ -17,13 +17,14 @@ from magfusion.files.lost_rows import LostRows
 from magfusion.files.messages import FIELD, IMU, ROWS, USUAL
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.row_stamps import batches_finding, separate_stamps
+from magfusion.files.stray_stamps import LONGEST_GAP, stray_finding, stray_rows
 from magfusion.files.table import LARGEST_NUMBER, Span
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
-from magfusion.units import Array, IntArray
+from magfusion.units import NANOSECOND, Array, IntArray
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -184,16 +185,27 @@ def _sorted(name: str, place: str, stamps: IntArray, values: Array) -> _Stream:
 
 def _own_times(stream: _Stream) -> _Stream:
     """Return a stream with the times of its samples, where the stamps are others."""
+    stray = stray_rows(stream.time_ns)
+    noticed = stray_finding(stream.name, stream.time_ns[stray])
+    kept = stream.time_ns[~stray], stream.values[~stray]
+    stream = _Stream(stream.name, stream.place, *kept, noticed)
     separate = separate_stamps(stream.time_ns, stream.values)
     if separate is None:
         return stream
-    noticed = batches_finding(stream.name, stream.time_ns)
-    return replace(stream, time_ns=separate, noticed=(*stream.noticed, noticed))
+    noticed += (batches_finding(stream.name, stream.time_ns),)
+    return replace(stream, time_ns=separate, noticed=noticed)
 
 
 def _measured(stream: _Stream, declared: list[Finding]) -> _Stream:
     """Return the messages that have a sample, and report the others."""
     declared += stream.noticed
+    jumps = np.diff(stream.time_ns) > LONGEST_GAP / NANOSECOND
+    if jumps.any():
+        raise InputError(
+            f"{stream.place}: the message stamped {stream.time_ns[1:][np.argmax(jumps)]} ns is more"
+            " than an hour after the one before: the clock jumped; use one side by --start and"
+            " --end."
+        )
     lost_epochs = LostRows.of(stream.time_ns, stream.values)
     for too_many, rows, remedy in zip(
         lost_epochs.too_many,

@@ -11,6 +11,7 @@ from magfusion.files.drive_columns import current_columns_of
 from magfusion.files.lost_rows import LostRows
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.rotor_columns import angle_columns_of
+from magfusion.files.stray_stamps import stray_finding
 from magfusion.files.table import TIME, Span, Table, TableLayout, read_table, write_table
 from magfusion.model.drive import DriveSamples
 from magfusion.model.rotor import RotorAngles
@@ -24,9 +25,9 @@ Stream = TypeVar("Stream", FieldSamples, Trajectory)
 _GYRO = ("gyro_x", "gyro_y", "gyro_z")
 _ACCEL = ("accel_x", "accel_y", "accel_z")
 FIELD = ("field_x", "field_y", "field_z")
-IMU_LAYOUT = TableLayout(numbers=(*_GYRO, *_ACCEL), repeats=True)
-FIELD_LAYOUT = TableLayout(numbers=FIELD, repeats=True)
-_SOME_AXES = TableLayout(numbers=(), repeats=True, some=FIELD)
+IMU_LAYOUT = TableLayout(numbers=(*_GYRO, *_ACCEL), repeats=True, strays=True)
+FIELD_LAYOUT = TableLayout(numbers=FIELD, repeats=True, strays=True)
+_SOME_AXES = TableLayout(numbers=(), repeats=True, some=FIELD, strays=True)
 
 
 def read_imu(
@@ -107,7 +108,9 @@ def measured_rows(
     if too_many:
         name = next(n for n, v in zip(names, values.T, strict=True) if np.isnan(v).any())
         table.refuse(lost_epochs.absent, name, np.full(len(table), np.nan), "write a finite number")
-    return table.time[lost_epochs.kept], values[lost_epochs.kept], lost_epochs.findings(stream)
+    noticed = stray_finding(stream, [stamp for _, stamp in table.stray])
+    noticed += lost_epochs.findings(stream)
+    return table.time[lost_epochs.kept], values[lost_epochs.kept], noticed
 
 
 def write_waveform(

@@ -17,7 +17,8 @@ from magfusion.files.foreign.units import NO_STAMP, Raw, to_nanoseconds
 from magfusion.files.lost_rows import MOST_MISSING, MOST_TWICE, LostRows
 from magfusion.files.plausible import SHORTEST_STEP
 from magfusion.files.row_stamps import batches_text, separate_stamps
-from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, LONGEST_GAP, ROWS_PER_GROUP
+from magfusion.files.stray_stamps import LONGEST_GAP, stray_rows
+from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, ROWS_PER_GROUP
 from magfusion.files.table import TIME as TIME_NS
 from magfusion.units import NANOSECOND, AnyArray, Array, BoolArray, IntArray
 
@@ -188,6 +189,7 @@ def _kept(
         none = keep & (length < LEAST_QUATERNION)
         counts.leave_out("with a quaternion of zeros", int(np.sum(none)))
         keep &= ~none
+    keep[keep] = ~_strays(stamps[keep], counts)
     stamps, values, rows, missing = stamps[keep], values[keep], rows[keep], missing[keep]
     if not len(stamps):
         return stamps, values
@@ -207,6 +209,15 @@ def _kept(
         counts.first = min(counts.first, int(stamps.min()))
         counts.last = max(counts.last, int(stamps.max()))
     return stamps, values
+
+
+def _strays(stamps: IntArray, counts: Counts) -> BoolArray:
+    """Return which rows have a stamp far from all others, and count them."""
+    if not len(stamps):
+        return np.zeros(0, dtype=bool)
+    stray = stray_rows(stamps, counts.written, counts.last if counts.written else None)
+    counts.leave_out("with a stray time", int(np.sum(stray)))
+    return stray
 
 
 def _refuse_jumps(plan: ImportPlan, stamps: IntArray, rows: IntArray, counts: Counts) -> None:
