@@ -36,9 +36,9 @@ ROOMS = {
             noise prior waveform
         """,
         "files": """
-            atomic bag_topics blas_threads commit lost_rows messages parquet_bounds plain_data
-            plain_table plausible row_stamps row_table site_draft site_ground site_values
-            standard_streams stray_stamps
+            atomic bag_recovery bag_topics blas_threads commit lost_rows messages parquet_bounds
+            plain_data plain_table plausible row_stamps row_table site_draft site_ground
+            site_values standard_streams stray_stamps
             bag_reader bag_rows checkpoint correlation field_map kept probe row_file survey table
             yaml_files
             attitude_table drive_columns fields hall instruments readings_table site_casing

@@ -23,7 +23,7 @@ from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import Finding
+from magfusion.model.trust import Finding, Verdict
 from magfusion.units import NANOSECOND, Array, IntArray
 
 if TYPE_CHECKING:
@@ -92,6 +92,7 @@ def read_bag(
     """
     with open_bag([path]) as reader:
         result = _read(reader, path, topics or Topics(), report)
+        notes = reader.notes
     imu, field, truth = (result.get(role) for role in ("imu", "magnetometer", "truth"))
     first = field if imu is None else imu
     if first is None:
@@ -100,7 +101,7 @@ def read_bag(
             " inertial sensor with it."
         )
     span = Span(int(first.time_ns[0]), start, end)
-    declared: list[Finding] = []
+    declared = [Finding("bag_unfinished", note, Verdict.TRUSTWORTHY) for note in notes]
     imu, field, truth = (
         None if one is None else _measured(one.within(span), declared)
         for one in (imu, field, truth)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
+UNFINISHED = ".bag.active"  # as ROS 1 leaves a bag of which the recorder was killed
 
 
 @dataclass(frozen=True)
@@ -21,10 +22,19 @@ def bag_files(path: Path) -> list[Path]:
     A directory with its metadata is opened as such, one without by the files in it.
     """
     if not path.is_dir():
-        return [path] if path.suffix in BAG_SUFFIXES else []
+        return [path] if _is_file_of_bag(path) else []
     if (path / "metadata.yaml").is_file():
         return [path]
-    return sorted(p for p in path.iterdir() if p.is_file() and p.suffix in BAG_SUFFIXES)
+    return files_in(path)
+
+
+def files_in(directory: Path) -> list[Path]:
+    """Return the files of bags in a directory."""
+    return sorted(p for p in directory.iterdir() if p.is_file() and _is_file_of_bag(p))
+
+
+def _is_file_of_bag(path: Path) -> bool:
+    return path.suffix in BAG_SUFFIXES or path.name.endswith(UNFINISHED)
 
 
 def is_bag(path: Path) -> bool:

@@ -294,7 +294,7 @@ def _figures(
         Figure("map", lines, section=Section.REPORT),
         Figure("understood", shown, section=Section.REMARKS),
     )
-    notes = [f"Skipped: {reason}" for reason in result.passed_over]
+    notes = [*result.findings.notes, *(f"Skipped: {reason}" for reason in result.passed_over)]
     notes += [note] if note else []
     notes += [f"{stream}: {one.batches}" for stream, one in counts.items() if one.batches]
     begin = (_first(counts) - epoch_ns) * 1e-9

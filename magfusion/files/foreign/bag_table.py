@@ -105,6 +105,7 @@ def plan_bag(
     """
     plans, place = [], place_of(paths)
     with open_bag(paths) as reader:
+        declared.notes += reader.notes
         result = sorted({(c.topic, c.msgtype) for c in reader.connections})
         for role in _COLUMNS:
             if role in others:

@@ -81,11 +81,12 @@ class ImportPlan:
 
 @dataclass(eq=False)
 class Findings:
-    """Problems of an import: sentences, and options that would resolve them."""
+    """Problems of an import: sentences, and options that would resolve them; and notes on it."""
 
     problems: list[str] = field(default_factory=list)
     proposals: list[str] = field(default_factory=list)
     guessed: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 def shown(source: Source, terms: Sequence[Term]) -> str:
