@@ -59,7 +59,7 @@ class ImportSettings(Settings):
         "Mapping of a file's column to one of the log, with its unit",
         note="e.g. 'imu.gyro_x=-GyrY[deg/s]', 'truth.quaternion=qx,qy,qz,qw[xyzw]'; columns"
         " without names are counted from 0; of a bag e.g. imu=/imu/data, magnetometer=/mag[uT],"
-        " truth=/tf:map->base_link; of an attitude in"
+        " truth=/tf:map->imu_link; of an attitude in"
         " angles truth.euler=roll,pitch,yaw[deg] (rotated by yaw, then pitch, then roll)",
         metavar="TABLE.COLUMN=NAME[UNIT]",
     )

@@ -9,23 +9,25 @@ from typing import Any
 
 import numpy as np
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Connection
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files.bag_reader import open_bag, place_of, refuse_overlap
 from magfusion.files.bag_rows import Messages, Wanted, read_parts
+from magfusion.files.foreign.bag_transforms import (
+    TRANSFORM_TYPES,
+    composed_transforms,
+    frame_chain,
+    frame_pairs,
+)
 from magfusion.files.foreign.columns import STREAMS, TIME, VELOCITY, ColumnMapping, Term
 from magfusion.files.foreign.plan import Findings, ImportPlan, Rate, Terms
 from magfusion.files.foreign.source import ROWS, RowBlock, Source, SourceColumn
 from magfusion.files.foreign.units import SourceUnit, accepted, parse_unit
 from magfusion.files.messages import (
-    FORMER_TRANSFORMS,
     ODOMETRY,
-    TRANSFORMS,
     USUAL,
     stamp_ns,
-    transform_row,
 )
 from magfusion.files.messages import (
     ROWS as ROW_OF,
@@ -39,7 +41,6 @@ _COLUMNS = {
     "truth": (*_POSE, *VELOCITY),
 }
 _SI = {"imu": ("rad/s", "m/s^2"), "magnetometer": ("T",), "truth": ("m", "1", "m/s")}
-_TRANSFORMS = (TRANSFORMS, FORMER_TRANSFORMS)
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ def _selected_topic(
         declared.problems.append(f"{place}: has no topic {name} for {role} (found {names}).")
         return None
     unit = read["unit"] or ""
-    if role == "truth" and kind in _TRANSFORMS:
+    if role == "truth" and kind in TRANSFORM_TYPES:
         frames = (read["parent"] or "", read["child"] or "")
         there = _has_transform(place, name, frames, reader, declared)
         return Topic(name, kind, frames) if there else None
@@ -199,9 +200,9 @@ def _selected_topic(
 def _has_transform(
     place: str, name: str, frames: tuple[str, str], reader: AnyReader, declared: Findings
 ) -> bool:
-    """Check that a topic has a transform; what it has instead is proposed."""
-    pairs = _pairs(reader, name)
-    if frames in pairs:
+    """Check that a topic leads from one frame to another; what it has instead is proposed."""
+    pairs = frame_pairs(reader, name)
+    if frame_chain(pairs, frames) is not None:
         return True
     shown = ", ".join(f"{a}->{b}" for a, b in pairs)
     declared.problems.append(
@@ -210,23 +211,6 @@ def _has_transform(
     )
     declared.proposals += [f"truth={name}:{a}->{b}" for a, b in pairs[:5]]
     return False
-
-
-def _pairs(reader: AnyReader, name: str) -> list[tuple[str, str]]:
-    connections = [c for c in reader.connections if c.topic == name]
-    result: dict[tuple[str, str], None] = {}
-    for count, (_, _, raw) in enumerate(reader.messages(connections)):
-        message: Any = reader.deserialize(raw, connections[0].msgtype)
-        result |= dict.fromkeys(
-            (_frame(t.header.frame_id), _frame(t.child_frame_id)) for t in message.transforms
-        )
-        if count > ROWS:
-            break
-    return list(result)
-
-
-def _frame(name: str) -> str:
-    return name.lstrip("/")
 
 
 def _plan(
@@ -289,7 +273,7 @@ def _rows(
     with open_bag(paths) as reader:
         connections = [c for c in reader.connections if c.topic == topic.name]
         if row is None:
-            parts = _transforms(reader, connections, topic)
+            parts = composed_transforms(reader, topic.name, topic.frames or ("", ""))
         else:
             parts = (p for _, p in read_parts(reader, {role: Wanted(place, connections, row)}))
         for part in _joined(parts):
@@ -308,22 +292,6 @@ def _joined(parts: Iterator[Messages]) -> Iterator[Messages]:
             waiting, count = [], 0
     if waiting:
         yield Messages(*map(np.concatenate, zip(*waiting, strict=True)))
-
-
-def _transforms(
-    reader: AnyReader, connections: Sequence[Connection], topic: Topic
-) -> Iterator[Messages]:
-    """Yield the transforms between two frames, a message at a time."""
-    for _, _, raw in reader.messages(connections):
-        message: Any = reader.deserialize(raw, topic.msgtype)
-        own = [
-            one
-            for one in message.transforms
-            if (_frame(one.header.frame_id), _frame(one.child_frame_id)) == topic.frames
-        ]
-        if own:
-            stamps = np.array([stamp_ns(one.header) for one in own])
-            yield Messages(stamps, np.array([transform_row(one) for one in own]))
 
 
 def _complete(role: str, values: Array) -> Array:
