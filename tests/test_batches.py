@@ -1,20 +1,24 @@
 """Samples that are recorded in batches with one stamp are counted, and spread between stamps."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet
 import pytest
-from conftest import Refuse
+from conftest import Refuse, change_table
 from example_bag import FIELD, GYRO, IMU, STAMPS, STEP_NS, N, field_message, header, imu_message
 from example_bag import write_bag as write_example
 from test_bag_files import imported, recording
 
+from magfusion.errors import InputError
 from magfusion.files.foreign.convert import write_stream
 from magfusion.files.foreign.plan import Findings, plan_stream
 from magfusion.files.foreign.text import text_source
+from magfusion.files.log import write_log
 from magfusion.files.open import open_log
 from magfusion.files.row_stamps import separate_stamps
+from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.results.figures import Figures
 
 BATCH = 5
@@ -115,6 +119,37 @@ def test_nothing_is_spread_over_a_gap(tmp_path: Path) -> None:
     np.testing.assert_allclose(stamps * 1e-9, taken, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("current", [False, True])
+def test_batches_of_a_log_are_read_unless_other_columns_have_their_stamps(
+    tmp_path: Path, current: bool
+) -> None:
+    time = 0.013 + 0.005 * np.arange(400)  # s
+    wave = Waveform(time, np.random.default_rng(8).normal(0.0, 2e-5, (400, 3)))
+    imu = ImuSamples(
+        time, np.zeros((400, 3)), np.tile([0.0, 0.0, 9.81], (400, 1)) + wave.time[:, None]
+    )
+    write_log(
+        Log(name="run", epoch_ns=int(STAMPS[0]), source="test", imu=imu, waveform=wave),
+        tmp_path / "log",
+    )
+
+    def together(columns: dict[str, Any]) -> None:
+        columns["time_ns"] = np.repeat(columns["time_ns"][4::5], 5)
+        if current and "field_x" in columns:
+            columns["current_A"] = np.ones(400)
+
+    for stream in ("imu", "magnetometer"):
+        change_table(tmp_path / "log" / f"{stream}.parquet", together)
+    if current:
+        with pytest.raises(InputError, match=r"row 1 .*the time of the row above"):
+            open_log(tmp_path / "log")
+        return
+    log = open_log(tmp_path / "log")
+    assert [finding.code for finding in log.noticed] == ["repeated_stamps"] * 2
+    for own in (log.imu.time, log.waveform.time if log.waveform else np.zeros(0)):
+        np.testing.assert_allclose(own, time, rtol=0, atol=1e-9)
+
+
 def test_rows_written_twice_and_clocks_too_coarse_are_no_batches(
     tmp_path: Path, refuse: Refuse
 ) -> None:
@@ -128,6 +163,10 @@ def test_rows_written_twice_and_clocks_too_coarse_are_no_batches(
     rounded = 5_000_000 * np.arange(300) // 50_000_000 * 50_000_000
     assert separate_stamps(rounded, values) is None
     assert separate_stamps(rounded + 12_345_678, values) is not None
+    stopped = once + 1_234_567
+    stopped[100:150] = stopped[100]
+    assert separate_stamps(np.where(np.arange(300) < 100, stopped[99], stopped), values) is None
+    assert separate_stamps(stopped, values) is None
     bag = write_example(tmp_path / "run", {"/imu": (IMU, _at_once), "/mag": (FIELD, field_message)})
     sentence = refuse("import", bag, "-o", tmp_path / "log")
     assert "39 of 40 rows have the stamp of another" in sentence

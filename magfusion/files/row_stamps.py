@@ -9,6 +9,7 @@ from magfusion.units import NANOSECOND, Array, IntArray
 
 LONGEST_BATCH = 2.0  # s between two stamps; coarser ones do not determine the times of samples
 MIN_BATCHES = 3
+LARGEST_BATCH = 4.0  # times the usual size, unless it took as much longer to fill
 ROUNDING_NS = 500  # of stamps in microseconds
 MOST_COPIES = 0.5  # of the rows with the stamp of the one above; more are one row, written again
 
@@ -41,6 +42,8 @@ def separate_stamps(time_ns: IntArray, values: Array) -> IntArray | None:
     step = float(np.median(np.diff(time_ns[last])))
     if step * NANOSECOND > LONGEST_BATCH or _is_rounded(time_ns[last], round(step)):
         return None
+    if _stalls(time_ns[last], np.diff(last, prepend=-1)):
+        return None
     seconds = (time_ns - time_ns[0]) * NANOSECOND
     result = time_ns[0] + np.rint(spread_batches(seconds, last) / NANOSECOND).astype(np.int64)
     return result if np.all(np.diff(result) > 0) else None
@@ -52,6 +55,25 @@ def _is_rounded(time_ns: IntArray, step: int) -> bool:
     Whether such a clock is rounded down, up or to the nearest step is not known.
     """
     return bool(np.all((time_ns + ROUNDING_NS) % step <= 2 * ROUNDING_NS))
+
+
+def _stalls(time_ns: IntArray, count: IntArray) -> bool:
+    """Return whether the clock stopped for a while, in which samples were taken.
+
+    Parameters
+    ----------
+    time_ns : ndarray of int, shape (batches,)
+        Stamps of batches (ns).
+    count : ndarray of int, shape (batches,)
+        Samples of each.
+    """
+    between = np.diff(time_ns)
+    usual, size = float(np.median(between)), float(np.median(count))
+    large = count > LARGEST_BATCH * size
+    crowded = between / usual < count[1:] / size / LARGEST_BATCH
+    # How long the first took to fill is not known: a recorder may begin with a full buffer.
+    first = large[0] and count[0] > MOST_TWICE * np.sum(count)
+    return bool(first or np.any(crowded & large[1:]))
 
 
 def batches_text(time_ns: IntArray) -> str:
