@@ -96,6 +96,19 @@ def test_a_bag_without_its_end_is_read_whole(tmp_path: Path, kind: str) -> None:
         assert [finding.code for finding in log.noticed] == ["bag_unfinished"]
 
 
+@pytest.mark.parametrize("kind", ["mcap", "bag"])
+def test_zeros_behind_what_was_written_are_no_messages(tmp_path: Path, kind: str) -> None:
+    path = _finished(tmp_path / "cut", kind)
+    content = path.read_bytes()
+    end = content.index(MEASURED[N // 2].tobytes())
+    path.write_bytes(content[:end] + bytes(len(content) - end) + bytes(100_000))
+    log = open_log(path)
+    np.testing.assert_array_equal(log.imu.gyro_body, GYRO)
+    assert log.waveform is not None
+    np.testing.assert_array_equal(log.waveform.measured_sensor[: N // 2], MEASURED[: N // 2])
+    assert [finding.code for finding in log.noticed] == ["bag_unfinished"]
+
+
 def test_of_a_compressed_chunk_that_is_cut_the_beginning_is_read(tmp_path: Path) -> None:
     rng = np.random.default_rng(7)
 
@@ -135,8 +148,8 @@ def test_a_bag_without_a_whole_message_is_refused(
 ) -> None:
     path = _finished(tmp_path / "cut", kind)
     content = path.read_bytes()
-    for size in (0, 10, 30, 100):
-        path.write_bytes(content[:size])
+    for size in (0, 10, 30, 100, 101):
+        path.write_bytes(content[:size] + bytes([255]) * (12 if size == 101 else 0))
         sentence = refuse("check", path)
         assert "cannot be read" in sentence or "has no messages of" in sentence
         refuse("import", path, "-o", tmp_path / "log")

@@ -8,11 +8,13 @@ import io
 import shutil
 import sqlite3
 import struct
+import sys
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import BinaryIO, NamedTuple
+from zlib import crc32
 
 import pyarrow as pa
 from rosbags.interfaces import Connection
@@ -21,8 +23,10 @@ from rosbags.rosbag1 import Writer
 _BLOCK = 1 << 16  # bytes of a cut chunk that are decompressed at once
 _MCAP = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")  # of MCAP: kind, length
-_FOOTER, _CHUNK, _DATA_END = 0x02, 0x06, 0x0F
-_CHUNK_HEAD = 28  # bytes before the name of the compression
+_NONE, _FOOTER, _CHUNK, _DATA_END = 0x00, 0x02, 0x06, 0x0F
+# Of a chunk, before the name of the compression: times, size and checksum of the records, and the
+# length of the name.
+_CHUNK_HEAD = struct.Struct("<QQQII")
 _ROS1 = b"#ROSBAG V2.0\n"
 _OF_MESSAGE, _OF_CHUNK, _OF_CONNECTION = b"\x02", b"\x05", b"\x07"
 
@@ -112,38 +116,53 @@ def _close_mcap(path: Path, copy: Path) -> None:
     """Write the whole records of a file, and an end without an index."""
     shutil.copyfile(path, copy)
     with copy.open("r+b") as file:
-        end = _end_of_records(file, len(_MCAP), path.stat().st_size)
-        file.seek(end)
-        cut = file.read()
+        end, further = _whole_part(file, path.stat().st_size)
         file.seek(end)
         file.truncate()
-        if cut[:1] == bytes([_CHUNK]):
-            file.write(_records_of_chunk(cut[_RECORD.size :]))
+        file.write(further)
         file.write(_RECORD.pack(_DATA_END, 4) + bytes(4))
         file.write(_RECORD.pack(_FOOTER, 20) + bytes(20) + _MCAP)
 
 
-def _end_of_records(file: BinaryIO, end: int, size: int) -> int:
-    """Return where the last whole record of an MCAP file ends, before its index."""
-    while True:
-        file.seek(end)
-        head = file.read(_RECORD.size)
-        if len(head) < _RECORD.size or head[0] in (_DATA_END, _FOOTER):
-            return end
-        after = end + _RECORD.size + int(_RECORD.unpack(head)[1])
-        if after > size:
-            return end
+def _whole_part(file: BinaryIO, size: int) -> tuple[int, bytes]:
+    """Return where the last whole record before the index ends, and those in a chunk cut there."""
+    end = len(_MCAP)
+    for kind, begin, after in _records(file, len(_MCAP)):
+        if kind == _CHUNK:
+            file.seek(begin + _RECORD.size)
+            body = file.read(min(after, size) - file.tell())
+            records, whole = _records_of_chunk(body)
+            if not whole or after > size:
+                return begin, records
+        if after > size or kind in (_DATA_END, _FOOTER):
+            return begin, b""
         end = after
+    return end, b""
 
 
-def _records_of_chunk(body: bytes) -> bytes:
-    """Return the whole records of a chunk that is cut: outside of a chunk they mean the same."""
-    if len(body) < _CHUNK_HEAD + 4:
-        return b""
-    length = int.from_bytes(body[_CHUNK_HEAD : _CHUNK_HEAD + 4], "little")
-    begin = _CHUNK_HEAD + 4 + length
-    data = _decompressed(body[begin + 8 :], body[begin - length : begin].decode())
-    return data[: _end_of_records(io.BytesIO(data), 0, len(data))]
+def _records(file: BinaryIO, begin: int) -> Iterator[tuple[int, int, int]]:
+    """Yield kind, beginning and end of each record of MCAP; the last may end beyond the file."""
+    file.seek(begin)
+    while len(head := file.read(_RECORD.size)) == _RECORD.size and head[0] != _NONE:
+        kind, length = _RECORD.unpack(head)
+        end = begin + _RECORD.size + length
+        yield kind, begin, end
+        begin = file.seek(min(end, sys.maxsize))  # of damaged records any length
+
+
+def _records_of_chunk(body: bytes) -> tuple[bytes, bool]:
+    """Return the whole records of a chunk, which mean the same outside of it; and whether all."""
+    if len(body) < _CHUNK_HEAD.size:
+        return b"", False
+    _, _, size, checksum, length = _CHUNK_HEAD.unpack_from(body)
+    begin = _CHUNK_HEAD.size + length
+    data = _decompressed(body[begin + 8 :], body[_CHUNK_HEAD.size : begin].decode())
+    ends = [end for _, _, end in _records(io.BytesIO(data), 0) if end <= len(data)]
+    records = data[: max(ends, default=0)]
+    if len(data) < size or not checksum:
+        return records, len(records) == size
+    whole = crc32(data) == checksum
+    return records if whole else b"", whole
 
 
 def _index_ros1(path: Path, copy: Path) -> None:
@@ -187,6 +206,8 @@ def _ros1_records(source: BinaryIO) -> Iterator[tuple[dict[bytes, bytes], bytes]
         if head is None or len(size := source.read(4)) < 4:
             return
         fields, length = _fields(head), int.from_bytes(size, "little")
+        if b"op" not in fields:  # zeros, of a file that was made longer than it was written
+            return
         body = source.read(length)
         if len(body) == length or fields.get(b"op") == _OF_CHUNK:
             yield fields, body
