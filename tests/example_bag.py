@@ -1,10 +1,11 @@
-"""ROS 2 bags with known samples, for tests of their import."""
+"""Bags of ROS 1 and 2 with known samples, for tests of their import."""
 
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
@@ -14,6 +15,7 @@ N = 40
 STEP_NS = 5_000_000
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
+STORE_1 = get_typestore(Stores.ROS1_NOETIC)
 IMU = "sensor_msgs/msg/Imu"
 FIELD = "sensor_msgs/msg/MagneticField"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -90,16 +92,40 @@ def write_bag(
     plugin: StoragePlugin = StoragePlugin.MCAP,
     compression: CompressionMode | None = None,
     arrival: np.ndarray | None = None,
+    samples: range = range(N),
 ) -> Path:
     writer = Writer(path, version=9, storage_plugin=plugin)
     if compression is not None:
         writer.set_compression(compression, CompressionFormat.ZSTD)
-    order = np.arange(N) if arrival is None else arrival
+    order = np.array(samples) if arrival is None else arrival
     with writer:
         for name, (msgtype, make) in topics.items():
             connection = writer.add_connection(name, msgtype, typestore=STORE)
-            for received, k in enumerate(order):
+            for received, k in enumerate(order, samples.start):
                 raw = STORE.serialize_cdr(make(int(k)), msgtype)
                 # Received late, and on another clock than the headers'.
                 writer.write(connection, 10**9 + STEP_NS * received, raw)
+    return path
+
+
+def _of_ros1(k: int, message: Any) -> Any:
+    """Return a message of ROS 2, header first, as ROS 1 has it: the header is numbered."""
+    types, kind = STORE_1.types, message.__msgtype__
+    stamp = message.header.stamp
+    head = types["std_msgs/msg/Header"](
+        k, types["builtin_interfaces/msg/Time"](stamp.sec, stamp.nanosec), "base"
+    )
+    names = [name for name in types[kind].__dataclass_fields__ if name != "__msgtype__"]
+    return types[kind](head, *(getattr(message, name) for name in names[1:]))
+
+
+def write_ros1_bag(
+    path: Path, topics: dict[str, tuple[str, Make]], samples: range = range(N)
+) -> Path:
+    with Writer1(path) as writer:
+        for name, (msgtype, make) in topics.items():
+            connection = writer.add_connection(name, msgtype, typestore=STORE_1)
+            for k in samples:
+                raw = STORE_1.serialize_ros1(_of_ros1(k, make(k)), msgtype)
+                writer.write(connection, int(STAMPS[k]), raw)
     return path

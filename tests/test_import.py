@@ -29,11 +29,10 @@ from example_bag import (
     imu_message,
     odometry_message,
     write_bag,
+    write_ros1_bag,
     xyz,
 )
-from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
-from rosbags.typesys import Stores, get_typestore
 from scipy.io import savemat
 
 from magfusion.files.open import open_log
@@ -270,24 +269,7 @@ def test_a_bag_that_publishes_microtesla_and_odometry(tmp_path: Path) -> None:
 
 
 def test_a_bag_of_ros_1_is_read_and_imported(tmp_path: Path) -> None:
-    store = get_typestore(Stores.ROS1_NOETIC)
-    types = store.types
-
-    def former(k: int, message: object) -> object:
-        stamp = header(int(STAMPS[k])).stamp
-        head = types["std_msgs/msg/Header"](
-            k, types["builtin_interfaces/msg/Time"](stamp.sec, stamp.nanosec), "base"
-        )
-        rest = [getattr(message, name) for name in message.__dataclass_fields__]  # type: ignore[attr-defined]
-        kind = message.__msgtype__  # type: ignore[attr-defined]
-        return types[kind](head, *rest[1 : len(types[kind].__dataclass_fields__) - 1])
-
-    with Writer1(tmp_path / "run.bag") as writer:
-        for name, (kind, make) in SENSORS.items():
-            connection = writer.add_connection(name, kind, typestore=store)
-            for k in range(N):
-                raw = store.serialize_ros1(former(k, make(k)), kind)
-                writer.write(connection, int(STAMPS[k]), raw)
+    write_ros1_bag(tmp_path / "run.bag", SENSORS)
     assert_same(open_log(tmp_path / "run.bag"), truth=False)
     log, _ = imported(tmp_path / "log", tmp_path / "run.bag")
     assert_same(log, truth=False)

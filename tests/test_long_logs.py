@@ -128,7 +128,7 @@ def test_reading_and_importing_a_bag_tell_how_far_they_are(
     assert {(stage, total) for stage, _, total in reported} == {("reading", 120)}
     reported.clear()
     monkeypatch.setattr(bag_table, "ROWS", 16)
-    plans = plan_bag(bag, {}, ("truth",), Findings())
+    plans = plan_bag([bag], {}, {}, ("truth",), Findings())
     rows: list[int] = []
     assert plans[0].source.count == 40
     write_stream(plans[0], tmp_path / "imu.parquet", report=rows.append)

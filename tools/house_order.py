@@ -25,9 +25,9 @@ ROOMS = {
     wing: rooms.split()
     for wing, rooms in {
         "model": """
-            arguments correlation drive field_map fixed_axes groups hall hermite imu_intrinsics
-            marks perturbation physics platform_motion probe progress quaternion region response
-            rotor short_repr temperature time_division trust
+            arguments batches correlation drive field_map fixed_axes groups hall hermite
+            imu_intrinsics marks perturbation physics platform_motion probe progress quaternion
+            region response rotor short_repr temperature time_division trust
             magnetometer
             site trajectory
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
@@ -36,9 +36,11 @@ ROOMS = {
             noise prior waveform
         """,
         "files": """
-            atomic bag_topics blas_threads commit lost_rows messages parquet_bounds plain_data
-            plain_table plausible row_table site_draft site_ground site_values standard_streams
-            bag_rows checkpoint correlation field_map kept probe row_file survey table yaml_files
+            atomic bag_recovery bag_topics blas_threads commit lost_rows messages parquet_bounds
+            plain_data plain_table plausible row_stamps row_table site_draft site_ground
+            site_values standard_streams stray_stamps
+            bag_reader bag_rows checkpoint correlation field_map kept probe row_file survey table
+            yaml_files
             attitude_table drive_columns fields hall instruments readings_table site_casing
             site_correlation site_motion site_region site_response site_rotor site_temperature
             trajectory_table wells_file

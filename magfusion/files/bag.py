@@ -2,46 +2,57 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.files.bag_reader import open_bag, refuse_overlap
 from magfusion.files.bag_rows import Messages, Wanted, read_parts
 from magfusion.files.bag_topics import Topics
 from magfusion.files.lost_rows import LostRows
 from magfusion.files.messages import FIELD, IMU, ROWS, USUAL
 from magfusion.files.plausible import check_field, check_imu
+from magfusion.files.row_stamps import batches_finding, separate_stamps
+from magfusion.files.stray_stamps import LONGEST_GAP, stray_finding, stray_rows
 from magfusion.files.table import LARGEST_NUMBER, Span
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import Finding
-from magfusion.units import Array, IntArray
+from magfusion.model.trust import Finding, Verdict
+from magfusion.units import NANOSECOND, Array, IntArray
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
     from rosbags.interfaces import Connection
 
 
+_NAMES = {"imu": "IMU", "magnetometer": "magnetometer", "truth": "truth"}  # of the roles
+
+
 @dataclass(frozen=True, eq=False)
 class _Stream:
-    """Messages of one topic as numbers, sorted by the stamps of their headers."""
+    """Messages of one topic as numbers, sorted by the stamps of their headers.
 
+    Parameters
+    ----------
+    name : str
+        Of its role in reports.
+    """
+
+    name: str
     place: str
-    msgtype: str
     time_ns: IntArray
     values: Array
+    noticed: tuple[Finding, ...] = ()
 
     def within(self, span: Span) -> _Stream:
         begin, end = np.searchsorted(self.time_ns, span.bounds_ns)
-        return _Stream(self.place, self.msgtype, self.time_ns[begin:end], self.values[begin:end])
+        return replace(self, time_ns=self.time_ns[begin:end], values=self.values[begin:end])
 
 
 def read_bag(
@@ -60,7 +71,8 @@ def read_bag(
     Parameters
     ----------
     path : Path
-        Directory of a bag, or its file (``.mcap``, ``.db3``, ``.bag`` of ROS 1).
+        Directory of a bag, with its metadata or without, or its file (``.mcap``, ``.db3``,
+        ``.bag`` of ROS 1).
     start, end : float, optional
         Seconds since the first inertial sample.
     report : callable
@@ -78,7 +90,9 @@ def read_bag(
         Where the bag cannot be read, has no topic of a sensor or several of one kind of which
         none was named, or holds messages that no instrument gives.
     """
-    result = _opened(path, topics or Topics(), report)
+    with open_bag([path]) as reader:
+        result = _read(reader, path, topics or Topics(), report)
+        notes = reader.notes
     imu, field, truth = (result.get(role) for role in ("imu", "magnetometer", "truth"))
     first = field if imu is None else imu
     if first is None:
@@ -87,10 +101,10 @@ def read_bag(
             " inertial sensor with it."
         )
     span = Span(int(first.time_ns[0]), start, end)
-    declared: list[Finding] = []
+    declared = [Finding("bag_unfinished", note, Verdict.TRUSTWORTHY) for note in notes]
     imu, field, truth = (
-        None if one is None else _measured(one.within(span), role, declared)
-        for one, role in ((imu, "IMU"), (field, "magnetometer"), (truth, "truth"))
+        None if one is None else _measured(one.within(span), declared)
+        for one in (imu, field, truth)
     )
     return Log(
         name=path.resolve().stem,
@@ -103,24 +117,13 @@ def read_bag(
     )
 
 
-def _opened(path: Path, topics: Topics, report: Report) -> dict[str, _Stream]:
-    """Return the streams of a bag by their roles; refuse one that cannot be read."""
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            return _read(reader, path, topics, report)
-    except InputError:
-        raise
-    except Exception as error:  # a damaged bag makes the library fail in any way whatever
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{path}: cannot be read ({reason}); record the bag again.") from error
-
-
 def _read(reader: AnyReader, path: Path, topics: Topics, report: Report) -> dict[str, _Stream]:
     """Return the streams by their roles, of one pass over the bag."""
     wanted: dict[str, Wanted] = {}
     for role, rows in ROWS.items():
         connections = _chosen(reader, path, getattr(topics, role), role, tuple(rows))
         if connections:
+            refuse_overlap(reader, connections[0].topic)
             row, place = rows[connections[0].msgtype], f"{path} topic {connections[0].topic}"
             wanted[role] = Wanted(place, connections, row)
     parts: dict[str, list[Messages]] = {role: [] for role in wanted}
@@ -131,7 +134,7 @@ def _read(reader: AnyReader, path: Path, topics: Topics, report: Report) -> dict
         if not parts[role]:
             raise InputError(f"{one.place}: holds no messages; record it, or leave it out.")
         stamps, values = (np.concatenate(column) for column in zip(*parts.pop(role), strict=True))
-        result[role] = _sorted(one.place, one.connections[0].msgtype, stamps, values)
+        result[role] = _own_times(_sorted(_NAMES[role], one.place, stamps, values))
     return result
 
 
@@ -166,7 +169,7 @@ def _refuse_several_types(connections: list[Connection], path: Path) -> None:
         raise InputError(f"{path}: topic {topic} has several types; record it with one.")
 
 
-def _sorted(place: str, msgtype: str, stamps: IntArray, values: Array) -> _Stream:
+def _sorted(name: str, place: str, stamps: IntArray, values: Array) -> _Stream:
     if np.any(np.diff(stamps) < 0):
         # A bag keeps the order of arrival, which the network may have changed.
         order = np.argsort(stamps, kind="stable")
@@ -178,11 +181,32 @@ def _sorted(place: str, msgtype: str, stamps: IntArray, values: Array) -> _Strea
             f"{place}: the message stamped {stamp} ns holds a number that is not finite; remove the"
             " message."
         )
-    return _Stream(place, msgtype, stamps, values)
+    return _Stream(name, place, stamps, values)
 
 
-def _measured(stream: _Stream, role: str, declared: list[Finding]) -> _Stream:
+def _own_times(stream: _Stream) -> _Stream:
+    """Return a stream with the times of its samples, where the stamps are others."""
+    stray = stray_rows(stream.time_ns)
+    noticed = stray_finding(stream.name, stream.time_ns[stray])
+    kept = stream.time_ns[~stray], stream.values[~stray]
+    stream = _Stream(stream.name, stream.place, *kept, noticed)
+    separate = separate_stamps(stream.time_ns, stream.values)
+    if separate is None:
+        return stream
+    noticed += (batches_finding(stream.name, stream.time_ns),)
+    return replace(stream, time_ns=separate, noticed=noticed)
+
+
+def _measured(stream: _Stream, declared: list[Finding]) -> _Stream:
     """Return the messages that have a sample, and report the others."""
+    declared += stream.noticed
+    jumps = np.diff(stream.time_ns) > LONGEST_GAP / NANOSECOND
+    if jumps.any():
+        raise InputError(
+            f"{stream.place}: the message stamped {stream.time_ns[1:][np.argmax(jumps)]} ns is more"
+            " than an hour after the one before: the clock jumped; use one side by --start and"
+            " --end."
+        )
     lost_epochs = LostRows.of(stream.time_ns, stream.values)
     for too_many, rows, remedy in zip(
         lost_epochs.too_many,
@@ -198,9 +222,9 @@ def _measured(stream: _Stream, role: str, declared: list[Finding]) -> _Stream:
                 f"{stream.place}: {np.sum(rows)} of {len(rows)} messages {remedy} (the first is"
                 f" stamped {stream.time_ns[np.argmax(rows)]} ns)."
             )
-    declared += lost_epochs.findings(role)
+    declared += lost_epochs.findings(stream.name)
     kept = lost_epochs.kept
-    return _Stream(stream.place, stream.msgtype, stream.time_ns[kept], stream.values[kept])
+    return replace(stream, time_ns=stream.time_ns[kept], values=stream.values[kept])
 
 
 def _imu(stream: _Stream, span: Span) -> ImuSamples:

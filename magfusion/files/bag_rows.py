@@ -109,12 +109,12 @@ def read_parts(
         Where a message is marked as not measured; or whatever the library raises of a bag that is
         damaged.
     """
-    name_of = {c.id: name for name, one in wanted.items() for c in one.connections}
+    name_of = {c.topic: name for name, one in wanted.items() for c in one.connections}
     every = [c for one in wanted.values() for c in one.connections]
     waiting: dict[str, list[bytes]] = {name: [] for name in wanted}
     total, done = sum(c.msgcount for c in every), 0
     for connection, _, raw in reader.messages(every) if every else ():
-        name = name_of[connection.id]
+        name = name_of[connection.topic]  # numbers repeat from file to file
         waiting[name].append(raw)
         if len(waiting[name]) == PART:
             report("reading", done, total)

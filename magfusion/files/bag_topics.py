@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
+UNFINISHED = ".bag.active"  # as ROS 1 leaves a bag of which the recorder was killed
 
 
 @dataclass(frozen=True)
@@ -15,6 +16,27 @@ class Topics:
     truth: str | None = None
 
 
+def bag_files(path: Path) -> list[Path]:
+    """Return what the library opens of a bag; nothing of what is none.
+
+    A directory with its metadata is opened as such, one without by the files in it.
+    """
+    if not path.is_dir():
+        return [path] if _is_file_of_bag(path) else []
+    if (path / "metadata.yaml").is_file():
+        return [path]
+    return files_in(path)
+
+
+def files_in(directory: Path) -> list[Path]:
+    """Return the files of bags in a directory."""
+    return sorted(p for p in directory.iterdir() if p.is_file() and _is_file_of_bag(p))
+
+
+def _is_file_of_bag(path: Path) -> bool:
+    return path.suffix in BAG_SUFFIXES or path.name.endswith(UNFINISHED)
+
+
 def is_bag(path: Path) -> bool:
-    """Return whether a path is a bag: a directory with its metadata, or a single file."""
-    return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix in BAG_SUFFIXES
+    """Return whether a path is a bag: a directory of one, or a single file."""
+    return bool(bag_files(path))

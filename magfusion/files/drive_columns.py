@@ -54,7 +54,7 @@ def read_drive(path: Path | None, span: Span) -> DriveSamples | None:
     names = () if path is None else drive_columns(path)
     if path is None or not names:
         return None
-    table = read_table(path, TableLayout(numbers=names, repeats=True), span)
+    table = read_table(path, TableLayout(numbers=names, repeats=True, strays=True), span)
     values = table.numbers(names, nan=True)
     kept = (np.diff(table.time, prepend=-np.inf) > 0.0) & np.isfinite(values).all(axis=1)
     if not np.any(kept):

@@ -1,32 +1,35 @@
 """Tables of inertial and magnetometer samples."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.files.drive_columns import current_columns_of
+from magfusion.files.drive_columns import column_names, current_columns_of
 from magfusion.files.lost_rows import LostRows
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.rotor_columns import angle_columns_of
+from magfusion.files.row_stamps import batches_finding, separate_stamps
+from magfusion.files.stray_stamps import stray_finding
 from magfusion.files.table import TIME, Span, Table, TableLayout, read_table, write_table
 from magfusion.model.drive import DriveSamples
 from magfusion.model.rotor import RotorAngles
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
-from magfusion.units import Array
+from magfusion.units import NANOSECOND, Array
 
 Stream = TypeVar("Stream", FieldSamples, Trajectory)
 
 _GYRO = ("gyro_x", "gyro_y", "gyro_z")
 _ACCEL = ("accel_x", "accel_y", "accel_z")
 FIELD = ("field_x", "field_y", "field_z")
-IMU_LAYOUT = TableLayout(numbers=(*_GYRO, *_ACCEL), repeats=True)
-FIELD_LAYOUT = TableLayout(numbers=FIELD, repeats=True)
-_SOME_AXES = TableLayout(numbers=(), repeats=True, some=FIELD)
+IMU_LAYOUT = TableLayout(numbers=(*_GYRO, *_ACCEL), repeats=True, strays=True)
+FIELD_LAYOUT = TableLayout(numbers=FIELD, repeats=True, strays=True)
+_SOME_AXES = TableLayout(numbers=(), repeats=True, some=FIELD, strays=True)
 
 
 def read_imu(
@@ -47,7 +50,7 @@ def read_imu(
     table = read_table(path, IMU_LAYOUT, span, names)
     if not len(table):
         raise InputError(f"{path}: holds no row {span}; choose a span that the log covers.")
-    time, values, noticed = measured_rows(table, (*_GYRO, *_ACCEL), "IMU")
+    time, values, noticed = measured_rows(table, (*_GYRO, *_ACCEL), "IMU", spread=True)
     imu = ImuSamples(time, values[:, :3].copy(), values[:, 3:].copy())
     check_imu(imu, str(path))
     return imu, noticed
@@ -84,7 +87,8 @@ def read_waveform(
     if not len(table):
         return None, ()
     columns = tuple(name for name in FIELD if table.has((name,)))
-    time, values, noticed = measured_rows(table, columns, "magnetometer")
+    alone = bool(names) or {TIME, *FIELD}.issuperset(column_names(path))
+    time, values, noticed = measured_rows(table, columns, "magnetometer", alone)
     check_field(np.linalg.norm(values, axis=1), str(path))
     if columns == FIELD:
         return Waveform(time, values), noticed
@@ -95,10 +99,22 @@ def read_waveform(
 
 
 def measured_rows(
-    table: Table, names: tuple[str, ...], stream: str
+    table: Table, names: tuple[str, ...], stream: str, spread: bool = False
 ) -> tuple[Array, Array, tuple[Finding, ...]]:
-    """Return times (s) and columns of the rows that hold a sample, and what the others are."""
+    """Return times (s) and columns of the rows that hold a sample, and what the others are.
+
+    Parameters
+    ----------
+    spread : bool
+        Whether samples of batches with one stamp are spread: where no other column has the stamps.
+    """
     values = table.numbers(names, nan=True)
+    separate = separate_stamps(table.time_ns, values) if spread else None
+    noticed = stray_finding(stream, [stamp for _, stamp in table.stray])
+    if separate is not None:
+        noticed += (batches_finding(stream, table.time_ns),)
+        time = table.time + (separate - table.time_ns) * NANOSECOND
+        table = replace(table, time_ns=separate, time=time)
     lost_epochs = LostRows.of(table.time_ns, values)
     too_often, too_many = lost_epochs.too_many
     if too_often:
@@ -107,7 +123,8 @@ def measured_rows(
     if too_many:
         name = next(n for n, v in zip(names, values.T, strict=True) if np.isnan(v).any())
         table.refuse(lost_epochs.absent, name, np.full(len(table), np.nan), "write a finite number")
-    return table.time[lost_epochs.kept], values[lost_epochs.kept], lost_epochs.findings(stream)
+    noticed += lost_epochs.findings(stream)
+    return table.time[lost_epochs.kept], values[lost_epochs.kept], noticed
 
 
 def write_waveform(

@@ -16,7 +16,8 @@ from magfusion.files.marks_table import SLOT
 from magfusion.files.named_samples import MAGNETOMETER
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.rotor_columns import rotor_columns
-from magfusion.files.table import LONGEST_GAP, Span, find_table
+from magfusion.files.stray_stamps import LONGEST_GAP
+from magfusion.files.table import Span, find_table
 from magfusion.files.table_stream import SampleBlock, pieces
 from magfusion.files.temperature_table import read_temperatures
 from magfusion.files.yaml_files import read_yaml

@@ -24,7 +24,7 @@ from magfusion.units import Array, BoolArray, IntArray
 
 SLOT, END = "slot", "end_ns"
 LARGEST_SLOT = 10_000
-_SLOT_LAYOUT = TableLayout(numbers=(SLOT,), repeats=True)
+_SLOT_LAYOUT = TableLayout(numbers=(SLOT,), repeats=True, strays=True)
 _BURSTS = TableLayout(numbers=(), integers=(TIME, END, SLOT), repeats=True)
 _REMEDY = f"write the number of a coil's slot, or {SILENT} where none is driven"
 

@@ -13,13 +13,14 @@ from magfusion.files.inertial_tables import FIELD, measured_rows
 from magfusion.files.marks_table import SLOT
 from magfusion.files.plausible import check_field
 from magfusion.files.rotor_columns import rotor_columns
+from magfusion.files.stray_stamps import stray_finding
 from magfusion.files.table import TIME, Span, TableLayout, read_table, write_table
 from magfusion.model.samples import Waveform
 from magfusion.model.trust import Finding
 from magfusion.units import IntArray
 
 MAGNETOMETER = "magnetometer"
-_LAYOUT = TableLayout(numbers=FIELD, texts=(MAGNETOMETER,), repeats=True)
+_LAYOUT = TableLayout(numbers=FIELD, texts=(MAGNETOMETER,), repeats=True, strays=True)
 
 
 def names_magnetometers(path: Path | None) -> bool:
@@ -54,7 +55,7 @@ def read_waveforms(
     table = read_table(path, _LAYOUT, span)
     names, of = table.texts(MAGNETOMETER)
     result: dict[str, Waveform] = {}
-    noticed: list[Finding] = []
+    noticed = [*stray_finding(MAGNETOMETER, [stamp for _, stamp in table.stray])]
     for k, name in enumerate(names):
         own = np.flatnonzero(of == k)
         if not len(own):
@@ -67,6 +68,7 @@ def read_waveforms(
             time_ns=table.time_ns[own],
             time=table.time[own],
             first_row=0,
+            stray=(),
         )
         time, values, lost_epochs = measured_rows(mine, FIELD, f"{MAGNETOMETER} {name}")
         check_field(np.linalg.norm(values, axis=1), str(place))

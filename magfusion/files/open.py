@@ -45,6 +45,6 @@ def open_log(
         return read_bag(path, start, end, topics, report)
     raise InputError(
         f"{path}: is no log: found neither {HEADER}, nor mav0/imu0/data.csv (EuRoC), nor"
-        " metadata.yaml, .mcap, .db3 or .bag (bags of ROS); give the path of one of them, or bring"
+        " .mcap, .db3 or .bag (bags of ROS); give the path of one of them, or bring"
         " tables of other names into a log by magfusion import."
     )

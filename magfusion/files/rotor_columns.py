@@ -29,7 +29,7 @@ def read_rotation(path: Path | None, span: Span) -> RotorAngles | None:
     names = () if path is None else rotor_columns(path)
     if path is None or not names:
         return None
-    table = read_table(path, TableLayout(numbers=names, repeats=True), span)
+    table = read_table(path, TableLayout(numbers=names, repeats=True, strays=True), span)
     values = table.numbers(names, nan=True)
     kept = (np.diff(table.time, prepend=-np.inf) > 0.0) & np.isfinite(values).all(axis=1)
     own = {n.removeprefix(_OF): v for n, v in zip(names, values[kept].T.copy(), strict=True)}

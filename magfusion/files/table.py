@@ -3,7 +3,7 @@
 import csv
 import itertools
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,13 +15,13 @@ import pyarrow.parquet
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
 from magfusion.files.parquet_bounds import MOST_BYTES, MOST_ROWS, read_batches, refuse_unfolding
+from magfusion.files.stray_stamps import LONGEST_GAP, stray_rows
 from magfusion.units import NANOSECOND, AnyArray, Array, IntArray
 
 TIME = "time_ns"
 ROWS_PER_GROUP = 1 << 17  # a slice reads whole groups
 # Larger than any clock's reading, and far enough from the ends of int64 to subtract.
 LARGEST_TIME_NS = 1 << 62
-LONGEST_GAP = 3600.0  # s; of a clock that did not jump
 LARGEST_NUMBER = 1e100  # whose square is still finite
 
 
@@ -89,6 +89,8 @@ class TableLayout(NamedTuple):
         Columns with numbers, of which one at least must be there.
     optional_texts : tuple of str
         Columns of text that may be there.
+    strays : bool
+        Whether single rows with stamps far from all others are left out, and not refused.
     """
 
     numbers: tuple[str, ...]
@@ -98,6 +100,7 @@ class TableLayout(NamedTuple):
     repeats: bool = False
     some: tuple[str, ...] = ()
     optional_texts: tuple[str, ...] = ()
+    strays: bool = False
 
     def _wanted(self, result: Sequence[str]) -> list[str]:
         """Return the columns to read, where the optional ones are as found."""
@@ -140,6 +143,8 @@ class Table:
         The same in seconds since the log's epoch.
     first_row : int
         Row of the file, counted from 0, with which the span begins.
+    stray : tuple of tuple of int
+        Rows of the file that were left out, and their stamps (ns).
     """
 
     path: Path
@@ -147,6 +152,7 @@ class Table:
     time_ns: IntArray
     time: Array
     first_row: int
+    stray: tuple[tuple[int, int], ...] = ()
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -195,8 +201,11 @@ class Table:
         """Raise an InputError that names the first bad row, if there is one."""
         if bad.any():
             k = int(np.argmax(bad))
+            row = self.first_row + k
+            for left_out, _ in self.stray:
+                row += left_out <= row
             raise InputError(
-                f"{self.path}: column {name}, row {self.first_row + k} (counted from 0):"
+                f"{self.path}: column {name}, row {row} (counted from 0):"
                 f" found {result[k]}; {remedy}."
             )
 
@@ -246,11 +255,17 @@ def read_table(path: Path, layout: TableLayout, span: Span, names: tuple[str, ..
         raise InputError(f"{path}: cannot be read ({reason}); write the file again.") from error
     whole = Table(path, data, np.empty(len(data), dtype=np.int64), np.empty(len(data)), first_row)
     time_ns = whole.integers(TIME)
+    if layout.strays and (stray := stray_rows(time_ns)).any():
+        rows = first_row + np.flatnonzero(stray)
+        left_out = tuple(zip(rows.tolist(), time_ns[stray].tolist(), strict=True))
+        whole = replace(whole, data=data.filter(pa.array(~stray)), stray=left_out)
+        time_ns = time_ns[~stray]
     check_times(whole, time_ns, layout, span)
     begin, end = np.searchsorted(time_ns, span.bounds_ns)
-    inside = data.slice(begin, end - begin)
+    inside = whole.data.slice(begin, end - begin)
     within = time_ns[begin:end]
-    table = Table(path, inside, within, span.seconds(within), first_row + int(begin))
+    begin_row = first_row + int(begin)
+    table = Table(path, inside, within, span.seconds(within), begin_row, whole.stray)
     jumped = np.diff(within, prepend=within[:1]) * NANOSECOND > LONGEST_GAP
     remedy = (
         "more than an hour after the row above: the clock jumped; correct the times, or use one"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magfusion.errors import InputError
-from magfusion.files.bag_topics import BAG_SUFFIXES
+from magfusion.files.bag_topics import is_bag
 from magfusion.files.open import open_log
 from magfusion.jobs.settings import Command, TopicSettings, argument
 from magfusion.results.figures import Figure, Figures, Section
@@ -49,7 +49,7 @@ def _read_truth(settings: EvaluateSettings) -> tuple[Trajectory, int]:
 
     path, topics = settings.truth, topics_option(settings.topics)
     is_result = (path / "trajectory.parquet").is_file()
-    if is_result or not (path.is_dir() or path.suffix in BAG_SUFFIXES):
+    if is_result or not (path.is_dir() or is_bag(path)):
         return read_estimate(path), 0
     log = open_log(path, topics=topics)
     if log.truth is None:

@@ -59,7 +59,7 @@ class ImportSettings(Settings):
         "Mapping of a file's column to one of the log, with its unit",
         note="e.g. 'imu.gyro_x=-GyrY[deg/s]', 'truth.quaternion=qx,qy,qz,qw[xyzw]'; columns"
         " without names are counted from 0; of a bag e.g. imu=/imu/data, magnetometer=/mag[uT],"
-        " truth=/tf:map->base_link; of an attitude in"
+        " truth=/tf:map->imu_link; of an attitude in"
         " angles truth.euler=roll,pitch,yaw[deg] (rotated by yaw, then pitch, then roll)",
         metavar="TABLE.COLUMN=NAME[UNIT]",
     )
@@ -294,8 +294,9 @@ def _figures(
         Figure("map", lines, section=Section.REPORT),
         Figure("understood", shown, section=Section.REMARKS),
     )
-    notes = [f"Skipped: {reason}" for reason in result.passed_over]
+    notes = [*result.findings.notes, *(f"Skipped: {reason}" for reason in result.passed_over)]
     notes += [note] if note else []
+    notes += [f"{stream}: {one.batches}" for stream, one in counts.items() if one.batches]
     begin = (_first(counts) - epoch_ns) * 1e-9
     if not is_first and abs(begin) > LATE:
         notes.append(

@@ -6,13 +6,13 @@ over the time since the last one, which is accurate to one step.
 
 import numpy as np
 
+from magfusion.model.batches import spread_batches
 from magfusion.units import Array
 
 TOGETHER = 0.2  # of the mean step; samples closer than that arrived in one burst
 SHARE = 0.4  # least share of such short steps where samples come in bursts
 LONGEST = 0.1  # s between two bursts; a longer pause is a switched stream, not a bus
 MAX_SAMPLES = 32  # samples in a burst
-PAUSE = 3.0  # times the usual time between bursts: a gap, over which nothing is spread
 
 
 def spread_bursts(stamps: Array) -> Array | None:
@@ -43,9 +43,4 @@ def spread_bursts(stamps: Array) -> Array | None:
     usual = float(np.median(between))
     if usual > LONGEST or np.median(count) > MAX_SAMPLES:
         return None
-    each = usual / float(np.median(count))
-    whole = between < PAUSE * usual
-    length = np.append(count[0] * each, np.where(whole, between, count[1:] * each))
-    length = np.minimum(length, np.append(np.inf, between))
-    place = np.arange(len(stamps)) - np.repeat(last, count)
-    return np.asarray(np.repeat(stamps[last], count) + place * np.repeat(length / count, count))
+    return spread_batches(stamps, last)

@@ -2,30 +2,32 @@
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Connection
-from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.files.bag_reader import open_bag, place_of, refuse_overlap
 from magfusion.files.bag_rows import Messages, Wanted, read_parts
+from magfusion.files.foreign.bag_transforms import (
+    TRANSFORM_TYPES,
+    composed_transforms,
+    frame_chain,
+    frame_pairs,
+)
 from magfusion.files.foreign.columns import STREAMS, TIME, VELOCITY, ColumnMapping, Term
-from magfusion.files.foreign.plan import Findings, ImportPlan, Terms
+from magfusion.files.foreign.plan import Findings, ImportPlan, Rate, Terms
 from magfusion.files.foreign.source import ROWS, RowBlock, Source, SourceColumn
 from magfusion.files.foreign.units import SourceUnit, accepted, parse_unit
 from magfusion.files.messages import (
-    FORMER_TRANSFORMS,
     ODOMETRY,
-    TRANSFORMS,
     USUAL,
     stamp_ns,
-    transform_row,
 )
 from magfusion.files.messages import (
     ROWS as ROW_OF,
@@ -39,7 +41,6 @@ _COLUMNS = {
     "truth": (*_POSE, *VELOCITY),
 }
 _SI = {"imu": ("rad/s", "m/s^2"), "magnetometer": ("T",), "truth": ("m", "1", "m/s")}
-_TRANSFORMS = (TRANSFORMS, FORMER_TRANSFORMS)
 
 
 @dataclass(frozen=True)
@@ -60,19 +61,7 @@ class Topic:
     unit: str = ""
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[AnyReader]:
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            yield reader
-    except InputError:
-        raise
-    except Exception as error:  # a damaged bag makes the library fail in any way whatever
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{path}: cannot be read ({reason}); record the bag again.") from error
-
-
-def first_stamp(path: Path, topic: str) -> int:
+def first_stamp(paths: Sequence[Path], topic: str) -> int:
     """Return the stamp of the first message of a topic (ns); without a header, its arrival.
 
     Raises
@@ -80,19 +69,20 @@ def first_stamp(path: Path, topic: str) -> int:
     InputError
         Where the bag has no such topic.
     """
-    with _opened(path) as reader:
+    with open_bag(paths) as reader:
         connections = [c for c in reader.connections if c.topic == topic]
         for _, arrived, raw in reader.messages(connections) if connections else ():
             message: Any = reader.deserialize(raw, connections[0].msgtype)
             header = getattr(message, "header", None)
             return int(arrived) if header is None else stamp_ns(header)
         names = ", ".join(sorted({c.topic for c in reader.connections}))
-    raise InputError(f"{path}: has no message of {topic} for --epoch (found {names}).")
+    raise InputError(f"{place_of(paths)}: has no message of {topic} for --epoch (found {names}).")
 
 
 def plan_bag(
-    path: Path,
+    paths: Sequence[Path],
     entries: Mapping[str, Sequence[ColumnMapping]],
+    rates: Mapping[str, Rate],
     others: Collection[str],
     declared: Findings,
 ) -> list[ImportPlan]:
@@ -100,8 +90,12 @@ def plan_bag(
 
     Parameters
     ----------
+    paths : sequence of Path
+        Bags of one recording.
     entries : mapping of sequence of ColumnMapping
         The user's choice for each stream: a topic, and frames or a unit behind it.
+    rates : mapping of Rate
+        Of streams whose messages are counted, whatever their stamps.
     others : collection of str
         Streams that come from elsewhere.
 
@@ -110,29 +104,31 @@ def plan_bag(
     InputError
         Where the bag cannot be read.
     """
-    plans = []
-    with _opened(path) as reader:
+    plans, place = [], place_of(paths)
+    with open_bag(paths) as reader:
+        declared.notes += reader.notes
         result = sorted({(c.topic, c.msgtype) for c in reader.connections})
         for role in _COLUMNS:
             if role in others:
                 continue
-            topic = _chosen(path, role, entries.get(role, ()), result, reader, declared)
+            topic = _chosen(place, role, entries.get(role, ()), result, reader, declared)
             if topic is not None:
+                refuse_overlap(reader, topic.name)
                 unit = parse_unit(topic.unit or "T", STREAMS["magnetometer"]["field_x"])
                 if unit is None:
                     declared.problems.append(
-                        f"{path}: --map '{role}={topic.name}[{topic.unit}]': write one of"
+                        f"{place}: --map '{role}={topic.name}[{topic.unit}]': write one of"
                         f" {accepted(STREAMS['magnetometer']['field_x'])}."
                     )
                 else:
                     own = [c for c in reader.connections if c.topic == topic.name]
                     count = sum(connection.msgcount for connection in own)
-                    plans.append(_plan(path, role, topic, unit, count))
+                    plans.append(_plan(paths, role, topic, unit, count, rates.get(role)))
     return plans
 
 
 def _chosen(
-    path: Path,
+    place: str,
     role: str,
     entries: Sequence[ColumnMapping],
     result: Sequence[tuple[str, str]],
@@ -141,23 +137,23 @@ def _chosen(
 ) -> Topic | None:
     for column in (entry for entry in entries if entry.column):
         declared.problems.append(
-            f"{path}: --map '{column}': a bag's columns are known; name the topic, as"
+            f"{place}: --map '{column}': a bag's columns are known; name the topic, as"
             f" {role}=/topic."
         )
         return None
     if entries:
-        return _selected_topic(path, role, entries[0], result, reader, declared)
+        return _selected_topic(place, role, entries[0], result, reader, declared)
     fitting = _fitting(result, role)
     if len(fitting) == 1:
         return Topic(*fitting[0])
     if fitting:
         names = ", ".join(name for name, _ in fitting)
-        declared.problems.append(f"{path}: several topics may be {role}: {names}; name one.")
+        declared.problems.append(f"{place}: several topics may be {role}: {names}; name one.")
         declared.proposals.append(f"{role}={fitting[0][0]}")
     elif role == "magnetometer":
         names = ", ".join(f"{name} ({kind})" for name, kind in result) or "none"
         kinds = " or ".join(ROW_OF[role])
-        declared.problems.append(f"{path}: no topic is of {kinds}, for {role} (found {names}).")
+        declared.problems.append(f"{place}: no topic is of {kinds}, for {role} (found {names}).")
     return None
 
 
@@ -168,7 +164,7 @@ def _fitting(result: Sequence[tuple[str, str]], role: str) -> list[tuple[str, st
 
 
 def _selected_topic(
-    path: Path,
+    place: str,
     role: str,
     entry: ColumnMapping,
     result: Sequence[tuple[str, str]],
@@ -182,65 +178,55 @@ def _selected_topic(
     kind = dict(reversed(result)).get(name)  # of two of a name the first
     if read is None or kind is None:
         names = ", ".join(topic for topic, _ in result)
-        declared.problems.append(f"{path}: has no topic {name} for {role} (found {names}).")
+        declared.problems.append(f"{place}: has no topic {name} for {role} (found {names}).")
         return None
     unit = read["unit"] or ""
-    if role == "truth" and kind in _TRANSFORMS:
+    if role == "truth" and kind in TRANSFORM_TYPES:
         frames = (read["parent"] or "", read["child"] or "")
-        there = _has_transform(path, name, frames, reader, declared)
+        there = _has_transform(place, name, frames, reader, declared)
         return Topic(name, kind, frames) if there else None
     if kind not in ROW_OF[role]:
         declared.problems.append(
-            f"{path}: topic {name} is of {kind}, which is none of {', '.join(ROW_OF[role])} for"
+            f"{place}: topic {name} is of {kind}, which is none of {', '.join(ROW_OF[role])} for"
             f" {role}; name another."
         )
         return None
     if unit and role != "magnetometer":
-        declared.problems.append(f"{path}: --map '{entry}': messages of {kind} are in SI units.")
+        declared.problems.append(f"{place}: --map '{entry}': messages of {kind} are in SI units.")
         return None
     return Topic(name, kind, None, unit)
 
 
 def _has_transform(
-    path: Path, name: str, frames: tuple[str, str], reader: AnyReader, declared: Findings
+    place: str, name: str, frames: tuple[str, str], reader: AnyReader, declared: Findings
 ) -> bool:
-    """Check that a topic has a transform; what it has instead is proposed."""
-    pairs = _pairs(reader, name)
-    if frames in pairs:
+    """Check that a topic leads from one frame to another; what it has instead is proposed."""
+    pairs = frame_pairs(reader, name)
+    if frame_chain(pairs, frames) is not None:
         return True
     shown = ", ".join(f"{a}->{b}" for a, b in pairs)
     declared.problems.append(
-        f"{path}: topic {name} has no transform {'->'.join(frames)} (found {shown});"
+        f"{place}: topic {name} has no transform {'->'.join(frames)} (found {shown});"
         " write world and body as truth=TOPIC:PARENT->CHILD."
     )
     declared.proposals += [f"truth={name}:{a}->{b}" for a, b in pairs[:5]]
     return False
 
 
-def _pairs(reader: AnyReader, name: str) -> list[tuple[str, str]]:
-    connections = [c for c in reader.connections if c.topic == name]
-    result: dict[tuple[str, str], None] = {}
-    for count, (_, _, raw) in enumerate(reader.messages(connections)):
-        message: Any = reader.deserialize(raw, connections[0].msgtype)
-        result |= dict.fromkeys(
-            (_frame(t.header.frame_id), _frame(t.child_frame_id)) for t in message.transforms
-        )
-        if count > ROWS:
-            break
-    return list(result)
-
-
-def _frame(name: str) -> str:
-    return name.lstrip("/")
-
-
-def _plan(path: Path, role: str, topic: Topic, field_unit: SourceUnit, count: int) -> ImportPlan:
-    place = f"{path} topic {topic.name}"
+def _plan(
+    paths: Sequence[Path],
+    role: str,
+    topic: Topic,
+    field_unit: SourceUnit,
+    count: int,
+    rate: Rate | None,
+) -> ImportPlan:
+    place = f"{place_of(paths)} topic {topic.name}"
     columns = _COLUMNS[role]
 
     def read(wanted: Sequence[int], _texts: Collection[int]) -> Iterator[RowBlock]:
         row = 0
-        for stamps, values in _rows(path, place, role, topic):
+        for stamps, values in _rows(paths, place, role, topic):
             table = [stamps, *values.T]
             yield RowBlock([table[k] for k in wanted], row + np.arange(len(stamps)))
             row += len(stamps)
@@ -250,31 +236,44 @@ def _plan(path: Path, role: str, topic: Topic, field_unit: SourceUnit, count: in
         si = next(s for s in _SI[role] if parse_unit(s, STREAMS[role][name]) is not None)
         unit = field_unit if role == "magnetometer" else _unit(si, role, name)
         usual[name] = (Term(k, unit),)
-    if role == "truth" and not _moves(path, place, topic):
+    if role == "truth" and not _moves(paths, place, topic):
         usual = {name: terms for name, terms in usual.items() if name not in VELOCITY}
     known = (SourceColumn(TIME), *map(SourceColumn, columns))
     source = Source(place, known, read, form=topic.msgtype, count=count)
-    return ImportPlan(role, source, usual)
+    if rate is not None:
+        del usual[TIME]
+        if rate.start_s is None:
+            rate = replace(rate, start_s=_first_sample(_rows(paths, place, role, topic), rate.hz))
+    return ImportPlan(role, source, usual, rate)
+
+
+def _first_sample(rows: Iterator[tuple[IntArray, Array]], hz: Fraction) -> Fraction:
+    """Return the time of the first sample (s); of a batch with one stamp the last keeps it."""
+    stamps = next((stamps for stamps, _ in rows), np.zeros(1, dtype=np.int64))
+    before = int(np.sum(stamps == stamps[0])) - 1
+    return Fraction(int(stamps[0]), 10**9) - before / hz
 
 
 def _unit(name: str, role: str, target: str) -> SourceUnit:
     return SourceUnit(name, STREAMS[role][target])
 
 
-def _moves(path: Path, place: str, topic: Topic) -> bool:
+def _moves(paths: Sequence[Path], place: str, topic: Topic) -> bool:
     """Return whether an odometry has a twist: many publishers leave it unfilled."""
     if topic.msgtype != ODOMETRY:
         return False
-    return any(values[:, len(_POSE) :].any() for _, values in _rows(path, place, "truth", topic))
+    return any(values[:, len(_POSE) :].any() for _, values in _rows(paths, place, "truth", topic))
 
 
-def _rows(path: Path, place: str, role: str, topic: Topic) -> Iterator[tuple[IntArray, Array]]:
+def _rows(
+    paths: Sequence[Path], place: str, role: str, topic: Topic
+) -> Iterator[tuple[IntArray, Array]]:
     """Yield stamps (ns) and values of the messages of a topic, `ROWS` at a time."""
     row = ROW_OF[role].get(topic.msgtype)
-    with _opened(path) as reader:
+    with open_bag(paths) as reader:
         connections = [c for c in reader.connections if c.topic == topic.name]
         if row is None:
-            parts = _transforms(reader, connections, topic)
+            parts = composed_transforms(reader, topic.name, topic.frames or ("", ""))
         else:
             parts = (p for _, p in read_parts(reader, {role: Wanted(place, connections, row)}))
         for part in _joined(parts):
@@ -293,22 +292,6 @@ def _joined(parts: Iterator[Messages]) -> Iterator[Messages]:
             waiting, count = [], 0
     if waiting:
         yield Messages(*map(np.concatenate, zip(*waiting, strict=True)))
-
-
-def _transforms(
-    reader: AnyReader, connections: Sequence[Connection], topic: Topic
-) -> Iterator[Messages]:
-    """Yield the transforms between two frames, a message at a time."""
-    for _, _, raw in reader.messages(connections):
-        message: Any = reader.deserialize(raw, topic.msgtype)
-        own = [
-            one
-            for one in message.transforms
-            if (_frame(one.header.frame_id), _frame(one.child_frame_id)) == topic.frames
-        ]
-        if own:
-            stamps = np.array([stamp_ns(one.header) for one in own])
-            yield Messages(stamps, np.array([transform_row(one) for one in own]))
 
 
 def _complete(role: str, values: Array) -> Array:

@@ -14,9 +14,11 @@ from magfusion.files.foreign.columns import EULER, OPTIONAL_COLUMNS, QUATERNION,
 from magfusion.files.foreign.plan import ImportPlan
 from magfusion.files.foreign.source import RowBlock
 from magfusion.files.foreign.units import NO_STAMP, Raw, to_nanoseconds
-from magfusion.files.lost_rows import MOST_MISSING, MOST_TWICE
+from magfusion.files.lost_rows import MOST_MISSING, MOST_TWICE, LostRows
 from magfusion.files.plausible import SHORTEST_STEP
-from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, LONGEST_GAP, ROWS_PER_GROUP
+from magfusion.files.row_stamps import batches_text, separate_stamps
+from magfusion.files.stray_stamps import LONGEST_GAP, stray_rows
+from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, ROWS_PER_GROUP
 from magfusion.files.table import TIME as TIME_NS
 from magfusion.units import NANOSECOND, AnyArray, Array, BoolArray, IntArray
 
@@ -40,6 +42,10 @@ class Counts:
         Rows that were not written, by the reason.
     unsorted : int
         Rows that were before the row above, and were put in their place.
+    batched : bool
+        Whether many rows have the stamp of the row above: they are judged when all are read.
+    batches : str
+        What became of samples of which several have one stamp; empty where none did.
     first, last : int
         Stamps (ns).
     """
@@ -48,6 +54,8 @@ class Counts:
     written: int = 0
     missing: int = 0
     unsorted: int = 0
+    batched: bool = False
+    batches: str = ""
     left_out: dict[str, int] = field(default_factory=dict)
     first: int = LARGEST_TIME_NS
     last: int = -LARGEST_TIME_NS
@@ -103,15 +111,15 @@ def write_stream(
             )
             if report is not None:
                 report(counts.read)
-    if counts.unsorted:
-        _sort(path, counts)
+    if counts.unsorted or counts.batched:
+        _order(path, counts, plan.stream)
     _check(plan, counts)
     return counts
 
 
 def _stamps(plan: ImportPlan, raw: dict[int, Raw], part: RowBlock) -> IntArray:
     if plan.rate is not None:
-        start = plan.shift_ns + round(plan.rate.start_s * 10**9)
+        start = plan.shift_ns + round((plan.rate.start_s or 0) * 10**9)
         step = float(10**9 / plan.rate.hz)
         return start + np.rint(part.rows * step).astype(np.int64)
     total = np.zeros(len(part.rows), dtype=np.int64)
@@ -181,6 +189,7 @@ def _kept(
         none = keep & (length < LEAST_QUATERNION)
         counts.leave_out("with a quaternion of zeros", int(np.sum(none)))
         keep &= ~none
+    keep[keep] = ~_strays(stamps[keep], counts)
     stamps, values, rows, missing = stamps[keep], values[keep], rows[keep], missing[keep]
     if not len(stamps):
         return stamps, values
@@ -190,14 +199,25 @@ def _kept(
     highest = np.maximum.accumulate(np.concatenate([[before], stamps]))[:-1]
     counts.unsorted += int(np.sum(stamps < highest))
     twice: BoolArray = np.diff(stamps, prepend=before) == 0
-    counts.leave_out("with the stamp of another", int(np.sum(twice)))
-    stamps, values = stamps[~twice], values[~twice]
-    counts.missing += int(np.sum(missing[~twice]))
+    counts.batched |= not counts.written and bool(np.mean(twice) > MOST_TWICE)
+    if not counts.batched:
+        counts.leave_out("with the stamp of another", int(np.sum(twice)))
+        stamps, values, missing = stamps[~twice], values[~twice], missing[~twice]
+    counts.missing += int(np.sum(missing))
     counts.written += len(stamps)
     if len(stamps):
         counts.first = min(counts.first, int(stamps.min()))
         counts.last = max(counts.last, int(stamps.max()))
     return stamps, values
+
+
+def _strays(stamps: IntArray, counts: Counts) -> BoolArray:
+    """Return which rows have a stamp far from all others, and count them."""
+    if not len(stamps):
+        return np.zeros(0, dtype=bool)
+    stray = stray_rows(stamps, counts.written, counts.last if counts.written else None)
+    counts.leave_out("with a stray time", int(np.sum(stray)))
+    return stray
 
 
 def _refuse_jumps(plan: ImportPlan, stamps: IntArray, rows: IntArray, counts: Counts) -> None:
@@ -225,15 +245,26 @@ def _refuse_jumps(plan: ImportPlan, stamps: IntArray, rows: IntArray, counts: Co
             )
 
 
-def _sort(path: Path, counts: Counts) -> None:
+def _order(path: Path, counts: Counts, stream: str) -> None:
+    """Sort the rows by time, and give those of one stamp their own or leave them out."""
     table = pa.parquet.read_table(path)
+    table = table.take(np.argsort(table[TIME_NS].to_numpy(), kind="stable"))
     stamps = table[TIME_NS].to_numpy()
-    order = np.argsort(stamps, kind="stable")
-    twice = np.diff(stamps[order], prepend=stamps[order][:1] - 1) == 0
-    counts.leave_out("with the stamp of another", int(np.sum(twice)))
-    counts.written -= int(np.sum(twice))
+    measured = [n for n in table.column_names[1:] if n not in OPTIONAL_COLUMNS.get(stream, {})]
+    values = np.stack([table[name].to_numpy() for name in measured], axis=1)
+    separate = separate_stamps(stamps, values)
+    if separate is not None:
+        counts.batches = batches_text(stamps)
+        counts.first = int(separate[0])
+        table = table.set_column(0, TIME_NS, pa.array(separate))
+    else:
+        twice, absent = LostRows.of(stamps, values)
+        counts.leave_out("with the stamp of another", int(np.sum(twice)))
+        counts.written -= int(np.sum(twice))
+        counts.missing -= int(np.sum(twice & absent))
+        table = table.filter(pa.array(~twice))
     pa.parquet.write_table(
-        table.take(order[~twice]),
+        table,
         path,
         compression="zstd",
         row_group_size=ROWS_PER_GROUP,

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from magfusion.errors import InputError
+from magfusion.files.bag_reader import is_ros1
 from magfusion.files.bag_topics import is_bag
 from magfusion.files.euroc import find_magnetometer, is_euroc
 from magfusion.files.foreign.arrays import ARRAYS, array_source
@@ -39,7 +40,8 @@ class GatheredStreams:
 
     Parameters
     ----------
-    bags : list of Path
+    bags : list of sequence of Path
+        Of each recording.
     passed_over : list of str
         Files in the folder that are no tables, and why.
     stamped : bool
@@ -48,7 +50,7 @@ class GatheredStreams:
 
     findings: Findings
     plans: dict[str, ImportPlan] = field(default_factory=dict)
-    bags: list[Path] = field(default_factory=list)
+    bags: list[Sequence[Path]] = field(default_factory=list)
     stamped: bool = False
     opened: dict[Path, Source] = field(default_factory=dict)
     passed_over: list[str] = field(default_factory=list)
@@ -71,9 +73,9 @@ def gather(paths: Sequence[Path], wanted: ImportRequest, declared: Findings) -> 
     for stream, path in wanted.files.items():
         if (source := _opened(path, wanted, result)) is not None:
             result.add(_table(stream, path, source, wanted, declared))
-    for path in paths:
+    for recording in _recordings(paths):
         try:
-            attempted |= _add(path, wanted, result)
+            attempted |= _add(recording, wanted, result)
         except InputError as error:
             declared.problems.append(str(error))
             attempted |= set(STREAMS)
@@ -143,14 +145,28 @@ def _halves(result: GatheredStreams, attempted: set[str], named: set[str]) -> se
     return {"imu"} if halves & attempted else set()
 
 
-def _add(path: Path, wanted: ImportRequest, result: GatheredStreams) -> set[str]:
+def _recordings(paths: Sequence[Path]) -> list[list[Path]]:
+    """Return positional sources, the bags of ROS 1 and those of ROS 2 each as one recording."""
+    result = [[path] for path in paths if not _is_bag(path)]
+    for ros1 in (True, False):
+        bags = [path for path in paths if _is_bag(path) and is_ros1(path) is ros1]
+        result += [bags] if bags else []
+    return result
+
+
+def _is_bag(path: Path) -> bool:
+    return path.exists() and not is_euroc(path) and is_bag(path)
+
+
+def _add(recording: Sequence[Path], wanted: ImportRequest, result: GatheredStreams) -> set[str]:
     """Add a positional source; return the streams that were looked for in it."""
+    path = recording[0]
     if not path.exists():
         raise InputError(f"{path}: there is no such file or directory; give the path of a source.")
     if path.is_dir() and is_log(path):
         raise InputError(f"{path}: is a log of magfusion already; nothing is to import.")
-    if is_bag(path):
-        return _add_bag(path, wanted, result)
+    if _is_bag(path):
+        return _add_bag(recording, wanted, result)
     if path.is_dir() and is_euroc(path):
         return _add_euroc(path, wanted, result)
     files = _tables_in(path) if path.is_dir() else [path]
@@ -162,11 +178,18 @@ def _add(path: Path, wanted: ImportRequest, result: GatheredStreams) -> set[str]
     return {stream for file in files for stream in _add_table(file, wanted, result, path.is_dir())}
 
 
-def _add_bag(path: Path, wanted: ImportRequest, result: GatheredStreams) -> set[str]:
-    result.bags.append(path)
+def _add_bag(bags: Sequence[Path], wanted: ImportRequest, result: GatheredStreams) -> set[str]:
+    result.bags.append(bags)
+    result.passed_over += [
+        f"{table}: is a table in the folder of a bag; name its stream, as by --truth FILE."
+        for bag in bags
+        if bag.is_dir()
+        for table in _tables_in(bag)
+        if table not in wanted.files.values()
+    ]
     result.stamped = True
     entries = {s: e for s, e in wanted.entries.items() if s not in wanted.files}
-    for plan in plan_bag(path, entries, tuple(wanted.files), result.findings):
+    for plan in plan_bag(bags, entries, wanted.rates, tuple(wanted.files), result.findings):
         result.add(plan)
     return set(STREAMS)
 

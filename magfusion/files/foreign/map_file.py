@@ -130,7 +130,7 @@ def _rates(lines: Sequence[str], declared: Findings) -> dict[str, Rate]:
         stream, _, value = (part.strip() for part in line.partition("="))
         number, _, start = value.partition("@")
         try:
-            rate = Rate(Fraction(number), Fraction(start or "0"))
+            rate = Rate(Fraction(number), Fraction(start) if start else None)
         except (ValueError, ZeroDivisionError):
             rate = None
         if stream not in STREAMS or rate is None or rate.hz <= 0:

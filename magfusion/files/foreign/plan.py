@@ -50,12 +50,12 @@ class Rate:
     Parameters
     ----------
     hz : fraction
-    start_s : fraction
-        Of the first row.
+    start_s : fraction, optional
+        Of the first row; by default 0, and of a bag the stamp of the first message.
     """
 
     hz: Fraction
-    start_s: Fraction = Fraction(0)
+    start_s: Fraction | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +81,12 @@ class ImportPlan:
 
 @dataclass(eq=False)
 class Findings:
-    """Problems of an import: sentences, and options that would resolve them."""
+    """Problems of an import: sentences, and options that would resolve them; and notes on it."""
 
     problems: list[str] = field(default_factory=list)
     proposals: list[str] = field(default_factory=list)
     guessed: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 def shown(source: Source, terms: Sequence[Term]) -> str:

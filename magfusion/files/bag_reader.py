@@ -1,0 +1,135 @@
+"""Bags opened by the library: one file or several of one recording, ROS 1 or 2."""
+
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+from rosbags.typesys import Stores, get_typestore
+
+from magfusion.errors import InputError
+from magfusion.files.bag_recovery import Recovered, recovered
+from magfusion.files.bag_topics import UNFINISHED, bag_files, files_in
+
+# Of the files of one recording: what a recorder buffers, and of short ones a part.
+MOST_OVERLAP_NS, MOST_OVERLAP = 1_000_000_000, 0.5
+
+
+def place_of(paths: Sequence[Path]) -> str:
+    """Return what a refusal calls bags."""
+    return ", ".join(map(str, paths))
+
+
+def is_ros1(path: Path) -> bool:
+    """Return whether a bag is of ROS 1."""
+    return all(map(_is_ros1_file, bag_files(path)))
+
+
+def _is_ros1_file(file: Path) -> bool:
+    return file.name.endswith((".bag", UNFINISHED))
+
+
+class BagReader(AnyReader):
+    """The library's reader, which of unfinished files reads one topic after the other.
+
+    Without an index the library refuses messages that are not in the order of their arrival, which
+    those of several topics are not.
+
+    Attributes
+    ----------
+    unfinished : dict
+        Files that the recorder did not finish, by the place of their reader.
+    """
+
+    unfinished: Mapping[int, Path] = {}
+
+    @property
+    def notes(self) -> list[str]:
+        """How much of files was read that the recorder did not finish."""
+        return [
+            f"{path}: the recorder did not finish the file."
+            f" {self.readers[k].message_count} messages in {self.readers[k].duration * 1e-9:.4g} s"
+            " are whole and are read; what follows them is lost."
+            for k, path in self.unfinished.items()
+        ]
+
+    def messages(
+        self,
+        connections: Collection[Connection] = (),
+        start: int | None = None,
+        stop: int | None = None,
+    ) -> Generator[tuple[Connection, int, bytes], None, None]:
+        """Yield messages as `AnyReader` does."""
+        if not self.unfinished:
+            yield from super().messages(connections, start, stop)
+            return
+        for connection in connections or self.connections:
+            yield from super().messages([connection], start, stop)
+
+
+@contextmanager
+def open_bag(paths: Sequence[Path]) -> Iterator[BagReader]:
+    """Open bags as one recording.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Directories of bags, or their files.
+
+    Raises
+    ------
+    InputError
+        Where a bag cannot be read, also while its messages are read.
+    """
+    files = [file for path in paths for file in bag_files(path)]
+    if len(set(map(_is_ros1_file, files))) > 1:
+        names = ", ".join(file.name for file in files)
+        raise InputError(
+            f"{place_of(paths)}: holds bags of ROS 1 and of ROS 2 ({names}); give the path of one."
+        )
+    try:
+        readable = [file for path in paths for file in _readable(path)]
+        copies = [copy.path for _, copy in readable]
+        with BagReader(copies, default_typestore=get_typestore(Stores.LATEST)) as reader:
+            reader.unfinished = {
+                k: path for k, (path, copy) in enumerate(readable) if not copy.whole
+            }
+            yield reader
+    except InputError:
+        raise
+    except Exception as error:  # a damaged bag makes the library fail in any way whatever
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(
+            f"{place_of(paths)}: cannot be read ({reason}); record the bag again."
+        ) from error
+
+
+def _readable(path: Path) -> list[tuple[Path, Recovered]]:
+    """Return what the library can read of a bag, with the files it is of."""
+    files = files_in(path) if path.is_dir() else [path]
+    copies = {file: recovered(file) for file in files}
+    if not any(copies.values()):  # else the metadata are of what the files were to be
+        copies = dict.fromkeys(bag_files(path))
+    return [(file, copy or Recovered(file, True, None)) for file, copy in copies.items()]
+
+
+def refuse_overlap(reader: AnyReader, topic: str) -> None:
+    """Refuse files that hold a topic at the same time: they are no parts of one recording.
+
+    Raises
+    ------
+    InputError
+    """
+    spans = sorted(
+        (one.start_time, one.end_time, str(one.path))
+        for one in reader.readers
+        if any(c.topic == topic and c.msgcount for c in one.connections)
+    )
+    for (start, end, first), (begin, last, second) in pairwise(spans):
+        shorter = min(end - start, last - begin)
+        if end - begin > min(MOST_OVERLAP_NS, MOST_OVERLAP * shorter):
+            raise InputError(
+                f"{first} and {second} both hold {topic} at the same time; give the path of one."
+            )

@@ -1,0 +1,153 @@
+"""Single stamps hours or years from all others are left out, and a clock that jumped is refused."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+from conftest import Refuse, change_table
+from example_bag import (
+    FIELD,
+    GYRO,
+    IMU,
+    MEASURED,
+    POSE,
+    POSITION,
+    STAMPS,
+    Make,
+    N,
+    field_message,
+    header,
+    imu_message,
+    pose_message,
+    write_bag,
+)
+from example_log import example_log
+from test_bag_files import imported, recording
+
+from magfusion.errors import InputError
+from magfusion.files.log import read_log, write_log
+from magfusion.files.open import open_log
+from magfusion.files.stray_stamps import stray_rows
+from magfusion.jobs.check import CheckSettings, run_check
+from magfusion.results.figures import Figures
+
+DAY, YEAR = 86_400, 31_536_000  # s
+TOPICS: dict[str, tuple[str, Make]] = {
+    "/imu": (IMU, imu_message),
+    "/mag": (FIELD, field_message),
+    "/pose": (POSE, pose_message),
+}
+ROLES = {"/imu": "IMU", "/mag": "magnetometer", "/pose": "truth"}
+
+
+@pytest.fixture(autouse=True)
+def _unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the check of imported logs, which has its own tests."""
+    monkeypatch.setattr("magfusion.jobs.import_log.run_check", lambda _: Figures())
+
+
+def _bag(path: Path, topic: str, row: int, shift_s: int) -> Path:
+    msgtype, make = TOPICS[topic]
+
+    def shifted(k: int) -> Any:
+        message = make(k)
+        if k == row:
+            message.header = header(int(STAMPS[k]) + shift_s * 10**9)
+        return message
+
+    return write_bag(path, TOPICS | {topic: (msgtype, shifted)})
+
+
+@pytest.mark.parametrize("topic", list(TOPICS))
+@pytest.mark.parametrize(("row", "shift_s"), [(7, DAY), (0, -YEAR), (N - 1, -DAY), (N - 1, YEAR)])
+def test_a_stray_stamp_of_a_bag_is_left_out_and_reported(
+    tmp_path: Path, topic: str, row: int, shift_s: int
+) -> None:
+    bag = _bag(tmp_path / "run", topic, row, shift_s)
+    log = open_log(bag)
+    (finding,) = log.noticed
+    assert finding.code == "stray_stamps"
+    assert finding.text.startswith(f"{ROLES[topic]}: 1 samples have stamps more than an hour")
+    by_import, figures = imported(tmp_path / "log", bag)
+    stream = ROLES[topic].lower()
+    assert figures[f"{stream}_dropped_with_a_stray_time"] == 1
+    for one in (log, by_import):
+        assert one.waveform is not None
+        assert one.truth is not None
+        for name, values, expected in (
+            ("/imu", one.imu.gyro_body, GYRO),
+            ("/mag", one.waveform.measured_sensor, MEASURED),
+            ("/pose", one.truth.position_world, POSITION),
+        ):
+            kept = np.delete(expected, row, axis=0) if name == topic else expected
+            np.testing.assert_array_equal(values, kept)
+        assert one.epoch_ns == STAMPS[1 if (topic, row) == ("/imu", 0) else 0]
+        assert one.imu.time[-1] < 0.2  # s
+
+
+@pytest.mark.parametrize("stream", ["imu", "magnetometer"])
+@pytest.mark.parametrize("shift_s", [DAY, -YEAR])
+def test_a_stray_stamp_of_a_log_is_left_out_wherever_its_row_is(
+    tmp_path: Path, stream: str, shift_s: int
+) -> None:
+    write_log(example_log(), tmp_path / "log")
+    table = tmp_path / "log" / f"{stream}.parquet"
+
+    def shift(columns: dict[str, Any]) -> None:
+        columns["time_ns"][5] += shift_s * 10**9
+
+    before = read_log(tmp_path / "log")
+    change_table(table, shift)
+    log = read_log(tmp_path / "log")
+    assert [finding.code for finding in log.noticed] == ["stray_stamps"]
+    own, whole = (
+        (one.imu.time if stream == "imu" else one.waveform.time if one.waveform else None)
+        for one in (log, before)
+    )
+    np.testing.assert_array_equal(own, np.delete(whole, 5))
+    # Rows are counted as the file has them.
+    change_table(table, lambda c: c["time_ns"].__setitem__(8, c["time_ns"][6]))
+    with pytest.raises(InputError, match=r"row 8 .*before the row above"):
+        read_log(tmp_path / "log")
+
+
+def test_a_clock_that_jumped_is_refused(tmp_path: Path, refuse: Refuse) -> None:
+    def late(k: int) -> Any:
+        message = imu_message(k)
+        message.header = header(int(STAMPS[k]) + (DAY * 10**9 if k >= N // 2 else 0))
+        return message
+
+    bag = write_bag(tmp_path / "run", TOPICS | {"/imu": (IMU, late)})
+    sentence = f"stamped {STAMPS[N // 2] + DAY * 10**9} ns is more than an hour after"
+    assert sentence in refuse("check", bag)
+    assert "86400 s after the row above" in refuse("import", bag, "-o", tmp_path / "log")
+    assert len(open_log(bag, 0.0, 1.0).imu) == N // 2
+
+
+def test_few_rows_are_strays_and_more_are_a_part_of_the_recording() -> None:
+    hour = 3_600_000_000_000
+    stamps = 5_000_000 * np.arange(2000)
+    for count, shift, expected in ((1, 2, 1), (20, 2, 20), (21, 2, 0), (20, -30_000, 20)):
+        far = stamps.copy()
+        far[100 : 100 + count] += shift * hour
+        stray = stray_rows(far)
+        np.testing.assert_array_equal(np.flatnonzero(stray), 100 + np.arange(expected))
+    assert not stray_rows(stamps * 1_000_000).any()  # each row is an hour and more after the last
+    assert not stray_rows(np.array([0, 2 * hour])).any()
+    # A part of a table is compared with what was read before it.
+    later = stamps[:3] + 2 * hour
+    assert stray_rows(later, 2000, int(stamps[-1])).all()
+    assert not stray_rows(later, 200, int(stamps[-1])).any()
+    assert not stray_rows(stamps[:3], 2000, int(stamps[-1])).any()
+    assert stray_rows(np.append(stamps, 1 << 62))[-1]
+
+
+def test_the_shared_bag_with_one_stamp_in_the_future_is_checked(tmp_path: Path) -> None:
+    bag = recording("one_stamp_in_the_future")
+    figures = run_check(CheckSettings(log=bag))
+    assert figures["magnetometer_duration_s"] == pytest.approx(5.9975, abs=1e-6)
+    imported(tmp_path / "log", bag)
+    table = pyarrow.parquet.read_table(tmp_path / "log" / "magnetometer.parquet")
+    assert len(table) == 2399
