@@ -36,9 +36,10 @@ ROOMS = {
             noise prior waveform
         """,
         "files": """
-            atomic bag_topics blas_threads commit lost_rows messages parquet_bounds plain_data
+            atomic bag_topics blas_threads commit messages parquet_bounds plain_data
             plain_table plausible row_table site_draft site_ground site_values standard_streams
-            bag_rows checkpoint correlation field_map kept probe row_file survey table yaml_files
+            bag_rows checkpoint correlation field_map kept lost_rows probe row_file survey table
+            yaml_files
             attitude_table drive_columns fields hall instruments readings_table site_casing
             site_correlation site_motion site_region site_response site_rotor site_temperature
             trajectory_table wells_file
