@@ -81,6 +81,7 @@ ROOMS = {
             allan_fit antenna_graph antenna_observability antenna_probe antenna_site beacon_refined
             ellipsoid magnetometer_graph rest
             antenna_tracking magnetometer_start
+            sphere_fit
             magnetometer_log
             magnetometer_size
         """,
