@@ -1,12 +1,18 @@
 """What is wrong with single samples of a recording is left out, counted and said."""
 
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.data_checks.data_cleaning import clean_log
+from magfusion.files.log import write_log
+from magfusion.files.open import open_log
+from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.trust import Verdict
 from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -67,3 +73,138 @@ def test_an_imu_that_hung_is_one_that_fell_silent() -> None:
     assert np.sum(inside) >= 7  # windows
     assert np.max(np.linalg.norm(errors.position_world[inside], axis=1)) < 0.1  # m
     assert np.mean(errors.nees[inside]) < 12.0
+
+
+@cache
+def walked() -> Log:
+    site, rng = demo_site(coil_radius=None), np.random.default_rng(9)
+    return simulate_log(site, SimulationConfig(DEMO_BOX_WORLD, duration=12.0), rng).log
+
+
+STREAMS = ["gyro", "accel", "field"]
+
+
+def with_spikes(log: Log, stream: str, rows: list[int], size: float, axis: int = 0) -> Log:
+    """Return a log of which an axis is off in some rows, in the stream's unit."""
+    wave = log.waveform
+    assert wave is not None
+    gyro, accel, field = (
+        values.copy() for values in (log.imu.gyro_body, log.imu.accel_body, wave.measured_sensor)
+    )
+    {"gyro": gyro, "accel": accel, "field": field}[stream][rows, axis] += size
+    imu = replace(log.imu, gyro_body=gyro, accel_body=accel)
+    return replace(log, imu=imu, waveform=replace(wave, measured_sensor=field))
+
+
+def missing_rows(log: Log, good: Log, stream: str) -> list[int]:
+    assert log.waveform is not None
+    assert good.waveform is not None
+    if stream == "field":
+        time, kept = log.waveform.time, good.waveform.time
+    else:
+        time, kept = log.imu.time, good.imu.time
+    nearest = np.min(np.abs(time[:, None] - kept), axis=1)
+    return np.flatnonzero(nearest > 1e-4).tolist()
+
+
+@pytest.mark.parametrize("size", [6.0, -35.0, 1e4, 1e19])
+@pytest.mark.parametrize("rows", [[700], [2, 2397], [2, 300, 650], list(range(40, 1000, 120))])
+@pytest.mark.parametrize("stream", STREAMS)
+def test_few_false_samples_are_left_out_as_many_are(
+    stream: str, rows: list[int], size: float
+) -> None:
+    log, site = walked(), demo_site(coil_radius=None)
+    good = clean_log(with_spikes(log, stream, rows, size, axis=1), site)
+    assert missing_rows(log, good, stream) == rows
+    (finding,) = good.noticed
+    assert f" {len(rows)} isolated samples" in finding.text
+    assert finding.verdict is Verdict.TRUSTWORTHY
+
+
+@pytest.mark.parametrize("stream", STREAMS)
+@pytest.mark.parametrize("row", [0, 1, -2, -1])
+def test_a_false_sample_at_an_end_is_left_out(stream: str, row: int) -> None:
+    log, site = walked(), demo_site(coil_radius=None)
+    good = clean_log(with_spikes(log, stream, [row], 35.0), site)
+    count = 4800 if stream == "field" else 2400
+    assert missing_rows(log, good, stream) == [row % count]
+    assert [f.code for f in good.noticed] == [
+        "false_samples" if stream == "field" else "imu_spikes"
+    ]
+
+
+@pytest.mark.parametrize("stream", ["gyro", "accel"])
+def test_one_false_inertial_sample_does_not_move_the_trajectory(stream: str) -> None:
+    log, site = walked(), demo_site(coil_radius=None)
+    whole = trajectory_errors(smooth(log, site).states, log.truth)
+    corrupted = smooth(with_spikes(log, stream, [900], 35.0), site)
+    assert trajectory_errors(corrupted.states, log.truth).ate < 1.2 * whole.ate + 2e-4  # m
+
+
+def test_fast_motion_and_knocks_lose_nothing() -> None:
+    log, site = walked(), demo_site(coil_radius=None)
+    time, gyro, accel = log.imu.time, log.imu.gyro_body.copy(), log.imu.accel_body.copy()
+    # 14 rad/s are 800 deg/s, in bursts of a second.
+    shaken = 14.0 * np.sin(2.0 * np.pi * 6.0 * time) * np.sin(0.5 * np.pi * time).clip(0.0) ** 2
+    gyro[:, 2] += shaken
+    accel[:, 0] += 0.05 * shaken**2  # of a lever arm
+    knock = 60.0 * np.exp(-np.arange(8) / 2.0) * np.cos(1.5 * np.arange(8))  # m/s^2
+    accel[500:508, 2] += knock
+    fast = replace(log, imu=replace(log.imu, gyro_body=gyro, accel_body=accel))
+    assert clean_log(fast, site) is fast
+
+
+def test_an_instrument_of_coarse_steps_loses_nothing() -> None:
+    log, site = walked(), demo_site(coil_radius=None)
+    rng, gyro = np.random.default_rng(3), np.zeros_like(log.imu.gyro_body)
+    gyro[rng.choice(len(gyro), 40, replace=False), 1] = 0.02  # rad/s; one step, now and then
+    accel = np.round(log.imu.accel_body, 1)
+    coarse = replace(log, imu=replace(log.imu, gyro_body=gyro, accel_body=accel))
+    assert not clean_log(coarse, site).noticed
+
+
+def test_false_samples_beside_lost_ones_are_left_out() -> None:
+    log, site = walked(), demo_site(coil_radius=None)
+    wave = log.waveform
+    assert wave is not None
+    rng = np.random.default_rng(5)
+    kept = np.sort(rng.choice(len(wave), int(0.95 * len(wave)), replace=False))
+    lost = replace(log, waveform=wave.rows(kept))
+    assert not [f for f in clean_log(lost, site).noticed if f.code == "false_samples"]
+    good = clean_log(with_spikes(lost, "field", [900], 1e-3), site)
+    assert missing_rows(lost, good, "field") == [900]
+
+
+def test_a_log_without_an_imu_loses_its_false_samples_too() -> None:
+    site = demo_site(coil_radius=None)
+    log = replace(walked(), imu=ImuSamples.empty(), inertial=False)
+    good = clean_log(with_spikes(log, "field", [700], 5.0), site)
+    assert missing_rows(log, good, "field") == [700]
+
+
+@pytest.mark.parametrize("name", ["imu", "magnetometer"])
+def test_a_number_that_no_instrument_gives_is_a_missing_sample(name: str, tmp_path: Path) -> None:
+    log, site = walked(), demo_site(coil_radius=None)
+    rows = [300, 301, 302, 900]
+    if name == "imu":
+        rate = with_spikes(log, "gyro", rows[:2], 1e12)
+        impossible = with_spikes(rate, "accel", rows[2:], -1e19, axis=2)
+    else:
+        impossible = with_spikes(log, "field", rows, 1e19)
+    write_log(impossible, tmp_path / "log")
+    read = open_log(tmp_path / "log")
+    stream = "field" if name == "magnetometer" else "gyro"
+    assert missing_rows(log, read, stream) == rows
+    (finding,) = read.noticed
+    assert finding.code == "missing_samples"
+    assert "4 samples are larger than any instrument measures" in finding.text
+    assert not clean_log(read, site).noticed[1:]
+
+
+def test_numbers_of_a_wrong_unit_are_refused_and_not_left_out(tmp_path: Path) -> None:
+    log = walked()
+    assert log.waveform is not None
+    nanotesla = replace(log.waveform, measured_sensor=1e9 * log.waveform.measured_sensor)
+    write_log(replace(log, waveform=nanotesla), tmp_path / "log")
+    with pytest.raises(InputError, match="another unit"):
+        open_log(tmp_path / "log")

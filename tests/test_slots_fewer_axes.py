@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import unsigned_amplitudes
 from derivatives import central_difference, relative_to_group
 from scipy.spatial.transform import Rotation
 from time_slots_and_mains import tracker
@@ -12,8 +13,10 @@ from magfusion.errors import EstimationError
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.estimation.snapshot.problem import FixProblem, FixState, epochs_of
 from magfusion.estimation.snapshot.sequential_channels import linearized, predicted
+from magfusion.jobs.fix_coil import find_coil
 from magfusion.model.parameters import initial_calibration, predict_channels
-from magfusion.model.samples import FieldSamples, ImuSamples
+from magfusion.model.progress import quiet
+from magfusion.model.samples import FieldSamples, ImuSamples, Log
 from magfusion.model.site import Site, Slots
 from magfusion.model.trajectory import Trajectory
 from magfusion.receiver.cycles import whole_cycles
@@ -127,3 +130,60 @@ def test_one_axis_about_a_lone_source_is_said_to_be_too_little() -> None:
     site = heard_by("z")
     with pytest.raises(EstimationError, match="three numbers of a single source of three coils"):
         fix_epochs(cycles_of(site), initial_calibration(site, 0.0))
+
+
+def floor_in_turn() -> Site:
+    """Return sixteen coils in a floor that are driven in turn, under a receiver of one axis."""
+    site = unsigned_amplitudes.floor()
+    slots = Slots(SLOTS.duration, len(site.beacons))
+    beacons = tuple(
+        replace(b, coils=(replace(b.coils[0], slot=k),), frequency_hz=2e3, slots=slots)
+        for k, b in enumerate(site.beacons)
+    )
+    sensor = replace(site.platform.magnetometer, position_body=np.zeros(3))
+    platform = replace(site.platform, magnetometer=sensor)
+    return replace(site, beacons=beacons, platform=platform)
+
+
+def measured_in_turn(
+    site: Site, count: int, *, signed: bool
+) -> tuple[FieldSamples, ImuSamples, np.ndarray]:
+    """Return fields of random poses, one for each cycle, an IMU at rest, and the places."""
+    rng, coils, sigma = np.random.default_rng(3), len(site.beacons), unsigned_amplitudes.SIGMA
+    place = rng.uniform(*unsigned_amplitudes.BOX, (count, 3))
+    turn, cycle = Rotation.random(count, rng).as_matrix(), np.repeat(np.arange(count), coils)
+    time, row = (np.arange(coils * count) + 0.5) * SLOTS.duration, np.arange(coils * count)
+    every = predict_channels(initial_calibration(site, 0.0), time, turn[cycle], place[cycle])
+    value = every[row, row % coils, 2]
+    value = value + sigma * (rng.standard_normal((2, len(value))).T @ [1.0, 1j])
+    phasor, cov = np.full_like(every, np.nan), np.full((*every.shape, 3), np.nan)
+    phasor[row, row % coils, 2] = value if signed else np.abs(value)
+    cov[row, row % coils] = sigma**2 * np.eye(3)
+    length = np.full(len(time), SLOTS.duration)
+    fields = FieldSamples(time, length, site.channels, phasor, cov, axes="z", signed=signed)
+    stamps = np.arange(0.0, time[-1] + 0.1, 0.005)
+    still = np.zeros((len(stamps), 3))
+    weight = np.tile([0.0, 0.0, site.gravity], (len(stamps), 1))
+    return fields, ImuSamples(stamps, still, weight), place
+
+
+@pytest.mark.parametrize("signed", [True, False])
+def test_a_coil_is_found_by_what_sixteen_others_send_in_turn(signed: bool) -> None:
+    site = floor_in_turn()
+    samples, samples_imu, place = measured_in_turn(site, 60, signed=signed)
+    result = whole_cycles(samples, samples_imu, site)
+    assert result.signed is signed
+    fixes = find_coil(Log("walk", 0, "test", samples_imu, fields=result), result, site, (), quiet)
+    away = np.linalg.norm(fixes.fixes.position_world[:, 0] - place, axis=1)
+    assert np.max(away) < 0.02  # m
+
+
+def test_cycles_and_joined_epochs_keep_whatever_else_was_measured() -> None:
+    site = floor_in_turn()
+    samples, samples_imu, _ = measured_in_turn(site, 4, signed=False)
+    named = replace(samples, magnetometers=tuple("m" for _ in samples.channels))
+    result = whole_cycles(named, samples_imu, site)
+    assert (result.signed, result.axes, result.magnetometers) == (False, "z", named.magnetometers)
+    again = FieldSamples.joined(result.epochs())
+    for name, value in vars(result).items():
+        np.testing.assert_array_equal(getattr(again, name), value, err_msg=name)

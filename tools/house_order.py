@@ -36,10 +36,11 @@ ROOMS = {
             noise prior waveform
         """,
         "files": """
-            atomic bag_recovery bag_topics blas_threads commit lost_rows messages parquet_bounds
+            atomic bag_recovery bag_topics blas_threads commit messages parquet_bounds
             plain_data plain_table plausible row_stamps row_table site_draft site_ground
             site_values standard_streams stray_stamps
-            bag_reader bag_rows checkpoint correlation field_map kept probe row_file survey table
+            bag_reader bag_rows checkpoint correlation field_map kept lost_rows probe row_file survey
+            table
             yaml_files
             attitude_table drive_columns fields hall instruments readings_table site_casing
             site_correlation site_motion site_region site_response site_rotor site_temperature
@@ -82,6 +83,7 @@ ROOMS = {
             allan_fit antenna_graph antenna_observability antenna_probe antenna_site beacon_refined
             ellipsoid magnetometer_graph rest
             antenna_tracking magnetometer_start
+            sphere_fit
             magnetometer_log
             magnetometer_size
         """,

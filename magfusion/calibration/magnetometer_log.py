@@ -29,6 +29,7 @@ from magfusion.calibration.magnetometer_start import (
     rival_offset,
     starts,
 )
+from magfusion.calibration.sphere_fit import sphere_fits
 from magfusion.calibration.steady_field import LONGEST, SteadyField, average, steady_field
 from magfusion.calibration.stops import distinct, find_stops
 from magfusion.errors import EstimationError, InputError
@@ -252,13 +253,19 @@ def _starts(
     prior: MagnetometerPrior,
     missing: list[str],
 ) -> tuple[MagnetometerFit, ...]:
-    """Return the initial estimate: from the ellipsoid where readings surround it, else the gyro."""
+    """Return initial estimates: from the ellipsoid where readings surround it.
+
+    Else from the magnitude of the field, and from the gyro.
+    """
     known, size = site.platform.magnetometer, float(np.linalg.norm(prior.field_world))
     if not missing:
         with suppress(EstimationError):
             return (fit_ellipsoid_gravity(readings.measured_sensor, up_sensor, size),)
+    by_size: list[MagnetometerFit] = []
+    with suppress(EstimationError):
+        by_size = sphere_fits(readings, known, prior)
     lag = site.platform.imu.time_offset
-    return starts(readings, imu, lag, known, prior.cov[9:, 9:], size)
+    return (*by_size, *starts(readings, imu, lag, known, prior.cov[9:, 9:], size))
 
 
 def _accel_sigma(readings: SteadyField, site: Site, is_stationary: bool) -> Array:

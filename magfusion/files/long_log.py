@@ -12,9 +12,10 @@ from magfusion.files.drive_columns import column_names, drive_columns
 from magfusion.files.fields import read_fields
 from magfusion.files.inertial_tables import read_if_there
 from magfusion.files.log import HEADER, LogHeader, is_log
+from magfusion.files.lost_rows import MOST_MISSING
 from magfusion.files.marks_table import SLOT
 from magfusion.files.named_samples import MAGNETOMETER
-from magfusion.files.plausible import check_field, check_imu
+from magfusion.files.plausible import beyond_range, check_field, check_imu
 from magfusion.files.rotor_columns import rotor_columns
 from magfusion.files.stray_stamps import LONGEST_GAP
 from magfusion.files.table import Span, find_table
@@ -80,7 +81,9 @@ class Samples:
 
     def _take(self, piece: SampleBlock) -> None:
         kept = np.diff(piece.time, prepend=self._newest) > 0.0
-        kept &= ~np.isnan(piece.values).any(axis=1)
+        beyond = beyond_range(piece.values)
+        # Else the unit is wrong.
+        kept &= ~(np.isnan(piece.values).any(axis=1) | (beyond & (np.mean(beyond) <= MOST_MISSING)))
         self._time, self._values, self._at = piece.time[kept], piece.values[kept], 0
         if not len(self._time):
             return

@@ -1,9 +1,10 @@
-"""Rows of a recording that hold no sample: NaN, or the stamp of the row above."""
+"""Rows of a recording without a sample: NaN, beyond any range, or the stamp of the row above."""
 
 from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.files.plausible import beyond_range
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -15,17 +16,24 @@ class LostRows(NamedTuple):
 
     twice: BoolArray
     absent: BoolArray
+    beyond: BoolArray
 
     @classmethod
     def of(cls, time_ns: IntArray, values: Array) -> "LostRows":
-        """Judge rows, sorted by their stamps (ns), of values of shape (n, columns)."""
+        """Judge rows, sorted by their stamps (ns), of values as `beyond_range` takes them.
+
+        Where most are beyond the range, the unit is wrong: none of them is left out.
+        """
         twice = np.diff(time_ns, prepend=time_ns[:1] - 1) == 0
-        return cls(np.asarray(twice), np.asarray(np.isnan(values).any(axis=1)))
+        absent, beyond = np.isnan(values).any(axis=1), beyond_range(values)
+        if np.sum(beyond) > MOST_MISSING * len(beyond):
+            beyond[:] = False
+        return cls(np.asarray(twice), np.asarray(absent), beyond & ~absent)
 
     @property
     def kept(self) -> BoolArray:
         """Which rows hold a sample, shape (n,)."""
-        return np.asarray(~(self.twice | self.absent))
+        return np.asarray(~(self.twice | self.absent | self.beyond))
 
     @property
     def too_many(self) -> tuple[bool, bool]:
@@ -45,6 +53,11 @@ class LostRows(NamedTuple):
                     f"{np.sum(self.twice)} samples have the stamp of the one before.",
                 ),
                 ("missing_samples", self.absent, f"{np.sum(self.absent)} samples are NaN."),
+                (
+                    "missing_samples",
+                    self.beyond,
+                    f"{np.sum(self.beyond)} samples are larger than any instrument measures.",
+                ),
             )
             if rows.any()
         )

@@ -5,13 +5,19 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.model.samples import ImuSamples
-from magfusion.units import Array
+from magfusion.units import Array, BoolArray
 
 LARGEST_FIELD = 1e-3  # T; twenty times the Earth's
 LARGEST_RATE = 50.0  # rad/s; beyond the range of common gyroscopes
 FASTEST_RATE = 80.0  # rad/s; beyond the range of any
 LARGEST_RATE_IN_DEGREES = 6000.0  # deg/s, and as much written for rad/s
 LARGEST_FORCE = 1e4  # m/s^2
+# A sample beyond these is no measurement, in whatever unit: ten times a shock accelerometer's range
+# (m/s^2), a hundred times a fluxgate's (T), and the rate above.
+_LARGEST_SAMPLES = {  # by the number of columns
+    6: np.repeat([LARGEST_RATE_IN_DEGREES, 1e6], 3),
+    **dict.fromkeys((1, 2, 3), np.array(100.0 * LARGEST_FIELD)),
+}
 SOUND = 0.98  # of the samples, by size
 CHECKED_DURATION = 2.0  # s
 MAX_TEST_SAMPLES = 20_000  # samples
@@ -20,6 +26,19 @@ WEIGHT_IN_G = (0.9, 1.1)  # where gravity is 9.8 m/s^2
 # Of the median, what nine in ten samples exceed: of a specific force without gravity half.
 LEAST_WEIGHT = 0.6
 SHORTEST_STEP = 2e-5  # s; faster than any inertial sensor
+
+
+def beyond_range(values: Array) -> BoolArray:
+    """Return which rows no instrument measures, shape (n,): a bit error in a number's exponent.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n, columns)
+        Rate and specific force (rad/s, m/s^2), or up to three components of a field (T); of other
+        columns no range is known.
+    """
+    largest = _LARGEST_SAMPLES.get(values.shape[1], np.array(np.inf))
+    return np.asarray((np.abs(values) > largest).any(axis=1))
 
 
 def check_imu(imu: ImuSamples, place: str) -> None:

@@ -15,6 +15,7 @@ from pydantic_core import PydanticCustomError
 from magfusion.errors import InputError
 from magfusion.files.drive_columns import beacon_of
 from magfusion.files.marks_table import is_slot, slots_of
+from magfusion.files.plausible import beyond_range
 from magfusion.files.site_temperature import COLDEST, HOTTEST
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS
 from magfusion.files.yaml_files import StrictModel, sentence
@@ -275,10 +276,11 @@ def _check_lengths(time: Array, **rows: AnyArray) -> None:
 
 
 def whole_rows(time: Array, *values: Array) -> tuple[Array, ...]:
-    """Return stamps (k,) and values (k, 3) without the rows of which a number is missing."""
-    if all(np.isfinite(rows).all() for rows in values):
+    """Return stamps (k,) and values (k, 3) without rows that lack a number or are beyond range."""
+    joined = np.hstack(values)
+    whole = np.isfinite(joined).all(axis=1) & ~beyond_range(joined)
+    if whole.all():
         return time, *values
-    whole = np.all([np.all(np.isfinite(rows), axis=1) for rows in values], axis=0)
     return time[whole], *(rows[whole] for rows in values)
 
 

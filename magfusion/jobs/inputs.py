@@ -280,8 +280,7 @@ def read_job(
         check_rotors(job.declared_path, job.log_path, log, site, separately=separately)
     log, site = logged(log, site)
     _require_described(job, log, site)
-    if log.waveform is not None:
-        log = clean_log(log, site)
+    log = clean_log(log, site)
     if log.waveforms and not raw:
         with named(job.log_path):
             result = demodulated_apart(log, site, lockin, repeated=reread)

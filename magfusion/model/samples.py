@@ -167,18 +167,19 @@ class FieldSamples:
     @staticmethod
     def joined(parts: list["FieldSamples"]) -> "FieldSamples":
         """Concatenate the epochs of several."""
-        return FieldSamples(
+        ahead, rotation = None, [p.channel_rotation for p in parts]
+        if any(p.ahead is not None for p in parts):
+            ahead = np.concatenate([p.ahead_or_zero for p in parts])
+        return replace(
+            parts[0],
             time=np.concatenate([p.time for p in parts]),
             window=np.concatenate([p.window for p in parts]),
-            channels=parts[0].channels,
             phasor_sensor=np.concatenate([p.phasor_sensor for p in parts]),
             phasor_cov=np.concatenate([p.phasor_cov for p in parts]),
-            ahead=None
-            if all(p.ahead is None for p in parts)
-            else np.concatenate([p.ahead_or_zero for p in parts]),
-            axes=parts[0].axes,
-            signed=parts[0].signed,
-            magnetometers=parts[0].magnetometers,
+            ahead=ahead,
+            channel_rotation=np.concatenate([r for r in rotation if r is not None])
+            if all(r is not None for r in rotation)
+            else None,
         )
 
     def epochs(self) -> list["FieldSamples"]:

@@ -87,7 +87,7 @@ CODES = {
     "magnetometers_contradict": "magnetometers are inconsistent, and none can be identified",
     "mains": "mains in the field",
     "metal_near": "metal or iron came near a single beacon or the sensor, and changes its field",
-    "missing_samples": "samples are not a number",
+    "missing_samples": "samples are NaN, or larger than any instrument measures",
     "moment_units": "the moments of all beacons are off by the factor of a unit or a convention",
     "moments": "the moments of beacons are not as declared",
     "mounting": "magnetometer and inertial sensor are not mounted as declared",

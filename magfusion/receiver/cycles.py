@@ -1,5 +1,7 @@
 """Combination of a cycle of time slots into one epoch."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from magfusion.errors import InputError
@@ -109,14 +111,13 @@ def cycles(
         cov[cycle[row], channel] = turn @ own @ np.swapaxes(turn, 1, 2)
     ahead = np.zeros((number, len(samples.channels)))
     ahead[cycle[row], channel] = samples.time[row] - time[cycle[row]]
-    return FieldSamples(
+    return replace(
+        samples,
         time=time,
         window=_lengths(samples, cycle, site),
-        channels=samples.channels,
         phasor_sensor=phasor,
         phasor_cov=cov,
         ahead=ahead,
-        axes=samples.axes,
         channel_rotation=rotated,
     )
 

@@ -11,7 +11,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.batch.strides import Strides
-from magfusion.estimation.graph.preintegration import BRIDGE_ACCEL_NOISE, BRIDGE_GYRO_NOISE
+from magfusion.estimation.graph.preintegration import (
+    BRIDGE_ACCEL_NOISE,
+    BRIDGE_GYRO_NOISE,
+    bias_walks,
+)
 from magfusion.estimation.snapshot.problem import nuisance_blocks
 from magfusion.estimation.snapshot.survey_error import whitened
 from magfusion.model.channel_effects import of_all_sensors
@@ -27,7 +31,6 @@ ACCEL, GYRO = slice(9, 12), slice(12, 15)
 MOTION = 15
 ROUNDS = 3  # of linearisation in one update: the first prediction may be wide
 STRONG_CHI_SQUARE = 16.0  # times the expected chi square, above which a channel is downweighted
-LEAST_WALK = 1e-9  # of a bias: without any a covariance may become singular
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,10 +210,10 @@ def _noise(site: Site, dt: float, size: int, gap_bridged: bool) -> Array:
     noise[3 + index, 3 + index] = accel**2 * dt**3 / 3.0
     noise[6 + index, 6 + index] = accel**2 * dt
     noise[3 + index, 6 + index] = noise[6 + index, 3 + index] = 0.5 * accel**2 * dt**2
-    walk = max(imu.gyro_bias_walk, LEAST_WALK)
+    walk, accel_walk = bias_walks(imu)
     noise[index, index] += walk**2 * dt**3 / 3.0
     noise[index, 12 + index] = noise[12 + index, index] = -0.5 * walk**2 * dt**2
-    noise[9 + index, 9 + index] = max(imu.accel_bias_walk, LEAST_WALK) ** 2 * dt
+    noise[9 + index, 9 + index] = accel_walk**2 * dt
     noise[12 + index, 12 + index] = walk**2 * dt
     return noise
 

@@ -34,10 +34,11 @@ def clean_log(log: Log, site: Site) -> Log:
     noticed = [replace(f, verdict=Verdict.TRUSTWORTHY) for f in false_samples(log, site)]
     noticed = [replace(f, text=f"{f.text} They are left out.") for f in noticed]
     wave = log.waveform
-    log = _without_inertial(log, np.union1d(result["gyroscope"], result["accelerometer"]))
-    if wave is not None:
-        kept = np.delete(np.arange(len(wave)), result["magnetometer"])
-        wave = wave.rows(kept)
+    inertial = [rows for name, rows in result.items() if name != "magnetometer"]
+    if inertial:
+        log = _without_inertial(log, np.unique(np.concatenate(inertial)))
+    if wave is not None and "magnetometer" in result:
+        wave = wave.rows(np.delete(np.arange(len(wave)), result["magnetometer"]))
     return replace(log, waveform=wave, noticed=(*log.noticed, *noticed))
 
 

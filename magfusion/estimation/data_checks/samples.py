@@ -28,7 +28,8 @@ LEAST_PILE = 12  # samples at a limit
 LEAST_RUN = 3  # of them in a row, at least once
 SPIKE = 15.0  # times the local scatter
 LEAST_SPIKES, SPIKE_SHARE = 5, 2e-4  # fewer may be knocks
-CERTAIN_SPIKE, MIN_CERTAIN = 30.0, 2  # times the scatter, and how many of those suffice
+CERTAIN_SPIKE = 50.0  # times the scatter; more than a knock moves one sample alone
+EVEN_GAIN = 70.0**0.5 / 6.0  # of noise, in a sample less the cubic: weights -1, 4, 4, -1 sixths
 SMOOTH_TONE = 0.15  # cycles a sample; above, neighbours do not predict a sample
 BLOCK = 128  # samples in which the scatter is measured
 AXES = "xyz"
@@ -260,25 +261,58 @@ def clipped(value: Array, largest: float = np.inf) -> tuple[int, float]:
     return (count if pile and longest >= max(LEAST_RUN, 0.5 * by_chance) else 0), limit
 
 
-def _spikes(stream: InstrumentStream) -> tuple[IntArray, int]:
-    """Return the isolated false samples, and how many of them are certain.
+def _spikes(stream: InstrumentStream) -> tuple[IntArray, BoolArray]:
+    """Return the isolated false samples, and which of them are certain.
 
     They are off the curve through their neighbours, which agree with each other; a knock moves
     several samples.
     """
-    x = stream.value
-    if len(x) < 2 * BLOCK:
-        return np.zeros(0, dtype=np.int64), 0
-    before, after = x[1:-3], x[3:-1]
-    curve = (4.0 * (before + after) - x[:-4] - x[4:]) / 6.0
-    off = np.abs(x[2:-2] - curve)
-    floor = 1e-9 * np.max(np.abs(x))
-    separate = np.maximum(np.abs(after - before), np.abs(x[:-4] - x[4:]))
-    alone, scatter = off > 3.0 * separate, _scatter(off)
-    result, certain = (
-        np.any(alone & (off > least * scatter + floor), axis=1) for least in (SPIKE, CERTAIN_SPIKE)
-    )
-    return np.flatnonzero(result) + 2, int(np.sum(certain))
+    x, count = stream.value, len(stream.value)
+    if count < 2 * BLOCK:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=bool)
+    row = np.arange(count)
+    first = np.clip(row - 2, 0, count - 5)
+    near = [first + k + (first + k >= row) for k in range(4)]
+    weight, widening = _cubic(stream.time, near)
+    curve = np.zeros_like(x)
+    for own, at in zip(weight, near, strict=True):
+        curve += own[:, None] * x[at]
+    before, after = x[near[1]], x[near[2]]
+    centre = 0.5 * (before + after)
+    outer = np.maximum(np.abs(x[near[0]] - centre), np.abs(x[near[3]] - centre))
+    separate = np.maximum(np.abs(after - before), outer)
+    from_curve = np.abs(x - curve)
+    off = np.minimum(from_curve, np.abs(x - centre))
+    scatter = widening * np.maximum(_scatter(from_curve / widening), _quantum(x))
+    scatter += 1e-9 * np.abs(centre)  # rounding
+    alone = off > 3.0 * separate
+    size = np.max(np.where(alone, off / np.maximum(scatter, np.finfo(float).tiny), 0.0), axis=1)
+    rows = np.flatnonzero(size > SPIKE)
+    return rows, size[rows] > CERTAIN_SPIKE
+
+
+def _cubic(time: Array, near: list[IntArray]) -> tuple[list[Array], Array]:
+    """Return weights (n,) of four neighbours in a cubic, and how much its error grows.
+
+    The latter, shape (n, 1), is relative to even samples: of noise, or of a smooth signal where
+    samples are missing or at an end.
+    """
+    step = float(np.median(np.diff(time)))
+    far = [(time[at] - time) / step for at in near]
+    weight = []
+    for k, own in enumerate(far):
+        others = [far[j] for j in range(4) if j != k]
+        weight.append(np.prod([other / (other - own) for other in others], axis=0))
+    noise = np.sqrt(1.0 + np.sum(np.square(weight), axis=0)) / EVEN_GAIN
+    smooth = np.abs(np.prod(far, axis=0)) / 4.0
+    return weight, np.maximum(1.0, np.maximum(noise, smooth))[:, None]
+
+
+def _quantum(x: Array) -> Array:
+    """Return the steps in which an instrument reads, shape (axes,)."""
+    step = np.abs(np.diff(x, axis=0))
+    least = np.min(np.where(step > 0.0, step, np.inf), axis=0)
+    return np.where(np.isfinite(least), least, 0.0)
 
 
 def _scatter(off: Array) -> Array:
@@ -292,14 +326,14 @@ def _scatter(off: Array) -> Array:
 
 
 def false_rows(stream: InstrumentStream, site: Site | None) -> IntArray:
-    """Return the isolated false samples of a stream; none where they are too few to be certain."""
+    """Return the isolated false samples of a stream; of a few, those that are no knocks."""
     if next(_clipped_axes(stream), None) is not None:
         return np.zeros(0, dtype=np.int64)  # clipping makes corners
     if stream.name == "magnetometer" and site is not None and not _smooth_between(stream, site):
         return np.zeros(0, dtype=np.int64)
     rows, certain = _spikes(stream)
-    few = len(rows) < max(LEAST_SPIKES, SPIKE_SHARE * len(stream.value)) and certain < MIN_CERTAIN
-    return rows[:0] if few else rows
+    few = len(rows) < max(LEAST_SPIKES, SPIKE_SHARE * len(stream.value))
+    return rows[certain] if few else rows
 
 
 def _smooth_between(stream: InstrumentStream, site: Site) -> bool:
@@ -317,7 +351,8 @@ def false_samples(log: Log, site: Site | None) -> Iterator[Finding]:
         if len(rows) == 0:
             continue
         x = stream.value
-        off = np.abs(x[rows] - 0.5 * (x[rows - 1] + x[rows + 1])) * stream.scale
+        before, after = np.abs(rows - 1), np.where(rows + 1 < len(x), rows + 1, rows - 1)
+        off = np.abs(x[rows] - 0.5 * (x[before] + x[after])) * stream.scale
         yield Finding(
             "false_samples" if stream.name == "magnetometer" else "imu_spikes",
             f"{stream.name}: {len(rows)} isolated samples ({1e3 * len(rows) / len(x):.2g} per"

@@ -6,13 +6,15 @@ perturbation, about the world's axes.
 
 import numpy as np
 
-from magfusion.estimation.graph.preintegration import BRIDGE_ACCEL_NOISE, BRIDGE_GYRO_NOISE
+from magfusion.estimation.graph.preintegration import (
+    BRIDGE_ACCEL_NOISE,
+    BRIDGE_GYRO_NOISE,
+    bias_walks,
+)
 from magfusion.estimation.graph.state import MOTION
 from magfusion.model.field import skew
 from magfusion.model.site import ImuModel
 from magfusion.units import Array, BoolArray
-
-LEAST_WALK = 1e-9  # of a bias: without any the ends of an interval would be tied
 
 
 def step_transitions(length: Array, rotation: Array, force_world: Array) -> Array:
@@ -61,7 +63,7 @@ def step_noise(length: Array, imu: ImuModel, gap_bridged: BoolArray) -> Array:
     noise[..., 6 + axes, 6 + axes] = (accel * length)[..., None]
     both = (0.5 * accel * length**2)[..., None]
     noise[..., 3 + axes, 6 + axes] = noise[..., 6 + axes, 3 + axes] = both
-    for begin, walk in ((9, imu.accel_bias_walk), (12, imu.gyro_bias_walk)):
+    for begin, walk in zip((12, 9), bias_walks(imu), strict=True):
         rows = begin + axes
-        noise[..., rows, rows] = (max(walk, LEAST_WALK) ** 2 * length)[..., None]
+        noise[..., rows, rows] = (walk**2 * length)[..., None]
     return noise

@@ -20,6 +20,9 @@ BRIDGE_ACCEL_NOISE = 3.0  # m/s^2/sqrt(Hz)
 RATE_SPAN = 0.08  # s; motion is slower, noise is not
 LEAST_HELD = 1e-4  # rad/s, and that per root s, about a fixed axis: no motion, but regular
 GAP_SAMPLES = 5.0  # a gap is this many times the usual sampling interval
+# s; a bias that walks by `white noise / LONGEST_WHITE` adds a third of the noise's variance to an
+# attitude or a velocity after this time. A slower one would tie states to the last digit.
+LONGEST_WHITE = 300.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +132,20 @@ def _filled(time: Array, edges: Array, gaps: IntArray, epochs: Array, usual: flo
     return np.concatenate(filled)
 
 
+def bias_walks(imu: ImuModel) -> tuple[float, float]:
+    """Return the walks of both biases, gyro first, as large as regular factors need.
+
+    Returns
+    -------
+    tuple of float
+        (rad/s/sqrt(s), m/s^2/sqrt(s))
+    """
+    return (
+        max(imu.gyro_bias_walk, imu.gyro_noise / LONGEST_WHITE),
+        max(imu.accel_bias_walk, imu.accel_noise / LONGEST_WHITE),
+    )
+
+
 def across_held(cov: Array, imu: ImuModel) -> Array:
     """Return the covariance of a gyro's bias, (3, 3), without that about the fixed axis."""
     if not isinstance(imu, HeldModel):
@@ -149,8 +166,9 @@ def preintegration_parameters(
     parameters.setGyroscopeCovariance(gyro**2 * np.eye(3))
     parameters.setAccelerometerCovariance(accel**2 * np.eye(3))
     parameters.setIntegrationCovariance(1e-12 * np.eye(3))
-    parameters.setBiasOmegaCovariance(across_held(imu.gyro_bias_walk**2 * np.eye(3), imu))
-    parameters.setBiasAccCovariance(imu.accel_bias_walk**2 * np.eye(3))
+    gyro_walk, accel_walk = bias_walks(imu)
+    parameters.setBiasOmegaCovariance(across_held(gyro_walk**2 * np.eye(3), imu))
+    parameters.setBiasAccCovariance(accel_walk**2 * np.eye(3))
     return parameters
 
 

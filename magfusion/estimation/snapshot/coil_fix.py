@@ -156,7 +156,9 @@ def _refined(epochs: CoilEpochs, known: Calibration, gain: Gain, grid: CoilGrid)
     order = np.argsort(rough.cost.reshape(-1, count), axis=1, kind="stable")[:, :REFINED]
     best = np.take_along_axis(rough.state.reshape(-1, count, 6), order[..., None], axis=1)
     result = _solved(problem, best)
-    order = np.argsort(result.cost, axis=1, kind="stable")[:, :MIRRORED]
+    # One outside of the region is tried by its mirror, which is inside.
+    outside = _outside(known.site, result.state[..., :3], result.cov[..., :3, :3])
+    order = np.argsort(result.cost - outside, axis=1, kind="stable")[:, :MIRRORED]
     best = np.take_along_axis(result.state, order[..., None], axis=1)
     # An amplitude with a wrong sign keeps it in a false minimum, which is shallow.
     owner = np.repeat(np.arange(len(epochs)), best.shape[1])
