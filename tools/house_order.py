@@ -46,7 +46,7 @@ ROOMS = {
             temperature_table tum
             inertial_tables odometry_bag site_magnetometer stream
             trajectory_formats
-            euroc named_records named_samples site_schema stream_contents
+            named_records named_samples site_schema stream_contents
             log site
             foreign open
             table_stream

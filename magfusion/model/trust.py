@@ -119,6 +119,7 @@ CODES = {
     "separation": "excluding a beacon moves the pose by more than noise and survey explain",
     "sign_open": "amplitudes near zero, whose sign is not determined, were left out",
     "silent_beacon": "a beacon is not detected, at all or for a while",
+    "stamp_resolution": "the stamps of a stream are coarser than nanoseconds",
     "streams_apart": "inertial sensor and magnetometer were not recorded at the same time",
     "stuck_axis": "an axis is constant",
     "survey_axes": "the survey's axes are not those declared",

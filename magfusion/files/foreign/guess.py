@@ -80,6 +80,7 @@ FAST = 8.0  # rad/s; a body that turns so fast on the mean is more likely measur
 FAR = 500.0  # m
 LEAST_RISING = 0.99  # of the steps of a clock
 _RATES_HZ = (5.0, 30_000.0)
+_DATES_S = (9.5e8, 4.1e9)  # s since 1970: from 2000 to 2100
 
 
 @dataclass(frozen=True)
@@ -241,8 +242,14 @@ def likely_unit(dimension: Dimension, values: Array) -> SourceUnit:
     return SourceUnit(next(iter(UNITS[dimension])), dimension)
 
 
-def likely_time_unit(raw: Raw) -> SourceUnit:
-    """Return the unit in which stamps would have a plausible rate."""
+def likely_time_unit(raw: Raw, usual: str = "s") -> SourceUnit:
+    """Return the unit in which stamps would have a plausible rate, or else be a date of today.
+
+    Parameters
+    ----------
+    usual : str
+        The unit that is preferred among several plausible ones.
+    """
     try:
         values = np.asarray(
             raw.to_numpy(zero_copy_only=False) if hasattr(raw, "null_count") else raw
@@ -252,13 +259,14 @@ def likely_time_unit(raw: Raw) -> SourceUnit:
         return SourceUnit(ISO, Dimension.TIME)
     steps = steps[steps > 0]
     step = float(np.median(steps)) if len(steps) else 0.0
-    for name in ("s", "ms", "us", "ns"):
-        if (
-            step > 0.0
-            and _RATES_HZ[0] <= 1.0 / (step * UNITS[Dimension.TIME][name]) <= _RATES_HZ[1]
-        ):
-            return SourceUnit(name, Dimension.TIME)
-    return SourceUnit("s", Dimension.TIME)
+    largest = float(np.nanmax(np.abs(values.astype(np.float64)), initial=0.0))
+
+    def doubts(name: str) -> tuple[bool, bool, bool]:
+        size = UNITS[Dimension.TIME][name]
+        sampled = step > 0.0 and _RATES_HZ[0] <= 1.0 / (step * size) <= _RATES_HZ[1]
+        return not sampled, not _DATES_S[0] <= largest * size <= _DATES_S[1], name != usual
+
+    return SourceUnit(min(("s", "ms", "us", "ns"), key=doubts), Dimension.TIME)
 
 
 def by_place(

@@ -226,7 +226,7 @@ class _Planning:
             return
         (one,) = named
         unit = one.unit
-        if unit is None and target == TIME and is_date(_sample(self.source, one.place, True)):
+        if unit is None and target == TIME and is_date(first_values(self.source, one.place, True)):
             unit = SourceUnit(ISO, Dimension.TIME)
         if unit is not None:
             self.terms[target] = (Term(one.place, unit),)
@@ -278,7 +278,7 @@ class _Planning:
         open_terms = [k for k in range(len(self.source.columns)) if k not in used]
         columns = [self.source.columns[k] for k in open_terms]
         samples = [_numbers(self.source, k) for k in open_terms]
-        dates = [is_date(_sample(self.source, k, True)) for k in open_terms]
+        dates = [is_date(first_values(self.source, k, True)) for k in open_terms]
         terms: Terms = {
             target: (Term(open_terms[place], unit),)
             for target, (place, unit) in by_place(self.stream, columns, samples, dates).items()
@@ -307,7 +307,7 @@ class _Planning:
         stem = target.rpartition("_")[0]
         places = [p for t, (p, _, _) in self.open.items() if t.rpartition("_")[0] == stem]
         if dimension is Dimension.TIME:
-            unit = likely_time_unit(_sample(self.source, place, True))
+            unit = likely_time_unit(first_values(self.source, place, True))
         else:
             unit = likely_unit(dimension, _size(self.source, places or [place]))
         return Term(place, unit, sign)
@@ -325,7 +325,7 @@ class _Planning:
             self.problem(f"columns of {self.stream} are not of one length: {rows}; map others")
 
 
-def _sample(source: Source, place: int, as_written: bool) -> Raw:
+def first_values(source: Source, place: int, as_written: bool) -> Raw:
     """Return the first values of a column; none where they cannot be read."""
     try:
         part = next(source.read([place], {place} if as_written else ()), None)
@@ -337,7 +337,7 @@ def _sample(source: Source, place: int, as_written: bool) -> Raw:
 def _numbers(source: Source, place: int) -> Array:
     """Return the first values of a column, none where they are no numbers."""
     try:
-        return np.asarray(_sample(source, place, False), dtype=np.float64)
+        return np.asarray(first_values(source, place, False), dtype=np.float64)
     except (TypeError, ValueError):
         return np.zeros(0)
 

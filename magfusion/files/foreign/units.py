@@ -152,6 +152,11 @@ def parse_unit(text: str, dimension: Dimension) -> SourceUnit | None:
     return None if result is None else SourceUnit(result, dimension, factor)
 
 
+def si_unit(dimension: Dimension) -> str:
+    """Return the SI unit of a dimension."""
+    return next(name for name, size in UNITS[dimension].items() if size == 1.0)
+
+
 def accepted(dimension: Dimension) -> str:
     """Return the units of a dimension in words."""
     names = [*UNITS[dimension], *([ISO] if dimension is Dimension.TIME else [])]
@@ -188,6 +193,24 @@ _NANOSECONDS = {
     "min": Fraction(60 * 10**9),
     "h": Fraction(3600 * 10**9),
 }
+
+
+def resolution_ns(raw: Raw, unit: SourceUnit) -> float:
+    """Return to what stamps are written (ns): the last decimal, or the spacing of their doubles."""
+    if unit.name == ISO:
+        return 1.0
+    size = unit.si / NANOSECOND
+    if isinstance(raw, pa.Array | pa.ChunkedArray):
+        text = pc.utf8_trim_whitespace(raw.drop_null().cast(pa.string()))
+        decimals = pc.extract_regex(text, r"^[-+]?\d*(?P<rest>[.,]?\d*)$")
+        if not decimals.null_count:
+            length = pc.max(pc.utf8_length(pc.struct_field(decimals, "rest"))).as_py() or 0
+            return float(size * 10.0 ** -max(length - 1, 0))
+        raw = pc.cast(text, pa.float64()).to_numpy(zero_copy_only=False)
+    values: AnyArray = np.asarray(raw)
+    if values.dtype.kind in "iu":
+        return size
+    return float(size * np.spacing(np.nanmax(np.abs(values), initial=0.0)))
 
 
 def _scaled_integers(values: IntArray, scale: Fraction) -> IntArray:
