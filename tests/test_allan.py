@@ -11,6 +11,7 @@ import pyarrow.parquet
 import pytest
 from conftest import Refuse, run_command
 from example_site import mixed_site
+from spoiled_log import burst_stamps
 
 from magfusion.calibration.allan import AllanStream
 from magfusion.calibration.allan_fit import fit_allan
@@ -217,6 +218,26 @@ def _coarse(simulation: Arrays) -> None:
 def _propagate(simulation: Arrays) -> None:
     time = simulation["time"]
     simulation["gyro"] += 0.4 * np.sin(time)[:, None]
+
+
+def _bursts(simulation: Arrays) -> None:
+    count = len(simulation["time"])
+    simulation["time"] = burst_stamps(count, RATE, np.random.default_rng(6))
+
+
+def _milliseconds(simulation: Arrays) -> None:
+    simulation["time"] = 1e-3 * np.floor(simulation["time"] * 1e3 * RATE / 150.0)
+
+
+@pytest.mark.parametrize(("spoil", "rate_hz"), [(_bursts, RATE), (_milliseconds, 150.0)])
+def test_samples_of_a_coarse_or_late_clock_are_counted(
+    spoil: Callable[[Arrays], None], rate_hz: float, tmp_path: Path
+) -> None:
+    result = _result(_rest(tmp_path / "log", spoil=spoil))
+    assert _codes(result) <= {"few_data"}  # of the walk
+    density = np.sqrt(RATE / rate_hz)  # the same samples at another rate
+    assert result.keys["gyro_noise"] == pytest.approx(GYRO[0] * density, rel=0.05)
+    assert result.keys["accel_noise"] == pytest.approx(ACCEL[0] * density, rel=0.05)
 
 
 @pytest.mark.parametrize(

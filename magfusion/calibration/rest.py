@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.calibration.allan import AllanStream, AllanVariance
+from magfusion.receiver.sampling_clock import sampling_clock
 from magfusion.units import Array, BoolArray, IntArray
 
 MOST_BLOCKS = 4096
@@ -70,7 +71,7 @@ class RestStream:
     def __init__(self, axes: int) -> None:
         self.allan = AllanStream(axes)
         self._axes = axes
-        self._step = 0.0
+        self._step, self._stamp = 0.0, -np.inf
         self._last: tuple[float, Array] | None = None
         self._slots = 0
         self._begin = self._end = 0.0
@@ -90,17 +91,17 @@ class RestStream:
 
     def add(self, time: Array, values: Array) -> None:
         """Process further samples: times (n,) (s), values (n, axes), NaN where one is missing."""
-        if self._last is not None:
-            fresh = np.flatnonzero(np.diff(time, prepend=self._last[0]) > 0.0)
-        else:
-            fresh = np.flatnonzero(np.diff(time, prepend=-np.inf) > 0.0)
+        fresh = np.flatnonzero(np.diff(time, prepend=self._stamp) > 0.0)
         time, values = time[fresh], values[fresh]
         if len(time) == 0:
             return
+        if self._last is None and len(time) < 3:
+            return
+        self._stamp = float(time[-1])
+        clock = sampling_clock(time)
+        time = time if clock is None else clock.time
         if self._last is None:
-            if len(time) < 3:
-                return
-            self._step = _usual_step(time)
+            self._step = _usual_step(time) if clock is None else clock.step
             self._begin = self._rest_begin = float(time[0])
             self._origin = np.nan_to_num(values[0])
         previous = time[0] - self._step if self._last is None else self._last[0]
