@@ -30,6 +30,7 @@ ROOMS = {
             rotor short_repr temperature time_division trust
             magnetometer
             site trajectory
+            truth_poses
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
             detection_range field ground moments without_imu
             parameters path_field strapdown_steps
