@@ -9,10 +9,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import Refuse
+from conftest import Refuse, run_command
 from example_bag import FIELD, SENSORS, field_message, write_bag
 
 from magfusion.cli import main
+from magfusion.files.log import read_log
 
 ROWS = 400
 _rng = np.random.default_rng(5)
@@ -240,3 +241,22 @@ def test_a_bag_of_which_something_is_open(
 def test_a_single_problem_is_one_sentence(tables: Path, refuse: Refuse) -> None:
     sentence = refuse("import", tables / "imu.csv", "-o", tables / "log")
     assert "give --magnetometer FILE" in sentence
+
+
+@pytest.mark.parametrize(
+    "names",
+    ["q[0],q[1],q[2],q[3]", "q0,q1,q2,q3", "q_1,q_2,q_3,q_4", "Quat(0),Quat(1),Quat(2),Quat(3)"],
+)
+def test_the_order_of_a_numbered_quaternion_is_asked_for(
+    tables: Path, capfd: pytest.CaptureFixture[str], names: str
+) -> None:
+    still = np.tile([0.0, 1.0, 2.0, 1.0, 0.0, 0.0, 0.0], (ROWS, 1))
+    write(tables / "truth.csv", f"t_ms,x_m,y_m,z_m,{names}", rows_of(TIME, still))
+    text = reported(capfd, f"{BOTH} --truth truth.csv")
+    option = f"--map 'truth.quaternion={names}[wxyz]' or [xyzw]"
+    assert f"give the order of the quaternion by {option}" in text
+    ordered = f"truth.quaternion={names}[wxyz]"
+    run_command("import", *BOTH.split(), "--truth", "truth.csv", "--map", ordered, "-o", "log")
+    truth = read_log(Path("log")).truth
+    assert truth is not None
+    np.testing.assert_allclose(truth.world_from_body[0], np.eye(3), atol=1e-12)

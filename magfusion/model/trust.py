@@ -129,6 +129,7 @@ CODES = {
     "temperature_missing": "a declared temperature dependence has no recorded temperature",
     "time_offset": "the IMU's time offset is not as declared",
     "transfer": "a calibration is not valid outside its own data",
+    "truth_inconsistent": "a truth contradicts the gyroscope or gravity",
     "undeclared_line": "a line that the site does not declare is transmitted",
     "unstable": "an estimator drifts over hours, or its errors do not match its covariance",
     "update_failed": "an update of the estimator failed; the state is a prediction",

@@ -26,6 +26,7 @@ from magfusion.estimation.data_checks.signal import (
 )
 from magfusion.estimation.data_checks.spectrum import undeclared_lines
 from magfusion.estimation.data_checks.stamps import uneven_stamps
+from magfusion.estimation.data_checks.truth import truth_findings
 from magfusion.estimation.data_checks.turn_witness import turned_otherwise
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
@@ -90,6 +91,7 @@ def recorded(
     result += turned_otherwise(log, site) if log.inertial else []
     if log.inertial and not any(finding.code in UNSTEADY for finding in result):
         result += gravity_and_field_findings(log, site, poses, estimated)
+        result += truth_findings(log)
         if site is not None and log.vectors is not None:
             result += iron_on_body(still_means(log, site, IRON_SPAN), site)
     if beacons and site is not None and site.beacons:

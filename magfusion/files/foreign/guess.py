@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.files.foreign.columns import EULER, STREAMS, TIME, Term
+from magfusion.files.foreign.columns import EULER, QUATERNION, STREAMS, TIME, Term
 from magfusion.files.foreign.source import SourceColumn
 from magfusion.files.foreign.units import (
     ISO,
@@ -55,6 +55,7 @@ _SHORT_TIMES = ("t", "ts", "utc", "sec", "seconds", "date", "zeit", "temps", "ti
 # Of messages of ROS written as text, whose stamps are in two columns.
 _WHOLE = re.compile(r"stamp\W*(secs?|seconds)$", re.I)
 _REST = re.compile(r"stamp\W*(nsecs?|nanosecs?|nanoseconds)$", re.I)
+_NUMBERED = re.compile(r"(?P<stem>.*?)[\[(:_.]*(?P<place>[0-4])[\])]*")
 _NOT_MEASURED = re.compile(r"bias|cov|std|sigma|var(?!io)|temp|offset|status|uncal|error")
 _OF_STREAM = {
     "imu": re.compile(r"imu|gyr|acc|inertial"),
@@ -107,6 +108,19 @@ def named_columns(columns: Sequence[SourceColumn], stream: str) -> dict[str, lis
     return {target: _nearest(named, columns, stream) for target, named in result.items()}
 
 
+def numbered_quaternion(columns: Sequence[SourceColumn]) -> tuple[str, ...]:
+    """Return the four columns of a quaternion that numbers name: their order is not known."""
+    known = {}
+    for column in columns:
+        numbered = _NUMBERED.fullmatch(column.name.strip())
+        stem = re.sub(r"[^a-z]", "", numbered["stem"].casefold()) if numbered else ""
+        if numbered and stem.endswith((*_STEMS["q"], *_SHORT["q"])):
+            known[int(numbered["place"])] = column.name
+    first = min(known, default=0)
+    places = range(first, first + 4)
+    return tuple(known[k] for k in places) if set(places) <= set(known) else ()
+
+
 def two_column_stamp(columns: Sequence[SourceColumn]) -> tuple[Term, ...]:
     """Return seconds and nanoseconds of stamps that are in two columns, if there are such."""
     whole = [k for k, column in enumerate(columns) if _WHOLE.search(column.name)]
@@ -118,7 +132,7 @@ def two_column_stamp(columns: Sequence[SourceColumn]) -> tuple[Term, ...]:
 
 
 def _named(place: int, column: SourceColumn, stream: str) -> Named | None:
-    if _NOT_MEASURED.search(column.name.casefold()):
+    if _NOT_MEASURED.search(column.name.casefold()) or _of_unknown_order(column, stream):
         return None
     for name, text in _readings(column):
         target = _target(name, stream)
@@ -131,6 +145,11 @@ def _named(place: int, column: SourceColumn, stream: str) -> Named | None:
     bare = _readings(column)[0][0]
     target = _target(bare, stream)
     return None if target is None else Named(place, target, None)
+
+
+def _of_unknown_order(column: SourceColumn, stream: str) -> bool:
+    numbered = _NUMBERED.fullmatch(column.name.strip()) is not None
+    return numbered and any(_target(name, stream) in QUATERNION for name, _ in _readings(column))
 
 
 def _readings(column: SourceColumn) -> list[tuple[str, str]]:

@@ -28,6 +28,7 @@ from magfusion.files.foreign.guess import (
     likely_time_unit,
     likely_unit,
     named_columns,
+    numbered_quaternion,
     two_column_stamp,
 )
 from magfusion.files.foreign.source import Source
@@ -258,6 +259,13 @@ class _Planning:
         what = f"no column is found for {', '.join(f'{self.stream}.{t}' for t in self.absent)}"
         remedy = f"name it by --map '{self.stream}.{self.absent[0]}=NAME[unit]'"
         self._propose_by_place()
+        numbered = numbered_quaternion(self.source.columns)
+        if numbered and set(self.absent) & set(QUATERNION):
+            four = ",".join(numbered)
+            remedy = (
+                f"give the order of the quaternion by --map '{self.stream}.quaternion={four}[wxyz]'"
+                " or [xyzw]"
+            )
         if self.absent == [TIME]:
             remedy += f", or give --rate-hz {self.stream}=HZ"
         self.problem(f"{what} (found {names}); {remedy}")
