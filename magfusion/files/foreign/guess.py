@@ -80,6 +80,7 @@ _TYPICAL = {Dimension.FORCE: STANDARD_GRAVITY, Dimension.FIELD: 5e-5}  # SI
 FAST = 8.0  # rad/s; a body that turns so fast on the mean is more likely measured in degrees
 FAR = 500.0  # m
 LEAST_RISING = 0.99  # of the steps of a clock
+LEAST_COUNTED = 0.9  # of the steps of an index
 _RATES_HZ = (5.0, 30_000.0)
 _DATES_S = (9.5e8, 4.1e9)  # s since 1970: from 2000 to 2100
 
@@ -302,7 +303,11 @@ def by_place(
     """
     result = _first_clock(samples, dates)
     clocks = [place for place, _ in result.values()]
-    open_terms = [k for k in range(len(columns)) if k not in clocks and len(samples[k])]
+    open_terms = [
+        k
+        for k in range(len(columns))
+        if k not in clocks and len(samples[k]) and not _is_index(samples[k])
+    ]
     dimensions = {stem: STREAMS[stream][f"{stem}_x"] for stem in _VECTORS.get(stream, ())}
     for stem in list(dimensions):
         triple = _by_unit(columns, open_terms, dimensions[stem])
@@ -322,7 +327,7 @@ def _first_clock(
     for place, (values, dated) in enumerate(zip(samples, dates, strict=True)):
         if dated:
             return {TIME: (place, SourceUnit(ISO, Dimension.TIME))}
-        if len(values) > 1 and _is_clock(values):
+        if len(values) > 1 and _is_clock(values) and not _is_index(values):
             return {TIME: (place, likely_time_unit(values))}
     return {}
 
@@ -370,6 +375,11 @@ def _unit_in(column: SourceColumn, dimension: Dimension) -> SourceUnit | None:
 def _is_clock(values: Array) -> bool:
     steps = np.diff(values)
     return bool(np.mean(steps > 0.0) > LEAST_RISING and np.all(np.isfinite(values)))
+
+
+def _is_index(values: Array) -> bool:
+    """Return whether values count rows: integers that rise by one, but where rows are lost."""
+    return len(values) > 1 and float(np.mean(np.diff(values) == 1.0)) > LEAST_COUNTED
 
 
 def _sizes(columns: Sequence[Array]) -> Array:

@@ -189,6 +189,7 @@ class _Planning:
         self.stream, self.source, self.declared, self.rate = stream, source, declared, rate
         self.terms: Terms = {}
         self.open: dict[str, tuple[int, float, str]] = {}
+        self.several: dict[str, Named] = {}
         self.absent: list[str] = []
         self.guessed: list[str] = []
         self.failed = False
@@ -238,6 +239,7 @@ class _Planning:
     def plan(self, velocity: bool) -> ImportPlan | None:
         self._report_absent()
         self._report_open()
+        self._propose_first()
         parts = [name for name in OPTIONAL if name in self.terms]
         if len(parts) not in (0, len(OPTIONAL)):
             if velocity:
@@ -266,18 +268,23 @@ class _Planning:
                 f"give the order of the quaternion by --map '{self.stream}.quaternion={four}[wxyz]'"
                 " or [xyzw]"
             )
-        if self.absent == [TIME]:
+        if TIME in self.absent:
             remedy += f", or give --rate-hz {self.stream}=HZ"
         self.problem(f"{what} (found {names}); {remedy}")
 
     def _report_several(self, target: str, named: Sequence[Named]) -> None:
-        """Report that several columns match one, and propose the first."""
+        """Report that several columns match one."""
         names = " and ".join(self.source.columns[n.place].name for n in named)
         self.problem(f"columns {names} may both be {self.stream}.{target}; name one")
-        first = named[0]
-        term = self._likely(target, first.place, 1.0)
-        term = term if first.unit is None else Term(first.place, first.unit)
-        self.declared.proposals += as_options(self.stream, self.source, {target: (term,)})
+        self.several[target] = named[0]
+
+    def _propose_first(self) -> None:
+        """Propose the first of several columns, with one unit for the axes of a sensor."""
+        terms: Terms = {}
+        for target, first in self.several.items():
+            known = None if first.unit is None else Term(first.place, first.unit)
+            terms[target] = (known or self._likely(target, first.place, 1.0),)
+        self.declared.proposals += as_options(self.stream, self.source, terms)
 
     def _propose_by_place(self) -> None:
         """Propose what columns that nothing is known of may be, by their sizes."""
@@ -313,8 +320,14 @@ class _Planning:
     def _likely(self, target: str, place: int, sign: float) -> Term:
         dimension = dimension_of(self.stream, target)
         stem = target.rpartition("_")[0]
-        places = [p for t, (p, _, _) in self.open.items() if t.rpartition("_")[0] == stem]
-        if dimension is Dimension.TIME:
+        targets = [t for t in STREAMS[self.stream] if t.rpartition("_")[0] == stem]
+        places = [self.open[t][0] for t in targets if t in self.open]
+        places += [self.several[t].place for t in targets if t in self.several]
+        declared = [term.unit for t in targets for term in self.terms.get(t, ())]
+        declared += [n.unit for t, n in self.several.items() if t in targets and n.unit]
+        if stem and declared:
+            unit = declared[0]
+        elif dimension is Dimension.TIME:
             unit = likely_time_unit(first_values(self.source, place, True))
         else:
             unit = likely_unit(dimension, _size(self.source, places or [place]))
