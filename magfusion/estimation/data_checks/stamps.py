@@ -20,6 +20,8 @@ LATTICE = 0.15  # of a step: stamps scatter less about a lattice, on which missi
 BLOCK = 64  # samples over which a clock is assumed even
 MIN_COVERAGE = 0.9  # share of the longer stream that the shorter one covers
 ROUNDING = 1e-6  # of a step
+MAX_CLOCKED = 100_000  # samples of which the clock is found; those beyond are counted by it
+MIN_LOST_SHARE = 1e-3  # that is no error of its rate
 LISTED = 3  # gaps that are listed
 
 
@@ -64,13 +66,17 @@ def timing(stream: str, time: Array, bundled: bool = True) -> Timing | None:
     """
     if len(time) < 3:
         return None
-    clock = sampling_clock(time, bundled)
+    clock = sampling_clock(time[:MAX_CLOCKED], bundled)
     step = np.diff(time)
     usual = float(np.median(step)) if clock is None else clock.step
     gap = np.flatnonzero(step > max(GAP, GAP_STEPS * usual))
     jitter, missing = _uneven(time, step, gap, usual)
     if clock is not None:
         jitter, missing = clock.scatter, float(clock.lost_count)
+    if clock is not None and len(time) > MAX_CLOCKED:
+        inside = np.delete(step, gap)
+        missing = float(np.sum(inside)) / usual - len(inside)
+        missing = missing if missing > MIN_LOST_SHARE * len(time) else 0.0
     return Timing(
         stream=stream,
         rate_hz=1.0 / usual,
