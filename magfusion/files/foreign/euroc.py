@@ -162,7 +162,7 @@ def _cut_rows(stream: str, count: int) -> Finding:
 def _resolution(stream: str, source: Source, term: Term) -> tuple[Finding, ...]:
     """Return the remark on stamps that are no integer nanoseconds."""
     size = resolution_ns(first_values(source, term.place, True), term.unit)
-    if size <= 1.0 and term.unit.name == "ns":
+    if size <= 1.0:
         return ()
     text = f"{stream}: stamps are read as {term.unit}; their resolution is {size * 1e-3:.3g} us."
     return (Finding("stamp_resolution", text, _REMARK),)

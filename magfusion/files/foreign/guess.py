@@ -15,6 +15,7 @@ from magfusion.files.foreign.units import (
     Raw,
     SourceUnit,
     parse_unit,
+    stamp_numbers,
 )
 from magfusion.units import STANDARD_GRAVITY, Array
 
@@ -270,16 +271,13 @@ def likely_time_unit(raw: Raw, usual: str = "s") -> SourceUnit:
     usual : str
         The unit that is preferred among several plausible ones.
     """
-    try:
-        values = np.asarray(
-            raw.to_numpy(zero_copy_only=False) if hasattr(raw, "null_count") else raw
-        )
-        steps = np.diff(values.astype(np.float64))
-    except (ValueError, TypeError):
+    values = stamp_numbers(raw)
+    if not len(values):
         return SourceUnit(ISO, Dimension.TIME)
+    steps = np.diff(values)
     steps = steps[steps > 0]
     step = float(np.median(steps)) if len(steps) else 0.0
-    largest = float(np.nanmax(np.abs(values.astype(np.float64)), initial=0.0))
+    largest = float(np.max(np.abs(values), initial=0.0))
 
     def doubts(name: str) -> tuple[bool, bool, bool]:
         size = UNITS[Dimension.TIME][name]
