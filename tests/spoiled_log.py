@@ -225,3 +225,16 @@ def jittery(sigma: float, seed: int = 2) -> Callable[[Array], Array]:
 
 
 RATE = 1.0 / DEGREE
+
+
+def burst_stamps(count: int, rate_hz: float, rng: np.random.Generator) -> Array:
+    """Return stamps (s) of a host that fetches 3 to 20 samples every 50 to 70 ms, 1-2 ms apart."""
+    bursts: list[Array] = []
+    now, sent = 0.1, 0
+    while sent < count:
+        now += rng.uniform(0.05, 0.07)
+        ready = int((now - rng.uniform(0.0, 0.12)) * rate_hz) - sent
+        size = min(int(np.clip(ready, 3, 20)), count - sent)
+        bursts.append(now + np.cumsum(rng.uniform(0.001, 0.002, size)))
+        now, sent = float(bursts[-1][-1]), sent + size
+    return np.concatenate(bursts)

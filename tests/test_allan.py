@@ -11,6 +11,8 @@ import pyarrow.parquet
 import pytest
 from conftest import Refuse, run_command
 from example_site import mixed_site
+from scipy.signal import butter, lfilter
+from spoiled_log import burst_stamps
 
 from magfusion.calibration.allan import AllanStream
 from magfusion.calibration.allan_fit import fit_allan
@@ -148,6 +150,38 @@ def test_intervals_hold_what_was_simulated(walk: float) -> None:
     assert np.median(covering) < 3e-5 + 1.5 * walk
 
 
+def _bending(time: np.ndarray, seed: int) -> np.ndarray:
+    return 5e-3 * np.sin(2.0 * np.pi * time / 100.0 + seed)
+
+
+def _ramp(time: np.ndarray, _seed: int) -> np.ndarray:
+    return 0.5 * time / time[-1]
+
+
+def _warming(time: np.ndarray, _seed: int) -> np.ndarray:
+    return 0.02 * np.exp(-time / 200.0)
+
+
+@pytest.mark.parametrize("drift", [_bending, _ramp, _warming])
+@pytest.mark.parametrize("filter_hz", [None, 10.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_an_axis_that_drifts_keeps_its_white_noise(
+    drift: Callable[[np.ndarray, int], np.ndarray], filter_hz: float | None, seed: int
+) -> None:
+    rng, count, white = np.random.default_rng(seed), 200_000, 3e-4
+    data = white * np.sqrt(RATE) * rng.normal(size=count)
+    if filter_hz is not None:
+        data = lfilter(*butter(1, filter_hz, fs=RATE), data)
+    stream = AllanStream(1)
+    stream.add((data + drift(np.arange(count) / RATE, seed))[:, None])
+    fit = fit_allan(stream.result(1.0 / RATE), 0)
+    assert fit is not None
+    assert fit.white.low < white < fit.white.high
+    assert fit.white.high < 1.2 * fit.white.value
+    _, deviation, _, _ = allantools.oadev(data, RATE, "freq", taus=[1.0])
+    assert fit.white.low < deviation[0] < fit.white.high
+
+
 def test_an_instruments_own_filter_is_no_quiet_instrument() -> None:
     """A running mean makes short clusters smooth: the white noise is that of long ones."""
     data = np.random.default_rng(6).normal(size=(1 << 16) + 7)
@@ -217,6 +251,52 @@ def _coarse(simulation: Arrays) -> None:
 def _propagate(simulation: Arrays) -> None:
     time = simulation["time"]
     simulation["gyro"] += 0.4 * np.sin(time)[:, None]
+
+
+def _bursts(simulation: Arrays) -> None:
+    count = len(simulation["time"])
+    simulation["time"] = burst_stamps(count, RATE, np.random.default_rng(6))
+
+
+def _milliseconds(simulation: Arrays) -> None:
+    simulation["time"] = 1e-3 * np.floor(simulation["time"] * 1e3 * RATE / 150.0)
+
+
+@pytest.mark.parametrize(("spoil", "rate_hz"), [(_bursts, RATE), (_milliseconds, 150.0)])
+def test_samples_of_a_coarse_or_late_clock_are_counted(
+    spoil: Callable[[Arrays], None], rate_hz: float, tmp_path: Path
+) -> None:
+    result = _result(_rest(tmp_path / "log", spoil=spoil))
+    assert _codes(result) <= {"few_data"}  # of the walk
+    density = np.sqrt(RATE / rate_hz)  # the same samples at another rate
+    assert result.keys["gyro_noise"] == pytest.approx(GYRO[0] * density, rel=0.05)
+    assert result.keys["accel_noise"] == pytest.approx(ACCEL[0] * density, rel=0.05)
+
+
+def _ideal(simulation: Arrays) -> None:
+    simulation["accel"] = np.tile([0.0, 0.0, 9.81], (len(simulation["time"]), 1))
+
+
+def test_an_axis_without_noise_is_named_and_the_others_are_measured(tmp_path: Path) -> None:
+    log = _rest(tmp_path / "log", 300.0, _ideal)
+    run_command("allan", log, "-o", tmp_path / "out")
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    (reason,) = [one for one in report["reasons"] if "accelerometer" in one["text"]]
+    assert reason["code"] == "stuck_axis"
+    assert "axes x, y, z without noise" in reason["text"]
+    assert report["gyro_noise"] == pytest.approx(GYRO[0], rel=0.05)
+    assert "accel_noise" not in report
+
+
+def test_a_log_without_any_noise_is_refused(tmp_path: Path, refuse: Refuse) -> None:
+    def nothing(simulation: Arrays) -> None:
+        _ideal(simulation)
+        for name in ("gyro", "field"):
+            simulation[name] = np.zeros_like(simulation[name])
+
+    log = _rest(tmp_path / "log", 300.0, nothing)
+    sentence = refuse("allan", log, "-o", tmp_path / "out")
+    assert "no noise: gyroscope x, y, z; accelerometer x, y, z; magnetometer x, y, z" in sentence
 
 
 @pytest.mark.parametrize(

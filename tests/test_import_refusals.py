@@ -9,10 +9,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import Refuse
+from conftest import Refuse, run_command
 from example_bag import FIELD, SENSORS, field_message, write_bag
 
 from magfusion.cli import main
+from magfusion.files.log import read_log
 
 ROWS = 400
 _rng = np.random.default_rng(5)
@@ -240,3 +241,70 @@ def test_a_bag_of_which_something_is_open(
 def test_a_single_problem_is_one_sentence(tables: Path, refuse: Refuse) -> None:
     sentence = refuse("import", tables / "imu.csv", "-o", tables / "log")
     assert "give --magnetometer FILE" in sentence
+
+
+@pytest.mark.parametrize(
+    "names",
+    ["q[0],q[1],q[2],q[3]", "q0,q1,q2,q3", "q_1,q_2,q_3,q_4", "Quat(0),Quat(1),Quat(2),Quat(3)"],
+)
+def test_the_order_of_a_numbered_quaternion_is_asked_for(
+    tables: Path, capfd: pytest.CaptureFixture[str], names: str
+) -> None:
+    still = np.tile([0.0, 1.0, 2.0, 1.0, 0.0, 0.0, 0.0], (ROWS, 1))
+    write(tables / "truth.csv", f"t_ms,x_m,y_m,z_m,{names}", rows_of(TIME, still))
+    text = reported(capfd, f"{BOTH} --truth truth.csv")
+    option = f"--map 'truth.quaternion={names}[wxyz]' or [xyzw]"
+    assert f"give the order of the quaternion by {option}" in text
+    ordered = f"truth.quaternion={names}[wxyz]"
+    run_command("import", *BOTH.split(), "--truth", "truth.csv", "--map", ordered, "-o", "log")
+    truth = read_log(Path("log")).truth
+    assert truth is not None
+    np.testing.assert_allclose(truth.world_from_body[0], np.eye(3), atol=1e-12)
+
+
+SHARP = np.array([0.3, 0.9, 9.7]) + 0.1 * _rng.standard_normal((ROWS, 3))  # m/s^2, one axis down
+
+
+def test_the_axes_of_a_sensor_are_proposed_in_one_unit(
+    tables: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    both = [
+        f"{side} {name} {axis}"
+        for side in ("left", "right")
+        for name in ("acc", "gyr")
+        for axis in "xyz"
+    ]
+    rates = 0.3 * RATES / 20.0  # rad/s
+    write(
+        tables / "both.csv",
+        ",".join(["t_ms", *both]),
+        rows_of(TIME, SHARP, rates, SHARP, rates),
+    )
+    text = reported(capfd, "mag.csv --imu both.csv")
+    assert "--map 'imu.accel=left acc x,left acc y,left acc z[m/s^2]'" in text
+    write(
+        tables / "part.csv",
+        "t_ms,acc x,acc y,acc z (m/s^2),gyr x (rad/s),gyr y,gyr z",
+        rows_of(TIME, SHARP, rates),
+    )
+    text = reported(capfd, "mag.csv --imu part.csv")
+    for option in ("accel_x=acc x[m/s^2]", "accel_y=acc y[m/s^2]", "gyro_y=gyr y[rad/s]"):
+        assert f"--map 'imu.{option}'" in text
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("lost", [0, 20])
+def test_an_index_is_no_time(
+    tables: Path, capfd: pytest.CaptureFixture[str], first: int, lost: int
+) -> None:
+    rows = [
+        [str(first + k), *row]
+        for k, row in enumerate(rows_of(FORCES, RATES))
+        if lost == 0 or k % lost
+    ]
+    write(tables / "counted.csv", "c0,c1,c2,c3,c4,c5,c6", rows)
+    text = reported(capfd, "mag.csv --imu counted.csv")
+    assert "--map 'imu.accel=c1,c2,c3[g]'" in text
+    assert "--map 'imu.gyro=c4,c5,c6[deg/s]'" in text
+    assert "imu.time=c0" not in text
+    assert "or give --rate-hz imu=HZ" in text

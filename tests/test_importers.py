@@ -131,6 +131,71 @@ def test_samples_that_were_not_taken_are_left_out_of_a_euroc_folder_and_said(
     assert [f.code for f in log.noticed] == ["repeated_stamps", "missing_samples"]
 
 
+def _rewrite(path: Path, write: Callable[[str], str], header: str | None) -> None:
+    """Change the head (None for none) and the stamps of every table of a EuRoC folder."""
+    for table in path.glob("mav0/*/data.csv"):
+        _, *rows = table.read_text().splitlines()
+        parts = (row.split(",", 1) for row in rows)
+        lines = [",".join([write(stamp), rest]) for stamp, rest in parts]
+        table.write_text("\n".join([*([] if header is None else [header]), *lines]) + "\n")
+
+
+def test_a_euroc_folder_without_heads_keeps_its_first_rows(tmp_path: Path) -> None:
+    path = _euroc(tmp_path / "euroc")
+    _rewrite(path, str, None)
+    log = open_log(path)
+    _assert_samples(log)
+    _assert_truth(log, ROTATION.apply(VELOCITY_BODY))
+    assert not log.noticed
+    run_command("import", path, "-o", tmp_path / "log")
+    _assert_samples(read_log(tmp_path / "log"))
+
+
+def _seconds(stamp: str) -> str:
+    return f"{stamp[:-9]}.{stamp[-9:-3]}"
+
+
+@pytest.mark.parametrize("header", [None, "#timestamp,a", "#timestamp [ns],a"])
+@pytest.mark.parametrize(
+    ("write", "resolution_ns", "told"),
+    [
+        (lambda stamp: f"{float(stamp):.18e}", 256, "as ns; their resolution is 0.256 us"),
+        (_seconds, 1000, "as s; their resolution is 1 us"),
+        (lambda stamp: stamp[:-3], 1000, "as us; their resolution is 1 us"),
+    ],
+)
+def test_stamps_of_a_euroc_folder_are_read_as_what_they_are(
+    tmp_path: Path,
+    header: str | None,
+    write: Callable[[str], str],
+    resolution_ns: int,
+    told: str,
+) -> None:
+    path = _euroc(tmp_path / "euroc")
+    _rewrite(path, write, header)
+    run_command("import", path, "-o", tmp_path / "log")
+    for log in (open_log(path), read_log(tmp_path / "log")):
+        assert abs(log.epoch_ns - START_NS) <= resolution_ns
+        recorded = (STAMPS - START_NS) * 1e-9
+        np.testing.assert_allclose(log.imu.time, recorded, rtol=0, atol=1e-9 * resolution_ns)
+        np.testing.assert_array_equal(log.imu.gyro_body, GYRO)
+        assert log.waveform is not None
+        np.testing.assert_array_equal(log.waveform.measured_sensor, MEASURED)
+        _assert_truth(log, ROTATION.apply(VELOCITY_BODY))
+    noticed = [f.text for f in open_log(path).noticed if f.code == "stamp_resolution"]
+    assert len(noticed) == 3
+    assert all(told in text for text in noticed)
+
+
+def test_a_row_that_is_cut_off_is_left_out_of_a_euroc_folder_and_counted(tmp_path: Path) -> None:
+    table = _euroc(tmp_path) / "mav0" / "imu0" / "data.csv"
+    table.write_text(table.read_text()[:-40])
+    log = open_log(tmp_path)
+    np.testing.assert_array_equal(log.imu.gyro_body, GYRO[:-1])
+    assert [f.code for f in log.noticed] == ["missing_samples"]
+    assert "imu: 1 row does not have as many cells" in log.noticed[0].text
+
+
 @pytest.mark.parametrize("kind", ["bag", "EuRoC"])
 def test_a_recording_needs_no_inertial_sensor(tmp_path: Path, kind: str) -> None:
     if kind == "bag":
@@ -162,17 +227,27 @@ def test_a_poses_only_ground_truth_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("stream", "text", "sentence"),
     [
-        ("imu0", "", "found no row; write nanoseconds"),
-        ("imu0", "#timestamp [ns]\n", "found no row; write nanoseconds"),
-        ("imu0", "#timestamp [s],a\n1.5,2\n", "found 1.5; write nanoseconds"),
+        ("imu0", "", "is empty; record it again"),
+        ("imu0", "#timestamp [ns]\n", "holds no table of numbers"),
+        ("imu0", "#timestamp [s],a\n1.5,2\n", "columns gyro_y, gyro_z, accel_x"),
         (
             "imu0",
             "#timestamp [ns],a,b,c\n1,2,3,4\n",
             "columns accel_x, accel_y, accel_z are missing",
         ),
-        ("imu0", "#t,a,b,c,d,e,f\n1,2,3,4,5,6,nine\n", "cannot be read .*nine"),
+        (
+            "imu0",
+            "#t,a,b,c,d,e,f\n1,2,3,4,5,6,nine\n",
+            "column f, row 0 .*found 'nine'; write a number",
+        ),
+        (
+            "imu0",
+            "#t,a,b,c,d,e,f\n1,2,3,4,5,6,7\nabc,2,3,4,5,6,7\n",
+            "found 'abc', which is no time in",
+        ),
+        ("imu0", "#t,a,b,c,d,e,f\n1,2,3,4,5,6,7\n,2,3,4,5,6,7\n", "row 1 .*found no value"),
         ("mag0", f"#t,a,b,c\n{START_NS},2e4,3e3,4e4\n", "divide nanotesla by 1e9"),
-        ("mag0", f"#t\n{START_NS}\n", "columns field_x, field_y, field_z are missing"),
+        ("mag0", f"#t\n{START_NS}\n", "holds no table of numbers"),
         ("state_groundtruth_estimate0", "#t,x,y,z,w,x,y,z\n1,0,0,0,0,0,0,0\n", "found 0.0"),
     ],
 )

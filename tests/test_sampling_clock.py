@@ -1,10 +1,13 @@
 """The even clock under stamps that scatter: ticks, lost samples, drift, and what is none."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from spoiled_log import burst_stamps
 
+from magfusion.estimation.data_checks.stamps import timing, uneven_stamps
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.receiver.even_clocks import on_even_clocks
 from magfusion.receiver.sampling_clock import sampling_clock
@@ -77,6 +80,49 @@ def test_even_stamps_stay(share_lost: float) -> None:
 def test_stamps_without_a_clock_stay() -> None:
     rng = np.random.default_rng(2)
     assert sampling_clock(np.cumsum(rng.exponential(STEP, COUNT))) is None
+
+
+@pytest.mark.parametrize("rate_hz", [99.0, 150.0, 210.0, 300.0, 400.0, 700.0])
+@pytest.mark.parametrize("resolution", [1e-3, 1.0 / 1024.0])  # s
+@pytest.mark.parametrize("cut", [np.rint, np.floor])
+def test_rounded_stamps_count_their_samples(
+    rate_hz: float, resolution: float, cut: Callable[[Array], Array]
+) -> None:
+    selected = np.arange(COUNT) / rate_hz
+    stamps = resolution * cut(selected / resolution)
+    clock, timed = sampling_clock(stamps), timing("magnetometer", stamps)
+    assert clock is not None
+    assert timed is not None
+    assert clock.lost_count == 0
+    assert clock.resolution == pytest.approx(resolution, rel=1e-5)
+    assert timed.rate_hz == pytest.approx(rate_hz, rel=1e-4)
+    assert timed.lost_share == 0.0
+    off = clock.time - selected
+    assert np.std(off) < 0.1 * resolution  # cutting off shifts all alike
+    assert np.max(np.abs(off)) < 0.7 * resolution
+
+
+def test_lost_samples_of_rounded_stamps_are_counted() -> None:
+    rng = np.random.default_rng(1)
+    selected = np.arange(COUNT)[rng.random(COUNT) >= 0.03] / 400.0
+    timed = timing("magnetometer", 1e-3 * np.rint(1e3 * selected))
+    assert timed is not None
+    assert timed.rate_hz == pytest.approx(400.0, rel=1e-4)
+    assert timed.lost_share == pytest.approx(0.03, abs=0.003)
+    assert timed.resolution == 1e-3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_samples_that_a_host_delivers_in_bursts_are_counted(seed: int) -> None:
+    stamps = burst_stamps(COUNT, 99.0, np.random.default_rng(seed))
+    clock, timed = sampling_clock(stamps), timing("imu", stamps)
+    assert clock is not None
+    assert timed is not None
+    assert timed.rate_hz == pytest.approx(99.0, rel=3e-3)  # 0.1 s late at either end, of 60 s
+    assert timed.lost_share == 0.0
+    assert np.ptp(np.diff(clock.time)) < 0.01 / 99.0  # s
+    log = Log("bursts", 0, "", ImuSamples(stamps, np.ones((COUNT, 3)), np.ones((COUNT, 3))), None)
+    assert {finding.code for finding in uneven_stamps(log, None)} == {"jitter"}
 
 
 def _log() -> Log:

@@ -30,6 +30,7 @@ ROOMS = {
             region response rotor short_repr temperature time_division trust
             magnetometer
             site trajectory
+            truth_poses
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
             detection_range field ground moments without_imu
             parameters path_field strapdown_steps
@@ -37,19 +38,18 @@ ROOMS = {
         """,
         "files": """
             atomic bag_recovery bag_topics blas_threads commit messages parquet_bounds
-            plain_data plain_table plausible row_stamps row_table site_draft site_ground
+            plain_data plain_table plausible row_table site_draft site_ground
             site_values standard_streams stray_stamps
-            bag_reader bag_rows checkpoint correlation field_map kept lost_rows probe row_file survey
-            table
-            yaml_files
+            bag_reader bag_rows checkpoint correlation field_map kept lost_rows probe row_file
+            survey table yaml_files
             attitude_table drive_columns fields hall instruments readings_table site_casing
             site_correlation site_motion site_region site_response site_rotor site_temperature
-            trajectory_table wells_file
+            row_stamps trajectory_table wells_file
             bag depth_table fix_table marks_table result_states rotor_columns site_plain site_text
             temperature_table tum
             inertial_tables odometry_bag site_magnetometer stream
             trajectory_formats
-            euroc named_records named_samples site_schema stream_contents
+            named_records named_samples site_schema stream_contents
             log site
             foreign open site_changes
             table_stream

@@ -6,9 +6,12 @@ Allan variance is distributed as a chi square with at least as many degrees of f
 clusters, which sets its weight.  Estimates at cluster times a factor of two apart are correlated by
 0.5 for white noise and by 0.88 for random walk (2^14 samples, 600 channels, simulated); the
 intervals account for it.
+
+Where a drift or a tone makes another shape, white noise is read where the slope of the deviation is
+-1/2, whatever the longer cluster times show.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -20,6 +23,9 @@ FLICKER = 2.0 * np.log(2.0) / np.pi
 LEAST_CLUSTERS = 2.0  # side by side, that a cluster time has
 LEAST_POINTS = 6  # cluster times that a fit needs
 SHAPE = 0.05  # relative: what an instrument may deviate from these four at any cluster time
+LEAST_WHITE = 5  # cluster times that separate white noise from a drift
+CLEAN = 1.0  # chi square a degree of freedom of cluster times with white noise and a drift
+WHITE_SHARE = 0.5  # of an Allan variance, where its slope is that of white noise
 FILTERED = 6  # octaves at the beginning that an instrument's own filter may spoil
 GOOD = 0.6  # of the chi square a degree of freedom, from which another beginning is tried
 MISFIT = 2.5  # of the same, from which the noise is of another kind
@@ -120,7 +126,48 @@ def fit_allan(result: AllanVariance, axis: int) -> AllanFit | None:
             best = fit
         if best.misfit < GOOD:
             break
-    return best
+    if best is None or best.misfit < GOOD:
+        return best
+    return replace(best, white=_white_slope(tau, variance, clusters) or best.white)
+
+
+def _white_slope(tau: Array, variance: Array, clusters: Array) -> Fitted | None:
+    """Return the white noise of the longest cluster times where only a drift adds to it.
+
+    There the deviation has the slopes of quantization, white noise, walk and ramp; the fifth
+    component of IEEE Std 952, the ramp, is also what a slow tone is at first.
+    """
+    for count in range(len(tau), LEAST_WHITE - 1, -1):
+        for first in range(min(FILTERED + 1, len(tau) - count + 1)):
+            part = slice(first, first + count)
+            fitted = _white_with_drift(tau[part], variance[part], 2.0 / clusters[part] + SHAPE**2)
+            if fitted is not None:
+                return fitted
+    return None
+
+
+def _white_with_drift(tau: Array, variance: Array, relative: Array) -> Fitted | None:
+    """Return white noise where quantization, walk and ramp explain the rest; otherwise None."""
+    design = np.stack([1.0 / tau, 3.0 / tau**2, tau / 3.0, 0.5 * tau**2], axis=-1)
+    model = variance
+    for _ in range(MAX_ITERATIONS):
+        weight = 1.0 / (np.sqrt(relative) * model)
+        square = _not_negative(design * weight[:, None], variance * weight)
+        before, model = model, np.maximum(design @ square, 1e-6 * variance)
+        if np.all(np.abs(model - before) < CONVERGED_STEP * model):
+            break
+    there = square > 0.0
+    freedom = max(len(tau) - int(np.sum(there)), 1)
+    misfit = float(np.sum((variance / model - 1.0) ** 2 / relative)) / freedom
+    share = square[0] / tau / model
+    if misfit > CLEAN or np.max(share) < WHITE_SHARE:
+        return None
+    weighed = design[:, there] / (np.sqrt(relative) * model)[:, None]
+    scale = np.linalg.norm(weighed, axis=0)
+    cov = np.linalg.pinv((weighed / scale).T @ (weighed / scale), hermitian=True)
+    # Neighbours share half of their errors, and all of them the instrument's shape.
+    sigma = float(np.sqrt(2.0 * cov[0, 0])) / scale[0] + SHAPE * square[0]
+    return _fitted(float(square[0]), float(sigma))
 
 
 def _design(tau: Array) -> Array:
@@ -147,7 +194,7 @@ def _fit(tau: Array, variance: Array, clusters: Array) -> AllanFit:
     curve = np.sqrt(_design(fine) @ square)
     least = int(np.argmin(curve))
     return AllanFit(
-        white=_fitted(square[1], sigma[1]),
+        white=_fitted(square[1], sigma[1] * max(1.0, float(np.sqrt(misfit)))),
         instability=_fitted(square[2], sigma[2]),
         walk=_fitted(square[3], sigma[3]),
         steps=float(np.sqrt(square[0])),

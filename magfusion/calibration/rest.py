@@ -8,9 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.calibration.allan import AllanStream, AllanVariance
+from magfusion.receiver.sampling_clock import sampling_clock
 from magfusion.units import Array, BoolArray, IntArray
 
 MOST_BLOCKS = 4096
+MAX_CLOCKED = 10_000  # samples that show whether stamps are coarse
+COARSE = 0.02  # of a step
 BLOCK = 1.0  # s, of the shortest stretch
 GAP = 0.5  # of a step, by which three steps in a row are too long where a sample is missing
 LONGEST_FILL = 64  # samples missing in a row; beyond, nothing is filled in
@@ -70,7 +73,7 @@ class RestStream:
     def __init__(self, axes: int) -> None:
         self.allan = AllanStream(axes)
         self._axes = axes
-        self._step = 0.0
+        self._step, self._stamp, self._counted = 0.0, -np.inf, False
         self._last: tuple[float, Array] | None = None
         self._slots = 0
         self._begin = self._end = 0.0
@@ -90,17 +93,19 @@ class RestStream:
 
     def add(self, time: Array, values: Array) -> None:
         """Process further samples: times (n,) (s), values (n, axes), NaN where one is missing."""
-        if self._last is not None:
-            fresh = np.flatnonzero(np.diff(time, prepend=self._last[0]) > 0.0)
-        else:
-            fresh = np.flatnonzero(np.diff(time, prepend=-np.inf) > 0.0)
+        fresh = np.flatnonzero(np.diff(time, prepend=self._stamp) > 0.0)
         time, values = time[fresh], values[fresh]
         if len(time) == 0:
             return
+        if self._last is None and len(time) < 3:
+            return
+        self._stamp = float(time[-1])
         if self._last is None:
-            if len(time) < 3:
-                return
-            self._step = _usual_step(time)
+            self._counted = _are_counted(time)
+        clock = sampling_clock(time) if self._counted else None
+        time = time if clock is None else clock.time
+        if self._last is None:
+            self._step = _usual_step(time) if clock is None else clock.step
             self._begin = self._rest_begin = float(time[0])
             self._origin = np.nan_to_num(values[0])
         previous = time[0] - self._step if self._last is None else self._last[0]
@@ -217,6 +222,12 @@ def _merged(
     scatter = np.max([row[3] for row in rows], axis=0)
     change = np.max([row[4] for row in rows], axis=0)
     return rows[0][0], rows[-1][1], mean, scatter, change
+
+
+def _are_counted(time: Array) -> bool:
+    """Return whether stamps are so coarse or late that their steps are not the sensor's."""
+    clock = sampling_clock(time[:MAX_CLOCKED])
+    return clock is not None and abs(_usual_step(time) / clock.step - 1.0) > COARSE
 
 
 def _usual_step(time: Array) -> float:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+import pyarrow as pa
 
 from magfusion.errors import InputError
 from magfusion.files.drive_columns import column_names, current_columns_of
@@ -33,9 +34,9 @@ _SOME_AXES = TableLayout(numbers=(), repeats=True, some=FIELD, strays=True)
 
 
 def read_imu(
-    path: Path, span: Span, names: tuple[str, ...] = ()
+    path: Path, span: Span, content: pa.Table | None = None
 ) -> tuple[ImuSamples, tuple[Finding, ...]]:
-    """Read and check inertial samples; ``names`` as in `read_table`.
+    """Read and check inertial samples; ``content`` as in `read_table`.
 
     Returns
     -------
@@ -47,7 +48,7 @@ def read_imu(
     InputError
         As `read_table` and `check_imu`; or where the span holds no sample.
     """
-    table = read_table(path, IMU_LAYOUT, span, names)
+    table = read_table(path, IMU_LAYOUT, span, content)
     if not len(table):
         raise InputError(f"{path}: holds no row {span}; choose a span that the log covers.")
     time, values, noticed = measured_rows(table, (*_GYRO, *_ACCEL), "IMU", spread=True)
@@ -65,9 +66,9 @@ def write_imu(imu: ImuSamples, path: Path, epoch_ns: int) -> None:
 
 
 def read_waveform(
-    path: Path | None, span: Span, names: tuple[str, ...] = ()
+    path: Path | None, span: Span, content: pa.Table | None = None
 ) -> tuple[Waveform | None, tuple[Finding, ...]]:
-    """Read and check magnetometer samples; ``names`` as in `read_table`.
+    """Read and check magnetometer samples; ``content`` as in `read_table`.
 
     A receiver of fewer axes leaves columns out.
 
@@ -83,11 +84,11 @@ def read_waveform(
     """
     if path is None:
         return None, ()
-    table = read_table(path, _SOME_AXES, span, names)
+    table = read_table(path, _SOME_AXES, span, content)
     if not len(table):
         return None, ()
     columns = tuple(name for name in FIELD if table.has((name,)))
-    alone = bool(names) or {TIME, *FIELD}.issuperset(column_names(path))
+    alone = content is not None or {TIME, *FIELD}.issuperset(column_names(path))
     time, values, noticed = measured_rows(table, columns, "magnetometer", alone)
     check_field(np.linalg.norm(values, axis=1), str(path))
     if columns == FIELD:

@@ -5,7 +5,7 @@ from pathlib import Path
 from magfusion.errors import InputError
 from magfusion.files.bag import read_bag
 from magfusion.files.bag_topics import Topics, is_bag
-from magfusion.files.euroc import is_euroc, read_euroc
+from magfusion.files.foreign.euroc import is_euroc, read_euroc
 from magfusion.files.log import HEADER, is_log, read_log
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import Log

@@ -225,15 +225,17 @@ def find_table(directory: Path, stem: str) -> Path | None:
     return paths[0] if paths else None
 
 
-def read_table(path: Path, layout: TableLayout, span: Span, names: tuple[str, ...] = ()) -> Table:
+def read_table(
+    path: Path, layout: TableLayout, span: Span, content: pa.Table | None = None
+) -> Table:
     """Read the columns of a layout and the rows of a span.
 
     A Parquet file is mapped, and only the row groups that the span needs are decoded.
 
     Parameters
     ----------
-    names : tuple of str
-        Names of the first columns of a CSV whose own header uses others.
+    content : pyarrow.Table, optional
+        What the file holds, where another reader has read it.
 
     Raises
     ------
@@ -244,8 +246,10 @@ def read_table(path: Path, layout: TableLayout, span: Span, names: tuple[str, ..
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; give the path of a table.")
     try:
-        if path.suffix == ".csv":
-            data, first_row = _read_csv(path, layout, names), 0
+        if content is not None:
+            data, first_row = content.select(layout.chosen(content.column_names, path)), 0
+        elif path.suffix == ".csv":
+            data, first_row = _read_csv(path, layout), 0
         else:
             data, first_row = _read_parquet(path, layout, span)
     except InputError:
@@ -318,7 +322,7 @@ def _groups_within(file: pa.parquet.ParquetFile, span: Span) -> range:
     return range(within[0], within[-1] + 1) if within else range(0)
 
 
-def _read_csv(path: Path, layout: TableLayout, renamed: tuple[str, ...]) -> pa.Table:
+def _read_csv(path: Path, layout: TableLayout) -> pa.Table:
     if path.stat().st_size > MOST_BYTES:
         raise InputError(
             f"{path}: is larger than {MOST_BYTES >> 20} MiB; write it as Parquet, of which a part"
@@ -326,7 +330,7 @@ def _read_csv(path: Path, layout: TableLayout, renamed: tuple[str, ...]) -> pa.T
         )
     with path.open(newline="", encoding="utf-8-sig") as stream:
         header = next(csv.reader(stream), [])
-    result = [*renamed[: len(header)], *(name.strip() for name in header[len(renamed) :])]
+    result = [name.strip() for name in header]
     names = layout.chosen(result, path)
     data = pa.csv.read_csv(
         path,

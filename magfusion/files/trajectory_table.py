@@ -77,18 +77,18 @@ def read_trajectory(
     epoch_ns: int,
     start: float | None = None,
     end: float | None = None,
-    names: tuple[str, ...] = (),
+    content: pa.Table | None = None,
 ) -> Trajectory:
     """Read and check a trajectory in Parquet or CSV, within start <= time < end (s).
 
-    ``names`` as in `read_table`.
+    ``content`` as in `read_table`.
 
     Raises
     ------
     InputError
         As `read_table`; or where a number is not finite or a quaternion not of unit length.
     """
-    table = read_table(path, _LAYOUT, Span(epoch_ns, start, end), names)
+    table = read_table(path, _LAYOUT, Span(epoch_ns, start, end), content)
     quaternion = table.numbers(_QUATERNION)
     length = np.linalg.norm(quaternion, axis=1)
     off = np.abs(length - 1.0) > QUATERNION_TOLERANCE

@@ -36,6 +36,7 @@ DENSITY = np.sqrt(2.0)  # one-sided density over what an Allan deviation shows
 HALF = 0.5
 # Signature of steps larger than the noise.
 OF_STEPS = frozenset({"false_samples", "imu_spikes", "repeated_samples", "frozen_imu"})
+OF_CONSTANTS = frozenset({"stuck_axis", "frozen_imu", "frozen_magnetometer"})
 LEAST_SAMPLES = 200
 AXES = "xyz"
 
@@ -63,6 +64,12 @@ class Instrument:
     def coarse(self) -> bool:
         """Whether quantization masks its noise."""
         return bool(np.max(self.repeated) > QUANTISED)
+
+    @property
+    def constant(self) -> str:
+        """The axes without any noise."""
+        still = ~np.any(self.variance.variance > 0.0, axis=0)
+        return ", ".join(axis for axis, one in zip(AXES, still, strict=True) if one)
 
     @property
     def known(self) -> list[AllanFit]:
@@ -147,10 +154,22 @@ def measured(job: Job, site: Site | None, report: Report) -> MeasuredNoise:
             own += _moved(rest, motion)
         result = _instruments(_without_motion(rest, job, stream, motion), parts)
         coarse = tuple(one.name for one in result if one.coarse)
-        findings += [f for f in own if f.code not in OF_STEPS or not f.text.startswith(coarse)]
+        constant = tuple(one.name for one in result if one.constant)
+        findings += [
+            f
+            for f in own
+            if not (f.code in OF_STEPS and f.text.startswith(coarse))
+            and not (f.code in OF_CONSTANTS and f.text.startswith(constant))
+        ]
         instruments += result
     if not instruments:
         raise InputError(f"{job.log_path}: holds neither inertial nor magnetometer samples")
+    if not any(one.known for one in instruments) and any(one.constant for one in instruments):
+        axes = "; ".join(f"{one.name} {one.constant}" for one in instruments if one.constant)
+        raise InputError(
+            f"{job.log_path}: these axes have no noise: {axes}; record instruments, or simulate"
+            " noise"
+        )
     for one in instruments:
         findings += _deviation_findings(one, duration)
     keys, intervals, units = _keys(instruments, site)
@@ -266,11 +285,21 @@ def _moved(rest: RestStream, motion: MotionModel) -> Iterator[Finding]:
 
 def _deviation_findings(one: Instrument, duration: float) -> Iterator[Finding]:
     """Yield findings on the Allan deviations of an instrument."""
+    if one.constant:
+        what = "axes" if "," in one.constant else "axis"
+        yield Finding(
+            "stuck_axis",
+            f"{one.name}: {what} {one.constant} without noise: all samples are equal, as of an"
+            " ideal simulator or a dead sensor. Its noise is unknown; record it again with noise.",
+            Verdict.DOUBTFUL,
+            60.0,
+        )
+        return
     if len(one.known) < 3:
         yield Finding(
             "few_data",
-            f"{one.name}: {duration:.0f} s are too short for its noise, or an axis is constant;"
-            " record at rest for at least some minutes.",
+            f"{one.name}: {duration:.0f} s are too short for its noise; record at rest for at least"
+            " some minutes.",
             Verdict.DOUBTFUL,
             50.0,
         )

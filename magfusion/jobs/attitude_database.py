@@ -14,8 +14,8 @@ from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorde
 from magfusion.files.attitude_table import write_database
 from magfusion.jobs.settings import Command, LogSettings, Settings, option
 from magfusion.model.site import Site
-from magfusion.model.trajectory import interpolate
 from magfusion.model.trust import Finding, Trust, Verdict
+from magfusion.model.truth_poses import truth_poses
 from magfusion.papers.p001_magnetometer.matching import predict_field
 from magfusion.papers.p001_magnetometer.matching_database import build_database, prepare
 from magfusion.receiver.admission import sample_rate_hz
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 TABLE = "attitudes.parquet"
 LEAST_FIELD = 1e-7  # T; a two hundredth of the Earth's at its weakest
-MAX_GAP = 0.2  # s; of the reference, across which it is interpolated
 DISTORTED, CONTRADICTED = 0.15, 0.3  # of the field: doubt, and more than iron on a platform does
 _TAPER = 1.5  # by which a raised cosine averages white noise less than equal weights do
 
@@ -115,9 +114,11 @@ def run_attitude_database(settings: DatabaseSettings, output: Path) -> Figures:
     reference, place = _reference(job, log, settings.trajectory)
     with named(job.log_path):
         result = steady(log, site, settings)
-    poses, known = interpolate(reference, result.time, MAX_GAP)
+    poses, known, reason = truth_poses(reference, result.time)
     if not np.any(known):
-        raise InputError(f"{place}: does not cover the magnetometer's time; give a longer one")
+        raise InputError(
+            f"{place}: does not cover the magnetometer's times: {reason}; give another"
+        )
     with named(job.log_path):
         built = build_database(
             result.field_body[known],

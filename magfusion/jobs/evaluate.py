@@ -36,25 +36,27 @@ def run_evaluate(settings: EvaluateSettings) -> Figures:
     from magfusion.results.errors import trajectory_errors
     from magfusion.results.report import error_figures
 
-    true, epoch_ns = _read_truth(settings)
+    true, epoch_ns, remarks = _read_truth(settings)
     result = read_estimate(settings.estimate, epoch_ns)
     with named(f"{settings.estimate} against {settings.truth}"):
         errors = error_figures(trajectory_errors(result, true))
-    return Figures(Figure("job", "evaluate", section=Section.TITLE)) | errors
+    notes = Figures(*[Figure("notes", remarks, section=Section.NOTES)] * bool(remarks))
+    return Figures(Figure("job", "evaluate", section=Section.TITLE)) | errors | notes
 
 
-def _read_truth(settings: EvaluateSettings) -> tuple[Trajectory, int]:
-    """Return the truth, and the zero of its clock (ns)."""
+def _read_truth(settings: EvaluateSettings) -> tuple[Trajectory, int, list[str]]:
+    """Return the truth, the zero of its clock (ns), and what contradicts it in its log."""
+    from magfusion.estimation.data_checks.truth import truth_findings
     from magfusion.jobs.inputs import read_estimate, topics_option
 
     path, topics = settings.truth, topics_option(settings.topics)
     is_result = (path / "trajectory.parquet").is_file()
     if is_result or not (path.is_dir() or is_bag(path)):
-        return read_estimate(path), 0
+        return read_estimate(path), 0, []
     log = open_log(path, topics=topics)
     if log.truth is None:
         raise InputError(f"{path}: has no truth; give a log with truth, a TUM file or a table")
-    return log.truth, log.epoch_ns
+    return log.truth, log.epoch_ns, [finding.text for finding in truth_findings(log)]
 
 
 COMMAND = Command(EvaluateSettings, run_evaluate, example="magfusion evaluate run log")

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files.attitude_table import read_database, write_attitudes
-from magfusion.jobs.attitude_database import MAX_GAP, TABLE, Sampling, steady
+from magfusion.jobs.attitude_database import TABLE, Sampling, steady
 from magfusion.jobs.match_trust import judge_matches
 from magfusion.jobs.settings import Command, LogSettings, option
 from magfusion.model.physics.earth import earth_field_world
 from magfusion.model.site import Site
 from magfusion.model.strapdown import resting
-from magfusion.model.trajectory import interpolate
+from magfusion.model.truth_poses import truth_poses
 from magfusion.papers.p001_magnetometer.matching import (
     THREE_ANGLES,
     match_roll,
@@ -257,7 +257,7 @@ def _compared(log: Log, time: Array, result: _Matched) -> tuple[Array | None, Fi
     """Return the true angles (NaN where there are none) and the errors against them."""
     if log.truth is None:
         return None, Figures()
-    poses, exists = interpolate(log.truth, time, MAX_GAP)
+    poses, exists, _ = truth_poses(log.truth, time)
     used = exists & result.matches.determined[:, 0]
     if not np.any(used):
         reason = "the truth covers no epoch whose attitude is determined"

@@ -24,8 +24,9 @@ from magfusion.jobs.inputs import Job, claim, named, read_job, require_imu
 from magfusion.model.progress import Report
 from magfusion.model.samples import Log
 from magfusion.model.site import Magnetometer, Site
-from magfusion.model.trajectory import Trajectory, interpolate
+from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Trust, uniform_trust
+from magfusion.model.truth_poses import truth_poses
 from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.page_motion import MotionPage
 from magfusion.results.recording import write_recording
@@ -36,7 +37,6 @@ from magfusion.units import DEGREE, Array, Rate
 if TYPE_CHECKING:
     from magfusion.estimation.online_integrity.judgement import JudgedState
 
-LONGEST_STEP = 0.1  # s; of a truth that is compared with
 _PLACE = {"json": "line", "msgpack": "record"}
 
 
@@ -142,7 +142,7 @@ def _errors(states: Trajectory, log: Log) -> Figures:
     """Return the errors of heading and tilt against the truth, where the log has one."""
     if log.truth is None or len(log.truth) == 0:
         return Figures()
-    truth, exists = interpolate(log.truth, states.time, LONGEST_STEP)
+    truth, exists, _ = truth_poses(log.truth, states.time)
     if not np.any(exists):
         return Figures()
     assert states.pose_cov is not None

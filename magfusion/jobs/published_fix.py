@@ -15,8 +15,9 @@ from magfusion.files.table import TIME, Span, write_table
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
 from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
-from magfusion.model.trajectory import Trajectory, interpolate
+from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Trust, uniform_trust
+from magfusion.model.truth_poses import truth_poses
 from magfusion.papers.p004_fingerprints.algorithms import fix_as_published
 from magfusion.papers.p004_fingerprints.fingerprint import fingerprint_database
 from magfusion.papers.p004_fingerprints.rotating import (
@@ -43,8 +44,6 @@ if TYPE_CHECKING:
     from magfusion.receiver.windows import LockinSettings
     from magfusion.results.errors import TrajectoryErrors
     from magfusion.units import Array, BoolArray
-
-MAX_GAP = 0.1  # s, of the truth, across which it is interpolated
 
 
 def run_published_fix(
@@ -148,7 +147,7 @@ def _position_figures(position_world: Array, stamps: Array, log: Log, site: Site
     """Return the error of the magnetometer's positions against the log's truth, if it has one."""
     if log.truth is None:
         return Figures()
-    true, compared = interpolate(log.truth, stamps, MAX_GAP)
+    true, compared, _ = truth_poses(log.truth, stamps)
     if len(true) == 0:
         return Figures()
     lever_world = true.world_from_body @ site.platform.magnetometer.position_body

@@ -298,12 +298,15 @@ class StreamClock:
         Missing samples outside gaps.
     replaced : bool
         Whether the clock replaces the stamps; otherwise the samples were taken at the stamps.
+    resolution : float
+        To which the stamps were rounded (s), where that explains their scatter; otherwise zero.
     """
 
     step: float
     scatter: float
     lost_count: int
     replaced: bool
+    resolution: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,16 +7,10 @@ import numpy as np
 
 from magfusion.model.samples import Log, StreamClock
 from magfusion.model.site import Site
-from magfusion.receiver.bursts import LONGEST, spread_bursts
 from magfusion.receiver.lockin import unexplained
-from magfusion.receiver.sampling_clock import SamplingClock, sampling_clock, smooth_clock
+from magfusion.receiver.sampling_clock import SamplingClock, sampling_clock
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import default_settings
-from magfusion.units import Array
-
-MAX_COUNT_ERROR = (
-    4.0  # steps; largest error of counted samples where a bus delivers several at a time
-)
 
 
 def on_even_clocks(log: Log, site: Site) -> Log:
@@ -25,35 +19,20 @@ def on_even_clocks(log: Log, site: Site) -> Log:
     The magnetometer decides between ticks and stamps: at the correct times, tones and rotation
     leave a smaller residual.  The IMU follows that decision.
     """
-    result = {"imu": _clock(log.imu.time, site)}
+    bundled = not has_schedule(site)
+    result = {"imu": sampling_clock(log.imu.time, bundled)}
     if log.waveform is not None:
-        result["magnetometer"] = _clock(log.waveform.time, site)
+        result["magnetometer"] = sampling_clock(log.waveform.time, bundled)
     clocks = {name: clock for name, clock in result.items() if clock is not None}
     if not clocks:
         return log
     even = _at(log, clocks)
     replaced = "magnetometer" not in clocks or _evener(log, even, site)
     notes = {
-        name: StreamClock(clock.step, clock.scatter, clock.lost_count, replaced)
+        name: StreamClock(clock.step, clock.scatter, clock.lost_count, replaced, clock.resolution)
         for name, clock in clocks.items()
     }
     return replace(even if replaced else log, clocks=notes)
-
-
-def _clock(stamps: Array, site: Site) -> SamplingClock | None:
-    """Return the uniform clock of stamps, which a bus may have bundled."""
-    separate = None if has_schedule(site) else spread_bursts(stamps)
-    if separate is None:
-        return sampling_clock(stamps)
-    # Without losses, samples are counted; a lost one shifts the later ones by at most one step.
-    steps = np.diff(separate)
-    step = float(np.mean(steps[steps < LONGEST]))
-    breaks = np.flatnonzero(steps >= LONGEST) + 1
-    parts = np.split(separate, breaks)
-    time = np.concatenate([smooth_clock(np.arange(len(part)), part) for part in parts])
-    if np.any(np.diff(time) <= 0.0) or np.max(np.abs(time - separate)) > MAX_COUNT_ERROR * step:
-        time = separate
-    return SamplingClock(time, step, float(np.sqrt(np.mean((time - stamps) ** 2))), 0)
 
 
 def _at(log: Log, clocks: Mapping[str, SamplingClock]) -> Log:

@@ -1,16 +1,17 @@
 """Uniform sampling clock of a stream whose time stamps scatter about it.
 
-A host stamps samples when they arrive, not when they were measured.  The uniform sampler is
-recovered: each sample is assigned a tick, lost samples skip theirs, and the clock is a smooth curve
-of stamps over ticks.
+A host stamps samples when they arrive, not when they were measured, several at a time, or by a
+coarse clock.  The uniform sampler is recovered: each sample is assigned a tick, lost samples skip
+theirs, and the clock is a smooth curve of stamps over ticks.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import make_lsq_spline
+from scipy.linalg import solveh_banded
 
-from magfusion.units import Array, ComplexArray, IntArray
+from magfusion.receiver.bursts import LONGEST, MAX_SAMPLES, spread_bursts
+from magfusion.units import NANOSECOND, Array, ComplexArray, IntArray
 
 EVEN = 0.01  # of a step; stamps that scatter less are a clock's own
 MOST_SCATTER = 0.45  # of a step, root mean square; beyond, ticks are not separable
@@ -24,6 +25,10 @@ MOST_PIECES = 40  # used for the median step
 SEARCHED = 0.08  # of the median step, either way
 KNOT = 10.0  # s; a clock's rate changes more slowly
 MIN_SAMPLES = 50  # samples
+ROUNDED = 0.05  # of a step, by which the mean of rounded stamps differs from their median
+MAX_ROUNDING_STEPS = 1.2  # median steps; rounding is half of one, cutting off one
+MOST_STEPS = 10_000  # of which a common divisor is looked for
+MAX_ROUNDING = 0.6  # of the divisor; rms of rounding is 1/sqrt(12) of it, of cutting off 1/sqrt(3)
 
 
 class SamplingClock(NamedTuple):
@@ -39,25 +44,69 @@ class SamplingClock(NamedTuple):
         Root mean square of stamps about the clock (s).
     lost_count : int
         Ticks without a sample, except in gaps.
+    resolution : float
+        To which the stamps are rounded (s), where that explains their scatter; otherwise zero.
     """
 
     time: Array
     step: float
     scatter: float
     lost_count: int
+    resolution: float = 0.0
 
 
-def sampling_clock(stamps: Array) -> SamplingClock | None:
+def sampling_clock(stamps: Array, bundled: bool = True) -> SamplingClock | None:
     """Return the uniform clock of scattered stamps; None if there is none or they scatter little.
 
     Parameters
     ----------
     stamps : ndarray, shape (n,)
         Strictly increasing (s).
+    bundled : bool
+        Whether a bus may deliver several samples at a time.
     """
-    if len(stamps) < PIECE or _even(stamps, float(np.median(np.diff(stamps)))):
+    separate = spread_bursts(stamps) if bundled else None
+    clock = _scattered_clock(stamps) if separate is None else _counted_clock(stamps, separate)
+    if clock is None:
         return None
-    step = _usual_step(stamps)
+    size = _resolution(stamps)
+    return clock._replace(resolution=size if clock.scatter < MAX_ROUNDING * size else 0.0)
+
+
+def _counted_clock(stamps: Array, separate: Array) -> SamplingClock:
+    """Return the clock of samples that arrive in bursts: without losses, they are counted."""
+    steps = np.diff(separate)
+    step = float(np.mean(steps[steps < LONGEST]))
+    breaks = np.flatnonzero(steps >= LONGEST) + 1
+    parts = np.split(separate, breaks)
+    time = np.concatenate([smooth_clock(np.arange(len(part)), part) for part in parts])
+    # A lost sample shifts the later ones by a step; a host delivers at most a burst late.
+    if np.any(np.diff(time) <= 0.0) or np.max(np.abs(time - separate)) > MAX_SAMPLES * step:
+        time = separate
+    return SamplingClock(time, step, float(np.sqrt(np.mean((time - stamps) ** 2))), 0)
+
+
+def _resolution(stamps: Array) -> float:
+    """Return the common divisor of the steps (s), by which two of them differ; zero if none."""
+    exact = 4.0 * max(NANOSECOND, float(np.spacing(np.max(np.abs(stamps)))))
+    steps = np.sort(np.diff(stamps[:MOST_STEPS]))
+    change = np.diff(steps, prepend=0.0)
+    separate = change[change > exact]
+    size = float(np.min(separate, initial=np.inf))
+    if not size > 10.0 * exact:
+        return 0.0
+    size = float(steps[-1] / np.round(steps[-1] / size))
+    off = np.abs(steps - size * np.round(steps / size))
+    return round(size, 9) if np.all(off <= 2.0 * exact) else 0.0
+
+
+def _scattered_clock(stamps: Array) -> SamplingClock | None:
+    if len(stamps) < PIECE:
+        return None
+    counted = _counted_step(stamps)
+    if counted is None and _even(stamps, float(np.median(np.diff(stamps)))):
+        return None
+    step = counted or _usual_step(stamps)
     if _even(stamps, step):
         return None
     whole = np.diff(stamps) / step
@@ -79,19 +128,41 @@ def _even(stamps: Array, step: float) -> bool:
     return bool(np.sqrt(np.mean((whole - np.round(whole)) ** 2)) < EVEN)
 
 
+def _counted_step(stamps: Array) -> float | None:
+    """Return the mean step (s) where it is not the median and the samples come as evenly.
+
+    Rounded stamps stay within a step of a straight line, those of lost samples leave it.
+    """
+    steps = np.diff(stamps)
+    median = float(np.median(steps))
+    mean = float(np.mean(steps[steps <= GAP * median]))
+    if abs(mean - median) < ROUNDED * median:
+        return None
+    count = len(stamps) // PIECE
+    pieces = stamps[: count * PIECE].reshape(count, PIECE).T
+    pieces = pieces - pieces[0]
+    lines = np.polyfit(np.arange(PIECE), pieces, 1)
+    off = pieces - np.outer(np.arange(PIECE), lines[0]) - lines[1]
+    return mean if np.max(np.abs(off)) < MAX_ROUNDING_STEPS * median else None
+
+
 def _usual_step(stamps: Array) -> float:
     """Return the time between two ticks (s): the period that fits the stamps of each piece best.
 
-    By the length of the mean phasor (Rayleigh's test), which is insensitive to lost samples.
+    By the length of the mean phasor (Rayleigh's test), which is insensitive to lost samples.  The
+    median step is not that of rounded stamps, and the mean not that where samples are lost.
     """
-    usual = float(np.median(np.diff(stamps)))
+    steps = np.diff(stamps)
+    median = float(np.median(steps))
+    mean = float(np.mean(steps[steps <= GAP * median]))
     count = len(stamps) // PIECE
     pieces = stamps[: count * PIECE].reshape(count, PIECE)[:MOST_PIECES]
-    width = SEARCHED
-    for _ in range(3):
-        tried = usual * (1.0 + np.linspace(-width, width, 161))
+    near = np.linspace(-SEARCHED, SEARCHED, 161)
+    tried = np.concatenate([median * (1.0 + near), mean * (1.0 + near)])
+    for width in (0.1 * SEARCHED, 0.01 * SEARCHED, 0.0):
         kept = [float(np.sum(np.abs(_phasor(pieces, step)) ** 2)) for step in tried]
-        usual, width = float(tried[int(np.argmax(kept))]), 0.1 * width
+        usual = float(tried[int(np.argmax(kept))])
+        tried = usual * (1.0 + np.linspace(-width, width, 161))
     return usual
 
 
@@ -179,7 +250,8 @@ def smooth_clock(tick: IntArray, stamps: Array) -> Array:
     """
     if len(stamps) < MIN_SAMPLES:
         return stamps
-    maximum = max(int((stamps[-1] - stamps[0]) / KNOT), 1)
+    span = float(stamps[-1] - stamps[0])
+    maximum = max(min(int(span / KNOT), len(stamps) // MIN_SAMPLES), 1)
     lines, sigma, least = maximum, 0.0, np.inf
     best = stamps
     while lines >= 1:
@@ -194,15 +266,33 @@ def smooth_clock(tick: IntArray, stamps: Array) -> Array:
 
 
 def _bent_lines(tick: IntArray, stamps: Array, lines: int) -> tuple[Array, Array]:
-    """Return so many connected straight lines at the ticks (s), and the residual of stamps (s)."""
-    inner = np.linspace(tick[0], tick[-1], lines + 1)[1:-1]
-    ends = (float(tick[0]), float(tick[-1]))
-    knots = np.concatenate([[ends[0]] * 2, inner, [ends[1]] * 2])
-    weight, result = np.ones(len(stamps)), stamps
+    """Return so many connected straight lines at the ticks (s), and the residual of stamps (s).
+
+    The least squares of hat functions are tridiagonal: linear in the samples, whereas
+    `scipy.interpolate.make_lsq_spline` takes their product with the knots.
+    """
+    knots = np.linspace(tick[0], tick[-1], lines + 1)
+    own = np.clip(np.searchsorted(knots, tick, side="right") - 1, 0, lines - 1)
+    share = (tick - knots[own]) / (knots[1] - knots[0])
+    straight = stamps[0] + (stamps[-1] - stamps[0]) * (tick - tick[0]) / (tick[-1] - tick[0])
+    value = stamps - straight  # small, so that sums do not round
+    weight, result = np.ones(len(stamps)), straight
     for _ in range(4):
-        spline = make_lsq_spline(tick.astype(float), stamps, knots, k=1, w=weight)
-        result = np.asarray(spline(tick.astype(float)))
+        square = weight**2
+        begin, end = square * (1.0 - share), square * share
+
+        def summed(terms: Array) -> Array:
+            return np.asarray(np.bincount(own, terms, lines), dtype=np.float64)
+
+        banded, right = np.zeros((2, lines + 1)), np.zeros(lines + 1)
+        banded[0, 1:] = summed(begin * share)
+        banded[1, :-1] = summed(begin * (1.0 - share))
+        banded[1, 1:] += summed(end * share)
+        right[:-1] = summed(begin * value)
+        right[1:] += summed(end * value)
+        node = solveh_banded(banded, right)
+        result = straight + (1.0 - share) * node[own] + share * node[own + 1]
         off = np.abs(stamps - result)
         sigma = np.median(off) / 0.6745
         weight = 1.0 / np.maximum(1.0, off / max(3.0 * sigma, 1e-12))
-    return result, stamps - result
+    return np.asarray(result), np.asarray(stamps - result)

@@ -11,6 +11,7 @@ from magfusion.errors import InputError
 from magfusion.model.arguments import check_arguments
 from magfusion.model.short_repr import one_line, short_repr
 from magfusion.model.trajectory import Trajectory, interpolate
+from magfusion.model.truth_poses import TruthPoses, truth_poses
 from magfusion.units import Array, BoolArray, IntArray
 
 
@@ -73,6 +74,8 @@ class TrajectoryErrors:
         Of the estimate, where it has one.
     nees : ndarray, shape (n,), optional
         Normalised estimation error squared, six degrees of freedom, where there is a covariance.
+    not_covered : str
+        Why other epochs were not compared; empty where all were.
     """
 
     __repr__ = short_repr
@@ -88,6 +91,7 @@ class TrajectoryErrors:
     world_from_body: Array
     pose_cov: Array | None = None
     nees: Array | None = None
+    not_covered: str = ""
 
     @property
     def ate(self) -> float:
@@ -139,14 +143,15 @@ class TrajectoryErrors:
 
 
 def trajectory_errors(
-    estimate: Trajectory, truth: Trajectory, *, max_gap: float = 0.1, delta_frames: int = 1
+    estimate: Trajectory, truth: Trajectory, *, max_gap: float | None = None, delta_frames: int = 1
 ) -> TrajectoryErrors:
     """Compare an estimate with the truth, interpolated to the estimate's times.
 
     Parameters
     ----------
-    max_gap : float
-        Longest step of the truth across which it is interpolated (s).
+    max_gap : float, optional
+        Longest step of the truth across which it is interpolated linearly (s); without it, the
+        truth is interpolated wherever its motion allows it, `magfusion.model.truth_poses`.
     delta_frames : int
         Length of the relative errors' pairs, in compared epochs.
 
@@ -163,12 +168,16 @@ def trajectory_errors(
         Where fewer than three epochs of the estimate have a truth.
     """
     check_arguments("trajectory_errors", estimate=(estimate, Trajectory), truth=(truth, Trajectory))
-    true, compared = interpolate(truth, estimate.time, max_gap)
+    if max_gap is None:
+        true, compared, reason = truth_poses(truth, estimate.time)
+    else:
+        reason = f"the others are in steps longer than {max_gap} s"
+        true, compared, reason = TruthPoses(*interpolate(truth, estimate.time, max_gap), reason)
     if len(true) < 3:
         raise InputError(
-            f"The truth covers {len(true)} of the estimate's {len(estimate)} epochs within"
-            f" {max_gap} s of a sample, and at least 3 are needed; check that both use the"
-            " same clock or allow a longer gap."
+            f"The truth covers {len(true)} of the estimate's {len(estimate)} epochs, and at least 3"
+            f" are needed: {reason}. Check that both use the same clock, and record the truth"
+            " at a higher rate."
         )
     rotation, position = estimate.world_from_body[compared], estimate.position_world[compared]
     pose_body = pose_errors(rotation, position, true)
@@ -185,6 +194,7 @@ def trajectory_errors(
         world_from_body=rotation,
         pose_cov=cov,
         nees=None if cov is None else _nees(pose_body, cov),
+        not_covered=reason if not np.all(compared) else "",
     )
 
 

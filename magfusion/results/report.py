@@ -97,7 +97,13 @@ def error_figures(
         Figure(name, value, unit, None, section, row, place)
         for name, value, unit, section, row, place in rows
     ]
-    figures.append(Figure("compared_epochs", len(errors.time), section=own))
+    skipped = int(np.sum(~errors.compared))
+    note = (
+        f"The truth does not cover {skipped} of {len(errors.compared)} epochs:"
+        f" {errors.not_covered}."
+    )
+    epochs = Figure("compared_epochs", len(errors.time), section=own)
+    figures.append(replace(epochs, note=note) if skipped and not prefix else epochs)
     if errors.nees is not None and errors.pose_cov is not None:
         sigma = np.sqrt(np.diagonal(errors.pose_cov, axis1=1, axis2=2))
         ratio = np.abs(errors.pose_body) / sigma

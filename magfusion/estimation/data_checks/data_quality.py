@@ -26,6 +26,7 @@ from magfusion.estimation.data_checks.signal import (
 )
 from magfusion.estimation.data_checks.spectrum import undeclared_lines
 from magfusion.estimation.data_checks.stamps import uneven_stamps
+from magfusion.estimation.data_checks.truth import truth_findings
 from magfusion.estimation.data_checks.turn_witness import turned_otherwise
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
@@ -48,6 +49,10 @@ LONGEST = 1200.0  # s; of a longer log, compasses and spectrum are checked on it
 # Of gyroscope and clocks: where they are wrong, the gyro-stabilized axes are wrong too.
 UNSTEADY = frozenset(
     {"gyro_sign", "gyro_units", "gyro_scale", "imu_axes", "imu_clock", "stuck_axis"}
+)
+# Of an accelerometer that does not show the vertical, by which a truth is checked.
+OF_GRAVITY = frozenset(
+    {"accel_scale", "accel_units", "gravity_direction", "gravity_missing", "gravity_sign"}
 )
 # What estimators bridge with an honest covariance is reported and casts no doubt.
 BRIDGED_CODES = frozenset({"gap", "samples_lost", "silent_beacon"})
@@ -90,6 +95,8 @@ def recorded(
     result += turned_otherwise(log, site) if log.inertial else []
     if log.inertial and not any(finding.code in UNSTEADY for finding in result):
         result += gravity_and_field_findings(log, site, poses, estimated)
+        if not any(finding.code in OF_GRAVITY for finding in result):
+            result += truth_findings(log)
         if site is not None and log.vectors is not None:
             result += iron_on_body(still_means(log, site, IRON_SPAN), site)
     if beacons and site is not None and site.beacons:

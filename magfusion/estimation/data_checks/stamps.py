@@ -8,6 +8,8 @@ import numpy as np
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
+from magfusion.receiver.sampling_clock import sampling_clock
+from magfusion.receiver.slots import has_schedule
 from magfusion.units import Array, IntArray
 
 GAP = 0.5  # s; too long for the estimators to treat as lost samples
@@ -18,6 +20,8 @@ LATTICE = 0.15  # of a step: stamps scatter less about a lattice, on which missi
 BLOCK = 64  # samples over which a clock is assumed even
 MIN_COVERAGE = 0.9  # share of the longer stream that the shorter one covers
 ROUNDING = 1e-6  # of a step
+MAX_CLOCKED = 100_000  # samples of which the clock is found; those beyond are counted by it
+MIN_LOST_SHARE = 1e-3  # that is no error of its rate
 LISTED = 3  # gaps that are listed
 
 
@@ -28,7 +32,7 @@ class Timing(NamedTuple):
     ----------
     stream : str
     rate_hz : float
-        Median.
+        Of the even clock, or by the median step where there is none.
     begin, end : float
         First and last stamp (s).
     jitter : float
@@ -37,6 +41,8 @@ class Timing(NamedTuple):
         Share of the samples that are missing outside the gaps.
     gap_begin, gap_end : ndarray, shape (gaps,)
         (s)
+    resolution : float
+        To which the stamps are rounded (s), where that explains the jitter; otherwise zero.
     """
 
     stream: str
@@ -47,15 +53,45 @@ class Timing(NamedTuple):
     lost_share: float
     gap_begin: Array
     gap_end: Array
+    resolution: float = 0.0
 
 
-def timing(stream: str, time: Array) -> Timing | None:
-    """Return the timing of a stream from its stamps (s); None of fewer than three."""
+def timing(stream: str, time: Array, bundled: bool = True) -> Timing | None:
+    """Return the timing of a stream from its stamps (s); None of fewer than three.
+
+    Parameters
+    ----------
+    bundled : bool
+        As in `sampling_clock`.
+    """
     if len(time) < 3:
         return None
+    clock = sampling_clock(time[:MAX_CLOCKED], bundled)
     step = np.diff(time)
-    usual = float(np.median(step))
+    usual = float(np.median(step)) if clock is None else clock.step
     gap = np.flatnonzero(step > max(GAP, GAP_STEPS * usual))
+    jitter, missing = _uneven(time, step, gap, usual)
+    if clock is not None:
+        jitter, missing = clock.scatter, float(clock.lost_count)
+    if clock is not None and len(time) > MAX_CLOCKED:
+        inside = np.delete(step, gap)
+        missing = float(np.sum(inside)) / usual - len(inside)
+        missing = missing if missing > MIN_LOST_SHARE * len(time) else 0.0
+    return Timing(
+        stream=stream,
+        rate_hz=1.0 / usual,
+        begin=float(time[0]),
+        end=float(time[-1]),
+        jitter=jitter,
+        lost_share=missing / (len(time) + missing),
+        gap_begin=time[gap],
+        gap_end=time[gap + 1],
+        resolution=0.0 if clock is None else clock.resolution,
+    )
+
+
+def _uneven(time: Array, step: Array, gap: IntArray, usual: float) -> tuple[float, float]:
+    """Return jitter (s) and number of missing samples of stamps that no even clock explains."""
     inside = np.delete(step, gap)
     turns = np.rint(inside / usual)
     off = inside - usual * turns
@@ -66,16 +102,7 @@ def timing(stream: str, time: Array) -> Timing | None:
     else:
         jitter = _unevenness(time, step, gap)
         missing = max(0.0, float(np.sum(inside)) / usual - len(inside))
-    return Timing(
-        stream=stream,
-        rate_hz=1.0 / usual,
-        begin=float(time[0]),
-        end=float(time[-1]),
-        jitter=jitter,
-        lost_share=missing / (len(time) + missing),
-        gap_begin=time[gap],
-        gap_end=time[gap + 1],
-    )
+    return jitter, missing
 
 
 def _unevenness(time: Array, step: Array, gap: IntArray) -> float:
@@ -94,21 +121,24 @@ def _unevenness(time: Array, step: Array, gap: IntArray) -> float:
     return float(np.sqrt(np.median(np.sum(residual**2, axis=1)) / (BLOCK - 2)))
 
 
-def timings(log: Log) -> tuple[Timing, ...]:
+def timings(log: Log, site: Site | None = None) -> tuple[Timing, ...]:
     """Return the timing of the raw streams of a log."""
-    result = [timing("imu", log.imu.time)] if log.inertial else []
+    bundled = site is None or not has_schedule(site)
+    result = [timing("imu", log.imu.time, bundled)] if log.inertial else []
     if log.waveform is not None:
-        result.append(timing("magnetometer", log.waveform.time))
+        result.append(timing("magnetometer", log.waveform.time, bundled))
     return tuple(one for one in result if one is not None)
 
 
-def uneven_stamps(log: Log, _site: Site | None) -> Iterator[Finding]:
+def uneven_stamps(log: Log, site: Site | None) -> Iterator[Finding]:
     """Yield the defects of a log's time stamps."""
-    result = timings(log)
+    result = timings(log, site)
     for one in result:
         yield from _of_one(one)
     for stream, clock in log.clocks.items():
-        if clock.replaced:
+        if clock.replaced and clock.resolution:
+            yield _rounded(stream, clock.resolution, clock.step)
+        elif clock.replaced:
             yield Finding(
                 "jitter",
                 f"{stream}: the stamps jitter by {1e3 * clock.scatter:.2g} ms (rms) about an even"
@@ -145,7 +175,9 @@ def _of_one(one: Timing) -> Iterator[Finding]:
             " a larger buffer or at a lower rate.",
             weight=one.lost_share / MAX_LOST_SHARE,
         )
-    if one.jitter > JITTER * usual:
+    if one.jitter > JITTER * usual and one.resolution:
+        yield _rounded(one.stream, one.resolution, usual)
+    elif one.jitter > JITTER * usual:
         yield Finding(
             "jitter",
             f"{one.stream}: the stamps jitter by {1e3 * one.jitter:.2g} ms (rms) about an even"
@@ -154,6 +186,16 @@ def _of_one(one: Timing) -> Iterator[Finding]:
             " sensor.",
             weight=one.jitter / (JITTER * usual),
         )
+
+
+def _rounded(stream: str, resolution: float, step: float) -> Finding:
+    return Finding(
+        "stamp_resolution",
+        f"{stream}: the stamps are rounded to {1e3 * resolution:.4g} ms. The estimators use an even"
+        f" clock of {1.0 / step:.4g} Hz instead. Stamp the samples in nanoseconds.",
+        Verdict.TRUSTWORTHY,
+        resolution / step,
+    )
 
 
 def _overlap_findings(imu: Timing, field: Timing) -> Iterator[Finding]:

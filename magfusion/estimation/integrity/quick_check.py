@@ -100,7 +100,7 @@ def quick_check(log: Log, site: Site | None, lockin: LockinSettings | None = Non
     """Check a log; without a site only the recording."""
     result = spectrum(log, site)
     seen = None if result is None else named_lines(result, site)
-    look = timings(log), still_means(log, site)
+    look = timings(log, site), still_means(log, site)
     if site is None or not site.beacons:
         return Look(Trust(recorded(log, site)), *look, None, result, seen)
     findings: list[Finding] = []

@@ -12,13 +12,13 @@ from magfusion.estimation.snapshot.priors import unexplained
 from magfusion.model.field import skew
 from magfusion.model.one_axis import ANY_ROLL, CIRCLE, axis_of, coil_lever, least_turn
 from magfusion.model.site import Site
-from magfusion.model.trajectory import Trajectory, interpolate
+from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, StateTrust, Trust, Verdict
+from magfusion.model.truth_poses import truth_poses
 from magfusion.units import Array, BoolArray
 
 AMBIGUOUS = 0.05  # posterior share from which an alternative is reported
 FEW = 0.1  # share of the epochs; a larger one casts doubt
-LONGEST_STEP = 0.1  # s; of a truth that is interpolated
 
 
 def poses_of(result: CoilFixes, time: Array, site: Site, *, signed: bool) -> Fixes:
@@ -92,7 +92,7 @@ def nearest_truth(truth: Trajectory, poses: Trajectory, site: Site, *, signed: b
 
     An error against them is one of position and direction: of five degrees of freedom.
     """
-    true, there = interpolate(truth, poses.time, LONGEST_STEP)
+    true, there, _ = truth_poses(truth, poses.time)
     if not len(true):
         return truth
     sensor, chosen = site.platform.magnetometer, poses.world_from_body[there]
@@ -113,7 +113,7 @@ def nearest_reported(fixes: Fixes, truth: Trajectory, site: Site) -> tuple[Traje
     fixes : Fixes
         As `JudgedPoses.alone`.
     """
-    true, there = interpolate(truth, fixes.time, LONGEST_STEP)
+    true, there, _ = truth_poses(truth, fixes.time)
     rows = np.arange(len(fixes))
     chosen = np.zeros(len(fixes), dtype=np.int64)
     lever = coil_lever(site.platform.magnetometer)

@@ -1,13 +1,13 @@
 """Columns of a log's streams, and how a user maps them: ``imu.gyro_x=-GyrY[deg/s]``."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 
 from magfusion.errors import InputError
 from magfusion.files.foreign.source import SourceColumn
-from magfusion.files.foreign.units import Dimension, SourceUnit, accepted, parse_unit
+from magfusion.files.foreign.units import Dimension, SourceUnit, accepted, parse_unit, si_unit
 
 TIME = "time"
 _AXES = "xyz"
@@ -223,6 +223,19 @@ def place_of(name: str, columns: Sequence[SourceColumn]) -> int | None:
     if number and int(number[1]) < len(columns):
         return int(number[1])
     return None
+
+
+def terms_by_place(
+    names: Mapping[str, Dimension], columns: Sequence[SourceColumn], time_unit: str
+) -> dict[str, tuple[Term, ...]]:
+    """Return columns that a format knows by their places, in the header's units or else in SI."""
+    terms: dict[str, tuple[Term, ...]] = {}
+    for place, ((name, dimension), column) in enumerate(zip(names.items(), columns, strict=False)):
+        tag = column.name.partition("[")[2].rstrip("] ")
+        unit = parse_unit(tag, dimension) if tag else None
+        usual = time_unit if dimension is Dimension.TIME else si_unit(dimension)
+        terms[name] = (Term(place, unit or SourceUnit(usual, dimension)),)
+    return terms
 
 
 def _loose(name: str) -> str:

@@ -1,6 +1,6 @@
 """A mapped table becomes a table of a log, part by part, and everything left out is counted."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -87,16 +87,11 @@ def write_stream(
     mapped = [name for name in plan.terms if name != TIME]
     names = list(dict.fromkeys(one for name in mapped for one in _written(name)))
     schema = pa.schema([(TIME_NS, pa.int64()), *((name, pa.float64()) for name in names)])
-    places = sorted({term.place for terms in plan.terms.values() for term in terms})
-    texts = {term.place for term in plan.terms.get(TIME, ())}
     options = {"compression": "zstd", "write_page_checksum": True}
     with pa.parquet.ParquetWriter(path, schema, **options) as writer:
-        for part in plan.source.read(places, texts):
+        for part, stamps, values in converted_rows(plan, names):
             for reason, count in part.left_out.items():
                 counts.leave_out(reason, count)
-            raw = dict(zip(places, part.columns, strict=True))
-            stamps = _stamps(plan, raw, part)
-            values = _values(plan, raw, names)
             rows = part.rows
             if shared:
                 own = ~np.isnan(values).all(axis=1)
@@ -115,6 +110,17 @@ def write_stream(
         _order(path, counts, plan.stream)
     _check(plan, counts)
     return counts
+
+
+def converted_rows(
+    plan: ImportPlan, names: Sequence[str]
+) -> Iterator[tuple[RowBlock, IntArray, Array]]:
+    """Yield a table in parts: as read, its stamps (ns, `NO_STAMP` if absent), values (n, names)."""
+    places = sorted({term.place for terms in plan.terms.values() for term in terms})
+    texts = {term.place for term in plan.terms.get(TIME, ())}
+    for part in plan.source.read(places, texts):
+        raw = dict(zip(places, part.columns, strict=True))
+        yield part, _stamps(plan, raw, part), _values(plan, raw, names)
 
 
 def _stamps(plan: ImportPlan, raw: dict[int, Raw], part: RowBlock) -> IntArray:
@@ -144,7 +150,7 @@ def _written(name: str) -> tuple[str, ...]:
     return QUATERNION if name in EULER else (name,)
 
 
-def _values(plan: ImportPlan, raw: dict[int, Raw], names: list[str]) -> Array:
+def _values(plan: ImportPlan, raw: dict[int, Raw], names: Sequence[str]) -> Array:
     result = {
         name: _si(raw[terms[0].place], terms[0])
         for name, terms in plan.terms.items()
@@ -258,7 +264,7 @@ def _order(path: Path, counts: Counts, stream: str) -> None:
         counts.first = int(separate[0])
         table = table.set_column(0, TIME_NS, pa.array(separate))
     else:
-        twice, absent = LostRows.of(stamps, values)
+        twice, absent, _ = LostRows.of(stamps, values)
         counts.leave_out("with the stamp of another", int(np.sum(twice)))
         counts.written -= int(np.sum(twice))
         counts.missing -= int(np.sum(twice & absent))

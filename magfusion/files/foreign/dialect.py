@@ -163,7 +163,7 @@ def _way_of_writing(
         shown = next((line for line in lines if line), "")[:60]
         raise InputError(
             f"{path}: holds no table of numbers (first line: {shown!r}); write a row of names and"
-            " rows of numbers, or name the --delimiter."
+            " rows of numbers, or import it with --delimiter."
         )
     return result
 

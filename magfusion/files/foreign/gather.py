@@ -1,37 +1,26 @@
 """From files to the plans of a log's streams, with all problems reported together."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from magfusion.errors import InputError
 from magfusion.files.bag_reader import is_ros1
 from magfusion.files.bag_topics import is_bag
-from magfusion.files.euroc import find_magnetometer, is_euroc
 from magfusion.files.foreign.arrays import ARRAYS, array_source
 from magfusion.files.foreign.bag_table import plan_bag
-from magfusion.files.foreign.columns import EULER, STREAMS, TIME, Term, Undecided, place_of
+from magfusion.files.foreign.columns import STREAMS, Undecided, place_of, terms_by_place
+from magfusion.files.foreign.euroc import euroc_tables, euroc_terms, is_euroc
 from magfusion.files.foreign.guess import streams_of
 from magfusion.files.foreign.map_file import ImportRequest
-from magfusion.files.foreign.plan import Findings, ImportPlan, Terms, plan_stream
+from magfusion.files.foreign.plan import Findings, ImportPlan, plan_stream
 from magfusion.files.foreign.rows import rows_where
 from magfusion.files.foreign.source import Source
 from magfusion.files.foreign.text import text_source
-from magfusion.files.foreign.units import Dimension, SourceUnit, parse_unit
 from magfusion.files.log import is_log
-from magfusion.files.table import find_table
 
 TEXTS = (".csv", ".tsv", ".txt", ".tum", ".dat", ".asc")
-_TUM = ("position_x", "position_y", "position_z", "qx", "qy", "qz", "qw")
-_SI = {
-    Dimension.TIME: "ns",
-    Dimension.RATE: "rad/s",
-    Dimension.FORCE: "m/s^2",
-    Dimension.FIELD: "T",
-    Dimension.LENGTH: "m",
-    Dimension.SPEED: "m/s",
-    Dimension.NUMBER: "1",
-}
+_TUM = ("time", "position_x", "position_y", "position_z", "qx", "qy", "qz", "qw")
 
 
 @dataclass(eq=False)
@@ -264,47 +253,20 @@ def _table(
         source = rows_where(source, place, value)
     usual = None
     if path.suffix.lower() == ".tum" and stream == "truth":
-        usual = _by_place(stream, (TIME, *_TUM), source, {Dimension.TIME: "s"})
+        columns = {name: STREAMS[stream][name] for name in _TUM}
+        usual = terms_by_place(columns, source.columns, "s")
     entries, rate = wanted.entries.get(stream, ()), wanted.rates.get(stream)
     return plan_stream(stream, source, entries, rate, declared, usual)
-
-
-def _by_place(
-    stream: str, names: Sequence[str], source: Source, units: dict[Dimension, str] | None = None
-) -> Terms:
-    """Return columns that a format knows by their places, in its units or those of the header."""
-    terms: Terms = {}
-    for place, (name, column) in enumerate(zip(names, source.columns, strict=False)):
-        dimension = STREAMS[stream][name]
-        tag = column.name.partition("[")[2].rstrip("] ")
-        unit = parse_unit(tag, dimension) if tag else None
-        usual = SourceUnit((_SI | (units or {}))[dimension], dimension)
-        terms[name] = (Term(place, unit or usual),)
-    return terms
-
-
-def _euroc_tables(path: Path) -> Iterator[tuple[str, Path]]:
-    inertial = path / "mav0" / "imu0" / "data.csv"
-    if inertial.is_file():
-        yield "imu", inertial
-    if (field := find_magnetometer(path)) is not None:
-        yield "magnetometer", field
-    truth = find_table(path / "mav0" / "state_groundtruth_estimate0", "data")
-    if truth is not None:
-        yield "truth", truth
 
 
 def _add_euroc(path: Path, wanted: ImportRequest, result: GatheredStreams) -> set[str]:
     streams: set[str] = set()
     result.stamped = True
-    for stream, table in _euroc_tables(path):
+    for stream, table in euroc_tables(path).items():
         streams.add(stream)
         if stream in wanted.files or (source := _opened(table, wanted, result)) is None:
             continue
-        names = [name for name in STREAMS[stream] if name not in EULER]
-        usual = _by_place(stream, names, source)
-        if len(usual) < len(names):
-            usual = {name: terms for name, terms in usual.items() if "velocity" not in name}
+        usual = euroc_terms(stream, source)
         entries, rate = wanted.entries.get(stream, ()), wanted.rates.get(stream)
         result.add(plan_stream(stream, source, entries, rate, result.findings, usual))
     if "magnetometer" not in streams | set(wanted.files):

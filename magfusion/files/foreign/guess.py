@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.files.foreign.columns import EULER, STREAMS, TIME, Term
+from magfusion.files.foreign.columns import EULER, QUATERNION, STREAMS, TIME, Term
 from magfusion.files.foreign.source import SourceColumn
 from magfusion.files.foreign.units import (
     ISO,
@@ -15,6 +15,7 @@ from magfusion.files.foreign.units import (
     Raw,
     SourceUnit,
     parse_unit,
+    stamp_numbers,
 )
 from magfusion.units import STANDARD_GRAVITY, Array
 
@@ -55,6 +56,7 @@ _SHORT_TIMES = ("t", "ts", "utc", "sec", "seconds", "date", "zeit", "temps", "ti
 # Of messages of ROS written as text, whose stamps are in two columns.
 _WHOLE = re.compile(r"stamp\W*(secs?|seconds)$", re.I)
 _REST = re.compile(r"stamp\W*(nsecs?|nanosecs?|nanoseconds)$", re.I)
+_NUMBERED = re.compile(r"(?P<stem>.*?)[\[(:_.]*(?P<place>[0-4])[\])]*")
 _NOT_MEASURED = re.compile(r"bias|cov|std|sigma|var(?!io)|temp|offset|status|uncal|error")
 _OF_STREAM = {
     "imu": re.compile(r"imu|gyr|acc|inertial"),
@@ -79,7 +81,9 @@ _TYPICAL = {Dimension.FORCE: STANDARD_GRAVITY, Dimension.FIELD: 5e-5}  # SI
 FAST = 8.0  # rad/s; a body that turns so fast on the mean is more likely measured in degrees
 FAR = 500.0  # m
 LEAST_RISING = 0.99  # of the steps of a clock
+LEAST_COUNTED = 0.9  # of the steps of an index
 _RATES_HZ = (5.0, 30_000.0)
+_DATES_S = (9.5e8, 4.1e9)  # s since 1970: from 2000 to 2100
 
 
 @dataclass(frozen=True)
@@ -106,6 +110,19 @@ def named_columns(columns: Sequence[SourceColumn], stream: str) -> dict[str, lis
     return {target: _nearest(named, columns, stream) for target, named in result.items()}
 
 
+def numbered_quaternion(columns: Sequence[SourceColumn]) -> tuple[str, ...]:
+    """Return the four columns of a quaternion that numbers name: their order is not known."""
+    known = {}
+    for column in columns:
+        numbered = _NUMBERED.fullmatch(column.name.strip())
+        stem = re.sub(r"[^a-z]", "", numbered["stem"].casefold()) if numbered else ""
+        if numbered and stem.endswith((*_STEMS["q"], *_SHORT["q"])):
+            known[int(numbered["place"])] = column.name
+    first = min(known, default=0)
+    places = range(first, first + 4)
+    return tuple(known[k] for k in places) if set(places) <= set(known) else ()
+
+
 def two_column_stamp(columns: Sequence[SourceColumn]) -> tuple[Term, ...]:
     """Return seconds and nanoseconds of stamps that are in two columns, if there are such."""
     whole = [k for k, column in enumerate(columns) if _WHOLE.search(column.name)]
@@ -117,7 +134,7 @@ def two_column_stamp(columns: Sequence[SourceColumn]) -> tuple[Term, ...]:
 
 
 def _named(place: int, column: SourceColumn, stream: str) -> Named | None:
-    if _NOT_MEASURED.search(column.name.casefold()):
+    if _NOT_MEASURED.search(column.name.casefold()) or _of_unknown_order(column, stream):
         return None
     for name, text in _readings(column):
         target = _target(name, stream)
@@ -130,6 +147,11 @@ def _named(place: int, column: SourceColumn, stream: str) -> Named | None:
     bare = _readings(column)[0][0]
     target = _target(bare, stream)
     return None if target is None else Named(place, target, None)
+
+
+def _of_unknown_order(column: SourceColumn, stream: str) -> bool:
+    numbered = _NUMBERED.fullmatch(column.name.strip()) is not None
+    return numbered and any(_target(name, stream) in QUATERNION for name, _ in _readings(column))
 
 
 def _readings(column: SourceColumn) -> list[tuple[str, str]]:
@@ -241,24 +263,28 @@ def likely_unit(dimension: Dimension, values: Array) -> SourceUnit:
     return SourceUnit(next(iter(UNITS[dimension])), dimension)
 
 
-def likely_time_unit(raw: Raw) -> SourceUnit:
-    """Return the unit in which stamps would have a plausible rate."""
-    try:
-        values = np.asarray(
-            raw.to_numpy(zero_copy_only=False) if hasattr(raw, "null_count") else raw
-        )
-        steps = np.diff(values.astype(np.float64))
-    except (ValueError, TypeError):
+def likely_time_unit(raw: Raw, usual: str = "s") -> SourceUnit:
+    """Return the unit in which stamps would have a plausible rate, or else be a date of today.
+
+    Parameters
+    ----------
+    usual : str
+        The unit that is preferred among several plausible ones.
+    """
+    values = stamp_numbers(raw)
+    if not len(values):
         return SourceUnit(ISO, Dimension.TIME)
+    steps = np.diff(values)
     steps = steps[steps > 0]
     step = float(np.median(steps)) if len(steps) else 0.0
-    for name in ("s", "ms", "us", "ns"):
-        if (
-            step > 0.0
-            and _RATES_HZ[0] <= 1.0 / (step * UNITS[Dimension.TIME][name]) <= _RATES_HZ[1]
-        ):
-            return SourceUnit(name, Dimension.TIME)
-    return SourceUnit("s", Dimension.TIME)
+    largest = float(np.max(np.abs(values), initial=0.0))
+
+    def doubts(name: str) -> tuple[bool, bool, bool]:
+        size = UNITS[Dimension.TIME][name]
+        sampled = step > 0.0 and _RATES_HZ[0] <= 1.0 / (step * size) <= _RATES_HZ[1]
+        return not sampled, not _DATES_S[0] <= largest * size <= _DATES_S[1], name != usual
+
+    return SourceUnit(min(("s", "ms", "us", "ns"), key=doubts), Dimension.TIME)
 
 
 def by_place(
@@ -275,7 +301,11 @@ def by_place(
     """
     result = _first_clock(samples, dates)
     clocks = [place for place, _ in result.values()]
-    open_terms = [k for k in range(len(columns)) if k not in clocks and len(samples[k])]
+    open_terms = [
+        k
+        for k in range(len(columns))
+        if k not in clocks and len(samples[k]) and not _is_index(samples[k])
+    ]
     dimensions = {stem: STREAMS[stream][f"{stem}_x"] for stem in _VECTORS.get(stream, ())}
     for stem in list(dimensions):
         triple = _by_unit(columns, open_terms, dimensions[stem])
@@ -295,7 +325,7 @@ def _first_clock(
     for place, (values, dated) in enumerate(zip(samples, dates, strict=True)):
         if dated:
             return {TIME: (place, SourceUnit(ISO, Dimension.TIME))}
-        if len(values) > 1 and _is_clock(values):
+        if len(values) > 1 and _is_clock(values) and not _is_index(values):
             return {TIME: (place, likely_time_unit(values))}
     return {}
 
@@ -343,6 +373,11 @@ def _unit_in(column: SourceColumn, dimension: Dimension) -> SourceUnit | None:
 def _is_clock(values: Array) -> bool:
     steps = np.diff(values)
     return bool(np.mean(steps > 0.0) > LEAST_RISING and np.all(np.isfinite(values)))
+
+
+def _is_index(values: Array) -> bool:
+    """Return whether values count rows: integers that rise by one, but where rows are lost."""
+    return len(values) > 1 and float(np.mean(np.diff(values) == 1.0)) > LEAST_COUNTED
 
 
 def _sizes(columns: Sequence[Array]) -> Array:

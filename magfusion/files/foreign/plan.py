@@ -28,6 +28,7 @@ from magfusion.files.foreign.guess import (
     likely_time_unit,
     likely_unit,
     named_columns,
+    numbered_quaternion,
     two_column_stamp,
 )
 from magfusion.files.foreign.source import Source
@@ -189,6 +190,7 @@ class _Planning:
         self.stream, self.source, self.declared, self.rate = stream, source, declared, rate
         self.terms: Terms = {}
         self.open: dict[str, tuple[int, float, str]] = {}
+        self.several: dict[str, Named] = {}
         self.absent: list[str] = []
         self.guessed: list[str] = []
         self.failed = False
@@ -227,7 +229,7 @@ class _Planning:
             return
         (one,) = named
         unit = one.unit
-        if unit is None and target == TIME and is_date(_sample(self.source, one.place, True)):
+        if unit is None and target == TIME and is_date(first_values(self.source, one.place, True)):
             unit = SourceUnit(ISO, Dimension.TIME)
         if unit is not None:
             self.terms[target] = (Term(one.place, unit),)
@@ -238,6 +240,7 @@ class _Planning:
     def plan(self, velocity: bool) -> ImportPlan | None:
         self._report_absent()
         self._report_open()
+        self._propose_first()
         parts = [name for name in OPTIONAL if name in self.terms]
         if len(parts) not in (0, len(OPTIONAL)):
             if velocity:
@@ -259,18 +262,30 @@ class _Planning:
         what = f"no column is found for {', '.join(f'{self.stream}.{t}' for t in self.absent)}"
         remedy = f"name it by --map '{self.stream}.{self.absent[0]}=NAME[unit]'"
         self._propose_by_place()
-        if self.absent == [TIME]:
+        numbered = numbered_quaternion(self.source.columns)
+        if numbered and set(self.absent) & set(QUATERNION):
+            four = ",".join(numbered)
+            remedy = (
+                f"give the order of the quaternion by --map '{self.stream}.quaternion={four}[wxyz]'"
+                " or [xyzw]"
+            )
+        if TIME in self.absent:
             remedy += f", or give --rate-hz {self.stream}=HZ"
         self.problem(f"{what} (found {names}); {remedy}")
 
     def _report_several(self, target: str, named: Sequence[Named]) -> None:
-        """Report that several columns match one, and propose the first."""
+        """Report that several columns match one."""
         names = " and ".join(self.source.columns[n.place].name for n in named)
         self.problem(f"columns {names} may both be {self.stream}.{target}; name one")
-        first = named[0]
-        term = self._likely(target, first.place, 1.0)
-        term = term if first.unit is None else Term(first.place, first.unit)
-        self.declared.proposals += as_options(self.stream, self.source, {target: (term,)})
+        self.several[target] = named[0]
+
+    def _propose_first(self) -> None:
+        """Propose the first of several columns, with one unit for the axes of a sensor."""
+        terms: Terms = {}
+        for target, first in self.several.items():
+            known = None if first.unit is None else Term(first.place, first.unit)
+            terms[target] = (known or self._likely(target, first.place, 1.0),)
+        self.declared.proposals += as_options(self.stream, self.source, terms)
 
     def _propose_by_place(self) -> None:
         """Propose what columns that nothing is known of may be, by their sizes."""
@@ -279,7 +294,7 @@ class _Planning:
         open_terms = [k for k in range(len(self.source.columns)) if k not in used]
         columns = [self.source.columns[k] for k in open_terms]
         samples = [_numbers(self.source, k) for k in open_terms]
-        dates = [is_date(_sample(self.source, k, True)) for k in open_terms]
+        dates = [is_date(first_values(self.source, k, True)) for k in open_terms]
         terms: Terms = {
             target: (Term(open_terms[place], unit),)
             for target, (place, unit) in by_place(self.stream, columns, samples, dates).items()
@@ -306,9 +321,15 @@ class _Planning:
     def _likely(self, target: str, place: int, sign: float) -> Term:
         dimension = dimension_of(self.stream, target)
         stem = target.rpartition("_")[0]
-        places = [p for t, (p, _, _) in self.open.items() if t.rpartition("_")[0] == stem]
-        if dimension is Dimension.TIME:
-            unit = likely_time_unit(_sample(self.source, place, True))
+        targets = [t for t in STREAMS[self.stream] if t.rpartition("_")[0] == stem]
+        places = [self.open[t][0] for t in targets if t in self.open]
+        places += [self.several[t].place for t in targets if t in self.several]
+        declared = [term.unit for t in targets for term in self.terms.get(t, ())]
+        declared += [n.unit for t, n in self.several.items() if t in targets and n.unit]
+        if stem and declared:
+            unit = declared[0]
+        elif dimension is Dimension.TIME:
+            unit = likely_time_unit(first_values(self.source, place, True))
         else:
             unit = likely_unit(dimension, _size(self.source, places or [place]))
         return Term(place, unit, sign)
@@ -326,7 +347,7 @@ class _Planning:
             self.problem(f"columns of {self.stream} are not of one length: {rows}; map others")
 
 
-def _sample(source: Source, place: int, as_written: bool) -> Raw:
+def first_values(source: Source, place: int, as_written: bool) -> Raw:
     """Return the first values of a column; none where they cannot be read."""
     try:
         part = next(source.read([place], {place} if as_written else ()), None)
@@ -338,7 +359,7 @@ def _sample(source: Source, place: int, as_written: bool) -> Raw:
 def _numbers(source: Source, place: int) -> Array:
     """Return the first values of a column, none where they are no numbers."""
     try:
-        return np.asarray(_sample(source, place, False), dtype=np.float64)
+        return np.asarray(first_values(source, place, False), dtype=np.float64)
     except (TypeError, ValueError):
         return np.zeros(0)
 

@@ -94,6 +94,7 @@ _SPELLINGS = {
     Dimension.NUMBER: {"": "1", "-": "1"},
 }
 _ISO = r"^\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.]\d{1,9})?)?(Z|[-+]\d\d:?\d\d)?$"
+_NUMBER = r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"
 # Dates with the day or slashes first are turned to ISO; a time of day is one of the first day.
 _WRITTEN = (
     (r"^(\d\d)\.(\d\d)\.(\d{4})", r"\3-\2-\1"),
@@ -152,6 +153,11 @@ def parse_unit(text: str, dimension: Dimension) -> SourceUnit | None:
     return None if result is None else SourceUnit(result, dimension, factor)
 
 
+def si_unit(dimension: Dimension) -> str:
+    """Return the SI unit of a dimension."""
+    return next(name for name, size in UNITS[dimension].items() if size == 1.0)
+
+
 def accepted(dimension: Dimension) -> str:
     """Return the units of a dimension in words."""
     names = [*UNITS[dimension], *([ISO] if dimension is Dimension.TIME else [])]
@@ -190,6 +196,24 @@ _NANOSECONDS = {
 }
 
 
+def resolution_ns(raw: Raw, unit: SourceUnit) -> float:
+    """Return to what stamps are written (ns): the last decimal, or the spacing of their doubles."""
+    if unit.name == ISO:
+        return 1.0
+    size = unit.si / NANOSECOND
+    if isinstance(raw, pa.Array | pa.ChunkedArray):
+        text = pc.utf8_trim_whitespace(raw.drop_null().cast(pa.string()))
+        decimals = pc.extract_regex(text, r"^[-+]?\d*(?P<rest>[.,]?\d*)$")
+        if not decimals.null_count:
+            length = pc.max(pc.utf8_length(pc.struct_field(decimals, "rest"))).as_py() or 0
+            return float(size * 10.0 ** -max(length - 1, 0))
+        raw = pc.cast(text, pa.float64()).to_numpy(zero_copy_only=False)
+    values: AnyArray = np.asarray(raw)
+    if values.dtype.kind in "iu":
+        return size
+    return float(size * np.spacing(np.nanmax(np.abs(values), initial=0.0)))
+
+
 def _scaled_integers(values: IntArray, scale: Fraction) -> IntArray:
     maximum = float(np.max(np.abs(values.astype(np.float64)), initial=0.0))
     if maximum * scale.numerator < 2.0**62:
@@ -221,7 +245,7 @@ def _decimals(raw: pa.Array, scale: Fraction) -> IntArray:
     try:
         values = pc.cast(text, pa.float64())
     except pa.ArrowInvalid:
-        good = pc.match_substring_regex(text, r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
+        good = pc.match_substring_regex(text, _NUMBER)
         bad = pc.filter(text, pc.invert(pc.fill_null(good, True)))
         raise ValueError(bad[0].as_py() if len(bad) else "what is no number") from None
     numbers = values.to_numpy(zero_copy_only=False)
@@ -278,6 +302,18 @@ MISSING = ("", "nan", "NaN", "NAN", "na", "NA", "N/A", "n/a", "null", "NULL", "N
 
 def _missing(text: pa.Array) -> pa.Array:
     return pc.is_in(text, value_set=pa.array(MISSING))
+
+
+def stamp_numbers(raw: Raw) -> Array:
+    """Return the stamps that are finite numbers, in their own unit; none of dates."""
+    if is_date(raw):
+        return np.zeros(0)
+    if isinstance(raw, pa.Array | pa.ChunkedArray):
+        text = pc.utf8_trim_whitespace(pc.cast(raw, pa.string()))
+        text = pc.replace_substring(text.drop_null(), ",", ".")
+        raw = pc.cast(text.filter(pc.match_substring_regex(text, _NUMBER)), pa.float64())
+    values = np.asarray(raw, dtype=np.float64)
+    return values[np.isfinite(values)]
 
 
 def seconds_apart(stamps: IntArray) -> float:

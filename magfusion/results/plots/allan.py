@@ -39,7 +39,9 @@ def write_allan_plot(path: Path, instruments: Sequence[Plotted]) -> None:
             if fit is not None:
                 tau = np.geomspace(fit.first_tau, result.tau[-1], 200)
                 panel.plot(tau, fit.deviation(tau), lw=1.0, color=colour)
-        panel.set(xscale="log", yscale="log", title=name, xlabel="cluster time (s)")
+        panel.set(title=name, xlabel="cluster time (s)")
+        if np.any(result.variance > 0.0):
+            panel.set(xscale="log", yscale="log")
         panel.set_ylabel(f"Allan deviation ({unit})")
         panel.minorticks_off()
         panel.grid(visible=True, lw=0.3, alpha=0.6)

@@ -1,0 +1,151 @@
+"""Check of a truth with the rotation of the gyroscope and the direction of gravity.
+
+A truth is no part of an estimate: what is wrong with it is a remark that explains the errors.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.model.samples import Log
+from magfusion.model.strapdown import attitude_from_gyro_at
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Finding, Verdict
+from magfusion.units import DEGREE, Array, IntArray
+
+SPAN = 0.5  # s; between two attitudes that are compared
+MIN_SPANS = 10
+MAX_GAP = 2.0  # s; between them, over which the bias of a gyroscope makes no rotation
+MAX_IMU_STEP = 0.1  # s; of inertial samples, in a gap of which nothing is compared
+LEAST_TURN = 0.03  # rad in a span; a body that turns less shows nothing
+FROZEN = 0.05  # of the gyroscope's rotation; a truth that turns less has stopped
+FROZEN_SHARE = 0.1  # of the spans with a rotation
+TOLERANCE, TOLERANCE_SHARE = 0.02, 0.25  # rad, and of the rotation; gyroscopes do better
+MAX_TILT = 5.0 * DEGREE  # of the mean specific force; accelerometers and motion do better
+DOWN = 150.0 * DEGREE
+DOWN_AXES = np.diag([1.0, -1.0, -1.0])
+CONVENTION = 15.0 * DEGREE  # from the axes of a convention
+# The components w, x, y, z that are meant, by their places among those that were read.
+ORDERS = {
+    "w, x, y, z read as x, y, z, w": (1, 2, 3, 0),
+    "x, y, z, w read as w, x, y, z": (3, 0, 1, 2),
+}
+
+
+def truth_findings(log: Log) -> Iterator[Finding]:
+    """Yield the remarks on a log's truth that contradicts its inertial samples."""
+    truth = log.truth
+    if truth is None or not log.inertial or len(log.imu) < MIN_SPANS:
+        return
+    after = np.searchsorted(log.imu.time, truth.time).clip(1, len(log.imu) - 1)
+    before, later = log.imu.time[after - 1], log.imu.time[after]
+    inside = (truth.time >= before) & (truth.time <= later) & (later - before < MAX_IMU_STEP)
+    poses = _rows(truth, np.flatnonzero(inside))
+    rows = _spans(poses.time)
+    turn = attitude_from_gyro_at(log.imu.time, log.imu.gyro_body, poses.time)
+    if len(rows) >= MIN_SPANS:
+        gyro = (turn[rows[:, 0]].inv() * turn[rows[:, 1]]).as_rotvec()
+        text = _rotation_text(poses.rotation, rows, gyro)
+        if text:
+            yield _finding(text)
+            return
+    text = _gravity_text(log, poses)
+    if text:
+        yield _finding(text)
+
+
+def _finding(text: str) -> Finding:
+    return Finding(
+        "truth_inconsistent",
+        f"truth: {text} Errors against it are not those of the estimate.",
+        Verdict.TRUSTWORTHY,
+        50.0,
+    )
+
+
+def _rows(truth: Trajectory, rows: IntArray) -> Trajectory:
+    return Trajectory(truth.time[rows], truth.world_from_body[rows], truth.position_world[rows])
+
+
+def _spans(time: Array) -> IntArray:
+    """Return pairs of samples about `SPAN` apart, shape (m, 2)."""
+    after = np.searchsorted(time, time + SPAN)
+    first = np.flatnonzero(after < len(time))
+    pairs = np.stack([first, after[first]], axis=1)
+    return pairs[time[pairs[:, 1]] - time[pairs[:, 0]] < MAX_GAP]
+
+
+def _rotation_text(attitude: Rotation, rows: IntArray, gyro: Array) -> str:
+    """Return how rotations of the truth differ from those of the gyroscope (m, 3) (rad)."""
+    size = np.linalg.norm(gyro, axis=1)
+    active = (size > LEAST_TURN) & (size < 0.5 * np.pi)
+    if np.sum(active) < MIN_SPANS:
+        return ""
+    rows, gyro, size = rows[active], gyro[active], size[active]
+    change = _changes(attitude, rows)
+    still = np.linalg.norm(change, axis=1) < FROZEN * size
+    if np.mean(still) > FROZEN_SHARE:
+        return (
+            f"its attitude is frozen in {100.0 * np.mean(still):.0f} % of the time in which the"
+            " gyroscope turns. Use another part of it, or repair its recording."
+        )
+    rows, gyro, change = rows[~still], gyro[~still], change[~still]
+    if _agrees(change, gyro):
+        return ""
+    return _cause(attitude, rows, gyro, change) or (
+        "its rotation is not that of the gyroscope. Check the order of its quaternion, its"
+        " clock, and whether it is world_from_body."
+    )
+
+
+def _cause(attitude: Rotation, rows: IntArray, gyro: Array, change: Array) -> str:
+    """Return the convention that makes rotations of the truth those of the gyroscope."""
+    for name, places in ORDERS.items():
+        meant = Rotation.from_quat(
+            attitude.as_quat(scalar_first=True)[:, places], scalar_first=True
+        )
+        if _agrees(_changes(meant, rows), gyro):
+            return f"its quaternion is in another order: {name}. Give the order, e.g. by --map."
+    if _agrees(_changes(attitude.inv(), rows), gyro):
+        return "its attitudes are body_from_world. Invert them."
+    columns, _, rows_t = np.linalg.svd(change.T @ gyro)
+    body = columns @ np.diag([1.0, 1.0, np.linalg.det(columns @ rows_t)]) @ rows_t
+    if not _agrees(change @ body, gyro):
+        return ""
+    angle = float(Rotation.from_matrix(body).magnitude()) / DEGREE
+    from_down = Rotation.from_matrix(body @ DOWN_AXES).magnitude()
+    if from_down < CONVENTION:
+        return "its body axes are forward, right, down (as with NED). Turn them to z up."
+    return (
+        f"its body axes are turned against the IMU's by {angle:.0f} deg. Turn its attitudes"
+        " into the axes of the IMU."
+    )
+
+
+def _changes(attitude: Rotation, rows: IntArray) -> Array:
+    """Return rotation vectors over spans in body axes, shape (m, 3) (rad)."""
+    return np.asarray((attitude[rows[:, 0]].inv() * attitude[rows[:, 1]]).as_rotvec())
+
+
+def _agrees(change: Array, gyro: Array) -> bool:
+    limit = np.maximum(TOLERANCE, TOLERANCE_SHARE * np.linalg.norm(gyro, axis=1))
+    return float(np.mean(np.linalg.norm(change - gyro, axis=1) < limit)) > 0.5
+
+
+def _gravity_text(log: Log, truth: Trajectory) -> str:
+    """Return how the mean specific force in the truth's world differs from the vertical."""
+    if len(truth) < MIN_SPANS or truth.time[-1] - truth.time[0] < MIN_SPANS * SPAN:
+        return ""
+    imu = log.imu
+    force = [np.interp(truth.time, imu.time, axis) for axis in imu.accel_body.T]
+    mean = np.mean(truth.rotation.apply(np.stack(force, axis=1)), axis=0)
+    tilt = float(np.arccos(np.clip(mean[2] / np.linalg.norm(mean), -1.0, 1.0)))
+    if tilt > DOWN:
+        return "the z axis of its world points down (as in NED). Turn it to z up."
+    if tilt > MAX_TILT:
+        return (
+            f"the vertical of its world is turned by {tilt / DEGREE:.0f} deg from gravity. Turn"
+            " its poses into the world of the site, z up."
+        )
+    return ""

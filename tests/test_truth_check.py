@@ -1,0 +1,112 @@
+"""A truth that is wrong is told from gyroscope and gravity, with the cause; a right one is not."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import run_command
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.data_checks.truth import truth_findings
+from magfusion.files.log import write_log
+from magfusion.model.samples import ImuSamples, Log
+from magfusion.model.trajectory import Trajectory
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.log import SimulationConfig, simulate_log
+
+Change = Callable[[Rotation], Rotation]
+NED_FROM_ENU = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+FRD_FROM_FLU = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+TURN = Rotation.from_euler("xyz", [20.0, 30.0, 40.0], degrees=True)
+
+
+@pytest.fixture(scope="module", params=["walk", "turn"])
+def recorded(request: pytest.FixtureRequest) -> Log:
+    config = SimulationConfig(DEMO_BOX_WORLD, duration=20.0, motion=request.param)
+    return simulate_log(demo_site(), config, np.random.default_rng(3)).log
+
+
+def _with_attitude(log: Log, change: Change) -> Log:
+    truth = log.truth
+    assert truth is not None
+    attitude = change(truth.rotation).as_matrix()
+    return replace(log, truth=Trajectory(truth.time, attitude, truth.position_world))
+
+
+def _misread(attitude: Rotation) -> Rotation:
+    return Rotation.from_quat(attitude.as_quat(scalar_first=True), scalar_first=False)
+
+
+def _misread_otherwise(attitude: Rotation) -> Rotation:
+    return Rotation.from_quat(attitude.as_quat(scalar_first=False), scalar_first=True)
+
+
+def _frozen(attitude: Rotation) -> Rotation:
+    return Rotation.concatenate([attitude[0]] * len(attitude))
+
+
+def _partly_frozen(attitude: Rotation) -> Rotation:
+    half = len(attitude) // 2
+    return Rotation.concatenate([attitude[:half], *[attitude[half]] * (len(attitude) - half)])
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (_misread, "w, x, y, z read as x, y, z, w"),
+        (_misread_otherwise, "x, y, z, w read as w, x, y, z"),
+        (lambda r: r.inv(), "body_from_world"),
+        (_frozen, "frozen in 100 %"),
+        (_partly_frozen, "is frozen in"),
+        (lambda r: NED_FROM_ENU * r * FRD_FROM_FLU, "forward, right, down"),
+        (lambda r: NED_FROM_ENU * r, "points down"),
+        (
+            lambda r: TURN * r,
+            r"vertical of its world is turned by 3[56] deg",
+        ),  # acos(cos 20 cos 30)
+        (lambda r: r * TURN, "body axes are turned against the IMU's by 49 deg"),
+    ],
+)
+def test_a_wrong_truth_is_reported_with_its_cause(
+    recorded: Log, change: Change, cause: str
+) -> None:
+    (finding,) = truth_findings(_with_attitude(recorded, change))
+    assert finding.code == "truth_inconsistent"
+    assert re.search(cause, finding.text)
+
+
+@pytest.mark.parametrize("every", [1, 20, 40])
+def test_a_right_truth_of_any_rate_is_not_reported(recorded: Log, every: int) -> None:
+    truth = recorded.truth
+    assert truth is not None
+    thin = Trajectory(
+        truth.time[::every], truth.world_from_body[::every], truth.position_world[::every]
+    )
+    assert not list(truth_findings(replace(recorded, truth=thin)))
+
+
+def test_a_gap_of_the_imu_is_no_contradiction(recorded: Log) -> None:
+    kept = (recorded.imu.time < 5.0) | (recorded.imu.time > 15.0)
+    imu = recorded.imu
+    cut = ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept])
+    assert not list(truth_findings(replace(recorded, imu=cut)))
+
+
+def test_a_turn_of_the_world_about_the_vertical_is_not_seen(recorded: Log) -> None:
+    heading = Rotation.from_euler("z", 50.0, degrees=True)
+    assert not list(truth_findings(_with_attitude(recorded, lambda r: heading * r)))
+
+
+def test_check_and_evaluate_report_a_wrong_truth(
+    recorded: Log, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write_log(_with_attitude(recorded, _misread), tmp_path / "log")
+    run_command("check", tmp_path / "log")
+    shown = capfd.readouterr().out
+    assert "TRUSTWORTHY" in shown  # no truth is used for the verdict
+    assert "quaternion is in another order" in shown
+    run_command("evaluate", tmp_path / "log" / "truth.parquet", tmp_path / "log")
+    assert "quaternion is in another order" in capfd.readouterr().out
