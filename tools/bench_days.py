@@ -19,7 +19,7 @@ import numpy as np
 
 from magfusion.estimation.online.navigator import NavigatorSettings
 from magfusion.files.checkpoint import run_key
-from magfusion.jobs.checkpoint import begin, save
+from magfusion.jobs.checkpoint import CheckpointWriter, begin
 from magfusion.jobs.drift_world import bare_loop, memory_mib
 from magfusion.model.trust import Risk
 from magfusion.receiver.windows import default_settings
@@ -64,6 +64,7 @@ def run(options: argparse.Namespace, place: Path) -> Kept:
     key = run_key("bench_days", options.hours, options.rate_hz, options.seed, options.estimator)
     begun = begin(place, key, world.site, settings, Kept(world.start()), resume=options.resume)
     navigator, kept = begun.navigator, begun.extra
+    writer = CheckpointWriter(place, key, sys.stderr)
     print("  hour  states  ms a state   loops      MiB  error/mm  (rms, of that hour)")
     for block in range(begun.position, config.blocks):
         built = world.stretch(block, 1, kept.biases)
@@ -100,7 +101,7 @@ def run(options: argparse.Namespace, place: Path) -> Kept:
             line = f"{(block + 1) // HOUR:6d}{kept.states:8d}{each:12.2f}{loops:8.1f}"
             print(f"{line}{memory_mib():9.0f}{rms:10.2f}", flush=True)
             kept = replace(kept, first_mib=first_mib, errors=())
-            save(navigator, block + 1, kept, place, key)
+            writer.save(navigator, block + 1, kept)
     return kept
 
 

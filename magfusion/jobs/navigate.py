@@ -13,7 +13,6 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.estimation.data_checks.spectrum import with_disturbing_lines
-from magfusion.estimation.online.corrected import corrected
 from magfusion.files.checkpoint import claim_checkpoint, run_key
 from magfusion.files.row_file import RowFile, claim_rows
 from magfusion.files.site import load_site
@@ -272,6 +271,8 @@ def _open_run(
 
 def _advance(run: NavigateRun, settings: NavigateSettings, report: Report) -> None:
     """Process the remaining pieces, and write checkpoints from time to time."""
+    from magfusion.estimation.online.corrected import corrected
+
     began = time.perf_counter() - run.elapsed
     every, reported = max(1, round(settings.every / PIECE)), -np.inf
     for k, piece in paced(run.replay.pieces(run.position), settings.realtime):

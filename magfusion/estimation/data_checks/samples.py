@@ -273,7 +273,7 @@ def _spikes(stream: InstrumentStream) -> tuple[IntArray, BoolArray]:
     row = np.arange(count)
     first = np.clip(row - 2, 0, count - 5)
     near = [first + k + (first + k >= row) for k in range(4)]
-    weight, widening = _cubic(stream.time, near)
+    weight, noise, widening = _cubic(stream.time, near)
     curve = np.zeros_like(x)
     for own, at in zip(weight, near, strict=True):
         curve += own[:, None] * x[at]
@@ -283,7 +283,7 @@ def _spikes(stream: InstrumentStream) -> tuple[IntArray, BoolArray]:
     separate = np.maximum(np.abs(after - before), outer)
     from_curve = np.abs(x - curve)
     off = np.minimum(from_curve, np.abs(x - centre))
-    scatter = widening * np.maximum(_scatter(from_curve / widening), _quantum(x))
+    scatter = widening * np.maximum(_scatter(from_curve / noise), _quantum(x))
     scatter += 1e-9 * np.abs(centre)  # rounding
     alone = off > 3.0 * separate
     size = np.max(np.where(alone, off / np.maximum(scatter, np.finfo(float).tiny), 0.0), axis=1)
@@ -291,11 +291,11 @@ def _spikes(stream: InstrumentStream) -> tuple[IntArray, BoolArray]:
     return rows, size[rows] > CERTAIN_SPIKE
 
 
-def _cubic(time: Array, near: list[IntArray]) -> tuple[list[Array], Array]:
+def _cubic(time: Array, near: list[IntArray]) -> tuple[list[Array], Array, Array]:
     """Return weights (n,) of four neighbours in a cubic, and how much its error grows.
 
-    The latter, shape (n, 1), is relative to even samples: of noise, or of a smooth signal where
-    samples are missing or at an end.
+    The latter, shape (n, 1), is relative to even samples: of noise alone, and of noise or a smooth
+    signal where samples are missing or at an end.
     """
     step = float(np.median(np.diff(time)))
     far = [(time[at] - time) / step for at in near]
@@ -303,9 +303,9 @@ def _cubic(time: Array, near: list[IntArray]) -> tuple[list[Array], Array]:
     for k, own in enumerate(far):
         others = [far[j] for j in range(4) if j != k]
         weight.append(np.prod([other / (other - own) for other in others], axis=0))
-    noise = np.sqrt(1.0 + np.sum(np.square(weight), axis=0)) / EVEN_GAIN
-    smooth = np.abs(np.prod(far, axis=0)) / 4.0
-    return weight, np.maximum(1.0, np.maximum(noise, smooth))[:, None]
+    noise = np.sqrt(1.0 + np.sum(np.square(weight), axis=0))[:, None] / EVEN_GAIN
+    smooth = np.abs(np.prod(far, axis=0))[:, None] / 4.0
+    return weight, noise, np.maximum(1.0, np.maximum(noise, smooth))
 
 
 def _quantum(x: Array) -> Array:
