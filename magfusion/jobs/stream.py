@@ -291,8 +291,12 @@ def _waiting(navigator: Navigator, time: float) -> dict[str, Any]:
     return nothing | {"reasons": _finding_rows(reasons), "ambiguous": open_}
 
 
-def _finding_rows(findings: tuple[Finding, ...]) -> list[dict[str, str]]:
-    return [{"code": finding.code, "text": finding.text} for finding in findings]
+def _finding_rows(findings: tuple[Finding, ...]) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    for finding in findings:
+        remedy = {} if finding.remedy is None else {"remedy": dict(finding.remedy)}
+        rows.append({"code": finding.code, "text": finding.text} | remedy)
+    return rows
 
 
 def state_content(navigator: Navigator, state: JudgedState) -> dict[str, Any]:

@@ -425,7 +425,8 @@ class Navigator:
         finding = corrected_finding(correction, self.declared, reasons)
         known = (f for f in self._corrected if f.code != finding.code)
         result._corrected = (*known, finding)
-        result._discontinuities.counter = self._discontinuities.counter + self.started
+        jumped = self._reported_until > -np.inf
+        result._discontinuities.counter = self._discontinuities.counter + jumped
         result._next_start = max(result._next_start, self._history.span - MARGIN)
         result._next_correction, result._wait = self._next_correction, self._wait
         result._site = json.dumps(site_content(correction.site))
