@@ -22,10 +22,10 @@ from example_bag import (
     write_ros1_bag,
 )
 from rosbags.rosbag2 import StoragePlugin
+from test_import_parts import imported
 
 from magfusion.errors import InputError
 from magfusion.files.open import open_log
-from magfusion.jobs.import_log import ImportSettings, run_import
 from magfusion.model.samples import Log
 from magfusion.results.figures import Figures
 
@@ -45,12 +45,6 @@ def recording(name: str) -> Path:
     if not path.exists():
         pytest.skip(f"{path} is not here")
     return path
-
-
-def imported(output: Path, *sources: Path, **options: object) -> tuple[Log, Figures]:
-    settings = ImportSettings(sources=tuple(map(str, sources)), **options)  # type: ignore[arg-type]
-    figures = run_import(settings, output)
-    return open_log(output), figures
 
 
 def assert_samples(log: Log, samples: slice = slice(None)) -> None:

@@ -103,7 +103,18 @@ def test_nan_and_null_are_missing_samples_as_in_tables(
     result, reported = answered(site, b"".join(write(one) for one in spoiled), settings)
     count = sum(np.size(lines[k]["imu"]["time"]) for k in inertial)
     assert [s for s in result if s["started"]] == [s for s in expected if s["started"]]
-    assert reported == f"magfusion: imu: {count} samples are NaN. They are left out.\n"
+    assert reported == (
+        f"magfusion: imu: {count} samples are NaN, or larger than any instrument measures. They are"
+        " left out.\n"
+    )
+
+
+def test_fields_in_nanotesla_are_refused_with_the_unit(site: Path) -> None:
+    time = (0.01 * np.arange(60)).tolist()
+    fields = [[1.2e3, 1.9e4, -4.5e4]] * 60
+    given = json_line({"magnetometer": {"time": time, "field": fields}})
+    with pytest.raises(InputError, match="magnetometer: no sample so far .* give tesla"):
+        answered(site, given)
 
 
 def test_a_stream_that_begins_with_missing_samples_waits(site: Path) -> None:
@@ -112,7 +123,7 @@ def test_a_stream_that_begins_with_missing_samples_waits(site: Path) -> None:
     present = json_line({"imu": {"time": 1.1, "gyro": [0.0, 0.0, 0.0], "accel": [0.0, 0.0, 9.8]}})
     result, reported = answered(site, missing + present)
     assert [line["time"] for line in result] == [1.1]
-    assert reported == "magfusion: imu: 1 samples are NaN. They are left out.\n"
+    assert reported.startswith("magfusion: imu: 1 samples are NaN, or larger than any instrument")
 
 
 def test_a_state_tells_all_that_is_known(walk: OnlineLog, site: Path) -> None:

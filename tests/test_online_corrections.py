@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from online_log import OnlineLog, online_log
+from test_online import BOTH, Estimator
 
 from magfusion.estimation.online.corrected import corrected
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
@@ -47,9 +48,11 @@ def log() -> OnlineLog:
     return online_log(4, SECONDS, every=0.25)
 
 
-@pytest.mark.parametrize("estimator", ["ekf", "smoother"])
-def test_a_reversed_coil_is_undone_before_the_first_state(log: OnlineLog, estimator: str) -> None:
-    settings = NavigatorSettings(estimator)  # type: ignore[arg-type]
+@pytest.mark.parametrize("estimator", BOTH)
+def test_a_reversed_coil_is_undone_before_the_first_state(
+    log: OnlineLog, estimator: Estimator
+) -> None:
+    settings = NavigatorSettings(estimator)
     navigator, states = walk(log, Navigator(reversed_coil(log.site), settings))
     (finding,) = navigator.corrected
     assert finding.code == "coil_reversed"
@@ -98,3 +101,16 @@ def test_a_corrected_navigator_goes_on_from_its_checkpoint(log: OnlineLog) -> No
     assert twin.corrected == navigator.corrected
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one.position_world, other.position_world, atol=1e-9)  # m
+
+
+def test_after_a_step_of_the_clock_the_declared_site_and_its_temperatures_remain(
+    log: OnlineLog,
+) -> None:
+    navigator, _ = walk(log, Navigator(reversed_coil(log.site), NavigatorSettings("ekf")), end=8.0)
+    navigator.add_temperature("A", 7.5, 31.0)
+    again = navigator.restarted()
+    assert again.corrected == ()
+    coils = (one.beacons[0].coils[0].moment_beacon for one in (again.site, log.site))
+    np.testing.assert_allclose(next(coils), -next(coils))
+    assert again.site.temperatures is not None
+    assert list(again.site.temperatures.each()) == [(7.5, "A", 31.0)]

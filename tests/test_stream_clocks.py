@@ -3,17 +3,21 @@
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from online_log import OnlineLog, online_log
-from test_navigate_stream import answered, records
+from test_navigate_stream import EKF, answered, records
 
 from magfusion.estimation.online.navigator import Navigator
 from magfusion.files.site import save_site
+from magfusion.files.stream import Record
 from magfusion.jobs.checkpoint import REPORT_INTERVAL, CheckpointWriter
+from magfusion.jobs.stream import StreamSettings
+from magfusion.jobs.stream_clocks import StreamClocks
 
 WRAP = 2.0**32 * 1e-6  # s; of a 32-bit counter of microseconds
 SECONDS = 22.0
@@ -114,3 +118,39 @@ def test_a_checkpoint_that_cannot_be_written_is_said_once_a_minute(
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 3
     assert all("the checkpoint cannot be written" in line for line in said)
+
+
+def test_stamps_of_companions_wrap_with_those_of_samples() -> None:
+    clocks = StreamClocks(0.0)
+    for now in np.arange(WRAP - 1.0, WRAP + 1.0, 0.1):
+        stamp = float(now % WRAP)
+        record = Record.model_validate(
+            {
+                "magnetometer": {"time": stamp, "field": [0.0, 0.0, 4e-5]},
+                "temperature": {"time": stamp, "degc": {"A": 20.0}},
+                "marks": {"start": [stamp], "end": [stamp], "slot": [0]},
+            }
+        )
+        found = clocks.unwrapped(record)
+        clocks.check(found)
+        assert found.magnetometer is not None
+        assert found.temperature is not None
+        assert found.marks is not None
+        stamps = (found.temperature.time, *found.magnetometer.time, *found.marks.end)
+        np.testing.assert_allclose(stamps, now, atol=1e-5)  # s
+
+
+def test_a_temperature_makes_no_checkpoint_and_is_no_old_data(
+    site: Path, lines: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = StreamSettings(EKF.navigator, checkpoint=tmp_path / "state", every=100.0)
+    first = [one for one in lines if newest(one) < 9.0]
+    answered(site, sent(first), settings)
+    saved: list[int] = []
+    monkeypatch.setattr(CheckpointWriter, "save", lambda *given: saved.append(given[2]))
+    reading = {"temperature": {"time": 9.0, "degc": {"A": 20.0}}}
+    rest = [one for one in lines if 9.0 <= newest(one) < 10.0]
+    given = sent([part for one in rest for part in (reading, one)])
+    _, reported = answered(site, given, replace(settings, resume=True))
+    assert reported == ""
+    assert len(saved) == 1

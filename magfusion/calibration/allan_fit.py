@@ -149,13 +149,7 @@ def _white_slope(tau: Array, variance: Array, clusters: Array) -> Fitted | None:
 def _white_with_drift(tau: Array, variance: Array, relative: Array) -> Fitted | None:
     """Return white noise where quantization, walk and ramp explain the rest; otherwise None."""
     design = np.stack([1.0 / tau, 3.0 / tau**2, tau / 3.0, 0.5 * tau**2], axis=-1)
-    model = variance
-    for _ in range(MAX_ITERATIONS):
-        weight = 1.0 / (np.sqrt(relative) * model)
-        square = _not_negative(design * weight[:, None], variance * weight)
-        before, model = model, np.maximum(design @ square, 1e-6 * variance)
-        if np.all(np.abs(model - before) < CONVERGED_STEP * model):
-            break
+    square, model = _reweighted(design, variance, relative)
     there = square > 0.0
     freedom = max(len(tau) - int(np.sum(there)), 1)
     misfit = float(np.sum((variance / model - 1.0) ** 2 / relative)) / freedom
@@ -177,13 +171,7 @@ def _design(tau: Array) -> Array:
 def _fit(tau: Array, variance: Array, clusters: Array) -> AllanFit:
     design = _design(tau)
     relative = 2.0 / clusters + SHAPE**2
-    model = variance
-    for _ in range(MAX_ITERATIONS):
-        weight = 1.0 / (np.sqrt(relative) * model)
-        square = _not_negative(design * weight[:, None], variance * weight)
-        before, model = model, np.maximum(design @ square, 1e-6 * variance)
-        if np.all(np.abs(model - before) < CONVERGED_STEP * model):
-            break
+    square, model = _reweighted(design, variance, relative)
     cov = _covariance(design, model, relative, clusters, square)
     sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
     off = variance / model
@@ -206,6 +194,18 @@ def _fit(tau: Array, variance: Array, clusters: Array) -> AllanFit:
         worst=float(np.sqrt(off[worst])),
         first_tau=float(tau[0]),
     )
+
+
+def _reweighted(design: Array, variance: Array, relative: Array) -> tuple[Array, Array]:
+    """Return squared components, and the variance they make, weighted by that variance itself."""
+    model = variance
+    for _ in range(MAX_ITERATIONS):
+        weight = 1.0 / (np.sqrt(relative) * model)
+        square = _not_negative(design * weight[:, None], variance * weight)
+        before, model = model, np.maximum(design @ square, 1e-6 * variance)
+        if np.all(np.abs(model - before) < CONVERGED_STEP * model):
+            break
+    return square, model
 
 
 def _not_negative(design: Array, value: Array) -> Array:

@@ -177,7 +177,7 @@ def need_figures(coverage: Coverage, limits: tuple[float, ...]) -> Figures:
     Parameters
     ----------
     limits : tuple of float
-        None, that of position (m), or also that of attitude (deg).
+        Of position (m), and of attitude (deg) where it matters; empty without a need.
     """
     level_m, level_deg = coverage.protection_level_m, coverage.protection_level_deg
     if not limits or level_m is None or level_deg is None:

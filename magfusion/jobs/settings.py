@@ -371,7 +371,7 @@ class NeedSettings(RiskSettings):
 
     @property
     def limits(self) -> tuple[float, ...]:
-        """Return the levels that are needed: none, that of position (m), or also attitude (deg)."""
+        """Return the needed levels: of position (m), and of attitude (deg) where it is given."""
         if self.need is None:
             return ()
         try:

@@ -18,6 +18,7 @@ from magfusion.estimation.online.state_of_now import PropagatedState
 from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.checkpoint import run_key
 from magfusion.files.named_records import site_fields
+from magfusion.files.plausible import beyond_range
 from magfusion.files.site import load_site
 from magfusion.files.stream import (
     Format,
@@ -37,10 +38,13 @@ from magfusion.model.marks import Marks
 from magfusion.model.quaternion import of_matrices
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
+from magfusion.results.verdict import finding_rows
 from magfusion.units import Array
 
 _PLACE = {"json": "line", "msgpack": "record"}
 NOT_ONLINE = "its samples are used by navigate --at-rest only."
+FIRST = 50  # samples; bit errors do not make as many in a row
+_UNITS = {"imu": "rad/s and m/s^2", "magnetometer": "tesla"}
 WAITING = 1.0  # s; before the first state, as often a sign of life
 
 
@@ -115,14 +119,14 @@ def _navigate(
     key, place = run_key("stream", site, settings.navigator), settings.checkpoint
     navigator = begin(place, key, site, settings.navigator, None, resume=settings.resume).navigator
     refused, saved, reached = 0, -np.inf, -np.inf
-    missing: Counter[str] = Counter()
+    counts = _SampleCounts()
     output, angles = _StateWriter(navigator, sink, others), AwaitedAngles(site)
     kept = None if place is None else CheckpointWriter(place, key, messages)
     clocks, resumed = StreamClocks(settings.navigator.delay), navigator.time
     for numbered in read_records(source, settings.form):
         try:
             numbered = _on_clock(numbered, clocks, output, messages)
-            newest = _process_record(output.navigator, site, numbered, missing, output)
+            newest = _process_record(output.navigator, site, numbered, counts, output)
         except InputError as error:
             sentence = f"standard input, {_PLACE[settings.form]} {numbered.number}: {error}"
             if not (settings.keep_going or isinstance(error, ClockJump)):
@@ -130,28 +134,58 @@ def _navigate(
             refused += 1
             messages.write(f"magfusion: {sentence} (skipped)\n")
             continue
-        if newest < resumed:
+        if -np.inf < newest < resumed:
             at = f"{resumed:.3f} s"
             messages.write(f"magfusion: data before the checkpoint ({at}) are not used\n")
             resumed = -np.inf
         angles.see(numbered.record)
         navigator = output.navigator = corrected(output.navigator)
         output.epochs()
-        waited = -np.inf < newest and not reached <= newest < reached + WAITING
-        if not navigator.started and waited:
+        measured = newest > -np.inf
+        if not navigator.started and measured and not reached <= newest < reached + WAITING:
             output.write(None, _waiting(navigator, newest))
             reached = newest
         sink.flush()
-        if kept is not None and not saved <= newest < saved + settings.every:
+        if kept is not None and measured and not saved <= newest < saved + settings.every:
             kept.save(output.navigator, numbered.number, None)
             saved = newest
     if output.reference:
         messages.write(f"magfusion: reference: {NOT_ONLINE}\n")
-    for stream, count in missing.items():
-        messages.write(f"magfusion: {stream}: {count} samples are NaN. They are left out.\n")
+    for stream, count in counts.left_out.items():
+        text = f"{count} samples are NaN, or larger than any instrument measures"
+        messages.write(f"magfusion: {stream}: {text}. They are left out.\n")
     if refused:
         messages.write(f"magfusion: {refused} records were skipped\n")
     return refused
+
+
+class _SampleCounts:
+    """Numbers of the samples of each stream."""
+
+    def __init__(self) -> None:
+        self.left_out: Counter[str] = Counter()
+        self._used: Counter[str] = Counter()
+
+    def whole(self, stream: str, time: Array, *values: Array) -> tuple[Array, ...]:
+        """Return the samples that are whole and within range, and count them.
+
+        Raises
+        ------
+        InputError
+            Where the first `FIRST` are all larger than any instrument measures.
+        """
+        result = whole_rows(time, *values)
+        missing = len(time) - len(result[0])
+        self._used[stream] += len(result[0])
+        if missing:
+            self.left_out[stream] += missing
+            large = bool(beyond_range(np.hstack(values)).any())
+            if large and not self._used[stream] and self.left_out[stream] >= FIRST:
+                raise InputError(
+                    f"{stream}: no sample so far is within the range of any instrument: another"
+                    f" unit is probably meant; give {_UNITS[stream]}"
+                )
+        return result
 
 
 class _StateWriter:
@@ -227,7 +261,7 @@ def _process_record(
     navigator: Navigator,
     site: Site,
     numbered: NumberedRecord,
-    missing: Counter[str],
+    counts: _SampleCounts,
     output: _StateWriter,
 ) -> float:
     """Feed a record to the navigator, and count missing data; return its newest time (s)."""
@@ -237,30 +271,24 @@ def _process_record(
     _process_companions(navigator, record)
     output.reference |= record.reference is not None
     if record.imu is not None:
-        time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
+        own = record.imu
+        time, gyro, accel = counts.whole("imu", own.time, own.gyro, own.accel)
         if len(time):
             navigator.propagate_imu(time, gyro, accel)
             output.now()
             navigator.advance()
-        _count_missing(missing, "imu", len(record.imu.time) - len(time))
         newest = max(newest, _last(time))
     if record.magnetometer is not None:
-        own = record.magnetometer.field.copy()
-        own[:, site.platform.magnetometer.lacking] = 0.0
-        time, field = whole_rows(record.magnetometer.time, own)
+        field = record.magnetometer.field.copy()
+        field[:, site.platform.magnetometer.lacking] = 0.0
+        time, field = counts.whole("magnetometer", record.magnetometer.time, field)
         if len(time):
             navigator.add_magnetometer(time, field, record.magnetometer.magnetometer)
-        _count_missing(missing, "magnetometer", len(record.magnetometer.time) - len(time))
         newest = max(newest, _last(time))
     if record.fields is not None:
         navigator.add_fields(along_axis(site_fields(record.fields, site), site))
         newest = max(newest, record.fields.time)
     return newest
-
-
-def _count_missing(missing: Counter[str], stream: str, number: int) -> None:
-    if number:
-        missing[stream] += number
 
 
 def _process_companions(navigator: Navigator, record: Record) -> None:
@@ -288,15 +316,7 @@ def _waiting(navigator: Navigator, time: float) -> dict[str, Any]:
     if not reasons and why != NoStart():
         reasons = (Finding("no_start", why.reason, Verdict.FAILED),)
     open_ = True if any(reason.code == "ambiguous" for reason in reasons) else None
-    return nothing | {"reasons": _finding_rows(reasons), "ambiguous": open_}
-
-
-def _finding_rows(findings: tuple[Finding, ...]) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = []
-    for finding in findings:
-        remedy = {} if finding.remedy is None else {"remedy": dict(finding.remedy)}
-        rows.append({"code": finding.code, "text": finding.text} | remedy)
-    return rows
+    return nothing | {"reasons": finding_rows(reasons), "ambiguous": open_}
 
 
 def state_content(navigator: Navigator, state: JudgedState) -> dict[str, Any]:
@@ -311,8 +331,8 @@ def state_content(navigator: Navigator, state: JudgedState) -> dict[str, Any]:
         "lost": state.is_lost,
         "reset_counter": state.reset_counter,
         "verdict": str(state.verdict),
-        "reasons": _finding_rows(state.judgement.reasons),
-        "remarks": _finding_rows(state.judgement.remarks),
+        "reasons": finding_rows(state.judgement.reasons),
+        "remarks": finding_rows(state.judgement.remarks),
         "excluded": list(state.judgement.excluded),
         "heard": list(state.judgement.detected),
         "protection_level_m": state.judgement.protection_level_m,

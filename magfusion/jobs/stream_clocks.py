@@ -30,6 +30,9 @@ class ClockStep(NamedTuple):
 
 @dataclass
 class _Clock:
+    """Clock of a stream (s): the last stamp, the newest accepted one, and one far from it."""
+
+    last_stamp: float = -np.inf
     newest: float = -np.inf
     wrapped: float = 0.0
     unconfirmed: float | None = None
@@ -51,28 +54,40 @@ class StreamClocks:
     def unwrapped(self, record: Record) -> Record:
         """Return a record whose stamps go on where a counter of 32 bits began again."""
         changed = {}
-        for name, kind, times in _streams(record):
-            clock = self._of(name)
-            first = float(times[0]) + clock.wrapped
-            for period in PERIODS:
-                near = abs((clock.newest + 0.5 * period) % period - 0.5 * period) < NEAR_END
-                if near and abs(first - clock.newest + period) < 2.0 * NEAR_END:
-                    clock.wrapped += period
-            if clock.wrapped:
-                part = getattr(record, kind)
-                changed[kind] = part.model_copy(update={"time": part.time + clock.wrapped})
+        for kind in type(record).model_fields:
+            part = getattr(record, kind)
+            names = [name for name in ("time", "start", "end") if hasattr(part, name)]
+            if not names or not np.size(getattr(part, names[0])):
+                continue
+            wrapped = self._wrapped(_name(record, kind), np.atleast_1d(getattr(part, names[0])))
+            if wrapped:
+                stamps = {name: getattr(part, name) + wrapped for name in names}
+                changed[kind] = part.model_copy(update=stamps)
         return record.model_copy(update=changed) if changed else record
+
+    def _wrapped(self, name: str, times: Array) -> float:
+        """Return what a stream's counter has lost by wrapping (s)."""
+        clock = self._of(name)
+        for period in PERIODS:
+            near = abs((clock.last_stamp + 0.5 * period) % period - 0.5 * period) < NEAR_END
+            if near and abs(float(times[0]) + clock.wrapped - clock.last_stamp + period) < NEAR_END:
+                clock.wrapped += period
+        clock.last_stamp = float(np.max(times)) + clock.wrapped
+        return clock.wrapped
 
     def step_in(self, record: Record) -> ClockStep | None:
         """Return the step of a stream's clock: it is seen in the second record after it."""
-        for name, _, times in _streams(record):
+        for name, times in _streams(record):
             clock, first = self._of(name), float(times[0])
             follows = (
                 clock.unconfirmed is not None and 0.0 <= first - clock.unconfirmed < LARGEST_JUMP
             )
             if follows and self._is_far(clock, times):
                 step = ClockStep(name, first, first - clock.newest)
-                self._clocks.clear()
+                self._clocks = {
+                    name: _Clock(last_stamp=one.last_stamp, wrapped=one.wrapped)
+                    for name, one in self._clocks.items()
+                }
                 return step
         return None
 
@@ -85,7 +100,7 @@ class StreamClocks:
             Where they are far from those before: the record is an error of its own, or the first
             after a step.
         """
-        for name, _, times in _streams(record):
+        for name, times in _streams(record):
             clock, last = self._of(name), float(np.max(times))
             if not self._is_far(clock, times):
                 clock.unconfirmed, clock.newest = None, max(clock.newest, last)
@@ -108,15 +123,15 @@ class StreamClocks:
         return behind or -np.inf < self._newest < float(np.min(times)) - LARGEST_JUMP
 
 
-def _streams(record: Record) -> Iterator[tuple[str, str, Array]]:
-    """Yield name, kind and stamps of the measurements in a record."""
-    if record.imu is not None and len(record.imu.time):
-        yield "imu", "imu", record.imu.time
-    if record.magnetometer is not None and len(record.magnetometer.time):
-        yield (
-            record.magnetometer.magnetometer or "magnetometer",
-            "magnetometer",
-            (record.magnetometer.time),
-        )
-    if record.fields is not None:
-        yield record.fields.magnetometer or "fields", "fields", np.array([record.fields.time])
+def _streams(record: Record) -> Iterator[tuple[str, Array]]:
+    """Yield name and stamps of the measurements in a record."""
+    for kind in ("imu", "magnetometer", "fields"):
+        part = getattr(record, kind)
+        if part is not None and np.size(part.time):
+            yield _name(record, kind), np.atleast_1d(part.time)
+
+
+def _name(record: Record, kind: str) -> str:
+    """Return the stream of a part of a record: of several magnetometers each has its own."""
+    own = getattr(getattr(record, kind), "magnetometer", None)
+    return kind if own is None else f"{kind} {own}"

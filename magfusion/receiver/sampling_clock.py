@@ -8,7 +8,7 @@ theirs, and the clock is a smooth curve of stamps over ticks.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solveh_banded
+from scipy.interpolate import make_lsq_spline
 
 from magfusion.receiver.bursts import LONGEST, MAX_SAMPLES, spread_bursts
 from magfusion.units import NANOSECOND, Array, ComplexArray, IntArray
@@ -266,33 +266,16 @@ def smooth_clock(tick: IntArray, stamps: Array) -> Array:
 
 
 def _bent_lines(tick: IntArray, stamps: Array, lines: int) -> tuple[Array, Array]:
-    """Return so many connected straight lines at the ticks (s), and the residual of stamps (s).
-
-    The least squares of hat functions are tridiagonal: linear in the samples, whereas
-    `scipy.interpolate.make_lsq_spline` takes their product with the knots.
-    """
-    knots = np.linspace(tick[0], tick[-1], lines + 1)
-    own = np.clip(np.searchsorted(knots, tick, side="right") - 1, 0, lines - 1)
-    share = (tick - knots[own]) / (knots[1] - knots[0])
-    straight = stamps[0] + (stamps[-1] - stamps[0]) * (tick - tick[0]) / (tick[-1] - tick[0])
-    value = stamps - straight  # small, so that sums do not round
-    weight, result = np.ones(len(stamps)), straight
+    """Return so many connected straight lines at the ticks (s), and the residual of stamps (s)."""
+    inner = np.linspace(tick[0], tick[-1], lines + 1)[1:-1]
+    ends = (float(tick[0]), float(tick[-1]))
+    knots = np.concatenate([[ends[0]] * 2, inner, [ends[1]] * 2])
+    at, weight, result = tick.astype(float), np.ones(len(stamps)), stamps
     for _ in range(4):
-        square = weight**2
-        begin, end = square * (1.0 - share), square * share
-
-        def summed(terms: Array) -> Array:
-            return np.asarray(np.bincount(own, terms, lines), dtype=np.float64)
-
-        banded, right = np.zeros((2, lines + 1)), np.zeros(lines + 1)
-        banded[0, 1:] = summed(begin * share)
-        banded[1, :-1] = summed(begin * (1.0 - share))
-        banded[1, 1:] += summed(end * share)
-        right[:-1] = summed(begin * value)
-        right[1:] += summed(end * value)
-        node = solveh_banded(banded, right)
-        result = straight + (1.0 - share) * node[own] + share * node[own + 1]
+        # By QR the time is that of samples times knots.
+        spline = make_lsq_spline(at, stamps, knots, k=1, w=weight, method="norm-eq")
+        result = np.asarray(spline(at))
         off = np.abs(stamps - result)
         sigma = np.median(off) / 0.6745
         weight = 1.0 / np.maximum(1.0, off / max(3.0 * sigma, 1e-12))
-    return np.asarray(result), np.asarray(stamps - result)
+    return result, stamps - result

@@ -35,8 +35,8 @@ def trust_figures(trust: Trust, answer: str | None = None) -> Figures:
     verdict = str(trust.verdict) if answer is None else answer
     return Figures(
         Figure("verdict", verdict, section=Section.VERDICT),
-        Figure("reasons", _finding_rows(_one_of_each(trust.reasons)), section=Section.VERDICT),
-        Figure("remarks", _finding_rows(trust.remarks), section=Section.VERDICT),
+        Figure("reasons", finding_rows(_one_of_each(trust.reasons)), section=Section.VERDICT),
+        Figure("remarks", finding_rows(trust.remarks), section=Section.VERDICT),
         Figure("unverified", [_unverified(u) for u in trust.unverified], section=Section.VERDICT),
     )
 
@@ -64,7 +64,8 @@ def _one_of_each(findings: tuple[Finding, ...]) -> tuple[Finding, ...]:
     return tuple(result)
 
 
-def _finding_rows(findings: tuple[Finding, ...]) -> list[dict[str, Any]]:
+def finding_rows(findings: tuple[Finding, ...]) -> list[dict[str, Any]]:
+    """Return findings as a report has them, with a remedy and what they explain."""
     rows = []
     for finding in findings:
         row: dict[str, Any] = {"code": finding.code, "text": finding.text}

@@ -31,6 +31,8 @@ OF_SAMPLES = {
 # What the streams show themselves, which comes before what follows of it.
 # What gravity, field and gyroscope are sure of where they fail a log, whatever follows of it.
 OF_COMPASSES = {"accel_units", "gravity_missing", "gravity_sign", "gyro_sign", "gyro_units"}
+# Of these a sensor measures nothing, and whatever follows is of that.
+NOT_MEASURED = {"frozen_imu", "frozen_magnetometer", "saturated", "stuck_axis"}
 # What follows of a field that is not as declared, wherever it comes from.
 OF_FIELDS = {
     "beacon_excluded",
@@ -134,8 +136,8 @@ def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
     Reasons that a mistake explains are listed with it, not beside it.
     """
     trust = with_cause(trust, cause)
-    of_samples = (f for f in trust.reasons if f.code in OF_SAMPLES)
-    first = next(of_samples, None) if cause is None else cause.finding
+    missing = (f for f in trust.reasons if f.code in NOT_MEASURED)
+    first = next(missing, None) if cause is None else cause.finding
     if first is None:
         return trust
     # What only says where something is wrong explains no more than what follows of it there.
@@ -152,7 +154,7 @@ def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
 
 
 def with_corrected(trust: Trust, corrected: tuple[Finding, ...]) -> Trust:
-    """Return the findings on a result of a corrected site, without what its states say of it."""
+    """Return the findings on a result of a corrected site, without others of the same codes."""
     codes = {finding.code for finding in corrected}
     kept = tuple(f for f in trust.findings if f.remedy or f.code not in codes)
     return replace(trust, findings=kept)

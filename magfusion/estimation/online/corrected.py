@@ -28,13 +28,12 @@ def corrected(navigator: Navigator) -> Navigator:
         trial = _tried(navigator, correction)
         if trial is None:
             continue
-        remaining = trial.remainder
         if _is_better(trial, correction):
             best = trial
-            if remaining is None:
+            if trial.remainder is None:
                 break
-        if remaining is not None:
-            waiting.insert(0, remaining._replace(finding=correction.finding))
+        if trial.remainder is not None:
+            waiting.insert(0, trial.remainder._replace(finding=correction.finding))
     return best
 
 

@@ -4,7 +4,6 @@
 epoch, and on request at any later time.
 """
 
-import json
 from collections import Counter, deque
 from dataclasses import replace
 from typing import Any
@@ -22,21 +21,17 @@ from magfusion.estimation.demodulation.sensor_frame_samples import (
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.process_noise import calibration_process_noise
 from magfusion.estimation.graph.propagation import Propagated, propagate
-from magfusion.estimation.graph.state import POSITION, ROTATION, State
+from magfusion.estimation.graph.state import State
 from magfusion.estimation.initialization.early import first_try, is_clear, next_try, open_start
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
-from magfusion.estimation.integrity.correction import (
-    Correction,
-    continued,
-    corrected_finding,
-    spread_of,
-)
+from magfusion.estimation.integrity.correction import Correction, continued, spread_of
 from magfusion.estimation.measurements.earth import check_earth
+from magfusion.estimation.online.applied_corrections import AppliedCorrections
 from magfusion.estimation.online.arrivals import arrivals_of
 from magfusion.estimation.online.ekf import ErrorStateFilter
 from magfusion.estimation.online.epoch_update import EpochUpdate, Estimator
 from magfusion.estimation.online.fixed_lag import SlidingWindow
-from magfusion.estimation.online.input_history import KEPT, InputHistory
+from magfusion.estimation.online.input_history import InputHistory
 from magfusion.estimation.online.input_queue import Arrivals
 from magfusion.estimation.online.navigator_data import navigator_rules
 from magfusion.estimation.online.navigator_settings import NavigatorSettings as NavigatorSettings
@@ -55,7 +50,6 @@ from magfusion.estimation.online_integrity.judgement import (
 from magfusion.estimation.online_integrity.summary import Summary
 from magfusion.files.blas_threads import warn_about_threads
 from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
-from magfusion.files.site import site_content
 from magfusion.model.arguments import check_arguments
 from magfusion.model.drive import DriveSamples, DriveShares
 from magfusion.model.marks import Marks
@@ -70,12 +64,17 @@ from magfusion.receiver.drive import DriveReceiver
 from magfusion.units import Array, IntArray
 
 MARGIN = 0.5  # s; of a span that a start uses
-LONGEST_WAIT = 600.0  # s; between corrections, doubled each time: a hundredth of the processor
-MOST_MISTAKES = 2  # undone together; with more, the site is another one
 
 
 class Navigator:
     """A running estimate of the platform's motion.
+
+    Attributes
+    ----------
+    declared : Site
+        As given, without the corrections of ``site``.
+    remainder : Correction, optional
+        Of a corrected parameter, by what it still seems to be wrong.
 
     Raises
     ------
@@ -102,13 +101,8 @@ class Navigator:
     summary: Summary
     why_no_start: NoStart
     rival_chi_square: float | None
-    _corrected: tuple[Finding, ...]
-    _turn: float
-    _shift: float
+    _corrections: AppliedCorrections
     _reported_until: float
-    _next_correction: float
-    _wait: float
-    _site: str | None  # as corrected, JSON
 
     def __init__(self, site: Site, settings: NavigatorSettings | None = None) -> None:
         check_arguments("Navigator", site=(site, Site))
@@ -153,11 +147,10 @@ class Navigator:
         self.why_no_start = NoStart()
         self.rival_chi_square = None
         self.declared, self._history = site, InputHistory()
-        self._correction: Correction | None = None
+        self._corrections, self._reported_until = AppliedCorrections(), -np.inf
         self._possible: tuple[Correction, ...] = ()
-        self._corrected, self._turn, self._shift = (), 0.0, 0.0
-        self._reported_until, self._next_correction, self._wait = -np.inf, -np.inf, KEPT
-        self._site = None
+        self._tried: Correction | None = None
+        self.remainder: Correction | None = None
 
     # Input
 
@@ -388,7 +381,8 @@ class Navigator:
 
     def restarted(self) -> "Navigator":
         """Return a navigator that starts again, as where the clock of the data has stepped."""
-        result = Navigator(self.declared, self.settings)
+        declared = replace(self.declared, temperatures=self._degrees, drives=self._drives)
+        result = Navigator(declared, self.settings)
         result._discontinuities.counter = self._discontinuities.counter + self.started
         return result
 
@@ -397,22 +391,12 @@ class Navigator:
     @property
     def corrected(self) -> tuple[Finding, ...]:
         """Mistakes of the declared site that are undone in this one."""
-        return self._corrected
-
-    @property
-    def remainder(self) -> Correction | None:
-        """Correction by what a corrected parameter still seems to be wrong."""
-        return next(iter(self._possible), None) if self._correction is not None else None
+        return self._corrections.findings
 
     def take_corrections(self) -> tuple[Correction, ...]:
         """Return what may be wrong with the site, the most likely first; seldom, as each costs."""
         possible, self._possible = self._possible, ()
-        now = self._history.newest
-        if not possible or now < self._next_correction or len(self._corrected) >= MOST_MISTAKES:
-            return ()
-        self._next_correction = now + self._wait
-        self._wait = min(2.0 * self._wait, LONGEST_WAIT)
-        return possible
+        return possible if possible and self._corrections.due(self._history.newest) else ()
 
     def with_correction(self, correction: Correction) -> "Navigator":
         """Return a navigator of a corrected site that has processed the newest input again.
@@ -421,26 +405,14 @@ class Navigator:
         """
         result = Navigator(correction.site, self.settings)
         reasons = (*self.judgement.reasons, *self.why_no_start.trust.reasons)
-        result.declared, result._correction = self.declared, correction
-        finding = corrected_finding(correction, self.declared, reasons)
-        known = (f for f in self._corrected if f.code != finding.code)
-        result._corrected = (*known, finding)
+        result.declared, result._tried = self.declared, correction
+        result._corrections = self._corrections.further(correction, self.declared, reasons)
         jumped = self._reported_until > -np.inf
         result._discontinuities.counter = self._discontinuities.counter + jumped
         result._next_start = max(result._next_start, self._history.span - MARGIN)
-        result._next_correction, result._wait = self._next_correction, self._wait
-        result._site = json.dumps(site_content(correction.site))
         self._history.replay(result)
         result._pending = [state for state in result._pending if state.time > self._reported_until]
         return result
-
-    def _with_corrected(self, judgement: Judgement) -> Judgement:
-        """Return a judgement with the doubt that a correction leaves."""
-        if not self._corrected:
-            return judgement
-        turn, shift = np.hypot(judgement.turn, self._turn), np.hypot(judgement.shift, self._shift)
-        judgement = judgement.with_findings(*self._corrected)
-        return replace(judgement, turn=float(turn), shift=float(shift))
 
     @property
     def counts(self) -> Counter[str]:
@@ -504,8 +476,7 @@ class Navigator:
         until = arrived.gathered(self.settings.delay, self._next_start)
         if until is None:
             return False
-        trial = self._correction is not None
-        start = arrived.first_state(until, self.settings, diagnose=not trial)
+        start = arrived.first_state(until, self.settings, diagnose=self._tried is None)
         self._possible = start.corrections
         longest = 4.0 * self.settings.start_duration
         if self._next_start < self.settings.start_duration and not is_clear(start):
@@ -527,19 +498,12 @@ class Navigator:
         self._arrived.start(start, self.settings.delay)
         self.rival_chi_square = start.rival_chi_square
         self._start_at(start.state)
-        if self._correction is not None:
-            self._apply(self._correction, start)
+        if self._tried is not None:
+            self._corrections.widen(spread_of(self._tried, start.score)[-1])
+            self.remainder = continued(self._tried, start.score)
         self.summary.unverified = start.trust.unverified
         self._store(start.state, self._update.begin(start))
         return True
-
-    def _apply(self, correction: Correction, start: OnlineStart) -> None:
-        """Take over the uncertainty of a correction, and its remainder."""
-        spread = spread_of(correction, start.score)[-1]
-        largest = [np.linalg.eigvalsh(spread[part, part])[-1] for part in (ROTATION, POSITION)]
-        self._turn, self._shift = np.sqrt(np.maximum(largest, 0.0)).tolist()
-        remaining = continued(correction, start.score)
-        self._possible = () if remaining is None else (remaining,)
 
     def _start_at(self, state: State) -> None:
         if self.settings.estimator == "ekf":
@@ -620,8 +584,7 @@ class Navigator:
         self._arrived.discard_before(self._estimator.state.time)
 
     def _store(self, state: State, judgement: Judgement) -> None:
-        judgement = self._with_corrected(judgement)
-        self._judgement = judgement
+        self._judgement = judgement = self._corrections.doubted(judgement)
         counter = self._discontinuities.counter
         self._pending.append(judged_state(state, judgement, counter))
         self.summary.note(state.time, judgement)

@@ -7,7 +7,7 @@ their inertial steps.
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -105,21 +105,31 @@ def navigator_rules(
     )
 
 
-def _finding_data(finding: Finding) -> dict[str, Any]:
-    """Return a finding, its remedy as JSON: of it, any key of a site's file may be a part."""
-    own = vars(finding) | {"verdict": str(finding.verdict)}
-    return own | {"remedy": json.dumps(finding.remedy), "explained": list(finding.explained)}
+@dataclass(frozen=True)
+class _FindingData:
+    """A finding, its remedy as JSON: any key of a site's file may be a part of it."""
+
+    code: str
+    text: str
+    verdict: Verdict
+    weight: float
+    remedy: str
+    explained: tuple[str, ...]
+
+
+_OF_FINDING = Rules({Verdict: str}, {Verdict: Verdict})
+
+
+def _finding_data(finding: Finding) -> Any:
+    own = vars(finding) | {"remedy": json.dumps(finding.remedy)}
+    return to_plain(_FindingData(**own), _OF_FINDING)
 
 
 def _finding(data: Any) -> Finding:
-    names = {field.name for field in fields(Finding)}
-    _check(isinstance(data, dict) and data.keys() == names, "is no finding")
-    texts = ("code", "text", "verdict", "remedy", *data["explained"])
-    _check(all(isinstance(data.get(t, t), str) for t in texts), "has a text that is none")
-    remedy = json.loads(data["remedy"])
+    own = from_plain(_FindingData, data, "finding", _OF_FINDING)
+    remedy = json.loads(own.remedy)
     _check(remedy is None or isinstance(remedy, dict), "has a remedy that is none")
-    own = {"verdict": Verdict(data["verdict"]), "remedy": remedy}
-    return Finding(**(data | own | {"explained": tuple(data["explained"])}))
+    return Finding(**(vars(own) | {"remedy": remedy}))
 
 
 def _levels(data: Any) -> Levels:

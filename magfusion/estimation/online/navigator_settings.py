@@ -32,10 +32,10 @@ class NavigatorSettings(EstimatorSettings):
         at a rate (Hz); they are propagated from the newest epoch.
     horizon : float
         How far ahead they are predicted (s).
-    lost_beyond : float
-        Sigma of the position (m) beyond which a platform that detects no beacon is lost.
     correction_time : float
         Time in which a correction enters them (s); at once where it is zero.
+    lost_beyond : float
+        Sigma of the position (m) beyond which a platform that detects no beacon is lost.
     """
 
     __repr__ = short_repr

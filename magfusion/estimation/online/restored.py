@@ -36,11 +36,12 @@ def restored(
         If it is no checkpoint, or does not fit the site.
     """
     parts = checkpoint.get("parts") if isinstance(checkpoint, dict) else None
-    corrected = parts.get("_site") if isinstance(parts, dict) else None
-    declared = Navigator(site, settings).declared
-    own = with_content(site, corrected) if isinstance(corrected, str) else site
-    navigator = Navigator(own, settings)
-    navigator.declared = declared
+    applied = parts.get("_corrections") if isinstance(parts, dict) else None
+    content = applied.get("content") if isinstance(applied, dict) else None
+    navigator = Navigator(site, settings)
+    if isinstance(content, str):
+        declared, navigator = navigator.declared, Navigator(with_content(site, content), settings)
+        navigator.declared = declared
     rules = navigator_rules(navigator.site, navigator.blocks, measurements)
     try:
         navigator.go_on_from(checkpoint, rules)

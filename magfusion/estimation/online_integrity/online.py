@@ -14,7 +14,7 @@ from scipy.special import chdtri
 
 from magfusion.estimation.data_checks.running import DecayingSums, nothing
 from magfusion.estimation.data_checks.steady_field import DOUBT, off_earth
-from magfusion.estimation.graph.state import MOTION, ROTATION, State
+from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, State
 from magfusion.estimation.online_integrity.gate import Gate
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.model.parameters import (
@@ -184,7 +184,7 @@ class OnlineMonitor:
         parts = [
             fixed,
             self._of_the_beginning(state.time),
-            self._of_being_lost(gate, lost_since),
+            self._of_being_lost(state, gate, lost_since),
             self._of_fields(),
             self._of_biases(state),
             self._of_calibration(state),
@@ -208,12 +208,14 @@ class OnlineMonitor:
             findings = tuple(f for f in findings if f.code not in PASSING)
         return replace(messages, findings=findings) if findings else Judgement()
 
-    def _of_being_lost(self, gate: Gate, lost_since: float | None) -> Judgement:
+    def _of_being_lost(self, state: State, gate: Gate, lost_since: float | None) -> Judgement:
         if lost_since is not None:
             if not gate.is_lost:
+                sigma = np.sqrt(np.linalg.eigvalsh(state.cov[POSITION, POSITION])[-1])
                 text = (
-                    f"Lost since {lost_since:.1f} s: no beacon is detected for longer than the IMU"
-                    " can replace them. The next fix of the beacons ends this."
+                    f"Lost since {lost_since:.1f} s: the sigma of the position is {sigma:.2g} m, as"
+                    " the beacons do not determine it. A fix of the beacons ends this; detect more"
+                    " of them, or raise --lost-beyond."
                 )
                 return Judgement((Finding("lost", text, Verdict.FAILED, 10.0),))
             text = (

@@ -14,10 +14,7 @@ import numpy as np
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, State, states_of
 from magfusion.estimation.integrity.correction import Correction, corrections
-from magfusion.estimation.integrity.fixed_parameter_test import (
-    causes_of,
-    finding_of,
-)
+from magfusion.estimation.integrity.fixed_parameter_test import causes_of, finding_of
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.suspects import Suspect
 from magfusion.estimation.measurements.phasors import FieldPhasors
