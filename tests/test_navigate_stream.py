@@ -113,7 +113,7 @@ def test_fields_in_nanotesla_are_refused_with_the_unit(site: Path) -> None:
     time = (0.01 * np.arange(60)).tolist()
     fields = [[1.2e3, 1.9e4, -4.5e4]] * 60
     given = json_line({"magnetometer": {"time": time, "field": fields}})
-    with pytest.raises(InputError, match="magnetometer: no sample so far .* give tesla"):
+    with pytest.raises(InputError, match=r"magnetometer: no sample so far .* give tesla"):
         answered(site, given)
 
 
