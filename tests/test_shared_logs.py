@@ -20,7 +20,7 @@ from magfusion.files.trajectory_table import read_trajectory
 from magfusion.jobs.inputs import Job
 from magfusion.jobs.smooth import run_smooth
 from magfusion.model.samples import Log
-from magfusion.model.trajectory import interpolate
+from magfusion.model.truth_poses import truth_poses
 from magfusion.results.errors import TrajectoryErrors, trajectory_errors
 
 LOGS = Path(__file__).parents[1].parent / "shared" / "logs"
@@ -93,7 +93,7 @@ def test_evo_finds_the_same_errors_in_the_tum_file(walk: Result) -> None:
     assert estimate.check()[0]
     assert walk.log.truth is not None
     stamps = estimate.timestamps - walk.log.epoch_ns * 1e-9
-    true, exists = interpolate(walk.log.truth, stamps, max_gap=0.1)
+    true, exists, _ = truth_poses(walk.log.truth, stamps)
     estimate.reduce_to_ids(np.flatnonzero(exists))
     quaternion = Rotation.from_matrix(true.world_from_body).as_quat(scalar_first=True)
     truth = PoseTrajectory3D(true.position_world, quaternion, estimate.timestamps)
