@@ -7,7 +7,6 @@ addition.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -39,6 +38,7 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import DEGREE, Array, ComplexArray
 
+CHANGED = "changed"  # code
 PARTS = (0.25, 0.5, 0.75)  # of the log, times of the tested steps
 MOST_BEACONS = 12  # with more, the test is not made
 MIN_EPOCHS = 40  # epochs, for parts with enough information
@@ -134,14 +134,6 @@ TYPICAL: dict[Parameter, float] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Change:
-    """A candidate fault, and the time of its step."""
-
-    fault: Suspect
-    begin: float
-
-
 def candidate_steps(result: Smoothed) -> list[Block]:
     """Return the steps of parameters that are tested for a log; none if it is too short."""
     return [block for part in _steps_by_time(result).values() for block in part]
@@ -166,36 +158,35 @@ def changed(case: Case) -> TestResult:
     every = wide.fixed
     information, gradient = wide.with_declared(tolerance=True)
     known = [
-        (one, estimate.log_p)
-        for one in _changes(parts, every)
-        if (estimate := release_gain(one.fault, information, gradient)) is not None
+        (fault, estimate.log_p)
+        for fault in _changes(parts, every)
+        if (estimate := release_gain(fault, information, gradient)) is not None
     ]
     informative = holm([log_p for _, log_p in known], BUDGET)
     if not np.any(informative):
         return NOTHING
     wide = answered(result, wide, case.log.imu)
     released = [
-        (one, cause)
-        for one, _ in known
-        if (cause := release_fault(case.pose_cov, wide, one.fault, information, gradient))
-        is not None
+        cause
+        for fault, _ in known
+        if (cause := release_fault(case.pose_cov, wide, fault, information, gradient)) is not None
     ]
-    significant = [pair for pair, yes in zip(released, informative, strict=True) if yes]
-    if not any(np.mean(cause.distance) > COVERED for _, cause in significant):
+    significant = [cause for cause, yes in zip(released, informative, strict=True) if yes]
+    if not any(np.mean(cause.distance) > COVERED for cause in significant):
         return NOTHING
-    change, cause = max(significant, key=lambda pair: pair[1].gain)
+    cause = max(significant, key=lambda one: one.gain)
     if cause.gain < _throughout(case, information, gradient):
         return NOTHING  # it was wrong from the beginning
     moved = cause.moved[:, :, None] * cause.moved[:, None, :]
     certain = wide.by_pose @ cause.known_cov @ np.swapaxes(wide.by_pose, 1, 2)
-    return TestResult((_finding(change, cause, prior_sigma(every)),), spread=moved + certain)
+    return TestResult((change_finding(cause, prior_sigma(every)),), spread=moved + certain)
 
 
-def _changes(parts: dict[float, list[Block]], every: tuple[Block, ...]) -> list[Change]:
+def _changes(parts: dict[float, list[Block]], every: tuple[Block, ...]) -> list[Suspect]:
     """Return the possible changes at each of some times, as columns after the fixed ones."""
     return [
-        Change(fault, at)
-        for at, part in zip(parts, _again(every, list(parts.values())), strict=True)
+        fault
+        for part in _again(every, list(parts.values()))
         for fault in _fault_candidates(part, dimension(every))
     ]
 
@@ -259,10 +250,10 @@ def _fault_candidates(blocks: list[Block], size: int) -> Iterator[Suspect]:
         common = np.zeros((size, 1))
         for block in gains:
             common[block.columns] = 1.0
-        yield Suspect("the strength of all fields", tuple(gains), common)
+        yield Suspect("the strength of all fields", tuple(gains), common, CHANGED)
     for block in blocks:
-        name = _display_name(block)
-        yield Suspect(name, (block,), np.eye(size)[:, np.arange(size)[block.columns]])
+        combine = np.eye(size)[:, np.arange(size)[block.columns]]
+        yield Suspect(changed_name((block,)), (block,), combine, CHANGED)
 
 
 def _of(block: Block) -> Parameter:
@@ -270,7 +261,17 @@ def _of(block: Block) -> Parameter:
     return block.parameter.of
 
 
-def _display_name(block: Block) -> str:
+def step_time(block: Block) -> float:
+    """Return the time of a step (s)."""
+    assert isinstance(block.parameter, StepChange | SinceBias)
+    return block.parameter.begin
+
+
+def changed_name(blocks: tuple[Block, ...]) -> str:
+    """Return what changed, in words: a parameter, or the pose of a beacon."""
+    block = blocks[0]
+    if len(blocks) > 1:
+        return f"the pose of beacon {block.owner}"
     kind = _of(block)
     if kind == GAIN:
         return f"the strength of beacon {block.owner}"
@@ -285,8 +286,9 @@ def _display_name(block: Block) -> str:
     return spoken_name(block._replace(parameter=kind))
 
 
-def _finding(change: Change, cause: ReleasedFault, sigma: Array) -> Finding:
-    block = change.fault.blocks[0]
+def change_finding(cause: ReleasedFault, sigma: Array) -> Finding:
+    """Return the finding on a step, with the typical errors of all parameters."""
+    block = cause.fault.blocks[0]
     kind, step = _of(block), (sigma * cause.step)[block.columns]
     size = float(np.linalg.norm(step))
     amounts = {
@@ -299,7 +301,7 @@ def _finding(change: Change, cause: ReleasedFault, sigma: Array) -> Finding:
         ACCEL_BIAS: f"by {size:.2g} m/s^2",
         GYRO_BIAS: f"by {size / DEGREE:.2g} deg/s",
     }
-    if kind == GAIN and len(change.fault.blocks) > 1:
+    if kind == GAIN and len(cause.fault.blocks) > 1:
         remedy = "the range or the temperature of the magnetometer, and the supply of the beacons"
     elif kind == GAIN:
         remedy = "its supply and its driver"
@@ -313,11 +315,11 @@ def _finding(change: Change, cause: ReleasedFault, sigma: Array) -> Finding:
         remedy = "whether it was moved"
     mean = float(np.mean(cause.distance))
     return Finding(
-        "changed",
-        f"A parameter changed during the log: {change.fault.name} {amounts[kind]}, from about"
-        f" {change.begin:.0f} s on ({float(sigmas(cause.log_p)):.0f} sigma). This moves the poses"
-        f" by {np.sqrt(mean):.1f} times their reported sigma. Check {remedy}. Smooth the parts"
-        " before and after separately (--start, --end).",
+        CHANGED,
+        f"A parameter changed during the log: {cause.fault.name} {amounts[kind]}, from about"
+        f" {step_time(block):.0f} s on ({float(sigmas(cause.log_p)):.0f} sigma). This moves the"
+        f" poses by {np.sqrt(mean):.1f} times their reported sigma. Check {remedy}. Process the"
+        " parts before and after separately (--start, --end).",
         Verdict.FAILED if mean > MAX_LINEAR_CHI_SQUARE else Verdict.DOUBTFUL,
         float(sigmas(cause.log_p)),
     )

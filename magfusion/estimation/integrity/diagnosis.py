@@ -136,12 +136,15 @@ def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
     Reasons that a mistake explains are listed with it, not beside it.
     """
     trust = with_cause(trust, cause)
-    missing = (f for f in trust.reasons if f.code in NOT_MEASURED)
-    first = next(missing, None) if cause is None else cause.finding
+    if cause is None:
+        known = (f for f in trust.reasons if f.code in NOT_MEASURED or f.code == "changed")
+        first = min(known, key=lambda f: f.code not in NOT_MEASURED, default=None)
+    else:
+        first = cause.finding
     if first is None:
         return trust
     # What only says where something is wrong explains no more than what follows of it there.
-    every = cause is None or first.weight >= FIRST
+    every = first.code in NOT_MEASURED or (cause is not None and first.weight >= FIRST)
 
     def is_explained(finding: Finding) -> bool:
         doubts = finding.verdict is not Verdict.TRUSTWORTHY and finding is not first

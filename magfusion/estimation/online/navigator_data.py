@@ -184,8 +184,8 @@ def _check_sums(sums: Sums) -> None:
     size, states = len(sums.gradient), sums.response.shape[:1]
     shapes = (sums.information.shape, sums.gradient.shape, sums.response.shape)
     _check(shapes == ((size, size), (size,), (*states, size)), "has sums of another shape")
-    values = np.concatenate([v.ravel() for v in (sums.information, sums.gradient, sums.response)])
-    _check(np.all(np.isfinite([*values, sums.time])), "has sums that are not finite")
+    parts = (sums.information, sums.gradient, sums.response, sums.onsets, sums.time)
+    _check(all(np.all(np.isfinite(part)) for part in parts), "has sums that are not finite")
 
 
 def _check_cov(cov: Array) -> None:

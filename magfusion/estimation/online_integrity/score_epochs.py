@@ -28,20 +28,25 @@ MEMORY = 60.0  # s; older innovations count less, as faults may change
 class Sums:
     """Sums over the innovations up to now, in typical errors of the fixed parameters.
 
+    After these h parameters follow those of `magfusion.estimation.online_integrity.beacon_steps`.
+
     Parameters
     ----------
-    information : ndarray, shape (h, h)
-    gradient : ndarray, shape (h,)
-    response : ndarray, shape (15 + estimated, h)
+    information : ndarray, shape (h + k, h + k)
+    gradient : ndarray, shape (h + k,)
+    response : ndarray, shape (15 + estimated, h + k)
         Effect of a unit error of these on the state.
     time : float
         (s)
+    onsets : tuple of float
+        Times of the tested steps (s).
     """
 
     information: Array
     gradient: Array
     response: Array
     time: float
+    onsets: tuple[float, ...] = ()
 
 
 class EpochTransition(NamedTuple):
@@ -108,12 +113,13 @@ def add_epochs(sums: Sums, epochs: Sequence[Epoch], targets: ScoreTargets) -> Su
     known = by_own @ alone @ np.swapaxes(by_own, 1, 2) + noise
     gain = np.swapaxes(np.linalg.solve(innovation, across[..., own]), 1, 2)
     pushed, response = _pushed(epochs, targets), sums.response
-    shown = np.empty((*error.shape, len(targets.unit)))
+    shown, fixed = np.empty((*error.shape, response.shape[1])), slice(0, len(targets.unit))
     for k, epoch in enumerate(epochs):
         if epoch.passed is not None:
             response = epoch.passed.transition[own, own] @ response
-            response[:9] -= pushed[k]
-        shown[k] = by_own[k] @ response - by_held[k]
+            response[:9, fixed] -= pushed[k]
+        shown[k] = by_own[k] @ response
+        shown[k][:, fixed] -= by_held[k]
         response = response - gain[k] @ shown[k]
     symmetric = 0.5 * (known + np.swapaxes(known, 1, 2))
     solved = np.linalg.solve(symmetric, np.concatenate([shown, error[..., None]], axis=2))
@@ -126,6 +132,7 @@ def add_epochs(sums: Sums, epochs: Sequence[Epoch], targets: ScoreTargets) -> Su
         kept[0] * sums.gradient + whole[:, -1],
         response,
         float(time[-1]),
+        sums.onsets,
     )
 
 

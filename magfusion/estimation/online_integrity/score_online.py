@@ -13,11 +13,13 @@ import numpy as np
 
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, State, states_of
+from magfusion.estimation.integrity.change_detection import CHANGED, change_finding
 from magfusion.estimation.integrity.correction import Correction, corrections
 from magfusion.estimation.integrity.fixed_parameter_test import causes_of, finding_of
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.suspects import Suspect
 from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.online_integrity.beacon_steps import BeaconSteps
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.estimation.online_integrity.score_epochs import (
     MEMORY,
@@ -32,7 +34,7 @@ from magfusion.estimation.online_integrity.score_targets import (
     of_beacons_named,
 )
 from magfusion.model.detection_range import are_many
-from magfusion.model.parameters import CLOCK_RATE, TIME_OFFSET, BeaconParameter, Block
+from magfusion.model.parameters import CLOCK_RATE, TIME_OFFSET, BeaconParameter, Block, prior_sigma
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.units import Array
@@ -79,6 +81,7 @@ class OnlineScore:
         self._epochs_since_score = 0
         self._detected_at = {}
         self.correction: Correction | None = None
+        self._steps = BeaconSteps(site, estimated)
         self._targets = self._targets_of(() if are_many(site) else [b.name for b in site.beacons])
 
     @property
@@ -172,6 +175,8 @@ class OnlineScore:
             led = self._waiting.pop().passed
         self._waiting.append(Epoch(predicted, led, tuple(measurements)))
         self._epochs_since_score += 1
+        if self._steps.is_due(self._sums, predicted.time) and (sums := self.settle()) is not None:
+            self._sums = self._steps.with_onset(sums)
         if are_many(self.site) or len(self._waiting) >= MOST_WAITING:
             self.settle()
 
@@ -198,25 +203,32 @@ class OnlineScore:
     def _evaluate(self, sums: Sums, state: State) -> Judgement:
         pose_cov, targets = state.cov[None, :6, :6], self.targets
         information = 0.5 * (sums.information + sums.information.T)
-        by = -sums.response
+        by, size = -sums.response, len(targets.unit)
+        steps = self._steps.blocks(sums.onsets, size)
+        more = ((0, len(information) - size), (0, 0))  # rows of the steps
         score = Score(
-            targets.fixed_blocks,
+            (*targets.fixed_blocks, *steps),
             information,
             sums.gradient,
-            targets.spread,
+            np.pad(targets.spread, more),
             by[None, :MOTION],
             by[MOTION:],
         )
 
         def candidates(information: Array, gradient: Array) -> list[Suspect]:
             gained = np.flatnonzero(targets.gains(information, gradient) > 0.0)
-            return [targets.fault_candidates[k] for k in gained.tolist()]
+            known = [targets.fault_candidates[k] for k in gained.tolist()]
+            fixed = [one._replace(combine=np.pad(one.combine, more)) for one in known]
+            return [*fixed, *self._steps.candidates(steps, information, gradient)]
 
         self.correction, first = None, next(causes_of(pose_cov, score, candidates), None)
         if first is None:
             return Judgement()
         cause, rivals = first.cause, first.rivals
         turn, shift = np.linalg.norm(cause.moved[0].reshape(2, 3), axis=1)
+        if cause.code == CHANGED:
+            finding = change_finding(cause, prior_sigma(score.fixed))
+            return Judgement((finding,), turn=float(turn), shift=float(shift))
         finding = finding_of(targets.site, score, cause, rivals)
         (correction,) = corrections(self.site, (finding,), (cause, *rivals), None)
         uncertainty = score.by_pose @ cause.known_cov @ np.swapaxes(score.by_pose, 1, 2)

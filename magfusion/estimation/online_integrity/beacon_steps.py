@@ -1,0 +1,118 @@
+"""Steps of beacons' estimated poses at recent times, in the online score test.
+
+A beacon that is moved contradicts no fixed parameter where its pose is estimated.  From the step
+on, the estimate of the pose errs by it: the response to a unit step begins as minus one there, and
+is then propagated as that of any other error.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import groupby
+
+import numpy as np
+
+from magfusion.estimation.graph.state import MOTION
+from magfusion.estimation.integrity.change_detection import (
+    MOST_BEACONS,
+    TYPICAL,
+    StepChange,
+    changed_name,
+    step_time,
+)
+from magfusion.estimation.integrity.fixed_parameter_test import LEAST_EVIDENCE
+from magfusion.estimation.integrity.released_fault import gains
+from magfusion.estimation.integrity.suspects import Suspect
+from magfusion.estimation.online_integrity.score_epochs import Sums
+from magfusion.model.parameters import BEACON_POSITION, BEACON_ROTATION, Block
+from magfusion.model.site import Site
+from magfusion.units import Array
+
+ONSET_INTERVAL = 2.0  # s; a step between two is tested as at the next one
+MOST_ONSETS = 6  # times of tested steps; the older ones are farther apart
+
+
+class BeaconSteps:
+    """The tested steps: of the pose of each beacon with an estimated one.
+
+    Parameters
+    ----------
+    estimated : tuple of Block
+        Calibration parameters in the state's tangent.
+    """
+
+    def __init__(self, site: Site, estimated: tuple[Block, ...]) -> None:
+        kinds = (BEACON_POSITION, BEACON_ROTATION)
+        own = [block for block in estimated if block.parameter in kinds]
+        self._blocks = tuple(own) if 1 < len(site.beacons) <= MOST_BEACONS else ()
+        at = [np.arange(b.columns.start, b.columns.stop) for b in self._blocks]
+        self._rows = MOTION + np.concatenate([np.zeros(0, dtype=np.int64), *at])
+        self._unit = np.concatenate(
+            [np.zeros(0), *(np.full(len(b.sigma), TYPICAL[b.parameter]) for b in self._blocks)]
+        )
+
+    def is_due(self, sums: Sums | None, time: float) -> bool:
+        """Return whether a new onset is to be tested from a time (s) on."""
+        if sums is None or not self._blocks:
+            return False
+        return len(sums.onsets) == 0 or time >= sums.onsets[-1] + ONSET_INTERVAL
+
+    def with_onset(self, sums: Sums) -> Sums:
+        """Return sums with a step at their time; of too many, the one closest to others ends."""
+        size = len(self._rows)
+        response = np.zeros((len(sums.response), size))
+        response[self._rows, np.arange(size)] = -self._unit
+        new = Sums(
+            np.pad(sums.information, (0, size)),
+            np.pad(sums.gradient, (0, size)),
+            np.concatenate([sums.response, response], axis=1),
+            sums.time,
+            (*sums.onsets, sums.time),
+        )
+        return new if len(new.onsets) <= MOST_ONSETS else self._without_one(new)
+
+    def _without_one(self, sums: Sums) -> Sums:
+        age = sums.time - np.array(sums.onsets)
+        # Ages in even ratios: a step is tested to a constant share of its age.
+        dropped = int(np.argmin((age[:-2] - age[2:]) / age[1:-1])) + 1
+        begin = len(sums.gradient) - len(self._rows) * (len(sums.onsets) - dropped)
+        kept = np.delete(np.arange(len(sums.gradient)), np.arange(begin, begin + len(self._rows)))
+        return replace(
+            sums,
+            information=sums.information[np.ix_(kept, kept)],
+            gradient=sums.gradient[kept],
+            response=sums.response[:, kept],
+            onsets=sums.onsets[:dropped] + sums.onsets[dropped + 1 :],
+        )
+
+    def blocks(self, onsets: tuple[float, ...], first: int) -> list[Block]:
+        """Return the steps as parameters, with their columns from the first on."""
+        result = []
+        for onset in onsets:
+            for block in self._blocks:
+                own = slice(first, first + len(block.sigma))
+                sigma = np.full(len(block.sigma), TYPICAL[block.parameter])
+                step = StepChange(block.parameter, onset)
+                result.append(Block(step, block.owner, own, sigma))
+                first = own.stop
+        return result
+
+    def candidates(self, steps: list[Block], information: Array, gradient: Array) -> list[Suspect]:
+        """Return what one event may have moved, where there is evidence for one of so many."""
+        events = list(self._events(steps))
+        result, price = [], 2.0 * np.log(max(len(events), 1))
+        for moved in events:
+            rows = np.concatenate([np.arange(b.columns.start, b.columns.stop) for b in moved])
+            own = information[np.ix_(rows, rows)]
+            gain = gains(np.eye(len(rows))[None], own, gradient[rows])
+            if gain[0] > LEAST_EVIDENCE + price:
+                combine = np.eye(len(gradient))[:, rows]
+                result.append(Suspect(changed_name(moved), moved, combine, "changed"))
+        return result
+
+    def _events(self, steps: list[Block]) -> Iterator[tuple[Block, ...]]:
+        """Yield the position of a beacon, its attitude, and both, at each onset."""
+        for _, blocks in groupby(steps, lambda b: (step_time(b), b.owner)):
+            own = tuple(blocks)
+            yield from ((block,) for block in own)
+            if len(own) > 1:
+                yield own

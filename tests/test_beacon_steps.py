@@ -1,0 +1,92 @@
+"""Beacons that are moved during a run, where the survey of all is estimated."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_problem import SIGMA, SmallLog
+from test_online_separation import NAVIGATOR, _feed
+from test_smoothed_separation import EPOCHS, STEP, _walk
+
+from magfusion.estimation.graph.state import between
+from magfusion.estimation.integrity.change_detection import StepChange
+from magfusion.estimation.online.navigator import Navigator
+from magfusion.model.parameters import BEACON_POSITION
+from magfusion.model.samples import FieldSamples
+from magfusion.model.trust import Verdict
+from magfusion.simulation.log import simulate_fields
+from magfusion.units import DEGREE, Array
+
+NOISE = 10.0 * SIGMA  # T; a beacon that is moved by centimetres passes the gate
+
+
+def _walk_with_a_step(seed: int, at: float, shift_world: Array) -> SmallLog:
+    """Return a walk among beacons surveyed to 1 cm, the first of which is moved at a time (s)."""
+    small, rng = _walk(seed), np.random.default_rng(1000 + seed)
+    first, *others = small.site.beacons
+    moved = replace(first, position_world=first.position_world + shift_world)
+    worlds = (small.site, replace(small.site, beacons=(moved, *others)))
+    states = rng.bit_generator.state
+    parts = []
+    for world in worlds:  # with the same noise
+        rng.bit_generator.state = states
+        parts.append(simulate_fields(world, small.truth, NOISE, rng, window=STEP))
+    before = parts[0].time <= at
+    fields = FieldSamples.joined([parts[0].rows(before), parts[1].rows(~before)])
+    surveyed = (
+        replace(
+            b,
+            sigma=replace(
+                b.sigma,
+                position_world=np.full(3, 0.01),
+                rotation_beacon=np.full(3, 0.5 * DEGREE),
+            ),
+        )
+        for b in small.site.beacons
+    )
+    return replace(small, site=replace(small.site, beacons=tuple(surveyed)), fields=fields)
+
+
+def _navigated(small: SmallLog) -> Navigator:
+    navigator = Navigator(small.site, NAVIGATOR)
+    _feed(navigator, small, 0, EPOCHS)
+    return navigator
+
+
+def test_the_columns_are_how_a_step_moves_the_estimate_and_its_innovations() -> None:
+    """Two runs with the same noise, the second with a step of one millimetre."""
+    still = _navigated(_walk_with_a_step(40, np.inf, np.zeros(3)))
+    sums = still._update.score.settle()
+    assert sums is not None
+    onset, shift = sums.onsets[1], 1e-3 * np.array([1.0, -1.0, 0.5])
+    moved = _navigated(_walk_with_a_step(40, onset, shift))
+    other = moved._update.score.settle()
+    assert other is not None
+    assert other.onsets == sums.onsets
+    score = still._update.score
+    steps = score._steps.blocks(sums.onsets, len(score.targets.unit))
+    kind = StepChange(BEACON_POSITION, onset)
+    (own,) = (b.columns for b in steps if b.key == (kind, still.site.beacons[0].name))
+    unit = shift / 0.01
+    expected = sums.response[:6, own] @ unit
+    result = between(still.take()[-1], moved.take()[-1], ())[:6]
+    size = float(np.linalg.norm(expected[3:]))
+    assert size > 5e-5  # m
+    np.testing.assert_allclose(result, expected, atol=0.05 * size)
+    gained = other.gradient[own] - sums.gradient[own]
+    np.testing.assert_allclose(gained, sums.information[own, own] @ unit, rtol=0.1)
+
+
+@pytest.mark.parametrize("seed", range(40, 42))
+def test_a_moved_beacon_is_named_and_one_at_rest_is_not(seed: int) -> None:
+    at, shift = 15.0, np.array([0.06, -0.06, 0.0])  # s, m
+    moved = _navigated(_walk_with_a_step(seed, at, shift))
+    doubted = [s for s in moved.take() if s.verdict is not Verdict.TRUSTWORTHY]
+    assert doubted[0].time > at
+    reason = doubted[-1].judgement.reasons[0]
+    assert reason.code == "changed"
+    assert f"the position of beacon {moved.site.beacons[0].name} by" in reason.text
+    size = float(reason.text.split(" by ")[1].split(" cm")[0])
+    assert size == pytest.approx(100.0 * float(np.linalg.norm(shift)), abs=2.0)  # cm
+    still = _navigated(_walk_with_a_step(seed, np.inf, np.zeros(3)))
+    assert all(s.verdict is Verdict.TRUSTWORTHY for s in still.take())
