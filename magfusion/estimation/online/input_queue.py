@@ -296,7 +296,7 @@ class Arrivals:
         steady = list(self.steady.values())
         return find_online_start(
             self.receiver.site,
-            self.inertial_samples(),
+            self.inertial_samples(end=until - self.applied_offset + MARGIN),
             self.waveform,
             self.fields,
             steady,

@@ -24,7 +24,7 @@ from magfusion.files.fields import SAME_TIME, side_by_side
 from magfusion.files.named_records import magnetometer_number
 from magfusion.model.marks import Marks
 from magfusion.model.parameters import seen_by
-from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
+from magfusion.model.samples import FieldSamples, SteadyFields, Waveform
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.lockin_receiver import LockinReceiver
@@ -274,12 +274,9 @@ class SeveralArrivals(Arrivals):
                 waves[stream.name] = Waveform(
                     wave.time - late[stream.name], wave.measured_sensor, marks
                 )
-        imu, known = self.inertial_samples(), until - self.applied_offset
-        kept = imu.time <= known
-        imu = ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept])
         return find_online_start(
             self.site,
-            imu,
+            self.inertial_samples(end=until - self.applied_offset),
             self.waveform,
             self.fields,
             [],
