@@ -12,12 +12,15 @@ import pytest
 from online_log import OnlineLog, online_log
 from test_navigate_stream import EKF, answered, records
 
-from magfusion.estimation.online.navigator import Navigator
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.site import save_site
 from magfusion.files.stream import Record
 from magfusion.jobs.checkpoint import REPORT_INTERVAL, CheckpointWriter
+from magfusion.jobs.replay import Replay, feed
 from magfusion.jobs.stream import StreamSettings
 from magfusion.jobs.stream_clocks import StreamClocks
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.log import SimulationConfig, simulate_log
 
 WRAP = 2.0**32 * 1e-6  # s; of a 32-bit counter of microseconds
 SECONDS = 22.0
@@ -154,3 +157,16 @@ def test_a_temperature_makes_no_checkpoint_and_is_no_old_data(
     _, reported = answered(site, given, replace(settings, resume=True))
     assert reported == ""
     assert len(saved) == 1
+
+
+def test_a_start_that_waits_for_late_samples_has_streams_of_one_length() -> None:
+    """The inertial samples of the time that it waits for are no difference of clocks."""
+    log = simulate_log(
+        demo_site(), SimulationConfig(DEMO_BOX_WORLD, duration=8.0), np.random.default_rng(3)
+    ).log
+    navigator = Navigator(demo_site(), NavigatorSettings("ekf", delay=1.0))
+    for _, piece in Replay(log).pieces():
+        feed(navigator, piece)
+    states = navigator.take()
+    assert states
+    assert not any(state.judgement.reasons for state in states)

@@ -27,7 +27,12 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.model.without_imu import as_declared, on_motion_prior, without_imu
 from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
-from magfusion.simulation.log import EPOCH_NS, simulate_fields
+from magfusion.simulation.log import (
+    EPOCH_NS,
+    SimulationConfig,
+    simulate_fields,
+    simulate_log,
+)
 from magfusion.simulation.motion import Rests, random_walk_motion
 
 HZ = 20.0
@@ -124,6 +129,35 @@ def test_the_covariance_holds_for_a_hand_and_the_prior_helps() -> None:
     alone = trajectory_errors(result.start.states, log.truth).position_world
     smoothed = trajectory_errors(result.states, log.truth).position_world
     assert np.mean(smoothed**2) < np.mean(alone**2)
+
+
+def of_samples(seed: int, beacons: int, duration: float) -> tuple[Log, Site]:
+    """Return raw samples of a walk among beacons whose moments alone are uncertain, by 5 %."""
+    site = exact()
+    chosen = tuple(
+        replace(b, sigma=replace(b.sigma, log_moment=np.full(len(b.coils), 0.05)))
+        for b in site.beacons[:beacons]
+    )
+    site = replace(site, beacons=chosen)
+    config = SimulationConfig(DEMO_BOX_WORLD, duration=duration, magnetometer_rate_hz=400.0)
+    return simulate_log(site, config, np.random.default_rng(seed)).log, site
+
+
+def mean_nees_of_samples(beacons: int, seeds: range, duration: float) -> float:
+    runs = [of_samples(seed, beacons, duration) for seed in seeds]
+    assert not any(len(log.imu) for log, _ in runs)
+    return float(np.mean([nees(smooth(log, site).states, log.truth) for log, site in runs]))
+
+
+def test_the_covariance_holds_for_raw_samples() -> None:
+    """Windows follow the poses, and their residuals are no measure of their noise."""
+    assert 3.0 < mean_nees_of_samples(4, range(2), 8.0) < 9.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("beacons", [2, 4])
+def test_the_covariance_holds_for_raw_samples_over_ten_seeds(beacons: int) -> None:
+    assert 3.0 < mean_nees_of_samples(beacons, range(10), 12.0) < 8.0
 
 
 def test_the_noise_within_an_interval_is_that_of_white_accelerations() -> None:

@@ -280,6 +280,8 @@ def _advance(run: NavigateRun, settings: NavigateSettings, report: Report) -> No
             _save(run, k, time.perf_counter() - began)
         running = run.navigator.started
         before = time.perf_counter()
+        if run.navigator.is_after_silence(piece.arrival - PIECE):
+            run.navigator = run.navigator.restarted()
         feed(run.navigator, piece)
         run.navigator = corrected(run.navigator)
         states = run.navigator.take()

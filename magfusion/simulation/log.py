@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.model.arguments import check_arguments
 from magfusion.model.marks import Marks
-from magfusion.model.samples import FieldSamples, Log, Waveform
+from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
 from magfusion.model.short_repr import short_repr
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -221,7 +221,7 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         name=f"simulated_{config.motion}",
         epoch_ns=EPOCH_NS,
         source="simulation",
-        imu=imu.samples,
+        imu=imu.samples if np.isfinite(site.platform.imu.gyro_noise) else ImuSamples.empty(),
         waveform=waveform,
         truth=_truth(motion, imu, true_site),
         reference=reference,

@@ -10,6 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.estimation.data_checks.resolution import (
+    is_coarse,
+    is_scheduled,
+    reached_in_steps,
+    step_of_axes,
+    within_a_step,
+)
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
@@ -88,14 +95,9 @@ def runs(flag: BoolArray) -> Runs:
     return Runs(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1))
 
 
-def frozen(stream: InstrumentStream, same: BoolArray) -> Runs:
-    """Return the stretches that are equal for longer than chance allows.
-
-    Parameters
-    ----------
-    same : bool ndarray, shape (n - 1,)
-        Whether a sample equals its predecessor.
-    """
+def frozen(stream: InstrumentStream, axes: tuple[int, ...]) -> Runs:
+    """Return the stretches in which axes are equal for longer than chance and steps allow."""
+    same = np.all(stream.value[1:, axes] == stream.value[:-1, axes], axis=1)
     count = len(same)
     edges = np.linspace(0, count, max(1, count // BLOCK) + 1).astype(np.int64)
     shares = np.add.reduceat(same, edges[:-1], dtype=np.float64) / np.diff(edges)
@@ -106,7 +108,9 @@ def frozen(stream: InstrumentStream, same: BoolArray) -> Runs:
     least = max(by_chance, SHORTEST_FREEZE / step, 6.0)
     result = runs(same)
     long = result.last - result.first >= least
-    return Runs(result.first[long], result.last[long])
+    first, last = result.first[long], result.last[long]
+    kept = ~(within_a_step(stream.value, axes, first, last) | is_scheduled(first, last))
+    return Runs(first[kept], last[kept])
 
 
 def frozen_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
@@ -117,14 +121,13 @@ def frozen_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
             yield _freeze(stream, "all axes", whole)
             continue
         for axis in range(len(stream.axes)):
-            value = stream.value[:, axis]
-            alone = frozen(stream, value[1:] == value[:-1])
+            alone = frozen(stream, (axis,))
             if len(alone) and not _at_limit(stream, axis, alone):
                 yield _freeze(stream, f"axis {stream.axes[axis]}", alone)
 
 
 def _all_frozen(stream: InstrumentStream) -> Runs:
-    return frozen(stream, np.all(stream.value[1:] == stream.value[:-1], axis=1))
+    return frozen(stream, tuple(range(len(stream.axes))))
 
 
 def _at_limit(stream: InstrumentStream, axis: int, result: Runs) -> bool:
@@ -183,7 +186,7 @@ def repeated_samples(log: Log, site: Site | None) -> Iterator[Finding]:
         # Coarse steps repeat by chance, independently per axis.
         by_chance = float(np.prod(np.mean(same, axis=0))) if same.shape[1] > 1 else 0.0
         fixed = (share - by_chance) / (1.0 - by_chance) if by_chance < 1.0 else 1.0
-        if fixed < MAX_REPEATED_SHARE or share > 0.98:
+        if fixed < MAX_REPEATED_SHARE or share > 0.98 or is_coarse(stream.value):
             continue
         rate_hz = 1.0 / float(np.median(np.diff(stream.time)))
         own = (1.0 - share) * rate_hz
@@ -217,7 +220,7 @@ def _clipped_axes(stream: InstrumentStream) -> Iterator[Finding]:
     for axis in range(len(stream.axes)):
         for sign in (-1.0, 1.0):
             count, limit = clipped(sign * value[:, axis], largest)
-            if count == 0:
+            if count == 0 or reached_in_steps(value, axis, sign * limit):
                 continue
             share = count / len(stream.time)
             first_at = stream.time[np.argmax(stream.value[:, axis] == sign * limit)]
@@ -283,7 +286,7 @@ def _spikes(stream: InstrumentStream) -> tuple[IntArray, BoolArray]:
     separate = np.maximum(np.abs(after - before), outer)
     from_curve = np.abs(x - curve)
     off = np.minimum(from_curve, np.abs(x - centre))
-    scatter = widening * np.maximum(_scatter(from_curve / noise), _quantum(x))
+    scatter = widening * np.maximum(_scatter(from_curve / noise), step_of_axes(x))
     scatter += 1e-9 * np.abs(centre)  # rounding
     alone = off > 3.0 * separate
     size = np.max(np.where(alone, off / np.maximum(scatter, np.finfo(float).tiny), 0.0), axis=1)
@@ -306,13 +309,6 @@ def _cubic(time: Array, near: list[IntArray]) -> tuple[list[Array], Array, Array
     noise = np.sqrt(1.0 + np.sum(np.square(weight), axis=0))[:, None] / EVEN_GAIN
     smooth = np.abs(np.prod(far, axis=0))[:, None] / 4.0
     return weight, noise, np.maximum(1.0, np.maximum(noise, smooth))
-
-
-def _quantum(x: Array) -> Array:
-    """Return the steps in which an instrument reads, shape (axes,)."""
-    step = np.abs(np.diff(x, axis=0))
-    least = np.min(np.where(step > 0.0, step, np.inf), axis=0)
-    return np.where(np.isfinite(least), least, 0.0)
 
 
 def _scatter(off: Array) -> Array:

@@ -134,7 +134,7 @@ class Arrivals:
     def add_imu(self, time: Array, gyro_body: Array, accel_body: Array) -> None:
         """Add inertial samples, as `Navigator.add_imu`."""
         stamps = np.atleast_1d(time)
-        check_clock("imu", stamps, self._newest)
+        check_clock("imu", stamps, self.newest)
         rows = np.hstack([np.atleast_2d(gyro_body), np.atleast_2d(accel_body)])
         self.imu.add(stamps, rows)
         if not self.receiver.site.platform.inertial:
@@ -149,22 +149,22 @@ class Arrivals:
         """Add raw samples of the magnetometer, as `Navigator.add_magnetometer`."""
         magnetometer_number(self.receiver.site, magnetometer, "samples")
         stamps = np.atleast_1d(time)
-        check_clock("magnetometer", stamps, self._newest)
+        check_clock("magnetometer", stamps, self.newest)
         self.waveform.add(stamps, np.atleast_2d(measured_sensor))
 
     def add_marks(self, marks: Marks) -> None:
         """Add bursts of coils, as `Navigator.add_marks`."""
-        check_clock("marks", marks.end, self._newest)
+        check_clock("marks", marks.end, self.newest)
         self.receiver.add_marks(marks)
 
     def add_slots(self, time: Array, slot: IntArray) -> None:
         """Add the slots of samples, as `Navigator.add_slots`."""
-        check_clock("magnetometer", time, self._newest)
+        check_clock("magnetometer", time, self.newest)
         self.receiver.add_slots(time, slot)
 
     def add_fields(self, samples: FieldSamples, steady: SteadyFields | None, after: float) -> int:
         """Add phasors, as `Navigator.add_fields`; return how many are not after a time (s)."""
-        check_clock("fields", samples.time, self._newest)
+        check_clock("fields", samples.time, self.newest)
         if self.fields and self.fields[-1].signed != samples.signed:
             raise InputError(
                 "fields: amplitudes without sign are mixed with phasors; use only one of them"
@@ -183,7 +183,7 @@ class Arrivals:
 
     def add_measurement(self, time: float, measurement: Measurement, after: float) -> bool:
         """Add any other measurement; return whether it is after a time (s)."""
-        check_clock("measurement", np.array([time]), self._newest)
+        check_clock("measurement", np.array([time]), self.newest)
         if time > after:
             self.others.append((time, measurement.at(0)))
             self.others.sort(key=lambda other: other[0])
@@ -207,7 +207,7 @@ class Arrivals:
         return self.others[0][0] if self.others else np.inf
 
     @property
-    def _newest(self) -> float:
+    def newest(self) -> float:
         """Newest stamp of all streams (s)."""
         return max(self.imu.newest, self.waveform.newest, self._newest_field)
 
@@ -296,7 +296,7 @@ class Arrivals:
         steady = list(self.steady.values())
         return find_online_start(
             self.receiver.site,
-            self.inertial_samples(),
+            self.inertial_samples(end=until - self.applied_offset + MARGIN),
             self.waveform,
             self.fields,
             steady,

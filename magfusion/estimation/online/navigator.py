@@ -13,6 +13,7 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.freeze import imu_remarks
 from magfusion.estimation.data_checks.inertial_noise import measured_noise, with_white_noise
+from magfusion.estimation.data_checks.stream_buffer import LARGEST_JUMP
 from magfusion.estimation.demodulation.drive_reference import drive_findings
 from magfusion.estimation.demodulation.sensor_frame_samples import (
     sensor_frame_phasors,
@@ -22,6 +23,7 @@ from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.process_noise import calibration_process_noise
 from magfusion.estimation.graph.propagation import Propagated, propagate
 from magfusion.estimation.graph.state import State
+from magfusion.estimation.initialization.earlier_state import with_earlier
 from magfusion.estimation.initialization.early import first_try, is_clear, next_try, open_start
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
 from magfusion.estimation.integrity.correction import Correction, continued, spread_of
@@ -58,7 +60,7 @@ from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.samples import FieldSamples, SteadyFields
 from magfusion.model.site import Site
 from magfusion.model.temperature import Temperatures
-from magfusion.model.trust import Finding
+from magfusion.model.trust import Finding, Verdict
 from magfusion.model.without_imu import on_motion_prior, require_motion_prior
 from magfusion.receiver.drive import DriveReceiver
 from magfusion.units import Array, IntArray
@@ -103,6 +105,7 @@ class Navigator:
     rival_chi_square: float | None
     _corrections: AppliedCorrections
     _reported_until: float
+    _earlier: State | None
 
     def __init__(self, site: Site, settings: NavigatorSettings | None = None) -> None:
         check_arguments("Navigator", site=(site, Site))
@@ -148,6 +151,7 @@ class Navigator:
         self.rival_chi_square = None
         self.declared, self._history = site, InputHistory()
         self._corrections, self._reported_until = AppliedCorrections(), -np.inf
+        self._earlier = None
         self._possible: tuple[Correction, ...] = ()
         self._tried: Correction | None = None
         self.remainder: Correction | None = None
@@ -380,11 +384,25 @@ class Navigator:
         )
 
     def restarted(self) -> "Navigator":
-        """Return a navigator that starts again, as where the clock of the data has stepped."""
+        """Return a navigator that starts again, where the clock has stepped or all was silent.
+
+        It keeps the biases and the calibration of a trustworthy state, with their random walks.
+        """
         declared = replace(self.declared, temperatures=self._degrees, drives=self._drives)
         result = Navigator(declared, self.settings)
-        result._discontinuities.counter = self._discontinuities.counter + self.started
+        result._discontinuities, result.summary = self._discontinuities, self.summary
+        result._discontinuities.counter += self.started
+        result.counts.update(self.counts)
+        result.counts["started again"] += 1
+        known, result._earlier = self._judgement.verdict is Verdict.TRUSTWORTHY, self._earlier
+        if self._estimator is not None:
+            known &= not self.corrected
+            result._earlier = _on_site(self._estimator.state, result.site) if known else None
         return result
+
+    def is_after_silence(self, time: float) -> bool:
+        """Return whether all streams were silent for so long before a time (s) that it restarts."""
+        return -np.inf < self._arrived.newest < time - LARGEST_JUMP
 
     # Corrections
 
@@ -493,6 +511,10 @@ class Navigator:
             self.why_no_start = open_start(start)
             self._next_start += 0.5 * self.settings.start_duration
             return False
+        if self._earlier is not None:
+            estimated = self.blocks[: len(self.settings.blocks(self.site)[0])]
+            parts = self._earlier, self.site, estimated, self._process_noise
+            start, self._earlier = replace(start, state=with_earlier(start.state, *parts)), None
         imu, _ = measured_noise(arrived.inertial_samples(), self.site.platform.imu)
         self._white = [imu.gyro_noise, imu.accel_noise]
         self._arrived.start(start, self.settings.delay)
@@ -600,3 +622,9 @@ class Navigator:
         noise, site = self._process_noise, with_white_noise(self.site, *self._white)
         blocks = self._of_imu
         return propagate(state, imu, time, site, offset, noise, usual, blocks, blind=blind)
+
+
+def _on_site(state: State, site: Site) -> State:
+    """Return a state whose calibration shares the readings of temperature and current of a site."""
+    shared = replace(state.calibration.site, temperatures=site.temperatures, drives=site.drives)
+    return replace(state, calibration=replace(state.calibration, site=shared))

@@ -24,7 +24,7 @@ from magfusion.files.fields import SAME_TIME, side_by_side
 from magfusion.files.named_records import magnetometer_number
 from magfusion.model.marks import Marks
 from magfusion.model.parameters import seen_by
-from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
+from magfusion.model.samples import FieldSamples, SteadyFields, Waveform
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.lockin_receiver import LockinReceiver
@@ -86,13 +86,13 @@ class SeveralArrivals(Arrivals):
             )
         stream, late = self.streams[which], self.site.platform.magnetometers[which].clock_offset
         stamps = np.atleast_1d(time) + late
-        check_clock(stream.samples.name, stamps, self._newest)
+        check_clock(stream.samples.name, stamps, self.newest)
         stream.samples.add(stamps, np.atleast_2d(measured_sensor))
         self.begun_at = min(self.begun_at, float(np.min(stamps, initial=np.inf)))
 
     def add_marks(self, marks: Marks) -> None:
         """Add bursts of coils, which every magnetometer receives."""
-        check_clock("marks", marks.end, self._newest)
+        check_clock("marks", marks.end, self.newest)
         for stream in self.streams:
             stream.receiver.add_marks(marks)
 
@@ -114,7 +114,7 @@ class SeveralArrivals(Arrivals):
                 "fields: they are mixed with samples of the magnetometers; use only one of them for"
                 " all magnetometers"
             )
-        check_clock("fields", samples.time, self._newest)
+        check_clock("fields", samples.time, self.newest)
         late = 0
         for one in samples.epochs():
             self._take_fields(one)
@@ -173,7 +173,8 @@ class SeveralArrivals(Arrivals):
         return [n for n, to in detected.items() if newest - to > SILENCE + self._longest]
 
     @property
-    def _newest(self) -> float:
+    def newest(self) -> float:
+        """Newest stamp of all streams (s)."""
         detected = max(self._last_times().values()) if np.isfinite(self.begun_at) else -np.inf
         return max(self.imu.newest, detected)
 
@@ -273,12 +274,9 @@ class SeveralArrivals(Arrivals):
                 waves[stream.name] = Waveform(
                     wave.time - late[stream.name], wave.measured_sensor, marks
                 )
-        imu, known = self.inertial_samples(), until - self.applied_offset
-        kept = imu.time <= known
-        imu = ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept])
         return find_online_start(
             self.site,
-            imu,
+            self.inertial_samples(end=until - self.applied_offset),
             self.waveform,
             self.fields,
             [],

@@ -101,7 +101,7 @@ def at_fix(state: State, fix: AgreedFix) -> State:
 def restarted(state: State, fix: AgreedFix) -> State:
     """Return a state with the pose of a fix alone; calibration is kept.
 
-    So are the biases, unless they are implausible for the instrument.
+    So are the biases, unless they are implausible for the instrument, or its prior is better.
     """
     best, site = fix.fixes.best(), state.calibration.site
     assert best.pose_cov is not None
@@ -110,13 +110,19 @@ def restarted(state: State, fix: AgreedFix) -> State:
     cov[:6, :6] = 4.0 * fix.excess * best.pose_cov[0]
     cov[6:9, 6:9] = site.platform.motion.speed_sigma**2 * np.eye(3)
     result = replace(at_fix(state, fix), velocity_world=np.zeros(3), cov=cov)
-    if np.max(np.abs(state.accel_bias_body)) > BIAS_LIMIT * site.platform.imu.accel_bias_sigma:
+    imu = site.platform.imu
+    if _is_worse(state.accel_bias_body, cov[ACCEL_BIAS, ACCEL_BIAS], imu.accel_bias_sigma):
         result = replace(result, accel_bias_body=np.zeros(3))
-        _reset_covariance(cov, ACCEL_BIAS, site.platform.imu.accel_bias_sigma)
-    if np.max(np.abs(state.gyro_bias_body)) > BIAS_LIMIT * site.platform.imu.gyro_bias_sigma:
+        _reset_covariance(cov, ACCEL_BIAS, imu.accel_bias_sigma)
+    if _is_worse(state.gyro_bias_body, cov[GYRO_BIAS, GYRO_BIAS], imu.gyro_bias_sigma):
         result = replace(result, gyro_bias_body=np.zeros(3))
-        _reset_covariance(cov, GYRO_BIAS, site.platform.imu.gyro_bias_sigma)
+        _reset_covariance(cov, GYRO_BIAS, imu.gyro_bias_sigma)
     return result
+
+
+def _is_worse(bias: Array, cov: Array, sigma: float) -> bool:
+    """Return whether a bias is less plausible, or less certain, than a prior of zero."""
+    return bool(np.max(np.abs(bias)) > BIAS_LIMIT * sigma or np.max(np.diagonal(cov)) > sigma**2)
 
 
 def _reset_covariance(cov: Array, columns: slice, sigma: float) -> None:

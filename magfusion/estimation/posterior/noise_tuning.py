@@ -36,9 +36,6 @@ OF_MOTION = {"angular_accel_density": "gyro_bias_walk", "accel_density": "accel_
 WALK = slice(12, 15)
 PLAUSIBLE = 6.0  # by a larger factor, either way, white noise is a fault
 MIN_REMAINING = 1e-3  # of an error; a smaller remainder is not informative
-# Of a beacon's noise; with a smaller remainder no IMU constrains the pose, but the beacon alone,
-# whose own residuals, which it absorbs, would seem to improve from pass to pass.
-SELF_MADE = 0.5
 
 
 @dataclass(frozen=True)
@@ -149,15 +146,12 @@ def tune(
     out: list[Tuned] = []
     for i, part in parts.items():
         name, (noise, usual) = prior[i].name, part.sizes
-        alone = not declared.platform.inertial
-        self_made = alone and _left_of_noise(errors[i].channels) < SELF_MADE
-        white = max(part.white, 1.0) if self_made else part.white
-        out.append(Tuned(name, "noise_factor", noise, white * noise))
+        # Poses without an IMU follow smooth errors and, from pass to pass, the noise of windows.
+        least = 0.0 if declared.platform.inertial else 1.0
+        out.append(Tuned(name, "noise_factor", noise, max(part.white, least) * noise))
         if part.model is not None:
             factor = min(part.model / min(less, 1.0), FAULT)  # faults come first
-            if alone:  # poses without other constraints follow a smooth error
-                factor = max(factor, 1.0)
-            out.append(Tuned(name, "model_error", usual, factor * usual))
+            out.append(Tuned(name, "model_error", usual, max(factor, least) * usual))
     return (*out, *_tuned_imu(system, now, declared, smooth))
 
 
@@ -182,13 +176,6 @@ def _without(own: ChannelErrors, blind: BoolArray | None) -> ChannelErrors:
     return replace(
         own, epoch=own.epoch[kept], seen=own.seen[kept], residuals=residual, variance=variance
     )
-
-
-def _left_of_noise(channels: list[ChannelErrors]) -> float:
-    """Return the share of a beacon's noise that remains in its residuals."""
-    residual = sum(float(np.sum(own.residuals[0] ** 2)) for own in channels)
-    given = sum(float(np.sum(own.variance[0])) * own.size[0] ** 2 for own in channels)
-    return residual / given if given > 0.0 else 1.0
 
 
 def _tuned_imu(system: ResidualProjection, now: Site, declared: Site, smooth: float) -> list[Tuned]:
