@@ -77,7 +77,11 @@ STREAMS = {
         "line 1.*time",
     ),
     "a line without end": ("json", b"0" * (LARGEST_RECORD + 10), "line 1: is larger than 16 MiB"),
-    "a record cut inside": ("msgpack", _PACKED + _PACKED[:20], "record 2: breaks off inside"),
+    "a record cut inside": (
+        "msgpack",
+        _PACKED + _PACKED[:20],
+        "record 2: breaks off after 20 bytes",
+    ),
     "a header of 4 GiB": (
         "msgpack",
         b"\xc6\xff\xff\xff\xff" + bytes(9),

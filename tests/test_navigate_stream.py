@@ -183,7 +183,14 @@ FIELDS = {"time": 1.0, "window": 0.4, "sigma": 1e-9, "phasors": {"A": [[VECTOR, 
 @pytest.mark.parametrize(
     ("record", "sentence"),
     [
-        (b"{", "Invalid JSON"),
+        (b"{", "write valid JSON"),
+        (
+            {"drive": {"time": 0, "current": {"x": 1}}},
+            "current.x: found 'x'; write text of the form",
+        ),
+        ({"drive": {"time": 0, "current": {}}}, "current: found {}; write at least 1 entries"),
+        ({"temperature": {"time": 0, "degc": {"A": "x"}}}, "degc.A: found 'x'; write a number"),
+        ({"temperature": {"time": 0, "degc": []}}, "degc: found []; write a mapping"),
         (b"[]", "write a mapping with the keys imu, magnetometer, fields"),
         (b"{}", "it should hold imu, magnetometer, fields, temperature, drive, marks or reference"),
         ({"gyro": 1}, "gyro: is not a known key; remove it or write one of imu, magnetometer"),

@@ -219,8 +219,8 @@ def test_samples_and_fields_in_one_stream_are_refused(site: Site, tmp_path: Path
         {"magnetometer": {**samples, "magnetometer": "left"}},
         {"fields": {**fields, "magnetometer": "right"}},
     ]
-    for order, findings in ((lines, "fields: they are mixed"), (lines[::-1], "mixed with fields")):
-        with pytest.raises(InputError, match=findings):
+    for order in (lines, lines[::-1]):
+        with pytest.raises(InputError, match=r"standard input.*: .* mixed with (samples|fields)"):
             piped(order, tmp_path)
 
 

@@ -128,7 +128,7 @@ def _assert_same(result: Any, wanted: Any, place: str = "site") -> None:
 
 OUT_OF_RANGE: list[tuple[Key, Any, str]] = [
     (("magfusion_site",), 2, "write 1"),
-    (("magfusion_site",), True, "integer"),
+    (("magfusion_site",), True, "write an integer"),
     (("magfusion_site",), "1", "integer"),
     (WORLD, [1], "mapping with the keys gravity_m_s2"),
     ((*WORLD, "gravity_m_s2"), -9.8, "greater than 0"),
@@ -146,12 +146,12 @@ OUT_OF_RANGE: list[tuple[Key, Any, str]] = [
     ((*WORLD, "location"), LOCATION | {"latitude_deg": 91}, "-90 to 90"),
     ((*WORLD, "location"), 51.5, "mapping with the keys latitude_deg"),
     ((*WORLD, "field_map"), "", "at least 1 character"),
-    ((*WORLD, "field_map"), 5, "string"),
+    ((*WORLD, "field_map"), 5, "write text"),
     (("beacons",), [], "at least one beacon"),
     (("beacons",), {}, "list"),
     (BEACON, 5, "mapping with the keys name"),
     ((*BEACON, "name"), "", "at least 1 character"),
-    ((*BEACON, "name"), 7, "string"),
+    ((*BEACON, "name"), 7, "write text"),
     ((*BEACON, "position_m"), [0, 0], "3 numbers"),
     ((*BEACON, "position_m"), [0, 0, True], "3 numbers"),
     ((*BEACON, "position_m"), [0, 0, "1"], "3 numbers"),
@@ -165,8 +165,8 @@ OUT_OF_RANGE: list[tuple[Key, Any, str]] = [
     ((*BEACON, "frequency_hz"), "25 Hz", "number"),
     ((*BEACON, "frequency_hz"), True, "number"),
     ((*BEACON, "coils"), [], "at least one coil"),
-    ((*BEACON, "synchronised"), "yes", "boolean"),
-    ((*BEACON, "synchronised"), 1, "boolean"),
+    ((*BEACON, "synchronised"), "yes", "write true or false"),
+    ((*BEACON, "synchronised"), 1, "write true or false"),
     ((*BEACON, "sigma", "position_m"), -0.001, "not negative"),
     ((*BEACON, "sigma", "position_m"), [0.1, 0.1, -0.1], "not negative"),
     ((*BEACON, "sigma", "position_m"), [0.1, 0.1], "one number or a list of 3 numbers"),
@@ -223,7 +223,7 @@ OUT_OF_RANGE: list[tuple[Key, Any, str]] = [
     ((*MAGNETOMETER, "sigma", "offset_t"), -1e-9, "not negative"),
     ((*MAGNETOMETER, "sigma", "rotation_deg"), INF, "finite"),
     ((*MAGNETOMETER, "sigma", "position_m"), [0, 0], "one number or a list of 3 numbers"),
-    (("calibration",), ["log"], "dictionary"),
+    (("calibration",), ["log"], "write a mapping"),
 ]
 
 
@@ -247,6 +247,7 @@ def test_a_bad_value_is_refused_with_its_place_itself_and_the_remedy(
     assert remedy in findings
     assert "\n" not in findings
     assert "Entry" not in findings, "a name of our code"
+    assert "should be a valid" not in findings, "words of a library"
 
 
 NEEDED: list[Key] = [

@@ -61,7 +61,7 @@ ROOMS = {
             admission ambient_left pieces slots
             design drive integration marked_bursts receiver reference slot_phasors slot_timing
             cycles lockin reference_clock
-            even_clocks lockin_receiver slot_receiver
+            even_clocks lockin_receiver running_clock slot_receiver
             joint marked
             receivers
         """,
@@ -105,7 +105,7 @@ ROOMS = {
         """,
         "jobs": """
             antenna_inputs fix_coil joint_kept receiver_axes region_option rotor_inputs state_rows
-            stream_clocks written
+            stream_clocks stream_samples written
             inputs navigate_results
             allan_noise checkpoint failure orientation settings without_beacons
             allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap

@@ -357,7 +357,7 @@ _TOO_LARGE = f"is larger than {LARGEST_RECORD >> 20} MiB; write fewer samples in
 
 
 def _msgpack_records(stream: BinaryIO) -> Iterator[NumberedRecord]:
-    number, fed = 0, 0
+    number, fed, whole = 0, 0, 0  # records; bytes received, and those of whole records
     unpacker = msgpack.Unpacker(
         max_buffer_size=LARGEST_RECORD + _CHUNK,
         max_str_len=LARGEST_RECORD,
@@ -371,7 +371,7 @@ def _msgpack_records(stream: BinaryIO) -> Iterator[NumberedRecord]:
             unpacker.feed(chunk)
             fed += len(chunk)
             for content in unpacker:
-                number += 1
+                number, whole = number + 1, unpacker.tell()
                 yield _checked(number, partial(Record.model_validate, content))
         except msgpack.BufferFull as error:
             raise InputError(f"{_RECORD} {number + 1}: {_TOO_LARGE}") from error
@@ -380,8 +380,10 @@ def _msgpack_records(stream: BinaryIO) -> Iterator[NumberedRecord]:
             raise InputError(
                 f"{_RECORD} {number + 1}: is no MessagePack ({reason}); write whole records"
             ) from error
-    if unpacker.tell() < fed:
-        raise InputError(f"{_RECORD} {number + 1}: breaks off inside; write whole records")
+    if fed > whole:
+        raise InputError(
+            f"{_RECORD} {number + 1}: breaks off after {fed - whole} bytes; write whole records"
+        )
 
 
 _RECORD = "standard input, record"

@@ -7,6 +7,7 @@ from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core.core_schema import ErrorType
 
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
@@ -136,20 +137,50 @@ def _parse(text: str, path: Path) -> object:
         raise InputError(f"{path}: is nested too deeply; write the keys plainly.") from error
 
 
+# By the type of an error; the words of pydantic are of its own types, not of a file's.
+_REMEDIES = {
+    "bool_type": "write true or false",
+    "dict_type": "write a mapping",
+    "finite_number": "write a finite number",
+    "float_type": "write a number",
+    "greater_than": "write a number greater than {gt}",
+    "greater_than_equal": "write a number greater than or equal to {ge}",
+    "int_from_float": "write an integer",
+    "int_type": "write an integer",
+    "less_than": "write a number less than {lt}",
+    "less_than_equal": "write a number less than or equal to {le}",
+    "list_type": "write a list",
+    "literal_error": "write {expected}",
+    "string_pattern_mismatch": "write text of the form {pattern}",
+    "string_too_short": "write at least {min_length} characters",
+    "string_type": "write text",
+    "too_long": "write at most {max_length} entries",
+    "too_short": "write at least {min_length} entries",
+}
+_PYDANTIC = frozenset(get_args(ErrorType))
+
+
 def sentence(error: ValidationError, model: type[BaseModel], whole: str = "file") -> str:
     """Return what is wrong, and the remedy, of content that does not fit its model."""
     first, others = error.errors(include_url=False)[0], error.error_count() - 1
-    place = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in first["loc"]).lstrip(".")
-    if first["type"] == "missing":
+    named = [part for part in first["loc"] if part != "[key]"]
+    place = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in named).lstrip(".")
+    code = first["type"]
+    if code == "missing":
         what = "is missing; add it"
-    elif first["type"] == "extra_forbidden":
+    elif code == "extra_forbidden":
         accepted = ", ".join(_keys(model, first["loc"]))
         what = f"is not a known key; remove it or write one of {accepted}"
-    elif first["type"] == "model_type":
+    elif code == "json_invalid":
+        reason = str(first["ctx"]["error"])
+        what = f"found {_shortened(first['input'])}; write valid JSON ({reason})"
+    elif code == "model_type":
         accepted = ", ".join(_keys(model, (*first["loc"], "")))
         what = f"found {_shortened(first['input'])}; write a mapping with the keys {accepted}"
     else:
-        remedy = re.sub(r"^(Input|String|List) should", "it should", first["msg"])
+        # The messages of validators of this package are whole sentences.
+        remedy = _REMEDIES.get(code, "correct it") if code in _PYDANTIC else first["msg"]
+        remedy = remedy.format_map(first.get("ctx", {})) if code in _REMEDIES else remedy
         what = f"found {_shortened(first['input'])}; {remedy}"
     more = f" (and {others} more in this {whole})" if others else ""
     return f"{place}: {what}{more}." if place else f"{what}{more}."

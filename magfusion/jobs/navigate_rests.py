@@ -14,9 +14,10 @@ from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.files.site import load_site, save_site
 from magfusion.files.standard_streams import binary_input, binary_output, until_closed
-from magfusion.files.stream import json_line, read_records, whole_rows
+from magfusion.files.stream import json_line, read_records
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
+from magfusion.jobs.stream_samples import StreamSamples
 from magfusion.model.progress import Report, quiet
 from magfusion.model.quaternion import of_matrices
 from magfusion.model.trajectory import Trajectory
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from magfusion.model.site import Site
     from magfusion.model.trust import Risk, Trust
     from magfusion.receiver.windows import LockinSettings
+    from magfusion.units import Array
 
 PIECE = 1.0  # s; of a log that is replayed
 # Options of `navigate` that it uses.
@@ -236,12 +238,12 @@ def run_rests_stream(
     InputError
         Where a record is invalid and ``keep_going`` is not set.
     """
-    navigator, refused = how.navigator(site), 0
+    navigator, samples, refused = how.navigator(site), StreamSamples(site), 0
     for numbered in read_records(source, form):
         try:
             if numbered.record is None:
                 raise InputError(numbered.refusal)
-            _process_record(navigator, numbered.record)
+            _process_record(navigator, numbered.record, samples)
         except InputError as error:
             sentence = f"standard input, {_PLACE[form]} {numbered.number}: {error}"
             if not keep_going:
@@ -252,24 +254,34 @@ def run_rests_stream(
         for state in navigator.take():
             sink.write(json_line(rest_content(state)))
         sink.flush()
+    for stream, _, *remaining in samples.end():
+        _add(navigator, stream, *remaining)
     navigator.end()
     for state in navigator.take():
         sink.write(json_line(rest_content(state)))
     sink.flush()
+    samples.report(messages)
     return refused
 
 
-def _process_record(navigator: RestNavigator, record: Record) -> None:
+def _add(navigator: RestNavigator, stream: str, time: Array, rows: Array) -> None:
     platform = navigator.site.platform
+    if stream == "imu":
+        navigator.add_imu(time, *platform.corrected_imu(rows[:, :3], rows[:, 3:]))
+    else:
+        navigator.add_magnetometer(platform.on_drive_clock(time), rows)
+
+
+def _process_record(navigator: RestNavigator, record: Record, samples: StreamSamples) -> None:
     if record.imu is not None:
-        time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
-        navigator.add_imu(time, *platform.corrected_imu(gyro, accel))
+        whole = samples.whole("imu", record.imu.time, record.imu.gyro, record.imu.accel)
+        _add(navigator, "imu", *samples.tested("imu", *whole))
     if record.reference is not None:
-        time, field = whole_rows(record.reference.time, record.reference.field)
-        navigator.add_reference(time, field)
+        own = record.reference
+        navigator.add_reference(*samples.whole("reference", own.time, own.field))
     if record.magnetometer is not None:
-        time, field = whole_rows(record.magnetometer.time, record.magnetometer.field)
-        navigator.add_magnetometer(platform.on_drive_clock(time), field)
+        whole = samples.whole("magnetometer", record.magnetometer.time, record.magnetometer.field)
+        _add(navigator, "magnetometer", *samples.tested("magnetometer", *whole))
     if record.fields is not None:
         raise InputError("--at-rest integrates samples of the magnetometer; omit fields")
 

@@ -17,10 +17,11 @@ from magfusion.estimation.orientation.online import ANYWHERE, TIMING, Orientatio
 from magfusion.estimation.orientation.remarks import doubts, remarks
 from magfusion.estimation.orientation.smoother import Oriented, oriented
 from magfusion.files.site import save_site
-from magfusion.files.stream import Format, json_line, read_records, whole_rows
+from magfusion.files.stream import Format, json_line, read_records
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
 from magfusion.jobs.inputs import Job, claim, named, read_job, require_imu
+from magfusion.jobs.stream_samples import StreamSamples
 from magfusion.model.progress import Report
 from magfusion.model.samples import Log
 from magfusion.model.site import Magnetometer, Site
@@ -195,11 +196,18 @@ def run_orientation_stream(
         Where a record is invalid and ``keep_going`` is not set.
     """
     navigator, refused = OrientationNavigator(site), 0
+    samples = StreamSamples(site, patient=False)  # each sample has a state
+
+    def write() -> None:
+        for state in navigator.take():
+            sink.write(json_line(_state_row(navigator, state)))
+        sink.flush()
+
     for numbered in read_records(source, form):
         try:
             if numbered.record is None:
                 raise InputError(numbered.refusal)
-            _process_record(navigator, numbered.record)
+            _process_record(navigator, numbered.record, samples)
         except InputError as error:
             sentence = f"standard input, {_PLACE[form]} {numbered.number}: {error}"
             if not keep_going:
@@ -207,21 +215,29 @@ def run_orientation_stream(
             refused += 1
             messages.write(f"magfusion: {sentence} (skipped)\n")
             continue
-        for state in navigator.take():
-            sink.write(json_line(_state_row(navigator, state)))
-        sink.flush()
+        write()
+    for stream, _, *remaining in samples.end():
+        _add(navigator, stream, *remaining)
+    write()
+    samples.report(messages)
     return refused
 
 
-def _process_record(navigator: OrientationNavigator, record: Any) -> None:
+def _add(navigator: OrientationNavigator, stream: str, time: Array, rows: Array) -> None:
+    platform = navigator.site.platform
+    if len(time) and stream == "imu":
+        navigator.add_imu(time, *platform.corrected_imu(rows[:, :3], rows[:, 3:]))
+    elif len(time):
+        navigator.add_magnetometer(platform.on_drive_clock(time), rows)
+
+
+def _process_record(navigator: OrientationNavigator, record: Any, samples: StreamSamples) -> None:
     if record.imu is not None:
-        time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
-        if len(time):
-            navigator.add_imu(time, *navigator.site.platform.corrected_imu(gyro, accel))
+        whole = samples.whole("imu", record.imu.time, record.imu.gyro, record.imu.accel)
+        _add(navigator, "imu", *samples.tested("imu", *whole))
     if record.magnetometer is not None:
-        time, field = whole_rows(record.magnetometer.time, record.magnetometer.field)
-        if len(time):
-            navigator.add_magnetometer(navigator.site.platform.on_drive_clock(time), field)
+        whole = samples.whole("magnetometer", record.magnetometer.time, record.magnetometer.field)
+        _add(navigator, "magnetometer", *samples.tested("magnetometer", *whole))
     if record.fields is not None:
         raise InputError("phasors of beacons that are not in the site; describe them there")
 

@@ -1,6 +1,5 @@
 """Navigation in a pipe: records in, a state out at every epoch, or current states at any rate."""
 
-from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
@@ -17,8 +16,7 @@ from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online.state_of_now import PropagatedState
 from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.checkpoint import run_key
-from magfusion.files.named_records import site_fields
-from magfusion.files.plausible import beyond_range
+from magfusion.files.named_records import magnetometer_number, site_fields
 from magfusion.files.site import load_site
 from magfusion.files.stream import (
     Format,
@@ -27,13 +25,14 @@ from magfusion.files.stream import (
     drive_samples,
     json_line,
     read_records,
-    whole_rows,
 )
 from magfusion.jobs.checkpoint import CheckpointWriter, begin
+from magfusion.jobs.inputs import named
 from magfusion.jobs.live import LiveSettings, StateSink, state_sinks
 from magfusion.jobs.region_option import ANYWHERE, Where
 from magfusion.jobs.rotor_inputs import AwaitedAngles, check_streamed_rotors
 from magfusion.jobs.stream_clocks import ClockJump, StreamClocks
+from magfusion.jobs.stream_samples import StreamSamples
 from magfusion.model.marks import Marks
 from magfusion.model.quaternion import of_matrices
 from magfusion.model.site import Site
@@ -43,8 +42,6 @@ from magfusion.units import Array
 
 _PLACE = {"json": "line", "msgpack": "record"}
 NOT_ONLINE = "its samples are used by navigate --at-rest only."
-FIRST = 50  # samples; bit errors do not make as many in a row
-_UNITS = {"imu": "rad/s and m/s^2", "magnetometer": "tesla"}
 WAITING = 1.0  # s; before the first state, as often a sign of life
 
 
@@ -119,14 +116,14 @@ def _navigate(
     key, place = run_key("stream", site, settings.navigator), settings.checkpoint
     navigator = begin(place, key, site, settings.navigator, None, resume=settings.resume).navigator
     refused, saved, reached = 0, -np.inf, -np.inf
-    counts = _SampleCounts()
+    samples = StreamSamples(site)
     output, angles = _StateWriter(navigator, sink, others), AwaitedAngles(site)
     kept = None if place is None else CheckpointWriter(place, key, messages)
     clocks, resumed = StreamClocks(settings.navigator.delay), navigator.time
     for numbered in read_records(source, settings.form):
         try:
-            numbered = _on_clock(numbered, clocks, output, messages)
-            newest = _process_record(output.navigator, site, numbered, counts, output)
+            numbered = _on_clock(numbered, clocks, samples, output, messages)
+            newest = _process_record(output.navigator, site, numbered, samples, output)
         except InputError as error:
             sentence = f"standard input, {_PLACE[settings.form]} {numbered.number}: {error}"
             if not (settings.keep_going or isinstance(error, ClockJump)):
@@ -149,43 +146,14 @@ def _navigate(
         if kept is not None and measured and not saved <= newest < saved + settings.every:
             kept.save(output.navigator, numbered.number, None)
             saved = newest
+    with named("standard input"):
+        _end(samples, output)
     if output.reference:
         messages.write(f"magfusion: reference: {NOT_ONLINE}\n")
-    for stream, count in counts.left_out.items():
-        text = f"{count} samples are NaN, or larger than any instrument measures"
-        messages.write(f"magfusion: {stream}: {text}. They are left out.\n")
+    samples.report(messages)
     if refused:
         messages.write(f"magfusion: {refused} records were skipped\n")
     return refused
-
-
-class _SampleCounts:
-    """Numbers of the samples of each stream."""
-
-    def __init__(self) -> None:
-        self.left_out: Counter[str] = Counter()
-        self._used: Counter[str] = Counter()
-
-    def whole(self, stream: str, time: Array, *values: Array) -> tuple[Array, ...]:
-        """Return the samples that are whole and within range, and count them.
-
-        Raises
-        ------
-        InputError
-            Where the first `FIRST` are all larger than any instrument measures.
-        """
-        result = whole_rows(time, *values)
-        missing = len(time) - len(result[0])
-        self._used[stream] += len(result[0])
-        if missing:
-            self.left_out[stream] += missing
-            large = bool(beyond_range(np.hstack(values)).any())
-            if large and not self._used[stream] and self.left_out[stream] >= FIRST:
-                raise InputError(
-                    f"{stream}: no sample so far is within the range of any instrument: another"
-                    f" unit is probably meant; give {_UNITS[stream]}"
-                )
-        return result
 
 
 class _StateWriter:
@@ -234,7 +202,11 @@ class _StateWriter:
 
 
 def _on_clock(
-    numbered: NumberedRecord, clocks: StreamClocks, output: _StateWriter, messages: TextIO
+    numbered: NumberedRecord,
+    clocks: StreamClocks,
+    samples: StreamSamples,
+    output: _StateWriter,
+    messages: TextIO,
 ) -> NumberedRecord:
     """Return a record on the clock of the others; after a step, navigation restarts.
 
@@ -252,6 +224,7 @@ def _on_clock(
             f"magfusion: {step.stream}: its clock stepped by {step.seconds:+.4g} s; navigation"
             f" restarts at {step.time:.3f} s\n"
         )
+        _end(samples, output)
         output.restart()
     clocks.check(record)
     return replace(numbered, record=record)
@@ -261,7 +234,7 @@ def _process_record(
     navigator: Navigator,
     site: Site,
     numbered: NumberedRecord,
-    counts: _SampleCounts,
+    samples: StreamSamples,
     output: _StateWriter,
 ) -> float:
     """Feed a record to the navigator, and count missing data; return its newest time (s)."""
@@ -272,23 +245,42 @@ def _process_record(
     output.reference |= record.reference is not None
     if record.imu is not None:
         own = record.imu
-        time, gyro, accel = counts.whole("imu", own.time, own.gyro, own.accel)
-        if len(time):
-            navigator.propagate_imu(time, gyro, accel)
-            output.now()
-            navigator.advance()
+        time, rows = samples.whole("imu", own.time, own.gyro, own.accel)
         newest = max(newest, _last(time))
+        if site.platform.inertial:  # if not, the navigator refuses them
+            time, rows = samples.tested("imu", time, rows)
+        _process_imu(output, time, rows)
     if record.magnetometer is not None:
         field = record.magnetometer.field.copy()
         field[:, site.platform.magnetometer.lacking] = 0.0
-        time, field = counts.whole("magnetometer", record.magnetometer.time, field)
-        if len(time):
-            navigator.add_magnetometer(time, field, record.magnetometer.magnetometer)
+        name = record.magnetometer.magnetometer
+        magnetometer_number(site, name, "samples")
+        time, rows = samples.whole("magnetometer", record.magnetometer.time, field)
         newest = max(newest, _last(time))
+        time, rows = samples.tested("magnetometer", time, rows, name)
+        if len(time):
+            navigator.add_magnetometer(time, rows, name)
     if record.fields is not None:
         navigator.add_fields(along_axis(site_fields(record.fields, site), site))
         newest = max(newest, record.fields.time)
     return newest
+
+
+def _process_imu(output: _StateWriter, time: Array, rows: Array) -> None:
+    if len(time):
+        output.navigator.propagate_imu(time, rows[:, :3], rows[:, 3:])
+        output.now()
+        output.navigator.advance()
+
+
+def _end(samples: StreamSamples, output: _StateWriter) -> None:
+    """Process the samples that wait for others, and write the states of them."""
+    for stream, name, time, rows in samples.end():
+        if stream == "imu":
+            _process_imu(output, time, rows)
+        else:
+            output.navigator.add_magnetometer(time, rows, name)
+    output.epochs()
 
 
 def _process_companions(navigator: Navigator, record: Record) -> None:

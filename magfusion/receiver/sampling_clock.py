@@ -69,7 +69,7 @@ def sampling_clock(stamps: Array, bundled: bool = True) -> SamplingClock | None:
     clock = _scattered_clock(stamps) if separate is None else _counted_clock(stamps, separate)
     if clock is None:
         return None
-    size = _resolution(stamps)
+    size = stamp_resolution(stamps)
     return clock._replace(resolution=size if clock.scatter < MAX_ROUNDING * size else 0.0)
 
 
@@ -86,7 +86,7 @@ def _counted_clock(stamps: Array, separate: Array) -> SamplingClock:
     return SamplingClock(time, step, float(np.sqrt(np.mean((time - stamps) ** 2))), 0)
 
 
-def _resolution(stamps: Array) -> float:
+def stamp_resolution(stamps: Array) -> float:
     """Return the common divisor of the steps (s), by which two of them differ; zero if none."""
     exact = 4.0 * max(NANOSECOND, float(np.spacing(np.max(np.abs(stamps)))))
     steps = np.sort(np.diff(stamps[:MOST_STEPS]))
@@ -104,10 +104,10 @@ def _scattered_clock(stamps: Array) -> SamplingClock | None:
     if len(stamps) < PIECE:
         return None
     counted = _counted_step(stamps)
-    if counted is None and _even(stamps, float(np.median(np.diff(stamps)))):
+    if counted is None and is_even(stamps, float(np.median(np.diff(stamps)))):
         return None
     step = counted or _usual_step(stamps)
-    if _even(stamps, step):
+    if is_even(stamps, step):
         return None
     whole = np.diff(stamps) / step
     breaks = np.flatnonzero(whole > GAP) + 1
@@ -122,7 +122,7 @@ def _scattered_clock(stamps: Array) -> SamplingClock | None:
     return SamplingClock(time, step, scatter, sum(p.lost_count for p in parts))
 
 
-def _even(stamps: Array, step: float) -> bool:
+def is_even(stamps: Array, step: float) -> bool:
     """Return whether stamps are whole steps apart."""
     whole = np.diff(stamps) / step
     return bool(np.sqrt(np.mean((whole - np.round(whole)) ** 2)) < EVEN)

@@ -7,6 +7,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
+from threading import Thread
 from typing import Any, TypeVar
 
 import numpy as np
@@ -161,6 +162,18 @@ def _gather(
     return [future.result() for future in futures]
 
 
+def _end_with_parent() -> None:
+    """End this worker as soon as its parent has ended, even if that was killed."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()
+
+
 @contextmanager
 def _processes(count: int) -> Iterator[Executor]:
     # Spawned, not forked: a fork copies the locks of other threads in their current state.
@@ -168,7 +181,7 @@ def _processes(count: int) -> Iterator[Executor]:
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     try:
-        with ProcessPoolExecutor(count, mp_context=context) as executor:
+        with ProcessPoolExecutor(count, context, initializer=_end_with_parent) as executor:
             yield executor
     except BrokenProcessPool as error:
         raise EstimationError(

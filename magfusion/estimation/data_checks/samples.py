@@ -270,13 +270,47 @@ def _spikes(stream: InstrumentStream) -> tuple[IntArray, BoolArray]:
     They are off the curve through their neighbours, which agree with each other; a knock moves
     several samples.
     """
-    x, count = stream.value, len(stream.value)
-    if count < 2 * BLOCK:
+    time, x = stream.time, stream.value
+    if len(x) < 2 * BLOCK:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=bool)
-    row = np.arange(count)
-    first = np.clip(row - 2, 0, count - 5)
+    own = deviations(time, x, float(np.median(np.diff(time))))
+    size = own.size(np.maximum(_scatter(own.residual), step_of_axes(x)))
+    rows = np.flatnonzero(size > SPIKE)
+    return rows, size[rows] > CERTAIN_SPIKE
+
+
+class Deviations(NamedTuple):
+    """Deviations of samples from their neighbours.
+
+    Parameters
+    ----------
+    off : ndarray, shape (n, axes)
+        Zero where the neighbours do not agree with each other.
+    residual : ndarray, shape (n, axes)
+        From the cubic through the neighbours, of noise as if they were even.
+    widening : ndarray, shape (n, 1)
+        How much larger it may be where they are not.
+    centre : ndarray, shape (n, axes)
+        Mean of the nearest neighbours.
+    """
+
+    off: Array
+    residual: Array
+    widening: Array
+    centre: Array
+
+    def size(self, scatter: Array) -> Array:
+        """Return deviations relative to the scatter of residuals, the largest axis, shape (n,)."""
+        usual = self.widening * scatter + 1e-9 * np.abs(self.centre)  # rounding
+        return np.asarray(np.max(self.off / np.maximum(usual, np.finfo(float).tiny), axis=1))
+
+
+def deviations(time: Array, x: Array, step: float) -> Deviations:
+    """Return deviations of samples (n, axes), at least five, at times (s) with a usual step."""
+    row = np.arange(len(x))
+    first = np.clip(row - 2, 0, len(x) - 5)
     near = [first + k + (first + k >= row) for k in range(4)]
-    weight, noise, widening = _cubic(stream.time, near)
+    weight, noise, widening = _cubic(time, near, step)
     curve = np.zeros_like(x)
     for own, at in zip(weight, near, strict=True):
         curve += own[:, None] * x[at]
@@ -286,21 +320,17 @@ def _spikes(stream: InstrumentStream) -> tuple[IntArray, BoolArray]:
     separate = np.maximum(np.abs(after - before), outer)
     from_curve = np.abs(x - curve)
     off = np.minimum(from_curve, np.abs(x - centre))
-    scatter = widening * np.maximum(_scatter(from_curve / noise), step_of_axes(x))
-    scatter += 1e-9 * np.abs(centre)  # rounding
-    alone = off > 3.0 * separate
-    size = np.max(np.where(alone, off / np.maximum(scatter, np.finfo(float).tiny), 0.0), axis=1)
-    rows = np.flatnonzero(size > SPIKE)
-    return rows, size[rows] > CERTAIN_SPIKE
+    return Deviations(
+        np.where(off > 3.0 * separate, off, 0.0), from_curve / noise, widening, centre
+    )
 
 
-def _cubic(time: Array, near: list[IntArray]) -> tuple[list[Array], Array, Array]:
+def _cubic(time: Array, near: list[IntArray], step: float) -> tuple[list[Array], Array, Array]:
     """Return weights (n,) of four neighbours in a cubic, and how much its error grows.
 
     The latter, shape (n, 1), is relative to even samples: of noise alone, and of noise or a smooth
     signal where samples are missing or at an end.
     """
-    step = float(np.median(np.diff(time)))
     far = [(time[at] - time) / step for at in near]
     weight = []
     for k, own in enumerate(far):
@@ -323,13 +353,22 @@ def _scatter(off: Array) -> Array:
 
 def false_rows(stream: InstrumentStream, site: Site | None) -> IntArray:
     """Return the isolated false samples of a stream; of a few, those that are no knocks."""
-    if next(_clipped_axes(stream), None) is not None:
-        return np.zeros(0, dtype=np.int64)  # clipping makes corners
-    if stream.name == "magnetometer" and site is not None and not _smooth_between(stream, site):
+    if not is_predictable(stream, site):
         return np.zeros(0, dtype=np.int64)
     rows, certain = _spikes(stream)
-    few = len(rows) < max(LEAST_SPIKES, SPIKE_SHARE * len(stream.value))
-    return rows[certain] if few else rows
+    return rows[certain] if are_few(len(rows), len(stream.value)) else rows
+
+
+def are_few(spikes: int, samples: int) -> bool:
+    """Return whether so many spikes among so many samples may be knocks."""
+    return spikes < max(LEAST_SPIKES, SPIKE_SHARE * samples)
+
+
+def is_predictable(stream: InstrumentStream, site: Site | None) -> bool:
+    """Return whether neighbours predict a sample: clipping makes corners, and so do fast tones."""
+    if next(_clipped_axes(stream), None) is not None:
+        return False
+    return stream.name != "magnetometer" or site is None or _smooth_between(stream, site)
 
 
 def _smooth_between(stream: InstrumentStream, site: Site) -> bool:

@@ -161,7 +161,8 @@ class RestNavigator:
             newest = min(newest, self._imu.newest + self.site.platform.imu.time_offset)
         if not last and np.isfinite(self._reference.newest):
             newest = min(newest, max(self._reference.newest, newest - MAX_WAIT))
-        if not (last or newest >= self._looked + LOOK) or len(self._wave) < 2:
+        due = np.isfinite(newest) and newest >= self._looked + LOOK
+        if not (last or due) or len(self._wave) < 2:
             return
         self._looked = newest
         log = self._log()

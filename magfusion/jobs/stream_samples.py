@@ -1,0 +1,111 @@
+"""Samples of the records in a pipe: missing, impossible and false ones are left out and counted."""
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import TextIO
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.estimation.data_checks.spike_filter import SpikeFilter
+from magfusion.files.plausible import beyond_range
+from magfusion.files.stream import whole_rows
+from magfusion.model.site import Site
+from magfusion.receiver.running_clock import RunningClock
+from magfusion.receiver.slots import has_schedule
+from magfusion.units import Array
+
+FIRST = 50  # samples; bit errors do not make as many in a row
+_INSTRUMENTS = {"imu": ("gyroscope", "accelerometer"), "magnetometer": ("magnetometer",)}
+_STAMPS = {"counted": "those of batches or bursts", "rounded": "rounded"}
+_UNITS = {"imu": "rad/s and m/s^2", "magnetometer": "tesla", "reference": "tesla"}
+
+
+class StreamSamples:
+    """Samples of each stream: those of the IMU, and of each magnetometer by its name.
+
+    Parameters
+    ----------
+    patient : bool
+        Whether the first samples wait until their stamps and values can be tested.
+    """
+
+    def __init__(self, site: Site, *, patient: bool = True) -> None:
+        self._site, self._patient = site, patient
+        self._missing: Counter[str] = Counter()
+        self._used: Counter[str] = Counter()
+        self._false: Counter[str] = Counter()
+        self._replaced: dict[str, str] = {}
+        self._clocks: dict[tuple[str, str | None], RunningClock] = {}
+        self._filters: dict[tuple[str, str | None], SpikeFilter] = {}
+
+    def whole(self, stream: str, time: Array, *values: Array) -> tuple[Array, Array]:
+        """Return the samples that are whole and within range, values in one array; count others.
+
+        Raises
+        ------
+        InputError
+            Where the first `FIRST` are all larger than any instrument measures.
+        """
+        kept, *rows = whole_rows(time, *values)
+        missing = len(time) - len(kept)
+        self._used[stream] += len(kept)
+        if missing:
+            self._missing[stream] += missing
+            large = bool(beyond_range(np.hstack(values)).any())
+            if large and not self._used[stream] and self._missing[stream] >= FIRST:
+                raise InputError(
+                    f"{stream}: no sample so far is within the range of any instrument: another"
+                    f" unit is probably meant; give {_UNITS[stream]}"
+                )
+        return kept, np.hstack(rows)
+
+    def tested(
+        self, stream: str, time: Array, rows: Array, name: str | None = None
+    ) -> tuple[Array, Array]:
+        """Return the samples at their times that pass the test for single false ones.
+
+        It needs the next two; stamps that are not of samples wait for their clock at the beginning.
+
+        Parameters
+        ----------
+        name : str, optional
+            Of one of several magnetometers.
+        """
+        key = stream, name
+        if key not in self._filters:
+            known = not self._patient or has_schedule(self._site)
+            self._clocks[key] = RunningClock("stamps" if known else None)
+            self._filters[key] = SpikeFilter(
+                _INSTRUMENTS[stream], self._site, patient=self._patient
+            )
+        return self._filters[key].push(*self._clocks[key].push(time, rows))
+
+    def end(self) -> Iterator[tuple[str, str | None, Array, Array]]:
+        """Yield the samples that wait for others, by stream and name, at the end of the streams.
+
+        What comes after is another stream.
+        """
+        filters, self._filters = self._filters, {}
+        for (stream, name), own in filters.items():
+            clock = self._clocks.pop((stream, name))
+            for time, rows in (own.push(*clock.end()), own.end()):
+                if len(time):
+                    yield stream, name, time, rows
+            self._false[stream] += own.left_out
+            if clock.stamping in _STAMPS:
+                self._replaced[stream] = (
+                    f"the stamps are {_STAMPS[clock.stamping]}; an even clock of"
+                    f" {1.0 / clock.step:.4g} Hz replaces them"
+                )
+
+    def report(self, messages: TextIO) -> None:
+        """Write how many samples are left out, after the end."""
+        for stream, count in self._missing.items():
+            text = f"{count} samples are NaN, or larger than any instrument measures"
+            messages.write(f"magfusion: {stream}: {text}. They are left out.\n")
+        for stream, text in self._replaced.items():
+            messages.write(f"magfusion: {stream}: {text}.\n")
+        for stream, count in (+self._false).items():
+            text = f"{count} isolated samples are off their neighbours, probably by bit errors"
+            messages.write(f"magfusion: {stream}: {text}. They are left out.\n")

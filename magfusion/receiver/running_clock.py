@@ -1,0 +1,177 @@
+"""Even clock of a stream whose stamps are of batches or bursts, or rounded, as samples arrive.
+
+The beginning decides by the procedures for logs; from there on samples are counted.
+"""
+
+from typing import Literal
+
+import numpy as np
+
+from magfusion.model.batches import PAUSE, spread_batches
+from magfusion.receiver.bursts import LONGEST, SHARE, TOGETHER, spread_bursts
+from magfusion.receiver.sampling_clock import is_even, sampling_clock, stamp_resolution
+from magfusion.units import Array, BoolArray, IntArray
+
+MIN_SAMPLES = 32  # that show whether stamps are even
+ENOUGH = 200  # samples that determine another clock
+MAX_WAIT = 2.0  # s; for either
+MEMORY = 2000  # stamps that determine the clock
+MIN_POINTS = 4  # batches
+REFIT = 0.1  # s between two fits
+LEAST_ADVANCE = 0.5  # of a step, where the clock is set back
+
+
+Stamping = Literal["stamps", "counted", "rounded"]
+
+
+class RunningClock:
+    """Replaces the stamps of a stream by an even clock, where they are not those of its samples.
+
+    Parameters
+    ----------
+    known : str, optional
+        of `stamping`, where it need not be found.
+
+    Attributes
+    ----------
+    stamping : str, optional
+        None until it is decided; ``counted`` if samples have the stamps of batches.
+    step : float
+        Between two samples (s).
+    """
+
+    def __init__(self, known: Stamping | None = None) -> None:
+        self._begin_again(known)
+
+    def _begin_again(self, known: Stamping | None = None) -> None:
+        self.stamping, self.step = known, 0.0
+        self._waiting: tuple[Array, Array] | None = None  # stamps and rows
+        self._tick, self._stamp, self._newest = 0, -np.inf, -np.inf
+        self._origin, self._pause, self._fitted = 0.0, np.inf, -np.inf
+        self._points, self._width = np.empty((2, 0)), 0
+
+    def push(self, stamps: Array, rows: Array) -> tuple[Array, Array]:
+        """Add samples (k,) with their stamps (s); return sampling times (s) of those known."""
+        self._width = rows.shape[1]
+        if self.stamping == "stamps" or not len(stamps):
+            return stamps, rows
+        if self.stamping is None:
+            return self._gather(stamps, rows)
+        gap = np.flatnonzero(np.diff(stamps, prepend=self._stamp) > self._pause)
+        if len(gap):
+            time, own = self._timed(stamps[: gap[0]]), rows[: gap[0]]
+            self._begin_again()
+            later = self._gather(stamps[gap[0] :], rows[gap[0] :])
+            return np.append(time, later[0]), np.concatenate([own, later[1]])
+        return self._timed(stamps), rows
+
+    def end(self) -> tuple[Array, Array]:
+        """Return the samples that wait at the end of the stream."""
+        waiting = self._waiting
+        return (
+            (np.empty(0), np.empty((0, self._width))) if waiting is None else self._decide(*waiting)
+        )
+
+    def _gather(self, stamps: Array, rows: Array) -> tuple[Array, Array]:
+        """Keep samples until the kind of clock is known."""
+        if self._waiting is not None:
+            stamps = np.append(self._waiting[0], stamps)
+            rows = np.concatenate([self._waiting[1], rows])
+        late = float(stamps[-1] - stamps[0]) >= MAX_WAIT
+        known = len(stamps) >= MIN_SAMPLES and not _is_candidate(stamps)
+        if len(stamps) >= ENOUGH or late or known:
+            return self._decide(stamps, rows)
+        self._waiting = stamps, rows
+        return stamps[:0], rows[:0]
+
+    def _decide(self, stamps: Array, rows: Array) -> tuple[Array, Array]:
+        """Find the clock of the first samples, and return them on it."""
+        self._waiting, self.stamping = None, "stamps"
+        if len(stamps) < MIN_SAMPLES or not _is_candidate(stamps):
+            return stamps, rows
+        together = np.diff(stamps) == 0.0
+        if together.any():
+            copies = (rows[1:] == rows[:-1]).all(axis=1)
+            last = np.append(np.flatnonzero(~together), len(stamps) - 1)
+            if np.mean(copies[together]) > 0.5 or len(last) < MIN_POINTS:
+                return stamps, rows
+            return self._start("counted", stamps, spread_batches(stamps, last), last), rows
+        separate = spread_bursts(stamps)
+        if separate is not None:
+            far = np.diff(stamps) > TOGETHER * float(np.mean(np.diff(stamps)))
+            last = np.append(np.flatnonzero(far), len(stamps) - 1)
+            return self._start("counted", stamps, separate, last), rows
+        clock = sampling_clock(stamps)
+        if clock is None or not clock.resolution:
+            return stamps, rows
+        return self._start("rounded", stamps, clock.time, np.arange(len(stamps))), rows
+
+    def _start(self, stamping: Stamping, stamps: Array, time: Array, last: IntArray) -> Array:
+        """Begin a clock with approximate times (n,); return them on it (s).
+
+        Parameters
+        ----------
+        last : ndarray of int
+            Samples whose stamps determine it.
+        """
+        self.stamping, tick = stamping, np.arange(len(stamps))
+        if stamping == "rounded":
+            step = float(np.median(np.diff(time)))
+            tick = np.cumsum(np.append(0, np.maximum(np.rint(np.diff(time) / step), 1.0)))
+        else:
+            between = float(np.median(np.diff(stamps[last])))
+            self._pause, last = max(PAUSE * between, LONGEST), last[:-1]
+        self._tick, self._stamp = int(tick[-1]), float(stamps[-1])
+        self._points = np.stack([tick[last], stamps[last]])
+        self._fit()
+        result = self._origin + self.step * tick
+        self._newest = float(result[-1])
+        return np.asarray(result)
+
+    def _timed(self, stamps: Array) -> Array:
+        """Return the sampling times (s) of further stamps (k,)."""
+        if not len(stamps) or stamps[0] < self._stamp or (np.diff(stamps) < 0.0).any():
+            return stamps  # late ones
+        before = np.append(self._stamp, stamps)
+        if self.stamping == "counted":
+            tick = self._tick + np.arange(len(before))
+            ends = np.flatnonzero(np.diff(before) > TOGETHER * self.step)
+        else:
+            tick = np.full(len(before), self._tick)
+            for k, stamp in enumerate(stamps.tolist()):
+                ahead = (stamp - self._origin) / self.step - tick[k]
+                tick[k + 1] = tick[k] + max(1, round(ahead))
+            ends = np.arange(1, len(before))
+        points = np.stack([tick[ends], before[ends]])
+        self._points = np.hstack([self._points, points])[:, -MEMORY:]
+        self._tick, self._stamp = int(tick[-1]), float(stamps[-1])
+        if self._stamp > self._fitted + REFIT:
+            self._fit()
+        least = self._newest + LEAST_ADVANCE * self.step * np.arange(1, len(before))
+        result = np.maximum(self._origin + self.step * tick[1:], least)
+        self._newest = float(result[-1])
+        return np.asarray(result)
+
+    def _fit(self) -> None:
+        """Fit a straight line to the stamps over their ticks; a stalled host counts less."""
+        tick, stamp = self._points
+        weight = np.ones(len(tick))
+        for _ in range(3):
+            slope, origin = np.polyfit(tick - tick[-1], stamp - stamp[-1], 1, w=np.sqrt(weight))
+            off = np.abs(stamp - stamp[-1] - origin - slope * (tick - tick[-1]))
+            weight = 1.0 / np.maximum(1.0, off / max(3.0 * float(np.median(off)) / 0.6745, 1e-12))
+        self.step, self._fitted = float(slope), float(stamp[-1])
+        self._origin = float(stamp[-1] + origin - slope * tick[-1])
+
+
+def _is_candidate(stamps: Array) -> bool:
+    """Return whether stamps are of batches or bursts, or rounded, and in order."""
+    steps = np.diff(stamps)
+    if (steps < 0.0).any():
+        return False
+    together: BoolArray = steps <= TOGETHER * float(np.mean(steps))
+    if np.mean(together) > 0.5 * SHARE:
+        return True
+    distinct = stamps[np.append(True, steps > 0.0)]
+    mean = float(np.mean(np.diff(distinct)))  # the median is that of rounded stamps
+    return not is_even(distinct, mean) and stamp_resolution(distinct) > 0.0

@@ -1,0 +1,126 @@
+"""Stamps of batches, of bursts and rounded ones in a pipe: the samples are counted as in logs."""
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from spoiled_log import burst_stamps
+from test_data_cleaning import walked
+from test_spike_filter import navigated, rms, undisturbed
+
+from magfusion.jobs.replay import run_replay
+from magfusion.receiver.running_clock import ENOUGH, MAX_WAIT, RunningClock
+from magfusion.receiver.sampling_clock import sampling_clock
+from magfusion.units import Array
+
+COUNT = 6000
+STEP = 0.005  # s
+
+
+def timed(stamps: Array, size: int = 7) -> tuple[Array, RunningClock, float]:
+    """Return times of samples that come several at a time (s), and the longest wait (s)."""
+    clock, rows = RunningClock(), np.random.default_rng(0).standard_normal((len(stamps), 3))
+    times, values, wait = [], [], 0.0
+    for k in range(0, len(stamps), size):
+        time, own = clock.push(stamps[k : k + size], rows[k : k + size])
+        times.append(time)
+        values.append(own)
+        sent, passed = min(k + size, len(stamps)), sum(len(t) for t in times)
+        if passed < sent:
+            wait = max(wait, float(stamps[sent - 1] - stamps[passed]))
+    time, own = clock.end()
+    np.testing.assert_array_equal(np.concatenate([*values, own]), rows)
+    result = np.append(np.concatenate(times), time)
+    assert np.all(np.diff(result) > 0.0)
+    return result, clock, wait
+
+
+def in_batches(time: Array, size: int = 8) -> Array:
+    """Return the stamps of samples that a driver reads together."""
+    row = np.arange(len(time))
+    return time[np.minimum(row // size * size + size - 1, len(time) - 1)]
+
+
+@pytest.mark.parametrize("size", [1, 8, 10])
+def test_batches_with_one_stamp_are_spread_evenly(size: int) -> None:
+    selected = STEP * np.arange(COUNT)
+    time, clock, wait = timed(in_batches(selected), size)
+    np.testing.assert_allclose(time, selected, rtol=0, atol=1e-9)
+    assert clock.stamping == "counted"
+    assert wait <= ENOUGH * STEP
+
+
+def test_a_pause_of_batches_begins_a_clock_again() -> None:
+    selected = STEP * np.arange(COUNT)
+    selected[2400:] += 5.0013
+    time, _, _ = timed(in_batches(selected))
+    np.testing.assert_allclose(time, selected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_bursts_are_counted_as_in_a_log(seed: int) -> None:
+    stamps = burst_stamps(COUNT, 99.0, np.random.default_rng(seed))
+    whole = sampling_clock(stamps)
+    assert whole is not None
+    time, clock, wait = timed(stamps)
+    off = time - whole.time
+    assert 1.0 / clock.step == pytest.approx(99.0, rel=1e-3)
+    assert wait <= MAX_WAIT + 0.1  # s, and a burst
+    # The past is a minute at most: as certain as a log of that length, of stamps 31 ms off.
+    assert np.std(off[:1000]) < 0.015  # s
+    assert np.std(off[2000:]) < 0.005  # s
+
+
+@pytest.mark.parametrize("rate_hz", [99.0, 150.0, 300.0, 400.0, 700.0])
+@pytest.mark.parametrize("cut", [np.rint, np.floor])
+def test_rounded_stamps_are_counted(rate_hz: float, cut: Callable[[Array], Array]) -> None:
+    selected = np.arange(COUNT) / rate_hz
+    time, clock, wait = timed(1e-3 * cut(1e3 * selected))
+    assert clock.stamping == "rounded"
+    assert np.std(time - selected) < 2e-5  # s; of the stamps 3e-4
+    assert wait <= MAX_WAIT + 0.1  # s
+
+
+@pytest.mark.parametrize("kind", ["even", "lost", "jitter"])
+def test_other_stamps_stay(kind: str) -> None:
+    rng = np.random.default_rng(1)
+    stamps = STEP * np.arange(COUNT)
+    if kind == "lost":
+        stamps = stamps[rng.random(COUNT) > 0.05]
+    if kind == "jitter":
+        stamps += 2e-4 * rng.standard_normal(COUNT)
+    time, _, wait = timed(stamps)
+    np.testing.assert_array_equal(time, stamps)
+    assert wait <= (ENOUGH if kind == "lost" else 40) * 1.06 * STEP
+
+
+@pytest.mark.parametrize("kind", ["batches", "rounded"])
+def test_a_pipe_is_as_accurate_with_stamps_of_batches(kind: str, tmp_path: Path) -> None:
+    log = walked()
+    assert log.waveform is not None
+    stamps = [
+        in_batches(t) if kind == "batches" else 1e-3 * np.floor(1e3 * t)
+        for t in (log.imu.time, log.waveform.time)
+    ]
+    sink = io.BytesIO()
+    run_replay(log, sink, "json", realtime=False)
+    given, place = (
+        [json.loads(line) for line in sink.getvalue().splitlines()],
+        {"imu": 0, "magnetometer": 0},
+    )
+    for record in given:
+        for (name, own), stamp in zip(((n, record.get(n)) for n in place), stamps, strict=True):
+            if own is not None:
+                first = place[name]
+                place[name] += len(own["time"])
+                own["time"] = stamp[first : place[name]].tolist()
+    lines = b"".join(json.dumps(one).encode() + b"\n" for one in given)
+    expected, result = undisturbed("ekf"), navigated(lines, "ekf", tmp_path)
+    assert result[2].count("an even clock of") == (
+        2 if kind == "batches" else result[2].count("\n")
+    )
+    for own, whole in zip(result[:2], expected[:2], strict=True):
+        assert rms(own) < 1.2 * rms(whole)
