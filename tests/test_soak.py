@@ -13,6 +13,21 @@ from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.endurance import EnduranceConfig, draw_endurance
 
 TOOL = Path(__file__).parents[1] / "tools" / "soak.py"
+WORLD = draw_endurance(demo_site(), EnduranceConfig(0.02), (1, 0))
+
+
+def _line(time: float, stamp: float, verdict: str = "trustworthy", off: float = 0.0) -> bytes:
+    """Return a state off its true position (m), protected to half a metre."""
+    true = WORLD.motion.position_world(np.array([time]))[0]
+    state = {
+        "time": stamp,
+        "started": True,
+        "lost": False,
+        "verdict": verdict,
+        "position": np.add(true, [off, 0.0, 0.0]).tolist(),
+        "protection_level_m": 0.5,
+    }
+    return json.dumps(state).encode()
 
 
 def test_each_fault_occurs_as_often_as_requested_and_alone() -> None:
@@ -41,20 +56,21 @@ def test_each_fault_occurs_as_often_as_requested_and_alone() -> None:
 def test_a_believed_error_beyond_the_claim_is_found_once(
     verdict: str, off: float, seconds: float, count: int
 ) -> None:
-    world = draw_endurance(demo_site(), EnduranceConfig(0.02), (1, 0))
-    judge = Judge(world, Result(1, 0.02, 1, "ekf"))
+    judge = Judge(WORLD, Result(1, 0.02, 1, "ekf"))
     for time in np.arange(10.0, 10.0 + seconds, 0.5):
-        true = world.motion.position_world(np.array([time]))[0]
-        state = {
-            "time": time,
-            "started": True,
-            "lost": False,
-            "verdict": verdict,
-            "position": np.add(true, [off, 0.0, 0.0]).tolist(),
-            "protection_level_m": 0.5,
-        }
-        judge.see(json.dumps(state).encode(), 60.0)
+        judge.see(_line(time, time, verdict, off))
     assert len(judge.result.finds) == count
+
+
+def test_states_are_on_the_new_clock_from_the_new_start_on() -> None:
+    judge = Judge(WORLD, Result(1, 0.02, 1, "ekf"))
+    judge.result.offset = -4.0
+    for time in np.arange(22.0, 26.0, 0.5):  # not read before the step was written
+        judge.see(_line(time, time))
+    judge.see(json.dumps({"time": 23.0, "started": False}).encode())
+    for time in np.arange(34.0, 40.0, 0.5):
+        judge.see(_line(time, time - 4.0))
+    assert not judge.result.finds
 
 
 def test_memory_that_grows_is_told_from_that_of_the_start() -> None:

@@ -154,24 +154,19 @@ class Judge:
     def __init__(self, world: EnduranceWorld, result: Result) -> None:
         self._world, self.result = world, result
         self._wrong_since: float | None = None
-        self._former, self._last = result.offset, -np.inf
+        self._offset = result.offset  # of the states that are read
         self.awaited: deque[Fault] = deque()
 
-    def step(self, seconds: float) -> None:
-        """Note a step of the clock."""
-        self._former, self.result.offset = self.result.offset, self.result.offset + seconds
-
-    def see(self, line: bytes, fed: float) -> None:
-        """Judge a state; ``fed`` is the time up to which samples have been written (s)."""
+    def see(self, line: bytes) -> None:
+        """Judge a state."""
         state = json.loads(line)
-        time_s = state["time"] - self._former
-        if not self._last - PIECE <= time_s <= fed + PIECE:
-            time_s = state["time"] - self.result.offset
+        if not state["started"]:  # a new start, which each step of the clock leads to
+            self._offset = self.result.offset
+        time_s = state["time"] - self._offset
         if not state["started"] or state["lost"]:
             self._wrong_since = None
             return
         self.result.states += 1
-        self._last = max(self._last, time_s)
         while self.awaited and time_s > self.awaited[0].end:
             fault = self.awaited.popleft()
             row = {"kind": fault.kind, "end": fault.end, "back_s": time_s - fault.end}
@@ -279,9 +274,8 @@ class Soak:
         self.judge.awaited.append(fault)
         if fault.kind == "clock_step":
             # Back by more than a second, or ahead by more than a minute, is a step.
-            self.judge.step(
-                70.0 + 1e4 * fault.size if fault.size > 0.5 else -2.0 - edge * fault.size
-            )
+            size = fault.size
+            self.result.offset += 70.0 + 1e4 * size if size > 0.5 else -2.0 - edge * size
         elif fault.kind == "kill":
             self.navigation.close(kill=True)
             self._read(edge)
@@ -294,7 +288,7 @@ class Soak:
 
     def _read(self, fed: float) -> None:
         while not self.navigation.lines.empty():
-            self.judge.see(self.navigation.lines.get(), fed)
+            self.judge.see(self.navigation.lines.get())
         self.judge.overdue(fed - 30.0)  # s; what is still in the pipe
 
     def _save(self, minute: int, elapsed: float) -> None:
