@@ -8,7 +8,8 @@ import pytest
 pytest.importorskip("hypothesis")
 
 from fuzz import CORPUS, Case, fuzz, run_case
-from fuzz_cases import example_inputs
+from fuzz_cases import PIPE
+from fuzz_inputs import example_inputs
 
 KEPT = sorted(CORPUS.glob("*.json"))
 
@@ -26,7 +27,7 @@ def test_what_breaks_is_found(
     def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError("a fault")
 
-    case: Case = {"kind": "site", "changes": [], "command": "navigate - --site SITE"}
+    case: Case = {"kind": "yaml", "changes": [], "command": PIPE, "file": "log/site.yaml"}
     assert run_case(case, inputs, tmp_path / "good") is None
     monkeypatch.setattr("magfusion.jobs.stream.run_stream", broken)
     result = run_case(case, inputs, tmp_path / "bad")

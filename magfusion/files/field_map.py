@@ -8,9 +8,11 @@ import pyarrow.parquet
 
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
+from magfusion.files.plain_table import refuse_damaged_text
 from magfusion.model.field_map import COMPONENTS, FieldMap
 from magfusion.units import Array
 
+LARGEST_DEVIATION = 3.0  # logarithm of the gain, or rad; a factor of 20 or half a turn
 _POSITION = ("position_x", "position_y", "position_z")
 _WEIGHTS = tuple(f"weight_{i}" for i in range(COMPONENTS))
 _UPPER = tuple(zip(*np.triu_indices(COMPONENTS), strict=True))
@@ -43,8 +45,9 @@ def _table(path: Path) -> pa.Table:
         raise InputError(f"{path}: there is no such field map; learn it by calibrate fieldmap.")
     try:
         table = pa.parquet.read_table(path)
-    except (pa.ArrowInvalid, OSError) as error:
-        reason = str(error).splitlines()[0]
+        refuse_damaged_text(table)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{path}: is no field map ({reason}); learn it again.") from error
     missing = [k for k in ("beacon", *_NUMBERS) if k not in table.column_names]
     if missing:
@@ -74,7 +77,16 @@ def read_field_maps(path: Path) -> dict[str, FieldMap]:
     if len(beacon) == 0:
         raise InputError(f"{path}: holds no rows; learn the field map again.")
     names = list(dict.fromkeys(beacon))
-    return {name: _map({k: v[beacon == name] for k, v in number.items()}) for name in names}
+    maps = {name: _map({k: v[beacon == name] for k, v in number.items()}) for name in names}
+    for name, result in maps.items():
+        with np.errstate(over="ignore", invalid="ignore"):
+            largest = float(np.max(np.abs(result.mean(result.points_world)[0])))
+        if not largest <= LARGEST_DEVIATION:
+            raise InputError(
+                f"{path}: the map of {name} deviates from the model by {largest:.3g} (logarithm of"
+                " the gain, or rad); learn it again."
+            )
+    return maps
 
 
 def _map(number: dict[str, Array]) -> FieldMap:

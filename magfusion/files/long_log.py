@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet
 
-from magfusion.errors import InputError
 from magfusion.files.drive_columns import column_names, drive_columns
 from magfusion.files.fields import read_fields
 from magfusion.files.inertial_tables import read_if_there
@@ -17,7 +16,6 @@ from magfusion.files.marks_table import SLOT
 from magfusion.files.named_samples import MAGNETOMETER
 from magfusion.files.plausible import beyond_range, check_field, check_imu
 from magfusion.files.rotor_columns import rotor_columns
-from magfusion.files.stray_stamps import LONGEST_GAP
 from magfusion.files.table import Span, find_table
 from magfusion.files.table_stream import SampleBlock, pieces
 from magfusion.files.temperature_table import read_temperatures
@@ -87,13 +85,6 @@ class Samples:
         self._time, self._values, self._at = piece.time[kept], piece.values[kept], 0
         if not len(self._time):
             return
-        step = np.diff(self._time, prepend=self._newest)
-        far = np.flatnonzero((step > LONGEST_GAP) & np.isfinite(step))
-        if len(far):
-            raise InputError(
-                f"{self._place}: found {self._time[far[0]]:.9g} s, more than an hour after the row"
-                " above: the clock jumped; correct the times, or use one side by --start and --end."
-            )
         self._newest = float(self._time[-1])
         if not self._checked:  # a mistake of the unit is one from the first sample on
             self._check()

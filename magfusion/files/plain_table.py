@@ -16,6 +16,19 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")  # R = Rz(yaw) Ry(pitch) Rx(roll)
 
 
+def refuse_damaged_text(table: pa.Table) -> None:
+    """Refuse names of columns, and texts in them, that are not UTF-8.
+
+    Raises
+    ------
+    pyarrow.ArrowInvalid
+    UnicodeDecodeError
+    """
+    table.validate(full=True)
+    if not table.column_names:  # which are decoded here
+        raise pa.ArrowInvalid("it has no columns")
+
+
 def read_whole(path: Path, what: str) -> pa.Table:
     """Read a table that must have a row.
 
@@ -32,8 +45,9 @@ def read_whole(path: Path, what: str) -> pa.Table:
         raise InputError(f"{path}: there is no such file; give the path of a {what}.")
     try:
         table = pa.csv.read_csv(path) if path.suffix == ".csv" else pa.parquet.read_table(path)
-    except (pa.ArrowInvalid, OSError) as error:
-        reason = str(error).splitlines()[0]
+        refuse_damaged_text(table)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{path}: is no readable {what} ({reason}); write it again.") from error
     if table.num_rows == 0:
         raise InputError(f"{path}: holds no rows; a {what} needs at least one measurement.")

@@ -15,6 +15,7 @@ import pyarrow.parquet
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
 from magfusion.files.parquet_bounds import MOST_BYTES, MOST_ROWS, read_batches, refuse_unfolding
+from magfusion.files.plain_table import refuse_damaged_text
 from magfusion.files.stray_stamps import LONGEST_GAP, stray_rows
 from magfusion.units import NANOSECOND, AnyArray, Array, IntArray
 
@@ -252,6 +253,7 @@ def read_table(
             data, first_row = _read_csv(path, layout), 0
         else:
             data, first_row = _read_parquet(path, layout, span)
+        refuse_damaged_text(data)
     except InputError:
         raise
     except (pa.ArrowException, OSError, ValueError) as error:
@@ -270,13 +272,25 @@ def read_table(
     within = time_ns[begin:end]
     begin_row = first_row + int(begin)
     table = Table(path, inside, within, span.seconds(within), begin_row, whole.stray)
-    jumped = np.diff(within, prepend=within[:1]) * NANOSECOND > LONGEST_GAP
+    refuse_jump(table, None)
+    return table
+
+
+def refuse_jump(table: Table, before: int | None) -> None:
+    """Refuse a row that is more than an hour after the row above.
+
+    Parameters
+    ----------
+    before : int, optional
+        Time of the row above the first (ns).
+    """
+    first = table.time_ns[:1] if before is None else before
+    jumped = np.diff(table.time_ns, prepend=first) * NANOSECOND > LONGEST_GAP
     remedy = (
         "more than an hour after the row above: the clock jumped; correct the times, or use one"
         " side by --start and --end"
     )
-    table.refuse(jumped, TIME, within, remedy)
-    return table
+    table.refuse(jumped, TIME, table.time_ns, remedy)
 
 
 def write_table(columns: dict[str, object], path: Path) -> None:

@@ -15,7 +15,15 @@ from magfusion.files.inertial_tables import FIELD_LAYOUT, IMU_LAYOUT
 from magfusion.files.log import HEADER, LogHeader, is_log
 from magfusion.files.open import open_log
 from magfusion.files.parquet_bounds import BATCH, refuse_unfolding
-from magfusion.files.table import TIME, Span, Table, TableLayout, check_times, find_table
+from magfusion.files.table import (
+    TIME,
+    Span,
+    Table,
+    TableLayout,
+    check_times,
+    find_table,
+    refuse_jump,
+)
 from magfusion.files.yaml_files import read_yaml
 from magfusion.units import Array, IntArray
 
@@ -101,7 +109,9 @@ def table_pieces(path: Path, layout: TableLayout, span: Span) -> Iterator[Table]
             if beyond > first:
                 within = time_ns[first:beyond]
                 part = data.slice(first, beyond - first)
-                yield Table(path, part, within, span.seconds(within), row + int(first))
+                table = Table(path, part, within, span.seconds(within), row + int(first))
+                refuse_jump(table, last if last is not None and last >= begin else None)
+                yield table
             if beyond < len(time_ns):
                 return
             row, last = row + len(data), int(time_ns[-1])

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from magfusion.errors import InputError
+from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.snapshot.priors import contradiction, trust_of, unexplained
 from magfusion.files.site import save_site
+from magfusion.jobs.failure import reason_of
 from magfusion.jobs.settings import Command, EstimateSettings, LogsSettings, WindowSettings, option
 from magfusion.model.parameters import difference
 from magfusion.model.prior import prior_sqrt_covariance
@@ -125,7 +128,7 @@ def run_calibrate_log(
     claimed = claim(output, JOB)
     log, site = read_job(job, unknown=True, report=report)
     cuts = _cuts(job, log, site, settings.cross_validate)
-    with named(job.log_path):
+    with named(job.log_path), _as_failure(job.log_path):
         result, placed = smooth_and_place(log, site, smoother, report)
     if not result.blocks:
         raise InputError(
@@ -134,7 +137,8 @@ def run_calibrate_log(
         )
     honest, trust = judge_result(result, log)
     result, moved = against_site(honest, grown(result, honest))
-    compared = None if cuts is None else _transfer(job, site, smoother, cuts, report)
+    with _as_failure(job.log_path):
+        compared = None if cuts is None else _transfer(job, site, smoother, cuts, report)
     trust = _report_once(trust, moved)
     if compared is not None:
         trust |= transferred(compared)
@@ -164,6 +168,15 @@ def run_calibrate_log(
         write_report(whole, figures)
     refuse_failed(job.log_path, output, trust)
     return figures
+
+
+@contextmanager
+def _as_failure(path: Path) -> Iterator[None]:
+    """Raise GTSAM's error of a singular system as a failure to estimate."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise EstimationError(f"{path}: {reason_of(error)}") from error
 
 
 def _report_once(trust: Trust, moved: Trust) -> Trust:

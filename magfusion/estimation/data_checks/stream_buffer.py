@@ -12,7 +12,7 @@ LARGEST_JUMP = 60.0  # s; a stamp farther from the newest of all streams means a
 
 
 def check_clock(name: str, time: Array, newest: float) -> None:
-    """Reject samples after a clock jump, forward or back.
+    """Reject samples after a clock jump, forward or back, or with one among them.
 
     Parameters
     ----------
@@ -20,23 +20,25 @@ def check_clock(name: str, time: Array, newest: float) -> None:
         Of the stream.
     time : ndarray, shape (k,)
     newest : float
-        Newest stamp of all streams (s): a stream that paused for long has not jumped.
+        Newest stamp of all streams (s): a stream that paused for long has not jumped; before any
+        stamp minus infinity.
 
     Raises
     ------
     InputError
     """
-    if len(time) == 0 or newest == -np.inf:
+    if len(time) == 0:
         return
+    newest = float(time.min()) if newest == -np.inf else newest
     if time.min() >= newest - LARGEST_JUMP and time.max() <= newest + LARGEST_JUMP:
         return  # the usual case
-    later = np.sort(np.append(time[time > newest], newest))
-    ahead = float(np.max(np.diff(later), initial=0.0))
-    back = newest - float(np.max(time))
-    if max(ahead, back) > LARGEST_JUMP:
-        way = "back" if back > ahead else "ahead"
+    stamps = np.sort(np.append(time, newest))
+    steps = np.diff(stamps)
+    k = int(np.argmax(steps))
+    if steps[k] > LARGEST_JUMP:
+        way = "back" if stamps[k] < newest else "ahead"
         raise InputError(
-            f"{name}: its clock jumped {way} by {max(ahead, back):.4g} s at {newest:.3f} s."
+            f"{name}: its clock jumped {way} by {steps[k]:.4g} s at {newest:.3f} s."
             " Start a new navigator, or correct the clock"
         )
 
