@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 from magfusion.estimation.batch import batch
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings
+from magfusion.estimation.graph.gtsam_graph import GtsamGraph, NativeProblem
+from magfusion.estimation.solve.bordered import optimise
 from magfusion.files.blas_threads import warn_about_threads
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import Log
@@ -30,6 +32,23 @@ class SmoothedLog(Smoothed):
     def trajectory(self) -> ResultTrajectory:
         """The states, with the data needed to save and plot them."""
         return result_trajectory(self.states, self.epoch_ns, self.calibration.site)
+
+    def to_gtsam(self, *, polish: bool = False) -> GtsamGraph:
+        """Return the graph of the last pass with its estimate, as GTSAM has it.
+
+        It has no considered parameters, which are uncertain without being estimated: marginals of
+        the graph are smaller than ``states.pose_cov``, which contains their effect.
+
+        Parameters
+        ----------
+        polish : bool
+            With the values at the minimum to rounding; a pass ends a little before it.
+        """
+        estimate = self.estimate
+        if polish:
+            estimate = optimise(self.graph, estimate, tolerance=0.0).estimate
+        native = NativeProblem(self.graph, estimate)
+        return GtsamGraph(native.graph, native.values, self.states.time, self.blocks)
 
     def _repr_html_(self) -> str:
         figures = heading("smooth", self.log_name)

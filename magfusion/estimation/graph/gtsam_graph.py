@@ -1,0 +1,133 @@
+"""The graph of a solved log as GTSAM's own nonlinear graph, for its optimisers and for users."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from magfusion.estimation.graph.graph import Graph, GraphEstimate
+from magfusion.estimation.graph.gtsam_factors import (
+    CalibrationKeys,
+    fill,
+    linear_factor,
+    measurement_factors,
+    whitened_factor,
+)
+from magfusion.estimation.graph.inertial import ROWS
+from magfusion.model.parameters import Block, difference, dimension
+from magfusion.model.short_repr import short_repr
+from magfusion.units import Array
+
+WIDTHS = {"x": 6, "v": 3, "b": 6}
+
+
+@dataclass(frozen=True, eq=False)
+class GtsamGraph:
+    """A solved log as GTSAM has it.
+
+    Parameters
+    ----------
+    graph : gtsam.NonlinearFactorGraph
+        Priors and inertial factors, measurements, then the calibration's prior and drift.
+    values : gtsam.Values
+        Poses X(k), velocities V(k) (m/s), biases B(k), and the calibration's steps C(i) from the
+        declared value of block ``i``; in a log with segments D(s) has those that drift.
+    time : ndarray, shape (epochs,)
+        Of the states (s).
+    blocks : tuple of Block
+        Calibration parameters of C(i).
+    """
+
+    __repr__ = short_repr
+
+    graph: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    time: Array
+    blocks: tuple[Block, ...]
+
+
+class NativeProblem:
+    """The problem of a `Graph` for GTSAM's optimisers.
+
+    Parameters
+    ----------
+    problem : Graph
+    estimate : GraphEstimate
+        Determines which variables a measurement depends on.
+    """
+
+    def __init__(self, problem: Graph, estimate: GraphEstimate) -> None:
+        self.problem, segments = problem, range(len(problem.segments))
+        declared = estimate.calibration if problem.declared is None else problem.declared
+        self.keys = [
+            CalibrationKeys(declared, problem.blocks, problem.segments.own(k)) for k in segments
+        ]
+        self.values = gtsam.Values(estimate.values)
+        self.keys[problem.segments.main].insert(self.values, estimate.calibration)
+        for k in segments:
+            self.keys[k].insert(self.values, estimate.at(k))
+        self.graph = gtsam.NonlinearFactorGraph()
+        for factor in self._factors():
+            self.graph.add(factor)
+
+    def estimate(self, values: gtsam.Values) -> GraphEstimate:
+        """Return the estimate at values of the graph."""
+        motion = gtsam.Values(values)
+        calibrations = tuple(keys.calibration(values) for keys in self.keys)
+        for key in {key for keys in self.keys for key, _ in keys.parts}:
+            motion.erase(key)
+        several = calibrations if len(calibrations) > 1 else ()
+        return GraphEstimate(motion, calibrations[self.problem.segments.main], several)
+
+    def _factors(self) -> Iterator[gtsam.NonlinearFactor]:
+        problem = self.problem
+        first = problem.native.size() - len(problem.links)
+        for i in range(problem.native.size()):
+            factor = problem.native.at(i)
+            yield factor if i < first else self._inertial(factor, i - first)
+        for factors in problem.factors:
+            keys = self.keys[factors.segment]
+            yield from measurement_factors(factors.measurement, keys, self.values)
+        main = self.keys[problem.segments.main]
+        if problem.blocks and problem.declared is not None:
+            yield main.prior_factor()
+        for k, whitening in enumerate(problem.segments.sqrt_information):
+            yield self._drift(k, whitening)
+
+    def _inertial(self, factor: gtsam.NonlinearFactor, k: int) -> gtsam.NonlinearFactor:
+        """Return an inertial factor with the calibration that acts on its stream."""
+        by_calibration = self.problem.links[k].by_calibration
+        keys = self.keys[int(self.problem.segments.at(np.array(k)))]
+        if by_calibration is None or not keys.blocks:
+            return factor
+        own = by_calibration[:, : dimension(keys.blocks)]
+        corrected = self.problem.links[k].calibration
+
+        def error(
+            _this: gtsam.NoiseModelFactor, values: gtsam.Values, jacobians: list[Array] | None
+        ) -> Array:
+            linear = factor.linearize(values)
+            assert isinstance(linear, gtsam.JacobianFactor)
+            calibration, by_values = keys.charted(values)
+            if jacobians is not None:
+                motion = np.split(linear.getA(), np.cumsum(widths)[:-1], axis=1)
+                fill(jacobians, [*motion, *keys.by_parts(own @ by_values)])
+            moved = difference(corrected, calibration, keys.blocks)
+            return np.asarray(own @ moved - linear.getb())
+
+        motion_keys = list(factor.keys())
+        widths = [WIDTHS[chr(gtsam.Symbol(key).chr())] for key in motion_keys]
+        every = [*motion_keys, *(key for key, _ in keys.parts)]
+        return whitened_factor(every, ROWS, error)
+
+    def _drift(self, k: int, whitening: Array) -> gtsam.NoiseModelFactor:
+        """Return the random walk of the drifting parameters from a segment to the next."""
+        columns, parts = self.problem.segments.drifting, []
+        for segment, sign in ((k, -1.0), (k + 1, 1.0)):
+            whole = np.zeros((len(whitening), dimension(self.problem.blocks)))
+            whole[:, columns] = sign * whitening
+            keys = self.keys[segment]
+            own = zip(keys.parts, keys.by_parts(whole), strict=True)
+            parts += [(part.key, by) for part, by in own if by.any()]
+        return linear_factor(parts)
