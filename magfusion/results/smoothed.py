@@ -1,10 +1,16 @@
 """A smoothed log for a program or a notebook: a result with its own display."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
+import gtsam
+import numpy as np
+
+from magfusion.errors import InputError
 from magfusion.estimation.batch import batch
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings
 from magfusion.estimation.graph.gtsam_graph import GtsamGraph, NativeProblem
+from magfusion.estimation.graph.user_factors import UserFactors
 from magfusion.estimation.solve.bordered import optimise
 from magfusion.files.blas_threads import warn_about_threads
 from magfusion.model.progress import Report, quiet
@@ -15,6 +21,7 @@ from magfusion.results.page import head_in_notebook
 from magfusion.results.report import smoothed_figures
 from magfusion.results.trajectory import ResultTrajectory, result_trajectory
 from magfusion.results.verdict import trust_figures
+from magfusion.units import Array
 
 NOT_JUDGED = "No verdict yet: call mf.judged(result, log) for the verdict."
 
@@ -57,7 +64,14 @@ class SmoothedLog(Smoothed):
 
 
 def smooth(
-    log: Log, site: Site, settings: SmootherSettings | None = None, report: Report = quiet
+    log: Log,
+    site: Site,
+    settings: SmootherSettings | None = None,
+    report: Report = quiet,
+    *,
+    factors: gtsam.NonlinearFactorGraph | None = None,
+    values: gtsam.Values | None = None,
+    times: Array | Sequence[float] = (),
 ) -> SmoothedLog:
     """Smooth a log: trajectory and calibration in one solution.
 
@@ -69,6 +83,12 @@ def smooth(
     settings : SmootherSettings, optional
     report : callable, optional
         Called with stage, finished steps and number of steps.
+    factors : gtsam.NonlinearFactorGraph, optional
+        More factors, on X(j), V(j) and B(j) of the j-th of ``times``, and on keys of their own.
+    values : gtsam.Values, optional
+        Initial values of their own keys.
+    times : sequence of float, optional
+        At which states are made for the factors (s), ascending, within the log.
 
     Raises
     ------
@@ -80,4 +100,13 @@ def smooth(
         Where the graph cannot be solved.
     """
     warn_about_threads()
+    if factors is not None:
+        user = UserFactors.of(factors, values, np.asarray(times, dtype=float))
+        begin, end = log.imu.time[[0, -1]]
+        outside = user.time[(user.time < begin) | (user.time > end)]
+        if len(outside):
+            raise InputError(
+                f"a factor is at {outside[0]:g} s, outside the log ({begin:g} to {end:g} s)"
+            )
+        settings = replace(settings or SmootherSettings(), factors=user)
     return SmoothedLog(**vars(batch.smooth(log, site, settings, report)))

@@ -157,9 +157,23 @@ def fill(jacobians: list[Array], parts: Sequence[Array]) -> None:
         jacobians[i] = part
 
 
-def whitened_factor(keys: Sequence[int], rows: int, error: ErrorFunction) -> gtsam.NoiseModelFactor:
-    """Return a factor of a whitened error, computed by a callback of GTSAM's form."""
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), keys, error)
+def whitened_factor(
+    keys: Sequence[int],
+    rows: int,
+    error: ErrorFunction,
+    like: gtsam.noiseModel.Base | None = None,
+) -> gtsam.NoiseModelFactor:
+    """Return a factor of a whitened error, computed by a callback of GTSAM's form.
+
+    Parameters
+    ----------
+    like : gtsam.noiseModel.Base, optional
+        Noise with the robust loss of the factor, if any.
+    """
+    noise: gtsam.noiseModel.Base = gtsam.noiseModel.Unit.Create(rows)
+    if isinstance(like, gtsam.noiseModel.Robust):
+        noise = gtsam.noiseModel.Robust.Create(like.robust(), noise)
+    return gtsam.CustomFactor(noise, keys, error)
 
 
 def linear_factor(parts: Sequence[tuple[int, Array]]) -> gtsam.NoiseModelFactor:

@@ -15,6 +15,7 @@ from magfusion.estimation.graph.gtsam_factors import (
     whitened_factor,
 )
 from magfusion.estimation.graph.inertial import ROWS
+from magfusion.estimation.graph.user_factors import UserFactors
 from magfusion.model.parameters import Block, difference, dimension
 from magfusion.model.short_repr import short_repr
 from magfusion.units import Array
@@ -29,7 +30,8 @@ class GtsamGraph:
     Parameters
     ----------
     graph : gtsam.NonlinearFactorGraph
-        Priors and inertial factors, measurements, then the calibration's prior and drift.
+        Priors and inertial factors, measurements, the calibration's prior and drift, then those
+        of a user's.
     values : gtsam.Values
         Poses X(k), velocities V(k) (m/s), biases B(k), and the calibration's steps C(i) from the
         declared value of block ``i``; in a log with segments D(s) has those that drift.
@@ -67,18 +69,30 @@ class NativeProblem:
         self.keys[problem.segments.main].insert(self.values, estimate.calibration)
         for k in segments:
             self.keys[k].insert(self.values, estimate.at(k))
+        if problem.user is not None:
+            self.values.insert(problem.user.values if estimate.own is None else estimate.own)
         self.graph = gtsam.NonlinearFactorGraph()
         for factor in self._factors():
             self.graph.add(factor)
 
     def estimate(self, values: gtsam.Values) -> GraphEstimate:
         """Return the estimate at values of the graph."""
-        motion = gtsam.Values(values)
+        motion, own = gtsam.Values(values), self.own(values)
         calibrations = tuple(keys.calibration(values) for keys in self.keys)
-        for key in {key for keys in self.keys for key, _ in keys.parts}:
+        steps = {key for keys in self.keys for key, _ in keys.parts}
+        for key in [*steps, *own.keys()]:
             motion.erase(key)
         several = calibrations if len(calibrations) > 1 else ()
-        return GraphEstimate(motion, calibrations[self.problem.segments.main], several)
+        return GraphEstimate(motion, calibrations[self.problem.segments.main], several, own)
+
+    def own(self, values: gtsam.Values) -> gtsam.Values:
+        """Return the values of the own keys of a user's factors."""
+        known, out = self.problem.user, gtsam.Values()
+        if known is not None and known.own:
+            out, own = gtsam.Values(values), {key for key, _ in known.own}
+            for key in set(values.keys()) - own:
+                out.erase(key)
+        return out
 
     def _factors(self) -> Iterator[gtsam.NonlinearFactor]:
         problem = self.problem
@@ -94,6 +108,38 @@ class NativeProblem:
             yield main.prior_factor()
         for k, whitening in enumerate(problem.segments.sqrt_information):
             yield self._drift(k, whitening)
+        if problem.user is not None:
+            for i in range(problem.user.graph.size()):
+                yield self._renamed(problem.user, problem.user.graph.at(i))
+
+    def _renamed(self, user: UserFactors, factor: gtsam.NonlinearFactor) -> gtsam.NonlinearFactor:
+        """Return a factor of a user's on the keys of this graph."""
+        keys = [user.key(key) for key in list(factor.keys())]
+        try:
+            return factor.rekey(keys)
+        except RuntimeError:  # a CustomFactor cannot be copied
+            assert isinstance(factor, gtsam.NoiseModelFactor)
+            own, noise = factor, factor.noiseModel()
+            assert isinstance(noise, gtsam.noiseModel.Robust | gtsam.noiseModel.Gaussian)
+            robust = isinstance(noise, gtsam.noiseModel.Robust)
+            whiten = noise.unweightedWhiten if robust else noise.whiten
+
+        def error(
+            _this: gtsam.NoiseModelFactor, values: gtsam.Values, jacobians: list[Array] | None
+        ) -> Array:
+            at = user.named(values, self.own(values))
+            whitened = whiten(own.unwhitenedError(at))
+            if jacobians is not None:
+                linear, zero = gtsam.JacobianFactor(own.linearize(at)), at.zeroVectors()
+                # The loss weights the rows of this graph's factor again.
+                size = np.linalg.norm(linear.getb())
+                unweighted = np.linalg.norm(whitened) / size if size > 0.0 else 1.0
+                widths = [len(zero.at(key)) for key in list(own.keys())]
+                parts = np.split(linear.getA(), np.cumsum(widths)[:-1], axis=1)
+                fill(jacobians, [unweighted * part for part in parts])
+            return whitened
+
+        return whitened_factor(keys, own.dim(), error, noise)
 
     def _inertial(self, factor: gtsam.NonlinearFactor, k: int) -> gtsam.NonlinearFactor:
         """Return an inertial factor with the calibration that acts on its stream."""
