@@ -5,16 +5,21 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import C, V, X
+from gtsam.symbol_shorthand import B, C, V, X
 from small_problem import SmallLog, small_log, small_problem
 from test_measurement_seam import KINDS
 
 import magfusion as mf
 from magfusion.estimation.graph.drift_segments import Segments
 from magfusion.estimation.graph.graph import Graph, GraphEstimate
+from magfusion.estimation.graph.gtsam_factors import measurement_factors
 from magfusion.estimation.graph.gtsam_graph import NativeProblem
-from magfusion.estimation.graph.inertial import links_between
+from magfusion.estimation.graph.inertial import inertial_factor, links_between
 from magfusion.estimation.graph.preintegration import cut_at_epochs, preintegrate
+from magfusion.estimation.graph.process_noise import ProcessNoise
+from magfusion.estimation.graph.propagation import propagate
+from magfusion.estimation.graph.state import State, values_of
+from magfusion.estimation.online.fixed_lag import SlidingWindow
 from magfusion.estimation.posterior.marginals import marginals
 from magfusion.model.parameters import choose_blocks, corrected_imu, dimension
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -238,3 +243,74 @@ def test_an_exported_graph_is_not_serialised(earth_result: mf.SmoothedLog) -> No
     graph = earth_result.to_gtsam().graph
     with pytest.raises(RuntimeError, match="clone"):
         graph.clone()
+
+
+def test_gtsams_optimiser_ends_at_the_same_trajectory(small: SmallLog) -> None:
+    ours, theirs = (
+        mf.smooth(small.log, small.site, mf.SmootherSettings(engine=engine))
+        for engine in ("bordered", "gtsam")
+    )
+    assert theirs.iterations != ours.iterations
+    assert ours.states.pose_cov is not None
+    for i, cov in enumerate(ours.states.pose_cov):
+        one, other = (result.estimate.values.atPose3(X(i)) for result in (ours, theirs))
+        away = one.localCoordinates(other) / np.sqrt(np.diag(cov))
+        assert np.max(np.abs(away)) < 1e-3
+
+
+def test_isam2_fed_epoch_by_epoch_ends_where_the_fixed_lag_does(small: SmallLog) -> None:
+    problem, start = small_problem(small, (), loss="cauchy")
+    calibration, truth, site = start.calibration, small.truth, small.site
+    measured, sigma = problem.measurements[0], np.repeat([0.02, 0.05, 0.1, 0.05, 0.002], 3)
+    assert truth.velocity_world is not None
+    state = State(
+        float(truth.time[0]),
+        truth.world_from_body[0],
+        truth.position_world[0] + 0.02,
+        truth.velocity_world[0],
+        np.zeros(3),
+        np.zeros(3),
+        calibration,
+        np.diag(sigma**2),
+    )
+    window = SlidingWindow(state, (), 100.0, ProcessNoise((), np.zeros(0)))
+    parameters = gtsam.ISAM2Params()
+    # GTSAM's thresholds are absolute: its defaults are many sigmas of these poses.
+    parameters.setRelinearizeThreshold(1e-7)
+    parameters.relinearizeSkip = 1
+    steps = gtsam.ISAM2GaussNewtonParams()
+    steps.setWildfireThreshold(1e-9)
+    parameters.setOptimizationParams(steps)
+    isam, keys = gtsam.ISAM2(parameters), mf.gtsam.CalibrationKeys(calibration, ())
+    graph, values = gtsam.NonlinearFactorGraph(), values_of([state])
+    graph.addPriorPose3(X(0), state.pose, gtsam.noiseModel.Diagonal.Sigmas(sigma[:6]))
+    graph.addPriorVector(V(0), state.velocity_world, gtsam.noiseModel.Diagonal.Sigmas(sigma[6:9]))
+    graph.addPriorConstantBias(
+        B(0), gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Diagonal.Sigmas(sigma[9:])
+    )
+    kept = []  # GTSAM does not hold a reference to a factor of Python
+    for i in range(1, len(truth)):
+        predicted = propagate(window.state, small.imu, float(truth.time[i]), site, 0.0, blocks=())
+        own = measured.rows(slice(i, i + 1))
+        # To convergence: its usual one step leaves a tenth of the newest pose's sigma or more.
+        window.absorb(predicted, [own.at(0)], predicted.state)
+        assert predicted.link is not None
+        graph.add(inertial_factor(i - 1, predicted.link.measurement))
+        there = values_of([predicted.state])
+        values.insert(X(i), there.atPose3(X(0)))
+        values.insert(V(i), there.atVector(V(0)))
+        values.insert(B(i), there.atConstantBias(B(0)))
+        for factor in measurement_factors(own, keys, values):
+            kept.append(factor)
+            graph.add(factor)
+        isam.update(graph, values)
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for _ in range(3):
+        isam.update()
+    last = len(truth) - 1
+    cov = isam.marginalCovariance(X(last))
+    away = window.state.pose.localCoordinates(isam.calculateEstimatePose3(X(last)))
+    assert np.max(np.abs(away) / np.sqrt(np.diag(cov))) < 0.01
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(window.state.cov)[:6]), np.sqrt(np.diag(cov)), rtol=0.01
+    )

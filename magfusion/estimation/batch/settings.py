@@ -67,6 +67,9 @@ class SmootherSettings(EstimatorSettings):
         Further measurements, with the times of their rows (s), at which states are made.
     factors : UserFactors, optional
         A user's, with the times at which states are made.
+    engine : {'bordered', 'gtsam'}
+        Optimiser of each pass: our loop, or GTSAM's Levenberg-Marquardt, to check it: its time
+        grows with the square of the length of the log.
     """
 
     __repr__ = short_repr
@@ -77,6 +80,7 @@ class SmootherSettings(EstimatorSettings):
     tune: bool = True
     measurements: tuple[tuple[Array, Measurement], ...] = ()
     factors: UserFactors | None = None
+    engine: str = "bordered"
 
     def __post_init__(self) -> None:
         if self.earth and self.coupling == "loose":

@@ -16,6 +16,7 @@ from magfusion.estimation.graph.gtsam_factors import (
 )
 from magfusion.estimation.graph.inertial import ROWS
 from magfusion.estimation.graph.user_factors import UserFactors
+from magfusion.estimation.solve.ordering import nested_dissection
 from magfusion.model.parameters import Block, difference, dimension
 from magfusion.model.short_repr import short_repr
 from magfusion.units import Array
@@ -74,6 +75,15 @@ class NativeProblem:
         self.graph = gtsam.NonlinearFactorGraph()
         for factor in self._factors():
             self.graph.add(factor)
+
+    @property
+    def ordering(self) -> gtsam.Ordering:
+        """Elimination order of `Graph`, with the keys of the calibration in place of its own."""
+        ordering = nested_dissection(self.problem.epochs, None)
+        motion = {ordering.at(i) for i in range(ordering.size())}
+        for key in reversed([key for key in list(self.values.keys()) if key not in motion]):
+            ordering.push_back(key)
+        return ordering
 
     def estimate(self, values: gtsam.Values) -> GraphEstimate:
         """Return the estimate at values of the graph."""
