@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from magfusion.errors import InputError as InputError
     from magfusion.estimation.batch.settings import SmootherSettings as SmootherSettings
     from magfusion.estimation.integrity.judge import judge_result as judge_result
+    from magfusion.estimation.measurements import gtsam as gtsam
     from magfusion.estimation.online.corrected import corrected as corrected
     from magfusion.estimation.online.navigator import Navigator as Navigator
     from magfusion.estimation.online.navigator_settings import (
@@ -99,7 +100,9 @@ def __getattr__(name: str) -> Any:
     if name == "__version__":
         from importlib.metadata import version
 
-        result = version("magfusion")
+        result: Any = version("magfusion")
+    elif name == "gtsam":  # a module: not in __all__, where it would hide GTSAM's own
+        result = import_module("magfusion.estimation.measurements.gtsam")
     elif name in _HOMES:
         result = getattr(import_module(f"magfusion.{_HOMES[name]}"), name)
     else:
@@ -109,4 +112,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOMES, "__version__"})
+    return sorted({*globals(), *_HOMES, "gtsam", "__version__"})

@@ -180,7 +180,8 @@ def test_only_solve_optimises() -> None:
         if imported or OPTIMISERS & set(names):
             solvers.add(_name(path))
     assert solvers == {
-        f"magfusion/estimation/solve/{name}.py" for name in ("batched", "bordered", "bounded")
+        f"magfusion/estimation/solve/{name}.py"
+        for name in ("batched", "bordered", "bounded", "native")
     }
     assert fallbacks == 2  # of a whole graph, and of a part of one
 

@@ -64,6 +64,9 @@ class SmoothSettings(
         "Robust loss of the fields",
         words={"none": None, "huber": "huber", "cauchy": "cauchy"},
     )
+    engine: Literal["bordered", "gtsam"] = option(
+        "bordered", "Optimiser of a log: its own loop, or GTSAM's Levenberg-Marquardt to check it"
+    )
     tune: bool = option(
         True, "Estimate noise and model error from the residuals, with the declared as a prior"
     )
@@ -92,6 +95,10 @@ class SmoothSettings(
                     "--at-rest gives phasors of whole rests, which do not support the Earth field"
                     " or a common gain; omit --earth and --free"
                 )
+        if self.more and self.engine != "bordered":
+            raise InputError(
+                "--engine gtsam solves one log; omit it, or smooth the logs one by one"
+            )
         if self.resume and self.checkpoint is None:
             raise InputError("--resume requires a file; give it with --checkpoint FILE")
         if self.checkpoint is not None and self.more:
@@ -110,6 +117,7 @@ class SmoothSettings(
             coupling=self.coupling,
             loss=self.robust,
             tune=self.tune,
+            engine=self.engine,
             estimate=self.groups,
             earth=self.earth,
             lockin=self.lockin(job),

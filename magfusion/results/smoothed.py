@@ -1,9 +1,17 @@
 """A smoothed log for a program or a notebook: a result with its own display."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
+import gtsam
+import numpy as np
+
+from magfusion.errors import InputError
 from magfusion.estimation.batch import batch
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings
+from magfusion.estimation.graph.gtsam_graph import GtsamGraph, NativeProblem
+from magfusion.estimation.graph.user_factors import UserFactors
+from magfusion.estimation.solve.bordered import optimise
 from magfusion.files.blas_threads import warn_about_threads
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import Log
@@ -13,6 +21,7 @@ from magfusion.results.page import head_in_notebook
 from magfusion.results.report import smoothed_figures
 from magfusion.results.trajectory import ResultTrajectory, result_trajectory
 from magfusion.results.verdict import trust_figures
+from magfusion.units import Array
 
 NOT_JUDGED = "No verdict yet: call mf.judged(result, log) for the verdict."
 
@@ -31,6 +40,23 @@ class SmoothedLog(Smoothed):
         """The states, with the data needed to save and plot them."""
         return result_trajectory(self.states, self.epoch_ns, self.calibration.site)
 
+    def to_gtsam(self, *, polish: bool = False) -> GtsamGraph:
+        """Return the graph of the last pass with its estimate, as GTSAM has it.
+
+        It has no considered parameters, which are uncertain without being estimated: marginals of
+        the graph are smaller than ``states.pose_cov``, which contains their effect.
+
+        Parameters
+        ----------
+        polish : bool
+            With the values at the minimum to rounding; a pass ends a little before it.
+        """
+        estimate = self.estimate
+        if polish:
+            estimate = optimise(self.graph, estimate, tolerance=0.0).estimate
+        native = NativeProblem(self.graph, estimate)
+        return GtsamGraph(native.graph, native.values, self.states.time, self.blocks)
+
     def _repr_html_(self) -> str:
         figures = heading("smooth", self.log_name)
         figures |= Figures() if self.trust is None else trust_figures(self.trust)
@@ -38,7 +64,14 @@ class SmoothedLog(Smoothed):
 
 
 def smooth(
-    log: Log, site: Site, settings: SmootherSettings | None = None, report: Report = quiet
+    log: Log,
+    site: Site,
+    settings: SmootherSettings | None = None,
+    report: Report = quiet,
+    *,
+    factors: gtsam.NonlinearFactorGraph | None = None,
+    values: gtsam.Values | None = None,
+    times: Array | Sequence[float] = (),
 ) -> SmoothedLog:
     """Smooth a log: trajectory and calibration in one solution.
 
@@ -50,6 +83,12 @@ def smooth(
     settings : SmootherSettings, optional
     report : callable, optional
         Called with stage, finished steps and number of steps.
+    factors : gtsam.NonlinearFactorGraph, optional
+        More factors, on X(j), V(j) and B(j) of the j-th of ``times``, and on keys of their own.
+    values : gtsam.Values, optional
+        Initial values of their own keys.
+    times : sequence of float, optional
+        At which states are made for the factors (s), ascending, within the log.
 
     Raises
     ------
@@ -61,4 +100,13 @@ def smooth(
         Where the graph cannot be solved.
     """
     warn_about_threads()
+    if factors is not None:
+        user = UserFactors.of(factors, values, np.asarray(times, dtype=float))
+        begin, end = log.imu.time[[0, -1]]
+        outside = user.time[(user.time < begin) | (user.time > end)]
+        if len(outside):
+            raise InputError(
+                f"a factor is at {outside[0]:g} s, outside the log ({begin:g} to {end:g} s)"
+            )
+        settings = replace(settings or SmootherSettings(), factors=user)
     return SmoothedLog(**vars(batch.smooth(log, site, settings, report)))

@@ -19,6 +19,7 @@ from magfusion.estimation.graph.imu_decimation import preintegrate_stream
 from magfusion.estimation.graph.inertial import Link, Preintegrated, inertial_graph, links_between
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.preintegration import low_passed_rate_at
+from magfusion.estimation.graph.user_factors import UserFactors
 from magfusion.estimation.measurements.earth import earth_measurement, unobserved_constraints
 from magfusion.estimation.measurements.fixed_roll import held_roll
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
@@ -66,6 +67,8 @@ class PreprocessedLog:
     silence : tuple of ndarray, optional
         Beginnings and ends of gaps in the inertial stream, filled by the motion from the fields
         (s).
+    user : UserFactors, optional
+        Factors of a user's.
     """
 
     demodulation: Demodulation
@@ -83,6 +86,7 @@ class PreprocessedLog:
     rival_chi_square: float | None = None
     rival: Trajectory | None = None
     silence: tuple[Array, Array] | None = None
+    user: UserFactors | None = None
 
     @property
     def imu(self) -> ImuSamples:
@@ -185,7 +189,14 @@ def graph_of(
     acting = links if links[0].by_calibration is not None else ()
     segments = segments_of(states.time, log.declared, log.blocks)
     graph = Graph(
-        native, tuple(measurements), log.declared, log.blocks, len(states), acting, segments
+        native,
+        tuple(measurements),
+        log.declared,
+        log.blocks,
+        len(states),
+        acting,
+        segments,
+        user=None if log.user is None else log.user.among(states.time),
     )
     return graph, gap_bridged
 

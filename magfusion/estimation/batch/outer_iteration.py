@@ -12,6 +12,7 @@ from magfusion.estimation.batch.outer_iterations import IterationState
 from magfusion.estimation.batch.settings import SmootherSettings
 from magfusion.estimation.demodulation.motion_compensation import MotionCompensated
 from magfusion.estimation.graph.graph import Graph, GraphEstimate, initial_estimate, read_states
+from magfusion.estimation.graph.gtsam_graph import NativeProblem
 from magfusion.estimation.measurements.zero_velocity import may_stand
 from magfusion.estimation.posterior.convergence import settled_at
 from magfusion.estimation.posterior.fixed_point_acceleration import Step, part_of_the_way
@@ -24,6 +25,7 @@ from magfusion.estimation.posterior.noise_tuning import (
 from magfusion.estimation.posterior.noise_tuning import has_converged as same_noise
 from magfusion.estimation.solve.bordered import Optimised, eliminate, marginal, optimise
 from magfusion.estimation.solve.memory import give_back_memory
+from magfusion.estimation.solve.native import optimise_natively
 from magfusion.model.parameters import Block
 from magfusion.model.site import MotionModel
 from magfusion.model.trajectory import Trajectory
@@ -82,11 +84,14 @@ class IterationPlan(NamedTuple):
         Whether noise and model error are estimated from its residuals.
     roughly : bool
         Whether approximate sigmas of its graph suffice.
+    engine : {'bordered', 'gtsam'}
+        Optimiser.
     """
 
     short: bool
     finds_noise: bool
     roughly: bool
+    engine: str
 
 
 def plan_pass(
@@ -97,7 +102,8 @@ def plan_pass(
     short = (now.done == 0 or now.tuning) and now.done + 1 < settings.max_iterations
     # The final noise is estimated from residuals whitened with the present sigmas.
     finds = now.tuning and (now.done > 0 or not by_waveform(log))
-    return IterationPlan(short, finds, short and not (finds and now.done >= TUNINGS))
+    roughly = short and not (finds and now.done >= TUNINGS)
+    return IterationPlan(short, finds, roughly, settings.engine)
 
 
 def by_waveform(log: PreprocessedLog) -> bool:
@@ -135,15 +141,27 @@ def solve_about(
     roughly = plan.roughly
     graph, gaps = graph_of(log, now.states, now.calibration, wave, now.standing, roughly=roughly)
     begun = initial_estimate(now.states, now.calibration, now.segments)
-    result = optimise(graph, begun, tolerance=tolerance)
+    result = _optimised(graph, begun, tolerance, plan.engine)
     iterations, after = result.iterations, read_states(result.estimate.values, time)
     stationary = _stationary_epochs(graph, result.estimate, after, calm & ~now.standing, motion)
     if np.any(stationary):  # directly: it costs no preintegration
         graph = replace(graph, measurements=(*graph.measurements, log.rests(stationary)))
-        result = optimise(graph, result.estimate, tolerance=tolerance)
+        result = _optimised(graph, result.estimate, tolerance, plan.engine)
         iterations += result.iterations
         after = read_states(result.estimate.values, time)
     return SolvedPass(graph, result, after, gaps, stationary, iterations)
+
+
+def _optimised(
+    graph: Graph, begun: GraphEstimate, tolerance: float, engine: str
+) -> Optimised[GraphEstimate]:
+    """Return the minimum of a graph by one of the optimisers."""
+    if engine == "bordered":
+        return optimise(graph, begun, tolerance=tolerance)
+    native = NativeProblem(graph, begun)
+    result = optimise_natively(native.graph, native.values, native.ordering, tolerance)
+    estimate = native.estimate(result.estimate)
+    return Optimised(estimate, result.cost, result.iterations, result.converged)
 
 
 def advance(now: IterationState, solved: SolvedPass) -> IterationState:

@@ -151,6 +151,8 @@ def _demodulated(log: Log, site: Site, settings: SmootherSettings) -> _Demodulat
         steady, samples = demodulation.steady(calibration), only(samples, detected(samples))
     between = _in_gaps(samples, log.imu, calibration.time_offset, site.platform.motion)
     others = [time for time, _ in settings.measurements]
+    if settings.factors is not None:
+        others.append(settings.factors.time)
     if demodulation.close is not None and not loose:
         others.append(demodulation.close.windows.centre)
     time = np.unique(np.concatenate([samples.time, between, *others]))
@@ -175,6 +177,7 @@ def _with_start(
         considered=considered,
         loss=settings.loss,
         others=settings.measurements,
+        user=settings.factors,
         rival_chi_square=begun.rival_chi_square,
         rival=begun.rival,
     )

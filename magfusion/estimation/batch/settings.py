@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from magfusion.estimation.graph.measurement import Measurement
+from magfusion.estimation.graph.user_factors import UserFactors
 from magfusion.model.parameters import (
     PARAMETERS,
     Block,
@@ -64,6 +65,11 @@ class SmootherSettings(EstimatorSettings):
         as a prior; with tight coupling.
     measurements : tuple of (ndarray, Measurement)
         Further measurements, with the times of their rows (s), at which states are made.
+    factors : UserFactors, optional
+        A user's, with the times at which states are made.
+    engine : {'bordered', 'gtsam'}
+        Optimiser of each pass: our loop, or GTSAM's Levenberg-Marquardt, to check it: its time
+        grows with the square of the length of the log.
     """
 
     __repr__ = short_repr
@@ -73,6 +79,8 @@ class SmootherSettings(EstimatorSettings):
     max_iterations: int = 10
     tune: bool = True
     measurements: tuple[tuple[Array, Measurement], ...] = ()
+    factors: UserFactors | None = None
+    engine: str = "bordered"
 
     def __post_init__(self) -> None:
         if self.earth and self.coupling == "loose":

@@ -20,6 +20,7 @@ from magfusion.estimation.graph.inertial import ROWS, Link
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.prior_factor import PriorShift, prior_factor
 from magfusion.estimation.graph.state import states_in, values_from
+from magfusion.estimation.graph.user_factors import UserFactors
 from magfusion.estimation.solve.ordering import nested_dissection
 from magfusion.model.parameters import (
     Block,
@@ -52,6 +53,8 @@ class GraphEstimate:
         Of the main segment, where a log is long enough for several.
     segments : tuple of Calibration
         Of every segment; empty where it is the same in all.
+    own : gtsam.Values, optional
+        Of the own keys of a user's factors; their initial values by default.
     """
 
     __repr__ = short_repr
@@ -59,6 +62,7 @@ class GraphEstimate:
     values: gtsam.Values
     calibration: Calibration
     segments: tuple[Calibration, ...] = ()
+    own: gtsam.Values | None = None
 
     def at(self, segment: int) -> Calibration:
         """Return the calibration of a segment."""
@@ -86,6 +90,8 @@ class Graph:
         Of a long log in which the calibration drifts.
     shift : PriorShift, optional
         Shift of the prior's mean by other uncertain parameters, where other logs made the prior.
+    user : UserFactors, optional
+        Factors of a user's.
     """
 
     __repr__ = short_repr
@@ -98,6 +104,7 @@ class Graph:
     links: tuple[Link, ...] = ()
     segments: Segments = ONE_SEGMENT
     shift: PriorShift | None = None
+    user: UserFactors | None = None
     factors: tuple[Factors, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -120,12 +127,13 @@ class Graph:
     @property
     def ordering(self) -> gtsam.Ordering:
         """Elimination order: halves before their separators, the calibration last."""
+        own = () if self.user is None else [key for key, _ in self.user.own]
         if not self.blocks:
-            return nested_dissection(self.epochs, None)
+            return nested_dissection(self.epochs, None, own=own)
         count = range(len(self.segments))
         first = np.searchsorted(self.segments.of_epoch, count).tolist()
         segments = [(first[k], self.segments.key(k)) for k in count]
-        return nested_dissection(self.epochs, CALIBRATION_KEY, segments)
+        return nested_dissection(self.epochs, CALIBRATION_KEY, segments, own)
 
     def cost(self, estimate: GraphEstimate) -> float:
         """Return half the sum of squared whitened residuals, priors included."""
@@ -137,6 +145,8 @@ class Graph:
             total = float(self.inertial(estimate).error(nothing))
         else:
             total = float(self.native.error(estimate.values))
+        if self.user is not None:
+            total += self.user.error(estimate.values, estimate.own)
         states = states_in(estimate.values)
         for factors in self.factors:
             total += factors.cost(states, estimate.at(factors.segment))
@@ -166,25 +176,31 @@ class Graph:
             graph.push_back(prior_factor(self.declared, estimate.calibration, self.blocks))
         for drift in self.segments.factors(self._calibrations(estimate), self.blocks):
             graph.push_back(drift)
+        if self.user is not None:
+            graph.push_back(self.user.linearize(estimate.values, estimate.own))
         return graph
 
     def moved(self, estimate: GraphEstimate, step: gtsam.VectorValues) -> GraphEstimate:
         """Return the estimate moved by a step of every variable."""
-        values = estimate.values.retract(step)
+        values, own = estimate.values.retract(step), None
+        if self.user is not None:
+            own = (self.user.values if estimate.own is None else estimate.own).retract(step)
         if not self.blocks:
-            return GraphEstimate(values, estimate.calibration)
+            return GraphEstimate(values, estimate.calibration, own=own)
         segments = []
         for k, before in enumerate(self._calibrations(estimate)):
-            whole, own = np.array(step.at(CALIBRATION_KEY)), self.segments.own(k)
-            if own is not None:
-                whole[own[1]] = step.at(own[0])
+            whole, variable = np.array(step.at(CALIBRATION_KEY)), self.segments.own(k)
+            if variable is not None:
+                whole[variable[1]] = step.at(variable[0])
             segments.append(retract(before, self.blocks, whole))
-        return GraphEstimate(values, segments[self.segments.main], tuple(segments))
+        return GraphEstimate(values, segments[self.segments.main], tuple(segments), own)
 
     def damping_scales(self) -> list[tuple[int, Array]]:
         """Return, for each key, the step that a unit damping allows."""
         scales = {X: POSE_STEP, V: VELOCITY_STEP, B: BIAS_STEP}
         terms = [(symbol(i), step) for symbol, step in scales.items() for i in range(self.epochs)]
+        if self.user is not None:
+            terms += [(key, np.ones(size)) for key, size in self.user.own]
         if not self.blocks:
             return terms
         sigma = prior_sigma(self.blocks)
@@ -279,6 +295,8 @@ class Graph:
             graph.push_back(drift)
         if self.blocks and self.declared is not None:
             graph.push_back(prior_factor(self.declared, estimate.calibration, self.blocks))
+        if self.user is not None:
+            graph.push_back(self.user.linearize(estimate.values, estimate.own))
         if not explaining:
             for i in range(graph.size()):
                 factor = graph.at(i)

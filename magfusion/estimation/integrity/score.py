@@ -285,7 +285,8 @@ def moved_estimate(result: Smoothed, score: Score, step: Array) -> GraphEstimate
         return retract(retract(calibration, result.blocks, by_blocks), score.fixed, own_step)
 
     segments = tuple(moved(calibration) for calibration in estimate.segments)
-    return GraphEstimate(estimate.values.retract(change), moved(estimate.calibration), segments)
+    values = estimate.values.retract(change)
+    return GraphEstimate(values, moved(estimate.calibration), segments, estimate.own)
 
 
 def field_residual(result: Smoothed, estimate: GraphEstimate, *, raw: bool = False) -> Array:

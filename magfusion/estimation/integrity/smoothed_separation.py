@@ -31,7 +31,7 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
     """Return the separation at every state, in body axes; None where it is not available.
 
     That is with fixes in the graph (loose coupling), for logs so long that their calibration
-    drifts, and for close tones that are measured jointly.
+    drifts, for close tones that are measured jointly, and with factors of a user's.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def _can_separate(graph: Graph) -> bool:
     fields = [f for f in graph.factors if isinstance(f.measurement, FieldPhasors)]
     together = any(isinstance(m, JointPhasors) for m in graph.measurements)
     one = len(fields) == 1 and len(graph.segments) <= 1
-    return one and not together and graph.declared is not None
+    return one and not together and graph.declared is not None and graph.user is None
 
 
 class _Tally:

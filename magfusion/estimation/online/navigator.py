@@ -5,9 +5,11 @@ epoch, and on request at any later time.
 """
 
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import gtsam
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
@@ -28,6 +30,7 @@ from magfusion.estimation.initialization.early import first_try, is_clear, next_
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
 from magfusion.estimation.integrity.correction import Correction, continued, spread_of
 from magfusion.estimation.measurements.earth import check_earth
+from magfusion.estimation.measurements.factor_of_state import state_factor
 from magfusion.estimation.online.applied_corrections import AppliedCorrections
 from magfusion.estimation.online.arrivals import arrivals_of
 from magfusion.estimation.online.ekf import ErrorStateFilter
@@ -284,6 +287,23 @@ class Navigator:
             self.counts["measurement too late"] += 1
         self._history.add(time, "add_measurement", time, measurement)
         self.advance()
+
+    def add_factor(self, factor: gtsam.NonlinearFactor, times: Sequence[float] | Array) -> None:
+        """Add a GTSAM factor on the state of one time (s), as `add_measurement` does.
+
+        Parameters
+        ----------
+        factor : gtsam.NonlinearFactor
+            On X(0), V(0), B(0), or some of them.
+        times : sequence of float
+            One.
+
+        Raises
+        ------
+        InputError
+            If the factor is on more than one state, or the clock jumped.
+        """
+        self.add_measurement(float(np.ravel(times)[0]), state_factor(factor, np.ravel(times)))
 
     def _stand_still(self, time: Array, *, raw: bool) -> None:
         """Advance a motion prior to the newest fields (s), where the site has no IMU."""

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from magfusion.errors import InputError
 from magfusion.estimation.batch.calibration_data import calibration_rules
 from magfusion.estimation.data_checks.running import DecayingSums
 from magfusion.estimation.data_checks.stream_buffer import Buffer
@@ -19,6 +20,7 @@ from magfusion.estimation.graph.inertial import ROWS, Link, Steps
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, State, states_of
 from magfusion.estimation.measurements.earth import EarthField
+from magfusion.estimation.measurements.factor_of_state import StateFactor
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors, Predictions
 from magfusion.estimation.measurements.pose_fix import PoseFix
@@ -225,6 +227,11 @@ def _check_window(window: SlidingWindow) -> None:
 
 
 def _measurement_data(measurement: Measurement) -> dict[str, Any]:
+    if isinstance(measurement, StateFactor):
+        raise InputError(
+            "a checkpoint cannot store a GTSAM factor of yours; write it when the factor is older"
+            " than the lag"
+        )
     return {
         "kind": type(measurement).__name__,
         **{k: to_plain(v, _WITHOUT_PREDICTIONS) for k, v in vars(measurement).items()},

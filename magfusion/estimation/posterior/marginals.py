@@ -115,7 +115,7 @@ def is_chain(graph: Graph, considered: tuple[Block, ...]) -> bool:
     too_long = 8.0 * graph.epochs * MOTION * maximum > AT_ONCE
     if graph.declared is None or len(graph.segments) > 1 or graph.shift is not None:
         return False
-    return not too_long and not leaves_out(graph.measurements)
+    return not too_long and graph.user is None and not leaves_out(graph.measurements)
 
 
 def _of_chain(graph: Graph, estimate: GraphEstimate, considered: tuple[Block, ...]) -> _Marginals:

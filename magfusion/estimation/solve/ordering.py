@@ -7,7 +7,10 @@ from gtsam.symbol_shorthand import B, V, X
 
 
 def nested_dissection(
-    epochs: int, last: int | None, segments: Sequence[tuple[int, int]] = ()
+    epochs: int,
+    last: int | None,
+    segments: Sequence[tuple[int, int]] = (),
+    own: Sequence[int] = (),
 ) -> gtsam.Ordering:
     """Return an elimination order of halves before their separators, the calibration last.
 
@@ -21,6 +24,8 @@ def nested_dissection(
     segments : sequence of (int, int)
         First epoch and key of segments that have their own variable; it comes after them, except
         where it is the last.
+    own : sequence of int
+        Keys that factors of a user's add: before the calibration.
     """
     ordering = gtsam.Ordering()
     begins = [begin for begin, _ in segments] or [0]
@@ -35,6 +40,8 @@ def nested_dissection(
                 ordering.push_back(segments[middle][1])
         elif high > low:
             stack += [(low, high, True), (middle + 1, high, False), (low, middle, False)]
+    for key in own:
+        ordering.push_back(key)
     if last is not None:
         ordering.push_back(last)
     return ordering
