@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from conftest import run_command
 from scipy.spatial.transform import Rotation
 
 Mistake = Callable[[dict[str, Any]], None]
@@ -39,25 +38,18 @@ def attitudes_exchanged(site: dict[str, Any]) -> None:
     one["rpy_deg"], other["rpy_deg"] = other["rpy_deg"], one["rpy_deg"]
 
 
-def magfusion(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "magfusion", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
 def smoothed(log: Path, site: dict[str, Any], output: Path) -> dict[str, Any]:
     """Return the report of the command with a site."""
     declared = output.with_suffix(".yaml")
     declared.write_text(yaml.safe_dump(site), encoding="utf-8")
-    run = magfusion("smooth", log, "--site", declared, "-o", output)
-    assert run.returncode == 0, run.stderr
+    run_command("smooth", log, "--site", declared, "-o", output)
     return dict(json.loads((output / "report.json").read_text(encoding="utf-8")))
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("correction") / "log"
-    made = magfusion("simulate", "-o", path, "--duration", SECONDS, "--seed", 4)
-    assert made.returncode == 0, made.stderr
+    run_command("simulate", "-o", path, "--duration", SECONDS, "--seed", 4)
     return path
 
 

@@ -21,8 +21,8 @@ def test_the_command_writes_table_picture_recording_and_report(
     worked: Worked, tmp_path: Path
 ) -> None:
     site, place = worked.log / "site.yaml", tmp_path / "plan"
-    for _ in range(2):  # an earlier result is replaced
-        run_command("coverage", site, "-o", place, "--spacing", 1, "--extra-beacon")
+    for options in (("--height", 1.5), ("--extra-beacon",)):  # an earlier result is replaced
+        run_command("coverage", site, "-o", place, "--spacing", 1, *options)
     assert {path.name for path in place.iterdir()} == FILES
     assert (place / "coverage.png").read_bytes().startswith(b"\x89PNG")
     assert (place / "run.rrd").read_bytes().startswith(b"RRF")

@@ -5,7 +5,7 @@ One test a rule: what breaks it is listed in the failure.
 
 import ast
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -19,6 +19,7 @@ from house import (
     files_by_folder,
     imports_of,
     modules,
+    nodes_of,
     parsed,
     room_circles,
     room_of,
@@ -47,12 +48,12 @@ def _importers(library: str) -> set[str]:
 
 
 def _offenders(
-    paths: Iterable[Path], result: Callable[[ast.Module], Iterable[object]]
+    paths: Iterable[Path], result: Callable[[Sequence[ast.AST]], Iterable[object]]
 ) -> list[str]:
     """Return a line for each file in which something was found."""
     out = []
     for path in paths:
-        there = list(result(parsed(path)))
+        there = list(result(nodes_of(path)))
         if there:
             out.append(f"{_name(path)}: {', '.join(map(str, there))}")
     return out
@@ -159,8 +160,8 @@ OPTIMISERS = {
 }
 
 
-def _identifiers(tree: ast.AST) -> Iterator[str]:
-    for node in ast.walk(tree):
+def _identifiers(nodes: Iterable[ast.AST]) -> Iterator[str]:
+    for node in nodes:
         if isinstance(node, ast.Name):
             yield node.id
         elif isinstance(node, ast.Attribute):
@@ -173,8 +174,7 @@ def test_only_solve_optimises() -> None:
     """One damped loop for many small problems, one for graphs, and one fallback to QR."""
     solvers, fallbacks = set(), 0
     for path in _modules():
-        tree = parsed(path)
-        names = list(_identifiers(tree))
+        names = list(_identifiers(nodes_of(path)))
         fallbacks += names.count("EliminateQR")
         imported = {name for name in imports_of(path) if name.startswith("scipy.optimize")}
         if imported or OPTIMISERS & set(names):
@@ -214,7 +214,7 @@ def test_one_file_of_estimation_builds_custom_factors() -> None:
     builders = {
         _name(path)
         for path in _modules()
-        for node in ast.walk(parsed(path))
+        for node in nodes_of(path)
         if isinstance(node, ast.Attribute | ast.alias)
         and "CustomFactor" in (node.attr if isinstance(node, ast.Attribute) else node.name)
     }
@@ -232,8 +232,8 @@ def _compares_with_hidden_tolerance(node: ast.AST) -> bool:
 def test_tests_state_the_tolerance_of_allclose() -> None:
     """Its default ``atol`` of 1e-8 is larger than any field, so that it is true of all teslas."""
 
-    def hidden(tree: ast.Module) -> list[int]:
-        return [n.lineno for n in ast.walk(tree) if _compares_with_hidden_tolerance(n)]
+    def hidden(nodes: Iterable[ast.AST]) -> list[int]:
+        return [getattr(n, "lineno", 0) for n in nodes if _compares_with_hidden_tolerance(n)]
 
     result = _offenders(sorted((ROOT / "tests").glob("*.py")), hidden)
     assert not result, "\n".join(["allclose without rtol and atol in lines", *result])
@@ -277,8 +277,8 @@ def _names_a_kind(node: ast.AST) -> bool:
 def test_nothing_is_decided_by_the_name_of_a_parameters_kind() -> None:
     """All that is particular to a kind of parameter is in its object: see model/parameters."""
 
-    def named(tree: ast.Module) -> list[int]:
-        return [node.lineno for node in ast.walk(tree) if _names_a_kind(node)]
+    def named(nodes: Iterable[ast.AST]) -> list[int]:
+        return [getattr(node, "lineno", 0) for node in nodes if _names_a_kind(node)]
 
     result = _offenders(_modules(), named)
     assert not result, "\n".join(["kinds or groups are compared in lines", *result])
@@ -308,8 +308,8 @@ _OF_THE_SITE = re.compile(
 )
 
 
-def _constants(tree: ast.Module) -> Iterator[str]:
-    for node in tree.body:
+def _constants(module: ast.Module) -> Iterator[str]:
+    for node in module.body:
         for target in node.targets if isinstance(node, ast.Assign) else ():
             for name in ast.walk(target):
                 if isinstance(name, ast.Name) and name.id.isupper():
@@ -317,5 +317,9 @@ def _constants(tree: ast.Module) -> Iterator[str]:
 
 
 def test_what_describes_the_platforms_motion_or_a_clock_is_in_the_site() -> None:
-    result = _offenders(_modules(), lambda tree: filter(_OF_THE_SITE.fullmatch, _constants(tree)))
+    result = [
+        f"{_name(path)}: {name}"
+        for path in _modules()
+        for name in filter(_OF_THE_SITE.fullmatch, _constants(parsed(path)))
+    ]
     assert not result, "\n".join(result)

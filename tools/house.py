@@ -42,10 +42,16 @@ def parsed(path: Path) -> ast.Module:
 
 
 @cache
+def nodes_of(path: Path) -> tuple[ast.AST, ...]:
+    """Return every node of a file's syntax tree, breadth first."""
+    return tuple(ast.walk(parsed(path)))
+
+
+@cache
 def imports_of(path: Path) -> tuple[str, ...]:
     """Return the dotted names that a file imports, wherever the import is."""
     result: list[str] = []
-    for node in ast.walk(parsed(path)):
+    for node in nodes_of(path):
         if isinstance(node, ast.Import):
             result += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

@@ -11,13 +11,14 @@ import ast
 import re
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+from house import ROOT, nodes_of
 from word_lists import ALLOWED, IN_IDENTIFIERS, IN_TEXT, LATER, WHOLE_IDENTIFIERS
 
-ROOT = Path(__file__).resolve().parents[1]
 CODE = ("magfusion", "tools", "scenarios")
 PAGES = ("docs", "README.md", "CONTRIBUTING.md")
 LISTS = ("text", "part", "whole")
@@ -82,14 +83,15 @@ def in_text(text: str) -> Iterator[tuple[int, str]]:
         yield blanked.count("\n", 0, match.start()), re.sub(r"\s+", "_", match[0].lower())
 
 
-def in_identifier(name: str) -> Iterator[tuple[str, str]]:
+@cache
+def in_identifier(name: str) -> list[tuple[str, str]]:
     """Return list and form of each banned word of an identifier."""
     words = [word.lower() for word in WORD.findall(name)]
     joined = f"_{'_'.join(words)}_"
-    parts = [form for form in PART if f"_{form}_" in joined]
-    yield from (("part", form) for form in parts)
+    parts = [("part", form) for form in PART if f"_{form}_" in joined]
     if not parts and joined.strip("_") in WHOLE:
-        yield "whole", joined.strip("_")
+        return [("whole", joined.strip("_"))]
+    return parts
 
 
 def _targets(node: ast.AST) -> Iterator[tuple[str, int]]:
@@ -115,10 +117,10 @@ def _is_contract(node: ast.AST) -> bool:
     return isinstance(call, ast.Call) and getattr(call.func, "id", None) in OPTIONS
 
 
-def _contract(tree: ast.Module) -> set[tuple[str, int]]:
+def _contract(nodes: Sequence[ast.AST]) -> set[tuple[str, int]]:
     """Return names and lines of options and of keys of the site's file."""
     out: set[tuple[str, int]] = set()
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.ClassDef):
             is_entry = node.name.endswith("Entry")
             for line in node.body:
@@ -127,31 +129,30 @@ def _contract(tree: ast.Module) -> set[tuple[str, int]]:
     return out
 
 
-def identifiers(tree: ast.Module) -> Iterator[tuple[str, int]]:
+def identifiers(nodes: Sequence[ast.AST]) -> Iterator[tuple[str, int]]:
     """Return names and lines of all that a module defines, but for the contract."""
-    contract, seen = _contract(tree), set()
-    for node in ast.walk(tree):
+    contract, seen = _contract(nodes), set()
+    for node in nodes:
         for name, line in _targets(node):
             if (name, line) not in contract and (name, line) not in seen:
                 seen.add((name, line))
                 yield name, line
 
 
-def messages(tree: ast.Module) -> Iterator[tuple[str, int]]:
+def messages(nodes: Sequence[ast.AST]) -> Iterator[tuple[str, int]]:
     """Return texts and lines of docstrings and of what has several words."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value:
             yield node.value, node.lineno
 
 
-def of_module(source: str, place: str, module: str) -> Iterator[Finding]:
-    """Return what stands in the way in a Python file; ``module`` is its own name."""
-    tree = ast.parse(source)
-    for name, line in [(module, 1), *identifiers(tree)]:
+def of_module(nodes: Sequence[ast.AST], place: str, module: str) -> Iterator[Finding]:
+    """Return what stands in the way in the nodes of a file; ``module`` is its own name."""
+    for name, line in [(module, 1), *identifiers(nodes)]:
         for kind, form in in_identifier(name):
             table = PART if kind == "part" else WHOLE
             yield Finding(place, line, kind, form, name, table[form])
-    for text, first in messages(tree):
+    for text, first in messages(nodes):
         for line, form in in_text(text):
             yield Finding(place, first + line, "text", form, form, TEXT[form])
 
@@ -175,7 +176,7 @@ def findings() -> list[Finding]:
     for path in _files(CODE, ".py"):
         if path.stem not in ("words", "word_lists"):
             place = path.relative_to(ROOT).as_posix()
-            out.extend(of_module(path.read_text(), place, path.stem))
+            out.extend(of_module(nodes_of(path), place, path.stem))
     for path in _files(PAGES, ".md"):
         out.extend(of_page(path.read_text(), path.relative_to(ROOT).as_posix()))
     return sorted(out)

@@ -15,12 +15,7 @@ import numpy as np
 from magfusion.errors import EstimationError
 from magfusion.estimation.solve.bounded import minimise_bounded
 from magfusion.model.field import predict, skew
-from magfusion.model.field_map import (
-    COMPONENTS,
-    FieldMap,
-    block_diagonal,
-    process_covariance,
-)
+from magfusion.model.field_map import COMPONENTS, FieldMap, correlation, posterior_system
 from magfusion.model.site import Site
 from magfusion.units import Array, ComplexArray, IntArray
 
@@ -222,21 +217,21 @@ def _plain_gain(detected: _DetectedFields) -> Array:
 
 def _conditioned(detected: _DetectedFields, process: _Process) -> FieldMap:
     count = len(detected.sensor_world)
-    kernel = process_covariance(detected.sensor_world, process.length_scale, process.sigma)
+    near = correlation(detected.sensor_world, detected.sensor_world, process.length_scale)
     state = np.zeros((count, COMPONENTS))
     state[:, 0] = _plain_gain(detected)
     for _ in range(RELINEARISATIONS):
         information, vector = _reduced(detected, state, process.residual)
-        system = np.eye(len(kernel)) + block_diagonal(information) @ kernel
-        weights = np.linalg.solve(system, vector.ravel())
-        before, state = state, (kernel @ weights).reshape(count, COMPONENTS)
+        system = posterior_system(near, process.sigma, information)
+        weights = np.linalg.solve(system, vector.ravel()).reshape(count, COMPONENTS)
+        before, state = state, near @ (process.sigma**2 * weights)
         # Where a survey is of other beacons, steps would diverge.
         state[:, 0] = np.clip(state[:, 0], np.log(_WEAKEST), -np.log(_WEAKEST))
         if np.max(np.abs(state - before)) < CONVERGED_STEP:
             break
     return FieldMap(
         points_world=detected.sensor_world,
-        weights=np.asarray(weights.reshape(count, COMPONENTS)),
+        weights=weights,
         information=information,
         length_scale=process.length_scale,
         gain_sigma=process.gain_sigma,

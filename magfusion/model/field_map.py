@@ -52,11 +52,13 @@ class FieldMap:
 
     @cached_property
     def _reduction(self) -> Array:
-        """``(1 + information K)^-1 information``, shape (4 m, 4 m)."""
-        kernel = process_covariance(self.points_world, self.length_scale, self.component_sigma)
-        information = block_diagonal(self.information)
-        system = np.eye(len(kernel)) + information @ kernel
-        return np.asarray(np.linalg.solve(system, information))
+        """``(1 + information K)^-1 information`` within each component, shape (4, m, m)."""
+        count = len(self.points_world)
+        near = correlation(self.points_world, self.points_world, self.length_scale)
+        system = posterior_system(near, self.component_sigma, self.information)
+        reduction = np.linalg.solve(system, block_diagonal(self.information))
+        reduction = reduction.reshape(count, COMPONENTS, count, COMPONENTS)
+        return np.moveaxis(np.diagonal(reduction, axis1=1, axis2=3), -1, 0).copy()
 
     @cached_property
     def typical_variance(self) -> Array:
@@ -100,9 +102,7 @@ class FieldMap:
         for start in range(0, len(position_world), rows):
             part = slice(start, start + rows)
             near = correlation(position_world[part], self.points_world, self.length_scale)
-            spread = near[:, None, :, None] * (np.eye(4) * prior)[None, :, None, :]
-            reach = spread.reshape(len(near), 4, -1)
-            known = np.einsum("nai,nai->na", reach @ self._reduction, reach)
+            known = prior**2 * np.einsum("ani,ni->na", near @ self._reduction, near)
             remaining = np.maximum(prior - known, 0.0)
             out[part] = np.stack([remaining[:, 0], np.mean(remaining[:, 1:], axis=1)], axis=1)
         return out
@@ -130,10 +130,14 @@ def correlation(first_world: Array, second_world: Array, length_scale: float) ->
     return np.exp(-0.5 * square / length_scale**2)
 
 
-def process_covariance(points_world: Array, length_scale: float, sigma: Array) -> Array:
-    """Return the prior covariance at the points, point by point, shape (4 m, 4 m)."""
-    near = correlation(points_world, points_world, length_scale)
-    return np.asarray(np.kron(near, np.diag(sigma**2)))
+def posterior_system(near: Array, sigma: Array, information: Array) -> Array:
+    """Return ``1 + information K``, K the prior covariance at the points, shape (4 m, 4 m).
+
+    Of their correlation (m, m), the sigmas (4,) and the points' information (m, 4, 4).
+    """
+    product = information[:, :, None, :] * sigma**2 * near[:, None, :, None]
+    size = COMPONENTS * len(near)
+    return np.asarray(np.eye(size) + product.reshape(size, size))
 
 
 def block_diagonal(blocks: Array) -> Array:

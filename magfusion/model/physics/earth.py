@@ -3,7 +3,6 @@
 import datetime
 
 import numpy as np
-import ppigrf
 
 from magfusion.errors import InputError
 from magfusion.units import DEGREE, NANOTESLA, Array
@@ -57,6 +56,8 @@ def earth_field_world(
             f"location.date: found {day}; the IGRF is valid from {IGRF_FIRST} to {IGRF_LAST}: give"
             " a date in it, or earth_field_t instead of the location"
         )
+    import ppigrf  # with pandas, a tenth of a command's start: for a site with a location alone
+
     midnight = datetime.datetime(day.year, day.month, day.day)
     east_north_up = ppigrf.igrf(longitude_deg, latitude_deg, height_m / 1e3, midnight)
     return np.array([float(np.squeeze(part)) for part in east_north_up]) * NANOTESLA
