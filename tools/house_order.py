@@ -70,7 +70,7 @@ ROOMS = {
             slots
             disturbance inertial rails rotor rotor_beacons
             drift field wells
-            waveform worlds
+            waveform
             log
             endurance
         """,
@@ -92,7 +92,7 @@ ROOMS = {
             p002_beacon
         """,
         "results": """
-            consistency errors figures gauge odometry page_style pose_information provenance
+            errors figures gauge odometry page_style pose_information provenance
             recording_file ros_messages shapes trend
             coverage drift live_foxglove observability odometry_dds odometry_mavlink recording_plots
             refinement rest_figures shown transfer verdict

@@ -217,14 +217,6 @@ def frame_pairs(epochs: int, delta: int) -> IntArray:
     return np.stack([ids[:-1], ids[1:]], axis=1)
 
 
-def time_pairs(time: Array, delta: float) -> IntArray:
-    """Return consecutive pairs of indices at least ``delta`` seconds apart, shape (m, 2)."""
-    ids = [0]
-    while (following := int(np.searchsorted(time, time[ids[-1]] + delta))) < len(time):
-        ids.append(following)
-    return np.stack([ids[:-1], ids[1:]], axis=1).astype(np.int64)
-
-
 def relative_errors(
     world_from_body: Array, position_world: Array, truth: Trajectory, pairs: IntArray
 ) -> RelativeErrors:
@@ -238,7 +230,7 @@ def relative_errors(
     truth : Trajectory
         At the same n epochs.
     pairs : ndarray of int, shape (m, 2)
-        From `frame_pairs` or `time_pairs`.
+        As from `frame_pairs`.
     """
     step, shift = _motion(world_from_body, position_world, pairs)
     true_step, true_shift = _motion(truth.world_from_body, truth.position_world, pairs)

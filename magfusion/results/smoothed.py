@@ -14,7 +14,7 @@ from magfusion.results.report import smoothed_figures
 from magfusion.results.trajectory import ResultTrajectory, result_trajectory
 from magfusion.results.verdict import trust_figures
 
-NOT_JUDGED = "No verdict yet: call mf.judged(result, log) for the verdict."
+NOT_JUDGED = "No verdict yet: call mf.judge_result(result, log) for the verdict."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
