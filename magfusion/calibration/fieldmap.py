@@ -15,12 +15,7 @@ import numpy as np
 from magfusion.errors import EstimationError
 from magfusion.estimation.solve.bounded import minimise_bounded
 from magfusion.model.field import predict, skew
-from magfusion.model.field_map import (
-    COMPONENTS,
-    FieldMap,
-    block_diagonal,
-    process_covariance,
-)
+from magfusion.model.field_map import COMPONENTS, FieldMap, block_diagonal, process_covariance
 from magfusion.model.site import Site
 from magfusion.units import Array, ComplexArray, IntArray
 

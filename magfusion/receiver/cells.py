@@ -12,11 +12,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from magfusion.errors import InputError
-from magfusion.model.detection_range import (
-    only_owned,
-    owned_at,
-    tones_of,
-)
+from magfusion.model.detection_range import only_owned, owned_at, tones_of
 from magfusion.model.field import predict
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Magnetometer, Site

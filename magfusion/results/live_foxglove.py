@@ -93,9 +93,7 @@ class FoxgloveServer:
         w, x, y, z = result.quaternion.tolist()
         turn, when = make.Quaternion(x=x, y=y, z=z, w=w), make.Timestamp(*divmod(stamp, _NS))
         pose = make.PoseInFrame(
-            timestamp=when,
-            frame_id=self._frame,
-            pose=make.Pose(position=place, orientation=turn),
+            timestamp=when, frame_id=self._frame, pose=make.Pose(position=place, orientation=turn)
         )
         transform = make.FrameTransform(
             timestamp=when,

@@ -319,11 +319,7 @@ def draw_endurance(site: Site, config: EnduranceConfig, seed: tuple[int, ...]) -
     site_rng, motion_rng, drift_rng, clock_rng = _generator(seed, _WORLD, 0).spawn(4)
     true_site = perturb_site(site, site_rng)
     motion = random_walk_motion(
-        motion_rng,
-        config.blocks * BLOCK,
-        config.box_world,
-        config.speed,
-        rests=config.schedule,
+        motion_rng, config.blocks * BLOCK, config.box_world, config.speed, rests=config.schedule
     )
     edges = BLOCK * np.arange(config.blocks + 1, dtype=float)
     drawn = draw_drift(config.drift, edges, len(site.beacons), drift_rng)
