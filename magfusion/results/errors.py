@@ -11,7 +11,7 @@ from magfusion.errors import InputError
 from magfusion.model.arguments import check_arguments
 from magfusion.model.short_repr import one_line, short_repr
 from magfusion.model.trajectory import Trajectory, interpolate
-from magfusion.model.truth_poses import TruthPoses, truth_poses
+from magfusion.model.truth_poses import truth_poses
 from magfusion.units import Array, BoolArray, IntArray
 
 
@@ -172,7 +172,7 @@ def trajectory_errors(
         true, compared, reason = truth_poses(truth, estimate.time)
     else:
         reason = f"the others are in steps longer than {max_gap} s"
-        true, compared, reason = TruthPoses(*interpolate(truth, estimate.time, max_gap), reason)
+        true, compared = interpolate(truth, estimate.time, max_gap)
     if len(true) < 3:
         raise InputError(
             f"The truth covers {len(true)} of the estimate's {len(estimate)} epochs, and at least 3"
