@@ -112,12 +112,7 @@ class FoxgloveServer:
 
 
 def _host_and_port(address: str) -> tuple[str, int]:
-    """Return host and port of ``[HOST:]PORT``.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return host and port of ``[HOST:]PORT``."""
     host, _, port = address.rpartition(":")
     if not port.isdecimal() or int(port) > 65535 or address.startswith(":"):
         raise InputError(

@@ -109,12 +109,7 @@ class RosPublisher:
 
 
 def _domain() -> int:
-    """Return the domain that ROS would use.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return the domain that ROS would use."""
     text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
     if not text.isdecimal() or int(text) > _LAST_DOMAIN:
         raise InputError(f"ROS_DOMAIN_ID: found {text!r}; it should be from 0 to {_LAST_DOMAIN}")
