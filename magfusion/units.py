@@ -12,9 +12,10 @@ BoolArray = npt.NDArray[np.bool_]
 AnyArray = npt.NDArray[Any]
 
 MU0_OVER_4PI = 1e-7  # T m / A
-NANOTESLA = 1e-9  # T
+MU0 = 4.0 * np.pi * MU0_OVER_4PI  # T m / A
+NANOTESLA, MICROTESLA = 1e-9, 1e-6  # T
 DEGREE = np.pi / 180.0  # rad
-NANOSECOND = 1e-9  # s
+NANOSECOND, HOUR, DAY = 1e-9, 3600.0, 86_400.0  # s
 STANDARD_GRAVITY = 9.80665  # m/s^2
 
 # Rate of states: at the field epochs, at every inertial sample, or a number per second (Hz).

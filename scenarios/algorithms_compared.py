@@ -1,6 +1,6 @@
 """Paper 004's three algorithms compared with maximum likelihood, in nine rooms (figures 7 and 8).
 
-Ten rooms of each kind (`magfusion.simulation.worlds`) with two hundred targets: noise alone (S0), a
+Ten rooms of each kind (`paper_rooms`) with two hundred targets: noise alone (S0), a
 smooth gain error (S1), two sets of errors fitted to the printed figures (F1, F2), coils of the true
 size (P0) and iron near them, as far as it has an effect (P1, P2) or near (N1, N2).  The sensor is
 level, as it was in the paper.
@@ -40,10 +40,10 @@ from algorithms_tried import (
     try_world,
 )
 from harness import Scale, chosen_scale, conclude, scenario_parser
+from paper_rooms import ROOM, S0, SCENARIOS, draw_world
 from scipy.spatial.transform import Rotation
 
 from magfusion.simulation.monte_carlo import run_many
-from magfusion.simulation.worlds import ROOM, S0, SCENARIOS, draw_world
 from magfusion.units import DEGREE
 
 TILTS_DEG = (0.0, 2.0, 10.0, 30.0, 90.0, 180.0)

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from algorithms_tried import MAPPED, METHODS, ML, OURS, PUBLISHED, AlgorithmOutcome
 from harness import blank_figure, rms, save_picture
+from paper_rooms import SCENARIOS
 from scipy.stats import t as student
 
-from magfusion.simulation.worlds import SCENARIOS
 from magfusion.units import Array
 
 PAPER_POSITION = dict(zip(PUBLISHED, (0.336, 0.114, 0.069), strict=True))  # m

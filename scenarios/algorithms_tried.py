@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from paper_rooms import Scenario, SceneLayout, SimulatedWorld, draw_world
 from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.fieldmap import MapPoints, learn_field_map
@@ -24,7 +25,6 @@ from magfusion.papers.p004_fingerprints.fingerprint import (
 from magfusion.papers.p004_fingerprints.rssi import RssiLines, fit_lines
 from magfusion.receiver.ellipse import plane_normal
 from magfusion.results.coverage import coverage
-from magfusion.simulation.worlds import Scenario, SceneLayout, SimulatedWorld, draw_world
 from magfusion.units import DEGREE, Array
 
 MODEL_ERROR = 0.02  # relative; half a per cent to five give nearly the same

@@ -25,18 +25,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from beacon_methods import calibrate_as_printed, consistent_centres, fit_known_moments
 from beacon_readings import PAPER, readings, report_readings
 from harness import blank_figure, chosen_scale, conclude, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.beacon import BeaconMeasurements, calibrate_beacon
-from magfusion.calibration.beacon_refined import attitudes, fit_known_moments
+from magfusion.calibration.beacon_refined import attitudes
 from magfusion.estimation.snapshot.candidates import wahba
 from magfusion.model.site import Beacon, BeaconSigma, Coil, Magnetometer
-from magfusion.papers.p002_beacon.calibration import (
-    calibrate_as_printed,
-    consistent_centres,
-)
 from magfusion.papers.p002_beacon.equations import eq_04_direction, eq_21_angles
 from magfusion.receiver.ellipse import plane_normal
 from magfusion.simulation.demo_site import demo_site

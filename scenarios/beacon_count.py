@@ -20,9 +20,9 @@ import numpy as np
 from algorithms_figures import means, standard_error
 from algorithms_tried import MAPPED, AlgorithmOutcome, Task, try_world
 from harness import Scale, blank_figure, chosen_scale, conclude, save_picture, scenario_parser
+from paper_rooms import F1, ring
 
 from magfusion.simulation.monte_carlo import run_many
-from magfusion.simulation.worlds import F1, ring
 from magfusion.units import Array
 
 COUNTS = (3, 4, 5, 6)

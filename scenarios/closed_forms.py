@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from harness import conclude, scenario_parser
 from scipy.spatial.transform import Rotation
+from tensor_fix import locate_by_tensor
 
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.field import predict
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.papers.p004_fingerprints.direction import locate_by_tensor
 from magfusion.papers.p004_fingerprints.equations import eq_05_normal, eq_07_direction
 from magfusion.receiver.ellipse import plane_normal, rms_amplitude, semi_axes
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site

@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 from harness import blank_figure, conclude, save_picture, scenario_parser
+from tensor_fix import locate_by_tensor
 
 from magfusion.model.site import Beacon, BeaconSigma, Coil
-from magfusion.papers.p004_fingerprints.direction import locate_by_tensor
 from magfusion.papers.p004_fingerprints.equations import eq_07_direction
 from magfusion.receiver.ellipse import plane_normal
 from magfusion.simulation.field import phasors_world

@@ -27,6 +27,7 @@ from pathlib import Path
 
 import numpy as np
 from harness import blank_figure, chosen_scale, conclude, save_picture, scenario_parser
+from paper_rooms import F1, SimulatedReceiver, SimulatedWorld, draw_world
 from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.fieldmap import MapPoints, learn_field_map
@@ -53,7 +54,6 @@ from magfusion.simulation.drift import (
 )
 from magfusion.simulation.monte_carlo import run_many
 from magfusion.simulation.waveform import Mains
-from magfusion.simulation.worlds import F1, SimulatedReceiver, SimulatedWorld, draw_world
 from magfusion.units import DEGREE, NANOTESLA, Array, ComplexArray
 
 HOUR = 3600.0  # s

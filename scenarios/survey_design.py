@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from harness import conclude, scenario_parser
+from paper_rooms import F1, ROOM, SimulatedWorld, draw_world
 
 from magfusion.papers.p004_fingerprints.algorithms import locate_by_lines
 from magfusion.papers.p004_fingerprints.equations import distances, eq_25_fingerprint
@@ -21,7 +22,6 @@ from magfusion.papers.p004_fingerprints.fingerprint import (
     locate_by_neighbours,
 )
 from magfusion.papers.p004_fingerprints.rssi import fit_block_lines, fit_lines
-from magfusion.simulation.worlds import F1, ROOM, SimulatedWorld, draw_world
 from magfusion.units import Array
 
 NEIGHBOURS = (1, 2, 4, 8, 16)

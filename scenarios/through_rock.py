@@ -24,10 +24,11 @@ from magfusion.model.ground import conductivity_of, in_ground
 from magfusion.model.parameters import CONDUCTIVITY
 from magfusion.model.samples import Log
 from magfusion.model.site import Beacon, BeaconSigma, Coil, Site
+from magfusion.model.trajectory import interpolated
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.layers import Layers
-from magfusion.simulation.log import EPOCH_NS, interpolate, perturb_site, simulate_fields
+from magfusion.simulation.log import EPOCH_NS, perturb_site, simulate_fields
 from magfusion.simulation.motion import random_walk_motion
 
 WRONG = 3.0  # factor of the declared conductivity
@@ -152,7 +153,7 @@ def position_errors(result: Smoothed, log: Log) -> tuple[float, float]:
     states, truth = result.states, log.truth
     assert truth is not None
     assert states.pose_cov is not None
-    true_world = interpolate(states.time, truth.time, truth.position_world)
+    true_world = interpolated(states.time, truth.time, truth.position_world)
     error = states.position_world - true_world
     in_body = np.einsum("nji,nj->ni", states.world_from_body, error)
     inverse = np.linalg.inv(states.pose_cov[:, 3:, 3:])

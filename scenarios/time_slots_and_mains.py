@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from harness import blank_figure, conclude, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation
+from tracker_poses import unit_coupling
 
 from magfusion.model.coil_field import as_points
 from magfusion.model.field import observe_from
@@ -38,7 +39,7 @@ from magfusion.model.site import (
     Site,
     Slots,
 )
-from magfusion.papers.p000_tracker.pose import TrackerFix, locate_by_svd, unit_coupling
+from magfusion.papers.p000_tracker.pose import TrackerFix, locate_by_svd
 from magfusion.receiver.ambient import Removal, subtraction_gain
 from magfusion.receiver.cycles import whole_cycles
 from magfusion.receiver.receivers import received

@@ -8,14 +8,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from tracker_bench import bench_points
+from tracker_poses import refine_poses
 
 from magfusion.calibration.antenna import AntennaSurvey, prior_sigma
 from magfusion.model.antenna import Antenna
 from magfusion.model.physics.dipole import dipole_field
 from magfusion.model.physics.finite_size import disc_kappa
-from magfusion.papers.p000_tracker.bench import bench_points
 from magfusion.papers.p000_tracker.equations import eq_09_whitened
-from magfusion.papers.p000_tracker.pose import locate_by_svd, refine_poses
+from magfusion.papers.p000_tracker.pose import locate_by_svd
 from magfusion.units import DEGREE, MU0_OVER_4PI, Array
 
 NODES = 12  # of a wire; the sum converges by a power of size over distance for each

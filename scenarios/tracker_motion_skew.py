@@ -19,6 +19,7 @@ import numpy as np
 from harness import blank_figure, conclude, rms, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation, RotationSpline
 from time_slots_and_mains import DISTANCE, UNIT, located, tracker
+from tracker_poses import world_poses
 
 from magfusion.estimation.batch.batch import smooth
 from magfusion.estimation.graph.state import as_trajectory
@@ -27,7 +28,6 @@ from magfusion.model.field import observe_from
 from magfusion.model.samples import FieldSamples, ImuSamples, Log
 from magfusion.model.site import Site, Slots
 from magfusion.model.trajectory import Trajectory
-from magfusion.papers.p000_tracker.pose import world_poses
 from magfusion.receiver.receivers import received
 from magfusion.simulation.field import phasors_world, synchronised_drives
 from magfusion.simulation.inertial import simulate_imu

@@ -19,11 +19,12 @@ from pathlib import Path
 import numpy as np
 from harness import between_deg, blank_figure, conclude, rms, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation
+from tracker_poses import refine_poses
 
 from magfusion.calibration.antenna import AntennaSurvey, fit_at_known_poses, prior_sigma
 from magfusion.model.antenna import KAPPAS, Antenna
 from magfusion.model.physics.finite_size import disc_kappa, square_kappa
-from magfusion.papers.p000_tracker.pose import locate_by_svd, refine_poses
+from magfusion.papers.p000_tracker.pose import locate_by_svd
 from magfusion.units import MU0_OVER_4PI, Array
 
 SIZE = 0.06  # m; of the transmitting coil, diameter or side

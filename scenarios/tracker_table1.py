@@ -42,11 +42,11 @@ from tracker_antennas import (
     usual_prior,
     with_kappas,
 )
+from tracker_bench import general_antenna, measure, rigid_antenna
 
 from magfusion.calibration.antenna import AntennaFit, AntennaSurvey, fit_at_known_poses
 from magfusion.calibration.antenna_graph import fit_at_uncertain_poses
 from magfusion.model.antenna import Antenna, antenna_from_vector
-from magfusion.papers.p000_tracker.bench import general_antenna, measure, rigid_antenna
 from magfusion.papers.p000_tracker.equations import attitude_from_angles, euler_angles
 from magfusion.units import DEGREE, Array
 

@@ -17,6 +17,7 @@ from tracker_antennas import (
     random_poses,
     usual_prior,
 )
+from tracker_bench import bench_points, helmert, measure
 from tracker_site import body_poses, in_beacon, tracker_site
 from tracker_table1 import POSITION_BEACON, TABLE, one_of
 
@@ -42,7 +43,6 @@ from magfusion.model.physics.dipole import dipole_field
 from magfusion.model.physics.finite_size import coil_kappa, coil_shape
 from magfusion.model.receive_coils import Observation
 from magfusion.model.site import Magnetometer
-from magfusion.papers.p000_tracker.bench import bench_points, helmert, measure
 from magfusion.papers.p000_tracker.equations import (
     attitude_from_angles,
     bursa_wolf_matrix,

@@ -9,7 +9,9 @@ import beacon_calibration
 import numpy as np
 import pytest
 from beacon_calibration import MOMENT, PLACES_WORLD, Block, Config, Errors, run_block
+from beacon_methods import calibrate_as_printed
 from beacon_readings import PAPER, readings
+from nees import average_nees_bounds
 from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.beacon import BeaconMeasurements, calibrate_beacon
@@ -17,14 +19,12 @@ from magfusion.calibration.beacon_refined import attitudes, calibrate_one, open_
 from magfusion.errors import InputError
 from magfusion.model.field import predict
 from magfusion.model.site import Beacon, BeaconSigma, Coil
-from magfusion.papers.p002_beacon.calibration import calibrate_as_printed
 from magfusion.papers.p002_beacon.equations import (
     eq_30_variance_of_psi,
     eq_31_variance_of_lambda,
     eq_32_variance_of_gamma,
     eq_33_geometric_centre,
 )
-from magfusion.results.consistency import average_nees_bounds
 from magfusion.simulation.field import phasors_world
 from magfusion.units import DEGREE, Array
 

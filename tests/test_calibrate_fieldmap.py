@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Refuse, Worked, run_command
+from paper_rooms import ROOM, S1, SimulatedWorld, draw_world
 from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.fieldmap import MapFit, MapPoints, learn_field_map, thinned
@@ -21,7 +22,6 @@ from magfusion.model.site import Site
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.disturbance import Ambient, Spheres, draw_spheres
 from magfusion.simulation.log import SimulationConfig, simulate_log
-from magfusion.simulation.worlds import ROOM, S1, SimulatedWorld, draw_world
 from magfusion.units import Array
 
 SEED = 5

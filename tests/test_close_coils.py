@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from nees import average_nees_bounds
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.batch.batch import smooth
@@ -17,7 +18,6 @@ from magfusion.model.coil_field import as_points
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.results.consistency import average_nees_bounds
 from magfusion.results.errors import pose_errors, trajectory_errors
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_fields, simulate_log

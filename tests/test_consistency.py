@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from nees import average_nees_bounds
 from scipy.stats import binom
 
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.model.parameters import difference, initial_calibration
 from magfusion.model.site import BeaconSigma, MagnetometerSigma, Site
 from magfusion.receiver.windows import LockinSettings
-from magfusion.results.consistency import average_nees_bounds
 from magfusion.results.errors import trajectory_errors
 from magfusion.results.refinement import parameter_estimates
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site

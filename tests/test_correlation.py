@@ -9,6 +9,7 @@ import pyarrow.parquet
 import pytest
 import yaml
 from example_site import mixed_site
+from nees import average_nees_bounds
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
@@ -24,7 +25,6 @@ from magfusion.model.parameters import (
 )
 from magfusion.model.prior import parameters_of, prior_sqrt_covariance, prior_sqrt_information
 from magfusion.model.site import BeaconSigma, MagnetometerSigma, Site
-from magfusion.results.consistency import average_nees_bounds
 from magfusion.results.coverage import coverage
 from magfusion.results.errors import trajectory_errors
 from magfusion.results.refinement import parameter_estimates, refined_site, result_site

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import tilted_attitude
 from scipy.spatial.transform import Rotation
+from tensor_fix import locate_by_tensor
 
 from magfusion.estimation.snapshot.candidates import beacon_directions
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.physics.dipole import dipole_field
 from magfusion.model.site import Coil
-from magfusion.papers.p004_fingerprints.direction import attitude_from_vectors, locate_by_tensor
+from magfusion.papers.p004_fingerprints.direction import attitude_from_vectors
 from magfusion.papers.p004_fingerprints.equations import (
     eq_05_normal,
     eq_07_direction,

@@ -16,12 +16,11 @@ from scipy.stats import chi2
 
 from magfusion.errors import InputError
 from magfusion.files.log import read_log
-from magfusion.model.physics.disturbance import MU0, induced_field, sphere_polarizability
+from magfusion.model.physics.disturbance import induced_field, sphere_polarizability
 from magfusion.model.site import Site
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.disturbance import (
     CLEARANCE,
-    DAY,
     Ambient,
     DayNight,
     FieldDrift,
@@ -34,7 +33,7 @@ from magfusion.simulation.field import synchronised_drives
 from magfusion.simulation.log import SimulationConfig, simulate_fields, simulate_log
 from magfusion.simulation.motion import SimulatedMotion, static_motion
 from magfusion.simulation.waveform import simulate_waveform
-from magfusion.units import NANOTESLA, Array
+from magfusion.units import DAY, MU0, NANOTESLA, Array
 
 TWO_PI = 2.0 * np.pi
 VOLUME = 4.0 * np.pi / MU0  # polarizability of a sphere of one metre, as radius cubed

@@ -1,4 +1,4 @@
-"""Slopes, Allan deviations and verdicts against what is known of synthetic errors."""
+"""Slopes and verdicts against what is known of synthetic errors."""
 
 import numpy as np
 import pytest
@@ -6,11 +6,9 @@ from scipy.signal import lfilter
 from scipy.stats import t as student
 
 from magfusion.results.drift import (
-    DAY,
     THREE_SIGMA,
     ErrorSeries,
     Slope,
-    allan_deviation,
     common_slope,
     evenly,
     in_windows,
@@ -19,6 +17,7 @@ from magfusion.results.drift import (
     slope_over_worlds,
     within,
 )
+from magfusion.units import DAY
 
 MINUTES = 60.0 * np.arange(2880.0)
 
@@ -147,35 +146,6 @@ def test_an_interval_on_both_sides_of_a_limit_tells_nothing():
 def test_too_few_values_have_no_slope():
     with pytest.raises(ValueError, match="three blocks"):
         slope_of_one(MINUTES[:2], np.zeros(2))
-
-
-def test_white_errors_fall_with_the_root_of_the_averaging_time():
-    rng = np.random.default_rng(7)
-    time, deviation = allan_deviation(rng.standard_normal((30_000, 3)), 2.0)
-    count = time / 2.0
-    short = count <= 100
-    assert np.allclose(deviation[short] * np.sqrt(count[short]), 1.0, rtol=0.06, atol=0.0)
-
-
-def test_a_random_walk_rises_as_its_closed_form():
-    """Means of m values of a walk of unit steps: variance (2 m^2 + 1) / (6 m)."""
-    rng = np.random.default_rng(8)
-    walk = np.cumsum(rng.standard_normal((30_000, 3)), axis=0)
-    time, deviation = allan_deviation(walk, 1.0)
-    short = time <= 100
-    expected = np.sqrt((2.0 * time[short] ** 2 + 1.0) / (6.0 * time[short]))
-    assert np.allclose(deviation[short], expected, rtol=0.08, atol=0.0)
-
-
-def test_a_drift_rises_with_the_averaging_time():
-    time, deviation = allan_deviation(0.2 * np.arange(3000.0), 1.0)
-    assert np.allclose(deviation, 0.2 * time / np.sqrt(2.0), rtol=1e-9, atol=0.0)
-
-
-def test_averaging_ends_at_a_third_of_the_series():
-    time, _ = allan_deviation(np.zeros(100), 60.0)
-    assert time[-1] == 33 * 60.0
-    assert len(allan_deviation(np.zeros(2), 1.0)[0]) == 0
 
 
 def a_series(time, measured):

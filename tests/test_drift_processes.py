@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from paper_rooms import ROOM, S0, draw_world
 from scipy.spatial.transform import Rotation
 
-from magfusion.simulation.disturbance import DAY
 from magfusion.simulation.drift import (
     COPPER_PER_KELVIN,
     DailySwing,
@@ -19,7 +19,7 @@ from magfusion.simulation.drift import (
 from magfusion.simulation.field import Drives, phasors_world
 from magfusion.simulation.motion import static_motion
 from magfusion.simulation.waveform import simulate_waveform
-from magfusion.simulation.worlds import ROOM, S0, draw_world
+from magfusion.units import DAY
 
 MINUTES = 60.0 * np.arange(1, 2881)  # two days
 PATHS = 4000

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from evo.core.metrics import APE, RPE, PoseRelation, Unit
 from evo.core.trajectory import PosePath3D
+from nees import average_nees_bounds, pooled_nees
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.model.trajectory import Trajectory
-from magfusion.results.consistency import average_nees_bounds, pooled_nees
-from magfusion.results.errors import relative_errors, time_pairs, trajectory_errors
+from magfusion.results.errors import trajectory_errors
 
 POSES = 80
 
@@ -77,23 +77,6 @@ def test_relative_errors_are_those_of_evo(delta: int) -> None:
         metric = RPE(relation, delta=delta, delta_unit=Unit.frames)
         metric.process_data((_evo(truth), _evo(estimate)))
         np.testing.assert_allclose(result, metric.error, rtol=1e-9)
-
-
-def test_pairs_in_seconds_are_chained_and_no_shorter_than_asked() -> None:
-    estimate, truth = _pair(5)
-    pairs = time_pairs(estimate.time, 0.5)
-    lengths = np.diff(estimate.time[pairs], axis=1)
-    assert lengths.min() >= 0.5
-    assert lengths.max() < 0.5 + 0.09  # s, one step
-    assert np.array_equal(pairs[1:, 0], pairs[:-1, 1])
-    result = relative_errors(estimate.world_from_body, estimate.position_world, truth, pairs)
-    metric = RPE(PoseRelation.translation_part, delta=1, delta_unit=Unit.frames)
-    ids = np.append(pairs[:, 0], pairs[-1, 1])
-    paths = _evo(truth), _evo(estimate)
-    for path in paths:
-        path.reduce_to_ids(ids)
-    metric.process_data(paths)
-    np.testing.assert_allclose(result.translation, metric.error, rtol=1e-9)
 
 
 def test_a_constant_world_rotation_is_no_aligned_attitude_error() -> None:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from paper_rooms import S0, draw_world, ring
 from test_gain_spread import error, scaled
 from tracker_site import body_poses, tracker_site
 
@@ -15,7 +16,6 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Verdict
 from magfusion.simulation.log import simulate_fields
-from magfusion.simulation.worlds import S0, draw_world, ring
 
 TARGETS = 40
 FOUR = ring(4)

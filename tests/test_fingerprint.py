@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tilted_attitude
+from paper_rooms import S0, draw_world, ring
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
@@ -35,7 +36,6 @@ from magfusion.papers.p004_fingerprints.rotating import (
 from magfusion.papers.p004_fingerprints.rssi import RssiLines
 from magfusion.receiver.ellipse import plane_normal
 from magfusion.simulation.field import phasors_world
-from magfusion.simulation.worlds import S0, draw_world, ring
 from magfusion.units import DEGREE, Array
 
 METHODS: tuple[Method, ...] = ("paper-lines", "paper-knn", "paper-knn-nt", "paper-fingerprint")

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from nees import average_nees_bounds
 
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import BeaconSigma, MagnetometerSigma, Site
-from magfusion.results.consistency import average_nees_bounds
 from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import draw_drives, perturb_site, simulate_fields

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from paper_rooms import ROOM, S0, draw_world
 
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.gain_consistency import gains_of
@@ -14,7 +15,6 @@ from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trust import Verdict
-from magfusion.simulation.worlds import ROOM, S0, draw_world
 
 TARGETS = 60
 LEVEL = np.eye(3)

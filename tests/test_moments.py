@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from tracker_site import tracker_site
 
-from magfusion.model.moments import with_moments
 from magfusion.model.parameters import (
     PARAMETERS,
     choose_blocks,
@@ -15,6 +14,7 @@ from magfusion.model.parameters import (
     initial_calibration,
     linearize_channels,
 )
+from magfusion.model.parameters.beacon import with_moments
 from magfusion.model.site import Beacon, Coil, Site
 from magfusion.simulation.demo_site import demo_site
 

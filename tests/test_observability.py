@@ -267,6 +267,6 @@ def test_the_difference_of_two_estimates_has_the_sigma_that_agreement_says() -> 
             moved = retract(start, blocks, 1e-3 * step)  # small: the chart is flat there
             tiny = tuple(b._replace(sigma=1e-3 * b.sigma) for b in blocks)
             estimated.append(Estimated(start, moved, tiny, 1e-6 * scaled))
-        directions.append(agreement(*estimated).by_direction)
+        directions.append(agreement(*estimated))
     spread = np.std(directions, axis=0)
     np.testing.assert_allclose(spread, 1.0, rtol=0.15)

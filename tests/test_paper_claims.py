@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import roll_matching
 import tracker_as_printed
+from paper_rooms import S0, draw_world
 from scipy.spatial.transform import Rotation
+from tracker_bench import bench_points, helmert, measure
 from tracker_table1 import TABLE
 
 from magfusion.calibration.magnetometer import from_paper, to_paper
 from magfusion.model.physics.dipole import dipole_field
 from magfusion.model.physics.solenoid import solenoid_field
-from magfusion.papers.p000_tracker.bench import bench_points, helmert, measure
 from magfusion.papers.p001_magnetometer import equations as p001
 from magfusion.papers.p001_magnetometer.matching import match_roll, predict_field, wrap
 from magfusion.papers.p002_beacon import equations as p002
@@ -28,7 +29,6 @@ from magfusion.papers.p004_fingerprints.fingerprint import (
 from magfusion.papers.p004_fingerprints.rssi import fit_lines, trilaterate
 from magfusion.receiver.ambient import subtraction_gain
 from magfusion.receiver.ellipse import plane_normal
-from magfusion.simulation.worlds import S0, draw_world
 from magfusion.units import DEGREE, MU0_OVER_4PI, NANOTESLA, Array
 
 # 000 -------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ import beacon_calibration
 import numpy as np
 import pytest
 from beacon_calibration import PLACES_WORLD
+from beacon_methods import calibrate_as_printed
 from scipy.spatial.transform import Rotation
 
 from magfusion.files.attitude_table import AttitudeDatabase
@@ -25,7 +26,6 @@ from magfusion.papers.p001_magnetometer import equations as p001
 from magfusion.papers.p001_magnetometer.matching import predict_field
 from magfusion.papers.p001_magnetometer.matching_database import nearest_entries, prepare
 from magfusion.papers.p002_beacon import equations as p002
-from magfusion.papers.p002_beacon.calibration import calibrate_as_printed
 from magfusion.papers.p004_fingerprints import equations as p004
 from magfusion.simulation.field import phasors_world
 from magfusion.units import DEGREE, MU0_OVER_4PI

@@ -14,7 +14,7 @@ from magfusion.model.physics.dipole import dipole_field
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.field import beacon_fields_world, phasors_world
 from magfusion.simulation.layers import Layers
-from magfusion.simulation.pipe import MU0, Pipe, Steel
+from magfusion.simulation.pipe import Pipe, Steel
 from magfusion.simulation.rails import (
     laid,
     layered_at,
@@ -23,7 +23,7 @@ from magfusion.simulation.rails import (
     secondary_world,
     steel_along_wells,
 )
-from magfusion.units import Array
+from magfusion.units import MU0, Array
 
 NOWHERE = np.array([[-0.1, -0.1, -0.1], [0.1, 0.1, 0.1]])
 NONE = np.zeros((0, 3))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from example_site import mixed_site
+from paper_rooms import ROOM, S0, draw_world
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -20,7 +21,6 @@ from magfusion.model.samples import FieldSamples
 from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import simulate_fields
-from magfusion.simulation.worlds import ROOM, S0, draw_world
 from magfusion.units import DEGREE
 
 SIGMA = 3e-10  # T, of a phasor's component

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from derivatives import central_difference, relative_to_group
 from gtsam.symbol_shorthand import B, V, X
+from nees import average_nees_bounds
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from small_problem import SmallLog, small_log, small_problem
@@ -36,7 +37,6 @@ from magfusion.model.parameters import (
     retract,
 )
 from magfusion.model.trajectory import Trajectory
-from magfusion.results.consistency import average_nees_bounds
 from magfusion.results.errors import trajectory_errors
 
 SURVEY = ("beacons", "moments", "magnetometer", "extrinsics")

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import static_48h
+from paper_rooms import F1, S0, draw_world
 from static_48h import CASES, HOUR, METHODS, Config, Errors, Row
 
 from magfusion.simulation.drift import Drift, DriveClock
 from magfusion.simulation.monte_carlo import run_many
 from magfusion.simulation.waveform import Mains
-from magfusion.simulation.worlds import F1, S0, draw_world
 
 TONES_HZ = np.array([25.0, 20.0, 30.0])
 COARSE = Config(worlds=1, interval=1800.0)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tracker_poses import refine_poses, unit_coupling, world_poses
 from tracker_site import body_poses, in_beacon, tracker_site
 
 from magfusion.errors import EstimationError, InputError
@@ -28,12 +29,7 @@ from magfusion.papers.p000_tracker.equations import (
     eq_11_attitude_of_eq_10,
     euler_angles,
 )
-from magfusion.papers.p000_tracker.pose import (
-    locate_by_svd,
-    refine_poses,
-    unit_coupling,
-    world_poses,
-)
+from magfusion.papers.p000_tracker.pose import locate_by_svd
 from magfusion.units import DEGREE, MU0_OVER_4PI
 
 NONE = np.zeros((3, 3))

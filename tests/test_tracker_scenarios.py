@@ -10,11 +10,11 @@ import pytest
 import tracker_near_field
 import tracker_table1
 from tracker_antennas import Config, Errors, bench_readings, couplings, nominal
+from tracker_bench import bench_points
 from tracker_near_field import learn_sizes
 from tracker_table1 import SCENARIO_A, SCENARIO_COMMON, SCENARIO_E, SCENARIO_F2, Row
 
 from magfusion.model.physics.solenoid import loop_field
-from magfusion.papers.p000_tracker.bench import bench_points
 from magfusion.papers.register import paper
 
 

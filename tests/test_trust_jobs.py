@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 from conftest import Worked, run_command
+from paper_rooms import ROOM, S1, draw_world
 from test_antenna_job import make_survey, nominal
 from test_calibrate_beacon import written
 from test_calibrate_magnetometer_job import miscalibrated
@@ -27,7 +28,6 @@ from magfusion.model.trust import CODES, Verdict
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.simulation.motion import Rests
-from magfusion.simulation.worlds import ROOM, S1, draw_world
 
 REMEDY = "Survey again."
 

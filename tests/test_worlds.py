@@ -4,16 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
-from table1_real_fields import BEACONS_WORLD, FREQUENCIES_HZ
-
-from magfusion.estimation.snapshot.likelihood import fix_epochs
-from magfusion.model.parameters import initial_calibration
-from magfusion.papers.p004_fingerprints.equations import eq_07_direction
-from magfusion.receiver.ellipse import plane_normal
-from magfusion.simulation.disturbance import CLEARANCE, Spheres
-from magfusion.simulation.worlds import (
+from paper_rooms import (
     F1,
     F2,
     N1,
@@ -33,6 +24,15 @@ from magfusion.simulation.worlds import (
     draw_world,
     ring,
 )
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from table1_real_fields import BEACONS_WORLD, FREQUENCIES_HZ
+
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.parameters import initial_calibration
+from magfusion.papers.p004_fingerprints.equations import eq_07_direction
+from magfusion.receiver.ellipse import plane_normal
+from magfusion.simulation.disturbance import CLEARANCE, Spheres
 from magfusion.units import DEGREE, MU0_OVER_4PI, NANOTESLA, Array, ComplexArray
 
 SILENT = SimulatedReceiver(sample_sigma=0.0, quantisation=0.0)

@@ -32,7 +32,7 @@ ROOMS = {
             site trajectory
             truth_poses
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
-            detection_range field ground moments without_imu
+            detection_range field ground without_imu
             parameters path_field strapdown_steps
             noise prior waveform
         """,
@@ -56,7 +56,7 @@ ROOMS = {
             long_log
         """,
         "receiver": """
-            ambient bursts cells ellipse even_samples hum noise range_ends rotor rotor_phase
+            ambient cells ellipse even_samples hum noise range_ends rotor rotor_phase
             sampling_clock turn windows
             admission ambient_left pieces slots
             design drive integration marked_bursts receiver reference slot_phasors slot_timing
@@ -70,7 +70,7 @@ ROOMS = {
             slots
             disturbance inertial rails rotor rotor_beacons
             drift field wells
-            waveform worlds
+            waveform
             log
             endurance
         """,
@@ -92,7 +92,7 @@ ROOMS = {
             p002_beacon
         """,
         "results": """
-            consistency errors figures gauge odometry page_style pose_information provenance
+            errors figures gauge odometry page_style pose_information provenance
             recording_file ros_messages shapes trend
             coverage drift live_foxglove observability odometry_dds odometry_mavlink recording_plots
             refinement rest_figures shown transfer verdict

@@ -1,7 +1,7 @@
 """Calibration of a tracker's antennas: joint least squares over a survey of known poses.
 
 Where the poses are themselves uncertain, see `magfusion.calibration.antenna_graph`; the procedure
-of paper 000 is in `magfusion.papers.p000_tracker.bench`.
+of paper 000 is in `scenarios/tracker_bench.py`.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,6 @@
 """Position, attitude and moments of a beacon from magnetometers at known poses.
 
-The exact alternative to paper 002 (`magfusion.papers.p002_beacon.calibration`).  The phasors are
+The exact alternative to paper 002 (`scenarios/beacon_methods.py`).  The phasors are
 linear in the moments.  Of nine unknowns (centre and two moments, imbalance and angle between the
 coils included) only the centre needs a search: variable projection from a grid, because every
 second fit from a single start ends in a local minimum.

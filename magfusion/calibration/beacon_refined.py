@@ -5,23 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.calibration.beacon import (
-    BeaconFits,
-    BeaconMeasurements,
-    calibrate_beacon,
-    whitened_parts,
-)
+from magfusion.calibration.beacon import BeaconFits, BeaconMeasurements, calibrate_beacon
 from magfusion.estimation.snapshot.candidates import wahba
-from magfusion.estimation.solve.batched import (
-    NormalEquations,
-    minimise,
-    moved_poses,
-    normal_equations,
-)
 from magfusion.model.coil_field import as_points, is_sized
-from magfusion.model.field import observe, predict
+from magfusion.model.field import predict
 from magfusion.model.site import Beacon, BeaconSigma
-from magfusion.units import Array, ComplexArray, IntArray
+from magfusion.units import Array, ComplexArray
 
 TURNS = 8  # each leaves the offset over the distance of the error, some hundredths
 OPEN = 0.1  # of the moment that a turn moves, below which it goes with the drive phase
@@ -191,45 +180,3 @@ def _spread(
     value = np.hstack([angle, np.log(sizes / np.linalg.norm(coils, axis=-1))])
     count = len(units)
     return (value[:count] - value[count:]).T / (2.0 * step)
-
-
-def fit_known_moments(
-    measured: BeaconMeasurements, centre_world: Array, world_from_beacon: Array
-) -> tuple[Array, Array, Array]:
-    """Find centre and attitude of a synchronised beacon whose moments are as declared.
-
-    Parameters
-    ----------
-    centre_world : ndarray, shape (runs, 3)
-        Start (m), e.g. from `calibrate_beacon`.
-    world_from_beacon : ndarray, shape (runs, 3, 3)
-
-    Returns
-    -------
-    centre_world : ndarray, shape (runs, 3)
-    world_from_beacon : ndarray, shape (runs, 3, 3)
-    cov : ndarray, shape (runs, 6, 6)
-        Of rotation and position, beacon axes: the Cramér-Rao bound.
-    """
-    seen = np.nan_to_num(measured.phasor_sensor)
-
-    def model(rows: IntArray, pose: Array) -> NormalEquations:
-        rotation, centre = pose[:, :9].reshape(-1, 3, 3), pose[:, 9:]
-        # The beacon is fixed; magnetometers move with the frame in which it has the requested pose.
-        back = measured.beacon.world_from_beacon @ np.swapaxes(rotation, -1, -2)
-        position = (measured.position_world - centre[:, None]) @ np.swapaxes(back, -1, -2)
-        result = observe(
-            replace(measured.beacon, field_map=None),
-            measured.magnetometer,
-            back[:, None] @ measured.world_from_body,
-            position + measured.beacon.position_world,
-        )
-        error = (result.phasor_sensor - seen[rows])[..., None]
-        return normal_equations(
-            whitened_parts(measured, error)[..., 0], whitened_parts(measured, result.beacon_pose)
-        )
-
-    start = np.concatenate([world_from_beacon.reshape(-1, 9), centre_world], axis=-1)
-    result = minimise(model, start, moved_poses)
-    pose = result.state
-    return pose[:, 9:], pose[:, :9].reshape(-1, 3, 3), np.asarray(np.linalg.inv(result.information))

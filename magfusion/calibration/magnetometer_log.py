@@ -36,6 +36,7 @@ from magfusion.errors import EstimationError, InputError
 from magfusion.model.field import skew
 from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.model.site import Magnetometer, Site
+from magfusion.model.trajectory import interpolated
 from magfusion.units import DEGREE, Array
 
 POSITIONS = 12
@@ -104,8 +105,8 @@ def calibrate_log(
         Beacons may transmit; their tones average out.
     site : Site
         Its sigmas of the magnetometer are the prior, its Earth field sets the scale.
-    Use only the stops, of which twelve are needed, with each axis up and down among them.
-        Take only the stops, of which twelve are needed, each axis up and down among them.
+    at_stops : bool
+        Use only the stops, of which twelve are needed, with each axis up and down among them.
 
     Raises
     ------
@@ -294,7 +295,7 @@ def _turns(
     time = imu.time + site.platform.imu.time_offset
     usual = float(np.median(np.diff(time)))
     grid = np.union1d(time[(time > epoch[0]) & (time < epoch[-1])], epoch)
-    rate = np.stack([np.interp(grid, time, axis) for axis in imu.gyro_body.T], axis=1)
+    rate = interpolated(grid, time, imu.gyro_body)
     mean, step = 0.5 * (rate[:-1] + rate[1:]), np.diff(grid)
     silent = time[:-1][np.diff(time) > 5.0 * usual]
     first = np.searchsorted(grid, epoch)

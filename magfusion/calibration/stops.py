@@ -41,15 +41,13 @@ class Stops:
         return self.end - self.begin
 
 
-def find_stops(imu: ImuSamples, motion: MotionModel, shortest: float = SHORTEST) -> Stops:
+def find_stops(imu: ImuSamples, motion: MotionModel) -> Stops:
     """Find sufficiently long stationary intervals.
 
     Parameters
     ----------
     motion : MotionModel
         Defines rest.
-    shortest : float
-        Length of the shortest stop (s).
 
     Returns
     -------
@@ -59,7 +57,7 @@ def find_stops(imu: ImuSamples, motion: MotionModel, shortest: float = SHORTEST)
     still = resting(imu.time, imu.gyro_body, imu.accel_body, motion=motion)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
     first, last = edges[::2], edges[1::2] - 1
-    long = imu.time[last] - imu.time[first] >= shortest
+    long = imu.time[last] - imu.time[first] >= SHORTEST
     first, last = first[long], last[long]
     rates = [
         float(np.linalg.norm(np.mean(imu.gyro_body[i : j + 1], axis=0)))

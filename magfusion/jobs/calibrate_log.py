@@ -312,7 +312,7 @@ def _transfer(
         calibrated.append(_score(logs[j], sites[i], settings))
     estimated = [Estimated(r.declared, r.calibration, r.blocks, r.calibration_cov) for r in results]
     separate = [
-        float(np.max(np.abs(agreement(estimated[i], estimated[j]).by_direction), initial=0.0))
+        float(np.max(np.abs(agreement(estimated[i], estimated[j])), initial=0.0))
         for i, j in pairs
         if i < j
     ]

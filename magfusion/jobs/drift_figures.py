@@ -10,7 +10,6 @@ from magfusion.jobs.drift_world import PACE, PIECE, STRETCH, WorldRun
 from magfusion.results.drift import (
     CERTAIN,
     CONFIDENCE,
-    DAY,
     MIN_COMMON,
     QUANTITIES,
     THREE_SIGMA,
@@ -27,7 +26,7 @@ from magfusion.results.drift import (
 )
 from magfusion.results.figures import Figure, Figures, Section
 from magfusion.simulation.endurance import BLOCK
-from magfusion.units import Array, BoolArray
+from magfusion.units import DAY, Array, BoolArray
 
 MINUTE = 60.0  # s; errors count at the phasors of whole minutes, which rests and walks have alike
 # False-alarm rate of the chi-square test of the NEES: one run in fifty, fewer as the rests of a

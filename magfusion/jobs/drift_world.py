@@ -28,7 +28,6 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.results.drift import ErrorSeries
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.endurance import (
-    HOUR,
     Biases,
     EnduranceConfig,
     EnduranceWorld,
@@ -37,7 +36,7 @@ from magfusion.simulation.endurance import (
     usual_drift,
 )
 from magfusion.simulation.inertial import BiasInstability
-from magfusion.units import Array, BoolArray
+from magfusion.units import HOUR, Array, BoolArray
 
 STRETCH = 10  # blocks that are made, navigated and written at once
 PIECE = 10.0  # s that are fed at once

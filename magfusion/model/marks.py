@@ -72,11 +72,6 @@ class SlotColumn:
         self._first = self._last = self._before = -np.inf
         self._slot, self._count = UNKNOWN_SLOT, 0
 
-    @property
-    def open_since(self) -> float:
-        """Time at which the current run began (s)."""
-        return self._first
-
     def add_samples(self, time: Array, slot: IntArray) -> Marks:
         """Return the bursts completed by samples; samples not later than earlier ones are skipped.
 

@@ -318,11 +318,6 @@ def paired_whitening(cov: Array, there: BoolArray) -> Array:
     return block_diagonal(np.stack([single, single], axis=-3))
 
 
-def twice(there: BoolArray) -> BoolArray:
-    """Repeat a quantity of components (..., 3) for real and imaginary part, (..., 6)."""
-    return np.concatenate([there, there], axis=-1)
-
-
 def stacked(phasor: ComplexArray) -> Array:
     """Stack complex vectors as real part, then imaginary part; zero where they are NaN."""
     parts = np.concatenate([phasor.real, phasor.imag], axis=-1)

@@ -18,25 +18,8 @@ CHUNK = 65_536  # samples at a time, to fit the CPU cache
 LONG = 1 << 18  # samples whose rotations are multiplied at once
 
 
-def rotation_increments(time: Array, gyro_body: Array) -> Rotation:
-    """Return the rotation from each sample to the next, for a rate linear between them.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    gyro_body : ndarray, shape (n, 3)
-        (rad/s)
-
-    Returns
-    -------
-    Rotation
-        n - 1 rotations ``body(k)_from_body(k+1)``; second-order coning included.
-    """
-    return Rotation.from_rotvec(_increments(time, gyro_body))
-
-
 def _increments(time: Array, gyro_body: Array) -> Array:
+    """Return the rotation vectors from each sample to the next, second-order coning included."""
     before, after = gyro_body[:-1], gyro_body[1:]
     dt = (time[1:] - time[:-1])[:, None]
     coning = cross(before.T, after.T).T * dt**2 / 12.0

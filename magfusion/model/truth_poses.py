@@ -4,8 +4,6 @@ Cubic interpolation: positions and rotation vectors within a step, with the slop
 through three samples (Catmull and Rom 1974, for uneven steps).
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -20,11 +18,16 @@ MAX_ROTATION_ERROR = 0.1 * DEGREE
 ORDER = 3  # of the error in the step
 
 
-class TruthPoses(NamedTuple):
-    """Poses of a truth at other times.
+def truth_poses(truth: Trajectory, time: Array) -> tuple[Trajectory, BoolArray, str]:
+    """Interpolate a truth of any rate at those times where its motion allows it.
 
     Parameters
     ----------
+    time : ndarray, shape (n,)
+        Strictly increasing (s).
+
+    Returns
+    -------
     poses : Trajectory
         At the m times that the truth covers.
     covered : ndarray of bool, shape (n,)
@@ -32,27 +35,13 @@ class TruthPoses(NamedTuple):
     reason : str
         Why others are not covered; empty where all are.
     """
-
-    poses: Trajectory
-    covered: BoolArray
-    reason: str
-
-
-def truth_poses(truth: Trajectory, time: Array) -> TruthPoses:
-    """Interpolate a truth of any rate at those times where its motion allows it.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Strictly increasing (s).
-    """
     known = truth.time
     if len(known) == 0 or len(time) == 0:
         empty = Trajectory(np.zeros(0), np.empty((0, 3, 3)), np.empty((0, 3)))
-        return TruthPoses(empty, np.zeros(len(time), dtype=bool), "The truth has no pose.")
+        return empty, np.zeros(len(time), dtype=bool), "The truth has no pose."
     inside = (time >= known[0]) & (time <= known[-1])
     covered = inside & (np.isin(time, known) | _usable_steps(truth)[_step_of(known, time)])
-    return TruthPoses(_cubic(truth, time[covered]), covered, _reason(truth, time, inside, covered))
+    return _cubic(truth, time[covered]), covered, _reason(truth, time, inside, covered)
 
 
 def _step_of(known: Array, time: Array) -> Array:

@@ -48,9 +48,7 @@ def on_motion_prior(site: Site) -> Site:
     never = replace(motion, rest_gyro=0.0, rest_accel=0.0)  # zeros must not be detected as rest
     replaced = Replaced(platform.imu, motion, site.gravity)
     return replace(
-        site,
-        gravity=0.0,
-        platform=replace(platform, imu=imu, motion=never, replaced=replaced),
+        site, gravity=0.0, platform=replace(platform, imu=imu, motion=never, replaced=replaced)
     )
 
 
@@ -76,11 +74,7 @@ def as_declared(site: Site) -> Site:
         site,
         gravity=replaced.gravity,
         platform=replace(
-            platform,
-            imu=replaced.imu,
-            motion=replaced.motion,
-            motion_prior=prior,
-            replaced=None,
+            platform, imu=replaced.imu, motion=replaced.motion, motion_prior=prior, replaced=None
         ),
     )
 

@@ -208,11 +208,7 @@ def _read(number: str) -> Paper:
     file = read_yaml(Path(__file__).parent / ROOMS[number] / "register.yaml", _File)
     entries = list(_numbered(number, file))
     return Paper(
-        number=number,
-        about=file.about,
-        note=file.note,
-        citation=file.citation,
-        entries=entries,
+        number=number, about=file.about, note=file.note, citation=file.citation, entries=entries
     )
 
 

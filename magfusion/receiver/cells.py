@@ -12,14 +12,11 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from magfusion.errors import InputError
-from magfusion.model.detection_range import (
-    only_owned,
-    owned_at,
-    tones_of,
-)
+from magfusion.model.detection_range import only_owned, owned_at, tones_of
 from magfusion.model.field import predict
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Magnetometer, Site
+from magfusion.model.trajectory import interpolated
 from magfusion.units import Array, IntArray
 
 PITCH = 2.0  # m; of the grid in the plane
@@ -56,7 +53,7 @@ class SensorPath(NamedTuple):
 
     def at(self, time: Array) -> tuple[Array, Array]:
         """Return the positions at times and their possible errors, (n, 3) and (n,) (m)."""
-        place = np.stack([np.interp(time, self.time, p) for p in self.position_world.T], axis=1)
+        place = interpolated(time, self.time, self.position_world)
         return place, MARGIN + np.interp(time, self.time, self.spread)
 
 

@@ -259,10 +259,7 @@ def separable(step: float, settings: LockinSettings, frequencies_hz: Array) -> b
     """Return whether a whole window of samples ``step`` apart (s) separates its columns."""
     elapsed = _whole_window(step, settings)
     design = design_of(
-        elapsed,
-        settings,
-        frequencies_hz,
-        nuisances_hz(settings, frequencies_hz, 0.5 / step),
+        elapsed, settings, frequencies_hz, nuisances_hz(settings, frequencies_hz, 0.5 / step)
     )[0]
     enough = design.shape[0] > design.shape[1]
     return enough and bool(np.linalg.cond(design.T @ design) < WORST_CONDITION)

@@ -21,11 +21,7 @@ from magfusion.receiver.admission import (
     usual_step,
 )
 from magfusion.receiver.design import Designs, Maps, nuisances_hz
-from magfusion.receiver.noise import (
-    noise_around_tones,
-    not_below,
-    smoothed_over_windows,
-)
+from magfusion.receiver.noise import noise_around_tones, not_below, smoothed_over_windows
 from magfusion.receiver.turn import (
     BodyTurn,
     body_from_measured,

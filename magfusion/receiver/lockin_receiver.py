@@ -8,19 +8,9 @@ from magfusion.errors import InputError
 from magfusion.model.detection_range import tones_of
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site
-from magfusion.receiver.admission import (
-    WindowGrid,
-    Windows,
-    sample_rate_hz,
-)
+from magfusion.receiver.admission import WindowGrid, Windows, sample_rate_hz
 from magfusion.receiver.cells import owned_by
-from magfusion.receiver.design import (
-    Designs,
-    Maps,
-    nuisances_hz,
-    separable,
-    variance_growth,
-)
+from magfusion.receiver.design import Designs, Maps, nuisances_hz, separable, variance_growth
 from magfusion.receiver.even_samples import Spacing
 from magfusion.receiver.lockin import WindowOperator, designs_of, window_operator
 from magfusion.receiver.receiver import Receiver

@@ -78,9 +78,10 @@ def pieces(
     fixed = np.searchsorted(time, centre + 0.5 * length) - first
     whole = fixed * step >= LEAST_SHARE * length
     centre, first, fixed = centre[whole], first[whole], fixed[whole]
-    fitted = _Fitted(waveform, frequencies_hz, extra_lines_hz, length, hum)
     result = [
-        fitted.of(centre[k], first[k], fixed[k])
+        _fitted(
+            waveform, frequencies_hz, extra_lines_hz, length, hum, (centre[k], first[k], fixed[k])
+        )
         for k in (slice(i, i + CHUNK) for i in range(0, len(centre), CHUNK))
     ]
     components = waveform.measured_sensor.shape[1]
@@ -93,43 +94,40 @@ def pieces(
     return Pieces(centre, length, phasor, others).rows(alive)
 
 
-@dataclass(frozen=True, eq=False)
-class _Fitted:
-    """Fit of a batch of pieces."""
+def _fitted(
+    waveform: Waveform,
+    frequencies_hz: Array,
+    extra_lines_hz: Array,
+    length: float,
+    hum: Hum | None,
+    span: tuple[Array, IntArray, IntArray],
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return the phasors of tones and of probes, shape (n, tones or probes, components).
 
-    waveform: Waveform
-    frequencies_hz: Array
-    extra_lines_hz: Array
-    length: float
-    hum: Hum | None
-
-    def of(
-        self, centre: Array, first: IntArray, held_lines: IntArray
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Return the phasors of tones and of probes, shape (n, tones or probes, components)."""
-        reach, time = np.arange(int(np.max(held_lines))), self.waveform.time
-        index = np.minimum(first[:, None] + reach, len(time) - 1)
-        elapsed, field = time[index] - centre[:, None], self.waveform.measured_sensor[index]
-        inside = reach < held_lines[:, None]
-        taper = np.where(inside, np.cos(np.pi * elapsed / self.length) ** 2, 0.0)
-        design = _design(elapsed, time[index], self.frequencies_hz, self.length, self.hum)
+    ``span`` has the centre of each piece (s), its first sample and their number, each (n,).
+    """
+    centre, first, count = span
+    reach, time = np.arange(int(np.max(count))), waveform.time
+    index = np.minimum(first[:, None] + reach, len(time) - 1)
+    elapsed, field = time[index] - centre[:, None], waveform.measured_sensor[index]
+    inside = reach < count[:, None]
+    taper = np.where(inside, np.cos(np.pi * elapsed / length) ** 2, 0.0)
+    design = _design(elapsed, time[index], frequencies_hz, length, hum)
+    fitted = _solved(design, taper, field)
+    for _ in range(CUT_TWICE):
+        impact = _outliers(field - design @ fitted, inside)
+        if not np.any(impact):
+            break
+        taper = np.where(impact, 0.0, taper)
         fitted = _solved(design, taper, field)
-        for _ in range(CUT_TWICE):
-            impact = _outliers(field - design @ fitted, inside)
-            if not np.any(impact):
-                break
-            taper = np.where(impact, 0.0, taper)
-            fitted = _solved(design, taper, field)
-        n = len(self.frequencies_hz)
-        phasor = fitted[:, 2 : 2 + n] - 1j * fitted[:, 2 + n : 2 + 2 * n]
-        turns = np.exp(-2j * np.pi * self.frequencies_hz * centre[:, None])
-        if not len(self.extra_lines_hz):
-            return phasor * turns[..., None], np.zeros((len(centre), 0, field.shape[2]), complex)
-        residual = (field - design @ fitted) * (taper * 2.0 / np.sum(taper, axis=1)[:, None])[
-            ..., None
-        ]
-        carrier = np.exp(-2j * np.pi * elapsed[..., None] * self.extra_lines_hz)
-        return phasor * turns[..., None], np.swapaxes(carrier, 1, 2) @ residual
+    n = len(frequencies_hz)
+    phasor = fitted[:, 2 : 2 + n] - 1j * fitted[:, 2 + n : 2 + 2 * n]
+    turns = np.exp(-2j * np.pi * frequencies_hz * centre[:, None])
+    if not len(extra_lines_hz):
+        return phasor * turns[..., None], np.zeros((len(centre), 0, field.shape[2]), complex)
+    residual = (field - design @ fitted) * (taper * 2.0 / np.sum(taper, axis=1)[:, None])[..., None]
+    carrier = np.exp(-2j * np.pi * elapsed[..., None] * extra_lines_hz)
+    return phasor * turns[..., None], np.swapaxes(carrier, 1, 2) @ residual
 
 
 def _solved(design: Array, taper: Array, field: Array) -> Array:

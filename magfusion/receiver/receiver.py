@@ -23,9 +23,7 @@ from magfusion.receiver.admission import (
     Windows,
     usual_step,
 )
-from magfusion.receiver.slots import (
-    has_schedule,
-)
+from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.turn import on_clock
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -297,13 +295,7 @@ class Receiver(ABC):
             self.dropped[reason] += dropped
 
     def _begin(
-        self,
-        waveform: Waveform,
-        imu: ImuSamples,
-        grid: WindowGrid,
-        share: float,
-        *,
-        clips: bool,
+        self, waveform: Waveform, imu: ImuSamples, grid: WindowGrid, share: float, *, clips: bool
     ) -> None:
         model = self.site.platform.imu
         stamps = imu.time + model.time_offset

@@ -9,12 +9,7 @@ from magfusion.receiver.lockin_receiver import LockinReceiver
 from magfusion.receiver.marked import MarkedReceiver
 from magfusion.receiver.receiver import Receiver
 from magfusion.receiver.slot_receiver import SlotReceiver
-from magfusion.receiver.slots import (
-    SlotSettings,
-    has_schedule,
-    is_marked,
-    slot_lockin,
-)
+from magfusion.receiver.slots import SlotSettings, has_schedule, is_marked, slot_lockin
 from magfusion.receiver.windows import LockinSettings, default_settings
 
 

@@ -64,18 +64,11 @@ def lag_of(waveform: Waveform, reference: Waveform, lines_hz: Array) -> Lag:
     lines_hz : ndarray
         Tones and mains (Hz), which are excluded.
     """
-    step = float(np.median(np.diff(waveform.time)))
-    size = int(BLOCK / step) // 2 * 2
-    starts = np.arange(0, len(waveform) - size + 1, size)
-    even, there = reference_at(waveform, reference, NO_LAG)
-    if not len(starts) or not np.any(there):
+    common = common_noise(waveform, reference, lines_hz)
+    if common is None:
         return NO_LAG
-    result = correlations(waveform.measured_sensor, even, starts, size, step, lines_hz)
-    step /= FINER
-    peaks = peak_of(result)
-    if peaks is None:
-        return NO_LAG
-    mean, best, lags = peaks
+    result, starts, mean, best, lags = common
+    step = float(np.median(np.diff(waveform.time))) / FINER
     first = max(best - NEAR_LAG * FINER, 0)
     own = result[:, first : best + NEAR_LAG * FINER + 1]
     near = lags[first : first + own.shape[1]]
@@ -97,33 +90,41 @@ def lag_of(waveform: Waveform, reference: Waveform, lines_hz: Array) -> Lag:
     return Lag(float(offset), float(rate))
 
 
-def correlations(
-    own: Array, other: Array, starts: IntArray, size: int, step: float, lines_hz: Array
-) -> Array:
-    """Return the power of the correlation of stretches at lags up to the largest, (n, lags).
+def common_noise(
+    waveform: Waveform, reference: Waveform, lines_hz: Array
+) -> tuple[Array, IntArray, Array, int, IntArray] | None:
+    """Correlate the noise of a sensor and a reference in stretches; None without a peak.
 
     Lags are finer than a step: the peak of whitened noise is as narrow as a step.
 
-    Parameters
-    ----------
+    Returns
+    -------
+    power : ndarray, shape (n, lags)
+        Of the correlation of each stretch.
     starts : int ndarray, shape (n,)
-        First samples of the stretches, of ``size`` samples each.
+        First samples of the stretches.
+    mean : ndarray, shape (lags,)
+        Of the powers.
+    best : int
+        Where its peak is.
+    lags : int ndarray, shape (lags,)
+        In steps over `FINER`.
     """
+    step = float(np.median(np.diff(waveform.time)))
+    size = int(BLOCK / step) // 2 * 2
+    starts = np.arange(0, len(waveform) - size + 1, size)
+    other, there = reference_at(waveform, reference, NO_LAG)
+    if not len(starts) or not np.any(there):
+        return None
     reach = int(LARGEST_LAG / step) * FINER
     lags = np.arange(-reach, reach + 1)
-    return np.stack(
-        [_correlation(own[k : k + size], other[k : k + size], step, lines_hz)[lags] for k in starts]
-    )
-
-
-def peak_of(result: Array) -> tuple[Array, int, IntArray] | None:
-    """Return the mean correlation by lag, where its peak is, and the lags; None without a peak."""
-    reach = (result.shape[1] - 1) // 2
-    mean = np.mean(result, axis=0)
+    pairs = ((waveform.measured_sensor[k : k + size], other[k : k + size]) for k in starts)
+    power = np.stack([_correlation(*pair, step, lines_hz)[lags] for pair in pairs])
+    mean = np.mean(power, axis=0)
     best = int(np.argmax(mean))
     if mean[best] - np.median(mean) < LEAST_PEAK * _scatter(mean):
         return None
-    return mean, best, np.arange(-reach, reach + 1)
+    return power, starts, mean, best, lags
 
 
 def _scatter(values: Array) -> float:

@@ -5,15 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.model.samples import Waveform
-from magfusion.receiver.reference import (
-    BLOCK,
-    FINER,
-    NO_LAG,
-    Lag,
-    correlations,
-    peak_of,
-    reference_at,
-)
+from magfusion.receiver.reference import BLOCK, FINER, Lag, common_noise
 from magfusion.units import Array
 
 MEMORY = 0.9  # weight of earlier stretches in each later one
@@ -71,16 +63,12 @@ def lag_in(waveform: Waveform, reference: Waveform, lines_hz: Array) -> tuple[fl
     lines_hz : ndarray
         Tones and mains (Hz), which are excluded.
     """
+    common = common_noise(waveform, reference, lines_hz)
+    if common is None:
+        return None
+    _, starts, mean, best, lags = common
     step = float(np.median(np.diff(waveform.time)))
     size = int(BLOCK / step) // 2 * 2
-    starts = np.arange(0, len(waveform) - size + 1, size)
-    even, there = reference_at(waveform, reference, NO_LAG)
-    if not len(starts) or not np.any(there):
-        return None
-    result = peak_of(correlations(waveform.measured_sensor, even, starts, size, step, lines_hz))
-    if result is None:
-        return None
-    mean, best, lags = result
     at = int(np.clip(best, 1, len(mean) - 2))
     before, here, after = mean[at - 1 : at + 2]
     finer = 0.5 * (before - after) / min(before - 2.0 * here + after, -1e-300)

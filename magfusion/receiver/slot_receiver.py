@@ -8,12 +8,7 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site
-from magfusion.receiver.admission import (
-    ROUNDING,
-    WindowGrid,
-    Windows,
-    sample_rate_hz,
-)
+from magfusion.receiver.admission import ROUNDING, WindowGrid, Windows, sample_rate_hz
 from magfusion.receiver.cycles import cycles, joins
 from magfusion.receiver.receiver import Receiver
 from magfusion.receiver.slot_phasors import SlotValues, demodulate_slots, slot_values

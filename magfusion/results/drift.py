@@ -1,4 +1,4 @@
-"""Whether an error grows with time: slopes with their standard errors, Allan deviation, verdicts.
+"""Whether an error grows with time: slopes with their standard errors, and verdicts.
 
 Neighbouring errors of one run are correlated, so that a slope's standard error comes from the
 scatter between independent worlds or, for a single world, from their correlation time
@@ -13,9 +13,8 @@ import numpy as np
 from scipy.special import fdtrc, stdtrit
 
 from magfusion.results.trend import trend
-from magfusion.units import Array, BoolArray
+from magfusion.units import DAY, HOUR, Array, BoolArray
 
-DAY, HOUR = 86_400.0, 3600.0  # s
 CONFIDENCE = 0.95  # with which a slope is told to be within its limit
 CERTAIN = 0.999  # and beyond it: many slopes are judged, and one may not fail by chance
 MIN_COMMON = 5  # worlds whose scatter determines three slopes
@@ -194,40 +193,6 @@ def slope_over_worlds(times: Sequence[Array], values: Sequence[Array]) -> Slope:
     rates = [np.polyfit(t / DAY, v, 1)[0] for t, v in zip(times, values, strict=True)]
     error = float(np.std(rates, ddof=1) / np.sqrt(len(rates)))
     return Slope(float(np.mean(rates)), error, len(rates) - 1)
-
-
-def allan_deviation(value: Array, step: float, points: int = 40) -> tuple[Array, Array]:
-    """Return averaging times and the overlapping Allan deviation of a series.
-
-    The deviation at m samples is the root of half the mean squared difference of neighbouring means
-    of m samples (IEEE Std 952-1997, annex C): it falls as 1 / sqrt(m) for white errors, and rises
-    as sqrt(m / 3) for a random walk.
-
-    Parameters
-    ----------
-    value : ndarray, shape (n,) or (n, axes)
-        At equal intervals; axes are averaged in square.
-    step : float
-        (s)
-    points : int
-        Maximum number of times, in equal ratios.
-
-    Returns
-    -------
-    time, deviation : ndarray, shape (m,)
-        Up to a third of the series (s; unit of the values).
-    """
-    columns = value.reshape(len(value), -1)
-    maximum = len(columns) // 3
-    if maximum < 1:
-        return np.empty(0), np.empty(0)
-    counts = np.unique(np.geomspace(1, maximum, points).astype(int))
-    total = np.concatenate([np.zeros((1, columns.shape[1])), np.cumsum(columns, axis=0)])
-    result = []
-    for m in counts:
-        mean = (total[m:] - total[:-m]) / m
-        result.append(np.sqrt(0.5 * np.mean((mean[m:] - mean[:-m]) ** 2)))
-    return counts * step, np.array(result)
 
 
 def evenly(series: ErrorSeries, interval: float) -> ErrorSeries:

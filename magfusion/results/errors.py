@@ -11,7 +11,7 @@ from magfusion.errors import InputError
 from magfusion.model.arguments import check_arguments
 from magfusion.model.short_repr import one_line, short_repr
 from magfusion.model.trajectory import Trajectory, interpolate
-from magfusion.model.truth_poses import TruthPoses, truth_poses
+from magfusion.model.truth_poses import truth_poses
 from magfusion.units import Array, BoolArray, IntArray
 
 
@@ -172,7 +172,7 @@ def trajectory_errors(
         true, compared, reason = truth_poses(truth, estimate.time)
     else:
         reason = f"the others are in steps longer than {max_gap} s"
-        true, compared, reason = TruthPoses(*interpolate(truth, estimate.time, max_gap), reason)
+        true, compared = interpolate(truth, estimate.time, max_gap)
     if len(true) < 3:
         raise InputError(
             f"The truth covers {len(true)} of the estimate's {len(estimate)} epochs, and at least 3"
@@ -217,14 +217,6 @@ def frame_pairs(epochs: int, delta: int) -> IntArray:
     return np.stack([ids[:-1], ids[1:]], axis=1)
 
 
-def time_pairs(time: Array, delta: float) -> IntArray:
-    """Return consecutive pairs of indices at least ``delta`` seconds apart, shape (m, 2)."""
-    ids = [0]
-    while (following := int(np.searchsorted(time, time[ids[-1]] + delta))) < len(time):
-        ids.append(following)
-    return np.stack([ids[:-1], ids[1:]], axis=1).astype(np.int64)
-
-
 def relative_errors(
     world_from_body: Array, position_world: Array, truth: Trajectory, pairs: IntArray
 ) -> RelativeErrors:
@@ -238,7 +230,7 @@ def relative_errors(
     truth : Trajectory
         At the same n epochs.
     pairs : ndarray of int, shape (m, 2)
-        From `frame_pairs` or `time_pairs`.
+        As from `frame_pairs`.
     """
     step, shift = _motion(world_from_body, position_world, pairs)
     true_step, true_shift = _motion(truth.world_from_body, truth.position_world, pairs)

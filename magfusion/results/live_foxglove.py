@@ -7,11 +7,10 @@ from typing import Any
 from magfusion.errors import InputError
 from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.stream import json_line
-from magfusion.results.odometry import odometry_of
+from magfusion.results.odometry import NS, odometry_of
 
 HOST = "127.0.0.1"
 LINGER = 0.5  # s
-_NS = 1_000_000_000
 _STATE = {
     "title": "magfusion.State",
     "type": "object",
@@ -83,7 +82,7 @@ class FoxgloveServer:
 
     def take(self, state: JudgedState | None, reported: Mapping[str, Any]) -> None:
         """Publish a state, and its pose if it has one."""
-        stamp = max(0, self._epoch_ns + round(float(reported["time"]) * _NS))
+        stamp = max(0, self._epoch_ns + round(float(reported["time"]) * NS))
         self._state.log(json_line(dict(reported)), log_time=stamp)
         if state is None or state.is_lost:
             return
@@ -91,11 +90,9 @@ class FoxgloveServer:
         x, y, z = result.position_world.tolist()
         place = make.Vector3(x=x, y=y, z=z)
         w, x, y, z = result.quaternion.tolist()
-        turn, when = make.Quaternion(x=x, y=y, z=z, w=w), make.Timestamp(*divmod(stamp, _NS))
+        turn, when = make.Quaternion(x=x, y=y, z=z, w=w), make.Timestamp(*divmod(stamp, NS))
         pose = make.PoseInFrame(
-            timestamp=when,
-            frame_id=self._frame,
-            pose=make.Pose(position=place, orientation=turn),
+            timestamp=when, frame_id=self._frame, pose=make.Pose(position=place, orientation=turn)
         )
         transform = make.FrameTransform(
             timestamp=when,
@@ -115,12 +112,7 @@ class FoxgloveServer:
 
 
 def _host_and_port(address: str) -> tuple[str, int]:
-    """Return host and port of ``[HOST:]PORT``.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return host and port of ``[HOST:]PORT``."""
     host, _, port = address.rpartition(":")
     if not port.isdecimal() or int(port) > 65535 or address.startswith(":"):
         raise InputError(

@@ -152,11 +152,7 @@ def _open_gauge(
 
 
 def _weakest(
-    blocks: tuple[Block, ...],
-    calibration: Calibration,
-    scaled: Array,
-    gauge: Array,
-    prior: Array,
+    blocks: tuple[Block, ...], calibration: Calibration, scaled: Array, gauge: Array, prior: Array
 ) -> tuple[Weakness, ...]:
     """Return the weakest directions apart from the gauge, weakest first."""
     size = len(prior)

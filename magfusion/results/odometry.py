@@ -9,7 +9,7 @@ from magfusion.estimation.graph.state import ROTATION, VELOCITY, State
 from magfusion.model.fixed_axes import fixed_axes_covariance
 from magfusion.units import Array
 
-_NS = 1_000_000_000
+NS = 1_000_000_000  # in a second
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ def odometry_of(state: State, epoch_ns: int = 0) -> Odometry:
     jacobian[:, ROTATION], jacobian[:, VELOCITY] = by_rotation, world_from_body.T
     velocity_cov = jacobian @ state.cov[:9, :9] @ jacobian.T
     return Odometry(
-        stamp_ns=max(0, epoch_ns + round(state.time * _NS)),
+        stamp_ns=max(0, epoch_ns + round(state.time * NS)),
         position_world=state.position_world,
         quaternion=Rotation.from_matrix(world_from_body).as_quat(scalar_first=True),
         velocity_body=velocity_body,

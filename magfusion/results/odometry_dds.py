@@ -11,12 +11,11 @@ from magfusion.errors import InputError
 from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.odometry_bag import UNKNOWN_VARIANCE
 from magfusion.results import ros_messages as ros
-from magfusion.results.odometry import Odometry, odometry_of
+from magfusion.results.odometry import NS, Odometry, odometry_of
 from magfusion.results.ros_messages import OdometryMessage as Message
 
 _TOPIC = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 _LAST_DOMAIN = 232  # its ports are the last ones that there are
-_NS = 1_000_000_000
 _DEPTH = 10  # messages that a reader may be late by, as the default of ROS
 
 
@@ -34,7 +33,7 @@ def odometry_message(odometry: Odometry, frame: str, child: str) -> Any:
     pose = ros.Pose(ros.Point(*odometry.position_world.tolist()), ros.Quaternion(x, y, z, w))
     twist = ros.Twist(ros.Vector3(*odometry.velocity_body.tolist()), ros.Vector3(0.0, 0.0, 0.0))
     return ros.OdometryMessage(
-        ros.Header(ros.Time(*divmod(odometry.stamp_ns, _NS)), frame),
+        ros.Header(ros.Time(*divmod(odometry.stamp_ns, NS)), frame),
         child,
         ros.PoseWithCovariance(pose, odometry.pose_cov.ravel().tolist()),
         ros.TwistWithCovariance(twist, twist_cov.ravel().tolist()),
@@ -110,12 +109,7 @@ class RosPublisher:
 
 
 def _domain() -> int:
-    """Return the domain that ROS would use.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return the domain that ROS would use."""
     text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
     if not text.isdecimal() or int(text) > _LAST_DOMAIN:
         raise InputError(f"ROS_DOMAIN_ID: found {text!r}; it should be from 0 to {_LAST_DOMAIN}")

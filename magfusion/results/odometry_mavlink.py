@@ -137,12 +137,7 @@ class MavlinkSender:
 
 
 def _resolved(address: str) -> tuple[int, Any]:
-    """Return family and socket address of ``udpout:HOST:PORT``.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return family and socket address of ``udpout:HOST:PORT``."""
     kind, _, place = address.partition(":")
     host, _, port = place.rpartition(":")
     if kind != "udpout" or not host or not (port.isdecimal() and 0 < int(port) < 65536):

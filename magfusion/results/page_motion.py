@@ -75,14 +75,7 @@ def error_section(motion: MotionPage) -> tuple[str, str]:
     if motion.errors is not None:
         return "Errors against the truth", _charts([*_of_axes(motion.errors), *size_charts(motion)])
     charts = size_charts(motion)
-    return (
-        ("Estimated accuracy (no truth available)", _charts(charts))
-        if charts
-        else (
-            "",
-            "",
-        )
-    )
+    return ("Estimated accuracy (no truth available)", _charts(charts)) if charts else ("", "")
 
 
 def residual_section(motion: MotionPage) -> str:
@@ -98,10 +91,7 @@ def residual_section(motion: MotionPage) -> str:
     charts = []
     for title, (time, rms) in list(result.items())[:MOST_BEACONS]:
         ends = time[[0, -1]]
-        lines = (
-            ChartLine(ends, np.ones(2), "", "expected"),
-            ChartLine(time, rms, "", dots=True),
-        )
+        lines = (ChartLine(ends, np.ones(2), "", "expected"), ChartLine(time, rms, "", dots=True))
         charts.append(
             Chart(title, TIME, "residual", lines, y_limits=(0.0, maximum), width=330, height=190)
         )

@@ -5,7 +5,6 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -125,8 +124,8 @@ def write_recording(
             log_doubtful(recording, trajectory, states, 0.008 * scale.size)
             log_levels(recording, trajectory, states, errors)
         _log_legend(recording, trajectory, truth is not None, propagated is not None, scale)
-        drawn = _Drawn(trajectory, errors, innovations or {}, states)
-        recording.send_blueprint(_blueprint(site, drawn, scale, banner))
+        plots = trajectory, errors, innovations or {}, states
+        recording.send_blueprint(_blueprint(site, *plots, scale, banner))
 
 
 def _summary(trajectory: Trajectory, errors: TrajectoryErrors | None) -> str:
@@ -312,38 +311,34 @@ def scene_view(site: Site, scale: Scale, name: str = "Scene") -> rrb.Spatial3DVi
     )
 
 
-class _Drawn(NamedTuple):
-    """Plots next to the scene."""
-
-    trajectory: Trajectory
-    errors: TrajectoryErrors | None
-    innovations: Mapping[str, tuple[Array, Array]]
-    states: StateTrust | None
-
-
 def _blueprint(
-    site: Site, drawn: _Drawn, scale: Scale, banner: tuple[str, str] | None
+    site: Site,
+    trajectory: Trajectory,
+    errors: TrajectoryErrors | None,
+    innovations: Mapping[str, tuple[Array, Array]],
+    states: StateTrust | None,
+    scale: Scale,
+    banner: tuple[str, str] | None,
 ) -> rrb.Blueprint:
-    trajectory = drawn.trajectory
     span = span_of(trajectory.time)
     upper: list[rrb.Container | rrb.View] = []
-    if drawn.errors is not None:
-        upper += [_by_axis(kind, drawn.errors, span) for kind in ERRORS]
-    if drawn.states is not None and has_levels(drawn.states):
+    if errors is not None:
+        upper += [_by_axis(kind, errors, span) for kind in ERRORS]
+    if states is not None and has_levels(states):
         upper += [
-            plot(level.place, level.name, span, readable_range(level.of(drawn.states), zero=True))
+            plot(level.place, level.name, span, readable_range(level.of(states), zero=True))
             for level in LEVELS
         ]
     lower: list[rrb.Container | rrb.View] = []
-    if drawn.innovations:
+    if innovations:
         name = "Residuals (1 expected)"
-        values = readable_range(np.ones(1), *(v for _, v in drawn.innovations.values()), zero=True)
+        values = readable_range(np.ones(1), *(v for _, v in innovations.values()), zero=True)
         lower.append(plot("plots/innovations", name, span, values))
     for place, name, unit, bias in biases(trajectory):
         if bias is not None:
             lower.append(plot(place, name, span, readable_range(unit * bias)))
     position = plot("plots/position_m", "Position (m)", span)
-    if drawn.errors is None:
+    if errors is None:
         upper.insert(0, position)
     else:  # below the scene where nothing else would stand there
         (upper if lower else lower).append(position)

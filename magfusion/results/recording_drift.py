@@ -7,11 +7,11 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from magfusion.results.drift import HOUR, QUANTITIES, EstimatorPlot, Quantity
+from magfusion.results.drift import QUANTITIES, EstimatorPlot, Quantity
 from magfusion.results.recording_file import whole_recording
 from magfusion.results.recording_layout import about_zero, layout, plot, readable_range, span_of
 from magfusion.results.recording_trust import BANNER, banner_text
-from magfusion.units import Array
+from magfusion.units import HOUR, Array
 
 MOST_POINTS = 5000  # of a series
 _COLOURS = ([220, 60, 60], [60, 160, 60], [60, 90, 220])

@@ -35,11 +35,7 @@ def gaps_of(time: Array) -> IntArray:
 
 
 def log_series(
-    recording: rr.RecordingStream,
-    place: str,
-    time: Array,
-    value: Array,
-    style: rr.SeriesLines,
+    recording: rr.RecordingStream, place: str, time: Array, value: Array, style: rr.SeriesLines
 ) -> None:
     """Send a series; the columns of a two-dimensional value are lines of one entity."""
     recording.log(place, style, static=True)

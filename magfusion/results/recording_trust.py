@@ -39,12 +39,7 @@ class LevelPlot(NamedTuple):
 
 LEVELS = (
     LevelPlot("plots/position_level_mm", "Protection (mm)", 1e3, slice(3, 6)),
-    LevelPlot(
-        "plots/attitude_level_deg",
-        "Protection (deg)",
-        float(np.rad2deg(1.0)),
-        slice(0, 3),
-    ),
+    LevelPlot("plots/attitude_level_deg", "Protection (deg)", float(np.rad2deg(1.0)), slice(0, 3)),
 )
 
 

@@ -228,11 +228,7 @@ def smoothed_figures(result: Smoothed, directions: Section = _REPORT) -> Figures
         Figure("window_s", float(np.median(result.fields.window)), "s"),
         Figure("passes", result.iteration_count, section=_REPORT),
         Figure("iterations", result.iterations, section=_REPORT),
-        Figure(
-            "converged",
-            result.converged,
-            section=_REPORT if result.converged else _SUMMARY,
-        ),
+        Figure("converged", result.converged, section=_REPORT if result.converged else _SUMMARY),
         Figure("cost", result.cost, section=_REPORT),
         where_found("intervals_bridged", result.gap_bridged > 0, result.gap_bridged),
         Figure(
@@ -242,9 +238,7 @@ def smoothed_figures(result: Smoothed, directions: Section = _REPORT) -> Figures
         ),
     )
     figures |= Figures(*(replace(f, note="") for f in rival_figures(result.rival_chi_square).all))
-    figures |= Figures(
-        Figure("time_offset_s", result.calibration.time_offset, section=_REPORT),
-    )
+    figures |= Figures(Figure("time_offset_s", result.calibration.time_offset, section=_REPORT))
     figures |= dropped_figures(result.dropped)
     figures |= residual_figures(result.residual, result.fields.channels) | _earth_figures(result)
     if states.pose_cov is not None:

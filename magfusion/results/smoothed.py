@@ -23,7 +23,7 @@ from magfusion.results.trajectory import ResultTrajectory, result_trajectory
 from magfusion.results.verdict import trust_figures
 from magfusion.units import Array
 
-NOT_JUDGED = "No verdict yet: call mf.judged(result, log) for the verdict."
+NOT_JUDGED = "No verdict yet: call mf.judge_result(result, log) for the verdict."
 
 
 @dataclass(frozen=True, eq=False, repr=False)

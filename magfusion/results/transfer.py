@@ -18,22 +18,7 @@ class Estimated(NamedTuple):
     cov: Array
 
 
-class CalibrationAgreement(NamedTuple):
-    """The difference of two calibrations in its own sigmas.
-
-    Parameters
-    ----------
-    by_parameter : ndarray, shape (parameters,)
-        Difference over the root of the sum of both posterior variances.
-    by_direction : ndarray, shape (determined,)
-        Along each direction that both logs determine, in sigmas of the difference.
-    """
-
-    by_parameter: Array
-    by_direction: Array
-
-
-def agreement(first: Estimated, second: Estimated) -> CalibrationAgreement:
+def agreement(first: Estimated, second: Estimated) -> Array:
     """Compare the calibrations of one installation by two logs.
 
     Both start at the same survey, and keep it where a log adds no information: such directions, the
@@ -45,6 +30,11 @@ def agreement(first: Estimated, second: Estimated) -> CalibrationAgreement:
     ----------
     first, second : Estimated
         With the same parameters and priors.
+
+    Returns
+    -------
+    ndarray, shape (determined,)
+        Difference along each direction that both logs determine, in its own sigmas.
     """
     # A log has its own phases: they refer to its own middle.
     kept = np.array([b.parameter != PHASE for b in first.blocks for _ in b.sigma], dtype=bool)
@@ -57,7 +47,4 @@ def agreement(first: Estimated, second: Estimated) -> CalibrationAgreement:
     value, vector = np.linalg.eigh(0.5 * both)
     determined = vector[:, np.sqrt(np.maximum(value, 0.0)) < DETERMINED_RATIO]
     variance = np.einsum("ik,ij,jk->k", determined, own, determined)
-    return CalibrationAgreement(
-        by_parameter=step / np.sqrt(np.diagonal(both)),
-        by_direction=(determined.T @ step) / np.sqrt(variance),
-    )
+    return np.asarray(determined.T @ step / np.sqrt(variance))

@@ -9,15 +9,12 @@ from magfusion.errors import InputError
 from magfusion.model.physics.disturbance import induced_field, sphere_polarizability
 from magfusion.simulation.atmosphere import Atmosphere
 from magfusion.simulation.layers import Layers
-from magfusion.simulation.pipe import Steel
-from magfusion.units import AnyArray, Array, ComplexArray
+from magfusion.simulation.pipe import STEEL_CONDUCTIVITY, STEEL_PERMEABILITY, Steel
+from magfusion.units import DAY, AnyArray, Array, ComplexArray
 
-DAY = 86_400.0  # s
 NOISIEST_TIME = 14.0 * 3600.0  # s of a day
 CLEARANCE = 0.5  # m from the surface of drawn iron to where the body moves, and to every beacon
 REACH = 0.5  # m beyond that clearance within which iron is drawn where nothing is said
-STEEL_PERMEABILITY = 100.0
-STEEL_CONDUCTIVITY = 5e6  # S/m
 _ATTEMPTS = 200  # to place one sphere
 _FEATURES = 512
 _POINTS = 4096  # of which that many features are held at once

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.simulation.disturbance import DAY
-from magfusion.units import Array
+from magfusion.units import DAY, Array
 
 COPPER_PER_KELVIN = 3.9e-3  # relative rise of resistance
 

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from magfusion.errors import InputError
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import ImuModel, Site
-from magfusion.model.trajectory import Trajectory
+from magfusion.model.trajectory import Trajectory, interpolated
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD
 from magfusion.simulation.disturbance import DayNight
 from magfusion.simulation.drift import (
@@ -25,12 +25,11 @@ from magfusion.simulation.drift import (
     draw_drift,
 )
 from magfusion.simulation.inertial import BiasInstability
-from magfusion.simulation.log import draw_drives, interpolate, perturb_site, simulate_fields
+from magfusion.simulation.log import draw_drives, perturb_site, simulate_fields
 from magfusion.simulation.motion import Rests, SimulatedMotion, random_walk_motion
-from magfusion.units import NANOTESLA, Array, BoolArray, ComplexArray
+from magfusion.units import HOUR, NANOTESLA, Array, BoolArray, ComplexArray
 
 BLOCK = 60.0  # s
-HOUR = 3600.0  # s
 MOST_HOURS = 1000.0
 SCHEDULE = Rests(start=40.0, move=180.0, pause=3420.0)
 MARGIN = 10.0  # s before and after a walk in which fields come as often as in it
@@ -225,8 +224,8 @@ class EnduranceWorld:
         known = stretch.imu.time
         return replace(
             self.motion.trajectory(time),
-            gyro_bias_body=interpolate(time, known, stretch.gyro_bias_body),
-            accel_bias_body=interpolate(time, known, stretch.accel_bias_body),
+            gyro_bias_body=interpolated(time, known, stretch.gyro_bias_body),
+            accel_bias_body=interpolated(time, known, stretch.accel_bias_body),
         )
 
     def _inertial(
@@ -319,11 +318,7 @@ def draw_endurance(site: Site, config: EnduranceConfig, seed: tuple[int, ...]) -
     site_rng, motion_rng, drift_rng, clock_rng = _generator(seed, _WORLD, 0).spawn(4)
     true_site = perturb_site(site, site_rng)
     motion = random_walk_motion(
-        motion_rng,
-        config.blocks * BLOCK,
-        config.box_world,
-        config.speed,
-        rests=config.schedule,
+        motion_rng, config.blocks * BLOCK, config.box_world, config.speed, rests=config.schedule
     )
     edges = BLOCK * np.arange(config.blocks + 1, dtype=float)
     drawn = draw_drift(config.drift, edges, len(site.beacons), drift_rng)

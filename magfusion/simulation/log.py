@@ -13,7 +13,7 @@ from magfusion.model.marks import Marks
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
 from magfusion.model.short_repr import short_repr
 from magfusion.model.site import Site
-from magfusion.model.trajectory import Trajectory
+from magfusion.model.trajectory import Trajectory, interpolated
 from magfusion.simulation.disturbance import Ambient, Bending, Spheres, draw_bending, draw_spheres
 from magfusion.simulation.field import Drives, phasors_world, synchronised_drives
 from magfusion.simulation.inertial import BiasInstability, SimulatedImu, simulate_imu
@@ -254,8 +254,8 @@ def _truth(motion: SimulatedMotion, imu: SimulatedImu, site: Site) -> Trajectory
     selected = (1.0 + clock.clock_rate) * stamp + clock.time_offset
     return replace(
         motion.trajectory(stamp),
-        gyro_bias_body=interpolate(stamp, selected, imu.gyro_bias_body),
-        accel_bias_body=interpolate(stamp, selected, imu.accel_bias_body),
+        gyro_bias_body=interpolated(stamp, selected, imu.gyro_bias_body),
+        accel_bias_body=interpolated(stamp, selected, imu.accel_bias_body),
     )
 
 
@@ -433,8 +433,3 @@ def _motion(config: SimulationConfig, rng: np.random.Generator) -> SimulatedMoti
     if config.motion == "turn":
         return turning_motion(*path, rests=config.rests)
     raise InputError(f"motion: found {config.motion!r}; give walk, turn or static")
-
-
-def interpolate(time: Array, known_time: Array, values: Array) -> Array:
-    """Return columns of values (n, k), interpolated to other times."""
-    return np.column_stack([np.interp(time, known_time, column) for column in values.T])

@@ -125,9 +125,7 @@ def worker_pool(
 
 
 def _run(
-    task: Callable[[Input, np.random.Generator], Output],
-    one: Input,
-    seed: np.random.SeedSequence,
+    task: Callable[[Input, np.random.Generator], Output], one: Input, seed: np.random.SeedSequence
 ) -> Output:
     return task(one, np.random.default_rng(seed))
 

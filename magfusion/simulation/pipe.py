@@ -17,9 +17,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.special import ive, kve
 
-from magfusion.units import MU0_OVER_4PI, AnyArray, Array, ComplexArray
+from magfusion.units import MU0, MU0_OVER_4PI, AnyArray, Array, ComplexArray
 
-MU0 = 4.0 * np.pi * MU0_OVER_4PI
 FINE, LEAST_CURVE = 0.5, 4  # of the radius, between poles; segments of a curve
 STEEL_PERMEABILITY, STEEL_CONDUCTIVITY = 100.0, 5e6  # relative, S/m
 

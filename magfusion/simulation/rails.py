@@ -70,21 +70,13 @@ def laid(pipes: tuple[Pipe, ...], box_world: Array, beacons_world: Array) -> Ste
     InputError
         If steel comes closer than `NEAREST` to the box or to a beacon, or crosses itself.
     """
-    whole = []
-    for number, pipe in enumerate(pipes, 1):
+    gaps = []
+    for pipe in pipes:
         along = np.linspace(pipe.start_world, pipe.end_world, 2000)
         to_box = np.linalg.norm(along - np.clip(along, *box_world), axis=1)
         to_beacon = np.linalg.norm(along[:, None] - beacons_world, axis=2)
-        away = min(float(np.min(to_box)), float(np.min(to_beacon, initial=np.inf))) - pipe.radius
-        if away < NEAREST:
-            raise InputError(
-                f"--rails: number {number} comes within {max(away, 0.0):.2g} m of the platform's"
-                f" range (--box) or of a beacon; keep a distance of {NEAREST:g} m"
-            )
-        whole.append(replace(pipe, segment=_segment(pipe, away)))
-    _check_count(whole)
-    _check_apart(whole)
-    return Steel(tuple(whole))
+        gaps.append(min(float(np.min(to_box)), float(np.min(to_beacon, initial=np.inf))))
+    return Steel(_segmented(pipes, gaps, "the platform's range (--box) or of a beacon"))
 
 
 def steel_along_wells(pipes: tuple[Pipe, ...], ways_world: list[Array]) -> tuple[Pipe, ...]:
@@ -95,35 +87,34 @@ def steel_along_wells(pipes: tuple[Pipe, ...], ways_world: list[Array]) -> tuple
     InputError
         If steel comes closer than `NEAREST` to a path, or crosses itself.
     """
-    whole = []
-    for number, pipe in enumerate(pipes, 1):
-        ways = np.concatenate(ways_world)
+    gaps, ways = [], np.concatenate(ways_world)
+    for pipe in pipes:
         offset = ways - pipe.start_world
         along = np.clip(offset @ pipe.axis_world, 0.0, pipe.length)[:, None]
-        separate = np.linalg.norm(offset - along * pipe.axis_world, axis=1)
-        away = float(np.min(separate)) - pipe.radius
+        gaps.append(float(np.min(np.linalg.norm(offset - along * pipe.axis_world, axis=1))))
+    return _segmented(pipes, gaps, "the path of the sensor or of the magnet")
+
+
+def _segmented(pipes: tuple[Pipe, ...], gaps: list[float], what: str) -> tuple[Pipe, ...]:
+    """Return pipes in segments that are short relative to their axes' distances from something."""
+    whole = []
+    for number, (pipe, gap) in enumerate(zip(pipes, gaps, strict=True), 1):
+        away = gap - pipe.radius
         if away < NEAREST:
             raise InputError(
-                f"--rails: number {number} comes within {max(away, 0.0):.2g} m of the path of the"
-                f" sensor or of the magnet; keep a distance of {NEAREST:g} m"
+                f"--rails: number {number} comes within {max(away, 0.0):.2g} m of {what}; keep a"
+                f" distance of {NEAREST:g} m"
             )
-        whole.append(replace(pipe, segment=_segment(pipe, away)))
-    _check_count(whole)
-    _check_apart(whole)
-    return tuple(whole)
-
-
-def _segment(pipe: Pipe, away: float) -> float:
-    return min(max(FINE * away, 0.05), LONGEST, pipe.length / MIN_SEGMENTS)
-
-
-def _check_count(pipes: list[Pipe]) -> None:
-    count = sum(len(pipe.centres_world()) for pipe in pipes)
+        segment = min(max(FINE * away, 0.05), LONGEST, pipe.length / MIN_SEGMENTS)
+        whole.append(replace(pipe, segment=segment))
+    count = sum(len(pipe.centres_world()) for pipe in whole)
     if count > MOST_SEGMENTS:
         raise InputError(
             f"--rails: {count} segments are too many (at most {MOST_SEGMENTS}); use shorter rails,"
             " or place them farther from the platform"
         )
+    _check_apart(whole)
+    return tuple(whole)
 
 
 def _check_apart(pipes: list[Pipe]) -> None:

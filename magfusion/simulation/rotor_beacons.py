@@ -11,13 +11,7 @@ import numpy as np
 
 from magfusion.model.rotor import RotorAngles
 from magfusion.model.site import Beacon, Coil, Site
-from magfusion.simulation.shaft import (
-    Shaft,
-    ShaftErrors,
-    draw_shaft,
-    moment_orders,
-    shaft_course,
-)
+from magfusion.simulation.shaft import Shaft, ShaftErrors, draw_shaft, moment_orders, shaft_course
 from magfusion.units import Array
 
 

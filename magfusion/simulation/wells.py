@@ -180,8 +180,5 @@ def drawn_steel(casing: Casing, rng: np.random.Generator) -> Casing:
         casing.conductivity,
     ]
     return replace(
-        casing,
-        wall=float(wall),
-        permeability=float(permeability),
-        conductivity=float(conductivity),
+        casing, wall=float(wall), permeability=float(permeability), conductivity=float(conductivity)
     )

@@ -182,10 +182,7 @@ def choose_blocks(
 
 
 def considered_blocks(
-    site: Site,
-    estimated: tuple[Block, ...],
-    *,
-    parameters: Iterable[Parameter] = PHASOR_PARAMETERS,
+    site: Site, estimated: tuple[Block, ...], *, parameters: Iterable[Parameter] = PHASOR_PARAMETERS
 ) -> tuple[Block, ...]:
     """Return the parameters that are uncertain but not among those estimated."""
     known = {block.key for block in estimated}
@@ -203,9 +200,7 @@ def placed(blocks: Iterable[Block], start: int = 0) -> tuple[Block, ...]:
 
 
 def _blocks(
-    site: Site,
-    parameters: Iterable[Parameter],
-    chosen: Callable[[Parameter, float], bool],
+    site: Site, parameters: Iterable[Parameter], chosen: Callable[[Parameter, float], bool]
 ) -> tuple[Block, ...]:
     blocks: list[Block] = []
     for parameter, owner in candidates(site, parameters):

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from magfusion.model.moments import with_moments
+from magfusion.model.coil_field import keep_sources
 from magfusion.model.parameters.parameter import (
     AXES,
     CENTIMETRE,
@@ -114,6 +114,30 @@ class _LogMoment(BeaconParameter, SiteParameter):
     def called(self, site: Site, owner: str, i: int) -> str:
         coil = f"coil {i} of " if len(self.part(site, owner).coils) > 1 else ""
         return f"the moment of {coil}beacon {owner}"
+
+
+def with_moments(site: Site, moments_beacon: Mapping[str, Array]) -> Site:
+    """Return the site with scaled moments of some beacons, as an estimator does at every step.
+
+    Parameters
+    ----------
+    moments_beacon : mapping of str to ndarray, shape (coils, 3)
+        By beacon name, in the same direction (A m^2).
+    """
+    beacons = tuple(
+        _changed(beacon, moments_beacon[beacon.name]) if beacon.name in moments_beacon else beacon
+        for beacon in site.beacons
+    )
+    other = replace(site, beacons=beacons)
+    keep_sources(site, other)
+    return other
+
+
+def _changed(beacon: Beacon, moments_beacon: Array) -> Beacon:
+    pairs = zip(beacon.coils, moments_beacon, strict=True)
+    return replace(
+        beacon, coils=tuple(replace(coil, moment_beacon=moment) for coil, moment in pairs)
+    )
 
 
 class _OfDrive(BeaconParameter):

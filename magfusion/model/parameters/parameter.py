@@ -8,12 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.model.channel_effects import (
-    driven,
-    of_all_sensors,
-    responded,
-    warmed,
-)
+from magfusion.model.channel_effects import driven, of_all_sensors, responded, warmed
 from magfusion.model.field import EarthObservation
 from magfusion.model.receive_coils import Observation
 from magfusion.model.samples import ImuSamples

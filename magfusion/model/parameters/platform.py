@@ -23,9 +23,7 @@ from magfusion.model.parameters.parameter import (
     SteadyView,
 )
 from magfusion.model.site import Magnetometer, Site
-from magfusion.units import Array, ComplexArray
-
-MICROTESLA = 1e-6  # T
+from magfusion.units import MICROTESLA, Array, ComplexArray
 
 
 class MagnetometerParameter(SiteParameter):

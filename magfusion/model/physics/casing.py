@@ -54,13 +54,6 @@ class Casing:
         return np.array([self.wall_sigma, self.permeability_sigma, self.conductivity_sigma])
 
 
-class Transmission(NamedTuple):
-    """Ratio of the field inside to that outside, a complex number for exp(+j w t)."""
-
-    across: complex
-    along: complex
-
-
 class Response(NamedTuple):
     """Response of tubes, each with its own change of the steel.
 
@@ -117,12 +110,6 @@ def tube_response(casing: Casing, frequency_hz: float, change: Array) -> Respons
         ]
     )
     return Response(1.0 / across, 1.0 / along, casing.radius * wall * (drawn - 1.0), by_steel)
-
-
-def tube_transmission(casing: Casing, frequency_hz: float) -> Transmission:
-    """Return the transmission through a tube's wall, for its declared steel."""
-    whole = tube_response(casing, frequency_hz, np.zeros((1, 3)))
-    return Transmission(complex(whole.across[0]), complex(whole.along[0]))
 
 
 def gathering_weights(

@@ -11,9 +11,7 @@ currents are neglected: below 1 MHz they are small in any ground.
 
 import numpy as np
 
-from magfusion.units import MU0_OVER_4PI, Array, ComplexArray
-
-MU0 = 4.0 * np.pi * MU0_OVER_4PI  # T m / A
+from magfusion.units import MU0, MU0_OVER_4PI, Array, ComplexArray
 
 
 def skin_depth(frequency_hz: Array | float, conductivity: float) -> Array:

@@ -18,9 +18,7 @@ permeability is the sum of such rings, ``-(2 pi / 15) conductivity a^5 dB/dt``.
 import numpy as np
 
 from magfusion.model.physics.dipole import dipole_field
-from magfusion.units import MU0_OVER_4PI, AnyArray, Array, ComplexArray
-
-MU0 = 4.0 * np.pi * MU0_OVER_4PI  # T m / A
+from magfusion.units import MU0, AnyArray, Array, ComplexArray
 
 _SMALL = 0.03  # below it the closed form cancels, and the series is exact to 1e-12
 

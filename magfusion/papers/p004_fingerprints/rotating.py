@@ -5,10 +5,7 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Beacon, Site
-from magfusion.papers.p004_fingerprints.algorithms import (
-    LEAST_BEACONS,
-    RotatingFields,
-)
+from magfusion.papers.p004_fingerprints.algorithms import LEAST_BEACONS, RotatingFields
 from magfusion.papers.p004_fingerprints.equations import eq_25_fingerprint
 from magfusion.papers.p004_fingerprints.fingerprint import (
     NEIGHBOURS,

@@ -18,11 +18,7 @@ import numpy as np
 
 from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Beacon
-from magfusion.results.design.layout_information import (
-    LayoutInformation,
-    added,
-    pose_covariance,
-)
+from magfusion.results.design.layout_information import LayoutInformation, added, pose_covariance
 from magfusion.units import Array, BoolArray, IntArray
 
 Objective = Literal["worst", "D", "A"]

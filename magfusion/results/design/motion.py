@@ -14,12 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.model.parameters import (
-    Block,
-    choose_blocks,
-    initial_calibration,
-    prior_sigma,
-)
+from magfusion.model.parameters import Block, choose_blocks, initial_calibration, prior_sigma
 from magfusion.model.prior import prior_sqrt_information
 from magfusion.model.site import Site
 from magfusion.results.observability import parameter_names

@@ -12,7 +12,6 @@ from magfusion.receiver.windows import CLOSEST_TONES_HZ
 from magfusion.units import Array
 
 NO_MOMENT = 0.1  # of the largest; a direction with less has none
-AXES_OFFERED = (3, 7, 13)
 
 
 @dataclass(frozen=True, eq=False)

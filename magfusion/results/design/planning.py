@@ -135,13 +135,7 @@ def designed(
         tones, allowed = frequencies_for(task.template, task.count, task.band, task.site.beacons)
         plain = tuned(task.template, tones[len(tones) // 2])
     candidates = candidates_of(task, plain)
-    information = LayoutInformation(
-        task.site,
-        plain,
-        task.points,
-        task.band.window,
-        task.risk,
-    )
+    information = LayoutInformation(task.site, plain, task.points, task.band.window, task.risk)
     draw, search_rng = rng.spawn(2)
     drawn = [random_layout(candidates, task.count, draw) for _ in range(layouts)]
     search = LayoutSearch(information, candidates, task.objective, in_time)

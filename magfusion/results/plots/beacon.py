@@ -57,9 +57,7 @@ def _centre(axes: Axes, panel: BeaconPanel, view: tuple[int, int]) -> None:
     ellipse_mm = moved_mm[:, None] + 3e3 * turn @ (np.sqrt(spread)[:, None] * circle)
     width, height = 3e3 * panel.declared.sigma.position_world[plane]
     axes.plot(
-        [-width, width, width, -width, -width],
-        [-height, -height, height, height, -height],
-        "0.6",
+        [-width, width, width, -width, -width], [-height, -height, height, height, -height], "0.6"
     )
     axes.plot(0.0, 0.0, "s", color="0.4", label="surveyed")
     axes.plot(*ellipse_mm, "tab:red")

@@ -8,14 +8,14 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from magfusion.calibration.allan import AllanStream
 from magfusion.results.drift import (
-    HOUR,
     QUANTITIES,
     EstimatorPlot,
     Quantity,
-    allan_deviation,
     in_windows,
 )
+from magfusion.units import HOUR
 
 _AXES = ("tab:red", "tab:green", "tab:blue")
 
@@ -116,10 +116,13 @@ def _draw_allan(axes: Axes, course: EstimatorPlot) -> None:
     """Draw the Allan deviation of each error."""
     for quantity in QUANTITIES:
         error = quantity.scale * course.errors.error[:, quantity.part]
-        time, deviation = allan_deviation(error, course.interval)
-        if len(time):
+        stream = AllanStream(error.shape[1])
+        stream.add(error)
+        result = stream.result(course.interval)
+        if len(result.tau):
             label = f"{quantity.name.replace('_', ' ')} ({quantity.unit})"
-            axes.loglog(time / HOUR, deviation, label=label)
+            deviation = np.sqrt(np.mean(result.variance, axis=1))
+            axes.loglog(result.tau / HOUR, deviation, label=label)
     axes.set(xlabel="averaged over (h)", ylabel="Allan deviation")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7)

@@ -7,13 +7,12 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from magfusion.units import NANOTESLA, Array
+from magfusion.units import MICROTESLA, NANOTESLA, Array
 
 _PLANES = ((0, 1), (1, 2), (2, 0))
 _AXES = "xyz"
 _BEFORE, _AFTER = "tab:orange", "tab:blue"
 DRAWN_DEVIATION = 0.25  # of the radius; what the largest deviation is drawn as
-MICROTESLA = 1e-6
 
 
 def write_magnetometer_plot(

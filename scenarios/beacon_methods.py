@@ -1,4 +1,4 @@
-"""Calibration of a rotating beacon as printed in paper 002, for comparison.
+"""Calibrations of a rotating beacon to compare: as printed in paper 002, and of known moments.
 
 The paper converts the normals of the field's plane to directions (Eq 4), computes the distances
 from the angles between them (Eq 9-11), the centre from the distances (Eq 12), and the attitude from
@@ -8,13 +8,20 @@ argument that the centre does not depend on the attitude (Eq 13-17) is false.  G
 magnetometers' axes, one degree of tilt moves the centre by 0.2 m.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
+from magfusion.calibration.beacon import BeaconMeasurements, whitened_parts
 from magfusion.estimation.snapshot.candidates import wahba
-from magfusion.estimation.solve.batched import minimise, normal_equations
+from magfusion.estimation.solve.batched import (
+    NormalEquations,
+    minimise,
+    moved_poses,
+    normal_equations,
+)
+from magfusion.model.field import observe
 from magfusion.papers.p002_beacon.equations import (
     eq_04_direction,
     eq_09_cosines,
@@ -155,3 +162,45 @@ def consistent_centres(
             if not any(np.linalg.norm(centre - other) < 1e-3 * size for other in known):
                 result.append(((1, *signs), centre))
     return result
+
+
+def fit_known_moments(
+    measured: BeaconMeasurements, centre_world: Array, world_from_beacon: Array
+) -> tuple[Array, Array, Array]:
+    """Find centre and attitude of a synchronised beacon whose moments are as declared.
+
+    Parameters
+    ----------
+    centre_world : ndarray, shape (runs, 3)
+        Start (m), e.g. from `calibrate_beacon`.
+    world_from_beacon : ndarray, shape (runs, 3, 3)
+
+    Returns
+    -------
+    centre_world : ndarray, shape (runs, 3)
+    world_from_beacon : ndarray, shape (runs, 3, 3)
+    cov : ndarray, shape (runs, 6, 6)
+        Of rotation and position, beacon axes: the Cramér-Rao bound.
+    """
+    seen = np.nan_to_num(measured.phasor_sensor)
+
+    def model(rows: IntArray, pose: Array) -> NormalEquations:
+        rotation, centre = pose[:, :9].reshape(-1, 3, 3), pose[:, 9:]
+        # The beacon is fixed; magnetometers move with the frame in which it has the requested pose.
+        back = measured.beacon.world_from_beacon @ np.swapaxes(rotation, -1, -2)
+        position = (measured.position_world - centre[:, None]) @ np.swapaxes(back, -1, -2)
+        result = observe(
+            replace(measured.beacon, field_map=None),
+            measured.magnetometer,
+            back[:, None] @ measured.world_from_body,
+            position + measured.beacon.position_world,
+        )
+        error = (result.phasor_sensor - seen[rows])[..., None]
+        return normal_equations(
+            whitened_parts(measured, error)[..., 0], whitened_parts(measured, result.beacon_pose)
+        )
+
+    start = np.concatenate([world_from_beacon.reshape(-1, 9), centre_world], axis=-1)
+    result = minimise(model, start, moved_poses)
+    pose = result.state
+    return pose[:, 9:], pose[:, :9].reshape(-1, 3, 3), np.asarray(np.linalg.inv(result.information))
