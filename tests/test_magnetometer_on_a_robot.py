@@ -15,8 +15,8 @@ from magfusion.files.log import write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.jobs.calibrate_magnetometer import run_calibrate_magnetometer
 from magfusion.jobs.inputs import Job
+from magfusion.receiver.bursts import spread_bursts
 from magfusion.receiver.even_clocks import on_even_clocks
-from magfusion.receiver.sampling_clock import spread_bursts
 
 LIMIT = scenario.LIMIT
 

@@ -56,7 +56,7 @@ ROOMS = {
             long_log
         """,
         "receiver": """
-            ambient cells ellipse even_samples hum noise range_ends rotor rotor_phase
+            ambient bursts cells ellipse even_samples hum noise range_ends rotor rotor_phase
             sampling_clock turn windows
             admission ambient_left pieces slots
             design drive integration marked_bursts receiver reference slot_phasors slot_timing

@@ -223,7 +223,7 @@ def _conditioned(detected: _DetectedFields, process: _Process) -> FieldMap:
     for _ in range(RELINEARISATIONS):
         information, vector = _reduced(detected, state, process.residual)
         system = posterior_system(near, process.sigma, information)
-        weights = np.linalg.solve(system, vector.ravel()).reshape(count, COMPONENTS)
+        weights = np.asarray(np.linalg.solve(system, vector.ravel())).reshape(count, COMPONENTS)
         before, state = state, near @ (process.sigma**2 * weights)
         # Where a survey is of other beacons, steps would diverge.
         state[:, 0] = np.clip(state[:, 0], np.log(_WEAKEST), -np.log(_WEAKEST))

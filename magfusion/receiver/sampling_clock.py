@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import make_lsq_spline
 
-from magfusion.model.batches import spread_batches
+from magfusion.receiver.bursts import LONGEST, MAX_SAMPLES, spread_bursts
 from magfusion.units import NANOSECOND, Array, ComplexArray, IntArray
 
 EVEN = 0.01  # of a step; stamps that scatter less are a clock's own
@@ -29,10 +29,6 @@ ROUNDED = 0.05  # of a step, by which the mean of rounded stamps differs from th
 MAX_ROUNDING_STEPS = 1.2  # median steps; rounding is half of one, cutting off one
 MOST_STEPS = 10_000  # of which a common divisor is looked for
 MAX_ROUNDING = 0.6  # of the divisor; rms of rounding is 1/sqrt(12) of it, of cutting off 1/sqrt(3)
-TOGETHER = 0.2  # of the mean step; samples closer than that arrived in one burst
-SHARE = 0.4  # least share of such short steps where samples come in bursts
-LONGEST = 0.1  # s between two bursts; a longer pause is a switched stream, not a bus
-MAX_SAMPLES = 32  # samples in a burst
 
 
 class SamplingClock(NamedTuple):
@@ -75,40 +71,6 @@ def sampling_clock(stamps: Array, bundled: bool = True) -> SamplingClock | None:
         return None
     size = stamp_resolution(stamps)
     return clock._replace(resolution=size if clock.scatter < MAX_ROUNDING * size else 0.0)
-
-
-def spread_bursts(stamps: Array) -> Array | None:
-    """Return sampling times of samples that arrived in bursts; None if they did not.
-
-    The samples of a burst were taken one after the other since the burst before.  Each burst is
-    spread over the time since the last one, which is accurate to one step.
-
-    Parameters
-    ----------
-    stamps : ndarray, shape (n,)
-        Strictly increasing (s).
-
-    Returns
-    -------
-    ndarray, shape (n,), or None
-        Strictly increasing (s); the last sample of a burst keeps its stamp.
-    """
-    if len(stamps) < 2 * MAX_SAMPLES:
-        return None
-    step = np.diff(stamps)
-    inside = step[step < 2.0 * LONGEST]
-    if len(inside) < MAX_SAMPLES:
-        return None
-    separate = step > TOGETHER * float(np.mean(inside))
-    if np.mean(~separate) < SHARE:
-        return None
-    last = np.append(np.flatnonzero(separate), len(stamps) - 1)
-    count = np.diff(last, prepend=-1)
-    between = np.diff(stamps[last])
-    usual = float(np.median(between))
-    if usual > LONGEST or np.median(count) > MAX_SAMPLES:
-        return None
-    return spread_batches(stamps, last)
 
 
 def _counted_clock(stamps: Array, separate: Array) -> SamplingClock:
