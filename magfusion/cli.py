@@ -27,7 +27,7 @@ from magfusion.estimation.solve.memory import keep_memory
 from magfusion.files.blas_threads import use_one_thread
 from magfusion.files.standard_streams import binary_output, occupy_closed, until_closed
 from magfusion.jobs import GROUPS, JOBS
-from magfusion.jobs.settings import Command, Option, Settings, options
+from magfusion.jobs.settings import OVERWRITE, Command, Option, Settings, options
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figures
 from magfusion.results.provenance import Run, recorded_as
@@ -229,6 +229,7 @@ def _callback(path: str, command: Command) -> Callable[..., None]:
 
     def run(context: typer.Context, **values: Any) -> None:
         output, as_json = values.pop("output", None), values.pop("as_json", False)
+        values.pop("overwrite", None)
         if as_json:
             binary_output()
         own = {field: _value(requested[field], value) for field, value in values.items()}
@@ -282,6 +283,9 @@ def _parameters(command: Command, writes: bool) -> list[inspect.Parameter]:
         hint: Any = Path | None if default is None else Path
         output = _keyword("output", Annotated[hint, info], default)
         result.insert(0, output)
+        if not command.output_file:
+            flag = typer.Option("--overwrite", help=f"{OVERWRITE}.")
+            result.append(_keyword("overwrite", Annotated[bool, flag], False))
     if command.reports:
         flag = typer.Option("--json", help="Print the report as a line of JSON, and nothing else.")
         result.append(_keyword("as_json", Annotated[bool, flag], False))
@@ -337,6 +341,7 @@ def _run(context: typer.Context, settings: Settings, given: set[str]) -> Run:
         values,
         frozenset(given),
         tuple(path for path in paths if isinstance(path, Path) and path.exists()),
+        context.params.get("overwrite", False),
     )
 
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -280,6 +281,27 @@ def test_the_console_script_keeps_the_contract(worked: Worked, tmp_path: Path) -
     assert (bad.returncode, bad.stdout, bad.stderr.count("\n")) == (2, "", 1)
     usage = _script("fix", "--frobnicate")
     assert (usage.returncode, usage.stdout, usage.stderr.count("\n")) == (2, "", 1)
+
+
+def test_an_earlier_result_is_moved_aside_unless_it_is_to_be_replaced(
+    worked: Worked, tmp_path: Path
+) -> None:
+    run = shutil.copytree(worked.fixes, tmp_path / "run")
+    (tmp_path / "run.1").write_text("a user's")
+    earlier = (run / "fixes.parquet").read_bytes()
+    moved = _script("fix", worked.log, "-o", run, "--end", 5, "--json")
+    assert (moved.returncode, json.loads(moved.stdout)["job"]) == (0, "fix")
+    assert moved.stderr.count("\n") == 1
+    assert "earlier result is now in run.2" in moved.stderr
+    assert (tmp_path / "run.2" / "fixes.parquet").read_bytes() == earlier
+    assert (run / "fixes.parquet").read_bytes() != earlier
+    replaced = _script("fix", worked.log, "-o", run, "--overwrite")
+    assert (replaced.returncode, replaced.stderr) == (0, "")
+    assert (run / "fixes.parquet").read_bytes() == earlier
+    # Nothing moves for invalid input.
+    bad = _script("fix", worked.log, "-o", run, "--start", 1e6)
+    assert bad.returncode == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "run.1", "run.2"]
 
 
 def test_help_and_version_are_told(capfd: pytest.CaptureFixture[str]) -> None:

@@ -288,7 +288,7 @@ def test_a_result_never_replaces_the_log_it_came_from(
     assert "holds other files" in refuse(*command, "-o", log)
 
 
-def test_an_earlier_result_is_replaced_but_not_what_a_user_put_into_it(
+def test_an_earlier_result_makes_way_but_not_what_a_user_put_into_it(
     worked: Worked, tmp_path: Path, refuse: Refuse
 ) -> None:
     run = shutil.copytree(worked.fixes, tmp_path / "run")

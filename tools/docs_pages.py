@@ -15,7 +15,7 @@ from typing import Any
 from latex2mathml.converter import convert
 
 from magfusion.jobs import JOBS
-from magfusion.jobs.settings import Command, Option, options
+from magfusion.jobs.settings import OVERWRITE, Command, Option, options
 from magfusion.model.trust import CODES
 from magfusion.papers.register import FINDINGS, KINDS, NumberedEntry, paper, papers
 
@@ -71,6 +71,8 @@ def option_table(path: str) -> str:
     title = f"**`magfusion {path}`**: {sentence}"
     if "output" in inspect.signature(command.run).parameters:
         rows.append(("`-o`, `--output`", f"{command.output_help}.", _output(command)))
+        if not command.output_file:
+            rows.append(("`--overwrite`", f"{OVERWRITE}.", ""))
     if command.reports:
         rows.append(("`--json`", "Print the report as a line of JSON, and nothing else.", ""))
     return f"{title}\n\n{_table(('option', 'what', 'default'), rows)}"

@@ -117,13 +117,19 @@ def _runs(process: int) -> bool:
 
 
 @contextmanager
-def whole_directory(path: Path, replaces: Callable[[Path], bool]) -> Iterator[Path]:
+def whole_directory(
+    path: Path,
+    replaces: Callable[[Path], bool],
+    backup: Callable[[Path], Path | None] = lambda _: None,
+) -> Iterator[Path]:
     """Yield a temporary directory next to ``path`` that replaces it only on success.
 
     Parameters
     ----------
     replaces : callable
         Whether the directory that is there may be replaced; an empty one always may.
+    backup : callable, optional
+        The path to which it is moved then; None removes it.
 
     Raises
     ------
@@ -139,7 +145,7 @@ def whole_directory(path: Path, replaces: Callable[[Path], bool]) -> Iterator[Pa
         _make(unfinished)
         with naming(path, unfinished):
             yield unfinished
-            _take_place(unfinished, path)
+            _take_place(unfinished, path, backup)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
         if not path.exists():
@@ -161,15 +167,17 @@ def _remove_empty(directories: list[Path]) -> None:
             directory.rmdir()
 
 
-def _take_place(unfinished: Path, path: Path) -> None:
+def _take_place(unfinished: Path, path: Path, backup: Callable[[Path], Path | None]) -> None:
     if not path.exists():
         unfinished.rename(path)
         return
-    former = _temporary_path(path, FORMER)
+    kept = backup(path)
+    former = kept or _temporary_path(path, FORMER)
     path.rename(former)
     try:
         unfinished.rename(path)
     except OSError:
         former.rename(path)
         raise
-    shutil.rmtree(former)
+    if kept is None:
+        shutil.rmtree(former)

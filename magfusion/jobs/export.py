@@ -127,6 +127,6 @@ COMMAND = Command(
     ExportSettings,
     run_export,
     output_required=True,
-    output_help="Output file, which is replaced",
+    output_file="Output file, which is replaced",
     example="magfusion export run -o run.mcap --frame map --child base_link",
 )

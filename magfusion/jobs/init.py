@@ -297,7 +297,7 @@ COMMAND = Command(
     InitSettings,
     run_init,
     output="site.yaml",
-    output_help="File to write; an existing file is not overwritten",
+    output_file="File to write; an existing file is not overwritten",
     example="magfusion init --imu BMI088 --magnetometer RM3100 --beacon 'A position_m=0,0,1"
     " rpy_deg=0,0,90 frequency_hz=25 moment_a_m2=220 axes=xy' -o new_site.yaml",
 )

@@ -1,11 +1,14 @@
 """Inputs and output directory of a job."""
 
 import json
+import os
 import re
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, fields, replace
+from itertools import count
 from pathlib import Path
 
 from magfusion.errors import EstimationError, InputError
@@ -48,6 +51,7 @@ from magfusion.model.without_imu import logged
 from magfusion.receiver.receivers import receiver_of
 from magfusion.receiver.windows import LockinSettings
 from magfusion.results.page import PAGE
+from magfusion.results.provenance import current_run
 from magfusion.results.report import FAILED
 
 
@@ -60,7 +64,7 @@ class Job:
     site_path : Path, optional
         By default ``site.yaml`` in the log's directory.
     output : Path
-        Directory of the results; an earlier result there is replaced.
+        Directory of the results; an earlier result there is moved to the next free name.
     start, end : float, optional
         Part of the log to use, seconds since its epoch.
     topics : Topics, optional
@@ -107,10 +111,15 @@ def _may_be_replaced(path: Path, kinds: tuple[str, ...]) -> bool:
     return job in kinds and result <= WRITTEN[job] | {FAILED, PAGE}
 
 
-def claim(output: Path, *kinds: str) -> AbstractContextManager[Path]:
+def claim(output: Path, *kinds: str, overwrite: bool = False) -> AbstractContextManager[Path]:
     """Return a context whose directory becomes ``output`` only on success.
 
     An obstacle raises an error at once, before the work.
+
+    Parameters
+    ----------
+    overwrite : bool
+        Whether an earlier result is removed, as with ``--overwrite``, rather than moved.
 
     Raises
     ------
@@ -121,8 +130,30 @@ def claim(output: Path, *kinds: str) -> AbstractContextManager[Path]:
     def replaces(path: Path) -> bool:
         return _may_be_replaced(path, kinds)
 
+    def backup(path: Path) -> Path | None:
+        run = current_run()
+        if overwrite or (run is not None and run.overwrite):
+            return None
+        return _backup_path(path, kinds)
+
     refuse_in_the_way(real(output), replaces)
-    return whole_directory(output, replaces)
+    return whole_directory(output, replaces, backup)
+
+
+def _backup_path(path: Path, kinds: tuple[str, ...]) -> Path | None:
+    """Return the place of an earlier result, without files of the run that ends; None of none."""
+    if not (path / "report.json").is_file():
+        return None
+    for name in set[str]().union(*(UNFINISHED.get(kind, set()) for kind in kinds)):
+        if (path / name).is_dir():
+            shutil.rmtree(path / name)
+        (path / name).unlink(missing_ok=True)
+    numbered = (path.with_name(f"{path.name}.{number}") for number in count(1))
+    kept = next(other for other in numbered if not os.path.lexists(other))
+    sys.stderr.write(
+        f"magfusion: {path}: the earlier result is now in {kept.name}; --overwrite replaces it\n"
+    )
+    return kept
 
 
 def keep_results(whole: Path, logs: list[tuple[str, Path, Path]]) -> None:

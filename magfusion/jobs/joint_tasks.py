@@ -171,7 +171,7 @@ def _written(result: Smoothed, log: Log, site: Site, given: LastTask) -> tuple[S
         log, site, task.smoother, result, given.risk, excess=given.excess, findings=given.findings
     )
     done = with_errors(done, log)
-    with claim(task.job.output, "smooth") as whole:
+    with claim(task.job.output, "smooth", overwrite=True) as whole:
         write_finished(whole, log, done, rate=given.rate)
     return done.result, done.trust
 

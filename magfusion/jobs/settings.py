@@ -130,6 +130,9 @@ class Settings:
                 requested.check(requested.name or field.name.replace("_", "-"), value)
 
 
+OVERWRITE = "Replace an earlier result there, instead of moving it to the next free name (.1, .2)"
+
+
 class Command(NamedTuple):
     """Call of a job; its name and description are in `magfusion.jobs.JOBS`.
 
@@ -145,8 +148,8 @@ class Command(NamedTuple):
         Whether it writes only if ``--output`` is given.
     reports : bool
         Whether it returns a report, which ``--json`` prints.
-    output_help : str
-        Help of ``--output``; `magfusion.cli` appends its default.
+    output_file : str
+        Help of ``--output`` of a job that writes one file instead of a directory of results.
     fails : bool
         Whether a failed verdict ends it with exit code 1.
     after : callable, optional
@@ -161,10 +164,15 @@ class Command(NamedTuple):
     output_required: bool = False
     output_optional: bool = False
     reports: bool = True
-    output_help: str = "Directory of the results"
+    output_file: str = ""
     fails: bool = True
     after: Callable[[Any, Path], None] | None = None
     example: str = ""
+
+    @property
+    def output_help(self) -> str:
+        """Help of ``--output``; `magfusion.cli` appends its default."""
+        return self.output_file or "Directory of the results"
 
 
 @dataclass(frozen=True, kw_only=True)

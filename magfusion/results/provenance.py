@@ -33,12 +33,15 @@ class Run:
         Those typed rather than left at their defaults.
     inputs : tuple of Path
         Input files and directories.
+    overwrite : bool
+        Whether an earlier result is removed rather than moved.
     """
 
     command: str
     options: Mapping[str, object] = field(default_factory=dict)
     given: frozenset[str] = frozenset()
     inputs: tuple[Path, ...] = ()
+    overwrite: bool = False
     started: datetime = field(default_factory=lambda: datetime.now(UTC))
     began: float = field(default_factory=time.perf_counter)
 
