@@ -7,9 +7,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -93,6 +94,27 @@ def test_a_navigator_of_raw_samples_goes_on_to_the_last_bit(worked: Worked, eart
 def test_what_is_no_state_of_a_navigator_is_refused(foreign: object) -> None:
     with pytest.raises(InputError, match="run without --resume"):
         restored(online_log(8, 10.0).site, NavigatorSettings(), foreign)
+
+
+def test_a_bias_that_no_instrument_has_is_refused() -> None:
+    log, kept = online_log(8, 14.0), list[Any]()
+    settings = NavigatorSettings("ekf")
+    navigate(log, settings, watch=lambda own, _: kept.append(own.checkpoint()))
+    assert restored(log.site, settings, kept[-1]).started
+    changed = list(_values_of(kept[-1], "gyro_bias_body"))
+    assert changed
+    changed[0][:] = 8e220
+    with pytest.raises(InputError, match="has a bias that no instrument has"):
+        restored(log.site, settings, kept[-1])
+
+
+def _values_of(content: Any, name: str) -> Iterator[Any]:
+    """Yield what has a name anywhere in plain data."""
+    for key, value in content.items() if isinstance(content, dict) else enumerate(content):
+        if key == name:
+            yield value
+        elif isinstance(value, dict | list):
+            yield from _values_of(value, name)
 
 
 def _rest(log: OnlineLog, navigator, begin: float) -> list[State]:  # type: ignore[no-untyped-def]

@@ -159,6 +159,22 @@ def test_a_temperature_makes_no_checkpoint_and_is_no_old_data(
     assert len(saved) == 1
 
 
+def test_data_after_a_step_back_behind_the_checkpoint_are_used(
+    site: Path, lines: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    settings = StreamSettings(EKF.navigator, checkpoint=tmp_path / "state", every=1.0)
+    answered(site, sent([one for one in lines if newest(one) < 9.0]), settings)
+    rest = [
+        stamped(one, lambda t: t - 6.0) if newest(one) >= 10.0 else one
+        for one in lines
+        if newest(one) >= 9.0
+    ]
+    states, reported = answered(site, sent(rest), replace(settings, resume=True))
+    assert "its clock stepped by" in reported
+    assert "before the checkpoint" not in reported
+    assert any(state["started"] for state in states)
+
+
 def test_a_start_that_waits_for_late_samples_has_streams_of_one_length() -> None:
     """The inertial samples of the time that it waits for are no difference of clocks."""
     log = simulate_log(

@@ -119,7 +119,7 @@ def _navigate(
     samples = StreamSamples(site)
     output, angles = _StateWriter(navigator, sink, others), AwaitedAngles(site)
     kept = None if place is None else CheckpointWriter(place, key, messages)
-    clocks, resumed = StreamClocks(settings.navigator.delay), navigator.time
+    clocks = StreamClocks(settings.navigator.delay)
     for numbered in read_records(source, settings.form):
         try:
             numbered = _on_clock(numbered, clocks, samples, output, messages)
@@ -131,10 +131,10 @@ def _navigate(
             refused += 1
             messages.write(f"magfusion: {sentence} (skipped)\n")
             continue
-        if -np.inf < newest < resumed:
-            at = f"{resumed:.3f} s"
+        if -np.inf < newest < output.resumed:
+            at = f"{output.resumed:.3f} s"
             messages.write(f"magfusion: data before the checkpoint ({at}) are not used\n")
-            resumed = -np.inf
+            output.resumed = -np.inf
         angles.see(numbered.record)
         navigator = output.navigator = corrected(output.navigator)
         output.epochs()
@@ -167,13 +167,15 @@ class _StateWriter:
     Attributes
     ----------
     navigator : Navigator
+    resumed : float
+        Time of the checkpoint (s), older data are not used; infinitely early without one.
     reference : bool
         Whether samples of a reference sensor have arrived, which are not used here.
     """
 
     def __init__(self, navigator: Navigator, sink: BinaryIO, others: tuple[StateSink, ...]) -> None:
         self.navigator, self._sink, self._others = navigator, sink, others
-        self._newest = -np.inf
+        self._newest, self.resumed = -np.inf, navigator.time
         self.reference = False
 
     def write(self, state: JudgedState | None, output: dict[str, Any]) -> None:
@@ -184,7 +186,8 @@ class _StateWriter:
 
     def restart(self) -> None:
         """Navigate on another clock."""
-        self.navigator, self._newest = self.navigator.restarted(), -np.inf
+        self.navigator = self.navigator.restarted()
+        self._newest = self.resumed = -np.inf
 
     def now(self) -> None:
         """Write the current states, before any other processing."""

@@ -31,6 +31,7 @@ from magfusion.estimation.online_integrity.judgement import JudgedState, Judgeme
 from magfusion.estimation.online_integrity.levels import Levels
 from magfusion.estimation.online_integrity.score_epochs import Sums
 from magfusion.files.plain_data import Rules, from_plain, to_plain
+from magfusion.files.plausible import beyond_range
 from magfusion.model.parameters import Block, Calibration, dimension, initial_calibration
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
@@ -165,6 +166,8 @@ def _check_state(state: State, size: int) -> None:
             _check(value.shape == shapes.get(name, (3,)), f"has a {name} of another shape")
             _check(np.all(np.isfinite(value)), f"has a {name} that is not finite")
     _check(np.isfinite(state.time), "has a time that is not finite")
+    bias = np.concatenate([state.gyro_bias_body, state.accel_bias_body])
+    _check(not beyond_range(bias[None])[0], "has a bias that no instrument has")
     rotated = state.world_from_body @ state.world_from_body.T
     _check(np.max(np.abs(rotated - np.eye(3))) < ROUNDING, "has an invalid rotation")
     _check_cov(state.cov)
