@@ -5,6 +5,7 @@ import gc
 import inspect
 import json
 import os
+import re
 import shlex
 import signal
 import sys
@@ -89,12 +90,18 @@ def main(arguments: list[str] | None = None) -> None:
     raise SystemExit(status)
 
 
+def _without_pydantic(message: str) -> str:
+    """Return what Typer says of a value, whose checks are pydantic's, as an instruction."""
+    message = message.replace(": Value error, ", ": ")
+    return re.sub(r"Input should be (.+?)(, unable to parse .*)?$", r"write \1", message)
+
+
 def _error_report(error: Exception) -> tuple[int, str]:
     """Return exit code and message of a command's exception."""
     if isinstance(error, typer.TyperException):
         context = getattr(error, "ctx", None)
         command = "magfusion" if context is None else context.command_path
-        return 2, f"{error.format_message().rstrip('.')}; see {command} --help"
+        return 2, f"{_without_pydantic(error.format_message()).rstrip('.')}; see {command} --help"
     if isinstance(error, InputError):
         return 2, str(error)
     if isinstance(error, EstimationError):
