@@ -91,7 +91,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _without_pydantic(message: str) -> str:
-    """Return what Typer says of a value, whose checks are pydantic's, as an instruction."""
+    """Return the message of Typer on a value, whose checks are pydantic's, as an instruction."""
     message = message.replace(": Value error, ", ": ")
     return re.sub(r"Input should be (.+?)(, unable to parse .*)?$", r"write \1", message)
 

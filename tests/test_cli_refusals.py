@@ -260,9 +260,9 @@ def test_a_mistake_on_the_command_line_is_told_in_one_sentence(
     places = {"LOG": log, "OUT": tmp_path / "out", "NONE": tmp_path / "NONE"}
     for name, path in places.items():
         line = line.replace(name, str(path))
-    told = refuse(*line.split())
-    assert re.search(pattern, told)
-    assert not re.search("Input should|Value error", told)  # pydantic's words
+    message = refuse(*line.split())
+    assert re.search(pattern, message)
+    assert not re.search("Input should|Value error", message)  # pydantic's words
 
 
 # Refusals of output ---------------------------------------------------------------------------
