@@ -197,7 +197,7 @@ def test_factors_have_the_derivatives_of_their_errors() -> None:
         linear = factor.linearize(values)
         assert isinstance(linear, gtsam.JacobianFactor)
         start = 0
-        for key in factor.keys():  # noqa: SIM118
+        for key in list(factor.keys()):
             size = values.zeroVectors().at(key).size
             expected = numeric(factor, values, key, size)
             given = linear.getA()[:, start : start + size]

@@ -115,44 +115,52 @@ def change_table(path: Path, changes: list[dict[str, Any]]) -> None:
         return
 
 
-def change_column(  # noqa: C901 - one line a way
-    columns: dict[str, Any], change: dict[str, Any]
-) -> None:
+def change_column(columns: dict[str, Any], change: dict[str, Any]) -> None:
     """Change the columns of a table, as lists, in place."""
     names = list(columns)
     if not names:
         return
-    name, row, value = names[change["column"] % len(names)], change["row"], change["value"]
-    column, rows = columns[name], slice(row, row + change["count"])
-    whole = name == "time_ns"
+    name, row = names[change["column"] % len(names)], change["row"]
+    rows = slice(row, row + change["count"])
+    if change["how"] in ("drop", "twice", "cut"):
+        _change_table(columns, change["how"], name, rows)
+    else:
+        _change_values(columns[name], change, rows, whole=name == "time_ns")
+
+
+def _change_table(columns: dict[str, Any], how: str, name: str, rows: slice) -> None:
+    if how == "drop":
+        del columns[name]
+        return
+    for column in columns.values():
+        if how == "twice":
+            column.extend(column[rows])
+        else:
+            del column[rows]
+
+
+def _change_values(column: list[Any], change: dict[str, Any], rows: slice, *, whole: bool) -> None:
+    """Change the values of a column; one of times holds whole numbers."""
+    row, value = rows.start, change["value"]
     number = int(value) if whole and abs(value) < 2**63 else value
+    is_number = all(isinstance(v, int | float) for v in column)
     match change["how"]:
         case "set" if row < len(column):
             column[row] = number
-        case "add" if all(isinstance(v, int | float) for v in column):
+        case "add" if is_number:
             column[rows] = [v + number for v in column[rows]]
         case "all":
             column[:] = [number] * len(column)
         case "scale" if not whole and all(isinstance(v, float) for v in column):
             column[:] = [v * value for v in column]
-        case "drop":
-            del columns[name]
         case "type":
             column[:] = [str(v) for v in column]
         case "text" if row < len(column):
-            column[:] = [
-                str(HOSTILE[change["count"] % len(HOSTILE)] if k == row else v)
-                for k, v in enumerate(column)
-            ]
-        case "twice":
-            for other in columns.values():
-                other.extend(other[rows])
-        case "jump" if whole and abs(value) < 2**40 and all(isinstance(v, int) for v in column):
+            hostile = HOSTILE[change["count"] % len(HOSTILE)]
+            column[:] = [str(hostile if k == row else v) for k, v in enumerate(column)]
+        case "jump" if whole and abs(value) < 2**40 and is_number:
             column[row:] = [v + int(value * 1e6) for v in column[row:]]
         case "nan" if not whole:
             column[rows] = [math.nan] * len(column[rows])
         case "shuffle":
             column.reverse()
-        case "cut":
-            for other in columns.values():
-                del other[rows]

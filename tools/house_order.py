@@ -106,7 +106,7 @@ ROOMS = {
         "jobs": """
             antenna_inputs fix_coil joint_kept receiver_axes region_option rotor_inputs state_rows
             stream_clocks stream_samples written
-            inputs navigate_results
+            inputs navigate_results result_directory
             allan_noise checkpoint failure orientation settings without_beacons
             allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
             calibrate_magnetometer check design_settings drift_world evaluate export init_settings

@@ -38,7 +38,7 @@ def run_allan(settings: AllanSettings, output: Path, report: Report = quiet) -> 
         Where the log cannot be read, or is too short for any estimate.
     """
     from magfusion.jobs.allan_noise import measured
-    from magfusion.jobs.inputs import claim, found_in
+    from magfusion.jobs.result_directory import claim, found_in
     from magfusion.results.plots.allan import write_allan_plot
     from magfusion.results.report import write_report
 

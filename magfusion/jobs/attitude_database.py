@@ -105,7 +105,8 @@ def run_attitude_database(settings: DatabaseSettings, output: Path) -> Figures:
         Where the log has no reference, an angle varies that one vector cannot determine, or
         ``output`` is in the way.
     """
-    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.jobs.inputs import named, read_job
+    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
     from magfusion.results.plots.match import write_database_plot
     from magfusion.results.report import write_report
 

@@ -56,7 +56,8 @@ def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
     EstimationError
         Where the fit does not converge.
     """
-    from magfusion.jobs.inputs import claim, found_in, named, refuse_failed
+    from magfusion.jobs.inputs import named
+    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
     from magfusion.results.plots.antenna import write_antenna_plot
     from magfusion.results.report import write_report
 

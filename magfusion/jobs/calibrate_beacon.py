@@ -79,7 +79,8 @@ def run_calibrate_beacon(settings: BeaconSettings, output: Path, report: Report 
     InputError
         Where a file cannot be used, a beacon was not surveyed, or it is not determined.
     """
-    from magfusion.jobs.inputs import claim, found_in, named, refuse_failed
+    from magfusion.jobs.inputs import named
+    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
     from magfusion.results.plots.beacon import write_beacon_plot
     from magfusion.results.report import write_report
 

@@ -62,7 +62,7 @@ def run_calibrate_fieldmap(settings: MapSettings, output: Path, report: Report =
     ------
     InputError
     """
-    from magfusion.jobs.inputs import claim, found_in, refuse_failed
+    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
     from magfusion.results.plots.fieldmap import write_plot
     from magfusion.results.report import write_report
 

@@ -107,7 +107,8 @@ def run_calibrate_log(
     from magfusion.estimation.batch.batch import SmootherSettings
     from magfusion.estimation.batch.self_survey import smooth_and_place
     from magfusion.estimation.integrity.judge import judge_result
-    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.jobs.inputs import named, read_job
+    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
     from magfusion.results.plots.log_calibration import write_log_calibration_plot
     from magfusion.results.refinement import parameter_estimates, result_site
     from magfusion.results.report import (

@@ -77,7 +77,8 @@ def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
     EstimationError
         Where the calibration has no solution.
     """
-    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed, require_imu
+    from magfusion.jobs.inputs import named, read_job, require_imu
+    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
     from magfusion.results.report import write_report
 
     claimed = claim(job.output, JOB)

@@ -48,7 +48,8 @@ def run_check(
     """
     from magfusion.estimation.demodulation.separate_demodulation import by_name, each_recorded
     from magfusion.estimation.integrity.quick_check import quick_check
-    from magfusion.jobs.inputs import claim, found_in, read_recording
+    from magfusion.jobs.inputs import read_recording
+    from magfusion.jobs.result_directory import claim, found_in
     from magfusion.results.plots.check import write_check_plot
     from magfusion.results.report import write_report
 

@@ -69,7 +69,7 @@ def run_coverage(settings: CoverageSettings, output: Path) -> Figures:
     InputError
         Where the site cannot be read, the settings do not fit, or ``output`` is in the way.
     """
-    from magfusion.jobs.inputs import claim
+    from magfusion.jobs.result_directory import claim
     from magfusion.results.plots.coverage import write_plot
     from magfusion.results.recording_coverage import write_coverage_recording
     from magfusion.results.report import write_report

@@ -43,7 +43,8 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     """
     from magfusion.estimation.demodulation.demodulation import phasors
     from magfusion.estimation.demodulation.separate_demodulation import demodulated_apart
-    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.jobs.inputs import named, read_job
+    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
     from magfusion.results.report import dropped_figures, write_report
 
     claimed, job = claim(output, "demodulate"), settings.job(output)

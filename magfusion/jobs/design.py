@@ -46,7 +46,7 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
     InputError
         Where a file cannot be read, the settings do not fit, or ``output`` is in the way.
     """
-    from magfusion.jobs.inputs import claim
+    from magfusion.jobs.result_directory import claim
     from magfusion.results.plots.design import Panel, write_plot
     from magfusion.results.recording_design import write_design_recording
     from magfusion.results.report import write_report

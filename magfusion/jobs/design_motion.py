@@ -33,7 +33,7 @@ def run_motion(
     InputError
         Where the site declares all parameters as known, or ``output`` is in the way.
     """
-    from magfusion.jobs.inputs import claim
+    from magfusion.jobs.result_directory import claim
     from magfusion.results.plots.motion import write_motion_plot
     from magfusion.results.report import write_report
 

@@ -103,7 +103,8 @@ def run_drift(settings: DriftSettings, output: Path, report: Report | None = Non
         Where an estimator does not start.
     """
     from magfusion.jobs.drift_world import claim_place, run_world
-    from magfusion.jobs.inputs import UNFINISHED_DRIFT, claim
+    from magfusion.jobs.result_directory import claim
+    from magfusion.jobs.written import UNFINISHED_DRIFT
     from magfusion.results.plots.drift import write_plot, write_stability
     from magfusion.results.recording_drift import write_drift_recording
     from magfusion.results.report import write_report

@@ -36,7 +36,7 @@ def failed_figures(
         return _read(output / "report.json")
     if job in _OWN:
         return None
-    from magfusion.jobs.inputs import claim, found_in
+    from magfusion.jobs.result_directory import claim, found_in
     from magfusion.results.report import write_report
 
     trust = Trust((Finding("no_solution", f"{error}.", Verdict.FAILED),))

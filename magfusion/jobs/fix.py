@@ -156,7 +156,8 @@ def run_fix(
     InputError, EstimationError
     """
     from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
-    from magfusion.jobs.inputs import claim, found_in, named, refuse_failed
+    from magfusion.jobs.inputs import named
+    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
     from magfusion.results.report import dropped_figures, fix_figures, where_found
 
     claimed = claim(job.output, "smooth", "fix")
@@ -255,7 +256,8 @@ def _run_coil(
     """Fix a receiver of one axis, whose roll about it is unobservable."""
     from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
     from magfusion.jobs.fix_coil import find_coil
-    from magfusion.jobs.inputs import found_in, named, refuse_failed
+    from magfusion.jobs.inputs import named
+    from magfusion.jobs.result_directory import found_in, refuse_failed
 
     with named(job.log_path):
         samples, _ = fix_inputs(phasors(log, site, lockin)[0], log, site)

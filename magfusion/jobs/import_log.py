@@ -107,7 +107,7 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
     InputError
         With all problems, and options that would resolve ambiguities.
     """
-    from magfusion.jobs.inputs import claim
+    from magfusion.jobs.result_directory import claim
     from magfusion.results.report import write_report
 
     claimed, declared = claim(output, "import"), Findings()

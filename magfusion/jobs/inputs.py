@@ -1,17 +1,12 @@
-"""Inputs and output directory of a job."""
+"""Inputs of a job."""
 
-import json
-import os
 import re
-import shutil
-import sys
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
-from itertools import count
 from pathlib import Path
 
-from magfusion.errors import EstimationError, InputError
+from magfusion.errors import InputError
 from magfusion.estimation.data_checks.data_cleaning import clean_log
 from magfusion.estimation.data_checks.magnetometers import without_silent
 from magfusion.estimation.demodulation.beacon_selection import select_detected
@@ -19,12 +14,6 @@ from magfusion.estimation.demodulation.drive_reference import turning_currents, 
 from magfusion.estimation.demodulation.separate_demodulation import demodulated_apart, of_site
 from magfusion.estimation.demodulation.temperature_compensation import at_reference
 from magfusion.estimation.measurements.signs import along_axis
-from magfusion.files.atomic import (
-    abandoned_pattern,
-    real,
-    refuse_in_the_way,
-    whole_directory,
-)
 from magfusion.files.bag_topics import Topics
 from magfusion.files.fields import order_channels
 from magfusion.files.open import open_log
@@ -34,25 +23,15 @@ from magfusion.files.tum import read_tum
 from magfusion.jobs.receiver_axes import check_axes
 from magfusion.jobs.region_option import ANYWHERE, Where
 from magfusion.jobs.rotor_inputs import check_rotors, is_for_ranging
-from magfusion.jobs.written import CHECKPOINT as CHECKPOINT
-from magfusion.jobs.written import KEPT as KEPT
-from magfusion.jobs.written import LOGS as LOGS
-from magfusion.jobs.written import LOGS_TABLE as LOGS_TABLE
-from magfusion.jobs.written import ROWS as ROWS
-from magfusion.jobs.written import UNFINISHED, WRITTEN
-from magfusion.jobs.written import UNFINISHED_DRIFT as UNFINISHED_DRIFT
 from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import Finding, Trust, Verdict
+from magfusion.model.trust import Finding, Verdict
 from magfusion.model.without_imu import logged
 from magfusion.receiver.receivers import receiver_of
 from magfusion.receiver.windows import LockinSettings
-from magfusion.results.page import PAGE
-from magfusion.results.provenance import current_run
-from magfusion.results.report import FAILED
 
 
 @dataclass(frozen=True)
@@ -93,106 +72,6 @@ NOT_USED = Finding(
     " or navigate with --at-rest.",
     Verdict.TRUSTWORTHY,
 )
-
-
-def _may_be_replaced(path: Path, kinds: tuple[str, ...]) -> bool:
-    """Return whether a directory contains only an earlier result of these jobs."""
-    result = {entry.name for entry in path.iterdir()}
-    # An incomplete checkpoint of a killed run.
-    abandoned = re.compile(abandoned_pattern(r"checkpoint\.(bin|rows)"))
-    result = {name for name in result if not abandoned.fullmatch(name)}
-    if any(result <= UNFINISHED.get(kind, set()) for kind in kinds):
-        return True
-    try:
-        report = json.loads((path / "report.json").read_text(encoding="utf-8"))
-        job = report["job"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
-    return job in kinds and result <= WRITTEN[job] | {FAILED, PAGE}
-
-
-def claim(output: Path, *kinds: str, overwrite: bool = False) -> AbstractContextManager[Path]:
-    """Return a context whose directory becomes ``output`` only on success.
-
-    An obstacle raises an error at once, before the work.
-
-    Parameters
-    ----------
-    overwrite : bool
-        Whether an earlier result is removed, as with ``--overwrite``, rather than moved.
-
-    Raises
-    ------
-    InputError
-        Where ``output`` contains anything but an earlier result of these jobs.
-    """
-
-    def replaces(path: Path) -> bool:
-        return _may_be_replaced(path, kinds)
-
-    def backup(path: Path) -> Path | None:
-        run = current_run()
-        if overwrite or (run is not None and run.overwrite):
-            return None
-        return _backup_path(path, kinds)
-
-    refuse_in_the_way(real(output), replaces)
-    return whole_directory(output, replaces, backup)
-
-
-def _backup_path(path: Path, kinds: tuple[str, ...]) -> Path | None:
-    """Return the place of an earlier result, without files of the run that ends; None of none."""
-    if not (path / "report.json").is_file():
-        return None
-    for name in set[str]().union(*(UNFINISHED.get(kind, set()) for kind in kinds)):
-        if (path / name).is_dir():
-            shutil.rmtree(path / name)
-        (path / name).unlink(missing_ok=True)
-    numbered = (path.with_name(f"{path.name}.{number}") for number in count(1))
-    kept = next(other for other in numbered if not os.path.lexists(other))
-    sys.stderr.write(
-        f"magfusion: {path}: the earlier result is now in {kept.name}; --overwrite replaces it\n"
-    )
-    return kept
-
-
-def keep_results(whole: Path, logs: list[tuple[str, Path, Path]]) -> None:
-    """Copy the files of several logs into the directory that becomes the output.
-
-    Parameters
-    ----------
-    logs : list of (str, Path, Path)
-        Name of each, its file, and the directory of its results.
-    """
-    (whole / KEPT).mkdir()
-    for name, kept, results in logs:
-        if kept.is_file():
-            shutil.copy2(kept, whole / KEPT / kept.name)
-        if results.is_dir():
-            shutil.copytree(results, whole / LOGS / name)
-
-
-def found_in(directory: Path, trust: Trust) -> Path:
-    """Return the directory of results: a separate one for a failed verdict."""
-    if trust.verdict is not Verdict.FAILED:
-        return directory
-    (directory / FAILED).mkdir()
-    return directory / FAILED
-
-
-def refuse_failed(place: Path, output: Path, trust: Trust) -> None:
-    """Raise an error for a failed verdict, after its report is written.
-
-    Raises
-    ------
-    EstimationError
-        With the first reason.
-    """
-    if trust.verdict is Verdict.FAILED:
-        raise EstimationError(
-            f"{place}: failed: {trust.ordered[0].text} The reasons are in {output / 'report.json'},"
-            f" the estimates in {output / FAILED}"
-        )
 
 
 @contextmanager

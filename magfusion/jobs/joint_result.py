@@ -12,9 +12,11 @@ import numpy as np
 from magfusion.estimation.posterior.noise_tuning import Tuned, with_noise
 from magfusion.files.row_table import write_rows
 from magfusion.files.site import save_site
-from magfusion.jobs.inputs import LOGS, LOGS_TABLE, Job, claim, keep_results
+from magfusion.jobs.inputs import Job
 from magfusion.jobs.joint_run import Joint, refine, tasks_of
 from magfusion.jobs.joint_tasks import together_settings
+from magfusion.jobs.result_directory import claim, keep_results
+from magfusion.jobs.written import LOGS, LOGS_TABLE
 from magfusion.model.parameters import Calibration
 from magfusion.model.progress import Report
 from magfusion.results.figures import (

@@ -27,7 +27,7 @@ from magfusion.estimation.integrity.logs_agree import LogAgreement, agreement
 from magfusion.files.atomic import real
 from magfusion.files.checkpoint import run_key
 from magfusion.files.kept import digest_of_files
-from magfusion.jobs.inputs import KEPT, Job, read_job, read_site
+from magfusion.jobs.inputs import Job, read_job, read_site
 from magfusion.jobs.joint_kept import Alone
 from magfusion.jobs.joint_tasks import (
     LastTask,
@@ -38,6 +38,7 @@ from magfusion.jobs.joint_tasks import (
     one_round,
     shared_of,
 )
+from magfusion.jobs.written import KEPT
 from magfusion.model.progress import Report
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk, Trust, Verdict

@@ -21,8 +21,9 @@ from magfusion.estimation.batch.joint_log import (
 from magfusion.estimation.integrity.judge import judge_result
 from magfusion.estimation.posterior.marginalized_log import shared_blocks
 from magfusion.jobs.failure import reason_of
-from magfusion.jobs.inputs import Job, claim, named, read_job
+from magfusion.jobs.inputs import Job, named, read_job
 from magfusion.jobs.joint_kept import Alone, load_alone, save_alone
+from magfusion.jobs.result_directory import claim
 from magfusion.model.parameters import GROUPS, initial_calibration
 from magfusion.model.samples import Log
 from magfusion.model.site import Site

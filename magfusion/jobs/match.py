@@ -85,7 +85,8 @@ def run_match(settings: MatchSettings, output: Path) -> Figures:
         Where more angles are requested than the vectors determine, with a remedy; where a file
         cannot be read, or ``output`` is in the way.
     """
-    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed, require_imu
+    from magfusion.jobs.inputs import named, read_job, require_imu
+    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
     from magfusion.results.plots.match import write_match_plot
     from magfusion.results.report import write_report
 

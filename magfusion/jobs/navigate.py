@@ -115,8 +115,10 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
     EstimationError
         Where the log gives no state.
     """
-    from magfusion.jobs.inputs import CHECKPOINT, claim, found_in, named, read_job, refuse_failed
+    from magfusion.jobs.inputs import named, read_job
     from magfusion.jobs.navigate_results import motion_of, write_navigated
+    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
+    from magfusion.jobs.written import CHECKPOINT
     from magfusion.results.report import write_report
 
     job, claimed = settings.job(output), claim(output, "navigate")
@@ -237,7 +239,7 @@ def _clear(run: NavigateRun, place: Path, outputs: list[Path]) -> None:
 
 
 def _rows_path(place: Path) -> Path:
-    from magfusion.jobs.inputs import CHECKPOINT, ROWS
+    from magfusion.jobs.written import CHECKPOINT, ROWS
 
     return place.with_name(ROWS if place.name == CHECKPOINT else f"{place.name}.rows")
 

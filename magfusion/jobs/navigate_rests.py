@@ -127,7 +127,8 @@ def run_rests(job: Job, how: How, report: Report = quiet) -> Figures:
     InputError, EstimationError
         Where it does not rest, or no beacon is detected.
     """
-    from magfusion.jobs.inputs import claim, named, read_job, refuse_failed
+    from magfusion.jobs.inputs import named, read_job
+    from magfusion.jobs.result_directory import claim, refuse_failed
 
     claimed = claim(job.output, "navigate")
     log, site = read_job(job, reference=True, select_beacons=False, report=report)
@@ -174,7 +175,7 @@ def _newest_of_rests(states: list[RestState]) -> list[RestState]:
 
 def _written(whole: Path, log: Log, site: Site, reported: list[RestState], trust: Trust) -> Figures:
     """Write the poses, and return their figures."""
-    from magfusion.jobs.inputs import found_in
+    from magfusion.jobs.result_directory import found_in
     from magfusion.results.recording import write_recording
     from magfusion.results.report import compared_with_truth
 

@@ -20,7 +20,8 @@ from magfusion.files.site import save_site
 from magfusion.files.stream import Format, json_line, read_records
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
-from magfusion.jobs.inputs import Job, claim, named, read_job, require_imu
+from magfusion.jobs.inputs import Job, named, read_job, require_imu
+from magfusion.jobs.result_directory import claim
 from magfusion.jobs.stream_samples import StreamSamples
 from magfusion.model.progress import Report
 from magfusion.model.samples import Log

@@ -14,7 +14,8 @@ from magfusion.files.survey import read_survey
 from magfusion.files.table import TIME, Span, write_table
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
-from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+from magfusion.jobs.inputs import named, read_job
+from magfusion.jobs.result_directory import claim, found_in, refuse_failed
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Trust, uniform_trust
 from magfusion.model.truth_poses import truth_poses

@@ -52,7 +52,8 @@ def run_range(settings: RangeSettings, output: Path) -> Figures:
     InputError
         Where the site has no rotor, or other beacons; or the log lacks data for ranging.
     """
-    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.jobs.inputs import named, read_job
+    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
     from magfusion.results.plots.ranging import RangePicture, write_range_plot
     from magfusion.results.report import write_report
 

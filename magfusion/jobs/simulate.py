@@ -251,7 +251,7 @@ def run_simulate(site: Site, config: SimulationConfig, output: Path, seed: int) 
     InputError
         Where ``output`` is in the way, or the configuration does not fit the site.
     """
-    from magfusion.jobs.inputs import claim
+    from magfusion.jobs.result_directory import claim
     from magfusion.results.report import write_report
 
     claimed = claim(output, "simulate")

@@ -116,7 +116,7 @@ def simulate_ranging(
     `neighbour` : tuple of Pipe
         Steel near the wells.
     """
-    from magfusion.jobs.inputs import claim
+    from magfusion.jobs.result_directory import claim
     from magfusion.results.report import write_report
 
     entry, claimed = read_wells(settings.wells), claim(output, "simulate")

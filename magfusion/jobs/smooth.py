@@ -185,7 +185,8 @@ def run_smooth(
         In the latter case the single-epoch fixes are saved in the output directory.
     """
     from magfusion.estimation.batch.self_survey import smooth_and_place
-    from magfusion.jobs.inputs import claim, named, refuse_failed
+    from magfusion.jobs.inputs import named
+    from magfusion.jobs.result_directory import claim, refuse_failed
     from magfusion.jobs.smooth_correction import corrected
     from magfusion.jobs.smooth_failure import Failure, save_failure
     from magfusion.jobs.smooth_result import finished, with_errors, write_finished

@@ -20,7 +20,7 @@ from magfusion.estimation.integrity.diagnosis import (
 )
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.jobs.fix import write_fix_result
-from magfusion.jobs.inputs import found_in
+from magfusion.jobs.result_directory import found_in
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import Log
 from magfusion.model.site import Site

@@ -35,7 +35,7 @@ from magfusion.files.site import save_site
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
 from magfusion.jobs.failure import reason_of
-from magfusion.jobs.inputs import found_in
+from magfusion.jobs.result_directory import found_in
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk, StateTrust, Trust, Verdict

@@ -64,7 +64,8 @@ def run_survey(settings: SurveySettings, output: Path) -> Figures:
         Where the log has no pose, none of its epochs can be a point, or ``output`` is in the way.
     """
     from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
-    from magfusion.jobs.inputs import claim, named, read_job
+    from magfusion.jobs.inputs import named, read_job
+    from magfusion.jobs.result_directory import claim
     from magfusion.results.plots.survey import write_survey_plot
     from magfusion.results.report import dropped_figures, write_report
 

@@ -30,7 +30,7 @@ class RunningClock:
     Parameters
     ----------
     known : str, optional
-        of `stamping`, where it need not be found.
+        Kind of stamps, where it need not be found.
 
     Attributes
     ----------
@@ -67,10 +67,9 @@ class RunningClock:
 
     def end(self) -> tuple[Array, Array]:
         """Return the samples that wait at the end of the stream."""
-        waiting = self._waiting
-        return (
-            (np.empty(0), np.empty((0, self._width))) if waiting is None else self._decide(*waiting)
-        )
+        if self._waiting is None:
+            return np.empty(0), np.empty((0, self._width))
+        return self._decide(*self._waiting)
 
     def _gather(self, stamps: Array, rows: Array) -> tuple[Array, Array]:
         """Keep samples until the kind of clock is known."""
@@ -137,11 +136,10 @@ class RunningClock:
             tick = self._tick + np.arange(len(before))
             ends = np.flatnonzero(np.diff(before) > TOGETHER * self.step)
         else:
-            tick = np.full(len(before), self._tick)
-            for k, stamp in enumerate(stamps.tolist()):
-                ahead = (stamp - self._origin) / self.step - tick[k]
-                tick[k + 1] = tick[k] + max(1, round(ahead))
-            ends = np.arange(1, len(before))
+            nearest = np.rint((stamps - self._origin) / self.step).astype(np.int64)
+            count = np.arange(len(before))  # every sample has a tick of its own
+            tick = np.maximum.accumulate(np.append(self._tick, nearest) - count) + count
+            ends = count[1:]
         points = np.stack([tick[ends], before[ends]])
         self._points = np.hstack([self._points, points])[:, -MEMORY:]
         self._tick, self._stamp = int(tick[-1]), float(stamps[-1])

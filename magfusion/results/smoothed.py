@@ -16,6 +16,7 @@ from magfusion.files.blas_threads import warn_about_threads
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
+from magfusion.model.without_imu import logged
 from magfusion.results.figures import Figures, heading
 from magfusion.results.page import head_in_notebook
 from magfusion.results.report import smoothed_figures
@@ -102,7 +103,7 @@ def smooth(
     warn_about_threads()
     if factors is not None:
         user = UserFactors.of(factors, values, np.asarray(times, dtype=float))
-        begin, end = log.imu.time[[0, -1]]
+        begin, end = logged(log, site)[0].imu.time[[0, -1]]
         outside = user.time[(user.time < begin) | (user.time > end)]
         if len(outside):
             raise InputError(

@@ -98,12 +98,7 @@ def field_factor(
         robust=loss,
     )
     keys = CalibrationKeys(calibration, ()) if keys is None else keys
-    own = [
-        key
-        for (key, _), block in zip(keys.parts, keys.blocks, strict=True)
-        if not isinstance(block.parameter, BeaconParameter) or block.owner == channel[0]
-    ]
-    return _factor(measurement, keys, pose_key, k, own, 6)
+    return _factor(measurement, keys, pose_key, k, channel[0], 6)
 
 
 def earth_field_factor(
@@ -150,12 +145,7 @@ def earth_field_factor(
         robust=robust,
     )
     keys = CalibrationKeys(calibration, ()) if keys is None else keys
-    own = [
-        key
-        for (key, _), block in zip(keys.parts, keys.blocks, strict=True)
-        if not isinstance(block.parameter, BeaconParameter)
-    ]
-    return _factor(measurement, keys, pose_key, 0, own, 3)
+    return _factor(measurement, keys, pose_key, 0, None, 3)
 
 
 def zero_velocity_factor(velocity_key: int, sigma: float) -> gtsam.PriorFactorVector:
@@ -170,8 +160,14 @@ def _factor(
     keys: CalibrationKeys,
     pose_key: int,
     group: int,
-    own: list[int],
+    beacon: str | None,
     components: int,
 ) -> gtsam.NoiseModelFactor:
+    """Return a factor on a pose, and on the parameters of one beacon and of no beacon."""
+    own = [
+        key
+        for (key, _), block in zip(keys.parts, keys.blocks, strict=True)
+        if not isinstance(block.parameter, BeaconParameter) or block.owner == beacon
+    ]
     shared = EpochRows(measurement, keys, MotionKeys(pose_key, ABSENT, ABSENT))
     return group_factor(shared, group, [pose_key, *own], components)

@@ -414,10 +414,11 @@ class Navigator:
         result._discontinuities.counter += self.started
         result.counts.update(self.counts)
         result.counts["started again"] += 1
-        known, result._earlier = self._judgement.verdict is Verdict.TRUSTWORTHY, self._earlier
-        if self._estimator is not None:
-            known &= not self.corrected
-            result._earlier = _on_site(self._estimator.state, result.site) if known else None
+        trusted = self._judgement.verdict is Verdict.TRUSTWORTHY and not self.corrected
+        if self._estimator is None:
+            result._earlier = self._earlier
+        elif trusted:
+            result._earlier = _on_site(self._estimator.state, result.site)
         return result
 
     def is_after_silence(self, time: float) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.integrity.change_detection import (
+    CHANGED,
     MOST_BEACONS,
     TYPICAL,
     StepChange,
@@ -106,7 +107,7 @@ class BeaconSteps:
             gain = gains(np.eye(len(rows))[None], own, gradient[rows])
             if gain[0] > LEAST_EVIDENCE + price:
                 combine = np.eye(len(gradient))[:, rows]
-                result.append(Suspect(changed_name(moved), moved, combine, "changed"))
+                result.append(Suspect(changed_name(moved), moved, combine, CHANGED))
         return result
 
     def _events(self, steps: list[Block]) -> Iterator[tuple[Block, ...]]:
