@@ -68,8 +68,8 @@ class SmootherSettings(EstimatorSettings):
     factors : UserFactors, optional
         A user's, with the times at which states are made.
     engine : {'bordered', 'gtsam'}
-        Optimiser of each pass: our loop, or GTSAM's Levenberg-Marquardt, to check it: its time
-        grows with the square of the length of the log.
+        Optimiser of each pass: our loop, or GTSAM's Levenberg-Marquardt, which is slower, to check
+        it.
     """
 
     __repr__ = short_repr
