@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from itertools import groupby
 from pathlib import Path
 
 SCRIPTS = Path(sys.executable).parent
@@ -23,17 +24,20 @@ def blocks(page: str) -> list[tuple[str, str]]:
 def run_blocks(page: str, directory: Path) -> None:
     """Run the commands of a page in a directory; what it shows of one must be what it says."""
     shown = ""
-    for language, block in blocks(page):
-        if language == "yaml":
-            (directory / block.split()[1]).write_text(block, encoding="utf-8")
-        elif language == "sh":
-            for command in _commands(block):
-                shown = _run(command, directory)
-        elif language == "python":
-            _run([sys.executable, "-c", block], directory)
-        else:
-            reported = differences(block, shown)
-            assert not reported, "\n".join(reported)
+    for is_python, together in groupby(blocks(page), key=lambda block: block[0] == "python"):
+        contents = list(together)
+        if is_python:  # a block has the names of the one before
+            _run([sys.executable, "-c", "".join(content for _, content in contents)], directory)
+            continue
+        for language, block in contents:
+            if language == "yaml":
+                (directory / block.split()[1]).write_text(block, encoding="utf-8")
+            elif language == "sh":
+                for command in _commands(block):
+                    shown = _run(command, directory)
+            else:
+                reported = differences(block, shown)
+                assert not reported, "\n".join(reported)
 
 
 def _commands(block: str) -> list[str]:
