@@ -10,7 +10,8 @@ from pydantic import ValidationError
 from magfusion.files.site_schema import SiteEntry
 from magfusion.files.yaml_files import StrictModel
 
-PAGE = (Path(__file__).parents[1] / "docs" / "formats.md").read_text()
+DOCS = Path(__file__).parents[1] / "docs"
+PAGE = "".join((DOCS / name).read_text() for name in ("formats.md", "aiding.md"))
 VERSION = "magfusion_site"  # of the file itself, which the first page shows
 
 

@@ -490,11 +490,11 @@ def test_every_kind_of_parameter_has_its_own_words_and_walks_as_the_site_says():
         words = {block.parameter.called(site, block.owner, i) for i in range(len(block.sigma))}
         assert block.kind == "phase" or len(words) == len(block.sigma)
         assert block.kind not in words
-    walks = {b.kind: b.parameter.walk_per_sqrt_hour(site) for b in ALL}
+    walks = {b.kind: b.parameter.walk_per_sqrt_hour(site, b.owner) for b in ALL}
     assert {k: v for k, v in walks.items() if v} == {
         "log_moment": 1e-3,
         "phase": 0.02,
         "drift": 1e-8,
     }
     faster = replace(site, clock=ClockModel(phase_walk=0.5))
-    assert PHASE.walk_per_sqrt_hour(faster) == 0.5
+    assert PHASE.walk_per_sqrt_hour(faster, "") == 0.5

@@ -187,6 +187,7 @@ def test_only_solve_optimises() -> None:
 
 
 SIMULATOR_SEES = {
+    "aiding",  # what a sensor is and records; how it measures is the estimator's
     "arguments",
     "correlation",
     "marks",

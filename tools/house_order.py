@@ -28,7 +28,7 @@ ROOMS = {
             arguments batches correlation drive field_map fixed_axes groups hall hermite
             imu_intrinsics marks perturbation physics platform_motion probe progress quaternion
             region response rotor short_repr temperature time_division trust
-            magnetometer
+            aiding magnetometer
             site trajectory
             truth_poses
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
@@ -42,13 +42,14 @@ ROOMS = {
             site_values standard_streams stray_stamps
             bag_reader bag_rows checkpoint correlation field_map kept lost_rows probe row_file
             survey table yaml_files
-            attitude_table drive_columns fields hall instruments readings_table site_casing
-            site_correlation site_motion site_region site_response site_rotor site_temperature
+            aiding_tables attitude_table drive_columns fields hall instruments readings_table
+            site_casing site_correlation site_motion site_region site_response site_rotor
+            site_temperature
             row_stamps trajectory_table wells_file
             bag depth_table fix_table marks_table result_states rotor_columns site_plain site_text
             temperature_table tum
             inertial_tables odometry_bag site_magnetometer stream
-            trajectory_formats
+            site_aiding trajectory_formats
             named_records named_samples site_schema stream_contents
             log site
             foreign open site_changes
@@ -68,7 +69,7 @@ ROOMS = {
         "simulation": """
             atmosphere demo_site ground layers magnetometers monte_carlo motion perturbed pipe shaft
             slots
-            disturbance inertial rails rotor rotor_beacons
+            aiding disturbance inertial rails rotor rotor_beacons
             drift field wells
             waveform
             log

@@ -9,6 +9,7 @@ import pyarrow as pa
 from pydantic import Field
 
 from magfusion.errors import InputError
+from magfusion.files.aiding_tables import read_aiding, write_aiding
 from magfusion.files.atomic import whole_directory
 from magfusion.files.depth_table import read_depths, write_depths
 from magfusion.files.drive_columns import read_drive
@@ -27,13 +28,17 @@ from magfusion.files.table import LARGEST_TIME_NS, Span, find_table
 from magfusion.files.temperature_table import read_temperatures, write_temperatures
 from magfusion.files.trajectory_table import read_trajectory, write_trajectory
 from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
+from magfusion.model.aiding import QUANTITIES
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
 
 HEADER = "log.yaml"
 _NOTHING: tuple[Finding, ...] = ()
-STREAMS = ("imu", "magnetometer", "fields", "truth", "temperature", "marks", "reference", "depth")
+STREAMS = (
+    *("imu", "magnetometer", "fields", "truth", "temperature", "marks", "reference", "depth"),
+    *QUANTITIES,
+)
 
 
 class LogHeader(StrictModel):
@@ -118,6 +123,7 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
         rotation=read_rotation(tables["magnetometer"], span),
         depths=read_depths(tables["depth"], header.epoch_ns),
         waveforms=waveforms,
+        aiding=read_aiding({kind: tables[kind] for kind in QUANTITIES}, span),
     )
     if log.waveform is None and log.fields is None and not log.waveforms:
         raise InputError(f"{path}: holds no field {span}; choose a span that the log covers.")
@@ -155,6 +161,7 @@ def write_log(log: Log, path: Path) -> None:
             write_temperatures(known, unfinished / "temperature.parquet", log.epoch_ns)
         if log.depths is not None and log.depths.readings:
             write_depths(log.depths, unfinished / "depth.parquet", log.epoch_ns)
+        write_aiding(log.aiding, unfinished, log.epoch_ns)
 
 
 def _write_samples(log: Log, directory: Path) -> None:

@@ -20,6 +20,7 @@ from magfusion.files.table import Span, find_table
 from magfusion.files.table_stream import SampleBlock, pieces
 from magfusion.files.temperature_table import read_temperatures
 from magfusion.files.yaml_files import read_yaml
+from magfusion.model.aiding import QUANTITIES
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.temperature import Temperatures
 from magfusion.units import Array
@@ -147,7 +148,7 @@ def long_log(path: Path, start: float | None = None, end: float | None = None) -
     if tables["imu"] is None or tables["magnetometer"] is tables["fields"] is None:
         return None  # which is refused where it is read whole
     raw = tables["magnetometer"]
-    if any(find_table(path, name) is not None for name in ("marks", "reference")) or (
+    if any(find_table(path, name) is not None for name in ("marks", "reference", *QUANTITIES)) or (
         raw is not None
         and (
             drive_columns(raw)

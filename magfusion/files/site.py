@@ -9,6 +9,7 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.files.field_map import read_field_maps, write_field_maps
+from magfusion.files.site_aiding import aiding_entries, aiding_sensor
 from magfusion.files.site_correlation import load_correlation, save_correlation
 from magfusion.files.site_ground import ground_entry, log_sigma
 from magfusion.files.site_magnetometer import magnetometer_entries, magnetometer_of, with_left_out
@@ -134,6 +135,7 @@ def site_of_entry(entry: SiteEntry, path: Path) -> Site:
         earth=model_of(EarthModel, entry.world.earth),
         region=None if entry.region is None else entry.region.region(),
         reference_world=None if entry.reference is None else entry.reference.position_m,
+        aiding=tuple(map(aiding_sensor, entry.aiding)),
     )
     if entry.correlation is None:
         return site
@@ -211,6 +213,7 @@ def site_content(site: Site) -> dict[str, Any]:
         },
         **_model_entry("clock", site.clock, ClockEntry),
         **region_entry(site.region),
+        **aiding_entries(site.aiding),
     }
     if site.reference_world is not None:
         content["reference"] = {"position_m": site.reference_world.tolist()}

@@ -13,6 +13,7 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticKnownError
 
+from magfusion.files.site_aiding import AidingEntry
 from magfusion.files.site_magnetometer import (
     MagnetometerEntry,
     check_magnetometers,
@@ -405,6 +406,7 @@ class SiteEntry(StrictModel):
     clock: ClockEntry = ClockEntry()
     region: RegionEntry | None = None
     reference: ReferenceEntry | None = None
+    aiding: list[AidingEntry] = Field(default_factory=list)
     calibration: dict[str, Any] | None = None
     correlation: Annotated[str, Field(min_length=1)] | None = None
 
@@ -430,4 +432,11 @@ class SiteEntry(StrictModel):
                 first = names.index(name)
                 remedy = f"give it another name than beacons[{first}]"
                 raise refusal_at(("beacons", i, "name"), name, remedy)
+        names = []
+        for i, sensor in enumerate(self.aiding):
+            name = sensor.name or sensor.quantity
+            if name in names:
+                remedy = f"give it another name than aiding[{names.index(name)}]"
+                raise refusal_at(("aiding", i, "name"), name, remedy)
+            names.append(name)
         return self

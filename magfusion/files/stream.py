@@ -19,6 +19,7 @@ from magfusion.files.plausible import beyond_range
 from magfusion.files.site_temperature import COLDEST, HOTTEST
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS
 from magfusion.files.yaml_files import StrictModel, sentence
+from magfusion.model.aiding import AidingSamples, Quantity
 from magfusion.model.drive import DriveSamples
 from magfusion.model.marks import UNKNOWN_SLOT
 from magfusion.model.samples import FieldSamples
@@ -82,6 +83,12 @@ def _series(value: object) -> Array:
     if result.ndim != 1:
         raise PydanticCustomError("series", "it should be {what}", {"what": what})
     return result
+
+
+def _series_or_vectors(value: object) -> Array:
+    """Return numbers with one or three columns, (k, columns)."""
+    nested = isinstance(value, list) and any(isinstance(row, list) for row in value)
+    return _vectors(value) if nested else _series(value)[:, None]
 
 
 def _slots(value: object) -> IntArray:
@@ -248,6 +255,25 @@ class MarksRecord(_Arrays):
         return self
 
 
+class AidingRecord(_Arrays):
+    """Samples of one aiding sensor: stamps (k,), and values (k,) or (k, 3), or names of marks (k,).
+
+    Values are in m/s, m, Pa or rad; null where an axis is not measured.
+    """
+
+    time: Annotated[Array, PlainValidator(_times)]
+    value: Annotated[Array, PlainValidator(_series_or_vectors)] | None = None
+    mark: list[str] | None = None
+
+    @model_validator(mode="after")
+    def _check_lengths(self) -> "AidingRecord":
+        if (self.value is None) == (self.mark is None):
+            raise PydanticCustomError("aiding", "it should have either value or mark")
+        given = {"mark": np.array(self.mark)} if self.value is None else {"value": self.value}
+        _check_lengths(self.time, **given)
+        return self
+
+
 class Record(StrictModel):
     """One line of the stream; it may hold several kinds of samples."""
 
@@ -258,11 +284,12 @@ class Record(StrictModel):
     drive: DriveRecord | None = None
     marks: MarksRecord | None = None
     reference: ReferenceRecord | None = None
+    aiding: dict[str, AidingRecord] | None = None
 
     @model_validator(mode="after")
     def _not_empty(self) -> "Record":
         if all(getattr(self, kind) is None for kind in type(self).model_fields):
-            kinds = "imu, magnetometer, fields, temperature, drive, marks or reference"
+            kinds = "imu, magnetometer, fields, temperature, drive, marks, reference or aiding"
             raise PydanticCustomError("empty", "it should hold {kinds}", {"kinds": kinds})
         return self
 
@@ -399,6 +426,27 @@ def _checked(number: int, read: Callable[[], Record]) -> NumberedRecord:
 def json_line(content: dict[str, Any]) -> bytes:
     """Return plain values as one line of JSON."""
     return json.dumps(content, allow_nan=False).encode() + b"\n"
+
+
+def aiding_samples(entry: AidingRecord, quantity: Quantity) -> AidingSamples:
+    """Return the samples of a record of a sensor of some quantity, without those that are missing.
+
+    Raises
+    ------
+    InputError
+        If they are of another.
+    """
+    if quantity == "mark" and entry.mark is not None:
+        return AidingSamples(
+            quantity, entry.time, np.zeros((len(entry.time), 0)), tuple(entry.mark)
+        )
+    columns = 3 if quantity in ("velocity", "position") else 1
+    if quantity == "mark" or entry.value is None or entry.value.shape[1] != columns:
+        wanted = "mark" if quantity == "mark" else f"value with {columns} numbers a sample"
+        raise InputError(f"a sensor of {quantity} needs {wanted}")
+    there = np.isfinite(entry.value)
+    kept = there.any(axis=1) if quantity == "velocity" else there.all(axis=1)
+    return AidingSamples(quantity, entry.time[kept], entry.value[kept])
 
 
 def drive_samples(entry: DriveRecord) -> DriveSamples:

@@ -1,6 +1,6 @@
 """What was recorded as records of a pipe; `magfusion.files.stream` reads them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, BinaryIO
 
 import msgpack
@@ -8,6 +8,7 @@ import numpy as np
 
 from magfusion.files.drive_columns import column_of
 from magfusion.files.stream import Format, json_line
+from magfusion.model.aiding import AidingSamples
 from magfusion.model.drive import DriveSamples
 from magfusion.model.marks import Marks
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
@@ -41,6 +42,19 @@ def reference_content(waveform: Waveform) -> dict[str, Any]:
     """Return samples of a reference sensor as a record."""
     field = [_or_none(row) for row in waveform.measured_sensor]
     return {"reference": {"time": waveform.time.tolist(), "field": field}}
+
+
+def aiding_content(aiding: Iterable[tuple[str, AidingSamples]]) -> dict[str, Any]:
+    """Return samples of aiding sensors, by name, as a record."""
+    return {"aiding": {name: _aiding_entry(samples) for name, samples in aiding}}
+
+
+def _aiding_entry(samples: AidingSamples) -> dict[str, Any]:
+    time = samples.time.tolist()
+    if samples.marks:
+        return {"time": time, "mark": list(samples.marks)}
+    rows = [_or_none(row) for row in samples.value]
+    return {"time": time, "value": rows if samples.value.shape[1] > 1 else [row[0] for row in rows]}
 
 
 def marks_content(marks: Marks) -> dict[str, Any]:

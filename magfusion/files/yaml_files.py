@@ -150,12 +150,15 @@ _REMEDIES = {
     "less_than": "write a number less than {lt}",
     "less_than_equal": "write a number less than or equal to {le}",
     "list_type": "write a list",
+    "model_attributes_type": "write a mapping",
     "literal_error": "write {expected}",
     "string_pattern_mismatch": "write text of the form {pattern}",
     "string_too_short": "write at least {min_length} characters",
     "string_type": "write text",
     "too_long": "write at most {max_length} entries",
     "too_short": "write at least {min_length} entries",
+    "union_tag_invalid": "give for {discriminator} one of {expected_tags}",
+    "union_tag_not_found": "add {discriminator}",
 }
 _PYDANTIC = frozenset(get_args(ErrorType))
 
@@ -163,19 +166,19 @@ _PYDANTIC = frozenset(get_args(ErrorType))
 def sentence(error: ValidationError, model: type[BaseModel], whole: str = "file") -> str:
     """Return what is wrong, and the remedy, of content that does not fit its model."""
     first, others = error.errors(include_url=False)[0], error.error_count() - 1
-    named = [part for part in first["loc"] if part != "[key]"]
+    named, within = _followed(model, first["loc"])
     place = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in named).lstrip(".")
     code = first["type"]
     if code == "missing":
         what = "is missing; add it"
     elif code == "extra_forbidden":
-        accepted = ", ".join(_keys(model, first["loc"]))
+        accepted = ", ".join(within.model_fields)
         what = f"is not a known key; remove it or write one of {accepted}"
     elif code == "json_invalid":
         reason = str(first["ctx"]["error"])
         what = f"found {_shortened(first['input'])}; write valid JSON ({reason})"
     elif code == "model_type":
-        accepted = ", ".join(_keys(model, (*first["loc"], "")))
+        accepted = ", ".join(within.model_fields)
         what = f"found {_shortened(first['input'])}; write a mapping with the keys {accepted}"
     else:
         # The messages of validators of this package are whole sentences.
@@ -186,17 +189,33 @@ def sentence(error: ValidationError, model: type[BaseModel], whole: str = "file"
     return f"{place}: {what}{more}." if place else f"{what}{more}."
 
 
-def _keys(model: type[BaseModel], place: tuple[int | str, ...]) -> list[str]:
-    for part in place[:-1]:
-        if isinstance(part, str):
-            model = _model_in(model.model_fields[part].annotation) or model
-    return list(model.model_fields)
+def _followed(
+    model: type[BaseModel], place: tuple[int | str, ...]
+) -> tuple[list[int | str], type[BaseModel]]:
+    """Return a place in a file, without what only a model has, and the model there."""
+    named, among = list[int | str](), [model]
+    for part in place:
+        tagged = [m for m in among if len(among) > 1 and part in _tags(m)]
+        if part in among[0].model_fields:
+            among = _models_in(among[0].model_fields[str(part)].annotation) or among[:1]
+        elif tagged:
+            among = tagged
+            continue
+        if part != "[key]":
+            named.append(part)
+    return named, among[0]
 
 
-def _model_in(annotation: Any) -> type[BaseModel] | None:
+def _tags(model: type[BaseModel]) -> tuple[Any, ...]:
+    """Return the values of the key that distinguishes a model from others in the same place."""
+    tag = model.model_fields.get("quantity")
+    return () if tag is None else get_args(tag.annotation)
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type):
-        return annotation if issubclass(annotation, BaseModel) else None
-    return next(filter(None, map(_model_in, get_args(annotation))), None)
+        return [annotation] if issubclass(annotation, BaseModel) else []
+    return [model for part in get_args(annotation) for model in _models_in(part)]
 
 
 def _shortened(value: object) -> str:

@@ -15,6 +15,7 @@ from magfusion.files.long_log import LongLog, long_log
 from magfusion.files.open import open_log
 from magfusion.files.standard_streams import binary_output, until_closed
 from magfusion.files.stream_contents import (
+    aiding_content,
     drive_content,
     fields_contents,
     imu_content,
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from magfusion.estimation.online.navigator import Navigator
     from magfusion.files.long_log import LongLog
     from magfusion.files.stream import Format
+    from magfusion.model.aiding import AidingSamples
     from magfusion.model.drive import DriveSamples
     from magfusion.model.marks import Marks
     from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
@@ -53,6 +55,8 @@ class Packet:
         One epoch each.
     waveforms : tuple of (str, Waveform)
         Of several magnetometers, those with samples or marks in it.
+    aiding : tuple of (str, AidingSamples)
+        Of the aiding sensors with samples in it.
     """
 
     arrival: float
@@ -60,6 +64,7 @@ class Packet:
     waveform: Waveform | None
     fields: tuple[FieldSamples, ...]
     waveforms: tuple[tuple[str, Waveform], ...] = ()
+    aiding: tuple[tuple[str, AidingSamples], ...] = ()
 
     @property
     def waves(self) -> Iterator[tuple[str | None, Waveform]]:
@@ -84,6 +89,7 @@ class Replay:
         streams = [log.imu.time, self._field_arrival]
         streams += [] if log.waveform is None else [log.waveform.time]
         streams += [wave.time for wave in log.waveforms.values()]
+        streams += [samples.time for samples in log.aiding.values()]
         known = [s for s in streams if len(s)]
         first = min(float(s[0]) for s in known)
         last = max(float(s[-1]) for s in known)
@@ -94,6 +100,7 @@ class Replay:
         self._waveform = _places(none if log.waveform is None else log.waveform.time, self._edges)
         self._each = {n: _places(w.time, self._edges) for n, w in log.waveforms.items()}
         self._fields = _places(self._field_arrival, self._edges)
+        self._aiding = {n: _places(s.time, self._edges) for n, s in log.aiding.items()}
 
     def __len__(self) -> int:
         return len(self._edges) - 1
@@ -112,6 +119,11 @@ class Replay:
             else replace(waveform.rows(part), marks=self._marks(waveform, k)),
             fields=() if fields is None else tuple(fields.rows(slice(i, i + 1)) for i in rows),
             waveforms=self._of_several(k),
+            aiding=tuple(
+                (name, samples.rows(slice(*self._aiding[name][k : k + 2])))
+                for name, samples in self.log.aiding.items()
+                if np.ptp(self._aiding[name][k : k + 2])
+            ),
         )
 
     def _of_several(self, k: int) -> tuple[tuple[str, Waveform], ...]:
@@ -145,6 +157,8 @@ def feed(navigator: Navigator, piece: Packet) -> None:
             navigator.add_marks(wave.marks)
         if len(wave):
             navigator.add_magnetometer(wave.time, wave.measured_sensor, name)
+    for sensor, aiding in piece.aiding:
+        navigator.add_aiding(sensor, aiding)
     for samples in piece.fields:
         navigator.add_fields(samples)
     navigator.advance()
@@ -211,6 +225,8 @@ def _contents(piece: Packet) -> Iterator[dict[str, Any]]:
             yield marks_content(wave.marks)
         if len(wave):
             yield magnetometer_content(wave, name)
+    if piece.aiding:
+        yield aiding_content(piece.aiding)
     for samples in piece.fields:
         yield from fields_contents(samples)
 

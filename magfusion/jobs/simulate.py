@@ -43,7 +43,7 @@ class SimulateSettings(ShaftSettings):
     """Settings of a simulation."""
 
     site: Path | None = option(None, "Site file", note="default: the demo's four beacons")
-    motion: Literal["walk", "turn", "static"] = option("walk", "Motion of the platform")
+    motion: Literal["walk", "turn", "static", "drive"] = option("walk", "Motion of the platform")
     duration: float = option(120.0, "Length", unit="s", least=1.0, most=1e6)
     box: str | None = option(None, "Room to move in, m: xmin,xmax,ymin,ymax,zmin,zmax")
     rate: float | None = option(

@@ -22,6 +22,7 @@ from magfusion.files.stream import (
     Format,
     NumberedRecord,
     Record,
+    aiding_samples,
     drive_samples,
     json_line,
     read_records,
@@ -35,7 +36,7 @@ from magfusion.jobs.stream_clocks import ClockJump, StreamClocks
 from magfusion.jobs.stream_samples import StreamSamples
 from magfusion.model.marks import Marks
 from magfusion.model.quaternion import of_matrices
-from magfusion.model.site import Site
+from magfusion.model.site import Site, aiding_sensor
 from magfusion.model.trust import Finding, Verdict
 from magfusion.results.verdict import finding_rows
 from magfusion.units import Array
@@ -293,6 +294,9 @@ def _process_companions(navigator: Navigator, record: Record) -> None:
             navigator.add_temperature(part, record.temperature.time, degc)
     if record.drive is not None:
         navigator.add_drive(drive_samples(record.drive))
+    for sensor, entry in (record.aiding or {}).items():
+        declared = aiding_sensor(navigator.site, sensor)
+        navigator.add_aiding(sensor, aiding_samples(entry, declared.quantity))
     if record.marks is not None:
         navigator.add_marks(Marks(record.marks.start, record.marks.end, record.marks.slot))
     if record.magnetometer is not None and record.magnetometer.slot is not None:

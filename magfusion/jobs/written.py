@@ -1,5 +1,6 @@
 """Files that each job writes, by name; those of one job may block another."""
 
+from magfusion.model.aiding import QUANTITIES
 from magfusion.results.report import FAILED
 
 _SITE = {"site.yaml", "site_field_map.parquet", "site_correlation.parquet"}
@@ -9,6 +10,7 @@ _TABLES = {
     "reference.parquet",
     "marks.parquet",
     "depth.parquet",
+    *(f"{kind}.parquet" for kind in QUANTITIES),
 }
 _TRUE_SITE = {f"true_{name}" for name in _SITE}
 _LOG = {"log.yaml", *_SITE, *_TRUE_SITE, "report.json", *_TABLES}

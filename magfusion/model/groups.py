@@ -7,6 +7,7 @@ GROUPS = (
     "magnetometer",
     "extrinsics",
     "time-offset",
+    "aiding",
     "ground",
     "earth",
 )

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from magfusion.model.aiding import AidingSamples
 from magfusion.model.drive import DriveSamples
 from magfusion.model.marks import Marks
 from magfusion.model.rotor import Depths as Depths
@@ -323,7 +324,8 @@ class Log:
     ``waveforms`` are the samples of several magnetometers, by name and each by its own stamps; then
     ``waveform`` is None.  ``recorded_imu`` has the inertial samples as recorded where ``imu`` is
     without the errors that the site declares (`magfusion.model.without_imu.logged`), ``clock_rate``
-    the rate by which the stamps of ``waveform`` are corrected.
+    the rate by which the stamps of ``waveform`` are corrected.  ``aiding`` has the samples of
+    further sensors, by name.
     """
 
     __repr__ = short_repr
@@ -347,6 +349,7 @@ class Log:
     waveforms: Mapping[str, Waveform] = field(default_factory=dict)
     recorded_imu: ImuSamples | None = None
     clock_rate: float = 0.0
+    aiding: Mapping[str, AidingSamples] = field(default_factory=dict)
 
     @property
     def vectors(self) -> Waveform | None:

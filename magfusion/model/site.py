@@ -7,6 +7,8 @@ from typing import Literal
 
 import numpy as np
 
+from magfusion.errors import InputError
+from magfusion.model.aiding import AidingSensor, Quantity
 from magfusion.model.correlation import Correlation
 from magfusion.model.drive import DriveShares
 from magfusion.model.field_map import FieldMap
@@ -330,6 +332,8 @@ class Site:
         Position of a second magnetometer that measures the noise (m).
     undetected : tuple of (int, Beacon)
         Beacons not detected in a log, with their indices among all; they remain as declared.
+    aiding : tuple of AidingSensor
+        Further sensors of the platform, with different names.
     """
 
     __repr__ = short_repr
@@ -351,6 +355,7 @@ class Site:
     log_conductivity_sigma: float = 0.0
     reference_world: Array | None = None
     undetected: tuple[tuple[int, Beacon], ...] = ()
+    aiding: tuple[AidingSensor, ...] = ()
 
     @cached_property
     def bounds(self) -> Bounds | None:
@@ -395,3 +400,26 @@ class Site:
         """Return the channels of one magnetometer."""
         count = len(self.channels) // len(self.platform.magnetometers)
         return slice(sensor * count, (sensor + 1) * count)
+
+
+def aiding_sensor(site: Site, name: str, quantity: Quantity | None = None) -> AidingSensor:
+    """Return an aiding sensor of a site, of a quantity if one is given.
+
+    Raises
+    ------
+    InputError
+        If the site has no such sensor.
+    """
+    known = {sensor.name: sensor for sensor in site.aiding}
+    if name not in known:
+        listed = ", ".join(known) or "none"
+        raise InputError(
+            f"{name} is no aiding sensor of the site (it has {listed}); add it to the site's"
+            " aiding, or drop its samples"
+        )
+    if quantity not in (None, known[name].quantity):
+        raise InputError(
+            f"{name} has samples of a {quantity}, but the site declares a {known[name].quantity};"
+            " correct one of them"
+        )
+    return known[name]

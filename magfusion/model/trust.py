@@ -17,6 +17,12 @@ from magfusion.units import Array, IntArray
 CODES = {
     "accel_scale": "the mean specific force is not gravity's, by a scale or a bias",
     "accel_units": "the specific force is in another unit",
+    "aiding_clock": "the clock of an aiding sensor is not as declared",
+    "aiding_disagrees": "an aiding sensor contradicts the estimate, and is not used",
+    "aiding_lever_arm": "the lever arm of an aiding sensor is not as declared",
+    "aiding_mounting": "an aiding sensor is not mounted as declared",
+    "aiding_offset": "the offset of an aiding sensor is not as declared",
+    "aiding_scale": "the scale of an aiding sensor is not as declared",
     "ambiguous": "another pose, or position of a beacon, explains the measurements nearly as well",
     "angle_convention": "the attitudes of beacons follow another convention",
     "angle_units": "the attitudes of beacons are in another unit",

@@ -14,6 +14,7 @@ from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
 from magfusion.model.short_repr import short_repr
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory, interpolated
+from magfusion.simulation.aiding import simulate_aiding
 from magfusion.simulation.disturbance import Ambient, Bending, Spheres, draw_bending, draw_spheres
 from magfusion.simulation.field import Drives, phasors_world, synchronised_drives
 from magfusion.simulation.inertial import BiasInstability, SimulatedImu, simulate_imu
@@ -22,6 +23,7 @@ from magfusion.simulation.magnetometers import answered, names_by_channel
 from magfusion.simulation.motion import (
     Rests,
     SimulatedMotion,
+    driving_motion,
     random_walk_motion,
     static_motion,
     turning_motion,
@@ -36,7 +38,7 @@ from magfusion.units import Array
 
 EPOCH_NS = 1_700_000_000_000_000_000
 
-MotionKind = Literal["walk", "turn", "static"]
+MotionKind = Literal["walk", "turn", "static", "drive"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +70,7 @@ class SimulationConfig:
         Lower and upper corner (m) of the body's range.
     duration : float
         (s)
-    motion : {"walk", "turn", "static"}
+    motion : {"walk", "turn", "static", "drive"}
     speed : float
         Approximate mean speed while moving (m/s).
     imu_rate_hz, magnetometer_rate_hz : float
@@ -227,6 +229,10 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         reference=reference,
         waveforms=waveforms,
         rotation=rotation,
+        # Spawned last, as the reference.
+        aiding=simulate_aiding(motion, true_site, config.duration, rng.spawn(1)[0])
+        if site.aiding
+        else {},
     )
     return SimulatedLog(log, true_site, drives, motion, ambient)
 
@@ -432,4 +438,6 @@ def _motion(config: SimulationConfig, rng: np.random.Generator) -> SimulatedMoti
         return random_walk_motion(*path, rests=config.rests)
     if config.motion == "turn":
         return turning_motion(*path, rests=config.rests)
-    raise InputError(f"motion: found {config.motion!r}; give walk, turn or static")
+    if config.motion == "drive":
+        return driving_motion(*path, rests=config.rests)
+    raise InputError(f"motion: found {config.motion!r}; give walk, turn, static or drive")

@@ -18,6 +18,7 @@ from magfusion.units import Array
 ATTITUDE_KNOT = 1.0  # s of moving
 LONGEST_RAMP = 1.0  # s from rest to full speed
 _DEGREE = 5
+WANDER = 10.0  # m; a driver corrects his line over some car lengths
 
 
 @dataclass(frozen=True)
@@ -165,6 +166,63 @@ def turning_motion(
     return SimulatedMotion(path, RotationSpline(knots, Rotation.concatenate(attitudes)), rate)
 
 
+def driving_motion(
+    rng: np.random.Generator,
+    duration: float,
+    box_world: Array,
+    speed: float = 1.0,
+    rests: Rests | None = None,
+) -> SimulatedMotion:
+    """Return laps of a vehicle along the longer walls of a box: it drives along its x axis, level.
+
+    Parameters
+    ----------
+    rng, duration, box_world, speed, rests
+        As in `random_walk_motion`.
+
+    Raises
+    ------
+    InputError
+        If the box, the duration or the speed is invalid.
+    """
+    rate, moving, _ = _progress(duration, rests or Rests(pause=0.0, move=duration))
+    box = _checked_box(box_world, speed)
+    seconds = np.arange(np.ceil(moving) + 2 * _DEGREE)
+    course = _lap(box, speed * seconds)
+    # Off the line by a fifth of the width, over some ten metres.
+    width, across = (
+        float(np.min(np.diff(box[:, :2], axis=0))),
+        int(np.argmin(np.ptp(box[:, :2], 0))),
+    )
+    knots = np.arange(0.0, speed * len(seconds) + WANDER, WANDER)
+    lateral = np.interp(speed * seconds, knots, rng.uniform(-0.1, 0.1, len(knots)) * width)
+    course[:, across] += lateral
+    path = BSpline(np.arange(len(seconds) + _DEGREE + 1.0) - _DEGREE, course, _DEGREE)
+    along = np.arange(0.0, np.ceil(moving) + 2.0, 0.5 * ATTITUDE_KNOT)
+    east, north, _ = path(along, nu=1).T
+    heading = np.arctan2(north, east)
+    return SimulatedMotion(
+        path, RotationSpline(along, Rotation.from_euler("z", heading[:, None])), rate
+    )
+
+
+def _lap(box: Array, distance: Array) -> Array:
+    """Return the places (n, 3) at distances (n,) (m) along two straights and two half circles."""
+    size, long = np.diff(box[:, :2], axis=0)[0], int(np.argmax(np.ptp(box[:, :2], axis=0)))
+    radius = 0.4 * float(size[1 - long])
+    straight = max(float(size[long]) - 2.0 * radius, 0.0)
+    half = straight + np.pi * radius
+    lap, rest = np.divmod(distance, half)
+    angle = np.maximum(rest - straight, 0.0) / max(radius, 1e-9)
+    forth = np.minimum(rest, straight) - straight / 2.0 + radius * np.sin(angle)
+    lateral = -radius * np.cos(angle)
+    sign = np.where(lap % 2.0 == 0.0, 1.0, -1.0)
+    out = np.tile(np.mean(box, axis=0), (len(distance), 1))
+    out[:, long] += sign * forth
+    out[:, 1 - long] += sign * lateral
+    return out
+
+
 def static_motion(position_world: Array, world_from_body: Rotation) -> SimulatedMotion:
     """Return a body that is always at rest."""
     still = BSpline(np.array([0.0, 1.0]), np.asarray(position_world, dtype=float)[None], 0)
@@ -206,6 +264,15 @@ def _path_in_box(
     rng: np.random.Generator, box_world: Array, speed: float, moving: float
 ) -> BSpline:
     """Return a quintic B-spline whose control points, and hence all of it, lie in the box."""
+    box = _checked_box(box_world, speed)
+    # Control points one unit apart, uniform in the box, give a mean speed of 0.17 diagonals a unit.
+    spacing = max(0.17 * float(np.linalg.norm(box[1] - box[0])) / speed, 1.0)
+    count = int(np.ceil(moving / spacing)) + 1 + _DEGREE
+    knots = (np.arange(count + _DEGREE + 1) - _DEGREE) * spacing
+    return BSpline(knots, rng.uniform(box[0], box[1], (count, 3)), _DEGREE)
+
+
+def _checked_box(box_world: Array, speed: float) -> Array:
     box = np.asarray(box_world, dtype=float)
     if box.shape != (2, 3) or np.any(box[0] > box[1]):
         raise InputError(
@@ -213,8 +280,4 @@ def _path_in_box(
         )
     if not speed > 0.0:
         raise InputError(f"speed: found {speed} m/s; give a positive number")
-    # Control points one unit apart, uniform in the box, give a mean speed of 0.17 diagonals a unit.
-    spacing = max(0.17 * float(np.linalg.norm(box[1] - box[0])) / speed, 1.0)
-    count = int(np.ceil(moving / spacing)) + 1 + _DEGREE
-    knots = (np.arange(count + _DEGREE + 1) - _DEGREE) * spacing
-    return BSpline(knots, rng.uniform(box[0], box[1], (count, 3)), _DEGREE)
+    return box

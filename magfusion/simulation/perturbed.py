@@ -7,6 +7,7 @@ from datetime import date
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.model.aiding import AidingSensor
 from magfusion.model.correlation import Component, Correlation
 from magfusion.model.physics.earth import earth_field_world
 from magfusion.model.site import Beacon, Magnetometer, Site, rotor_coils
@@ -31,7 +32,25 @@ def perturb_site(site: Site, rng: np.random.Generator) -> Site:
     if site.log_conductivity_sigma:
         error = draw("ground", "ground", "conductivity", np.array([site.log_conductivity_sigma]))
         beacons = tuple(replace(b, conductivity=b.conductivity * np.exp(error[0])) for b in beacons)
-    return replace(site, beacons=beacons, platform=platform)
+    aiding = tuple(_perturb_aiding(sensor, draw) for sensor in site.aiding)
+    return replace(site, beacons=beacons, platform=platform, aiding=aiding)
+
+
+def _perturb_aiding(sensor: AidingSensor, draw: Draw) -> AidingSensor:
+    name, sigmas = sensor.name, sensor.sigmas
+    turn = Rotation.from_rotvec(draw("aiding", name, "rotation", sigmas.rotation_sensor))
+    lever = draw("aiding", name, "position", sigmas.position_body)
+    scale = draw("aiding", name, "scale", sigmas.scale[None])[0]
+    offset = draw("aiding", name, "offset", sigmas.offset[None])[0]
+    late = draw("aiding", name, "clock_offset", sigmas.time_offset[None])[0]
+    return replace(
+        sensor,
+        position_body=sensor.position_body + lever,
+        body_from_sensor=sensor.body_from_sensor @ turn.as_matrix(),
+        scale=sensor.scale + scale,
+        offset=sensor.offset + offset,
+        time_offset=sensor.time_offset + late,
+    )
 
 
 def _draws(correlation: Correlation | None, rng: np.random.Generator) -> Draw:

@@ -15,6 +15,8 @@ from magfusion.estimation.batch.settings import SmootherSettings
 from magfusion.estimation.data_checks.detection import detected, only
 from magfusion.estimation.demodulation.demodulation import Demodulation, demodulated
 from magfusion.estimation.demodulation.several_demodulation import demodulated_several
+from magfusion.estimation.graph.measurement import Measurement
+from magfusion.estimation.measurements.aiding_samples import aiding_measurements
 from magfusion.estimation.measurements.fixed_roll import without_roll
 from magfusion.estimation.measurements.zero_velocity import quiet_before
 from magfusion.estimation.snapshot.fix import Fixes
@@ -57,7 +59,7 @@ class WarmStart:
 
 
 class _Demodulated(NamedTuple):
-    """A log before it has a start, with the times of its states (s)."""
+    """A log before it has a start, with the times of its states (s), and other measurements."""
 
     log: Log
     demodulation: Demodulation
@@ -65,6 +67,7 @@ class _Demodulated(NamedTuple):
     steady: SteadyFields | None
     time: Array
     calibration: Calibration
+    measured: tuple[tuple[Array, Measurement], ...]
 
 
 def preprocess(log: Log, site: Site, settings: SmootherSettings, report: Report) -> PreprocessedLog:
@@ -150,13 +153,25 @@ def _demodulated(log: Log, site: Site, settings: SmootherSettings) -> _Demodulat
     if settings.earth:
         steady, samples = demodulation.steady(calibration), only(samples, detected(samples))
     between = _in_gaps(samples, log.imu, calibration.time_offset, site.platform.motion)
-    others = [time for time, _ in settings.measurements]
+    measured = (*settings.measurements, *_aiding(log, calibration, samples, settings.loss))
+    others = [time for time, _ in measured]
     if settings.factors is not None:
         others.append(settings.factors.time)
     if demodulation.close is not None and not loose:
         others.append(demodulation.close.windows.centre)
     time = np.unique(np.concatenate([samples.time, between, *others]))
-    return _Demodulated(log, demodulation, samples, steady, time, calibration)
+    return _Demodulated(log, demodulation, samples, steady, time, calibration, measured)
+
+
+def _aiding(
+    log: Log, calibration: Calibration, samples: FieldSamples, loss: str | None
+) -> tuple[tuple[Array, Measurement], ...]:
+    """Return what the aiding sensors measured while there are states."""
+    if not log.aiding:
+        return ()
+    imu = replace(log.imu, time=log.imu.time + calibration.time_offset)
+    span = float(samples.time[0]), float(samples.time[-1])
+    return aiding_measurements(log.aiding, calibration.site, imu, span, loss)
 
 
 def _with_start(
@@ -176,7 +191,7 @@ def _with_start(
         blocks=blocks,
         considered=considered,
         loss=settings.loss,
-        others=settings.measurements,
+        others=selected.measured,
         user=settings.factors,
         rival_chi_square=begun.rival_chi_square,
         rival=begun.rival,

@@ -223,7 +223,12 @@ def low_passed(imu: ImuSamples) -> ImuSamples:
 
 
 def low_passed_rate_at(imu: ImuSamples, time_offset: float, wanted: Array) -> Array:
-    """Return the rate of `low_passed` at some times, without averaging the whole stream.
+    """Return the rates of `inertial_at`, shape (m, 3) (rad/s)."""
+    return _low_passed_at(imu, imu.gyro_body, time_offset, wanted)
+
+
+def inertial_at(imu: ImuSamples, time_offset: float, wanted: Array) -> Array:
+    """Return `low_passed` samples at some times, without averaging the whole stream.
 
     Parameters
     ----------
@@ -234,15 +239,20 @@ def low_passed_rate_at(imu: ImuSamples, time_offset: float, wanted: Array) -> Ar
 
     Returns
     -------
-    ndarray, shape (m, 3)
-        (rad/s)
+    ndarray, shape (m, 6)
+        Rate and specific force (rad/s, m/s^2).
     """
+    both = np.hstack([imu.gyro_body, imu.accel_body])
+    return _low_passed_at(imu, both, time_offset, wanted)
+
+
+def _low_passed_at(imu: ImuSamples, rows: Array, time_offset: float, wanted: Array) -> Array:
     last, reach = len(imu) - 1, low_pass_reach(_usual(imu))
     before = np.clip(np.searchsorted(imu.time, wanted - time_offset) - 1, 0, max(last - 1, 0))
     after = np.minimum(before + 1, last)
-    ends = np.zeros((2, len(wanted), 3))
+    ends = np.zeros((2, len(wanted), rows.shape[1]))
     for k in range(-reach, reach + 1):
-        ends += imu.gyro_body[np.clip(np.stack([before, after]) + k, 0, last)]
+        ends += rows[np.clip(np.stack([before, after]) + k, 0, last)]
     span = np.maximum(imu.time[after] - imu.time[before], np.finfo(float).tiny)
     share = np.clip((wanted - time_offset - imu.time[before]) / span, 0.0, 1.0)[:, None]
     return np.asarray(((1.0 - share) * ends[0] + share * ends[1]) / (2 * reach + 1))

@@ -82,7 +82,8 @@ def calibration_process_noise(
         Number of parameters at the end that are only considered: they are constant.
     """
     parts = [
-        np.full(len(b.sigma), b.parameter.walk_per_sqrt_hour(site) ** 2 / HOUR) for b in blocks
+        np.full(len(b.sigma), b.parameter.walk_per_sqrt_hour(site, b.owner) ** 2 / HOUR)
+        for b in blocks
     ]
     variance = np.concatenate(parts) if parts else np.zeros(0)
     variance[len(variance) - considered :] = 0.0

@@ -11,6 +11,12 @@ import numpy as np
 
 from magfusion.model.ground import conductivity_of
 from magfusion.model.parameters import (
+    AIDING_CLOCK,
+    AIDING_OFFSET,
+    AIDING_POSITION,
+    AIDING_PRESSURE,
+    AIDING_ROTATION,
+    AIDING_SCALE,
     BEACON_POSITION,
     BEACON_ROTATION,
     CLOCK_OFFSET,
@@ -156,6 +162,12 @@ TYPICAL: dict[Parameter, float] = {
     CLOCK_OFFSET: 1e-4,
     CLOCK_RATE: 1e-5,
     CONDUCTIVITY: 0.1,
+    AIDING_SCALE: 0.01,
+    AIDING_OFFSET: 0.1,
+    AIDING_PRESSURE: 1.0,
+    AIDING_CLOCK: 0.01,
+    AIDING_ROTATION: DEGREE,
+    AIDING_POSITION: 0.05,
 }
 
 # What no site declares and every instrument has: scales and axes of a MEMS, where in its case the
@@ -196,6 +208,12 @@ CODE: dict[Parameter, str] = {
     CLOCK_OFFSET: "magnetometer_clock",
     CLOCK_RATE: "imu_clock",
     CONDUCTIVITY: "ground",
+    AIDING_SCALE: "aiding_scale",
+    AIDING_OFFSET: "aiding_offset",
+    AIDING_PRESSURE: "aiding_offset",
+    AIDING_CLOCK: "aiding_clock",
+    AIDING_ROTATION: "aiding_mounting",
+    AIDING_POSITION: "aiding_lever_arm",
 }
 
 TILT, STRETCH = "survey_tilt", "survey_scale"

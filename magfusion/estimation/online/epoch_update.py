@@ -20,6 +20,7 @@ from magfusion.estimation.online.ekf import ErrorStateFilter
 from magfusion.estimation.online.fixed_lag import SlidingWindow
 from magfusion.estimation.online.input_queue import Arrivals
 from magfusion.estimation.online.measured import EpochMeasurements
+from magfusion.estimation.online_integrity.aiding_gate import AidingGate
 from magfusion.estimation.online_integrity.bank import SubsetBank
 from magfusion.estimation.online_integrity.dead_reckoning_check import DeadReckoningCheck
 from magfusion.estimation.online_integrity.gate import Gate
@@ -71,6 +72,7 @@ class EpochUpdate:
     """
 
     gate: Gate
+    aiding: AidingGate
     monitor: OnlineMonitor
     score: OnlineScore
     metal: NearMetal
@@ -95,6 +97,7 @@ class EpochUpdate:
         self.site, self.blocks, self.bank, self._lost_beyond = site, blocks, bank, lost_beyond
         self._detected_at = -np.inf
         self.gate = Gate(site.channels, blocks, MagnetometerWatch(site))
+        self.aiding = AidingGate(blocks, self.gate.counts)
         self.of_currents: tuple[Finding, ...] = ()
         self._roll = roll_findings(site)
         self.metal, self._dead_reckoning = NearMetal(site, blocks), DeadReckoningCheck(blocks)
@@ -137,7 +140,7 @@ class EpochUpdate:
         result = arrived.measured(
             before, state, samples, step, earth=earth, standing=standing, is_lost=lost_epochs
         )
-        measurements: list[Measurement] = arrived.others_at(state.time)
+        measurements = self.aiding.passed(arrived.others_at(state.time), state)
         if standing:
             measurements.append(zero_velocity(NOW, self.site.platform.motion.rest_speed_sigma))
         point = None
@@ -250,6 +253,7 @@ class EpochUpdate:
             *self.metal.judgement().findings,
             *self.of_currents,
             *self.gate.watch.findings(),
+            *self.aiding.findings(state.time),
             *_of_place(self.site, state),
             *self._roll,
         )

@@ -18,9 +18,10 @@ from magfusion.estimation.demodulation.motion_compensation import (
     demodulate_predicted,
 )
 from magfusion.estimation.graph.measurement import Measurement
-from magfusion.estimation.graph.preintegration import RATE_SPAN
+from magfusion.estimation.graph.preintegration import RATE_SPAN, inertial_at
 from magfusion.estimation.graph.state import MOTION, VELOCITY, State, as_trajectory
 from magfusion.estimation.initialization.online import NoStart, OnlineStart, find_online_start
+from magfusion.estimation.measurements.aiding import AidingMeasurement
 from magfusion.estimation.measurements.earth import earth_measurement
 from magfusion.estimation.measurements.model_error import epochs_sharing_error_at
 from magfusion.estimation.measurements.phasors import field_phasors
@@ -431,13 +432,26 @@ class Arrivals:
         if self.fields or not isinstance(receiver, LockinReceiver) or receiver.admission is None:
             return
         until, streams = time + receiver.settings.window / 2.0, (self.imu, self.waveform)
+        if self.inertial >= self.awaited:  # what has not arrived yet is no silence
+            until = min(until, self.inertial)
         self.imu_filler.fill(state, until, *streams, self.applied_offset, receiver.admission)
 
     def others_at(self, time: float) -> list[Measurement]:
         """Return the other measurements at a time (s), and remove them."""
-        result = [measurement for when, measurement in self.others if when == time]
+        due = [measurement for when, measurement in self.others if when == time]
         self.others = [other for other in self.others if other[0] > time]
-        return result
+        return [
+            self._with_inertial(one, time) if isinstance(one, AidingMeasurement) else one
+            for one in due
+        ]
+
+    def _with_inertial(self, measurement: AidingMeasurement, time: float) -> AidingMeasurement:
+        stamp = time - self.applied_offset
+        imu = self.inertial_samples(stamp - RATE_SPAN, stamp + RATE_SPAN)
+        if not len(imu):
+            return measurement
+        at = inertial_at(imu, self.applied_offset, np.array([time]))
+        return measurement.with_inertial(at)
 
     def rests(self, state: State) -> bool:
         """Return whether the platform is stationary, as far as is known."""

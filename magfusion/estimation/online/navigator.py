@@ -29,6 +29,11 @@ from magfusion.estimation.initialization.earlier_state import with_earlier
 from magfusion.estimation.initialization.early import first_try, is_clear, next_try, open_start
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
 from magfusion.estimation.integrity.correction import Correction, continued, spread_of
+from magfusion.estimation.measurements.aiding_samples import (
+    aiding_measurement,
+    measured_time,
+    thinned,
+)
 from magfusion.estimation.measurements.earth import check_earth
 from magfusion.estimation.measurements.factor_of_state import state_factor
 from magfusion.estimation.online.applied_corrections import AppliedCorrections
@@ -55,13 +60,14 @@ from magfusion.estimation.online_integrity.judgement import (
 from magfusion.estimation.online_integrity.summary import Summary
 from magfusion.files.blas_threads import warn_about_threads
 from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
+from magfusion.model.aiding import AidingSamples
 from magfusion.model.arguments import check_arguments
 from magfusion.model.drive import DriveSamples, DriveShares
 from magfusion.model.marks import Marks
 from magfusion.model.parameters import dimension, inertial_blocks, placed
 from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.samples import FieldSamples, SteadyFields
-from magfusion.model.site import Site
+from magfusion.model.site import Site, aiding_sensor
 from magfusion.model.temperature import Temperatures
 from magfusion.model.trust import Finding, Verdict
 from magfusion.model.without_imu import on_motion_prior, require_motion_prior
@@ -109,6 +115,7 @@ class Navigator:
     _corrections: AppliedCorrections
     _reported_until: float
     _earlier: State | None
+    _aiding_until: dict[str, float]  # time of each sensor's last sample (s)
 
     def __init__(self, site: Site, settings: NavigatorSettings | None = None) -> None:
         check_arguments("Navigator", site=(site, Site))
@@ -154,7 +161,7 @@ class Navigator:
         self.rival_chi_square = None
         self.declared, self._history = site, InputHistory()
         self._corrections, self._reported_until = AppliedCorrections(), -np.inf
-        self._earlier = None
+        self._earlier, self._aiding_until = None, {}
         self._possible: tuple[Correction, ...] = ()
         self._tried: Correction | None = None
         self.remainder: Correction | None = None
@@ -286,6 +293,28 @@ class Navigator:
         if not self._arrived.add_measurement(time, measurement, after):
             self.counts["measurement too late"] += 1
         self._history.add(time, "add_measurement", time, measurement)
+        self.advance()
+
+    def add_aiding(self, sensor: str, samples: AidingSamples) -> None:
+        """Add samples of an aiding sensor of the site; a state is created at each that is used.
+
+        Raises
+        ------
+        InputError
+            If the site has no such sensor, they are of another kind, or the clock jumped.
+        """
+        declared = aiding_sensor(self.site, sensor, samples.quantity)
+        self._history.add(samples.time, "add_aiding", sensor, samples)
+        after = -np.inf if self._estimator is None else self._estimator.state.time
+        used = thinned(declared, samples, self._aiding_until.get(sensor, -np.inf))
+        if len(used) < len(samples):
+            self.counts[f"{sensor} sample beyond its rate"] += len(samples) - len(used)
+        if len(samples):
+            self._aiding_until[sensor] = float(samples.time[-1])
+        measurement = aiding_measurement(declared, used)
+        for i, time in enumerate(measured_time(declared, used).tolist()):
+            if not self._arrived.add_measurement(time, measurement.rows(slice(i, i + 1)), after):
+                self.counts["measurement too late"] += 1
         self.advance()
 
     def add_factor(self, factor: gtsam.NonlinearFactor, times: Sequence[float] | Array) -> None:

@@ -19,6 +19,7 @@ from magfusion.estimation.data_checks.stream_buffer import Buffer
 from magfusion.estimation.graph.inertial import ROWS, Link, Steps
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, State, states_of
+from magfusion.estimation.measurements.aiding_samples import MEASUREMENTS as OF_AIDING
 from magfusion.estimation.measurements.earth import EarthField
 from magfusion.estimation.measurements.factor_of_state import StateFactor
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
@@ -45,6 +46,7 @@ MEASUREMENTS: tuple[type[Measurement], ...] = (
     EarthField,
     ZeroVelocity,
     PoseFix,
+    *OF_AIDING.values(),
 )
 ROUNDING = 1e-6  # of a rotation, and of a correlation's least eigenvalue
 

@@ -343,7 +343,7 @@ class OnlineMonitor:
     @cached_property
     def _walk(self) -> Array:
         """Random-walk variance of each estimated parameter in an hour."""
-        own = (b.parameter.walk_per_sqrt_hour(self.site) ** 2 for b in self.estimated)
+        own = (b.parameter.walk_per_sqrt_hour(self.site, b.owner) ** 2 for b in self.estimated)
         return np.repeat(list(own), [len(b.sigma) for b in self.estimated])
 
     @cached_property

@@ -10,6 +10,13 @@ from dataclasses import replace
 import numpy as np
 
 from magfusion.model.channel_effects import axis_factors, responded
+from magfusion.model.parameters.aiding import AIDING_CLOCK as AIDING_CLOCK
+from magfusion.model.parameters.aiding import AIDING_OFFSET as AIDING_OFFSET
+from magfusion.model.parameters.aiding import AIDING_POSITION as AIDING_POSITION
+from magfusion.model.parameters.aiding import AIDING_PRESSURE as AIDING_PRESSURE
+from magfusion.model.parameters.aiding import AIDING_ROTATION as AIDING_ROTATION
+from magfusion.model.parameters.aiding import AIDING_SCALE as AIDING_SCALE
+from magfusion.model.parameters.aiding import AidingParameter as AidingParameter
 from magfusion.model.parameters.beacon import BEACON_POSITION as BEACON_POSITION
 from magfusion.model.parameters.beacon import BEACON_ROTATION as BEACON_ROTATION
 from magfusion.model.parameters.beacon import DRIFT as DRIFT
@@ -63,6 +70,12 @@ PARAMETERS: tuple[Parameter, ...] = (
     CLOCK_OFFSET,
     TIME_OFFSET,
     CLOCK_RATE,
+    AIDING_SCALE,
+    AIDING_OFFSET,
+    AIDING_PRESSURE,
+    AIDING_CLOCK,
+    AIDING_ROTATION,
+    AIDING_POSITION,
     CONDUCTIVITY,
     DECLINATION,
     STRENGTH,
@@ -207,8 +220,9 @@ def _blocks(
         sigma = parameter.sigma(site, owner)
         largest = float(np.max(sigma))
         if largest > 0.0 and chosen(parameter, largest):
-            # A known axis within an unknown block.
-            sigma = np.maximum(sigma, 1e-6 * largest)
+            # A known axis within an unknown block; turns about two axes turn the third, too.
+            known = 1e-3 if getattr(parameter, "is_rotation", False) else 1e-6
+            sigma = np.maximum(sigma, known * largest)
             blocks.append(Block(parameter, owner, slice(0), sigma))
     return placed(blocks)
 

@@ -246,7 +246,7 @@ class Parameter:
         """Return the inertial samples corrected for this parameter."""
         return imu
 
-    def walk_per_sqrt_hour(self, site: Site) -> float:
+    def walk_per_sqrt_hour(self, site: Site, owner: str) -> float:
         """Return the standard deviation that it gains in an hour."""
         return attrgetter(self.walk)(site) / self.si if self.walk else 0.0
 
@@ -289,7 +289,7 @@ class SiteParameter(Parameter):
         if self.is_rotation:
             value = value @ Rotation.from_rotvec(step).as_matrix()
         else:
-            value = value + self.si * step.reshape(value.shape)
+            value = np.asarray(value + self.si * step.reshape(value.shape))
         part = replace(part, **{self.attribute: value})
         return replace(calibration, site=self.with_part(calibration.site, part))
 

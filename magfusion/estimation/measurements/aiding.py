@@ -1,0 +1,121 @@
+"""What aiding sensors have in common as measurements: rows, parameters, robust loss."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+
+from magfusion.estimation.graph.measurement import Loss, Measurement, Rows, calibration_rows
+from magfusion.estimation.graph.state import States
+from magfusion.model.aiding import AidingSensor
+from magfusion.model.parameters import AIDING_CLOCK, AidingParameter, Block, Calibration
+from magfusion.model.site import aiding_sensor
+from magfusion.units import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What a sensor measures at an estimate, with derivatives.
+
+    Parameters
+    ----------
+    value : ndarray, shape (n, k)
+    by_pose, by_velocity, by_bias : ndarray, shape (n, k, 6 or 3), optional
+        As of `Rows`.
+    by_parameter : mapping
+        By a parameter of the sensor, in SI units, shape (n, k, columns).
+    """
+
+    value: Array
+    by_pose: Array
+    by_velocity: Array | None = None
+    by_bias: Array | None = None
+    by_parameter: Mapping[AidingParameter, Array] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class AidingMeasurement(Measurement):
+    """Samples of an aiding sensor.
+
+    Parameters
+    ----------
+    sensor : str
+        Name.
+    robust : {None, 'huber', 'cauchy'}
+    value, sigma : ndarray, shape (n, k)
+        Measured; sigma is infinite for what is not.
+    time_offset : ndarray, shape (n,)
+        By which the sensor's stamps are corrected already (s).
+    inertial_body : ndarray, shape (n, 6)
+        Measured rate and specific force, with their biases (rad/s, m/s^2).
+    """
+
+    sensor: str
+    robust: str | None
+    value: Array
+    sigma: Array
+    time_offset: Array
+    inertial_body: Array
+
+    @abstractmethod
+    def predicted(self, states: States, rate_body: Array, sensor: AidingSensor) -> Prediction:
+        """Return what the sensor measures at some states and rates (rad/s)."""
+
+    @property
+    def loss(self) -> Loss | None:
+        """Robust loss of each sample: wheels slip, ranges are reflected."""
+        return None if self.robust is None else Loss(self.robust)
+
+    def with_inertial(self, inertial_body: Array) -> Self:
+        """Return the measurement with the inertial samples of its epochs (n, 6)."""
+        return replace(self, inertial_body=inertial_body)
+
+    def linearize(
+        self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
+    ) -> Rows:
+        """Return the rows at an estimate, one group of each sample."""
+        sensor = aiding_sensor(calibration.site, self.sensor)
+        bias = states.read_bias()
+        rate_body = self.inertial_body[:, :3] - bias[:, 3:]
+        force_body = self.inertial_body[:, 3:] - bias[:, :3]
+        at = self.predicted(states, rate_body, sensor)
+        by_time = _by_time(at, states, rate_body, force_body, calibration.site.gravity)
+        late = sensor.time_offset - self.time_offset
+        by_parameter = {**at.by_parameter, AIDING_CLOCK: by_time[..., None]}
+        by_calibration = calibration_rows((len(states), self.value.shape[1]), blocks)
+        for block in blocks:
+            own = block.parameter
+            if isinstance(own, AidingParameter) and block.owner == self.sensor:
+                by_calibration[..., block.columns] = own.si * by_parameter[own]
+        weight = 1.0 / self.sigma[..., None]
+        residual = self._residual(at.value + late[:, None] * by_time)
+        return Rows(
+            error=(weight[..., 0] * residual)[:, None],
+            by_pose=(weight * at.by_pose)[:, None],
+            by_velocity=None if at.by_velocity is None else (weight * at.by_velocity)[:, None],
+            by_bias=None if at.by_bias is None else (weight * at.by_bias)[:, None],
+            by_calibration=(weight * by_calibration)[:, None] if blocks else None,
+        )
+
+    def _residual(self, predicted: Array) -> Array:
+        """Return predicted minus measured, zero where nothing is measured."""
+        return np.where(np.isfinite(self.sigma), predicted - self.value, 0.0)
+
+
+def _by_time(
+    at: Prediction, states: States, rate_body: Array, force_body: Array, gravity: float
+) -> Array:
+    """Return the derivative of a prediction by time, shape (n, k).
+
+    The angular acceleration, which moves a lever arm, is not measured and left out.
+    """
+    rotation = states.world_from_body
+    velocity_body = (np.swapaxes(rotation, 1, 2) @ states.velocity_world[..., None])[..., 0]
+    twist = np.concatenate([rate_body, velocity_body], axis=1)
+    out = (at.by_pose @ twist[..., None])[..., 0]
+    if at.by_velocity is not None:
+        accel_world = (rotation @ force_body[..., None])[..., 0] - [0.0, 0.0, gravity]
+        out = out + (at.by_velocity @ accel_world[..., None])[..., 0]
+    return np.asarray(out)

@@ -1,0 +1,110 @@
+"""Samples of a site's aiding sensors as measurements."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.estimation.graph.preintegration import inertial_at
+from magfusion.estimation.measurements.aiding import AidingMeasurement
+from magfusion.estimation.measurements.body_velocity import BodyVelocity
+from magfusion.estimation.measurements.heading import Heading
+from magfusion.estimation.measurements.height import Height
+from magfusion.estimation.measurements.point_position import PointPosition
+from magfusion.estimation.measurements.point_range import PointRange
+from magfusion.model.aiding import AidingSamples, AidingSensor, Quantity
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import Site, aiding_sensor
+from magfusion.units import Array
+
+MEASUREMENTS: dict[Quantity, type[AidingMeasurement]] = {
+    "velocity": BodyVelocity,
+    "range": PointRange,
+    "position": PointPosition,
+    "mark": PointPosition,
+    "height": Height,
+    "pressure": Height,
+    "heading": Heading,
+}
+
+
+def aiding_measurement(
+    sensor: AidingSensor, samples: AidingSamples, robust: str | None = None
+) -> AidingMeasurement:
+    """Return samples of a sensor as a measurement, one row each.
+
+    Raises
+    ------
+    InputError
+        If a mark is none of the site's.
+    """
+    value = _on_marks(sensor, samples) if sensor.quantity == "mark" else samples.value
+    missing = np.isnan(value)
+    speed = np.sqrt(np.nansum(value**2, axis=1))
+    noise = np.hypot(sensor.sigma, sensor.relative_sigma * speed)
+    unmeasured = np.inf if sensor.constraint_sigma is None else sensor.constraint_sigma
+    return MEASUREMENTS[sensor.quantity](
+        epoch=np.arange(len(samples)),
+        sensor=sensor.name,
+        robust=robust,
+        value=np.where(missing, 0.0, value),
+        sigma=np.where(missing, unmeasured, noise[:, None]),
+        time_offset=np.full(len(samples), float(sensor.time_offset)),
+        inertial_body=np.zeros((len(samples), 6)),
+    )
+
+
+def measured_time(sensor: AidingSensor, samples: AidingSamples) -> Array:
+    """Return when samples were measured, on the log's clock (s)."""
+    return samples.time + float(sensor.time_offset)
+
+
+def thinned(sensor: AidingSensor, samples: AidingSamples, last: float) -> AidingSamples:
+    """Return the samples that are used: the first of each period of the sensor's rate.
+
+    Parameters
+    ----------
+    last : float
+        Time of the last one before them (s), or minus infinity.
+    """
+    period = np.floor(samples.time * sensor.rate_hz * (1.0 + 1e-9))
+    before = np.floor(last * sensor.rate_hz * (1.0 + 1e-9))
+    return samples.rows(np.diff(period, prepend=before) > 0.0)
+
+
+def aiding_measurements(
+    aiding: Mapping[str, AidingSamples],
+    site: Site,
+    imu: ImuSamples,
+    span: tuple[float, float],
+    robust: str | None,
+) -> tuple[tuple[Array, AidingMeasurement], ...]:
+    """Return the samples of a log as measurements, with the times of their rows (s).
+
+    Parameters
+    ----------
+    imu : ImuSamples
+        Its stamps on the log's clock.
+    span : tuple of float
+        First and last time of the states (s); samples outside are left out.
+    """
+    out = []
+    for name, every in aiding.items():
+        sensor = aiding_sensor(site, name, every.quantity)
+        samples = thinned(sensor, every, -np.inf)
+        time = measured_time(sensor, samples)
+        inside = (time >= span[0]) & (time <= span[1])
+        samples, time = samples.rows(inside), time[inside]
+        if len(time):
+            measurement = aiding_measurement(sensor, samples, robust)
+            out.append((time, measurement.with_inertial(inertial_at(imu, 0.0, time))))
+    return tuple(out)
+
+
+def _on_marks(sensor: AidingSensor, samples: AidingSamples) -> Array:
+    unknown = sorted(set(samples.marks) - set(sensor.marks_world))
+    if unknown:
+        raise InputError(
+            f"{sensor.name}: {unknown[0]} is no mark of the site; add it to aiding.marks_m"
+        )
+    return np.array([sensor.marks_world[mark] for mark in samples.marks]).reshape(-1, 3)

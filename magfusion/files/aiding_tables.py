@@ -1,0 +1,95 @@
+"""Tables of a log's aiding sensors: one of each quantity, with a row for each sample."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from magfusion.files.table import TIME, Span, Table, TableLayout, read_table, write_table
+from magfusion.model.aiding import AidingSamples, Quantity
+from magfusion.units import DEGREE, Array
+
+SENSOR, MARK = "sensor", "mark"
+COLUMNS: dict[Quantity, tuple[str, ...]] = {
+    "velocity": ("velocity_x", "velocity_y", "velocity_z"),
+    "range": ("range",),
+    "position": ("position_x", "position_y", "position_z"),
+    "mark": (),
+    "height": ("height",),
+    "pressure": ("pressure",),
+    "heading": ("heading_deg",),
+}
+UNIT = {"heading": DEGREE}
+
+
+def layout_of(quantity: Quantity) -> TableLayout:
+    """Return the columns of a quantity's table; of a velocity, an axis may be missing."""
+    columns = COLUMNS[quantity]
+    return TableLayout(
+        numbers=() if quantity == "velocity" else columns,
+        texts=(MARK,) if quantity == "mark" else (),
+        some=columns if quantity == "velocity" else (),
+        repeats=True,
+        optional_texts=(SENSOR,),
+    )
+
+
+def read_aiding(tables: Mapping[Quantity, Path | None], span: Span) -> dict[str, AidingSamples]:
+    """Read the samples of every aiding sensor; one without a name has that of its quantity.
+
+    Raises
+    ------
+    InputError
+        As `read_table`; or where two samples of a sensor have one time.
+    """
+    out: dict[str, AidingSamples] = {}
+    for quantity, path in tables.items():
+        if path is not None:
+            out |= _read_quantity(quantity, read_table(path, layout_of(quantity), span))
+    return out
+
+
+def _read_quantity(quantity: Quantity, table: Table) -> dict[str, AidingSamples]:
+    names: list[str] = [quantity]
+    which = np.zeros(len(table), dtype=np.int64)
+    if table.has((SENSOR,)):
+        names, which = table.texts(SENSOR)
+    marks, of_row = table.texts(MARK) if quantity == "mark" else ([], which)
+    value, out = _values(quantity, table), dict[str, AidingSamples]()
+    for k, name in enumerate(names):
+        own = np.flatnonzero(which == k)
+        twice = np.zeros(len(table), dtype=bool)
+        twice[own[1:]] = np.diff(table.time[own]) == 0.0
+        again = f"the time of another sample of {name}: remove one of the two"
+        table.refuse(twice, TIME, table.time_ns, again)
+        there = own[np.isfinite(value[own]).any(axis=1)] if COLUMNS[quantity] else own
+        of_sample = tuple(marks[of_row[i]] for i in there) if quantity == "mark" else ()
+        out[name] = AidingSamples(quantity, table.time[there], value[there], of_sample)
+    return out
+
+
+def _values(quantity: Quantity, table: Table) -> Array:
+    value = np.full((len(table), len(COLUMNS[quantity])), np.nan)
+    for i, name in enumerate(COLUMNS[quantity]):
+        if table.has((name,)):
+            value[:, i] = table.numbers((name,), nan=quantity == "velocity")[:, 0]
+    return value * UNIT.get(quantity, 1.0)
+
+
+def write_aiding(aiding: Mapping[str, AidingSamples], directory: Path, epoch_ns: int) -> None:
+    """Write samples as Parquet, one file of each quantity, sorted by time."""
+    for quantity in dict.fromkeys(samples.quantity for samples in aiding.values()):
+        own = {name: samples for name, samples in aiding.items() if samples.quantity == quantity}
+        time = np.concatenate([samples.time for samples in own.values()])
+        value = np.concatenate([samples.value for samples in own.values()]) / UNIT.get(
+            quantity, 1.0
+        )
+        order = np.argsort(time, kind="stable")
+        names = np.repeat(list(own), [len(samples) for samples in own.values()])
+        columns: dict[str, object] = {TIME: Span(epoch_ns).stamps(time[order])}
+        columns[SENSOR] = names[order].tolist()
+        columns |= {name: value[order, i] for i, name in enumerate(COLUMNS[quantity])}
+        if quantity == "mark":
+            marks = np.array([mark for samples in own.values() for mark in samples.marks])
+            columns[MARK] = marks[order].tolist()
+        write_table(columns, directory / f"{quantity}.parquet")

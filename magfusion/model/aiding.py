@@ -1,0 +1,124 @@
+"""Aiding sensors of a platform, besides IMU and magnetometers, and their samples."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+
+from magfusion.model.short_repr import short_repr
+from magfusion.units import Array, BoolArray
+
+Quantity = Literal["velocity", "range", "position", "mark", "height", "pressure", "heading"]
+QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
+AIDING_RATE = 10.0  # Hz; what a vehicle does between is measured by the IMU
+
+
+def _zero() -> Array:
+    return np.zeros(())
+
+
+@dataclass(frozen=True, eq=False)
+class AidingSigma:
+    """Prior standard deviations of the parameters of an aiding sensor.
+
+    Parameters
+    ----------
+    position_body, rotation_sensor : ndarray, shape (3,)
+        (m, rad)
+    scale, offset, time_offset : ndarray, shape ()
+        Of a scale factor, in the unit of the measurement, and (s).
+    """
+
+    position_body: Array = field(default_factory=lambda: np.zeros(3))
+    rotation_sensor: Array = field(default_factory=lambda: np.zeros(3))
+    scale: Array = field(default_factory=_zero)
+    offset: Array = field(default_factory=_zero)
+    time_offset: Array = field(default_factory=_zero)
+
+
+@dataclass(frozen=True, eq=False)
+class AidingSensor:
+    """One aiding sensor, which measures in the SI unit of its quantity.
+
+    Parameters
+    ----------
+    quantity : str
+        ``velocity`` of the sensor in its own axes (m/s); ``range`` to ``point_world`` (m);
+        ``position`` (m), or that of a named ``mark`` on which the sensor is; ``height`` above the
+        world's zero (m), or as a ``pressure`` (Pa); ``heading`` of the body's x axis, clockwise
+        from the world's y axis (rad).
+    sigma : float
+        Of white noise.
+    relative_sigma : float
+        Noise of a velocity as a share of its size.
+    constraint_sigma : float, optional
+        Standard deviation about zero of the axes of a velocity that are not measured, as of wheels
+        that do not slide (nonholonomic constraint, m/s).
+    position_body : ndarray, shape (3,)
+        Lever arm (m).
+    body_from_sensor : ndarray, shape (3, 3)
+    point_world : ndarray, shape (3,), optional
+        (m)
+    marks_world : mapping, optional
+        Positions of the marks by their names, shape (3,) (m).
+    scale, offset : ndarray, shape ()
+        ``measured = scale * true + offset``; of a pressure, the true value is a height.
+    offset_walk : float
+        Standard deviation that the offset gains in an hour.
+    time_offset : ndarray, shape ()
+        A sample stamped t was measured at t + time_offset (s).
+    rate_hz : float
+        Greatest rate of the samples that are used; others are left out.
+    """
+
+    __repr__ = short_repr
+
+    name: str
+    quantity: Quantity
+    sigma: float
+    relative_sigma: float = 0.0
+    constraint_sigma: float | None = None
+    position_body: Array = field(default_factory=lambda: np.zeros(3))
+    body_from_sensor: Array = field(default_factory=lambda: np.eye(3))
+    point_world: Array | None = None
+    marks_world: Mapping[str, Array] = field(default_factory=dict)
+    scale: Array = field(default_factory=lambda: np.ones(()))
+    offset: Array = field(default_factory=_zero)
+    offset_walk: float = 0.0
+    time_offset: Array = field(default_factory=_zero)
+    rate_hz: float = AIDING_RATE
+    sigmas: AidingSigma = field(default_factory=AidingSigma)
+
+
+@dataclass(frozen=True, eq=False)
+class AidingSamples:
+    """Samples of one aiding sensor.
+
+    Parameters
+    ----------
+    quantity : str
+        As of `AidingSensor`.
+    time : ndarray, shape (n,)
+        Seconds since the log's epoch.
+    value : ndarray, shape (n, components)
+        Three of a velocity or position, none of a mark, else one; NaN for an axis of a velocity
+        that is not measured.
+    marks : tuple of str
+        Name of each sample's mark, if they are marks.
+    """
+
+    __repr__ = short_repr
+
+    quantity: Quantity
+    time: Array
+    value: Array
+    marks: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def rows(self, kept: BoolArray | slice) -> "AidingSamples":
+        """Return some of the samples."""
+        marks = tuple(np.array(self.marks, dtype=object)[kept]) if self.marks else ()
+        return AidingSamples(self.quantity, self.time[kept], self.value[kept], marks)
