@@ -12,6 +12,7 @@ from magfusion.files.yaml_files import StrictModel
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE = "".join((DOCS / name).read_text() for name in ("formats.md", "aiding.md"))
+PAGE = re.sub(r"^```\w*$", "`", PAGE, flags=re.M)  # a block is quoted as a whole
 VERSION = "magfusion_site"  # of the file itself, which the first page shows
 
 

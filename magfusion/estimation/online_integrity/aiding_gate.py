@@ -53,8 +53,8 @@ class AidingGate:
         return tuple(
             Finding(
                 "aiding_disagrees",
-                f"{sensor} contradicts the estimate since {start_time:.1f} s, and is not used: it slips"
-                " or is blocked, or its scale, mounting or clock is not as declared; correct"
+                f"{sensor} contradicts the estimate since {start_time:.1f} s, and is not used: it"
+                " slips or is blocked, or its scale, mounting or clock is not as declared; correct"
                 " them in the site's aiding, or leave it out.",
                 Verdict.DOUBTFUL,
                 (time - start_time) / REJECTED_LONG,
