@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,12 +15,13 @@ from magfusion.files.bag_reader import open_bag, refuse_overlap
 from magfusion.files.bag_rows import Messages, Wanted, read_parts
 from magfusion.files.bag_topics import Topics
 from magfusion.files.lost_rows import LostRows
-from magfusion.files.messages import FIELD, IMU, ROWS, USUAL
+from magfusion.files.messages import AIDING_ROWS, FIELD, IMU, ROWS, USUAL
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.row_stamps import batches_finding, separate_stamps
 from magfusion.files.stray_stamps import LONGEST_GAP, stray_finding, stray_rows
 from magfusion.files.table import LARGEST_NUMBER, Span
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
+from magfusion.model.aiding import AidingSamples, Quantity
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.trajectory import Trajectory
@@ -61,6 +63,7 @@ def read_bag(
     end: float | None = None,
     topics: Topics | None = None,
     report: Report = quiet,
+    aiding: Mapping[str, Quantity] | None = None,
 ) -> Log:
     """Read inertial samples, magnetometer and truth of a bag.
 
@@ -77,6 +80,9 @@ def read_bag(
         Seconds since the first inertial sample.
     report : callable
         Called with the number of messages read.
+    aiding : mapping, optional
+        What aiding sensors measure, by their names, which are those of their topics, with or
+        without the namespace.
 
     Returns
     -------
@@ -91,7 +97,7 @@ def read_bag(
         none was named, or holds messages that no instrument gives.
     """
     with open_bag([path]) as reader:
-        result = _read(reader, path, topics or Topics(), report)
+        result = _read(reader, path, topics or Topics(), report, aiding or {})
         notes = reader.notes
     imu, field, truth = (result.get(role) for role in ("imu", "magnetometer", "truth"))
     first = field if imu is None else imu
@@ -106,6 +112,11 @@ def read_bag(
         None if one is None else _measured(one.within(span), declared)
         for one in (imu, field, truth)
     )
+    others = {
+        name: _aiding(_measured(result[name].within(span), declared), quantity, span)
+        for name, quantity in (aiding or {}).items()
+        if name in result
+    }
     return Log(
         name=path.resolve().stem,
         epoch_ns=span.epoch_ns,
@@ -114,14 +125,22 @@ def read_bag(
         waveform=None if field is None else _waveform(field, span),
         truth=None if truth is None else _trajectory(truth, span),
         noticed=tuple(declared),
+        aiding=others,
     )
 
 
-def _read(reader: AnyReader, path: Path, topics: Topics, report: Report) -> dict[str, _Stream]:
-    """Return the streams by their roles, of one pass over the bag."""
-    wanted: dict[str, Wanted] = {}
+def _read(
+    reader: AnyReader, path: Path, topics: Topics, report: Report, aiding: Mapping[str, Quantity]
+) -> dict[str, _Stream]:
+    """Return the streams by their roles or sensors, of one pass over the bag."""
+    wanted = {
+        name: one
+        for name, quantity in aiding.items()
+        if (one := _of_sensor(reader, path, name, quantity)) is not None
+    }
+    used = {one.connections[0].topic for one in wanted.values()}
     for role, rows in ROWS.items():
-        connections = _chosen(reader, path, getattr(topics, role), role, tuple(rows))
+        connections = _chosen(reader, path, getattr(topics, role), role, tuple(rows), used)
         if connections:
             refuse_overlap(reader, connections[0].topic)
             row, place = rows[connections[0].msgtype], f"{path} topic {connections[0].topic}"
@@ -134,15 +153,46 @@ def _read(reader: AnyReader, path: Path, topics: Topics, report: Report) -> dict
         if not parts[role]:
             raise InputError(f"{one.place}: holds no messages; record it, or leave it out.")
         stamps, values = (np.concatenate(column) for column in zip(*parts.pop(role), strict=True))
-        result[role] = _own_times(_sorted(_NAMES[role], one.place, stamps, values))
+        result[role] = _own_times(_sorted(_NAMES.get(role, role), one.place, stamps, values))
     return result
 
 
+def _of_sensor(reader: AnyReader, path: Path, name: str, quantity: Quantity) -> Wanted | None:
+    """Return the messages of an aiding sensor; None if the bag has no topic of its name."""
+    name = name.strip("/")
+    topics = sorted({c.topic for c in reader.connections})
+    named = [topic for topic in topics if topic.strip("/") == name]
+    named = named or [topic for topic in topics if topic.rsplit("/", 1)[-1] == name]
+    if not named:
+        return None
+    rows = AIDING_ROWS.get(quantity, {})
+    connections = [c for c in reader.connections if c.topic == named[0] and c.msgtype in rows]
+    if len(named) > 1 or not connections:
+        found = ", ".join(sorted({c.msgtype for c in reader.connections if c.topic in named}))
+        raise InputError(
+            f"{path}: the site's aiding sensor {name} measures {quantity}, of which"
+            f" {' and '.join(named)} of {found} is no single topic of"
+            f" {' or '.join(rows) or 'any type'}; give it the whole name of another topic."
+        )
+    _refuse_several_types(connections, path)
+    row = rows[connections[0].msgtype]
+    return Wanted(f"{path} topic {named[0]}", connections, row)
+
+
+def _aiding(stream: _Stream, quantity: Quantity, span: Span) -> AidingSamples:
+    return AidingSamples(quantity, span.seconds(stream.time_ns), stream.values)
+
+
 def _chosen(
-    reader: AnyReader, path: Path, topic: str | None, role: str, msgtypes: tuple[str, ...]
+    reader: AnyReader,
+    path: Path,
+    topic: str | None,
+    role: str,
+    msgtypes: tuple[str, ...],
+    used: set[str],
 ) -> list[Connection]:
-    """Return the connections of the one topic that plays a role."""
-    connections = [c for c in reader.connections if c.msgtype in msgtypes]
+    """Return the connections of the one topic that plays a role, and is not used as another."""
+    connections = [c for c in reader.connections if c.msgtype in msgtypes and c.topic not in used]
     if topic is None:
         connections = [c for c in connections if c.msgtype in USUAL] or connections
     names = sorted({c.topic for c in connections})

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from magfusion.errors import InputError
+from magfusion.model.aiding import Quantity
 
 IMU = "sensor_msgs/msg/Imu"
 FIELD = "sensor_msgs/msg/MagneticField"
@@ -64,6 +65,57 @@ ROWS: dict[str, dict[str, Row]] = {
         POSE_WITH_COVARIANCE: _sure_pose_row,
         TRANSFORM: transform_row,
     },
+}
+
+
+def _sure_twist_row(message: Any) -> list[float]:
+    return _vector(message.twist.twist.linear)
+
+
+def _twist_row(message: Any) -> list[float]:
+    return _vector(message.twist.linear)
+
+
+def _position_row(message: Any) -> list[float]:
+    return _vector(message.pose.position)
+
+
+def _sure_position_row(message: Any) -> list[float]:
+    return _vector(message.pose.pose.position)
+
+
+def _point_row(message: Any) -> list[float]:
+    return _vector(message.point)
+
+
+def _pose_height_row(message: Any) -> list[float]:
+    return [message.pose.position.z]
+
+
+def _range_row(message: Any) -> list[float]:
+    return [message.range]
+
+
+def _pressure_row(message: Any) -> list[float]:
+    return [message.fluid_pressure]
+
+
+# Of aiding sensors, by what they measure and type.
+AIDING_ROWS: dict[Quantity, dict[str, Row]] = {
+    "velocity": {
+        ODOMETRY: _sure_twist_row,
+        "geometry_msgs/msg/TwistWithCovarianceStamped": _sure_twist_row,
+        "geometry_msgs/msg/TwistStamped": _twist_row,
+    },
+    "range": {"sensor_msgs/msg/Range": _range_row},
+    "position": {
+        ODOMETRY: _sure_position_row,
+        POSE: _position_row,
+        POSE_WITH_COVARIANCE: _sure_position_row,
+        "geometry_msgs/msg/PointStamped": _point_row,
+    },
+    "height": {POSE: _pose_height_row},
+    "pressure": {"sensor_msgs/msg/FluidPressure": _pressure_row},
 }
 
 

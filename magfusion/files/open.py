@@ -9,6 +9,7 @@ from magfusion.files.foreign.euroc import is_euroc, read_euroc
 from magfusion.files.log import HEADER, is_log, read_log
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import Log
+from magfusion.model.site import Site
 
 
 def open_log(
@@ -17,6 +18,7 @@ def open_log(
     end: float | None = None,
     topics: Topics | None = None,
     report: Report = quiet,
+    site: Site | None = None,
 ) -> Log:
     """Read a log, an EuRoC folder or a bag, whichever the path is.
 
@@ -28,6 +30,8 @@ def open_log(
         Of a bag that has several of one type.
     report : callable
         Called with the part of a bag that has been read.
+    site : Site, optional
+        Whose aiding sensors are read of a bag, by the names of their topics.
 
     Raises
     ------
@@ -42,7 +46,8 @@ def open_log(
     if is_euroc(path):
         return read_euroc(path, start, end)
     if is_bag(path):
-        return read_bag(path, start, end, topics, report)
+        aiding = {} if site is None else {one.name: one.quantity for one in site.aiding}
+        return read_bag(path, start, end, topics, report, aiding)
     raise InputError(
         f"{path}: is no log: found neither {HEADER}, nor mav0/imu0/data.csv (EuRoC), nor"
         " .mcap, .db3 or .bag (bags of ROS); give the path of one of them, or bring"

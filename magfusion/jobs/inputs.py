@@ -184,7 +184,7 @@ def read_job(
         For invalid content of either file.
     """
     site = read_site(job, unknown=unknown, without=without, several=several)
-    log = _as_known(job, _open(job, report), site)
+    log = _as_known(job, _open(job, report, site), site)
     check_axes(job.declared_path, job.log_path, log, site, fewer=fewer, amplitudes=amplitudes)
     if not rotor:
         check_rotors(job.declared_path, job.log_path, log, site, separately=separately)
@@ -280,12 +280,12 @@ def read_recording(job: Job, report: Report = quiet) -> tuple[Log, Site | None]:
                     " the samples; give the log with magnetometer.parquet"
                 )
             return log, site
-        return clean_log(_open(job, report), site), site
+        return clean_log(_open(job, report, site), site), site
     return open_log(job.log_path, job.start, job.end, job.topics, report), None
 
 
-def _open(job: Job, report: Report = quiet) -> Log:
-    log = open_log(job.log_path, job.start, job.end, job.topics, report)
+def _open(job: Job, report: Report = quiet, site: Site | None = None) -> Log:
+    log = open_log(job.log_path, job.start, job.end, job.topics, report, site)
     if log.waveform is None and log.fields is None and not log.waveforms:
         raise InputError(
             f"{job.log_path}: has no magnetometer samples in the selected part; record the"
