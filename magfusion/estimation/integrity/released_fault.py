@@ -7,6 +7,7 @@ import numpy as np
 from magfusion.estimation.data_checks.statistics import log_p_chi_square
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.suspects import CODE, USUAL, Inertial, Suspect
+from magfusion.model.parameters import AidingParameter
 from magfusion.units import Array
 
 FARTHEST = 30.0  # typical errors; directions with a larger sigma are ignored
@@ -82,7 +83,7 @@ class ReleasedFault(ReleaseGain):
 
     @property
     def is_mistake(self) -> bool:
-        """Whether the poses err by it more than they claim, or an IMU is farther off than usual.
+        """Whether the poses err by it more than they claim, or a sensor is farther off than usual.
 
         What is no farther off than instruments usually are is no mistake.
         """
@@ -91,8 +92,8 @@ class ReleasedFault(ReleaseGain):
             float(np.linalg.norm(b.sigma * self.step[b.columns])) > USUAL.get(b.parameter, 0.0)
             for b in blocks
         )
-        of_imu = all(isinstance(b.parameter, Inertial) for b in blocks)
-        return exceeds and (of_imu or float(np.mean(self.distance)) > COVERED)
+        of_sensor = all(isinstance(b.parameter, Inertial | AidingParameter) for b in blocks)
+        return exceeds and (of_sensor or float(np.mean(self.distance)) > COVERED)
 
 
 def gains(combine: Array, information: Array, gradient: Array) -> Array:

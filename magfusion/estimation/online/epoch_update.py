@@ -253,10 +253,10 @@ class EpochUpdate:
             *self.metal.judgement().findings,
             *self.of_currents,
             *self.gate.watch.findings(),
-            *self.aiding.findings(state.time),
             *_of_place(self.site, state),
             *self._roll,
         )
+        findings = self.aiding.judged(findings, state.time)
         return findings if self.bank is None else self.bank.with_levels(findings, state)
 
     def _compare(self, samples: FieldSamples, state: State) -> None:

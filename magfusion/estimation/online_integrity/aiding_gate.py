@@ -2,17 +2,24 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 from scipy.stats import chi2
 
 from magfusion.estimation.graph.measurement import Measurement, group_distances
 from magfusion.estimation.graph.state import State, states_of
+from magfusion.estimation.integrity.suspects import CODE
 from magfusion.estimation.measurements.aiding import AidingMeasurement
-from magfusion.model.parameters import Block
+from magfusion.estimation.online_integrity.judgement import Judgement
+from magfusion.model.parameters import PARAMETERS, AidingParameter, Block
 from magfusion.model.trust import Finding, Verdict
 
 FALSE_REJECTIONS = 1e-3  # of true samples, which costs a thousandth of the information
 REJECTED_LONG = 5.0  # s of nothing but rejections; slips and reflections are shorter
+MEMORY = 0.995  # of the share of rejections, per sample
+TRUNCATED = 0.05  # share beyond which what is accepted is no fair sample of the errors
+CONTRADICTS = 0.25  # share beyond which a sensor is not as declared
+OF_PARAMETERS = frozenset(CODE[p] for p in PARAMETERS if isinstance(p, AidingParameter))
 GATE = {k: float(chi2.isf(FALSE_REJECTIONS, k)) for k in (1, 2, 3)}  # by degrees of freedom
 
 
@@ -23,13 +30,16 @@ class AidingGate:
     ----------
     rejected_since : dict of str to float
         Of each sensor whose last sample was rejected, the time of the first such in a row (s).
+    rejected_share : dict of str to float
+        Decaying mean of its rejections.
     """
 
     rejected_since: dict[str, float]
+    rejected_share: dict[str, float]
 
     def __init__(self, blocks: Sequence[Block], counts: Counter[str]) -> None:
         self.blocks, self.counts = tuple(blocks), counts
-        self.rejected_since = {}
+        self.rejected_since, self.rejected_share = {}, {}
 
     def passed(self, measurements: list[Measurement], state: State) -> list[Measurement]:
         """Return the measurements of one epoch without those that fail the test."""
@@ -41,24 +51,39 @@ class AidingGate:
         rows = measurement.linearize(states_of([state]), state.calibration, self.blocks)
         measured = int((measurement.sigma < float("inf")).sum())
         explained = bool(group_distances(rows, state.cov)[0, 0] <= GATE[measured])
+        sensor, before = measurement.sensor, self.rejected_share.get(measurement.sensor, 0.0)
+        self.rejected_share[sensor] = MEMORY * before + (1.0 - MEMORY) * (not explained)
         if explained:
-            self.rejected_since.pop(measurement.sensor, None)
+            self.rejected_since.pop(sensor, None)
         else:
-            self.counts[f"outlier of {measurement.sensor}"] += 1
-            self.rejected_since.setdefault(measurement.sensor, state.time)
+            self.counts[f"outlier of {sensor}"] += 1
+            self.rejected_since.setdefault(sensor, state.time)
         return explained
 
-    def findings(self, time: float) -> tuple[Finding, ...]:
-        """Return the sensors that contradict the state for long."""
-        return tuple(
-            Finding(
-                "aiding_disagrees",
-                f"{sensor} contradicts the estimate since {start_time:.1f} s, and is not used: it"
-                " slips or is blocked, or its scale, mounting or clock is not as declared; correct"
-                " them in the site's aiding, or leave it out.",
-                Verdict.DOUBTFUL,
-                (time - start_time) / REJECTED_LONG,
+    def judged(self, judgement: Judgement, time: float) -> Judgement:
+        """Return a judgement with the sensors that contradict the state.
+
+        A parameter of a sensor is not estimated by the samples that the test leaves.
+        """
+        contradicting = {
+            sensor: share
+            for sensor, share in self.rejected_share.items()
+            if share > CONTRADICTS or time > self.rejected_since.get(sensor, time) + REJECTED_LONG
+        }
+        if max(self.rejected_share.values(), default=0.0) > TRUNCATED:
+            kept = tuple(f for f in judgement.findings if f.code not in OF_PARAMETERS)
+            judgement = replace(judgement, findings=kept)
+        return judgement.with_findings(
+            *(
+                Finding(
+                    "aiding_disagrees",
+                    f"{sensor} contradicts the estimate, {100.0 * share:.0f} % of its samples are"
+                    " not used: it slips or is blocked, or its scale, mounting, lever arm or clock"
+                    " is not as declared; smooth the log to see which, correct it in the site's"
+                    " aiding, or leave the sensor out.",
+                    Verdict.DOUBTFUL,
+                    share / CONTRADICTS,
+                )
+                for sensor, share in contradicting.items()
             )
-            for sensor, start_time in self.rejected_since.items()
-            if time > start_time + REJECTED_LONG
         )
