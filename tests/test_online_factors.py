@@ -343,7 +343,8 @@ def test_the_navigator_makes_states_between_its_epochs_for_odometry() -> None:
 
 
 REFUSED: dict[str, tuple[Literal["smoother", "ekf"], list[float], str]] = {
-    "no time": ("smoother", [], "has no times"),
+    "no time": ("smoother", [], "that are none or too close"),
+    "one state twice": ("smoother", [11.0, 11.000001], "that are none or too close"),
     "a state before the window": ("smoother", [3.0, 11.0], "3, 11 s, not within the smoother's"),
     "states too far apart": ("smoother", [11.0, 16.5], "not within the smoother's lag of 4 s"),
     "an earlier state of the filter": ("ekf", [11.0], "the filter has only the state of one"),

@@ -324,8 +324,10 @@ class Navigator:
     def _check_states(self, time: Array) -> None:
         """Refuse factors on states (s) that the estimator does not have and will not make."""
         name = ", ".join(f"{t:g}" for t in time)
-        if len(time) == 0:
-            raise InputError("a factor has no times; give the time of each of its states")
+        if len(time) == 0 or np.any(np.diff(time) < 2.0 * SAME_TIME):
+            raise InputError(
+                f"a factor is at times ({name}) that are none or too close; give one for each state"
+            )
         coming = len(time) == 1 and time[0] > self.time
         if self.settings.estimator == "ekf" and not coming:
             raise InputError(
