@@ -16,6 +16,7 @@ from test_user_factors import speed
 import magfusion as mf
 from magfusion.estimation.graph.gtsam_factors import CalibrationKeys, measurement_factors
 from magfusion.estimation.graph.inertial import inertial_factor
+from magfusion.estimation.graph.kalman import considered_share, partial_update
 from magfusion.estimation.graph.preintegration import cut_at_epochs, preintegrate
 from magfusion.estimation.graph.process_noise import ProcessNoise
 from magfusion.estimation.graph.propagation import propagate
@@ -23,6 +24,7 @@ from magfusion.estimation.graph.state import State, between, values_of
 from magfusion.estimation.graph.user_factors import UserFactors
 from magfusion.estimation.measurements.factor_of_state import state_factor
 from magfusion.estimation.online.fixed_lag import SlidingWindow
+from magfusion.estimation.online.window_prior import WindowPrior
 from magfusion.model.parameters import PHASOR_PARAMETERS
 from magfusion.units import Array
 
@@ -210,6 +212,31 @@ def test_states_that_left_stay_as_clones_for_the_factors_on_them(small: SmallLog
     newest = np.sqrt(np.diag(window.state.cov)[:6])
     np.testing.assert_allclose(newest, np.sqrt(np.diag(cov[-1])), rtol=0.01)
     assert window.dropped == 0
+
+
+@pytest.mark.parametrize("considered", [0, 2])
+def test_clones_change_nothing_in_the_drift_and_the_considered_parameters(considered: int) -> None:
+    rng, size, states = np.random.default_rng(3), 15 + 4, (first_state(small_log(5)),) * 3
+    root, mean = rng.normal(size=(30 + size, 30 + size)), rng.normal(size=30 + size)
+    joint = WindowPrior(states, root, root @ mean)
+    cov = np.linalg.inv(root.T @ root)[30:, 30:]
+    alone = np.linalg.inv(np.linalg.cholesky(cov))
+    share, noise = considered_share(size, considered), np.diag([0.0, 0.3, 0.0, 0.2])
+    known = np.diag(rng.uniform(0.5, 2.0, size))
+    several, single = (
+        prior.predicted(noise, known, share)
+        for prior in (joint, WindowPrior(states[:1], alone, alone @ mean[30:]))
+    )
+    for prior in (several, single):
+        inverse = np.linalg.inv(prior.sqrt_information)
+        expected = partial_update(mean[30:], cov.copy(), known, share)
+        np.testing.assert_allclose(
+            (inverse @ prior.right)[-size:], expected[0], rtol=1e-6, atol=1e-9
+        )
+        expected[1][15:, 15:] += noise
+        np.testing.assert_allclose(
+            (inverse @ inverse.T)[-size:, -size:], expected[1], rtol=1e-6, atol=1e-9
+        )
 
 
 def test_a_factor_that_fails_leaves_the_window_as_it_was(small: SmallLog) -> None:
