@@ -1,21 +1,14 @@
 """Factors of a user's GTSAM graph in the estimators."""
 
-from typing import Literal
-
 import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, L, V, X
-from online_log import epoch, online_log
 from small_problem import SmallLog, small_log
-from test_measurement_seam import one_update
 
 import magfusion as mf
 from magfusion.estimation.graph.graph import GraphEstimate
 from magfusion.estimation.graph.gtsam_graph import NativeProblem
-from magfusion.estimation.graph.state import between
-from magfusion.estimation.measurements.factor_of_state import state_factor
-from magfusion.model.parameters import PHASOR_PARAMETERS
 from magfusion.units import Array
 
 SETTINGS = mf.SmootherSettings(estimate=("magnetometer",), tune=False)
@@ -152,80 +145,3 @@ def test_wrong_factors_are_refused(
     graph.add(gtsam.GPSFactor(key, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.1)))
     with pytest.raises(mf.InputError, match=text):
         mf.smooth(small.log, small.site, SETTINGS, factors=graph, times=times)
-
-
-# --- online ---
-
-
-def state_factors() -> list[gtsam.NonlinearFactor]:
-    sigma = gtsam.noiseModel.Isotropic.Sigma
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(1.345)
-    robust = gtsam.noiseModel.Robust.Create(huber, sigma(1, 0.05))
-    return [
-        gtsam.GPSFactor(X(0), np.array([0.3, 0.2, 1.1]), sigma(3, 0.02)),
-        gtsam.CustomFactor(robust, [V(0)], speed),
-        gtsam.PriorFactorConstantBias(B(0), gtsam.imuBias.ConstantBias(), sigma(6, 0.02)),
-    ]
-
-
-def test_online_factors_have_the_effect_of_a_dense_solution() -> None:
-    factors = state_factors()
-    measured = [state_factor(factor, np.zeros(1)) for factor in factors]
-    light, window, predicted, blocks = one_update(("moments",), PHASOR_PARAMETERS, measured)
-    prior, values = predicted.state, gtsam.Values()
-    values.insert(X(0), prior.pose)
-    values.insert(V(0), prior.velocity_world)
-    values.insert(B(0), gtsam.imuBias.ConstantBias(prior.accel_bias_body, prior.gyro_bias_body))
-    graph = gtsam.NonlinearFactorGraph()
-    for factor in factors:
-        graph.add(factor)
-    ordering = gtsam.Ordering()
-    for key in (X(0), V(0), B(0)):
-        ordering.push_back(key)
-    jacobian, right = graph.linearize(values).jacobian(ordering)
-    whole = np.pad(jacobian, ((0, 0), (0, len(prior.cov) - 15)))
-    cov = np.linalg.inv(np.linalg.inv(prior.cov) + whole.T @ whole)
-    step, sigma = cov @ whole.T @ right, np.sqrt(np.diag(cov))
-    assert np.max(np.abs(step) / sigma) > 0.1
-    for state in (light, window):
-        np.testing.assert_allclose(between(prior, state, blocks) / sigma, step / sigma, atol=1e-6)
-        np.testing.assert_allclose(
-            state.cov / np.outer(sigma, sigma), cov / np.outer(sigma, sigma), atol=1e-6
-        )
-
-
-@pytest.mark.parametrize("estimator", ["smoother", "ekf"])
-def test_the_navigator_takes_a_factor_at_a_time_of_its_own(
-    estimator: Literal["smoother", "ekf"],
-) -> None:
-    log, when = online_log(6, 13.0), 11.13
-    truth = log.motion.trajectory(np.array([when])).position_world[0]
-    sigma = gtsam.noiseModel.Isotropic.Sigma(3, 1e-4)
-    states = {}
-    for given in (False, True):
-        navigator = mf.Navigator(log.site, mf.NavigatorSettings(estimator=estimator))
-        for k in range(len(log.fields)):
-            begin = -np.inf if k == 0 else log.fields.time[k - 1]
-            now = (log.imu.time >= begin) & (log.imu.time < log.fields.time[k])
-            navigator.add_imu(log.imu.time[now], log.imu.gyro_body[now], log.imu.accel_body[now])
-            navigator.add_fields(epoch(log.fields, k))
-            if given and begin < when <= log.fields.time[k]:
-                navigator.add_factor(gtsam.GPSFactor(X(0), truth, sigma), times=[when])
-        states[given] = navigator.take()
-        assert navigator.counts["measurement too late"] == 0
-    there = next(state for state in states[True] if state.time == when)
-    assert when not in [state.time for state in states[False]]
-    assert np.linalg.norm(there.position_world - truth) < 3e-4
-    assert there.position_sigma < 1.1e-4
-
-
-def test_what_online_factors_cannot_do_is_refused() -> None:
-    log = online_log(6, 6.0)
-    navigator = mf.Navigator(log.site)
-    sigma = gtsam.noiseModel.Isotropic.Sigma
-    odometry = gtsam.BetweenFactorPose3(X(0), X(1), gtsam.Pose3(), sigma(6, 0.1))
-    with pytest.raises(mf.InputError, match="this is on x0, x1 at 2 times"):
-        navigator.add_factor(odometry, times=[1.0, 2.0])
-    navigator.add_factor(state_factors()[0], times=[1.0])
-    with pytest.raises(mf.InputError, match="cannot store a GTSAM factor"):
-        navigator.checkpoint()

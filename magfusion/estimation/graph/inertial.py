@@ -1,7 +1,7 @@
 """Inertial factors between states, and their derivatives by calibration parameters of the IMU."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -22,6 +22,7 @@ from magfusion.units import Array
 Preintegrated = gtsam.PreintegratedCombinedMeasurementsG
 STEP = 1e-2  # of a parameter's sigma, of the difference quotient
 ROWS = 15  # of an inertial factor
+SHORTEST_STEP = 1e-9  # s; the rounding of a time stamp, and no step
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +46,28 @@ class Steps:
         biases = (bias[None] for bias in (self.accel_bias_body, self.gyro_bias_body))
         return preintegrate(self.increments, site.platform.imu, site.gravity, *biases)[0]
 
+    def split(self, after: float) -> "tuple[Steps, Steps]":
+        """Return the steps until some time after the first state (s), and the others."""
+        own, ends = self.increments, np.cumsum(self.increments.dt)
+        k = int(np.searchsorted(ends, after))
+        parts = (
+            (slice(0, k + 1), np.append(own.dt[:k], after - (ends[k] - own.dt[k]))),
+            (slice(k, None), np.append(ends[k] - after, own.dt[k + 1 :])),
+        )
+        out = []
+        for rows, dt in parts:
+            kept = dt > SHORTEST_STEP
+            gyro, accel, first = own.gyro_body[rows], own.accel_body[rows], [0, int(kept.sum())]
+            increments = replace(
+                own,
+                gyro_body=gyro[kept],
+                accel_body=accel[kept],
+                dt=dt[kept],
+                first=np.array(first),
+            )
+            out.append(replace(self, increments=increments))
+        return out[0], out[1]
+
 
 @dataclass(frozen=True, eq=False)
 class Link:
@@ -64,6 +87,16 @@ class Link:
     by_calibration: Array | None
     calibration: Calibration
     steps: Steps | None = None
+
+    def split(self, after: float, site: Site) -> "tuple[Link, Link]":
+        """Return the links to and from a new state, some time after the first (s)."""
+        assert self.steps is not None
+        assert self.by_calibration is None
+        first, second = (
+            replace(self, measurement=steps.preintegrated(site), steps=steps)
+            for steps in self.steps.split(after)
+        )
+        return first, second
 
 
 def inertial_factor(i: int, measurement: Preintegrated) -> gtsam.GalileanCombinedImuFactor:

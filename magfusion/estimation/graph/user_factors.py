@@ -1,6 +1,7 @@
 """Factors of a user's GTSAM graph on the states of an estimator."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -9,11 +10,22 @@ from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.errors import InputError
 from magfusion.estimation.graph.factors import empty_factor
+from magfusion.estimation.solve.bordered import eliminate_partial
 from magfusion.model.short_repr import short_repr
 from magfusion.units import Array, IntArray
 
 MOTION: dict[str, Callable[[int], int]] = {"x": X, "v": V, "b": B}
 RESERVED = "cdhn"  # of the calibration, its segments, considered parameters and nuisances
+OWN_ITERATIONS = 3  # of Gauss and Newton, for the optimum of own keys at given states
+
+
+@contextmanager
+def _evaluated() -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as failure:  # as of a key whose variable has another type
+        reason = str(failure).strip().splitlines()[0]
+        raise InputError(f"a factor of yours cannot be evaluated ({reason})") from failure
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,15 +53,21 @@ class UserFactors:
 
     @classmethod
     def of(
-        cls, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values | None, time: Array
+        cls,
+        graph: gtsam.NonlinearFactorGraph | gtsam.NonlinearFactor,
+        values: gtsam.Values | None,
+        time: Array | Sequence[float],
     ) -> "UserFactors":
-        """Return factors of which every key is known.
+        """Return factors, or one, of which every key is known.
 
         Raises
         ------
         InputError
         """
         time = np.atleast_1d(np.asarray(time, dtype=float))
+        if isinstance(graph, gtsam.NonlinearFactor):
+            single, graph = graph, gtsam.NonlinearFactorGraph()
+            graph.add(single)
         if not (np.all(np.isfinite(time)) and np.all(np.diff(time) > 0.0)):
             raise InputError("times of factors must be finite and ascending")
         own, used = gtsam.Values() if values is None else gtsam.Values(values), set()
@@ -87,12 +105,8 @@ class UserFactors:
 
     def error(self, values: gtsam.Values, own: gtsam.Values | None) -> float:
         """Return half the sum of squares, or the loss, at an estimate of states and own keys."""
-        at = self.named(values, own)
-        try:
-            return float(self.graph.error(at))
-        except RuntimeError as failure:  # as of a key whose variable has another type
-            reason = str(failure).strip().splitlines()[0]
-            raise InputError(f"a factor of yours cannot be evaluated ({reason})") from failure
+        with _evaluated():
+            return float(self.graph.error(self.named(values, own)))
 
     def linearize(
         self, values: gtsam.Values, own: gtsam.Values | None
@@ -108,6 +122,24 @@ class UserFactors:
             whole.getb()[: len(right)] = right
             out.push_back(whole)
         return out
+
+    def marginalized(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
+        """Return the linear factors at an estimate of the states, without their own keys.
+
+        These are at their optimum for the states, and eliminated.
+        """
+        with _evaluated():
+            if not self.own:
+                return self.linearize(values, None)
+            own, ordering = self.values, gtsam.Ordering()
+            for key, _ in self.own:
+                ordering.push_back(key)
+            fixed = values.zeroVectors()
+            for _ in range(OWN_ITERATIONS):
+                linear = self.linearize(values, own)
+                solved, rest = eliminate_partial(linear, ordering, orthogonal=True)
+                own = own.retract(solved.optimize(fixed))
+            return rest
 
     def key(self, key: int) -> int:
         """Return the estimator's key of a user's key."""

@@ -15,7 +15,7 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.freeze import imu_remarks
 from magfusion.estimation.data_checks.inertial_noise import measured_noise, with_white_noise
-from magfusion.estimation.data_checks.stream_buffer import LARGEST_JUMP
+from magfusion.estimation.data_checks.stream_buffer import LARGEST_JUMP, check_clock
 from magfusion.estimation.demodulation.drive_reference import drive_findings
 from magfusion.estimation.demodulation.sensor_frame_samples import (
     sensor_frame_phasors,
@@ -25,6 +25,7 @@ from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.process_noise import calibration_process_noise
 from magfusion.estimation.graph.propagation import Propagated, propagate
 from magfusion.estimation.graph.state import State
+from magfusion.estimation.graph.user_factors import UserFactors
 from magfusion.estimation.initialization.earlier_state import with_earlier
 from magfusion.estimation.initialization.early import first_try, is_clear, next_try, open_start
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
@@ -40,7 +41,7 @@ from magfusion.estimation.online.applied_corrections import AppliedCorrections
 from magfusion.estimation.online.arrivals import arrivals_of
 from magfusion.estimation.online.ekf import ErrorStateFilter
 from magfusion.estimation.online.epoch_update import EpochUpdate, Estimator
-from magfusion.estimation.online.fixed_lag import SlidingWindow
+from magfusion.estimation.online.fixed_lag import SAME_TIME, SlidingWindow
 from magfusion.estimation.online.input_history import InputHistory
 from magfusion.estimation.online.input_queue import Arrivals
 from magfusion.estimation.online.navigator_data import navigator_rules
@@ -116,6 +117,7 @@ class Navigator:
     _reported_until: float
     _earlier: State | None
     _aiding_until: dict[str, float]  # time of each sensor's last sample (s)
+    _early: list[UserFactors]
 
     def __init__(self, site: Site, settings: NavigatorSettings | None = None) -> None:
         check_arguments("Navigator", site=(site, Site))
@@ -161,7 +163,7 @@ class Navigator:
         self.rival_chi_square = None
         self.declared, self._history = site, InputHistory()
         self._corrections, self._reported_until = AppliedCorrections(), -np.inf
-        self._earlier, self._aiding_until = None, {}
+        self._earlier, self._early, self._aiding_until = None, [], {}
         self._possible: tuple[Correction, ...] = ()
         self._tried: Correction | None = None
         self.remainder: Correction | None = None
@@ -317,22 +319,73 @@ class Navigator:
                 self.counts["measurement too late"] += 1
         self.advance()
 
-    def add_factor(self, factor: gtsam.NonlinearFactor, times: Sequence[float] | Array) -> None:
-        """Add a GTSAM factor on the state of one time (s), as `add_measurement` does.
+    def add_factor(
+        self,
+        factor: gtsam.NonlinearFactor | gtsam.NonlinearFactorGraph,
+        times: Sequence[float] | Array,
+        values: gtsam.Values | None = None,
+    ) -> None:
+        """Add GTSAM factors on the states of some times (s).
+
+        A factor on the state of one time to come creates it, as `add_measurement` does.  Others
+        create states in the smoother's window, and enter with the next epoch after the last time.
 
         Parameters
         ----------
-        factor : gtsam.NonlinearFactor
-            On X(0), V(0), B(0), or some of them.
+        factor : gtsam.NonlinearFactor or gtsam.NonlinearFactorGraph
+            On X(j), V(j), B(j) of the j-th time, and on keys of their own, which are variables of
+            this call.
         times : sequence of float
-            One.
+            Ascending, within the lag; one for the filter.
+        values : gtsam.Values, optional
+            Initial values of their own keys.
 
         Raises
         ------
         InputError
-            If the factor is on more than one state, or the clock jumped.
+            If a key is unknown, a state is not one of the estimator's, or the clock jumped.
         """
-        self.add_measurement(float(np.ravel(times)[0]), state_factor(factor, np.ravel(times)))
+        factors = UserFactors.of(factor, values, times)
+        self._check_states(factors.time)
+        check_clock("factor", factors.time, self._arrived.newest)
+        self.receive_factors(factors)
+
+    def _check_states(self, time: Array) -> None:
+        """Refuse factors on states (s) that the estimator does not have and will not make."""
+        name = ", ".join(f"{t:g}" for t in time)
+        if len(time) == 0 or np.any(np.diff(time) < 2.0 * SAME_TIME):
+            raise InputError(
+                f"a factor is at times ({name}) that are none or too close; give one for each state"
+            )
+        coming = len(time) == 1 and time[0] > self.time
+        if self.settings.estimator == "ekf" and not coming:
+            raise InputError(
+                f"a factor is at {name} s, but the filter has only the state of one time, from now"
+                " on; use the smoother, or magfusion.smooth(factors=...)"
+            )
+        if not coming and self._of_imu:
+            raise InputError(
+                f"a factor is at {name} s, but parameters of the IMU allow only one time to come;"
+                " use magfusion.smooth(factors=...)"
+            )
+        window, lag = self._estimator, self.settings.lag
+        oldest = window.oldest if isinstance(window, SlidingWindow) else -np.inf
+        if time[-1] - time[0] > lag or time[0] < oldest - SAME_TIME:
+            raise InputError(
+                f"a factor is at {name} s, not within the smoother's lag of {lag:g} s;"
+                " increase NavigatorSettings.lag, or use magfusion.smooth(factors=...)"
+            )
+
+    def receive_factors(self, factors: UserFactors) -> None:
+        """Add checked factors; those that are too late by now are counted."""
+        if len(factors.time) == 1 and factors.time[0] > self.time:
+            self.add_measurement(float(factors.time[0]), state_factor(factors))
+            return
+        self._history.add(factors.time, "receive_factors", factors)
+        if self._estimator is None:
+            self._early.append(factors)
+        elif isinstance(self._estimator, SlidingWindow):
+            self._estimator.waiting = [*self._estimator.waiting, factors]
 
     def _stand_still(self, time: Array, *, raw: bool) -> None:
         """Advance a motion prior to the newest fields (s), where the site has no IMU."""
@@ -490,7 +543,10 @@ class Navigator:
     @property
     def losses(self) -> dict[str, int]:
         """All rejections, losses and recoveries by reason: `counts`, windows, samples."""
-        return {**self.counts, **self._arrived.losses}
+        window = self._estimator
+        dropped = window.dropped if isinstance(window, SlidingWindow) else 0
+        of_factors = {"factors dropped": dropped} if dropped else {}
+        return {**self.counts, **of_factors, **self._arrived.losses}
 
     def checkpoint(self) -> dict[str, Any]:
         """Return the complete state as plain data, from which `restored` makes a navigator."""
@@ -582,8 +638,14 @@ class Navigator:
             self._estimator = ErrorStateFilter(state, self.blocks, self._considered)
         else:
             self._estimator = SlidingWindow(
-                state, self.blocks, self.settings.lag, self._process_noise, self._considered
+                state,
+                self.blocks,
+                self.settings.lag,
+                self._process_noise,
+                self._considered,
+                with_white_noise(self.site, *self._white),
             )
+            self._estimator.waiting, self._early = self._early, []
 
     def _step(self) -> bool:
         """Process the next epoch, if all its data have arrived."""

@@ -8,7 +8,7 @@ their inertial steps.
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from magfusion.estimation.data_checks.stream_buffer import Buffer
 from magfusion.estimation.graph.inertial import ROWS, Link, Steps
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, State, states_of
+from magfusion.estimation.graph.user_factors import UserFactors
 from magfusion.estimation.measurements.aiding_samples import MEASUREMENTS as OF_AIDING
 from magfusion.estimation.measurements.earth import EarthField
 from magfusion.estimation.measurements.factor_of_state import StateFactor
@@ -26,7 +27,8 @@ from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors, Predictions
 from magfusion.estimation.measurements.pose_fix import PoseFix
 from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
-from magfusion.estimation.online.fixed_lag import Node, SlidingWindow, WindowPrior
+from magfusion.estimation.online.fixed_lag import Node, SlidingWindow
+from magfusion.estimation.online.window_prior import WindowPrior
 from magfusion.estimation.online_integrity.bank import SubsetBank
 from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
 from magfusion.estimation.online_integrity.levels import Levels
@@ -79,6 +81,7 @@ def navigator_rules(
     return Rules(
         writers={
             **of_calibration.writers,
+            UserFactors: _refuse_factors,
             Link: lambda link: _link_data(link, of_calibration),
             Measurement: _measurement_data,
             Verdict: str,
@@ -231,12 +234,16 @@ def _check_window(window: SlidingWindow) -> None:
     _check(all(node.link for node in window.nodes[1:]), "has nodes that are not linked")
 
 
+def _refuse_factors(_: UserFactors) -> NoReturn:
+    raise InputError(
+        "a checkpoint cannot store a GTSAM factor of yours; write it when the factor is older"
+        " than the lag"
+    )
+
+
 def _measurement_data(measurement: Measurement) -> dict[str, Any]:
     if isinstance(measurement, StateFactor):
-        raise InputError(
-            "a checkpoint cannot store a GTSAM factor of yours; write it when the factor is older"
-            " than the lag"
-        )
+        _refuse_factors(measurement.factors)
     return {
         "kind": type(measurement).__name__,
         **{k: to_plain(v, _WITHOUT_PREDICTIONS) for k, v in vars(measurement).items()},
