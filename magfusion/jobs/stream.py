@@ -258,7 +258,7 @@ def _process_record(
         field[:, site.platform.magnetometer.lacking] = 0.0
         name = record.magnetometer.magnetometer
         magnetometer_number(site, name, "samples")
-        time, rows = samples.whole("magnetometer", record.magnetometer.time, field)
+        time, rows = samples.whole("magnetometer", record.magnetometer.time, field, name=name)
         newest = max(newest, _last(time))
         time, rows = samples.tested("magnetometer", time, rows, name)
         if len(time):
