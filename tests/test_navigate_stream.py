@@ -297,6 +297,19 @@ def test_states_come_as_soon_as_their_records(walk: OnlineLog, site: Path) -> No
     assert b'"started": true' in rest or seen[-1]["started"]
 
 
+def test_messages_on_a_full_disk_do_not_end_navigation(walk: OnlineLog, site: Path) -> None:
+    """A standard error that takes nothing: the states are those without it."""
+    given = records(walk) + b"no record\n"
+    command = [SCRIPT, "navigate", "-", "--site", site, "--estimator", "ekf", "--keep-going"]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            command, input=given, stdout=subprocess.PIPE, stderr=full, check=False
+        )
+    assert done.returncode == 0
+    expected, _ = answered(site, records(walk))
+    assert len(done.stdout.splitlines()) == len(expected)
+
+
 def test_a_reader_that_leaves_is_no_error(walk: OnlineLog, tmp_path: Path) -> None:
     write_log(as_log(walk), tmp_path / "log")
     command = f"{SCRIPT} replay {tmp_path / 'log'} | head -n 1"

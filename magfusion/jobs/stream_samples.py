@@ -9,6 +9,7 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.estimation.data_checks.spike_filter import SpikeFilter
 from magfusion.files.plausible import RANGE_KEYS, beyond_range, declared_range, exceeds
+from magfusion.files.standard_streams import write_message
 from magfusion.model.site import Site
 from magfusion.receiver.running_clock import RunningClock
 from magfusion.receiver.slots import has_schedule
@@ -117,12 +118,12 @@ class StreamSamples:
         """Write how many samples are left out, after the end."""
         for stream, count in (+self._missing).items():
             text = f"{count} samples are NaN, or larger than any instrument measures"
-            messages.write(f"magfusion: {stream}: {text}. They are left out.\n")
+            write_message(messages, f"{stream}: {text}. They are left out.")
         for instrument, count in (+self._beyond).items():
             text = f"{count} samples are beyond the range in platform.{RANGE_KEYS[instrument]}"
-            messages.write(f"magfusion: {instrument}: {text}. They are left out.\n")
+            write_message(messages, f"{instrument}: {text}. They are left out.")
         for stream, text in self._replaced.items():
-            messages.write(f"magfusion: {stream}: {text}.\n")
+            write_message(messages, f"{stream}: {text}.")
         for stream, count in (+self._false).items():
             text = f"{count} isolated samples are off their neighbours, probably by bit errors"
-            messages.write(f"magfusion: {stream}: {text}. They are left out.\n")
+            write_message(messages, f"{stream}: {text}. They are left out.")
