@@ -10,9 +10,11 @@ import pytest
 from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.data_checks.data_cleaning import clean_log
+from magfusion.estimation.data_checks.samples import clipped_samples
 from magfusion.files.log import write_log
 from magfusion.files.open import open_log
 from magfusion.model.samples import ImuSamples, Log
+from magfusion.model.site import Site
 from magfusion.model.trust import Verdict
 from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -199,6 +201,53 @@ def test_a_number_that_no_instrument_gives_is_a_missing_sample(name: str, tmp_pa
     assert finding.code == "missing_samples"
     assert "4 samples are larger than any instrument measures" in finding.text
     assert not clean_log(read, site).noticed[1:]
+
+
+RANGES = {"gyro": 6.0, "accel": 30.0, "field": 2e-4}  # rad/s, m/s^2, T: of the walk, and no more
+
+
+def _ranged(site: Site) -> Site:
+    imu = replace(site.platform.imu, gyro_range=RANGES["gyro"], accel_range=RANGES["accel"])
+    sensor = replace(site.platform.magnetometer, field_range=RANGES["field"])
+    return replace(site, platform=replace(site.platform, imu=imu, magnetometer=sensor))
+
+
+@pytest.mark.parametrize("stream", RANGES)
+def test_a_sample_beyond_the_declared_range_is_a_missing_one(stream: str) -> None:
+    """Seven in a row too, which no test of single samples sees; one at the range is clipped."""
+    log, site = walked(), demo_site(coil_radius=None)
+    rows, beyond = [*range(400, 407), 900], 1.5 * RANGES[stream]
+    corrupted = _set(log, stream, rows, -beyond)
+    ranged = clean_log(corrupted, _ranged(site))
+    assert missing_rows(log, ranged, stream) == rows
+    (finding,) = ranged.noticed
+    assert (finding.code, finding.verdict) == ("missing_samples", Verdict.TRUSTWORTHY)
+    assert "8 samples are beyond the range" in finding.text
+    clipped = clean_log(_set(log, stream, rows[:7], RANGES[stream]), _ranged(site))
+    assert missing_rows(log, clipped, stream) == []
+    (finding,) = clipped_samples(clipped, _ranged(site))
+    assert (finding.code, finding.verdict) == ("saturated", Verdict.DOUBTFUL)
+    assert "in 7 samples" in finding.text
+    assert not [*clipped_samples(clean_log(log, _ranged(site)), _ranged(site))]
+
+
+def test_a_range_that_most_samples_exceed_is_refused_by_its_key() -> None:
+    log, site = walked(), demo_site(coil_radius=None)
+    imu = replace(site.platform.imu, accel_range=2.0)  # m/s^2, of a weight of 9.8
+    with pytest.raises(InputError, match=r"range of 2 in platform\.imu\.accel_range_m_s2, of "):
+        clean_log(log, replace(site, platform=replace(site.platform, imu=imu)))
+
+
+def _set(log: Log, stream: str, rows: list[int], value: float) -> Log:
+    """Return a log whose samples have a value on an axis."""
+    if stream == "field":
+        assert log.waveform is not None
+        field = log.waveform.measured_sensor.copy()
+        field[rows, 1] = value
+        return replace(log, waveform=replace(log.waveform, measured_sensor=field))
+    own = getattr(log.imu, f"{stream}_body").copy()
+    own[rows, 1] = value
+    return replace(log, imu=replace(log.imu, **{f"{stream}_body": own}))
 
 
 def test_numbers_of_a_wrong_unit_are_refused_and_not_left_out(tmp_path: Path) -> None:

@@ -256,9 +256,9 @@ def test_noise_that_comes_and_goes_is_claimed_where_it_is():
     assert 8.0 < after.mean() / before.mean() < 12.0
 
 
-def drops(waveform, imu, settings=WINDOW):
+def drops(waveform, imu, settings=WINDOW, site=None):
     """Return the centres that are kept, those of a log without fault, and the reasons."""
-    site = noiseless()
+    site = site or noiseless()
     full = choose_windows(ordinary(), still_imu(8.0), site, settings)
     receiver = LockinReceiver(site, settings)
     windows, _ = receiver.whole(waveform, imu)
@@ -294,6 +294,19 @@ def test_a_saturated_stretch_drops_the_windows_that_hold_it(axis, sign):
     measured[1203:1323, axis] = sign * 1e-4  # 3.0075 s to 3.305 s
     kept, full, reasons = drops(replace(waveform, measured_sensor=measured), still_imu(8.0))
     corrupted = holding(full, 3.0075, 3.3051)
+    check_drop(kept, full, reasons, corrupted, "magnetometer saturated")
+
+
+def test_a_sample_at_the_declared_range_drops_the_windows_that_hold_it():
+    waveform = ordinary()
+    measured = waveform.measured_sensor.copy()
+    measured[[1203, 2003], 1] = -2e-4  # T, at 3.0075 and 5.0075 s
+    platform = noiseless().platform
+    sensor = replace(platform.magnetometer, field_range=2e-4)
+    site = replace(noiseless(), platform=replace(platform, magnetometer=sensor))
+    spiked = replace(waveform, measured_sensor=measured)
+    kept, full, reasons = drops(spiked, still_imu(8.0), site=site)
+    corrupted = holding(full, 3.0075, 3.0076) | holding(full, 5.0075, 5.0076)
     check_drop(kept, full, reasons, corrupted, "magnetometer saturated")
 
 

@@ -1,13 +1,18 @@
 """Many runs: the same numbers wherever they run, and what a cluster that is not there is told."""
 
 import os
+import signal
+import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from magfusion.errors import InputError
+from magfusion.errors import EstimationError, InputError
 from magfusion.simulation.monte_carlo import run_many
 
 
@@ -96,6 +101,106 @@ def test_a_cluster_without_workers_is_told_so(monkeypatch: pytest.MonkeyPatch) -
         pytest.raises(InputError, match="has no workers"),
     ):
         run_many(same, INPUTS, cluster=empty.scheduler_address)
+
+
+@contextmanager
+def _processes() -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Yield what starts a process with its messages in a pipe; none outlives the test."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(*words: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", *words], stderr=subprocess.PIPE, text=True
+        )
+        started.append(process)
+        return process
+
+    try:
+        yield start
+    finally:
+        for process in started:
+            process.kill()
+            process.communicate()
+
+
+def _line(process: subprocess.Popen[str], words: str) -> str:
+    """Return the next message with these words."""
+    assert process.stderr is not None
+    return next(line for line in process.stderr if words in line)
+
+
+def _scheduler(
+    start: Callable[..., subprocess.Popen[str]],
+) -> tuple[subprocess.Popen[str], str, tuple[str, ...]]:
+    """Return a scheduler, its address, and the words that start a worker."""
+    pytest.importorskip("distributed")
+    plain = ("--host", "127.0.0.1", "--no-dashboard")
+    scheduler = start("dask", "scheduler", *plain, "--port", "0", "--no-show")
+    address = _line(scheduler, "Scheduler at:").split()[-1]
+    return scheduler, address, ("dask", "worker", address, *plain, "--no-nanny", "--nthreads", "1")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_command_whose_last_worker_is_killed_says_so_and_ends_at_once(
+    number: signal.Signals, code: int, tmp_path: Path
+) -> None:
+    with _processes() as start:
+        scheduler, address, worker_words = _scheduler(start)
+        worker, place = start(*worker_words), str(tmp_path / "drift")
+        _line(worker, "Registered to")
+        words = ("drift", "--hours", "200", "--estimator", "ekf", "--cluster", address, "-o", place)
+        command = start("magfusion", *words)
+        _line(scheduler, "Receive client connection: Client-")
+        time.sleep(2.0)  # s; the task begins
+        worker.kill()
+        killed = time.monotonic()
+        assert address in _line(command, "no worker is left")
+        assert time.monotonic() - killed < 10.0
+        command.send_signal(number)
+        sent = time.monotonic()
+        assert command.wait(60.0) == code
+        assert time.monotonic() - sent < 5.0
+
+
+def nap(seconds: float, rng: np.random.Generator) -> float:
+    time.sleep(seconds)
+    return rng.normal()
+
+
+def test_tasks_wait_for_another_worker(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
+    monkeypatch.setattr("magfusion.simulation.monte_carlo.WATCH_S", 0.2)
+    with _processes() as start:
+        _, address, worker_words = _scheduler(start)
+        first = start(*worker_words)
+        _line(first, "Registered to")
+
+        def replace_worker(_stage: str, done: int, _total: int) -> None:
+            if done == 1 and first.poll() is None:
+                first.kill()
+                time.sleep(1.0)
+                start(*worker_words)
+
+        result = run_many(nap, [0.5] * 3, cluster=address, report=replace_worker)
+    assert result == run_many(nap, [0.0] * 3, workers=1)
+    assert capsys.readouterr().err.count("no worker is left") == 1
+
+
+def test_a_scheduler_that_ends_is_named() -> None:
+    distributed = pytest.importorskip("distributed")
+    started = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=ANY
+    )
+    with pytest.raises(EstimationError, match=f"{started.scheduler_address}: the scheduler has"):
+        run_many(
+            nap,
+            [0.2, 60.0],
+            cluster=started.scheduler_address,
+            report=lambda _stage, done, _total: started.close() if done else None,
+        )
 
 
 def test_dask_that_is_missing_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:

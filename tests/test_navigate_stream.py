@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +107,30 @@ def test_nan_and_null_are_missing_samples_as_in_tables(
     assert reported == (
         f"magfusion: imu: {count} samples are NaN, or larger than any instrument measures. They are"
         " left out.\n"
+    )
+
+
+def test_samples_beyond_a_declared_range_are_missing_in_the_pipe(
+    walk: OnlineLog, tmp_path: Path
+) -> None:
+    imu = replace(walk.site.platform.imu, gyro_range=6.0)  # rad/s
+    save_site(
+        replace(walk.site, platform=replace(walk.site.platform, imu=imu)), tmp_path / "s.yaml"
+    )
+    lines = [json.loads(line) for line in records(walk).splitlines()]
+    inertial = [k for k, one in enumerate(lines) if "imu" in one][200:1000:100]
+    remaining = [one for k, one in enumerate(lines) if k not in inertial]
+    for k in inertial:
+        gyro = np.array(lines[k]["imu"]["gyro"])
+        gyro[..., 2] = 6.1
+        lines[k]["imu"]["gyro"] = gyro.tolist()
+    expected, _ = answered(tmp_path / "s.yaml", b"".join(map(json_line, remaining)))
+    result, reported = answered(tmp_path / "s.yaml", b"".join(map(json_line, lines)))
+    count = sum(np.size(lines[k]["imu"]["time"]) for k in inertial)
+    assert [s for s in result if s["started"]] == [s for s in expected if s["started"]]
+    assert reported == (
+        f"magfusion: gyroscope: {count} samples are beyond the range in"
+        " platform.imu.gyro_range_rad_s. They are left out.\n"
     )
 
 
@@ -270,6 +295,19 @@ def test_states_come_as_soon_as_their_records(walk: OnlineLog, site: Path) -> No
         rest = running.stdout.read()
     assert running.returncode == 0
     assert b'"started": true' in rest or seen[-1]["started"]
+
+
+def test_messages_on_a_full_disk_do_not_end_navigation(walk: OnlineLog, site: Path) -> None:
+    """A standard error that takes nothing: the states are those without it."""
+    given = records(walk) + b"no record\n"
+    command = [SCRIPT, "navigate", "-", "--site", site, "--estimator", "ekf", "--keep-going"]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            command, input=given, stdout=subprocess.PIPE, stderr=full, check=False
+        )
+    assert done.returncode == 0
+    expected, _ = answered(site, records(walk))
+    assert len(done.stdout.splitlines()) == len(expected)
 
 
 def test_a_reader_that_leaves_is_no_error(walk: OnlineLog, tmp_path: Path) -> None:

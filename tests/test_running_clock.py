@@ -84,6 +84,29 @@ def test_rounded_stamps_are_counted(rate_hz: float, cut: Callable[[Array], Array
     assert wait <= MAX_WAIT + 0.1  # s
 
 
+@pytest.mark.parametrize("rate_hz", [130.0, 300.0, 400.0])
+@pytest.mark.parametrize("jitter", [2e-4, 5e-4])
+def test_rounded_stamps_of_a_host_that_jitters_and_loses_samples(
+    rate_hz: float, jitter: float
+) -> None:
+    """A delayed sample is no loss, and a loss shifts the ticks of all that follow."""
+    rng = np.random.default_rng(2)
+    selected = (np.arange(COUNT) / rate_hz * (1.0 + 2e-5))[rng.random(COUNT) > 0.01]
+    delayed = selected + np.abs(jitter * rng.standard_normal(len(selected)))
+    stamps = np.maximum.accumulate(1e-3 * np.floor(1e3 * delayed))
+    time, clock, _ = timed(stamps)
+    assert clock.stamping == "rounded"
+    off = (time - selected)[ENOUGH:]
+    off = np.abs(off - np.median(off))  # s; of the stamps up to 2e-3
+    near = off < 0.5 / rate_hz
+    assert np.mean(near) > 0.998  # a delay by a step looks like a loss
+    assert np.sqrt(np.mean(off[near] ** 2)) < 1e-4
+    distinct = np.append(True, np.diff(stamps) > 0.0)
+    whole = sampling_clock(stamps[distinct])
+    assert whole is not None
+    assert np.std(time[distinct][ENOUGH:] - whole.time[ENOUGH:]) < 2e-4  # s
+
+
 @pytest.mark.parametrize("kind", ["even", "lost", "jitter"])
 def test_other_stamps_stay(kind: str) -> None:
     rng = np.random.default_rng(1)

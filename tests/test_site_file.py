@@ -197,6 +197,12 @@ OUT_OF_RANGE: list[tuple[Key, Any, str]] = [
     ((*IMU, "time_offset_s"), NAN, "finite"),
     ((*IMU, "time_offset_sigma_s"), -0.01, "greater than or equal to 0"),
     ((*IMU, "clock_rate_ppm"), 2e4, "between -10000 and 10000"),
+    ((*IMU, "gyro_range_rad_s"), 0, "greater than 0"),
+    ((*IMU, "gyro_range_rad_s"), NAN, "finite number"),
+    ((*IMU, "accel_range_m_s2"), -160.0, "greater than 0"),
+    ((*MAGNETOMETER, "range_t"), 0.0, "greater than 0"),
+    ((*MAGNETOMETER, "range_t"), INF, "finite number"),
+    ((*MAGNETOMETER, "range_t"), 1e5, "not nT"),
     ((*IMU, "clock_rate_sigma_ppm"), -1.0, "greater than or equal to 0"),
     ((*MOTION, "rest_gyro_rad_s"), 0.0, "greater than 0"),
     ((*MOTION, "rest_span_s"), 0.1, "greater than or equal to 0.2"),
@@ -521,8 +527,11 @@ def _random_site(rng: np.random.Generator) -> Site:
         ),
     )
     imu = type(demo.platform.imu)(*rng.uniform(1e-6, 1.0, 8), *(rng.uniform(1.0, 1e3, 2) / 1e6))
+    ranges = dict(zip(("gyro_range", "accel_range"), rng.uniform(1.0, 99.0, 2), strict=True))
+    imu = dataclasses.replace(imu, **ranges)
     motion = MotionModel(*rng.uniform(0.5, 1.0, len(vars(MotionModel()))))
     magnetometer = dataclasses.replace(magnetometer, offset_walk=1e-8 * rng.uniform())
+    magnetometer = dataclasses.replace(magnetometer, field_range=1e-3 * rng.uniform())
     return dataclasses.replace(
         demo,
         gravity=rng.uniform(9.7, 9.9),

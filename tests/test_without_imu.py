@@ -268,6 +268,22 @@ def test_a_smoothed_log_has_no_biases_and_no_inertial_rate(
     assert load_site(tmp_path / "run" / "site.yaml").gravity == exact().gravity
 
 
+def test_navigate_says_why_states_have_no_protection_level(tmp_path: Path) -> None:
+    """Windows of 0.4 s are too far apart for the prior of a hand: each is a fix of its own."""
+    run_command("simulate", "-o", tmp_path / "log", "--duration", 12, "--seed", 3)
+    (tmp_path / "log" / "imu.parquet").unlink()
+    site = load_site(tmp_path / "log" / "site.yaml")
+    platform = replace(site.platform, motion_prior=A_HAND)
+    save_site(replace(site, platform=platform), tmp_path / "log" / "site.yaml")
+    run_command("navigate", tmp_path / "log", "--estimator", "ekf", "-o", tmp_path / "run")
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["states_without_level"] == report["epochs"] > 0
+    (remark,) = [one for one in report["remarks"] if one["code"] == "no_redundancy"]
+    assert "states have no protection level" in remark["text"]
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "states have no protection level" in page
+
+
 def test_inertial_samples_that_the_site_does_not_describe_are_refused(
     bare: Path, tmp_path: Path, refuse: Refuse
 ) -> None:

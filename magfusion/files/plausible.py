@@ -4,19 +4,27 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.model.magnetometer import Magnetometer
+from magfusion.model.platform_motion import ImuModel
 from magfusion.model.samples import ImuSamples
+from magfusion.model.site import Platform
 from magfusion.units import Array, BoolArray
 
 LARGEST_FIELD = 1e-3  # T; twenty times the Earth's
 LARGEST_RATE = 50.0  # rad/s; beyond the range of common gyroscopes
 FASTEST_RATE = 80.0  # rad/s; beyond the range of any
-LARGEST_RATE_IN_DEGREES = 6000.0  # deg/s, and as much written for rad/s
+LARGEST_RATE_IN_DEGREES = ImuModel.gyro_range  # deg/s, and as much written for rad/s
 LARGEST_FORCE = 1e4  # m/s^2
-# A sample beyond these is no measurement, in whatever unit: ten times a shock accelerometer's range
-# (m/s^2), a hundred times a fluxgate's (T), and the rate above.
+# A sample beyond these is no measurement, in whatever unit.
 _LARGEST_SAMPLES = {  # by the number of columns
-    6: np.repeat([LARGEST_RATE_IN_DEGREES, 1e6], 3),
-    **dict.fromkeys((1, 2, 3), np.array(100.0 * LARGEST_FIELD)),
+    6: np.repeat([ImuModel.gyro_range, ImuModel.accel_range], 3),
+    **dict.fromkeys((1, 2, 3), np.array(Magnetometer.field_range)),
+}
+RANGE_ROUNDING = 1e-4  # of a range: its written decimals, and the missing code of 16 bits, 3e-5
+RANGE_KEYS = {  # by the name of the instrument
+    "gyroscope": "imu.gyro_range_rad_s",
+    "accelerometer": "imu.accel_range_m_s2",
+    "magnetometer": "magnetometer.range_t",
 }
 SOUND = 0.98  # of the samples, by size
 CHECKED_DURATION = 2.0  # s
@@ -39,6 +47,36 @@ def beyond_range(values: Array) -> BoolArray:
     """
     largest = _LARGEST_SAMPLES.get(values.shape[1], np.array(np.inf))
     return np.asarray((np.abs(values) > largest).any(axis=1))
+
+
+def declared_range(instrument: str, platform: Platform, name: str | None = None) -> float:
+    """Return the range of an instrument, named as in `RANGE_KEYS`; infinite if none is declared.
+
+    Parameters
+    ----------
+    name : str, optional
+        Of one of several magnetometers.
+    """
+    if instrument == "magnetometer":
+        every = {sensor.name: sensor for sensor in platform.magnetometers}
+        own = every.get(name or "", platform.magnetometer)
+        largest, usual = own.field_range, Magnetometer.field_range
+    else:
+        imu = platform.imu if platform.replaced is None else platform.replaced.imu
+        largest, usual = imu.accel_range, ImuModel.accel_range
+        if instrument == "gyroscope":
+            largest, usual = imu.gyro_range, ImuModel.gyro_range
+    return largest if largest < usual else np.inf
+
+
+def exceeds(values: Array, largest: float) -> BoolArray:
+    """Return which rows (n, axes) are beyond a declared range, shape (n,)."""
+    return np.asarray((np.abs(values) > largest * (1.0 + RANGE_ROUNDING)).any(axis=1))
+
+
+def reaches(values: Array, largest: float) -> BoolArray:
+    """Return which values are at the end of a declared range, or beyond, in their shape."""
+    return np.asarray(np.abs(values) >= largest * (1.0 - RANGE_ROUNDING))
 
 
 def check_imu(imu: ImuSamples, place: str) -> None:

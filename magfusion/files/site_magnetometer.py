@@ -96,6 +96,9 @@ class MagnetometerEntry(StrictModel):
     name: Annotated[str, Field(min_length=1), AfterValidator(plain_name)] | None = None
     clock_offset_s: Annotated[float, between(-1e3, 1e3)] = Magnetometer.clock_offset
     clock_rate_ppm: Annotated[float, between(-1e4, 1e4)] = Magnetometer.clock_rate
+    range_t: Annotated[
+        AboveZero, tesla(Magnetometer.field_range), between(1e-9, Magnetometer.field_range)
+    ] = Magnetometer.field_range
     sigma: MagnetometerSigmaEntry = Field(default_factory=MagnetometerSigmaEntry)
 
 
@@ -183,6 +186,7 @@ def magnetometer_of(entry: MagnetometerEntry) -> Magnetometer:
         name=entry.name or Magnetometer.name,
         clock_offset=entry.clock_offset_s,
         clock_rate=entry.clock_rate_ppm / MILLION,
+        field_range=entry.range_t,
     )
 
 
@@ -216,6 +220,8 @@ def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
         own["clock_offset_s"] = float(magnetometer.clock_offset)
     if magnetometer.clock_rate != Magnetometer.clock_rate:
         own["clock_rate_ppm"] = ppm(magnetometer.clock_rate)
+    if magnetometer.field_range != Magnetometer.field_range:
+        own["range_t"] = float(magnetometer.field_range)
     clock = {"clock_offset_s": float(sigma.clock_offset)} if sigma.clock_offset else {}
     return (
         own

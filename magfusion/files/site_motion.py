@@ -50,6 +50,12 @@ class ImuEntry(StrictModel):
     time_offset_sigma_s: Annotated[_FromZero, between(0.0, 1e3)] = _MILLISECONDS
     clock_rate_ppm: Annotated[float, between(-1e4, 1e4)] = 0.0
     clock_rate_sigma_ppm: Annotated[_FromZero, between(0.0, 1e4)] = 50.0  # of quartz
+    gyro_range_rad_s: Annotated[_AboveZero, between(1e-3, ImuModel.gyro_range)] = (
+        ImuModel.gyro_range
+    )
+    accel_range_m_s2: Annotated[_AboveZero, between(1e-3, ImuModel.accel_range)] = (
+        ImuModel.accel_range
+    )
 
 
 class ImuIntrinsicsEntry(StrictModel):
@@ -89,6 +95,8 @@ def imu_entry(imu: ImuModel) -> dict[str, Any]:
     usual = {
         "clock_rate_ppm": ImuModel.clock_rate,
         "clock_rate_sigma_ppm": ImuModel.clock_rate_sigma,
+        "gyro_range_rad_s": ImuModel.gyro_range,
+        "accel_range_m_s2": ImuModel.accel_range,
     }
     keys = zip(ImuEntry.model_fields, vars(imu).values(), strict=True)
     entry = {k: ppm(v) if k.endswith("_ppm") else float(v) for k, v in keys if usual.get(k) != v}

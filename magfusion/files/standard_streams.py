@@ -5,7 +5,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TextIO
 
 from magfusion.errors import InputError
 
@@ -48,6 +48,12 @@ def binary_output() -> BinaryIO:
     if sys.stdout is None:
         raise InputError("standard output: is closed; lead it into a file or a pipe")
     return sys.stdout.buffer
+
+
+def write_message(messages: TextIO, text: str) -> None:
+    """Write a line about the run, which goes on if that is impossible, as on a full disk."""
+    with suppress(OSError):
+        messages.write(f"magfusion: {text}\n")
 
 
 @contextmanager

@@ -15,7 +15,6 @@ from pydantic_core import PydanticCustomError
 from magfusion.errors import InputError
 from magfusion.files.drive_columns import beacon_of
 from magfusion.files.marks_table import is_slot, slots_of
-from magfusion.files.plausible import beyond_range
 from magfusion.files.site_temperature import COLDEST, HOTTEST
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS
 from magfusion.files.yaml_files import StrictModel, sentence
@@ -300,15 +299,6 @@ def _check_lengths(time: Array, **rows: AnyArray) -> None:
             given = {"name": name, "rows": len(values), "times": len(time)}
             text = "{name} has {rows} rows for {times} times; they should be as many"
             raise PydanticCustomError("lengths", text, given)
-
-
-def whole_rows(time: Array, *values: Array) -> tuple[Array, ...]:
-    """Return stamps (k,) and values (k, 3) without rows that lack a number or are beyond range."""
-    joined = np.hstack(values)
-    whole = np.isfinite(joined).all(axis=1) & ~beyond_range(joined)
-    if whole.all():
-        return time, *values
-    return time[whole], *(rows[whole] for rows in values)
 
 
 def field_samples(entry: FieldsRecord, channels: tuple[tuple[str, int], ...]) -> FieldSamples:

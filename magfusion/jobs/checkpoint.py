@@ -16,6 +16,7 @@ from magfusion.files.checkpoint import (
 )
 from magfusion.files.plain_data import from_plain, to_plain
 from magfusion.files.row_file import RowPosition
+from magfusion.files.standard_streams import write_message
 from magfusion.jobs.inputs import named
 from magfusion.model.site import Site
 
@@ -101,7 +102,8 @@ class CheckpointWriter:
             now = time.monotonic()
             if now >= self._reported_at + REPORT_INTERVAL:
                 self._reported_at = now
-                self._messages.write(
-                    f"magfusion: {self._place}: the checkpoint cannot be written"
-                    f" ({error.strerror or error}); navigation goes on, and tries again\n"
+                write_message(
+                    self._messages,
+                    f"{self._place}: the checkpoint cannot be written"
+                    f" ({error.strerror or error}); navigation goes on, and tries again",
                 )

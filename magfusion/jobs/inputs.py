@@ -190,7 +190,8 @@ def read_job(
         check_rotors(job.declared_path, job.log_path, log, site, separately=separately)
     log, site = logged(log, site)
     _require_described(job, log, site)
-    log = clean_log(log, site)
+    with named(job.log_path):
+        log = clean_log(log, site)
     if log.waveforms and not raw:
         with named(job.log_path):
             result = demodulated_apart(log, site, lockin, repeated=reread)
@@ -280,7 +281,8 @@ def read_recording(job: Job, report: Report = quiet) -> tuple[Log, Site | None]:
                     " the samples; give the log with magnetometer.parquet"
                 )
             return log, site
-        return clean_log(_open(job, report, site), site), site
+        with named(job.log_path):
+            return clean_log(_open(job, report, site), site), site
     return open_log(job.log_path, job.start, job.end, job.topics, report), None
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TextIO
 
 from magfusion.errors import InputError
+from magfusion.files.standard_streams import write_message
 from magfusion.jobs.settings import FrameSettings, option
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ def state_sinks(
         for sink in sinks:
             wrong = sink.close()
             if wrong is not None:
-                messages.write(f"magfusion: {wrong}\n")
+                write_message(messages, wrong)
 
 
 def _opened(settings: LiveSettings, site: Site, epoch_ns: int) -> Iterator[StateSink]:

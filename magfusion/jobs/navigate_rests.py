@@ -13,7 +13,12 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.files.site import load_site, save_site
-from magfusion.files.standard_streams import binary_input, binary_output, until_closed
+from magfusion.files.standard_streams import (
+    binary_input,
+    binary_output,
+    until_closed,
+    write_message,
+)
 from magfusion.files.stream import json_line, read_records
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
@@ -250,7 +255,7 @@ def run_rests_stream(
             if not keep_going:
                 raise InputError(sentence) from error
             refused += 1
-            messages.write(f"magfusion: {sentence} (skipped)\n")
+            write_message(messages, f"{sentence} (skipped)")
             continue
         for state in navigator.take():
             sink.write(json_line(rest_content(state)))

@@ -91,6 +91,22 @@ def no_start(seconds: float, why: NoStart) -> Trust:
     return why.trust | Trust((Finding("no_start", text, Verdict.FAILED, weight),))
 
 
+def _without_levels(states: StateTrust, navigator: Navigator) -> Trust:
+    """Return why states have no protection level: a fix of an epoch begins the comparison again."""
+    count, fixes = (
+        int(np.sum(~np.isfinite(states.protection_level_m))),
+        navigator.counts["found by a fix"],
+    )
+    if navigator.settings.risk is None or count == 0 or 2 * fixes < count:
+        return Trust()
+    text = (
+        f"{count} of {len(states.protection_level_m)} states have no protection level: {fixes}"
+        " poses are fixes of one epoch, as the motion before is not known well enough. Record an"
+        " IMU, or use fix or smooth, which give levels."
+    )
+    return Trust((Finding("no_redundancy", text, Verdict.TRUSTWORTHY, 0.0),))
+
+
 def _without_repeated(online: Trust, findings: tuple[Finding, ...]) -> Trust:
     """Remove findings of the beginning that also apply to the whole recording."""
     every: dict[tuple[str, str], int] = {}
@@ -169,6 +185,7 @@ def navigated(
     current, lagged = _part(rows, own, site), None
     assert current is not None
     states = current.states
+    trust |= _without_levels(current.trust, navigator)
     estimates, refined = _calibration(navigator, log.name)
     errors, compared = compared_with_truth(states, comparable(log, states, site))
     figures = heading("navigate", log.name) | trust_figures(trust)

@@ -17,6 +17,7 @@ from magfusion.estimation.orientation.online import ANYWHERE, TIMING, Orientatio
 from magfusion.estimation.orientation.remarks import doubts, remarks
 from magfusion.estimation.orientation.smoother import Oriented, oriented
 from magfusion.files.site import save_site
+from magfusion.files.standard_streams import write_message
 from magfusion.files.stream import Format, json_line, read_records
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
@@ -214,7 +215,7 @@ def run_orientation_stream(
             if not keep_going:
                 raise InputError(sentence) from error
             refused += 1
-            messages.write(f"magfusion: {sentence} (skipped)\n")
+            write_message(messages, f"{sentence} (skipped)")
             continue
         write()
     for stream, _, *remaining in samples.end():

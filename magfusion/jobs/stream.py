@@ -18,6 +18,7 @@ from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.checkpoint import run_key
 from magfusion.files.named_records import magnetometer_number, site_fields
 from magfusion.files.site import load_site
+from magfusion.files.standard_streams import write_message
 from magfusion.files.stream import (
     Format,
     NumberedRecord,
@@ -130,11 +131,11 @@ def _navigate(
             if not (settings.keep_going or isinstance(error, ClockJump)):
                 raise InputError(sentence) from error
             refused += 1
-            messages.write(f"magfusion: {sentence} (skipped)\n")
+            write_message(messages, f"{sentence} (skipped)")
             continue
         if -np.inf < newest < output.resumed:
             at = f"{output.resumed:.3f} s"
-            messages.write(f"magfusion: data before the checkpoint ({at}) are not used\n")
+            write_message(messages, f"data before the checkpoint ({at}) are not used")
             output.resumed = -np.inf
         angles.see(numbered.record)
         navigator = output.navigator = corrected(output.navigator)
@@ -150,10 +151,10 @@ def _navigate(
     with named("standard input"):
         _end(samples, output)
     if output.reference:
-        messages.write(f"magfusion: reference: {NOT_ONLINE}\n")
+        write_message(messages, f"reference: {NOT_ONLINE}")
     samples.report(messages)
     if refused:
-        messages.write(f"magfusion: {refused} records were skipped\n")
+        write_message(messages, f"{refused} records were skipped")
     return refused
 
 
@@ -224,9 +225,10 @@ def _on_clock(
     record = clocks.unwrapped(numbered.record)
     step = clocks.step_in(record)
     if step is not None:
-        messages.write(
-            f"magfusion: {step.stream}: its clock stepped by {step.seconds:+.4g} s; navigation"
-            f" restarts at {step.time:.3f} s\n"
+        write_message(
+            messages,
+            f"{step.stream}: its clock stepped by {step.seconds:+.4g} s; navigation"
+            f" restarts at {step.time:.3f} s",
         )
         _end(samples, output)
         output.restart()
@@ -259,7 +261,7 @@ def _process_record(
         field[:, site.platform.magnetometer.lacking] = 0.0
         name = record.magnetometer.magnetometer
         magnetometer_number(site, name, "samples")
-        time, rows = samples.whole("magnetometer", record.magnetometer.time, field)
+        time, rows = samples.whole("magnetometer", record.magnetometer.time, field, name=name)
         newest = max(newest, _last(time))
         time, rows = samples.tested("magnetometer", time, rows, name)
         if len(time):

@@ -8,8 +8,8 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.data_checks.spike_filter import SpikeFilter
-from magfusion.files.plausible import beyond_range
-from magfusion.files.stream import whole_rows
+from magfusion.files.plausible import RANGE_KEYS, beyond_range, declared_range, exceeds
+from magfusion.files.standard_streams import write_message
 from magfusion.model.site import Site
 from magfusion.receiver.running_clock import RunningClock
 from magfusion.receiver.slots import has_schedule
@@ -33,32 +33,47 @@ class StreamSamples:
     def __init__(self, site: Site, *, patient: bool = True) -> None:
         self._site, self._patient = site, patient
         self._missing: Counter[str] = Counter()
+        self._beyond: Counter[str] = Counter()
         self._used: Counter[str] = Counter()
         self._false: Counter[str] = Counter()
         self._replaced: dict[str, str] = {}
         self._clocks: dict[tuple[str, str | None], RunningClock] = {}
         self._filters: dict[tuple[str, str | None], SpikeFilter] = {}
 
-    def whole(self, stream: str, time: Array, *values: Array) -> tuple[Array, Array]:
+    def whole(
+        self, stream: str, time: Array, *values: Array, name: str | None = None
+    ) -> tuple[Array, Array]:
         """Return the samples that are whole and within range, values in one array; count others.
+
+        Parameters
+        ----------
+        name : str, optional
+            Of one of several magnetometers.
 
         Raises
         ------
         InputError
-            Where the first `FIRST` are all larger than any instrument measures.
+            Where the first `FIRST` are all larger than any instrument measures, or than declared.
         """
-        kept, *rows = whole_rows(time, *values)
-        missing = len(time) - len(kept)
-        self._used[stream] += len(kept)
-        if missing:
-            self._missing[stream] += missing
-            large = bool(beyond_range(np.hstack(values)).any())
-            if large and not self._used[stream] and self._missing[stream] >= FIRST:
-                raise InputError(
-                    f"{stream}: no sample so far is within the range of any instrument: another"
-                    f" unit is probably meant; give {_UNITS[stream]}"
-                )
-        return kept, np.hstack(rows)
+        rows = np.hstack(values)
+        large = beyond_range(rows)
+        missing = large | ~np.isfinite(rows).all(axis=1)
+        self._missing[stream] += int(np.sum(missing))
+        absent = self._missing[stream]
+        for instrument, own in zip(_INSTRUMENTS.get(stream, ()), values, strict=False):
+            beyond = exceeds(own, declared_range(instrument, self._site.platform, name)) & ~missing
+            self._beyond[instrument] += int(np.sum(beyond))
+            absent += self._beyond[instrument]
+            missing |= beyond
+            large |= beyond
+        kept = ~missing
+        self._used[stream] += int(np.sum(kept))
+        if large.any() and not self._used[stream] and absent >= FIRST:
+            raise InputError(
+                f"{stream}: no sample so far is within the range of the instrument: another unit is"
+                f" probably meant; give {_UNITS[stream]}, or correct the range in the site"
+            )
+        return time[kept], rows[kept]
 
     def tested(
         self, stream: str, time: Array, rows: Array, name: str | None = None
@@ -101,11 +116,14 @@ class StreamSamples:
 
     def report(self, messages: TextIO) -> None:
         """Write how many samples are left out, after the end."""
-        for stream, count in self._missing.items():
+        for stream, count in (+self._missing).items():
             text = f"{count} samples are NaN, or larger than any instrument measures"
-            messages.write(f"magfusion: {stream}: {text}. They are left out.\n")
+            write_message(messages, f"{stream}: {text}. They are left out.")
+        for instrument, count in (+self._beyond).items():
+            text = f"{count} samples are beyond the range in platform.{RANGE_KEYS[instrument]}"
+            write_message(messages, f"{instrument}: {text}. They are left out.")
         for stream, text in self._replaced.items():
-            messages.write(f"magfusion: {stream}: {text}.\n")
+            write_message(messages, f"{stream}: {text}.")
         for stream, count in (+self._false).items():
             text = f"{count} isolated samples are off their neighbours, probably by bit errors"
-            messages.write(f"magfusion: {stream}: {text}. They are left out.\n")
+            write_message(messages, f"{stream}: {text}. They are left out.")

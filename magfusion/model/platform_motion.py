@@ -46,7 +46,8 @@ class ImuModel:
     """Inertial noise: densities per square root of hertz, walks per square root of second.
 
     A sample stamped t was taken at t + ``time_offset`` on the log's clock; the offset is that of
-    the first sample and grows by ``clock_rate``.
+    the first sample and grows by ``clock_rate``.  ``gyro_range`` (rad/s) and ``accel_range``
+    (m/s^2) are the largest values of each axis in size; by default no instrument has larger ones.
     """
 
     gyro_noise: float
@@ -59,6 +60,8 @@ class ImuModel:
     time_offset_sigma: float = 0.01
     clock_rate: float = 0.0
     clock_rate_sigma: float = 5e-5
+    gyro_range: float = 6000.0  # a deg/s value of a fast gyroscope, if written for rad/s
+    accel_range: float = 1e6  # ten times a shock accelerometer's
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.model.samples import Waveform
-from magfusion.receiver.range_ends import RangeEnds, saturated, still
+from magfusion.receiver.range_ends import RangeEnds, at_declared_range, saturated, still
 from magfusion.units import Array, BoolArray, IntArray
 
 MAGNETOMETER_GAP = "gap in the magnetometer stream"
@@ -191,6 +191,7 @@ class Admission:
         waveform: Waveform,
         imu_time: Array,
         growth: Growth,
+        field_range: float,
     ) -> IntArray:
         """Return the reason to drop each window, an index into `REASONS`; -1 for none.
 
@@ -205,6 +206,8 @@ class Admission:
         growth : callable
             Takes windows with missing samples and the times of all samples; returns the variance of
             their phasors relative to a whole window.
+        field_range : float
+            Of the magnetometer, as declared (T).
         """
         half = windows.length / 2.0 + grid.early
         begin, end = windows.centre - half, windows.centre + windows.length / 2.0 - grid.early
@@ -223,8 +226,9 @@ class Admission:
             lacking[requested] = growth(windows.rows(requested), time) > MOST_GROWTH
         drop(MAGNETOMETER_GAP, lacking)
         drop(TOO_FEW, few)
+        last = windows.first + windows.count
+        drop(SATURATED, at_declared_range(waveform, windows.first, last, field_range))
         if self.clips:
-            last = windows.first + windows.count
             drop(STILL, still(waveform, windows.first, last))
             drop(SATURATED, saturated(waveform, windows.first, last, self.ends))
         drop(NO_INERTIAL, begin < self.imu_begin - self.imu_margin)

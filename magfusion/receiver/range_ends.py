@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.files.plausible import reaches
 from magfusion.model.samples import Waveform
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -51,6 +52,14 @@ def _changed(measured: Array) -> BoolArray:
     """Return which samples (n, 3) differ from the one before, (n - 1,)."""
     x, y, z = (measured[1:] != measured[:-1]).T
     return np.asarray(x | y | z)
+
+
+def at_declared_range(
+    waveform: Waveform, first: IntArray, last: IntArray, largest: float
+) -> BoolArray:
+    """Return in which windows an axis is at the end of a declared range (T)."""
+    count = np.cumsum(np.append(0, reaches(waveform.measured_sensor, largest).any(axis=1)))
+    return np.asarray(count[np.maximum(last, first)] > count[first])
 
 
 def saturated(

@@ -11,6 +11,7 @@ from collections import Counter
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.files.plausible import declared_range
 from magfusion.model.marks import Marks
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
@@ -270,7 +271,10 @@ class Receiver(ABC):
         windows = self._windows(number, waveform.time)
         # With the declared clock: a later estimate of it changes no decision.
         stamps = imu.time + self.site.platform.imu.time_offset
-        verdict = self.admission.verdicts(self.grid, windows, waveform, stamps, self._growth)
+        largest = declared_range("magnetometer", self.site.platform)
+        verdict = self.admission.verdicts(
+            self.grid, windows, waveform, stamps, self._growth, largest
+        )
         counts = np.bincount(verdict + 1, minlength=len(REASONS) + 1)[1:]
         for reason, count in zip(REASONS, counts.tolist(), strict=True):
             self._count(reason, count)

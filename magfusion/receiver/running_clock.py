@@ -9,7 +9,7 @@ import numpy as np
 
 from magfusion.model.batches import PAUSE, spread_batches
 from magfusion.receiver.bursts import LONGEST, SHARE, TOGETHER, spread_bursts
-from magfusion.receiver.sampling_clock import is_even, sampling_clock, stamp_resolution
+from magfusion.receiver.sampling_clock import is_even, lost_ticks, sampling_clock, stamp_resolution
 from magfusion.units import Array, BoolArray, IntArray
 
 MIN_SAMPLES = 32  # that show whether stamps are even
@@ -18,6 +18,8 @@ MAX_WAIT = 2.0  # s; for either
 MEMORY = 2000  # stamps that determine the clock
 MIN_POINTS = 4  # batches
 REFIT = 0.1  # s between two fits
+UNDECIDED = 30  # samples
+CLEAR = 0.25  # of a step, root mean square; beyond, the ticks of the first samples are not certain
 LEAST_ADVANCE = 0.5  # of a step, where the clock is set back
 
 
@@ -49,6 +51,7 @@ class RunningClock:
         self._tick, self._stamp, self._newest = 0, -np.inf, -np.inf
         self._origin, self._pause, self._fitted = 0.0, np.inf, -np.inf
         self._points, self._width = np.empty((2, 0)), 0
+        self._scatter, self._rounding = 0.0, 0.0
 
     def push(self, stamps: Array, rows: Array) -> tuple[Array, Array]:
         """Add samples (k,) with their stamps (s); return sampling times (s) of those known."""
@@ -89,7 +92,7 @@ class RunningClock:
         if len(stamps) < MIN_SAMPLES or not _is_candidate(stamps):
             return stamps, rows
         together = np.diff(stamps) == 0.0
-        if together.any():
+        if np.mean(together) > 0.5 * SHARE:
             copies = (rows[1:] == rows[:-1]).all(axis=1)
             last = np.append(np.flatnonzero(~together), len(stamps) - 1)
             if np.mean(copies[together]) > 0.5 or len(last) < MIN_POINTS:
@@ -101,7 +104,8 @@ class RunningClock:
             last = np.append(np.flatnonzero(far), len(stamps) - 1)
             return self._start("counted", stamps, separate, last), rows
         clock = sampling_clock(stamps)
-        if clock is None or not clock.resolution:
+        self._rounding = stamp_resolution(stamps)
+        if clock is None or not self._rounding or clock.scatter > CLEAR * clock.step:
             return stamps, rows
         return self._start("rounded", stamps, clock.time, np.arange(len(stamps))), rows
 
@@ -113,10 +117,10 @@ class RunningClock:
         last : ndarray of int
             Samples whose stamps determine it.
         """
-        self.stamping, tick = stamping, np.arange(len(stamps))
+        self.stamping, tick = stamping, np.arange(float(len(stamps)))
         if stamping == "rounded":
             step = float(np.median(np.diff(time)))
-            tick = np.cumsum(np.append(0, np.maximum(np.rint(np.diff(time) / step), 1.0)))
+            tick = np.cumsum(np.append(0.0, np.maximum(np.rint(np.diff(time) / step), 1.0)))
         else:
             between = float(np.median(np.diff(stamps[last])))
             self._pause, last = max(PAUSE * between, LONGEST), last[:-1]
@@ -133,15 +137,13 @@ class RunningClock:
             return stamps  # late ones
         before = np.append(self._stamp, stamps)
         if self.stamping == "counted":
-            tick = self._tick + np.arange(len(before))
+            tick = self._tick + np.arange(float(len(before)))
             ends = np.flatnonzero(np.diff(before) > TOGETHER * self.step)
+            points = np.stack([tick[ends], before[ends]])
+            self._points = np.hstack([self._points, points])
         else:
-            nearest = np.rint((stamps - self._origin) / self.step).astype(np.int64)
-            count = np.arange(len(before))  # every sample has a tick of its own
-            tick = np.maximum.accumulate(np.append(self._tick, nearest) - count) + count
-            ends = count[1:]
-        points = np.stack([tick[ends], before[ends]])
-        self._points = np.hstack([self._points, points])[:, -MEMORY:]
+            tick = self._with_losses(stamps)
+        self._points = self._points[:, -MEMORY:]
         self._tick, self._stamp = int(tick[-1]), float(stamps[-1])
         if self._stamp > self._fitted + REFIT:
             self._fit()
@@ -150,16 +152,31 @@ class RunningClock:
         self._newest = float(result[-1])
         return np.asarray(result)
 
+    def _with_losses(self, stamps: Array) -> Array:
+        """Return the ticks of the newest sample before, and of further stamps (k,).
+
+        What is late may be delayed, or follow a loss, which the next samples show: the ticks of the
+        last `UNDECIDED` are determined again.
+        """
+        (fixed, recent), known = np.split(self._points, [-UNDECIDED], axis=1), len(stamps)
+        base = fixed[0, -1] if fixed.shape[1] else recent[0, 0] - 1.0
+        own = np.append(recent[1], stamps)
+        count = base + np.arange(1.0, len(own) + 1.0)
+        tick = count + lost_ticks((own - self._origin) / self.step - count, self._scatter)
+        self._points = np.hstack([fixed, np.stack([tick, own])])
+        return tick[-known - 1 :]
+
     def _fit(self) -> None:
         """Fit a straight line to the stamps over their ticks; a stalled host counts less."""
         tick, stamp = self._points
-        weight = np.ones(len(tick))
+        weight, least = np.ones(len(tick)), max(self._rounding, 1e-12)
         for _ in range(3):
             slope, origin = np.polyfit(tick - tick[-1], stamp - stamp[-1], 1, w=np.sqrt(weight))
             off = np.abs(stamp - stamp[-1] - origin - slope * (tick - tick[-1]))
-            weight = 1.0 / np.maximum(1.0, off / max(3.0 * float(np.median(off)) / 0.6745, 1e-12))
+            weight = 1.0 / np.maximum(1.0, off / max(3.0 * float(np.median(off)) / 0.6745, least))
         self.step, self._fitted = float(slope), float(stamp[-1])
         self._origin = float(stamp[-1] + origin - slope * tick[-1])
+        self._scatter = max(0.3 * least, float(np.median(off)) / 0.6745) / slope
 
 
 def _is_candidate(stamps: Array) -> bool:

@@ -26,7 +26,7 @@ SEARCHED = 0.08  # of the median step, either way
 KNOT = 10.0  # s; a clock's rate changes more slowly
 MIN_SAMPLES = 50  # samples
 ROUNDED = 0.05  # of a step, by which the mean of rounded stamps differs from their median
-MAX_ROUNDING_STEPS = 1.2  # median steps; rounding is half of one, cutting off one
+MAX_ROUNDING_STEPS = 1.2  # resolutions; rounding is half of one, cutting off one
 MOST_STEPS = 10_000  # of which a common divisor is looked for
 MAX_ROUNDING = 0.6  # of the divisor; rms of rounding is 1/sqrt(12) of it, of cutting off 1/sqrt(3)
 
@@ -143,7 +143,8 @@ def _counted_step(stamps: Array) -> float | None:
     pieces = pieces - pieces[0]
     lines = np.polyfit(np.arange(PIECE), pieces, 1)
     off = pieces - np.outer(np.arange(PIECE), lines[0]) - lines[1]
-    return mean if np.max(np.abs(off)) < MAX_ROUNDING_STEPS * median else None
+    rounding = min(stamp_resolution(stamps) or median, median)  # a loss is a whole step
+    return mean if np.max(np.abs(off)) < MAX_ROUNDING_STEPS * rounding else None
 
 
 def _usual_step(stamps: Array) -> float:
@@ -191,7 +192,7 @@ def _ticks(stamps: Array, step: float) -> IntArray:
             slope, start = step, _phase(own, step) - step
         previous = int(tick[begin - 1]) if begin else -1
         scatter = max(_scatter(own, slope), EVEN * step)
-        slip = _slips((own - start) / slope - np.arange(1, len(own) + 1), scatter / slope)
+        slip = lost_ticks((own - start) / slope - np.arange(1, len(own) + 1), scatter / slope)
         kept = len(own) if begin + PIECE >= len(stamps) else KEPT
         tick[begin : begin + kept] = previous + 1 + np.arange(kept) + slip[:kept]
         begin += kept
@@ -210,7 +211,7 @@ def _scatter(stamps: Array, step: float) -> float:
     return float(np.median(np.abs(separate)) / 0.6745 / np.sqrt(2.0))
 
 
-def _slips(late: Array, sigma: float) -> IntArray:
+def lost_ticks(late: Array, sigma: float) -> IntArray:
     """Return the most probable number of ticks lost before each sample of a piece.
 
     Dynamic programming over the number of lost ticks, which never decreases.

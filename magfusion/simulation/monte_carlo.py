@@ -3,24 +3,29 @@
 import multiprocessing
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from threading import Thread
-from typing import Any, TypeVar
+from threading import Event, Thread
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.files.blas_threads import OF_ALL, THREADS
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 Input = TypeVar("Input")
 Output = TypeVar("Output")
 Report = Callable[[str, int, int], None]  # stage, done, total
 
 CONNECT_S = 10.0  # patience with a cluster, s
+WATCH_S = 2.0  # s, from one look at its workers to the next
 # A worker has one core: more threads of linear algebra would compete for it.
 _ONE_THREAD = (OF_ALL, *THREADS)
 
@@ -198,6 +203,7 @@ def _processes(count: int) -> Iterator[Executor]:
 def _dask(address: str) -> Iterator[Executor]:
     try:
         from distributed import Client
+        from distributed.scheduler import KilledWorker, NoWorkerError
     except ImportError as error:
         raise InputError(
             f"--cluster {address}: dask is not installed; pip install 'magfusion[cluster]'"
@@ -218,5 +224,33 @@ def _dask(address: str) -> Iterator[Executor]:
                 f" {address}"
             ) from error
         # Equal inputs are separate runs.
-        with client.get_executor(pure=False) as executor:
+        executor, ended = client.get_executor(pure=False), Event()
+        Thread(target=_report_loss, args=(client, address, ended), daemon=True).start()
+        try:
             yield executor
+        except (KilledWorker, NoWorkerError) as error:
+            raise EstimationError(
+                f"--cluster {address}: its workers have ended, possibly for lack of memory; start"
+                " them again, with more memory each"
+            ) from error
+        except CancelledError as error:
+            raise EstimationError(
+                f"--cluster {address}: the scheduler has ended; start it and its workers again"
+            ) from error
+        finally:
+            ended.set()
+            executor.shutdown(wait=False)  # an interrupt must not wait for tasks
+
+
+def _report_loss(client: "Client", address: str, ended: Event) -> None:
+    """Write once, until there is one again, that no worker is left."""
+    worked = True
+    while not ended.wait(WATCH_S):
+        before = worked
+        with suppress(OSError, ValueError):  # a client that has no scheduler ends by itself
+            worked = bool(client.nthreads())
+        if before and not worked:
+            sys.stderr.write(
+                f"magfusion: --cluster {address}: no worker is left; the tasks wait for one. Start"
+                f" dask worker {address}, or end this run by Ctrl-C.\n"
+            )

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from magfusion.errors import InputError
 from magfusion.estimation.data_checks.samples import (
     false_rows,
     false_samples,
@@ -15,9 +16,11 @@ from magfusion.estimation.data_checks.samples import (
     frozen_samples,
     streams,
 )
+from magfusion.files.lost_rows import MOST_MISSING
+from magfusion.files.plausible import RANGE_KEYS, declared_range, exceeds
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
-from magfusion.model.trust import Verdict
+from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.even_clocks import on_even_clocks
 from magfusion.units import IntArray
 
@@ -26,20 +29,51 @@ def clean_log(log: Log, site: Site) -> Log:
     """Return a log with single wrong stamps and samples corrected.
 
     Its ``clocks`` and ``noticed`` report the corrections.
+
+    Raises
+    ------
+    InputError
+        Where most samples of an instrument are beyond its declared range.
     """
-    log = _without_freeze(on_even_clocks(log, site), site)
+    log = _without_freeze(on_even_clocks(_within_range(log, site), site), site)
     result = {stream.name: false_rows(stream, site) for stream in streams(log)}
     if not any(len(rows) for rows in result.values()):
         return log
     noticed = [replace(f, verdict=Verdict.TRUSTWORTHY) for f in false_samples(log, site)]
     noticed = [replace(f, text=f"{f.text} They are left out.") for f in noticed]
+    return replace(_without(log, result), noticed=(*log.noticed, *noticed))
+
+
+def _within_range(log: Log, site: Site) -> Log:
+    """Return a log without samples beyond the declared range of their instrument."""
+    result: dict[str, IntArray] = {}
+    noticed: list[Finding] = []
+    for stream in streams(log):
+        largest = declared_range(stream.name, site.platform)
+        rows = np.flatnonzero(exceeds(stream.value, largest))
+        if not len(rows):
+            continue
+        key = f"platform.{RANGE_KEYS[stream.name]}"
+        text = f"{stream.name}: {len(rows)} samples are beyond the range of {largest:g} in {key}"
+        if len(rows) > MOST_MISSING * len(stream.value):
+            raise InputError(f"{text}, of {len(stream.value)}; correct {key}, or the samples' unit")
+        result[stream.name] = rows
+        text = f"{text}. They are left out."
+        noticed.append(Finding("missing_samples", text, Verdict.TRUSTWORTHY))
+    if not result:
+        return log
+    return replace(_without(log, result), noticed=(*log.noticed, *noticed))
+
+
+def _without(log: Log, result: dict[str, IntArray]) -> Log:
+    """Return a log without some samples, by the name of their instrument."""
     wave = log.waveform
     inertial = [rows for name, rows in result.items() if name != "magnetometer"]
     if inertial:
         log = _without_inertial(log, np.unique(np.concatenate(inertial)))
     if wave is not None and "magnetometer" in result:
         wave = wave.rows(np.delete(np.arange(len(wave)), result["magnetometer"]))
-    return replace(log, waveform=wave, noticed=(*log.noticed, *noticed))
+    return replace(log, waveform=wave)
 
 
 def _without_inertial(log: Log, rows: IntArray) -> Log:

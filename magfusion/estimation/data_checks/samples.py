@@ -6,6 +6,7 @@ A magnetometer that is read faster than it measures repeats values without being
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from magfusion.estimation.data_checks.resolution import (
     step_of_axes,
     within_a_step,
 )
+from magfusion.files.plausible import declared_range, reaches
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
@@ -24,18 +26,15 @@ from magfusion.receiver.slots import has_schedule
 from magfusion.units import Array, BoolArray, IntArray
 
 CHANCE = 1e-7  # probability of a false alarm per stream
-SHORTEST_FREEZE = 0.15  # s
-DOUBTFUL_FREEZE = 0.25  # s; up to here a beacon is missed once at most
+SHORTEST_FREEZE, DOUBTFUL_FREEZE = 0.15, 0.25  # s; below the latter one epoch is missed
 DEAD = 0.5  # share of the log from which a frozen axis is a dead one
 MAX_REPEATED_SHARE = 0.05  # share of repeated samples from which it is reported
 OFTEN = 0.4  # share from which the values are late by more than a step
 ALWAYS = 0.98  # share of the samples
 PILE = 5.0  # an extreme value this many times as frequent as its neighbours is a limit
-LEAST_PILE = 12  # samples at a limit
-LEAST_RUN = 3  # of them in a row, at least once
-SPIKE = 15.0  # times the local scatter
+LEAST_PILE, LEAST_RUN = 12, 3  # samples at a limit, and of them in a row, at least once
+SPIKE, CERTAIN_SPIKE = 15.0, 50.0  # times the local scatter; the latter is no knock's
 LEAST_SPIKES, SPIKE_SHARE = 5, 2e-4  # fewer may be knocks
-CERTAIN_SPIKE = 50.0  # times the scatter; more than a knock moves one sample alone
 EVEN_GAIN = 70.0**0.5 / 6.0  # of noise, in a sample less the cubic: weights -1, 4, 4, -1 sixths
 SMOOTH_TONE = 0.15  # cycles a sample; above, neighbours do not predict a sample
 BLOCK = 128  # samples in which the scatter is measured
@@ -201,13 +200,13 @@ def repeated_samples(log: Log, site: Site | None) -> Iterator[Finding]:
         )
 
 
-def clipped_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
+def clipped_samples(log: Log, site: Site | None) -> Iterator[Finding]:
     """Yield the axes that reach the limit of their instrument's range."""
     for stream in streams(log):
-        yield from _clipped_axes(stream)
+        yield from _clipped_axes(stream, site)
 
 
-def _clipped_axes(stream: InstrumentStream) -> Iterator[Finding]:
+def _clipped_axes(stream: InstrumentStream, site: Site | None) -> Iterator[Finding]:
     value, still = stream.value, _all_frozen(stream)
     if len(still):
         kept = np.ones(len(stream.time), dtype=bool)
@@ -217,21 +216,24 @@ def _clipped_axes(stream: InstrumentStream) -> Iterator[Finding]:
     if len(value) < LEAST_PILE:
         return
     largest = float(np.max(np.abs(value)))
-    for axis in range(len(stream.axes)):
-        for sign in (-1.0, 1.0):
-            count, limit = clipped(sign * value[:, axis], largest)
+    declared = np.inf if site is None else declared_range(stream.name, site.platform)
+    for axis, sign in product(range(len(stream.axes)), (-1.0, 1.0)):
+        own = sign * value[:, axis]
+        count, limit = int(np.sum((own > 0.0) & reaches(own, declared))), float(np.max(own))
+        if not count:
+            count, limit = clipped(own, largest)
             if count == 0 or reached_in_steps(value, axis, sign * limit):
                 continue
-            share = count / len(stream.time)
-            first_at = stream.time[np.argmax(stream.value[:, axis] == sign * limit)]
-            yield Finding(
-                "saturated",
-                f"{stream.name}: axis {stream.axes[axis]} is saturated at"
-                f" {sign * limit * stream.scale:+.4g} {stream.unit} in {count} samples"
-                f" ({100.0 * share:.2g} %), first at {first_at:.2f} s. Select a larger range, or"
-                " avoid the motion or field that exceeds it.",
-                weight=500.0 + 100.0 * share,
-            )
+        share = count / len(stream.time)
+        first_at = stream.time[np.argmax(stream.value[:, axis] == sign * limit)]
+        yield Finding(
+            "saturated",
+            f"{stream.name}: axis {stream.axes[axis]} is saturated at"
+            f" {sign * limit * stream.scale:+.4g} {stream.unit} in {count} samples"
+            f" ({100.0 * share:.2g} %), first at {first_at:.2f} s. Select a larger range, or"
+            " avoid the motion or field that exceeds it.",
+            weight=500.0 + 100.0 * share,
+        )
 
 
 def clipped(value: Array, largest: float = np.inf) -> tuple[int, float]:
@@ -366,7 +368,7 @@ def are_few(spikes: int, samples: int) -> bool:
 
 def is_predictable(stream: InstrumentStream, site: Site | None) -> bool:
     """Return whether neighbours predict a sample: clipping makes corners, and so do fast tones."""
-    if next(_clipped_axes(stream), None) is not None:
+    if next(_clipped_axes(stream, site), None) is not None:
         return False
     return stream.name != "magnetometer" or site is None or _smooth_between(stream, site)
 
