@@ -13,6 +13,7 @@ from magfusion.estimation.data_checks.data_quality import recorded
 from magfusion.estimation.demodulation.demodulation import demodulated
 from magfusion.estimation.integrity.diagnosis import diagnosed, seen_in_streams, with_cause
 from magfusion.estimation.integrity.explanation import Explanation, clearly_best
+from magfusion.estimation.integrity.field_snapshots import snapshots_of
 from magfusion.estimation.integrity.likely_cause import cause_of
 from magfusion.estimation.integrity.motion_causes import timing_causes
 from magfusion.estimation.integrity.motion_comparison import compared, surveyed
@@ -129,6 +130,18 @@ def test_survey_errors_as_declared_name_none(seed: int, motion: MotionKind) -> N
         box_world=DEMO_BOX_WORLD, duration=12.0, motion=motion, time_offset=0.0
     )
     case = simulated(replace(site, beacons=beacons), config, seed)
+    assert cause_of(case.log, case.site) is None
+
+
+def test_unknown_drive_phases_are_no_contradiction() -> None:
+    site = demo_site(coil_radius=None, synchronised=False)
+    beacons = tuple(with_sigma(b, 0.01, 0.5 * DEGREE, 0.01) for b in site.beacons)
+    config = SimulationConfig(
+        box_world=DEMO_BOX_WORLD, duration=8.0, motion="turn", time_offset=0.0
+    )
+    case = simulated(replace(site, beacons=beacons), config, seed=3)
+    samples = demodulated(case.log, case.site).fields
+    assert snapshots_of(samples, case.imu, case.site).excess < 1.2
     assert cause_of(case.log, case.site) is None
 
 

@@ -138,7 +138,10 @@ class Snapshots:
 
         `chi_square` is larger or smaller by chance, as an error at one epoch is one at all others.
         """
-        return self._jointly(())
+        joint = self._jointly(())
+        if all(beacon.synchronised for beacon in self.site.beacons):
+            return joint
+        return min(joint, self.chi_square)  # from unknown phases no minimum is sure to be reached
 
     @property
     def excess(self) -> float:
@@ -162,7 +165,8 @@ class Snapshots:
     def _jointly(self, parameters: Sequence[tuple[Parameter, str, float]]) -> float:
         wide = _blocks(self.site, parameters)
         released = {block.key for block in wide}
-        survey = (b for b in choose_blocks(self.site, OF_SURVEY) if b.key not in released)
+        groups = (*OF_SURVEY, "phase")
+        survey = (b for b in choose_blocks(self.site, groups) if b.key not in released)
         own = replace(self, survey_error=False)
         return own._minimised(placed([*survey, *wide]), self.fixes)[0]
 
