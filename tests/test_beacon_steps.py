@@ -8,12 +8,19 @@ from small_problem import SIGMA, SmallLog
 from test_online_separation import NAVIGATOR, _feed
 from test_smoothed_separation import EPOCHS, STEP, _walk
 
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.graph.state import between
 from magfusion.estimation.integrity.change_detection import StepChange
+from magfusion.estimation.integrity.diagnosis import with_changed_beacons
+from magfusion.estimation.integrity.smoothed_exclusion import (
+    excluded_to_the_end,
+    separated_smooth,
+)
 from magfusion.estimation.online.navigator import Navigator
+from magfusion.jobs.smooth_result import finished
 from magfusion.model.parameters import BEACON_POSITION
 from magfusion.model.samples import FieldSamples
-from magfusion.model.trust import Verdict
+from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.simulation.log import simulate_fields
 from magfusion.units import DEGREE, Array
 
@@ -90,3 +97,31 @@ def test_a_moved_beacon_is_named_and_one_at_rest_is_not(seed: int) -> None:
     assert size == pytest.approx(100.0 * float(np.linalg.norm(shift)), abs=2.0)  # cm
     still = _navigated(_walk_with_a_step(seed, np.inf, np.zeros(3)))
     assert all(s.verdict is Verdict.TRUSTWORTHY for s in still.take())
+
+
+def test_smoothing_names_a_beacon_moved_for_good_and_nothing_else() -> None:
+    at, shift = 0.6 * EPOCHS * STEP, np.array([0.3, -0.3, 0.0])  # s, m
+    small = _walk_with_a_step(41, at, shift)
+    result = smooth(small.log, small.site, SmootherSettings())
+    separated = separated_smooth(result)
+    onsets = excluded_to_the_end(separated)
+    name = small.site.beacons[0].name
+    assert onsets == {name: pytest.approx(at, abs=2.5)}
+    (reason,) = finished(small.log, small.site, SmootherSettings(), result, None).trust.reasons
+    assert reason.code == "changed"  # as navigation calls it
+    assert f" of beacon {name} by" in reason.text
+    size = float(reason.text.split(" by ")[1].split(" cm")[0])
+    assert size == pytest.approx(100.0 * float(np.linalg.norm(shift)), abs=4.0)  # cm
+    assert "excluded from then on" in reason.text
+
+
+def test_the_change_of_a_beacon_explains_what_follows_of_it() -> None:
+    excluded = Finding("beacon_excluded", "Beacon B contradicts the others from 18 to 40 s.")
+    other = Finding("gyro_g_sensitivity", "The log contradicts it.")
+    saturated = Finding("saturated", "The gyro is saturated.")
+    change = Finding("changed", "A parameter changed: the position of beacon B.")
+    before = Trust((excluded, other, saturated))
+    assert with_changed_beacons(before, {}) is before
+    reasons = with_changed_beacons(before, {"B": change}).reasons
+    assert [reason.code for reason in reasons] == ["changed", "saturated"]
+    assert reasons[0].explained == ("gyro_g_sensitivity",)

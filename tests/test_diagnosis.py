@@ -6,21 +6,23 @@ from functools import lru_cache
 import mistake_case
 import numpy as np
 import pytest
-from mistake_case import Case, good_case, simulated
+from mistake_case import Case, good_case, simulated, with_sigma
 from mistake_list import MISTAKES
 
 from magfusion.estimation.data_checks.data_quality import recorded
 from magfusion.estimation.demodulation.demodulation import demodulated
 from magfusion.estimation.integrity.diagnosis import diagnosed, seen_in_streams, with_cause
 from magfusion.estimation.integrity.explanation import Explanation, clearly_best
+from magfusion.estimation.integrity.field_snapshots import snapshots_of
 from magfusion.estimation.integrity.likely_cause import cause_of
 from magfusion.estimation.integrity.motion_causes import timing_causes
 from magfusion.estimation.integrity.motion_comparison import compared, surveyed
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.trust import CODES, Finding, Trust, Verdict
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
-from magfusion.simulation.log import SimulationConfig
+from magfusion.simulation.log import MotionKind, SimulationConfig
 from magfusion.simulation.motion import Rests
+from magfusion.units import DEGREE
 
 SECONDS = 16.0
 
@@ -117,6 +119,67 @@ def test_a_clean_log_names_none(motion: str, seed: int) -> None:
     )
     case = simulated(demo_site(coil_radius=None), config, seed)
     assert cause_of(case.log, case.site) is None
+
+
+@pytest.mark.parametrize(("seed", "motion"), [(8, "turn"), (10, "walk")])
+def test_survey_errors_as_declared_name_none(seed: int, motion: MotionKind) -> None:
+    # One error of a survey is the same at all epochs: each is no evidence of its own.
+    site = demo_site(coil_radius=None)
+    beacons = tuple(with_sigma(b, 0.01, 0.5 * DEGREE, 0.01) for b in site.beacons)
+    config = SimulationConfig(
+        box_world=DEMO_BOX_WORLD, duration=12.0, motion=motion, time_offset=0.0
+    )
+    case = simulated(replace(site, beacons=beacons), config, seed)
+    assert cause_of(case.log, case.site) is None
+
+
+def test_unknown_drive_phases_are_no_contradiction() -> None:
+    site = demo_site(coil_radius=None, synchronised=False)
+    beacons = tuple(with_sigma(b, 0.01, 0.5 * DEGREE, 0.01) for b in site.beacons)
+    config = SimulationConfig(
+        box_world=DEMO_BOX_WORLD, duration=8.0, motion="turn", time_offset=0.0
+    )
+    case = simulated(replace(site, beacons=beacons), config, seed=3)
+    samples = demodulated(case.log, case.site).fields
+    assert snapshots_of(samples, case.imu, case.site).excess < 1.2
+    assert cause_of(case.log, case.site) is None
+
+
+def test_a_beacon_far_beyond_its_sigma_is_named() -> None:
+    site = demo_site(coil_radius=None)
+    beacons = tuple(with_sigma(b, 0.01, 0.5 * DEGREE, 0.01) for b in site.beacons)
+    site = replace(site, beacons=beacons)
+    config = SimulationConfig(
+        box_world=DEMO_BOX_WORLD, duration=12.0, motion="turn", time_offset=0.0
+    )
+    case = simulated(site, config, seed=2)
+    moved = replace(
+        beacons[2], position_world=beacons[2].position_world + np.array([0.12, -0.1, 0.05])
+    )
+    result = cause_of(case.log, replace(site, beacons=(*beacons[:2], moved, beacons[3])))
+    assert result is not None
+    assert (result[0].code, result[0].beacon) == ("beacon_pose", moved.name)
+
+
+def test_wide_windows_average_the_motion_of_either_sensor() -> None:
+    # Two tones 3.8 Hz apart: windows of 0.53 s, 0.26 s from one to the next.
+    site = demo_site(coil_radius=None)
+    beacons = tuple(
+        replace(b, frequency_hz=f)
+        for b, f in zip(site.beacons, (24.7, 28.5, 37.3, 58.2), strict=True)
+    )
+    site = replace(site, beacons=beacons)
+    config = SimulationConfig(
+        box_world=DEMO_BOX_WORLD, duration=SECONDS, motion="turn", time_offset=0.0
+    )
+    case = simulated(site, config, seed=4)
+    samples = demodulated(case.log, site).fields
+    assert np.median(samples.window) > 0.5
+    every = surveyed(samples, initial_calibration(site, float(np.mean(samples.time))))
+    motion = compared(every, case.imu, site)
+    assert motion is not None
+    chi_square, _ = motion.explained(np.eye(3), np.eye(3))
+    assert chi_square < 1.3 * motion.freedom
 
 
 def test_nothing_is_tried_of_what_is_trustworthy_or_explains_itself() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.batch.self_survey import Placement
+from magfusion.estimation.integrity.change_detection import changed_beacon
 from magfusion.estimation.integrity.correction import (
     Correction,
     continued,
@@ -16,10 +17,15 @@ from magfusion.estimation.integrity.correction import (
     is_clear,
     spread_of,
 )
-from magfusion.estimation.integrity.diagnosis import diagnosed, with_cause
+from magfusion.estimation.integrity.diagnosis import (
+    diagnosed,
+    with_cause,
+    with_changed_beacons,
+)
 from magfusion.estimation.integrity.judge import judged_with_score
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.smoothed_exclusion import (
+    excluded_to_the_end,
     separated_smooth,
     states_between,
     states_judged,
@@ -109,6 +115,11 @@ def finished(
         By which the site was corrected: it is the reason why the result is doubtful.
     """
     separated = separated_smooth(result, risk)
+    changes = {
+        name: finding
+        for name, onset in excluded_to_the_end(separated).items()
+        if (finding := changed_beacon(result, log, name, onset)) is not None
+    }
     give_back_memory()
     result, trust, score, causes = judged_with_score(separated.result, log)
     if correction is not None:
@@ -119,8 +130,9 @@ def finished(
         wider = excess * result.states.pose_cov
         result = replace(result, states=replace(result.states, pose_cov=wider))
     trust = with_long_exclusions(trust | separated.trust | Trust(findings))
+    trust = with_changed_beacons(trust, changes)
     cause = diagnosed(log, site, trust, settings.lockin) if correction is None else None
-    excluded = any(f.code == "beacon_excluded" for f in trust.reasons)
+    excluded = bool(changes) or any(f.code == "beacon_excluded" for f in trust.reasons)
     possible = corrections(site, trust.reasons, () if excluded else causes, cause)
     is_named = bool(causes) or any(f.code == "changed" for f in trust.reasons)
     trust = with_cause(trust, None if is_named and not is_clear(cause) else cause)

@@ -21,6 +21,7 @@ from magfusion.simulation.inertial import BiasInstability, SimulatedImu, simulat
 from magfusion.simulation.layers import Layers
 from magfusion.simulation.magnetometers import answered, names_by_channel
 from magfusion.simulation.motion import (
+    ATTITUDE_KNOT,
     Rests,
     SimulatedMotion,
     driving_motion,
@@ -39,6 +40,7 @@ from magfusion.units import Array
 EPOCH_NS = 1_700_000_000_000_000_000
 
 MotionKind = Literal["walk", "turn", "static", "drive"]
+TURN_STEP = 0.6  # rad rms between two knots of a turn, at most: more than pi is shortened
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +75,8 @@ class SimulationConfig:
     motion : {"walk", "turn", "static", "drive"}
     speed : float
         Approximate mean speed while moving (m/s).
+    turn_rate : float
+        Angular rate of a turn, rms (rad/s).
     imu_rate_hz, magnetometer_rate_hz : float
         The latter more than 2.5 times the highest tone.
     time_offset : float, optional
@@ -109,6 +113,7 @@ class SimulationConfig:
     duration: float = 60.0
     motion: MotionKind = "walk"
     speed: float = 0.5
+    turn_rate: float = 0.6
     rests: Rests = field(default_factory=Rests)
     imu_rate_hz: float = 200.0
     magnetometer_rate_hz: float = 400.0
@@ -437,7 +442,8 @@ def _motion(config: SimulationConfig, rng: np.random.Generator) -> SimulatedMoti
     if config.motion == "walk":
         return random_walk_motion(*path, rests=config.rests)
     if config.motion == "turn":
-        return turning_motion(*path, rests=config.rests)
+        interval = min(ATTITUDE_KNOT, TURN_STEP / config.turn_rate)
+        return turning_motion(*path, config.turn_rate, config.rests, interval)
     if config.motion == "drive":
         return driving_motion(*path, rests=config.rests)
     raise InputError(f"motion: found {config.motion!r}; give walk, turn, static or drive")

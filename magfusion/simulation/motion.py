@@ -143,6 +143,7 @@ def turning_motion(
     speed: float = 0.3,
     rate_rms: float = 0.6,
     rests: Rests | None = None,
+    interval: float = ATTITUDE_KNOT,
 ) -> SimulatedMotion:
     """Return a rotation about all axes, as of a body rotated by hand for calibration.
 
@@ -152,15 +153,17 @@ def turning_motion(
         As in `random_walk_motion`.
     rate_rms : float
         Of the angular rate (rad/s), approximate.
+    interval : float
+        Of the knots of the attitude (s); a turn of more than pi between two is shortened.
 
     Raises
     ------
     InputError
         If the box, the duration or the speed is invalid.
     """
-    rate, moving, knots = _progress(duration, rests or Rests())
+    rate, moving, knots = _progress(duration, rests or Rests(), interval)
     attitudes = [Rotation.random(rng=rng)]
-    for step in rng.normal(0.0, rate_rms * ATTITUDE_KNOT / np.sqrt(3.0), (len(knots) - 1, 3)):
+    for step in rng.normal(0.0, rate_rms * interval / np.sqrt(3.0), (len(knots) - 1, 3)):
         attitudes.append(attitudes[-1] * Rotation.from_rotvec(step))
     path = _path_in_box(rng, box_world, speed, moving)
     return SimulatedMotion(path, RotationSpline(knots, Rotation.concatenate(attitudes)), rate)
@@ -253,11 +256,13 @@ def progress_rate(duration: float, rests: Rests) -> BPoly:
     return BPoly.from_derivatives(knots, [[value, 0.0, 0.0] for value in values])
 
 
-def _progress(duration: float, rests: Rests) -> tuple[BPoly, float, Array]:
+def _progress(
+    duration: float, rests: Rests, interval: float = ATTITUDE_KNOT
+) -> tuple[BPoly, float, Array]:
     """Return the rate of progress, the seconds of moving, and the knots of attitude over them."""
     rate = progress_rate(duration, rests)
     moving = float(rate.integrate(rate.x[0], rate.x[-1]))
-    return rate, moving, np.arange(np.ceil(moving / ATTITUDE_KNOT) + 2) * ATTITUDE_KNOT
+    return rate, moving, np.arange(np.ceil(moving / interval) + 2) * interval
 
 
 def _path_in_box(

@@ -46,9 +46,21 @@ def beacon_causes(known: Snapshots) -> Iterator[Explanation]:
     ranked = sorted(names, key=lambda name: left[name].chi_square / max(left[name].freedom, 1.0))
     for name in ranked[:SUSPECTS]:
         # No mistake in a beacon explains more than to leave it out.
-        if _explained(known, left[name].chi_square, 0, "phase", "", "").clear:
+        clear = _explained(known, left[name].chi_square, 0, "phase", "", "").clear
+        if clear and _contradicts(known, left[name], name):
             for one in _of_one(known, left[name], name):
                 yield replace(one, beacon=name)
+
+
+def _contradicts(known: Snapshots, left: Snapshots, name: str) -> bool:
+    """Return whether a beacon contradicts the others, whose survey errs as declared.
+
+    Either as another pose and moment of it would, or in any other way.
+    """
+    kinds = (BEACON_POSITION, BEACON_ROTATION, LOG_MOMENT)
+    free = [(kind, name, wide) for kind, wide in zip(kinds, WIDE[:3], strict=True)]
+    tests = 2 * len(known.site.beacons)
+    return known.rejects_rest(left, tests) or known.rejects(free, tests)
 
 
 def matrix_causes(known: Snapshots, steady: float | None) -> Iterator[Explanation]:
@@ -59,7 +71,10 @@ def matrix_causes(known: Snapshots, steady: float | None) -> Iterator[Explanatio
     steady : float, optional
         Usual size of the steady field, relative to the Earth's.
     """
-    after, found = known.fitted([(MATRIX, MATRIX.owner, 0.3)], known.fixes)
+    free = [(MATRIX, MATRIX.owner, 0.3)]
+    if known.excess < MISFIT and not known.rejects(free, tests=1):
+        return
+    after, found = known.fitted(free, known.fixes)
     magnetometer = known.site.platform.magnetometer
     change = found.site.platform.magnetometer.matrix - magnetometer.matrix
     even = 0.5 * (change + change.T)
@@ -82,7 +97,7 @@ def matrix_causes(known: Snapshots, steady: float | None) -> Iterator[Explanatio
 
 def survey_causes(known: Snapshots) -> Iterator[Explanation]:
     """Yield what a survey that is worse than declared, of all beacons, would explain."""
-    if known.chi_square < MISFIT * known.freedom:
+    if known.excess < MISFIT:
         return
     free = []
     for beacon in known.site.beacons:

@@ -6,20 +6,24 @@ parameters: by the decrease of the cost and the change of the poses, for any con
 addition.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.data_checks.statistics import holm, sigmas
-from magfusion.estimation.integrity.fixed_parameter_test import MAX_LINEAR_CHI_SQUARE
+from magfusion.estimation.integrity.fixed_parameter_test import (
+    LEAST_EVIDENCE,
+    MAX_LINEAR_CHI_SQUARE,
+)
 from magfusion.estimation.integrity.released_fault import (
     COVERED,
     ReleasedFault,
     release_fault,
     release_gain,
 )
-from magfusion.estimation.integrity.score import answered
+from magfusion.estimation.integrity.score import answered, scores_of
 from magfusion.estimation.integrity.suspects import Inertial, Stream, Suspect, spoken_name, suspects
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.model.parameters import (
@@ -34,8 +38,10 @@ from magfusion.model.parameters import (
     prior_sigma,
 )
 from magfusion.model.parameters.parameter import PhasorView
+from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
+from magfusion.model.without_imu import logged
 from magfusion.units import DEGREE, Array, ComplexArray
 
 CHANGED = "changed"  # code
@@ -182,6 +188,40 @@ def changed(case: Case) -> TestResult:
     return TestResult((change_finding(cause, prior_sigma(every)),), spread=moved + certain)
 
 
+def changed_beacon(result: Smoothed, log: Log, name: str, onset: float) -> Finding | None:
+    """Return the finding on a beacon that changed at a known time (s); None if none explains it.
+
+    Parameters
+    ----------
+    result : Smoothed
+        With the fields of the beacon after that.
+    """
+    kinds = (GAIN, BEACON_POSITION, BEACON_ROTATION)
+    steps = [_step(kind, name, onset) for kind in kinds]
+    imu = logged(log, result.declared.site)[0].imu
+    scores, pose_cov = scores_of(result, imu, steps), result.states.pose_cov
+    if scores is None or pose_cov is None:
+        return None
+    score = answered(result, scores.every, imu)
+    information, gradient = score.with_declared(tolerance=True)
+    own, size = list(score.fixed[-len(steps) :]), dimension(score.fixed)
+    rows = np.concatenate([np.arange(size)[block.columns] for block in own[1:]])
+    pose = Suspect(changed_name(own[1:]), tuple(own[1:]), np.eye(size)[:, rows], CHANGED)
+    released = (
+        release_fault(pose_cov, score, fault, information, gradient)
+        for fault in (*_fault_candidates(own, size), pose)
+    )
+    causes = [one for one in released if one is not None and one.gain > LEAST_EVIDENCE]
+    if not causes:
+        return None
+    finding = change_finding(max(causes, key=lambda one: one.gain), prior_sigma(score.fixed))
+    return replace(
+        finding,
+        text=f"{finding.text} Its fields are excluded from then on.",
+        verdict=Verdict.DOUBTFUL,
+    )
+
+
 def _changes(parts: dict[float, list[Block]], every: tuple[Block, ...]) -> list[Suspect]:
     """Return the possible changes at each of some times, as columns after the fixed ones."""
     return [
@@ -221,15 +261,12 @@ def _blocks(site: Site, at: float) -> list[Block]:
     every += [(BEACON_ROTATION, owner) for owner in owners]
     if site.platform.inertial:
         every += [(kind, "imu") for kind in (TIME_OFFSET, ACCEL_BIAS, GYRO_BIAS)]
-    return [
-        Block(
-            SinceBias(kind, at) if isinstance(kind, Bias) else StepChange(kind, at),
-            owner,
-            slice(0),
-            np.full(_width(kind), TYPICAL[kind]),
-        )
-        for kind, owner in every
-    ]
+    return [_step(kind, owner, at) for kind, owner in every]
+
+
+def _step(kind: Parameter, owner: str, at: float) -> Block:
+    step = SinceBias(kind, at) if isinstance(kind, Bias) else StepChange(kind, at)
+    return Block(step, owner, slice(0), np.full(_width(kind), TYPICAL[kind]))
 
 
 def _width(kind: Parameter) -> int:
@@ -267,7 +304,7 @@ def step_time(block: Block) -> float:
     return block.parameter.begin
 
 
-def changed_name(blocks: tuple[Block, ...]) -> str:
+def changed_name(blocks: Sequence[Block]) -> str:
     """Return what changed, in words: a parameter, or the pose of a beacon."""
     block = blocks[0]
     if len(blocks) > 1:

@@ -4,6 +4,7 @@ Where a witness says that something is wrong, and the streams do not show a caus
 usual mistakes are tried; see `likely_cause`.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -154,6 +155,27 @@ def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
     kept = tuple(f for f in trust.findings if f is not first and not is_explained(f))
     explained = tuple(dict.fromkeys((*first.explained, *codes)))
     return Trust((*kept, replace(first, explained=explained)), trust.unverified)
+
+
+def with_changed_beacons(trust: Trust, changes: Mapping[str, Finding]) -> Trust:
+    """Return findings in which the changes of beacons precede, and explain, all others.
+
+    Parameters
+    ----------
+    changes : mapping of str to Finding
+        By name of a beacon that is excluded since then, which its change explains.
+    """
+    if not changes:
+        return trust
+    own = tuple(f"Beacon {name} contradicts" for name in changes)
+    kept = [f for f in trust.findings if not f.text.startswith(own)]
+    traces = {
+        f.code for f in kept if f.verdict is Verdict.DOUBTFUL and f.code not in SEEN - {"changed"}
+    }
+    kept = [f for f in kept if f.verdict is not Verdict.DOUBTFUL or f.code not in traces]
+    explained = tuple(sorted(traces - {"changed"}))
+    first = (replace(f, weight=FIRST, explained=explained) for f in changes.values())
+    return replace(trust, findings=(*kept, *first))
 
 
 def with_corrected(trust: Trust, corrected: tuple[Finding, ...]) -> Trust:

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.data_checks.statistics import TEST_BUDGET, log_p_chi_square
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.estimation.snapshot.survey_error import whitened
@@ -16,6 +17,7 @@ from magfusion.model.parameters import (
     Block,
     Calibration,
     Parameter,
+    choose_blocks,
     dimension,
     initial_calibration,
     linearize_channels,
@@ -28,6 +30,7 @@ from magfusion.model.site import Site
 from magfusion.units import AnyArray, Array, IntArray
 
 EPOCHS = 24
+OF_SURVEY = ("beacons", "moments", "magnetometer")  # groups of parameters
 ITERATIONS = 20
 
 
@@ -59,10 +62,13 @@ class Snapshots:
     ----------
     samples : FieldSamples
     calibration : Calibration
+    survey_error : bool
+        Whether the weights include the survey's errors, as if every epoch had its own.
     """
 
     samples: FieldSamples
     calibration: Calibration
+    survey_error: bool = True
 
     @property
     def site(self) -> Site:
@@ -86,7 +92,7 @@ class Snapshots:
 
     def of(self, site: Site) -> "Snapshots":
         """Return the same epochs with another site."""
-        return Snapshots(self.samples, replace(self.calibration, site=site))
+        return replace(self, calibration=replace(self.calibration, site=site))
 
     def some(self, count: int) -> "Snapshots":
         """Return a subset of the epochs."""
@@ -98,7 +104,7 @@ class Snapshots:
         """Return the same epochs as if a beacon had not been received."""
         own = np.array([beacon == name for beacon, _ in self.samples.channels])
         phasor = np.where(own[:, None], np.nan, self.samples.phasor_sensor)
-        return Snapshots(replace(self.samples, phasor_sensor=phasor), self.calibration)
+        return replace(self, samples=replace(self.samples, phasor_sensor=phasor))
 
     def residual(self, fixes: Fixes) -> Array:
         """Return the whitened residual at the best fixes, shape (n, channels, 6)."""
@@ -109,7 +115,7 @@ class Snapshots:
 
     @cached_property
     def _weights(self) -> Array:
-        cov = measurement_cov(self.site, self.samples, survey_error=True)
+        cov = measurement_cov(self.site, self.samples, survey_error=self.survey_error)
         return whitening(cov, self.samples.there)
 
     def fitted(
@@ -124,7 +130,47 @@ class Snapshots:
         fixes : Fixes
             Initial poses.
         """
-        blocks = _blocks(self.site, parameters)
+        return self._minimised(_blocks(self.site, parameters), fixes)
+
+    @cached_property
+    def joint_chi_square(self) -> float:
+        """Chi square with the survey's errors estimated, each the same at all epochs.
+
+        `chi_square` is larger or smaller by chance, as an error at one epoch is one at all others.
+        """
+        joint = self._jointly(())
+        if all(beacon.synchronised for beacon in self.site.beacons):
+            return joint
+        return min(joint, self.chi_square)  # from unknown phases no minimum is sure to be reached
+
+    @property
+    def excess(self) -> float:
+        """Mean square of what the survey, as declared, does not explain."""
+        return self.joint_chi_square / max(self.freedom, 1.0)
+
+    def rejects(self, parameters: Sequence[tuple[Parameter, str, float]], tests: int) -> bool:
+        """Return whether the fields contradict some parameters, one of so many tests.
+
+        The likelihood ratio of larger errors of them than their declared sigmas.
+        """
+        released = self._jointly(parameters)
+        count = sum(len(b.sigma) for b in _blocks(self.site, parameters))
+        return _is_significant(self.joint_chi_square, released, count, self.freedom, tests)
+
+    def rejects_rest(self, rest: "Snapshots", tests: int) -> bool:
+        """Return whether what a subset leaves out contradicts it, one of so many tests."""
+        count, after = self.freedom - rest.freedom, rest.joint_chi_square
+        return _is_significant(self.joint_chi_square, after, count, rest.freedom, tests)
+
+    def _jointly(self, parameters: Sequence[tuple[Parameter, str, float]]) -> float:
+        wide = _blocks(self.site, parameters)
+        released = {block.key for block in wide}
+        groups = (*OF_SURVEY, "phase")
+        survey = (b for b in choose_blocks(self.site, groups) if b.key not in released)
+        own = replace(self, survey_error=False)
+        return own._minimised(placed([*survey, *wide]), self.fixes)[0]
+
+    def _minimised(self, blocks: tuple[Block, ...], fixes: Fixes) -> tuple[float, Calibration]:
         start = _Guess(
             self.calibration,
             fixes.world_from_body[:, 0],
@@ -152,7 +198,7 @@ class Snapshots:
         every = np.concatenate([by_pose, by_free, error], axis=-1)
         rows = whitened(self._weights, every).reshape(n, -1, every.shape[-1])
         square = np.swapaxes(rows, 1, 2) @ rows
-        sigma = np.concatenate([block.sigma for block in blocks])
+        sigma = np.concatenate([np.zeros(0), *(block.sigma for block in blocks)])
         size = 6 * n + len(sigma)
         information, gradient = np.zeros((size, size)), np.zeros(size)
         for k in range(n):
@@ -166,6 +212,12 @@ class Snapshots:
         gradient[6 * n :] = np.sum(square[:, 6:-1, -1], axis=0) + at.estimate / sigma**2
         cost = np.sum(square[:, -1, -1]) + np.sum((at.estimate / sigma) ** 2)
         return NormalEquations(np.array([cost]), gradient[None], information[None])
+
+
+def _is_significant(before: float, after: float, count: float, freedom: float, tests: int) -> bool:
+    noise = max(1.0, after / max(freedom, 1.0))
+    log_p = log_p_chi_square((before - after) / noise, count)
+    return bool(log_p < np.log(TEST_BUDGET / tests))
 
 
 def _blocks(site: Site, parameters: Sequence[tuple[Parameter, str, float]]) -> tuple[Block, ...]:

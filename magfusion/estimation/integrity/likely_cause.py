@@ -61,15 +61,12 @@ def cause_of(
     known = snapshots_of(samples, part.imu, site)
     tried = _of_fields(known, samples, _steady(part, site))
     of_fields, of_motion = clearly_best(tried), None
-    if known.chi_square < MISFIT * known.freedom:
-        # As declared the fields may be so: what explains them is weighed against what moves.
-        of_motion = clearly_best(_of_motion(known, samples, part.imu))
-    elif of_fields is None and any(one.clear for one in tried):
+    if of_fields is None and any(one.clear for one in tried):
         return None  # it is of the fields, whichever it is: no inertial sensor explains it
-    elif of_fields is None:
-        rest = _unexplained(known)
-        if rest is not None:
-            return rest
+    if of_fields is None and (rest := _unexplained(known)) is not None:
+        return rest
+    if of_fields is None or known.excess < MISFIT:
+        # As declared the fields may be so: what explains them is weighed against what moves.
         of_motion = clearly_best(_of_motion(known, samples, part.imu))
     if of_motion is not None and (of_fields is None or of_motion.fall > of_fields.fall):
         return of_motion, of_motion.text(
@@ -82,8 +79,7 @@ def cause_of(
 
 def _unexplained(known: Snapshots) -> tuple[Explanation, str] | None:
     """Return what is to be said of fields that no single mistake explains."""
-    before, freedom = known.chi_square, max(known.freedom, 1.0)
-    excess = before / freedom
+    before, freedom, excess = known.joint_chi_square, max(known.freedom, 1.0), known.excess
     if excess < MISFIT or not _moves(known):
         return None
     rms = float(np.sqrt(excess))

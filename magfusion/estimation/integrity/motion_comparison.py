@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from magfusion.estimation.data_checks.turning import convolved
+from magfusion.estimation.integrity.field_snapshots import OF_SURVEY
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.estimation.snapshot.survey_error import whitened
@@ -36,10 +37,10 @@ TURN_SPAN = 0.4  # s, over which rotations are compared
 CURVE_SPAN = 0.6  # s, of each half of a second difference
 GRID = 0.01  # s, of the specific force
 EVEN = 0.25  # of a span, largest deviation of an epoch from it
+WIDEST = 1.5  # times a span, up to which it is a multiple of the epochs' interval
 LOCAL_ROTATION = 3e-3  # rad, error of fixes besides noise
 LOCAL_POSITION = 1e-3  # m
 LOCAL_TILT = 2e-3  # rad
-OF_SURVEY = ("beacons", "moments", "magnetometer")
 MOUNTED = (SENSOR_ROTATION, SENSOR_POSITION)  # which are estimated separately
 
 SHARED = {"gyro": slice(0, 3), "accel": slice(3, 6), "tilt": slice(6, 8)}
@@ -166,10 +167,13 @@ class Surveyed:
         Of all epochs, with the site's mounting and lever arm.
     by_survey : ndarray, shape (n, 6, k)
         Rotation (rad) and translation (m) in body axes, of one sigma each.
+    window : float
+        Over which a fix averages the position (s).
     """
 
     fixes: Fixes
     by_survey: Array
+    window: float
 
 
 def surveyed(samples: FieldSamples, calibration: Calibration) -> Surveyed:
@@ -182,7 +186,8 @@ def surveyed(samples: FieldSamples, calibration: Calibration) -> Surveyed:
     weights = whitening(measurement_cov(site, samples, survey_error=False), samples.there)
     by_sigma = by_blocks @ prior_sqrt_covariance(site, blocks)
     result = np.linalg.pinv(whitened(weights, by_pose)) @ whitened(weights, by_sigma)
-    return Surveyed(fixes, np.where(np.isfinite(result), result, 0.0))
+    window = float(np.median(samples.window))
+    return Surveyed(fixes, np.where(np.isfinite(result), result, 0.0), window)
 
 
 def compared(known: Surveyed, imu: ImuSamples, site: Site, late: float = 0.0) -> Compared | None:
@@ -201,18 +206,19 @@ def compared(known: Surveyed, imu: ImuSamples, site: Site, late: float = 0.0) ->
         fixes.pose_cov[:, 0],
     )
     certain = fixes.determined[:, 0] & (fixes.probability[:, 0] > 0.99)
-    certain &= (time > stamps[0] + CURVE_SPAN) & (time < stamps[-1] - CURVE_SPAN)
+    turn_span, curve_span = _of_epochs(time, TURN_SPAN), _of_epochs(time, CURVE_SPAN)
+    certain &= (time > stamps[0] + curve_span) & (time < stamps[-1] - curve_span)
     rotation_sigma = np.sqrt(np.einsum("nii->n", cov[:, :3, :3]) / 3.0)
     place_sigma = np.sqrt(np.einsum("nii->n", cov[:, 3:, 3:]) / 3.0)
-    i, j = _pairs(time, certain, TURN_SPAN)
-    before, at, after = _triples(time, certain, CURVE_SPAN)
+    i, j = _pairs(time, certain, turn_span)
+    before, at, after = _triples(time, certain, curve_span)
     if len(i) < 8 or len(at) < 8:
         return None
     relative = np.swapaxes(turn[i], 1, 2) @ turn[j]
     attitude = attitude_from_gyro(stamps, imu.gyro_body)
     by_gyro = attitude_at(attitude, stamps, imu.gyro_body, time)
     half = 0.5 * (time[after] - time[before])[:, None]
-    force, propagated = _forces(fixes, stamps, imu, time[at])
+    force, propagated = _forces(known, stamps, imu, time[at], curve_span)
     rotated = Rotation.from_matrix(relative).as_rotvec()
     by_turn, by_place = known.by_survey[:, :3], turn @ known.by_survey[:, 3:]
     tilted = turn @ by_turn
@@ -255,6 +261,13 @@ def _prior(site: Site) -> Array:
     )
 
 
+def _of_epochs(time: Array, span: float) -> float:
+    """Return the multiple of the epochs' interval that is nearest to a span (s)."""
+    interval = float(np.median(np.diff(time))) if len(time) > 1 else span
+    nearest = max(1.0, np.round(span / interval)) * interval
+    return nearest if nearest < WIDEST * span else span
+
+
 def _pairs(time: Array, certain: BoolArray, span: float) -> tuple[IntArray, IntArray]:
     """Return pairs of epochs a span apart, in sequence."""
     out: list[tuple[int, int]] = []
@@ -289,18 +302,22 @@ def _triples(time: Array, certain: BoolArray, span: float) -> tuple[IntArray, In
     return triples[:, 0], triples[:, 1], triples[:, 2]
 
 
-def _forces(fixes: Fixes, stamps: Array, imu: ImuSamples, wanted: Array) -> tuple[Array, Array]:
+def _forces(
+    known: Surveyed, stamps: Array, imu: ImuSamples, wanted: Array, span: float
+) -> tuple[Array, Array]:
     """Return the specific force in world axes, weighted as by a second difference.
 
-    The second difference of positions is the mean acceleration under a triangle of twice
-    `CURVE_SPAN`.
+    The second difference of positions over a span is the mean acceleration under a triangle of
+    twice the span, averaged over the window of a fix.
     """
-    time = fixes.time
+    fixes, time = known.fixes, known.fixes.time
     grid = np.linspace(time[0], time[-1], round((time[-1] - time[0]) / GRID) + 1)
     turns = Slerp(time, Rotation.from_matrix(fixes.world_from_body[:, 0]))(grid).as_matrix()
     force = np.stack([np.interp(grid, stamps, axis) for axis in imu.accel_body.T], axis=1)
-    count = round(CURVE_SPAN / GRID)
+    count = round(span / GRID)
     weight = np.concatenate([np.arange(1, count + 1), np.arange(count - 1, 0, -1)]) / count**2
+    box = max(1, round(known.window / GRID))
+    weight = np.convolve(weight, np.full(box, 1.0 / box))
     outer = turns[:, :, :, None] * force[:, None, None, :]
     both = np.concatenate([outer.reshape(len(grid), 27), turns.reshape(len(grid), 9)], axis=1)
     mean = convolved(both, weight, mode="same")

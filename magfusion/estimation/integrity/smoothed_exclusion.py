@@ -283,6 +283,21 @@ def _excluded_findings(
     return findings
 
 
+def excluded_to_the_end(separated: SeparatedSmooth) -> dict[str, float]:
+    """Return from when on (s) a beacon is excluded, where it is until the end."""
+    result, excluded = separated.result, separated.states.excluded
+    time, onsets = result.fields.time, {}
+    for beacon in result.declared.site.beacons if excluded else ():
+        out = np.flatnonzero([beacon.name in excluded[i] for i in result.epoch.tolist()])
+        if not len(out):
+            continue
+        first, last = _stretches(out, time)[-1]
+        lasting = time[last] - time[first] > LONGEST_EXCLUSION
+        if lasting and first > 0 and time[-1] - time[last] < TOGETHER:
+            onsets[beacon.name] = float(time[first])
+    return onsets
+
+
 def with_long_exclusions(trust: Trust) -> Trust:
     """Return findings in which a long exclusion precedes all others: they are its traces.
 
