@@ -183,8 +183,12 @@ TOLERANCE: dict[Parameter, float] = {
     SENSOR_POSITION: 0.004,
 }
 
-# Largest error that is no mistake: of the last two, the size of a housing and its mounting.
-USUAL: dict[Parameter, float] = TOLERANCE | {SENSOR_ROTATION: 0.4 * DEGREE, SENSOR_POSITION: 0.015}
+# Largest error that is no mistake: the size of a housing and its mounting, the latency of a bus.
+USUAL: dict[Parameter, float] = TOLERANCE | {
+    SENSOR_ROTATION: 0.4 * DEGREE,
+    SENSOR_POSITION: 0.015,
+    AIDING_CLOCK: 0.02,
+}
 
 # Of the finding that calls it in question; as in `magfusion.model.trust.CODES`.
 CODE: dict[Parameter, str] = {
