@@ -168,10 +168,10 @@ def _of_sensor(reader: AnyReader, path: Path, name: str, quantity: Quantity) -> 
     rows = AIDING_ROWS.get(quantity, {})
     connections = [c for c in reader.connections if c.topic == named[0] and c.msgtype in rows]
     if len(named) > 1 or not connections:
-        found = ", ".join(sorted({c.msgtype for c in reader.connections if c.topic in named}))
+        types = ", ".join(sorted({c.msgtype for c in reader.connections if c.topic in named}))
         raise InputError(
             f"{path}: the site's aiding sensor {name} measures {quantity}, of which"
-            f" {' and '.join(named)} of {found} is no single topic of"
+            f" {' and '.join(named)} of {types} is no single topic of"
             f" {' or '.join(rows) or 'any type'}; give it the whole name of another topic."
         )
     _refuse_several_types(connections, path)

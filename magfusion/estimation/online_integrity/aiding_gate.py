@@ -60,7 +60,7 @@ class AidingGate:
             self.rejected_since.setdefault(sensor, state.time)
         return explained
 
-    def judged(self, judgement: Judgement, time: float) -> Judgement:
+    def assessed(self, judgement: Judgement, time: float) -> Judgement:
         """Return a judgement with the sensors that contradict the state.
 
         A parameter of a sensor is not estimated by the samples that the test leaves.
