@@ -92,9 +92,10 @@ ROOMS = {
             p002_beacon
         """,
         "results": """
-            errors figures gauge odometry page_style pose_information provenance
+            association figures gauge odometry page_style pose_information provenance
             recording_file ros_messages shapes trend
-            coverage drift live_foxglove observability odometry_dds odometry_mavlink recording_plots
+            alignment coverage drift errors live_foxglove observability odometry_dds
+            odometry_mavlink recording_plots truth_frame
             refinement rest_figures shown transfer verdict
             coverage_colours design motion_coverage recording_layout recording_trust screen
             plots recording recording_drift

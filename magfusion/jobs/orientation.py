@@ -142,7 +142,7 @@ def _figures(result: Oriented, states: Trajectory, elapsed: float) -> Figures:
 
 def _errors(states: Trajectory, log: Log) -> Figures:
     """Return the errors of heading and tilt against the truth, where the log has one."""
-    if log.truth is None or len(log.truth) == 0:
+    if log.truth is None or len(log.truth) == 0 or not log.truth.has_attitude:
         return Figures()
     truth, exists, _ = truth_poses(log.truth, states.time)
     if not np.any(exists):
