@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
 
@@ -17,7 +18,7 @@ from magfusion.estimation.orientation.online import ANYWHERE, TIMING, Orientatio
 from magfusion.estimation.orientation.remarks import doubts, remarks
 from magfusion.estimation.orientation.smoother import Oriented, oriented
 from magfusion.files.site import save_site
-from magfusion.files.stream import Format, json_line, read_records
+from magfusion.files.stream import NumberedRecord, json_line
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
 from magfusion.jobs.inputs import Job, named, read_job, require_imu
@@ -38,8 +39,6 @@ from magfusion.units import DEGREE, Array, Rate
 
 if TYPE_CHECKING:
     from magfusion.estimation.online_integrity.judgement import JudgedState
-
-_PLACE = {"json": "line", "msgpack": "record"}
 
 
 def run_orientation(name: str, job: Job, rate: Rate, *, back: bool, report: Report) -> Figures:
@@ -182,7 +181,11 @@ def _refined(site: Site, last: Orientation) -> Site:
 
 
 def run_orientation_stream(
-    site: Site, form: Format, keep_going: bool, source: BinaryIO, sink: BinaryIO, messages: TextIO
+    site: Site,
+    records: Iterable[NumberedRecord],
+    keep_going: bool,
+    sink: BinaryIO,
+    messages: TextIO,
 ) -> int:
     """Write the orientation for the records of a stream; a line of JSON per inertial sample.
 
@@ -204,13 +207,13 @@ def run_orientation_stream(
             sink.write(json_line(_state_row(navigator, state)))
         sink.flush()
 
-    for numbered in read_records(source, form):
+    for numbered in records:
         try:
             if numbered.record is None:
                 raise InputError(numbered.refusal)
             _process_record(navigator, numbered.record, samples)
         except InputError as error:
-            sentence = f"standard input, {_PLACE[form]} {numbered.number}: {error}"
+            sentence = numbered.located(error)
             if not keep_going:
                 raise InputError(sentence) from error
             refused += 1
