@@ -196,6 +196,6 @@ def test_rests_go_through_log_and_pipe(tmp_path: Path, refuse: Refuse) -> None:
 def test_a_record_that_cannot_be_is_refused(record: dict[str, object], reported: str) -> None:
     source = io.BytesIO(json.dumps(record).encode() + b"\n")
     how = How(None, 1e-3, Risk())
+    records = read_records(source, "json")
     with pytest.raises(InputError, match=reported):
-        records = read_records(source, "json")
         run_rests_stream(far_site(), how, records, False, io.BytesIO(), io.StringIO())

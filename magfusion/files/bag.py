@@ -121,7 +121,7 @@ def _read(reader: AnyReader, path: Path, topics: Topics, report: Report) -> dict
     """Return the streams by their roles, of one pass over the bag."""
     wanted: dict[str, Wanted] = {}
     for role, rows in ROWS.items():
-        connections = _chosen(reader, path, getattr(topics, role), role, tuple(rows))
+        connections = role_connections(reader, path, getattr(topics, role), role, tuple(rows))
         if connections:
             refuse_overlap(reader, connections[0].topic)
             row, place = rows[connections[0].msgtype], f"{path} topic {connections[0].topic}"
@@ -138,7 +138,7 @@ def _read(reader: AnyReader, path: Path, topics: Topics, report: Report) -> dict
     return result
 
 
-def _chosen(
+def role_connections(
     reader: AnyReader, path: Path, topic: str | None, role: str, msgtypes: tuple[str, ...]
 ) -> list[Connection]:
     """Return the connections of the one topic that plays a role."""
