@@ -18,6 +18,7 @@ from magfusion.files.site import save_site
 from magfusion.files.trajectory_table import read_trajectory, trajectory_columns, write_trajectory
 from magfusion.files.tum import read_tum, write_tum
 from magfusion.model.trajectory import Trajectory
+from magfusion.results.alignment import clock_offset
 from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
@@ -215,6 +216,23 @@ def test_the_offset_of_the_clocks_is_estimated(
     shown = report(positions(late, late.position_world) if alone else late, "--align-time")
     assert shown["time_offset_s"] == pytest.approx(offset, abs=2e-3)  # 2 mm at 1 m/s
     assert shown["ate_m"] == pytest.approx(np.sqrt(3.0) * NOISE, rel=0.1)
+
+
+def test_the_clock_of_a_quiet_part_of_a_coarse_estimate_is_that_of_its_own_part(
+    walked: Trajectory,
+) -> None:
+    """At 5 Hz, and before ten times as fast a motion: the whole truth is no scale for the part."""
+    faster = walked.time[-1] + 0.1 * (walked.time[1:] - walked.time[0])
+    truth = Trajectory(
+        np.concatenate([walked.time, faster]),
+        np.concatenate([walked.world_from_body, walked.world_from_body[1:]]),
+        np.concatenate([walked.position_world, walked.position_world[1:]]),
+    )
+    part = rows(walked, slice(7, 5000, 40))
+    late = Trajectory(part.time + 0.3, part.world_from_body, part.position_world)
+    assert clock_offset(late, truth) == pytest.approx(-0.3, abs=2e-3)
+    prism = positions(truth, truth.position_world)
+    assert clock_offset(late, prism) == pytest.approx(-0.3, abs=2e-3)
 
 
 def test_clocks_of_different_motions_are_refused(

@@ -20,13 +20,17 @@ MAX_ROTATION_ERROR = 0.1 * DEGREE
 ORDER = 3  # of the error in the step
 
 
-def truth_poses(truth: Trajectory, time: Array) -> tuple[Trajectory, BoolArray, str]:
+def truth_poses(
+    truth: Trajectory, time: Array, *, any_motion: bool = False
+) -> tuple[Trajectory, BoolArray, str]:
     """Interpolate a truth of any rate at those times where its motion allows it.
 
     Parameters
     ----------
     time : ndarray, shape (n,)
         Strictly increasing (s).
+    any_motion : bool
+        Whether only gaps are not interpolated across, whatever the error.
 
     Returns
     -------
@@ -43,7 +47,10 @@ def truth_poses(truth: Trajectory, time: Array) -> tuple[Trajectory, BoolArray, 
         return empty, np.zeros(len(time), dtype=bool), "The truth has no pose."
     truth, lacking = _completed(truth)
     inside = (time >= known[0]) & (time <= known[-1])
-    covered = inside & (np.isin(time, known) | _usable_steps(truth)[_step_of(known, time)])
+    if any_motion:
+        covered = in_short_steps(truth, time)
+    else:
+        covered = inside & (np.isin(time, known) | _usable_steps(truth)[_step_of(known, time)])
     poses = _cubic(truth, time[covered])
     poses = replace(poses, **{name: np.full_like(getattr(poses, name), np.nan) for name in lacking})
     return poses, covered, _reason(truth, time, inside, covered)
