@@ -29,7 +29,7 @@ def test_what_breaks_is_found(
 
     case: Case = {"kind": "yaml", "changes": [], "command": PIPE, "file": "log/site.yaml"}
     assert run_case(case, inputs, tmp_path / "good") is None
-    monkeypatch.setattr("magfusion.jobs.stream.run_stream", broken)
+    monkeypatch.setattr("magfusion.jobs.stream.navigate_records", broken)
     result = run_case(case, inputs, tmp_path / "bad")
     assert result is not None
     assert "ZeroDivisionError: a fault" in result

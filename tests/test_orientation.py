@@ -19,6 +19,7 @@ from magfusion.estimation.orientation.remarks import remarks
 from magfusion.estimation.orientation.smoother import oriented, pieces
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
+from magfusion.files.stream import read_records
 from magfusion.files.stream_contents import imu_content, magnetometer_content, write_record
 from magfusion.jobs.inputs import Job
 from magfusion.jobs.orientation import run_orientation, run_orientation_stream
@@ -158,7 +159,9 @@ def test_the_pipe_tells_an_orientation_for_each_sample_and_no_position(attached)
             "json",
         )
     source.seek(0)
-    assert run_orientation_stream(site, "json", False, source, sink, io.StringIO()) == 0
+    assert (
+        run_orientation_stream(site, read_records(source, "json"), False, sink, io.StringIO()) == 0
+    )
     reported = [json.loads(line) for line in sink.getvalue().splitlines()]
     assert len(reported) > 780
     assert {t["position"] for t in reported} == {None}

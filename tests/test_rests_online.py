@@ -27,6 +27,7 @@ from magfusion.estimation.rests.running_stationary_mean import RunningMean
 from magfusion.estimation.rests.stationary_integration import IntegratedRests, Rest, integrate_rests
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
+from magfusion.files.stream import read_records
 from magfusion.jobs.navigate_rests import How, replayed, run_rests_stream
 from magfusion.jobs.replay import run_replay
 from magfusion.model.samples import FieldSamples, Waveform
@@ -164,7 +165,7 @@ def test_rests_go_through_log_and_pipe(tmp_path: Path, refuse: Refuse) -> None:
     assert b'"reference"' in source.getvalue()
     source.seek(0)
     how = How(None, 1e-3, Risk())
-    assert run_rests_stream(site, how, "json", False, source, sink, messages) == 0
+    assert run_rests_stream(site, how, read_records(source, "json"), False, sink, messages) == 0
     lines = [json.loads(line) for line in sink.getvalue().splitlines()]
     standing = [line["standing"] for line in lines]
     assert standing[0]
@@ -195,5 +196,6 @@ def test_rests_go_through_log_and_pipe(tmp_path: Path, refuse: Refuse) -> None:
 def test_a_record_that_cannot_be_is_refused(record: dict[str, object], reported: str) -> None:
     source = io.BytesIO(json.dumps(record).encode() + b"\n")
     how = How(None, 1e-3, Risk())
+    records = read_records(source, "json")
     with pytest.raises(InputError, match=reported):
-        run_rests_stream(far_site(), how, "json", False, source, io.BytesIO(), io.StringIO())
+        run_rests_stream(far_site(), how, records, False, io.BytesIO(), io.StringIO())

@@ -58,7 +58,7 @@ def test_what_a_truth_of_uneven_steps_covers_is_right(walked: Trajectory) -> Non
 def test_a_motion_too_fast_for_its_truth_is_not_compared(walked: Trajectory) -> None:
     slow = _at_rate(walked, 0.4)
     with pytest.raises(InputError, match=r"moves too much to interpolate to 2 mm and 0\.1 deg"):
-        trajectory_errors(_rows(walked, np.arange(3, len(walked), 40)), slow)
+        trajectory_errors(_rows(walked, np.arange(3, len(walked), 600)), slow)
 
 
 def test_a_gap_of_a_truth_is_reported(walked: Trajectory) -> None:

@@ -93,9 +93,10 @@ ROOMS = {
             p002_beacon
         """,
         "results": """
-            errors figures gauge odometry page_style pose_information provenance
+            association dds_domain figures gauge odometry page_style pose_information provenance
             recording_file ros_messages shapes trend
-            coverage drift live_foxglove observability odometry_dds odometry_mavlink recording_plots
+            alignment coverage drift errors live_foxglove observability odometry_dds
+            odometry_mavlink recording_plots records_dds truth_frame
             refinement rest_figures shown transfer verdict
             coverage_colours design motion_coverage recording_layout recording_trust screen
             plots recording recording_drift
@@ -116,7 +117,8 @@ ROOMS = {
             antenna_fit demodulate design_motion drift_figures fix import_log init_questions
             joint_tasks match_trust navigate_settings simulate smooth_correction smooth_failure
             stream
-            antenna_report antenna_trust coverage drift init joint_run match navigate_rests
+            antenna_report antenna_trust coverage drift init joint_run match record_source
+            navigate_rests
             calibrate_antenna design_figures joint_result navigate
             calibrate_log design smooth
             demo

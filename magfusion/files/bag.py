@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -140,7 +140,7 @@ def _read(
     }
     used = {one.connections[0].topic for one in wanted.values()}
     for role, rows in ROWS.items():
-        connections = _chosen(reader, path, getattr(topics, role), role, tuple(rows), used)
+        connections = role_connections(reader, path, getattr(topics, role), role, tuple(rows), used)
         if connections:
             refuse_overlap(reader, connections[0].topic)
             row, place = rows[connections[0].msgtype], f"{path} topic {connections[0].topic}"
@@ -183,13 +183,13 @@ def _aiding(stream: _Stream, quantity: Quantity, span: Span) -> AidingSamples:
     return AidingSamples(quantity, span.seconds(stream.time_ns), stream.values)
 
 
-def _chosen(
+def role_connections(
     reader: AnyReader,
     path: Path,
     topic: str | None,
     role: str,
     msgtypes: tuple[str, ...],
-    used: set[str],
+    used: Collection[str] = (),
 ) -> list[Connection]:
     """Return the connections of the one topic that plays a role, and is not used as another."""
     connections = [c for c in reader.connections if c.msgtype in msgtypes and c.topic not in used]

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, BinaryIO, Literal
 
@@ -340,11 +340,23 @@ def _noise(entry: FieldsRecord, name: str, tone: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class NumberedRecord:
-    """A record with its place in the stream, or the sentence with the reason why it is none."""
+    """A record with its place in the stream, or the sentence with the reason why it is none.
+
+    Parameters
+    ----------
+    source, unit : str
+        What is read, and what ``number`` counts.
+    """
 
     number: int
     record: Record | None
     refusal: str = ""
+    source: str = "standard input"
+    unit: str = "line"
+
+    def located(self, reason: object) -> str:
+        """Return a sentence on it with its place."""
+        return f"{self.source}, {self.unit} {self.number}: {reason}"
 
 
 def read_records(stream: BinaryIO, form: Format) -> Iterator[NumberedRecord]:
@@ -367,7 +379,7 @@ def _json_records(stream: BinaryIO) -> Iterator[NumberedRecord]:
                 line = stream.readline(_CHUNK)
             yield NumberedRecord(number, None, _TOO_LARGE)
         elif line.strip():
-            yield _checked(number, partial(Record.model_validate_json, line))
+            yield checked_record(number, partial(Record.model_validate_json, line))
 
 
 _TOO_LARGE = f"is larger than {LARGEST_RECORD >> 20} MiB; write fewer samples in a record."
@@ -389,7 +401,8 @@ def _msgpack_records(stream: BinaryIO) -> Iterator[NumberedRecord]:
             fed += len(chunk)
             for content in unpacker:
                 number, whole = number + 1, unpacker.tell()
-                yield _checked(number, partial(Record.model_validate, content))
+                read = partial(Record.model_validate, content)
+                yield replace(checked_record(number, read), unit="record")
         except msgpack.BufferFull as error:
             raise InputError(f"{_RECORD} {number + 1}: {_TOO_LARGE}") from error
         except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
@@ -406,7 +419,8 @@ def _msgpack_records(stream: BinaryIO) -> Iterator[NumberedRecord]:
 _RECORD = "standard input, record"
 
 
-def _checked(number: int, read: Callable[[], Record]) -> NumberedRecord:
+def checked_record(number: int, read: Callable[[], Record]) -> NumberedRecord:
+    """Return a record with its number, or the reason why it is none."""
     try:
         return NumberedRecord(number, read())
     except ValidationError as error:

@@ -108,7 +108,8 @@ class TableLayout(NamedTuple):
         groups = [g for g in self.optional if set(g) & set(result)]
         texts = [*self.texts, *filter(result.__contains__, self.optional_texts)]
         some = [*filter(result.__contains__, self.some)] or self.some
-        return [*self.integers, *texts, *self.numbers, *itertools.chain(*groups), *some]
+        names = (*self.integers, *texts, *self.numbers, *itertools.chain(*groups), *some)
+        return [*dict.fromkeys(names)]
 
     def chosen(self, result: Sequence[str], path: Path) -> list[str]:
         """Return the columns to read of those found; refuse a table that lacks one."""

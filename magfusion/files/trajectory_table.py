@@ -19,7 +19,9 @@ _ACCEL_BIAS = ("accel_bias_x", "accel_bias_y", "accel_bias_z")
 _UPPER = np.triu_indices(6)
 _COV = tuple(f"cov_{i}{j}" for i, j in zip(*_UPPER, strict=True))
 _LAYOUT = TableLayout(
-    numbers=(*_POSITION, *_QUATERNION), optional=(_VELOCITY, _GYRO_BIAS, _ACCEL_BIAS, _COV)
+    numbers=(),
+    some=(*_POSITION, *_QUATERNION),
+    optional=(_POSITION, _QUATERNION, _VELOCITY, _GYRO_BIAS, _ACCEL_BIAS, _COV),
 )
 QUATERNION_TOLERANCE = 1e-3  # of its length from one
 
@@ -45,9 +47,11 @@ def write_trajectory(
 
 def trajectory_columns(trajectory: Trajectory, epoch_ns: int) -> dict[str, object]:
     """Return the columns of a trajectory's table; parts that it does not have are left out."""
-    quaternion = Rotation.from_matrix(trajectory.world_from_body).as_quat(scalar_first=True)
+    quaternion = None
+    if trajectory.has_attitude:
+        quaternion = trajectory.rotation.as_quat(scalar_first=True)
     parts: list[tuple[tuple[str, ...], Array | None]] = [
-        (_POSITION, trajectory.position_world),
+        (_POSITION, trajectory.position_world if trajectory.has_position else None),
         (_QUATERNION, quaternion),
         (_VELOCITY, trajectory.velocity_world),
         (_GYRO_BIAS, trajectory.gyro_bias_body),
@@ -81,6 +85,8 @@ def read_trajectory(
 ) -> Trajectory:
     """Read and check a trajectory in Parquet or CSV, within start <= time < end (s).
 
+    A truth may have positions alone or attitudes alone; the other part is NaN then.
+
     ``content`` as in `read_table`.
 
     Raises
@@ -89,18 +95,20 @@ def read_trajectory(
         As `read_table`; or where a number is not finite or a quaternion not of unit length.
     """
     table = read_table(path, _LAYOUT, Span(epoch_ns, start, end), content)
-    quaternion = table.numbers(_QUATERNION)
-    length = np.linalg.norm(quaternion, axis=1)
-    off = np.abs(length - 1.0) > QUATERNION_TOLERANCE
-    table.refuse(off, "qw to qz", length, "the length of a rotation's quaternion is 1: scale it")
-    rotation = np.empty((0, 3, 3))
-    if len(table):
-        rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    rotation, position = np.full((len(table), 3, 3), np.nan), _numbers(table, _POSITION)
+    if table.has(_QUATERNION):
+        quaternion = table.numbers(_QUATERNION)
+        length = np.linalg.norm(quaternion, axis=1)
+        off = np.abs(length - 1.0) > QUATERNION_TOLERANCE
+        remedy = "the length of a rotation's quaternion is 1: scale it"
+        table.refuse(off, "qw to qz", length, remedy)
+        if len(table):
+            rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     cov = _numbers(table, _COV)
     return Trajectory(
         time=table.time,
         world_from_body=rotation,
-        position_world=table.numbers(_POSITION),
+        position_world=np.full((len(table), 3), np.nan) if position is None else position,
         velocity_world=_numbers(table, _VELOCITY),
         gyro_bias_body=_numbers(table, _GYRO_BIAS),
         accel_bias_body=_numbers(table, _ACCEL_BIAS),

@@ -1,4 +1,7 @@
-"""Trajectories as text, as the TUM RGB-D benchmark lays them out: time x y z qx qy qz qw."""
+"""Trajectories as text, as the TUM RGB-D benchmark lays them out: time x y z qx qy qz qw.
+
+Positions alone are lines of time x y z.
+"""
 
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -13,16 +16,20 @@ from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.model.trajectory import Trajectory
 
 _COLUMNS = "time_s x y z qx qy qz qw"
+_POSITIONS = "time_s x y z"
+_EIGHT = f"eight finite numbers: {_COLUMNS}"
 _NS_PER_S = 1_000_000_000
 
 
 def write_tum(trajectory: Trajectory, path: Path, epoch_ns: int) -> None:
     """Write the poses as a TUM file, which evo reads; times are on the log's clock."""
     stamps = Span(epoch_ns).stamps(trajectory.time).tolist()
-    quaternion = Rotation.from_matrix(trajectory.world_from_body).as_quat()
-    poses = np.hstack([trajectory.position_world, quaternion]).tolist()
+    parts = [trajectory.position_world]
+    if trajectory.has_attitude:
+        parts.append(trajectory.rotation.as_quat())
+    poses = np.hstack(parts).tolist()
     with whole_file(path) as unfinished, unfinished.open("w", encoding="utf-8") as stream:
-        stream.write(f"# {_COLUMNS}\n")
+        stream.write(f"# {_COLUMNS if trajectory.has_attitude else _POSITIONS}\n")
         for stamp, pose in zip(stamps, poses, strict=True):
             # A double cannot hold today's date to the nanosecond, decimal digits can.
             time = f"{Decimal(stamp).scaleb(-9):.9f}"
@@ -32,18 +39,24 @@ def write_tum(trajectory: Trajectory, path: Path, epoch_ns: int) -> None:
 def read_tum(path: Path, epoch_ns: int = 0) -> Trajectory:
     """Read and check a TUM file; times are seconds since ``epoch_ns``.
 
+    Attitudes of a file with positions alone are NaN.
+
     Raises
     ------
     InputError
-        Where the file is absent, not text, empty, a line does not hold eight finite numbers, a
+        Where the file is absent, not text, empty, a line does not hold eight finite numbers (or
+        four, of positions alone: as many as the first line), a
         quaternion is not of unit length, or the times do not increase.
     """
     lines = _lines(path)
-    values = np.array([_numbers(path, number, text) for number, text in lines])
+    count = len(_POSITIONS.split() if len(lines[0][1].split()) == 4 else _COLUMNS.split())
+    values = np.array([_numbers(path, number, text, count) for number, text in lines])
     stamps = np.array([_stamp(path, number, text) for number, text in lines], dtype=np.int64)
     time = Span(epoch_ns).seconds(stamps)
     for k in np.flatnonzero(np.diff(time) <= 0.0)[:1]:
         _refuse(path, lines[k + 1][0], f"time {lines[k + 1][1].split()[0]}", "increasing times")
+    if count == 4:
+        return Trajectory(time, np.full((len(time), 3, 3), np.nan), values)
     length = np.linalg.norm(values[:, 3:], axis=1)
     for k in np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)[:1]:
         _refuse(path, lines[k][0], f"a quaternion of length {length[k]:.6g}", "one of length 1")
@@ -65,14 +78,15 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     return lines
 
 
-def _numbers(path: Path, number: int, text: str) -> list[float]:
+def _numbers(path: Path, number: int, text: str, count: int) -> list[float]:
     """Return position and quaternion."""
     try:
         values = [float(part) for part in text.split()]
     except ValueError:
         values = []
-    if len(values) != 8 or not (np.abs(values) < LARGEST_NUMBER).all():
-        _refuse(path, number, repr(text[:60]), f"eight finite numbers: {_COLUMNS}")
+    if len(values) != count or not (np.abs(values) < LARGEST_NUMBER).all():
+        wanted = f"four finite numbers: {_POSITIONS}" if count == 4 else _EIGHT
+        _refuse(path, number, repr(text[:60]), wanted)
     return values[1:]
 
 

@@ -28,7 +28,7 @@ JOBS = {
     ),
     "navigate": (
         "navigate",
-        "Navigate online: along a log, or from records on standard input (-).",
+        "Navigate online: along a log, or live from standard input (-) or ROS 2 (ros2:).",
     ),
     "evaluate": (
         "evaluate",

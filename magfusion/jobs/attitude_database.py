@@ -188,7 +188,7 @@ def judge_database(index: Index, site: Site, log: Log) -> Trust:
 
 
 def _reference(job: Job, log: Log, trajectory: Path | None) -> tuple[Trajectory, Path]:
-    from magfusion.jobs.inputs import read_estimate
+    from magfusion.jobs.inputs import read_estimate, whole_poses
 
     if trajectory is not None:
         return read_estimate(trajectory, log.epoch_ns), trajectory
@@ -196,7 +196,7 @@ def _reference(job: Job, log: Log, trajectory: Path | None) -> tuple[Trajectory,
         raise InputError(
             f"{job.log_path}: has no truth; give the result of magfusion smooth with --trajectory"
         )
-    return log.truth, job.log_path
+    return whole_poses(log.truth, job.log_path), job.log_path
 
 
 def steady(log: Log, site: Site, sampling: Sampling) -> Steady:

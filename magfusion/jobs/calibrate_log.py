@@ -329,7 +329,11 @@ def _score(log: Log, site: Site, settings: SmootherSettings) -> PartScore:
     if log.truth is None:
         return PartScore(residual, None, None)
     errors = trajectory_errors(fixed.states, log.truth)
-    return PartScore(residual, errors.aligned_ate, errors.aligned_attitude_rmse_deg)
+    return PartScore(
+        residual,
+        errors.aligned_ate if errors.has_position else None,
+        errors.aligned_attitude_rmse_deg if errors.has_attitude else None,
+    )
 
 
 # Attribute of a score, key of its figure, label and unit.

@@ -107,7 +107,7 @@ def find_coil(
     figures |= _figures(fixes, result, signed=kept.signed)
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     compared = None
-    if log.truth is not None:
+    if log.truth is not None and log.truth.has_poses:
         # A comparison with the other mirror would only measure their separation.
         compared, other = nearest_reported(verdicts.alone, log.truth, site)
         rotated = nearest_truth(log.truth, compared, site, signed=kept.signed)

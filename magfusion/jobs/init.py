@@ -56,6 +56,7 @@ def run_init(settings: InitSettings, output: Path) -> Figures | None:
         return None
     if output.exists() or output.is_symlink():
         raise InputError(f"{output}: already exists; give another file with -o, or remove it")
+    settings, mounted = _mounted(settings)
     transmitted = _detect_transmitters(settings)
     settings, transmitted = _complete_settings(settings, transmitted)
     draft, findings = _draft(settings, transmitted)
@@ -64,8 +65,33 @@ def run_init(settings: InitSettings, output: Path) -> Figures | None:
     return (
         heading("init", output.name)
         | trust_figures(Trust(tuple(findings)))
+        | mounted
         | _figures(draft, transmitted)
     )
+
+
+def _mounted(settings: InitSettings) -> tuple[InitSettings, Figures]:
+    """Return lever arm and mounting from the transforms of a bag, and their chain of frames."""
+    if settings.bag is None:
+        return settings, Figures()
+    from magfusion.files.foreign.bag_extrinsics import read_extrinsics
+    from magfusion.jobs.inputs import topics_option
+
+    result = read_extrinsics(settings.bag, topics_option(settings.topics))
+    # Rounded: composing a chain makes 89.99999999 of 90 degrees.
+    place, angles = result.position_body, result.body_from_sensor.as_euler("xyz", degrees=True)
+    lever, mounting = (
+        ",".join(f"{v + 0.0:.6f}" for v in three.round(6)) for three in (place, angles)
+    )
+    settings = replace(
+        settings, lever=settings.lever or lever, mounting=settings.mounting or mounting
+    )
+    figures = (
+        ("frames", result.chain),
+        ("lever_m", settings.lever),
+        ("mounting_deg", settings.mounting),
+    )
+    return settings, Figures(*(Figure(name, value) for name, value in figures))
 
 
 def _detect_transmitters(settings: InitSettings) -> Transmitted | None:

@@ -21,6 +21,11 @@ class InitSettings(TopicSettings):
     log: Path | None = option(
         None, "Recording in which to find the tones of the beacons", note="default: none"
     )
+    bag: Path | None = option(
+        None,
+        "Bag of ROS whose /tf_static mounts the magnetometer against the IMU",
+        note="for --lever and --mounting that are not given",
+    )
     imu: str | None = option(None, "Inertial sensor, from --list-imus")
     magnetometer: str | None = option(None, "Magnetometer, from --list-magnetometers")
     lever: str | None = option(None, "Magnetometer from the IMU, in its axes, m", metavar="X,Y,Z")
@@ -36,5 +41,5 @@ class InitSettings(TopicSettings):
     @property
     def described(self) -> bool:
         """Whether the installation itself is described."""
-        findings = (self.imu, self.magnetometer, self.lever, self.mounting, self.location)
+        findings = (self.imu, self.magnetometer, self.lever, self.mounting, self.location, self.bag)
         return bool(self.beacon) or any(one is not None for one in findings)

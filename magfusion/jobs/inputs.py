@@ -302,8 +302,27 @@ def read_estimate(path: Path, epoch_ns: int = 0) -> Trajectory:
     Raises
     ------
     InputError
-        Where there is none.
+        Where there is none, or it has positions or attitudes alone.
     """
+    return whole_poses(read_any_poses(path, epoch_ns), path)
+
+
+def whole_poses(poses: Trajectory, path: Path) -> Trajectory:
+    """Return poses, e.g. a log's truth, that have positions and attitudes.
+
+    Raises
+    ------
+    InputError
+        Where one of them is unknown.
+    """
+    if not poses.has_poses:
+        alone = "positions" if poses.has_position else "attitudes"
+        raise InputError(f"{path}: has {alone} alone, but whole poses are needed; give both")
+    return poses
+
+
+def read_any_poses(path: Path, epoch_ns: int = 0) -> Trajectory:
+    """Read a trajectory as `read_estimate`, which may have positions or attitudes alone."""
     if path.is_dir():
         if not (path / "trajectory.parquet").is_file():
             raise InputError(f"{path}: has no trajectory.parquet; give the result of a job")

@@ -206,12 +206,12 @@ def table_facts(result: Smoothed, trust: Trust, log: Log) -> dict[str, Any]:
             errors = trajectory_errors(states, log.truth)
         except InputError:  # a truth elsewhere
             return facts
-        facts |= {
-            "ate_m": errors.ate,
-            "attitude_rmse_deg": errors.attitude_rmse_deg,
-            "aligned_ate_m": errors.aligned_ate,
-            "aligned_attitude_rmse_deg": errors.aligned_attitude_rmse_deg,
-        }
+        if errors.has_position:
+            facts |= {"ate_m": errors.ate, "aligned_ate_m": errors.aligned_ate}
+        if errors.has_attitude:
+            aligned = errors.aligned_attitude_rmse_deg
+            facts |= {"attitude_rmse_deg": errors.attitude_rmse_deg}
+            facts |= {"aligned_attitude_rmse_deg": aligned}
         if errors.nees is not None:
             facts["nees_mean"] = float(np.mean(errors.nees))
     return facts

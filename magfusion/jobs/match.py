@@ -256,7 +256,7 @@ def _earth_field(job: Job, site: Site) -> Array:
 
 def _compared(log: Log, time: Array, result: _Matched) -> tuple[Array | None, Figures]:
     """Return the true angles (NaN where there are none) and the errors against them."""
-    if log.truth is None:
+    if log.truth is None or not log.truth.has_attitude:
         return None, Figures()
     poses, exists, _ = truth_poses(log.truth, time)
     used = exists & result.matches.determined[:, 0]

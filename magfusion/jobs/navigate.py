@@ -16,7 +16,7 @@ from magfusion.estimation.data_checks.spectrum import with_disturbing_lines
 from magfusion.files.checkpoint import claim_checkpoint, run_key
 from magfusion.files.row_file import RowFile, claim_rows
 from magfusion.files.site import load_site
-from magfusion.files.standard_streams import binary_input, binary_output, until_closed
+from magfusion.files.standard_streams import binary_output, until_closed
 from magfusion.jobs.live import state_sinks
 from magfusion.jobs.navigate_rests import run_at_rest
 from magfusion.jobs.navigate_settings import NavigateSettings
@@ -46,16 +46,13 @@ if TYPE_CHECKING:
 LONGEST_EPOCH = 60.0  # s; of a phasor that belongs to a state of now
 
 
-OF_A_LOG = {"output", "start", "end", "topics", "realtime", "as_json"}
-
-
 def run(
     settings: NavigateSettings, output: Path, given: set[str], report: Report = quiet
 ) -> Figures | None:
     """Navigate along a log or stream; see `run_navigate` and `run_stream`."""
     if settings.at_rest:
         return run_at_rest(settings, output, given, report)
-    if str(settings.log) == "-":
+    if settings.is_live:
         _run_pipe(settings, given)
         return None
     from magfusion.jobs.without_beacons import refuse_without_beacons, without_beacons
@@ -72,24 +69,20 @@ def run(
 
 
 def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
-    from magfusion.jobs.stream import StreamSettings, run_stream
+    from magfusion.jobs.record_source import live_records
+    from magfusion.jobs.stream import StreamSettings, navigate_records
 
-    if settings.site is None:
-        raise InputError("navigate - requires the site's file; give it with --site SITE.yaml")
-    if given & OF_A_LOG:
-        raise InputError(
-            "--output, --start, --end, --topics, --realtime and --json require a log; omit them"
-            " with -"
-        )
-    site = load_site(settings.site, without=True, several=True)
+    site_path = settings.live_site(given)
+    site = load_site(site_path, without=True, several=True)
     if not site.beacons:
         from magfusion.jobs.orientation import run_orientation_stream
         from magfusion.jobs.without_beacons import refuse_without_beacons
 
         refuse_without_beacons(given)
         with until_closed():
-            streams = (binary_input(), binary_output(), sys.stderr)
-            run_orientation_stream(site, settings.form, settings.keep_going, *streams)
+            records = live_records(settings, site, sys.stderr)
+            streams = (binary_output(), sys.stderr)
+            run_orientation_stream(site, records, settings.keep_going, *streams)
         return
     chosen = StreamSettings(
         settings.navigator(settings.job(Path())),
@@ -102,7 +95,8 @@ def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
         settings.where,
     )
     with until_closed():
-        run_stream(settings.site, chosen, binary_input(), binary_output(), sys.stderr)
+        records = live_records(settings, site, sys.stderr)
+        navigate_records(site_path, chosen, records, binary_output(), sys.stderr)
 
 
 def run_navigate(settings: NavigateSettings, output: Path, report: Report = quiet) -> Figures:

@@ -13,15 +13,11 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.files.site import load_site, save_site
-from magfusion.files.standard_streams import (
-    binary_input,
-    binary_output,
-    until_closed,
-    write_message,
-)
-from magfusion.files.stream import json_line, read_records
+from magfusion.files.standard_streams import binary_output, until_closed, write_message
+from magfusion.files.stream import json_line
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
+from magfusion.jobs.record_source import live_records
 from magfusion.jobs.stream_samples import StreamSamples
 from magfusion.model.progress import Report, quiet
 from magfusion.model.quaternion import of_matrices
@@ -31,8 +27,10 @@ from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from magfusion.estimation.rests.rest_stream import RestNavigator, RestState
-    from magfusion.files.stream import Format, Record
+    from magfusion.files.stream import NumberedRecord, Record
     from magfusion.jobs.inputs import Job
     from magfusion.jobs.navigate_settings import NavigateSettings
     from magfusion.model.samples import Log
@@ -48,7 +46,6 @@ READERS = {
     *("at_rest", "false_alarm", "window", "step", "mains_hz", "risk", "fault_prior"),
     *("hemisphere", "region"),
 }
-_PLACE = {"json": "line", "msgpack": "record"}
 
 
 @dataclass(frozen=True)
@@ -71,17 +68,15 @@ def run_at_rest(
 ) -> Figures | None:
     """Estimate the position of a stationary platform during its rest."""
     refuse_other(given)
-    pipe = str(settings.log) == "-"
+    pipe = settings.is_live
     job = settings.job(Path() if pipe else output)
     how = How(settings.lockin(job), settings.false_alarm, settings.risks)
     if not pipe:
         return run_rests(job, how, report)
-    if settings.site is None:
-        raise InputError("navigate - requires the site's file; give it with --site SITE.yaml")
-    site = settings.where.bounded(load_site(settings.site))
+    site = settings.where.bounded(load_site(settings.live_site(given)))
     with until_closed():
-        streams = (binary_input(), binary_output(), sys.stderr)
-        run_rests_stream(site, how, settings.form, settings.keep_going, *streams)
+        records = live_records(settings, site, sys.stderr)
+        run_rests_stream(site, how, records, settings.keep_going, binary_output(), sys.stderr)
     return None
 
 
@@ -226,9 +221,8 @@ def _rest_figures(newest: list[RestState]) -> Figures:
 def run_rests_stream(
     site: Site,
     how: How,
-    form: Format,
+    records: Iterable[NumberedRecord],
     keep_going: bool,
-    source: BinaryIO,
     sink: BinaryIO,
     messages: TextIO,
 ) -> int:
@@ -245,13 +239,13 @@ def run_rests_stream(
         Where a record is invalid and ``keep_going`` is not set.
     """
     navigator, samples, refused = how.navigator(site), StreamSamples(site), 0
-    for numbered in read_records(source, form):
+    for numbered in records:
         try:
             if numbered.record is None:
                 raise InputError(numbered.refusal)
             _process_record(navigator, numbered.record, samples)
         except InputError as error:
-            sentence = f"standard input, {_PLACE[form]} {numbered.number}: {error}"
+            sentence = numbered.located(error)
             if not keep_going:
                 raise InputError(sentence) from error
             refused += 1

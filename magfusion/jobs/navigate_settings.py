@@ -26,6 +26,11 @@ if TYPE_CHECKING:
     from magfusion.jobs.inputs import Job
 
 
+PIPE, ROS2 = "-", "ros2:"
+OF_A_LOG = {"output", "start", "end", "realtime", "as_json"}
+OF_THE_OTHER = {PIPE: {"topics"}, ROS2: {"form"}}
+
+
 @dataclass(frozen=True, kw_only=True)
 class NavigateSettings(
     RegionSettings,
@@ -40,7 +45,9 @@ class NavigateSettings(
 ):
     """Online navigation, along a log or from records on standard input."""
 
-    log: Path = argument("Log to replay, or - for records on standard input")
+    log: Path = argument(
+        "Log to replay, - for records on standard input, or ros2: for topics of ROS 2"
+    )
     estimator: Literal["smoother", "ekf"] = option(
         "smoother", "Fixed-lag smoother, or Kalman filter"
     )
@@ -88,6 +95,31 @@ class NavigateSettings(
             raise InputError(
                 "--horizon and --blend require states between epochs; give --rate imu, or --rate HZ"
             )
+
+    @property
+    def is_live(self) -> bool:
+        """Whether data arrive while it runs."""
+        return str(self.log) in (PIPE, ROS2)
+
+    def live_site(self, given: set[str]) -> Path:
+        """Return the site's file of data that arrive while it runs.
+
+        Raises
+        ------
+        InputError
+            Where it is not given, or an option that such data do not have.
+        """
+        if self.site is None:
+            raise InputError(
+                f"navigate {self.log} requires the site's file; give it with --site SITE.yaml"
+            )
+        if given & (OF_A_LOG | OF_THE_OTHER[str(self.log)]):
+            other = "--topics" if str(self.log) == PIPE else "--format"
+            raise InputError(
+                f"--output, --start, --end, {other}, --realtime and --json require another source;"
+                f" omit them with {self.log}"
+            )
+        return self.site
 
     def navigator(self, job: Job) -> NavigatorSettings:
         """Return the settings of the estimator."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
 
@@ -18,7 +19,7 @@ from magfusion.estimation.orientation.remarks import doubts, remarks
 from magfusion.estimation.orientation.smoother import Oriented, oriented
 from magfusion.files.site import save_site
 from magfusion.files.standard_streams import write_message
-from magfusion.files.stream import Format, json_line, read_records
+from magfusion.files.stream import NumberedRecord, json_line
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
 from magfusion.jobs.inputs import Job, named, read_job, require_imu
@@ -39,8 +40,6 @@ from magfusion.units import DEGREE, Array, Rate
 
 if TYPE_CHECKING:
     from magfusion.estimation.online_integrity.judgement import JudgedState
-
-_PLACE = {"json": "line", "msgpack": "record"}
 
 
 def run_orientation(name: str, job: Job, rate: Rate, *, back: bool, report: Report) -> Figures:
@@ -143,7 +142,7 @@ def _figures(result: Oriented, states: Trajectory, elapsed: float) -> Figures:
 
 def _errors(states: Trajectory, log: Log) -> Figures:
     """Return the errors of heading and tilt against the truth, where the log has one."""
-    if log.truth is None or len(log.truth) == 0:
+    if log.truth is None or len(log.truth) == 0 or not log.truth.has_attitude:
         return Figures()
     truth, exists, _ = truth_poses(log.truth, states.time)
     if not np.any(exists):
@@ -183,7 +182,11 @@ def _refined(site: Site, last: Orientation) -> Site:
 
 
 def run_orientation_stream(
-    site: Site, form: Format, keep_going: bool, source: BinaryIO, sink: BinaryIO, messages: TextIO
+    site: Site,
+    records: Iterable[NumberedRecord],
+    keep_going: bool,
+    sink: BinaryIO,
+    messages: TextIO,
 ) -> int:
     """Write the orientation for the records of a stream; a line of JSON per inertial sample.
 
@@ -205,13 +208,13 @@ def run_orientation_stream(
             sink.write(json_line(_state_row(navigator, state)))
         sink.flush()
 
-    for numbered in read_records(source, form):
+    for numbered in records:
         try:
             if numbered.record is None:
                 raise InputError(numbered.refusal)
             _process_record(navigator, numbered.record, samples)
         except InputError as error:
-            sentence = f"standard input, {_PLACE[form]} {numbered.number}: {error}"
+            sentence = numbered.located(error)
             if not keep_going:
                 raise InputError(sentence) from error
             refused += 1

@@ -146,7 +146,7 @@ def _findings(method: str, valid: BoolArray, spread: float) -> tuple[Finding, ..
 
 def _position_figures(position_world: Array, stamps: Array, log: Log, site: Site) -> Figures:
     """Return the error of the magnetometer's positions against the log's truth, if it has one."""
-    if log.truth is None:
+    if log.truth is None or not log.truth.has_poses:
         return Figures()
     true, compared, _ = truth_poses(log.truth, stamps)
     if len(true) == 0:

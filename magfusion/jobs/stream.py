@@ -1,5 +1,6 @@
 """Navigation in a pipe: records in, a state out at every epoch, or current states at any rate."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
@@ -42,7 +43,6 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.results.verdict import finding_rows
 from magfusion.units import Array
 
-_PLACE = {"json": "line", "msgpack": "record"}
 NOT_ONLINE = "its samples are used by navigate --at-rest only."
 WAITING = 1.0  # s; before the first state, as often a sign of life
 
@@ -101,16 +101,34 @@ def run_stream(
     InputError
         Where the site cannot be read, or a record is invalid and ``keep_going`` is not set.
     """
+    records = read_records(source, settings.form)
+    return navigate_records(site_path, settings, records, sink, messages)
+
+
+def navigate_records(
+    site_path: Path,
+    settings: StreamSettings,
+    records: Iterable[NumberedRecord],
+    sink: BinaryIO,
+    messages: TextIO,
+) -> int:
+    """Navigate from records of any source, as `run_stream`."""
     site = settings.where.bounded(load_site(site_path, several=True))
     check_streamed_rotors(site_path, site)
+    samples = StreamSamples(site)
     with state_sinks(settings.live, site, 0, messages) as sinks:
-        return _navigate(site, settings, source, sink, messages, sinks)
+        try:
+            return _navigate(site, settings, records, samples, sink, messages, sinks)
+        except KeyboardInterrupt:  # the only end of a source that is live
+            samples.report(messages)
+            raise
 
 
 def _navigate(
     site: Site,
     settings: StreamSettings,
-    source: BinaryIO,
+    records: Iterable[NumberedRecord],
+    samples: StreamSamples,
     sink: BinaryIO,
     messages: TextIO,
     others: tuple[StateSink, ...],
@@ -118,16 +136,15 @@ def _navigate(
     key, place = run_key("stream", site, settings.navigator), settings.checkpoint
     navigator = begin(place, key, site, settings.navigator, None, resume=settings.resume).navigator
     refused, saved, reached = 0, -np.inf, -np.inf
-    samples = StreamSamples(site)
     output, angles = _StateWriter(navigator, sink, others), AwaitedAngles(site)
     kept = None if place is None else CheckpointWriter(place, key, messages)
     clocks = StreamClocks(settings.navigator.delay)
-    for numbered in read_records(source, settings.form):
+    for numbered in records:
         try:
             numbered = _on_clock(numbered, clocks, samples, output, messages)
             newest = _process_record(output.navigator, site, numbered, samples, output)
         except InputError as error:
-            sentence = f"standard input, {_PLACE[settings.form]} {numbered.number}: {error}"
+            sentence = numbered.located(error)
             if not (settings.keep_going or isinstance(error, ClockJump)):
                 raise InputError(sentence) from error
             refused += 1

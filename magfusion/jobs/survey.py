@@ -94,7 +94,7 @@ def run_survey(settings: SurveySettings, output: Path) -> Figures:
 
 
 def _poses(job: Job, settings: SurveySettings, log: Log) -> Trajectory:
-    from magfusion.jobs.inputs import read_estimate
+    from magfusion.jobs.inputs import read_estimate, whole_poses
 
     if settings.trajectory is not None:
         return read_estimate(settings.trajectory, log.epoch_ns)
@@ -102,7 +102,7 @@ def _poses(job: Job, settings: SurveySettings, log: Log) -> Trajectory:
         raise InputError(
             f"{job.log_path}: has no truth for the poses; give a smoothed result with --trajectory"
         )
-    return log.truth
+    return whole_poses(log.truth, job.log_path)
 
 
 def make_survey(

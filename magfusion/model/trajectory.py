@@ -54,9 +54,9 @@ class Trajectory(PoseAccess):
     time : ndarray, shape (n,)
         Seconds since the log's epoch, strictly increasing.
     world_from_body : ndarray, shape (n, 3, 3)
-        Rotation matrices.
+        Rotation matrices; NaN of a truth that has positions alone.
     position_world : ndarray, shape (n, 3)
-        (m)
+        (m); NaN of a truth that has attitudes alone.
     velocity_world : ndarray, shape (n, 3), optional
         (m/s)
     gyro_bias_body : ndarray, shape (n, 3), optional
@@ -91,6 +91,21 @@ class Trajectory(PoseAccess):
         spans = [f"{self.time[0]:g} to {self.time[-1]:g} s"] if len(self) else []
         known = [n for n, _ in _SHAPES[3:] if getattr(self, n) is not None]
         return one_line(type(self).__name__, [f"{len(self)} poses", *spans, *known])
+
+    @property
+    def has_position(self) -> bool:
+        """Whether the positions are known."""
+        return not np.isnan(self.position_world).any()
+
+    @property
+    def has_attitude(self) -> bool:
+        """Whether the attitudes are known."""
+        return not np.isnan(self.world_from_body).any()
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether positions and attitudes are known."""
+        return self.has_position and self.has_attitude
 
     @property
     def cov(self) -> Array | None:

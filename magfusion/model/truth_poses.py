@@ -4,6 +4,8 @@ Cubic interpolation: positions and rotation vectors within a step, with the slop
 through three samples (Catmull and Rom 1974, for uneven steps).
 """
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -18,18 +20,22 @@ MAX_ROTATION_ERROR = 0.1 * DEGREE
 ORDER = 3  # of the error in the step
 
 
-def truth_poses(truth: Trajectory, time: Array) -> tuple[Trajectory, BoolArray, str]:
+def truth_poses(
+    truth: Trajectory, time: Array, *, any_motion: bool = False
+) -> tuple[Trajectory, BoolArray, str]:
     """Interpolate a truth of any rate at those times where its motion allows it.
 
     Parameters
     ----------
     time : ndarray, shape (n,)
         Strictly increasing (s).
+    any_motion : bool
+        Whether only gaps are not interpolated across, whatever the error.
 
     Returns
     -------
     poses : Trajectory
-        At the m times that the truth covers.
+        At the m times that the truth covers; a part that the truth lacks is NaN.
     covered : ndarray of bool, shape (n,)
         Which times these are.
     reason : str
@@ -39,9 +45,32 @@ def truth_poses(truth: Trajectory, time: Array) -> tuple[Trajectory, BoolArray, 
     if len(known) == 0 or len(time) == 0:
         empty = Trajectory(np.zeros(0), np.empty((0, 3, 3)), np.empty((0, 3)))
         return empty, np.zeros(len(time), dtype=bool), "The truth has no pose."
+    truth, lacking = _completed(truth)
     inside = (time >= known[0]) & (time <= known[-1])
-    covered = inside & (np.isin(time, known) | _usable_steps(truth)[_step_of(known, time)])
-    return _cubic(truth, time[covered]), covered, _reason(truth, time, inside, covered)
+    if any_motion:
+        covered = in_short_steps(truth, time)
+    else:
+        covered = inside & (np.isin(time, known) | _usable_steps(truth)[_step_of(known, time)])
+    poses = _cubic(truth, time[covered])
+    poses = replace(poses, **{name: np.full_like(getattr(poses, name), np.nan) for name in lacking})
+    return poses, covered, _reason(truth, time, inside, covered)
+
+
+def in_short_steps(truth: Trajectory, time: Array) -> BoolArray:
+    """Return which times (n,) are within the truth and not in one of its gaps."""
+    known = truth.time
+    short = np.diff(known) <= MAX_STEPS * np.median(np.diff(known))
+    return (time >= known[0]) & (time <= known[-1]) & short[_step_of(known, time)]
+
+
+def _completed(truth: Trajectory) -> tuple[Trajectory, list[str]]:
+    """Return a truth with a constant for the part that it lacks, and the name of that part."""
+    parts = {}
+    if not truth.has_attitude:
+        parts["world_from_body"] = np.tile(np.eye(3), (len(truth), 1, 1))
+    if not truth.has_position:
+        parts["position_world"] = np.zeros((len(truth), 3))
+    return replace(truth, **parts), list(parts)
 
 
 def _step_of(known: Array, time: Array) -> Array:

@@ -11,7 +11,7 @@ from magfusion.errors import InputError
 from magfusion.model.arguments import check_arguments
 from magfusion.model.short_repr import one_line, short_repr
 from magfusion.model.trajectory import Trajectory, interpolate
-from magfusion.model.truth_poses import truth_poses
+from magfusion.results.association import AssociatedPoses, associate, select_poses
 from magfusion.units import Array, BoolArray, IntArray
 
 
@@ -50,12 +50,15 @@ class RelativeErrors(NamedTuple):
 class TrajectoryErrors:
     """Estimate minus truth at each of the estimate's times for which there is a truth.
 
+    Errors of a part that the truth lacks are NaN: of attitude, or of position.
+
     Parameters
     ----------
     time : ndarray, shape (n,)
         Seconds since the log's epoch.
     compared : ndarray of bool, shape (epochs of the estimate,)
-        Which epochs of the estimate were compared.
+        Which epochs of the estimate were compared; of a truth that is too coarse to be
+        interpolated, which of its samples.
     position_world : ndarray, shape (n, 3)
         (m)
     pose_body : ndarray, shape (n, 6)
@@ -73,9 +76,11 @@ class TrajectoryErrors:
     pose_cov : ndarray, shape (n, 6, 6), optional
         Of the estimate, where it has one.
     nees : ndarray, shape (n,), optional
-        Normalised estimation error squared, six degrees of freedom, where there is a covariance.
+        Normalised estimation error squared where there is a covariance, of `degrees_of_freedom`.
     not_covered : str
         Why other epochs were not compared; empty where all were.
+    at_truth : bool
+        Whether the samples of the truth were compared.
     """
 
     __repr__ = short_repr
@@ -92,6 +97,22 @@ class TrajectoryErrors:
     pose_cov: Array | None = None
     nees: Array | None = None
     not_covered: str = ""
+    at_truth: bool = False
+
+    @property
+    def has_position(self) -> bool:
+        """Whether positions are compared."""
+        return not np.isnan(self.position_world).any()
+
+    @property
+    def has_attitude(self) -> bool:
+        """Whether attitudes are compared."""
+        return not np.isnan(self.attitude).any()
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Of a pose error."""
+        return 3 * self.has_position + 3 * self.has_attitude
 
     @property
     def ate(self) -> float:
@@ -139,19 +160,20 @@ class TrajectoryErrors:
         if self.pose_cov is None:
             return None
         sigma = np.sqrt(np.diagonal(self.pose_cov, axis1=1, axis2=2))
-        return float(np.mean(np.abs(self.pose_body) <= 3.0 * sigma))
+        ratio = np.abs(self.pose_body) / sigma
+        return float(np.mean(ratio[np.isfinite(self.pose_body)] <= 3.0))
 
 
 def trajectory_errors(
     estimate: Trajectory, truth: Trajectory, *, max_gap: float | None = None, delta_frames: int = 1
 ) -> TrajectoryErrors:
-    """Compare an estimate with the truth, interpolated to the estimate's times.
+    """Compare an estimate with the truth at the same times, as `associate` finds them.
 
     Parameters
     ----------
     max_gap : float, optional
-        Longest step of the truth across which it is interpolated linearly (s); without it, the
-        truth is interpolated wherever its motion allows it, `magfusion.model.truth_poses`.
+        Longest step of the truth across which it is interpolated linearly (s); without it, it is
+        interpolated wherever its motion allows that.
     delta_frames : int
         Length of the relative errors' pairs, in compared epochs.
 
@@ -169,22 +191,24 @@ def trajectory_errors(
     """
     check_arguments("trajectory_errors", estimate=(estimate, Trajectory), truth=(truth, Trajectory))
     if max_gap is None:
-        true, compared, reason = truth_poses(truth, estimate.time)
+        pairs = associate(estimate, truth)
     else:
         reason = f"the others are in steps longer than {max_gap} s"
         true, compared = interpolate(truth, estimate.time, max_gap)
+        pairs = AssociatedPoses(select_poses(estimate, compared), true, compared, reason)
+    true, own = pairs.truth, pairs.estimate
     if len(true) < 3:
         raise InputError(
             f"The truth covers {len(true)} of the estimate's {len(estimate)} epochs, and at least 3"
-            f" are needed: {reason}. Check that both use the same clock, and record the truth"
-            " at a higher rate."
+            f" are needed: {pairs.not_covered}. Check that both use the same clock (evaluate"
+            " --align-time estimates an offset), and record the truth at a higher rate, or estimate"
+            " at one (--rate)."
         )
-    rotation, position = estimate.world_from_body[compared], estimate.position_world[compared]
+    rotation, position, cov = own.world_from_body, own.position_world, own.pose_cov
     pose_body = pose_errors(rotation, position, true)
-    cov = None if estimate.pose_cov is None else estimate.pose_cov[compared]
     return TrajectoryErrors(
         time=true.time,
-        compared=compared,
+        compared=pairs.compared,
         position_world=position - true.position_world,
         pose_body=pose_body,
         attitude=np.linalg.norm(pose_body[:, :3], axis=1),
@@ -194,21 +218,28 @@ def trajectory_errors(
         world_from_body=rotation,
         pose_cov=cov,
         nees=None if cov is None else _nees(pose_body, cov),
-        not_covered=reason if not np.all(compared) else "",
+        not_covered=pairs.not_covered if not np.all(pairs.compared) else "",
+        at_truth=pairs.at_truth,
     )
 
 
 def pose_errors(world_from_body: Array, position_world: Array, truth: Trajectory) -> Array:
     """Return ``Pose3.localCoordinates(truth, estimate)`` of each epoch, shape (n, 6).
 
-    Rotation, then translation, in body axes (rad, m).
+    Rotation, then translation, in body axes (rad, m); NaN of a part that one of them lacks.
     """
-    pairs = zip(
-        _poses(truth.world_from_body, truth.position_world),
-        _poses(world_from_body, position_world),
-        strict=True,
-    )
-    return np.array([true.localCoordinates(estimated) for true, estimated in pairs])
+    turn, place = truth.world_from_body, truth.position_world
+    lacking = np.zeros(6, dtype=bool)
+    lacking[:3] = np.isnan(turn).any() or np.isnan(world_from_body).any()
+    lacking[3:] = np.isnan(place).any() or np.isnan(position_world).any()
+    if lacking[0]:
+        turn = world_from_body = np.where(np.isnan(world_from_body), np.eye(3), world_from_body)
+    if lacking[3]:
+        place = position_world = np.zeros_like(place)
+    pairs = zip(_poses(turn, place), _poses(world_from_body, position_world), strict=True)
+    errors = np.array([true.localCoordinates(estimated) for true, estimated in pairs])
+    errors[:, lacking] = np.nan
+    return errors
 
 
 def frame_pairs(epochs: int, delta: int) -> IntArray:
@@ -232,6 +263,9 @@ def relative_errors(
     pairs : ndarray of int, shape (m, 2)
         As from `frame_pairs`.
     """
+    if np.isnan(world_from_body).any() or not truth.has_attitude:
+        unknown = np.full(len(pairs), np.nan)  # the translation's axes are those of the attitude
+        return RelativeErrors(pairs, unknown, unknown)
     step, shift = _motion(world_from_body, position_world, pairs)
     true_step, true_shift = _motion(truth.world_from_body, truth.position_world, pairs)
     # The shifts' difference need not be rotated: its length is the same in all axes.
@@ -256,6 +290,8 @@ def _poses(world_from_body: Array, position_world: Array) -> list[gtsam.Pose3]:
 
 
 def _align(position: Array, target: Array) -> Array:
+    if np.isnan(position).any() or np.isnan(target).any():
+        return np.full_like(target, np.nan)
     centre, target_centre = position.mean(axis=0), target.mean(axis=0)
     # Along a line, or at rest, many rotations fit equally well, with the same residual.
     turn = gtsam.Rot3.ClosestTo((target - target_centre).T @ (position - centre)).matrix()
@@ -263,11 +299,15 @@ def _align(position: Array, target: Array) -> Array:
 
 
 def _aligned_attitude(estimated: Array, true: Array) -> Array:
+    if np.isnan(estimated).any() or np.isnan(true).any():
+        return np.full(len(true), np.nan)
     offset = Rotation.from_matrix(estimated @ np.swapaxes(true, 1, 2))
     return np.asarray((offset.mean().inv() * offset).magnitude())
 
 
 def _nees(error: Array, cov: Array) -> Array:
+    known = np.flatnonzero(np.isfinite(error).all(axis=0))
+    error, cov = error[:, known], cov[:, known[:, None], known]
     return np.asarray(np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[..., None])[..., 0]))
 
 

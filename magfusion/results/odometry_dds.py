@@ -1,21 +1,17 @@
 """States as nav_msgs/Odometry by DDS, which nodes of ROS 2 receive; no ROS is installed here."""
 
-import os
-import re
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from magfusion.errors import InputError
 from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.odometry_bag import UNKNOWN_VARIANCE
 from magfusion.results import ros_messages as ros
+from magfusion.results.dds_domain import dds_name, join_domain
 from magfusion.results.odometry import NS, Odometry, odometry_of
 from magfusion.results.ros_messages import OdometryMessage as Message
 
-_TOPIC = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
-_LAST_DOMAIN = 232  # its ports are the last ones that there are
 _DEPTH = 10  # messages that a reader may be late by, as the default of ROS
 
 
@@ -59,35 +55,21 @@ class RosPublisher:
     """
 
     def __init__(self, topic: str, epoch_ns: int, frame: str, child: str) -> None:
-        if not _TOPIC.fullmatch(topic):
-            raise InputError(f"--ros2 {topic!r}: is not a topic; write one like /robot/odometry")
-        domain = _domain()
-        try:
-            from cyclonedds.core import DDSException, Policy, Qos
-            from cyclonedds.domain import DomainParticipant
-            from cyclonedds.pub import DataWriter
-            from cyclonedds.topic import Topic
-            from cyclonedds.util import duration
-        except ImportError as error:
-            raise InputError(
-                "--ros2: cyclonedds is not installed; pip install 'magfusion[ros2]'"
-            ) from error
+        name = dds_name("--ros2", topic)
+        self._participant = join_domain("--ros2")
+        from cyclonedds.core import DDSException, Policy, Qos
+        from cyclonedds.pub import DataWriter
+        from cyclonedds.topic import Topic
+        from cyclonedds.util import duration
+
         # Reliable, since ROS subscribers request that, but it never blocks.
         requested = Qos(
             Policy.Reliability.Reliable(max_blocking_time=duration(seconds=0)),
             Policy.History.KeepLast(_DEPTH),
             Policy.Durability.Volatile,
         )
-        try:
-            self._participant = DomainParticipant(domain)
-            self._writer = DataWriter(
-                self._participant, Topic(self._participant, f"rt{topic}", Message), qos=requested
-            )
-        except DDSException as error:
-            raise InputError(
-                f"--ros2 {topic!r}: DDS does not start in domain {domain} ({error}); check the"
-                " network, ROS_DOMAIN_ID and CYCLONEDDS_URI"
-            ) from error
+        of_states = Topic(self._participant, name, Message)
+        self._writer = DataWriter(self._participant, of_states, qos=requested)
         self._refusal, self._epoch_ns, self._frames = DDSException, epoch_ns, (frame, child)
         self._unsent, self._why = 0, ""
 
@@ -106,11 +88,3 @@ class RosPublisher:
         if not self._unsent:
             return None
         return f"--ros2: {self._unsent} messages could not be sent ({self._why})"
-
-
-def _domain() -> int:
-    """Return the domain that ROS would use."""
-    text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
-    if not text.isdecimal() or int(text) > _LAST_DOMAIN:
-        raise InputError(f"ROS_DOMAIN_ID: found {text!r}; it should be from 0 to {_LAST_DOMAIN}")
-    return int(text)

@@ -125,11 +125,11 @@ def _of_axes(errors: TrajectoryErrors) -> list[Chart]:
         position_sigma, attitude_sigma = _sigmas(errors.pose_cov, errors.world_from_body)
     size, unit = _unit_of(errors.position_world, position_sigma)
     charts = []
-    for k, axis in enumerate("xyz"):
+    for k, axis in enumerate("xyz" * errors.has_position):
         title = f"Position, {axis} of the world"
         sigma = None if position_sigma is None else position_sigma[:, k] / size
         charts.append(_error(title, unit, errors.time, errors.position_world[:, k] / size, sigma))
-    for k, axis in enumerate("xyz"):
+    for k, axis in enumerate("xyz" * errors.has_attitude):
         title = f"Attitude, about {axis} of the body"
         sigma = None if attitude_sigma is None else attitude_sigma[:, k] / DEGREE
         value = errors.attitude_body[:, k] / DEGREE
@@ -167,7 +167,7 @@ def size_charts(motion: MotionPage) -> list[Chart]:
             level = trust.protection_level_m if unit == "m" else trust.protection_level_deg
             if np.any(np.isfinite(level)):
                 lines.append(ChartLine(states.time, level, "protection level", "level"))
-        if errors is not None:
+        if errors is not None and np.isfinite(errors.pose_body[:, part]).all():
             result = np.linalg.norm(errors.pose_body[:, part], axis=1) / size
             lines.append(ChartLine(errors.time, result, "error", "error"))
         title = f"{name}: size and bounds"
@@ -208,7 +208,7 @@ def _unit_of(values: Array, sigma: Array | None) -> tuple[float, str]:
 
 def _truth_within(motion: MotionPage) -> Trajectory | None:
     truth, time = motion.truth, motion.states.time
-    if truth is None:
+    if truth is None or not truth.has_position:
         return None
     inside = (truth.time >= time[0]) & (truth.time <= time[-1])
     if not inside.any():

@@ -108,7 +108,7 @@ def write_recording(
         if propagated is not None:
             _log_path(recording, "world/carried", propagated, _PROPAGATED, 0.6)
         _log_sigmas(recording, trajectory, scale)
-        if truth is not None:
+        if truth is not None and truth.has_position:
             _log_path(recording, "world/truth", truth, _TRUTH, 0.8)
             _log_beads(recording, truth, scale)
         log_position(recording, trajectory, truth)
@@ -141,8 +141,9 @@ def _summary(trajectory: Trajectory, errors: TrajectoryErrors | None) -> str:
             f"3 sigma {1e3 * widest[0]:.2g} mm and {np.rad2deg(widest[1]):.2g} deg (median)"
         )
     if errors is not None:
-        met = f"{1e3 * errors.ate:.2g} mm and {errors.attitude_rmse_deg:.2g} deg"
-        findings.append(f"errors {met} rms against the truth")
+        met = [f"{1e3 * errors.ate:.2g} mm"] * errors.has_position
+        met += [f"{errors.attitude_rmse_deg:.2g} deg"] * errors.has_attitude
+        findings.append(f"errors {' and '.join(met)} rms against the truth")
     return "; ".join(findings)
 
 

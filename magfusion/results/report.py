@@ -96,20 +96,26 @@ def error_figures(
     figures = [
         Figure(name, value, unit, None, section, row, place)
         for name, value, unit, section, row, place in rows
+        if np.isfinite(value)  # of a truth with positions or attitudes alone
     ]
     skipped = int(np.sum(~errors.compared))
+    covers = "estimate" if errors.at_truth else "truth"
+    of = "samples of the truth" if errors.at_truth else "epochs"
     note = (
-        f"The truth does not cover {skipped} of {len(errors.compared)} epochs:"
+        f"The {covers} does not cover {skipped} of {len(errors.compared)} {of}:"
         f" {errors.not_covered}."
     )
     epochs = Figure("compared_epochs", len(errors.time), section=own)
+    if errors.at_truth:
+        epochs = replace(epochs, remark="compared at the samples of the truth, which is coarser")
     figures.append(replace(epochs, note=note) if skipped and not prefix else epochs)
     if errors.nees is not None and errors.pose_cov is not None:
         sigma = np.sqrt(np.diagonal(errors.pose_cov, axis1=1, axis2=2))
         ratio = np.abs(errors.pose_body) / sigma
         mean, inside = float(np.mean(errors.nees)), errors.inside_3_sigma
+        expected = errors.degrees_of_freedom
         figures += [
-            Figure("nees_mean", mean, section=own, label="mean NEES (6 expected)"),
+            Figure("nees_mean", mean, section=own, label=f"mean NEES ({expected} expected)"),
             Figure("nees_median", float(np.median(errors.nees)), section=_REPORT),
             Figure("inside_3_sigma", inside, section=own, label="share within 3 sigma"),
             *(
@@ -117,6 +123,7 @@ def error_figures(
                     f"{part}_inside_3_sigma", float(np.mean(ratio[:, k] <= 3.0)), section=_REPORT
                 )
                 for part, k in (("position", slice(3, 6)), ("attitude", slice(0, 3)))
+                if np.isfinite(ratio[:, k]).all()
             ),
         ]
     return Figures(*(replace(f, name=prefix + f.name) for f in figures))

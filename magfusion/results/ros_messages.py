@@ -1,4 +1,4 @@
-"""nav_msgs/Odometry and its parts, as ROS 2 sends them by DDS: field by field.
+"""Messages of ROS 2 and their parts, as ROS sends them by DDS: field by field.
 
 No ROS code is used: on the wire a message is its fields in this order, and its name.
 """
@@ -11,8 +11,10 @@ from cyclonedds.idl.types import array, float64, int32, uint32
 
 if TYPE_CHECKING:
     Covariance = list[float]
+    AxesCovariance = list[float]
 else:
     Covariance = array[float64, 36]
+    AxesCovariance = array[float64, 9]
 
 
 @dataclass
@@ -99,3 +101,25 @@ class OdometryMessage(IdlStruct, typename="nav_msgs.msg.dds_.Odometry_"):
     child_frame_id: str
     pose: PoseWithCovariance
     twist: TwistWithCovariance
+
+
+@dataclass
+class ImuMessage(IdlStruct, typename="sensor_msgs.msg.dds_.Imu_"):
+    """Attitude, rate of rotation (rad/s) and specific force (m/s^2) of an IMU."""
+
+    header: Header
+    orientation: Quaternion
+    orientation_covariance: AxesCovariance
+    angular_velocity: Vector3
+    angular_velocity_covariance: AxesCovariance
+    linear_acceleration: Vector3
+    linear_acceleration_covariance: AxesCovariance
+
+
+@dataclass
+class MagneticFieldMessage(IdlStruct, typename="sensor_msgs.msg.dds_.MagneticField_"):
+    """Field of a magnetometer (T)."""
+
+    header: Header
+    magnetic_field: Vector3
+    magnetic_field_covariance: AxesCovariance

@@ -36,7 +36,7 @@ ORDERS = {
 def truth_findings(log: Log) -> Iterator[Finding]:
     """Yield the remarks on a log's truth that contradicts its inertial samples."""
     truth = log.truth
-    if truth is None or not log.inertial or len(log.imu) < MIN_SPANS:
+    if truth is None or not truth.has_attitude or not log.inertial or len(log.imu) < MIN_SPANS:
         return
     after = np.searchsorted(log.imu.time, truth.time).clip(1, len(log.imu) - 1)
     before, later = log.imu.time[after - 1], log.imu.time[after]

@@ -30,7 +30,7 @@ def with_open_roll(states: Trajectory, site: Site) -> Trajectory:
 
 def comparable(log: Log, states: Trajectory, site: Site) -> Log:
     """Return a log whose truth has the assumed roll, where the roll is undetermined."""
-    if log.truth is None or not roll_is_open(site):
+    if log.truth is None or not (log.truth.has_poses and roll_is_open(site)):
         return log
     signed = log.fields is None or log.fields.signed
     return replace(log, truth=nearest_truth(log.truth, states, site, signed=signed))

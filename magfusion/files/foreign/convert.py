@@ -191,10 +191,11 @@ def _kept(
         # A truth has no use for rows that hold no pose; a stream of samples knows that one is lost.
         counts.leave_out("without a pose", int(np.sum(keep & missing)))
         keep &= ~missing
-        length = np.linalg.norm(values[:, [names.index(q) for q in QUATERNION]], axis=1)
-        none = keep & (length < LEAST_QUATERNION)
-        counts.leave_out("with a quaternion of zeros", int(np.sum(none)))
-        keep &= ~none
+        if QUATERNION[0] in names:
+            length = np.linalg.norm(values[:, [names.index(q) for q in QUATERNION]], axis=1)
+            none = keep & (length < LEAST_QUATERNION)
+            counts.leave_out("with a quaternion of zeros", int(np.sum(none)))
+            keep &= ~none
     keep[keep] = ~_strays(stamps[keep], counts)
     stamps, values, rows, missing = stamps[keep], values[keep], rows[keep], missing[keep]
     if not len(stamps):

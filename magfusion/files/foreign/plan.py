@@ -157,6 +157,12 @@ def plan_stream(
     named = named_columns(source.columns, stream)
     velocity = any(name in given for name in OPTIONAL)
     without = _other_rotation(given, named)
+    if stream == "truth" and not numbered_quaternion(source.columns):
+        known = {*given, *(usual or {}), *(name for name, own in named.items() if own)}
+        alone, absent = _absent_part(known)
+        without += absent
+        if absent:
+            declared.notes.append(f"{source.place}: the truth has {alone} alone.")
     for target in STREAMS[stream]:
         if target in without:
             continue
@@ -181,6 +187,16 @@ def _other_rotation(
         return QUATERNION
     angles = declared.issuperset(EULER) and declared.isdisjoint(QUATERNION)
     return QUATERNION if angles else EULER
+
+
+def _absent_part(known: set[str]) -> tuple[str, tuple[str, ...]]:
+    """Return which part a truth has alone, and the columns of the other."""
+    attitude, position = (*QUATERNION, *EULER), GROUPS["position"]
+    if known.isdisjoint(attitude) and not known.isdisjoint(position):
+        return "positions", attitude
+    if known.isdisjoint(position) and not known.isdisjoint(attitude):
+        return "attitudes", position
+    return "", ()
 
 
 class _Planning:
