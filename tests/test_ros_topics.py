@@ -134,7 +134,7 @@ def _piped(log: Path) -> list[dict[str, Any]]:
 def test_topics_without_messages_are_reported_once(log: Path) -> None:
     command = ("navigate", "ros2:", "--site", log / "site.yaml", "--topics", "imu=/other/imu")
     with subprocess.Popen(
-        [sys.executable, "-m", "magfusion", *map(str, command)], stderr=subprocess.PIPE
+        [sys.executable, "-m", "magfusion", *map(str, command)], stderr=subprocess.PIPE, bufsize=0
     ) as running:
         assert running.stderr is not None
         lines = []
