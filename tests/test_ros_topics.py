@@ -7,12 +7,14 @@ import select
 import signal
 import subprocess
 import sys
+import time
 import uuid
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from aiding_site import aided_site
 from conftest import Refuse
 from rosbags.typesys import Stores, get_typestore
 
@@ -26,12 +28,14 @@ from magfusion.simulation.log import SimulationConfig, simulate_log
 pytest.importorskip("cyclonedds")
 
 from cyclonedds.domain import DomainParticipant
+from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from test_live_ros import LOOPBACK, ROS_DEFAULT
 
 from magfusion.estimation.online.navigator import NavigatorSettings
 from magfusion.files.bag_topics import Topics
+from magfusion.model.aiding import AidingSensor
 from magfusion.results import records_dds
 from magfusion.results import ros_messages as ros
 
@@ -39,6 +43,10 @@ STORE = get_typestore(Stores.ROS2_HUMBLE)
 MAX_WAIT = 90.0  # s
 HEADER = ros.Header(ros.Time(12, 500_000_000), "imu")
 UNKNOWN = [0.0] * 9
+POSE = ros.Pose(ros.Point(1.0, 2.0, 3.0), ros.Quaternion(0.0, 0.0, 0.0, 1.0))
+TWIST = ros.TwistWithCovariance(
+    ros.Twist(ros.Vector3(0.5, 0.25, -0.125), ros.Vector3(0.0, 0.0, 0.1)), [0.0] * 36
+)
 
 
 @pytest.fixture
@@ -73,6 +81,13 @@ def _imu(header: ros.Header) -> ros.ImuMessage:
             ros.MagneticFieldMessage(HEADER, ros.Vector3(2e-5, 0.0, -4e-5), UNKNOWN),
             "sensor_msgs/msg/MagneticField",
         ),
+        (ros.PoseStampedMessage(HEADER, POSE), "geometry_msgs/msg/PoseStamped"),
+        (
+            ros.TwistWithCovarianceStampedMessage(HEADER, TWIST),
+            "geometry_msgs/msg/TwistWithCovarianceStamped",
+        ),
+        (ros.RangeMessage(HEADER, 0, 0.5, 0.25, 50.0, 4.125), "sensor_msgs/msg/Range"),
+        (ros.FluidPressureMessage(HEADER, 101325.0, 4.0), "sensor_msgs/msg/FluidPressure"),
     ],
 )
 def test_the_bytes_are_those_of_ros(message: Any, kind: str) -> None:
@@ -150,10 +165,45 @@ def test_topics_without_messages_are_reported_once(log: Path) -> None:
 
 def test_messages_without_a_stamp_are_refused() -> None:
     content = {"imu": {"time": [0.0], **records_dds.SUBSCRIPTIONS["imu"].content([_imu(HEADER)])}}
-    numbered = records_dds._numbered(3, content, {"imu": "/imu/data"})
+    numbered = records_dds._numbered(3, content, records_dds.SUBSCRIPTIONS)
     assert numbered.record is None
     sentence = numbered.located(numbered.refusal)
     assert sentence.startswith("ros2:, message 3: /imu/data has messages without a stamp; set")
+
+
+def test_aiding_sensors_are_subscribed_to_by_their_names(domain: int) -> None:
+    """A sensor's topic may have any type of what it measures; the writer decides."""
+    site = aided_site(
+        AidingSensor("wheels/odom", "velocity", 0.02),
+        AidingSensor("visual", "velocity", 0.02),
+        AidingSensor("uwb", "range", 0.1, point_world=np.zeros(3)),
+    )
+    received = records_dds.subscribe(None, site, io.StringIO())
+    participant = DomainParticipant(domain)
+    sent: dict[str, Any] = {
+        "/wheels/odom": ros.OdometryMessage(
+            HEADER, "base", ros.PoseWithCovariance(POSE, [0.0] * 36), TWIST
+        ),
+        "/visual": ros.TwistWithCovarianceStampedMessage(HEADER, TWIST),
+        "/uwb": ros.RangeMessage(HEADER, 0, 0.5, 0.25, 50.0, 4.125),
+    }
+    writers = [
+        (DataWriter(participant, Topic(participant, f"rt{name}", type(one))), one)
+        for name, one in sent.items()
+    ]
+    values: dict[str, Any] = {}
+    begin = time.monotonic()
+    while len(values) < len(sent) and time.monotonic() < begin + MAX_WAIT:
+        for writer, message in writers:
+            writer.write(message)
+        record = next(received).record
+        assert record is not None
+        values |= {name: own.value[0].tolist() for name, own in (record.aiding or {}).items()}
+    assert values == {
+        "wheels/odom": [0.5, 0.25, -0.125],
+        "visual": [0.5, 0.25, -0.125],
+        "uwb": [4.125],
+    }
 
 
 def test_every_subscription_is_a_part_of_a_record_and_a_role() -> None:

@@ -9,6 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 from magfusion.errors import InputError
+from magfusion.files.messages import AIDING_ROWS, Row
 from magfusion.files.stream import NumberedRecord, Record, checked_record
 from magfusion.results.dds_domain import dds_name, join_domain
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from cyclonedds.sub import DataReader
 
     from magfusion.files.bag_topics import Topics
+    from magfusion.model.aiding import AidingSensor
     from magfusion.model.site import Site
 
 SILENCE = 5.0  # s; a topic without messages for longer is reported
@@ -31,19 +33,22 @@ class Subscription(NamedTuple):
     Parameters
     ----------
     topic : str
-        Default name.
+        Name.
     message : str
         Its class in `magfusion.results.ros_messages`.
     kind : str
         Its type in ROS.
     content : callable
         Returns the part's keys, but for the time, of messages.
+    sensor : str, optional
+        Aiding sensor of the site, which may have topics of several types.
     """
 
     topic: str
     message: str
     kind: str
     content: Callable[[Sequence[Any]], dict[str, list[Any]]]
+    sensor: str | None = None
 
 
 def _imu_content(messages: Sequence[Any]) -> dict[str, list[Any]]:
@@ -67,6 +72,27 @@ SUBSCRIPTIONS = {  # by the part of a record
         "/mag", "MagneticFieldMessage", "sensor_msgs/msg/MagneticField", _field_content
     ),
 }
+AIDING_MESSAGES = {  # class by type
+    "nav_msgs/msg/Odometry": "OdometryMessage",
+    "geometry_msgs/msg/TwistWithCovarianceStamped": "TwistWithCovarianceStampedMessage",
+    "geometry_msgs/msg/PoseStamped": "PoseStampedMessage",
+    "sensor_msgs/msg/Range": "RangeMessage",
+    "sensor_msgs/msg/FluidPressure": "FluidPressureMessage",
+}
+
+
+def _of_aiding(sensor: AidingSensor) -> Iterator[Subscription]:
+    """Yield the subscriptions of a sensor: to the topic of its name, of every type it may have."""
+    for kind, row in AIDING_ROWS.get(sensor.quantity, {}).items():
+        if kind in AIDING_MESSAGES:
+            content = partial(_aiding_content, row)
+            topic = f"/{sensor.name.strip('/')}"
+            yield Subscription(topic, AIDING_MESSAGES[kind], kind, content, sensor.name)
+
+
+def _aiding_content(row: Row, messages: Sequence[Any]) -> dict[str, list[Any]]:
+    rows = [row(one) for one in messages]
+    return {"value": rows if len(rows[0]) > 1 else [value for (value,) in rows]}
 
 
 def subscribe(topics: Topics | None, site: Site, messages: TextIO) -> Iterator[NumberedRecord]:
@@ -91,14 +117,23 @@ def subscribe(topics: Topics | None, site: Site, messages: TextIO) -> Iterator[N
     if topics is not None and topics.truth is not None:
         raise InputError("--topics: truth is of a log; omit it with ros2:")
     parts = [part for part in SUBSCRIPTIONS if part != "imu" or site.platform.inertial]
-    names = {part: getattr(topics, part, None) or SUBSCRIPTIONS[part].topic for part in parts}
-    for part, name in names.items():
-        dds_name(f"--topics {part}", name)
+    wanted = {
+        part: SUBSCRIPTIONS[part]._replace(
+            topic=getattr(topics, part, None) or SUBSCRIPTIONS[part].topic
+        )
+        for part in parts
+    }
+    for part, one in wanted.items():
+        dds_name(f"--topics {part}", one.topic)
+    for sensor in site.aiding:
+        wanted |= {f"{sensor.name} {one.kind}": one for one in _of_aiding(sensor)}
     participant = join_domain("ros2:")
-    return _received(participant, _readers(participant, names), names, messages)
+    return _received(participant, _readers(participant, wanted), wanted, messages)
 
 
-def _readers(participant: DomainParticipant, names: dict[str, str]) -> dict[str, DataReader[Any]]:
+def _readers(
+    participant: DomainParticipant, wanted: dict[str, Subscription]
+) -> dict[str, DataReader[Any]]:
     from cyclonedds.core import Policy, Qos
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
@@ -109,9 +144,9 @@ def _readers(participant: DomainParticipant, names: dict[str, str]) -> dict[str,
         Policy.Reliability.BestEffort, Policy.History.KeepLast(DEPTH), Policy.Durability.Volatile
     )
     readers = {}
-    for part, name in names.items():
-        message = getattr(ros_messages, SUBSCRIPTIONS[part].message)
-        topic = Topic(participant, dds_name("--topics", name), message)
+    for part, one in wanted.items():
+        message = getattr(ros_messages, one.message)
+        topic = Topic(participant, dds_name("--topics", one.topic), message)
         readers[part] = DataReader(participant, topic, qos=qos)
     return readers
 
@@ -119,7 +154,7 @@ def _readers(participant: DomainParticipant, names: dict[str, str]) -> dict[str,
 def _received(
     participant: DomainParticipant,
     readers: dict[str, DataReader[Any]],
-    names: dict[str, str],
+    wanted: dict[str, Subscription],
     messages: TextIO,
 ) -> Iterator[NumberedRecord]:
     from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState, WaitSet
@@ -129,37 +164,61 @@ def _received(
     new = ViewState.Any | InstanceState.Any | SampleState.NotRead
     for reader in readers.values():
         waiting.attach(ReadCondition(reader, new))
-    newest, silent, number = dict.fromkeys(readers, time.monotonic()), set[str](), 0
+    labels = {part: one.sensor or part for part, one in wanted.items()}
+    newest, silent, number = dict.fromkeys(labels.values(), time.monotonic()), set[str](), 0
     while True:
         waiting.wait(POLL_NS)
-        content = {}
+        content: dict[str, Any] = {}
         for part, reader in readers.items():
             arrived = [one for one in reader.take(DEPTH) if not isinstance(one, InvalidSample)]
             if arrived:
                 number += len(arrived)
-                newest[part] = time.monotonic()
-                silent.discard(part)
-                stamps = [one.header.stamp.sec + NS * one.header.stamp.nanosec for one in arrived]
-                content[part] = {"time": stamps, **SUBSCRIPTIONS[part].content(arrived)}
-            elif part not in silent and time.monotonic() - newest[part] > SILENCE:
-                silent.add(part)
-                messages.write(_silence_text(part, names[part]))
+                newest[labels[part]] = time.monotonic()
+                silent.discard(labels[part])
+                _add(content, part, wanted[part], arrived)
+        for part, label in labels.items():
+            if label not in silent and time.monotonic() - newest[label] > SILENCE:
+                silent.add(label)
+                messages.write(_silence_text(part, wanted[part]))
                 messages.flush()
         if content:
-            yield _numbered(number, content, names)
+            yield _numbered(number, content, wanted)
 
 
-def _numbered(number: int, content: dict[str, Any], names: dict[str, str]) -> NumberedRecord:
-    unstamped = [names[part] for part, own in content.items() if 0.0 in own["time"]]
+def _add(
+    content: dict[str, Any], part: str, subscription: Subscription, messages: Sequence[Any]
+) -> None:
+    """Add messages to the content of a record."""
+    stamps = [one.header.stamp.sec + NS * one.header.stamp.nanosec for one in messages]
+    own = {"time": stamps, **subscription.content(messages)}
+    if subscription.sensor is None:
+        content[part] = own
+    else:
+        content.setdefault("aiding", {})[subscription.sensor] = own
+
+
+def _numbered(
+    number: int, content: dict[str, Any], wanted: dict[str, Subscription]
+) -> NumberedRecord:
+    aiding = content.get("aiding", {})
+    streams = {k: v for k, v in content.items() if k != "aiding"} | aiding
+    unstamped = [name for name, own in streams.items() if 0.0 in own["time"]]
     if unstamped:
-        reason = f"{unstamped[0]} has messages without a stamp; set header.stamp in its driver"
+        one = wanted.get(unstamped[0])
+        topic = f"/{unstamped[0].strip('/')}" if one is None else one.topic
+        reason = f"{topic} has messages without a stamp; set header.stamp in its driver"
         return NumberedRecord(number, None, reason, "ros2:", "message")
     record = checked_record(number, partial(Record.model_validate, content))
     return replace(record, source="ros2:", unit="message")
 
 
-def _silence_text(part: str, name: str) -> str:
+def _silence_text(part: str, subscription: Subscription) -> str:
+    remedy = (
+        f"its name (--topics {part}=NAME)"
+        if subscription.sensor is None
+        else f"the name of {subscription.sensor} in the site's aiding"
+    )
     return (
-        f"magfusion: {name}: no message for {SILENCE:g} s; check its name (--topics {part}=NAME),"
-        f" its type ({SUBSCRIPTIONS[part].kind}) and ROS_DOMAIN_ID\n"
+        f"magfusion: {subscription.topic}: no message for {SILENCE:g} s; check {remedy}, its type"
+        f" ({subscription.kind}) and ROS_DOMAIN_ID\n"
     )

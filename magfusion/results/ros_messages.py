@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, float64, int32, uint32
+from cyclonedds.idl.types import array, float32, float64, int32, uint8, uint32
 
 if TYPE_CHECKING:
     Covariance = list[float]
@@ -123,3 +123,42 @@ class MagneticFieldMessage(IdlStruct, typename="sensor_msgs.msg.dds_.MagneticFie
     header: Header
     magnetic_field: Vector3
     magnetic_field_covariance: AxesCovariance
+
+
+@dataclass
+class TwistWithCovarianceStampedMessage(
+    IdlStruct, typename="geometry_msgs.msg.dds_.TwistWithCovarianceStamped_"
+):
+    """Velocity of a visual or laser odometry."""
+
+    header: Header
+    twist: TwistWithCovariance
+
+
+@dataclass
+class PoseStampedMessage(IdlStruct, typename="geometry_msgs.msg.dds_.PoseStamped_"):
+    """Pose in the header's frame."""
+
+    header: Header
+    pose: Pose
+
+
+@dataclass
+class RangeMessage(IdlStruct, typename="sensor_msgs.msg.dds_.Range_"):
+    """Distance (m)."""
+
+    header: Header
+    radiation_type: uint8
+    field_of_view: float32
+    min_range: float32
+    max_range: float32
+    range: float32
+
+
+@dataclass
+class FluidPressureMessage(IdlStruct, typename="sensor_msgs.msg.dds_.FluidPressure_"):
+    """Pressure of air or water (Pa)."""
+
+    header: Header
+    fluid_pressure: float64
+    variance: float64
