@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from magfusion.files.open import open_log as open_log
     from magfusion.files.site import load_site as load_site
     from magfusion.files.site import save_site as save_site
+    from magfusion.model.aiding import AidingSamples as AidingSamples
     from magfusion.model.field import observe as observe
     from magfusion.model.parameters import initial_calibration as initial_calibration
     from magfusion.model.parameters.parameter import Calibration as Calibration
@@ -65,6 +66,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "Calibration": "model.parameters.parameter",
     "EstimationError": "errors",
+    "AidingSamples": "model.aiding",
     "FieldSamples": "model.samples",
     "Finding": "model.trust",
     "InputError": "errors",
