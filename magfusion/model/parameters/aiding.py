@@ -17,7 +17,7 @@ from magfusion.model.parameters.parameter import (
     SiteParameter,
 )
 from magfusion.model.site import Site, aiding_sensor
-from magfusion.units import Array
+from magfusion.units import HOUR, Array
 
 
 class AidingParameter(SiteParameter):
@@ -62,6 +62,11 @@ class _Offset(AidingParameter):
     kind = attribute = sigma_attribute = "offset"
     words = "the offset of {owner}"
     of_quantities: tuple[Quantity, ...] = ("range", "height", "heading")
+
+    def sigma(self, site: Site, owner: str) -> Array:
+        """Return the declared standard deviation; one that walks gains that of a second at once."""
+        a_second = self.walk_per_sqrt_hour(site, owner) / np.sqrt(HOUR)
+        return np.maximum(super().sigma(site, owner), a_second)
 
     def walk_per_sqrt_hour(self, site: Site, owner: str) -> float:
         """Return the standard deviation that it gains in an hour."""
