@@ -255,7 +255,7 @@ def test_beacons_without_synchronisation_always_have_phase_and_drift():
     assert drive[1].sigma == ClockModel().drift_sigma
 
 
-@pytest.mark.parametrize("group", sorted(set(GROUPS) - {"ground", "earth"}))
+@pytest.mark.parametrize("group", sorted(set(GROUPS) - {"aiding", "ground", "earth"}))
 def test_a_group_is_chosen_by_its_name_alone(group):
     blocks = choose_blocks(mixed_site(), [group])
     assert {b.group for b in blocks} == {group}
@@ -264,7 +264,7 @@ def test_a_group_is_chosen_by_its_name_alone(group):
 
 def test_a_group_that_is_asked_for_comes_however_small_its_sigma_unless_it_is_zero():
     assert {b.group for b in choose_blocks(well_surveyed(), GROUPS)} == (
-        set(GROUPS) - {"phase", "ground", "earth"}
+        set(GROUPS) - {"phase", "aiding", "ground", "earth"}
     )
     known = with_magnetometer_sigma(
         well_surveyed(), matrix=np.zeros((3, 3)), position_body=np.zeros(3)
