@@ -133,9 +133,9 @@ def simulate_vehicle(config: Config, rng: np.random.Generator) -> tuple[Simulate
         SimulationConfig(
             box,
             duration,
-            "drive",
-            speed,
-            Rests(2.0, duration, 0.0),
+            motion="drive",
+            speed=speed,
+            rests=Rests(2.0, duration, 0.0),
             imu_rate_hz=100.0,
             magnetometer_rate_hz=100.0,
         ),

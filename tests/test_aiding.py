@@ -196,7 +196,13 @@ def test_a_sensor_that_is_none_is_refused(entry, finding, tmp_path):
 def _simulated(*chosen, seed=1, duration=20.0, **changes):
     site = aided_site(*chosen)
     config = SimulationConfig(
-        ROOM, duration, "drive", 1.0, Rests(2.0, duration, 0.0), perturb=False, **changes
+        ROOM,
+        duration,
+        motion="drive",
+        speed=1.0,
+        rests=Rests(2.0, duration, 0.0),
+        perturb=False,
+        **changes,
     )
     return simulate_log(site, config, np.random.default_rng(seed))
 

@@ -145,7 +145,9 @@ def test_a_vehicles_bag_is_smoothed_and_navigated_without_a_mapping(tmp_path):
     wheels = AidingSensor("odom", "velocity", 0.02)
     site = aided_site(wheels)
     room = np.array([[0.5, 0.5, 0.8], [5.5, 4.5, 1.2]])  # m
-    config = SimulationConfig(room, 9.0, "drive", 1.0, Rests(2.0, 9.0, 0.0), perturb=False)
+    config = SimulationConfig(
+        room, 9.0, motion="drive", speed=1.0, rests=Rests(2.0, 9.0, 0.0), perturb=False
+    )
     _write_drive(tmp_path / "bag", simulate_log(site, config, np.random.default_rng(3)))
     save_site(replace(site, aiding=(wheels,)), tmp_path / "site.yaml")
     for job in ("smooth", "navigate"):
