@@ -15,12 +15,16 @@ from magfusion.model.parameters import PARAMETERS, AidingParameter, Block
 from magfusion.model.trust import Finding, Verdict
 
 FALSE_REJECTIONS = 1e-3  # of true samples, which costs a thousandth of the information
+# The same after a rejection: a slip goes on, while the prediction becomes less certain.
+FALSE_REJECTIONS_AGAIN = 0.05
 REJECTED_LONG = 5.0  # s of nothing but rejections; slips and reflections are shorter
 MEMORY = 0.995  # of the share of rejections, per sample
 TRUNCATED = 0.05  # share beyond which what is accepted is no fair sample of the errors
 CONTRADICTS = 0.25  # share beyond which a sensor is not as declared
 OF_PARAMETERS = frozenset(CODE[p] for p in PARAMETERS if isinstance(p, AidingParameter))
-GATE = {k: float(chi2.isf(FALSE_REJECTIONS, k)) for k in (1, 2, 3)}  # by degrees of freedom
+FREEDOM = (1, 2, 3)
+GATE = {k: float(chi2.isf(FALSE_REJECTIONS, k)) for k in FREEDOM}
+GATE_AGAIN = {k: float(chi2.isf(FALSE_REJECTIONS_AGAIN, k)) for k in FREEDOM}
 
 
 class AidingGate:
@@ -49,8 +53,9 @@ class AidingGate:
         if not isinstance(measurement, AidingMeasurement):
             return True
         rows = measurement.linearize(states_of([state]), state.calibration, self.blocks)
+        gate = GATE_AGAIN if measurement.sensor in self.rejected_since else GATE
         measured = int((measurement.sigma < float("inf")).sum())
-        explained = bool(group_distances(rows, state.cov)[0, 0] <= GATE[measured])
+        explained = bool(group_distances(rows, state.cov)[0, 0] <= gate[measured])
         sensor, before = measurement.sensor, self.rejected_share.get(measurement.sensor, 0.0)
         self.rejected_share[sensor] = MEMORY * before + (1.0 - MEMORY) * (not explained)
         if explained:
