@@ -193,6 +193,27 @@ def test_a_sensor_that_is_none_is_refused(entry, finding, tmp_path):
         load_site(path)
 
 
+@pytest.mark.parametrize("name", ["A", "imu", "truth"])
+def test_a_name_that_another_part_has_is_refused(name, tmp_path):
+    save_site(aided_site(replace(WHEELS, name=name)), tmp_path / "site.yaml")
+    with pytest.raises(InputError, match=r"aiding\[0\].name: .*another name"):
+        load_site(tmp_path / "site.yaml")
+
+
+@pytest.mark.parametrize(
+    ("quantity", "value", "finding"),
+    [
+        ("range", [[1.0, 2.0]], "give 1 for each of 1 times"),
+        ("velocity", [[np.nan] * 3], "no finite value"),
+        ("position", [[0.0, np.inf, 0.0]], "no finite value"),
+        ("mark", [[]], "name of a mark"),
+    ],
+)
+def test_samples_that_are_none_are_refused(quantity, value, finding):
+    with pytest.raises(InputError, match=finding):
+        AidingSamples(quantity, np.zeros(1), np.array(value))
+
+
 def _simulated(*chosen, seed=1, duration=20.0, **changes):
     site = aided_site(*chosen)
     config = SimulationConfig(

@@ -42,11 +42,12 @@ ROOMS = {
             site_values standard_streams stray_stamps
             bag_reader bag_rows checkpoint correlation field_map kept lost_rows probe row_file
             survey table yaml_files
-            aiding_tables attitude_table drive_columns fields hall instruments readings_table
+            attitude_table drive_columns fields hall instruments readings_table
             site_casing site_correlation site_motion site_region site_response site_rotor
             site_temperature
             row_stamps trajectory_table wells_file
-            bag depth_table fix_table marks_table result_states rotor_columns site_plain site_text
+            aiding_tables bag depth_table fix_table marks_table result_states rotor_columns
+            site_plain site_text
             temperature_table tum
             inertial_tables odometry_bag site_magnetometer stream
             site_aiding trajectory_formats

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from magfusion.files.readings_table import rows_by_name
 from magfusion.files.table import TIME, Span, Table, TableLayout, read_table, write_table
 from magfusion.model.aiding import AidingSamples, Quantity
 from magfusion.units import DEGREE, Array
@@ -56,12 +57,7 @@ def _read_quantity(quantity: Quantity, table: Table) -> dict[str, AidingSamples]
         names, which = table.texts(SENSOR)
     marks, of_row = table.texts(MARK) if quantity == "mark" else ([], which)
     value, out = _values(quantity, table), dict[str, AidingSamples]()
-    for k, name in enumerate(names):
-        own = np.flatnonzero(which == k)
-        twice = np.zeros(len(table), dtype=bool)
-        twice[own[1:]] = np.diff(table.time[own]) == 0.0
-        again = f"the time of another sample of {name}: remove one of the two"
-        table.refuse(twice, TIME, table.time_ns, again)
+    for name, own in rows_by_name(table, names, which, "sample"):
         there = own[np.isfinite(value[own]).any(axis=1)] if COLUMNS[quantity] else own
         of_sample = tuple(marks[of_row[i]] for i in there) if quantity == "mark" else ()
         out[name] = AidingSamples(quantity, table.time[there], value[there], of_sample)

@@ -1,12 +1,12 @@
 """A table of readings: a row for each, whatever part of the installation it is of."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from magfusion.files.table import TIME, Span, TableLayout, read_table, write_table
-from magfusion.units import Array
+from magfusion.files.table import TIME, Span, Table, TableLayout, read_table, write_table
+from magfusion.units import Array, IntArray
 
 PART = "part"
 
@@ -39,16 +39,29 @@ def read_readings(
     table = read_table(path, layout, Span(epoch_ns))
     value = table.numbers((column,))[:, 0]
     table.refuse((value < bounds[0]) | (value > bounds[1]), column, value, remedy)
-    names, which = table.texts(PART)
-    readings = {}
+    each = rows_by_name(table, *table.texts(PART), what)
+    return {name: np.stack([table.time[own], value[own]]) for name, own in each}
+
+
+def rows_by_name(
+    table: Table, names: Sequence[str], which: IntArray, what: str
+) -> Iterator[tuple[str, IntArray]]:
+    """Yield each name with its rows; refuse two of a name at one time.
+
+    Parameters
+    ----------
+    which : int ndarray, shape (n,)
+        Index of each row's name.
+    what : str
+        One row, in words.
+    """
     for k, name in enumerate(names):
         own = np.flatnonzero(which == k)
         twice = np.zeros(len(table), dtype=bool)
         twice[own[1:]] = np.diff(table.time[own]) == 0.0
         again = f"the time of another {what} of {name}: remove one of the two"
         table.refuse(twice, TIME, table.time_ns, again)
-        readings[name] = np.stack([table.time[own], value[own]])
-    return readings
+        yield name, own
 
 
 def write_readings(readings: Mapping[str, Array], path: Path, epoch_ns: int, column: str) -> None:

@@ -87,15 +87,18 @@ class VelocityEntry(_Mounted):
     sigma: _VelocitySigma = Field(default_factory=_VelocitySigma)
 
 
-class RangeEntry(_Mounted):
-    """Distance from a known point."""
-
-    quantity: Literal["range"]
+class _WithOffset(_Mounted):
     noise_m: AboveZero
-    point_m: Position
     offset_m: _Distance = 0.0
     offset_walk_m: NotNegative = 0.0  # gained in an hour
     sigma: _OffsetSigma = Field(default_factory=_OffsetSigma)
+
+
+class RangeEntry(_WithOffset):
+    """Distance from a known point."""
+
+    quantity: Literal["range"]
+    point_m: Position
 
 
 class PositionEntry(_Mounted):
@@ -115,14 +118,10 @@ class MarkEntry(_Mounted):
     sigma: _PositionSigma = Field(default_factory=_PositionSigma)
 
 
-class HeightEntry(_Mounted):
+class HeightEntry(_WithOffset):
     """Height of the sensor."""
 
     quantity: Literal["height"]
-    noise_m: AboveZero
-    offset_m: _Distance = 0.0
-    offset_walk_m: NotNegative = 0.0  # gained in an hour
-    sigma: _OffsetSigma = Field(default_factory=_OffsetSigma)
 
 
 class PressureEntry(_Mounted):

@@ -396,6 +396,9 @@ class ReferenceEntry(StrictModel):
     position_m: Position
 
 
+_OWN_NAMES = ("imu", "magnetometer", "sensor", "site", "truth")  # owners of parameters and roles
+
+
 class SiteEntry(StrictModel):
     """The whole file."""
 
@@ -432,11 +435,13 @@ class SiteEntry(StrictModel):
                 first = names.index(name)
                 remedy = f"give it another name than beacons[{first}]"
                 raise refusal_at(("beacons", i, "name"), name, remedy)
-        names = []
+        used = {name: f"beacons[{i}]" for i, name in enumerate(names)}
+        used |= {m.name: f"magnetometers[{i}]" for i, m in enumerate(self.platform.every) if m.name}
+        used |= {name: f"the platform's {name}" for name in _OWN_NAMES}
         for i, sensor in enumerate(self.aiding):
             name = sensor.name or sensor.quantity
-            if name in names:
-                remedy = f"give it another name than aiding[{names.index(name)}]"
+            if name in used:
+                remedy = f"give it another name than {used[name]}"
                 raise refusal_at(("aiding", i, "name"), name, remedy)
-            names.append(name)
+            used[name] = f"aiding[{i}]"
         return self

@@ -36,9 +36,10 @@ from magfusion.jobs.region_option import ANYWHERE, Where
 from magfusion.jobs.rotor_inputs import AwaitedAngles, check_streamed_rotors
 from magfusion.jobs.stream_clocks import ClockJump, StreamClocks
 from magfusion.jobs.stream_samples import StreamSamples
+from magfusion.model.aiding import sensor_named
 from magfusion.model.marks import Marks
 from magfusion.model.quaternion import of_matrices
-from magfusion.model.site import Site, aiding_sensor
+from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.results.verdict import finding_rows
 from magfusion.units import Array
@@ -314,7 +315,7 @@ def _process_companions(navigator: Navigator, record: Record) -> None:
     if record.drive is not None:
         navigator.add_drive(drive_samples(record.drive))
     for sensor, entry in (record.aiding or {}).items():
-        declared = aiding_sensor(navigator.site, sensor)
+        declared = sensor_named(navigator.site.aiding, sensor)
         navigator.add_aiding(sensor, aiding_samples(entry, declared.quantity))
     if record.marks is not None:
         navigator.add_marks(Marks(record.marks.start, record.marks.end, record.marks.slot))

@@ -6,6 +6,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from magfusion.errors import InputError
 from magfusion.model.short_repr import short_repr
 from magfusion.units import Array, BoolArray
 
@@ -115,6 +116,20 @@ class AidingSamples:
     value: Array
     marks: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        columns = {"velocity": 3, "position": 3, "mark": 0}.get(self.quantity, 1)
+        if self.value.shape != (len(self.time), columns):
+            raise InputError(
+                f"{self.quantity}: the values have the shape {self.value.shape}; give {columns} for"
+                f" each of {len(self.time)} times"
+            )
+        missing = np.isnan(self.value)
+        whole = ~missing.all(axis=1) if self.quantity == "velocity" else ~missing.any(axis=1)
+        if columns and not (np.all(whole) and np.all(missing | np.isfinite(self.value))):
+            raise InputError(f"{self.quantity}: a sample has no finite value; leave it out")
+        if self.quantity == "mark" and len(self.marks) != len(self.time):
+            raise InputError("mark: give the name of a mark for each time")
+
     def __len__(self) -> int:
         return len(self.time)
 
@@ -122,3 +137,28 @@ class AidingSamples:
         """Return some of the samples."""
         marks = tuple(np.array(self.marks, dtype=object)[kept]) if self.marks else ()
         return AidingSamples(self.quantity, self.time[kept], self.value[kept], marks)
+
+
+def sensor_named(
+    sensors: tuple[AidingSensor, ...], name: str, quantity: Quantity | None = None
+) -> AidingSensor:
+    """Return an aiding sensor of a site by its name, and its quantity if that is known.
+
+    Raises
+    ------
+    InputError
+        If the site has no such sensor.
+    """
+    known = {sensor.name: sensor for sensor in sensors}
+    if name not in known:
+        listed = ", ".join(known) or "none"
+        raise InputError(
+            f"{name} is no aiding sensor of the site (it has {listed}); add it to the site's"
+            " aiding, or drop its samples"
+        )
+    if quantity not in (None, known[name].quantity):
+        raise InputError(
+            f"{name} has samples of a {quantity}, but the site declares a {known[name].quantity};"
+            " correct one of them"
+        )
+    return known[name]

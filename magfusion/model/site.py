@@ -7,8 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from magfusion.errors import InputError
-from magfusion.model.aiding import AidingSensor, Quantity
+from magfusion.model.aiding import AidingSensor
 from magfusion.model.correlation import Correlation
 from magfusion.model.drive import DriveShares
 from magfusion.model.field_map import FieldMap
@@ -400,26 +399,3 @@ class Site:
         """Return the channels of one magnetometer."""
         count = len(self.channels) // len(self.platform.magnetometers)
         return slice(sensor * count, (sensor + 1) * count)
-
-
-def aiding_sensor(site: Site, name: str, quantity: Quantity | None = None) -> AidingSensor:
-    """Return an aiding sensor of a site, of a quantity if one is given.
-
-    Raises
-    ------
-    InputError
-        If the site has no such sensor.
-    """
-    known = {sensor.name: sensor for sensor in site.aiding}
-    if name not in known:
-        listed = ", ".join(known) or "none"
-        raise InputError(
-            f"{name} is no aiding sensor of the site (it has {listed}); add it to the site's"
-            " aiding, or drop its samples"
-        )
-    if quantity not in (None, known[name].quantity):
-        raise InputError(
-            f"{name} has samples of a {quantity}, but the site declares a {known[name].quantity};"
-            " correct one of them"
-        )
-    return known[name]

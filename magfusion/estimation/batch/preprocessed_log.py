@@ -170,7 +170,7 @@ def _aiding(
     if not log.aiding:
         return ()
     imu = replace(log.imu, time=log.imu.time + calibration.time_offset)
-    span = float(samples.time[0]), float(samples.time[-1])
+    span = float(samples.time[0]), float(imu.time[-1])
     return aiding_measurements(log.aiding, calibration.site, imu, span, loss)
 
 

@@ -9,9 +9,8 @@ import numpy as np
 
 from magfusion.estimation.graph.measurement import Loss, Measurement, Rows, calibration_rows
 from magfusion.estimation.graph.state import States
-from magfusion.model.aiding import AidingSensor
+from magfusion.model.aiding import AidingSensor, sensor_named
 from magfusion.model.parameters import AIDING_CLOCK, AidingParameter, Block, Calibration
-from magfusion.model.site import aiding_sensor
 from magfusion.units import Array
 
 
@@ -76,7 +75,7 @@ class AidingMeasurement(Measurement):
         self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
     ) -> Rows:
         """Return the rows at an estimate, one group of each sample."""
-        sensor = aiding_sensor(calibration.site, self.sensor)
+        sensor = sensor_named(calibration.site.aiding, self.sensor)
         bias = states.read_bias()
         rate_body = self.inertial_body[:, :3] - bias[:, 3:]
         force_body = self.inertial_body[:, 3:] - bias[:, :3]

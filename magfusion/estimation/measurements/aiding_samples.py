@@ -12,9 +12,9 @@ from magfusion.estimation.measurements.heading import Heading
 from magfusion.estimation.measurements.height import Height
 from magfusion.estimation.measurements.point_position import PointPosition
 from magfusion.estimation.measurements.point_range import PointRange
-from magfusion.model.aiding import AidingSamples, AidingSensor, Quantity
+from magfusion.model.aiding import AidingSamples, AidingSensor, Quantity, sensor_named
 from magfusion.model.samples import ImuSamples
-from magfusion.model.site import Site, aiding_sensor
+from magfusion.model.site import Site
 from magfusion.units import Array
 
 MEASUREMENTS: dict[Quantity, type[AidingMeasurement]] = {
@@ -90,7 +90,7 @@ def aiding_measurements(
     """
     out = []
     for name, every in aiding.items():
-        sensor = aiding_sensor(site, name, every.quantity)
+        sensor = sensor_named(site.aiding, name, every.quantity)
         samples = thinned(sensor, every, -np.inf)
         time = measured_time(sensor, samples)
         inside = (time >= span[0]) & (time <= span[1])

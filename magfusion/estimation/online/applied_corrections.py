@@ -55,6 +55,9 @@ class AppliedCorrections:
         """Return these with one more; parameters as of `corrected_finding`."""
         result = AppliedCorrections()
         finding = corrected_finding(correction, declared, reasons)
+        for earlier in self.findings:
+            if earlier.code == finding.code:  # the text of a further step has only the remainder
+                finding = replace(finding, text=earlier.text)
         known = (f for f in self.findings if f.code != finding.code)
         result.findings = (*known, finding)
         result.content = json.dumps(site_content(correction.site))

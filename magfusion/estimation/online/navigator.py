@@ -61,14 +61,14 @@ from magfusion.estimation.online_integrity.judgement import (
 from magfusion.estimation.online_integrity.summary import Summary
 from magfusion.files.blas_threads import warn_about_threads
 from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
-from magfusion.model.aiding import AidingSamples
+from magfusion.model.aiding import AidingSamples, sensor_named
 from magfusion.model.arguments import check_arguments
 from magfusion.model.drive import DriveSamples, DriveShares
 from magfusion.model.marks import Marks
 from magfusion.model.parameters import dimension, inertial_blocks, placed
 from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.samples import FieldSamples, SteadyFields
-from magfusion.model.site import Site, aiding_sensor
+from magfusion.model.site import Site
 from magfusion.model.temperature import Temperatures
 from magfusion.model.trust import Finding, Verdict
 from magfusion.model.without_imu import on_motion_prior, require_motion_prior
@@ -305,7 +305,7 @@ class Navigator:
         InputError
             If the site has no such sensor, they are of another kind, or the clock jumped.
         """
-        declared = aiding_sensor(self.site, sensor, samples.quantity)
+        declared = sensor_named(self.site.aiding, sensor, samples.quantity)
         self._history.add(samples.time, "add_aiding", sensor, samples)
         after = -np.inf if self._estimator is None else self._estimator.state.time
         used = thinned(declared, samples, self._aiding_until.get(sensor, -np.inf))

@@ -221,7 +221,7 @@ def _blocks(
         largest = float(np.max(sigma))
         if largest > 0.0 and chosen(parameter, largest):
             # A known axis within an unknown block; turns about two axes turn the third, too.
-            known = 1e-3 if getattr(parameter, "is_rotation", False) else 1e-6
+            known = 1e-3 if parameter.is_rotation else 1e-6
             sigma = np.maximum(sigma, known * largest)
             blocks.append(Block(parameter, owner, slice(0), sigma))
     return placed(blocks)

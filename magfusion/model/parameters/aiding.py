@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.model.aiding import QUANTITIES, AidingSensor, Quantity
+from magfusion.model.aiding import QUANTITIES, AidingSensor, Quantity, sensor_named
 from magfusion.model.parameters.parameter import (
     AXES,
     CENTIMETRE,
@@ -16,7 +16,7 @@ from magfusion.model.parameters.parameter import (
     ParameterUnit,
     SiteParameter,
 )
-from magfusion.model.site import Site, aiding_sensor
+from magfusion.model.site import Site
 from magfusion.units import HOUR, Array
 
 
@@ -32,7 +32,7 @@ class AidingParameter(SiteParameter):
 
     def part(self, site: Site, owner: str) -> AidingSensor:
         """Return the sensor."""
-        return aiding_sensor(site, owner)
+        return sensor_named(site.aiding, owner)
 
     def with_part(self, site: Site, part: AidingSensor) -> Site:
         """Return the site with the sensor of that name replaced."""

@@ -178,6 +178,7 @@ class Parameter:
     # variance of a beacon's field.
     field_error: ClassVar[float] = 0.0
     falls: ClassVar[int] = 0
+    is_rotation: ClassVar[bool] = False  # perturbed on its right
     by_turning: ClassVar[str] = ""  # its name in advice to determine it by rotation
     walk: ClassVar[str] = ""  # site attribute of its standard deviation gained in an hour (SI)
 
@@ -268,7 +269,6 @@ class SiteParameter(Parameter):
     declared = True
     attribute: ClassVar[str]
     sigma_attribute: ClassVar[str]
-    is_rotation: ClassVar[bool] = False  # perturbed on its right
 
     def part(self, site: Site, owner: str) -> Any:
         """Return the part of the site."""
