@@ -19,7 +19,7 @@ from algorithms_figures import (
 )
 from algorithms_tried import FIX, MAPPED, METHODS, ML, PUBLISHED, AlgorithmOutcome
 
-DISTURBED = ("S1", "F1", "F2", "P0", "P1", "P2", "N1", "N2")
+DISTURBED = ("S1", "F1", "P0", "N1")  # one of each kind
 A1, A2, A3 = PUBLISHED
 UNMAPPED = tuple(name for name in METHODS if name != MAPPED)
 Trajectories = Mapping[str, Sequence[AlgorithmOutcome]]

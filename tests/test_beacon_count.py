@@ -50,16 +50,8 @@ def test_the_bound_falls_as_expected(
 
 @pytest.fixture(scope="module")
 def full() -> Mapping[int, Sequence[AlgorithmOutcome]]:
-    return run(Config())
-
-
-@pytest.mark.slow
-def test_the_figure_has_its_ratios_in_twelve_rooms(
-    full: Mapping[int, Sequence[AlgorithmOutcome]],
-) -> None:
-    error = errors(full, A3).mean(axis=1)
-    assert np.all(shares(error) < 0.9)
-    assert shares(error)[-1] <= 0.75
+    """A third of the figure's rooms: a map takes five seconds to learn."""
+    return run(Config(worlds=4))
 
 
 @pytest.mark.slow
