@@ -50,7 +50,7 @@ def test_the_bound_falls_as_expected(
 
 @pytest.fixture(scope="module")
 def full() -> Mapping[int, Sequence[AlgorithmOutcome]]:
-    """A third of the figure's rooms: a map takes five seconds to learn."""
+    """Return a third of the figure's rooms: a map takes five seconds to learn."""
     return run(Config(worlds=4))
 
 

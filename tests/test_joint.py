@@ -1,6 +1,6 @@
 """Several logs of one site: their joint solution is that of one graph of all of them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -10,11 +10,12 @@ from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.batch.joint import (
-    LogReport,
+    LogInformation,
     Shared,
     SharedCalibration,
     apart_in_sigmas,
     known_by,
+    total_information,
 )
 from magfusion.estimation.batch.joint_log import (
     OfLog,
@@ -26,7 +27,7 @@ from magfusion.estimation.batch.joint_log import (
 )
 from magfusion.estimation.graph.factors import CALIBRATION_KEY
 from magfusion.estimation.graph.graph import Graph, GraphEstimate, initial_estimate
-from magfusion.estimation.integrity.logs_agree import agreement
+from magfusion.estimation.integrity.logs_agree import Deviation, LogAgreement, agreement, deviation
 from magfusion.estimation.posterior.marginalized_log import columns_of, marginalize
 from magfusion.jobs.joint_tasks import shared_of, together_settings
 from magfusion.model.parameters import Calibration, difference, dimension, placed
@@ -85,25 +86,40 @@ class Together:
     rounds: list[Round]
 
 
-def others(kept: list[OfLog], which: int) -> list[LogReport]:
-    return [log.report for i, log in enumerate(kept) if i != which]
+def in_total(shared: Shared, logs: Sequence[LogInformation], at: Array) -> SharedCalibration:
+    return known_by(shared, total_information(shared, logs, at), at)
+
+
+def compared(together: "Together", logs: Sequence[LogInformation]) -> LogAgreement:
+    shared, at = together.shared, together.known.step
+
+    def deviations(pool: list[int]) -> list[Deviation]:
+        total = total_information(shared, [logs[i] for i in pool], at)
+        assert total is not None
+        rest = ([logs[j] for j in pool if j != i] for i in pool)
+        return [deviation(shared, total, total_information(shared, o, at), at) for o in rest]
+
+    return agreement(shared, "abcdefgh"[: len(logs)], deviations)
 
 
 def refined(site: Site, true: Site, logs: list[Log], rounds: int = ROUNDS) -> Together:
     alone = [smooth(log, site, SETTINGS) for log in logs]
     shared = shared_of(site, SETTINGS)
     kept = [of_smoothed(result, shared) for result in alone]
-    known = known_by(shared, [log.report for log in kept], kept[0].report.step)
+    at = kept[0].information.step
     solved: list[Round] = []
     for _ in range(rounds):
+        at = in_total(shared, [log.information for log in kept], at).step
+        priors = [
+            in_total(shared, [one.information for one in kept if one is not own], at)
+            for own in kept
+        ]
         solved = [
-            solve_round(
-                log, site, SETTINGS, own, shared, known_by(shared, others(kept, i), known.step)
-            )
-            for i, (log, own) in enumerate(zip(logs, kept, strict=True))
+            solve_round(log, site, SETTINGS, own, shared, prior)
+            for log, own, prior in zip(logs, kept, priors, strict=True)
         ]
         kept = [after_round(own, done, shared) for own, done in zip(kept, solved, strict=True)]
-        known = known_by(shared, [log.report for log in kept], known.step)
+    known = in_total(shared, [log.information for log in kept], at)
     return Together(site, true, logs, alone, shared, known, kept, solved)
 
 
@@ -223,8 +239,8 @@ def test_the_joint_solution_is_that_of_one_graph_of_all_logs(together: Together)
 
 def test_a_log_alone_condensed_says_what_its_own_posterior_says(together: Together) -> None:
     result, shared = together.alone[0], together.shared
-    own = of_smoothed(result, shared).report
-    known = known_by(shared, [own], own.step)
+    own = of_smoothed(result, shared).information
+    known = known_by(shared, own, own.step)
     rows = ~columns_of(result.blocks, own=True)
     np.testing.assert_allclose(
         np.sqrt(np.diagonal(known.honest)),
@@ -240,9 +256,8 @@ def test_together_logs_know_more_and_each_knows_it(together: Together) -> None:
     sigma = np.sqrt(np.diagonal(together.known.honest))
     for own, done, result in zip(together.kept, together.rounds, together.alone, strict=True):
         rows = ~columns_of(result.blocks, own=True)
-        alone = known_by(
-            together.shared, [of_smoothed(result, together.shared).report], own.report.step
-        )
+        information = of_smoothed(result, together.shared).information
+        alone = known_by(together.shared, information, own.information.step)
         less = alone.cov - together.known.cov
         scale = np.sqrt(np.diagonal(alone.cov))
         assert np.min(np.linalg.eigvalsh(less / scale[:, None] / scale)) > -0.05  # each at its own
@@ -255,10 +270,9 @@ def test_together_logs_know_more_and_each_knows_it(together: Together) -> None:
 
 
 def test_logs_of_one_site_agree(together: Together) -> None:
-    alone = [of_smoothed(result, together.shared).report for result in together.alone]
-    for findings in (alone, [log.report for log in together.kept]):
-        known = known_by(together.shared, findings, together.known.step)
-        result = agreement(together.shared, findings, ["a", "b"], known)
+    alone = [of_smoothed(result, together.shared).information for result in together.alone]
+    for logs in (alone, [log.information for log in together.kept]):
+        result = compared(together, logs)
         assert result.of_log == ((), ())
         assert result.excess == 1.0
         assert np.max(result.sigmas) < 4.0
@@ -266,13 +280,12 @@ def test_logs_of_one_site_agree(together: Together) -> None:
 
 def test_a_log_that_says_otherwise_is_named_with_its_beacon(together: Together) -> None:
     """What two logs say thrice, and once with beacon C elsewhere."""
-    findings = [log.report for log in together.kept]
+    logs = [log.information for log in together.kept]
     (place,) = (b for b in together.shared.blocks if b.name == "C.position")
-    moved = findings[0].step.copy()
+    moved = logs[0].step.copy()
     moved[place.columns.start] += 0.05  # m
-    liar = LogReport(moved, findings[0].part)
-    known = known_by(together.shared, [*findings, liar], together.known.step)
-    result = agreement(together.shared, [*findings, liar], ["a", "b", "c"], known)
+    liar = LogInformation(moved, logs[0].part)
+    result = compared(together, [*logs, liar])
     assert result.of_log[:2] == ((), ())
     (finding,) = result.of_log[2]
     assert finding.code == "logs_disagree"

@@ -1,15 +1,20 @@
-"""File of a log that was smoothed alone, among several; a rerun resumes from it."""
+"""Files of the logs among several: one alone or after a round, and what some know together.
+
+A rerun resumes from those that were smoothed alone.  The others are how the workers of a round
+exchange data, so that the driver passes names of files.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from magfusion.errors import InputError
 from magfusion.estimation.batch.chain import Start
-from magfusion.estimation.batch.joint import LogReport
+from magfusion.estimation.batch.joint import LogInformation
 from magfusion.estimation.batch.joint_log import OfLog
 from magfusion.estimation.batch.preprocessed_log import WarmStart
 from magfusion.estimation.posterior.marginalized_log import MarginalizedLog
@@ -19,6 +24,8 @@ from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import AnyArray, Array
+
+File = TypeVar("File")
 
 _STATES = (
     "time",
@@ -32,25 +39,52 @@ _RIVAL = "rival_"
 _SCALARS = ("reference_time", "imu_begin", "time_offset", "clock_rate")
 
 
-class Alone(NamedTuple):
-    """A log that was smoothed alone.
+class Kept(NamedTuple):
+    """A log alone, or after a round.
 
     Parameters
     ----------
-    log : OfLog, optional
-        None where it failed.
+    log : OfLog
     facts : dict
-        Of the table of logs.
+        Of the table of logs, when it was smoothed alone.
     """
 
-    log: OfLog | None
+    log: OfLog
     facts: dict[str, Any]
 
 
-def save_alone(path: Path, key: str, alone: Alone) -> None:
-    """Write a log that was smoothed alone."""
-    assert alone.log is not None
-    log, begun = alone.log, alone.log.begun
+def save_information(path: Path, information: LogInformation) -> None:
+    """Write what one or several logs know of the shared calibration."""
+    arrays = {"step": information.step, **vars(information.part)}
+    save_kept(path, "", StoredArrays(arrays, {"logs": information.logs}))
+
+
+def load_information(path: Path) -> LogInformation:
+    """Return what one or several logs know of the shared calibration."""
+    arrays, facts = written_by_worker(path, load_kept(path, ""))
+    part = MarginalizedLog(**{k: v for k, v in arrays.items() if k != "step"})
+    return LogInformation(arrays["step"], part, facts["logs"])
+
+
+def written_by_worker(path: Path, stored: File | None) -> File:
+    """Return what was stored in a file that a worker has written.
+
+    Raises
+    ------
+    InputError
+        Where there is nothing.
+    """
+    if stored is None:
+        raise InputError(
+            f"{path}: cannot be read, though another worker wrote it; choose an --output on a file"
+            " system that all workers share"
+        )
+    return stored
+
+
+def save_log(path: Path, key: str, kept: Kept) -> None:
+    """Write a log alone or after a round."""
+    log, begun = kept.log, kept.log.begun
     arrays: dict[str, AnyArray] = {**_of_states(begun.states, "")}
     if begun.rival is not None:
         arrays |= _of_states(begun.rival, _RIVAL)
@@ -61,11 +95,11 @@ def save_alone(path: Path, key: str, alone: Alone) -> None:
         "drift": begun.declared.drift,
         "chosen": begun.start.chosen,
         "determined": begun.start.determined,
-        "said_step": log.report.step,
+        "said_step": log.information.step,
     }
-    arrays |= {f"said_{name}": part for name, part in vars(log.report.part).items()}
+    arrays |= {f"said_{name}": part for name, part in vars(log.information.part).items()}
     facts = {
-        "table": alone.facts,
+        "table": kept.facts,
         "noise": [[t.owner, t.key, t.declared, t.estimated] for t in log.noise],
         "rival_chi_square": begun.rival_chi_square,
         **{name: getattr(begun.declared, name) for name in _SCALARS},
@@ -73,8 +107,8 @@ def save_alone(path: Path, key: str, alone: Alone) -> None:
     save_kept(path, key, StoredArrays(arrays, facts))
 
 
-def load_alone(path: Path, key: str, site: Site) -> Alone | None:
-    """Return the log smoothed alone under a key; None where there is none."""
+def load_log(path: Path, key: str, site: Site) -> Kept | None:
+    """Return the log written under a key; None where there is none."""
     kept = load_kept(path, key)
     if kept is None:
         return None
@@ -102,8 +136,8 @@ def load_alone(path: Path, key: str, site: Site) -> Alone | None:
     )
     noise = tuple(Tuned(*one) for one in facts["noise"])
     standing = np.asarray(arrays["standing"], dtype=bool)
-    findings = LogReport(arrays["said_step"], part)
-    return Alone(OfLog(begun, arrays["steps"], noise, standing, findings), facts["table"])
+    information = LogInformation(arrays["said_step"], part)
+    return Kept(OfLog(begun, arrays["steps"], noise, standing, information), facts["table"])
 
 
 def _of_states(states: Trajectory, prefix: str) -> dict[str, Array]:

@@ -99,9 +99,8 @@ def run_joint(
 def _calibration(joint: Joint) -> Calibration:
     """Return the joint calibration, with the noise estimated from the logs (geometric mean)."""
     result: dict[tuple[str, str], list[Tuned]] = {}
-    for log in joint.logs:
-        for tuned in log.noise:
-            result.setdefault((tuned.owner, tuned.key), []).append(tuned)
+    for tuned in joint.noise:
+        result.setdefault((tuned.owner, tuned.key), []).append(tuned)
     noise = [
         replace(every[0], estimated=float(np.exp(np.mean(np.log([t.estimated for t in every])))))
         for every in result.values()

@@ -1,14 +1,16 @@
 """Several logs of one site: each alone, then rounds to a common calibration, then a final pass.
 
-The results of a log alone are stored in the output under a key; the rounds resume from them.
+The results of a log alone are stored in the output under a key; the rounds resume from them.  The
+driver holds sums over the logs, and passes names of files.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,25 +20,28 @@ from magfusion.estimation.batch.joint import (
     Shared,
     SharedCalibration,
     apart_in_sigmas,
-    between,
     known_by,
-    uncoupled,
 )
-from magfusion.estimation.batch.joint_log import OfLog
-from magfusion.estimation.integrity.logs_agree import LogAgreement, agreement
+from magfusion.estimation.integrity.logs_agree import Deviation, LogAgreement, agreement
+from magfusion.estimation.posterior.noise_tuning import Tuned
 from magfusion.files.atomic import real
 from magfusion.files.checkpoint import run_key
 from magfusion.files.kept import digest_of_files
 from magfusion.jobs.inputs import Job, read_job, read_site
-from magfusion.jobs.joint_kept import Alone
 from magfusion.jobs.joint_tasks import (
+    Alone,
     LastTask,
     LogTask,
     RoundTask,
+    SumTask,
+    added,
     alone,
+    from_others,
     last,
     one_round,
     shared_of,
+    shared_site,
+    sum_of,
 )
 from magfusion.jobs.written import KEPT
 from magfusion.model.progress import Report
@@ -44,7 +49,7 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk, Trust, Verdict
 from magfusion.results.provenance import versions
 from magfusion.simulation.monte_carlo import WorkerPool, worker_pool
-from magfusion.units import Rate
+from magfusion.units import Array, Rate
 
 CONVERGED_STEP = 1e-6  # sigmas; a step of the shared calibration that ends the rounds
 MOST_ROUNDS = 20
@@ -64,8 +69,8 @@ class Joint:
         Of the shared calibration.
     excess : float
         Factor on its variances, as the logs contradict each other.
-    logs : tuple of OfLog
-        The logs in the solution.
+    noise : tuple of Tuned
+        Estimated from each log alone.
     table : list of dict
         A row for each given log.
     """
@@ -73,7 +78,7 @@ class Joint:
     shared: Shared
     known: SharedCalibration
     excess: float
-    logs: tuple[OfLog, ...]
+    noise: tuple[Tuned, ...]
     table: list[dict[str, Any]]
     trust: Trust
     rounds: int
@@ -167,30 +172,29 @@ def refine(
     EstimationError
         Where no log remains.
     """
-    site = _declared(tasks)
-    shared = shared_of(site, tasks[0].smoother)
+    site, shared = shared_site(read_site(tasks[0].job), tasks[0].smoother)
     with worker_pool(len(tasks), cluster=cluster, workers=workers) as hands:
         first = hands.run(alone, tasks, report=_staged(report, "smoothing each log alone"))
-        some = [
-            (task, one.log)
-            for task, one in zip(tasks, first, strict=True)
-            if one.log is not None and one.facts["verdict"] != Verdict.FAILED
-        ]
-        if not some:
+        used, steps = [], []
+        for task, one in zip(tasks, first, strict=True):
+            if one.step is not None and one.facts["verdict"] != Verdict.FAILED:
+                used.append(task)
+                steps.append(one.step)
+        if not used:
             raise EstimationError(
                 f"none of the {len(tasks)} logs can be used: {tasks[0].name}:"
                 f" {first[0].facts['reason']}"
             )
-        used, logs = [task for task, _ in some], [log for _, log in some]
-        before = _agreement(used, logs, shared)
-        logs, known, moved, rounds = _rounds(hands, used, logs, shared, report)
+        driver = Driver(hands, used, shared, report)
+        sums = driver.sums(0, np.mean(steps, axis=0))
+        before = driver.agreement(sums)
+        sums, moved = driver.repeated(sums)
+        known = sums.known
         # Given the prior of the others, a robust loss soon rejects contradicting measurements.
-        agreed = before if any(before.of_log) else _agreement(used, logs, shared)
+        agreed = before if any(before.of_log) else driver.agreement(sums)
         given = [
             LastTask(one, agreed.excess, findings, writes, rate, risk)
-            for one, findings in zip(
-                _round_tasks(used, logs, shared, known), agreed.of_log, strict=True
-            )
+            for one, findings in zip(driver.tasks_given(sums), agreed.of_log, strict=True)
         ]
         rows = hands.run(last, given, report=_staged(report, "each log in the joint solution"))
     of_used = {t.name: row for t, row in zip(used, rows, strict=True)}
@@ -200,61 +204,117 @@ def refine(
         for task, one in zip(tasks, first, strict=True)
     ]
     trust = trust_of_all(table, agreed, _undetected(site, first), moved)
-    return Joint(shared, known, agreed.excess, tuple(logs), table, trust, rounds)
-
-
-def _declared(tasks: list[LogTask]) -> Site:
-    """Return the site, without correlations between shared and own parameters of each log."""
-    site = read_site(tasks[0].job)
-    return uncoupled(site, shared_of(site, tasks[0].smoother).blocks)
+    noise = tuple(tuned for one in first for tuned in one.noise if one.step is not None)
+    return Joint(shared, known, agreed.excess, noise, table, trust, sums.rounds)
 
 
 def _staged(report: Report, stage: str) -> Report:
     return lambda _stage, done, total: report(stage, done, total)
 
 
-def _round_tasks(
-    tasks: list[LogTask], logs: list[OfLog], shared: Shared, known: SharedCalibration
-) -> list[RoundTask]:
-    findings = [log.report for log in logs]
-    return [
-        RoundTask(task, log, shared, known_by(shared, findings[:i] + findings[i + 1 :], known.step))
-        for i, (task, log) in enumerate(zip(tasks, logs, strict=True))
-    ]
+class Sums(NamedTuple):
+    """What the logs know after some rounds, in groups.
 
-
-def _agreement(tasks: list[LogTask], logs: list[OfLog], shared: Shared) -> LogAgreement:
-    findings = [log.report for log in logs]
-    known = known_by(shared, findings, np.mean([one.step for one in findings], axis=0))
-    return agreement(shared, findings, [task.name for task in tasks], known)
-
-
-def _rounds(
-    hands: WorkerPool, tasks: list[LogTask], logs: list[OfLog], shared: Shared, report: Report
-) -> tuple[list[OfLog], SharedCalibration, float, int]:
-    """Repeat until no log moves the shared calibration.
-
-    Where a round moves it farther than the one before, as with contradicting logs, further updates
-    are damped.
+    Parameters
+    ----------
+    rounds : int
+    known : SharedCalibration
+        By all of them.
+    groups : list of list of Path
+        Of each log.
+    sums : list of Path
+        Of each group.
     """
-    at = np.mean([log.report.step for log in logs], axis=0)
-    known = known_by(shared, [log.report for log in logs], at)
-    moved, share = np.inf, 1.0
-    for done in range(MOST_ROUNDS):
-        report("refining together", done, MOST_ROUNDS)
-        solved = hands.run(one_round, _round_tasks(tasks, logs, shared, known))
-        logs = [
-            replace(new, report=between(shared, old.report, new.report, share))
-            for old, new in zip(logs, solved, strict=True)
+
+    rounds: int
+    known: SharedCalibration
+    groups: list[list[Path]]
+    sums: list[Path]
+
+    def others(self, own: Path) -> tuple[Path, ...]:
+        """Return the files of all other logs: of each in its group, and the other groups' sums."""
+        which = next(i for i, group in enumerate(self.groups) if own in group)
+        rest = [path for path in self.groups[which] if path != own]
+        return *rest, *self.sums[:which], *self.sums[which + 1 :]
+
+
+@dataclass(frozen=True, eq=False)
+class Driver:
+    """Rounds over the files of the logs, without a log in memory.
+
+    Parameters
+    ----------
+    tasks : list of LogTask
+    """
+
+    hands: WorkerPool
+    tasks: list[LogTask]
+    shared: Shared
+    report: Report
+
+    def sums(self, rounds: int, at: Array, pool: Sequence[int] | None = None) -> Sums:
+        """Return what the logs of a pool, or all, know; the workers add each group."""
+        pool = range(len(self.tasks)) if pool is None else pool
+        paths = [self.tasks[i].information(rounds) for i in pool]
+        size = math.isqrt(len(paths) - 1) + 1  # as many groups as logs in each
+        groups = [paths[i : i + size] for i in range(0, len(paths), size)]
+        files = [self.tasks[0].kept.parent / "sums" / f"{i}.npz" for i in range(len(groups))]
+        one = self.tasks[0]
+        given = [SumTask(one, tuple(g), at, f) for g, f in zip(groups, files, strict=True)]
+        sums = self.hands.run(sum_of, given)
+        return Sums(rounds, known_by(self.shared, added(self.shared, sums, at), at), groups, sums)
+
+    def tasks_given(self, sums: Sums, share: float = 1.0) -> list[RoundTask]:
+        """Return the tasks of all logs."""
+        at, rounds = sums.known.step, sums.rounds
+        return [
+            RoundTask(task, rounds, sums.others(task.information(rounds)), at, share)
+            for task in self.tasks
         ]
-        after = known_by(shared, [log.report for log in logs], known.step)
-        before, moved = moved, apart_in_sigmas(after.step, known.step, after.cov) / share
-        known = after
-        if moved < CONVERGED_STEP:
-            return logs, known, moved, done + 1
-        if moved > before and moved > LARGE and done:
-            share = max(0.5 * share, SMALLEST_SHARE)
-    return logs, known, moved, MOST_ROUNDS
+
+    def agreement(self, sums: Sums) -> LogAgreement:
+        """Return the consistency of the logs after some rounds."""
+
+        def deviations(pool: list[int]) -> list[Deviation]:
+            at, rounds = sums.known.step, sums.rounds
+            of_pool = self.sums(rounds, at, pool)
+            of_log = [(self.tasks[i], self.tasks[i].information(rounds)) for i in pool]
+            given = [RoundTask(task, rounds, of_pool.others(own), at) for task, own in of_log]
+            return self.hands.run(from_others, given)
+
+        return agreement(self.shared, [task.name for task in self.tasks], deviations)
+
+    def repeated(self, sums: Sums) -> tuple[Sums, float]:
+        """Repeat until no log moves the shared calibration.
+
+        Where a round moves it farther than the one before, as with contradicting logs, further
+        updates are damped.
+
+        Returns
+        -------
+        sums : Sums
+        moved : float
+            Change in the last round, in sigmas.
+        """
+        moved, share = np.inf, 1.0
+        while moved >= CONVERGED_STEP and sums.rounds < MOST_ROUNDS:
+            self.report("refining together", sums.rounds, MOST_ROUNDS)
+            self.hands.run(one_round, self.tasks_given(sums, share))
+            known = sums.known
+            self._discard(sums.rounds)
+            sums = self.sums(sums.rounds + 1, known.step)
+            after = sums.known
+            before, moved = moved, apart_in_sigmas(after.step, known.step, after.cov) / share
+            if moved > before and moved > LARGE and sums.rounds > 1:
+                share = max(0.5 * share, SMALLEST_SHARE)
+        return sums, moved
+
+    def _discard(self, rounds: int) -> None:
+        """Remove the files of a round that is superseded."""
+        for task in self.tasks:
+            if rounds:
+                task.state(rounds).unlink(missing_ok=True)
+            task.information(rounds).unlink(missing_ok=True)
 
 
 def _undetected(site: Site, first: Sequence[Alone]) -> list[str]:

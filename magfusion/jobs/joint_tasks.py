@@ -1,38 +1,61 @@
-"""Tasks of one log among several, in any process: alone, a round, and the final pass."""
+"""Tasks of one log among several, in any process: alone, a round, and the final pass.
+
+The workers share the output directory: states and information stay in its files, and the driver
+sends and receives names and figures.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.batch.joint import Shared, SharedCalibration, uncoupled
+from magfusion.estimation.batch.joint import (
+    LogInformation,
+    Shared,
+    SharedCalibration,
+    between,
+    known_by,
+    total_information,
+    uncoupled,
+)
 from magfusion.estimation.batch.joint_log import (
-    OfLog,
     after_round,
     joint_posterior,
     of_smoothed,
     solve_round,
 )
 from magfusion.estimation.integrity.judge import judge_result
+from magfusion.estimation.integrity.logs_agree import Deviation, deviation
 from magfusion.estimation.posterior.marginalized_log import shared_blocks
+from magfusion.estimation.posterior.noise_tuning import Tuned
 from magfusion.jobs.failure import reason_of
-from magfusion.jobs.inputs import Job, named, read_job
-from magfusion.jobs.joint_kept import Alone, load_alone, save_alone
+from magfusion.jobs.inputs import Job, named, read_job, read_site
+from magfusion.jobs.joint_kept import (
+    Kept,
+    load_information,
+    load_log,
+    save_information,
+    save_log,
+    written_by_worker,
+)
 from magfusion.jobs.result_directory import claim
 from magfusion.model.parameters import GROUPS, initial_calibration
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.errors import trajectory_errors
-from magfusion.units import Rate
+from magfusion.units import Array, Rate
 
 if TYPE_CHECKING:
     from magfusion.model.trust import Risk
+
+ROUNDS = "rounds"  # directory beside the kept solutions
 
 
 @dataclass(frozen=True)
@@ -57,23 +80,83 @@ class LogTask:
     kept: Path
     key: str
 
+    def state(self, rounds: int) -> Path:
+        """Return the file of the log after some rounds."""
+        return self.kept.parent / ROUNDS / f"{self.name}.{rounds}.npz" if rounds else self.kept
 
-@dataclass(frozen=True, eq=False)
-class RoundTask:
-    """One of several logs, with the prior from the others.
+    def information(self, rounds: int) -> Path:
+        """Return the file of what the log knows of the shared calibration after some rounds."""
+        return self.kept.parent / ROUNDS / f"{self.name}.{rounds}.information.npz"
+
+
+class Alone(NamedTuple):
+    """A log smoothed alone.
 
     Parameters
     ----------
-    log : OfLog
-    shared : Shared
-    prior : SharedCalibration
-        From all others and the survey.
+    step : ndarray, shape (s,), optional
+        To its shared calibration from the declared; None where it failed.
+    noise : tuple of Tuned
+    facts : dict
+        Of the table of logs.
+    """
+
+    step: Array | None
+    noise: tuple[Tuned, ...]
+    facts: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class RoundTask:
+    """One of several logs, and where to find the prior from the others.
+
+    Parameters
+    ----------
+    rounds : int
+        Number of rounds before.
+    others : tuple of Path
+        Information of all other logs, each or in sums.
+    at : ndarray, shape (s,)
+        From the declared calibration to the linearisation point.
+    share : float
+        Of the change of the information.
     """
 
     task: LogTask
-    log: OfLog
-    shared: Shared
-    prior: SharedCalibration
+    rounds: int
+    others: tuple[Path, ...]
+    at: Array
+    share: float = 1.0
+
+    def read(self) -> tuple[Log, Site, Shared, Kept]:
+        """Return the log, its site, the shared parameters, and the log's data so far."""
+        log, site, shared = read_shared(self.task)
+        path = self.task.state(self.rounds)
+        return log, site, shared, written_by_worker(path, load_log(path, self.task.key, site))
+
+    def prior(self, shared: Shared) -> SharedCalibration:
+        """Return the estimate from all other logs and the survey."""
+        return known_by(shared, added(shared, self.others, self.at), self.at)
+
+
+@dataclass(frozen=True, eq=False)
+class SumTask:
+    """Information of some logs, to be added.
+
+    Parameters
+    ----------
+    task : LogTask
+        Any of the logs.
+    parts : tuple of Path
+    at : ndarray, shape (s,)
+        From the declared calibration to the linearisation point.
+    result : Path
+    """
+
+    task: LogTask
+    parts: tuple[Path, ...]
+    at: Array
+    result: Path
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,11 +181,16 @@ class LastTask:
     risk: Risk | None
 
 
+def shared_site(site: Site, smoother: SmootherSettings) -> tuple[Site, Shared]:
+    """Return a site without correlation of shared and own parameters, and the former."""
+    site = uncoupled(site, shared_of(site, smoother).blocks)
+    return site, shared_of(site, smoother)
+
+
 def read_shared(task: LogTask) -> tuple[Log, Site, Shared]:
     """Return a log, its site, and the parameters it shares with the others."""
     log, site = read_job(task.job)
-    site = uncoupled(site, shared_blocks(task.smoother.blocks(site)[0]))
-    return replace(log, name=task.name), site, shared_of(site, task.smoother)
+    return replace(log, name=task.name), *shared_site(site, task.smoother)
 
 
 def together_settings(smoother: SmootherSettings) -> SmootherSettings:
@@ -124,38 +212,68 @@ def shared_of(site: Site, smoother: SmootherSettings) -> Shared:
 def alone(task: LogTask, _rng: np.random.Generator) -> Alone:
     """Smooth a log alone and store it, or load the stored result."""
     log, site, shared = read_shared(task)
-    known = load_alone(task.kept, task.key, site)
-    if known is not None:
-        return known
-    try:
-        with named(task.job.log_path):
-            result = smooth(log, site, task.smoother)
-    except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
-        failed = {"verdict": str(Verdict.FAILED), "code": "no_solution", "reason": reason_of(error)}
-        return Alone(None, failed)
-    detected = np.any(result.fields.valid, axis=0).tolist()
-    names = {name for (name, _), yes in zip(result.fields.channels, detected, strict=True) if yes}
-    kept = of_smoothed(result, shared)
-    honest, trust = judge_result(result, log)
-    done = Alone(kept, table_facts(honest, trust, log) | {"heard": sorted(names)})
-    save_alone(task.kept, task.key, done)
-    return done
+    kept = load_log(task.kept, task.key, site)
+    if kept is None:
+        try:
+            with named(task.job.log_path):
+                result = smooth(log, site, task.smoother)
+        except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
+            reason = {"code": "no_solution", "reason": reason_of(error)}
+            return Alone(None, (), {"verdict": str(Verdict.FAILED), **reason})
+        detected = np.any(result.fields.valid, axis=0).tolist()
+        channels = zip(result.fields.channels, detected, strict=True)
+        names = {name for (name, _), yes in channels if yes}
+        honest, trust = judge_result(result, log)
+        facts = table_facts(honest, trust, log) | {"heard": sorted(names)}
+        kept = Kept(of_smoothed(result, shared), facts)
+        save_log(task.kept, task.key, kept)
+    save_information(task.information(0), kept.log.information)
+    return Alone(kept.log.information.step, kept.log.noise, kept.facts)
 
 
-def one_round(task: RoundTask, _rng: np.random.Generator) -> OfLog:
-    """Solve a log with the prior from the others."""
-    log, site, _ = read_shared(task.task)
-    done = solve_round(log, site, task.task.smoother, task.log, task.shared, task.prior)
-    return after_round(task.log, done, task.shared)
+def one_round(given: RoundTask, _rng: np.random.Generator) -> None:
+    """Solve a log with the prior from the others, and store it."""
+    log, site, shared, kept = given.read()
+    task, before = given.task, kept.log.information
+    done = solve_round(log, site, task.smoother, kept.log, shared, given.prior(shared))
+    after = after_round(kept.log, done, shared)
+    known = between(shared, before, after.information, given.share)
+    save_log(
+        task.state(given.rounds + 1), task.key, Kept(replace(after, information=known), kept.facts)
+    )
+    save_information(task.information(given.rounds + 1), known)
+
+
+def added(shared: Shared, paths: Iterable[Path], at: Array) -> LogInformation | None:
+    """Return the sum of the information in some files."""
+    return total_information(shared, map(load_information, paths), at)
+
+
+def sum_of(given: SumTask, _rng: np.random.Generator) -> Path:
+    """Add what some logs know, and return the path of the sum."""
+    _, shared = shared_site(read_site(given.task.job), given.task.smoother)
+    total = added(shared, given.parts, given.at)
+    assert total is not None
+    save_information(given.result, total)
+    return given.result
+
+
+def from_others(given: RoundTask, _rng: np.random.Generator) -> Deviation:
+    """Return the deviation of a log from the others."""
+    _, shared = shared_site(read_site(given.task.job), given.task.smoother)
+    own, others = given.task.information(given.rounds), given.others
+    total = added(shared, (own, *others), given.at)
+    assert total is not None
+    return deviation(shared, total, added(shared, others, given.at), given.at)
 
 
 def last(given: LastTask, _rng: np.random.Generator) -> dict[str, Any]:
     """Assess a log in the joint solution, write its results, and return its row of the table."""
     own = given.round
-    log, site, _ = read_shared(own.task)
+    log, site, shared, kept = own.read()
     blocks, _ = own.task.smoother.blocks(site)
-    done = solve_round(log, site, own.task.smoother, own.log, own.shared, own.prior)
-    result = joint_posterior(own.log, done, blocks)
+    done = solve_round(log, site, own.task.smoother, kept.log, shared, own.prior(shared))
+    result = joint_posterior(kept.log, done, blocks)
     if given.writes:
         result, trust = _written(result, log, site, given)
     else:

@@ -1,15 +1,18 @@
 """The calibration that several logs share: estimated from all of them, and from all but one.
 
 Each log is solved with the survey and the other logs as its prior.  This gives the joint solution
-once the other logs are linearised at that solution; only one log is in memory at a time.
+once the other logs are linearised at that solution; only one log is in memory at a time.  What the
+others know is added, never the own part subtracted from the sum over all: that would lose the
+directions that logs determine well.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 
-from magfusion.estimation.posterior.marginalized_log import MarginalizedLog, summed, taken_at
+from magfusion.estimation.posterior.marginalized_log import MarginalizedLog, taken_at
 from magfusion.model.correlation import Correlation, joined
 from magfusion.model.parameters import Block, Calibration, difference, prior_sigma, retract
 from magfusion.model.prior import parameters_of, prior_sqrt_information
@@ -69,26 +72,62 @@ class SharedCalibration:
 
 
 @dataclass(frozen=True, eq=False)
-class LogReport:
-    """Information of one log, and its linearisation point of the shared calibration.
+class LogInformation:
+    """Information of one log, or of several, on the shared calibration.
 
     Parameters
     ----------
     step : ndarray, shape (s,)
         From the declared calibration to the linearisation point.
+    part : MarginalizedLog
+    logs : int
+        Number of logs in the sum.
     """
 
     step: Array
     part: MarginalizedLog
+    logs: int = 1
+
+    def taken_at(self, shared: Shared, step: Array) -> "LogInformation":
+        """Return the same information at another linearisation point."""
+        before, after = shared.moved(self.step), shared.moved(step)
+        return replace(self, step=step, part=taken_at(self.part, before, after, shared.blocks))
 
 
-def known_by(shared: Shared, logs: Sequence[LogReport], at: Array) -> SharedCalibration:
+def total_information(
+    shared: Shared, logs: Iterable[LogInformation], at: Array
+) -> LogInformation | None:
+    """Return the sum over logs, or over sums of logs, at one linearisation point.
+
+    Parameters
+    ----------
+    logs : iterable of LogInformation
+        Only two are in memory at a time.
+    at : ndarray, shape (s,)
+        From the declared calibration to the linearisation point.
+
+    Returns
+    -------
+    LogInformation, optional
+        None of no log.
+    """
+
+    def both(a: LogInformation | None, b: LogInformation) -> LogInformation:
+        if a is None:
+            return b
+        part = {k: v + getattr(b.part, k) for k, v in vars(a.part).items()}
+        return LogInformation(at, MarginalizedLog(**part), a.logs + b.logs)
+
+    return reduce(both, (one.taken_at(shared, at) for one in logs), None)
+
+
+def known_by(shared: Shared, logs: LogInformation | None, at: Array) -> SharedCalibration:
     """Return the shared calibration from survey and logs after a Gauss-Newton step.
 
     Parameters
     ----------
-    logs : sequence of `LogReport`
-        Any number.
+    logs : LogInformation, optional
+        None for the survey alone.
     at : ndarray, shape (s,)
         From the declared calibration to the linearisation point of the step.
     """
@@ -97,14 +136,13 @@ def known_by(shared: Shared, logs: Sequence[LogReport], at: Array) -> SharedCali
     information = prior.copy()
     gradient = -prior @ difference(shared.declared, here, shared.blocks)
     by_common, separate = np.zeros((len(at), 0)), np.zeros_like(prior)
-    if logs:
-        parts = [taken_at(s.part, shared.moved(s.step), here, shared.blocks) for s in logs]
-        total = summed(parts)
+    if logs is not None:
+        total = logs.taken_at(shared, at).part
         information += total.information
         gradient += total.gradient
         by_common = total.by_common
         # Logs of one place may have met the same iron: as if all had met the same.
-        separate = len(logs) * total.by_place + total.by_log
+        separate = logs.logs * total.by_place + total.by_log
     cov = np.linalg.inv(unit[:, None] * information * unit)
     cov = unit[:, None] * (0.5 * (cov + cov.T)) * unit
     after = retract(here, shared.blocks, cov @ gradient)
@@ -112,14 +150,15 @@ def known_by(shared: Shared, logs: Sequence[LogReport], at: Array) -> SharedCali
     return SharedCalibration(step, cov, cov @ by_common, cov @ separate @ cov)
 
 
-def between(shared: Shared, old: LogReport, new: LogReport, share: float) -> LogReport:
+def between(
+    shared: Shared, old: LogInformation, new: LogInformation, share: float
+) -> LogInformation:
     """Return the information of a log after a share of its change, linearised at the new point."""
     if share == 1.0:
         return new
-    here, there = shared.moved(new.step), shared.moved(old.step)
-    before = vars(taken_at(old.part, there, here, shared.blocks))
+    before = vars(old.taken_at(shared, new.step).part)
     part = {k: share * v + (1.0 - share) * before[k] for k, v in vars(new.part).items()}
-    return LogReport(new.step, MarginalizedLog(**part))
+    return LogInformation(new.step, MarginalizedLog(**part))
 
 
 def apart_in_sigmas(one: Array, other: Array, cov: Array) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed, posterior
 from magfusion.estimation.batch.joint import (
-    LogReport,
+    LogInformation,
     Shared,
     SharedCalibration,
     as_prior,
@@ -45,15 +45,15 @@ class OfLog:
         Estimated when it was smoothed alone.
     standing : bool ndarray, shape (states,)
         Where the platform is at rest.
-    report : `LogReport`
-        Its information on the shared calibration.
+    information : LogInformation
+        On the shared calibration.
     """
 
     begun: WarmStart
     steps: Array
     noise: tuple[Tuned, ...]
     standing: BoolArray
-    report: LogReport
+    information: LogInformation
 
 
 class Round(NamedTuple):
@@ -77,9 +77,11 @@ def of_smoothed(result: Smoothed, shared: Shared) -> OfLog:
         result.rival,
     )
     part = marginalize(result.graph, result.estimate, result.considered, result.field_errors)
-    findings = LogReport(difference(shared.declared, result.calibration, shared.blocks), part)
+    information = LogInformation(
+        difference(shared.declared, result.calibration, shared.blocks), part
+    )
     steps = _steps(result.declared, result.estimate, result.blocks)
-    return OfLog(begun, steps, result.noise, result.standing, findings)
+    return OfLog(begun, steps, result.noise, result.standing, information)
 
 
 def solve_round(
@@ -147,10 +149,15 @@ def after_round(kept: OfLog, done: Round, shared: Shared) -> OfLog:
     here = Trajectory(**{k: v[measured] for k, v in vars(states).items() if v is not None})
     errors = field_errors(estimate.calibration.site, here.time, here)
     part = marginalize(done.graph, estimate, log.considered, errors)
-    findings = LogReport(difference(shared.declared, estimate.calibration, shared.blocks), part)
+    information = LogInformation(
+        difference(shared.declared, estimate.calibration, shared.blocks), part
+    )
     begun = replace(kept.begun, states=states)
     return replace(
-        kept, begun=begun, steps=_steps(kept.begun.declared, estimate, log.blocks), report=findings
+        kept,
+        begun=begun,
+        steps=_steps(kept.begun.declared, estimate, log.blocks),
+        information=information,
     )
 
 

@@ -1,11 +1,11 @@
 """Consistency of the logs of one site: each against the survey and all other logs."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.batch.joint import LogReport, Shared, SharedCalibration, known_by
+from magfusion.estimation.batch.joint import LogInformation, Shared, known_by
 from magfusion.estimation.data_checks.statistics import TEST_BUDGET, holm, sigmas
 from magfusion.estimation.integrity.priors_of_log import TOLERATED, distance
 from magfusion.model.parameters import BeaconParameter
@@ -33,15 +33,30 @@ class LogAgreement(NamedTuple):
     sigmas: Array
 
 
-class _Distance(NamedTuple):
-    """Chi square, freedom and log probability of each block, then of all together."""
+class Deviation(NamedTuple):
+    """Deviation of a log's calibration from that of the other logs.
+
+    Parameters
+    ----------
+    tests : list of (float, int, float)
+        Chi square, freedom and log probability of each block, then of all together.
+    by_block : list of float
+        Largest change of each block, in its own sigmas.
+    """
 
     tests: list[tuple[float, int, float]]
-    by_block: list[float]  # largest change, in its own sigmas
+    by_block: list[float]
+
+    @property
+    def least(self) -> float:
+        """Log probability of the least probable test."""
+        return min(log_p for _, _, log_p in self.tests)
 
 
 def agreement(
-    shared: Shared, logs: Sequence[LogReport], names: Sequence[str], joint: SharedCalibration
+    shared: Shared,
+    names: Sequence[str],
+    deviations: Callable[[list[int]], Sequence[Deviation]],
 ) -> LogAgreement:
     """Test every log against the others; report those that contradict, the largest first.
 
@@ -52,28 +67,28 @@ def agreement(
     ----------
     names : sequence of str
         Of the logs, for the findings.
-    joint : SharedCalibration
-        From all logs.
+    deviations : callable
+        Returns the `deviation` of each log of a pool, given by their numbers.
     """
-    pool, excess = list(range(len(logs))), 1.0
-    findings: list[tuple[Finding, ...]] = [() for _ in logs]
-    first = [_distance(shared, logs, pool, i, joint) for i in pool]
+    pool, excess = list(range(len(names))), 1.0
+    findings: list[tuple[Finding, ...]] = [() for _ in names]
+    first = deviations(pool)
     result = dict(zip(pool, first, strict=True))
     while len(pool) > 1:
         ratios = _contradictions(result)
         if not ratios:
             break
-        worst = min(ratios, key=lambda i: _least(result[i]))
+        worst = min(ratios, key=lambda i: result[i].least)
         excess = max(excess, *ratios[worst])
         other = [names[i] for i in pool if i != worst]
         findings[worst] = (_finding(shared, names[worst], other, result[worst]),)
         pool.remove(worst)
-        result = {i: _distance(shared, logs, pool, i, joint) for i in pool}
+        result = dict(zip(pool, deviations(pool), strict=True))
     far = np.array([float(sigmas(one.tests[-1][2])) for one in first])
     return LogAgreement(tuple(findings), excess, far)
 
 
-def _contradictions(result: dict[int, _Distance]) -> dict[int, list[float]]:
+def _contradictions(result: dict[int, Deviation]) -> dict[int, list[float]]:
     """Return the excess chi squares of each log that contradicts the others."""
     tests = [(i, test) for i, one in result.items() for test in one.tests]
     informative = holm([log_p for _, (_, _, log_p) in tests], TEST_BUDGET)
@@ -84,29 +99,35 @@ def _contradictions(result: dict[int, _Distance]) -> dict[int, list[float]]:
     return out
 
 
-def _least(one: _Distance) -> float:
-    return min(log_p for _, _, log_p in one.tests)
+def deviation(
+    shared: Shared, total: LogInformation, rest: LogInformation | None, at: Array
+) -> Deviation:
+    """Return the deviation of a log from the other logs of a pool.
 
-
-def _distance(
-    shared: Shared, logs: Sequence[LogReport], pool: list[int], which: int, joint: SharedCalibration
-) -> _Distance:
-    """Return the deviation of a log's calibration from that of the other logs of a pool."""
-    every = known_by(shared, [logs[i] for i in pool], joint.step)
-    others = known_by(shared, [logs[i] for i in pool if i != which], joint.step)
-    none = np.zeros((len(joint.step), joint.by_common.shape[1]))
-    before = others.by_common if others.by_common.shape[1] else none
-    moved = every.by_common - before
+    Parameters
+    ----------
+    total : LogInformation
+        Of all logs of the pool.
+    rest : LogInformation, optional
+        Of the others.
+    at : ndarray, shape (s,)
+        From the declared calibration to the linearisation point.
+    """
+    every = known_by(shared, total, at)
+    others = known_by(shared, rest, at)
+    moved = every.by_common.copy()
+    if rest is not None:
+        moved -= others.by_common
     cov = others.cov - every.cov + moved @ moved.T + every.separate_errors + others.separate_errors
     scale = np.sqrt(np.diagonal(others.cov))
     change, cov = (every.step - others.step) / scale, cov / scale[:, None] / scale
     tests = [distance(change, cov, [block]) for block in shared.blocks]
     tests.append(distance(change, cov, list(shared.blocks)))
     certain = np.abs(change) / np.sqrt(np.maximum(np.diagonal(cov), 1e-4))
-    return _Distance(tests, [float(np.max(certain[b.columns])) for b in shared.blocks])
+    return Deviation(tests, [float(np.max(certain[b.columns])) for b in shared.blocks])
 
 
-def _finding(shared: Shared, name: str, others: list[str], one: _Distance) -> Finding:
+def _finding(shared: Shared, name: str, others: list[str], one: Deviation) -> Finding:
     blocks = shared.blocks
     order = sorted(range(len(blocks)), key=lambda k: one.tests[k][2])[:NAMED]
     amounts = ", ".join(f"{blocks[k].name} by {one.by_block[k]:.1f} sigma" for k in order)
@@ -123,4 +144,4 @@ def _finding(shared: Shared, name: str, others: list[str], one: _Distance) -> Fi
         f" and the survey (a total chi square of {square:.3g} on {freedom}). Probably {cause}"
         " between the logs. Refine the site separately by the logs before and after."
     )
-    return Finding("logs_disagree", text, weight=float(sigmas(_least(one))))
+    return Finding("logs_disagree", text, weight=float(sigmas(one.least)))

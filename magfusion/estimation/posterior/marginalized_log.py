@@ -7,7 +7,6 @@ Gauss-Newton step of one graph of all the logs.
 """
 
 from dataclasses import dataclass, replace
-from functools import reduce
 
 import gtsam
 import numpy as np
@@ -131,15 +130,6 @@ def _without_own(
     else:
         right = right[~own]
     return 0.5 * (information + information.T), right
-
-
-def summed(parts: list[MarginalizedLog]) -> MarginalizedLog:
-    """Return the sum over several logs with the same linearisation point."""
-
-    def both(a: MarginalizedLog, b: MarginalizedLog) -> MarginalizedLog:
-        return MarginalizedLog(**{k: v + getattr(b, k) for k, v in vars(a).items()})
-
-    return reduce(both, parts)
 
 
 def taken_at(
