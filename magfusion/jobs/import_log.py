@@ -89,6 +89,12 @@ class ImportSettings(Settings):
         "Delimiter: a character, or comma, semicolon, tab, pipe, space",
         note="default: detected",
     )
+    missing: tuple[str, ...] = option(
+        (),
+        "Marker of missing values, as --missing=-999",
+        note="besides nan, NA, null, none, -, -- and empty cells",
+        metavar="TEXT",
+    )
     epoch: str | None = option(
         None,
         "Zero of the log clock, to which drive phases refer: a stamp in ns, first (the first"
@@ -127,6 +133,7 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         settings.offset,
         settings.rows,
         settings.delimiter,
+        settings.missing,
         settings.epoch,
         settings.map_file,
         declared,

@@ -225,7 +225,7 @@ def _opened(path: Path, wanted: ImportRequest, result: GatheredStreams) -> Sourc
         if path.suffix.lower() in ARRAYS:
             source = array_source(path)
         else:
-            source = text_source(path, wanted.delimiter)
+            source = text_source(path, wanted.delimiter, wanted.missing)
     except InputError as error:
         result.findings.problems.append(str(error))
         return None

@@ -25,6 +25,7 @@ class MapFile(StrictModel):
     magnetometer: str | None = None
     truth: str | None = None
     delimiter: str | None = None
+    missing: list[str] = Field(default_factory=list)
     epoch: str | int | None = None
     rate_hz: dict[str, float | int | str] = Field(default_factory=dict)
     offset: dict[str, float | int | str] = Field(default_factory=dict)
@@ -46,6 +47,8 @@ class ImportRequest:
         Added to the times of a stream.
     rows : dict
         Column, and the value that rows of the stream have in it.
+    missing : tuple of str
+        Markers of missing values.
     """
 
     files: dict[str, Path]
@@ -55,6 +58,7 @@ class ImportRequest:
     epoch: str | None = None
     shifts_ns: dict[str, int] = field(default_factory=dict)
     rows: dict[str, tuple[str, str]] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
 
 
 def read_request(
@@ -64,6 +68,7 @@ def read_request(
     offsets: Sequence[str],
     rows: Sequence[str],
     delimiter: str | None,
+    missing: Sequence[str],
     epoch: str | None,
     map_file: Path | None,
     declared: Findings,
@@ -91,6 +96,7 @@ def read_request(
         epoch if epoch is not None or model.epoch is None else str(model.epoch),
         _shifts([*_as_options(model.offset), *offsets], declared),
         _rows([*_as_options(model.rows), *rows], declared),
+        (*model.missing, *missing),
     )
 
 
