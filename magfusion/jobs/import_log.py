@@ -17,6 +17,7 @@ from magfusion.files.foreign.halves import HALVES, join_halves
 from magfusion.files.foreign.map_file import read_request
 from magfusion.files.foreign.plan import Findings
 from magfusion.files.log import HEADER
+from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.files.yaml_files import write_yaml
 from magfusion.jobs.check import CheckSettings, run_check
 from magfusion.jobs.settings import Command, Settings, option
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from magfusion.files.foreign.plan import Findings, ImportPlan
 
 FIRST = "first"
+_FIELDS = ("magnetometer", "fields")
 LATE = 1e8  # s; stamps that count from 1970, or from another day
 
 
@@ -237,8 +239,8 @@ def _refuse_apart(counts: dict[str, Counts], declared: Findings) -> None:
 
 
 def _first(counts: dict[str, Counts]) -> int:
-    """Return the first inertial stamp (ns), or that of the magnetometer where there is none."""
-    return (counts["imu"] if "imu" in counts else counts["magnetometer"]).first
+    """Return the first inertial stamp (ns), or that of another stream where there is none."""
+    return next(counts[name] for name in ("imu", *_FIELDS, *HALVES) if name in counts).first
 
 
 def _write_header(directory: Path, output: Path, result: GatheredStreams, epoch_ns: int) -> None:
@@ -250,7 +252,12 @@ def _write_header(directory: Path, output: Path, result: GatheredStreams, epoch_
 
 
 def _checked(directory: Path, output: Path, result: GatheredStreams, site: Path | None) -> Figures:
-    """Return the findings of the check of the log, with the final file names."""
+    """Return the findings of the check of the log, with the final file names.
+
+    A log without fields, for `allan` alone, is not checked.
+    """
+    if not set(_FIELDS) & set(result.plans):
+        return Figures()
     try:
         figures = run_check(CheckSettings(log=directory, site=site))
     except InputError as error:
@@ -304,6 +311,11 @@ def _figures(
     notes = [*result.findings.notes, *(f"Skipped: {reason}" for reason in result.passed_over)]
     notes += [note] if note else []
     notes += [f"{stream}: {one.batches}" for stream, one in counts.items() if one.batches]
+    notes += [
+        f"{stream}: quaternions up to {100.0 * one.scaled:.2g} % off were scaled to unit length."
+        for stream, one in counts.items()
+        if one.scaled > QUATERNION_TOLERANCE
+    ]
     begin = (_first(counts) - epoch_ns) * 1e-9
     if not is_first and abs(begin) > LATE:
         notes.append(

@@ -70,8 +70,10 @@ def gather(paths: Sequence[Path], wanted: ImportRequest, declared: Findings) -> 
             attempted |= set(STREAMS)
     attempted |= _halves(result, attempted, set(wanted.files))
     if "magnetometer" not in attempted:
-        declared.problems.append(
-            "No table is given for the magnetometer; give --magnetometer FILE."
+        declared.problems += [] if result.plans else ["No table of a sensor is given; give one."]
+        result.passed_over.append(
+            "the magnetometer, of which no table is given (--magnetometer FILE): only allan takes a"
+            " log without it"
         )
     elif "magnetometer" in result.plans and not {"imu", "gyro", "accel"} & set(result.plans):
         result.passed_over.append(
@@ -127,9 +129,9 @@ def _halves(result: GatheredStreams, attempted: set[str], named: set[str]) -> se
             del result.plans[stream]
         return set()
     for stream in halves - attempted if halves & attempted else ():
-        result.findings.problems.append(
-            f"The {stream} is missing for the other half of the inertial sensor; give --{stream}"
-            " FILE."
+        result.passed_over.append(
+            f"the {stream}, of which no table is given (--{stream} FILE): of the other half alone"
+            " allan measures the noise"
         )
     return {"imu"} if halves & attempted else set()
 
@@ -178,9 +180,11 @@ def _add_bag(bags: Sequence[Path], wanted: ImportRequest, result: GatheredStream
     ]
     result.stamped = True
     entries = {s: e for s, e in wanted.entries.items() if s not in wanted.files}
-    for plan in plan_bag(bags, entries, wanted.rates, tuple(wanted.files), result.findings):
+    plans = plan_bag(bags, entries, wanted.rates, tuple(wanted.files), result.findings)
+    for plan in plans:
         result.add(plan)
-    return set(STREAMS)
+    none = {"magnetometer"} if plans and not result.findings.problems else set()
+    return set(STREAMS) - none | {plan.stream for plan in plans}
 
 
 def _add_table(
@@ -271,8 +275,8 @@ def _add_euroc(path: Path, wanted: ImportRequest, result: GatheredStreams) -> se
         result.add(plan_stream(stream, source, entries, rate, result.findings, usual))
     if "magnetometer" not in streams | set(wanted.files):
         folders = ", ".join(sorted(entry.name for entry in (path / "mav0").iterdir()))
-        result.findings.problems.append(
+        result.passed_over.append(
             f"{path}: mav0 holds no folder of a magnetometer (found {folders}); call it mag0, or"
             " give --magnetometer FILE."
         )
-    return streams | {"imu", "magnetometer"}
+    return streams | {"imu"}

@@ -83,6 +83,7 @@ _VECTORS = {
 _TYPICAL = {Dimension.FORCE: STANDARD_GRAVITY, Dimension.FIELD: 5e-5}  # SI
 FAST = 8.0  # rad/s; a body that turns so fast on the mean is more likely measured in degrees
 FAR = 500.0  # m
+NORMALISED = 0.15  # about one, of a field divided by its size: no gauss, the Earth has .7
 LEAST_RISING = 0.99  # of the steps of a clock
 LEAST_COUNTED = 0.9  # of the steps of an index
 _RATES_HZ = (5.0, 30_000.0)
@@ -269,6 +270,8 @@ def likely_unit(dimension: Dimension, values: Array) -> SourceUnit:
     """Return the unit in which the sizes of vectors, shape (n,), would be plausible."""
     known = np.abs(values[np.isfinite(values)])
     size = float(np.median(known)) if len(known) else 0.0
+    if dimension is Dimension.FIELD and abs(size - 1.0) < NORMALISED:
+        return SourceUnit("uT", dimension, "50")  # of the local field, which no table gives
     if dimension in _TYPICAL and size > 0.0:
         typical = _TYPICAL[dimension]
         names = {name: abs(np.log(size * si / typical)) for name, si in UNITS[dimension].items()}
