@@ -7,16 +7,19 @@ import sys
 from pathlib import Path
 
 import allantools
+import h5py
 import numpy as np
+import pyarrow.parquet
 import pytest
-from import_twins import G, SITE, Motion, noisy, turning, write
-from scipy.spatial.transform import Rotation
+from import_twins import EARTH, G, SITE, Motion, noisy, turning, write
+from scipy.io import savemat
 
 from magfusion.files.open import open_log
 from magfusion.units import DEGREE, Array
 
 IRON = np.array([22.0, -13.0, 9.0])  # uT
 OFFSET_UT = 0.3
+EARTH_NT = 1e3 * EARTH
 
 
 @pytest.fixture(autouse=True)
@@ -167,4 +170,125 @@ def test_an_industrial_imu_counts_weeks_and_seconds_of_gps() -> None:
     import_log("mip.csv")
     log = open_log(Path("log"))
     np.testing.assert_allclose(np.diff(log.imu.time), 0.01, atol=1e-6)
+    assert_offset(field)
+
+
+def at_rest(rate: float, duration: float, seed: int) -> tuple[Array, Array, Array]:
+    """Return times (s), rates (rad/s) and forces (m/s^2) of an instrument at rest."""
+    time = np.arange(round(rate * duration)) / rate
+    still = np.tile([0.01, -0.02, 0.005, 0.3, -0.2, G], (len(time), 1))
+    gyro = noisy(still[:, :3], 3e-3 * np.sqrt(rate / 100.0), seed)
+    return time, gyro, noisy(still[:, 3:], 0.02 * np.sqrt(rate / 100.0), seed + 1)
+
+
+def assert_allan(values: Array, rate: float, key: str) -> None:
+    """Compare white noise with the interval of allantools (3 sigma), at an eighth of a second."""
+    report = figures("allan", "log", output="noise")
+    for axis, column in zip("xyz", values.T, strict=True):
+        count = max(1, round(rate / 8.0))
+        found = allantools.oadev(column, rate, data_type="freq", taus=[count / rate])
+        tau, deviation = found[0][0], found[1][0]
+        edf = allantools.edf_greenhall(0, 2, count, len(column), overlapping=True)
+        low, high = allantools.confidence_interval(deviation, edf, ci=0.997)
+        assert low < report[f"{key}_white_{axis}"] / np.sqrt(tau) < high
+
+
+def test_gait_analysis_has_a_sensor_a_foot_side_by_side() -> None:
+    rate = 204.8
+    _, gyro, accel = at_rest(rate, 240.0, 20)
+    other = at_rest(rate, 240.0, 30)
+    count = np.arange(len(gyro)) + 1.0
+    head = [
+        "Sample;Left foot;;;;;;Right foot;;;;;",
+        ";" + ";".join(2 * [*axes("Acc ", " (g)"), *axes("Gyr ", " (deg/s)")]),
+    ]
+    feet = np.hstack([accel / G, gyro / DEGREE, other[2] / G, other[1] / DEGREE])
+    write(Path("gait.csv"), head, count, feet, sign=";")
+    import_log("gait.csv", "--rate-hz", "imu=204.8")
+    np.testing.assert_allclose(open_table("imu", "gyro"), gyro, atol=1e-6)
+    assert_allan(gyro, rate, "gyro")
+
+
+def open_table(stem: str, column: str) -> Array:
+    """Return three columns of a table of the log."""
+    data = pyarrow.parquet.read_table(Path("log", f"{stem}.parquet"))
+    return np.stack([data[f"{column}_{axis}"].to_numpy() for axis in "xyz"], axis=1)
+
+
+def host_stamps(count: int, seed: int) -> Array:
+    """Return times at which a host receives samples of 100 Hz: several at once, then none."""
+    rng, times = np.random.default_rng(seed), []
+    while len(times) < count:
+        batch = int(rng.integers(3, 8))
+        arrived = (len(times) + batch) * 0.01
+        times += list(arrived + np.cumsum(rng.uniform(1e-3, 2e-3, batch)))
+    return np.array(times[:count])
+
+
+def test_a_usb_host_stamps_buffers_of_four_rows() -> None:
+    motion = turning(np.arange(6000) * 0.01, 11)
+    gyro, accel = inertial(motion, 12)
+    field = measured(motion, 14)
+    with h5py.File("run.mat", "w", userblock_size=512) as file:
+        for seed, (name, values) in enumerate(
+            {"gyroData": gyro, "accData": -accel / G, "magData": field * 1e-2}.items()
+        ):
+            stamps = 1000.0 + host_stamps(len(values), seed)
+            file.create_dataset(name, data=np.column_stack([stamps, values]))  # MATLAB's 4 x n
+    with Path("run.mat").open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64")
+    import_log("run.mat", "--map", "accel.accel=-accData:x,-accData:y,-accData:z[g]")
+    log = open_log(Path("log"))
+    assert log.imu.accel_body[:, 2].max() > 9.0
+    assert_offset(field)
+
+
+def test_a_magnetometer_alone_is_an_array_with_false_samples() -> None:
+    motion = turning(np.arange(3000) * 0.02, 13, (1.6, 1.3, 3.0))
+    field = measured(motion, 15)
+    spoiled = field.copy()
+    spoiled[[100, 901, 1500, 2222]] = [[900, 0, 0], [0, -2000, 5], [300, 300, 300], [0, 0, 0]]
+    savemat("turned.mat", {"magRaw": spoiled})
+    import_log("turned.mat", "--rate-hz", "magnetometer=50")
+    assert_offset(field)
+
+
+def test_a_breakout_board_rests_for_half_a_minute() -> None:
+    rate = 30.0
+    time = np.arange(900) / rate
+    field = noisy(np.tile(EARTH_NT, (len(time), 1)), 20.0, 16)
+    lines = ["# RM3100 breakout, gain 75", "# x[nT] y[nT] z[nT] total[nT] time[s] unix[s]"]
+    size = np.linalg.norm(field, axis=1)
+    columns = field, size, time, 1_714_550_000.0 + time
+    write(Path("board.txt"), lines, *columns, sign="  ", form="%.3f")
+    import_log("board.txt")
+    assert_allan(field * 1e-9, rate, "magnetometer")
+
+
+def test_a_board_turned_by_hand_has_no_times() -> None:
+    motion = turning(np.arange(4000) * 0.02, 17)
+    _, accel = inertial(motion, 18)
+    field = measured(motion, 19)
+    write(Path("hand.csv"), ["ax,ay,az,mx,my,mz"], accel / G, field * 1e-2)
+    import_log("hand.csv", "--rate-hz", "accel=50", "--rate-hz", "magnetometer=50")
+    assert_offset(field)
+
+
+def test_a_robot_with_hard_iron_has_a_truth_by_two_clocks() -> None:
+    motion = turning(np.arange(6000) * 0.01, 21, (0.15, 0.9, 3.0), 8.0)
+    gyro, accel = inertial(motion, 22)
+    field = measured(motion, 24, iron=np.array([60.0, -50.0, 45.0]), noise=0.05)
+    write(Path("imu.csv"), ["t_s,wx,wy,wz,ax,ay,az"], motion.time, gyro, accel)
+    write(Path("mag.csv"), ["t_s,mag_x_uT,mag_y_uT,mag_z_uT"], motion.time, field)
+    turn = 0.9989 * motion.world_from_body.as_quat()
+    stamps = motion.time.copy()
+    stamps[::20] += 1_714_550_000.0
+    place = np.zeros_like(field)
+    head = ["t_s,x_m,y_m,z_m,qx,qy,qz,qw"]
+    write(Path("truth.csv"), head, stamps, place, turn, form="%.12g")
+    text = import_log("imu.csv", "mag.csv", "truth.csv")
+    assert "up to 0.11 % off were scaled to unit length" in text
+    truth = open_log(Path("log")).truth
+    assert truth is not None
+    assert len(truth) == 5700
     assert_offset(field)

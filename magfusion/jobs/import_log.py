@@ -8,6 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+import pyarrow.parquet
+
 from magfusion.errors import InputError, InputErrors
 from magfusion.files.foreign.bag_table import first_stamp
 from magfusion.files.foreign.columns import STREAMS
@@ -156,8 +159,11 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
                 declared.problems.append(str(error))
         note = ""
         if set(HALVES) <= set(counts) and not declared.problems:
+            evened = [half for half in HALVES if _on_even_clock(directory / f"{half}.parquet")]
             joined = join_halves(directory, counts)
             counts["imu"], note = joined.counts, joined.note
+            if evened:
+                note += f" Stamps of the {' and '.join(evened)} are of bursts: an even clock is used."
         _refuse_apart(counts, declared)
         _refuse(declared)
         epoch_ns = _first(counts) if epoch == FIRST else int(epoch)
@@ -168,6 +174,21 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         figures |= _figures(result, counts, epoch_ns, epoch == FIRST, note)
         write_report(directory, figures)
     return figures
+
+
+def _on_even_clock(path: Path) -> bool:
+    """Replace stamps of bursts by those of the samples, between which a half is interpolated."""
+    from magfusion.files.table import TIME, write_table
+    from magfusion.receiver.sampling_clock import sampling_clock
+
+    table = pyarrow.parquet.read_table(path)
+    stamps = table[TIME].to_numpy()
+    clock = sampling_clock((stamps - stamps[0]) * NANOSECOND)
+    if clock is None:
+        return False
+    even = stamps[0] + np.rint(clock.time / NANOSECOND).astype(np.int64)
+    write_table({name: table[name] for name in table.column_names} | {TIME: even}, path)
+    return True
 
 
 def _report_stream(report: Report, stream: str, plan: ImportPlan, rows: int) -> None:
