@@ -71,7 +71,9 @@ def noisy(values: Array, sigma: float, seed: int) -> Array:
     return values + sigma * np.random.default_rng(seed).standard_normal(values.shape)
 
 
-def write(path: Path, head: list[str], *columns: Array, sign: str = ",", form: str = "%.7g") -> Path:
+def write(
+    path: Path, head: list[str], *columns: Array, sign: str = ",", form: str = "%.7g"
+) -> Path:
     """Write columns as text."""
     rows = np.column_stack(columns)
     forms = [form] * rows.shape[1]

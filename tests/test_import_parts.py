@@ -106,7 +106,9 @@ def test_where_a_half_is_silent_samples_are_missing_and_not_invented(tmp_path: P
     assert len(log.imu.time) == len(detected)  # the reader leaves missing samples out
 
 
-def test_halves_without_a_moment_in_common_are_refused_and_one_alone_is_no_imu(tmp_path: Path) -> None:
+def test_halves_without_a_moment_in_common_are_refused_and_one_alone_is_no_imu(
+    tmp_path: Path,
+) -> None:
     time = np.arange(200) / 100.0
     one = table(tmp_path / "gyro.csv", "t (s),wx (rad/s),wy (rad/s),wz (rad/s)", time, gyro(time))
     two = table(

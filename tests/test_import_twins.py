@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pyarrow.parquet
 import pytest
-from import_twins import EARTH, G, SITE, Motion, noisy, turning, write
+from import_twins import EARTH, SITE, G, Motion, noisy, turning, write
 from scipy.io import savemat
 
 from magfusion.files.open import open_log
@@ -57,7 +57,9 @@ def figures(*words: str, output: str) -> dict[str, object]:
 def ellipsoid_centre(field: Array) -> Array:
     """Return the centre of the quadric nearest to points, shape (3,)."""
     x, y, z = (field - field.mean(axis=0)).T
-    terms = np.column_stack([x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z, 2 * x, 2 * y, 2 * z])
+    terms = np.column_stack(
+        [x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z, 2 * x, 2 * y, 2 * z]
+    )
     a = np.linalg.lstsq(terms, np.ones(len(x)), rcond=None)[0]
     shape = np.array([[a[0], a[3], a[4]], [a[3], a[1], a[5]], [a[4], a[5], a[2]]])
     return np.asarray(field.mean(axis=0) - np.linalg.solve(shape, a[6:]))
@@ -67,7 +69,7 @@ def assert_offset(field: Array) -> None:
     """Compare the calibrated offset of the imported log with that of an ellipsoid (uT)."""
     report = figures("calibrate", "magnetometer", "log", "--site", "site.yaml", output="out")
     offset = [report[f"magnetometer.offset_nt_{axis}"] for axis in "xyz"]
-    print(report["verdict"], np.array(offset)*1e-3, ellipsoid_centre(field))
+    print(report["verdict"], np.array(offset) * 1e-3, ellipsoid_centre(field))
     np.testing.assert_allclose(np.array(offset) * 1e-3, ellipsoid_centre(field), atol=OFFSET_UT)
 
 
@@ -78,7 +80,7 @@ def measured(motion: Motion, seed: int, iron: Array = IRON, noise: float = 0.2) 
 
 
 def inertial(motion: Motion, seed: int) -> tuple[Array, Array]:
-    gyro = noisy(motion.gyro, 2e-3, seed) + [2e-3, -1e-3, 3e-3]
+    gyro = noisy(motion.gyro, 2e-3, seed) + np.array([2e-3, -1e-3, 3e-3])
     return gyro, noisy(motion.accel, 0.02, seed + 1)
 
 
@@ -153,7 +155,9 @@ def test_an_autopilot_log_as_text_has_the_attitude_in_another_table() -> None:
     import_log("sensor_combined.csv", "sensor_mag.csv", "--truth", "attitude.csv")
     truth = open_log(Path("log")).truth
     assert truth is not None
-    np.testing.assert_allclose(truth.world_from_body, motion.world_from_body.as_matrix()[::5], atol=1e-6)
+    np.testing.assert_allclose(
+        truth.world_from_body, motion.world_from_body.as_matrix()[::5], atol=1e-6
+    )
     assert_offset(field[::2])
 
 

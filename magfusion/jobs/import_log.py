@@ -163,7 +163,9 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
             joined = join_halves(directory, counts)
             counts["imu"], note = joined.counts, joined.note
             if evened:
-                note += f" Stamps of the {' and '.join(evened)} are of bursts: an even clock is used."
+                note += (
+                    f" Stamps of the {' and '.join(evened)} are of bursts: an even clock is used."
+                )
         _refuse_apart(counts, declared)
         _refuse(declared)
         epoch_ns = _first(counts) if epoch == FIRST else int(epoch)

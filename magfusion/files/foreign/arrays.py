@@ -109,7 +109,7 @@ def fields_of(name: str, array: Any, unit: str = "", by_column: bool = False) ->
         names = [name or "0"]
     return [
         _Field(
-            SourceColumn(f"{own}{suffix}", unit), array, shape[down], block, _taken(take, place)
+            SourceColumn(f"{own}{suffix}", unit), array, shape[down], block, _element(take, place)
         )
         for own, place in zip(names, places, strict=True)
         for suffix, take in parts.items()
@@ -133,14 +133,15 @@ def _block(axis: int, array: Any, begin: int, end: int) -> AnyArray:
     return np.moveaxis(np.asarray(array[index]), axis, 0)
 
 
-def _taken(
+def _element(
     part: Callable[[AnyArray], AnyArray], place: tuple[int, ...]
 ) -> Callable[[AnyArray], AnyArray]:
-    return lambda block: part(block[(slice(None), *place)])
+    return lambda block: part(np.moveaxis(block, 0, -1)[place])
 
 
 def _is_complex(dtype: np.dtype[Any]) -> bool:
-    return dtype.kind == "c" or dtype.names == ("real", "imag")  # MATLAB's in HDF5
+    of_matlab = dtype.names == ("real", "imag")  # in HDF5
+    return of_matlab or np.issubdtype(dtype, np.complexfloating)
 
 
 _COMPLEX: dict[str, Callable[[AnyArray], AnyArray]] = {

@@ -169,7 +169,7 @@ def _chosen(
 
 
 def _propose_unit(paths: Sequence[Path], place: str, topic: Topic, declared: Findings) -> None:
-    """Ask for the unit of a field whose messages do not declare it."""
+    """Request the unit of a field whose messages do not declare it."""
     parts = (np.linalg.norm(v, axis=1) for _, v in _rows(paths, place, "magnetometer", topic))
     size = next(parts, np.zeros(0))
     declared.problems.append(

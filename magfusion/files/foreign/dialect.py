@@ -61,9 +61,7 @@ class Dialect:
         return ", ".join([*parts, f"data from line {self.line}"])
 
 
-def find_dialect(
-    path: Path, delimiter: str | None = None, markers: Sequence[str] = ()
-) -> Dialect:
+def find_dialect(path: Path, delimiter: str | None = None, markers: Sequence[str] = ()) -> Dialect:
     """Return how a file of text is written.
 
     Parameters

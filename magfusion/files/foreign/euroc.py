@@ -125,9 +125,9 @@ def euroc_terms(stream: str, source: Source) -> Terms:
     terms = terms_by_place(columns, source.columns, "ns")
     if terms.keys() <= {TIME} or (stream == "imu" and len(terms) < len(columns)):
         missing = ", ".join(name for name in columns if name not in {*terms, *VELOCITY, *_BIASES})
-        found = ", ".join(column.name for column in source.columns)
+        names = ", ".join(column.name for column in source.columns)
         raise InputError(
-            f"{source.place}: columns {missing} are missing (found {found}); add what is missing."
+            f"{source.place}: columns {missing} are missing (found {names}); add what is missing."
         )
     named = {name: own for name, own in named_columns(source.columns, stream).items() if own}
     needed = [name for name in columns if name not in {*VELOCITY, *_BIASES}]

@@ -58,7 +58,9 @@ _WHOLE = re.compile(r".*stamp\W*(secs?|seconds)$", re.I)
 _REST = re.compile(r".*stamp\W*(nsecs?|nanosecs?|nanoseconds)$", re.I)
 # Of receivers of GPS.
 _WEEK = re.compile(r"(gps\W*)?week( ?(number|no))?$", re.I)
-_OF_WEEK = re.compile(r"(gps\W*)?(tow|seconds? of week|week ?seconds?)\W*(s|sec|seconds)?\W*$", re.I)
+_OF_WEEK = re.compile(
+    r"(gps\W*)?(tow|seconds? of week|week ?seconds?)\W*(s|sec|seconds)?\W*$", re.I
+)
 _NUMBERED = re.compile(r"(?P<stem>.*?)[\[(:_.]*(?P<place>[0-4])[\])]*")
 _NOT_MEASURED = re.compile(r"bias|cov|std|sigma|var(?!io)|temp|offset|status|uncal|error")
 _OF_STREAM = {
