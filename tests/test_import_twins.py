@@ -1,9 +1,10 @@
-"""Twins of public recordings go in by one import with pasted proposals, and their figures are right."""
+"""Twins of public recordings go in by one import with pasted proposals; figures are right."""
 
 import json
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import allantools
@@ -11,10 +12,17 @@ import h5py
 import numpy as np
 import pyarrow.parquet
 import pytest
+import unsigned_amplitudes
 from import_twins import EARTH, SITE, G, Motion, noisy, turning, write
 from scipy.io import savemat
+from scipy.spatial.transform import Rotation
+from tracker_site import body_poses, tracker_site
 
 from magfusion.files.open import open_log
+from magfusion.files.site import save_site
+from magfusion.model.parameters import initial_calibration, predict_channels
+from magfusion.model.samples import FieldSamples
+from magfusion.model.time_division import MarkedSlots, Slots
 from magfusion.units import DEGREE, Array
 
 IRON = np.array([22.0, -13.0, 9.0])  # uT
@@ -296,3 +304,80 @@ def test_a_robot_with_hard_iron_has_a_truth_by_two_clocks() -> None:
     assert truth is not None
     assert len(truth) == 5700
     assert_offset(field)
+
+
+def imported_fields() -> FieldSamples:
+    fields = open_log(Path("log")).fields
+    assert fields is not None
+    return fields
+
+
+def test_sixteen_coils_are_a_column_of_amplitudes() -> None:
+    walk = unsigned_amplitudes.walk(0, 6.0)
+    save_site(walk.site, Path("coils.yaml"))
+    size = np.abs(walk.phasors.phasor_sensor[..., 2])
+    np.savetxt("frames.txt", size.ravel() * 1e9)
+    words = ("--fields", "frames.txt", "--rate-hz", "fields=10@0.5", "--sigma", "0.1*nT")
+    import_log(*words, "--site", "coils.yaml")
+    fields = imported_fields()
+    assert not fields.signed
+    np.testing.assert_allclose(fields.time, walk.phasors.time, atol=1e-8)
+    np.testing.assert_allclose(fields.phasor_sensor[..., 0].real, size, rtol=1e-6)
+    report = figures("fix", "log", "--site", "coils.yaml", output="out")
+    print({k: v for k, v in report.items() if "chi" in k or "resid" in k or k == "verdict"})
+
+
+def test_sixteen_coils_are_raw_samples_beside_a_marker() -> None:
+    rate, burst, carrier = 96_000.0, 0.01, 4_000.0
+    site = unsigned_amplitudes.floor()
+    beacons = tuple(
+        replace(beacon, frequency_hz=carrier, slots=MarkedSlots(), synchronised=False,
+            coils=(replace(beacon.coils[0], slot=k),))
+        for k, beacon in enumerate(site.beacons)
+    )  # fmt: skip
+    save_site(replace(site, beacons=beacons), Path("coils.yaml"))
+    rng = np.random.default_rng(41)
+    size = rng.uniform(5.0, 50.0, 16)  # nT
+    time = np.arange(round(16 * 5 * burst * rate)) / rate
+    slot = (time // burst).astype(int) % 16
+    wave = size[slot] * np.cos(2.0 * np.pi * carrier * time + 0.4) + rng.normal(0.0, 1.0, len(time))
+    counts = np.rint(wave / 0.01).astype(np.int16)
+    np.savez("adc.npz", adc=counts, marker=slot.astype(np.int16))
+    maps = ("magnetometer.field_z=adc[0.01*nT]", "magnetometer.slot=marker")
+    words = [word for one in maps for word in ("--map", one)]
+    import_log("--magnetometer", "adc.npz", *words, "--rate-hz", "magnetometer=96000")
+    ended = command("demodulate", "log", "--site", "coils.yaml", "-o", "fields")
+    assert ended.returncode == 0, ended.stderr
+    fields = open_log(Path("fields")).fields
+    assert fields is not None
+    found = np.nanmedian(np.abs(fields.phasor_sensor[..., 2]), axis=0)
+    np.testing.assert_allclose(found, size * 1e-9, rtol=0.02)
+
+
+@pytest.mark.parametrize("pulsed", [False, True])
+def test_a_tracker_of_three_coils(pulsed: bool) -> None:
+    rng = np.random.default_rng(43)
+    site = tracker_site(rng, gain=0.0, tilt=0.0, centre=0.0)
+    (beacon,) = site.beacons
+    hertz = 0.0 if pulsed else 1000.0
+    coils = tuple(replace(coil, phase=0.0) for coil in beacon.coils)
+    beacon = replace(beacon, frequency_hz=hertz, slots=Slots(0.005, 4, 0.0), coils=coils)
+    site = replace(site, beacons=(beacon,))
+    save_site(site, Path("tracker.yaml"))
+    attitude, place = body_poses(site, 40, rng)
+    time = 0.02 * np.arange(40)
+    seen = predict_channels(initial_calibration(site, 0.0), time, attitude, place)
+    noise = 1e-11 * (rng.standard_normal(seen.shape) + 1j * rng.standard_normal(seen.shape))
+    values = (seen + noise) * 1e9
+    if pulsed:
+        ambient = rng.uniform(-3e4, 3e4, (40, 1, 3))
+        values = np.concatenate([values.real + ambient, ambient], axis=1)
+    savemat("tracker.mat", {"coils": values})
+    words = ("--fields", "tracker.mat", "--rate-hz", "fields=50", "--sigma", "0.01*nT")
+    import_log(*words, "--site", "tracker.yaml")
+    phasor = imported_fields().phasor_sensor
+    np.testing.assert_allclose(phasor, (seen + (noise.real if pulsed else noise)), atol=1e-15)
+    quaternion = Rotation.from_matrix(attitude).as_quat()
+    np.savetxt("truth.tum", np.column_stack([time, place, quaternion]))
+    report = figures("fix", "log", "--site", "tracker.yaml", output="out")
+    print({k: v for k, v in report.items()})

@@ -13,13 +13,15 @@ import pyarrow.parquet
 
 from magfusion.errors import InputError, InputErrors
 from magfusion.files.foreign.bag_table import first_stamp
-from magfusion.files.foreign.columns import STREAMS
+from magfusion.files.foreign.columns import FIELDS, TABLES
 from magfusion.files.foreign.convert import write_stream
 from magfusion.files.foreign.gather import gather
 from magfusion.files.foreign.halves import HALVES, join_halves
 from magfusion.files.foreign.map_file import read_request
+from magfusion.files.foreign.phasor_rows import write_phasors
 from magfusion.files.foreign.plan import Findings
 from magfusion.files.log import HEADER
+from magfusion.files.site import load_site
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.files.yaml_files import write_yaml
 from magfusion.jobs.check import CheckSettings, run_check
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
     from magfusion.files.foreign.plan import Findings, ImportPlan
 
 FIRST = "first"
-_FIELDS = ("magnetometer", "fields")
+_FIELDS = ("magnetometer", FIELDS)
 LATE = 1e8  # s; stamps that count from 1970, or from another day
 
 
@@ -59,6 +61,9 @@ class ImportSettings(Settings):
     )
     magnetometer: Path | None = option(None, "Table of the magnetometer", metavar="FILE")
     truth: Path | None = option(None, "Table of true poses, or a TUM file", metavar="FILE")
+    fields: Path | None = option(
+        None, "Table of phasors, amplitudes or levels of coils", metavar="FILE"
+    )
     map: tuple[str, ...] = option(
         (),
         "Mapping of a file's column to one of the log, with its unit",
@@ -100,6 +105,9 @@ class ImportSettings(Settings):
         note="besides nan, NA, null, none, -, -- and empty cells",
         metavar="TEXT",
     )
+    sigma: str | None = option(
+        None, "Sigma of phasors whose table has none, as 0.5*nT", metavar="NUMBER*UNIT"
+    )
     epoch: str | None = option(
         None,
         "Zero of the log clock, to which drive phases refer: a stamp in ns, first (the first"
@@ -126,7 +134,7 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         declared.problems.append(
             f"{settings.site}: there is no such file; give the path of a site."
         )
-    files = {stream: getattr(settings, stream) for stream in STREAMS}
+    files = {stream: getattr(settings, stream) for stream in TABLES}
     if not settings.sources and not any(files.values()) and settings.map_file is None:
         raise InputError(
             "no recording given; give a bag, a folder or tables, or --imu FILE --magnetometer FILE"
@@ -139,11 +147,15 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         settings.rows,
         settings.delimiter,
         settings.missing,
+        settings.sigma,
         settings.epoch,
         settings.map_file,
         declared,
     )
-    result = gather([Path(source) for source in settings.sources], wanted, declared)
+    site = None
+    if settings.site is not None and settings.site.is_file():
+        site = load_site(settings.site, unknown=True, without=True, several=True)
+    result = gather([Path(source) for source in settings.sources], wanted, declared, site)
     epoch = _epoch(wanted.epoch, result)
     _refuse(declared)
     with claimed as directory:
@@ -157,6 +169,8 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
                 counts[stream] = write_stream(plan, path, shared, release_gain)
             except InputError as error:
                 declared.problems.append(str(error))
+        if result.phasors is not None:
+            counts[FIELDS] = write_phasors(result.phasors, directory / f"{FIELDS}.parquet")
         note = ""
         if set(HALVES) <= set(counts) and not declared.problems:
             evened = [half for half in HALVES if _on_even_clock(directory / f"{half}.parquet")]
@@ -245,7 +259,7 @@ def _epoch(text: str | None, result: GatheredStreams) -> str | int:
 
 def _refuse_apart(counts: dict[str, Counts], declared: Findings) -> None:
     """Reject streams whose times do not overlap: they are of different clocks."""
-    if not {"imu", "magnetometer"} <= set(counts):
+    if "imu" not in counts or not set(_FIELDS) & set(counts):
         return
     for name in set(counts) - {"imu", "gyro", "accel"}:
         one, other = counts["imu"], counts[name]
@@ -267,9 +281,7 @@ def _first(counts: dict[str, Counts]) -> int:
 
 
 def _write_header(directory: Path, output: Path, result: GatheredStreams, epoch_ns: int) -> None:
-    source = "imported: " + ", ".join(
-        dict.fromkeys(plan.source.place for plan in result.plans.values())
-    )
+    source = "imported: " + ", ".join(dict.fromkeys(plan.source.place for plan in result.every))
     header = {"magfusion_log": 1, "name": output.resolve().name, "epoch_ns": epoch_ns}
     write_yaml(header | {"source": source}, directory / HEADER)
 
@@ -279,7 +291,7 @@ def _checked(directory: Path, output: Path, result: GatheredStreams, site: Path 
 
     A log without fields, for `allan` alone, is not checked.
     """
-    if not set(_FIELDS) & set(result.plans):
+    if "magnetometer" not in result.plans and result.phasors is None:
         return Figures()
     try:
         figures = run_check(CheckSettings(log=directory, site=site))
@@ -323,8 +335,8 @@ def _figures(
                 for reason, count in one.left_out.items()
             ),
         )
-    forms = {p.source.place: p.source.form for p in result.plans.values() if p.source.form}
-    lines = [line for plan in result.plans.values() for line in plan.options()]
+    forms = {plan.source.place: plan.source.form for plan in result.every if plan.source.form}
+    lines = [line for plan in result.every for line in plan.options()]
     shown = [f"{place}: {form}" for place, form in forms.items()]
     shown += ["interpreted as:", *(f"  --map {_quoted(line)}" for line in lines)]
     figures |= Figures(

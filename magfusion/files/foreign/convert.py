@@ -131,10 +131,17 @@ def converted_rows(
     texts = {term.place for term in plan.terms.get(TIME, ())}
     for part in plan.source.read(places, texts):
         raw = dict(zip(places, part.columns, strict=True))
-        yield part, _stamps(plan, raw, part), _values(plan, raw, names)
+        yield part, stamps_of(plan, raw, part), _values(plan, raw, names)
 
 
-def _stamps(plan: ImportPlan, raw: dict[int, Raw], part: RowBlock) -> IntArray:
+def stamps_of(plan: ImportPlan, raw: dict[int, Raw], part: RowBlock) -> IntArray:
+    """Return the times of some rows (ns), `NO_STAMP` if absent.
+
+    Raises
+    ------
+    InputError
+        Where a text is no time.
+    """
     if plan.rate is not None:
         start = plan.shift_ns + round((plan.rate.start_s or 0) * 10**9)
         step = float(10**9 / plan.rate.hz)
@@ -311,8 +318,8 @@ def _check(plan: ImportPlan, counts: Counts) -> None:
     off = counts.left_out.get("with a quaternion not of unit length", 0)
     if off > FEW_OFF * (counts.written + off):
         raise InputError(
-            f"{place}: {off} of {counts.read} quaternions are more than {100.0 * MOST_OFF:.0f} % off"
-            " unit length: map other columns, or scale them if they are rotations."
+            f"{place}: {off} of {counts.read} quaternions are more than {100.0 * MOST_OFF:.0f} %"
+            " off unit length: map other columns, or scale them if they are rotations."
         )
     twice = counts.left_out.get("with the stamp of another", 0)
     if twice > MOST_TWICE * (counts.written + twice):

@@ -6,15 +6,22 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from magfusion.files.foreign.columns import TIME, ColumnMapping, Term, Undecided, place_of, term_of
+from magfusion.files.foreign.columns import (
+    FIELDS,
+    TIME,
+    ColumnMapping,
+    Term,
+    Undecided,
+    place_of,
+    term_of,
+)
 from magfusion.files.foreign.guess import likely_time_unit, named_columns
 from magfusion.files.foreign.plan import Findings, Rate, first_values, shown
 from magfusion.files.foreign.source import Source, SourceColumn
 from magfusion.files.foreign.units import UNITS, Dimension, SourceUnit
 from magfusion.model.site import Site
-from magfusion.receiver.slots import has_schedule, places
+from magfusion.model.time_division import Slots
 
-FIELDS = "fields"
 AMBIENT = "ambient"  # levels without a drive, which are subtracted
 AXES = "xyz"
 VALUES = (*(f"re_{axis}" for axis in AXES), *(f"im_{axis}" for axis in AXES))
@@ -33,6 +40,7 @@ _NAMES: dict[str, tuple[str, ...]] = {
 }
 LABELS = ("beacon", "slot", "tone", "axis")
 _NUMBERS = (1, 2, 3, 6)  # of columns of a coil: amplitude; re, im; three levels; re, then im
+_COMPONENT = re.compile(r"(:[0-2])?(\.re|\.im)?$|[_ ]?[xyz]$", re.I)
 LIKELY_FIELD = 1e-8  # T; of a beacon, to which the proposed unit is the nearest
 
 
@@ -101,7 +109,9 @@ def plan_phasors(
     if not labelled and not coils and not request.problems:
         frame = _coils_by_site(source, terms, request, declared)
     if labelled and not {"re", "re_x", "re_y", "re_z", "value"} & set(terms):
-        request.problems.append("no column of values is found; name it by --map 'fields.re=NAME[T]'")
+        request.problems.append(
+            "no column of values is found; name it by --map 'fields.re=NAME[T]'"
+        )
     if TIME not in terms and rate is None:
         request.problems.append("no time is found; map fields.time, or give --rate-hz fields=HZ")
     if "sigma" not in terms and sigma is None:
@@ -116,7 +126,9 @@ def plan_phasors(
 
 def _coil(name: str) -> tuple[str, int] | str:
     beacon, _, tone = name.rpartition(".")
-    return (beacon, int(tone)) if beacon and tone.isdigit() else name if name == AMBIENT else (name, 0)
+    if beacon and tone.isdigit():
+        return beacon, int(tone)
+    return name if name == AMBIENT else (name, 0)
 
 
 def _coil_option(source: Source, coil: tuple[str, int] | str, terms: Sequence[Term]) -> str:
@@ -195,7 +207,8 @@ def _component_names(text: str, columns: Sequence[SourceColumn]) -> list[str]:
         return names
     (name,) = names
     vector = [f"{name}:{k}" for k in range(3)]
-    for parts in (vector, [f"{name}.re", f"{name}.im"], [f"{v}{p}" for p in (".re", ".im") for v in vector]):
+    complex_vector = [f"{one}{part}" for part in (".re", ".im") for one in vector]
+    for parts in (vector, [f"{name}.re", f"{name}.im"], complex_vector):
         if set(parts) <= known:
             return parts
     return names
@@ -211,40 +224,60 @@ def _likely_unit(source: Source, columns: Sequence[int], dimension: Dimension) -
     return SourceUnit(likely, Dimension.FIELD)
 
 
+def coils_in_order(site: Site) -> list[tuple[str, int] | None]:
+    """Return the channels of a site as they follow each other, None of a silent slot."""
+    slots = {
+        slot: (beacon.name, tone)
+        for beacon in site.beacons
+        for tone, (_, slot) in enumerate(beacon.tones)
+        if slot is not None
+    }
+    if not slots:
+        return list(site.channels)
+    known = next(beacon.slots for beacon in site.beacons if beacon.slots is not None)
+    count = known.count if isinstance(known, Slots) else 1 + max(slots)
+    return [slots.get(slot) for slot in range(count)]
+
+
 def _coils_by_site(
     source: Source, terms: dict[str, tuple[Term, ...]], request: _Request, declared: Findings
 ) -> int:
     """Propose the columns of each coil of the site, or return how many rows are one cycle."""
-    own = {term.place for those in terms.values() for term in those}
+    own = {term.place for name, those in terms.items() if name != "value" for term in those}
     open_columns = [k for k in range(len(source.columns)) if k not in own]
     if request.site is None:
         names = ", ".join(column.name for column in source.columns[:30])
         request.problems.append(
-            f"no column of a beacon or slot is found (found {names}); map it, or the columns of each"
-            " coil by --map 'fields.BEACON.TONE=NAME[nT]', or give --site"
+            f"no column of a beacon or slot is found (found {names}); map it, or the columns of"
+            " each coil by --map 'fields.BEACON.TONE=NAME[nT]', or give --site"
         )
         return 0
-    cycle = places(request.site) if has_schedule(request.site) else len(request.site.channels)
     if len(open_columns) == 1:
-        request.problems.append(
-            f"map the column of amplitudes, of which {cycle} rows are a cycle, by --map"
-            f" 'fields.value={source.columns[open_columns[0]].name}[nT]'"
-        ) if "value" not in terms else None
-        return cycle
-    coils: list[tuple[str, int] | str] = [*request.site.channels, AMBIENT]
-    groups: dict[str, list[str]] = {}
-    for k in open_columns:
-        name = source.columns[k].name
-        groups.setdefault(re.sub(r"(:?[0-2])?(\.re|\.im)$|:[0-2]$|[_ ]?[xyzXYZ]$", "", name), []).append(name)
-    if len(groups) not in (len(coils) - 1, len(coils)):
-        groups = {source.columns[k].name: [source.columns[k].name] for k in open_columns}
-    request.problems.append(
-        f"the columns of the {len(coils) - 1} coils of the site are not mapped"
-    )
-    if len(groups) in (len(coils) - 1, len(coils)):
-        unit = _likely_unit(source, open_columns[:1], Dimension.FIELD)
-        for coil, names in zip(coils, groups.values(), strict=False):
-            ordered = [n for p in (".re", "", ".im") for n in names if n.endswith(p or n[-1:]) and (p or n[-3:] not in (".re", ".im"))]
-            name = coil if isinstance(coil, str) else f"{coil[0]}.{coil[1]}"
-            declared.proposals.append(f"{FIELDS}.{name}={','.join(ordered)}[{unit}]")
+        name = source.columns[open_columns[0]].name
+        if "value" not in terms:
+            request.problems.append(f"the unit of column {name} is not given, for fields.value")
+            unit = _likely_unit(source, open_columns, Dimension.FIELD)
+            declared.proposals.append(f"{FIELDS}.value={name}[{unit}]")
+        return len(coils_in_order(request.site))
+    _propose_coils(source, open_columns, request.site, declared)
+    request.problems.append("no columns are mapped to the coils of the site")
     return 0
+
+
+def _propose_coils(source: Source, places: Sequence[int], site: Site, declared: Findings) -> None:
+    """Propose columns, or groups of them, one coil after the other; a last one is the ambient."""
+    coils: list[tuple[str, int] | str] = [*site.channels, AMBIENT]
+    groups: dict[str, list[str]] = {}
+    for k in places:
+        name = source.columns[k].name
+        groups.setdefault(_COMPONENT.sub("", name), []).append(name)
+    counts = len(coils) - 1, len(coils)
+    if len(groups) not in counts:
+        groups = {source.columns[k].name: [source.columns[k].name] for k in places}
+    if len(groups) not in counts:
+        return
+    unit = _likely_unit(source, places, Dimension.FIELD)
+    for coil, names in zip(coils, groups.values(), strict=False):
+        ordered = sorted(names, key=lambda name: name.endswith(".im"))
+        name = coil if isinstance(coil, str) else f"{coil[0]}.{coil[1]}"
+        declared.proposals.append(f"{FIELDS}.{name}={','.join(ordered)}[{unit}]")

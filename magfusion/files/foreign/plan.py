@@ -157,13 +157,15 @@ def plan_stream(
     named = named_columns(source.columns, stream)
     velocity = any(name in given for name in OPTIONAL)
     without = _other_rotation(given, named)
+    known = {*given, *(usual or {}), *(name for name, own in named.items() if own)}
     if stream == "truth":
-        known = {*given, *(usual or {}), *(name for name, own in named.items() if own)}
         known |= set(QUATERNION) if numbered_quaternion(source.columns) else set()
         alone, absent = _absent_part(known)
         without += absent
         if absent:
             declared.notes.append(f"{source.place}: the truth has {alone} alone.")
+    if stream == "magnetometer" and (axes := known.intersection(GROUPS["field"])):
+        without += tuple(sorted(set(GROUPS["field"]) - axes))
     for target in STREAMS[stream]:
         if target in without:
             continue

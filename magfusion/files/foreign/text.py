@@ -161,10 +161,11 @@ def _no_number(path: Path, dialect: Dialect, wanted: Sequence[int], reason: str)
                 )
                 bad = np.flatnonzero(~known.fill_null(True).to_numpy(zero_copy_only=False))
                 if len(bad):
+                    cell = text[int(bad[0])].as_py()
                     return (
                         f"{path}: column {dialect.columns[k].name}, row {row + int(bad[0])} of the"
-                        f" data (counted from 0): found {(cell := text[int(bad[0])].as_py())!r}; write"
-                        f" a number, or nan where there is none (or give --missing={cell})."
+                        f" data (counted from 0): found {cell!r}; write a number, or nan where"
+                        f" there is none (or give --missing={cell})."
                     )
             row += len(batch)
     except pa.ArrowException as error:
