@@ -106,7 +106,9 @@ def test_where_a_half_is_silent_samples_are_missing_and_not_invented(tmp_path: P
     assert len(log.imu.time) == len(detected)  # the reader leaves missing samples out
 
 
-def test_halves_without_a_moment_in_common_and_a_half_alone_are_refused(tmp_path: Path) -> None:
+def test_halves_without_a_moment_in_common_are_refused_and_one_alone_is_no_imu(
+    tmp_path: Path,
+) -> None:
     time = np.arange(200) / 100.0
     one = table(tmp_path / "gyro.csv", "t (s),wx (rad/s),wy (rad/s),wz (rad/s)", time, gyro(time))
     two = table(
@@ -117,9 +119,10 @@ def test_halves_without_a_moment_in_common_and_a_half_alone_are_refused(tmp_path
         InputError, match=r"gyro and accel have no moment in common.*--offset TABLE"
     ):
         imported(tmp_path / "log", one, two, field)
-    with pytest.raises(InputError, match=r"accel is missing for the other half.*--accel FILE"):
-        imported(tmp_path / "log", one, field)
-    assert not (tmp_path / "log").exists()
+    log, figures = imported(tmp_path / "half", one, field)
+    assert not len(log.imu)
+    assert any("the accel, of which no table is given" in note for note in figures["notes"])
+    assert (tmp_path / "half" / "gyro.parquet").is_file()
     log, _ = imported(tmp_path / "log", one, two, field, offset=("accel=-90",))
     np.testing.assert_allclose(log.imu.accel_body, accel(time), rtol=0, atol=1e-7)
 

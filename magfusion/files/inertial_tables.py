@@ -29,6 +29,10 @@ _GYRO = ("gyro_x", "gyro_y", "gyro_z")
 _ACCEL = ("accel_x", "accel_y", "accel_z")
 FIELD = ("field_x", "field_y", "field_z")
 IMU_LAYOUT = TableLayout(numbers=(*_GYRO, *_ACCEL), repeats=True, strays=True)
+HALF_LAYOUTS = {  # of a gyro or an accelerometer alone
+    "gyro": TableLayout(numbers=_GYRO, repeats=True, strays=True),
+    "accel": TableLayout(numbers=_ACCEL, repeats=True, strays=True),
+}
 FIELD_LAYOUT = TableLayout(numbers=FIELD, repeats=True, strays=True)
 _SOME_AXES = TableLayout(numbers=(), repeats=True, some=FIELD, strays=True)
 

@@ -12,7 +12,13 @@ LONGEST_GAP = 3600.0  # s; of a clock that did not jump
 MOST_STRAY, MOST_STRAY_ROWS = 0.01, 100
 
 
-def stray_rows(time_ns: IntArray, before: int = 0, last_ns: int | None = None) -> BoolArray:
+def stray_rows(
+    time_ns: IntArray,
+    before: int = 0,
+    last_ns: int | None = None,
+    accepted_share: float = MOST_STRAY,
+    accepted_rows: int = MOST_STRAY_ROWS,
+) -> BoolArray:
     """Return which rows have a stamp that is more than an hour from those of the others.
 
     Parameters
@@ -23,6 +29,8 @@ def stray_rows(time_ns: IntArray, before: int = 0, last_ns: int | None = None) -
         Rows of the same table that were read before these.
     last_ns : int, optional
         Stamp of the last of them.
+    accepted_share, accepted_rows : float, int
+        Of the rows, that may be stray.
 
     Returns
     -------
@@ -41,7 +49,7 @@ def stray_rows(time_ns: IntArray, before: int = 0, last_ns: int | None = None) -
     if last_ns is not None:
         near = np.abs(seconds[order] - last) <= LONGEST_GAP
         few = ~np.isin(np.arange(len(count)), group[near])
-    accepted = min(max(1.0, MOST_STRAY * (len(time_ns) + before)), MOST_STRAY_ROWS)
+    accepted = min(max(1.0, accepted_share * (len(time_ns) + before)), accepted_rows)
     if np.sum(count[few]) <= accepted:
         stray[order] = few[group]
     return stray

@@ -11,7 +11,7 @@ import pyarrow.parquet
 
 from magfusion.errors import InputError
 from magfusion.files.bag_topics import Topics
-from magfusion.files.inertial_tables import FIELD_LAYOUT, IMU_LAYOUT
+from magfusion.files.inertial_tables import FIELD_LAYOUT, HALF_LAYOUTS, IMU_LAYOUT
 from magfusion.files.log import HEADER, LogHeader, is_log
 from magfusion.files.open import open_log
 from magfusion.files.parquet_bounds import BATCH, refuse_unfolding
@@ -28,7 +28,7 @@ from magfusion.files.yaml_files import read_yaml
 from magfusion.units import Array, IntArray
 
 # Name of each stream, its file and its columns.
-STREAMS = {"imu": IMU_LAYOUT, "magnetometer": FIELD_LAYOUT}
+STREAMS = {"imu": IMU_LAYOUT, "magnetometer": FIELD_LAYOUT, **HALF_LAYOUTS}
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +77,8 @@ def _whole(
     path: Path, stream: str, start: float | None, end: float | None, topics: Topics | None
 ) -> Iterator[SampleBlock]:
     log = open_log(path, start, end, topics)
+    if stream in HALF_LAYOUTS:
+        return
     if stream == "imu":
         time, values = log.imu.time, np.hstack([log.imu.gyro_body, log.imu.accel_body])
     elif log.waveform is None:

@@ -143,15 +143,15 @@ def measured(job: Job, site: Site | None, report: Report) -> MeasuredNoise:
     samples: dict[str, int] = {}
     duration = 0.0
     for k, (stream, parts) in enumerate(_STREAMS.items()):
-        report(f"reading {stream}", k, 3)
+        report(f"reading {stream}", k, len(_STREAMS) + 1)
         rest, messages = _gathered(job, stream, 3 * len(parts))
-        if not messages.pieces:
+        if not messages.pieces or not len(rest):
             continue
         samples[stream] = len(rest)
         duration = max(duration, rest.duration)
         own = list(messages.findings(rest.missing_share))
-        if stream == "imu":
-            own += _moved(rest, motion)
+        if stream != "magnetometer":
+            own += _moved(rest, _limits(rest, motion, stream))
         result = _instruments(_without_motion(rest, job, stream, motion), parts)
         coarse = tuple(one.name for one in result if one.coarse)
         constant = tuple(one.name for one in result if one.constant)
@@ -202,16 +202,17 @@ def _pieces(job: Job, stream: str) -> Iterator[SampleBlock]:
     return pieces(job.log_path, stream, job.start, job.end, job.topics)
 
 
-def _limits(rest: RestStream, motion: MotionModel) -> Array:
+def _limits(rest: RestStream, motion: MotionModel, stream: str) -> Array:
     """Return the allowed deviation of each axis from its median at rest."""
-    inertial = np.repeat([motion.rest_gyro, motion.rest_accel], 3)
-    return inertial if len(rest.mean) == len(inertial) else np.full(len(rest.mean), np.inf)
+    largest = {"gyro": motion.rest_gyro, "accel": motion.rest_accel, "magnetometer": np.inf}
+    limits = np.repeat([largest[key] for key, _, _ in _STREAMS[stream]], 3)
+    return limits[: len(rest.mean)]
 
 
 def _without_motion(rest: RestStream, job: Job, stream: str, motion: MotionModel) -> RestStream:
     """Return a stream without the stretches that were shaken, knocked or frozen."""
     blocks = rest.blocks()
-    differing = blocks.outlying() | blocks.exceeding(_limits(rest, motion))
+    differing = blocks.outlying() | blocks.exceeding(_limits(rest, motion, stream))
     if not differing.any() or np.mean(differing) > MOVED:
         return rest
     begin, end = blocks.begin[differing], blocks.end[differing]
@@ -224,8 +225,11 @@ def _without_motion(rest: RestStream, job: Job, stream: str, motion: MotionModel
 
 
 # Per stream, the instruments of its columns.
+_GYRO, _ACCEL = ("gyro", "gyroscope", "rad/s"), ("accel", "accelerometer", "m/s^2")
 _STREAMS = {
-    "imu": (("gyro", "gyroscope", "rad/s"), ("accel", "accelerometer", "m/s^2")),
+    "imu": (_GYRO, _ACCEL),
+    "gyro": (_GYRO,),
+    "accel": (_ACCEL,),
     "magnetometer": (("magnetometer", "magnetometer", "T"),),
 }
 
@@ -247,20 +251,26 @@ def _of_piece(stream: str, piece: SampleBlock) -> list[Finding]:
     time, values = piece.time[there & fresh], piece.values[there & fresh]
     nothing = np.zeros((0, 3))
     imu, wave = ImuSamples(np.zeros(0), nothing, nothing), None
-    if stream == "imu":
-        imu = ImuSamples(time, values[:, :3], values[:, 3:])
+    if stream != "magnetometer":  # of a half alone for both: findings on the other are left out
+        imu = ImuSamples(time, values[:, :3], values[:, -3:])
     else:
         wave = Waveform(time, values)
     log = Log("piece", 0, "", imu, wave)
-    return [finding for monitor in STREAM_TESTS for finding in monitor(log, None)]
+    absent = {"gyro": "accelerometer", "accel": "gyroscope"}.get(stream, "none")
+    return [
+        finding
+        for monitor in STREAM_TESTS
+        for finding in monitor(log, None)
+        if not finding.text.startswith(absent)
+    ]
 
 
-def _moved(rest: RestStream, motion: MotionModel) -> Iterator[Finding]:
+def _moved(rest: RestStream, limits: Array) -> Iterator[Finding]:
     """Yield the intervals in which an inertial sensor was not at rest."""
     blocks = rest.blocks()
     if len(blocks.begin) == 0:
         return
-    away = blocks.exceeding(_limits(rest, motion))
+    away = blocks.exceeding(limits)
     moved = away | blocks.outlying()
     share = float(np.mean(moved))
     if not moved.any():

@@ -8,15 +8,21 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+import pyarrow.parquet
+
 from magfusion.errors import InputError, InputErrors
 from magfusion.files.foreign.bag_table import first_stamp
-from magfusion.files.foreign.columns import STREAMS
+from magfusion.files.foreign.columns import FIELDS, TABLES
 from magfusion.files.foreign.convert import write_stream
 from magfusion.files.foreign.gather import gather
 from magfusion.files.foreign.halves import HALVES, join_halves
 from magfusion.files.foreign.map_file import read_request
+from magfusion.files.foreign.phasor_rows import write_phasors
 from magfusion.files.foreign.plan import Findings
 from magfusion.files.log import HEADER
+from magfusion.files.site import load_site
+from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.files.yaml_files import write_yaml
 from magfusion.jobs.check import CheckSettings, run_check
 from magfusion.jobs.settings import Command, Settings, option
@@ -30,6 +36,7 @@ if TYPE_CHECKING:
     from magfusion.files.foreign.plan import Findings, ImportPlan
 
 FIRST = "first"
+_FIELDS = ("magnetometer", FIELDS)
 LATE = 1e8  # s; stamps that count from 1970, or from another day
 
 
@@ -54,6 +61,9 @@ class ImportSettings(Settings):
     )
     magnetometer: Path | None = option(None, "Table of the magnetometer", metavar="FILE")
     truth: Path | None = option(None, "Table of true poses, or a TUM file", metavar="FILE")
+    fields: Path | None = option(
+        None, "Table of phasors, amplitudes or levels of coils", metavar="FILE"
+    )
     map: tuple[str, ...] = option(
         (),
         "Mapping of a file's column to one of the log, with its unit",
@@ -89,6 +99,15 @@ class ImportSettings(Settings):
         "Delimiter: a character, or comma, semicolon, tab, pipe, space",
         note="default: detected",
     )
+    missing: tuple[str, ...] = option(
+        (),
+        "Marker of missing values, as --missing=-999",
+        note="besides nan, NA, null, none, -, -- and empty cells",
+        metavar="TEXT",
+    )
+    sigma: str | None = option(
+        None, "Sigma of phasors whose table has none, as 0.5*nT", metavar="NUMBER*UNIT"
+    )
     epoch: str | None = option(
         None,
         "Zero of the log clock, to which drive phases refer: a stamp in ns, first (the first"
@@ -115,7 +134,7 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         declared.problems.append(
             f"{settings.site}: there is no such file; give the path of a site."
         )
-    files = {stream: getattr(settings, stream) for stream in STREAMS}
+    files = {stream: getattr(settings, stream) for stream in TABLES}
     if not settings.sources and not any(files.values()) and settings.map_file is None:
         raise InputError(
             "no recording given; give a bag, a folder or tables, or --imu FILE --magnetometer FILE"
@@ -127,11 +146,16 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         settings.offset,
         settings.rows,
         settings.delimiter,
+        settings.missing,
+        settings.sigma,
         settings.epoch,
         settings.map_file,
         declared,
     )
-    result = gather([Path(source) for source in settings.sources], wanted, declared)
+    site = None
+    if settings.site is not None and settings.site.is_file():
+        site = load_site(settings.site, unknown=True, without=True, several=True)
+    result = gather([Path(source) for source in settings.sources], wanted, declared, site)
     epoch = _epoch(wanted.epoch, result)
     _refuse(declared)
     with claimed as directory:
@@ -145,10 +169,17 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
                 counts[stream] = write_stream(plan, path, shared, release_gain)
             except InputError as error:
                 declared.problems.append(str(error))
+        if result.phasors is not None:
+            counts[FIELDS] = write_phasors(result.phasors, directory / f"{FIELDS}.parquet")
         note = ""
         if set(HALVES) <= set(counts) and not declared.problems:
+            evened = [half for half in HALVES if _on_even_clock(directory / f"{half}.parquet")]
             joined = join_halves(directory, counts)
             counts["imu"], note = joined.counts, joined.note
+            if evened:
+                note += (
+                    f" Stamps of the {' and '.join(evened)} are of bursts: an even clock is used."
+                )
         _refuse_apart(counts, declared)
         _refuse(declared)
         epoch_ns = _first(counts) if epoch == FIRST else int(epoch)
@@ -159,6 +190,21 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         figures |= _figures(result, counts, epoch_ns, epoch == FIRST, note)
         write_report(directory, figures)
     return figures
+
+
+def _on_even_clock(path: Path) -> bool:
+    """Replace stamps of bursts by those of the samples, between which a half is interpolated."""
+    from magfusion.files.table import TIME, write_table
+    from magfusion.receiver.sampling_clock import sampling_clock
+
+    table = pyarrow.parquet.read_table(path)
+    stamps = table[TIME].to_numpy()
+    clock = sampling_clock((stamps - stamps[0]) * NANOSECOND)
+    if clock is None:
+        return False
+    even = stamps[0] + np.rint(clock.time / NANOSECOND).astype(np.int64)
+    write_table({name: table[name] for name in table.column_names} | {TIME: even}, path)
+    return True
 
 
 def _report_stream(report: Report, stream: str, plan: ImportPlan, rows: int) -> None:
@@ -213,7 +259,7 @@ def _epoch(text: str | None, result: GatheredStreams) -> str | int:
 
 def _refuse_apart(counts: dict[str, Counts], declared: Findings) -> None:
     """Reject streams whose times do not overlap: they are of different clocks."""
-    if not {"imu", "magnetometer"} <= set(counts):
+    if "imu" not in counts or not set(_FIELDS) & set(counts):
         return
     for name in set(counts) - {"imu", "gyro", "accel"}:
         one, other = counts["imu"], counts[name]
@@ -230,20 +276,23 @@ def _refuse_apart(counts: dict[str, Counts], declared: Findings) -> None:
 
 
 def _first(counts: dict[str, Counts]) -> int:
-    """Return the first inertial stamp (ns), or that of the magnetometer where there is none."""
-    return (counts["imu"] if "imu" in counts else counts["magnetometer"]).first
+    """Return the first inertial stamp (ns), or that of another stream where there is none."""
+    return next(counts[name] for name in ("imu", *_FIELDS, *HALVES) if name in counts).first
 
 
 def _write_header(directory: Path, output: Path, result: GatheredStreams, epoch_ns: int) -> None:
-    source = "imported: " + ", ".join(
-        dict.fromkeys(plan.source.place for plan in result.plans.values())
-    )
+    source = "imported: " + ", ".join(dict.fromkeys(plan.source.place for plan in result.every))
     header = {"magfusion_log": 1, "name": output.resolve().name, "epoch_ns": epoch_ns}
     write_yaml(header | {"source": source}, directory / HEADER)
 
 
 def _checked(directory: Path, output: Path, result: GatheredStreams, site: Path | None) -> Figures:
-    """Return the findings of the check of the log, with the final file names."""
+    """Return the findings of the check of the log, with the final file names.
+
+    A log without fields, for `allan` alone, is not checked.
+    """
+    if "magnetometer" not in result.plans and result.phasors is None:
+        return Figures()
     try:
         figures = run_check(CheckSettings(log=directory, site=site))
     except InputError as error:
@@ -286,8 +335,8 @@ def _figures(
                 for reason, count in one.left_out.items()
             ),
         )
-    forms = {p.source.place: p.source.form for p in result.plans.values() if p.source.form}
-    lines = [line for plan in result.plans.values() for line in plan.options()]
+    forms = {plan.source.place: plan.source.form for plan in result.every if plan.source.form}
+    lines = [line for plan in result.every for line in plan.options()]
     shown = [f"{place}: {form}" for place, form in forms.items()]
     shown += ["interpreted as:", *(f"  --map {_quoted(line)}" for line in lines)]
     figures |= Figures(
@@ -297,6 +346,11 @@ def _figures(
     notes = [*result.findings.notes, *(f"Skipped: {reason}" for reason in result.passed_over)]
     notes += [note] if note else []
     notes += [f"{stream}: {one.batches}" for stream, one in counts.items() if one.batches]
+    notes += [
+        f"{stream}: quaternions up to {100.0 * one.scaled:.2g} % off were scaled to unit length."
+        for stream, one in counts.items()
+        if one.scaled > QUATERNION_TOLERANCE
+    ]
     begin = (_first(counts) - epoch_ns) * 1e-9
     if not is_first and abs(begin) > LATE:
         notes.append(

@@ -7,7 +7,7 @@ _SITE = {"site.yaml", "site_field_map.parquet", "site_correlation.parquet"}
 _RESULT = {"trajectory.tum", "trajectory.parquet", *_SITE, "run.rrd", "report.json", FAILED}
 _TABLES = {
     *("imu.parquet", "magnetometer.parquet", "fields.parquet", "truth.parquet"),
-    "reference.parquet",
+    *("reference.parquet", "gyro.parquet", "accel.parquet"),
     "marks.parquet",
     "depth.parquet",
     *(f"{kind}.parquet" for kind in QUANTITIES),

@@ -142,7 +142,13 @@ def _one_back(
 ) -> Orientation:
     """Return a state smoothed by later measurements (Rauch, Tung and Striebel)."""
     cross = later.transition @ state.cov
-    gain = np.linalg.solve(later.predicted.cov, cross).T
+    is_estimated = (
+        np.diag(later.predicted.cov) > 0.0
+    )  # of the others a site says that they are known
+    gain = np.zeros((SIZE, SIZE))
+    gain[:, is_estimated] = np.linalg.solve(
+        later.predicted.cov[np.ix_(is_estimated, is_estimated)], cross[is_estimated]
+    ).T
     step = gain @ later.predicted.step_to(after, measured_from_body)
     cov = state.cov + gain @ (after.cov - later.predicted.cov) @ gain.T
     floor = 1e-3 * np.diag(state.cov)

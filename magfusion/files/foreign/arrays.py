@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from magfusion.files.foreign.units import Raw
 from magfusion.units import AnyArray
 
 MOST_COLUMNS = 64  # of an array that is a table
+AXES_AND_TIME, LEAST_STAMPS = 4, 8  # columns of a sensor with its stamps; rows that show it
 HDF5_MARK = b"\x89HDF"
 ARRAYS = (".npy", ".npz", ".wav", ".mat", ".h5", ".hdf5", ".hdf", ".parquet")
 
@@ -63,10 +65,6 @@ def _rows(array: Any, begin: int, end: int) -> AnyArray:
     return np.asarray(array[begin:end])
 
 
-def _turned_rows(array: Any, begin: int, end: int) -> AnyArray:
-    return np.asarray(array[:, begin:end]).T
-
-
 def _numeric(dtype: np.dtype[Any]) -> bool:
     kinds = (np.integer, np.floating, np.datetime64)
     return any(np.issubdtype(dtype, kind) for kind in kinds)
@@ -91,17 +89,65 @@ def fields_of(name: str, array: Any, unit: str = "", by_column: bool = False) ->
         Whether the array was written column after column, as MATLAB does.
     """
     shape, dtype = array.shape, array.dtype
-    if dtype.names and len(shape) == 1:
+    parts = _COMPLEX if _is_complex(dtype) else {"": np.asarray} if _numeric(dtype) else {}
+    if dtype.names and not parts and len(shape) == 1:
         return _named_parts(name, array, unit)
-    if not _numeric(dtype) or len(shape) not in (1, 2):
+    if not parts or len(shape) not in (1, 2, 3) or max(shape) < 2:
         return []
-    if len(shape) == 1 or 1 in shape:
-        if max(shape) < 2:
-            return []
-        single = len(shape) == 2 and shape[0] == 1
-        block = _turned_rows if single else _rows
-        return [_Field(SourceColumn(name or "0", unit), array, max(shape), block, np.ravel)]
-    return _matrix_columns(name, array, unit, by_column)
+    down = _rows_axis(shape, by_column)
+    across = [k for k in range(len(shape)) if k != down]
+    places = [()] if len(shape) == 1 else list(np.ndindex(*(shape[k] for k in across)))
+    if len(places) * len(parts) > MOST_COLUMNS:
+        return []
+    block = partial(_block, down)
+    names = [_column_name(name, place[::-1] if by_column else place) for place in places]
+    if len(places) == AXES_AND_TIME and len(shape) == 2:
+        first = block(array, 0, ROWS)[:, 0]
+        if len(first) > LEAST_STAMPS and np.all(np.diff(first) >= 0.0) and first[-1] > first[0]:
+            names = [f"{name}:{one}" for one in ("time", "x", "y", "z")]
+    if len(places) == 1:
+        names = [name or "0"]
+    return [
+        _Field(
+            SourceColumn(f"{own}{suffix}", unit), array, shape[down], block, _element(take, place)
+        )
+        for own, place in zip(names, places, strict=True)
+        for suffix, take in parts.items()
+    ]
+
+
+def _rows_axis(shape: Sequence[int], by_column: bool) -> int:
+    """Return along which axis of an array its rows are."""
+    if len(shape) == 2 and 1 not in shape:
+        return int(shape[0] < shape[1] if not by_column else shape[0] <= MOST_COLUMNS)
+    return int(np.argmax(shape))
+
+
+def _column_name(name: str, place: Sequence[int]) -> str:
+    return ":".join([*([name] if name else []), *map(str, place)])
+
+
+def _block(axis: int, array: Any, begin: int, end: int) -> AnyArray:
+    """Return some rows of an array, first."""
+    index = (*[slice(None)] * axis, slice(begin, end))
+    return np.moveaxis(np.asarray(array[index]), axis, 0)
+
+
+def _element(
+    part: Callable[[AnyArray], AnyArray], place: tuple[int, ...]
+) -> Callable[[AnyArray], AnyArray]:
+    return lambda block: part(np.moveaxis(block, 0, -1)[place])
+
+
+def _is_complex(dtype: np.dtype[Any]) -> bool:
+    of_matlab = dtype.names == ("real", "imag")  # in HDF5
+    return of_matlab or np.issubdtype(dtype, np.complexfloating)
+
+
+_COMPLEX: dict[str, Callable[[AnyArray], AnyArray]] = {
+    ".re": lambda block: np.asarray(block["real"] if block.dtype.names else block.real),
+    ".im": lambda block: np.asarray(block["imag"] if block.dtype.names else block.imag),
+}
 
 
 def _named_parts(name: str, array: Any, unit: str) -> list[_Field]:
@@ -113,23 +159,6 @@ def _named_parts(name: str, array: Any, unit: str) -> list[_Field]:
         )
         for part in array.dtype.names
         if _numeric(array.dtype[part]) and not array.dtype[part].shape
-    ]
-
-
-def _matrix_columns(name: str, array: Any, unit: str, by_column: bool) -> list[_Field]:
-    """Return the columns of a matrix, the longer side down."""
-    shape = array.shape
-    rotated = shape[0] < shape[1] if not by_column else shape[0] <= MOST_COLUMNS
-    rows, width = (shape[1], shape[0]) if rotated else shape
-    if width > MOST_COLUMNS:
-        return []
-    return [
-        _Field(
-            SourceColumn(f"{name}:{k}" if name else str(k), unit),
-            *(array, rows, _turned_rows if rotated else _rows),
-            _component(k),
-        )
-        for k in range(width)
     ]
 
 

@@ -21,6 +21,7 @@ from magfusion.files.foreign.bag_transforms import (
     frame_pairs,
 )
 from magfusion.files.foreign.columns import STREAMS, TIME, VELOCITY, ColumnMapping, Term
+from magfusion.files.foreign.guess import likely_unit
 from magfusion.files.foreign.plan import Findings, ImportPlan, Rate, Terms
 from magfusion.files.foreign.source import ROWS, RowBlock, Source, SourceColumn
 from magfusion.files.foreign.units import SourceUnit, accepted, parse_unit
@@ -39,6 +40,11 @@ _COLUMNS = {
     "imu": tuple(STREAMS["imu"])[1:],
     "magnetometer": tuple(STREAMS["magnetometer"])[1:],
     "truth": (*_POSE, *VELOCITY),
+}
+VECTOR = "geometry_msgs/msg/Vector3Stamped"  # of drivers that publish a field in their own unit
+_ROWS = ROW_OF | {
+    "magnetometer": ROW_OF["magnetometer"]
+    | {VECTOR: lambda message: [message.vector.x, message.vector.y, message.vector.z]}
 }
 _SI = {"imu": ("rad/s", "m/s^2"), "magnetometer": ("T",), "truth": ("m", "1", "m/s")}
 
@@ -112,7 +118,9 @@ def plan_bag(
             if role in others:
                 continue
             topic = _chosen(place, role, entries.get(role, ()), result, reader, declared)
-            if topic is not None:
+            if topic is not None and topic.msgtype == VECTOR and not topic.unit:
+                _propose_unit(paths, place, topic, declared)
+            elif topic is not None:
                 refuse_overlap(reader, topic.name)
                 unit = parse_unit(topic.unit or "T", STREAMS["magnetometer"]["field_x"])
                 if unit is None:
@@ -152,15 +160,31 @@ def _chosen(
         declared.proposals.append(f"{role}={fitting[0][0]}")
     elif role == "magnetometer":
         names = ", ".join(f"{name} ({kind})" for name, kind in result) or "none"
-        kinds = " or ".join(ROW_OF[role])
-        declared.problems.append(f"{place}: no topic is of {kinds}, for {role} (found {names}).")
+        kinds = " or ".join(_ROWS[role])
+        alone = any(_fitting(result, "imu"))
+        (declared.notes if alone else declared.problems).append(
+            f"{place}: no topic is of {kinds}, for {role} (found {names})."
+        )
     return None
+
+
+def _propose_unit(paths: Sequence[Path], place: str, topic: Topic, declared: Findings) -> None:
+    """Request the unit of a field whose messages do not declare it."""
+    parts = (np.linalg.norm(v, axis=1) for _, v in _rows(paths, place, "magnetometer", topic))
+    size = next(parts, np.zeros(0))
+    declared.problems.append(
+        f"{place}: messages of {topic.msgtype} give no unit, for magnetometer={topic.name} (median"
+        f" size {np.median(size) if len(size) else np.nan:.4g})."
+    )
+    unit = likely_unit(STREAMS["magnetometer"]["field_x"], size)
+    declared.proposals.append(f"magnetometer={topic.name}[{unit}]")
 
 
 def _fitting(result: Sequence[tuple[str, str]], role: str) -> list[tuple[str, str]]:
     """Return the topics of a type for a role: of the usual ones, if there are such."""
-    fitting = [one for one in result if one[1] in ROW_OF[role]]
-    return [one for one in fitting if one[1] in USUAL] or fitting
+    fitting = [one for one in result if one[1] in _ROWS[role]]
+    usual = [one for one in fitting if one[1] in USUAL] or fitting
+    return [one for one in usual if one[1] != VECTOR or "mag" in one[0].casefold()]
 
 
 def _selected_topic(
@@ -185,9 +209,9 @@ def _selected_topic(
         frames = (read["parent"] or "", read["child"] or "")
         there = _has_transform(place, name, frames, reader, declared)
         return Topic(name, kind, frames) if there else None
-    if kind not in ROW_OF[role]:
+    if kind not in _ROWS[role]:
         declared.problems.append(
-            f"{place}: topic {name} is of {kind}, which is none of {', '.join(ROW_OF[role])} for"
+            f"{place}: topic {name} is of {kind}, which is none of {', '.join(_ROWS[role])} for"
             f" {role}; name another."
         )
         return None
@@ -269,7 +293,7 @@ def _rows(
     paths: Sequence[Path], place: str, role: str, topic: Topic
 ) -> Iterator[tuple[IntArray, Array]]:
     """Yield stamps (ns) and values of the messages of a topic, `ROWS` at a time."""
-    row = ROW_OF[role].get(topic.msgtype)
+    row = _ROWS[role].get(topic.msgtype)
     with open_bag(paths) as reader:
         connections = [c for c in reader.connections if c.topic == topic.name]
         if row is None:

@@ -38,6 +38,8 @@ STREAMS: dict[str, dict[str, Dimension]] = {
         **_vector("velocity", Dimension.SPEED),
     },
 }
+FIELDS = "fields"  # of phasors, whose columns depend on the coils
+TABLES = (*STREAMS, FIELDS)
 OPTIONAL = frozenset(VELOCITY)
 # What is taken only where it is said, and may be missing in any row.
 OPTIONAL_COLUMNS: dict[str, dict[str, Dimension]] = {"magnetometer": {"slot": Dimension.NUMBER}}
@@ -116,6 +118,8 @@ def parse_entry(text: str) -> list[ColumnMapping]:
             f"--map {text!r}: write TABLE.COLUMN=NAME[unit], as 'imu.gyro_x=GyrX[deg/s]', or"
             " TABLE=TOPIC"
         )
+    if stream == FIELDS and column:
+        return [ColumnMapping(stream, column, value)]
     if stream not in STREAMS:
         raise InputError(f"--map {text!r}: {stream} is no table; write one of {', '.join(STREAMS)}")
     if not column or column in STREAMS[stream] or column in OPTIONAL_COLUMNS.get(stream, {}):
@@ -172,12 +176,19 @@ def resolve(entry: ColumnMapping, columns: Sequence[SourceColumn]) -> tuple[Term
     parts = [entry.value]
     if dimension is Dimension.TIME and place_of(entry.value, columns) is None:
         parts = re.split(r"(?<=\])\s*\+\s*", entry.value)
-    return tuple(_term(part.strip(), columns, dimension, entry) for part in parts)
+    return tuple(term_of(part.strip(), columns, dimension, entry) for part in parts)
 
 
-def _term(
+def term_of(
     text: str, columns: Sequence[SourceColumn], dimension: Dimension, entry: ColumnMapping
 ) -> Term:
+    """Return the column, sign and unit that a text means.
+
+    Raises
+    ------
+    Undecided
+        As `resolve`.
+    """
     for sign, lead in ((1.0, ""), (1.0, "+"), (-1.0, "-")):
         if not text.startswith(lead):
             continue

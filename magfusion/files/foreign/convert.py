@@ -17,7 +17,12 @@ from magfusion.files.foreign.units import NO_STAMP, Raw, to_nanoseconds
 from magfusion.files.lost_rows import MOST_MISSING, MOST_TWICE, LostRows
 from magfusion.files.plausible import SHORTEST_STEP
 from magfusion.files.row_stamps import batches_text, separate_stamps
-from magfusion.files.stray_stamps import LONGEST_GAP, stray_rows
+from magfusion.files.stray_stamps import (
+    LONGEST_GAP,
+    MOST_STRAY,
+    MOST_STRAY_ROWS,
+    stray_rows,
+)
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, ROWS_PER_GROUP
 from magfusion.files.table import TIME as TIME_NS
 from magfusion.units import NANOSECOND, AnyArray, Array, BoolArray, IntArray
@@ -27,6 +32,9 @@ STEPS = {  # s
     **dict.fromkeys(("imu", "gyro", "accel"), (SHORTEST_STEP, 0.5)),
     "magnetometer": (1e-6, 0.5),
 }
+MOST_OFF = 0.01  # of a quaternion's length from one: rounding, or one that was interpolated
+FEW_OFF = 0.1  # of the rows, whose quaternions may be worse
+OTHER_CLOCK = 0.3  # of a truth's rows, that may be stamped by another clock
 LEAST_QUATERNION = 1e-6  # of its length; trackers write zeros where they see nothing
 
 
@@ -44,6 +52,8 @@ class Counts:
         Rows that were before the row above, and were put in their place.
     batched : bool
         Whether many rows have the stamp of the row above: they are judged when all are read.
+    scaled : float
+        Largest deviation of a quaternion's length from one, that was scaled to one.
     batches : str
         What became of samples of which several have one stamp; empty where none did.
     first, last : int
@@ -55,6 +65,7 @@ class Counts:
     missing: int = 0
     unsorted: int = 0
     batched: bool = False
+    scaled: float = 0.0
     batches: str = ""
     left_out: dict[str, int] = field(default_factory=dict)
     first: int = LARGEST_TIME_NS
@@ -120,10 +131,17 @@ def converted_rows(
     texts = {term.place for term in plan.terms.get(TIME, ())}
     for part in plan.source.read(places, texts):
         raw = dict(zip(places, part.columns, strict=True))
-        yield part, _stamps(plan, raw, part), _values(plan, raw, names)
+        yield part, stamps_of(plan, raw, part), _values(plan, raw, names)
 
 
-def _stamps(plan: ImportPlan, raw: dict[int, Raw], part: RowBlock) -> IntArray:
+def stamps_of(plan: ImportPlan, raw: dict[int, Raw], part: RowBlock) -> IntArray:
+    """Return the times of some rows (ns), `NO_STAMP` if absent.
+
+    Raises
+    ------
+    InputError
+        Where a text is no time.
+    """
     if plan.rate is not None:
         start = plan.shift_ns + round((plan.rate.start_s or 0) * 10**9)
         step = float(10**9 / plan.rate.hz)
@@ -192,11 +210,8 @@ def _kept(
         counts.leave_out("without a pose", int(np.sum(keep & missing)))
         keep &= ~missing
         if QUATERNION[0] in names:
-            length = np.linalg.norm(values[:, [names.index(q) for q in QUATERNION]], axis=1)
-            none = keep & (length < LEAST_QUATERNION)
-            counts.leave_out("with a quaternion of zeros", int(np.sum(none)))
-            keep &= ~none
-    keep[keep] = ~_strays(stamps[keep], counts)
+            keep &= _is_rotation(values, [names.index(q) for q in QUATERNION], keep, counts)
+    keep[keep] = ~_strays(plan.stream, stamps[keep], counts)
     stamps, values, rows, missing = stamps[keep], values[keep], rows[keep], missing[keep]
     if not len(stamps):
         return stamps, values
@@ -218,11 +233,26 @@ def _kept(
     return stamps, values
 
 
-def _strays(stamps: IntArray, counts: Counts) -> BoolArray:
+def _is_rotation(values: Array, places: list[int], rows: BoolArray, counts: Counts) -> BoolArray:
+    """Return which of some rows have a quaternion of a rotation; scale it to unit length."""
+    length = np.linalg.norm(values[:, places], axis=1)
+    none = rows & (length < LEAST_QUATERNION)
+    off = rows & ~none & ~(np.abs(length - 1.0) <= MOST_OFF)
+    counts.leave_out("with a quaternion of zeros", int(np.sum(none)))
+    counts.leave_out("with a quaternion not of unit length", int(np.sum(off)))
+    good = rows & ~none & ~off
+    values[np.ix_(good, places)] /= length[good, None]
+    counts.scaled = max(counts.scaled, float(np.max(np.abs(length[good] - 1.0), initial=0.0)))
+    return good
+
+
+def _strays(stream: str, stamps: IntArray, counts: Counts) -> BoolArray:
     """Return which rows have a stamp far from all others, and count them."""
     if not len(stamps):
         return np.zeros(0, dtype=bool)
-    stray = stray_rows(stamps, counts.written, counts.last if counts.written else None)
+    accepted = (OTHER_CLOCK, len(stamps)) if stream == "truth" else (MOST_STRAY, MOST_STRAY_ROWS)
+    last = counts.last if counts.written else None
+    stray = stray_rows(stamps, counts.written, last, *accepted)
     counts.leave_out("with a stray time", int(np.sum(stray)))
     return stray
 
@@ -285,6 +315,12 @@ def _check(plan: ImportPlan, counts: Counts) -> None:
         reasons = ", ".join(f"{n} {reason}" for reason, n in counts.left_out.items())
         result = f"none of {counts.read} rows can be used ({reasons})" if counts.read else "no rows"
         raise InputError(f"{place}: {result} for {stream}; record it again, or map other columns.")
+    off = counts.left_out.get("with a quaternion not of unit length", 0)
+    if off > FEW_OFF * (counts.written + off):
+        raise InputError(
+            f"{place}: {off} of {counts.read} quaternions are more than {100.0 * MOST_OFF:.0f} %"
+            " off unit length: map other columns, or scale them if they are rotations."
+        )
     twice = counts.left_out.get("with the stamp of another", 0)
     if twice > MOST_TWICE * (counts.written + twice):
         raise InputError(

@@ -41,6 +41,8 @@ class Dialect:
         Of the first row of data in the file (bytes).
     line : int
         The same as a line, counted from 1.
+    missing : tuple of str
+        What is written where there is no number.
     """
 
     delimiter: str
@@ -49,6 +51,7 @@ class Dialect:
     offset: int
     line: int
     columns: tuple[SourceColumn, ...]
+    missing: tuple[str, ...] = MISSING
 
     def __str__(self) -> str:
         words = {sign: word for word, sign in WORDS.items()}
@@ -58,13 +61,15 @@ class Dialect:
         return ", ".join([*parts, f"data from line {self.line}"])
 
 
-def find_dialect(path: Path, delimiter: str | None = None) -> Dialect:
+def find_dialect(path: Path, delimiter: str | None = None, markers: Sequence[str] = ()) -> Dialect:
     """Return how a file of text is written.
 
     Parameters
     ----------
     delimiter : str, optional
         One of `WORDS` or a character; found where it is not given.
+    markers : sequence of str
+        Of missing values, in addition to `MISSING`.
 
     Raises
     ------
@@ -83,17 +88,18 @@ def find_dialect(path: Path, delimiter: str | None = None) -> Dialect:
         raise InputError(
             f"--delimiter {delimiter!r}: write one character, or one of {', '.join(WORDS)}"
         )
+    missing = (*MISSING, *markers)
     sign, decimal, width = _way_of_writing(
-        bare, DELIMITERS if requested is None else (requested,), path
+        bare, DELIMITERS if requested is None else (requested,), path, missing
     )
-    begin = next(k for k, line in enumerate(bare) if _is_data(line, sign, decimal, width))
+    begin = next(k for k, line in enumerate(bare) if _is_data(line, sign, decimal, width, missing))
     offset = mark + len("".join(lines[:begin]).encode(encoding))
     names, units = _header(bare[:begin], sign, width)
     columns = tuple(
         SourceColumn(name or str(k), unit)
         for k, (name, unit) in enumerate(zip(names, units, strict=True))
     )
-    return Dialect(sign, decimal, encoding, offset, begin + 1, columns)
+    return Dialect(sign, decimal, encoding, offset, begin + 1, columns, missing)
 
 
 def _head(path: Path) -> bytes:
@@ -139,12 +145,12 @@ def cells_of(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
 
 
-def _is_number(cell: str, decimal: str) -> bool:
-    return bool(_NUMBER[decimal].fullmatch(cell) or cell in MISSING or _DATE.fullmatch(cell))
+def _is_number(cell: str, decimal: str, missing: Sequence[str]) -> bool:
+    return bool(_NUMBER[decimal].fullmatch(cell) or cell in missing or _DATE.fullmatch(cell))
 
 
 def _way_of_writing(
-    lines: Sequence[str], delimiters: Sequence[str], path: Path
+    lines: Sequence[str], delimiters: Sequence[str], path: Path, missing: Sequence[str]
 ) -> tuple[str, str, int]:
     """Return delimiter, decimal sign and number of columns that make most cells numbers."""
     filled = [line for line in lines if line and not line.startswith(COMMENTS)]
@@ -153,10 +159,9 @@ def _way_of_writing(
     for sign in delimiters:
         rows = [cells_of(line, sign) for line in sample]
         width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
-        if width < 2:
-            continue
-        for decimal in ".,":
-            score = _share_of_numbers(rows, width, decimal)
+        for decimal in ".," if width else "":
+            score = _share_of_numbers(rows, width, decimal, missing)
+            score *= 1.0 if width > 1 else LEAST_SCORE  # of one column only where no other reads
             if score > best:
                 best, result = score, (sign, decimal, width)
     if result is None or best < LEAST_SCORE:
@@ -168,18 +173,20 @@ def _way_of_writing(
     return result
 
 
-def _share_of_numbers(rows: Sequence[Sequence[str]], width: int, decimal: str) -> float:
+def _share_of_numbers(
+    rows: Sequence[Sequence[str]], width: int, decimal: str, missing: Sequence[str]
+) -> float:
     """Return how many of all cells are numbers in a row of some width."""
     cells = [cell for row in rows if len(row) == width for cell in row]
-    return sum(_is_number(cell, decimal) for cell in cells) / sum(map(len, rows))
+    return sum(_is_number(cell, decimal, missing) for cell in cells) / sum(map(len, rows))
 
 
-def _is_data(line: str, sign: str, decimal: str, width: int) -> bool:
+def _is_data(line: str, sign: str, decimal: str, width: int, missing: Sequence[str]) -> bool:
     if not line or line.startswith(COMMENTS):
         return False
     cells = cells_of(line, sign)
-    numbers = sum(_is_number(cell, decimal) and cell not in MISSING for cell in cells)
-    return len(cells) == width and 2 * numbers >= max(1, sum(c not in MISSING for c in cells))
+    numbers = sum(_is_number(cell, decimal, missing) and cell not in missing for cell in cells)
+    return len(cells) == width and 2 * numbers >= max(1, sum(c not in missing for c in cells))
 
 
 def _header(lines: Sequence[str], sign: str, width: int) -> tuple[list[str], list[str]]:
@@ -196,7 +203,21 @@ def _header(lines: Sequence[str], sign: str, width: int) -> tuple[list[str], lis
     units = [_unbracketed(cell) for cell in rows[0]]
     if len(rows) == 2 and all(map(_is_unit, units)) and any(units):
         return rows[1], units
+    names = [cell for cell in rows[0] if cell]
+    if len(rows) == 2 and len(set(names)) < len(names):
+        return _grouped(*rows), none
     return rows[0], none
+
+
+def _grouped(names: Sequence[str], groups: Sequence[str]) -> list[str]:
+    """Return names with those of the groups in the row above; a unit of a group stays last."""
+    result, group = [], ""
+    for name, above in zip(names, groups, strict=True):
+        group = above or group
+        tagged = re.fullmatch(r"(.*?)\s*([\[(][^\[\]()]*[\])])", group)
+        stem, unit = tagged.groups() if tagged and name else (group, "")
+        result.append(f"{stem} {name} {unit}".strip())
+    return result
 
 
 def _row_of_names(line: str, sign: str, width: int) -> list[str] | None:
@@ -205,8 +226,8 @@ def _row_of_names(line: str, sign: str, width: int) -> list[str] | None:
         cells_of(bare, sign),
         re.split(r"\s*[,;\t|]\s*|\s+", bare) if line != bare else [],
     ):
-        if len(cells) == width - 1:
-            cells = [*cells, ""]
+        if 1 < len(cells) < width and ("" in cells or len(cells) == width - 1):
+            cells = [*cells, *[""] * (width - len(cells))]
         if len(cells) == width and any(cells):
             return cells
     return None

@@ -15,7 +15,7 @@ from magfusion.errors import InputError
 from magfusion.files.foreign.arrays import array_source
 from magfusion.files.foreign.columns import EULER, STREAMS, TIME, VELOCITY, Term, terms_by_place
 from magfusion.files.foreign.convert import converted_rows
-from magfusion.files.foreign.guess import likely_time_unit
+from magfusion.files.foreign.guess import likely_time_unit, named_columns
 from magfusion.files.foreign.plan import ImportPlan, Terms, first_values
 from magfusion.files.foreign.source import Source
 from magfusion.files.foreign.text import text_source
@@ -110,13 +110,34 @@ def euroc_tables(path: Path) -> dict[str, Path]:
 
 
 def euroc_terms(stream: str, source: Source) -> Terms:
-    """Return the columns of a stream by their places, in the header's units or those of EuRoC.
+    """Return the columns of a stream by their header, or by their places where it names them not.
 
-    Stamps are nanoseconds, but where only another unit makes a plausible rate.
+    Units are those of the header, or else of EuRoC. Stamps are nanoseconds, but where only another
+    unit makes a plausible rate.
+
+    Raises
+    ------
+    InputError
+        Where columns are missing.
     """
     columns = {name: unit for name, unit in STREAMS[stream].items() if name not in EULER}
     columns |= _BIASES if stream == "truth" else {}
     terms = terms_by_place(columns, source.columns, "ns")
+    if terms.keys() <= {TIME} or (stream == "imu" and len(terms) < len(columns)):
+        missing = ", ".join(name for name in columns if name not in {*terms, *VELOCITY, *_BIASES})
+        names = ", ".join(column.name for column in source.columns)
+        raise InputError(
+            f"{source.place}: columns {missing} are missing (found {names}); add what is missing."
+        )
+    named = {name: own for name, own in named_columns(source.columns, stream).items() if own}
+    needed = [name for name in columns if name not in {*VELOCITY, *_BIASES}]
+    places = {name: own[0].place for name, own in named.items() if len(own) == 1}
+    if set(needed) <= set(places) and any(places[n] != terms[n][0].place for n in needed):
+        terms = {
+            name: (Term(places[name], named[name][0].unit or terms[name][0].unit),)
+            for name in columns
+            if name in places
+        }
     for group in (VELOCITY, tuple(_BIASES)):
         if not set(group) <= set(terms):
             terms = {name: own for name, own in terms.items() if name not in group}

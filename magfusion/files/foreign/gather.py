@@ -9,15 +9,17 @@ from magfusion.files.bag_reader import is_ros1
 from magfusion.files.bag_topics import is_bag
 from magfusion.files.foreign.arrays import ARRAYS, array_source
 from magfusion.files.foreign.bag_table import plan_bag
-from magfusion.files.foreign.columns import STREAMS, Undecided, place_of, terms_by_place
+from magfusion.files.foreign.columns import FIELDS, STREAMS, Undecided, place_of, terms_by_place
 from magfusion.files.foreign.euroc import euroc_tables, euroc_terms, is_euroc
 from magfusion.files.foreign.guess import streams_of
 from magfusion.files.foreign.map_file import ImportRequest
+from magfusion.files.foreign.phasors import PhasorPlan, plan_phasors
 from magfusion.files.foreign.plan import Findings, ImportPlan, plan_stream
 from magfusion.files.foreign.rows import rows_where
 from magfusion.files.foreign.source import Source
 from magfusion.files.foreign.text import text_source
 from magfusion.files.log import is_log
+from magfusion.model.site import Site
 
 TEXTS = (".csv", ".tsv", ".txt", ".tum", ".dat", ".asc")
 _TUM = ("time", "position_x", "position_y", "position_z", "qx", "qy", "qz", "qw")
@@ -43,6 +45,12 @@ class GatheredStreams:
     stamped: bool = False
     opened: dict[Path, Source] = field(default_factory=dict)
     passed_over: list[str] = field(default_factory=list)
+    phasors: PhasorPlan | None = None
+
+    @property
+    def every(self) -> tuple[ImportPlan | PhasorPlan, ...]:
+        """Plans of all tables."""
+        return (*self.plans.values(), *([] if self.phasors is None else [self.phasors]))
 
     def add(self, plan: ImportPlan | None) -> None:
         """Add a stream, of which there may be one."""
@@ -55,12 +63,17 @@ class GatheredStreams:
             self.plans[plan.stream] = plan
 
 
-def gather(paths: Sequence[Path], wanted: ImportRequest, declared: Findings) -> GatheredStreams:
+def gather(
+    paths: Sequence[Path], wanted: ImportRequest, declared: Findings, site: Site | None = None
+) -> GatheredStreams:
     """Return how files become the streams of a log; ``declared`` has the problems."""
     result = GatheredStreams(declared)
     attempted = set(wanted.files)
     for stream, path in wanted.files.items():
-        if (source := _opened(path, wanted, result)) is not None:
+        source = _opened(path, wanted, result)
+        if source is not None and stream == FIELDS:
+            result.phasors = _phasors(source, wanted, site, declared)
+        elif source is not None:
             result.add(_table(stream, path, source, wanted, declared))
     for recording in _recordings(paths):
         try:
@@ -69,14 +82,7 @@ def gather(paths: Sequence[Path], wanted: ImportRequest, declared: Findings) -> 
             declared.problems.append(str(error))
             attempted |= set(STREAMS)
     attempted |= _halves(result, attempted, set(wanted.files))
-    if "magnetometer" not in attempted:
-        declared.problems.append(
-            "No table is given for the magnetometer; give --magnetometer FILE."
-        )
-    elif "magnetometer" in result.plans and not {"imu", "gyro", "accel"} & set(result.plans):
-        result.passed_over.append(
-            "the imu, of which no table is given (--imu FILE): the log has no inertial samples"
-        )
+    _report_absent(result, attempted)
     _refuse_unused(result, wanted)
     declared.problems += (
         result.passed_over if declared.problems else []
@@ -92,14 +98,38 @@ def gather(paths: Sequence[Path], wanted: ImportRequest, declared: Findings) -> 
     return result
 
 
+def _report_absent(result: GatheredStreams, attempted: set[str]) -> None:
+    """Note which sensors no table is given of."""
+    if not {"magnetometer", FIELDS} & attempted:
+        if not result.plans and not result.findings.problems:
+            result.findings.problems.append("No table of a sensor is given; give one.")
+        result.passed_over.append(
+            "the magnetometer, of which no table is given (--magnetometer FILE): only allan takes a"
+            " log without it"
+        )
+    elif "magnetometer" in result.plans and not {"imu", "gyro", "accel"} & set(result.plans):
+        result.passed_over.append(
+            "the imu, of which no table is given (--imu FILE): the log has no inertial samples"
+        )
+
+
+def _phasors(
+    source: Source, wanted: ImportRequest, site: Site | None, declared: Findings
+) -> PhasorPlan | None:
+    entries, rate = wanted.entries.get(FIELDS, ()), wanted.rates.get(FIELDS)
+    plan = plan_phasors(source, entries, rate, wanted.sigma, site, declared)
+    return plan and replace(plan, shift_ns=wanted.shifts_ns.get(FIELDS, 0))
+
+
 def _refuse_unused(result: GatheredStreams, wanted: ImportRequest) -> None:
     """Refuse options of tables that are not read: a clock that is not moved would pass silently."""
     if result.findings.problems:
         return
+    known = {*result.plans, *([] if result.phasors is None else [FIELDS])}
     for option, streams in (("offset", wanted.shifts_ns), ("rows", wanted.rows)):
         for stream in streams:
             of_format = option == "rows" and result.stamped and stream not in wanted.files
-            if stream in result.plans and not of_format:
+            if stream in known and not of_format:
                 continue
             read = ", ".join(result.plans)
             result.findings.problems.append(
@@ -127,9 +157,9 @@ def _halves(result: GatheredStreams, attempted: set[str], named: set[str]) -> se
             del result.plans[stream]
         return set()
     for stream in halves - attempted if halves & attempted else ():
-        result.findings.problems.append(
-            f"The {stream} is missing for the other half of the inertial sensor; give --{stream}"
-            " FILE."
+        result.passed_over.append(
+            f"the {stream}, of which no table is given (--{stream} FILE): of the other half alone"
+            " allan measures the noise"
         )
     return {"imu"} if halves & attempted else set()
 
@@ -178,9 +208,11 @@ def _add_bag(bags: Sequence[Path], wanted: ImportRequest, result: GatheredStream
     ]
     result.stamped = True
     entries = {s: e for s, e in wanted.entries.items() if s not in wanted.files}
-    for plan in plan_bag(bags, entries, wanted.rates, tuple(wanted.files), result.findings):
+    plans = plan_bag(bags, entries, wanted.rates, tuple(wanted.files), result.findings)
+    for plan in plans:
         result.add(plan)
-    return set(STREAMS)
+    none = {"magnetometer"} if plans and not result.findings.problems else set()
+    return set(STREAMS) - none | {plan.stream for plan in plans}
 
 
 def _add_table(
@@ -225,7 +257,7 @@ def _opened(path: Path, wanted: ImportRequest, result: GatheredStreams) -> Sourc
         if path.suffix.lower() in ARRAYS:
             source = array_source(path)
         else:
-            source = text_source(path, wanted.delimiter)
+            source = text_source(path, wanted.delimiter, wanted.missing)
     except InputError as error:
         result.findings.problems.append(str(error))
         return None
@@ -271,8 +303,8 @@ def _add_euroc(path: Path, wanted: ImportRequest, result: GatheredStreams) -> se
         result.add(plan_stream(stream, source, entries, rate, result.findings, usual))
     if "magnetometer" not in streams | set(wanted.files):
         folders = ", ".join(sorted(entry.name for entry in (path / "mav0").iterdir()))
-        result.findings.problems.append(
+        result.passed_over.append(
             f"{path}: mav0 holds no folder of a magnetometer (found {folders}); call it mag0, or"
             " give --magnetometer FILE."
         )
-    return streams | {"imu", "magnetometer"}
+    return streams | {"imu"}

@@ -54,8 +54,13 @@ _TIMES = (
 )
 _SHORT_TIMES = ("t", "ts", "utc", "sec", "seconds", "date", "zeit", "temps", "tiempo", "tempo")
 # Of messages of ROS written as text, whose stamps are in two columns.
-_WHOLE = re.compile(r"stamp\W*(secs?|seconds)$", re.I)
-_REST = re.compile(r"stamp\W*(nsecs?|nanosecs?|nanoseconds)$", re.I)
+_WHOLE = re.compile(r".*stamp\W*(secs?|seconds)$", re.I)
+_REST = re.compile(r".*stamp\W*(nsecs?|nanosecs?|nanoseconds)$", re.I)
+# Of receivers of GPS.
+_WEEK = re.compile(r"(gps\W*)?week( ?(number|no))?$", re.I)
+_OF_WEEK = re.compile(
+    r"(gps\W*)?(tow|seconds? of week|week ?seconds?)\W*(s|sec|seconds)?\W*$", re.I
+)
 _NUMBERED = re.compile(r"(?P<stem>.*?)[\[(:_.]*(?P<place>[0-4])[\])]*")
 _NOT_MEASURED = re.compile(r"bias|cov|std|sigma|var(?!io)|temp|offset|status|uncal|error")
 _OF_STREAM = {
@@ -80,6 +85,7 @@ _VECTORS = {
 _TYPICAL = {Dimension.FORCE: STANDARD_GRAVITY, Dimension.FIELD: 5e-5}  # SI
 FAST = 8.0  # rad/s; a body that turns so fast on the mean is more likely measured in degrees
 FAR = 500.0  # m
+NORMALISED = 0.15  # about one, of a field divided by its size: no gauss, the Earth has .7
 LEAST_RISING = 0.99  # of the steps of a clock
 LEAST_COUNTED = 0.9  # of the steps of an index
 _RATES_HZ = (5.0, 30_000.0)
@@ -124,13 +130,17 @@ def numbered_quaternion(columns: Sequence[SourceColumn]) -> tuple[str, ...]:
 
 
 def two_column_stamp(columns: Sequence[SourceColumn]) -> tuple[Term, ...]:
-    """Return seconds and nanoseconds of stamps that are in two columns, if there are such."""
-    whole = [k for k, column in enumerate(columns) if _WHOLE.search(column.name)]
-    rest = [k for k, column in enumerate(columns) if _REST.search(column.name)]
-    if len(whole) != 1 or len(rest) != 1:
-        return ()
-    units = [SourceUnit(name, Dimension.TIME) for name in ("s", "ns")]
-    return tuple(Term(*one) for one in zip((whole[0], rest[0]), units, strict=True))
+    """Return stamps that are in two columns: seconds and nanoseconds, or weeks and seconds."""
+    second, rest = SourceUnit("s", Dimension.TIME), SourceUnit("ns", Dimension.TIME)
+    week = SourceUnit("s", Dimension.TIME, "604800")
+    for pair in (((_WHOLE, second), (_REST, rest)), ((_WEEK, week), (_OF_WEEK, second))):
+        places = [
+            [k for k, column in enumerate(columns) if pattern.match(column.name)]
+            for pattern, _ in pair
+        ]
+        if [len(own) for own in places] == [1, 1]:
+            return tuple(Term(own[0], unit) for own, (_, unit) in zip(places, pair, strict=True))
+    return ()
 
 
 def _named(place: int, column: SourceColumn, stream: str) -> Named | None:
@@ -178,6 +188,7 @@ def _readings(column: SourceColumn) -> list[tuple[str, str]]:
 
 def _target(name: str, stream: str) -> str | None:
     norm = re.sub(r"[^a-z0-9]", "", name.casefold())
+    norm = re.sub(r"(buffer|buf|data|raw)(?=[wxyz]$)", "", norm)
     if norm in _SHORT_TIMES or norm.endswith(_TIMES):
         return TIME
     for angle in EULER:
@@ -212,7 +223,8 @@ def _nearest(named: list[Named], columns: Sequence[SourceColumn], stream: str) -
 
     def score(one: Named) -> int:
         name = columns[one.place].name.casefold()
-        return bool(_OF_STREAM[own].search(name)) - any(p.search(name) for p in others)
+        half = stream != own and _OF_FILE[stream].search(name) is not None
+        return half + bool(_OF_STREAM[own].search(name)) - any(p.search(name) for p in others)
 
     best = max(map(score, named))
     return [one for one in named if score(one) == best]
@@ -235,7 +247,15 @@ def streams_of(columns: Sequence[SourceColumn], file_stem: str) -> set[str]:
             any(_is_certain(n, columns, stream, declared) for n in named[one]) for one in needed
         ):
             result.add(stream)
-    return result - {"gyro", "accel"} if "imu" in result else result
+    if "imu" in result and not _have_own_times(columns):
+        return result - {"gyro", "accel"}
+    return result - {"imu"}
+
+
+def _have_own_times(columns: Sequence[SourceColumn]) -> bool:
+    """Return whether gyro and accelerometer have a time each."""
+    times = [named_columns(columns, half)[TIME] for half in ("gyro", "accel")]
+    return all(len(own) == 1 for own in times) and times[0][0].place != times[1][0].place
 
 
 def _is_certain(
@@ -252,6 +272,8 @@ def likely_unit(dimension: Dimension, values: Array) -> SourceUnit:
     """Return the unit in which the sizes of vectors, shape (n,), would be plausible."""
     known = np.abs(values[np.isfinite(values)])
     size = float(np.median(known)) if len(known) else 0.0
+    if dimension is Dimension.FIELD and abs(size - 1.0) < NORMALISED:
+        return SourceUnit("uT", dimension, "50")  # of the local field, which no table gives
     if dimension in _TYPICAL and size > 0.0:
         typical = _TYPICAL[dimension]
         names = {name: abs(np.log(size * si / typical)) for name, si in UNITS[dimension].items()}

@@ -9,8 +9,9 @@ from pathlib import Path
 from pydantic import Field
 
 from magfusion.errors import InputError
-from magfusion.files.foreign.columns import STREAMS, ColumnMapping, parse_entry
+from magfusion.files.foreign.columns import TABLES, ColumnMapping, parse_entry
 from magfusion.files.foreign.plan import Findings, Rate
+from magfusion.files.foreign.units import Dimension, parse_unit
 from magfusion.files.yaml_files import StrictModel, read_yaml
 
 MOST_SHIFT = 10**10  # s
@@ -24,7 +25,10 @@ class MapFile(StrictModel):
     accel: str | None = None
     magnetometer: str | None = None
     truth: str | None = None
+    fields: str | None = None
+    sigma: str | None = None
     delimiter: str | None = None
+    missing: list[str] = Field(default_factory=list)
     epoch: str | int | None = None
     rate_hz: dict[str, float | int | str] = Field(default_factory=dict)
     offset: dict[str, float | int | str] = Field(default_factory=dict)
@@ -46,6 +50,10 @@ class ImportRequest:
         Added to the times of a stream.
     rows : dict
         Column, and the value that rows of the stream have in it.
+    missing : tuple of str
+        Markers of missing values.
+    sigma : float, optional
+        Of phasors whose table has none (T).
     """
 
     files: dict[str, Path]
@@ -55,6 +63,8 @@ class ImportRequest:
     epoch: str | None = None
     shifts_ns: dict[str, int] = field(default_factory=dict)
     rows: dict[str, tuple[str, str]] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
+    sigma: float | None = None
 
 
 def read_request(
@@ -64,6 +74,8 @@ def read_request(
     offsets: Sequence[str],
     rows: Sequence[str],
     delimiter: str | None,
+    missing: Sequence[str],
+    sigma: str | None,
     epoch: str | None,
     map_file: Path | None,
     declared: Findings,
@@ -78,7 +90,7 @@ def read_request(
     model = MapFile(**{}) if map_file is None else read_yaml(map_file, MapFile)
     root = Path() if map_file is None else map_file.parent
     named = {stream: path for stream, path in files.items() if path is not None}
-    for stream in STREAMS:
+    for stream in TABLES:
         name = getattr(model, stream)
         if name is not None and stream not in named:
             named[stream] = root / name
@@ -91,6 +103,8 @@ def read_request(
         epoch if epoch is not None or model.epoch is None else str(model.epoch),
         _shifts([*_as_options(model.offset), *offsets], declared),
         _rows([*_as_options(model.rows), *rows], declared),
+        (*model.missing, *missing),
+        _sigma(model.sigma if sigma is None else sigma, declared),
     )
 
 
@@ -133,14 +147,22 @@ def _rates(lines: Sequence[str], declared: Findings) -> dict[str, Rate]:
             rate = Rate(Fraction(number), Fraction(start) if start else None)
         except (ValueError, ZeroDivisionError):
             rate = None
-        if stream not in STREAMS or rate is None or rate.hz <= 0:
+        if stream not in TABLES or rate is None or rate.hz <= 0:
             declared.problems.append(
-                f"--rate-hz {line!r}: write TABLE=HZ with a table of {', '.join(STREAMS)}, or"
+                f"--rate-hz {line!r}: write TABLE=HZ with a table of {', '.join(TABLES)}, or"
                 " TABLE=HZ@SECONDS where its first row is later than the log's zero."
             )
         else:
             result[stream] = rate
     return result
+
+
+def _sigma(text: str | None, declared: Findings) -> float | None:
+    unit = None if text is None else parse_unit(text, Dimension.FIELD)
+    if text is None or (unit is not None and unit.si > 0.0):
+        return None if unit is None else unit.si
+    declared.problems.append(f"--sigma {text!r}: write a number and its unit, as 0.5*nT.")
+    return None
 
 
 def _shifts(lines: Sequence[str], declared: Findings) -> dict[str, int]:
@@ -151,9 +173,9 @@ def _shifts(lines: Sequence[str], declared: Findings) -> dict[str, int]:
             seconds = Fraction(value)
         except (ValueError, ZeroDivisionError):
             seconds = None
-        if stream not in STREAMS or seconds is None or abs(seconds) > MOST_SHIFT:
+        if stream not in TABLES or seconds is None or abs(seconds) > MOST_SHIFT:
             declared.problems.append(
-                f"--offset {line!r}: write TABLE=SECONDS with a table of {', '.join(STREAMS)};"
+                f"--offset {line!r}: write TABLE=SECONDS with a table of {', '.join(TABLES)};"
                 " the seconds are added to its times."
             )
         else:
@@ -166,9 +188,9 @@ def _rows(lines: Sequence[str], declared: Findings) -> dict[str, tuple[str, str]
     for line in lines:
         stream, _, value = (part.strip() for part in line.partition("="))
         column, _, wanted = (part.strip() for part in value.rpartition(":"))
-        if stream not in STREAMS or not column or not wanted:
+        if stream not in TABLES or not column or not wanted:
             declared.problems.append(
-                f"--rows {line!r}: write TABLE=COLUMN:VALUE with a table of {', '.join(STREAMS)},"
+                f"--rows {line!r}: write TABLE=COLUMN:VALUE with a table of {', '.join(TABLES)},"
                 " as 'gyro=sensor:gyroscope'."
             )
         else:

@@ -157,12 +157,15 @@ def plan_stream(
     named = named_columns(source.columns, stream)
     velocity = any(name in given for name in OPTIONAL)
     without = _other_rotation(given, named)
-    if stream == "truth" and not numbered_quaternion(source.columns):
-        known = {*given, *(usual or {}), *(name for name, own in named.items() if own)}
+    known = {*given, *(usual or {}), *(name for name, own in named.items() if own)}
+    if stream == "truth":
+        known |= set(QUATERNION) if numbered_quaternion(source.columns) else set()
         alone, absent = _absent_part(known)
         without += absent
         if absent:
             declared.notes.append(f"{source.place}: the truth has {alone} alone.")
+    if stream == "magnetometer" and (axes := known.intersection(GROUPS["field"])):
+        without += tuple(sorted(set(GROUPS["field"]) - axes))
     for target in STREAMS[stream]:
         if target in without:
             continue
@@ -285,6 +288,7 @@ class _Planning:
                 f"give the order of the quaternion by --map '{self.stream}.quaternion={four}[wxyz]'"
                 " or [xyzw]"
             )
+            self.declared.proposals.append(f"{self.stream}.quaternion={four}[wxyz]")
         if TIME in self.absent:
             remedy += f", or give --rate-hz {self.stream}=HZ"
         self.problem(f"{what} (found {names}); {remedy}")

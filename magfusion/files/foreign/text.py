@@ -15,13 +15,13 @@ import pyarrow.csv
 from magfusion.errors import InputError
 from magfusion.files.foreign.dialect import COMMENTS, SPACES, Dialect, find_dialect
 from magfusion.files.foreign.source import RowBlock, Source
-from magfusion.files.foreign.units import MISSING, Raw
+from magfusion.files.foreign.units import Raw
 
 BLOCK = 1 << 22  # bytes
 TORN = "not of as many cells as the others"
 
 
-def text_source(path: Path, delimiter: str | None = None) -> Source:
+def text_source(path: Path, delimiter: str | None = None, markers: Sequence[str] = ()) -> Source:
     """Return a table of text.
 
     Raises
@@ -29,7 +29,7 @@ def text_source(path: Path, delimiter: str | None = None) -> Source:
     InputError
         Where it holds no table.
     """
-    dialect = find_dialect(path, delimiter)
+    dialect = find_dialect(path, delimiter, markers)
 
     def read(wanted: Sequence[int], texts: Collection[int]) -> Iterator[RowBlock]:
         return _read(path, dialect, wanted, texts)
@@ -90,7 +90,8 @@ def _batches(
     convert = pa.csv.ConvertOptions(
         column_types=types,
         include_columns=list(types),
-        null_values=list(MISSING),
+        null_values=list(dialect.missing),
+        strings_can_be_null=True,
         decimal_point=dialect.decimal,
     )
     with _opened(path, dialect) as stream:
@@ -156,14 +157,15 @@ def _no_number(path: Path, dialect: Dialect, wanted: Sequence[int], reason: str)
                 text = batch.column(f"c{k}")
                 known = pc.or_(
                     pc.match_substring_regex(text, number),
-                    pc.is_in(pc.utf8_trim_whitespace(text), value_set=pa.array(MISSING)),
+                    pc.is_in(pc.utf8_trim_whitespace(text), value_set=pa.array(dialect.missing)),
                 )
                 bad = np.flatnonzero(~known.fill_null(True).to_numpy(zero_copy_only=False))
                 if len(bad):
+                    cell = text[int(bad[0])].as_py()
                     return (
                         f"{path}: column {dialect.columns[k].name}, row {row + int(bad[0])} of the"
-                        f" data (counted from 0): found {text[int(bad[0])].as_py()!r}; write a"
-                        " number, or nan where there is none."
+                        f" data (counted from 0): found {cell!r}; write a number, or nan where"
+                        f" there is none (or give --missing={cell})."
                     )
             row += len(batch)
     except pa.ArrowException as error:

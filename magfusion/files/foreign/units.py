@@ -297,7 +297,10 @@ def _of_timestamps(stamps: pa.Array) -> IntArray:
     )
 
 
-MISSING = ("", "nan", "NaN", "NAN", "na", "NA", "N/A", "n/a", "null", "NULL", "None", "none", "-")
+MISSING = (
+    *("", "nan", "NaN", "NAN", "na", "NA", "N/A", "n/a"),
+    *("null", "NULL", "None", "none", "-", "--", "---"),
+)
 
 
 def _missing(text: pa.Array) -> pa.Array:
