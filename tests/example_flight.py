@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from pymavlink.DFReader import DFFormat, DFReader_binary
 from pyulog import ULog
 from scipy.spatial.transform import Rotation
 
@@ -158,6 +159,59 @@ def write_ulog(path: Path, messages: dict[str, tuple[str, dict[str, np.ndarray]]
         log._data_list.append(ULog.Data(added))
     log.write_ulog(str(path))
     return path
+
+
+def dataflash_messages(flight: Flight) -> dict[str, tuple[str, str, np.ndarray]]:
+    """Return messages of ArduPilot: format, names, and rows with the stamp first."""
+    euler = np.degrees(flight.attitude.as_euler("ZYX")[:, ::-1])
+    euler[:, 2] %= 360.0
+    inertial = [np.zeros(len(flight.imu_us)), *flight.gyro.T, *flight.accel.T]
+    milligauss = np.rint(flight.gauss * 1e3)
+    zero = np.zeros(len(flight.truth_us))
+    state = [zero, *euler.T, *flight.velocity.T, zero, *flight.position.T]
+    return {
+        "IMU": (
+            "QBffffff",
+            "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ",
+            np.column_stack([flight.imu_us, *inertial]),
+        ),
+        "MAG": (
+            "QBhhh",
+            "TimeUS,I,MagX,MagY,MagZ",
+            np.column_stack([flight.mag_us, 0 * flight.mag_us, *milligauss.T]),
+        ),
+        "XKF1": (
+            "QBccCfffffff",
+            "TimeUS,C,Roll,Pitch,Yaw,VN,VE,VD,dPD,PN,PE,PD",
+            np.column_stack([flight.truth_us, *state]),
+        ),
+    }
+
+
+def write_dataflash(path: Path, messages: dict[str, tuple[str, str, np.ndarray]]) -> Path:
+    """Write messages in the order of their stamps, by pymavlink's packing."""
+    empty = path.with_suffix(".empty")
+    empty.write_bytes(b"\xa3\x95\x80")
+    with DFReader_binary(str(empty)) as writer:
+        formats = [DFFormat(0x80, "FMT", 89, "BBnNZ", "Type,Length,Name,Format,Columns")]
+        packed = []
+        for number, (name, (form, columns, rows)) in enumerate(messages.items(), start=0x81):
+            one = DFFormat(number, name, 0, form, columns)
+            formats.append(one)
+            scale = [multiple or 1.0 for multiple in one.msg_mults]
+            for row in rows:
+                values = [
+                    kind(round(value / step)) if step != 1.0 or kind is int else float(value)
+                    for value, step, kind in zip(row, scale, map(_packed, form), strict=True)
+                ]
+                packed.append((row[0], writer.make_msgbuf(one, values)))
+        head = b"".join(map(writer.make_format_msgbuf, formats))
+    path.write_bytes(head + b"".join(body for _, body in sorted(packed, key=lambda one: one[0])))
+    return path
+
+
+def _packed(letter: str) -> type:
+    return float if letter in "fd" else int
 
 
 def _array(name: str, values: np.ndarray) -> dict[str, np.ndarray]:

@@ -8,7 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from example_flight import Flight, flight_of, integrals, px4_messages, raw_fields, write_ulog
+from example_flight import (
+    Flight,
+    dataflash_messages,
+    flight_of,
+    integrals,
+    px4_messages,
+    raw_fields,
+    write_dataflash,
+    write_ulog,
+)
 
 from magfusion.files.log import read_log
 from magfusion.jobs.simulate import run_simulate
@@ -138,3 +147,62 @@ def test_a_ulog_without_its_package_or_contents_is_refused(flight: Flight, tmp_p
     done = magfusion("import", tmp_path / "none.ulg", "-o", tmp_path / "log")
     assert done.returncode == 2
     assert "is no PX4 ULog" in " ".join(done.stderr.split())
+
+
+def test_a_dataflash_log_gives_its_samples_and_poses(
+    flown: Path, flight: Flight, tmp_path: Path
+) -> None:
+    messages = dataflash_messages(flight)
+    form, names, rows = messages["MAG"]
+    second = np.hstack([rows[:, :1], np.ones((len(rows), 1)), rows[:, 2:] + 30.0])
+    messages["MAG"] = form, names, np.vstack([rows, second])
+    path = write_dataflash(tmp_path / "flight.BIN", messages)
+    own, shown = imported(path, tmp_path / "log", "--site", str(flown / "site.yaml"))
+    log = read_log(flown)
+    assert_same(own, log, field=0.5001e-7)  # half a milligauss
+    assert turned(own, log) < np.radians(0.0051 * np.sqrt(3.0))  # of hundredths of a degree
+    assert own.truth is not None
+    assert log.truth is not None
+    np.testing.assert_allclose(own.truth.position_world, log.truth.position_world, atol=1e-6)
+    assert own.truth.velocity_world is not None
+    np.testing.assert_allclose(own.truth.velocity_world, log.truth.velocity_world, atol=1e-6)
+    assert "magnetometer=MAG:1" in " ".join(shown.split())
+    report = json.loads((tmp_path / "log" / "report.json").read_text())
+    assert report["verdict"] == "trustworthy"
+    other, _ = imported(path, tmp_path / "other", "--map", "magnetometer=MAG:1")
+    assert other.waveform is not None
+    assert own.waveform is not None
+    moved = other.waveform.measured_sensor - own.waveform.measured_sensor
+    np.testing.assert_allclose(moved, np.tile([3e-6, -3e-6, -3e-6], (len(moved), 1)), atol=1e-12)
+
+
+def test_attitudes_of_a_dataflash_log_without_an_ekf(
+    flown: Path, flight: Flight, tmp_path: Path
+) -> None:
+    messages = dataflash_messages(flight)
+    _, _, rows = messages.pop("XKF1")
+    angles = np.hstack([rows[:, :1], rows[:, 2:5]])
+    messages["ATT"] = "QccC", "TimeUS,Roll,Pitch,Yaw", angles
+    own, _ = imported(write_dataflash(tmp_path / "flight.bin", messages), tmp_path / "log")
+    assert turned(own, read_log(flown)) < np.radians(0.0051 * np.sqrt(3.0))
+    assert own.truth is not None
+    assert np.isnan(own.truth.position_world).all()
+
+
+def test_a_dataflash_log_without_its_package_or_contents_is_refused(
+    flight: Flight, tmp_path: Path
+) -> None:
+    messages = dataflash_messages(flight)
+    path = write_dataflash(tmp_path / "flight.bin", messages)
+    done = magfusion("import", path, "-o", tmp_path / "log", without="pymavlink")
+    assert done.returncode == 2
+    assert "pip install 'magfusion[mavlink]'" in " ".join(done.stderr.split())
+    del messages["MAG"]
+    path = write_dataflash(tmp_path / "blind.bin", messages)
+    done = magfusion("import", path, "-o", tmp_path / "log")
+    assert done.returncode == 2
+    assert "has no message MAG" in " ".join(done.stderr.split())
+    (tmp_path / "none.bin").write_bytes(b"no flight")
+    done = magfusion("import", tmp_path / "none.bin", "-o", tmp_path / "log")
+    assert done.returncode == 2
+    assert "is no ArduPilot DataFlash log" in " ".join(done.stderr.split())

@@ -19,6 +19,7 @@ from magfusion.files.foreign.columns import (
     parse_entry,
     resolve,
 )
+from magfusion.files.foreign.dataflash import read_dataflash
 from magfusion.files.foreign.plan import Findings, ImportPlan, Rate, plan_stream
 from magfusion.files.foreign.source import ROWS, RowBlock, Source, SourceColumn
 from magfusion.files.foreign.ulog import read_ulog
@@ -68,6 +69,21 @@ FLIGHTS = {
                 _TRUTH,
                 "truth.position=y,x,-z[m]",
                 "truth.velocity=vy,vx,-vz[m/s]",
+            ),
+        },
+    ),
+    ".bin": FlightFormat(
+        "ArduPilot DataFlash log",
+        read_dataflash,
+        {
+            "IMU": (
+                "imu.gyro=GyrX,-GyrY,-GyrZ[rad/s]",
+                "imu.accel=AccX,-AccY,-AccZ[m/s^2]",
+            ),
+            "MAG": ("magnetometer.field=MagX,-MagY,-MagZ[mG]",),
+            **dict.fromkeys(
+                ("XKF1", "NKF1", "ATT"),
+                (_TRUTH, "truth.position=PE,PN,-PD[m]", "truth.velocity=VE,VN,-VD[m/s]"),
             ),
         },
     ),
