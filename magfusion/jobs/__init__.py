@@ -12,7 +12,7 @@ JOBS = {
     ),
     "import": (
         "import_log",
-        "Import tables of any names and units, a bag or a EuRoC folder, and check the log.",
+        "Import tables of any names and units, a bag, a EuRoC folder or a flight log.",
     ),
     "check": (
         "check",

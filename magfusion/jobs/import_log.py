@@ -45,7 +45,7 @@ class ImportSettings(Settings):
     """Files of a recording and the streams of a log."""
 
     sources: tuple[str, ...] = option(
-        (), "Bag, EuRoC folder, tables, or a directory of tables", positional=True
+        (), "Bag, EuRoC folder, flight log, tables, or a directory of tables", positional=True
     )
     imu: Path | None = option(
         None,
@@ -112,7 +112,7 @@ class ImportSettings(Settings):
         None,
         "Zero of the log clock, to which drive phases refer: a stamp in ns, first (the first"
         " inertial sample), or a bag's topic (its first message)",
-        note="default: 0 of the file's own clock, of bags and EuRoC folders first",
+        note="default: 0 of the file's own clock, of bags, EuRoC folders and flight logs first",
         metavar="NS|TOPIC|first",
     )
     site: Path | None = option(None, "Site file to check the log against")

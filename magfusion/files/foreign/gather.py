@@ -11,6 +11,7 @@ from magfusion.files.foreign.arrays import ARRAYS, array_source
 from magfusion.files.foreign.bag_table import plan_bag
 from magfusion.files.foreign.columns import FIELDS, STREAMS, Undecided, place_of, terms_by_place
 from magfusion.files.foreign.euroc import euroc_tables, euroc_terms, is_euroc
+from magfusion.files.foreign.flight import FLIGHTS, plan_flight
 from magfusion.files.foreign.guess import streams_of
 from magfusion.files.foreign.map_file import ImportRequest
 from magfusion.files.foreign.phasors import PhasorPlan, plan_phasors
@@ -188,6 +189,8 @@ def _add(recording: Sequence[Path], wanted: ImportRequest, result: GatheredStrea
         return _add_bag(recording, wanted, result)
     if path.is_dir() and is_euroc(path):
         return _add_euroc(path, wanted, result)
+    if path.suffix.lower() in FLIGHTS and path.is_file():
+        return _add_flight(path, wanted, result)
     files = _tables_in(path) if path.is_dir() else [path]
     if not files:
         raise InputError(
@@ -213,6 +216,14 @@ def _add_bag(bags: Sequence[Path], wanted: ImportRequest, result: GatheredStream
         result.add(plan)
     none = {"magnetometer"} if plans and not result.findings.problems else set()
     return set(STREAMS) - none | {plan.stream for plan in plans}
+
+
+def _add_flight(path: Path, wanted: ImportRequest, result: GatheredStreams) -> set[str]:
+    result.stamped = True
+    entries = {s: e for s, e in wanted.entries.items() if s not in wanted.files}
+    for plan in plan_flight(path, entries, wanted.rates, tuple(wanted.files), result.findings):
+        result.add(plan)
+    return set(STREAMS)
 
 
 def _add_table(
