@@ -24,7 +24,6 @@ from example_bag import (
     xyz,
 )
 from rosbags.rosbag2 import StoragePlugin, Writer
-
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
