@@ -18,7 +18,7 @@ from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_lo
 from magfusion.simulation.waveform import simulate_waveform
 from magfusion.units import DEGREE, Array
 
-Group = Literal["none", "site", "data", "world", "midway", "instrument"]
+Group = Literal["none", "site", "data", "world", "midway", "instrument", "aiding"]
 LOGS = ("moving", "rough", "rest")
 DURATION = 40.0  # s
 TIME_OFFSET = 0.004  # s, of the IMU, within its prior

@@ -1,6 +1,7 @@
 """All mistakes of `mistakes` by name, and the case without one."""
 
 import mistakes_changing
+import mistakes_of_aiding
 import mistakes_of_data
 import mistakes_of_instruments
 import mistakes_of_site
@@ -16,6 +17,7 @@ MISTAKES = {
         mistakes_of_world,
         mistakes_changing,
         mistakes_of_instruments,
+        mistakes_of_aiding,
     )
     for mistake in part.MISTAKES
 }

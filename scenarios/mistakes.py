@@ -224,9 +224,15 @@ def summed(rows: Sequence[Row]) -> Summary:
 
 
 def slowness(rows: Sequence[Row]) -> list[float]:
-    """Return the processor time of each row relative to that of the good log."""
-    good = {(r.log, r.estimator): r.seconds for r in rows if r.mistake == "good"}
-    return [row.seconds / good[row.log, row.estimator] for row in rows]
+    """Return the processor time of each row relative to that of the good log of its sensors."""
+    good = {(r.mistake, r.log, r.estimator): r.seconds for r in rows}
+
+    def of_good(row: Row) -> float:
+        key = row.log, row.estimator
+        aided = good.get(("aiding_as_declared", *key)) if row.known.group == "aiding" else None
+        return good["good", *key] if aided is None else aided
+
+    return [row.seconds / of_good(row) for row in rows]
 
 
 def _named(row: Row) -> str:

@@ -30,7 +30,7 @@ def sensors() -> tuple[AidingSensor, ...]:
     return (
         AidingSensor("visual", "velocity", 0.02, body_from_sensor=TURN, **mounted),
         AidingSensor("anchor", "range", 0.05, point_world=np.array([8.0, 1.0, 2.0]), **mounted),
-        AidingSensor("prism", "position", 0.01, **mounted),
+        AidingSensor("prism", "position", 0.01, origin=(60.5, 25.25, 30.0), **mounted),
         AidingSensor("foot", "mark", 0.01, marks_world={"7": np.array([2.0, 1.0, 0.5])}, **mounted),
         AidingSensor("level", "height", 0.02, offset_walk=0.1, **mounted),
         AidingSensor(

@@ -163,7 +163,7 @@ def test_a_site_keeps_its_sensors(tmp_path):
     save_site(SITE, path)
     again = load_site(path)
     for one, other in zip(SITE.aiding, again.aiding, strict=True):
-        for name in ("quantity", "name", "rate_hz", "offset_walk", "constraint_sigma"):
+        for name in ("quantity", "name", "origin", "rate_hz", "offset_walk", "constraint_sigma"):
             assert getattr(one, name) == getattr(other, name)
         assert abs(one.sigma - other.sigma) < 1e-12
         for name in ("position_body", "body_from_sensor", "offset", "time_offset"):

@@ -24,11 +24,13 @@ from example_bag import (
     xyz,
 )
 from rosbags.rosbag2 import StoragePlugin, Writer
+from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.files.aiding_messages import SensorMessages
 from magfusion.files.bag import read_bag
 from magfusion.files.site import save_site
-from magfusion.model.aiding import AidingSensor
+from magfusion.model.aiding import AidingSensor, Quantity
 from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
 from magfusion.simulation.motion import Rests
 
@@ -53,6 +55,10 @@ def _pressure(k: int) -> Any:
     return STORE.types[PRESSURE](header(int(STAMPS[k])), 1e5 + k, 0.0)
 
 
+def _sensors(quantities: dict[str, Quantity]) -> tuple[AidingSensor, ...]:
+    return tuple(AidingSensor(name, quantity, 0.1) for name, quantity in quantities.items())
+
+
 def test_topics_are_read_by_the_names_of_the_sensors(tmp_path):
     topics = SENSORS | {
         "/wheels/odom": (ODOMETRY, odometry_message),
@@ -65,14 +71,16 @@ def test_topics_are_read_by_the_names_of_the_sensors(tmp_path):
     bag = write_bag(tmp_path / "bag", topics)
     log = read_bag(
         bag,
-        aiding={
-            "odom": "velocity",
-            "/visual": "velocity",
-            "uwb": "range",
-            "air": "pressure",
-            "prism": "position",
-            "absent": "height",
-        },
+        aiding=_sensors(
+            {
+                "odom": "velocity",
+                "/visual": "velocity",
+                "uwb": "range",
+                "air": "pressure",
+                "prism": "position",
+                "absent": "height",
+            }
+        ),
     )
     assert log.aiding.keys() == {"odom", "/visual", "uwb", "air", "prism"}
     assert np.array_equal(log.aiding["odom"].value, VELOCITY_BODY)
@@ -87,21 +95,21 @@ def test_topics_are_read_by_the_names_of_the_sensors(tmp_path):
 def test_the_odometry_of_a_sensor_is_no_truth(tmp_path):
     bag = write_bag(tmp_path / "bag", SENSORS | {"/odom": (ODOMETRY, odometry_message)})
     assert read_bag(bag).truth is not None
-    assert read_bag(bag, aiding={"odom": "velocity"}).truth is None
+    assert read_bag(bag, aiding=_sensors({"odom": "velocity"})).truth is None
 
 
 def test_a_topic_of_another_type_is_refused(tmp_path):
     bag = write_bag(tmp_path / "bag", SENSORS | {"/uwb": (PRESSURE, _pressure)})
     with pytest.raises(InputError, match="aiding sensor uwb measures range"):
-        read_bag(bag, aiding={"uwb": "range"})
+        read_bag(bag, aiding=_sensors({"uwb": "range"}))
 
 
 def test_two_topics_of_a_short_name_are_refused(tmp_path):
     two = {f"/{side}/uwb": (RANGE, _range) for side in ("left", "right")}
     bag = write_bag(tmp_path / "bag", SENSORS | two)
     with pytest.raises(InputError, match="/left/uwb and /right/uwb"):
-        read_bag(bag, aiding={"uwb": "range"})
-    assert read_bag(bag, aiding={"left/uwb": "range"}).aiding.keys() == {"left/uwb"}
+        read_bag(bag, aiding=_sensors({"uwb": "range"}))
+    assert read_bag(bag, aiding=_sensors({"left/uwb": "range"})).aiding.keys() == {"left/uwb"}
 
 
 def _write_drive(path: Any, simulated: SimulatedLog) -> None:
@@ -155,3 +163,51 @@ def test_a_vehicles_bag_is_smoothed_and_navigated_without_a_mapping(tmp_path):
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         assert "TRUSTWORTHY" in done.stdout
+
+
+def _fix(k: int, status: int) -> Any:
+    """Return a fix 100 m north and k metres above the origin, by a degree of the meridian."""
+    types = STORE.types
+    flattened = 6.69437999014e-3
+    sine = np.sin(np.deg2rad(ORIGIN[0]))
+    meridian = 6378137.0 * (1.0 - flattened) / (1.0 - flattened * sine**2) ** 1.5  # m
+    latitude = ORIGIN[0] + np.rad2deg(100.0 / meridian)
+    satellites = types["sensor_msgs/msg/NavSatStatus"](status, 1)
+    place = latitude, ORIGIN[1], ORIGIN[2] + float(k)
+    return types[FIX](header(int(STAMPS[k])), satellites, *place, np.zeros(9), 0)
+
+
+FIX = "sensor_msgs/msg/NavSatFix"
+ORIGIN = (60.5, 25.25, 30.0)
+
+
+def test_fixes_of_gnss_are_positions_in_the_tangent_plane(tmp_path):
+    """The plane leaves the ellipsoid by 0.8 mm in 100 m; where there is no fix there is none."""
+    bag = write_bag(tmp_path / "bag", SENSORS | {"/gnss": (FIX, lambda k: _fix(k, k % 2 - 1))})
+    sensor = AidingSensor("gnss", "position", 1.0, origin=ORIGIN)
+    samples = read_bag(bag, aiding=(sensor,)).aiding["gnss"]
+    assert np.allclose(samples.value[:, 0], 0.0, rtol=0.0, atol=1e-9)
+    assert np.allclose(samples.value[:, 1], 100.0, rtol=0.0, atol=2e-3)
+    assert np.allclose(samples.value[:, 2], np.arange(1, N, 2) - 0.8e-3, rtol=0.0, atol=1e-4)
+    with pytest.raises(InputError, match="add the origin of the world"):
+        read_bag(bag, aiding=(replace(sensor, origin=None),))
+
+
+def test_poses_without_a_twist_give_velocities():
+    """Of a circle; in parts as they arrive as well as at once."""
+    sensor, rate, speed = AidingSensor("visual", "velocity", 0.02), 0.5, 1.2
+    time = 3.0 + np.arange(0.0, 10.0, 1.0 / 30.0)
+    angle = rate * time
+    position = speed / rate * np.stack([np.sin(angle), -np.cos(angle), 0.0 * angle], axis=1)
+    attitude = Rotation.from_rotvec(np.outer(angle, [0.0, 0.0, 1.0])).as_quat()
+    rows = np.hstack([position, attitude, np.zeros((len(time), 3))])
+    stamps, velocity = SensorMessages(sensor).samples(time, rows)
+    assert np.allclose(np.diff(stamps), 0.1, rtol=0.0, atol=1e-6)
+    # The chord of 0.05 rad is shorter than its arc by 1 in 9,600.
+    assert np.allclose(velocity, [speed, 0.0, 0.0], rtol=0.0, atol=2e-4)
+    online = SensorMessages(sensor)
+    parts = [online.samples(time[k : k + 4], rows[k : k + 4]) for k in range(0, len(time), 4)]
+    assert np.allclose(np.concatenate([one for one, _ in parts]), stamps, rtol=0.0, atol=1e-12)
+    assert np.allclose(np.concatenate([one for _, one in parts]), velocity, rtol=0.0, atol=1e-9)
+    rows[:, 7] = speed
+    assert len(SensorMessages(sensor).samples(time, rows)[0]) == len(time)

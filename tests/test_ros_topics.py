@@ -88,6 +88,10 @@ def _imu(header: ros.Header) -> ros.ImuMessage:
         ),
         (ros.RangeMessage(HEADER, 0, 0.5, 0.25, 50.0, 4.125), "sensor_msgs/msg/Range"),
         (ros.FluidPressureMessage(HEADER, 101325.0, 4.0), "sensor_msgs/msg/FluidPressure"),
+        (
+            ros.NavSatFixMessage(HEADER, ros.NavSatStatus(0, 1), 60.5, 25.25, 12.5, UNKNOWN, 2),
+            "sensor_msgs/msg/NavSatFix",
+        ),
     ],
 )
 def test_the_bytes_are_those_of_ros(message: Any, kind: str) -> None:
@@ -164,7 +168,7 @@ def test_topics_without_messages_are_reported_once(log: Path) -> None:
 
 
 def test_messages_without_a_stamp_are_refused() -> None:
-    content = {"imu": {"time": [0.0], **records_dds.SUBSCRIPTIONS["imu"].content([_imu(HEADER)])}}
+    content = {"imu": records_dds.SUBSCRIPTIONS["imu"].content([0.0], [_imu(HEADER)])}
     numbered = records_dds._numbered(3, content, records_dds.SUBSCRIPTIONS)
     assert numbered.record is None
     sentence = numbered.located(numbered.refusal)

@@ -40,8 +40,8 @@ ROOMS = {
             atomic bag_recovery bag_topics blas_threads commit messages parquet_bounds
             plain_data plain_table plausible row_table site_draft site_ground
             site_values standard_streams stray_stamps
-            bag_reader bag_rows checkpoint correlation field_map kept lost_rows probe row_file
-            survey table yaml_files
+            aiding_messages bag_reader bag_rows checkpoint correlation field_map kept lost_rows
+            probe row_file survey table yaml_files
             attitude_table drive_columns fields hall instruments readings_table
             site_casing site_correlation site_motion site_region site_response site_rotor
             site_temperature

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,17 +11,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.files.aiding_messages import SensorMessages, aiding_rows
 from magfusion.files.bag_reader import open_bag, refuse_overlap
 from magfusion.files.bag_rows import Messages, Wanted, read_parts
 from magfusion.files.bag_topics import Topics
 from magfusion.files.lost_rows import LostRows
-from magfusion.files.messages import AIDING_ROWS, FIELD, IMU, ROWS, USUAL
+from magfusion.files.messages import FIELD, IMU, ROWS, USUAL
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.row_stamps import batches_finding, separate_stamps
 from magfusion.files.stray_stamps import LONGEST_GAP, stray_finding, stray_rows
 from magfusion.files.table import LARGEST_NUMBER, Span
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
-from magfusion.model.aiding import AidingSamples, Quantity
+from magfusion.model.aiding import AidingSamples, AidingSensor
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.trajectory import Trajectory
@@ -63,7 +64,7 @@ def read_bag(
     end: float | None = None,
     topics: Topics | None = None,
     report: Report = quiet,
-    aiding: Mapping[str, Quantity] | None = None,
+    aiding: tuple[AidingSensor, ...] = (),
 ) -> Log:
     """Read inertial samples, magnetometer and truth of a bag.
 
@@ -80,9 +81,8 @@ def read_bag(
         Seconds since the first inertial sample.
     report : callable
         Called with the number of messages read.
-    aiding : mapping, optional
-        What aiding sensors measure, by their names, which are those of their topics, with or
-        without the namespace.
+    aiding : tuple of AidingSensor
+        Their names are those of their topics, with or without the namespace.
 
     Returns
     -------
@@ -97,7 +97,7 @@ def read_bag(
         none was named, or holds messages that no instrument gives.
     """
     with open_bag([path]) as reader:
-        result = _read(reader, path, topics or Topics(), report, aiding or {})
+        result = _read(reader, path, topics or Topics(), report, aiding)
         notes = reader.notes
     imu, field, truth = (result.get(role) for role in ("imu", "magnetometer", "truth"))
     first = field if imu is None else imu
@@ -113,9 +113,9 @@ def read_bag(
         for one in (imu, field, truth)
     )
     others = {
-        name: _aiding(_measured(result[name].within(span), declared), quantity, span)
-        for name, quantity in (aiding or {}).items()
-        if name in result
+        one.name: _aiding(_measured(result[one.name].within(span), declared), one, span)
+        for one in aiding
+        if one.name in result
     }
     return Log(
         name=path.resolve().stem,
@@ -130,13 +130,13 @@ def read_bag(
 
 
 def _read(
-    reader: AnyReader, path: Path, topics: Topics, report: Report, aiding: Mapping[str, Quantity]
+    reader: AnyReader, path: Path, topics: Topics, report: Report, aiding: tuple[AidingSensor, ...]
 ) -> dict[str, _Stream]:
     """Return the streams by their roles or sensors, of one pass over the bag."""
     wanted = {
-        name: one
-        for name, quantity in aiding.items()
-        if (one := _of_sensor(reader, path, name, quantity)) is not None
+        sensor.name: one
+        for sensor in aiding
+        if (one := _of_sensor(reader, path, sensor)) is not None
     }
     used = {one.connections[0].topic for one in wanted.values()}
     for role, rows in ROWS.items():
@@ -153,24 +153,27 @@ def _read(
         if not parts[role]:
             raise InputError(f"{one.place}: holds no messages; record it, or leave it out.")
         stamps, values = (np.concatenate(column) for column in zip(*parts.pop(role), strict=True))
+        if role not in ROWS:  # a receiver of GNSS has no fix for long
+            there = ~np.isnan(values).all(axis=1)
+            stamps, values = stamps[there], values[there]
         result[role] = _own_times(_sorted(_NAMES.get(role, role), one.place, stamps, values))
     return result
 
 
-def _of_sensor(reader: AnyReader, path: Path, name: str, quantity: Quantity) -> Wanted | None:
+def _of_sensor(reader: AnyReader, path: Path, sensor: AidingSensor) -> Wanted | None:
     """Return the messages of an aiding sensor; None if the bag has no topic of its name."""
-    name = name.strip("/")
+    name = sensor.name.strip("/")
     topics = sorted({c.topic for c in reader.connections})
     named = [topic for topic in topics if topic.strip("/") == name]
     named = named or [topic for topic in topics if topic.rsplit("/", 1)[-1] == name]
     if not named:
         return None
-    rows = AIDING_ROWS.get(quantity, {})
+    rows = aiding_rows(sensor)
     connections = [c for c in reader.connections if c.topic == named[0] and c.msgtype in rows]
     if len(named) > 1 or not connections:
         types = ", ".join(sorted({c.msgtype for c in reader.connections if c.topic in named}))
         raise InputError(
-            f"{path}: the site's aiding sensor {name} measures {quantity}, of which"
+            f"{path}: the site's aiding sensor {name} measures {sensor.quantity}, of which"
             f" {' and '.join(named)} of {types} is no single topic of"
             f" {' or '.join(rows) or 'any type'}; give it the whole name of another topic."
         )
@@ -179,8 +182,9 @@ def _of_sensor(reader: AnyReader, path: Path, name: str, quantity: Quantity) -> 
     return Wanted(f"{path} topic {named[0]}", connections, row)
 
 
-def _aiding(stream: _Stream, quantity: Quantity, span: Span) -> AidingSamples:
-    return AidingSamples(quantity, span.seconds(stream.time_ns), stream.values)
+def _aiding(stream: _Stream, sensor: AidingSensor, span: Span) -> AidingSamples:
+    time = span.seconds(stream.time_ns)
+    return AidingSamples(sensor.quantity, *SensorMessages(sensor).samples(time, stream.values))
 
 
 def role_connections(

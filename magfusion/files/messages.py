@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any
 
 from magfusion.errors import InputError
-from magfusion.model.aiding import Quantity
 
 IMU = "sensor_msgs/msg/Imu"
 FIELD = "sensor_msgs/msg/MagneticField"
@@ -20,38 +19,42 @@ FORMER_TRANSFORMS = "tf/msg/tfMessage"
 Row = Callable[[Any], list[float]]
 
 
-def _vector(value: Any) -> list[float]:
+def vector_row(value: Any) -> list[float]:
+    """Return the components of a vector or point."""
     return [value.x, value.y, value.z]
 
 
 def _imu_row(message: Any) -> list[float]:
-    return _vector(message.angular_velocity) + _vector(message.linear_acceleration)
+    return vector_row(message.angular_velocity) + vector_row(message.linear_acceleration)
 
 
 def _field_row(message: Any) -> list[float]:
-    return _vector(message.magnetic_field)
+    return vector_row(message.magnetic_field)
 
 
 def _pose(pose: Any) -> list[float]:
-    return [*_vector(pose.position), *_vector(pose.orientation), pose.orientation.w]
+    return [*vector_row(pose.position), *vector_row(pose.orientation), pose.orientation.w]
 
 
-def _pose_row(message: Any) -> list[float]:
+def pose_row(message: Any) -> list[float]:
+    """Return position and quaternion, x first, of a stamped pose."""
     return _pose(message.pose)
 
 
-def _sure_pose_row(message: Any) -> list[float]:
+def sure_pose_row(message: Any) -> list[float]:
+    """Return the same of a pose with its covariance."""
     return _pose(message.pose.pose)
 
 
-def _odometry_row(message: Any) -> list[float]:
-    return _pose(message.pose.pose) + _vector(message.twist.twist.linear)
+def odometry_row(message: Any) -> list[float]:
+    """Return the same of an odometry, and its velocity in axes of its child frame."""
+    return _pose(message.pose.pose) + vector_row(message.twist.twist.linear)
 
 
 def transform_row(message: Any) -> list[float]:
     """Return translation and quaternion, x first, of a stamped transform."""
     turn = message.transform.rotation
-    return [*_vector(message.transform.translation), *_vector(turn), turn.w]
+    return [*vector_row(message.transform.translation), *vector_row(turn), turn.w]
 
 
 # By role and type: a pose's quaternion has x first; of an odometry the velocity follows, in body
@@ -60,62 +63,11 @@ ROWS: dict[str, dict[str, Row]] = {
     "imu": {IMU: _imu_row},
     "magnetometer": {FIELD: _field_row},
     "truth": {
-        ODOMETRY: _odometry_row,
-        POSE: _pose_row,
-        POSE_WITH_COVARIANCE: _sure_pose_row,
+        ODOMETRY: odometry_row,
+        POSE: pose_row,
+        POSE_WITH_COVARIANCE: sure_pose_row,
         TRANSFORM: transform_row,
     },
-}
-
-
-def _sure_twist_row(message: Any) -> list[float]:
-    return _vector(message.twist.twist.linear)
-
-
-def _twist_row(message: Any) -> list[float]:
-    return _vector(message.twist.linear)
-
-
-def _position_row(message: Any) -> list[float]:
-    return _vector(message.pose.position)
-
-
-def _sure_position_row(message: Any) -> list[float]:
-    return _vector(message.pose.pose.position)
-
-
-def _point_row(message: Any) -> list[float]:
-    return _vector(message.point)
-
-
-def _pose_height_row(message: Any) -> list[float]:
-    return [message.pose.position.z]
-
-
-def _range_row(message: Any) -> list[float]:
-    return [message.range]
-
-
-def _pressure_row(message: Any) -> list[float]:
-    return [message.fluid_pressure]
-
-
-# Of aiding sensors, by what they measure and type.
-AIDING_ROWS: dict[Quantity, dict[str, Row]] = {
-    "velocity": {
-        ODOMETRY: _sure_twist_row,
-        "geometry_msgs/msg/TwistWithCovarianceStamped": _sure_twist_row,
-        "geometry_msgs/msg/TwistStamped": _twist_row,
-    },
-    "range": {"sensor_msgs/msg/Range": _range_row},
-    "position": {
-        ODOMETRY: _sure_position_row,
-        POSE: _position_row,
-        POSE_WITH_COVARIANCE: _sure_position_row,
-        "geometry_msgs/msg/PointStamped": _point_row,
-    },
-    "height": {POSE: _pose_height_row},
-    "pressure": {"sensor_msgs/msg/FluidPressure": _pressure_row},
 }
 
 

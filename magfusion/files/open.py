@@ -46,7 +46,7 @@ def open_log(
     if is_euroc(path):
         return read_euroc(path, start, end)
     if is_bag(path):
-        aiding = {} if site is None else {one.name: one.quantity for one in site.aiding}
+        aiding = () if site is None else site.aiding
         return read_bag(path, start, end, topics, report, aiding)
     raise InputError(
         f"{path}: is no log: found neither {HEADER}, nor mav0/imu0/data.csv (EuRoC), nor"

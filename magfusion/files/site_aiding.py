@@ -34,6 +34,7 @@ UNITS: dict[Quantity, str] = {
     "heading": "deg",
 }
 DENSEST = 2e4  # kg/m^3; mercury has 13,600
+LARGEST_HEIGHT = 1e5  # m; the space begins there
 HIGHEST_PRESSURE = 1e9  # Pa; ten times that of the deepest sea
 _Distance = Annotated[float, between(-LARGEST_DISTANCE, LARGEST_DISTANCE)]
 _Share = Annotated[FromZero, between(0.0, 1.0)]
@@ -101,11 +102,20 @@ class RangeEntry(_WithOffset):
     point_m: Position
 
 
+class OriginEntry(StrictModel):
+    """Place of the world's origin on the ellipsoid WGS84."""
+
+    latitude_deg: Annotated[float, between(-90.0, 90.0)]
+    longitude_deg: Annotated[float, between(-180.0, 360.0)]
+    height_m: Annotated[float, between(-LARGEST_HEIGHT, LARGEST_HEIGHT)]
+
+
 class PositionEntry(_Mounted):
     """Position of the sensor."""
 
     quantity: Literal["position"]
     noise_m: AboveZero
+    origin: OriginEntry | None = None
     sigma: _PositionSigma = Field(default_factory=_PositionSigma)
 
 
@@ -168,6 +178,7 @@ def aiding_sensor(entry: AidingEntry) -> AidingSensor:
     constraint, density = (
         getattr(entry, key, None) for key in ("constraint_noise_m_s", "density_kg_m3")
     )
+    origin = getattr(entry, "origin", None)
     scale = getattr(entry, "scale", 1.0) if density is None else -density * STANDARD_GRAVITY
     return AidingSensor(
         entry.name or entry.quantity,
@@ -191,6 +202,7 @@ def aiding_sensor(entry: AidingEntry) -> AidingSensor:
             np.array(number(entry.sigma, "offset")),
             np.array(entry.sigma.time_offset_s),
         ),
+        None if origin is None else (origin.latitude_deg, origin.longitude_deg, origin.height_m),
     )
 
 
@@ -220,6 +232,8 @@ def _entry(sensor: AidingSensor) -> dict[str, Any]:
     }
     if sensor.point_world is not None:
         own["point_m"] = plain(sensor.point_world)
+    if sensor.origin is not None:
+        own["origin"] = dict(zip(OriginEntry.model_fields, sensor.origin, strict=True))
     if sensor.quantity == "pressure":
         own["density_kg_m3"] = float(-sensor.scale / STANDARD_GRAVITY)
     if sensor.quantity == "velocity" and sensor.scale != 1.0:

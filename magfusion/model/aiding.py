@@ -71,6 +71,9 @@ class AidingSensor:
         A sample stamped t was measured at t + time_offset (s).
     rate_hz : float
         Greatest rate of the samples that are used; others are left out.
+    origin : tuple of float, optional
+        Latitude, longitude (degrees) and ellipsoidal height (m) of the world's origin, for
+        positions of GNSS; the world's axes are east, north and up there.
     """
 
     __repr__ = short_repr
@@ -90,6 +93,7 @@ class AidingSensor:
     time_offset: Array = field(default_factory=_zero)
     rate_hz: float = AIDING_RATE
     sigmas: AidingSigma = field(default_factory=AidingSigma)
+    origin: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)

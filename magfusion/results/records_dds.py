@@ -8,8 +8,10 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
+import numpy as np
+
 from magfusion.errors import InputError
-from magfusion.files.messages import AIDING_ROWS, Row
+from magfusion.files.aiding_messages import NAV_SAT_FIX, SensorMessages, aiding_rows
 from magfusion.files.stream import NumberedRecord, Record, checked_record
 from magfusion.results.dds_domain import dds_name, join_domain
 
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
     from cyclonedds.sub import DataReader
 
     from magfusion.files.bag_topics import Topics
+    from magfusion.files.messages import Row
     from magfusion.model.aiding import AidingSensor
     from magfusion.model.site import Site
 
@@ -39,7 +42,7 @@ class Subscription(NamedTuple):
     kind : str
         Its type in ROS.
     content : callable
-        Returns the part's keys, but for the time, of messages.
+        Returns the part's keys of stamps (s) and messages.
     sensor : str, optional
         Aiding sensor of the site, which may have topics of several types.
     """
@@ -47,19 +50,20 @@ class Subscription(NamedTuple):
     topic: str
     message: str
     kind: str
-    content: Callable[[Sequence[Any]], dict[str, list[Any]]]
+    content: Callable[[list[float], Sequence[Any]], dict[str, list[Any]]]
     sensor: str | None = None
 
 
-def _imu_content(messages: Sequence[Any]) -> dict[str, list[Any]]:
+def _imu_content(stamps: list[float], messages: Sequence[Any]) -> dict[str, list[Any]]:
     return {
+        "time": stamps,
         "gyro": [_xyz(one.angular_velocity) for one in messages],
         "accel": [_xyz(one.linear_acceleration) for one in messages],
     }
 
 
-def _field_content(messages: Sequence[Any]) -> dict[str, list[Any]]:
-    return {"field": [_xyz(one.magnetic_field) for one in messages]}
+def _field_content(stamps: list[float], messages: Sequence[Any]) -> dict[str, list[Any]]:
+    return {"time": stamps, "field": [_xyz(one.magnetic_field) for one in messages]}
 
 
 def _xyz(vector: Any) -> list[float]:
@@ -78,21 +82,28 @@ AIDING_MESSAGES = {  # class by type
     "geometry_msgs/msg/PoseStamped": "PoseStampedMessage",
     "sensor_msgs/msg/Range": "RangeMessage",
     "sensor_msgs/msg/FluidPressure": "FluidPressureMessage",
+    NAV_SAT_FIX: "NavSatFixMessage",
 }
 
 
 def _of_aiding(sensor: AidingSensor) -> Iterator[Subscription]:
     """Yield the subscriptions of a sensor: to the topic of its name, of every type it may have."""
-    for kind, row in AIDING_ROWS.get(sensor.quantity, {}).items():
+    for kind, row in aiding_rows(sensor).items():
         if kind in AIDING_MESSAGES:
-            content = partial(_aiding_content, row)
+            content = partial(_aiding_content, row, SensorMessages(sensor))
             topic = f"/{sensor.name.strip('/')}"
             yield Subscription(topic, AIDING_MESSAGES[kind], kind, content, sensor.name)
 
 
-def _aiding_content(row: Row, messages: Sequence[Any]) -> dict[str, list[Any]]:
-    rows = [row(one) for one in messages]
-    return {"value": rows if len(rows[0]) > 1 else [value for (value,) in rows]}
+def _aiding_content(
+    row: Row, of_sensor: SensorMessages, stamps: list[float], messages: Sequence[Any]
+) -> dict[str, list[Any]]:
+    """Return samples; none where the messages have no value, or no stamp to tell the order."""
+    if 0.0 in stamps:
+        return {"time": stamps}
+    time, value = of_sensor.samples(np.array(stamps), np.array([row(one) for one in messages]))
+    value = value[:, 0] if value.shape[1:] == (1,) else value
+    return {"time": time.tolist(), "value": value.tolist()}
 
 
 def subscribe(topics: Topics | None, site: Site, messages: TextIO) -> Iterator[NumberedRecord]:
@@ -190,10 +201,10 @@ def _add(
 ) -> None:
     """Add messages to the content of a record."""
     stamps = [one.header.stamp.sec + NS * one.header.stamp.nanosec for one in messages]
-    own = {"time": stamps, **subscription.content(messages)}
+    own = subscription.content(stamps, messages)
     if subscription.sensor is None:
         content[part] = own
-    else:
+    elif own["time"]:
         content.setdefault("aiding", {})[subscription.sensor] = own
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, float32, float64, int32, uint8, uint32
+from cyclonedds.idl.types import array, float32, float64, int8, int32, uint8, uint16, uint32
 
 if TYPE_CHECKING:
     Covariance = list[float]
@@ -162,3 +162,24 @@ class FluidPressureMessage(IdlStruct, typename="sensor_msgs.msg.dds_.FluidPressu
     header: Header
     fluid_pressure: float64
     variance: float64
+
+
+@dataclass
+class NavSatStatus(IdlStruct, typename="sensor_msgs.msg.dds_.NavSatStatus_"):
+    """Kind of a fix, below zero if there is none, and the systems that took part."""
+
+    status: int8
+    service: uint16
+
+
+@dataclass
+class NavSatFixMessage(IdlStruct, typename="sensor_msgs.msg.dds_.NavSatFix_"):
+    """Latitude and longitude (degrees), and height above the ellipsoid WGS84 (m)."""
+
+    header: Header
+    status: NavSatStatus
+    latitude: float64
+    longitude: float64
+    altitude: float64
+    position_covariance: AxesCovariance
+    position_covariance_type: uint8

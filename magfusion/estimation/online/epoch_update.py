@@ -220,7 +220,7 @@ class EpochUpdate:
         state, offset = predicted.state, arrived.applied_offset
         imu = arrived.inertial_samples(before.time - offset, state.time - offset)
         self.score.predict(before, state, predicted.transition, imu)
-        self.score.measured(measurements, state)
+        self.score.measured(measurements, state, self.aiding.rejected)
 
     def _update_monitor(
         self, before: State, predicted: Propagated, state: State, measured: EpochMeasurements | None

@@ -4,10 +4,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 from scipy.stats import chi2
 
 from magfusion.estimation.graph.measurement import Measurement, group_distances
-from magfusion.estimation.graph.state import State, states_of
+from magfusion.estimation.graph.state import MOTION, State, states_of
 from magfusion.estimation.integrity.suspects import CODE
 from magfusion.estimation.measurements.aiding import AidingMeasurement
 from magfusion.estimation.online_integrity.judgement import Judgement
@@ -17,9 +18,9 @@ from magfusion.model.trust import Finding, Verdict
 FALSE_REJECTIONS = 1e-3  # of true samples, which costs a thousandth of the information
 # The same after a rejection: a slip goes on, while the prediction becomes less certain.
 FALSE_REJECTIONS_AGAIN = 0.05
+SCORED_LOSS = "cauchy"  # of rejected samples in the score: slips do not name a parameter
 REJECTED_LONG = 5.0  # s of nothing but rejections; slips and reflections are shorter
 MEMORY = 0.995  # of the share of rejections, per sample
-TRUNCATED = 0.05  # share beyond which what is accepted is no fair sample of the errors
 CONTRADICTS = 0.25  # share beyond which a sensor is not as declared
 OF_PARAMETERS = frozenset(CODE[p] for p in PARAMETERS if isinstance(p, AidingParameter))
 FREEDOM = (1, 2, 3)
@@ -36,17 +37,22 @@ class AidingGate:
         Of each sensor whose last sample was rejected, the time of the first such in a row (s).
     rejected_share : dict of str to float
         Decaying mean of its rejections.
+    rejected : tuple of Measurement
+        Samples of the last epoch that were rejected, at a state that is known better than they
+        measure: they show what is wrong with their sensor.
     """
 
     rejected_since: dict[str, float]
     rejected_share: dict[str, float]
+    rejected: tuple[Measurement, ...]
 
     def __init__(self, blocks: Sequence[Block], counts: Counter[str]) -> None:
         self.blocks, self.counts = tuple(blocks), counts
-        self.rejected_since, self.rejected_share = {}, {}
+        self.rejected_since, self.rejected_share, self.rejected = {}, {}, ()
 
     def passed(self, measurements: list[Measurement], state: State) -> list[Measurement]:
         """Return the measurements of one epoch without those that fail the test."""
+        self.rejected = ()
         return [one for one in measurements if self._is_explained(one, state)]
 
     def _is_explained(self, measurement: Measurement, state: State) -> bool:
@@ -63,21 +69,20 @@ class AidingGate:
         else:
             self.counts[f"outlier of {sensor}"] += 1
             self.rejected_since.setdefault(sensor, state.time)
+            jacobian = rows.jacobian(len(state.cov) - MOTION)[0, 0]
+            if np.trace(jacobian @ state.cov @ jacobian.T) < measured:
+                self.rejected += (replace(measurement, robust=SCORED_LOSS),)
         return explained
 
     def assessed(self, judgement: Judgement, time: float) -> Judgement:
-        """Return a judgement with the sensors that contradict the state.
-
-        A parameter of a sensor is not estimated by the samples that the test leaves.
-        """
+        """Return a judgement with the sensors that contradict the state, if no cause is known."""
+        if any(finding.code in OF_PARAMETERS for finding in judgement.findings):
+            return judgement
         contradicting = {
             sensor: share
             for sensor, share in self.rejected_share.items()
             if share > CONTRADICTS or time > self.rejected_since.get(sensor, time) + REJECTED_LONG
         }
-        if max(self.rejected_share.values(), default=0.0) > TRUNCATED:
-            kept = tuple(f for f in judgement.findings if f.code not in OF_PARAMETERS)
-            judgement = replace(judgement, findings=kept)
         return judgement.with_findings(
             *(
                 Finding(

@@ -19,7 +19,7 @@ from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
 from magfusion.estimation.online_integrity.score_targets import ScoreTargets
 from magfusion.model.parameters import Calibration
 from magfusion.model.samples import ImuSamples
-from magfusion.units import Array
+from magfusion.units import Array, BoolArray
 
 MEMORY = 60.0  # s; older innovations count less, as faults may change
 
@@ -78,11 +78,14 @@ class Epoch(NamedTuple):
         None where the state was not propagated.
     measurements : tuple of Measurement
         After the gate.
+    rejected : tuple of Measurement
+        Innovations that did not update the state.
     """
 
     predicted: State
     passed: EpochTransition | None
     measurements: tuple[Measurement, ...] = ()
+    rejected: tuple[Measurement, ...] = ()
 
 
 def passed(before: State, after: State, transition: Array, imu: ImuSamples) -> EpochTransition:
@@ -97,21 +100,23 @@ def passed(before: State, after: State, transition: Array, imu: ImuSamples) -> E
 def add_epochs(sums: Sums, epochs: Sequence[Epoch], targets: ScoreTargets) -> Sums:
     """Return the sums with the innovations of some consecutive epochs."""
     own, rest = slice(0, targets.size), targets.rest
-    error, jacobian = _rows(epochs, targets)
+    error, jacobian, is_used = _rows(epochs, targets)
     by_state, by_held = (
         jacobian[..., : targets.whole],
         jacobian[..., targets.whole :] * targets.unit,
     )
     cov = np.array([epoch.predicted.cov for epoch in epochs])
     by_own, across, noise = by_state[..., own], by_state @ cov, np.eye(error.shape[1])
-    innovation = across @ np.swapaxes(by_state, 1, 2) + noise
+    # Rejected rows have no gain, and no part in that of the others.
+    both_used = is_used[:, :, None] * is_used[:, None, :]
+    updating = across @ np.swapaxes(by_state, 1, 2) * both_used + noise
     alone = cov[:, own, own]
     if len(rest):
         considered = cov[:, rest]
         learnt = np.linalg.solve(considered[:, :, rest], considered[:, :, own])
         alone = alone - np.swapaxes(considered[:, :, own], 1, 2) @ learnt
     known = by_own @ alone @ np.swapaxes(by_own, 1, 2) + noise
-    gain = np.swapaxes(np.linalg.solve(innovation, across[..., own]), 1, 2)
+    gain = np.swapaxes(np.linalg.solve(updating, across[..., own] * is_used[..., None]), 1, 2)
     pushed, response = _pushed(epochs, targets), sums.response
     shown, fixed = np.empty((*error.shape, response.shape[1])), slice(0, len(targets.unit))
     for k, epoch in enumerate(epochs):
@@ -157,44 +162,46 @@ def _pushed(epochs: Sequence[Epoch], targets: ScoreTargets) -> Array:
     return out
 
 
-def _rows(epochs: Sequence[Epoch], targets: ScoreTargets) -> tuple[Array, Array]:
-    """Return errors (epochs, m) and Jacobians (epochs, m, whole + h), padded with zeros.
+def _rows(epochs: Sequence[Epoch], targets: ScoreTargets) -> tuple[Array, Array, BoolArray]:
+    """Return errors (epochs, m), Jacobians (epochs, m, whole + h), and which rows are used.
 
-    Rows without information on the state are zero.
+    They are padded with zeros; rows without information on the state are zero.
     """
     width, parts = targets.whole - MOTION + len(targets.unit), [list[_Row]() for _ in epochs]
-    shared: dict[object, list[tuple[int, Measurement]]] = {}
+    shared: dict[object, list[tuple[int, bool, Measurement]]] = {}
     for k, epoch in enumerate(epochs):
-        for number, measurement in enumerate(epoch.measurements):
+        for number, measurement in enumerate((*epoch.measurements, *epoch.rejected)):
             key = _linearization_key(measurement, epoch.predicted.calibration, (k, number))
-            shared.setdefault(key, []).append((k, measurement))
+            used = number < len(epoch.measurements)
+            shared.setdefault(key, []).append((k, used, measurement))
     for group in shared.values():
-        numbers = [k for k, _ in group]
-        states = [epochs[k].predicted for k in numbers]
-        rows = _linearized([measurement for _, measurement in group], states, targets)
+        states = [epochs[k].predicted for k, *_ in group]
+        rows = _linearized([measurement for *_, measurement in group], states, targets)
         jacobian = rows.jacobian(width).reshape(len(group), -1, MOTION + width)
         error = rows.error.reshape(len(group), -1)
-        for k, *row in zip(numbers, error, jacobian, strict=True):
-            parts[k].append(_Row(*row))
+        for (k, used, _), *row in zip(group, error, jacobian, strict=True):
+            parts[k].append(_Row(*row, used))
     maximum = max((sum(len(one.error) for one in own) for own in parts), default=0)
     errors, jacobians = (
         np.zeros((len(epochs), maximum)),
         np.zeros((len(epochs), maximum, MOTION + width)),
     )
+    is_used = np.zeros((len(epochs), maximum), dtype=bool)
     for k, own in enumerate(parts):
         begin = 0
         for one in own:
-            end = begin + len(one.error)
-            errors[k, begin:end], jacobians[k, begin:end] = one
-            begin = end
+            rows_of = slice(begin, begin := begin + len(one.error))
+            errors[k, rows_of], jacobians[k, rows_of] = one.error, one.jacobian
+            is_used[k, rows_of] = one.is_used
     unreported = ~np.any(jacobians[..., : targets.whole], axis=2)
     errors[unreported], jacobians[unreported] = 0.0, 0.0
-    return errors, jacobians
+    return errors, jacobians, is_used
 
 
 class _Row(NamedTuple):
     error: Array
     jacobian: Array
+    is_used: bool
 
 
 _OFFSET = (FieldPhasors, JointPhasors, EarthField)  # that depend on the applied IMU time offset

@@ -165,15 +165,20 @@ class OnlineScore:
         if self._sums is not None:
             self._waiting.append(Epoch(after, passed(before, after, transition, imu)))
 
-    def measured(self, measurements: Sequence[Measurement], predicted: State) -> None:
-        """Process the innovations of an epoch, after the gate."""
+    def measured(
+        self,
+        measurements: Sequence[Measurement],
+        predicted: State,
+        rejected: Sequence[Measurement] = (),
+    ) -> None:
+        """Process the innovations of an epoch, after the gate, and those of rejected samples."""
         self._select_beacons(measurements, predicted.time)
-        if self._sums is None or not measurements:
+        if self._sums is None or not (measurements or rejected):
             return
         led = None
         if self._waiting and self._waiting[-1].predicted is predicted:
             led = self._waiting.pop().passed
-        self._waiting.append(Epoch(predicted, led, tuple(measurements)))
+        self._waiting.append(Epoch(predicted, led, tuple(measurements), tuple(rejected)))
         self._epochs_since_score += 1
         if self._steps.is_due(self._sums, predicted.time) and (sums := self.settle()) is not None:
             self._sums = self._steps.with_onset(sums)

@@ -91,6 +91,43 @@ def gravity(latitude_deg: float, height_m: float) -> float:
     return float(surface * (1 - 2 * slope * height + 3 * height**2))
 
 
+def east_north_up(
+    latitude_deg: float,
+    longitude_deg: float,
+    height_m: float,
+    origin: tuple[float, float, float],
+) -> Array:
+    """Return a position in the tangent plane of an origin, shape (3,) (m).
+
+    Parameters
+    ----------
+    latitude_deg, longitude_deg, height_m : float
+        On and above the ellipsoid WGS84.
+    origin : tuple of float
+        The same of the world's origin.
+    """
+    latitude, longitude = origin[0] * DEGREE, origin[1] * DEGREE
+    away = _earth_fixed(latitude_deg, longitude_deg, height_m) - _earth_fixed(*origin)
+    east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
+    up = np.array(
+        [
+            np.cos(latitude) * np.cos(longitude),
+            np.cos(latitude) * np.sin(longitude),
+            np.sin(latitude),
+        ]
+    )
+    return np.stack([east, np.cross(up, east), up]) @ away
+
+
+def _earth_fixed(latitude_deg: float, longitude_deg: float, height_m: float) -> Array:
+    """Return a position in the axes of WGS84, shape (3,) (m)."""
+    latitude, longitude = latitude_deg * DEGREE, longitude_deg * DEGREE
+    curvature = _SEMI_MAJOR / np.sqrt(1.0 - _ECCENTRICITY2 * np.sin(latitude) ** 2)
+    across = (curvature + height_m) * np.cos(latitude)
+    along_axis = ((1.0 - _ECCENTRICITY2) * curvature + height_m) * np.sin(latitude)
+    return np.array([across * np.cos(longitude), across * np.sin(longitude), along_axis])
+
+
 def _check_place(latitude_deg: float, height_m: float) -> None:
     if not -90.0 <= latitude_deg <= 90.0:
         raise InputError(

@@ -1,0 +1,142 @@
+"""Messages of ROS that aiding sensors send, as samples of what these measure."""
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.files.messages import (
+    ODOMETRY,
+    POSE,
+    POSE_WITH_COVARIANCE,
+    Row,
+    odometry_row,
+    pose_row,
+    sure_pose_row,
+    vector_row,
+)
+from magfusion.model.aiding import AidingSensor, Quantity
+from magfusion.model.physics.earth import east_north_up
+from magfusion.units import Array
+
+NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
+POSE_COLUMNS = 7  # position and quaternion; a twist follows
+SHORTEST_QUATERNION = 0.5  # an attitude that was left unfilled is zero
+LONGEST_STEP = 2.0  # periods of the sensor's rate between poses whose difference is a velocity
+
+
+def _sure_twist_row(message: Any) -> list[float]:
+    return vector_row(message.twist.twist.linear)
+
+
+def _twist_row(message: Any) -> list[float]:
+    return vector_row(message.twist.linear)
+
+
+def _position_row(message: Any) -> list[float]:
+    return vector_row(message.pose.position)
+
+
+def _sure_position_row(message: Any) -> list[float]:
+    return vector_row(message.pose.pose.position)
+
+
+def _point_row(message: Any) -> list[float]:
+    return vector_row(message.point)
+
+
+def _pose_height_row(message: Any) -> list[float]:
+    return [message.pose.position.z]
+
+
+def _range_row(message: Any) -> list[float]:
+    return [message.range]
+
+
+def _pressure_row(message: Any) -> list[float]:
+    return [message.fluid_pressure]
+
+
+def _fix_row(sensor: AidingSensor, message: Any) -> list[float]:
+    if sensor.origin is None:
+        raise InputError(
+            f"{sensor.name}: {NAV_SAT_FIX} gives latitudes; add the origin of the world to the"
+            " sensor in the site's aiding: origin: {latitude_deg, longitude_deg, height_m}."
+        )
+    if message.status.status < 0:  # no fix
+        return [np.nan] * 3
+    place = message.latitude, message.longitude, message.altitude
+    return [float(x) for x in east_north_up(*place, sensor.origin)]
+
+
+_ROWS: Mapping[Quantity, Mapping[str, Row]] = {
+    "velocity": {
+        ODOMETRY: odometry_row,
+        "geometry_msgs/msg/TwistWithCovarianceStamped": _sure_twist_row,
+        "geometry_msgs/msg/TwistStamped": _twist_row,
+        POSE: pose_row,
+        POSE_WITH_COVARIANCE: sure_pose_row,
+    },
+    "range": {"sensor_msgs/msg/Range": _range_row},
+    "position": {
+        ODOMETRY: _sure_position_row,
+        POSE: _position_row,
+        POSE_WITH_COVARIANCE: _sure_position_row,
+        "geometry_msgs/msg/PointStamped": _point_row,
+    },
+    "height": {POSE: _pose_height_row},
+    "pressure": {"sensor_msgs/msg/FluidPressure": _pressure_row},
+}
+
+
+def aiding_rows(sensor: AidingSensor) -> dict[str, Row]:
+    """Return how messages become numbers, by the types that a sensor may send."""
+    rows = dict(_ROWS.get(sensor.quantity, {}))
+    if sensor.quantity == "position":
+        rows[NAV_SAT_FIX] = partial(_fix_row, sensor)
+    return rows
+
+
+class SensorMessages:
+    """Converts the messages of one sensor, in the order of their stamps, to samples."""
+
+    def __init__(self, sensor: AidingSensor) -> None:
+        self._sensor, self._last = sensor, np.zeros((0, 1 + POSE_COLUMNS))
+
+    def samples(self, time: Array, rows: Array) -> tuple[Array, Array]:
+        """Return times (s) and values of messages; those without a value are left out.
+
+        A velocity without a twist is that of the poses' differences, in the middle of each.
+
+        Parameters
+        ----------
+        time : ndarray, shape (n,)
+        rows : ndarray, shape (n, columns)
+            As of `aiding_rows`.
+        """
+        there = ~np.isnan(rows).any(axis=1)
+        time, rows = time[there], rows[there]
+        if self._sensor.quantity != "velocity" or rows.shape[1] < POSE_COLUMNS:
+            return time, rows
+        twist = rows[:, POSE_COLUMNS:]
+        if twist.any():
+            return time, twist
+        poses = np.hstack([time[:, None], rows[:, :POSE_COLUMNS]])
+        return self._differences(np.concatenate([self._last, poses]))
+
+    def _differences(self, poses: Array) -> tuple[Array, Array]:
+        """Return velocities in the axes of poses (n, 8), the first of each period of the rate."""
+        rate = self._sensor.rate_hz
+        poses = poses[np.linalg.norm(poses[:, 4:], axis=1) > SHORTEST_QUATERNION]
+        period = np.floor(poses[:, 0] * rate * (1.0 + 1e-9))
+        poses = poses[np.diff(period, prepend=-np.inf) > 0.0]
+        self._last = poses[-1:]
+        step, attitude = np.diff(poses[:, 0]), Rotation.from_quat(poses[:, 4:])
+        near = step <= LONGEST_STEP / rate
+        first, second = attitude[:-1], attitude[1:]
+        middle = first * Rotation.from_rotvec(0.5 * (first.inv() * second).as_rotvec())
+        velocity = middle.inv().apply(np.diff(poses[:, 1:4], axis=0) / step[:, None])
+        return (poses[:-1, 0] + 0.5 * step)[near], velocity[near]

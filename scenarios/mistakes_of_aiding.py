@@ -1,0 +1,109 @@
+"""What is wrongly declared of aiding sensors: scale, lever arm, frame, clock; and outliers.
+
+All rows are of one platform that has a sensor of several kinds besides its magnetometer.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from mistake_case import Case, Change, Mistake, again
+from scipy.spatial.transform import Rotation
+
+from magfusion.model.aiding import AidingSensor
+from magfusion.units import DEGREE, Array
+
+REST = ("rest",)
+LEVER = np.array([0.3, -0.2, 0.1])  # m
+AWAY = np.array([0.12, 0.0, 0.16])  # m; 20 cm
+SHARE = 0.05  # of samples that are outliers
+TURNED = Rotation.from_euler("xyz", [3.0, -5.0, 20.0], degrees=True).as_matrix()
+SENSORS = (
+    AidingSensor("visual", "velocity", 0.02, position_body=LEVER, body_from_sensor=TURNED),
+    AidingSensor(
+        "anchor", "range", 0.05, position_body=LEVER, point_world=np.array([6.0, 1.0, 2.0])
+    ),
+    AidingSensor("prism", "position", 0.01, position_body=LEVER),
+    AidingSensor("level", "height", 0.02, position_body=LEVER),
+    AidingSensor("compass", "heading", 0.5 * DEGREE),
+)
+
+
+def _aided(case: Case) -> Case:
+    """Return the case of a platform with aiding sensors, declared as they are."""
+    site = replace(case.site, aiding=SENSORS)
+    return replace(again(case, site), site=site)
+
+
+def _declared(name: str, change: Callable[[AidingSensor], AidingSensor]) -> Change:
+    """Return a mistake in what the site says of a sensor."""
+
+    def changed(case: Case) -> Case:
+        aided = _aided(case)
+        sensors = tuple(change(s) if s.name == name else s for s in aided.site.aiding)
+        return replace(aided, site=replace(aided.site, aiding=sensors))
+
+    return changed
+
+
+def _scaled(sensor: AidingSensor) -> AidingSensor:
+    return replace(sensor, scale=1.05 * sensor.scale)
+
+
+def _levered(sensor: AidingSensor) -> AidingSensor:
+    return replace(sensor, position_body=sensor.position_body + AWAY)
+
+
+def _late(sensor: AidingSensor) -> AidingSensor:
+    return replace(sensor, time_offset=sensor.time_offset + 0.2)
+
+
+def _turned(sensor: AidingSensor) -> AidingSensor:
+    turn = Rotation.from_rotvec([0.0, 0.0, 3.0], degrees=True).as_matrix()
+    return replace(sensor, body_from_sensor=sensor.body_from_sensor @ turn)
+
+
+def _offset(sensor: AidingSensor) -> AidingSensor:
+    return replace(sensor, offset=sensor.offset + 3.0 * DEGREE)
+
+
+def _outliers(name: str, size: float) -> Change:
+    """Return data of which one sample in twenty is wrong by up to a size."""
+
+    def changed(case: Case) -> Case:
+        aided = _aided(case)
+        samples = aided.log.aiding[name]
+        hit = case.rng.random(len(samples)) < SHARE
+        wrong: Array = case.rng.uniform(-size, size, samples.value.shape)
+        value = samples.value + hit[:, None] * wrong
+        aiding = {**aided.log.aiding, name: replace(samples, value=value)}
+        return replace(aided, log=replace(aided.log, aiding=aiding))
+
+    return changed
+
+
+_LEVER, _CLOCK = ("aiding_lever_arm",), ("aiding_clock",)
+_AT_REST = ("aiding_lever_arm", "aiding_offset")  # of one attitude they are one
+
+MISTAKES = (
+    Mistake("aiding_as_declared", "aiding", _aided, harmless=True),
+    Mistake("velocity_scale_5pct", "aiding", _declared("visual", _scaled), ("aiding_scale",), REST),
+    Mistake("velocity_lever_20cm", "aiding", _declared("visual", _levered), _LEVER, REST),
+    Mistake(
+        "velocity_turned_3deg", "aiding", _declared("visual", _turned), ("aiding_mounting",), REST
+    ),
+    Mistake("velocity_clock_200ms", "aiding", _declared("visual", _late), _CLOCK, REST),
+    Mistake("velocity_outliers", "aiding", _outliers("visual", 1.0), harmless=True),
+    Mistake("range_lever_20cm", "aiding", _declared("anchor", _levered), _AT_REST),
+    Mistake("range_clock_200ms", "aiding", _declared("anchor", _late), _CLOCK, REST),
+    Mistake("range_outliers", "aiding", _outliers("anchor", 3.0), harmless=True),
+    Mistake("position_lever_20cm", "aiding", _declared("prism", _levered), _LEVER),
+    Mistake("position_clock_200ms", "aiding", _declared("prism", _late), _CLOCK, REST),
+    Mistake("position_outliers", "aiding", _outliers("prism", 2.0), harmless=True),
+    Mistake("height_lever_20cm", "aiding", _declared("level", _levered), _AT_REST),
+    Mistake("height_clock_200ms", "aiding", _declared("level", _late), _CLOCK, REST),
+    Mistake("height_outliers", "aiding", _outliers("level", 2.0), harmless=True),
+    Mistake("heading_turned_3deg", "aiding", _declared("compass", _offset), ("aiding_offset",)),
+    Mistake("heading_clock_200ms", "aiding", _declared("compass", _late), _CLOCK, REST),
+    Mistake("heading_outliers", "aiding", _outliers("compass", 90.0 * DEGREE), harmless=True),
+)
