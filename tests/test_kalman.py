@@ -340,7 +340,7 @@ def test_filters_of_the_bank_are_this_one_without_a_beacon(considered: int, drif
     bank = SubsetBank(site, blocks, considered)
     bank._begin(start)
     bank._cov[2, POSITION, POSITION] += drifted**2 * np.eye(3)
-    before = bank._cov.copy()
+    before = bank._whole()
     kalman = ErrorStateFilter(start, blocks, considered)
     kalman.absorb(predicted, epoch)
     bank.absorb(predicted, epoch, kalman.state)
@@ -352,6 +352,6 @@ def test_filters_of_the_bank_are_this_one_without_a_beacon(considered: int, drif
         alone.F, alone.Q = predicted.transition, predicted.noise
         alone.predict()
         alone.update_from_far(-error[owner != group], H[owner != group])
-        assert separate(bank._cov[1 + group], alone.P, alone.P) < close
+        assert separate(bank._whole()[1 + group], alone.P, alone.P) < close
         if group >= 0:
             assert separate(bank._step[group] + went, alone.x, alone.P) < close

@@ -7,6 +7,9 @@ that slow faults are detected too.
 All are updated in the same calls and not as one `PartialUpdateFilter` each (0.8 instead of 2.0 ms
 an epoch of four beacons): filterpy inverts ``S``, which fails for a filter that has drifted by
 kilometres.
+
+Considered parameters are the same random variables in all filters: what these correlate among
+themselves is stored once, and the products with it are formed once for all.
 """
 
 from collections.abc import Sequence
@@ -47,8 +50,9 @@ class SubsetBank:
     """
 
     _step: Array | None  # (groups, n); deviation of each filter from the estimate
-    _cov: Array | None  # (1 + groups, n, n); of the filter with all, then of those without
-    _joint: Array | None  # (groups, n, n); cross-covariance of each with the one with all
+    _cov: Array | None  # (1 + groups, m, n); rows of what is estimated, with all and then without
+    _joint: Array | None  # (groups, m, m); cross-covariance of each with the one with all
+    _common: Array | None  # (n - m, n - m); covariance of considered parameters
 
     def __init__(
         self, site: Site, blocks: tuple[Block, ...], considered: int, risk: Risk | None = None
@@ -61,7 +65,7 @@ class SubsetBank:
         self.groups = min(len(self.names), MAX_FILTERS)
         members = np.bincount(np.arange(len(self.names)) % self.groups)
         self._prior = np.array(self.risk.fault * members[None], dtype=np.float64)
-        self._step = self._cov = self._joint = None
+        self._step = self._cov = self._joint = self._common = None
         names = [name for name, _ in site.channels]
         self._owner = np.array([self.names.index(name) % self.groups for name in names])
 
@@ -73,17 +77,23 @@ class SubsetBank:
         ValueError
             If they do not.
         """
-        parts = (self._step, self._cov, self._joint)
+        parts = (self._step, self._cov, self._joint, self._common)
         if all(part is None for part in parts):
             return
-        shapes = ((self.groups, size), (1 + self.groups, size, size), (self.groups, size, size))
+        own, groups = size - self.considered, self.groups
+        shapes = (
+            (groups, size),
+            (1 + groups, own, size),
+            (groups, own, own),
+            (self.considered, self.considered),
+        )
         for part, shape in zip(parts, shapes, strict=True):
             if part is None or part.shape != shape or not np.all(np.isfinite(part)):
                 raise ValueError("has filters of another shape, or not finite")
 
     def reset(self) -> None:
         """Discard all filters: the estimate has restarted."""
-        self._step = self._cov = self._joint = None
+        self._step = self._cov = self._joint = self._common = None
 
     def absorb(
         self, predicted: Propagated, measurements: Sequence[Measurement], after: State
@@ -102,47 +112,75 @@ class SubsetBank:
         if self._step is None or self._step.shape[1] != len(after.cov):
             self._begin(after)
             return
-        assert self._cov is not None
-        assert self._joint is not None
-        motion, noise = predicted.transition[:MOTION], predicted.noise
-        step, cov, joint = (part.copy() for part in (self._step, self._cov, self._joint))
-        step[:, :MOTION] = step @ motion.T
-        for part in (cov, joint):
-            part[:, :MOTION] = motion @ part
-            part[:, :, :MOTION] = part @ motion.T
-            part += noise
         error, jacobian, owner = self._rows(measurements, predicted.state)
-        selected = self._accepted_rows(jacobian, owner)
-        self._leave_out_together(measurements, owner, jacobian, selected)
+        spans = self._spans(measurements, owner)
         if leaves_out(measurements):
             kept = np.any(jacobian, axis=1)
-            error, jacobian, selected = error[kept], jacobian[kept], selected[:, kept]
-        # Considered parameters have no gain: only rows and columns of all others are updated.
-        count = cov.shape[1] - self.considered
+            error, jacobian, owner = error[kept], jacobian[kept], owner[kept]
+            spans = [basis[kept] for basis in spans]
+        step, cov, joint, common = self._propagated(predicted)
+        count = cov.shape[1]
         own, considered = slice(0, count), slice(count, None)
-        crossed, back = selected @ cov, np.swapaxes(selected, 1, 2)
-        gain = self._gains(crossed[:, :, own], crossed @ back)
+        of_common = jacobian[:, considered] @ common
+
+        def selected(rows: Array) -> Array:
+            return self._selected(rows, owner, spans)
+
+        by_own, by_common = selected(jacobian[:, own]), selected(jacobian[:, considered])
+        back, back_common = (np.swapaxes(part, 1, 2) for part in (by_own, by_common))
+        spread = selected(np.swapaxes(selected(of_common @ jacobian[:, considered].T), 1, 2))
+        shared = cov[:, :, considered] @ back_common
+        crossed = by_own @ cov[:, :, own] + np.swapaxes(shared, 1, 2)
+        gain = self._gains(crossed, crossed @ back + by_own @ shared + spread)
         rotated = np.swapaxes(gain, 1, 2)
-        innovation = error + step @ jacobian.T
-        step[:, own] -= (gain[1:] @ innovation[..., None])[..., 0]
+        step[:, own] -= (gain[1:] @ (error + step @ jacobian.T)[..., None])[..., 0]
         step[:, own] -= between(predicted.state, after, self._estimated)
         # Joseph's form, as the gain is not optimal with considered parameters.
-        half = cov[:, own] - gain @ crossed
-        whole = half[:, :, own] + (gain - half @ back) @ rotated
-        cov[:, own, own] = 0.5 * (whole + np.swapaxes(whole, 1, 2))
-        cov[:, own, considered] = half[:, :, considered]
-        cov[:, considered, own] = np.swapaxes(half[:, :, considered], 1, 2)
-        joint[:, own] -= gain[1:] @ (selected[1:] @ joint)
-        across = joint @ back[0]
-        joint[:, own, own] += gain[1:] @ rotated[0]
-        joint[:, :, own] -= across @ rotated[0]
-        self._step, self._cov, self._joint = step, cov, joint
+        half = cov - gain @ np.concatenate([crossed, by_own @ cov[:, :, considered]], axis=2)
+        half[:, :, considered] -= (gain @ by_common) @ common
+        spread = half[:, :, own] @ back + half[:, :, considered] @ back_common
+        whole = half[:, :, own] + (gain - spread) @ rotated
+        joint -= gain[1:] @ (by_own[1:] @ joint + by_common[1:] @ cov[0, :, considered].T)
+        across = joint @ back[0] + half[1:, :, considered] @ back_common[0]
+        joint += (gain[1:] - across) @ rotated[0]
+        half[:, :, own] = 0.5 * (whole + np.swapaxes(whole, 1, 2))
+        self._step, self._cov, self._joint, self._common = step, half, joint, common
+
+    def _propagated(self, predicted: Propagated) -> tuple[Array, Array, Array, Array]:
+        """Return deviations, covariances, cross-covariances and what is common, at the epoch."""
+        assert self._step is not None
+        assert self._cov is not None
+        assert self._joint is not None
+        assert self._common is not None
+        motion, noise = predicted.transition[:MOTION], predicted.noise
+        count = self._cov.shape[1]
+        by_own, by_common, shared = motion[:, :count], motion[:, count:], self._cov[:, :, count:]
+        step, cov, joint = (part.copy() for part in (self._step, self._cov, self._joint))
+        step[:, :MOTION] = step @ motion.T
+        cov[:, :MOTION] = motion @ self._whole()
+        joint[:, :MOTION] = by_own @ joint + by_common @ shared[0].T
+        joint[:, :, :MOTION] = np.concatenate([joint, cov[1:, :, count:]], axis=2) @ motion.T
+        cov[:, :, :MOTION] = cov @ motion.T
+        cov += noise[:count]
+        joint += noise[:count, :count]
+        return step, cov, joint, self._common + noise[count:, count:]
+
+    def _whole(self) -> Array:
+        """Return the whole covariance of each filter, shape (1 + groups, n, n)."""
+        assert self._cov is not None
+        assert self._common is not None
+        count = self._cov.shape[1]
+        common = np.broadcast_to(self._common, (len(self._cov), *self._common.shape))
+        below = np.concatenate([np.swapaxes(self._cov[:, :, count:], 1, 2), common], axis=2)
+        return np.concatenate([self._cov, below], axis=1)
 
     def _begin(self, state: State) -> None:
         size = len(state.cov)
+        count = size - self.considered
         self._step = np.zeros((self.groups, size))
-        self._joint = np.repeat(state.cov[None], self.groups, axis=0)
-        self._cov = np.repeat(state.cov[None], 1 + self.groups, axis=0)
+        self._joint = np.repeat(state.cov[None, :count, :count], self.groups, axis=0)
+        self._cov = np.repeat(state.cov[None, :count], 1 + self.groups, axis=0)
+        self._common = state.cov[count:, count:].copy()
         own = np.arange(len(WIDE))
         self._cov[1:, own, own] += WIDE**2
 
@@ -163,22 +201,33 @@ class SubsetBank:
         jacobian = np.concatenate([rows[1] for rows, _ in parts])
         return error, jacobian, np.concatenate([owner for _, owner in parts])
 
-    def _accepted_rows(self, jacobian: Array, owner: IntArray) -> Array:
-        """Return the rows that each filter uses, zero for those it excludes."""
+    def _selected(self, rows: Array, owner: IntArray, spans: list[Array]) -> Array:
+        """Return the rows that each filter uses, zero for those it excludes.
+
+        Parameters
+        ----------
+        rows : ndarray, shape (rows, k) or (1 + groups, rows, k)
+        spans : list of ndarray, shape (rows, p)
+            Orthonormal basis of each group's part of jointly measured tones.
+        """
+        rows = np.broadcast_to(rows, (1 + self.groups, *rows.shape[-2:]))
         # The first filter excludes no beacon.
         kept = np.arange(-1, self.groups)[:, None] != np.where(owner < 0, self.groups, owner)
-        return np.where(kept[:, :, None], jacobian, 0.0)
+        result = np.where(kept[:, :, None], rows, 0.0)
+        for i, basis in enumerate(spans, start=1):
+            result[i] -= basis @ (basis.T @ rows[i])
+        return result
 
-    def _leave_out_together(
-        self, measurements: Sequence[Measurement], owner: IntArray, jacobian: Array, selected: Array
-    ) -> None:
-        """Project each group out of the rows of jointly measured tones."""
-        rows = np.flatnonzero(owner == TOGETHER)
+    def _spans(self, measurements: Sequence[Measurement], owner: IntArray) -> list[Array]:
+        """Return what each group spans of the rows of jointly measured tones."""
+        result = []
         for measurement in measurements:
             if isinstance(measurement, JointPhasors):
                 for group in range(self.groups):
                     basis = measurement.spanned((self._owner == group)[None])[0]
-                    selected[1 + group, rows] -= basis @ (basis.T @ jacobian[rows])
+                    result.append(np.zeros((len(owner), basis.shape[1])))
+                    result[-1][owner == TOGETHER] = basis
+        return result
 
     def _gains(self, crossed: Array, spread: Array) -> Array:
         """Return the gain of every filter, shape (1 + groups, estimated, rows)."""
@@ -264,8 +313,12 @@ class SubsetBank:
         """
         if self._cov is None or self._joint is None:
             return np.ones((len(transition), 2))
-        size = transition.shape[2]
-        cov, joint = self._cov[:, :size, :size], self._joint[:, :size, :size]
+        size, count = transition.shape[2], self._cov.shape[1]
+        whole = self._whole()
+        joint = np.tile(whole[0], (self.groups, 1, 1))
+        joint[:, :count, :count] = self._joint
+        joint[:, :count, count:] = self._cov[1:, :, count:]
+        cov, joint = whole[:, :size, :size], joint[:, :size, :size]
         separate = cov[1:] + cov[:1] - joint - np.swapaxes(joint, 1, 2)
         pose = transition[:, None, :6]
         back = np.swapaxes(pose, 2, 3)
