@@ -41,7 +41,9 @@ _NAMES: dict[str, tuple[str, ...]] = {
 LABELS = ("beacon", "slot", "tone", "axis")
 _NUMBERS = (1, 2, 3, 6)  # of columns of a coil: amplitude; re, im; three levels; re, then im
 _COMPONENT = re.compile(r"(:[0-2])?(\.re|\.im)?$|[_ ]?[xyz]$", re.I)
-LIKELY_FIELD = 1e-8  # T; of a beacon, to which the proposed unit is the nearest
+LIKELY_FIELD = 3e-8  # T; of a coil, to which the proposed unit is the nearest
+AMBIENT_FIELD = 5e-5  # T; of levels that contain the Earth's
+LIKELY_UNITS = ("T", "uT", "nT", "pT")
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,13 +216,17 @@ def _component_names(text: str, columns: Sequence[SourceColumn]) -> list[str]:
     return names
 
 
-def _likely_unit(source: Source, columns: Sequence[int], dimension: Dimension) -> SourceUnit:
+def _likely_unit(
+    source: Source, columns: Sequence[int], dimension: Dimension, typical: float = LIKELY_FIELD
+) -> SourceUnit:
     raw = first_values(source, columns[0], dimension is Dimension.TIME)
     if dimension is Dimension.TIME:
         return likely_time_unit(raw)
     size = float(np.nanmedian(np.abs(np.asarray(raw, dtype=np.float64)))) if len(raw) else 0.0
     units = UNITS[Dimension.FIELD]
-    likely = min(units, key=lambda n: abs(np.log(max(size, 1e-30) * units[n] / LIKELY_FIELD)))
+    likely = min(
+        LIKELY_UNITS, key=lambda name: abs(np.log(max(size, 1e-30) * units[name] / typical))
+    )
     return SourceUnit(likely, Dimension.FIELD)
 
 
@@ -276,7 +282,8 @@ def _propose_coils(source: Source, places: Sequence[int], site: Site, declared: 
         groups = {source.columns[k].name: [source.columns[k].name] for k in places}
     if len(groups) not in counts:
         return
-    unit = _likely_unit(source, places, Dimension.FIELD)
+    typical = AMBIENT_FIELD if len(groups) == len(coils) else LIKELY_FIELD
+    unit = _likely_unit(source, places, Dimension.FIELD, typical)
     for coil, names in zip(coils, groups.values(), strict=False):
         ordered = sorted(names, key=lambda name: name.endswith(".im"))
         name = coil if isinstance(coil, str) else f"{coil[0]}.{coil[1]}"
