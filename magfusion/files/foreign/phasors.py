@@ -15,10 +15,10 @@ from magfusion.files.foreign.columns import (
     place_of,
     term_of,
 )
-from magfusion.files.foreign.guess import likely_time_unit, named_columns
+from magfusion.files.foreign.guess import likely_time_unit, named_columns, readings
 from magfusion.files.foreign.plan import Findings, Rate, first_values, shown
 from magfusion.files.foreign.source import Source, SourceColumn
-from magfusion.files.foreign.units import UNITS, Dimension, SourceUnit
+from magfusion.files.foreign.units import UNITS, Dimension, SourceUnit, parse_unit
 from magfusion.model.site import Site
 from magfusion.model.time_division import Slots
 
@@ -153,27 +153,38 @@ def _row_terms(
             known = named_columns(source.columns, "magnetometer")[TIME]
             matching = [] if request.rate is not None else [one.place for one in known]
         else:
-            matching = [k for k, c in enumerate(source.columns) if _bare(c.name) in names]
+            matching = [k for k, c in enumerate(source.columns) if _is_named(c, names)]
         if len(matching) == 1:
-            name = f"#{matching[0]}" if target in LABELS else source.columns[matching[0]].name
-            entry = ColumnMapping(FIELDS, target, name)
+            unit = "" if target in LABELS else _unit_in_name(source.columns[matching[0]], target)
+            entry = ColumnMapping(FIELDS, target, f"{source.columns[matching[0]].name}{unit}")
             terms[target] = _resolved(source, entry, request, declared)
     return {target: own for target, own in terms.items() if own}
 
 
-def _bare(name: str) -> str:
-    return re.sub(r"[\[(].*|[^a-z]", "", name.casefold())
+def _is_named(column: SourceColumn, names: Sequence[str]) -> bool:
+    """Return whether a column is called by one of some names, perhaps with its unit."""
+    bare = [re.sub(r"[^a-z]", "", name.casefold()) for name, _ in readings(column)]
+    return any(name in names for name in bare)
+
+
+def _unit_in_name(column: SourceColumn, target: str) -> str:
+    """Return the unit at the end of a name, in brackets; empty where the name has none."""
+    known = [unit for _, unit in readings(column) if parse_unit(unit, _dimension(target))]
+    bracketed = column.unit or not known or column.name.endswith(("]", ")"))
+    return "" if bracketed else f"[{known[0]}]"
+
+
+def _dimension(target: str) -> Dimension:
+    if target in LABELS:
+        return Dimension.NUMBER
+    return Dimension.TIME if target in (TIME, "window") else Dimension.FIELD
 
 
 def _resolved(
     source: Source, entry: ColumnMapping, request: _Request, declared: Findings
 ) -> tuple[Term, ...]:
     """Return the columns that an entry means; none where it is open, which is reported."""
-    dimension = Dimension.FIELD
-    if entry.column in LABELS:
-        dimension = Dimension.NUMBER
-    elif entry.column in (TIME, "window"):
-        dimension = Dimension.TIME
+    dimension = _dimension(entry.column)
     parts = re.fullmatch(r"(?P<names>.*?)\s*(?P<unit>\[[^\[\]]*[^\[\]\d][^\[\]]*\])?", entry.value)
     assert parts is not None
     names = _component_names(parts["names"], source.columns)
