@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import allantools
 import h5py
@@ -57,10 +58,10 @@ def import_log(*words: str, output: str = "log") -> str:
     return ended.stdout
 
 
-def figures(*words: str, output: str) -> dict[str, object]:
+def figures(*words: str, output: str) -> dict[str, Any]:
     ended = command(*words, "-o", output)
     assert ended.returncode == 0, ended.stderr
-    report: dict[str, object] = json.loads(Path(output, "report.json").read_text())
+    report: dict[str, Any] = json.loads(Path(output, "report.json").read_text())
     return report
 
 
@@ -82,6 +83,11 @@ def assert_offset(field: Array) -> None:
     np.testing.assert_allclose(np.array(offset) * 1e-3, ellipsoid_centre(field), atol=OFFSET_UT)
 
 
+def times(count: int, hertz: float) -> Array:
+    """Return times of samples (s), shape (count,)."""
+    return np.asarray(np.arange(count) / hertz, dtype=np.float64)
+
+
 def measured(motion: Motion, seed: int, iron: Array = IRON, noise: float = 0.2) -> Array:
     """Return magnetometer samples (uT) with iron on the body."""
     soft = np.eye(3) + 0.03 * np.array([[0.5, 0.2, 0.0], [0.2, -0.4, 0.1], [0.0, 0.1, 0.3]])
@@ -98,7 +104,7 @@ def axes(stem: str, unit: str = "", names: str = "XYZ") -> list[str]:
 
 
 def test_an_inertial_module_holds_a_slow_and_late_magnetometer() -> None:
-    motion = turning(np.arange(9000) * 0.01, 1)
+    motion = turning(times(9000, 100.0), 1)
     gyro, accel = inertial(motion, 2)
     late = turning(motion.time - 0.055, 1)
     field = np.repeat(measured(late, 4)[::5], 5, axis=0)
@@ -111,7 +117,7 @@ def test_an_inertial_module_holds_a_slow_and_late_magnetometer() -> None:
 
 @pytest.mark.parametrize("gyro_too", [True, False])
 def test_a_telephone_writes_a_table_a_sensor(gyro_too: bool) -> None:
-    motion = turning(np.arange(6000) * 0.01, 3)
+    motion = turning(times(6000, 100.0), 3)
     gyro, accel = inertial(motion, 4)
     field = measured(motion, 6)
     folder = Path("phone")
@@ -131,7 +137,7 @@ def test_a_telephone_writes_a_table_a_sensor(gyro_too: bool) -> None:
 
 
 def test_motion_capture_writes_attitudes_beside_an_imu() -> None:
-    motion = turning(np.arange(6000) * 0.01, 5)
+    motion = turning(times(6000, 100.0), 5)
     gyro, accel = inertial(motion, 6)
     field = noisy(motion.field, 0.3, 8) / np.linalg.norm(motion.field[0])
     turn = motion.world_from_body.as_quat(scalar_first=True)
@@ -148,7 +154,7 @@ def test_motion_capture_writes_attitudes_beside_an_imu() -> None:
 
 
 def test_an_autopilot_log_as_text_has_the_attitude_in_another_table() -> None:
-    motion = turning(np.arange(7500) * 0.008, 7)
+    motion = turning(times(7500, 125.0), 7)
     gyro, accel = inertial(motion, 8)
     field = measured(motion, 10)
     stamps = np.rint(112_000_000 + motion.time * 1e6)
@@ -170,7 +176,7 @@ def test_an_autopilot_log_as_text_has_the_attitude_in_another_table() -> None:
 
 
 def test_an_industrial_imu_counts_weeks_and_seconds_of_gps() -> None:
-    motion = turning(np.arange(6000) * 0.01, 9)
+    motion = turning(times(6000, 100.0), 9)
     gyro, accel = inertial(motion, 10)
     field = measured(motion, 12)
     head = ["GPS Week", "GPS TOW", *axes("", " Accel [x8004]"), *axes("", " Gyro [x8005]")]
@@ -187,7 +193,7 @@ def test_an_industrial_imu_counts_weeks_and_seconds_of_gps() -> None:
 
 def at_rest(rate: float, duration: float, seed: int) -> tuple[Array, Array, Array]:
     """Return times (s), rates (rad/s) and forces (m/s^2) of an instrument at rest."""
-    time = np.arange(round(rate * duration)) / rate
+    time = times(round(rate * duration), rate)
     still = np.tile([0.01, -0.02, 0.005, 0.3, -0.2, G], (len(time), 1))
     gyro = noisy(still[:, :3], 3e-3 * np.sqrt(rate / 100.0), seed)
     return time, gyro, noisy(still[:, 3:], 0.02 * np.sqrt(rate / 100.0), seed + 1)
@@ -209,7 +215,7 @@ def test_gait_analysis_has_a_sensor_a_foot_side_by_side() -> None:
     rate = 204.8
     _, gyro, accel = at_rest(rate, 240.0, 20)
     other = at_rest(rate, 240.0, 30)
-    count = np.arange(len(gyro)) + 1.0
+    count = 1.0 + times(len(gyro), 1.0)
     head = [
         "Sample;Left foot;;;;;;Right foot;;;;;",
         ";" + ";".join(2 * [*axes("Acc ", " (g)"), *axes("Gyr ", " (deg/s)")]),
@@ -229,16 +235,17 @@ def open_table(stem: str, column: str) -> Array:
 
 def host_stamps(count: int, seed: int) -> Array:
     """Return times at which a host receives samples of 100 Hz: several at once, then none."""
-    rng, times = np.random.default_rng(seed), []
-    while len(times) < count:
+    rng = np.random.default_rng(seed)
+    stamps: list[float] = []
+    while len(stamps) < count:
         batch = int(rng.integers(3, 8))
-        arrived = (len(times) + batch) * 0.01
-        times += list(arrived + np.cumsum(rng.uniform(1e-3, 2e-3, batch)))
-    return np.array(times[:count])
+        arrived = (len(stamps) + batch) * 0.01
+        stamps += list(arrived + np.cumsum(rng.uniform(1e-3, 2e-3, batch)))
+    return np.array(stamps[:count])
 
 
 def test_a_usb_host_stamps_buffers_of_four_rows() -> None:
-    motion = turning(np.arange(6000) * 0.01, 11)
+    motion = turning(times(6000, 100.0), 11)
     gyro, accel = inertial(motion, 12)
     field = measured(motion, 14)
     with h5py.File("run.mat", "w", userblock_size=512) as file:
@@ -256,7 +263,7 @@ def test_a_usb_host_stamps_buffers_of_four_rows() -> None:
 
 
 def test_a_magnetometer_alone_is_an_array_with_false_samples() -> None:
-    motion = turning(np.arange(3000) * 0.02, 13, (1.6, 1.3, 3.0))
+    motion = turning(times(3000, 50.0), 13, (1.6, 1.3, 3.0))
     field = measured(motion, 15)
     spoiled = field.copy()
     spoiled[[100, 901, 1500, 2222]] = [[900, 0, 0], [0, -2000, 5], [300, 300, 300], [0, 0, 0]]
@@ -267,7 +274,7 @@ def test_a_magnetometer_alone_is_an_array_with_false_samples() -> None:
 
 def test_a_breakout_board_rests_for_half_a_minute() -> None:
     rate = 30.0
-    time = np.arange(900) / rate
+    time = times(900, rate)
     field = noisy(np.tile(EARTH_NT, (len(time), 1)), 20.0, 16)
     lines = ["# RM3100 breakout, gain 75", "# x[nT] y[nT] z[nT] total[nT] time[s] unix[s]"]
     size = np.linalg.norm(field, axis=1)
@@ -278,7 +285,7 @@ def test_a_breakout_board_rests_for_half_a_minute() -> None:
 
 
 def test_a_board_turned_by_hand_has_no_times() -> None:
-    motion = turning(np.arange(4000) * 0.02, 17)
+    motion = turning(times(4000, 50.0), 17)
     _, accel = inertial(motion, 18)
     field = measured(motion, 19)
     write(Path("hand.csv"), ["ax,ay,az,mx,my,mz"], accel / G, field * 1e-2)
@@ -287,7 +294,7 @@ def test_a_board_turned_by_hand_has_no_times() -> None:
 
 
 def test_a_robot_with_hard_iron_has_a_truth_by_two_clocks() -> None:
-    motion = turning(np.arange(6000) * 0.01, 21, (0.15, 0.9, 3.0), 8.0)
+    motion = turning(times(6000, 100.0), 21, (0.15, 0.9, 3.0), 8.0)
     gyro, accel = inertial(motion, 22)
     field = measured(motion, 24, iron=np.array([60.0, -50.0, 45.0]), noise=0.05)
     write(Path("imu.csv"), ["t_s,wx,wy,wz,ax,ay,az"], motion.time, gyro, accel)
@@ -372,7 +379,7 @@ def test_a_tracker_of_three_coils(pulsed: bool) -> None:
     site = replace(site, beacons=(beacon,))
     save_site(site, Path("tracker.yaml"))
     attitude, place = body_poses(site, 40, rng)
-    time = 0.02 * np.arange(40)
+    time = times(40, 50.0)
     seen = predict_channels(initial_calibration(site, 0.0), time, attitude, place)
     noise = 1e-11 * (rng.standard_normal(seen.shape) + 1j * rng.standard_normal(seen.shape))
     values = (seen + noise) * 1e9
@@ -433,7 +440,7 @@ def test_tables_by_rows_name_beacon_or_slot_and_axis() -> None:
 
 
 def test_a_log_without_tones_has_a_site_without_beacons() -> None:
-    motion = turning(np.arange(3000) * 0.01, 51)
+    motion = turning(times(3000, 100.0), 51)
     gyro, accel = inertial(motion, 52)
     head = [
         "t_s",
@@ -450,7 +457,7 @@ def test_a_log_without_tones_has_a_site_without_beacons() -> None:
 
 
 def test_a_user_marks_missing_values() -> None:
-    motion = turning(np.arange(1000) * 0.01, 55)
+    motion = turning(times(1000, 100.0), 55)
     field = measured(motion, 56)
     rows = [
         f"{t:.2f},{x:.3f},{y:.3f},{z:.3f}" for t, (x, y, z) in zip(motion.time, field, strict=True)
@@ -468,7 +475,7 @@ def test_a_user_marks_missing_values() -> None:
 
 @pytest.mark.parametrize("gauss", [True, False])
 def test_several_bags_publish_vectors(gauss: bool) -> None:
-    def message(k: int) -> object:
+    def message(k: int) -> Any:
         values = MEASURED[k] * (1e4 if gauss else 1e6)
         kind = STORE.types["geometry_msgs/msg/Vector3Stamped"]
         return kind(header(int(STAMPS[k])), xyz("Vector3", values))
@@ -489,7 +496,7 @@ def test_several_bags_publish_vectors(gauss: bool) -> None:
 
 
 def test_columns_of_a_euroc_folder_are_those_of_its_header() -> None:
-    motion = turning(np.arange(500) * 0.01, 57)
+    motion = turning(times(500, 100.0), 57)
     stamps = 1_403_636_579_000_000_000 + np.arange(500) * 10_000_000
     rates = axes("w_RS_S_", " [rad s^-1]", "xyz")
     tables = {
