@@ -262,11 +262,11 @@ def _coils_by_site(
     """Propose the columns of each coil of the site, or return how many rows are one cycle."""
     own = {term.place for name, those in terms.items() if name != "value" for term in those}
     open_columns = [k for k in range(len(source.columns)) if k not in own]
-    if request.site is None:
+    if request.site is None or not request.site.beacons:
         names = ", ".join(column.name for column in source.columns[:30])
         request.problems.append(
             f"no column of a beacon or slot is found (found {names}); map it, or the columns of"
-            " each coil by --map 'fields.BEACON.TONE=NAME[nT]', or give --site"
+            " each coil by --map 'fields.BEACON.TONE=NAME[nT]', or give --site with its beacons"
         )
         return 0
     if len(open_columns) == 1:
