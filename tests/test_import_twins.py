@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import allantools
 import h5py
@@ -13,16 +14,18 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 import unsigned_amplitudes
+from example_bag import IMU, MEASURED, STAMPS, STORE, N, header, imu_message, write_ros1_bag, xyz
 from import_twins import EARTH, SITE, G, Motion, noisy, turning, write
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 from tracker_site import body_poses, tracker_site
 
 from magfusion.files.open import open_log
-from magfusion.files.site import save_site
+from magfusion.files.site import load_site, save_site
 from magfusion.model.parameters import initial_calibration, predict_channels
 from magfusion.model.samples import FieldSamples
 from magfusion.model.time_division import MarkedSlots, Slots
+from magfusion.model.trajectory import interpolated
 from magfusion.units import DEGREE, Array
 
 IRON = np.array([22.0, -13.0, 9.0])  # uT
@@ -55,10 +58,10 @@ def import_log(*words: str, output: str = "log") -> str:
     return ended.stdout
 
 
-def figures(*words: str, output: str) -> dict[str, object]:
+def figures(*words: str, output: str) -> dict[str, Any]:
     ended = command(*words, "-o", output)
     assert ended.returncode == 0, ended.stderr
-    report: dict[str, object] = json.loads(Path(output, "report.json").read_text())
+    report: dict[str, Any] = json.loads(Path(output, "report.json").read_text())
     return report
 
 
@@ -77,8 +80,12 @@ def assert_offset(field: Array) -> None:
     """Compare the calibrated offset of the imported log with that of an ellipsoid (uT)."""
     report = figures("calibrate", "magnetometer", "log", "--site", "site.yaml", output="out")
     offset = [report[f"magnetometer.offset_nt_{axis}"] for axis in "xyz"]
-    print(report["verdict"], np.array(offset) * 1e-3, ellipsoid_centre(field))
     np.testing.assert_allclose(np.array(offset) * 1e-3, ellipsoid_centre(field), atol=OFFSET_UT)
+
+
+def times(count: int, hertz: float) -> Array:
+    """Return times of samples (s), shape (count,)."""
+    return np.asarray(np.arange(count) / hertz, dtype=np.float64)
 
 
 def measured(motion: Motion, seed: int, iron: Array = IRON, noise: float = 0.2) -> Array:
@@ -97,7 +104,7 @@ def axes(stem: str, unit: str = "", names: str = "XYZ") -> list[str]:
 
 
 def test_an_inertial_module_holds_a_slow_and_late_magnetometer() -> None:
-    motion = turning(np.arange(9000) * 0.01, 1)
+    motion = turning(times(9000, 100.0), 1)
     gyro, accel = inertial(motion, 2)
     late = turning(motion.time - 0.055, 1)
     field = np.repeat(measured(late, 4)[::5], 5, axis=0)
@@ -110,7 +117,7 @@ def test_an_inertial_module_holds_a_slow_and_late_magnetometer() -> None:
 
 @pytest.mark.parametrize("gyro_too", [True, False])
 def test_a_telephone_writes_a_table_a_sensor(gyro_too: bool) -> None:
-    motion = turning(np.arange(6000) * 0.01, 3)
+    motion = turning(times(6000, 100.0), 3)
     gyro, accel = inertial(motion, 4)
     field = measured(motion, 6)
     folder = Path("phone")
@@ -130,7 +137,7 @@ def test_a_telephone_writes_a_table_a_sensor(gyro_too: bool) -> None:
 
 
 def test_motion_capture_writes_attitudes_beside_an_imu() -> None:
-    motion = turning(np.arange(6000) * 0.01, 5)
+    motion = turning(times(6000, 100.0), 5)
     gyro, accel = inertial(motion, 6)
     field = noisy(motion.field, 0.3, 8) / np.linalg.norm(motion.field[0])
     turn = motion.world_from_body.as_quat(scalar_first=True)
@@ -143,12 +150,11 @@ def test_motion_capture_writes_attitudes_beside_an_imu() -> None:
     text = import_log("capture.csv", "--truth", "capture.csv")
     assert "up to 0.3 % off were scaled to unit length" in text
     report = figures("smooth", "log", "--site", "site.yaml", output="out")
-    print(report["attitude_rmse_deg"])
     assert report["attitude_rmse_deg"] < 2.0
 
 
 def test_an_autopilot_log_as_text_has_the_attitude_in_another_table() -> None:
-    motion = turning(np.arange(7500) * 0.008, 7)
+    motion = turning(times(7500, 125.0), 7)
     gyro, accel = inertial(motion, 8)
     field = measured(motion, 10)
     stamps = np.rint(112_000_000 + motion.time * 1e6)
@@ -170,7 +176,7 @@ def test_an_autopilot_log_as_text_has_the_attitude_in_another_table() -> None:
 
 
 def test_an_industrial_imu_counts_weeks_and_seconds_of_gps() -> None:
-    motion = turning(np.arange(6000) * 0.01, 9)
+    motion = turning(times(6000, 100.0), 9)
     gyro, accel = inertial(motion, 10)
     field = measured(motion, 12)
     head = ["GPS Week", "GPS TOW", *axes("", " Accel [x8004]"), *axes("", " Gyro [x8005]")]
@@ -187,7 +193,7 @@ def test_an_industrial_imu_counts_weeks_and_seconds_of_gps() -> None:
 
 def at_rest(rate: float, duration: float, seed: int) -> tuple[Array, Array, Array]:
     """Return times (s), rates (rad/s) and forces (m/s^2) of an instrument at rest."""
-    time = np.arange(round(rate * duration)) / rate
+    time = times(round(rate * duration), rate)
     still = np.tile([0.01, -0.02, 0.005, 0.3, -0.2, G], (len(time), 1))
     gyro = noisy(still[:, :3], 3e-3 * np.sqrt(rate / 100.0), seed)
     return time, gyro, noisy(still[:, 3:], 0.02 * np.sqrt(rate / 100.0), seed + 1)
@@ -209,7 +215,7 @@ def test_gait_analysis_has_a_sensor_a_foot_side_by_side() -> None:
     rate = 204.8
     _, gyro, accel = at_rest(rate, 240.0, 20)
     other = at_rest(rate, 240.0, 30)
-    count = np.arange(len(gyro)) + 1.0
+    count = 1.0 + times(len(gyro), 1.0)
     head = [
         "Sample;Left foot;;;;;;Right foot;;;;;",
         ";" + ";".join(2 * [*axes("Acc ", " (g)"), *axes("Gyr ", " (deg/s)")]),
@@ -229,16 +235,17 @@ def open_table(stem: str, column: str) -> Array:
 
 def host_stamps(count: int, seed: int) -> Array:
     """Return times at which a host receives samples of 100 Hz: several at once, then none."""
-    rng, times = np.random.default_rng(seed), []
-    while len(times) < count:
+    rng = np.random.default_rng(seed)
+    stamps: list[float] = []
+    while len(stamps) < count:
         batch = int(rng.integers(3, 8))
-        arrived = (len(times) + batch) * 0.01
-        times += list(arrived + np.cumsum(rng.uniform(1e-3, 2e-3, batch)))
-    return np.array(times[:count])
+        arrived = (len(stamps) + batch) * 0.01
+        stamps += list(arrived + np.cumsum(rng.uniform(1e-3, 2e-3, batch)))
+    return np.array(stamps[:count])
 
 
 def test_a_usb_host_stamps_buffers_of_four_rows() -> None:
-    motion = turning(np.arange(6000) * 0.01, 11)
+    motion = turning(times(6000, 100.0), 11)
     gyro, accel = inertial(motion, 12)
     field = measured(motion, 14)
     with h5py.File("run.mat", "w", userblock_size=512) as file:
@@ -256,7 +263,7 @@ def test_a_usb_host_stamps_buffers_of_four_rows() -> None:
 
 
 def test_a_magnetometer_alone_is_an_array_with_false_samples() -> None:
-    motion = turning(np.arange(3000) * 0.02, 13, (1.6, 1.3, 3.0))
+    motion = turning(times(3000, 50.0), 13, (1.6, 1.3, 3.0))
     field = measured(motion, 15)
     spoiled = field.copy()
     spoiled[[100, 901, 1500, 2222]] = [[900, 0, 0], [0, -2000, 5], [300, 300, 300], [0, 0, 0]]
@@ -267,7 +274,7 @@ def test_a_magnetometer_alone_is_an_array_with_false_samples() -> None:
 
 def test_a_breakout_board_rests_for_half_a_minute() -> None:
     rate = 30.0
-    time = np.arange(900) / rate
+    time = times(900, rate)
     field = noisy(np.tile(EARTH_NT, (len(time), 1)), 20.0, 16)
     lines = ["# RM3100 breakout, gain 75", "# x[nT] y[nT] z[nT] total[nT] time[s] unix[s]"]
     size = np.linalg.norm(field, axis=1)
@@ -278,7 +285,7 @@ def test_a_breakout_board_rests_for_half_a_minute() -> None:
 
 
 def test_a_board_turned_by_hand_has_no_times() -> None:
-    motion = turning(np.arange(4000) * 0.02, 17)
+    motion = turning(times(4000, 50.0), 17)
     _, accel = inertial(motion, 18)
     field = measured(motion, 19)
     write(Path("hand.csv"), ["ax,ay,az,mx,my,mz"], accel / G, field * 1e-2)
@@ -287,7 +294,7 @@ def test_a_board_turned_by_hand_has_no_times() -> None:
 
 
 def test_a_robot_with_hard_iron_has_a_truth_by_two_clocks() -> None:
-    motion = turning(np.arange(6000) * 0.01, 21, (0.15, 0.9, 3.0), 8.0)
+    motion = turning(times(6000, 100.0), 21, (0.15, 0.9, 3.0), 8.0)
     gyro, accel = inertial(motion, 22)
     field = measured(motion, 24, iron=np.array([60.0, -50.0, 45.0]), noise=0.05)
     write(Path("imu.csv"), ["t_s,wx,wy,wz,ax,ay,az"], motion.time, gyro, accel)
@@ -324,7 +331,14 @@ def test_sixteen_coils_are_a_column_of_amplitudes() -> None:
     np.testing.assert_allclose(fields.time, walk.phasors.time, atol=1e-8)
     np.testing.assert_allclose(fields.phasor_sensor[..., 0].real, size, rtol=1e-6)
     report = figures("fix", "log", "--site", "coils.yaml", output="out")
-    print({k: v for k, v in report.items() if "chi" in k or "resid" in k or k == "verdict"})
+    assert report["residual_rms_median"] < 1.3
+    truth = walk.log.truth
+    assert truth is not None
+    lever = walk.site.platform.magnetometer.position_body
+    world = interpolated(
+        walk.phasors.time, truth.time, truth.position_world + truth.world_from_body @ lever
+    )
+    assert_fixed(world, 0.01, lever)
 
 
 def test_sixteen_coils_are_raw_samples_beside_a_marker() -> None:
@@ -365,7 +379,7 @@ def test_a_tracker_of_three_coils(pulsed: bool) -> None:
     site = replace(site, beacons=(beacon,))
     save_site(site, Path("tracker.yaml"))
     attitude, place = body_poses(site, 40, rng)
-    time = 0.02 * np.arange(40)
+    time = times(40, 50.0)
     seen = predict_channels(initial_calibration(site, 0.0), time, attitude, place)
     noise = 1e-11 * (rng.standard_normal(seen.shape) + 1j * rng.standard_normal(seen.shape))
     values = (seen + noise) * 1e9
@@ -377,7 +391,135 @@ def test_a_tracker_of_three_coils(pulsed: bool) -> None:
     import_log(*words, "--site", "tracker.yaml")
     phasor = imported_fields().phasor_sensor
     np.testing.assert_allclose(phasor, (seen + (noise.real if pulsed else noise)), atol=1e-15)
-    quaternion = Rotation.from_matrix(attitude).as_quat()
-    np.savetxt("truth.tum", np.column_stack([time, place, quaternion]))
     report = figures("fix", "log", "--site", "tracker.yaml", output="out")
-    print({k: v for k, v in report.items()})
+    assert report["residual_rms_median"] < 1.3
+    assert_fixed(place, 1e-3, np.zeros(3))
+
+
+def assert_fixed(place: Array, tolerance: float, lever: Array) -> None:
+    """Compare the nearest of the possible places of each epoch's sensor with the true one (m)."""
+    table = pyarrow.parquet.read_table(Path("out", "fixes.parquet"))
+    poses = np.stack([table[f"position_{axis}"].to_numpy() for axis in "xyz"], axis=1)
+    epoch = np.unique(table["time_ns"].to_numpy(), return_inverse=True)[1]
+    turn = Rotation.from_quat(np.stack([table[f"q{a}"].to_numpy() for a in "xyzw"], axis=1))
+    error = np.linalg.norm(poses + turn.apply(lever) - place[epoch], axis=1)
+    nearest = np.full(len(place), np.inf)
+    np.minimum.at(nearest, epoch, error)
+    assert np.median(nearest) < tolerance
+
+
+def test_tables_by_rows_name_beacon_or_slot_and_axis() -> None:
+    site = tracker_site(np.random.default_rng(43), gain=0.0, tilt=0.0, centre=0.0)
+    beacon = replace(site.beacons[0], slots=Slots(0.005, 4, 0.0))
+    save_site(replace(site, beacons=(beacon,)), Path("tracker.yaml"))
+    rng = np.random.default_rng(44)
+    values = rng.standard_normal((10, 3, 3)) + 1j * rng.standard_normal((10, 3, 3))
+    lines = {"slot": ["t_s,slot,axis,re_nT,im_nT,sigma_nT"], "beacon": []}
+    lines["beacon"] = [
+        "t_s;beacon;tone;re_x;re_y;re_z;im_x;im_y;im_z;sigma",
+        "s;;;" + "nT;" * 6 + "nT",
+    ]
+    for k, t in enumerate(0.02 * np.arange(10)):
+        for coil in range(3):
+            own = values[k, coil]
+            lines["slot"] += [
+                f"{t:.3f},{coil},{axis},{v.real:.9f},{v.imag:.9f},0.1"
+                for axis, v in zip("xyz", own, strict=True)
+            ]
+            numbers = ";".join(f"{v:.9f}" for v in (*own.real, *own.imag))
+            lines["beacon"].append(f"{t:.3f};T;{coil};{numbers};0.1")
+        lines["slot"].append(f"{t:.3f},3,x,0.0,0.0,0.1")  # silent
+    for label, rows in lines.items():
+        Path(f"{label}.csv").write_text("\n".join(rows) + "\n")
+        import_log("--fields", f"{label}.csv", "--site", "tracker.yaml", output=f"by_{label}")
+        fields = open_log(Path(f"by_{label}")).fields
+        assert fields is not None
+        assert fields.channels == (("T", 0), ("T", 1), ("T", 2))
+        np.testing.assert_allclose(fields.phasor_sensor, values * 1e-9, atol=1e-17)
+        np.testing.assert_allclose(fields.phasor_cov[..., 0, 0], 1e-20, rtol=1e-9)
+
+
+def test_a_log_without_tones_has_a_site_without_beacons() -> None:
+    motion = turning(times(3000, 100.0), 51)
+    gyro, accel = inertial(motion, 52)
+    head = [
+        "t_s",
+        *axes("w", "_rad_s", "xyz"),
+        *axes("a", "_m_s2", "xyz"),
+        *axes("B", "_uT", "xyz"),
+    ]
+    write(Path("all.csv"), [",".join(head)], motion.time, gyro, accel, measured(motion, 54))
+    import_log("all.csv")
+    ended = command("init", "--log", "log", "-o", "new.yaml")
+    assert ended.returncode == 0, ended.stderr
+    assert load_site(Path("new.yaml"), without=True).beacons == ()
+    figures("calibrate", "magnetometer", "log", "--site", "new.yaml", output="out")
+
+
+def test_a_user_marks_missing_values() -> None:
+    motion = turning(times(1000, 100.0), 55)
+    field = measured(motion, 56)
+    rows = [
+        f"{t:.2f},{x:.3f},{y:.3f},{z:.3f}" for t, (x, y, z) in zip(motion.time, field, strict=True)
+    ]
+    rows[7], rows[9] = "0.07,--,1,2", "0.09,lost,1,2"
+    Path("mag.csv").write_text("\n".join(["t_s,Bx_uT,By_uT,Bz_uT", *rows]) + "\n")
+    ended = command("import", "mag.csv", "-o", "log")
+    assert ended.returncode == 2
+    assert "--missing=lost" in ended.stderr
+    import_log("mag.csv", "--missing=lost")
+    waveform = open_log(Path("log")).waveform
+    assert waveform is not None
+    assert len(waveform.time) == 998
+
+
+@pytest.mark.parametrize("gauss", [True, False])
+def test_several_bags_publish_vectors(gauss: bool) -> None:
+    def message(k: int) -> Any:
+        values = MEASURED[k] * (1e4 if gauss else 1e6)
+        kind = STORE.types["geometry_msgs/msg/Vector3Stamped"]
+        return kind(header(int(STAMPS[k])), xyz("Vector3", values))
+
+    half = N // 2
+    for number, rows in enumerate((range(half), range(half, N))):
+        topics = {
+            "/imu/data": (IMU, imu_message),
+            "/imu/mag": ("geometry_msgs/msg/Vector3Stamped", message),
+            "/imu/dv": ("geometry_msgs/msg/Vector3Stamped", message),
+        }
+        write_ros1_bag(Path(f"run_{number}.bag"), topics, rows)
+    import_log("run_0.bag", "run_1.bag")
+    log = open_log(Path("log"))
+    assert log.waveform is not None
+    np.testing.assert_allclose(log.waveform.measured_sensor, MEASURED, rtol=1e-9)
+    assert len(log.imu) == N
+
+
+def test_columns_of_a_euroc_folder_are_those_of_its_header() -> None:
+    motion = turning(times(500, 100.0), 57)
+    stamps = 1_403_636_579_000_000_000 + np.arange(500) * 10_000_000
+    rates = axes("w_RS_S_", " [rad s^-1]", "xyz")
+    tables = {
+        "imu0": (
+            [*axes("a_RS_S_", " [m s^-2]", "zyx"), *rates],
+            motion.accel[:, ::-1],
+            motion.gyro,
+        ),
+        "mag0": (axes("", " [gauss]", "zxy"), motion.field[:, [2, 0, 1]] * 1e-2),
+    }
+    for name, (head, *columns) in tables.items():
+        folder = Path("flight", "mav0", name)
+        folder.mkdir(parents=True)
+        lines = [
+            f"{t}," + ",".join(f"{v:.9f}" for v in row)
+            for t, row in zip(stamps, np.hstack(columns), strict=True)
+        ]
+        (folder / "data.csv").write_text(
+            "\n".join([",".join(["#timestamp [ns]", *head]), *lines]) + "\n"
+        )
+    import_log("flight")
+    for log in (open_log(Path("log")), open_log(Path("flight"))):
+        assert log.waveform is not None
+        np.testing.assert_allclose(log.imu.accel_body, motion.accel, atol=1e-8)
+        np.testing.assert_allclose(log.imu.gyro_body, motion.gyro, atol=1e-8)
+        np.testing.assert_allclose(log.waveform.measured_sensor, motion.field * 1e-6, atol=1e-12)

@@ -18,7 +18,7 @@ from magfusion.files.foreign.convert import write_stream
 from magfusion.files.foreign.gather import gather
 from magfusion.files.foreign.halves import HALVES, join_halves
 from magfusion.files.foreign.map_file import read_request
-from magfusion.files.foreign.phasor_rows import write_phasors
+from magfusion.files.foreign.phasor_rows import is_signed, write_phasors
 from magfusion.files.foreign.plan import Findings
 from magfusion.files.log import HEADER
 from magfusion.files.site import load_site
@@ -293,6 +293,8 @@ def _checked(directory: Path, output: Path, result: GatheredStreams, site: Path 
     """
     if "magnetometer" not in result.plans and result.phasors is None:
         return Figures()
+    if result.phasors is not None and not is_signed(directory / f"{FIELDS}.parquet"):
+        site = None  # amplitudes alone are not checked against one
     try:
         figures = run_check(CheckSettings(log=directory, site=site))
     except InputError as error:

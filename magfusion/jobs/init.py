@@ -113,12 +113,6 @@ def _detect_transmitters(settings: InitSettings) -> Transmitted | None:
             f"{settings.log}: is too short for a spectrum; record at least ten seconds, or omit"
             " --log"
         )
-    if not result.tones and not settings.beacon:
-        others = f" ({'; '.join(result.others)})" if result.others else ""
-        raise InputError(
-            f"{settings.log}: the magnetometer's spectrum has no significant tone{others}; switch"
-            " the beacons on, or describe them with --beacon"
-        )
     return result
 
 
@@ -182,6 +176,10 @@ def _with_tones(
             f"--beacon {silent[0]}: frequency_hz is missing, and the recording does not determine"
             f" it (significant: {_listed(free_slots) or 'no other tone'}); give frequency_hz"
         )
+    if not beacons and not transmitted.tones:
+        others = f" (other lines: {'; '.join(transmitted.others)})" if transmitted.others else ""
+        text = f"The recording has no significant tone{others}: the site has no beacons."
+        return [], [*findings, Finding("assumed", text)]
     if not beacons:
         tones = zip(_names(), transmitted.tones, strict=False)
         return [_of_tone(BeaconDraft(name), tone) for name, tone in tones], findings

@@ -102,7 +102,7 @@ def gather(
 def _report_absent(result: GatheredStreams, attempted: set[str]) -> None:
     """Note which sensors no table is given of."""
     if not {"magnetometer", FIELDS} & attempted:
-        if not result.plans and not result.findings.problems:
+        if not result.plans.keys() - {"truth"} and not result.findings.problems:
             result.findings.problems.append("No table of a sensor is given; give one.")
         result.passed_over.append(
             "the magnetometer, of which no table is given (--magnetometer FILE): only allan takes a"

@@ -146,7 +146,7 @@ def two_column_stamp(columns: Sequence[SourceColumn]) -> tuple[Term, ...]:
 def _named(place: int, column: SourceColumn, stream: str) -> Named | None:
     if _NOT_MEASURED.search(column.name.casefold()) or _of_unknown_order(column, stream):
         return None
-    for name, text in _readings(column):
+    for name, text in readings(column):
         target = _target(name, stream)
         if target is None:
             continue
@@ -154,22 +154,22 @@ def _named(place: int, column: SourceColumn, stream: str) -> Named | None:
         unit = parse_unit(text, dimension) if text or dimension is Dimension.NUMBER else None
         if unit is not None or not text:
             return Named(place, target, unit)
-    bare = _readings(column)[0][0]
+    bare = readings(column)[0][0]
     target = _target(bare, stream)
     return None if target is None else Named(place, target, None)
 
 
 def _of_unknown_order(column: SourceColumn, stream: str) -> bool:
     numbered = _NUMBERED.fullmatch(column.name.strip()) is not None
-    return numbered and any(_target(name, stream) in QUATERNION for name, _ in _readings(column))
+    return numbered and any(_target(name, stream) in QUATERNION for name, _ in readings(column))
 
 
-def _readings(column: SourceColumn) -> list[tuple[str, str]]:
-    """Return the ways to part a name from its unit, the surest first."""
+def readings(column: SourceColumn) -> list[tuple[str, str]]:
+    """Return the ways to separate a name from its unit, the most certain first."""
     indexed = re.fullmatch(r"(.*)(?:\[([012])\]|:([012]))", column.name)
     if indexed is not None:
         axis = "xyz"[int(indexed[2] or indexed[3])]
-        parts = _readings(SourceColumn(indexed[1], column.unit))
+        parts = readings(SourceColumn(indexed[1], column.unit))
         return [(f"{name}_{axis}", unit) for name, unit in parts]
     name = column.name
     tag = re.fullmatch(r"(.*?)\s*[\[(]([^\[\]()]*)[\])]\s*", name)
@@ -262,7 +262,7 @@ def _is_certain(
     named: Named, columns: Sequence[SourceColumn], stream: str, declared: set[str]
 ) -> bool:
     """Return whether a column is of a stream; for an x alone its file or its unit decides."""
-    bare, _ = _readings(columns[named.place])[0]
+    bare, _ = readings(columns[named.place])[0]
     if stream == "truth" or bare.strip().casefold() != "x":
         return True
     return stream in declared if declared else named.unit is not None
@@ -388,7 +388,7 @@ def _by_size(
 
 def _unit_in(column: SourceColumn, dimension: Dimension) -> SourceUnit | None:
     """Return the unit of a dimension that a column of unknown name has."""
-    units = (parse_unit(text, dimension) for _, text in _readings(column) if text)
+    units = (parse_unit(text, dimension) for _, text in readings(column) if text)
     return next((unit for unit in units if unit is not None), None)
 
 

@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
 
 from magfusion.errors import InputError
 from magfusion.files.fields import write_fields
@@ -79,6 +81,11 @@ def write_phasors(plan: PhasorPlan, path: Path) -> Counts:
     counts.first, counts.last = int(time_ns[0]), int(time_ns[-1])
     counts.written = int(np.sum(np.isfinite(phasor).any(axis=2)))
     return counts
+
+
+def is_signed(path: Path) -> bool:
+    """Return whether a table of fields holds phasors, and not amplitudes alone."""
+    return "amplitude" not in pa.parquet.read_schema(path).names
 
 
 def _columns(plan: PhasorPlan) -> tuple[IntArray, dict[int, Raw]]:

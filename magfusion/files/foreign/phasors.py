@@ -15,10 +15,10 @@ from magfusion.files.foreign.columns import (
     place_of,
     term_of,
 )
-from magfusion.files.foreign.guess import likely_time_unit, named_columns
+from magfusion.files.foreign.guess import likely_time_unit, named_columns, readings
 from magfusion.files.foreign.plan import Findings, Rate, first_values, shown
 from magfusion.files.foreign.source import Source, SourceColumn
-from magfusion.files.foreign.units import UNITS, Dimension, SourceUnit
+from magfusion.files.foreign.units import UNITS, Dimension, SourceUnit, parse_unit
 from magfusion.model.site import Site
 from magfusion.model.time_division import Slots
 
@@ -41,7 +41,9 @@ _NAMES: dict[str, tuple[str, ...]] = {
 LABELS = ("beacon", "slot", "tone", "axis")
 _NUMBERS = (1, 2, 3, 6)  # of columns of a coil: amplitude; re, im; three levels; re, then im
 _COMPONENT = re.compile(r"(:[0-2])?(\.re|\.im)?$|[_ ]?[xyz]$", re.I)
-LIKELY_FIELD = 1e-8  # T; of a beacon, to which the proposed unit is the nearest
+LIKELY_FIELD = 3e-8  # T; of a coil, to which the proposed unit is the nearest
+AMBIENT_FIELD = 5e-5  # T; of levels that contain the Earth's
+LIKELY_UNITS = ("T", "uT", "nT", "pT")
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,27 +153,38 @@ def _row_terms(
             known = named_columns(source.columns, "magnetometer")[TIME]
             matching = [] if request.rate is not None else [one.place for one in known]
         else:
-            matching = [k for k, c in enumerate(source.columns) if _bare(c.name) in names]
+            matching = [k for k, c in enumerate(source.columns) if _is_named(c, names)]
         if len(matching) == 1:
-            name = f"#{matching[0]}" if target in LABELS else source.columns[matching[0]].name
-            entry = ColumnMapping(FIELDS, target, name)
+            unit = "" if target in LABELS else _unit_in_name(source.columns[matching[0]], target)
+            entry = ColumnMapping(FIELDS, target, f"{source.columns[matching[0]].name}{unit}")
             terms[target] = _resolved(source, entry, request, declared)
     return {target: own for target, own in terms.items() if own}
 
 
-def _bare(name: str) -> str:
-    return re.sub(r"[\[(].*|[^a-z]", "", name.casefold())
+def _is_named(column: SourceColumn, names: Sequence[str]) -> bool:
+    """Return whether a column is called by one of some names, perhaps with its unit."""
+    bare = [re.sub(r"[^a-z]", "", name.casefold()) for name, _ in readings(column)]
+    return any(name in names for name in bare)
+
+
+def _unit_in_name(column: SourceColumn, target: str) -> str:
+    """Return the unit at the end of a name, in brackets; empty where the name has none."""
+    known = [unit for _, unit in readings(column) if parse_unit(unit, _dimension(target))]
+    bracketed = column.unit or not known or column.name.endswith(("]", ")"))
+    return "" if bracketed else f"[{known[0]}]"
+
+
+def _dimension(target: str) -> Dimension:
+    if target in LABELS:
+        return Dimension.NUMBER
+    return Dimension.TIME if target in (TIME, "window") else Dimension.FIELD
 
 
 def _resolved(
     source: Source, entry: ColumnMapping, request: _Request, declared: Findings
 ) -> tuple[Term, ...]:
     """Return the columns that an entry means; none where it is open, which is reported."""
-    dimension = Dimension.FIELD
-    if entry.column in LABELS:
-        dimension = Dimension.NUMBER
-    elif entry.column in (TIME, "window"):
-        dimension = Dimension.TIME
+    dimension = _dimension(entry.column)
     parts = re.fullmatch(r"(?P<names>.*?)\s*(?P<unit>\[[^\[\]]*[^\[\]\d][^\[\]]*\])?", entry.value)
     assert parts is not None
     names = _component_names(parts["names"], source.columns)
@@ -214,13 +227,17 @@ def _component_names(text: str, columns: Sequence[SourceColumn]) -> list[str]:
     return names
 
 
-def _likely_unit(source: Source, columns: Sequence[int], dimension: Dimension) -> SourceUnit:
+def _likely_unit(
+    source: Source, columns: Sequence[int], dimension: Dimension, typical: float = LIKELY_FIELD
+) -> SourceUnit:
     raw = first_values(source, columns[0], dimension is Dimension.TIME)
     if dimension is Dimension.TIME:
         return likely_time_unit(raw)
     size = float(np.nanmedian(np.abs(np.asarray(raw, dtype=np.float64)))) if len(raw) else 0.0
     units = UNITS[Dimension.FIELD]
-    likely = min(units, key=lambda n: abs(np.log(max(size, 1e-30) * units[n] / LIKELY_FIELD)))
+    likely = min(
+        LIKELY_UNITS, key=lambda name: abs(np.log(max(size, 1e-30) * units[name] / typical))
+    )
     return SourceUnit(likely, Dimension.FIELD)
 
 
@@ -245,11 +262,11 @@ def _coils_by_site(
     """Propose the columns of each coil of the site, or return how many rows are one cycle."""
     own = {term.place for name, those in terms.items() if name != "value" for term in those}
     open_columns = [k for k in range(len(source.columns)) if k not in own]
-    if request.site is None:
+    if request.site is None or not request.site.beacons:
         names = ", ".join(column.name for column in source.columns[:30])
         request.problems.append(
             f"no column of a beacon or slot is found (found {names}); map it, or the columns of"
-            " each coil by --map 'fields.BEACON.TONE=NAME[nT]', or give --site"
+            " each coil by --map 'fields.BEACON.TONE=NAME[nT]', or give --site with its beacons"
         )
         return 0
     if len(open_columns) == 1:
@@ -276,7 +293,8 @@ def _propose_coils(source: Source, places: Sequence[int], site: Site, declared: 
         groups = {source.columns[k].name: [source.columns[k].name] for k in places}
     if len(groups) not in counts:
         return
-    unit = _likely_unit(source, places, Dimension.FIELD)
+    typical = AMBIENT_FIELD if len(groups) == len(coils) else LIKELY_FIELD
+    unit = _likely_unit(source, places, Dimension.FIELD, typical)
     for coil, names in zip(coils, groups.values(), strict=False):
         ordered = sorted(names, key=lambda name: name.endswith(".im"))
         name = coil if isinstance(coil, str) else f"{coil[0]}.{coil[1]}"

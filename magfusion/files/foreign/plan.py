@@ -156,16 +156,9 @@ def plan_stream(
     given = {entry.column: entry for entry in entries}
     named = named_columns(source.columns, stream)
     velocity = any(name in given for name in OPTIONAL)
-    without = _other_rotation(given, named)
     known = {*given, *(usual or {}), *(name for name, own in named.items() if own)}
-    if stream == "truth":
-        known |= set(QUATERNION) if numbered_quaternion(source.columns) else set()
-        alone, absent = _absent_part(known)
-        without += absent
-        if absent:
-            declared.notes.append(f"{source.place}: the truth has {alone} alone.")
-    if stream == "magnetometer" and (axes := known.intersection(GROUPS["field"])):
-        without += tuple(sorted(set(GROUPS["field"]) - axes))
+    absent = _absent_axes(stream, source, known, declared)
+    without = (*_other_rotation(given, named), *absent)
     for target in STREAMS[stream]:
         if target in without:
             continue
@@ -190,6 +183,21 @@ def _other_rotation(
         return QUATERNION
     angles = declared.issuperset(EULER) and declared.isdisjoint(QUATERNION)
     return QUATERNION if angles else EULER
+
+
+def _absent_axes(
+    stream: str, source: Source, known: set[str], declared: Findings
+) -> tuple[str, ...]:
+    """Return the columns that a truth of one part, or a magnetometer of fewer axes, lacks."""
+    if stream == "magnetometer" and not known.isdisjoint(GROUPS["field"]):
+        return tuple(name for name in GROUPS["field"] if name not in known)
+    if stream != "truth":
+        return ()
+    known = known | (set(QUATERNION) if numbered_quaternion(source.columns) else set())
+    alone, absent = _absent_part(known)
+    if absent:
+        declared.notes.append(f"{source.place}: the truth has {alone} alone.")
+    return absent
 
 
 def _absent_part(known: set[str]) -> tuple[str, tuple[str, ...]]:
