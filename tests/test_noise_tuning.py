@@ -9,12 +9,13 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import minimize
 from scipy.stats import chi2
+from small_problem import small_log
 
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.posterior import variance_components
 from magfusion.estimation.posterior.noise_tuning import Tuned, tuned_site
 from magfusion.estimation.posterior.residual_redundancy import ChannelErrors
-from magfusion.estimation.posterior.tuned_noise import tuned_noise
+from magfusion.estimation.posterior.tuned_noise import covered_beacons, tuned_noise
 from magfusion.estimation.posterior.variance_components import (
     KINDS,
     NORMAL,
@@ -322,3 +323,16 @@ def test_the_mean_nees_is_honest_whatever_was_declared(factor: float) -> None:
     assert low < np.mean(values) < high, (np.mean(values), np.mean(untuned))
     if factor > 1.0:
         assert np.mean(untuned) < low, np.mean(untuned)
+
+
+def test_noise_that_the_declared_model_error_covers_is_no_doubt() -> None:
+    """The part of a model error that changes quickly is tuned as noise, far below the error."""
+    small = small_log(1, sigma=1e-12, perturb=False)
+    name = small.site.beacons[0].name
+    grown = Tuned(name, "noise_factor", 1.0, 5.0)
+    for model_error, expected in ((1e-2, {name}), (1e-9, set())):
+        covered = covered_beacons(
+            [grown], small.fields, replace(small.site, model_error=model_error)
+        )
+        assert covered == expected
+        assert len(list(tuned_noise([grown], covered))) == 1 - len(expected)

@@ -180,6 +180,17 @@ def test_start_phases_find_a_drift_of_many_turns() -> None:
     assert np.all(np.abs(turns(result.phase - at_middle)) < 0.05)  # rad
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_start_phases_of_a_beacon_below_the_noise_leave_its_clock_as_declared(seed: int) -> None:
+    """Its phases are noise that lasts: in a half of the log it points another way by chance."""
+    rng, time = np.random.default_rng(seed), np.arange(0.0, 30.0, 0.2)
+    site = demo_site(coil_radius=None, synchronised=False)
+    phase = np.cumsum(0.5 * rng.standard_normal((len(time), len(site.channels))), axis=0)
+    phase[:60] = 0.1 * rng.standard_normal((60, len(site.channels)))
+    result = start_phases(initial_calibration(site, 15.0), time, phase)
+    assert np.all(np.abs(result.drift) < 3.0 * site.clock.drift_sigma)
+
+
 def without_imu(log: Log, start: float, end: float) -> Log:
     imu = log.imu
     kept = (imu.time < start) | (imu.time > end)

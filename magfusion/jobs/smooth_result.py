@@ -19,8 +19,8 @@ from magfusion.estimation.integrity.correction import (
 )
 from magfusion.estimation.integrity.diagnosis import (
     diagnosed,
-    with_cause,
     with_changed_beacons,
+    with_explaining_cause,
 )
 from magfusion.estimation.integrity.judge import judged_with_score
 from magfusion.estimation.integrity.score import Score
@@ -135,7 +135,7 @@ def finished(
     excluded = bool(changes) or any(f.code == "beacon_excluded" for f in trust.reasons)
     possible = corrections(site, trust.reasons, () if excluded else causes, cause)
     is_named = bool(causes) or any(f.code == "changed" for f in trust.reasons)
-    trust = with_cause(trust, None if is_named and not is_clear(cause) else cause)
+    trust = with_explaining_cause(trust, None if is_named and not is_clear(cause) else cause)
     if correction is not None:
         trust |= Trust((_explaining(correction.finding, trust),))
     by_state = states_judged(separated, result, trust.verdict)

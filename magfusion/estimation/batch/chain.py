@@ -5,13 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.data_checks.statistics import effective_number
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.channel_effects import of_all_sensors
 from magfusion.model.parameters import Calibration
 from magfusion.model.quaternion import inverse, matrices, product
 from magfusion.model.samples import ImuSamples
 from magfusion.model.short_repr import short_repr
-from magfusion.model.site import Site
+from magfusion.model.site import ClockModel, Site
 from magfusion.model.strapdown import mean_about, turn_from_gyro_at
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
@@ -20,6 +21,7 @@ POSITION_SIGMA = 0.1  # m; added to the fixes' own, which calibration errors exc
 ROTATION_SIGMA = 0.1  # rad; and the possible contribution of the gyro's bias
 LEAP_COST = 100.0  # of a jump between unrelated hypotheses: one bad epoch must not break a chain
 RIVAL_COST = 1000.0  # chi square; a chain worse by more is no rival
+LEAST_SCATTER = 1e-4  # rad^2; of single-epoch phases, as field models are that wrong
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +175,7 @@ def start_phases(calibration: Calibration, time: Array, phase: Array) -> Calibra
             continue
         frequency = float(beacon.tone_frequencies_hz[0])
         drift[i] += _dominant_drift(
-            elapsed, phase[:, rows.start], frequency, calibration.site.clock.drift_largest
+            elapsed, phase[:, rows.start], frequency, calibration.site.clock
         )
         rate = 2.0 * np.pi * beacon.tone_frequencies_hz * (drift[i] - calibration.drift[i])
         remaining = np.exp(1j * (phase[:, rows] - elapsed[:, None] * rate))
@@ -182,10 +184,16 @@ def start_phases(calibration: Calibration, time: Array, phase: Array) -> Calibra
     return replace(calibration, phase=of_all_sensors(calibration.site, one), drift=drift)
 
 
-def _dominant_drift(elapsed: Array, phase: Array, frequency_hz: float, largest: float) -> float:
-    """Return the clock error that aligns the phases best."""
+def _dominant_drift(elapsed: Array, phase: Array, frequency_hz: float, clock: ClockModel) -> float:
+    """Return the most probable clock error; phases of a weak beacon alone fit any equally well."""
     reach = max(float(np.ptp(elapsed)), 1e-3)
+    largest = clock.drift_largest
     number = int(np.clip(16.0 * largest * frequency_hz * reach, 3, 20_000)) | 1
-    rates = np.linspace(-largest, largest, number) * 2.0 * np.pi * frequency_hz
-    score = [abs(np.sum(np.exp(1j * (phase - rate * elapsed)))) for rate in rates]
-    return float(rates[int(np.argmax(score))] / (2.0 * np.pi * frequency_hz))
+    drifts = np.linspace(-largest, largest, number)
+    turns = 2.0 * np.pi * frequency_hz * elapsed
+    share = np.array([abs(np.mean(np.exp(1j * (phase - drift * turns)))) for drift in drifts])
+    steady = np.exp(1j * (phase - drifts[np.argmax(share)] * turns))
+    scatter = steady - np.mean(steady)
+    count = effective_number(np.stack([scatter.real, scatter.imag], axis=1))
+    likelihood = count * np.log1p(LEAST_SCATTER - share**2)
+    return float(drifts[np.argmin(likelihood + (drifts / clock.drift_sigma) ** 2)])

@@ -1,7 +1,8 @@
 """Inertial residuals: inconsistency of rates and forces with the magnetic-field solution.
 
 At the optimum the states have absorbed most of an inertial factor's error; the expected residual
-follows from their covariance, computed for a sample of the intervals.
+follows from their covariance, computed for a sample of the intervals.  An error of the field model
+that is constant in place turns the states slowly, and leaves more than that: as much as drawn ones.
 """
 
 import gtsam
@@ -9,12 +10,17 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.batch.log_graph import overlap
 from magfusion.estimation.graph.graph import GraphEstimate
 from magfusion.estimation.graph.inertial import ROWS
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.posterior.residual_redundancy import ResidualProjection
 from magfusion.estimation.solve.bordered import eliminate
+from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
 SAMPLED = 24  # intervals whose covariance is computed: most are similar
+DRAWS = 4  # of errors: one that is constant in place has few independent parts
 WIDTHS = {"x": 6, "v": 3, "b": 6}
 
 
@@ -54,4 +60,16 @@ def expected_squares(result: Smoothed) -> Array:
             matrix[:, columns[key]] = factor.getA()[:, begin : begin + width]
             begin += width
         residual[row] = 1.0 - np.einsum("ij,jk,ik->i", matrix, joint, matrix)
-    return np.median(residual, axis=0)
+    return np.maximum(np.median(residual, axis=0), _drawn_squares(result))
+
+
+def _drawn_squares(result: Smoothed) -> Array:
+    """Return the mean square of each row that drawn noise and model errors leave, shape (15,)."""
+    if not any(isinstance(m, FieldPhasors) for m in result.graph.measurements):
+        return np.zeros(ROWS)
+    rows = {k: v[result.epoch] for k, v in vars(result.states).items() if v is not None}
+    known = result.graph, result.estimate, result.fields, Trajectory(**rows)
+    parts = *known, overlap(result.fields), result.considered
+    drawn = [ResidualProjection(*parts, seed).inertial_squares for seed in range(DRAWS)]
+    noise, rough, smooth, own = np.mean(drawn, axis=0)
+    return np.asarray(noise + np.maximum(rough, smooth) + own)

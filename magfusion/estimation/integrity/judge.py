@@ -30,7 +30,7 @@ from magfusion.estimation.integrity.score import (
 )
 from magfusion.estimation.integrity.smoothed_compass import compass
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
-from magfusion.estimation.posterior.tuned_noise import tuned_noise
+from magfusion.estimation.posterior.tuned_noise import covered_beacons, tuned_noise
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.model.arguments import check_arguments
 from magfusion.model.samples import Log
@@ -87,7 +87,8 @@ def judged_with_score(result: R, log: Log) -> JudgedResult[R]:
     streams = log, result.declared.site, BRIDGED_CODES
     released = detected_in(result.fields, result.declared.site)
     detected = recorded(*streams, estimated=states, beacons=alone, compensated=released)
-    trust = Trust((*tuned_noise(result.noise), *detected))
+    covered = covered_beacons(result.noise, result.fields, result.declared.site)
+    trust = Trust((*tuned_noise(result.noise, covered), *detected))
     give_back_memory()
     pose_cov = result.states.pose_cov
     if pose_cov is None:

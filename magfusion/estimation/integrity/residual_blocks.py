@@ -21,6 +21,7 @@ from magfusion.estimation.data_checks.statistics import (
 from magfusion.estimation.graph.graph import GraphEstimate
 from magfusion.estimation.graph.state import states_in
 from magfusion.estimation.integrity.inertial_misfit import expected_squares, inertial_errors
+from magfusion.estimation.integrity.smoothed_exclusion import LEFT_OUT
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.pose_fix import PoseFix
@@ -28,6 +29,8 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array, BoolArray
 
 BLOCK, MOST_BLOCKS = 10.0, 24  # s; stretches that are tested separately
+SHORT_BLOCK = 2.0  # s; all beacons together: as long as iron takes to pass one
+MOST_SHORT = 1800  # of them, in an hour
 INDEPENDENT = 3.0  # of a phasor's six numbers: one model error affects several
 TOLERATED = 1.2**2  # mean square below which sigmas are acceptable
 TOLERATED_INERTIAL = 1.5**2
@@ -62,10 +65,10 @@ class Misfit(NamedTuple):
     whole: bool
 
 
-def blocks_of(time: Array) -> list[BoolArray]:
-    """Return the stretches of a log, the whole of it first."""
+def blocks_of(time: Array, block: float = BLOCK, maximum: int = MOST_BLOCKS) -> list[BoolArray]:
+    """Return the stretches of a log, the whole of it first; of a length (s), or as many."""
     length = float(time[-1] - time[0])
-    count = int(np.clip(length / BLOCK, 1, MOST_BLOCKS))
+    count = int(np.clip(length / block, 1, maximum))
     at = np.minimum((time - time[0]) / max(length, 1e-9) * count, count - 1).astype(int)
     whole = np.ones(len(time), dtype=bool)
     return [whole] if count == 1 else [whole, *(at == k for k in range(count))]
@@ -118,7 +121,7 @@ def fields(case: Case, raw: Array, weighed: Array) -> TestResult:
     informative = _significant(tests, TOLERATED)
     if not informative:
         return NOTHING
-    factor = _field_factor(case, weighed, blocks)
+    factor = np.maximum(_field_factor(case, weighed, blocks), _unexplained(case, raw, weighed))
     verdict = Verdict.DOUBTFUL if np.max(factor) > TOLERATED else Verdict.TRUSTWORTHY
     findings = tuple(
         _field_finding(result, named, time, verdict) for named in _by_name(informative)
@@ -203,6 +206,22 @@ def _field_factor(case: Case, rest: Array, blocks: list[BoolArray]) -> Array:
             inside = rows[at]
             out[inside] = np.maximum(out[inside], factor)
     return out
+
+
+def _unexplained(case: Case, raw: Array, weighed: Array) -> Array:
+    """Return the factor for poses at which no rejected beacon explains the residuals.
+
+    Where those of the accepted beacons are too large as well, whichever is rejected, all may be
+    false, as by iron near the platform.
+    """
+    time = case.result.fields.time
+    used = np.any(raw != 0.0, axis=2)  # an excluded beacon has no weight at all
+    rejected = np.sum(weighed**2, axis=2) < LEFT_OUT * np.sum(raw**2, axis=2)
+    short, every = blocks_of(time, SHORT_BLOCK, MOST_SHORT), np.where(used[..., None], raw, np.nan)
+    accepted = np.where(rejected[..., None], np.nan, every)
+    tests = misfits("", accepted, short[1:] or short, INDEPENDENT * raw.shape[1])
+    rows = [one.rows for one in _significant(tests, TOLERATED) if np.any(rejected[one.rows])]
+    return _field_factor(case, every, rows)
 
 
 def _mean(values: Array) -> float:

@@ -67,6 +67,8 @@ class ResidualProjection:
     considered : tuple of Block
         Uncertain parameters that are not estimated elsewhere.  Here they are: the effect of their
         errors is no noise.
+    seed : int
+        Of the drawn errors.
     """
 
     ordinary: BoolArray  # inertial intervals without a gap
@@ -79,8 +81,10 @@ class ResidualProjection:
         poses: Trajectory,
         windows: float,
         considered: tuple[Block, ...] = (),
+        seed: int = 0,
     ) -> None:
-        self._samples = samples
+        # Reproducible for the same log.
+        self._samples, self._rng = samples, np.random.default_rng(seed)
         self._measured = next(m for m in graph.measurements if isinstance(m, FieldPhasors))
         site = estimate.calibration.site
         first = graph.native.size() - graph.epochs + 1
@@ -112,14 +116,15 @@ class ResidualProjection:
         if residual is None:
             residual = left_by_tree(graph, estimate, considered, fields, inertial)
         every = [field / self._weight for field in residual[0]]
+        # Squares of whitened remainders of all drawn errors, mean over the intervals, (errors, 15).
+        self.inertial_squares = np.mean(residual[1][1:] ** 2, axis=1)
         of_imu = [(self._unwhitening @ own[..., None])[..., 0] for own in residual[1]]
         self._inertial = of_imu
         self._separate = self._without_pose(every)
 
     def _drawn(self, site: Site, sensor_world: Array, windows: float) -> list[tuple[Array, Array]]:
         """Return drawn errors of fields and inertial factors: noise, model errors, the IMU's."""
-        rng = np.random.default_rng(0)  # reproducible for the same log
-        samples, root = self._samples, self._measured.sqrt_information[..., :3, :3]
+        rng, samples, root = self._rng, self._samples, self._measured.sqrt_information[..., :3, :3]
         unit = model_error_cov(np.nan_to_num(samples.phasor_sensor), 1.0)
         self._variance = [_spread(root, c) for c in (samples.phasor_cov, unit)]
         noise, model = np.array(self._size)[:, self._owner]

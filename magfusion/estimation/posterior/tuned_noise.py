@@ -1,8 +1,13 @@
 """Findings of noise far from the declared values."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
+
+import numpy as np
 
 from magfusion.estimation.posterior.noise_tuning import OF_MOTION, Tuned
+from magfusion.model.field import model_error_cov
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 
 FACTOR = 2.999  # a larger change is reported; that of a model error is limited to three
@@ -17,9 +22,41 @@ WORDS = {
 }
 
 
-def tuned_noise(tuned: Sequence[Tuned]) -> Iterator[Finding]:
-    """Yield the findings of estimated noise: more than declared makes a result doubtful."""
-    more = [t for t in tuned if t.factor > FACTOR and t.key not in OF_MOTION]
+def covered_beacons(tuned: Sequence[Tuned], fields: FieldSamples, site: Site) -> set[str]:
+    """Return the beacons whose declared model error is larger than what their noise has grown to.
+
+    The tuning counts the part of a model error that changes from epoch to epoch as noise.
+    """
+    errors = {
+        b.name: site.model_error if b.model_error is None else b.model_error for b in site.beacons
+    }
+    result = set()
+    for one in (t for t in tuned if t.key == "noise_factor"):
+        own = np.array([name == one.owner for name, _ in fields.channels])
+        used = fields.valid & own
+        noise = np.sum(np.trace(fields.phasor_cov[used], axis1=1, axis2=2))
+        model = model_error_cov(fields.phasor_sensor[used], errors[one.owner])
+        declared = one.declared**2 * noise + np.sum(np.trace(model, axis1=1, axis2=2))
+        if one.estimated**2 * noise < declared:
+            result.add(one.owner)
+    return result
+
+
+def tuned_noise(tuned: Sequence[Tuned], covered: Container[str] = ()) -> Iterator[Finding]:
+    """Yield the findings of estimated noise: more than declared makes a result doubtful.
+
+    Parameters
+    ----------
+    covered : container of str
+        Beacons whose declared model error covers their noise.
+    """
+    more = [
+        t
+        for t in tuned
+        if t.factor > FACTOR
+        and t.key not in OF_MOTION
+        and not (t.key == "noise_factor" and t.owner in covered)
+    ]
     less = [t for t in tuned if t.factor < 1.0 / FACTOR]
     faster = [t for t in tuned if t.factor > FACTOR and t.key in OF_MOTION]
     if faster:
