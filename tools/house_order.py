@@ -33,7 +33,7 @@ ROOMS = {
             truth_poses
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
             detection_range field ground without_imu
-            parameters path_field strapdown_steps
+            bandpass parameters path_field strapdown_steps
             noise prior waveform
         """,
         "files": """
@@ -42,7 +42,7 @@ ROOMS = {
             site_values standard_streams stray_stamps
             bag_reader bag_rows checkpoint correlation field_map kept lost_rows probe row_file
             survey table yaml_files
-            attitude_table drive_columns fields hall instruments readings_table
+            attitude_table audio drive_columns fields hall instruments readings_table
             site_casing site_correlation site_motion site_region site_response site_rotor
             site_temperature
             row_stamps trajectory_table wells_file
@@ -58,8 +58,8 @@ ROOMS = {
             long_log
         """,
         "receiver": """
-            ambient bursts cells ellipse even_samples hum noise range_ends rotor rotor_phase
-            sampling_clock turn windows
+            ambient bursts cells ellipse even_samples hum noise range_ends rotor
+            rotor_phase sampling_clock turn windows
             admission ambient_left pieces slots
             design drive integration marked_bursts receiver reference slot_phasors slot_timing
             cycles lockin reference_clock

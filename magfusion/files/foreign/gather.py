@@ -58,7 +58,7 @@ class GatheredStreams:
 def gather(paths: Sequence[Path], wanted: ImportRequest, declared: Findings) -> GatheredStreams:
     """Return how files become the streams of a log; ``declared`` has the problems."""
     result = GatheredStreams(declared)
-    attempted = set(wanted.files)
+    attempted = set(wanted.files) | ({"magnetometer"} if wanted.recorded else set())
     for stream, path in wanted.files.items():
         if (source := _opened(path, wanted, result)) is not None:
             result.add(_table(stream, path, source, wanted, declared))

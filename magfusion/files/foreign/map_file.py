@@ -46,6 +46,8 @@ class ImportRequest:
         Added to the times of a stream.
     rows : dict
         Column, and the value that rows of the stream have in it.
+    recorded : bool
+        Whether the magnetometer is a recording, which is no table.
     """
 
     files: dict[str, Path]
@@ -55,6 +57,7 @@ class ImportRequest:
     epoch: str | None = None
     shifts_ns: dict[str, int] = field(default_factory=dict)
     rows: dict[str, tuple[str, str]] = field(default_factory=dict)
+    recorded: bool = False
 
 
 def read_request(
