@@ -11,8 +11,11 @@ from magfusion.errors import InputError
 from magfusion.estimation.batch.settings import SmootherSettings
 from magfusion.files.audio import describe_recording
 from magfusion.files.inertial_tables import write_imu
+from magfusion.files.named_records import with_waveform
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site, save_site
+from magfusion.files.stream import Record
+from magfusion.files.stream_contents import baseband_content
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.jobs.import_log import ImportSettings, run_import
 from magfusion.jobs.inputs import Job
@@ -120,6 +123,22 @@ def test_the_bands_of_a_recording_are_its_waveform(recorded: Path, tmp_path: Pat
     assert np.max(np.abs(whole.time[at] - bands.time)) < 1e-9
     error = bands.measured_sensor - whole.measured_sensor[at]
     assert np.sqrt(np.mean(error**2)) == pytest.approx(NOISE, rel=0.05)
+
+
+def test_baseband_is_the_waveform_of_the_bands(recorded: Path) -> None:
+    """Whatever the stamps are, the tones are at their own frequencies."""
+    site = sound_site()
+    band = BandFilter.of_site(site, RATE_HZ)
+    assert band is not None
+    volts = soundfile.read(recorded / "walk.flac", frames=RATE_HZ)[0][:, :3]
+    place, tones = BandSampler(band).push(volts)
+    stamps = 17.3 + place / RATE_HZ * (1.0 + 5e-5)
+    turned = tones * np.exp(-2j * np.pi * stamps[:, None] * band.tones_hz)[..., None]
+    record = Record.model_validate(baseband_content(stamps, turned, band.tones_hz))
+    samples = with_waveform(record, site).magnetometer
+    assert samples is not None
+    error = samples.field - volts[place.astype(int)]
+    assert np.max(np.abs(error)) < 6.0 * NOISE / (NOMINAL_T_PER_V * FULL_SCALE)
 
 
 def test_blocks_of_any_size_give_the_same_bands() -> None:
