@@ -33,7 +33,7 @@ ROOMS = {
             truth_poses
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
             detection_range field ground without_imu
-            parameters path_field strapdown_steps
+            bandpass parameters path_field strapdown_steps
             noise prior waveform
         """,
         "files": """
@@ -42,7 +42,7 @@ ROOMS = {
             site_values standard_streams stray_stamps
             aiding_messages bag_reader bag_rows checkpoint correlation field_map kept lost_rows
             probe row_file survey table yaml_files
-            attitude_table drive_columns fields hall instruments readings_table
+            attitude_table audio drive_columns fields hall instruments readings_table
             site_casing site_correlation site_motion site_region site_response site_rotor
             site_temperature
             row_stamps trajectory_table wells_file
@@ -58,8 +58,8 @@ ROOMS = {
             long_log
         """,
         "receiver": """
-            ambient bursts cells ellipse even_samples hum noise range_ends rotor rotor_phase
-            sampling_clock turn windows
+            ambient bursts cells ellipse even_samples host_clock hum noise range_ends rotor
+            rotor_phase sampling_clock turn windows
             admission ambient_left pieces slots
             design drive integration marked_bursts receiver reference slot_phasors slot_timing
             cycles lockin reference_clock
@@ -108,12 +108,12 @@ ROOMS = {
         """,
         "jobs": """
             antenna_inputs fix_coil joint_kept receiver_axes region_option rotor_inputs state_rows
-            stream_clocks stream_samples written
+            listen_lines listen_sound stream_clocks stream_samples written
             inputs navigate_results result_directory
             allan_noise checkpoint failure orientation settings without_beacons
             allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
             calibrate_magnetometer check design_settings drift_world evaluate export init_settings
-            live papers published_fix range_wells rates region replay rest_settings
+            listen live papers published_fix range_wells rates region replay rest_settings
             simulate_ranging smooth_result survey view
             antenna_fit demodulate design_motion drift_figures fix import_log init_questions
             joint_tasks match_trust navigate_settings simulate smooth_correction smooth_failure

@@ -11,6 +11,7 @@ from pydantic import Field
 from magfusion.errors import InputError
 from magfusion.files.aiding_tables import read_aiding, write_aiding
 from magfusion.files.atomic import whole_directory
+from magfusion.files.audio import AudioEntry, read_audio
 from magfusion.files.depth_table import read_depths, write_depths
 from magfusion.files.drive_columns import read_drive
 from magfusion.files.fields import read_fields, write_fields
@@ -30,6 +31,7 @@ from magfusion.files.trajectory_table import read_trajectory, write_trajectory
 from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
 from magfusion.model.aiding import QUANTITIES
 from magfusion.model.samples import ImuSamples, Log, Waveform
+from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
 
@@ -48,6 +50,7 @@ class LogHeader(StrictModel):
     name: str
     epoch_ns: int = Field(ge=-LARGEST_TIME_NS, le=LARGEST_TIME_NS)
     source: str
+    audio: AudioEntry | None = None
 
 
 def is_log(path: Path) -> bool:
@@ -55,17 +58,19 @@ def is_log(path: Path) -> bool:
     return (path / HEADER).is_file()
 
 
-def _tables(path: Path) -> dict[str, Path | None]:
+def _tables(path: Path, audio: AudioEntry | None) -> dict[str, Path | None]:
     """Return the table of each stream; refuse a log without any of the field."""
     tables = {stem: find_table(path, stem) for stem in STREAMS}
-    if tables["magnetometer"] is None and tables["fields"] is None:
+    if tables["magnetometer"] is None and tables["fields"] is None and audio is None:
         raise InputError(
             f"{path}: holds no magnetometer.parquet and no fields.parquet (nor .csv); add one."
         )
     return tables
 
 
-def read_log(path: Path, start: float | None = None, end: float | None = None) -> Log:
+def read_log(
+    path: Path, start: float | None = None, end: float | None = None, site: Site | None = None
+) -> Log:
     """Read and check a log, or the part of it with start <= time < end.
 
     Parameters
@@ -74,6 +79,8 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
         A directory with ``log.yaml`` and a table per stream, Parquet or CSV.
     start, end : float, optional
         Seconds since the log's epoch. Rows outside are neither decoded nor checked.
+    site : Site, optional
+        Of an audio recording only the bands of its tones are read.
 
     Returns
     -------
@@ -93,13 +100,15 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
     if not is_log(path):
         raise InputError(f"{path}: holds no {HEADER}; give the path of a log's directory.")
     header = read_yaml(path / HEADER, LogHeader)
-    tables = _tables(path)
+    tables = _tables(path, header.audio)
     span = Span(header.epoch_ns, start, end)
     imu, of_imu = ImuSamples.empty(), _NOTHING
     if tables["imu"] is not None:
         imu, of_imu = read_imu(tables["imu"], span)
     waveforms, waveform, of_waveform = dict[str, Waveform](), None, _NOTHING
-    if names_magnetometers(tables["magnetometer"]):
+    if header.audio is not None:
+        waveform = read_audio(path, header.audio, span, site)
+    elif names_magnetometers(tables["magnetometer"]):
         waveforms, of_waveform = read_waveforms(tables["magnetometer"], span)
     else:
         waveform, of_waveform = read_waveform(tables["magnetometer"], span)

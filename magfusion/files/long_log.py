@@ -144,6 +144,9 @@ def long_log(path: Path, start: float | None = None, end: float | None = None) -
     """
     if not is_log(path) or max(_rows(path, name) for name in _COLUMNS) <= LONG:
         return None
+    header = read_yaml(path / HEADER, LogHeader)
+    if header.audio is not None:
+        return None
     tables = {name: find_table(path, name) for name in (*_COLUMNS, "fields")}
     if tables["imu"] is None or tables["magnetometer"] is tables["fields"] is None:
         return None  # which is refused where it is read whole
@@ -157,7 +160,7 @@ def long_log(path: Path, start: float | None = None, end: float | None = None) -
         )
     ):
         return None
-    span = Span(read_yaml(path / HEADER, LogHeader).epoch_ns, start, end)
+    span = Span(header.epoch_ns, start, end)
     fields = read_if_there(tables["fields"], read_fields, span)
     temperatures = read_temperatures(find_table(path, "temperature"), span.epoch_ns)
     return LongLog(path, span, fields, temperatures)

@@ -5,14 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from magfusion.errors import InputError
 from magfusion.files.fields import on_log_clock, side_by_side
-from magfusion.files.stream import field_samples
+from magfusion.files.stream import MagnetometerRecord, field_samples
+from magfusion.model.bandpass import waveform_of_bands
+from magfusion.model.detection_range import tones_of
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 
 if TYPE_CHECKING:
-    from magfusion.files.stream import FieldsRecord
+    from magfusion.files.stream import FieldsRecord, Record
 
 
 def magnetometer_number(site: Site, name: str | None, what: str) -> int:
@@ -37,6 +41,28 @@ def magnetometer_number(site: Site, name: str | None, what: str) -> int:
             f" {', '.join(names)}); give the site in which the log was recorded"
         )
     return names.index(name)
+
+
+def with_waveform(record: Record, site: Site) -> Record:
+    """Return a record with the waveform of the tones whose complex amplitudes it holds.
+
+    Raises
+    ------
+    InputError
+        Where they are not the tones of the site, or its receiver is not of alternating fields.
+    """
+    bands = record.baseband
+    if bands is None:
+        return record
+    tones_hz = np.sort(tones_of(site).frequencies_hz)
+    if not np.array_equal(np.sort(bands.hz), tones_hz) or record.magnetometer is not None:
+        listed = ", ".join(f"{tone:g}" for tone in tones_hz)
+        raise InputError(f"baseband: give all tones of the site ({listed} Hz), and no magnetometer")
+    if not site.platform.magnetometer.ac_coupled or site.platform.further:
+        raise InputError("baseband: declare one platform.magnetometer with ac_coupled: true")
+    field = waveform_of_bands(bands.time, bands.re + 1j * bands.im, bands.hz)
+    samples = MagnetometerRecord(time=bands.time, field=field)
+    return record.model_copy(update={"baseband": None, "magnetometer": samples})
 
 
 def site_fields(entry: FieldsRecord, site: Site) -> FieldSamples:

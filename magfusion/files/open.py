@@ -31,7 +31,8 @@ def open_log(
     report : callable
         Called with the part of a bag that has been read.
     site : Site, optional
-        Whose aiding sensors are read of a bag, by the names of their topics.
+        Whose aiding sensors are read of a bag, by the names of their topics, and whose tones of a
+        recording.
 
     Raises
     ------
@@ -42,7 +43,7 @@ def open_log(
     if not path.exists():
         raise InputError(f"{path}: there is no such file or directory; give the path of a log.")
     if is_log(path):
-        return read_log(path, start, end)
+        return read_log(path, start, end, site)
     if is_euroc(path):
         return read_euroc(path, start, end)
     if is_bag(path):

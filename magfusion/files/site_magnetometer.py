@@ -17,7 +17,9 @@ from magfusion.files.site_plain import (
     sigma_entry,
 )
 from magfusion.files.site_response import (
+    AxisCoilsEntry,
     AxisResponsesEntry,
+    CoilEntry,
     Listed,
     check_response,
     response_entry,
@@ -48,6 +50,7 @@ from magfusion.files.yaml_files import StrictModel
 from magfusion.model.site import Magnetometer, MagnetometerSigma, Platform
 from magfusion.units import Array
 
+RESPONSE_KEYS = ("response", "axis_responses", "coil", "axis_coils")
 LARGEST_PHASE = 0.2  # rad; of a tone by a clock's sigma: three of them are still nearly linear
 
 
@@ -91,6 +94,9 @@ class MagnetometerEntry(StrictModel):
     warming: SensorTemperatureEntry | None = None
     response: Listed | None = None
     axis_responses: AxisResponsesEntry | None = None
+    coil: CoilEntry | None = None
+    axis_coils: AxisCoilsEntry | None = None
+    ac_coupled: bool = Magnetometer.ac_coupled
     casing: CasingEntry | None = None
     axes: Annotated[list[Literal["x", "y", "z"]], Field(min_length=1, max_length=3)] | None = None
     name: Annotated[str, Field(min_length=1), AfterValidator(plain_name)] | None = None
@@ -150,8 +156,9 @@ def check_tones(sensor: MagnetometerEntry, tones_hz: Array, at: tuple[str | int,
     at : tuple
         Place of the magnetometer in the site's file.
     """
-    if sensor.response is not None and sensor.axis_responses is not None:
-        raise refusal_at((*at, "response"), "both", "remove it, or axis_responses")
+    given = [key for key in RESPONSE_KEYS if getattr(sensor, key) is not None]
+    if len(given) > 1:
+        raise refusal_at((*at, given[0]), "both", f"remove it, or {given[1]}")
     if sensor.response is not None:
         check_response(sensor.response, tones_hz, (*at, "response"))
     if sensor.axis_responses is not None:
@@ -180,13 +187,16 @@ def magnetometer_of(entry: MagnetometerEntry) -> Magnetometer:
         offset_walk=entry.offset_walk_t,
         coil_kappa=entry.coil_kappa_m2,
         temperature_model=None if entry.warming is None else entry.warming.temperature_model(),
-        response=responses_of(entry.response, entry.axis_responses),
+        response=responses_of(
+            entry.response or entry.coil, entry.axis_responses or entry.axis_coils
+        ),
         casing=None if entry.casing is None else entry.casing.casing(),
         axes="".join(sorted(set(entry.axes or Magnetometer.axes))),
         name=entry.name or Magnetometer.name,
         clock_offset=entry.clock_offset_s,
         clock_rate=entry.clock_rate_ppm / MILLION,
         field_range=entry.range_t,
+        ac_coupled=entry.ac_coupled or bool(entry.coil or entry.axis_coils),
     )
 
 
@@ -222,6 +232,8 @@ def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
         own["clock_rate_ppm"] = ppm(magnetometer.clock_rate)
     if magnetometer.field_range != Magnetometer.field_range:
         own["range_t"] = float(magnetometer.field_range)
+    if magnetometer.ac_coupled:
+        own["ac_coupled"] = True
     clock = {"clock_offset_s": float(sigma.clock_offset)} if sigma.clock_offset else {}
     return (
         own

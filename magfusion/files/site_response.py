@@ -1,5 +1,6 @@
 """Keys of a magnetometer's frequency response."""
 
+from dataclasses import astuple
 from typing import Annotated, Any
 
 import numpy as np
@@ -9,12 +10,13 @@ from magfusion.files.site_values import (
     HIGHEST_FREQUENCY,
     LARGEST_ANGLE,
     LOWEST_FREQUENCY,
+    AboveZero,
     at_least_one,
     between,
     refusal_at,
 )
 from magfusion.files.yaml_files import StrictModel
-from magfusion.model.response import AxisResponses, FrequencyResponse
+from magfusion.model.response import AxisResponses, FrequencyResponse, PickupCoil
 from magfusion.units import DEGREE, Array
 
 
@@ -42,17 +44,42 @@ class AxisResponsesEntry(StrictModel):
         return {"x": self.x, "y": self.y, "z": self.z}
 
 
+class CoilEntry(StrictModel):
+    """A pick-up coil with its amplifier, recorded as volts."""
+
+    turns: Annotated[AboveZero, between(1.0, 1e6)]
+    area_m2: Annotated[AboveZero, between(1e-9, 1e3)]
+    resonance_hz: Annotated[float, between(LOWEST_FREQUENCY, 1e9)]
+    quality: Annotated[AboveZero, between(1e-3, 1e4)]
+    amplifier_gain: Annotated[AboveZero, between(1e-6, 1e8)] = 1.0
+
+    def response(self) -> FrequencyResponse:
+        """Return its response to volts as they are read."""
+        return FrequencyResponse.of_coil(PickupCoil(*self.model_dump().values()))
+
+
+class AxisCoilsEntry(StrictModel):
+    """The coil of each axis where they differ."""
+
+    x: CoilEntry
+    y: CoilEntry
+    z: CoilEntry
+
+
 def responses_of(
-    shared_by: list[ResponseEntry] | None, separately: AxisResponsesEntry | None
+    shared_by: list[ResponseEntry] | CoilEntry | None,
+    separately: AxisResponsesEntry | AxisCoilsEntry | None,
 ) -> FrequencyResponse | AxisResponses | None:
     """Return the entries of all axes, or of each."""
     if separately is not None:
-        return AxisResponses(*(_response(entries) for entries in separately.axes.values()))
+        return AxisResponses(*(_response(getattr(separately, axis)) for axis in "xyz"))
     return _response(shared_by) if shared_by else None
 
 
-def _response(entries: list[ResponseEntry]) -> FrequencyResponse:
-    """Return the entries in order of frequency."""
+def _response(entries: list[ResponseEntry] | CoilEntry) -> FrequencyResponse:
+    """Return the response of a coil, or the entries in order of frequency."""
+    if isinstance(entries, CoilEntry):
+        return entries.response()
     rows = sorted((e.frequency_hz, e.gain, e.phase_deg * DEGREE) for e in entries)
     return FrequencyResponse(*np.array(rows).T)
 
@@ -83,12 +110,16 @@ def response_entry(response: FrequencyResponse | AxisResponses | None) -> dict[s
     if response is None:
         return {}
     if isinstance(response, AxisResponses):
+        key = "axis_responses" if response.x.coil is None else "axis_coils"
         axes = zip("xyz", response.axes, strict=True)
-        return {"axis_responses": {axis: _rows(own) for axis, own in axes}}
-    return {"response": _rows(response)}
+        return {key: {axis: _rows(own) for axis, own in axes}}
+    return {"response" if response.coil is None else "coil": _rows(response)}
 
 
-def _rows(response: FrequencyResponse) -> list[dict[str, float]]:
+def _rows(response: FrequencyResponse) -> list[dict[str, float]] | dict[str, float]:
+    if response.coil is not None:
+        values = astuple(response.coil)
+        return dict(zip(CoilEntry.model_fields, map(float, values), strict=True))
     rows = zip(response.frequency_hz, response.gain, response.phase / DEGREE, strict=True)
     return [
         {"frequency_hz": float(f), "gain": float(g), "phase_deg": round(float(p), 12)}

@@ -76,6 +76,10 @@ def _vectors(value: object) -> Array:
     return result
 
 
+def _numbers_of_tones(value: object) -> Array:
+    return _numbers(value, "for each time three numbers a tone", missing=True)
+
+
 def _series(value: object) -> Array:
     what = "a number, or a list of them"
     result = np.atleast_1d(_numbers(value, what, missing=True))
@@ -183,6 +187,27 @@ class ReferenceRecord(_Arrays):
         return self
 
 
+class BasebandRecord(_Arrays):
+    """Complex amplitudes of tones: stamps (k,), frequencies (tones,), parts (k, tones, 3) (T).
+
+    The field of a tone at a stamp is the real part of ``(re + j im) exp(j 2 pi hz time)``.
+    """
+
+    time: Annotated[Array, PlainValidator(_times)]
+    hz: Annotated[Array, PlainValidator(_series)]
+    re: Annotated[Array, PlainValidator(_numbers_of_tones)]
+    im: Annotated[Array, PlainValidator(_numbers_of_tones)]
+
+    @model_validator(mode="after")
+    def _check_lengths(self) -> "BasebandRecord":
+        _check_lengths(self.time, re=self.re, im=self.im)
+        shape = (len(self.time), len(self.hz), 3)
+        if self.re.shape != shape or self.im.shape != shape:
+            text = "re and im should have three numbers for each tone at each time"
+            raise PydanticCustomError("tones", text)
+        return self
+
+
 class FieldsRecord(_Arrays):
     """Phasors of one window, or amplitudes of one axis; of every detected beacon, its tones.
 
@@ -284,11 +309,12 @@ class Record(StrictModel):
     marks: MarksRecord | None = None
     reference: ReferenceRecord | None = None
     aiding: dict[str, AidingRecord] | None = None
+    baseband: BasebandRecord | None = None
 
     @model_validator(mode="after")
     def _not_empty(self) -> "Record":
         if all(getattr(self, kind) is None for kind in type(self).model_fields):
-            kinds = "imu, magnetometer, fields, temperature, drive, marks, reference or aiding"
+            kinds = ", ".join(type(self).model_fields)
             raise PydanticCustomError("empty", "it should hold {kinds}", {"kinds": kinds})
         return self
 

@@ -12,7 +12,7 @@ from magfusion.model.aiding import AidingSamples
 from magfusion.model.drive import DriveSamples
 from magfusion.model.marks import Marks
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
-from magfusion.units import Array
+from magfusion.units import Array, ComplexArray
 
 
 def write_record(content: dict[str, Any], stream: BinaryIO, form: Format) -> None:
@@ -36,6 +36,12 @@ def magnetometer_content(waveform: Waveform, magnetometer: str | None = None) ->
     field = [_or_none(row) for row in measured]
     named = {} if magnetometer is None else {"magnetometer": magnetometer}
     return {"magnetometer": {**named, "time": waveform.time.tolist(), "field": field}}
+
+
+def baseband_content(time: Array, baseband: ComplexArray, tones_hz: Array) -> dict[str, Any]:
+    """Return the complex amplitudes of tones (n, tones, 3) (T) as a record."""
+    parts = {"re": baseband.real.tolist(), "im": baseband.imag.tolist()}
+    return {"baseband": {"time": time.tolist(), "hz": tones_hz.tolist(), **parts}}
 
 
 def reference_content(waveform: Waveform) -> dict[str, Any]:

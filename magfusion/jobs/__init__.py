@@ -59,6 +59,10 @@ JOBS = {
         "match",
         "Estimate roll, or roll and pitch, from the Earth's field, by a database or closed form.",
     ),
+    "listen": (
+        "listen",
+        "Print the samples of a sound card, serial line or UDP as records for navigate -.",
+    ),
     "replay": ("replay", "Print a log as records for magfusion navigate -."),
     "papers": (
         "papers",

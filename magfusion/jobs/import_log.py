@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,9 +12,10 @@ import numpy as np
 import pyarrow.parquet
 
 from magfusion.errors import InputError, InputErrors
+from magfusion.files.audio import SUFFIXES, AudioEntry, describe_recording, open_audio
 from magfusion.files.foreign.bag_table import first_stamp
 from magfusion.files.foreign.columns import FIELDS, TABLES
-from magfusion.files.foreign.convert import write_stream
+from magfusion.files.foreign.convert import Counts, write_stream
 from magfusion.files.foreign.gather import gather
 from magfusion.files.foreign.halves import HALVES, join_halves
 from magfusion.files.foreign.map_file import read_request
@@ -31,7 +32,6 @@ from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.units import NANOSECOND
 
 if TYPE_CHECKING:
-    from magfusion.files.foreign.convert import Counts
     from magfusion.files.foreign.gather import GatheredStreams
     from magfusion.files.foreign.plan import Findings, ImportPlan
 
@@ -108,6 +108,13 @@ class ImportSettings(Settings):
     sigma: str | None = option(
         None, "Sigma of phasors whose table has none, as 0.5*nT", metavar="NUMBER*UNIT"
     )
+    channels: str | None = option(
+        None,
+        "Channels of a recording that the log refers to: x, y, z, sync, or - for others",
+        note="WAV, FLAC; in volts, magfusion[audio]; sync has pulses at whole seconds",
+        metavar="NAME,...",
+    )
+    full_scale: float = option(1.0, "Voltage of a full-scale sample of the recording, V")
     epoch: str | None = option(
         None,
         "Zero of the log clock, to which drive phases refer: a stamp in ns, first (the first"
@@ -116,6 +123,20 @@ class ImportSettings(Settings):
         metavar="NS|TOPIC|first",
     )
     site: Path | None = option(None, "Site file to check the log against")
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.full_scale <= 1e6:
+            raise InputError(f"--full-scale {self.full_scale:g}: give volts, above 0")
+
+    @property
+    def recording(self) -> Path | None:
+        """The recording that the log refers to."""
+        if self.channels is None:
+            return None
+        given = [Path(s) for s in self.sources if Path(s).suffix.lower() in SUFFIXES]
+        if len(given) != 1 or self.magnetometer is not None:
+            raise InputError("--channels: give one recording, e.g. walk.flac, as magnetometer")
+        return given[0]
 
 
 def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -> Figures:
@@ -130,6 +151,7 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
     from magfusion.results.report import write_report
 
     claimed, declared = claim(output, "import"), Findings()
+    recording = settings.recording
     if settings.site is not None and not settings.site.is_file():
         declared.problems.append(
             f"{settings.site}: there is no such file; give the path of a site."
@@ -152,10 +174,18 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         settings.map_file,
         declared,
     )
+    audio: AudioEntry | None = None
+    if recording is not None:
+        begin_ns = wanted.shifts_ns.pop("magnetometer", 0)
+        audio = describe_recording(
+            recording, settings.channels or "", settings.full_scale, begin_ns
+        )
+        wanted = replace(wanted, recorded=True)
+    others = [Path(source) for source in settings.sources if Path(source) != recording]
     site = None
     if settings.site is not None and settings.site.is_file():
         site = load_site(settings.site, unknown=True, without=True, several=True)
-    result = gather([Path(source) for source in settings.sources], wanted, declared, site)
+    result = gather(others, wanted, declared, site)
     epoch = _epoch(wanted.epoch, result)
     _refuse(declared)
     with claimed as directory:
@@ -171,19 +201,13 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
                 declared.problems.append(str(error))
         if result.phasors is not None:
             counts[FIELDS] = write_phasors(result.phasors, directory / f"{FIELDS}.parquet")
-        note = ""
-        if set(HALVES) <= set(counts) and not declared.problems:
-            evened = [half for half in HALVES if _on_even_clock(directory / f"{half}.parquet")]
-            joined = join_halves(directory, counts)
-            counts["imu"], note = joined.counts, joined.note
-            if evened:
-                note += (
-                    f" Stamps of the {' and '.join(evened)} are of bursts: an even clock is used."
-                )
+        if recording is not None and audio is not None:
+            counts["magnetometer"] = _recorded(recording, audio)
+        note = "" if declared.problems else _with_imu(directory, counts)
         _refuse_apart(counts, declared)
         _refuse(declared)
         epoch_ns = _first(counts) if epoch == FIRST else int(epoch)
-        _write_header(directory, output, result, epoch_ns)
+        _write_header(directory, output, result, epoch_ns, audio)
         report("checking", 0, 1)
         figures = _checked(directory, output, result, settings.site)
         figures = heading("import", output.resolve().name) | figures
@@ -280,10 +304,40 @@ def _first(counts: dict[str, Counts]) -> int:
     return next(counts[name] for name in ("imu", *_FIELDS, *HALVES) if name in counts).first
 
 
-def _write_header(directory: Path, output: Path, result: GatheredStreams, epoch_ns: int) -> None:
-    source = "imported: " + ", ".join(dict.fromkeys(plan.source.place for plan in result.every))
+def _with_imu(directory: Path, counts: dict[str, Counts]) -> str:
+    """Join the halves of an IMU, where there are two, and return a note."""
+    if not set(HALVES) <= set(counts):
+        return ""
+    evened = [half for half in HALVES if _on_even_clock(directory / f"{half}.parquet")]
+    joined = join_halves(directory, counts)
+    counts["imu"], note = joined.counts, joined.note
+    if evened:
+        note += f" Stamps of the {' and '.join(evened)} are of bursts: an even clock is used."
+    return note
+
+
+def _recorded(path: Path, audio: AudioEntry) -> Counts:
+    """Return the count and span of a recording's samples."""
+    with open_audio(path) as recording:
+        frames = recording.frames
+    last = audio.begin_ns + round((frames - 1) / audio.rate_hz / NANOSECOND)
+    return Counts(read=frames, written=frames, first=audio.begin_ns, last=last)
+
+
+def _write_header(
+    directory: Path,
+    output: Path,
+    result: GatheredStreams,
+    epoch_ns: int,
+    audio: AudioEntry | None,
+) -> None:
+    places = [plan.source.place for plan in result.every]
+    places += [] if audio is None else [audio.file]
+    source = "imported: " + ", ".join(dict.fromkeys(places))
     header = {"magfusion_log": 1, "name": output.resolve().name, "epoch_ns": epoch_ns}
-    write_yaml(header | {"source": source}, directory / HEADER)
+    header |= {"source": source}
+    header |= {} if audio is None else {"audio": audio.model_dump()}
+    write_yaml(header, directory / HEADER)
 
 
 def _checked(directory: Path, output: Path, result: GatheredStreams, site: Path | None) -> Figures:

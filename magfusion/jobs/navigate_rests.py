@@ -12,6 +12,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
+from magfusion.files.named_records import with_waveform
 from magfusion.files.site import load_site, save_site
 from magfusion.files.standard_streams import binary_output, until_closed, write_message
 from magfusion.files.stream import json_line
@@ -243,7 +244,7 @@ def run_rests_stream(
         try:
             if numbered.record is None:
                 raise InputError(numbered.refusal)
-            _process_record(navigator, numbered.record, samples)
+            _process_record(navigator, with_waveform(numbered.record, site), samples)
         except InputError as error:
             sentence = numbered.located(error)
             if not keep_going:

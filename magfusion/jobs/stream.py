@@ -17,7 +17,7 @@ from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online.state_of_now import PropagatedState
 from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.checkpoint import run_key
-from magfusion.files.named_records import magnetometer_number, site_fields
+from magfusion.files.named_records import magnetometer_number, site_fields, with_waveform
 from magfusion.files.site import load_site
 from magfusion.files.standard_streams import write_message
 from magfusion.files.stream import (
@@ -142,7 +142,7 @@ def _navigate(
     clocks = StreamClocks(settings.navigator.delay)
     for numbered in records:
         try:
-            numbered = _on_clock(numbered, clocks, samples, output, messages)
+            numbered = _on_clock(numbered, site, clocks, samples, output, messages)
             newest = _process_record(output.navigator, site, numbered, samples, output)
         except InputError as error:
             sentence = numbered.located(error)
@@ -226,6 +226,7 @@ class _StateWriter:
 
 def _on_clock(
     numbered: NumberedRecord,
+    site: Site,
     clocks: StreamClocks,
     samples: StreamSamples,
     output: _StateWriter,
@@ -240,7 +241,7 @@ def _on_clock(
     """
     if numbered.record is None:
         return numbered
-    record = clocks.unwrapped(numbered.record)
+    record = with_waveform(clocks.unwrapped(numbered.record), site)
     step = clocks.step_in(record)
     if step is not None:
         write_message(

@@ -72,6 +72,8 @@ class Magnetometer:
         of the drives.
     field_range : float
         Largest value of each axis in size (T); by default a hundred times a fluxgate's.
+    ac_coupled : bool
+        Whether it measures alternating fields alone: no steady field, and nothing of it.
     """
 
     __repr__ = short_repr
@@ -93,6 +95,7 @@ class Magnetometer:
     clock_offset: float = 0.0
     clock_rate: float = 0.0
     field_range: float = 0.1
+    ac_coupled: bool = False
 
     @property
     def lacking(self) -> tuple[int, ...]:

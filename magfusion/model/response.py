@@ -1,7 +1,8 @@
 """Frequency response of a magnetometer relative to its response to steady fields.
 
 Fluxgates, search coils and anti-aliasing filters attenuate a tone and shift its phase.  Between
-the given frequencies both are linear in the frequency's logarithm.
+the given frequencies both are linear in the frequency's logarithm.  A recording of volts is read as
+if one volt were `NOMINAL_T_PER_V`; the response of its receiver is relative to that.
 """
 
 from dataclasses import dataclass
@@ -9,6 +10,43 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.units import Array, ComplexArray
+
+NOMINAL_T_PER_V = 1e-6  # of a coil of about 0.5 m^2 with an amplifier of 200 at 1.5 kHz
+TABULATED_HZ = (1.0, 1e5)  # of a pick-up coil
+# Linear interpolation errs by h^2/8 of the second derivative of log-gain over log-frequency, which
+# is 4 Q^2 at resonance: with h = ln(10)/2000 and Q = 10 by 7e-5.
+POINTS_PER_DECADE = 2000
+
+
+@dataclass(frozen=True)
+class PickupCoil:
+    """Receive coil with an amplifier: ``V = j w N A g B / (1 - (f/f0)^2 + j f / (f0 Q))``.
+
+    Parameters
+    ----------
+    turns : float
+        N.
+    area : float
+        A, mean of the turns (m^2).
+    resonance_hz : float
+        f0, of its inductance and all capacitance across it.
+    quality : float
+        Q.
+    amplifier_gain : float
+        g.
+    """
+
+    turns: float
+    area: float
+    resonance_hz: float
+    quality: float
+    amplifier_gain: float
+
+    def volts_per_tesla(self, frequency_hz: Array) -> ComplexArray:
+        """Return the sensitivity to alternating fields (V/T), shape (n,)."""
+        ratio = frequency_hz / self.resonance_hz
+        flux = 2j * np.pi * frequency_hz * self.turns * self.area * self.amplifier_gain
+        return np.asarray(flux / (1.0 - ratio**2 + 1j * ratio / self.quality))
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,11 +61,23 @@ class FrequencyResponse:
         Measured amplitude relative to the field's.
     phase : ndarray, shape (n,)
         Measured phase relative to the field's (rad); negative for a lag.
+    coil : PickupCoil, optional
+        Whose response it is.
     """
 
     frequency_hz: Array
     gain: Array
     phase: Array
+    coil: PickupCoil | None = None
+
+    @staticmethod
+    def of_coil(coil: PickupCoil) -> "FrequencyResponse":
+        """Tabulate the response of a coil to volts as they are read (`NOMINAL_T_PER_V`)."""
+        lowest, highest = TABULATED_HZ
+        count = int(np.log10(highest / lowest) * POINTS_PER_DECADE) + 1
+        frequency_hz = np.geomspace(lowest, highest, count)
+        gain = NOMINAL_T_PER_V * coil.volts_per_tesla(frequency_hz)
+        return FrequencyResponse(frequency_hz, np.abs(gain), np.unwrap(np.angle(gain)), coil)
 
     @property
     def axes(self) -> tuple["FrequencyResponse", ...]:

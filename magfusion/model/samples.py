@@ -62,6 +62,8 @@ class Waveform:
         Times at which coils were driven, if recorded; includes bursts outside the samples.
     axes : str
         Axes of the receiver; the other columns are invalid.
+    ac_coupled : bool
+        Whether the samples hold no steady field.
     """
 
     __repr__ = short_repr
@@ -70,13 +72,15 @@ class Waveform:
     measured_sensor: Array
     marks: Marks | None = None
     axes: str = "xyz"
+    ac_coupled: bool = False
 
     def __len__(self) -> int:
         return len(self.time)
 
     def rows(self, kept: IntArray | BoolArray | slice) -> "Waveform":
         """Return a subset of the samples."""
-        return Waveform(self.time[kept], self.measured_sensor[kept], self.marks, self.axes)
+        time, measured = self.time[kept], self.measured_sensor[kept]
+        return replace(self, time=time, measured_sensor=measured)
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,6 +357,6 @@ class Log:
 
     @property
     def vectors(self) -> Waveform | None:
-        """Raw samples of all three axes; None if axes are missing."""
+        """Raw samples of the whole field; None if axes or the steady field are missing."""
         wave = self.waveform
-        return None if wave is None or wave.axes != "xyz" else wave
+        return None if wave is None or wave.axes != "xyz" or wave.ac_coupled else wave

@@ -108,6 +108,8 @@ def logged(log: Log, site: Site) -> tuple[Log, Site]:
     clock.  A corrected log can be corrected again, by the same or another site.
     """
     log = _at_clock_rate(log, site.platform.magnetometer.clock_rate)
+    if site.platform.magnetometer.ac_coupled and log.waveform is not None:
+        log = replace(log, waveform=replace(log.waveform, ac_coupled=True))
     if not len(log.imu):
         return without_imu(log, site)
     recorded = log.imu if log.recorded_imu is None else log.recorded_imu

@@ -238,8 +238,12 @@ def _longer(part: Array, size: int) -> Array:
 
 
 def nuisances_hz(settings: LockinSettings, frequencies: Array, nyquist_hz: float) -> Array:
-    """Return the harmonics of the mains that are fitted with the tones (Hz)."""
-    if settings.mains_hz <= 0:
+    """Return the harmonics of the mains that are fitted with the tones (Hz).
+
+    None where a tone is faster than the sampling: the samples are those of the tones' bands alone
+    (`magfusion.model.bandpass`).
+    """
+    if settings.mains_hz <= 0 or np.max(frequencies, initial=0.0) > nyquist_hz:
         return np.zeros(0)
     lines = np.arange(settings.mains_hz, 0.95 * nyquist_hz, settings.mains_hz)[:6]
     others = np.concatenate([frequencies, settings.lines_hz])

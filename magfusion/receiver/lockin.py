@@ -66,6 +66,8 @@ class WindowOperator:
     lacking : tuple of int
         Axes that the receiver lacks.  The samples of the others cannot be rotated, so that the
         square of any rotation is noise, unless a prediction has been subtracted.
+    ac_coupled : bool
+        Whether the samples hold no steady field.
     """
 
     designs: Designs
@@ -78,6 +80,7 @@ class WindowOperator:
     is_separable: BoolArray
     lacking: tuple[int, ...] = ()
     tone_of_channel: IntArray | None = None
+    ac_coupled: bool = False
 
     @property
     def frequencies_hz(self) -> Array:
@@ -158,7 +161,7 @@ class WindowOperator:
             axes="".join(axis for k, axis in enumerate("xyz") if k not in self.lacking),
         )
         spread = constant_unit[:, None, None] * np.mean(smooth, axis=1)
-        constant[:, self.lacking] = np.nan
+        constant[:, range(3) if self.ac_coupled else self.lacking] = np.nan
         return samples, SteadyFields(centre, constant, spread), self._by_channel(by)
 
     def unexplained(self, measured_sensor: Array) -> Array:
@@ -270,6 +273,7 @@ def window_operator(
         is_separable=np.zeros(len(windows), dtype=bool),
         lacking=lacking,
         tone_of_channel=tones.of_channel if tones.reused else None,
+        ac_coupled=site.platform.magnetometer.ac_coupled,
     )
 
 

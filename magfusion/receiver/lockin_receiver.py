@@ -5,6 +5,7 @@ from functools import cached_property
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.model.bandpass import is_bandpass
 from magfusion.model.detection_range import tones_of
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site
@@ -58,7 +59,7 @@ class LockinReceiver(Receiver):
         rate_hz = sample_rate_hz(waveform)
         frequencies = self._sent
         highest = float(np.max(frequencies))
-        if highest > 0.45 * rate_hz:
+        if highest > 0.45 * rate_hz and not is_bandpass(self.site, rate_hz):
             raise InputError(
                 f"magnetometer: sampled at {rate_hz:.4g} Hz, too slow for the tone at {highest:g}"
                 f" Hz; at least {highest / 0.45:.4g} Hz are needed"

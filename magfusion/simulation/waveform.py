@@ -121,7 +121,7 @@ def simulate_waveform(
     point_world = motion.position_world(time) + lever_world
     here = site, drives, time, point_world, ambient or Ambient(), marks
     field_world = np.zeros((count, 3)) if magnetometer.response else beacons_world(*here)
-    if site.earth_field_world is not None:
+    if site.earth_field_world is not None and not magnetometer.ac_coupled:
         field_world += site.earth_field_world
         if ambient is not None and ambient.rails is not None:
             field_world += magnetised_world(ambient.rails, site.earth_field_world, point_world)

@@ -14,6 +14,7 @@ from scipy.ndimage import median_filter
 
 from magfusion.errors import InputError
 from magfusion.estimation.data_checks.turning import field_body
+from magfusion.model.bandpass import is_bandpass
 from magfusion.model.quaternion import rotate
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.site import Site
@@ -104,11 +105,16 @@ def still_field(log: Log, site: Site | None) -> Array:
 
 
 def spectrum(log: Log, site: Site | None) -> Spectrum | None:
-    """Return the mean spectrum of a waveform in gyro-stabilized axes; None if it is too short."""
+    """Return the mean spectrum of a waveform in gyro-stabilized axes.
+
+    None if it is too short, or has the bands of tones alone.
+    """
     wave = log.waveform
     if wave is None or len(wave) < 2:
         return None
     step = float(np.median(np.diff(wave.time)))
+    if site is not None and is_bandpass(site, 1.0 / step):
+        return None
     duration = float(wave.time[-1] - wave.time[0])
     length = int(np.clip(SHARE * duration, SHORTEST, SEGMENT) / step)
     count = int(duration / step) + 1

@@ -150,6 +150,10 @@ def check_earth(site: Site) -> None:
         raise InputError(
             "--earth uses a single magnetometer; leave it out, or give a site with one"
         )
+    if site.platform.magnetometer.ac_coupled:
+        raise InputError(
+            "--earth uses the steady field, but the magnetometer is ac_coupled; omit it"
+        )
     if field is None:
         raise InputError(
             "the site has no Earth field to measure against; give earth_field_t or a location in"

@@ -69,7 +69,7 @@ def gather(
 ) -> GatheredStreams:
     """Return how files become the streams of a log; ``declared`` has the problems."""
     result = GatheredStreams(declared)
-    attempted = set(wanted.files)
+    attempted = set(wanted.files) | ({"magnetometer"} if wanted.recorded else set())
     for stream, path in wanted.files.items():
         source = _opened(path, wanted, result)
         if source is not None and stream == FIELDS:

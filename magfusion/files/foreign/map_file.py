@@ -54,6 +54,8 @@ class ImportRequest:
         Markers of missing values.
     sigma : float, optional
         Of phasors whose table has none (T).
+    recorded : bool
+        Whether the magnetometer is a recording, which is no table.
     """
 
     files: dict[str, Path]
@@ -65,6 +67,7 @@ class ImportRequest:
     rows: dict[str, tuple[str, str]] = field(default_factory=dict)
     missing: tuple[str, ...] = ()
     sigma: float | None = None
+    recorded: bool = False
 
 
 def read_request(

@@ -1,0 +1,216 @@
+"""Recordings of a sound card as the magnetometer of a log: the log refers to the file."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from magfusion.errors import InputError
+from magfusion.files.table import LARGEST_TIME_NS, Span
+from magfusion.files.yaml_files import StrictModel
+from magfusion.model.bandpass import BandFilter, BandSampler
+from magfusion.model.response import NOMINAL_T_PER_V
+from magfusion.model.samples import Waveform
+from magfusion.model.site import Site
+from magfusion.units import NANOSECOND, Array
+
+if TYPE_CHECKING:
+    from soundfile import SoundFile
+
+AXES: tuple[Literal["x", "y", "z"], ...] = ("x", "y", "z")
+SYNC = "sync"
+SUFFIXES = (".wav", ".flac", ".w64", ".caf", ".aiff")
+PIECE = 1 << 14  # samples of every channel; 0.4 MB of three
+LEAST_PULSES = 3
+EDGE_TOLERANCE = 1e-3  # s; of a pulse about the even clock: a GNSS receiver has 1e-7
+Channel = Annotated[int, Field(ge=0, le=1023)]
+
+
+class AudioEntry(StrictModel):
+    """Key ``audio`` of ``log.yaml``.
+
+    Parameters
+    ----------
+    file : str
+        Path, from the log's directory if relative.
+    channels : dict
+        Channel of each axis of the receiver, counted from 0.
+    full_scale_v : float
+        Voltage of a sample of 1 (V).
+    rate_hz : float
+        Of the samples on the log's clock.
+    begin_ns : int
+        Stamp of the first sample.
+    """
+
+    file: str
+    channels: dict[Literal["x", "y", "z"], Channel] = Field(min_length=1)
+    full_scale_v: float = Field(gt=0.0, le=1e6)
+    rate_hz: float = Field(ge=1.0, le=1e7)
+    begin_ns: int = Field(ge=-LARGEST_TIME_NS, le=LARGEST_TIME_NS)
+
+
+@contextmanager
+def open_audio(path: Path) -> Iterator["SoundFile"]:
+    """Open a recording.
+
+    Raises
+    ------
+    InputError
+        Where the package that reads it is missing, or the file is no recording.
+    """
+    try:
+        import soundfile
+    except (ImportError, OSError) as error:
+        raise InputError(
+            f"{path}: soundfile is not installed; pip install 'magfusion[audio]'"
+        ) from error
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such recording; restore it, or import it again")
+    try:
+        with soundfile.SoundFile(path) as recording:
+            yield recording
+    except soundfile.LibsndfileError as error:
+        reason = str(error).rpartition(": ")[2].rstrip(".")
+        raise InputError(
+            f"{path}: is no readable recording ({reason}); give WAV or FLAC"
+        ) from error
+
+
+def read_audio(
+    directory: Path, entry: AudioEntry, span: Span, site: Site | None = None
+) -> Waveform | None:
+    """Return the samples of a recording within a span; None where there is none.
+
+    Volts are read as `magfusion.model.response.NOMINAL_T_PER_V`.
+
+    Parameters
+    ----------
+    site : Site, optional
+        Only the bands of its tones are kept, where they are far enough apart.
+
+    Raises
+    ------
+    InputError
+        As `open_audio`, or where the file lacks a channel.
+    """
+    path, begin = directory / entry.file, (entry.begin_ns - span.epoch_ns) * NANOSECOND
+    band = None if site is None else BandFilter.of_site(site, entry.rate_hz)
+    sampler = None if band is None else BandSampler(band)
+    places, parts = [np.zeros(0)], [np.zeros((0, 3))]
+    with open_audio(path) as recording:
+        limits = (
+            begin if span.start is None else span.start,
+            np.inf if span.end is None else span.end,
+        )
+        first, last = (
+            int(np.clip(np.ceil((at - begin) * entry.rate_hz - 1e-6), 0, recording.frames))
+            for at in limits
+        )
+        for at, field in _blocks(path, recording, entry, first, last):
+            if sampler is None:
+                place = np.arange(float(at), float(at + len(field)))
+            else:
+                place, tones = sampler.push(field)
+                place, field = first + place, np.sum(tones.real, axis=1)
+            places.append(place)
+            parts.append(field)
+    time = begin + np.concatenate(places) / entry.rate_hz
+    if not len(time):
+        return None
+    axes = "".join(axis for axis in AXES if axis in entry.channels)
+    return Waveform(time, np.concatenate(parts), axes=axes, ac_coupled=True)
+
+
+def _blocks(
+    path: Path, recording: "SoundFile", entry: AudioEntry, first: int, last: int
+) -> Iterator[tuple[int, Array]]:
+    """Yield parts of a recording: number of the first sample, and fields (n, 3) (T)."""
+    highest = max(entry.channels.values())
+    if highest >= recording.channels:
+        raise InputError(
+            f"{path}: has {recording.channels} channels, not a channel {highest}; import it again"
+        )
+    recording.seek(first)
+    for block in recording.blocks(PIECE, frames=max(last - first, 0), always_2d=True):
+        field = np.zeros((len(block), 3))
+        for axis, channel in entry.channels.items():
+            field[:, AXES.index(axis)] = block[:, channel]
+        yield first, field * (entry.full_scale_v * NOMINAL_T_PER_V)
+        first += len(block)
+
+
+def describe_recording(path: Path, names: str, full_scale_v: float, begin_ns: int) -> AudioEntry:
+    """Return the entry of a recording for the header of a log.
+
+    Parameters
+    ----------
+    names : str
+        Of its channels, in their order: x, y, z, sync (pulses at whole seconds, by which the rate
+        of the samples is measured), or - for one that is not used.
+
+    Raises
+    ------
+    InputError
+    """
+    named, count = channels_of(names)
+    with open_audio(path) as recording:
+        if count != recording.channels:
+            raise InputError(
+                f"--channels {names!r}: {path} has {recording.channels} channels; name each of them"
+            )
+        rate_hz = float(recording.samplerate)
+        if SYNC in named:
+            rate_hz = _rate_by_pulses(path, recording, named.pop(SYNC))
+    return AudioEntry(
+        file=str(path.resolve()),
+        channels={axis: named[axis] for axis in AXES if axis in named},
+        full_scale_v=full_scale_v,
+        rate_hz=rate_hz,
+        begin_ns=begin_ns,
+    )
+
+
+def channels_of(names: str) -> tuple[dict[str, int], int]:
+    """Return the channels that are used by their names, and the number of all.
+
+    Raises
+    ------
+    InputError
+        Where a name is unknown or given twice, or no axis is named.
+    """
+    listed = [name.strip() for name in names.split(",")]
+    used = {name: k for k, name in enumerate(listed) if name != "-"}
+    twice = len(used) < len(listed) - listed.count("-")
+    if not set(used) <= {*AXES, SYNC} or twice or not set(used) & set(AXES):
+        raise InputError(
+            f"--channels {names!r}: name each channel x, y, z, sync, or - where it is not used;"
+            " each once, and at least one axis"
+        )
+    return used, len(listed)
+
+
+def _rate_by_pulses(path: Path, recording: "SoundFile", channel: int) -> float:
+    """Return the samples per second (Hz) from rising edges at whole seconds."""
+    level = max(np.max(b[:, channel]) for b in recording.blocks(PIECE, always_2d=True))
+    recording.seek(0)
+    rising, at, before = [], 0, np.inf
+    for block in recording.blocks(PIECE, always_2d=True):
+        pulse = np.concatenate([[before], block[:, channel]])
+        edge = np.flatnonzero((pulse[:-1] < 0.5 * level) & (pulse[1:] >= 0.5 * level))
+        # Between two samples, where the edge crosses half of the height.
+        rising.append(at + edge - (pulse[edge + 1] - 0.5 * level) / (pulse[edge + 1] - pulse[edge]))
+        at, before = at + len(block), pulse[-1]
+    edges = np.concatenate(rising)
+    second = np.round((edges - edges[:1]) / recording.samplerate)
+    if len(edges) >= LEAST_PULSES and np.ptp(second) > 0:
+        rate_hz, first = np.polyfit(second, edges, 1)
+        if np.max(np.abs(edges - first - rate_hz * second)) < EDGE_TOLERANCE * rate_hz:
+            return float(rate_hz)
+    raise InputError(
+        f"{path}: channel {channel} (sync) has {len(edges)} edges that are not a second apart;"
+        " give pulses at whole seconds, or - for this channel"
+    )

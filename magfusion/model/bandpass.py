@@ -1,0 +1,144 @@
+"""Bandpass sampling: a recording reduced to narrow bands about its tones, at their frequencies.
+
+A receiver of alternating fields needs nothing but these bands.  A symmetric FIR filter passes them
+at once, and its output is sampled so slowly that they alias, each clear of the others.  The samples
+are of the true waveform at their times, so that a lock-in at these times sees each tone at its own
+frequency.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.signal import firwin, kaiserord
+
+from magfusion.model.detection_range import tones_of
+from magfusion.model.site import Site
+from magfusion.units import Array, ComplexArray
+
+# Noise is measured two resolutions of a window beside a tone, 25 Hz in the shortest default one
+# (0.08 s, between harmonics of the mains); motion modulates a tone by less.
+PASS_HZ = 30.0
+WIDEST_HZ = 60.0  # of a transition: the delay is 42 ms
+NARROWEST_HZ = 20.0  # of a transition: the delay is 0.13 s
+STOP_DB = 80.0
+MIN_SPACING_HZ = 2.0 * PASS_HZ + NARROWEST_HZ
+
+
+@dataclass(frozen=True, eq=False)
+class BandFilter:
+    """Filter of the bands of a site's tones at a sampling rate.
+
+    Parameters
+    ----------
+    tones_hz : ndarray, shape (tones,)
+    rate_hz : float
+        Of the recording.
+    decimation : int
+        Samples of the recording for each that is kept.
+    taps : complex ndarray, shape (length, tones)
+        Of the analytic signal in the middle of its samples.
+    """
+
+    tones_hz: Array
+    rate_hz: float
+    decimation: int
+    taps: ComplexArray
+
+    @property
+    def middle(self) -> int:
+        """Samples before the first result: the delay."""
+        return len(self.taps) // 2
+
+    @staticmethod
+    def of_site(site: Site, rate_hz: float) -> "BandFilter | None":
+        """Return the filter with the least_hz samples.
+
+        None if bands overlap, no samples are saved, or the receiver needs its steady field.
+        """
+        if not site.beacons or not site.platform.magnetometer.ac_coupled:
+            return None
+        tones_hz = np.sort(tones_of(site).frequencies_hz)
+        spacing = float(np.min(np.diff(tones_hz), initial=np.inf))
+        if min(spacing, tones_hz[0]) < MIN_SPACING_HZ:
+            return None
+        transition = min(spacing - 2.0 * PASS_HZ, WIDEST_HZ)
+        between = 2.0 * PASS_HZ + transition  # of two bands that do not fold onto each other
+        decimation = _decimation(tones_hz, rate_hz, between)
+        if decimation < 2 or tones_hz[-1] + 0.5 * between > 0.5 * rate_hz:
+            return None
+        length, beta = kaiserord(STOP_DB, transition / (0.5 * rate_hz))
+        cutoff = PASS_HZ + 0.5 * transition
+        lowpass = firwin(length | 1, cutoff, window=("kaiser", beta), fs=rate_hz)
+        elapsed = (np.arange(len(lowpass)) - len(lowpass) // 2) / rate_hz
+        carrier = np.exp(-2j * np.pi * elapsed[:, None] * tones_hz)
+        return BandFilter(tones_hz, rate_hz, decimation, 2.0 * lowpass[:, None] * carrier)
+
+
+def _decimation(tones_hz: Array, rate_hz: float, between_hz: float) -> int:
+    """Return the largest decimation that keeps the bands this far apart; 1 for none."""
+    least_hz = 2.0 * len(tones_hz) * between_hz
+    for decimation in range(int(rate_hz / least_hz), 1, -1):
+        rate = rate_hz / decimation
+        alias = np.sort(np.abs(tones_hz - rate * np.round(tones_hz / rate)))
+        edges = 2.0 * np.array([alias[0], 0.5 * rate - alias[-1]])
+        if min(np.min(edges), np.min(np.diff(alias), initial=np.inf)) >= between_hz:
+            return decimation
+    return 1
+
+
+class BandSampler:
+    """Reduces a recording, block by block."""
+
+    def __init__(self, band: BandFilter) -> None:
+        self._band, self._samples = band, np.zeros((0, 0))
+        self._taps = np.concatenate([band.taps.real, band.taps.imag], axis=1)
+        self._next = band.middle
+
+    def push(self, block: Array) -> tuple[Array, ComplexArray]:
+        """Return places and analytic signals of the samples that a block completes.
+
+        Parameters
+        ----------
+        block : ndarray, shape (n, columns)
+            The next samples.
+
+        Returns
+        -------
+        ndarray, shape (m,)
+            Number of the recording's sample at which each is.
+        complex ndarray, shape (m, tones, columns)
+            Its real part is the waveform of each tone's band.
+        """
+        before = self._samples if len(self._samples) else block[:0]
+        samples = np.concatenate([before, block])
+        length, step = len(self._taps), self._band.decimation
+        count = max((len(samples) - length) // step + 1, 0)
+        place = self._next + step * np.arange(count, dtype=float)
+        self._next += step * count
+        self._samples = samples[step * count :]
+        tones = len(self._band.tones_hz)
+        if not count:
+            return place, np.zeros((0, tones, block.shape[1]), dtype=np.complex128)
+        windows = sliding_window_view(samples, length, axis=0)[::step]
+        parts = np.ascontiguousarray(windows) @ self._taps
+        return place, np.swapaxes(parts[..., :tones] + 1j * parts[..., tones:], 1, 2)
+
+
+def waveform_of_bands(time: Array, baseband: ComplexArray, tones_hz: Array) -> Array:
+    """Return the waveform at its times from the complex amplitudes of tones, shape (n, 3).
+
+    Parameters
+    ----------
+    baseband : complex ndarray, shape (n, tones, 3)
+        Field of each tone is the real part of it times ``exp(j 2 pi f t)``.
+    """
+    turn = np.exp(2j * np.pi * time[:, None] * tones_hz)
+    return np.real(np.einsum("nt,nti->ni", turn, baseband))
+
+
+def is_bandpass(site: Site, rate_hz: float) -> bool:
+    """Return whether samples of a site's receiver are those of bands: slower than its tones."""
+    if not site.platform.magnetometer.ac_coupled or not site.beacons:
+        return False
+    return float(np.max(site.tone_frequencies_hz)) > 0.45 * rate_hz
