@@ -11,7 +11,12 @@ from mistake_list import MISTAKES
 
 from magfusion.estimation.data_checks.data_quality import recorded
 from magfusion.estimation.demodulation.demodulation import demodulated
-from magfusion.estimation.integrity.diagnosis import diagnosed, seen_in_streams, with_cause
+from magfusion.estimation.integrity.diagnosis import (
+    diagnosed,
+    seen_in_streams,
+    with_cause,
+    with_explaining_cause,
+)
 from magfusion.estimation.integrity.explanation import Explanation, clearly_best
 from magfusion.estimation.integrity.field_snapshots import snapshots_of
 from magfusion.estimation.integrity.likely_cause import cause_of
@@ -283,3 +288,13 @@ def test_most_mistakes_in_motion_are_named_rightly_and_few_wrongly(
     assert right >= 0.6 * requested
     # Next of kin: coil and phase, units and scale, lever arm and place.
     assert len(wrong) <= 0.2 * requested, wrong
+
+
+@pytest.mark.parametrize("code", ["gyro_units", "gravity_missing", "mounting", "stuck_axis"])
+def test_what_gravity_and_field_fail_comes_before_a_change_that_follows(code: str) -> None:
+    """A log whose axes or units are wrong throughout fits a step somewhere, too."""
+    change = Finding("changed", "A parameter changed.", Verdict.FAILED, 900.0)
+    wrong = Finding(code, "It is wrong throughout.", Verdict.FAILED, 20.0)
+    for trust in (Trust((change, wrong)), Trust((wrong, change))):
+        assert with_explaining_cause(trust, None).ordered[0].code == code
+    assert with_explaining_cause(Trust((change,)), None).ordered[0].code == "changed"

@@ -132,7 +132,7 @@ def finished(
     trust = with_long_exclusions(trust | separated.trust | Trust(findings))
     trust = with_changed_beacons(trust, changes)
     cause = diagnosed(log, site, trust, settings.lockin) if correction is None else None
-    excluded = bool(changes) or any(f.code == "beacon_excluded" for f in trust.reasons)
+    excluded = bool(changes)
     possible = corrections(site, trust.reasons, () if excluded else causes, cause)
     is_named = bool(causes) or any(f.code == "changed" for f in trust.reasons)
     trust = with_explaining_cause(trust, None if is_named and not is_clear(cause) else cause)

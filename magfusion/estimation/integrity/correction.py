@@ -118,10 +118,14 @@ def _with_turned_imu(site: Site, correction: Correction) -> Array | None:
     Nothing but the frame of the result distinguishes them: either is as likely.
     """
     before, after = (one.platform.magnetometer.body_from_sensor for one in (site, correction.site))
-    turn_body = Rotation.from_matrix(after @ before.T).as_rotvec()
+    turn = Rotation.from_matrix(after @ before.T)
+    turn_body = turn.as_rotvec()
     if not turn_body.any():
         return correction.spread
-    step = np.concatenate([turn_body, np.zeros(3)])[None]
+    # The magnetometer stays where it is found; the body moves about it.
+    place, moved = (one.platform.magnetometer.position_body for one in (site, correction.site))
+    shift_body = moved - turn.apply(place)
+    step = np.concatenate([turn_body, shift_body])[None]
     return 0.5 * _outer(step) + (0.0 if correction.spread is None else correction.spread)
 
 

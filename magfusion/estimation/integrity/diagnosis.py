@@ -115,11 +115,26 @@ def seen_in_streams(trust: Trust) -> bool:
     )
 
 
+def _is_wrong_throughout(trust: Trust) -> bool:
+    """Return whether a sensor measures nothing, or gravity, field and gyroscope fail a log.
+
+    No parameter changed meanwhile: a step explains a part of anything.
+    """
+    codes = {*OF_COMPASSES, "magnetometer_axes", "mounting"}
+    return any(
+        f.code in NOT_MEASURED or (f.code in codes and f.verdict is Verdict.FAILED)
+        for f in trust.reasons
+    )
+
+
 def with_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
     """Return the findings on a result, the cause first where it is known."""
     diverged = any(finding.code == "diverged" for finding in trust.findings)
+    wrong = _is_wrong_throughout(trust)
 
     def placed(finding: Finding) -> Finding:
+        if finding.code == "changed" and wrong:
+            return replace(finding, weight=min(finding.weight, 1.0))
         if finding.code in SEEN and finding.verdict is not Verdict.TRUSTWORTHY:
             return replace(finding, verdict=trust.verdict, weight=OF_SEEN + finding.weight)
         if diverged and finding.code not in ("diverged", "geometry"):
@@ -138,7 +153,8 @@ def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
     """
     trust = with_cause(trust, cause)
     if cause is None:
-        known = (f for f in trust.reasons if f.code in NOT_MEASURED or f.code == "changed")
+        before = NOT_MEASURED if _is_wrong_throughout(trust) else {*NOT_MEASURED, "changed"}
+        known = (f for f in trust.reasons if f.code in before)
         first = min(known, key=lambda f: f.code not in NOT_MEASURED, default=None)
     else:
         first = cause.finding
