@@ -17,9 +17,9 @@ REST = ("rest",)
 LEVER = np.array([0.3, -0.2, 0.1])  # m
 AWAY = np.array([0.12, 0.0, 0.16])  # m; 20 cm
 SHARE = 0.05  # of samples that are outliers
-TURNED = Rotation.from_euler("xyz", [3.0, -5.0, 20.0], degrees=True).as_matrix()
+SENSOR_ATTITUDE = Rotation.from_euler("xyz", [3.0, -5.0, 20.0], degrees=True).as_matrix()
 SENSORS = (
-    AidingSensor("visual", "velocity", 0.02, position_body=LEVER, body_from_sensor=TURNED),
+    AidingSensor("visual", "velocity", 0.02, position_body=LEVER, body_from_sensor=SENSOR_ATTITUDE),
     AidingSensor(
         "anchor", "range", 0.05, position_body=LEVER, point_world=np.array([6.0, 1.0, 2.0])
     ),
@@ -36,7 +36,7 @@ def _aided(case: Case) -> Case:
 
 
 def _declared(name: str, change: Callable[[AidingSensor], AidingSensor]) -> Change:
-    """Return a mistake in what the site says of a sensor."""
+    """Return a mistake in the declaration of a sensor."""
 
     def changed(case: Case) -> Case:
         aided = _aided(case)
@@ -58,7 +58,7 @@ def _late(sensor: AidingSensor) -> AidingSensor:
     return replace(sensor, time_offset=sensor.time_offset + 0.2)
 
 
-def _turned(sensor: AidingSensor) -> AidingSensor:
+def _rotated(sensor: AidingSensor) -> AidingSensor:
     turn = Rotation.from_rotvec([0.0, 0.0, 3.0], degrees=True).as_matrix()
     return replace(sensor, body_from_sensor=sensor.body_from_sensor @ turn)
 
@@ -83,24 +83,24 @@ def _outliers(name: str, size: float) -> Change:
 
 
 _LEVER, _CLOCK = ("aiding_lever_arm",), ("aiding_clock",)
-_AT_REST = ("aiding_lever_arm", "aiding_offset")  # of one attitude they are one
+_LEVER_OR_OFFSET = ("aiding_lever_arm", "aiding_offset")  # of one attitude they are one
 
 MISTAKES = (
     Mistake("aiding_as_declared", "aiding", _aided, harmless=True),
     Mistake("velocity_scale_5pct", "aiding", _declared("visual", _scaled), ("aiding_scale",), REST),
     Mistake("velocity_lever_20cm", "aiding", _declared("visual", _levered), _LEVER, REST),
     Mistake(
-        "velocity_turned_3deg", "aiding", _declared("visual", _turned), ("aiding_mounting",), REST
+        "velocity_turned_3deg", "aiding", _declared("visual", _rotated), ("aiding_mounting",), REST
     ),
     Mistake("velocity_clock_200ms", "aiding", _declared("visual", _late), _CLOCK, REST),
     Mistake("velocity_outliers", "aiding", _outliers("visual", 1.0), harmless=True),
-    Mistake("range_lever_20cm", "aiding", _declared("anchor", _levered), _AT_REST),
+    Mistake("range_lever_20cm", "aiding", _declared("anchor", _levered), _LEVER_OR_OFFSET),
     Mistake("range_clock_200ms", "aiding", _declared("anchor", _late), _CLOCK, REST),
     Mistake("range_outliers", "aiding", _outliers("anchor", 3.0), harmless=True),
     Mistake("position_lever_20cm", "aiding", _declared("prism", _levered), _LEVER),
     Mistake("position_clock_200ms", "aiding", _declared("prism", _late), _CLOCK, REST),
     Mistake("position_outliers", "aiding", _outliers("prism", 2.0), harmless=True),
-    Mistake("height_lever_20cm", "aiding", _declared("level", _levered), _AT_REST),
+    Mistake("height_lever_20cm", "aiding", _declared("level", _levered), _LEVER_OR_OFFSET),
     Mistake("height_clock_200ms", "aiding", _declared("level", _late), _CLOCK, REST),
     Mistake("height_outliers", "aiding", _outliers("level", 2.0), harmless=True),
     Mistake("heading_turned_3deg", "aiding", _declared("compass", _offset), ("aiding_offset",)),

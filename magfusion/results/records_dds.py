@@ -98,7 +98,7 @@ def _of_aiding(sensor: AidingSensor) -> Iterator[Subscription]:
 def _aiding_content(
     row: Row, of_sensor: SensorMessages, stamps: list[float], messages: Sequence[Any]
 ) -> dict[str, list[Any]]:
-    """Return samples; none where the messages have no value, or no stamp to tell the order."""
+    """Return samples; none where the messages have no value, or no stamp."""
     if 0.0 in stamps:
         return {"time": stamps}
     time, value = of_sensor.samples(np.array(stamps), np.array([row(one) for one in messages]))
