@@ -179,8 +179,8 @@ def _rows(epochs: Sequence[Epoch], targets: ScoreTargets) -> tuple[Array, Array,
         rows = _linearized([measurement for *_, measurement in group], states, targets)
         jacobian = rows.jacobian(width).reshape(len(group), -1, MOTION + width)
         error = rows.error.reshape(len(group), -1)
-        for (k, used, _), *row in zip(group, error, jacobian, strict=True):
-            parts[k].append(_Row(*row, used))
+        for (k, used, _), own_error, own_jacobian in zip(group, error, jacobian, strict=True):
+            parts[k].append(_Row(own_error, own_jacobian, used))
     maximum = max((sum(len(one.error) for one in own) for own in parts), default=0)
     errors, jacobians = (
         np.zeros((len(epochs), maximum)),
