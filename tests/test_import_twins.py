@@ -136,6 +136,7 @@ def test_a_telephone_writes_a_table_a_sensor(gyro_too: bool) -> None:
     assert_offset(field)
 
 
+@pytest.mark.slow
 def test_motion_capture_writes_attitudes_beside_an_imu() -> None:
     motion = turning(times(6000, 100.0), 5)
     gyro, accel = inertial(motion, 6)
@@ -153,6 +154,7 @@ def test_motion_capture_writes_attitudes_beside_an_imu() -> None:
     assert report["attitude_rmse_deg"] < 2.0
 
 
+@pytest.mark.slow
 def test_an_autopilot_log_as_text_has_the_attitude_in_another_table() -> None:
     motion = turning(times(7500, 125.0), 7)
     gyro, accel = inertial(motion, 8)
@@ -175,6 +177,7 @@ def test_an_autopilot_log_as_text_has_the_attitude_in_another_table() -> None:
     assert_offset(field[::2])
 
 
+@pytest.mark.slow
 def test_an_industrial_imu_counts_weeks_and_seconds_of_gps() -> None:
     motion = turning(times(6000, 100.0), 9)
     gyro, accel = inertial(motion, 10)
@@ -211,6 +214,7 @@ def assert_allan(values: Array, rate: float, key: str) -> None:
         assert low < report[f"{key}_white_{axis}"] / np.sqrt(tau) < high
 
 
+@pytest.mark.slow
 def test_gait_analysis_has_a_sensor_a_foot_side_by_side() -> None:
     rate = 204.8
     _, gyro, accel = at_rest(rate, 240.0, 20)
@@ -244,6 +248,7 @@ def host_stamps(count: int, seed: int) -> Array:
     return np.array(stamps[:count])
 
 
+@pytest.mark.slow
 def test_a_usb_host_stamps_buffers_of_four_rows() -> None:
     motion = turning(times(6000, 100.0), 11)
     gyro, accel = inertial(motion, 12)
@@ -262,6 +267,7 @@ def test_a_usb_host_stamps_buffers_of_four_rows() -> None:
     assert_offset(field)
 
 
+@pytest.mark.slow
 def test_a_magnetometer_alone_is_an_array_with_false_samples() -> None:
     motion = turning(times(3000, 50.0), 13, (1.6, 1.3, 3.0))
     field = measured(motion, 15)
@@ -284,6 +290,7 @@ def test_a_breakout_board_rests_for_half_a_minute() -> None:
     assert_allan(field * 1e-9, rate, "magnetometer")
 
 
+@pytest.mark.slow
 def test_a_board_turned_by_hand_has_no_times() -> None:
     motion = turning(times(4000, 50.0), 17)
     _, accel = inertial(motion, 18)
@@ -293,6 +300,7 @@ def test_a_board_turned_by_hand_has_no_times() -> None:
     assert_offset(field)
 
 
+@pytest.mark.slow
 def test_a_robot_with_hard_iron_has_a_truth_by_two_clocks() -> None:
     motion = turning(times(6000, 100.0), 21, (0.15, 0.9, 3.0), 8.0)
     gyro, accel = inertial(motion, 22)
@@ -319,6 +327,7 @@ def imported_fields() -> FieldSamples:
     return fields
 
 
+@pytest.mark.slow
 def test_sixteen_coils_are_a_column_of_amplitudes() -> None:
     walk = unsigned_amplitudes.walk(0, 6.0)
     save_site(walk.site, Path("coils.yaml"))
@@ -408,6 +417,7 @@ def assert_fixed(place: Array, tolerance: float, lever: Array) -> None:
     assert np.median(nearest) < tolerance
 
 
+@pytest.mark.slow
 def test_tables_by_rows_name_beacon_or_slot_and_axis() -> None:
     site = tracker_site(np.random.default_rng(43), gain=0.0, tilt=0.0, centre=0.0)
     beacon = replace(site.beacons[0], slots=Slots(0.005, 4, 0.0))
