@@ -110,7 +110,9 @@ class DetectionFilter:
         strong, valid = detected(samples, DETECTION_CHI_SQUARE_ONLINE), samples.valid[0]
         reach = int(np.ceil(samples.window[0] / step - 1e-6))
         if self._detected_for is None:
-            self._detected_for = np.full(strong.shape[1], reach)
+            # The motion of a first state leaves more in a window than the noise of its phasors.
+            clear = detected(samples, STRONG_CHI_SQUARE * DETECTION_CHI_SQUARE_ONLINE)
+            self._detected_for = np.where(clear[0], reach, 0)
         # What an epoch does not hold (another slot's tone) has not fallen silent.
         counted = np.where(strong[0], self._detected_for + 1, 0)
         self._detected_for = np.where(valid, counted, self._detected_for)
