@@ -1,9 +1,11 @@
-"""Which beacons a first window has: only those that are far above what its motion leaves."""
+"""Which beacons are detected, and how many sentences those have that are not."""
 
 import numpy as np
 
 from magfusion.estimation.data_checks.detection import DetectionFilter
+from magfusion.estimation.data_checks.signal import BeaconDetection, undetected_findings
 from magfusion.model.samples import FieldSamples
+from magfusion.simulation.demo_site import demo_site
 
 SIGMA = 1e-10  # T
 STEP, WINDOW = 0.4, 0.8  # s
@@ -23,3 +25,14 @@ def test_a_weak_tone_of_the_first_window_waits_until_it_has_lasted_a_window() ->
     detection = DetectionFilter()
     valid = [detection.of(epoch(STEP * k), STEP).valid[0].tolist() for k in range(4)]
     assert valid == [[True, False, False]] * 2 + [[True, True, False]] * 2
+
+
+def test_beacons_that_are_never_detected_have_one_sentence() -> None:
+    strong = np.zeros((10, 4), dtype=bool)
+    strong[:, 2] = True
+    snr = np.where(strong, 100.0, 1.0)
+    names = tuple("ABCD")
+    detection = BeaconDetection(np.arange(10.0), names, snr, 1e-9 * snr, strong)
+    (finding,) = undetected_findings(detection, demo_site())
+    assert finding.text.startswith("beacons A (20 Hz), B (25 Hz), D (35 Hz) are never detected")
+    assert "remove them from site.yaml" in finding.text

@@ -219,17 +219,30 @@ def undetected_findings(detection: BeaconDetection, site: Site) -> Iterator[Find
             100.0,
         )
     frequency = {b.name: b.tone_frequencies_hz for b in site.beacons}
-    for k, name in enumerate(detection.beacons):
-        tones = " and ".join(f"{f:g} Hz" for f in frequency[name])
-        if share[k] < HARDLY:
-            yield Finding(
-                "silent_beacon",
-                f"beacon {name} is never detected at {tones}: it is switched off, out of range, or"
-                " on another frequency. Switch it on, or remove it from site.yaml.",
-                weight=400.0,
-            )
-        elif not detection.across:
-            yield from _silences(detection, k, tones)
+    tones = [" and ".join(f"{f:g} Hz" for f in frequency[name]) for name in detection.beacons]
+    never = np.flatnonzero(share < HARDLY).tolist()
+    if never:
+        yield _never_detected([(detection.beacons[k], tones[k]) for k in never])
+    for k in range(len(tones)):
+        if k not in never and not detection.across:
+            yield from _silences(detection, k, tones[k])
+
+
+def _never_detected(beacons: list[tuple[str, str]]) -> Finding:
+    """Return one finding about beacons, given their names and tones."""
+    if len(beacons) == 1:
+        ((name, tones),) = beacons
+        subject, them = f"beacon {name} is never detected at {tones}: it is", "it"
+    else:
+        named = ", ".join(f"{name} ({tones})" for name, tones in beacons[:LISTED])
+        more = f" and {len(beacons) - LISTED} more" if len(beacons) > LISTED else ""
+        subject, them = f"beacons {named}{more} are never detected: they are", "them"
+    return Finding(
+        "silent_beacon",
+        f"{subject} switched off, out of range, or on another frequency. Switch {them} on, or"
+        f" remove {them} from site.yaml.",
+        weight=400.0,
+    )
 
 
 def _silences(detection: BeaconDetection, k: int, tones: str) -> Iterator[Finding]:
