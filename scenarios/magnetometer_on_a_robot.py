@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_cleaning import clean_log
-from magfusion.jobs.calibrate_magnetometer import calibrated, estimates_of
+from magfusion.jobs.magnetometer_trust import calibrated, estimates_of
 from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.site import (

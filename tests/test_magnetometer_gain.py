@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site
-from magfusion.jobs.calibrate_magnetometer import calibrated
+from magfusion.jobs.magnetometer_trust import calibrated
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.site import Magnetometer, MagnetometerSigma, Site
 from magfusion.model.trust import Trust, Verdict

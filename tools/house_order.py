@@ -83,7 +83,7 @@ ROOMS = {
         "calibration": """
             allan antenna beacon fieldmap graph magnetometer steady_field stops
             allan_fit antenna_graph antenna_observability antenna_probe antenna_site beacon_refined
-            ellipsoid magnetometer_graph rest
+            ellipsoid magnetometer_graph rest turn_coverage
             antenna_tracking magnetometer_start
             sphere_fit
             magnetometer_log
@@ -98,11 +98,11 @@ ROOMS = {
             recording_file ros_messages shapes trend
             alignment coverage drift errors live_foxglove observability odometry_dds
             odometry_mavlink recording_plots records_dds truth_frame
-            refinement rest_figures shown transfer verdict
+            refinement rest_figures shown transfer turn_guide verdict
             coverage_colours design motion_coverage recording_layout recording_trust screen
             plots recording recording_drift
             page_motion recording_coverage recording_design recording_live
-            page trajectory
+            page recording_turns trajectory
             report
             smoothed
         """,
@@ -110,7 +110,8 @@ ROOMS = {
             antenna_inputs fix_coil joint_kept receiver_axes region_option rotor_inputs state_rows
             listen_lines listen_sound stream_clocks stream_samples written
             inputs navigate_results result_directory
-            allan_noise checkpoint failure orientation settings without_beacons
+            allan_noise checkpoint failure magnetometer_trust magnetometer_turns orientation
+            settings without_beacons
             allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
             calibrate_magnetometer check design_settings drift_world evaluate export init_settings
             listen live papers published_fix range_wells rates region replay rest_settings

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import sys
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from magfusion.calibration.magnetometer import field_from_measured, refined, spread
+from magfusion.calibration.magnetometer import spread
 from magfusion.errors import InputError
-from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
-from magfusion.estimation.snapshot.priors import contradiction, trust_of
-from magfusion.files.site import save_site
-from magfusion.jobs.settings import Command, LogSettings, option
-from magfusion.model.site import Magnetometer, Site
-from magfusion.model.trust import Finding, Trust, Verdict
+from magfusion.files.site import load_site, save_site
+from magfusion.files.standard_streams import binary_input
+from magfusion.files.stream import read_records
+from magfusion.jobs.magnetometer_trust import calibrated, calibrated_field, estimates_of
+from magfusion.jobs.settings import Command, LogSettings, argument, option
 from magfusion.results.figures import (
     Figure,
     Figures,
@@ -26,37 +27,83 @@ from magfusion.results.figures import (
     heading,
 )
 from magfusion.results.verdict import notes_of, trust_figures
-from magfusion.units import DEGREE, NANOTESLA, Array
+from magfusion.units import DEGREE, Array
 
 if TYPE_CHECKING:
     from magfusion.calibration.magnetometer_log import LogCalibration
-    from magfusion.estimation.snapshot.priors import Contradiction
+    from magfusion.calibration.turn_coverage import TurnStatus
     from magfusion.jobs.inputs import Job
     from magfusion.model.samples import Log
-    from magfusion.model.trust import Finding, Trust
-    from magfusion.results.figures import Figures, ParameterEstimate
+    from magfusion.model.site import Site
+    from magfusion.model.trust import Trust
 
 
 JOB = "calibrate magnetometer"
-SCALE = 0.3  # of the matrix, by which it contradicts the site, however wide its sigmas
-SCALE_SIGMAS, LEAST_SCALE = 5.0, 0.01  # of the declared sigma; and what is never an error
-FIRST = 1e3  # weight of what is the cause of other findings
-LOOSE = 0.02  # of the field; an offset that is no more certain than that is not determined
-USELESS = 0.06  # and here nothing is gained by it: three degrees of heading
-SMALLEST, LARGEST = 1.5e-5, 1e-4  # T; the Earth's field, with what steel does to it
-_AXES = "xyz"
+PIPE = "-"
+OF_PIPE = {"form", "offset_sigma", "live"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class MagnetometerSettings(LogSettings):
-    """Part of a log used to calibrate the magnetometer."""
+    """Part of a log used to calibrate the magnetometer, or records on standard input."""
 
+    log: Path = argument("Log, or - for records on standard input: then the rotation is guided")
     positions: bool = option(False, "Use only the stops of the log: twelve or more")
+    form: Literal["json", "msgpack"] = option("json", "Records in the pipe", name="format")
+    offset_sigma: float = option(
+        0.1,
+        "Offset sigma at which a guided rotation ends",
+        unit="uT",
+        least=1e-3,
+        most=10.0,
+    )
+    live: bool = option(False, "Show the guidance in the viewer")
 
 
-def run(settings: MagnetometerSettings, output: Path) -> Figures:
+def run(settings: MagnetometerSettings, output: Path, given: set[str]) -> Figures:
     """Calibrate the magnetometer; see `run_calibrate_magnetometer`."""
+    is_pipe = str(settings.log) == PIPE
+    unfit = given & ({"positions", "start", "end", "topics"} if is_pipe else OF_PIPE)
+    if unfit:
+        names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in unfit))
+        source = "a log" if is_pipe else "records on standard input (-)"
+        raise InputError(f"{names.replace('--form', '--format')}: only for {source}; omit it")
+    if is_pipe:
+        return run_guided(settings, output)
     return run_calibrate_magnetometer(settings.job(output), positions=settings.positions)
+
+
+def run_guided(settings: MagnetometerSettings, output: Path) -> Figures:
+    """Guide a rotation by the records on standard input, and calibrate as from a log.
+
+    Raises
+    ------
+    InputError
+        Where there is no site, or a record is invalid.
+    EstimationError
+        Where the records end before the calibration is certain.
+    """
+    from magfusion.jobs.magnetometer_turns import guide
+    from magfusion.jobs.result_directory import claim
+    from magfusion.results.recording_turns import open_turn_view
+    from magfusion.results.turn_guide import terminal_guide
+
+    if settings.site is None:
+        raise InputError(f"{JOB} - requires the site's file; give it with --site SITE.yaml")
+    claimed, site = claim(output, JOB), load_site(settings.site, without=True)
+    records, limit = read_records(binary_input(), settings.form), 1e-6 * settings.offset_sigma
+    history: list[TurnStatus] = []
+    viewer = open_turn_view().show if settings.live else None
+    with terminal_guide(sys.stderr, limit) as terminal:
+
+        def show(status: TurnStatus) -> None:
+            history.append(status)
+            terminal(status)
+            if viewer is not None:
+                viewer(status)
+
+        guided = guide(site, records, calibrated, limit, show, sys.stderr)
+    return write_calibrated(claimed, *guided, history)
 
 
 def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
@@ -78,8 +125,7 @@ def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
         Where the calibration has no solution.
     """
     from magfusion.jobs.inputs import named, read_job, require_imu
-    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
-    from magfusion.results.report import write_report
+    from magfusion.jobs.result_directory import claim, refuse_failed
 
     claimed = claim(job.output, JOB)
     log, site = read_job(job, without=True)
@@ -92,23 +138,39 @@ def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
         )
     with named(job.log_path):
         result, trust = calibrated(log, site, positions=positions)
-    declared = site.platform.magnetometer
-    before, after = _fields(result, declared), _fields(result, result.magnetometer)
-    size = float(np.linalg.norm(result.prior.field_world))
-    estimates = estimates_of(result, declared)
-    figures = _figures(log, result, estimates, before, after, trust)
-    with claimed as whole:
-        directory = found_in(whole, trust)
-        save_site(_refined_site(site, result, log.name, estimates), directory / "site.yaml")
-        _plot(directory / "magnetometer.png", result, before, after, size)
-        write_report(whole, figures)
+    figures = write_calibrated(claimed, log, site, result, trust)
     refuse_failed(job.log_path, job.output, trust)
     return figures
 
 
-def _fields(calibration: LogCalibration, magnetometer: Magnetometer) -> Array:
-    measured = calibration.readings.measured_sensor
-    return field_from_measured(measured, magnetometer.matrix, magnetometer.offset)
+def write_calibrated(
+    claimed: AbstractContextManager[Path],
+    log: Log,
+    site: Site,
+    calibration: LogCalibration,
+    trust: Trust,
+    turns: Sequence[TurnStatus] = (),
+) -> Figures:
+    """Write site, picture, report and the recording of a guided rotation; return the figures."""
+    from magfusion.jobs.result_directory import found_in
+    from magfusion.results.report import write_report
+
+    declared = site.platform.magnetometer
+    before = calibrated_field(calibration, declared)
+    after = calibrated_field(calibration, calibration.magnetometer)
+    size = float(np.linalg.norm(calibration.prior.field_world))
+    estimates = estimates_of(calibration, declared)
+    figures = _figures(log, calibration, estimates, before, after, trust)
+    with claimed as whole:
+        directory = found_in(whole, trust)
+        save_site(_refined_site(site, calibration, log.name, estimates), directory / "site.yaml")
+        _plot(directory / "magnetometer.png", calibration, before, after, size)
+        if turns:
+            from magfusion.results.recording_turns import write_turns
+
+            write_turns(directory / "run.rrd", log.name, turns)
+        write_report(whole, figures)
+    return figures
 
 
 def _plot(
@@ -130,34 +192,6 @@ def _refined_site(
         calibration=calibration_record(log_name, estimates),
         correlation=known and known.without(("magnetometer",), ["magnetometer"]),
     )
-
-
-def estimates_of(calibration: LogCalibration, declared: Magnetometer) -> list[ParameterEstimate]:
-    """Return the twelve estimated parameters, with those declared in a site."""
-    fit, prior = calibration.graph.fit, calibration.prior
-    names = [f"magnetometer.matrix_{row}{column}" for row in _AXES for column in _AXES]
-    names += [f"magnetometer.offset_nt_{axis}" for axis in _AXES]
-    vectors = [("magnetometer.matrix", "", 1.0)] * 9
-    vectors += [("magnetometer.offset", "nT", NANOTESLA)] * 3
-    change = np.concatenate([(fit.matrix - declared.matrix).ravel(), fit.offset - declared.offset])
-    former = np.concatenate([declared.matrix.ravel(), declared.offset])
-    variances = np.diagonal(fit.cov), np.diagonal(prior.cov)
-    loose = np.full(12, np.inf)
-    loose[9:] = LOOSE * float(np.linalg.norm(prior.field_world))
-    rows = zip(names, vectors, change, *variances, former, loose, strict=True)
-    return [
-        ParameterEstimate(
-            name,
-            float(moved / scale),
-            unit,
-            label=label,
-            sigma=float(np.sqrt(variance) / scale),
-            prior_sigma=float(np.sqrt(before) / scale),
-            is_open=bool(variance > limit**2),
-            declared=float(value / scale),
-        )
-        for name, (label, unit, scale), moved, variance, before, value, limit in rows
-    ]
 
 
 def _figures(
@@ -196,184 +230,6 @@ def _figures(
         | determined_figures(estimates)
         | notes_of(trust)
     )
-
-
-def calibrated(log: Log, site: Site, *, positions: bool = False) -> tuple[LogCalibration, Trust]:
-    """Return the calibration from a log's waveform, and findings on it.
-
-    Raises
-    ------
-    InputError, EstimationError
-        As `run_calibrate_magnetometer`.
-    """
-    from magfusion.calibration.magnetometer_log import calibrate_log
-    from magfusion.calibration.magnetometer_size import calibrate_alone
-
-    assert log.waveform is not None
-    if log.inertial:
-        result = calibrate_log(log.waveform, log.imu, site, at_stops=positions)
-    else:
-        result = calibrate_alone(log.waveform, site)
-    return judge_calibration(result, site, log)
-
-
-def judge_calibration(
-    calibration: LogCalibration, site: Site, log: Log
-) -> tuple[LogCalibration, Trust]:
-    """Return a calibration with sigmas consistent with its tests, and their findings."""
-    declared, prior, fit = site.platform.magnetometer, calibration.prior, calibration.graph.fit
-    estimates = estimates_of(calibration, declared)
-    change = np.concatenate([(fit.matrix - declared.matrix).ravel(), fit.offset - declared.offset])
-    own = contradiction(
-        [one.key for one in estimates],
-        change,
-        prior.cov - fit.cov,
-        prior.cov,
-        "Declare larger sigmas if the sensor was not calibrated before; else check its mounting.",
-    )
-    trust, excess = trust_of(own, _declared_difference(calibration))
-    honest = replace(fit, cov=excess * fit.cov)
-    calibration = replace(
-        calibration,
-        graph=replace(calibration.graph, fit=honest),
-        magnetometer=refined(declared, honest),
-    )
-    platform = replace(site.platform, magnetometer=calibration.magnetometer)
-    streams = recorded(log, replace(site, platform=platform), BRIDGED_CODES)
-    return calibration, trust | Trust(
-        (*_doubts(calibration, site), *_remarks(calibration, log), *streams)
-    )
-
-
-def _declared_difference(calibration: LogCalibration) -> Contradiction:
-    """Return whether the other estimated parameters contradict the site."""
-    graph, prior = calibration.graph, calibration.prior
-    names = ["earth.dip", *(f"imu.{k}_bias_{axis}" for k in ("accel", "gyro") for axis in _AXES)]
-    change = np.concatenate([[graph.dip_change], graph.accel_bias_body, graph.gyro_bias_body])
-    sigma = np.repeat([prior.dip_sigma, prior.accel_bias_sigma, prior.gyro_bias_sigma], [1, 3, 3])
-    cov = np.diag(sigma**2)
-    remedy = (
-        "Check the Earth field and the mounting in the site, and that the specific force includes"
-        " gravity; rotate more slowly, away from iron."
-    )
-    return contradiction(names, change, cov, cov, remedy, "The other estimated parameters")
-
-
-def _doubts(calibration: LogCalibration, site: Site) -> Iterator[Finding]:
-    yield from _of_another_scale(calibration, site)
-    if calibration.rival is not None:
-        own, other = (_microtesla(b) for b in (calibration.magnetometer.offset, calibration.rival))
-        yield Finding(
-            "ambiguous",
-            f"Two offsets fit the readings, {own} and {other} uT, mirror images of each other: the"
-            " sensor was rotated about one axis only. Rotate it about a second axis.",
-            Verdict.FAILED,
-        )
-    yield from _of_another_size(calibration, site)
-    sigma = float(np.max(calibration.magnetometer.sigma.offset))
-    size = float(np.linalg.norm(calibration.prior.field_world))
-    if sigma > LOOSE * size:
-        yield Finding(
-            "few_data",
-            f"The offset sigma is {1e6 * sigma:.2g} uT, {100.0 * sigma / size:.2g} % of the field:"
-            " it is not determined. Rotate the sensor further, about all its axes.",
-            Verdict.FAILED if sigma > USELESS * size else Verdict.DOUBTFUL,
-            weight=sigma / (LOOSE * size),
-        )
-    disturbed = calibration.field_sigma / float(np.linalg.norm(calibration.prior.field_world))
-    if disturbed > site.earth.strength_sigma:
-        yield Finding(
-            "earth_field",
-            f"The magnitude of the calibrated field scatters by {100.0 * disturbed:.2g} %, but the"
-            f" site declares a disturbance of {100.0 * site.earth.strength_sigma:.2g} %"
-            " (world.earth.strength_sigma). Rotate the sensor in one place, away from iron.",
-            weight=disturbed / site.earth.strength_sigma,
-        )
-
-
-def _microtesla(offset: Array) -> str:
-    return "[" + ", ".join(f"{1e6 * axis:.1f}" for axis in offset) + "]"
-
-
-def _of_another_scale(calibration: LogCalibration, site: Site) -> Iterator[Finding]:
-    """Yield a finding if only another scale of the sensor matches the declared field.
-
-    It precedes findings of the calibration against its prior, of which it is the cause.
-    """
-    declared = site.platform.magnetometer.matrix
-    ratio = float(np.cbrt(np.linalg.det(calibration.graph.fit.matrix) / np.linalg.det(declared)))
-    sigma = float(np.sqrt(np.mean(np.diagonal(calibration.prior.cov)[[0, 4, 8]]) / 3.0))
-    far = abs(ratio - 1.0) / min(SCALE, SCALE_SIGMAS * max(sigma, LEAST_SCALE))
-    if far < 1.0:
-        return
-    text = (
-        f"The estimated scale of the magnetometer is {ratio:.3g} times the declared one: the"
-        " readings have another unit, or the site's Earth field has another magnitude."
-    )
-    if site.earth_field_world is not None and abs(ratio - 1.0) < 1.0:
-        size = 1e6 * float(np.linalg.norm(site.earth_field_world))
-        text = (
-            f"With the declared calibration the readings are of a field of {ratio * size:.3g} uT,"
-            f" but the site declares {size:.3g} uT: steel is near, the field is of another place,"
-            " or the readings have another unit. Calibrate away from steel, or declare the local"
-            " field (earth_field_t)."
-        )
-    yield Finding("earth_field", text, Verdict.FAILED, FIRST + far)
-
-
-def _of_another_size(calibration: LogCalibration, site: Site) -> Iterator[Finding]:
-    """Yield findings if the magnitude of the calibrated field is not as declared, or impossible."""
-    size = float(np.mean(np.linalg.norm(_fields(calibration, calibration.magnetometer), axis=1)))
-    remedy = (
-        " A hard iron remains that this motion does not separate from the field: rotate the sensor"
-        " about all its axes, and declare a larger sigma of its offset"
-    )
-    if site.earth_field_world is None:
-        if not SMALLEST < size < LARGEST:
-            yield Finding(
-                "earth_field",
-                f"The calibrated field is {1e6 * size:.3g} uT, outside the Earth's 22 to 67."
-                f"{remedy}; or give the local field (earth_field_t).",
-                Verdict.FAILED,
-                size / LARGEST,
-            )
-        return
-    declared = float(np.linalg.norm(site.earth_field_world))
-    off = abs(size / declared - 1.0)
-    if off > site.earth.strength_sigma:
-        yield Finding(
-            "earth_field",
-            f"The calibrated field is {1e6 * size:.3g} uT, but the site declares"
-            f" {1e6 * declared:.3g} (within {100.0 * site.earth.strength_sigma:.2g} %).{remedy}.",
-            Verdict.FAILED if off > SCALE else Verdict.DOUBTFUL,
-            off / site.earth.strength_sigma,
-        )
-
-
-def _remarks(calibration: LogCalibration, log: Log) -> Iterator[Finding]:
-    for sentence in calibration.missing:
-        text = f"{sentence[0].upper()}{sentence[1:]}."
-        yield Finding("few_data", text, Verdict.TRUSTWORTHY)
-    if not log.inertial:
-        text = (
-            "The log has no IMU: the field's magnitude does not determine the rotation of the"
-            " sensor, which stays as declared. Record an IMU as well to estimate it."
-        )
-        yield Finding("few_data", text, Verdict.TRUSTWORTHY)
-    if not calibration.scale_known:
-        yield Finding(
-            "few_data",
-            "The site has no Earth field: the scale of the matrix is as declared, and only ratios,"
-            " angles and offset are estimated; give earth_field_t or a location.",
-            Verdict.TRUSTWORTHY,
-        )
-    if calibration.shape_kept:
-        yield Finding(
-            "transfer",
-            "The declared shape and offset fit each half of the log as well as the calibration of"
-            " the other half: they are kept, and only the sensor's rotation is estimated.",
-            Verdict.TRUSTWORTHY,
-        )
 
 
 COMMAND = Command(

@@ -37,7 +37,7 @@ WRITTEN = {
     "calibrate beacon": _SITE | {"beacon.png", "report.json"},
     "calibrate antenna": _SITE | {"antenna.png", "report.json"},
     "calibrate fieldmap": _SITE | {"field_map.png", "report.json"},
-    "calibrate magnetometer": _SITE | {"magnetometer.png", "report.json"},
+    "calibrate magnetometer": _SITE | {"magnetometer.png", "run.rrd", "report.json"},
     "calibrate attitude-database": {"attitudes.parquet", "attitudes.png", "report.json"},
     "allan": _SITE | {"allan.png", "report.json", FAILED},
     "check": {"check.png", "report.json", FAILED},

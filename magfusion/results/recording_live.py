@@ -89,8 +89,8 @@ def _innovation(beacon: str) -> str:
     return f"plots/innovations/{rr.escape_entity_path_part(beacon)}"
 
 
-def open_live_view(site: Site) -> LiveView:
-    """Open a viewer for live states.
+def spawned() -> rr.RecordingStream:
+    """Open a viewer; return a recording that is connected to it.
 
     Raises
     ------
@@ -104,7 +104,12 @@ def open_live_view(site: Site) -> LiveView:
         raise InputError(
             f"--live: the viewer cannot be started ({str(error).splitlines()[0]}); omit it"
         ) from error
-    return LiveView(site, recording)
+    return recording
+
+
+def open_live_view(site: Site) -> LiveView:
+    """Open a viewer for live states; raises as `spawned`."""
+    return LiveView(site, spawned())
 
 
 def _blueprint() -> rrb.Blueprint:
