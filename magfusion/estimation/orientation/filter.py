@@ -224,10 +224,11 @@ class OrientationFilter:
         transition = np.eye(SIZE)
         transition[TURN, GYRO_BIAS] = begin @ turn.by_bias
         transition[TURN, GYRO_MATRIX] = begin @ turn.by_matrix
-        by_turn = -skew(begin @ turn.push)
+        by_turn = -skew(np.array([0.0, 0.0, self.site.gravity * length]))
         transition[SPEED, TURN] = by_turn
+        velocity = state.velocity_world + gained
         for part in (GYRO_BIAS, GYRO_MATRIX):  # on average half of the rotation tilts the force
-            transition[SPEED, part] = 0.5 * by_turn @ transition[TURN, part]
+            transition[SPEED, part] = (0.5 * by_turn + skew(velocity)) @ transition[TURN, part]
         transition[SPEED, ACCEL_BIAS] = -begin @ turn.by_force
         transition[OFFSET, OFFSET] = begin @ whole @ begin.T
         transition[NEAR, NEAR] = kept * np.eye(3)
@@ -248,7 +249,7 @@ class OrientationFilter:
             state,
             time=float(stretch.time[-1]),
             world_from_body=begin @ whole,
-            velocity_world=state.velocity_world + gained,
+            velocity_world=velocity,
             near=kept * state.near,
             cov=transition @ state.cov @ transition.T + np.diag(noise),
         )

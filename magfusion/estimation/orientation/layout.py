@@ -64,11 +64,12 @@ class Orientation:
 
     def moved(self, step: Array, measured_from_body: Array) -> "Orientation":
         """Return the state moved by a tangent vector; the covariance is constant."""
-        attitude = Rotation.from_rotvec(step[TURN]).as_matrix() @ self.world_from_body
+        turn = Rotation.from_rotvec(step[TURN]).as_matrix()
+        attitude = turn @ self.world_from_body
         return replace(
             self,
             world_from_body=attitude,
-            velocity_world=self.velocity_world + step[SPEED],
+            velocity_world=turn @ self.velocity_world + step[SPEED],
             gyro_bias=self.gyro_bias + step[GYRO_BIAS],
             accel_bias=self.accel_bias + step[ACCEL_BIAS],
             gyro_matrix=self.gyro_matrix + step[GYRO_MATRIX].reshape(3, 3),
@@ -86,7 +87,7 @@ class Orientation:
         return np.concatenate(
             [
                 Rotation.from_matrix(turn).as_rotvec(),
-                other.velocity_world - self.velocity_world,
+                other.velocity_world - turn @ self.velocity_world,
                 other.gyro_bias - self.gyro_bias,
                 other.accel_bias - self.accel_bias,
                 (other.gyro_matrix - self.gyro_matrix).ravel(),
