@@ -15,8 +15,10 @@ from magfusion.errors import InputError
 from magfusion.estimation.graph.kalman import PartialUpdateFilter
 from magfusion.estimation.orientation.layout import (
     ACCEL_BIAS,
+    ACCEL_MATRIX,
     FAR,
     GYRO_BIAS,
+    GYRO_FORCE,
     GYRO_MATRIX,
     LAG,
     MATRIX,
@@ -32,6 +34,7 @@ from magfusion.estimation.orientation.stretch import (
     OrientationStretch,
     StretchMotion,
     body_from_end,
+    corrected_rate,
     integrate_stretch,
 )
 from magfusion.model.field import observe_earth, skew
@@ -40,7 +43,9 @@ from magfusion.model.site import Site
 from magfusion.model.strapdown import triad
 from magfusion.units import Array
 
-GYRO_SCALE = 0.003  # usual error of a gyroscope's scale and axes
+GYRO_SCALE = ACCEL_SCALE = 0.003  # usual error of an instrument's scale and axes
+# A MEMS gyroscope's sensitivity to specific force, in data sheets 0.1 deg/s/g; (rad/s)/(m/s^2).
+GYRO_FORCE_SIGMA = np.deg2rad(0.1) / 9.80665
 AMBIENT = 0.02  # of the field's size: usual disturbance of each component, indoors
 SETTLING_TIME, MOVED = 10.0, 2.0  # s; its correlation time, at rest and in motion
 WAY = 0.5  # m; distance after which it is independent, however short the time
@@ -58,7 +63,7 @@ FAR_STRENGTH = 0.04  # of the field's size: error of the declared one everywhere
 OFFSET_WALK = 0.01  # uT per square root of second
 # A carried platform rotates with the arm that carries it: its speed correlates with its attitude
 # periodically, as for a false bias.  In motion this is the share for the accelerometer's bias.
-SWUNG = 0.05  # of the speed: the accelerometer's bias
+SWUNG = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +74,7 @@ class Update:
     ----------
     predicted, state : Orientation
         Before and after the measurements of its end.
-    transition : ndarray, shape (40, 40)
+    transition : ndarray, shape (58, 58)
     attitude : ndarray, shape (n + 1, 3, 3)
         ``begin_from_then`` at its samples.
     disturbance : float
@@ -89,9 +94,9 @@ class Update:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """Measured minus predicted (3,), its derivative (3, 40), and its variance (3,).
+    """Measured minus predicted (3,), its derivative (3, 58), and its variance (3,).
 
-    ``share`` (40,) is the share of each parameter, one unless it is correlated with the motion.
+    ``share`` (58,) is the share of each parameter, one unless it is correlated with the motion.
     """
 
     by_state: Array
@@ -177,6 +182,8 @@ class OrientationFilter:
             cov[GYRO_BIAS, GYRO_BIAS] = imu.gyro_bias_sigma**2 * np.eye(3)
             cov[ACCEL_BIAS, ACCEL_BIAS] = imu.accel_bias_sigma**2 * np.eye(3)
             cov[GYRO_MATRIX, GYRO_MATRIX] = GYRO_SCALE**2 * np.eye(9)
+            cov[GYRO_FORCE, GYRO_FORCE] = GYRO_FORCE_SIGMA**2 * np.eye(9)
+            cov[ACCEL_MATRIX, ACCEL_MATRIX] = ACCEL_SCALE**2 * np.eye(9)
             cov[OFFSET, OFFSET] = np.diag((sensor.sigma.offset / MICROTESLA) ** 2)
             cov[NEAR, NEAR] = self._least * np.eye(3)
             cov[MATRIX, MATRIX] = np.diag(sensor.sigma.matrix.ravel() ** 2)
@@ -190,6 +197,8 @@ class OrientationFilter:
                 gyro_bias=zero,
                 accel_bias=zero,
                 gyro_matrix=np.zeros((3, 3)),
+                gyro_force=np.zeros((3, 3)),
+                accel_matrix=np.zeros((3, 3)),
                 offset=sensor.offset / MICROTESLA,
                 near=zero,
                 matrix=sensor.matrix,
@@ -197,7 +206,7 @@ class OrientationFilter:
                 far=zero,
                 cov=cov,
             )
-        up = np.mean(stretch.accel_body, axis=0) - old.accel_bias
+        up = (np.eye(3) + old.accel_matrix) @ np.mean(stretch.accel_body, axis=0) - old.accel_bias
         heading = HEADING
         if len(stretch.field):
             measured = np.mean(stretch.field, axis=0) - old.offset
@@ -227,9 +236,11 @@ class OrientationFilter:
         by_turn = -skew(np.array([0.0, 0.0, self.site.gravity * length]))
         transition[SPEED, TURN] = by_turn
         velocity = state.velocity_world + gained
-        for part in (GYRO_BIAS, GYRO_MATRIX):  # on average half of the rotation tilts the force
+        transition[TURN, GYRO_FORCE] = begin @ turn.by_gyro_force
+        for part in (GYRO_BIAS, GYRO_MATRIX, GYRO_FORCE):  # on average half of the rotation tilts the force
             transition[SPEED, part] = (0.5 * by_turn + skew(velocity)) @ transition[TURN, part]
         transition[SPEED, ACCEL_BIAS] = -begin @ turn.by_force
+        transition[SPEED, ACCEL_MATRIX] = begin @ turn.by_accel_matrix
         transition[OFFSET, OFFSET] = begin @ whole @ begin.T
         transition[NEAR, NEAR] = kept * np.eye(3)
         noise = np.zeros(SIZE)
@@ -265,7 +276,7 @@ class OrientationFilter:
             variance = max(self._speed, LEAST_SPEED**2) * max(1.0, SPEED_TIME / length)
         share = np.ones(SIZE)
         if not stretch.rests:
-            share[ACCEL_BIAS] = SWUNG
+            share[ACCEL_BIAS] = share[ACCEL_MATRIX] = SWUNG
         return Row(by_state, -state.velocity_world, np.full(3, variance), share)
 
     def _may_rest(self, state: Orientation, turn: StretchMotion) -> bool:
@@ -278,7 +289,9 @@ class OrientationFilter:
         by_state = np.zeros((3, SIZE))
         by_state[:, GYRO_BIAS] = -np.eye(3)
         by_state[:, GYRO_MATRIX] = np.kron(np.eye(3), rate)
-        still = rate @ (np.eye(3) + state.gyro_matrix).T - state.gyro_bias
+        force = np.mean(stretch.accel_body, axis=0)
+        by_state[:, GYRO_FORCE] = -np.kron(np.eye(3), force)
+        still = corrected_rate(state, rate, force)
         length = max(float(np.sum(stretch.steps)), 1e-3)
         return Row(by_state, -still, np.full(3, REST_RATE**2 / length), np.ones(SIZE))
 

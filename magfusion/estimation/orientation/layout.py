@@ -19,7 +19,8 @@ TURN, SPEED = slice(0, 3), slice(3, 6)
 GYRO_BIAS, ACCEL_BIAS, GYRO_MATRIX = slice(6, 9), slice(9, 12), slice(12, 21)
 OFFSET, NEAR, MATRIX = slice(21, 24), slice(24, 27), slice(27, 36)
 LAG, FAR = slice(36, 37), slice(37, 40)
-SIZE = 40
+GYRO_FORCE, ACCEL_MATRIX = slice(40, 49), slice(49, 58)
+SIZE = 58
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +37,9 @@ class Orientation:
     gyro_bias, accel_bias : ndarray, shape (3,)
         Body axes (rad/s, m/s^2).
     gyro_matrix : ndarray, shape (3, 3)
-        True rate = (1 + matrix) measured rate - bias.
+        True rate = (1 + matrix) measured rate - bias - force matrix times measured force.
+    gyro_force, accel_matrix : ndarray, shape (3, 3)
+        True force = (1 + matrix) measured force - bias.
     offset : ndarray, shape (3,)
         Of the magnetometer, measured axes (uT).
     matrix : ndarray, shape (3, 3)
@@ -46,7 +49,7 @@ class Orientation:
         everywhere.
     lag : float
         Delay of the field samples relative to the inertial samples (s).
-    cov : ndarray, shape (40, 40)
+    cov : ndarray, shape (58, 58)
     """
 
     time: float
@@ -55,6 +58,8 @@ class Orientation:
     gyro_bias: Array
     accel_bias: Array
     gyro_matrix: Array
+    gyro_force: Array
+    accel_matrix: Array
     offset: Array
     near: Array
     matrix: Array
@@ -73,6 +78,8 @@ class Orientation:
             gyro_bias=self.gyro_bias + step[GYRO_BIAS],
             accel_bias=self.accel_bias + step[ACCEL_BIAS],
             gyro_matrix=self.gyro_matrix + step[GYRO_MATRIX].reshape(3, 3),
+            gyro_force=self.gyro_force + step[GYRO_FORCE].reshape(3, 3),
+            accel_matrix=self.accel_matrix + step[ACCEL_MATRIX].reshape(3, 3),
             offset=self.offset + measured_from_body @ attitude.T @ step[OFFSET],
             near=self.near + step[NEAR],
             matrix=self.matrix + step[MATRIX].reshape(3, 3),
@@ -96,5 +103,7 @@ class Orientation:
                 (other.matrix - self.matrix).ravel(),
                 [other.lag - self.lag],
                 other.far - self.far,
+                (other.gyro_force - self.gyro_force).ravel(),
+                (other.accel_matrix - self.accel_matrix).ravel(),
             ]
         )
