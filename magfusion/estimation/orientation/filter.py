@@ -16,6 +16,7 @@ from magfusion.estimation.graph.kalman import PartialUpdateFilter
 from magfusion.estimation.orientation.layout import (
     ACCEL_BIAS,
     ACCEL_MATRIX,
+    ARM,
     FAR,
     GYRO_BIAS,
     GYRO_FORCE,
@@ -62,8 +63,8 @@ TILT, HEADING = 0.05, 0.3  # rad; of the first attitude
 FAR_STRENGTH = 0.04  # of the field's size: error of the declared one everywhere
 OFFSET_WALK = 0.01  # uT per square root of second
 # A carried platform rotates with the arm that carries it: its speed correlates with its attitude
-# periodically, as for a false bias.  In motion this is the share for the accelerometer's bias.
-SWUNG = 1.0
+# periodically, as for a false bias, unless the arm is estimated too.
+ARM_LENGTH = 0.5  # m; of a human arm, each component
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +75,7 @@ class Update:
     ----------
     predicted, state : Orientation
         Before and after the measurements of its end.
-    transition : ndarray, shape (58, 58)
+    transition : ndarray, shape (61, 61)
     attitude : ndarray, shape (n + 1, 3, 3)
         ``begin_from_then`` at its samples.
     disturbance : float
@@ -94,9 +95,9 @@ class Update:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """Measured minus predicted (3,), its derivative (3, 58), and its variance (3,).
+    """Measured minus predicted (3,), its derivative (3, 61), and its variance (3,).
 
-    ``share`` (58,) is the share of each parameter, one unless it is correlated with the motion.
+    ``share`` (61,) is the share of each parameter, one unless it is correlated with the motion.
     """
 
     by_state: Array
@@ -156,7 +157,7 @@ class OrientationFilter:
         before = self.state
         turn = integrate_stretch(stretch, before)
         predicted, transition = self._predicted(before, stretch, turn)
-        rows = [self._of_speed(predicted, stretch)]
+        rows = [self._of_speed(predicted, stretch, turn)]
         if stretch.rests and self._may_rest(predicted, turn):
             rows.append(self._of_rest(predicted, stretch))
         changed = False
@@ -184,6 +185,7 @@ class OrientationFilter:
             cov[GYRO_MATRIX, GYRO_MATRIX] = GYRO_SCALE**2 * np.eye(9)
             cov[GYRO_FORCE, GYRO_FORCE] = GYRO_FORCE_SIGMA**2 * np.eye(9)
             cov[ACCEL_MATRIX, ACCEL_MATRIX] = ACCEL_SCALE**2 * np.eye(9)
+            cov[ARM, ARM] = ARM_LENGTH**2 * np.eye(3)
             cov[OFFSET, OFFSET] = np.diag((sensor.sigma.offset / MICROTESLA) ** 2)
             cov[NEAR, NEAR] = self._least * np.eye(3)
             cov[MATRIX, MATRIX] = np.diag(sensor.sigma.matrix.ravel() ** 2)
@@ -199,6 +201,7 @@ class OrientationFilter:
                 gyro_matrix=np.zeros((3, 3)),
                 gyro_force=np.zeros((3, 3)),
                 accel_matrix=np.zeros((3, 3)),
+                arm=zero,
                 offset=sensor.offset / MICROTESLA,
                 near=zero,
                 matrix=sensor.matrix,
@@ -266,18 +269,20 @@ class OrientationFilter:
         )
         return predicted, transition
 
-    def _of_speed(self, state: Orientation, stretch: OrientationStretch) -> Row:
+    def _of_speed(
+        self, state: Orientation, stretch: OrientationStretch, turn: StretchMotion
+    ) -> Row:
         by_state = np.zeros((3, SIZE))
         by_state[:, SPEED] = np.eye(3)
         if stretch.rests:
             variance = self.site.platform.motion.rest_speed_sigma**2
-        else:
-            length = max(float(np.sum(stretch.steps)), 1e-3)
-            variance = max(self._speed, LEAST_SPEED**2) * max(1.0, SPEED_TIME / length)
-        share = np.ones(SIZE)
-        if not stretch.rests:
-            share[ACCEL_BIAS] = share[ACCEL_MATRIX] = SWUNG
-        return Row(by_state, -state.velocity_world, np.full(3, variance), share)
+            return Row(by_state, -state.velocity_world, np.full(3, variance), np.ones(SIZE))
+        length = max(float(np.sum(stretch.steps)), 1e-3)
+        variance = max(self._speed, LEAST_SPEED**2) * max(1.0, SPEED_TIME / length)
+        by_arm = state.world_from_body @ skew(turn.rate[-1])
+        by_state[:, ARM] = -by_arm
+        error = by_arm @ state.arm - state.velocity_world
+        return Row(by_state, error, np.full(3, variance), np.ones(SIZE))
 
     def _may_rest(self, state: Orientation, turn: StretchMotion) -> bool:
         """Return whether the rate may be a bias, and no slow and even turn: larger ones are not."""

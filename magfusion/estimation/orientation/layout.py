@@ -19,8 +19,8 @@ TURN, SPEED = slice(0, 3), slice(3, 6)
 GYRO_BIAS, ACCEL_BIAS, GYRO_MATRIX = slice(6, 9), slice(9, 12), slice(12, 21)
 OFFSET, NEAR, MATRIX = slice(21, 24), slice(24, 27), slice(27, 36)
 LAG, FAR = slice(36, 37), slice(37, 40)
-GYRO_FORCE, ACCEL_MATRIX = slice(40, 49), slice(49, 58)
-SIZE = 58
+GYRO_FORCE, ACCEL_MATRIX, ARM = slice(40, 49), slice(49, 58), slice(58, 61)
+SIZE = 61
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +40,8 @@ class Orientation:
         True rate = (1 + matrix) measured rate - bias - force matrix times measured force.
     gyro_force, accel_matrix : ndarray, shape (3, 3)
         True force = (1 + matrix) measured force - bias.
+    arm : ndarray, shape (3,)
+        From the point that the platform swings about to its sensor, body axes (m).
     offset : ndarray, shape (3,)
         Of the magnetometer, measured axes (uT).
     matrix : ndarray, shape (3, 3)
@@ -49,7 +51,7 @@ class Orientation:
         everywhere.
     lag : float
         Delay of the field samples relative to the inertial samples (s).
-    cov : ndarray, shape (58, 58)
+    cov : ndarray, shape (61, 61)
     """
 
     time: float
@@ -60,6 +62,7 @@ class Orientation:
     gyro_matrix: Array
     gyro_force: Array
     accel_matrix: Array
+    arm: Array
     offset: Array
     near: Array
     matrix: Array
@@ -80,6 +83,7 @@ class Orientation:
             gyro_matrix=self.gyro_matrix + step[GYRO_MATRIX].reshape(3, 3),
             gyro_force=self.gyro_force + step[GYRO_FORCE].reshape(3, 3),
             accel_matrix=self.accel_matrix + step[ACCEL_MATRIX].reshape(3, 3),
+            arm=self.arm + step[ARM],
             offset=self.offset + measured_from_body @ attitude.T @ step[OFFSET],
             near=self.near + step[NEAR],
             matrix=self.matrix + step[MATRIX].reshape(3, 3),
@@ -105,5 +109,6 @@ class Orientation:
                 other.far - self.far,
                 (other.gyro_force - self.gyro_force).ravel(),
                 (other.accel_matrix - self.accel_matrix).ravel(),
+                other.arm - self.arm,
             ]
         )
