@@ -29,6 +29,7 @@ from magfusion.units import DEGREE
 
 IMUS = ("MTi-3", "MTi-300", "BMI270", "ICM-42688-P", "LSM6DSO", "BMI160", "MPU-9250")
 GYRO_BIAS, ACCEL_BIAS = 0.5 * DEGREE, 0.05  # rad/s, m/s^2; usual ones of what is calibrated
+REACH = 0.3  # m; of a hand, usual (each component): well inside of the iron of the building
 
 
 @dataclass(frozen=True)
@@ -67,11 +68,14 @@ def twin(seed: int) -> tuple[Log, Site]:
 
     motion = rng.choice(["turned", "swung", "both"])
     one_axis = np.roll([1.0, 0.1, 0.1], rng.integers(3)) if rng.random() < 1 / 3 else np.ones(3)
+    hertz = between(0.3, 1.2)
+    within_reach = REACH * (2.0 * np.pi * hertz) ** 2
+    shaking = between(0.2, 1.0) if motion == "turned" else between(1.0, 8.0)
     kind = Kind(
         turning=0.0 if motion == "swung" else between(0.4, 4.0),
         wobble=between(0.03, 0.2) if motion == "swung" else 0.0,
-        shaking=between(0.2, 1.0) if motion == "turned" else between(1.0, 8.0),
-        hertz=between(0.3, 1.2),
+        shaking=min(shaking, within_reach),
+        hertz=hertz,
         pauses=bool(rng.random() < 0.5),
         rest=rng.uniform(0.5, 5.0),
         iron=(1.5, 4.0),

@@ -240,8 +240,9 @@ class OrientationFilter:
         transition[SPEED, TURN] = by_turn
         velocity = state.velocity_world + gained
         transition[TURN, GYRO_FORCE] = begin @ turn.by_gyro_force
-        for part in (GYRO_BIAS, GYRO_MATRIX, GYRO_FORCE):  # on average half of the rotation tilts the force
-            transition[SPEED, part] = (0.5 * by_turn + skew(velocity)) @ transition[TURN, part]
+        middle = skew(state.velocity_world + 0.5 * gained)
+        for part in (GYRO_BIAS, GYRO_MATRIX, GYRO_FORCE):  # on average half of it tilts the force
+            transition[SPEED, part] = (0.5 * by_turn + middle) @ transition[TURN, part]
         transition[SPEED, ACCEL_BIAS] = -begin @ turn.by_force
         transition[SPEED, ACCEL_MATRIX] = begin @ turn.by_accel_matrix
         transition[OFFSET, OFFSET] = begin @ whole @ begin.T
