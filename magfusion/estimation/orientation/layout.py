@@ -1,9 +1,9 @@
 """State of an orientation without beacons, and the tangent of its covariance.
 
 Errors of attitude, velocity and offset are in world axes, the last two rotated with the attitude
-(the two-frame group of Barrau and Bonnabel).  The unobservable direction, the heading at rest with an
-unknown offset, is then independent of the estimate, and the filter gains no false information on
-it.  Fields are in microtesla, so that the covariance stays well conditioned.
+(the two-frame group of Barrau and Bonnabel).  The unobservable direction, the heading at rest with
+an unknown offset, is then independent of the estimate, and the filter gains no false information
+on it.  Fields are in microtesla, so that the covariance stays well conditioned.
 """
 
 from dataclasses import dataclass, replace
