@@ -2,7 +2,7 @@
 
 Gravity is the mean specific force: the velocity of a moving platform is kept near that of an arm
 that swings it, within its usual speed.  The velocity's error turns with that of the attitude (the
-invariant error of Barrau and Bonnabel): only gravity relates them, and speed tells nothing of the
+invariant error of Barrau and Bonnabel): only gravity relates them, and speed does not inform on the
 heading.  The field's deviation from the declared one is in the state, once in world axes, where
 it changes as the platform moves, and once with the platform.  If neither explains the measured
 field, something has changed: a magnet was attached, or iron is near.  Then both are estimated
