@@ -61,6 +61,14 @@ class Kind:
         Distances of the building's iron (m).
     walk : float
         Usual speed of who carries it, to and fro (m/s, each horizontal component).
+    axes : (float, float, float)
+        Share of the turning about each axis of the body.
+    visits : int
+        Times that something magnetic is brought near and taken away.
+    repeated : float
+        Of the magnetometer's samples.
+    imu, imu_errors : ImuModel
+        As declared, and of which the share is usual.
     """
 
     turning: float = 0.0
@@ -74,6 +82,11 @@ class Kind:
     lifted: bool = False
     iron: tuple[float, float] = (1.2, 3.0)
     walk: float = 0.0
+    axes: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    visits: int = 0
+    repeated: float = REPEATED
+    imu: ImuModel = IMU
+    imu_errors: ImuModel = IMU
 
 
 KINDS = {
@@ -109,7 +122,9 @@ KINDS = {
 }
 
 
-def site_as_declared(offset_sigma: float = 2e-6, matrix_sigma: float = 0.02) -> Site:
+def site_as_declared(
+    offset_sigma: float = 2e-6, matrix_sigma: float = 0.02, imu: ImuModel = IMU
+) -> Site:
     """Return a site as a careful user would write it (offset in T)."""
     sigma = MagnetometerSigma(
         np.full((3, 3), matrix_sigma), np.full(3, offset_sigma), np.zeros(3), np.zeros(3)
@@ -126,7 +141,7 @@ def site_as_declared(offset_sigma: float = 2e-6, matrix_sigma: float = 0.02) -> 
         gravity=GRAVITY,
         model_error=0.005,
         beacons=(),
-        platform=Platform(IMU, sensor),
+        platform=Platform(imu, sensor),
         earth_field_world=EARTH_WORLD,
         earth=EarthModel(),
     )
@@ -144,23 +159,32 @@ def simulated(
     share : float
         Of what the site declares: usual errors of the instruments.
     """
-    kind, rng = KINDS[name], np.random.default_rng([seed, *name.encode()])
+    rng = np.random.default_rng([seed, *name.encode()])
+    return simulated_kind(KINDS[name], rng, duration, rate, share, f"{name} x{share:g} {seed}")
+
+
+def simulated_kind(
+    kind: Kind, rng: np.random.Generator, duration: float, rate: float, share: float, name: str
+) -> tuple[Log, Site]:
+    """Return a log of a kind, and its site."""
     time = np.arange(0.0, duration, 1.0 / rate)
     truth, place = _motion(kind, rng, time)
     world = EARTH_WORLD + _building(rng, place, share, kind.iron)
     if kind.lifted:
         world += _table(rng, place)
+    for _ in range(kind.visits):
+        world += _visit(rng, time, place)
     body = np.tile(2e-6 * share * rng.normal(size=3), (len(time), 1))
     if kind.magnet == "near":
         world += _magnet_near(rng, place)
     elif kind.magnet != "none":
         begun = 0.0 if kind.magnet == "from the start" else 0.4 * duration
         body[time >= begun] += _some_way(rng) * rng.uniform(5e-6, 30e-6)
-    site = site_as_declared()
-    imu = _inertial(rng, time, truth, place, share)
-    wave = _field(rng, time, truth, world, body, share, kind.late)
+    site = site_as_declared(imu=kind.imu)
+    imu = _inertial(rng, time, truth, place, share, kind.imu_errors)
+    wave = _field(rng, time, truth, world, body, share, kind)
     poses = Trajectory(time, truth.as_matrix(), place)
-    return Log(f"{name} x{share:g} {seed}", 0, "simulated", imu, wave, truth=poses), site
+    return Log(name, 0, "simulated", imu, wave, truth=poses), site
 
 
 def _some_way(rng: np.random.Generator) -> Array:
@@ -194,7 +218,7 @@ def _activity(kind: Kind, rng: np.random.Generator, time: Array) -> Array:
 def _motion(kind: Kind, rng: np.random.Generator, time: Array) -> tuple[Rotation, Array]:
     active = _activity(kind, rng, time)
     step = time[1] - time[0]
-    spin = kind.turning * _wave(rng, time, kind.hertz) * active
+    spin = kind.turning * np.array(kind.axes) * _wave(rng, time, kind.hertz) * active
     turns = [Rotation.from_rotvec([*rng.uniform(-0.5, 0.5, size=2), rng.uniform(-3.0, 3.0)])]
     if kind.turning > 0.0:
         for turn in Rotation.from_rotvec(spin[1:] * step):
@@ -249,6 +273,19 @@ def _magnet_near(rng: np.random.Generator, place: Array) -> Array:
     return np.asarray(result * rng.uniform(1e-5, 4e-5) / np.max(np.linalg.norm(result, axis=1)))
 
 
+def _visit(rng: np.random.Generator, time: Array, place: Array) -> Array:
+    """Return the field of something magnetic that is near for some seconds."""
+    begin, length = rng.uniform(0.1 * time[-1], 0.9 * time[-1]), rng.uniform(3.0, 20.0)
+    near = np.clip(np.minimum(time - begin, begin + length - time) / 1.0, 0.0, 1.0)[:, None]
+    centre = place[np.searchsorted(time, begin)] + rng.uniform(0.2, 0.6) * _some_way(rng)
+    offset = place - centre
+    # It is in no one's way: what is carried passes it at a distance of at least 0.1 m.
+    far = np.linalg.norm(offset, axis=1)[:, None]
+    offset *= np.maximum(1.0, 0.1 / np.maximum(far, 1e-3))
+    result = near * _dipole(offset, _some_way(rng))
+    return np.asarray(result * rng.uniform(5e-6, 4e-5) / np.max(np.linalg.norm(result, axis=1)))
+
+
 def _table(rng: np.random.Generator, place: Array) -> Array:
     """Return what iron in a table adds: microteslas on it, little above it."""
     below = np.array([*rng.uniform(-0.15, 0.15, size=2), -rng.uniform(0.15, 0.35)])
@@ -257,7 +294,12 @@ def _table(rng: np.random.Generator, place: Array) -> Array:
 
 
 def _inertial(
-    rng: np.random.Generator, time: Array, truth: Rotation, place: Array, share: float
+    rng: np.random.Generator,
+    time: Array,
+    truth: Rotation,
+    place: Array,
+    share: float,
+    imu: ImuModel,
 ) -> ImuSamples:
     rate = 1.0 / (time[1] - time[0])
     spin = (truth[:-1].inv() * truth[1:]).as_rotvec() * rate
@@ -266,13 +308,13 @@ def _inertial(
     force = truth.inv().apply(push + np.array([0.0, 0.0, GRAVITY]))
     gyro = gyro @ (np.eye(3) + 3e-3 * rng.normal(size=(3, 3))).T
     gyro += 2e-4 * share * force @ rng.normal(size=(3, 3))  # by the force
-    gyro += IMU.gyro_bias_sigma * share * rng.normal(size=3)
-    walk = IMU.gyro_bias_walk / np.sqrt(rate) * rng.normal(size=gyro.shape)
+    gyro += imu.gyro_bias_sigma * share * rng.normal(size=3)
+    walk = imu.gyro_bias_walk / np.sqrt(rate) * rng.normal(size=gyro.shape)
     gyro += np.cumsum(walk, axis=0)
-    gyro += share * IMU.gyro_noise * np.sqrt(rate / 2.0) * rng.normal(size=gyro.shape)
+    gyro += share * imu.gyro_noise * np.sqrt(rate / 2.0) * rng.normal(size=gyro.shape)
     force = force @ (np.eye(3) + 3e-3 * share * rng.normal(size=(3, 3))).T
-    force += IMU.accel_bias_sigma * share * rng.normal(size=3)
-    force += share * IMU.accel_noise * np.sqrt(rate / 2.0) * rng.normal(size=force.shape)
+    force += imu.accel_bias_sigma * share * rng.normal(size=3)
+    force += share * imu.accel_noise * np.sqrt(rate / 2.0) * rng.normal(size=force.shape)
     return ImuSamples(time, gyro, force)
 
 
@@ -283,14 +325,14 @@ def _field(
     world: Array,
     body: Array,
     share: float,
-    newest: float,
+    kind: Kind,
 ) -> Waveform:
     matrix = np.eye(3) + 0.02 * share * rng.normal(size=(3, 3))
     field = truth.inv().apply(world) @ matrix.T + body
-    late = rng.uniform(0.0, newest)
+    late = rng.uniform(0.0, kind.late)
     field = np.stack([np.interp(time - late, time, c) for c in field.T], axis=1)
     field += 4e-7 * rng.normal(size=field.shape)
     shown = np.arange(len(time))
-    again = np.flatnonzero(rng.random(len(time) - 1) < REPEATED) + 1
+    again = np.flatnonzero(rng.random(len(time) - 1) < kind.repeated) + 1
     shown[again] = again - 1
     return Waveform(time, field[shown])

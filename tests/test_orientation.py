@@ -7,14 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import earth_alone as scenario
+import earth_twins as twins
 import earth_worlds as worlds
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.estimation.orientation.filter import OrientationFilter, Row, updated
-from magfusion.estimation.orientation.layout import ACCEL_BIAS, NEAR, SIZE, SPEED
+from magfusion.estimation.orientation.filter import OrientationFilter
+from magfusion.estimation.orientation.layout import NEAR, SIZE, SPEED, TURN
 from magfusion.estimation.orientation.remarks import remarks
 from magfusion.estimation.orientation.smoother import oriented, pieces
 from magfusion.files.log import write_log
@@ -82,7 +83,32 @@ def test_the_prediction_of_a_stretch_has_its_derivative(attached):
     state, matrix = estimator.state, estimator.measured_from_body
     learnt = copy.deepcopy(estimator)  # the speed, with which the field becomes another
     update = estimator.take(cut[150])
-    for k in (0, 1, 2, 4, 6, 7, 9, 11, 12, 15, 20, 21, 23, 25, 30, 36, 39):
+    for k in (
+        0,
+        1,
+        2,
+        4,
+        6,
+        7,
+        9,
+        11,
+        12,
+        15,
+        20,
+        21,
+        23,
+        25,
+        30,
+        36,
+        39,
+        40,
+        44,
+        48,
+        49,
+        53,
+        57,
+        60,
+    ):
         ends = []
         for sign in (1.0, -1.0):
             step = np.zeros(SIZE)
@@ -92,7 +118,8 @@ def test_the_prediction_of_a_stretch_has_its_derivative(attached):
             ends.append(update.predicted.step_to(other.take(cut[150]).predicted, matrix))
         off = (ends[0] - ends[1]) / 2e-5 - update.transition[:, k]
         # What the turn does to the force on the way is worked out at the middle of the stretch.
-        assert np.max(np.abs(off[SPEED])) < 6e-3
+        by_unit = 10.0 if 40 <= k < 49 else 1.0  # rates by the force, m/s^2
+        assert np.max(np.abs(off[SPEED])) < 6e-3 * by_unit
         off[SPEED] = 0.0
         assert np.max(np.abs(off)) < 1e-4 + 1e-3 * np.max(np.abs(update.transition[:, k]))
 
@@ -174,7 +201,7 @@ def test_the_pipe_tells_an_orientation_for_each_sample_and_no_position(attached)
 
 
 def test_what_swings_with_an_arm_is_not_taken_for_a_bias():
-    """With all of the speed and the field for the biases, tilt errs by more than a degree here."""
+    """Without the arm in the state, tilt errs by .6 degrees here."""
     log, site = worlds.simulated("slow carrying", 0, duration=30.0, rate=50.0, share=0.05)
     result = oriented(log, site, back=False)
     heading, _, tilt = scenario.errors(result.time, result.world_from_body, log.truth)
@@ -198,19 +225,15 @@ def test_the_field_becomes_another_on_half_a_metre_of_way(kind):
     assert 0.25 < way < 1.0
 
 
-def test_a_share_of_a_measurement_moves_a_parameter_less_and_leaves_it_uncertain(smoothed):
-    state, by_state = smoothed.states[100], np.zeros((3, SIZE))
-    by_state[:, SPEED] = by_state[:, ACCEL_BIAS] = np.eye(3)
-    row = Row(by_state, np.full(3, 0.1), np.full(3, 0.01), np.ones(SIZE))
-    half = np.ones(SIZE)
-    half[ACCEL_BIAS] = 0.5
-    whole, part = (updated(state, [replace(row, share=s)], np.eye(3)) for s in (row.share, half))
-    np.testing.assert_allclose(part.velocity_world, whole.velocity_world)
-    moved = whole.accel_bias - state.accel_bias
-    np.testing.assert_allclose(part.accel_bias - state.accel_bias, 0.5 * moved)
-    before, after, between = (np.diag(s.cov)[ACCEL_BIAS] for s in (state, whole, part))
-    np.testing.assert_allclose(between, 0.25 * before + 0.75 * after)
-    assert np.min(np.linalg.eigvalsh(part.cov)) > -1e-12
+def test_speed_does_not_inform_on_the_heading(attached):
+    """Motion and a rest after it would otherwise reduce its sigma by linearisation alone."""
+    log, site = attached
+    estimator = OrientationFilter(site)
+    variance = []
+    for stretch in pieces(log, site):
+        none = replace(stretch, field_time=stretch.field_time[:0], field=stretch.field[:0])
+        variance.append(estimator.take(none).state.cov[TURN, TURN][2, 2])
+    assert np.min(variance) > 0.999 * variance[0]
 
 
 @pytest.mark.slow
@@ -225,3 +248,14 @@ def test_in_the_mean_it_is_better_than_vqf_and_claims_no_more_than_is_true():
         mean = [np.mean([np.hypot(r.heading_deg, r.tilt_deg) for r in o]) for o in (ours, others)]
         assert mean[0] < mean[1]
         assert np.mean([r.heading_nees for r in ours]) < 1.5
+
+
+@pytest.mark.slow
+def test_drawn_twins_are_not_worse_than_by_vqf():
+    pytest.importorskip("vqf")
+    rows = [row for seed in range(100, 105) for row in twins.compared(*twins.twin(seed))]
+    for way in ("online", "offline"):
+        own = [row for row in rows if row.way == way]
+        assert np.median([row.ratio for row in own]) < 1.05
+        assert np.median([row.heading_nees for row in own]) < 1.5
+        assert np.median([row.tilt_nees for row in own]) < 3.0

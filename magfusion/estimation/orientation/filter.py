@@ -1,7 +1,9 @@
 """Orientation filter: gravity, the Earth's field, rest, and disturbances of the field.
 
-Gravity is the mean specific force: the velocity of a moving platform is kept near zero, within its
-usual speed.  The field's deviation from the declared one is in the state, once in world axes, where
+Gravity is the mean specific force: the velocity of a moving platform is kept near that of an arm
+that swings it, within its usual speed.  The velocity's error turns with that of the attitude (the
+invariant error of Barrau and Bonnabel): only gravity relates them, and speed does not inform on the
+heading.  The field's deviation from the declared one is in the state, once in world axes, where
 it changes as the platform moves, and once with the platform.  If neither explains the measured
 field, something has changed: a magnet was attached, or iron is near.  Then both are estimated
 again, and the gyroscope propagates the heading until the motion distinguishes them.
@@ -15,8 +17,11 @@ from magfusion.errors import InputError
 from magfusion.estimation.graph.kalman import PartialUpdateFilter
 from magfusion.estimation.orientation.layout import (
     ACCEL_BIAS,
+    ACCEL_MATRIX,
+    ARM,
     FAR,
     GYRO_BIAS,
+    GYRO_FORCE,
     GYRO_MATRIX,
     LAG,
     MATRIX,
@@ -32,6 +37,7 @@ from magfusion.estimation.orientation.stretch import (
     OrientationStretch,
     StretchMotion,
     body_from_end,
+    corrected_rate,
     integrate_stretch,
 )
 from magfusion.model.field import observe_earth, skew
@@ -40,7 +46,9 @@ from magfusion.model.site import Site
 from magfusion.model.strapdown import triad
 from magfusion.units import Array
 
-GYRO_SCALE = 0.003  # usual error of a gyroscope's scale and axes
+GYRO_SCALE = ACCEL_SCALE = 0.003  # usual error of an instrument's scale and axes
+# A MEMS gyroscope's sensitivity to specific force, in data sheets 0.1 deg/s/g; (rad/s)/(m/s^2).
+GYRO_FORCE_SIGMA = np.deg2rad(0.1) / 9.80665
 AMBIENT = 0.02  # of the field's size: usual disturbance of each component, indoors
 SETTLING_TIME, MOVED = 10.0, 2.0  # s; its correlation time, at rest and in motion
 WAY = 0.5  # m; distance after which it is independent, however short the time
@@ -57,8 +65,8 @@ TILT, HEADING = 0.05, 0.3  # rad; of the first attitude
 FAR_STRENGTH = 0.04  # of the field's size: error of the declared one everywhere
 OFFSET_WALK = 0.01  # uT per square root of second
 # A carried platform rotates with the arm that carries it: its speed correlates with its attitude
-# periodically, as for a false bias.  In motion this is the share for the accelerometer's bias.
-SWUNG = 0.05  # of the speed: the accelerometer's bias
+# periodically, as for a false bias, unless the arm is estimated too.
+ARM_LENGTH = 0.5  # m; of a human arm, each component
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +77,7 @@ class Update:
     ----------
     predicted, state : Orientation
         Before and after the measurements of its end.
-    transition : ndarray, shape (40, 40)
+    transition : ndarray, shape (61, 61)
     attitude : ndarray, shape (n + 1, 3, 3)
         ``begin_from_then`` at its samples.
     disturbance : float
@@ -89,15 +97,11 @@ class Update:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """Measured minus predicted (3,), its derivative (3, 40), and its variance (3,).
-
-    ``share`` (40,) is the share of each parameter, one unless it is correlated with the motion.
-    """
+    """Measured minus predicted (3,), its derivative (3, 61), and its variance (3,)."""
 
     by_state: Array
     error: Array
     variance: Array
-    share: Array
 
 
 class OrientationFilter:
@@ -151,7 +155,7 @@ class OrientationFilter:
         before = self.state
         turn = integrate_stretch(stretch, before)
         predicted, transition = self._predicted(before, stretch, turn)
-        rows = [self._of_speed(predicted, stretch)]
+        rows = [self._of_speed(predicted, stretch, turn)]
         if stretch.rests and self._may_rest(predicted, turn):
             rows.append(self._of_rest(predicted, stretch))
         changed = False
@@ -177,6 +181,9 @@ class OrientationFilter:
             cov[GYRO_BIAS, GYRO_BIAS] = imu.gyro_bias_sigma**2 * np.eye(3)
             cov[ACCEL_BIAS, ACCEL_BIAS] = imu.accel_bias_sigma**2 * np.eye(3)
             cov[GYRO_MATRIX, GYRO_MATRIX] = GYRO_SCALE**2 * np.eye(9)
+            cov[GYRO_FORCE, GYRO_FORCE] = GYRO_FORCE_SIGMA**2 * np.eye(9)
+            cov[ACCEL_MATRIX, ACCEL_MATRIX] = ACCEL_SCALE**2 * np.eye(9)
+            cov[ARM, ARM] = ARM_LENGTH**2 * np.eye(3)
             cov[OFFSET, OFFSET] = np.diag((sensor.sigma.offset / MICROTESLA) ** 2)
             cov[NEAR, NEAR] = self._least * np.eye(3)
             cov[MATRIX, MATRIX] = np.diag(sensor.sigma.matrix.ravel() ** 2)
@@ -190,6 +197,9 @@ class OrientationFilter:
                 gyro_bias=zero,
                 accel_bias=zero,
                 gyro_matrix=np.zeros((3, 3)),
+                gyro_force=np.zeros((3, 3)),
+                accel_matrix=np.zeros((3, 3)),
+                arm=zero,
                 offset=sensor.offset / MICROTESLA,
                 near=zero,
                 matrix=sensor.matrix,
@@ -197,7 +207,7 @@ class OrientationFilter:
                 far=zero,
                 cov=cov,
             )
-        up = np.mean(stretch.accel_body, axis=0) - old.accel_bias
+        up = (np.eye(3) + old.accel_matrix) @ np.mean(stretch.accel_body, axis=0) - old.accel_bias
         heading = HEADING
         if len(stretch.field):
             measured = np.mean(stretch.field, axis=0) - old.offset
@@ -224,11 +234,15 @@ class OrientationFilter:
         transition = np.eye(SIZE)
         transition[TURN, GYRO_BIAS] = begin @ turn.by_bias
         transition[TURN, GYRO_MATRIX] = begin @ turn.by_matrix
-        by_turn = -skew(begin @ turn.push)
+        by_turn = -skew(np.array([0.0, 0.0, self.site.gravity * length]))
         transition[SPEED, TURN] = by_turn
-        for part in (GYRO_BIAS, GYRO_MATRIX):  # on average half of the rotation tilts the force
-            transition[SPEED, part] = 0.5 * by_turn @ transition[TURN, part]
+        velocity = state.velocity_world + gained
+        transition[TURN, GYRO_FORCE] = begin @ turn.by_gyro_force
+        middle = skew(state.velocity_world + 0.5 * gained)
+        for part in (GYRO_BIAS, GYRO_MATRIX, GYRO_FORCE):  # on average half of it tilts the force
+            transition[SPEED, part] = (0.5 * by_turn + middle) @ transition[TURN, part]
         transition[SPEED, ACCEL_BIAS] = -begin @ turn.by_force
+        transition[SPEED, ACCEL_MATRIX] = begin @ turn.by_accel_matrix
         transition[OFFSET, OFFSET] = begin @ whole @ begin.T
         transition[NEAR, NEAR] = kept * np.eye(3)
         noise = np.zeros(SIZE)
@@ -248,24 +262,26 @@ class OrientationFilter:
             state,
             time=float(stretch.time[-1]),
             world_from_body=begin @ whole,
-            velocity_world=state.velocity_world + gained,
+            velocity_world=velocity,
             near=kept * state.near,
             cov=transition @ state.cov @ transition.T + np.diag(noise),
         )
         return predicted, transition
 
-    def _of_speed(self, state: Orientation, stretch: OrientationStretch) -> Row:
+    def _of_speed(
+        self, state: Orientation, stretch: OrientationStretch, turn: StretchMotion
+    ) -> Row:
         by_state = np.zeros((3, SIZE))
         by_state[:, SPEED] = np.eye(3)
         if stretch.rests:
             variance = self.site.platform.motion.rest_speed_sigma**2
-        else:
-            length = max(float(np.sum(stretch.steps)), 1e-3)
-            variance = max(self._speed, LEAST_SPEED**2) * max(1.0, SPEED_TIME / length)
-        share = np.ones(SIZE)
-        if not stretch.rests:
-            share[ACCEL_BIAS] = SWUNG
-        return Row(by_state, -state.velocity_world, np.full(3, variance), share)
+            return Row(by_state, -state.velocity_world, np.full(3, variance))
+        length = max(float(np.sum(stretch.steps)), 1e-3)
+        variance = max(self._speed, LEAST_SPEED**2) * max(1.0, SPEED_TIME / length)
+        by_arm = state.world_from_body @ skew(turn.rate[-1])
+        by_state[:, ARM] = -by_arm
+        error = by_arm @ state.arm - state.velocity_world
+        return Row(by_state, error, np.full(3, variance))
 
     def _may_rest(self, state: Orientation, turn: StretchMotion) -> bool:
         """Return whether the rate may be a bias, and no slow and even turn: larger ones are not."""
@@ -277,9 +293,11 @@ class OrientationFilter:
         by_state = np.zeros((3, SIZE))
         by_state[:, GYRO_BIAS] = -np.eye(3)
         by_state[:, GYRO_MATRIX] = np.kron(np.eye(3), rate)
-        still = rate @ (np.eye(3) + state.gyro_matrix).T - state.gyro_bias
+        force = np.mean(stretch.accel_body, axis=0)
+        by_state[:, GYRO_FORCE] = -np.kron(np.eye(3), force)
+        still = corrected_rate(state, rate, force)
         length = max(float(np.sum(stretch.steps)), 1e-3)
-        return Row(by_state, -still, np.full(3, REST_RATE**2 / length), np.ones(SIZE))
+        return Row(by_state, -still, np.full(3, REST_RATE**2 / length))
 
     def _of_field(
         self, state: Orientation, stretch: OrientationStretch, turn: StretchMotion
@@ -306,7 +324,7 @@ class OrientationFilter:
             measured_from_seen, error + seen.earth_world @ state.near
         )
         self._learn_deviation(off_world, variance, stretch)
-        row = Row(by_state, error, np.full(3, variance), np.ones(SIZE))
+        row = Row(by_state, error, np.full(3, variance))
         if separate <= GATE:
             return row, False, state
         change = max(float(error @ error), LEAST_CHANGE**2)
@@ -350,14 +368,13 @@ class OrientationFilter:
 
 
 def updated(state: Orientation, rows: list[Row], measured_from_body: Array) -> Orientation:
-    """Return the state after an update, of which each parameter takes its share.
+    """Return the state after an update.
 
     filterpy's update costs 0.14 ms more per segment than the bare formula (0.9 instead of 0.76 ms).
     """
     kalman = PartialUpdateFilter(SIZE)
     kalman.P = state.cov
     for row in rows:
-        kalman.share = row.share
         kalman.update_linear(row.error, row.by_state, np.diag(row.variance))
     moved = state.moved(kalman.x, measured_from_body)
     return replace(moved, cov=0.5 * (kalman.P + kalman.P.T))

@@ -1,9 +1,9 @@
 """State of an orientation without beacons, and the tangent of its covariance.
 
-Errors of attitude and offset are in world axes, that of the offset rotated with the attitude (the
-two-frame group of Barrau and Bonnabel).  The unobservable direction, the heading at rest with an
-unknown offset, is then independent of the estimate, and the filter gains no false information on
-it.  Fields are in microtesla, so that the covariance stays well conditioned.
+Errors of attitude, velocity and offset are in world axes, the last two rotated with the attitude
+(the two-frame group of Barrau and Bonnabel).  The unobservable direction, the heading at rest with
+an unknown offset, is then independent of the estimate, and the filter gains no false information
+on it.  Fields are in microtesla, so that the covariance stays well conditioned.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +19,8 @@ TURN, SPEED = slice(0, 3), slice(3, 6)
 GYRO_BIAS, ACCEL_BIAS, GYRO_MATRIX = slice(6, 9), slice(9, 12), slice(12, 21)
 OFFSET, NEAR, MATRIX = slice(21, 24), slice(24, 27), slice(27, 36)
 LAG, FAR = slice(36, 37), slice(37, 40)
-SIZE = 40
+GYRO_FORCE, ACCEL_MATRIX, ARM = slice(40, 49), slice(49, 58), slice(58, 61)
+SIZE = 61
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +37,11 @@ class Orientation:
     gyro_bias, accel_bias : ndarray, shape (3,)
         Body axes (rad/s, m/s^2).
     gyro_matrix : ndarray, shape (3, 3)
-        True rate = (1 + matrix) measured rate - bias.
+        True rate = (1 + matrix) measured rate - bias - force matrix times measured force.
+    gyro_force, accel_matrix : ndarray, shape (3, 3)
+        True force = (1 + matrix) measured force - bias.
+    arm : ndarray, shape (3,)
+        From the point that the platform swings about to its sensor, body axes (m).
     offset : ndarray, shape (3,)
         Of the magnetometer, measured axes (uT).
     matrix : ndarray, shape (3, 3)
@@ -46,7 +51,7 @@ class Orientation:
         everywhere.
     lag : float
         Delay of the field samples relative to the inertial samples (s).
-    cov : ndarray, shape (40, 40)
+    cov : ndarray, shape (61, 61)
     """
 
     time: float
@@ -55,6 +60,9 @@ class Orientation:
     gyro_bias: Array
     accel_bias: Array
     gyro_matrix: Array
+    gyro_force: Array
+    accel_matrix: Array
+    arm: Array
     offset: Array
     near: Array
     matrix: Array
@@ -64,14 +72,18 @@ class Orientation:
 
     def moved(self, step: Array, measured_from_body: Array) -> "Orientation":
         """Return the state moved by a tangent vector; the covariance is constant."""
-        attitude = Rotation.from_rotvec(step[TURN]).as_matrix() @ self.world_from_body
+        turn = Rotation.from_rotvec(step[TURN]).as_matrix()
+        attitude = turn @ self.world_from_body
         return replace(
             self,
             world_from_body=attitude,
-            velocity_world=self.velocity_world + step[SPEED],
+            velocity_world=turn @ self.velocity_world + step[SPEED],
             gyro_bias=self.gyro_bias + step[GYRO_BIAS],
             accel_bias=self.accel_bias + step[ACCEL_BIAS],
             gyro_matrix=self.gyro_matrix + step[GYRO_MATRIX].reshape(3, 3),
+            gyro_force=self.gyro_force + step[GYRO_FORCE].reshape(3, 3),
+            accel_matrix=self.accel_matrix + step[ACCEL_MATRIX].reshape(3, 3),
+            arm=self.arm + step[ARM],
             offset=self.offset + measured_from_body @ attitude.T @ step[OFFSET],
             near=self.near + step[NEAR],
             matrix=self.matrix + step[MATRIX].reshape(3, 3),
@@ -86,7 +98,7 @@ class Orientation:
         return np.concatenate(
             [
                 Rotation.from_matrix(turn).as_rotvec(),
-                other.velocity_world - self.velocity_world,
+                other.velocity_world - turn @ self.velocity_world,
                 other.gyro_bias - self.gyro_bias,
                 other.accel_bias - self.accel_bias,
                 (other.gyro_matrix - self.gyro_matrix).ravel(),
@@ -95,5 +107,8 @@ class Orientation:
                 (other.matrix - self.matrix).ravel(),
                 [other.lag - self.lag],
                 other.far - self.far,
+                (other.gyro_force - self.gyro_force).ravel(),
+                (other.accel_matrix - self.accel_matrix).ravel(),
+                other.arm - self.arm,
             ]
         )

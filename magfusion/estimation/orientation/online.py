@@ -12,12 +12,18 @@ from magfusion.estimation.orientation.filter import OrientationFilter
 from magfusion.estimation.orientation.layout import (
     ACCEL_BIAS,
     GYRO_BIAS,
-    SPEED,
     TURN,
     Orientation,
 )
 from magfusion.estimation.orientation.remarks import current_findings, doubts, position_open
-from magfusion.estimation.orientation.stretch import GAP, STEP, OrientationStretch, stretches
+from magfusion.estimation.orientation.stretch import (
+    GAP,
+    STEP,
+    OrientationStretch,
+    corrected_rate,
+    stretches,
+)
+from magfusion.model.field import skew
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import MotionModel, Site
 from magfusion.units import Array
@@ -137,7 +143,7 @@ class OrientationNavigator:
         state = self.filter.state
         assert state is not None
         assert self._propagated is not None
-        rate = (np.eye(3) + state.gyro_matrix) @ row[1:4] - state.gyro_bias
+        rate = corrected_rate(state, row[1:4], row[4:7])
         step = rate * min(float(row[0]) - self._propagated_to, GAP)
         self._propagated = self._propagated @ Rotation.from_rotvec(step).as_matrix()
         self._propagated_to = float(row[0])
@@ -174,7 +180,8 @@ def motion_cov(state: Orientation, attitude: Array, ahead: float, gyro_noise: fl
     turn = state.cov[TURN, TURN] + gyro_noise**2 * max(ahead, 0.0) * np.eye(3)
     cov[ROTATION, ROTATION] = attitude.T @ turn @ attitude
     cov[POSITION, POSITION] = ANYWHERE**2 * np.eye(3)
-    cov[VELOCITY, VELOCITY] = state.cov[SPEED, SPEED]
+    by_motion = np.hstack([-skew(state.velocity_world), np.eye(3)])  # the speed turns with it
+    cov[VELOCITY, VELOCITY] = by_motion @ state.cov[:6, :6] @ by_motion.T
     cov[OWN_ACCEL_BIAS, OWN_ACCEL_BIAS] = state.cov[ACCEL_BIAS, ACCEL_BIAS]
     cov[OWN_GYRO_BIAS, OWN_GYRO_BIAS] = state.cov[GYRO_BIAS, GYRO_BIAS]
     return cov

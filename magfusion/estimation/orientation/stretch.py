@@ -61,12 +61,12 @@ class StretchMotion:
     ----------
     attitude : ndarray, shape (n + 1, 3, 3)
         ``begin_from_then``: at the beginning, and at every sample.
-    by_bias, by_matrix : ndarray, shape (3, 3), (3, 9)
+    by_bias, by_matrix, by_gyro_force : ndarray, shape (3, 3), (3, 9), (3, 9)
         Derivatives of the whole rotation, axes of the beginning.
     push : ndarray, shape (3,)
         Integral of the specific force, axes of the beginning (m/s).
-    by_force : ndarray, shape (3, 3)
-        Its derivative by the specific force.
+    by_force, by_accel_matrix : ndarray, shape (3, 3), (3, 9)
+        Its derivatives by the specific force.
     rate : ndarray, shape (n, 3)
         Corrected (rad/s).
     """
@@ -74,15 +74,18 @@ class StretchMotion:
     attitude: Array
     by_bias: Array
     by_matrix: Array
+    by_gyro_force: Array
     push: Array
     by_force: Array
+    by_accel_matrix: Array
     rate: Array
 
 
 def integrate_stretch(stretch: OrientationStretch, state: Orientation) -> StretchMotion:
     """Integrate a segment."""
     dt = stretch.steps
-    rate = stretch.gyro_body @ (np.eye(3) + state.gyro_matrix).T - state.gyro_bias
+    rate = corrected_rate(state, stretch.gyro_body, stretch.accel_body)
+    force = stretch.accel_body @ (np.eye(3) + state.accel_matrix).T - state.accel_bias
     steps = Rotation.from_rotvec(rate * dt[:, None]).as_matrix()
     attitude = np.empty((len(dt) + 1, 3, 3))
     attitude[0] = np.eye(3)
@@ -90,14 +93,23 @@ def integrate_stretch(stretch: OrientationStretch, state: Orientation) -> Stretc
         attitude[i + 1] = attitude[i] @ step
     middle = 0.5 * (attitude[1:] + attitude[:-1])
     weighted = middle * dt[:, None, None]
+    by_accel = np.einsum("nij,nk->ijk", weighted, stretch.accel_body).reshape(3, 9)
     return StretchMotion(
         attitude=attitude,
         by_bias=-np.sum(weighted, axis=0),
         by_matrix=np.einsum("nij,nk->ijk", weighted, stretch.gyro_body).reshape(3, 9),
-        push=np.einsum("nij,nj->i", weighted, stretch.accel_body - state.accel_bias),
+        by_gyro_force=-by_accel,
+        push=np.einsum("nij,nj->i", weighted, force),
         by_force=np.sum(weighted, axis=0),
+        by_accel_matrix=by_accel,
         rate=rate,
     )
+
+
+def corrected_rate(state: Orientation, gyro_body: Array, accel_body: Array) -> Array:
+    """Return the true rates (rad/s) of measured ones, shape (..., 3)."""
+    scaled = gyro_body @ (np.eye(3) + state.gyro_matrix).T
+    return np.asarray(scaled - accel_body @ state.gyro_force.T - state.gyro_bias)
 
 
 def body_from_end(
