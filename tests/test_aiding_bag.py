@@ -185,12 +185,17 @@ def test_fixes_of_gnss_are_positions_in_the_tangent_plane(tmp_path):
     """The plane leaves the ellipsoid by 0.8 mm in 100 m; where there is no fix there is none."""
     bag = write_bag(tmp_path / "bag", SENSORS | {"/gnss": (FIX, lambda k: _fix(k, k % 2 - 1))})
     sensor = AidingSensor("gnss", "position", 1.0, origin=ORIGIN)
-    samples = read_bag(bag, aiding=(sensor,)).aiding["gnss"]
+    log = read_bag(bag, aiding=(sensor,))
+    assert f"gnss: {N // 2} of {N} messages have no value (no fix)." in log.noticed[0].text
+    samples = log.aiding["gnss"]
     assert np.allclose(samples.value[:, 0], 0.0, rtol=0.0, atol=1e-9)
     assert np.allclose(samples.value[:, 1], 100.0, rtol=0.0, atol=2e-3)
     assert np.allclose(samples.value[:, 2], np.arange(1, N, 2) - 0.8e-3, rtol=0.0, atol=1e-4)
     with pytest.raises(InputError, match="add the origin of the world"):
         read_bag(bag, aiding=(replace(sensor, origin=None),))
+    bag = write_bag(tmp_path / "without", SENSORS | {"/gnss": (FIX, lambda k: _fix(k, -1))})
+    with pytest.raises(InputError, match=r"none of its .* messages has a value .*leave gnss out"):
+        read_bag(bag, aiding=(sensor,))
 
 
 def test_poses_without_a_twist_give_velocities():

@@ -181,8 +181,10 @@ def test_aiding_sensors_are_subscribed_to_by_their_names(domain: int) -> None:
         AidingSensor("wheels/odom", "velocity", 0.02),
         AidingSensor("visual", "velocity", 0.02),
         AidingSensor("uwb", "range", 0.1, point_world=np.zeros(3)),
+        AidingSensor("gnss", "position", 1.0, origin=(60.5, 25.25, 30.0)),
     )
-    received = records_dds.subscribe(None, site, io.StringIO())
+    said = io.StringIO()
+    received = records_dds.subscribe(None, site, said)
     participant = DomainParticipant(domain)
     sent: dict[str, Any] = {
         "/wheels/odom": ros.OdometryMessage(
@@ -191,9 +193,10 @@ def test_aiding_sensors_are_subscribed_to_by_their_names(domain: int) -> None:
         "/visual": ros.TwistWithCovarianceStampedMessage(HEADER, TWIST),
         "/uwb": ros.RangeMessage(HEADER, 0, 0.5, 0.25, 50.0, 4.125),
     }
+    no_fix = ros.NavSatFixMessage(HEADER, ros.NavSatStatus(-1, 1), 0.0, 0.0, 0.0, UNKNOWN, 0)
     writers = [
         (DataWriter(participant, Topic(participant, f"rt{name}", type(one))), one)
-        for name, one in sent.items()
+        for name, one in (sent | {"/gnss": no_fix}).items()
     ]
     values: dict[str, Any] = {}
     begin = time.monotonic()
@@ -208,6 +211,7 @@ def test_aiding_sensors_are_subscribed_to_by_their_names(domain: int) -> None:
         "visual": [0.5, 0.25, -0.125],
         "uwb": [4.125],
     }
+    assert "/gnss: messages without a value (no fix) are left out, so far 1\n" in said.getvalue()
 
 
 def test_every_subscription_is_a_part_of_a_record_and_a_role() -> None:

@@ -101,10 +101,17 @@ def aiding_rows(sensor: AidingSensor) -> dict[str, Row]:
 
 
 class SensorMessages:
-    """Converts the messages of one sensor, in the order of their stamps, to samples."""
+    """Converts the messages of one sensor, in the order of their stamps, to samples.
+
+    Attributes
+    ----------
+    without_value : int
+        Messages left out so far.
+    """
 
     def __init__(self, sensor: AidingSensor) -> None:
         self._sensor, self._last = sensor, np.zeros((0, 1 + POSE_COLUMNS))
+        self.without_value = 0
 
     def samples(self, time: Array, rows: Array) -> tuple[Array, Array]:
         """Return times (s) and values of messages; those without a value are left out.
@@ -118,6 +125,7 @@ class SensorMessages:
             As of `aiding_rows`.
         """
         there = ~np.isnan(rows).any(axis=1)
+        self.without_value += int(np.sum(~there))
         time, rows = time[there], rows[there]
         if self._sensor.quantity != "velocity" or rows.shape[1] < POSE_COLUMNS:
             return time, rows

@@ -153,11 +153,24 @@ def _read(
         if not parts[role]:
             raise InputError(f"{one.place}: holds no messages; record it, or leave it out.")
         stamps, values = (np.concatenate(column) for column in zip(*parts.pop(role), strict=True))
-        if role not in ROWS:  # a receiver of GNSS has no fix for long
-            there = ~np.isnan(values).all(axis=1)
-            stamps, values = stamps[there], values[there]
-        result[role] = _own_times(_sorted(_NAMES.get(role, role), one.place, stamps, values))
+        stream = _Stream(_NAMES.get(role, role), one.place, stamps, values)
+        # A receiver of GNSS has no fix for long: what is absent there is no mistake of recording.
+        result[role] = _own_times(_sorted(stream if role in ROWS else _with_values(stream)))
     return result
+
+
+def _with_values(stream: _Stream) -> _Stream:
+    """Leave out the messages of an aiding sensor that have no value, and count them."""
+    absent = np.asarray(np.isnan(stream.values).all(axis=1))
+    if absent.all():
+        raise InputError(
+            f"{stream.place}: none of its {len(absent)} messages has a value (no fix?); leave"
+            f" {stream.name} out of the site's aiding."
+        )
+    text = f"{stream.name}: {np.sum(absent)} of {len(absent)} messages have no value (no fix)."
+    left_out = Finding("missing_samples", f"{text} They are left out.", Verdict.TRUSTWORTHY)
+    there = stream.time_ns[~absent], stream.values[~absent]
+    return _Stream(stream.name, stream.place, *there, (left_out,) if absent.any() else ())
 
 
 def _of_sensor(reader: AnyReader, path: Path, sensor: AidingSensor) -> Wanted | None:
@@ -223,7 +236,8 @@ def _refuse_several_types(connections: list[Connection], path: Path) -> None:
         raise InputError(f"{path}: topic {topic} has several types; record it with one.")
 
 
-def _sorted(name: str, place: str, stamps: IntArray, values: Array) -> _Stream:
+def _sorted(stream: _Stream) -> _Stream:
+    stamps, values = stream.time_ns, stream.values
     if np.any(np.diff(stamps) < 0):
         # A bag keeps the order of arrival, which the network may have changed.
         order = np.argsort(stamps, kind="stable")
@@ -232,16 +246,16 @@ def _sorted(name: str, place: str, stamps: IntArray, values: Array) -> _Stream:
     if bad.any():
         stamp = stamps[np.argmax(bad)]
         raise InputError(
-            f"{place}: the message stamped {stamp} ns holds a number that is not finite; remove the"
-            " message."
+            f"{stream.place}: the message stamped {stamp} ns holds a number that is not finite;"
+            " remove the message."
         )
-    return _Stream(name, place, stamps, values)
+    return replace(stream, time_ns=stamps, values=values)
 
 
 def _own_times(stream: _Stream) -> _Stream:
     """Return a stream with the times of its samples, where the stamps are others."""
     stray = stray_rows(stream.time_ns)
-    noticed = stray_finding(stream.name, stream.time_ns[stray])
+    noticed = stream.noticed + stray_finding(stream.name, stream.time_ns[stray])
     kept = stream.time_ns[~stray], stream.values[~stray]
     stream = _Stream(stream.name, stream.place, *kept, noticed)
     separate = separate_stamps(stream.time_ns, stream.values)

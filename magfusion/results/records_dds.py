@@ -86,22 +86,37 @@ AIDING_MESSAGES = {  # class by type
 }
 
 
-def _of_aiding(sensor: AidingSensor) -> Iterator[Subscription]:
+def _of_aiding(sensor: AidingSensor, messages: TextIO) -> Iterator[Subscription]:
     """Yield the subscriptions of a sensor: to the topic of its name, of every type it may have."""
     for kind, row in aiding_rows(sensor).items():
         if kind in AIDING_MESSAGES:
-            content = partial(_aiding_content, row, SensorMessages(sensor))
             topic = f"/{sensor.name.strip('/')}"
+            content = partial(_aiding_content, row, SensorMessages(sensor), topic, messages)
             yield Subscription(topic, AIDING_MESSAGES[kind], kind, content, sensor.name)
 
 
 def _aiding_content(
-    row: Row, of_sensor: SensorMessages, stamps: list[float], messages: Sequence[Any]
+    row: Row,
+    of_sensor: SensorMessages,
+    topic: str,
+    report_to: TextIO,
+    stamps: list[float],
+    messages: Sequence[Any],
 ) -> dict[str, list[Any]]:
-    """Return samples; none where the messages have no value, or no stamp."""
+    """Return samples; none where the messages have no stamp, or no value.
+
+    The latter are counted, and reported at the first, the tenth, the hundredth, ...
+    """
     if 0.0 in stamps:
         return {"time": stamps}
+    count = of_sensor.without_value
     time, value = of_sensor.samples(np.array(stamps), np.array([row(one) for one in messages]))
+    if any(count < 10**k <= of_sensor.without_value for k in range(9)):
+        report_to.write(
+            f"magfusion: {topic}: messages without a value (no fix) are left out, so far"
+            f" {of_sensor.without_value}\n"
+        )
+        report_to.flush()
     value = value[:, 0] if value.shape[1:] == (1,) else value
     return {"time": time.tolist(), "value": value.tolist()}
 
@@ -137,7 +152,7 @@ def subscribe(topics: Topics | None, site: Site, messages: TextIO) -> Iterator[N
     for part, one in wanted.items():
         dds_name(f"--topics {part}", one.topic)
     for sensor in site.aiding:
-        wanted |= {f"{sensor.name} {one.kind}": one for one in _of_aiding(sensor)}
+        wanted |= {f"{sensor.name} {one.kind}": one for one in _of_aiding(sensor, messages)}
     participant = join_domain("ros2:")
     return _received(participant, _readers(participant, wanted), wanted, messages)
 
