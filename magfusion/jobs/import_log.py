@@ -23,21 +23,19 @@ from magfusion.files.foreign.phasor_rows import is_signed, write_phasors
 from magfusion.files.foreign.plan import Findings
 from magfusion.files.log import HEADER
 from magfusion.files.site import load_site
-from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.files.yaml_files import write_yaml
 from magfusion.jobs.check import CheckSettings, run_check
+from magfusion.jobs.import_figures import FIELD_STREAMS, first_stamp_of, import_figures
 from magfusion.jobs.settings import Command, Settings, option
 from magfusion.model.progress import Report, quiet
-from magfusion.results.figures import Figure, Figures, Section, heading
+from magfusion.results.figures import Figures, Section, heading
 from magfusion.units import NANOSECOND
 
 if TYPE_CHECKING:
     from magfusion.files.foreign.gather import GatheredStreams
-    from magfusion.files.foreign.plan import Findings, ImportPlan
+    from magfusion.files.foreign.plan import ImportPlan
 
 FIRST = "first"
-_FIELDS = ("magnetometer", FIELDS)
-LATE = 1e8  # s; stamps that count from 1970, or from another day
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,12 +204,12 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         note = "" if declared.problems else _with_imu(directory, counts)
         _refuse_apart(counts, declared)
         _refuse(declared)
-        epoch_ns = _first(counts) if epoch == FIRST else int(epoch)
+        epoch_ns = first_stamp_of(counts) if epoch == FIRST else int(epoch)
         _write_header(directory, output, result, epoch_ns, audio)
         report("checking", 0, 1)
         figures = _checked(directory, output, result, settings.site)
         figures = heading("import", output.resolve().name) | figures
-        figures |= _figures(result, counts, epoch_ns, epoch == FIRST, note)
+        figures |= import_figures(result, counts, epoch_ns, epoch == FIRST, note)
         write_report(directory, figures)
     return figures
 
@@ -246,17 +244,13 @@ def _refuse(declared: Findings) -> None:
     lines = [f"nothing was imported, for {count}:", *(f"  {one}" for one in problems)]
     if declared.guessed:
         lines += ["recognised by name and unit, and used as is:"]
-        lines += [f"  --map {_quoted(one)}" for one in dict.fromkeys(declared.guessed)]
+        lines += [f"  --map {shlex.quote(one)}" for one in dict.fromkeys(declared.guessed)]
     if declared.proposals:
         proposals = list(dict.fromkeys(declared.proposals))
         lines += ["proposed by name and size; check it, and add it to the command:"]
-        lines += [f"  --map {_quoted(one)} \\" for one in proposals[:-1]]
-        lines += [f"  --map {_quoted(proposals[-1])}"]
+        lines += [f"  --map {shlex.quote(one)} \\" for one in proposals[:-1]]
+        lines += [f"  --map {shlex.quote(proposals[-1])}"]
     raise InputErrors(*lines)
-
-
-def _quoted(text: str) -> str:
-    return shlex.quote(text)
 
 
 def _epoch(text: str | None, result: GatheredStreams) -> str | int:
@@ -283,7 +277,7 @@ def _epoch(text: str | None, result: GatheredStreams) -> str | int:
 
 def _refuse_apart(counts: dict[str, Counts], declared: Findings) -> None:
     """Reject streams whose times do not overlap: they are of different clocks."""
-    if "imu" not in counts or not set(_FIELDS) & set(counts):
+    if "imu" not in counts or not set(FIELD_STREAMS) & set(counts):
         return
     for name in set(counts) - {"imu", "gyro", "accel"}:
         one, other = counts["imu"], counts[name]
@@ -297,11 +291,6 @@ def _refuse_apart(counts: dict[str, Counts], declared: Findings) -> None:
                 " one clock, by the unit of a time, --offset TABLE=SECONDS or --rate-hz"
                 " TABLE=HZ@SECONDS."
             )
-
-
-def _first(counts: dict[str, Counts]) -> int:
-    """Return the first inertial stamp (ns), or that of another stream where there is none."""
-    return next(counts[name] for name in ("imu", *_FIELDS, *HALVES) if name in counts).first
 
 
 def _with_imu(directory: Path, counts: dict[str, Counts]) -> str:
@@ -367,58 +356,6 @@ def _checked(directory: Path, output: Path, result: GatheredStreams, site: Path 
 
 def _place(plan: ImportPlan) -> str:
     return f"{plan.source.place} as {plan.stream} by {', '.join(plan.options())}"
-
-
-def _figures(
-    result: GatheredStreams, counts: dict[str, Counts], epoch_ns: int, is_first: bool, note: str
-) -> Figures:
-    """Return the numbers of read and omitted rows, and the interpreted columns."""
-    figures = Figures(
-        Figure("epoch_ns", epoch_ns, "ns", label="epoch" + (", first sample" * is_first))
-    )
-    for stream, one in counts.items():
-        figures |= Figures(
-            Figure(f"{stream}_rows_read", one.read, label=f"{stream}, rows read"),
-            Figure(f"{stream}_rows_written", one.written, section=Section.REPORT),
-            *_where_some(stream, "missing", one.missing, "missing samples, kept as NaN"),
-            *_where_some(stream, "unsorted", one.unsorted, "put in order of time"),
-            *(
-                Figure(
-                    f"{stream}_dropped_{reason.replace(' ', '_')}",
-                    count,
-                    label=f"{stream}, rows omitted {reason}",
-                )
-                for reason, count in one.left_out.items()
-            ),
-        )
-    forms = {plan.source.place: plan.source.form for plan in result.every if plan.source.form}
-    lines = [line for plan in result.every for line in plan.options()]
-    shown = [f"{place}: {form}" for place, form in forms.items()]
-    shown += ["interpreted as:", *(f"  --map {_quoted(line)}" for line in lines)]
-    figures |= Figures(
-        Figure("map", lines, section=Section.REPORT),
-        Figure("understood", shown, section=Section.REMARKS),
-    )
-    notes = [*result.findings.notes, *(f"Skipped: {reason}" for reason in result.passed_over)]
-    notes += [note] if note else []
-    notes += [f"{stream}: {one.batches}" for stream, one in counts.items() if one.batches]
-    notes += [
-        f"{stream}: quaternions up to {100.0 * one.scaled:.2g} % off were scaled to unit length."
-        for stream, one in counts.items()
-        if one.scaled > QUATERNION_TOLERANCE
-    ]
-    begin = (_first(counts) - epoch_ns) * 1e-9
-    if not is_first and abs(begin) > LATE:
-        notes.append(
-            f"The log begins {begin:.9g} s after its epoch, to which the drive phases refer; if"
-            " they refer to its first sample, import it with --epoch first."
-        )
-    return figures | Figures(*[Figure("notes", notes, section=Section.NOTES)] * bool(notes))
-
-
-def _where_some(stream: str, key: str, count: int, words: str) -> list[Figure]:
-    section = Section.SUMMARY if count else Section.REPORT
-    return [Figure(f"{stream}_{key}", count, section=section, label=f"{stream}, {words}")]
 
 
 COMMAND = Command(
