@@ -88,9 +88,13 @@ class SoundSource:
         """
         try:
             import sounddevice
-        except (ImportError, OSError) as error:  # the latter without the library of PortAudio
+        except ImportError as error:
             raise InputError(
                 "--device: sounddevice is not installed; pip install 'magfusion[audio]'"
+            ) from error
+        except OSError as error:
+            raise InputError(
+                f"--device: {error}; install PortAudio (Debian: apt install libportaudio2)"
             ) from error
         own = {"device": self._device, "channels": self._count, "samplerate": self._rate_hz}
 

@@ -52,7 +52,7 @@ class BandFilter:
 
     @staticmethod
     def of_site(site: Site, rate_hz: float) -> "BandFilter | None":
-        """Return the filter with the least_hz samples.
+        """Return the filter with the fewest samples.
 
         None if bands overlap, no samples are saved, or the receiver needs its steady field.
         """

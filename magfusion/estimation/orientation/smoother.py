@@ -142,9 +142,8 @@ def _one_back(
 ) -> Orientation:
     """Return a state smoothed by later measurements (Rauch, Tung and Striebel)."""
     cross = later.transition @ state.cov
-    is_estimated = (
-        np.diag(later.predicted.cov) > 0.0
-    )  # of the others a site says that they are known
+    # A state that the site declares known has no variance to invert.
+    is_estimated = np.diag(later.predicted.cov) > 0.0
     gain = np.zeros((SIZE, SIZE))
     gain[:, is_estimated] = np.linalg.solve(
         later.predicted.cov[np.ix_(is_estimated, is_estimated)], cross[is_estimated]
