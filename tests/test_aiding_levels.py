@@ -5,8 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from aiding_site import aided_site
-from test_aiding import ROOM, WHEELS
+from test_aiding import ROOM, WHEELS, _simulated
 
+import magfusion as mf
+from magfusion.estimation.batch.settings import SmootherSettings
+from magfusion.estimation.integrity.smoothed_separation import separate_sensors
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.jobs.replay import Replay, feed
 from magfusion.model.site import Site
@@ -68,3 +71,24 @@ def test_a_gap_that_only_wheels_bridge_has_no_level() -> None:
     assert np.mean(np.isfinite(level[after])) > 0.9
     known = np.isfinite(level)  # by the IMU at first
     assert np.all(error[known] < level[known])
+
+
+@pytest.mark.slow
+def test_a_smoothed_log_is_separated_from_that_without_the_wheels() -> None:
+    site, log = aided_site(WHEELS), _simulated(WHEELS, duration=8.0).log
+    settings = SmootherSettings(loss=None, tune=False)
+    result = mf.smooth(log, site, settings)
+    without = mf.smooth(replace(log, aiding={}), site, settings)
+    estimate = separate_sensors(result)
+    assert estimate is not None
+    assert without.states.pose_cov is not None
+    shared = np.isin(result.states.time, without.states.time)
+    cov = without.states.pose_cov[np.isin(without.states.time, result.states.time)]
+    sigma = np.sqrt(np.einsum("nii->ni", cov))
+    own = np.sqrt(np.einsum("nii->ni", estimate.subset_cov[shared, 0]))
+    np.testing.assert_allclose(own, sigma, rtol=0.05)
+    moved = without.states.position_world[np.isin(without.states.time, result.states.time)]
+    moved = moved - result.states.position_world[shared]
+    body = np.einsum("nji,nj->ni", result.states.world_from_body[shared], moved)
+    step = estimate.step[shared, 0, 3:]
+    assert np.max(np.abs(body - step) / sigma[:, 3:]) < 0.2

@@ -26,7 +26,12 @@ from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors, leaves_out
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.estimation.online_integrity.levels import Levels, LevelsQuery
-from magfusion.estimation.posterior.separation import MIN_COUNT, Separation, radii
+from magfusion.estimation.posterior.separation import (
+    MIN_COUNT,
+    OPEN_POSITION,
+    Separation,
+    radii,
+)
 from magfusion.model.parameters import Block, dimension
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk, Verdict
@@ -37,7 +42,7 @@ SLACK = 3.0  # sigma; smaller deviations are covered
 # Initial uncertainty of a filter without a beacon, as the first state was estimated with all.
 WIDE = np.repeat([0.2, 0.3, 0.5], 3)  # rad, m, m/s
 NO_OWNER, TOGETHER = -1, -2  # groups of rows that belong to no source, or to all beacons
-OPEN_ROTATION, OPEN_POSITION = 0.3, 10.0  # rad, m; beyond, nothing else determines the pose
+OPEN_ROTATION = 0.3  # rad; beyond, nothing else determines the attitude
 OPEN = np.repeat([OPEN_ROTATION, OPEN_POSITION, OPEN_POSITION], 3)  # of a filter without a sensor
 
 
