@@ -230,12 +230,12 @@ def _navigated(
 
 
 def _smoothed(log: Log, site: Site, _: Config) -> tuple[Array, Array, Array, Array, Array, str]:
-    result = mf.smooth(log, site)
+    result, trust = mf.judge_result(mf.smooth(log, site), log)
     states = result.states
     assert states.pose_cov is not None
-    failed = np.zeros(len(states), dtype=bool)
+    failed = np.full(len(states), trust.verdict is Verdict.FAILED)
     parts = states.time, states.world_from_body, states.position_world, states.pose_cov
-    return *parts, failed, "smoothed"
+    return *parts, failed, trust.verdict.value
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ from derivatives import central_difference, relative_to_group
 from online_log import SIGMA, surveyed_site
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.batch.search import MAX_TRACKS, Search, follow_tracks, upright
 from magfusion.estimation.batch.strides import strides_between
 from magfusion.estimation.batch.tracks import (
     MOTION,
@@ -23,6 +24,7 @@ from magfusion.estimation.graph.propagation import propagate
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.measurements.phasors import field_phasors
 from magfusion.estimation.online.ekf import ErrorStateFilter
+from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
@@ -194,3 +196,26 @@ def test_what_is_not_credible_costs_little_more_the_worse_it_is() -> None:
         assert np.linalg.norm(bad.position[0] - tracks.position[0]) < 0.01  # m
         costs.append(float(bad.cost[0] - good.cost[0]))
     assert 0.0 < costs[0] < costs[1] < 5.0 * costs[0]
+
+
+def test_fixes_recover_tracks_that_are_all_lost() -> None:
+    """Tracks kilometres away explain the fields equally badly: none costs more than a restart."""
+    site, motion = surveyed_site(), walk()
+    time = np.arange(0.5, 2.9, 0.15)
+    samples = simulate_fields(
+        site, motion.trajectory(time), SIGMA, np.random.default_rng(1), window=0.1
+    )
+    calibration, imu = initial_calibration(site, 0.0), ideal_imu(motion, site)
+    search = Search(
+        samples,
+        track_phasors(samples, calibration),
+        strides_between(imu, OFFSET, time),
+        fix_epochs(samples, calibration),
+        upright(imu, OFFSET, time, site),
+    )
+    one = tracks_at(site, motion, 0).rows(np.zeros(MAX_TRACKS, dtype=np.int64))
+    away = 1e3 * np.arange(1, MAX_TRACKS + 1)[:, None] * [1.0, 0.0, 0.0]
+    result = follow_tracks(search, replace(one, position=one.position + away), range(len(time)))
+    last = result.visits[-1]
+    best = last.position[np.argmin(last.cost)]
+    assert np.linalg.norm(best - motion.position_world(time[-1:])[0]) < 0.05  # m

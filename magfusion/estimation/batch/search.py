@@ -65,8 +65,8 @@ class FoundTrajectory:
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
-    """Inputs of the search."""
+class Search:
+    """Inputs of the search: phasors, strides, fixes and gravity of the same epochs."""
 
     samples: FieldSamples
     phasors: TrackPhasors
@@ -76,6 +76,7 @@ class _Search:
 
     @property
     def site(self) -> Site:
+        """As declared."""
         return self.phasors.site
 
 
@@ -121,20 +122,22 @@ def search(
     some = samples.rows(kept)
     offset, site = calibration.time_offset, calibration.site
     at = Fixes(**{name: value[kept] for name, value in vars(fixes).items()})
-    search = _Search(
+    search = Search(
         some,
         track_phasors(some, calibration),
         strides_between(imu, offset, some.time),
         at,
-        _upright(imu, offset, some.time, site),
+        upright(imu, offset, some.time, site),
     )
     count = len(some)
-    ahead = _follow(search, _seeds(search, 0), range(count))
+    ahead = follow_tracks(search, _seeds(search, 0), range(count))
     last = ahead.visits[-1]
     best = last.rows(np.argsort(last.cost)[:RETURNING])
     # The backward search uses the forward data again: that gives only its start.
     again = replace(best, cov=4.0 * best.cov, cost=np.zeros(len(best)))
-    back = _follow(search, replace(again, parent=np.arange(len(again))), range(count - 1, -1, -1))
+    back = follow_tracks(
+        search, replace(again, parent=np.arange(len(again))), range(count - 1, -1, -1)
+    )
     return _trajectories(search, back)
 
 
@@ -151,7 +154,7 @@ def thinned(samples: FieldSamples) -> IntArray:
     return np.arange(0, len(samples), max(1, stride))
 
 
-def _upright(imu: ImuSamples, time_offset: float, time: Array, site: Site) -> Gravity:
+def upright(imu: ImuSamples, time_offset: float, time: Array, site: Site) -> Gravity:
     """Return the direction of the mean specific force, which motion disturbs."""
     stamps, motion = imu.time + time_offset, site.platform.motion
     chain = attitude_from_gyro(stamps, imu.gyro_body)
@@ -163,7 +166,7 @@ def _upright(imu: ImuSamples, time_offset: float, time: Array, site: Site) -> Gr
     return Gravity(up / np.linalg.norm(up, axis=1, keepdims=True), sigma)
 
 
-def _seeds(search: _Search, k: int) -> Tracks:
+def _seeds(search: Search, k: int) -> Tracks:
     """Return tracks that begin at the fixes of an epoch, with their drive phases."""
     phasors, rows = search.phasors, np.array([k])
     fixes = fix_epochs(
@@ -212,7 +215,8 @@ def _frequencies(site: Site) -> Array:
     return np.concatenate([beacon.tone_frequencies_hz for beacon in site.beacons])
 
 
-def _follow(search: _Search, tracks: Tracks, order: Sequence[int]) -> _Followed:
+def follow_tracks(search: Search, tracks: Tracks, order: Sequence[int]) -> _Followed:
+    """Return tracks propagated and updated over epochs, in the order of a range."""
     phasors, backward = search.phasors, order[0] > order[-1]
     time = phasors.time
     visits, meetings = [_light(tracks)], list[_Meeting]()
@@ -250,23 +254,32 @@ def _light(tracks: Tracks) -> Tracks:
     return replace(tracks, cov=np.zeros((len(tracks), 0, 0)))
 
 
-def _with_others(search: _Search, tracks: Tracks, k: int, level: float, *, fresh: bool) -> Tracks:
+def _with_others(search: Search, tracks: Tracks, k: int, level: float, *, fresh: bool) -> Tracks:
     """Return tracks, with new ones at hypotheses of an epoch that no track is near."""
     best = int(np.argmin(tracks.cost))
-    price = tracks.cost[best] + LEAP * level
+    price, parent = tracks.cost[best] + LEAP * level, tracks.parent[best]
     others = [_restart(search, tracks, best, k)]
     if fresh:
         others.append(_seeds(search, k))
     for other in others:
         if len(other):
-            parent = np.full(len(other), tracks.parent[best])
-            other = replace(other, cost=price + other.cost, parent=parent)
-            elsewhere = ~np.any(_same(other, tracks), axis=1)
-            tracks = tracks.joined(other.rows(elsewhere))
+            parents = np.full(len(other), parent)
+            other = replace(other, cost=price + other.cost, parent=parents)
+            new = other.rows(~np.any(_same(other, tracks), axis=1))
+            tracks = _with_places(tracks, len(new)).joined(new)
     return tracks
 
 
-def _restart(search: _Search, tracks: Tracks, best: int, k: int) -> Tracks:
+def _with_places(tracks: Tracks, number: int) -> Tracks:
+    """Return the best tracks, without the worst where new ones need their places.
+
+    At their price new tracks would be discarded before any epoch shows that all others are lost.
+    """
+    kept = MAX_TRACKS - min(number, MAX_TRACKS // 2)
+    return tracks.rows(np.argsort(tracks.cost)[:kept])
+
+
+def _restart(search: Search, tracks: Tracks, best: int, k: int) -> Tracks:
     """Return tracks at the fixes of an epoch, with the drive phases of the best track.
 
     Its motion is not used, since that may be the cause of its error.
@@ -344,7 +357,7 @@ def _merged(tracks: Tracks, visit: int) -> tuple[Tracks, list[_Meeting]]:
     return tracks.rows(~elapsed), met
 
 
-def _trajectories(search: _Search, followed: _Followed) -> list[FoundTrajectory]:
+def _trajectories(search: Search, followed: _Followed) -> list[FoundTrajectory]:
     """Return the best path, and those that differ from it for a while and are not much worse."""
     last = len(followed.visits) - 1
     order = np.argsort(followed.visits[-1].cost)
@@ -380,7 +393,7 @@ def differ(some: Trajectory, others: Trajectory) -> bool:
 
 
 def _read(
-    search: _Search, followed: _Followed, path: list[tuple[int, int]], cost: float
+    search: Search, followed: _Followed, path: list[tuple[int, int]], cost: float
 ) -> FoundTrajectory:
     """Return a path as a trajectory; its visits are in backward order."""
     rows = [(followed.visits[visit], row) for visit, row in path]

@@ -11,7 +11,11 @@ from magfusion.estimation.batch.batch import Smoothed, solved_again
 from magfusion.estimation.batch.log_graph import overlap
 from magfusion.estimation.graph.measurement import Measurement, robust_weight
 from magfusion.estimation.graph.state import states_in
-from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
+from magfusion.estimation.integrity.smoothed_separation import (
+    aiding_used,
+    separate_sensors,
+    separate_smoothed,
+)
 from magfusion.estimation.measurements.joint_phasors import JointPhasors, at_nearest
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.posterior.protection_levels import protection_levels
@@ -62,6 +66,10 @@ def separated_smooth(result: Smoothed, risk: Risk | None = None) -> SeparatedSmo
         return _without_level(result)
     first = estimate
     result, estimate, out = _without_false(result, estimate, names, risk)
+    sources = [f"beacon {name}" for name in names]
+    if (by_sensor := separate_sensors(result)) is not None:
+        estimate |= by_sensor
+        sources += aiding_used(result)
     excess = estimate.excess(risk, SLACK)
     alarmed = np.any(excess > 1.0, axis=1)
     level_m, level_deg = protection_levels(estimate, risk, SLACK)
@@ -70,7 +78,7 @@ def separated_smooth(result: Smoothed, risk: Risk | None = None) -> SeparatedSmo
     trust = Trust(
         (
             *_excluded_findings(result, first, out, names),
-            *_alarm_findings(result, estimate, excess, names, risk),
+            *_alarm_findings(result, estimate, excess, sources, risk),
             *_redundancy_findings(level_m, alarmed),
         )
     )
@@ -322,17 +330,23 @@ def _stretches(epochs: IntArray, time: Array) -> list[tuple[int, int]]:
 
 
 def _alarm_findings(
-    result: Smoothed, separated: Separation, excess: Array, names: tuple[str, ...], risk: Risk
+    result: Smoothed, separated: Separation, excess: Array, sources: list[str], risk: Risk
 ) -> list[Finding]:
     worst = float(np.max(excess))
     if worst <= _of_a_whole_log(separated, risk):
         return []
-    state, beacon = np.unravel_index(np.argmax(excess), excess.shape)
+    state, source = np.unravel_index(np.argmax(excess), excess.shape)
+    is_beacon = source < len(result.declared.site.beacons)
+    remedy = (
+        "the beacons contradict each other. Check their positions and moments in the site, and iron"
+        " in the room."
+        if is_beacon
+        else "it contradicts the others. Check its scale, mounting and clock in the site."
+    )
     text = (
-        f"The trajectory with and without beacon {names[int(beacon)]} differ by up to"
-        f" {1e3 * _largest(separated, int(beacon)):.3g} mm, {worst:.3g} times what noise and survey"
-        f" explain, most at {result.states.time[int(state)]:.1f} s: the beacons contradict each"
-        " other. Check their positions and moments in the site, and iron in the room."
+        f"The trajectory with and without {sources[int(source)]} differ by up to"
+        f" {1e3 * _largest(separated, int(source)):.3g} mm, {worst:.3g} times what noise and survey"
+        f" explain, most at {result.states.time[int(state)]:.1f} s: {remedy}"
     )
     return [Finding("separation", text, weight=worst)]
 
@@ -353,7 +367,7 @@ def _redundancy_findings(level_m: Array, alarmed: BoolArray) -> list[Finding]:
         return []
     text = (
         f"{int(np.sum(without))} of {len(level_m)} states have no protection level: without one of"
-        " the beacons the pose is undetermined, so that a false one would not be detected. Add a"
-        " beacon."
+        " the beacons or aiding sensors the pose is undetermined, so that a false one would not be"
+        " detected. Add a beacon."
     )
     return [Finding("no_redundancy", text, Verdict.TRUSTWORTHY, 0.0)]

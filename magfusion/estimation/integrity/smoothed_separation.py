@@ -1,13 +1,15 @@
-"""The smoothed trajectory without each beacon: alarms and protection levels by state."""
+"""The smoothed trajectory without each beacon or sensor: alarms and protection levels by state."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.graph.graph import Graph
 from magfusion.estimation.graph.state import MOTION
+from magfusion.estimation.measurements.aiding import AidingMeasurement
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.posterior import block_tridiagonal_system as chains
@@ -18,7 +20,7 @@ from magfusion.estimation.posterior.block_tridiagonal_system import (
 )
 from magfusion.estimation.posterior.convergence import OPEN_ROTATION
 from magfusion.estimation.posterior.information_contributions import Parts, parts_of
-from magfusion.estimation.posterior.separation import Separation
+from magfusion.estimation.posterior.separation import OPEN_POSITION, Separation
 from magfusion.estimation.solve.chain import STRETCH, inverses, solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.units import Array, BoolArray
@@ -55,29 +57,85 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
         parts = parts_of(rest, rows, pieces, kept)
         del rest, rows, pieces
         give_back_memory()
-        solved = _without_each(parts, kept, solved)
+        solved, _ = _without_each(parts, kept, solved)
         del parts  # before the next group: for a long log they are large
         give_back_memory()
     detected, count = tally.detected, tally.count
     cost = kept @ tally.square - np.array([one.explained for one in solved])
     numbers = np.array([6 * np.sum(detected & (owner == j)) * count for j in every])
     others = np.array([np.any(detected & (owner != j)) for j in every])
+    return _separation(solved, others, cost[1:], numbers)
+
+
+def aiding_used(result: Smoothed) -> list[str]:
+    """Return the aiding sensors with samples in a result."""
+    measured = (m for m in result.graph.measurements if isinstance(m, AidingMeasurement))
+    return list(dict.fromkeys(m.sensor for m in measured))
+
+
+def separate_sensors(result: Smoothed) -> Separation | None:
+    """Return the separation from the estimates without each aiding sensor.
+
+    None where it is not available, or without sensors.
+    """
+    graph = result.graph
+    sensors = aiding_used(result)
+    if not sensors or not _can_separate(graph):
+        return None
+    graphs = [graph, *(_without_sensor(graph, name) for name in sensors)]
+    kept = np.ones((1, len(result.declared.site.owner)), dtype=bool)
+    solved: list[list[_Variant]] = [[] for _ in graphs]
+    for columns in column_groups(result.uncertain, graph.epochs):
+        reference = None
+        for k, one in enumerate(graphs):
+            rest, rows = block_tridiagonal_system(one, result.estimate, result.uncertain, columns)
+            assert rows is not None
+            rest.diagonal += np.diag(1.0 / OPEN**2)
+            parts = parts_of(rest, rows, rows.pieces(), kept)
+            del rest, rows
+            solved[k], reference = _without_each(parts, kept, solved[k], reference)
+            del parts
+            give_back_memory()
+    variants, number = [one for (one,) in solved], len(sensors)
+    estimate = _separation(variants, np.ones(number, dtype=bool), np.zeros(number), np.ones(number))
+    near = np.einsum("nbii->nbi", estimate.subset_cov)[..., 3:].sum(axis=2) < OPEN_POSITION**2
+    return replace(estimate, determined=estimate.determined & near)
+
+
+def _without_sensor(graph: Graph, name: str) -> Graph:
+    kept = tuple(
+        m for m in graph.measurements if not (isinstance(m, AidingMeasurement) and m.sensor == name)
+    )
+    return replace(graph, measurements=kept)
+
+
+def _separation(
+    solved: list["_Variant"], others: BoolArray, cost: Array, numbers: Array
+) -> Separation:
+    """Return the separation of variants from the first one.
+
+    Parameters
+    ----------
+    others : bool ndarray, shape (variants - 1,)
+        Whether any other beacon is detected.
+    cost, numbers : ndarray, shape (variants - 1,)
+        Squared residuals, and number of rows that are left out.
+    """
     step, cov = (np.array([getattr(v, name) for v in solved]) for name in ("step", "cov"))
     separate = np.array([v.separate_errors for v in solved[1:]])
-    del solved
     variance = np.einsum("hnii->hni", cov[1:])
     shift = step[1:] - step[:1]
     determined = np.isfinite(shift).all(axis=2) & (variance > 0.0).all(axis=2)
     determined &= np.sum(variance[..., :3], axis=2) < OPEN_ROTATION**2
     determined &= others[:, None]
-    shape = (graph.epochs, len(every))
+    shape = shift.shape[1], len(shift)
     return Separation(
         np.swapaxes(shift, 0, 1),
         cov[0],
         np.swapaxes(cov[1:], 0, 1),
         np.swapaxes(separate, 0, 1),
         np.swapaxes(determined, 0, 1),
-        np.broadcast_to(cost[1:], shape),
+        np.broadcast_to(cost, shape),
         np.broadcast_to(numbers, shape),
     )
 
@@ -128,20 +186,31 @@ class _Variant:
     inverse: Array
 
 
-def _without_each(parts: Parts, kept: BoolArray, before: list[_Variant]) -> list[_Variant]:
+class _Reference(NamedTuple):
+    """Response (n, 6, columns) and covariance (n, 6, 6) of the estimate with all."""
+
+    response: Array
+    alone: Array
+
+
+def _without_each(
+    parts: Parts, kept: BoolArray, before: list[_Variant], reference: _Reference | None = None
+) -> tuple[list[_Variant], _Reference]:
     """Solve variants with some of the channels, shape (h, channels).
 
     Parameters
     ----------
     before : list of _Variant
         Solved with other columns of the considered parameters.
+    reference : _Reference, optional
+        By default the first variant.
     """
     count, _, size = parts.parts[0].sums.border.shape
     per_variant = 8.0 * 4.0 * count * MOTION * (MOTION + parts.count + size)
     group = max(1, int(chains.AT_ONCE / per_variant))
     known = [one.inverse for one in before] if before else _inverses(parts, kept)
     parts.discard_diagonals()
-    out, whole, alone = list(before), np.zeros((0, 6, 0)), np.zeros((0, 6, 6))
+    out = list(before)
     for first in range(0, len(kept), group):
         some = slice(first, first + group)
         result = solve_chain(
@@ -149,9 +218,9 @@ def _without_each(parts: Parts, kept: BoolArray, before: list[_Variant]) -> list
         )
         for k, states in enumerate(result.states):
             response = states[..., 1:]
-            if first + k == 0:
-                whole = response.copy()
-                alone = result.cov[k].copy()
+            if reference is None:
+                reference = _Reference(response.copy(), result.cov[k].copy())
+            whole, alone = reference
             if not before:
                 own, explained = result.cov[k].copy(), float(result.explained[k])
                 step = states[..., 0].copy()
@@ -162,7 +231,8 @@ def _without_each(parts: Parts, kept: BoolArray, before: list[_Variant]) -> list
                 out[first + k].cov[here] += own @ np.swapaxes(own, -1, -2)
                 out[first + k].separate_errors[here] += moved @ np.swapaxes(moved, -1, -2)
         del result, states, response  # before the next group, too
-    return out
+    assert reference is not None
+    return out, reference
 
 
 def _inverses(parts: Parts, kept: BoolArray) -> list[Array]:

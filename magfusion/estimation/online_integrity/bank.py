@@ -1,7 +1,8 @@
-"""Filters without each beacon, run with the estimate: online solution separation at constant cost.
+"""Filters without each source, run with the estimate: online solution separation at constant cost.
 
-Each is stored as its deviation from the estimate, linearised there, with the covariance of both.
-A false beacon influences the estimate's prior for long, but never that of the filter without it, so
+A source is a beacon or an aiding sensor.  Each filter is stored as its deviation from the estimate,
+linearised there, with the covariance of both.
+A false source influences the estimate's prior for long, but never that of the filter without it, so
 that slow faults are detected too.
 
 All are updated in the same calls and not as one `PartialUpdateFilter` each (0.8 instead of 2.0 ms
@@ -20,26 +21,33 @@ import numpy as np
 from magfusion.estimation.graph.measurement import Measurement, measured_rows
 from magfusion.estimation.graph.propagation import Propagated
 from magfusion.estimation.graph.state import MOTION, State, between
+from magfusion.estimation.measurements.aiding import AidingMeasurement
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors, leaves_out
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.estimation.online_integrity.levels import Levels, LevelsQuery
-from magfusion.estimation.posterior.separation import MIN_COUNT, Separation, radii
+from magfusion.estimation.posterior.separation import (
+    MIN_COUNT,
+    OPEN_POSITION,
+    Separation,
+    radii,
+)
 from magfusion.model.parameters import Block, dimension
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk, Verdict
-from magfusion.units import DEGREE, Array, IntArray
+from magfusion.units import DEGREE, Array, BoolArray, IntArray
 
-MAX_FILTERS = 6  # filters; with more beacons some share one
+MAX_FILTERS = 6  # filters without beacons; with more beacons some share one
 SLACK = 3.0  # sigma; smaller deviations are covered
 # Initial uncertainty of a filter without a beacon, as the first state was estimated with all.
 WIDE = np.repeat([0.2, 0.3, 0.5], 3)  # rad, m, m/s
-NO_OWNER, TOGETHER = -1, -2  # groups of rows that belong to no beacon, or to all
-OPEN_ROTATION, OPEN_POSITION = 0.3, 10.0  # rad, m; beyond, nothing else determines the pose
+NO_OWNER, TOGETHER = -1, -2  # groups of rows that belong to no source, or to all beacons
+OPEN_ROTATION = 0.3  # rad; beyond, nothing else determines the attitude
+OPEN = np.repeat([OPEN_ROTATION, OPEN_POSITION, OPEN_POSITION], 3)  # of a filter without a sensor
 
 
 class SubsetBank:
-    """Filters without each beacon, or without each of a few groups of them.
+    """Filters without each beacon, or each of a few groups of them, and without each sensor.
 
     Parameters
     ----------
@@ -62,12 +70,15 @@ class SubsetBank:
         self._estimated = tuple(block for block in blocks if block.columns.stop <= last)
         self.risk = Risk() if risk is None else risk
         self.names = [beacon.name for beacon in site.beacons]
-        self.groups = min(len(self.names), MAX_FILTERS)
-        members = np.bincount(np.arange(len(self.names)) % self.groups)
+        self._sensors = [sensor.name for sensor in site.aiding]
+        self._shared = min(len(self.names), MAX_FILTERS)
+        self.groups = self._shared + len(self._sensors)
+        members = np.bincount(np.arange(len(self.names)) % self._shared)
+        members = np.concatenate([members, np.ones(len(self._sensors))])
         self._prior = np.array(self.risk.fault * members[None], dtype=np.float64)
         self._step = self._cov = self._joint = self._common = None
         names = [name for name, _ in site.channels]
-        self._owner = np.array([self.names.index(name) % self.groups for name in names])
+        self._owner = np.array([self.names.index(name) % self._shared for name in names])
 
     def check(self, size: int) -> None:
         """Check that the filters of a checkpoint fit states of a size.
@@ -144,6 +155,10 @@ class SubsetBank:
         across = joint @ back[0] + half[1:, :, considered] @ back_common[0]
         joint += (gain[1:] - across) @ rotated[0]
         half[:, :, own] = 0.5 * (whole + np.swapaxes(whole, 1, 2))
+        # Far from the estimate the fields are not linear: without a sensor whose absence leaves the
+        # position open, a filter has only its uncertainty, until other sources determine it.
+        far = self._shared + np.flatnonzero(~_determined(half[1 + self._shared :, :6, :6]))
+        step[far], joint[far] = 0.0, half[0, :, own]
         self._step, self._cov, self._joint, self._common = step, half, joint, common
 
     def _propagated(self, predicted: Propagated) -> tuple[Array, Array, Array, Array]:
@@ -183,16 +198,20 @@ class SubsetBank:
         self._common = state.cov[count:, count:].copy()
         own = np.arange(len(WIDE))
         self._cov[1:, own, own] += WIDE**2
+        self._cov[1 + self._shared :, own, own] += OPEN**2
 
     def _rows(
         self, measurements: Sequence[Measurement], state: State
     ) -> tuple[Array, Array, IntArray]:
-        """Return error, Jacobian and group of each row; negative for rows of no single beacon."""
+        """Return error, Jacobian and group of each row; negative for rows of no single source."""
         parts = [(measured_rows([], state, self.blocks), np.zeros(0, dtype=np.int64))]
         for measurement in measurements:
             rows = measured_rows([measurement], state, self.blocks)
             if isinstance(measurement, FieldPhasors):
                 owner = np.repeat(self._owner, 6)
+            elif isinstance(measurement, AidingMeasurement):
+                group = self._shared + self._sensors.index(measurement.sensor)
+                owner = np.full(len(rows[0]), group)
             else:
                 together = isinstance(measurement, JointPhasors)
                 owner = np.full(len(rows[0]), TOGETHER if together else NO_OWNER)
@@ -250,8 +269,7 @@ class SubsetBank:
         turn, shift = np.max(np.where(result.determined[0, :, None], result.shift[0], 0.0), axis=0)
         text = (
             f"The state with and without {self._called(worst)} differs by {1e3 * shift:.3g} mm,"
-            f" {excess[worst]:.3g} times what noise and survey explain: the beacons contradict each"
-            " other. Check their drive, and iron or a shield near one."
+            f" {excess[worst]:.3g} times what noise and survey explain: {self._remedy(worst)}"
         )
         return replace(
             judgement,
@@ -271,8 +289,17 @@ class SubsetBank:
             return np.zeros(self.groups)
         return result.excess(self.risk, SLACK)[0]
 
+    def _remedy(self, group: int) -> str:
+        if group >= self._shared:
+            return "it contradicts the others. Check its scale, mounting and clock in the site."
+        return (
+            "the beacons contradict each other. Check their drive, and iron or a shield near one."
+        )
+
     def _called(self, group: int) -> str:
-        names = self.names[group :: self.groups]
+        if group >= self._shared:
+            return self._sensors[group - self._shared]
+        names = self.names[group :: self._shared]
         return f"beacon {names[0]}" if len(names) == 1 else f"beacons {', '.join(names)}"
 
     def separation(self, state: State) -> Separation | None:
@@ -283,10 +310,7 @@ class SubsetBank:
         # A copy: a state whose levels are not yet computed must not reference the whole filters.
         subset, joint = self._cov[1:][pose].copy(), self._joint[pose]
         separate = subset + self._cov[:1][pose] - joint - np.swapaxes(joint, 1, 2)
-        variance = np.einsum("gii->gi", subset)
-        determined = (np.sum(variance[:, :3], axis=1) < OPEN_ROTATION**2) & (
-            np.sum(variance[:, 3:], axis=1) < OPEN_POSITION**2
-        )
+        determined = _determined(subset)
         count = (1, self.groups)
         return Separation(
             self._step[None, :, :6].copy(),
@@ -331,3 +355,10 @@ class SubsetBank:
             for i in range(len(before))
         ]
         return np.asarray(np.maximum(np.max(shares, axis=(0, 2)), 1.0))
+
+
+def _determined(cov: Array) -> BoolArray:
+    """Return whether covariances of poses (n, 6, 6) are those of determined ones."""
+    variance = np.einsum("gii->gi", cov)
+    rotation, position = np.sum(variance[:, :3], axis=1), np.sum(variance[:, 3:], axis=1)
+    return np.asarray((rotation < OPEN_ROTATION**2) & (position < OPEN_POSITION**2))

@@ -25,6 +25,7 @@ from magfusion.units import Array, BoolArray, IntArray
 ROOT_2, ROOT_2_PI = float(np.sqrt(2.0)), float(np.sqrt(2.0 / np.pi))
 POSE = 6  # axes: rotation, then position
 SINGLE_FAULT_TAIL = 0.215  # probability of a tail below which a single number bounds it
+OPEN_POSITION = 10.0  # m; norm of the sigmas beyond which a position is not determined
 MIN_COUNT = 1e-30  # rad, m; a deviation below it is zero
 PARTS = (slice(0, 3), slice(3, 6))  # rotation, position
 ROWS = np.arange(POSE).reshape(2, 3, 1)  # of the blocks of both, shape (2, 3, 3) with
@@ -115,6 +116,14 @@ class Separation:
     determined: BoolArray
     cost: Array
     rows: Array
+
+    def __or__(self, other: "Separation") -> "Separation":
+        """Return the estimates of both, relative to the same one with all."""
+        pairs = {
+            name: np.concatenate([getattr(self, name), getattr(other, name)], axis=1)
+            for name in ("step", "subset_cov", "separation_cov", "determined", "cost", "rows")
+        }
+        return Separation(cov=self.cov, **pairs)
 
     @cached_property
     def _sigmas(self) -> Radius:
