@@ -175,7 +175,7 @@ def pulses(rate_hz: float) -> Array:
 def test_pulses_give_the_rate_of_the_samples(tmp_path: Path) -> None:
     rate_hz = RATE_HZ * (1.0 + 5e-5)
     soundfile.write(tmp_path / "a.wav", np.c_[0 * pulses(rate_hz), pulses(rate_hz)], RATE_HZ)
-    entry = describe_recording(tmp_path / "a.wav", "x,sync", 1.0, 0)
+    entry, _ = describe_recording(tmp_path / "a.wav", "x,sync", 1.0, 0)
     assert entry.rate_hz == pytest.approx(rate_hz, abs=0.3)  # a sample in five seconds
 
 

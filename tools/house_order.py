@@ -33,8 +33,8 @@ ROOMS = {
             truth_poses
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
             detection_range field ground without_imu
-            bandpass parameters path_field strapdown_steps
-            noise prior waveform
+            bandpass parameters path_field slips strapdown_steps
+            noise prior slip_sampler waveform
         """,
         "files": """
             atomic bag_recovery bag_topics blas_threads commit messages parquet_bounds

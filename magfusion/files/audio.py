@@ -1,6 +1,6 @@
 """Recordings of a sound card as the magnetometer of a log: the log refers to the file."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -15,6 +15,9 @@ from magfusion.model.bandpass import BandFilter, BandSampler
 from magfusion.model.response import NOMINAL_T_PER_V
 from magfusion.model.samples import Waveform
 from magfusion.model.site import Site
+from magfusion.model.slip_sampler import SlipSampler, can_slip
+from magfusion.model.slips import Slip
+from magfusion.model.trust import Finding, Verdict
 from magfusion.units import NANOSECOND, Array
 
 if TYPE_CHECKING:
@@ -24,8 +27,10 @@ AXES: tuple[Literal["x", "y", "z"], ...] = ("x", "y", "z")
 SYNC = "sync"
 SUFFIXES = (".wav", ".flac", ".w64", ".caf", ".aiff")
 PIECE = 1 << 14  # samples of every channel; 0.4 MB of three
+MOST_NAMED = 8  # slips in a sentence
 LEAST_PULSES = 3
 EDGE_TOLERANCE = 1e-3  # s; of a pulse about the even clock: a GNSS receiver has 1e-7
+Count = Annotated[int, Field(ge=1)]
 Channel = Annotated[int, Field(ge=0, le=1023)]
 
 
@@ -44,6 +49,8 @@ class AudioEntry(StrictModel):
         Of the samples on the log's clock.
     begin_ns : int
         Stamp of the first sample.
+    slips : list of [int, int]
+        Of each place where samples are lost: number of the first sample after it, and of the lost.
     """
 
     file: str
@@ -51,6 +58,17 @@ class AudioEntry(StrictModel):
     full_scale_v: float = Field(gt=0.0, le=1e6)
     rate_hz: float = Field(ge=1.0, le=1e7)
     begin_ns: int = Field(ge=-LARGEST_TIME_NS, le=LARGEST_TIME_NS)
+    slips: list[Annotated[list[Count], Field(min_length=2, max_length=2)]] = Field(
+        default_factory=list
+    )
+
+    def parts(self, frames: int) -> Iterator[tuple[int, int, int]]:
+        """Yield begin and end of each part without a slip, and the samples lost before it."""
+        begin = missing = 0
+        for place, count in self.slips:
+            yield begin, place, missing
+            begin, missing = place, missing + count
+        yield begin, frames, missing
 
 
 @contextmanager
@@ -99,25 +117,28 @@ def read_audio(
     """
     path, begin = directory / entry.file, (entry.begin_ns - span.epoch_ns) * NANOSECOND
     band = None if site is None else BandFilter.of_site(site, entry.rate_hz)
-    sampler = None if band is None else BandSampler(band)
     places, parts = [np.zeros(0)], [np.zeros((0, 3))]
     with open_audio(path) as recording:
         limits = (
             begin if span.start is None else span.start,
             np.inf if span.end is None else span.end,
         )
-        first, last = (
-            int(np.clip(np.ceil((at - begin) * entry.rate_hz - 1e-6), 0, recording.frames))
-            for at in limits
-        )
-        for at, field in _blocks(path, recording, entry, first, last):
-            if sampler is None:
-                place = np.arange(float(at), float(at + len(field)))
-            else:
-                place, tones = sampler.push(field)
-                place, field = first + place, np.sum(tones.real, axis=1)
-            places.append(place)
-            parts.append(field)
+        for lowest, highest, missing in entry.parts(recording.frames):
+            first, last = (
+                int(
+                    np.clip(np.ceil((at - begin) * entry.rate_hz - missing - 1e-6), lowest, highest)
+                )
+                for at in limits
+            )
+            sampler = None if band is None else BandSampler(band)
+            for at, field in _blocks(path, recording, entry, first, last):
+                if sampler is None:
+                    place = np.arange(float(at), float(at + len(field)))
+                else:
+                    place, tones = sampler.push(field)
+                    place, field = first + place, np.sum(tones.real, axis=1)
+                places.append(place + missing)
+                parts.append(field)
     time = begin + np.concatenate(places) / entry.rate_hz
     if not len(time):
         return None
@@ -143,14 +164,51 @@ def _blocks(
         first += len(block)
 
 
-def describe_recording(path: Path, names: str, full_scale_v: float, begin_ns: int) -> AudioEntry:
-    """Return the entry of a recording for the header of a log.
+def lost_finding(entry: AudioEntry | None) -> tuple[Finding, ...]:
+    """Return where samples of a recording are lost, if any are."""
+    if entry is None or not entry.slips:
+        return ()
+    text = f"audio: {slip_text(entry.slips, entry.rate_hz)}. The stamps after them are corrected."
+    return (Finding("samples_lost", text, Verdict.TRUSTWORTHY),)
+
+
+def slip_text(slips: Sequence[Sequence[int]], rate_hz: float) -> str:
+    """Return lengths and times of slips (s after the first sample) as words."""
+    before_each = np.cumsum([0, *(count for _, count in slips)])
+    words = [
+        f"{count} samples ({1e3 * count / rate_hz:.4g} ms) are lost at"
+        f" {(place + before) / rate_hz:.3f} s"
+        for (place, count), before in zip(slips, before_each[:-1].tolist(), strict=True)
+    ]
+    return ", ".join(words[:MOST_NAMED]) + f", and at {len(words) - MOST_NAMED} more places" * (
+        len(words) > MOST_NAMED
+    )
+
+
+def _slips(path: Path, recording: "SoundFile", entry: AudioEntry, site: Site) -> SlipSampler | None:
+    """Find lost samples by the phases of a site's tones; None where these do not allow it."""
+    band = BandFilter.of_site(site, entry.rate_hz) if can_slip(site) else None
+    if band is None:
+        return None
+    sampler = SlipSampler(band, site)
+    for _, field in _blocks(path, recording, entry, 0, recording.frames):
+        sampler.push(field)
+    sampler.finish()
+    return sampler
+
+
+def describe_recording(
+    path: Path, names: str, full_scale_v: float, begin_ns: int, site: Site | None = None
+) -> tuple[AudioEntry, tuple[str, ...]]:
+    """Return the entry of a recording for the header of a log, and remarks on lost samples.
 
     Parameters
     ----------
     names : str
         Of its channels, in their order: x, y, z, sync (pulses at whole seconds, by which the rate
         of the samples is measured), or - for one that is not used.
+    site : Site, optional
+        By whose tones lost samples are found.
 
     Raises
     ------
@@ -162,16 +220,56 @@ def describe_recording(path: Path, names: str, full_scale_v: float, begin_ns: in
             raise InputError(
                 f"--channels {names!r}: {path} has {recording.channels} channels; name each of them"
             )
-        rate_hz = float(recording.samplerate)
+        entry = AudioEntry(
+            file=str(path.resolve()),
+            channels={axis: named[axis] for axis in AXES if axis in named},
+            full_scale_v=full_scale_v,
+            rate_hz=float(recording.samplerate),
+            begin_ns=begin_ns,
+        )
+        search = None if site is None else _slips(path, recording, entry, site)
+        slips = () if search is None else tuple(search.slips)
         if SYNC in named:
-            rate_hz = _rate_by_pulses(path, recording, named.pop(SYNC))
-    return AudioEntry(
-        file=str(path.resolve()),
-        channels={axis: named[axis] for axis in AXES if axis in named},
-        full_scale_v=full_scale_v,
-        rate_hz=rate_hz,
-        begin_ns=begin_ns,
+            edges = _edges(recording, named[SYNC])
+            slips = tuple(_by_pulses(slip, edges, entry.rate_hz) for slip in slips)
+            entry = entry.model_copy(update={"slips": [[s.place, s.missing] for s in slips]})
+            rate_hz = _rate_by_pulses(path, entry, edges, named[SYNC])
+            entry = entry.model_copy(update={"rate_hz": rate_hz})
+        entry = entry.model_copy(update={"slips": [[s.place, s.missing] for s in slips]})
+    return entry, () if search is None else slip_remarks(
+        slips, search.unexplained, float(recording.samplerate)
     )
+
+
+def slip_remarks(slips: Sequence[Slip], unexplained: int, rate_hz: float) -> tuple[str, ...]:
+    """Return sentences on slips, those that are ambiguous, and steps that are none."""
+    result = []
+    if slips:
+        result.append(f"{slip_text([[s.place, s.missing] for s in slips], rate_hz)}.")
+    result += [
+        f"The slip after sample {slip.place} is ambiguous: {slip.missing} or"
+        f" {' or '.join(map(str, slip.others))} samples explain the phases of the tones."
+        for slip in slips
+        if slip.others
+    ]
+    if unexplained:
+        result.append(
+            f"The tones step {unexplained} times in a way that no number of lost samples explains:"
+            " a beacon that is switched, a loose contact, or several losses within 0.4 s."
+        )
+    return tuple(result)
+
+
+def _by_pulses(slip: Slip, edges: Array, rate_hz: float) -> Slip:
+    """Decide among the lengths of a slip by pulses at whole seconds, if they are there."""
+    at = int(np.searchsorted(edges, slip.place))
+    if not 0 < at < len(edges):
+        return slip
+    interval = edges[at] - edges[at - 1]
+    missing = np.array([slip.missing, *slip.others])
+    off = np.abs((interval + missing + 0.5 * rate_hz) % rate_hz - 0.5 * rate_hz)
+    best = int(np.argmin(off))
+    return Slip(slip.place, int(missing[best])) if off[best] < EDGE_TOLERANCE * rate_hz else slip
 
 
 def channels_of(names: str) -> tuple[dict[str, int], int]:
@@ -193,8 +291,9 @@ def channels_of(names: str) -> tuple[dict[str, int], int]:
     return used, len(listed)
 
 
-def _rate_by_pulses(path: Path, recording: "SoundFile", channel: int) -> float:
-    """Return the samples per second (Hz) from rising edges at whole seconds."""
+def _edges(recording: "SoundFile", channel: int) -> Array:
+    """Return the rising edges of pulses, as numbers of samples."""
+    recording.seek(0)
     level = max(np.max(b[:, channel]) for b in recording.blocks(PIECE, always_2d=True))
     recording.seek(0)
     rising, at, before = [], 0, np.inf
@@ -204,13 +303,19 @@ def _rate_by_pulses(path: Path, recording: "SoundFile", channel: int) -> float:
         # Between two samples, where the edge crosses half of the height.
         rising.append(at + edge - (pulse[edge + 1] - 0.5 * level) / (pulse[edge + 1] - pulse[edge]))
         at, before = at + len(block), pulse[-1]
-    edges = np.concatenate(rising)
-    second = np.round((edges - edges[:1]) / recording.samplerate)
+    return np.concatenate(rising)
+
+
+def _rate_by_pulses(path: Path, entry: AudioEntry, edges: Array, channel: int) -> float:
+    """Return the samples per second (Hz) from rising edges at whole seconds."""
+    for place, missing in entry.slips[::-1]:
+        edges = edges + missing * (edges >= place)
+    second = np.round((edges - edges[:1]) / entry.rate_hz)
     if len(edges) >= LEAST_PULSES and np.ptp(second) > 0:
         rate_hz, first = np.polyfit(second, edges, 1)
         if np.max(np.abs(edges - first - rate_hz * second)) < EDGE_TOLERANCE * rate_hz:
             return float(rate_hz)
     raise InputError(
         f"{path}: channel {channel} (sync) has {len(edges)} edges that are not a second apart;"
-        " give pulses at whole seconds, or - for this channel"
+        " give pulses at whole seconds, or - for this channel; where samples are lost, --site"
     )

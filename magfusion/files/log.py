@@ -11,7 +11,7 @@ from pydantic import Field
 from magfusion.errors import InputError
 from magfusion.files.aiding_tables import read_aiding, write_aiding
 from magfusion.files.atomic import whole_directory
-from magfusion.files.audio import AudioEntry, read_audio
+from magfusion.files.audio import AudioEntry, lost_finding, read_audio
 from magfusion.files.depth_table import read_depths, write_depths
 from magfusion.files.drive_columns import read_drive
 from magfusion.files.fields import read_fields, write_fields
@@ -125,7 +125,7 @@ def read_log(
         waveform=waveform,
         fields=read_if_there(tables["fields"], read_fields, span),
         truth=read_if_there(tables["truth"], _read_truth, span),
-        noticed=(*of_imu, *of_waveform),
+        noticed=(*of_imu, *of_waveform, *lost_finding(header.audio)),
         temperatures=read_temperatures(tables["temperature"], header.epoch_ns),
         drive=read_drive(tables["magnetometer"], span),
         reference=read_waveform(tables["reference"], span)[0],

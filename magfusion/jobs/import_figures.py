@@ -25,7 +25,11 @@ def first_stamp_of(counts: dict[str, Counts]) -> int:
 
 
 def import_figures(
-    result: GatheredStreams, counts: dict[str, Counts], epoch_ns: int, is_first: bool, note: str
+    result: GatheredStreams,
+    counts: dict[str, Counts],
+    epoch_ns: int,
+    is_first: bool,
+    remarks: tuple[str, ...],
 ) -> Figures:
     """Return the numbers of read and omitted rows, and the interpreted columns."""
     figures = Figures(
@@ -55,7 +59,7 @@ def import_figures(
         Figure("understood", shown, section=Section.REMARKS),
     )
     notes = [*result.findings.notes, *(f"Skipped: {reason}" for reason in result.passed_over)]
-    notes += [note] if note else []
+    notes += filter(None, remarks)
     notes += [f"{stream}: {one.batches}" for stream, one in counts.items() if one.batches]
     notes += [
         f"{stream}: quaternions up to {100.0 * one.scaled:.2g} % off were scaled to unit length."

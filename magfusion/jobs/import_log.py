@@ -172,17 +172,18 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         settings.map_file,
         declared,
     )
-    audio: AudioEntry | None = None
-    if recording is not None:
-        begin_ns = wanted.shifts_ns.pop("magnetometer", 0)
-        audio = describe_recording(
-            recording, settings.channels or "", settings.full_scale, begin_ns
-        )
-        wanted = replace(wanted, recorded=True)
-    others = [Path(source) for source in settings.sources if Path(source) != recording]
     site = None
     if settings.site is not None and settings.site.is_file():
         site = load_site(settings.site, unknown=True, without=True, several=True)
+    audio: AudioEntry | None = None
+    remarks: tuple[str, ...] = ()
+    if recording is not None:
+        begin_ns = wanted.shifts_ns.pop("magnetometer", 0)
+        audio, remarks = describe_recording(
+            recording, settings.channels or "", settings.full_scale, begin_ns, site
+        )
+        wanted = replace(wanted, recorded=True)
+    others = [Path(source) for source in settings.sources if Path(source) != recording]
     result = gather(others, wanted, declared, site)
     epoch = _epoch(wanted.epoch, result)
     _refuse(declared)
@@ -209,7 +210,7 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         report("checking", 0, 1)
         figures = _checked(directory, output, result, settings.site)
         figures = heading("import", output.resolve().name) | figures
-        figures |= import_figures(result, counts, epoch_ns, epoch == FIRST, note)
+        figures |= import_figures(result, counts, epoch_ns, epoch == FIRST, (note, *remarks))
         write_report(directory, figures)
     return figures
 
@@ -309,7 +310,8 @@ def _recorded(path: Path, audio: AudioEntry) -> Counts:
     """Return the count and span of a recording's samples."""
     with open_audio(path) as recording:
         frames = recording.frames
-    last = audio.begin_ns + round((frames - 1) / audio.rate_hz / NANOSECOND)
+    true = frames - 1 + sum(lost for _, lost in audio.slips)
+    last = audio.begin_ns + round(true / audio.rate_hz / NANOSECOND)
     return Counts(read=frames, written=frames, first=audio.begin_ns, last=last)
 
 

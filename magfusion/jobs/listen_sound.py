@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.files.audio import channels_of
+from magfusion.files.audio import channels_of, slip_remarks
 from magfusion.files.stream_contents import baseband_content
-from magfusion.model.bandpass import MIN_SPACING_HZ, BandFilter, BandSampler
+from magfusion.model.bandpass import MIN_SPACING_HZ, BandFilter
 from magfusion.model.response import NOMINAL_T_PER_V
+from magfusion.model.slip_sampler import SlipSampler
 from magfusion.receiver.host_clock import HostClock
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from magfusion.model.site import Site
+    from magfusion.model.slips import Slip
     from magfusion.units import Array
 
 BLOCK = 0.02  # s
@@ -72,7 +74,7 @@ class SoundSource:
                 f"the tones of the site are not separable at {rate_hz} Hz: set them at least"
                 f" {MIN_SPACING_HZ:g} Hz apart and below half of the rate"
             )
-        self._band, self._sampler = band, BandSampler(band)
+        self._band, self._sampler = band, SlipSampler(band, site)
         self._clock, self._received, self._overflows = HostClock(1.0 / rate_hz), 0, 0
         self._begin: float | None = None
         self.shift = 0.0
@@ -137,8 +139,8 @@ class SoundSource:
         if self._received < WARM_UP * self._rate_hz:
             return
         # The phases of the tones need an even clock, so that the others are brought to this one.
-        newest = self._received / self._rate_hz
-        host = float(self._clock.stamps(np.array([float(self._received)]), arrival)[0])
+        newest = (self._received + self._sampler.missing) / self._rate_hz
+        host = float(self._clock.stamps(np.array([newest * self._rate_hz]), arrival)[0])
         self._begin = host - newest if self._begin is None else self._begin
         self.shift = self._begin + newest - host
         stamps = self._begin + place / self._rate_hz
@@ -146,14 +148,21 @@ class SoundSource:
             turn = np.exp(-2j * np.pi * stamps[:, None] * self._band.tones_hz)
             yield baseband_content(stamps, baseband * turn[..., None], self._band.tones_hz)
 
+    @property
+    def slips(self) -> list[Slip]:
+        """Lost samples, as far as they are found."""
+        return self._sampler.slips
+
     def close(self) -> Iterator[str]:
         """End the recording, and report blocks that were lost."""
         if self._stream is not None:
             self._stream.close()
-        if self._overflows:
+        for sentence in slip_remarks(self.slips, self._sampler.unexplained, self._rate_hz):
+            yield f"{self._device}: {sentence}"
+        if self._overflows > len(self.slips):
             yield (
                 f"{self._device}: {self._overflows} times samples were lost, as the computer was"
-                " busy; their number is unknown."
+                f" busy; {len(self.slips)} of them are corrected."
             )
 
 
