@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -62,12 +62,7 @@ def open_audio(path: Path) -> Iterator["SoundFile"]:
     InputError
         Where the package that reads it is missing, or the file is no recording.
     """
-    try:
-        import soundfile
-    except (ImportError, OSError) as error:
-        raise InputError(
-            f"{path}: soundfile is not installed; pip install 'magfusion[audio]'"
-        ) from error
+    soundfile = _soundfile(path)
     if not path.is_file():
         raise InputError(f"{path}: there is no such recording; restore it, or import it again")
     try:
@@ -78,6 +73,28 @@ def open_audio(path: Path) -> Iterator["SoundFile"]:
         raise InputError(
             f"{path}: is no readable recording ({reason}); give WAV or FLAC"
         ) from error
+
+
+def write_audio(path: Path, samples: Array, rate_hz: int) -> None:
+    """Write samples (n, channels) from -1 to 1 as 24 bit.
+
+    Raises
+    ------
+    InputError
+        Where the package that writes it is missing.
+    """
+    soundfile = _soundfile(path)
+    soundfile.write(path, samples, rate_hz, subtype="PCM_24")
+
+
+def _soundfile(path: Path) -> Any:
+    try:
+        import soundfile
+    except (ImportError, OSError) as error:  # the latter without the library of libsndfile
+        raise InputError(
+            f"{path}: soundfile is not installed; pip install 'magfusion[audio]'"
+        ) from error
+    return soundfile
 
 
 def read_audio(

@@ -81,6 +81,7 @@ JOBS = {
         "coil",
         "Tabulate what a coil of wire gives: moment, volts, watts, warming, capacitor, fields.",
     ),
+    "drive": ("drive", "Write a sound file that is played for the beacons of a site."),
     "drift": (
         "drift",
         "Test the long-term stability of the online estimators on days of simulated data.",

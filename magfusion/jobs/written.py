@@ -29,6 +29,7 @@ WRITTEN = {
     "fix": _RESULT | {"fixes.parquet"},
     "navigate": _RESULT | {"lagged.parquet"} | UNFINISHED["navigate"],
     "drift": {"drift.png", "stability.png", "run.rrd", "report.json"} | UNFINISHED["drift"],
+    "drive": {"beacons.wav", "report.json"},
     "import": {"log.yaml", *_TABLES, "report.json"},
     "simulate": _LOG,
     "demodulate": _LOG,
