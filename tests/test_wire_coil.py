@@ -158,3 +158,12 @@ def test_without_a_capacitor_the_inductance_limits_the_current() -> None:
 
 def test_a_coil_that_burns_has_no_equilibrium() -> None:
     assert operating_point(ROUND, current=40.0) is None
+
+
+def test_neighbouring_layers_raise_the_resistance() -> None:
+    """Dowell's series: 1 + (5 p^2 - 1) / 45 x^4 of p layers, of a thickness of x skin depths."""
+    depth = 0.0661 / np.sqrt(200.0)  # m, of copper at 200 Hz
+    x = 0.886 * ROUND.wire / depth * np.sqrt(1.0 / 1.1)
+    series = 1.0 + (5.0 * ROUND.layers**2 - 1.0) / 45.0 * x**4
+    assert ROUND.alternating_ratio(200.0) == pytest.approx(series, rel=2e-3)
+    assert ROUND.alternating_ratio(1e-3) == pytest.approx(1.0, abs=1e-6)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 DISTANCES = range(1, 11)  # m
 ENAMEL = 1.08  # diameter of enamelled wire over that of its copper
-SKIN_DEPTH_AT_1_HZ = 0.0661  # m, of copper
+LARGEST_RATIO = 1.1  # of resistances, without a note
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,10 +129,10 @@ def _alternating(coil: WireCoil, point: OperatingPoint, settings: CoilSettings) 
     from magfusion.model.physics.wire_coil import resonance_capacitance
 
     reactance = math.tau * settings.frequency * coil.inductance
-    skin = SKIN_DEPTH_AT_1_HZ / settings.frequency**0.5
+    ratio = coil.alternating_ratio(settings.frequency)
     note = (
-        f"Current flows in a skin of {skin:.2g} m, so resistance and warming are larger than"
-        " reported; use thinner or stranded wire."
+        f"At this frequency the resistance is about {ratio:.2g} times that to direct current, by"
+        " skin and neighbouring layers, and the coil warms more; use thinner or stranded wire."
     )
     cold = coil.resistance(settings.air)
     return Figures(
@@ -144,7 +144,7 @@ def _alternating(coil: WireCoil, point: OperatingPoint, settings: CoilSettings) 
         ),
         Figure("capacitor_v", point.current * reactance, "V", label="its peak voltage"),
         Figure("quality", reactance / cold, label="quality of the resonance"),
-        Figure("skin_depth_m", skin, "m", note=note if settings.wire > 2.0 * skin else ""),
+        Figure("alternating_ratio", ratio, note=note if ratio > LARGEST_RATIO else ""),
         Figure(
             "sensitivity_v_t",
             math.tau * settings.frequency * coil.turns * coil.area,

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 LARGEST_BOX, SMALLEST_BOX = 1e5, 1e-3  # m
 DRIFT_TIME = 600.0  # s
-RECORDING = "recording.flac"
+RECORDING = "recording.wav"
 LATE = 0.037  # s; the clock of a reference
 
 

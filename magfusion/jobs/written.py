@@ -31,7 +31,7 @@ WRITTEN = {
     "drift": {"drift.png", "stability.png", "run.rrd", "report.json"} | UNFINISHED["drift"],
     "drive": {"beacons.wav", "report.json"},
     "import": {"log.yaml", *_TABLES, "report.json"},
-    "simulate": _LOG | {"recording.flac"},
+    "simulate": _LOG | {"recording.wav"},
     "demodulate": _LOG,
     "survey": {"survey.parquet", "survey.png", "report.json"},
     "calibrate log": _SITE | {"calibration.png", "report.json", KEPT, LOGS_TABLE},

@@ -8,7 +8,7 @@ import numpy as np
 
 from magfusion.model.physics.free_convection import ZERO_DEGC, heat_loss
 from magfusion.model.physics.inductance import coil_inductance
-from magfusion.units import MU0_OVER_4PI, Array
+from magfusion.units import MU0, MU0_OVER_4PI, Array
 
 # Annealed copper (IEC 60028): resistivity at 20 degC (ohm m), its change per kelvin, density.
 COPPER_RESISTIVITY, COPPER_PER_K, COPPER_DENSITY = 1.7241e-8, 3.93e-3, 8890.0
@@ -86,6 +86,20 @@ class WireCoil:
         """Return the resistance to direct current (ohm)."""
         cold = COPPER_RESISTIVITY * self.wire_length / (np.pi * (0.5 * self.wire) ** 2)
         return float(cold * (1.0 + COPPER_PER_K * (temperature_degc - REFERENCE_DEGC)))
+
+    def alternating_ratio(self, frequency_hz: float) -> float:
+        """Return the resistance to alternating current relative to that to direct current.
+
+        Of skin and neighbouring layers, by the field of a long coil (P. L. Dowell, Proc. IEE 113,
+        1966, 1387): an estimate for a short one.
+        """
+        if frequency_hz == 0.0:
+            return 1.0
+        depth = np.sqrt(COPPER_RESISTIVITY / (np.pi * frequency_hz * MU0))
+        x = np.sqrt(np.pi) / 2.0 * self.wire / depth * np.sqrt(self.wire / self.insulated)
+        skin = (np.sinh(2.0 * x) + np.sin(2.0 * x)) / (np.cosh(2.0 * x) - np.cos(2.0 * x))
+        layer = (np.sinh(x) - np.sin(x)) / (np.cosh(x) + np.cos(x))
+        return float(x * (skin + 2.0 / 3.0 * (self.layers**2 - 1) * layer))
 
     def heat_loss(self, temperature_degc: float, air_degc: float) -> float:
         """Return the heat that its surface gives away (W)."""
