@@ -32,7 +32,7 @@ ROOMS = {
             site trajectory
             truth_poses
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
-            detection_range field ground without_imu
+            detection_range drive_signal field ground without_imu
             bandpass parameters path_field slips strapdown_steps
             noise prior slip_sampler waveform
         """,
@@ -113,8 +113,8 @@ ROOMS = {
             allan_noise checkpoint failure magnetometer_trust magnetometer_turns orientation
             settings without_beacons
             allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
-            calibrate_magnetometer check design_settings drift_world evaluate export import_figures
-            init_settings
+            calibrate_magnetometer check coil design_settings drift_world drive evaluate export
+            import_figures init_settings
             listen live papers published_fix range_wells rates region replay rest_settings
             simulate_ranging smooth_result survey view
             antenna_fit demodulate design_motion drift_figures fix import_log init_questions

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -80,12 +80,7 @@ def open_audio(path: Path) -> Iterator["SoundFile"]:
     InputError
         Where the package that reads it is missing, or the file is no recording.
     """
-    try:
-        import soundfile
-    except (ImportError, OSError) as error:
-        raise InputError(
-            f"{path}: soundfile is not installed; pip install 'magfusion[audio]'"
-        ) from error
+    soundfile = _soundfile(path)
     if not path.is_file():
         raise InputError(f"{path}: there is no such recording; restore it, or import it again")
     try:
@@ -96,6 +91,57 @@ def open_audio(path: Path) -> Iterator["SoundFile"]:
         raise InputError(
             f"{path}: is no readable recording ({reason}); give WAV or FLAC"
         ) from error
+
+
+def write_audio(path: Path, samples: Array, rate_hz: int) -> None:
+    """Write samples (n, channels) from -1 to 1 as 24 bit.
+
+    Raises
+    ------
+    InputError
+        Where the package that writes it is missing.
+    """
+    soundfile = _soundfile(path)
+    soundfile.write(path, samples, rate_hz, subtype="PCM_24")
+
+
+def as_recording(
+    waveform: Waveform, name: str, full_scale_v: float, epoch_ns: int
+) -> tuple[AudioEntry, Array]:
+    """Return the entry of a receiver's recording, and its samples as a sound card has them.
+
+    Raises
+    ------
+    InputError
+        Where they exceed full scale.
+    """
+    volts = waveform.measured_sensor / NOMINAL_T_PER_V
+    highest = float(np.max(np.abs(volts), initial=0.0))
+    if highest >= full_scale_v:
+        raise InputError(
+            f"the receiver's voltage reaches {highest:.3g} V, beyond the full scale of"
+            f" {full_scale_v:g} V; set a larger one, or a lower amplifier_gain in the site"
+        )
+    rate_hz = round((len(waveform) - 1) / float(waveform.time[-1] - waveform.time[0]))
+    used = [k for k, axis in enumerate(AXES) if axis in waveform.axes]
+    entry = AudioEntry(
+        file=name,
+        channels={AXES[k]: number for number, k in enumerate(used)},
+        full_scale_v=full_scale_v,
+        rate_hz=float(rate_hz),
+        begin_ns=epoch_ns + round(float(waveform.time[0]) / NANOSECOND),
+    )
+    return entry, volts[:, used] / full_scale_v
+
+
+def _soundfile(path: Path) -> Any:
+    try:
+        import soundfile
+    except (ImportError, OSError) as error:  # the latter without the library of libsndfile
+        raise InputError(
+            f"{path}: soundfile is not installed; pip install 'magfusion[audio]'"
+        ) from error
+    return soundfile
 
 
 def read_audio(

@@ -141,10 +141,15 @@ def read_log(
     return log
 
 
-def write_log(log: Log, path: Path) -> None:
+def write_log(log: Log, path: Path, audio: AudioEntry | None = None) -> None:
     """Write a log as a directory of Parquet files; a log that is there is replaced.
 
     Files of other names that lie in the former log are kept.
+
+    Parameters
+    ----------
+    audio : AudioEntry, optional
+        Of the recording that has its samples.
 
     Raises
     ------
@@ -155,7 +160,9 @@ def write_log(log: Log, path: Path) -> None:
         if path.is_dir():
             _keep_others(path, unfinished)
         header = {"magfusion_log": 1, "name": log.name, "epoch_ns": log.epoch_ns}
-        write_yaml(header | {"source": log.source}, unfinished / HEADER)
+        header |= {"source": log.source}
+        header |= {} if audio is None else {"audio": audio.model_dump()}
+        write_yaml(header, unfinished / HEADER)
         if log.inertial and len(log.imu):
             write_imu(log.imu, unfinished / "imu.parquet", log.epoch_ns)
         _write_samples(log, unfinished)

@@ -77,6 +77,11 @@ JOBS = {
         "design",
         "Design an installation: places, axes and frequencies of beacons for a hall.",
     ),
+    "coil": (
+        "coil",
+        "Tabulate what a coil of wire gives: moment, volts, watts, warming, capacitor, fields.",
+    ),
+    "drive": ("drive", "Write a sound file that is played for the beacons of a site."),
     "drift": (
         "drift",
         "Test the long-term stability of the online estimators on days of simulated data.",

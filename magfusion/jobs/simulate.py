@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.files.audio import as_recording, write_audio
 from magfusion.files.log import write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.jobs.rotor_inputs import is_for_ranging
@@ -27,7 +28,8 @@ from magfusion.simulation.slots import Multiplexer
 from magfusion.simulation.waveform import usual_rate_hz
 
 if TYPE_CHECKING:
-    from magfusion.model.site import Site
+    from magfusion.model.samples import Log
+    from magfusion.model.site import Magnetometer, Site
     from magfusion.simulation.log import Reference, SimulationConfig
     from magfusion.simulation.pipe import Steel
     from magfusion.units import Array
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 
 LARGEST_BOX, SMALLEST_BOX = 1e5, 1e-3  # m
 DRIFT_TIME = 600.0  # s
+RECORDING = "recording.wav"
 LATE = 0.037  # s; the clock of a reference
 
 
@@ -53,6 +56,13 @@ class SimulateSettings(ShaftSettings):
         least=10.0,
         most=1e6,
         note="default: 400, or as many as the tones and time slots of the site need",
+    )
+    full_scale: float | None = option(
+        None,
+        "Record the magnetometer as a sound card of this full scale does, 24 bit at --rate",
+        unit="V",
+        above=0.0,
+        note="default: as numbers; magfusion[audio]",
     )
     imu_rate: float = option(200.0, "Inertial sampling rate", unit="Hz", least=10.0, most=1e4)
     perturb: bool = option(True, "Draw the true calibration from the site's sigmas")
@@ -189,7 +199,7 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
             else None,
         ),
     )
-    return run_simulate(site, config, output, settings.seed)
+    return run_simulate(site, config, output, settings.seed, settings.full_scale)
 
 
 def _rails(text: str | None, box_world: Array, site: Site) -> Steel | None:
@@ -238,13 +248,21 @@ def _refuse_wells(settings: SimulateSettings, site: Site) -> None:
         )
 
 
-def run_simulate(site: Site, config: SimulationConfig, output: Path, seed: int) -> Figures:
+def run_simulate(
+    site: Site,
+    config: SimulationConfig,
+    output: Path,
+    seed: int,
+    full_scale_v: float | None = None,
+) -> Figures:
     """Simulate a log, with truth.
 
     Parameters
     ----------
     site : Site
         The user's declared site; written with the log as ``site.yaml``.
+    full_scale_v : float, optional
+        Of the sound card that records the magnetometer (V); numbers are written if None.
 
     Raises
     ------
@@ -276,11 +294,25 @@ def run_simulate(site: Site, config: SimulationConfig, output: Path, seed: int) 
         )
     )
     with claimed as directory:
-        write_log(simulated.log, directory)
+        _write_log(simulated.log, directory, full_scale_v, site.platform.magnetometer)
         save_site(site, directory / "site.yaml")
         save_site(simulated.true_site, directory / "true_site.yaml")
         write_report(directory, figures)
     return figures
+
+
+def _write_log(log: Log, directory: Path, full_scale_v: float | None, sensor: Magnetometer) -> None:
+    if full_scale_v is None:
+        write_log(log, directory)
+        return
+    if log.waveform is None or not sensor.ac_coupled:
+        raise InputError(
+            "--full-scale: a sound card records no steady field; declare coil, or ac_coupled: true,"
+            " for the site's single magnetometer"
+        )
+    entry, samples = as_recording(log.waveform, RECORDING, full_scale_v, log.epoch_ns)
+    write_log(replace(log, waveform=None), directory, entry)
+    write_audio(directory / RECORDING, samples, round(entry.rate_hz))
 
 
 COMMAND = Command(

@@ -1,0 +1,71 @@
+"""The kit's page alone leads from parts to a trajectory, in at most twelve commands."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from page_blocks import blocks
+from test_sound_server import PROGRAMS, server
+
+PAGE = (Path(__file__).parents[1] / "docs" / "kit.md").read_text()
+PLAYED = re.search(r"^```\n(pactl .*\nparecord .*) &\n(paplay .*)\n```$", PAGE, re.M)
+SHOWN = re.findall(r"`(magfusion view .*?)`", PAGE)
+MOST_COMMANDS = 12
+LARGEST_ERROR = 2e-3  # m, after alignment
+__all__ = ["server"]
+
+
+def commands() -> list[str]:
+    """Return the commands that the page runs, in their order."""
+    return [
+        line
+        for language, block in blocks(PAGE)
+        if language == "sh"
+        for line in block.split("\n")
+        if line
+    ]
+
+
+def test_at_most_twelve_commands() -> None:
+    assert PLAYED is not None
+    assert len(SHOWN) == 1
+    played = sum(len(group.splitlines()) for group in PLAYED.groups())
+    assert len(commands()) + played + len(SHOWN) <= MOST_COMMANDS
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not all(map(shutil.which, PROGRAMS)), reason="PulseAudio is not installed here")
+def test_a_stranger_plays_a_walk_and_finds_it(tmp_path: Path, server: dict[str, str]) -> None:
+    """All commands of the page, with what is heard in place of the simulated recording."""
+    assert PLAYED is not None
+    own = server | {"PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])}
+    for language, block in blocks(PAGE):
+        if language == "yaml":
+            (tmp_path / block.split()[1]).write_text(block, encoding="utf-8")
+
+    def run(command: str) -> str:
+        done = subprocess.run(
+            command, shell=True, cwd=tmp_path, env=own, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, f"{command}: {done.stdout} {done.stderr}"
+        return done.stdout
+
+    for command in commands():
+        if command.startswith("magfusion import"):
+            (load, record), play = PLAYED[1].splitlines(), PLAYED[2]
+            run(load)
+            with subprocess.Popen(record.split(), cwd=tmp_path, env=own) as recorder:
+                time.sleep(1.0)  # until it records
+                run(play)
+                recorder.terminate()
+            command = command.replace("walk/recording.wav", "heard.wav")
+        shown = run(f"{command} --json" if command.startswith("magfusion evaluate") else command)
+    assert json.loads(shown)["ate_m"] < LARGEST_ERROR
+    report = json.loads((tmp_path / "heard_run" / "report.json").read_text())
+    assert report["verdict"] == "trustworthy"
