@@ -32,15 +32,15 @@ from magfusion.estimation.batch.batch import SmootherSettings
 from magfusion.estimation.batch.joint import LogInformation, Shared, apart_in_sigmas
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
-from magfusion.jobs.inputs import Job, read_site
+from magfusion.jobs.inputs import Job
+from magfusion.jobs.joint_driver import Driver
 from magfusion.jobs.joint_kept import load_information, save_information
-from magfusion.jobs.joint_run import Driver, tasks_of
+from magfusion.jobs.joint_run import site_files, tasks_of
 from magfusion.jobs.joint_tasks import (
     LogTask,
     RoundTask,
     alone,
     one_round,
-    shared_site,
     together_settings,
 )
 from magfusion.model.parameters import difference, initial_calibration
@@ -104,7 +104,7 @@ def any_round(given: tuple[RoundTask, bool], rng: np.random.Generator) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
     if isinstance(task, SimulatedLog):  # a quadratic is the same wherever it is linearised
         known = load_information(task.information(given[0].rounds))
-        save_information(task.information(given[0].rounds + 1), known)
+        save_information(task.information(given[0].rounds + 1), *known)
     else:
         one_round(given[0], rng)
 
@@ -157,20 +157,22 @@ def main() -> None:
         hands.run(simulated, [RealLog(place / "site.yaml", true, p) for p in paths], seed=1)
         tasks: list[LogTask] = tasks_of(jobs, SETTINGS, place / "out")
         began = time.process_time()
-        steps = [one.step for one in hands.run(alone, tasks)]
+        hands.run(alone, tasks)
         alone_s = time.process_time() - began
-        _, shared = shared_site(read_site(jobs[0]), SETTINGS)
+        files = site_files(tasks)
+        shared = files.calendar().shared
         truth = difference(shared.declared, initial_calibration(true, 0.0), shared.blocks)
         for i in range(options.real, options.logs):
             like = tasks[rng.integers(options.real)]
             kept = like.kept.with_stem(f"simulated{i}")
             tasks.append(SimulatedLog(kept.stem, like.job, SETTINGS, kept, like.key))
-            known = drawn(load_information(like.information(0)), shared, truth, rng)
-            save_information(tasks[-1].information(0), known)
+            stored = load_information(like.information(0))
+            known = drawn(stored.information, shared, truth, rng)
+            save_information(tasks[-1].information(0), known, stored.blocks)
         metered = Metered(hands.executor, kills=scale["cluster"] is not None)
-        driver = Driver(metered, tasks, shared, quiet)
+        driver = Driver(metered, tasks, files, quiet)
         began = time.process_time()
-        sums = driver.sums(0, np.mean(steps, axis=0))
+        sums = driver.first_sums()
         before = driver.agreement(sums)
         agreement_s = time.process_time() - began
         began = time.process_time()

@@ -120,9 +120,11 @@ ROOMS = {
             antenna_fit demodulate design_motion drift_figures fix import_log init_questions
             joint_tasks match_trust navigate_settings simulate smooth_correction smooth_failure
             stream
-            antenna_report antenna_trust coverage drift init joint_run match record_source
+            antenna_report antenna_trust coverage drift init joint_calendar match record_source
             navigate_rests
-            calibrate_antenna design_figures joint_result navigate
+            calibrate_antenna design_figures joint_driver navigate
+            joint_run
+            joint_result
             calibrate_log design smooth
             demo
         """,

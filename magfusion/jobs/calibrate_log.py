@@ -90,6 +90,11 @@ class LogCalibrationSettings(LogsSettings, WindowSettings, EstimateSettings):
     cross_validate: int | None = option(
         None, "Calibrate on each of this many parts of the log, score on the others"
     )
+    calendar: bool = option(
+        False,
+        "Search for beacons that were moved or exchanged between the logs, and platforms that"
+        " changed; estimate them separately before and after",
+    )
 
 
 def run_calibrate_log(
@@ -125,7 +130,9 @@ def run_calibrate_log(
 
         if settings.cross_validate is not None:
             raise InputError("--cross-validate splits one log; several were given")
-        return run_joint(JOB, settings, smoother, output, report)
+        return run_joint(JOB, settings, smoother, output, report, by_date=settings.calendar)
+    if settings.calendar:
+        raise InputError("--calendar compares several logs; one was given")
     claimed = claim(output, JOB)
     log, site = read_job(job, unknown=True, report=report)
     cuts = _cuts(job, log, site, settings.cross_validate)

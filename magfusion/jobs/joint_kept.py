@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.estimation.batch.calendar import BlockName, Calendar, LogBlocks
 from magfusion.estimation.batch.chain import Start
 from magfusion.estimation.batch.joint import LogInformation
 from magfusion.estimation.batch.joint_log import OfLog
@@ -53,17 +54,44 @@ class Kept(NamedTuple):
     facts: dict[str, Any]
 
 
-def save_information(path: Path, information: LogInformation) -> None:
-    """Write what one or several logs know of the shared calibration."""
+class StoredInformation(NamedTuple):
+    """Information of a log, or of several, on the shared calibration.
+
+    Parameters
+    ----------
+    blocks : LogBlocks, optional
+        Those of one log; None of a sum, which is on the parameters of all logs.
+    """
+
+    information: LogInformation
+    blocks: LogBlocks | None
+
+    def whole(self, calendar: Calendar) -> LogInformation:
+        """Return the information on the parameters of all logs."""
+        if self.blocks is None:
+            return self.information
+        return calendar.whole(self.information, self.blocks)
+
+
+def save_information(
+    path: Path, information: LogInformation, blocks: LogBlocks | None = None
+) -> None:
+    """Write the information of one log, or of several, on the shared calibration."""
     arrays = {"step": information.step, **vars(information.part)}
-    save_kept(path, "", StoredArrays(arrays, {"logs": information.logs}))
+    facts = {"logs": information.logs, "blocks": blocks}
+    save_kept(path, "", StoredArrays(arrays, facts))
 
 
-def load_information(path: Path) -> LogInformation:
-    """Return what one or several logs know of the shared calibration."""
+def load_information(path: Path) -> StoredInformation:
+    """Return the information of one log, or of several, on the shared calibration."""
     arrays, facts = written_by_worker(path, load_kept(path, ""))
     part = MarginalizedLog(**{k: v for k, v in arrays.items() if k != "step"})
-    return LogInformation(arrays["step"], part, facts["logs"])
+    information = LogInformation(arrays["step"], part, facts["logs"])
+    if facts["blocks"] is None:
+        return StoredInformation(information, None)
+    time, platform, *names = facts["blocks"]
+    shared, considered = (tuple(BlockName(*name) for name in part) for part in names)
+    return StoredInformation(information, LogBlocks(time, platform, shared, considered))
 
 
 def written_by_worker(path: Path, stored: File | None) -> File:

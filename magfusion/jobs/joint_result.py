@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -16,9 +17,10 @@ from magfusion.jobs.inputs import Job
 from magfusion.jobs.joint_run import Joint, refine, tasks_of
 from magfusion.jobs.joint_tasks import together_settings
 from magfusion.jobs.result_directory import claim, keep_results
-from magfusion.jobs.written import LOGS, LOGS_TABLE
-from magfusion.model.parameters import Calibration
+from magfusion.jobs.written import CALENDAR_TABLE, LOGS, LOGS_TABLE, PLATFORMS
+from magfusion.model.parameters import Block, Calibration
 from magfusion.model.progress import Report
+from magfusion.model.site import Site
 from magfusion.results.figures import (
     Figure,
     Figures,
@@ -49,6 +51,7 @@ def run_joint(
     *,
     rate: Rate = "field",
     risk: Risk | None = None,
+    by_date: bool = False,
 ) -> Figures:
     """Refine one site with several logs together.
 
@@ -56,6 +59,8 @@ def run_joint(
     ----------
     command : {'smooth', 'calibrate log'}
         The former writes the trajectory of each log too.
+    by_date : bool
+        Whether changes between the logs are searched.
 
     Raises
     ------
@@ -76,19 +81,25 @@ def run_joint(
         writes=writes,
         rate=rate,
         risk=risk,
+        by_date=by_date,
         report=report,
     )
-    cov, name = joint.excess * joint.known.honest, ", ".join(task.name for task in tasks)
-    calibration = _calibration(joint)
-    blocks = joint.shared.blocks
-    estimates = parameter_estimates(joint.shared.declared, calibration, blocks, cov)
+    name = ", ".join(task.name for task in tasks)
+    calibration, cov = _calibration(joint, 0)
+    declared, blocks = joint.calendar.platforms[0].shared.declared, _blocks(joint)
+    estimates = parameter_estimates(declared, calibration, blocks, cov)
     figures = heading(command, name) | _figures(joint, calibration, cov, estimates, writes=writes)
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     result = observability(calibration, blocks, cov)
     with claimed as whole:
         keep_results(whole, [(t.name, t.kept, t.job.output) for t in tasks])
         save_site(refined_site(calibration, blocks, cov, estimates, name), whole / "site.yaml")
+        for i in range(1, len(joint.calendar.platforms)):
+            (whole / PLATFORMS).mkdir(exist_ok=True)
+            save_site(_other_site(joint, i, name), whole / PLATFORMS / f"{i + 1}.yaml")
         write_rows(whole / LOGS_TABLE, joint.table)
+        if joint.months:
+            write_rows(whole / CALENDAR_TABLE, joint.months)
         if not writes:
             ratios = result.ratio_but_for_gauge, result.direction_ratio
             write_log_calibration_plot(whole / "calibration.png", estimates, *ratios)
@@ -96,16 +107,33 @@ def run_joint(
     return figures
 
 
-def _calibration(joint: Joint) -> Calibration:
-    """Return the joint calibration, with the noise estimated from the logs (geometric mean)."""
+def _blocks(joint: Joint, platform: int = 0) -> tuple[Block, ...]:
+    return joint.calendar.platforms[platform].shared.blocks
+
+
+def _calibration(joint: Joint, platform: int) -> tuple[Calibration, Array]:
+    """Return the joint calibration with one platform after all changes, and its covariance.
+
+    The noise is that estimated from the logs of the platform (geometric mean).
+    """
     result: dict[tuple[str, str], list[Tuned]] = {}
-    for tuned in joint.noise:
+    for tuned in joint.noise[platform]:
         result.setdefault((tuned.owner, tuned.key), []).append(tuned)
     noise = [
         replace(every[0], estimated=float(np.exp(np.mean(np.log([t.estimated for t in every])))))
         for every in result.values()
     ]
-    return with_noise(joint.shared.moved(joint.known.step), noise)
+    known = joint.known.of(*joint.calendar.columns(joint.calendar.on(platform, math.inf)))
+    shared = joint.calendar.platforms[platform].shared
+    return with_noise(shared.moved(known.step), noise), joint.excess * known.honest
+
+
+def _other_site(joint: Joint, platform: int, name: str) -> Site:
+    calibration, cov = _calibration(joint, platform)
+    declared = joint.calendar.platforms[platform].shared.declared
+    blocks = _blocks(joint, platform)
+    estimates = parameter_estimates(declared, calibration, blocks, cov)
+    return refined_site(calibration, blocks, cov, estimates, name)
 
 
 def _figures(
@@ -117,13 +145,14 @@ def _figures(
     writes: bool,
 ) -> Figures:
     section = Section.REPORT if writes else Section.DIRECTIONS
-    result = observability(calibration, joint.shared.blocks, cov)
+    result = observability(calibration, _blocks(joint), cov)
     return (
         trust_figures(joint.trust)
         | Figures(
             Figure(LOGS, joint.table, section=Section.LOGS),
             Figure("logs_used", sum(row["used"] == "yes" for row in joint.table)),
             Figure("rounds", joint.rounds),
+            Figure("changes", [one.row for one in joint.changes], section=Section.REPORT),
         )
         | observability_figures(estimates, result, section)
         | Figures(*estimates)

@@ -6,55 +6,48 @@ driver holds sums over the logs, and passes names of files.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import Any
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.batch.batch import SmootherSettings
+from magfusion.estimation.batch.calendar import Calendar
 from magfusion.estimation.batch.joint import (
-    Shared,
     SharedCalibration,
-    apart_in_sigmas,
-    known_by,
 )
-from magfusion.estimation.integrity.logs_agree import Deviation, LogAgreement, agreement
+from magfusion.estimation.integrity.change_between_logs import FoundChange
+from magfusion.estimation.integrity.logs_agree import LogAgreement
 from magfusion.estimation.posterior.noise_tuning import Tuned
 from magfusion.files.atomic import real
 from magfusion.files.checkpoint import run_key
 from magfusion.files.kept import digest_of_files
+from magfusion.files.site_changes import changed_keys
 from magfusion.jobs.inputs import Job, read_job, read_site
+from magfusion.jobs.joint_calendar import (
+    ChangeReport,
+    check_dates,
+    describe_change,
+)
+from magfusion.jobs.joint_driver import MOST_ROUNDS, Driver
 from magfusion.jobs.joint_tasks import (
     Alone,
     LastTask,
     LogTask,
-    RoundTask,
-    SumTask,
-    added,
+    SiteFiles,
     alone,
-    from_others,
     last,
-    one_round,
     shared_of,
-    shared_site,
-    sum_of,
 )
 from magfusion.jobs.written import KEPT
 from magfusion.model.progress import Report
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk, Trust, Verdict
 from magfusion.results.provenance import versions
-from magfusion.simulation.monte_carlo import WorkerPool, worker_pool
-from magfusion.units import Array, Rate
+from magfusion.simulation.monte_carlo import worker_pool
+from magfusion.units import Rate
 
-CONVERGED_STEP = 1e-6  # sigmas; a step of the shared calibration that ends the rounds
-MOST_ROUNDS = 20
-LARGE = 0.5  # sigmas; rounds that move it by more, and by more each time, are held back
-SMALLEST_SHARE = 0.25
 UNSETTLED = 0.1  # sigmas that the last round may have moved it by
 _SITE_FILES = ("site.yaml", "site_field_map.parquet", "site_correlation.parquet")
 
@@ -66,19 +59,25 @@ class Joint:
     Parameters
     ----------
     known : SharedCalibration
-        Of the shared calibration.
+        Of the parameters of all logs.
+    calendar : Calendar
+    changes : list of ChangeReport
+    months : list of dict
+        Parameters by month.
     excess : float
         Factor on its variances, as the logs contradict each other.
-    noise : tuple of Tuned
-        Estimated from each log alone.
+    noise : tuple of tuple of Tuned
+        For each platform, estimated from each log alone.
     table : list of dict
         A row for each given log.
     """
 
-    shared: Shared
     known: SharedCalibration
+    calendar: Calendar
+    changes: list[ChangeReport]
+    months: list[dict[str, Any]]
     excess: float
-    noise: tuple[Tuned, ...]
+    noise: tuple[tuple[Tuned, ...], ...]
     table: list[dict[str, Any]]
     trust: Trust
     rounds: int
@@ -94,10 +93,10 @@ def tasks_of(jobs: Sequence[Job], smoother: SmootherSettings, output: Path) -> l
     for job in jobs:
         if not job.log_path.exists():
             read_job(job)  # which says so
-    site = _one_site(jobs, smoother)
+    site, platforms = _one_site(jobs, smoother)
     names, seen = _names([job.log_path for job in jobs]), dict[str, Path]()
     tasks = []
-    for job, name in zip(jobs, names, strict=True):
+    for job, name, platform in zip(jobs, names, platforms, strict=True):
         content = digest_of_files([job.log_path], without=frozenset(_SITE_FILES))
         if content in seen:
             raise InputError(
@@ -105,28 +104,31 @@ def tasks_of(jobs: Sequence[Job], smoother: SmootherSettings, output: Path) -> l
                 " each log once"
             )
         seen[content] = job.log_path
-        made_by = content, site, job.start, job.end, job.topics, smoother, versions()
+        made_by = content, site[platform], job.start, job.end, job.topics, smoother, versions()
         key = run_key("smooth", *made_by)
         place = real(output) / KEPT
         own = replace(job, output=place / name)
-        tasks.append(LogTask(name, own, smoother, place / f"{name}.npz", key))
+        tasks.append(LogTask(name, own, smoother, place / f"{name}.npz", key, platform))
     return tasks
 
 
-def _one_site(jobs: Sequence[Job], smoother: SmootherSettings) -> str:
-    """Return the digest of the one site of several logs."""
-    result = {}
+def _one_site(jobs: Sequence[Job], smoother: SmootherSettings) -> tuple[list[str], list[int]]:
+    """Return the digest of the site with each platform, and the platform of each log."""
+    digests: dict[str, Path] = {}
+    first, platforms = read_site(jobs[0]), []
     for job in jobs:
         path = job.declared_path
-        read_site(job)
         others = [path.with_name(name) for name in _SITE_FILES[1:]]
-        result[digest_of_files([path, *others])] = path
-    if len(result) > 1:
-        first, other = list(result.values())[:2]
-        raise InputError(
-            f"{other}: differs from {first}; logs that refine one site share its file: give it with"
-            " --site SITE.yaml"
-        )
+        digest = digest_of_files([path, *others])
+        if digest not in digests:
+            other = [key for key in changed_keys(first, read_site(job)) if not _of_platform(key)]
+            if other:
+                raise InputError(
+                    f"{path}: {other[0]} differs from {jobs[0].declared_path}; logs that refine one"
+                    " site share its file but for the platform: give it with --site SITE.yaml"
+                )
+            digests[digest] = path
+        platforms.append([*digests].index(digest))
     shared = shared_of(read_site(jobs[0]), smoother)
     if smoother.coupling == "loose" or not shared.blocks:
         raise InputError(
@@ -134,7 +136,17 @@ def _one_site(jobs: Sequence[Job], smoother: SmootherSettings) -> str:
             " nothing to refine together; declare the uncertainty of the survey, keep --coupling"
             " tight and --estimate as they are, or smooth each log on its own"
         )
-    return next(iter(result))
+    return [*digests], platforms
+
+
+def _of_platform(key: str) -> bool:
+    return key.split(".")[0] == "platform"
+
+
+def site_files(tasks: Sequence[LogTask]) -> SiteFiles:
+    """Return the files of the site with each platform."""
+    of_platform = {task.platform: task.job for task in reversed(tasks)}
+    return SiteFiles(tuple(of_platform[i] for i in sorted(of_platform)), tasks[0].smoother)
 
 
 def _names(paths: list[Path]) -> list[str]:
@@ -156,6 +168,7 @@ def refine(
     writes: bool,
     rate: Rate = "field",
     risk: Risk | None = None,
+    by_date: bool = False,
     report: Report,
 ) -> Joint:
     """Refine one site with all logs together.
@@ -164,6 +177,8 @@ def refine(
     ----------
     writes : bool
         Whether the trajectory of each log is written, to its job's output.
+    by_date : bool
+        Whether changes between the logs are searched, and what changed has new parameters.
 
     Raises
     ------
@@ -172,21 +187,25 @@ def refine(
     EstimationError
         Where no log remains.
     """
-    site, shared = shared_site(read_site(tasks[0].job), tasks[0].smoother)
+    files = site_files(tasks)
     with worker_pool(len(tasks), cluster=cluster, workers=workers) as hands:
         first = hands.run(alone, tasks, report=_staged(report, "smoothing each log alone"))
-        used, steps = [], []
-        for task, one in zip(tasks, first, strict=True):
-            if one.step is not None and one.facts["verdict"] != Verdict.FAILED:
-                used.append(task)
-                steps.append(one.step)
+        used = [
+            (one.time, task)
+            for task, one in zip(tasks, first, strict=True)
+            if one.solved and one.facts["verdict"] != Verdict.FAILED
+        ]
         if not used:
             raise EstimationError(
                 f"none of the {len(tasks)} logs can be used: {tasks[0].name}:"
                 f" {first[0].facts['reason']}"
             )
-        driver = Driver(hands, used, shared, report)
-        sums = driver.sums(0, np.mean(steps, axis=0))
+        driver = Driver(hands, [task for _, task in used], files, report)
+        changes: list[FoundChange] = []
+        if by_date:
+            check_dates([time for time, _ in used], [task.name for _, task in used])
+            driver, changes = driver.with_changes()
+        sums = driver.first_sums()
         before = driver.agreement(sums)
         sums, moved = driver.repeated(sums)
         known = sums.known
@@ -197,124 +216,32 @@ def refine(
             for one, findings in zip(driver.tasks_given(sums), agreed.of_log, strict=True)
         ]
         rows = hands.run(last, given, report=_staged(report, "each log in the joint solution"))
-    of_used = {t.name: row for t, row in zip(used, rows, strict=True)}
-    far = {t.name: float(s) for t, s in zip(used, agreed.sigmas, strict=True)}
+        months = driver.months(sums) if by_date else []
+    of_used = {t.name: row for t, row in zip(driver.tasks, rows, strict=True)}
+    far = {t.name: float(s) for t, s in zip(driver.tasks, agreed.sigmas, strict=True)}
     table = [
         _row(task, one.facts, of_used.get(task.name), far.get(task.name))
         for task, one in zip(tasks, first, strict=True)
     ]
-    trust = trust_of_all(table, agreed, _undetected(site, first), moved)
-    noise = tuple(tuned for one in first for tuned in one.noise if one.step is not None)
-    return Joint(shared, known, agreed.excess, noise, table, trust, sums.rounds)
+    trust = trust_of_all(table, agreed, _undetected(read_site(files.jobs[0]), first), moved)
+    noise = tuple(
+        tuple(
+            tuned
+            for task, one in zip(tasks, first, strict=True)
+            if task.platform == platform
+            for tuned in one.noise
+        )
+        for platform in range(len(files.jobs))
+    )
+    reports = [describe_change(one, driver.calendar, known) for one in changes]
+    trust |= Trust(tuple(one.finding for one in reports))
+    return Joint(
+        known, driver.calendar, reports, months, agreed.excess, noise, table, trust, sums.rounds
+    )
 
 
 def _staged(report: Report, stage: str) -> Report:
     return lambda _stage, done, total: report(stage, done, total)
-
-
-class Sums(NamedTuple):
-    """What the logs know after some rounds, in groups.
-
-    Parameters
-    ----------
-    rounds : int
-    known : SharedCalibration
-        By all of them.
-    groups : list of list of Path
-        Of each log.
-    sums : list of Path
-        Of each group.
-    """
-
-    rounds: int
-    known: SharedCalibration
-    groups: list[list[Path]]
-    sums: list[Path]
-
-    def others(self, own: Path) -> tuple[Path, ...]:
-        """Return the files of all other logs: of each in its group, and the other groups' sums."""
-        which = next(i for i, group in enumerate(self.groups) if own in group)
-        rest = [path for path in self.groups[which] if path != own]
-        return *rest, *self.sums[:which], *self.sums[which + 1 :]
-
-
-@dataclass(frozen=True, eq=False)
-class Driver:
-    """Rounds over the files of the logs, without a log in memory.
-
-    Parameters
-    ----------
-    tasks : list of LogTask
-    """
-
-    hands: WorkerPool
-    tasks: list[LogTask]
-    shared: Shared
-    report: Report
-
-    def sums(self, rounds: int, at: Array, pool: Sequence[int] | None = None) -> Sums:
-        """Return what the logs of a pool, or all, know; the workers add each group."""
-        pool = range(len(self.tasks)) if pool is None else pool
-        paths = [self.tasks[i].information(rounds) for i in pool]
-        size = math.isqrt(len(paths) - 1) + 1  # as many groups as logs in each
-        groups = [paths[i : i + size] for i in range(0, len(paths), size)]
-        files = [self.tasks[0].kept.parent / "sums" / f"{i}.npz" for i in range(len(groups))]
-        one = self.tasks[0]
-        given = [SumTask(one, tuple(g), at, f) for g, f in zip(groups, files, strict=True)]
-        sums = self.hands.run(sum_of, given)
-        return Sums(rounds, known_by(self.shared, added(self.shared, sums, at), at), groups, sums)
-
-    def tasks_given(self, sums: Sums, share: float = 1.0) -> list[RoundTask]:
-        """Return the tasks of all logs."""
-        at, rounds = sums.known.step, sums.rounds
-        return [
-            RoundTask(task, rounds, sums.others(task.information(rounds)), at, share)
-            for task in self.tasks
-        ]
-
-    def agreement(self, sums: Sums) -> LogAgreement:
-        """Return the consistency of the logs after some rounds."""
-
-        def deviations(pool: list[int]) -> list[Deviation]:
-            at, rounds = sums.known.step, sums.rounds
-            of_pool = self.sums(rounds, at, pool)
-            of_log = [(self.tasks[i], self.tasks[i].information(rounds)) for i in pool]
-            given = [RoundTask(task, rounds, of_pool.others(own), at) for task, own in of_log]
-            return self.hands.run(from_others, given)
-
-        return agreement(self.shared, [task.name for task in self.tasks], deviations)
-
-    def repeated(self, sums: Sums) -> tuple[Sums, float]:
-        """Repeat until no log moves the shared calibration.
-
-        Where a round moves it farther than the one before, as with contradicting logs, further
-        updates are damped.
-
-        Returns
-        -------
-        sums : Sums
-        moved : float
-            Change in the last round, in sigmas.
-        """
-        moved, share = np.inf, 1.0
-        while moved >= CONVERGED_STEP and sums.rounds < MOST_ROUNDS:
-            self.report("refining together", sums.rounds, MOST_ROUNDS)
-            self.hands.run(one_round, self.tasks_given(sums, share))
-            known = sums.known
-            self._discard(sums.rounds)
-            sums = self.sums(sums.rounds + 1, known.step)
-            after = sums.known
-            before, moved = moved, apart_in_sigmas(after.step, known.step, after.cov) / share
-            if moved > before and moved > LARGE and sums.rounds > 1:
-                share = max(0.5 * share, SMALLEST_SHARE)
-        return sums, moved
-
-    def _discard(self, rounds: int) -> None:
-        """Remove the files of a round that is superseded."""
-        for task in self.tasks:
-            if rounds:
-                task.state(rounds).unlink(missing_ok=True)
-            task.information(rounds).unlink(missing_ok=True)
 
 
 def _undetected(site: Site, first: Sequence[Alone]) -> list[str]:

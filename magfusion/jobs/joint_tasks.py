@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,6 +16,13 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.batch.calendar import (
+    Calendar,
+    LogBlocks,
+    PlatformCalibration,
+    SiteChange,
+    names_of,
+)
 from magfusion.estimation.batch.joint import (
     LogInformation,
     Shared,
@@ -45,7 +53,7 @@ from magfusion.jobs.joint_kept import (
     written_by_worker,
 )
 from magfusion.jobs.result_directory import claim
-from magfusion.model.parameters import GROUPS, initial_calibration
+from magfusion.model.parameters import GROUPS, Block, initial_calibration
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
@@ -72,6 +80,8 @@ class LogTask:
         File of its solution alone.
     key : str
         Hash of all its inputs.
+    platform : int
+        Index of its platform among those of all logs.
     """
 
     name: str
@@ -79,6 +89,7 @@ class LogTask:
     smoother: SmootherSettings
     kept: Path
     key: str
+    platform: int = 0
 
     def state(self, rounds: int) -> Path:
         """Return the file of the log after some rounds."""
@@ -94,16 +105,56 @@ class Alone(NamedTuple):
 
     Parameters
     ----------
-    step : ndarray, shape (s,), optional
-        To its shared calibration from the declared; None where it failed.
+    solved : bool
+    time : float
+        Of its first sample (s, Unix).
     noise : tuple of Tuned
     facts : dict
         Of the table of logs.
     """
 
-    step: Array | None
+    solved: bool
+    time: float
     noise: tuple[Tuned, ...]
     facts: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class SiteFiles:
+    """Files of a site with its platforms, and its changes: the calendar, in a few bytes.
+
+    Parameters
+    ----------
+    jobs : tuple of Job
+        One of each platform.
+    smoother : SmootherSettings
+    changes : tuple of SiteChange
+    """
+
+    jobs: tuple[Job, ...]
+    smoother: SmootherSettings
+    changes: tuple[SiteChange, ...] = ()
+
+    def calendar(self) -> Calendar:
+        """Return the parameters of all logs."""
+        platforms = (
+            _platform(job, self.smoother, job.declared_path.stat().st_mtime_ns) for job in self.jobs
+        )
+        return _calendar(tuple(platforms), self.changes)
+
+
+@lru_cache(maxsize=16)
+def _platform(job: Job, smoother: SmootherSettings, _modified: int) -> PlatformCalibration:
+    """Return the declared calibration of a platform, read once in a process."""
+    site, shared = shared_site(read_site(job), smoother)
+    return PlatformCalibration(shared, considered_of(site, smoother))
+
+
+@lru_cache(maxsize=4)
+def _calendar(
+    platforms: tuple[PlatformCalibration, ...], changes: tuple[SiteChange, ...]
+) -> Calendar:
+    return Calendar(platforms, changes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +163,7 @@ class RoundTask:
 
     Parameters
     ----------
+    files : SiteFiles
     rounds : int
         Number of rounds before.
     others : tuple of Path
@@ -122,6 +174,7 @@ class RoundTask:
         Of the change of the information.
     """
 
+    files: SiteFiles
     task: LogTask
     rounds: int
     others: tuple[Path, ...]
@@ -134,9 +187,13 @@ class RoundTask:
         path = self.task.state(self.rounds)
         return log, site, shared, written_by_worker(path, load_log(path, self.task.key, site))
 
-    def prior(self, shared: Shared) -> SharedCalibration:
-        """Return the estimate from all other logs and the survey."""
-        return known_by(shared, added(shared, self.others, self.at), self.at)
+    def prior(self) -> SharedCalibration:
+        """Return the estimate of the log's parameters from all other logs and the survey."""
+        calendar = self.files.calendar()
+        known = known_by(calendar.shared, added(calendar, self.others, self.at), self.at)
+        blocks = load_information(self.task.information(self.rounds)).blocks
+        assert blocks is not None
+        return known.of(*calendar.columns(blocks))
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,15 +202,14 @@ class SumTask:
 
     Parameters
     ----------
-    task : LogTask
-        Any of the logs.
+    files : SiteFiles
     parts : tuple of Path
     at : ndarray, shape (s,)
         From the declared calibration to the linearisation point.
     result : Path
     """
 
-    task: LogTask
+    files: SiteFiles
     parts: tuple[Path, ...]
     at: Array
     result: Path
@@ -209,17 +265,35 @@ def shared_of(site: Site, smoother: SmootherSettings) -> Shared:
     return Shared(initial_calibration(site, 0.0), shared_blocks(blocks))
 
 
+def considered_of(site: Site, smoother: SmootherSettings) -> tuple[Block, ...]:
+    """Return the parameters that are considered in every log of a site."""
+    return shared_blocks(smoother.blocks(site)[1])
+
+
+def blocks_of(log: Log, site: Site, shared: Shared, task: LogTask) -> LogBlocks:
+    """Return the names of a log's parameters."""
+    considered = considered_of(site, task.smoother)
+    time = 1e-9 * log.epoch_ns + first_time(log)
+    return LogBlocks(time, task.platform, names_of(shared.blocks), names_of(considered))
+
+
+def first_time(log: Log) -> float:
+    """Return the time of a log's first sample since its epoch (s)."""
+    streams = [s.time for s in (log.imu, log.waveform, log.fields) if s is not None]
+    return min(float(time[0]) for time in streams if len(time))
+
+
 def alone(task: LogTask, _rng: np.random.Generator) -> Alone:
     """Smooth a log alone and store it, or load the stored result."""
     log, site, shared = read_shared(task)
-    kept = load_log(task.kept, task.key, site)
+    kept, blocks = load_log(task.kept, task.key, site), blocks_of(log, site, shared, task)
     if kept is None:
         try:
             with named(task.job.log_path):
                 result = smooth(log, site, task.smoother)
         except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
             reason = {"code": "no_solution", "reason": reason_of(error)}
-            return Alone(None, (), {"verdict": str(Verdict.FAILED), **reason})
+            return Alone(False, blocks.time, (), {"verdict": str(Verdict.FAILED), **reason})
         detected = np.any(result.fields.valid, axis=0).tolist()
         channels = zip(result.fields.channels, detected, strict=True)
         names = {name for (name, _), yes in channels if yes}
@@ -227,32 +301,32 @@ def alone(task: LogTask, _rng: np.random.Generator) -> Alone:
         facts = table_facts(honest, trust, log) | {"heard": sorted(names)}
         kept = Kept(of_smoothed(result, shared), facts)
         save_log(task.kept, task.key, kept)
-    save_information(task.information(0), kept.log.information)
-    return Alone(kept.log.information.step, kept.log.noise, kept.facts)
+    save_information(task.information(0), kept.log.information, blocks)
+    return Alone(True, blocks.time, kept.log.noise, kept.facts)
 
 
 def one_round(given: RoundTask, _rng: np.random.Generator) -> None:
     """Solve a log with the prior from the others, and store it."""
     log, site, shared, kept = given.read()
     task, before = given.task, kept.log.information
-    done = solve_round(log, site, task.smoother, kept.log, shared, given.prior(shared))
+    done = solve_round(log, site, task.smoother, kept.log, shared, given.prior())
     after = after_round(kept.log, done, shared)
     known = between(shared, before, after.information, given.share)
     save_log(
         task.state(given.rounds + 1), task.key, Kept(replace(after, information=known), kept.facts)
     )
-    save_information(task.information(given.rounds + 1), known)
+    save_information(task.information(given.rounds + 1), known, blocks_of(log, site, shared, task))
 
 
-def added(shared: Shared, paths: Iterable[Path], at: Array) -> LogInformation | None:
+def added(calendar: Calendar, paths: Iterable[Path], at: Array) -> LogInformation | None:
     """Return the sum of the information in some files."""
-    return total_information(shared, map(load_information, paths), at)
+    every = (load_information(path).whole(calendar) for path in paths)
+    return total_information(calendar.shared, every, at)
 
 
 def sum_of(given: SumTask, _rng: np.random.Generator) -> Path:
-    """Add what some logs know, and return the path of the sum."""
-    _, shared = shared_site(read_site(given.task.job), given.task.smoother)
-    total = added(shared, given.parts, given.at)
+    """Add the information of some logs, and return the path of the sum."""
+    total = added(given.files.calendar(), given.parts, given.at)
     assert total is not None
     save_information(given.result, total)
     return given.result
@@ -260,11 +334,12 @@ def sum_of(given: SumTask, _rng: np.random.Generator) -> Path:
 
 def from_others(given: RoundTask, _rng: np.random.Generator) -> Deviation:
     """Return the deviation of a log from the others."""
-    _, shared = shared_site(read_site(given.task.job), given.task.smoother)
-    own, others = given.task.information(given.rounds), given.others
-    total = added(shared, (own, *others), given.at)
+    calendar, others = given.files.calendar(), given.others
+    own = given.task.information(given.rounds)
+    total = added(calendar, (own, *others), given.at)
     assert total is not None
-    return deviation(shared, total, added(shared, others, given.at), given.at)
+    rest = added(calendar, others, given.at)
+    return deviation(calendar.shared, total, rest, given.at)
 
 
 def last(given: LastTask, _rng: np.random.Generator) -> dict[str, Any]:
@@ -272,7 +347,7 @@ def last(given: LastTask, _rng: np.random.Generator) -> dict[str, Any]:
     own = given.round
     log, site, shared, kept = own.read()
     blocks, _ = own.task.smoother.blocks(site)
-    done = solve_round(log, site, own.task.smoother, kept.log, shared, own.prior(shared))
+    done = solve_round(log, site, own.task.smoother, kept.log, shared, own.prior())
     result = joint_posterior(kept.log, done, blocks)
     if given.writes:
         result, trust = _written(result, log, site, given)

@@ -16,6 +16,7 @@ _TRUE_SITE = {f"true_{name}" for name in _SITE}
 _LOG = {"log.yaml", *_SITE, *_TRUE_SITE, "report.json", *_TABLES}
 UNFINISHED_DRIFT = "unfinished"
 KEPT, LOGS, LOGS_TABLE = "kept", "logs", "logs.csv"  # of several logs
+PLATFORMS, CALENDAR_TABLE = "platforms", "calendar.csv"
 CHECKPOINT, ROWS = "checkpoint.bin", "checkpoint.rows"
 # In the directory while these jobs run.
 UNFINISHED = {
@@ -25,7 +26,7 @@ UNFINISHED = {
     "calibrate log": {KEPT},
 }
 WRITTEN = {
-    "smooth": _RESULT | {"fixes.parquet", KEPT, LOGS, LOGS_TABLE},
+    "smooth": _RESULT | {"fixes.parquet", KEPT, LOGS, LOGS_TABLE, PLATFORMS},
     "fix": _RESULT | {"fixes.parquet"},
     "navigate": _RESULT | {"lagged.parquet"} | UNFINISHED["navigate"],
     "drift": {"drift.png", "stability.png", "run.rrd", "report.json"} | UNFINISHED["drift"],
@@ -34,7 +35,8 @@ WRITTEN = {
     "simulate": _LOG | {"recording.wav"},
     "demodulate": _LOG,
     "survey": {"survey.parquet", "survey.png", "report.json"},
-    "calibrate log": _SITE | {"calibration.png", "report.json", KEPT, LOGS_TABLE},
+    "calibrate log": _SITE
+    | {"calibration.png", "report.json", KEPT, LOGS_TABLE, PLATFORMS, CALENDAR_TABLE},
     "calibrate beacon": _SITE | {"beacon.png", "report.json"},
     "calibrate antenna": _SITE | {"antenna.png", "report.json"},
     "calibrate fieldmap": _SITE | {"field_map.png", "report.json"},

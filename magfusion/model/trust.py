@@ -80,6 +80,7 @@ CODES = {
     "lever_arm": "the lever arm of the magnetometer is not as declared",
     "log_left_out": "one of several logs failed alone and is not used for the refinement",
     "logs_disagree": "a log is inconsistent with the others about the shared site",
+    "site_changed": "a beacon was moved or exchanged between logs, or a platform changed",
     "long_windows": "tones are separated in long windows where short ones could not be used",
     "lost": "no solution near the estimated position explains the fields",
     "low_pass": "the magnetometer has a low-pass filter that is not declared",

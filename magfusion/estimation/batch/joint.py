@@ -8,16 +8,17 @@ directions that logs determine well.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import cached_property, reduce
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.posterior.marginalized_log import MarginalizedLog, taken_at
+from magfusion.estimation.posterior.marginalized_log import MarginalizedLog
 from magfusion.model.correlation import Correlation, joined
-from magfusion.model.parameters import Block, Calibration, difference, prior_sigma, retract
+from magfusion.model.parameters import Block, Calibration, prior_sigma, retract
 from magfusion.model.prior import parameters_of, prior_sqrt_information
 from magfusion.model.site import Site
-from magfusion.units import Array
+from magfusion.units import Array, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,20 +29,45 @@ class Shared:
     ----------
     declared : Calibration
     blocks : tuple of Block
+    prior : ndarray, shape (s, s), optional
+        Information of the survey; by default that of the declared site.
     """
 
     declared: Calibration
     blocks: tuple[Block, ...]
+    prior: Array | None = None
 
-    @property
+    @cached_property
     def information(self) -> Array:
         """Of the survey alone, shape (s, s)."""
+        if self.prior is not None:
+            return self.prior
         whitening = prior_sqrt_information(self.declared.site, self.blocks)
-        return whitening.T @ whitening
+        return np.asarray(whitening.T @ whitening)
+
+    @cached_property
+    def _rotations(self) -> IntArray:
+        """Columns of the rotations, shape (rotations, 3)."""
+        columns = [b.columns.start for b in self.blocks if b.parameter.is_rotation]
+        return np.array(columns, dtype=np.int64)[:, None] + np.arange(3)
 
     def moved(self, step: Array) -> Calibration:
         """Return the calibration after a step."""
         return retract(self.declared, self.blocks, step)
+
+    def after(self, at: Array, step: Array) -> Array:
+        """Return the step from the declared calibration after another step from ``at``."""
+        result, turned = at + step, self._rotations
+        first, second = (Rotation.from_rotvec(each[turned]) for each in (at, step))
+        result[turned] = (first * second).as_rotvec()
+        return np.asarray(result)
+
+    def between(self, before: Array, after: Array) -> Array:
+        """Return the step from one calibration to another: the inverse of `after`."""
+        result, turned = after - before, self._rotations
+        first, second = (Rotation.from_rotvec(each[turned]) for each in (before, after))
+        result[turned] = (first.inv() * second).as_rotvec()
+        return np.asarray(result)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +96,23 @@ class SharedCalibration:
         """Covariance including considered parameters, shape (s, s)."""
         return self.cov + self.by_common @ self.by_common.T + self.separate_errors
 
+    def of(self, columns: IntArray, common: IntArray) -> "SharedCalibration":
+        """Return the marginal of some parameters.
+
+        Parameters
+        ----------
+        columns, common : int ndarray, shapes (s,), (c,)
+            Of the shared parameters, and of those considered in every log.
+        """
+        square, moved = np.ix_(columns, columns), self.by_common[columns]
+        others = np.delete(moved, common, axis=1)
+        return SharedCalibration(
+            self.step[columns],
+            self.cov[square],
+            moved[:, common],
+            self.separate_errors[square] + others @ others.T,
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class LogInformation:
@@ -88,10 +131,41 @@ class LogInformation:
     part: MarginalizedLog
     logs: int = 1
 
+    def among(
+        self, size: int, columns: IntArray, common: IntArray, considered: int
+    ) -> "LogInformation":
+        """Return the same information on more parameters.
+
+        Parameters
+        ----------
+        size, considered : int
+            Number of the shared parameters of all logs, and of those considered in every log.
+        columns, common : int ndarray, shapes (s,), (c,)
+            Those of this log.
+        """
+
+        def spread(matrix: Array) -> Array:
+            whole = np.zeros((size, size))
+            whole[np.ix_(columns, columns)] = matrix
+            return whole
+
+        step, gradient, by_common = np.zeros(size), np.zeros(size), np.zeros((size, considered))
+        step[columns], gradient[columns] = self.step, self.part.gradient
+        by_common[np.ix_(columns, common)] = self.part.by_common
+        part = MarginalizedLog(
+            spread(self.part.information),
+            gradient,
+            by_common,
+            spread(self.part.by_place),
+            spread(self.part.by_log),
+        )
+        return LogInformation(step, part, self.logs)
+
     def taken_at(self, shared: Shared, step: Array) -> "LogInformation":
         """Return the same information at another linearisation point."""
-        before, after = shared.moved(self.step), shared.moved(step)
-        return replace(self, step=step, part=taken_at(self.part, before, after, shared.blocks))
+        moved = self.part.information @ shared.between(self.step, step)
+        part = replace(self.part, gradient=self.part.gradient - moved)
+        return replace(self, step=step, part=part)
 
 
 def total_information(
@@ -131,10 +205,8 @@ def known_by(shared: Shared, logs: LogInformation | None, at: Array) -> SharedCa
     at : ndarray, shape (s,)
         From the declared calibration to the linearisation point of the step.
     """
-    here, prior = shared.moved(at), shared.information
-    unit = prior_sigma(shared.blocks)
-    information = prior.copy()
-    gradient = -prior @ difference(shared.declared, here, shared.blocks)
+    prior, unit = shared.information, prior_sigma(shared.blocks)
+    information, gradient = prior.copy(), -prior @ at
     by_common, separate = np.zeros((len(at), 0)), np.zeros_like(prior)
     if logs is not None:
         total = logs.taken_at(shared, at).part
@@ -145,8 +217,7 @@ def known_by(shared: Shared, logs: LogInformation | None, at: Array) -> SharedCa
         separate = logs.logs * total.by_place + total.by_log
     cov = np.linalg.inv(unit[:, None] * information * unit)
     cov = unit[:, None] * (0.5 * (cov + cov.T)) * unit
-    after = retract(here, shared.blocks, cov @ gradient)
-    step = difference(shared.declared, after, shared.blocks)
+    step = shared.after(at, cov @ gradient)
     return SharedCalibration(step, cov, cov @ by_common, cov @ separate @ cov)
 
 

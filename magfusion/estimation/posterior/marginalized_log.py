@@ -130,14 +130,3 @@ def _without_own(
     else:
         right = right[~own]
     return 0.5 * (information + information.T), right
-
-
-def taken_at(
-    part: MarginalizedLog,
-    linearization_point: Calibration,
-    calibration: Calibration,
-    shared: tuple[Block, ...],
-) -> MarginalizedLog:
-    """Return a quadratic at another linearisation point."""
-    step = difference(linearization_point, calibration, shared)
-    return replace(part, gradient=part.gradient - part.information @ step)
