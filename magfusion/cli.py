@@ -42,7 +42,7 @@ TERMINATED = (
 LONGEST_REASON = 200  # characters, of an error that was not foreseen
 _HELP = {"help_option_names": ["-h", "--help"]}
 # Options of how much is printed, by the level that they select.
-_LEVELS = {
+_LEVELS: dict[Level, tuple[tuple[str, ...], str]] = {
     "verbose": (("--verbose", "-v"), "Print all figures, with the calibration."),
     "quiet": (("--quiet", "-q"), "Print the verdict only, and no progress."),
     "json": (("--json",), "Print the report as a line of JSON, and nothing else."),

@@ -27,7 +27,7 @@ AXES = (
 ROWS = {
     "error": "error",
     "sigma": "sigma",
-    "frame_sigma": "of it the frame (survey)",
+    "frame_sigma": "of it frame (survey)",
     "frame_removed_error": "error without the frame",
     "frame_removed_sigma": "sigma without the frame",
 }
@@ -60,7 +60,7 @@ def survey_frame(calibration: Calibration, blocks: tuple[Block, ...]) -> Frame |
     scaled = moves / prior_sigma(blocks)[:, None]
     places = [block.sigma for block in blocks if block.parameter == BEACON_POSITION]
     survey = float(np.sqrt(np.mean(np.concatenate(places) ** 2)))
-    return Frame(np.linalg.inv(scaled.T @ scaled), survey)
+    return Frame(np.asarray(np.linalg.inv(scaled.T @ scaled)), survey)
 
 
 def axis_figures(
@@ -106,7 +106,7 @@ def axis_figures(
 
 
 def _frame_label(frame: Frame) -> str:
-    return f"of it the frame (survey ± {1e3 * frame.survey_m:.3g} mm)"
+    return f"of it frame (survey ± {1e3 * frame.survey_m:.3g} mm)"
 
 
 def _rms(values: Array) -> Array:
@@ -119,8 +119,8 @@ def _in_units(row: Array) -> list[float]:
 
 def _world_errors(errors: TrajectoryErrors) -> Array:
     """Return position and rotation vector of the errors in world axes (m, rad), shape (n, 6)."""
-    turned = (errors.world_from_body @ errors.attitude_body[..., None])[..., 0]
-    return np.concatenate([errors.position_world, turned], axis=1)
+    rotated = (errors.world_from_body @ errors.attitude_body[..., None])[..., 0]
+    return np.concatenate([errors.position_world, rotated], axis=1)
 
 
 def _world_variance(world_from_body: Array, pose_cov: Array) -> Array:

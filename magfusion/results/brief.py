@@ -3,7 +3,6 @@
 ``--verbose`` shows all other figures, as the page of a result does.
 """
 
-from collections.abc import Iterator
 from pathlib import Path
 
 from magfusion.model.trust import Verdict
@@ -15,12 +14,13 @@ from magfusion.results.verdict import look_of
 Rows = list[list[str]]
 # Remarks that require no action.
 _ROUTINE = {"noise_tuned"}
+MOST_NAMED = 2  # fixed parameters
 _MATTERS = 0.5  # of the sigma of a pose; smaller effects of fixed parameters are only counted
 # Criteria of stability, where the key is no term of a navigator.
 _CRITERIA = {"carried": "error between fields", "lost": "tracking without loss"}
 _NEXT = {
     Verdict.TRUSTWORTHY: "magfusion view {output}, or open {output}/report.html",
-    Verdict.DOUBTFUL: "remove the cause above and repeat; until then the sigmas and levels cover it",
+    Verdict.DOUBTFUL: "remove the cause above and repeat; until then the sigmas cover it",
     Verdict.FAILED: "remove the cause above and repeat; for diagnosis open {output}/failed",
 }
 _NEXT_OF = {
@@ -73,6 +73,8 @@ def _pose_rows(figures: Figures) -> Rows:
         level = "none" if level_m is None else _length(number(level_m))
         level += "" if level_deg is None else f", {number_text(level_deg, 2)} deg"
         cause = figures.get("protection_level_cause")
+        explained = any(one["code"] == "no_redundancy" for one in findings(figures, "remarks"))
+        cause = None if explained and level_m is None else cause
         rows.append(["protection level", f"{level} ({cause})" if cause else level])
     spent = f"{figures['epochs']} epochs" if "epochs" in figures else ""
     if "duration_s" in figures:
@@ -92,28 +94,29 @@ def _length(metres: float) -> str:
 
 
 def _unverified(figures: Figures) -> str:
-    """Return the fixed parameters that may move a pose by half its sigma, and how many others."""
+    """Return the fixed parameters of most effect on a pose, and the number of the others."""
     rows = findings(figures, "unverified")
     part = {"m": ("x", "y", "z"), "deg": ("rot_x", "rot_y", "yaw")}
     total = {
         unit: sum(number(figures.get(f"sigma_{axis}_{unit}")) ** 2 for axis in axes) ** 0.5
         for unit, axes in part.items()
     }
-    matters = [
-        one
+    effect = {
+        str(one["parameter"]): max(
+            float(one[key]) / total[unit] if total[unit] else 0.0
+            for key, unit in (("position_m", "m"), ("rotation_deg", "deg"))
+        )
         for one in rows
-        if float(one["position_m"]) > _MATTERS * total["m"]
-        or float(one["rotation_deg"]) > _MATTERS * total["deg"]
-    ]
+    }
+    rows.sort(key=lambda one: -effect[str(one["parameter"])])
+    matters = [one for one in rows[:MOST_NAMED] if effect[str(one["parameter"])] > _MATTERS]
     words = [
-        f"{one['parameter']} (an error of {one['sigma']} would move poses by"
-        f" {_length(float(one['position_m']))}, {number_text(one['rotation_deg'], 2)} deg)"
+        f"{one['parameter']} (± {one['sigma']} moves poses by {_length(float(one['position_m']))},"
+        f" {number_text(one['rotation_deg'], 2)} deg)"
         for one in matters
     ]
     others = len(rows) - len(matters)
-    if others:
-        words.append(f"{others} of less effect")
-    return "; ".join(words)
+    return ", ".join([*words, f"{others} of less effect (--verbose)"] if others else words)
 
 
 def _check_rows(figures: Figures) -> Rows:
@@ -124,16 +127,18 @@ def _check_rows(figures: Figures) -> Rows:
                 number_text(figures.get(f"{stream}_{key}"))
                 for key in ("rate_hz", "duration_s", "jitter_ms")
             )
-            lost = 100.0 * number(figures.get(f"{stream}_lost_share"))
-            rows.append([stream, f"{rate} Hz for {span} s, jitter {jitter} ms, {lost:.2g} % lost"])
+            lost_percent = 100.0 * number(figures.get(f"{stream}_lost_share"))
+            rows.append(
+                [stream, f"{rate} Hz for {span} s, jitter {jitter} ms, {lost_percent:.2g} % lost"]
+            )
     if "gravity_m_s2" in figures:
-        words = f"mean specific force {number_text(figures['gravity_m_s2'])} m/s^2"
+        text = f"mean specific force {number_text(figures['gravity_m_s2'])} m/s^2"
         if "steady_field_ut" in figures:
-            words += (
+            text += (
                 f", static field {number_text(figures['steady_field_ut'])} uT at"
                 f" {number_text(figures['field_from_vertical_deg'])} deg from the vertical"
             )
-        rows.append(["gravity and field", words])
+        rows.append(["gravity and field", text])
     snr = {f.beacon: f.value for f in figures.all if f.name == "snr_{beacon}"}
     share = {f.beacon: number(f.value) for f in figures.all if f.name == "heard_{beacon}"}
     words = [f"{n} {number_text(v)} in {100.0 * share[n]:.3g} %" for n, v in snr.items()]
@@ -178,9 +183,8 @@ def _criteria(figures: Figures) -> Rows:
         for key, value in figures.items():
             criterion = key.removeprefix(f"{name}_").removesuffix("_verdict")
             if key == f"{name}_{criterion}_verdict" and criterion not in slopes:
-                words = _CRITERIA.get(criterion, criterion.replace("_", " "))
-                verdicts.setdefault(str(value), []).append(words)
+                shown = _CRITERIA.get(criterion, criterion.replace("_", " "))
+                verdicts.setdefault(str(value), []).append(shown)
         listed = "; ".join(f"{verdict}: {', '.join(own)}" for verdict, own in verdicts.items())
         rows.append([f"{name}, other criteria", listed])
     return rows
-

@@ -80,7 +80,9 @@ def frame_directions(beacons: tuple[Beacon, ...], blocks: tuple[Block, ...]) -> 
     ndarray, shape (dimension, 4), optional
         Per metre and radian; None where a beacon is fixed, and the frame with it.
     """
-    moves = [gauge.direction for gauge in (*_shifts(beacons, blocks), *_turns(beacons, blocks, (2,)))]
+    moves = [
+        gauge.direction for gauge in (*_shifts(beacons, blocks), *_turns(beacons, blocks, (2,)))
+    ]
     return np.stack(moves, axis=1) if len(moves) == 4 else None
 
 

@@ -65,15 +65,25 @@ def axis_rows(figures: Figures) -> list[list[str]]:
     known = {figure.name: number(figure.value) for figure in own}
     labels = {row: f.label for f in own for row in ROWS if f.name.startswith(f"{row}_x_")}
     columns = [["rms", *labels.values()]]
-    for of, factor, shown in (("m", scale, unit), ("deg", 1.0, "deg")):
+    for of, factor, shown in (("m", scale, unit), ("deg", 1.0, "°")):
         axes = [axis for axis, own_unit in AXES if own_unit == of]
         values = {a: [known.get(f"{row}_{a}_{of}") for row in labels] for a in axes}
         sizes = [factor * abs(v) for column in values.values() for v in column if v]
-        decimals = max(0, 1 - math.floor(math.log10(min(sizes)))) if sizes else 0
+        decimals = _common_decimals(sizes)
         for axis, column in values.items():
-            cells = ["" if v is None else f"{factor * v:.{decimals}f}" if v else "0" for v in column]
+            cells = [
+                "" if v is None else f"{factor * v:.{decimals}f}" if v else "0" for v in column
+            ]
             columns.append([f"{axis.replace('_', ' ')} {shown}", *cells])
     return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _common_decimals(sizes: list[float]) -> int:
+    """Return two digits of the smallest, as far as the largest has five at most."""
+    if not sizes:
+        return 0
+    fine, coarse = (math.floor(math.log10(end(sizes))) for end in (min, max))
+    return max(0, min(1 - fine, 4 - coarse))
 
 
 # Columns of the table of logs on the screen, and their titles.

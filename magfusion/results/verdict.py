@@ -133,7 +133,7 @@ def _level_cause(states: StateTrust, beacons: int, known: bool) -> str:
         return few if beacons == 1 else "see the reasons of the verdict"
     excluded = int(np.median([len(names) for names in states.excluded])) if states.excluded else 0
     count = beacons - excluded
-    without = f" ({excluded} excluded)" if excluded else ""
+    of = f"{count} of {beacons}" if excluded else f"{count}"
     if count <= 2:
-        return f"{count} beacons{without}: if one is faulty, the other alone bounds the error; add one"
-    return f"bounds the error if any one of {count} beacons{without} is faulty"
+        return f"{of} beacons: if one is faulty, the other alone bounds the error; add one"
+    return f"bounds the error if any one of {of} beacons is faulty"
