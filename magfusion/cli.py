@@ -33,12 +33,20 @@ from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figures
 from magfusion.results.provenance import Run, recorded_as
 
+Level = Literal["json", "quiet", "brief", "verbose"]
 DEBUG = "--debug"
 TERMINATED = (
     "terminated, and unfinished files are removed; repeat the command, with --resume where it had a"
     " checkpoint"
 )
 LONGEST_REASON = 200  # characters, of an error that was not foreseen
+_HELP = {"help_option_names": ["-h", "--help"]}
+# Options of how much is printed, by the level that they select.
+_LEVELS: dict[Level, tuple[tuple[str, ...], str]] = {
+    "verbose": (("--verbose", "-v"), "Print all figures, with the calibration."),
+    "quiet": (("--quiet", "-q"), "Print the verdict only, and no progress."),
+    "json": (("--json",), "Print the report as a line of JSON, and nothing else."),
+}
 _NAMED_BY_LOG = "; default: the log's name and the job's"
 _NOT_WRITTEN = "; default: nothing is written"
 
@@ -166,11 +174,17 @@ def application() -> typer.Typer:
         cls=_Jobs,
         help="Navigation from magnetic beacons and inertial sensors where there is no GNSS.",
         epilog=_example("magfusion demo"),
+        context_settings=_HELP,
         pretty_exceptions_enable=False,
     )
     app.callback()(_options)
     groups = {
-        name: typer.Typer(cls=_Jobs, help=text, epilog=_example(f"magfusion {name} {first} --help"))
+        name: typer.Typer(
+            cls=_Jobs,
+            help=text,
+            epilog=_example(f"magfusion {name} {first} --help"),
+            context_settings=_HELP,
+        )
         for name, text in GROUPS.items()
         for first in [next(path.split()[1] for path in JOBS if path.startswith(f"{name} "))]
     }
@@ -188,7 +202,8 @@ def _command(path: str) -> Any:
     name = path.split()[-1]
     only = typer.Typer(add_completion=False)
     command: Command = import_module(f"magfusion.jobs.{module}").COMMAND
-    only.command(name, help=text, epilog=_example(command.example))(_callback(path, command))
+    epilog = _example(command.example)
+    only.command(name, help=text, epilog=epilog, context_settings=_HELP)(_callback(path, command))
     return get_command(only)
 
 
@@ -235,9 +250,9 @@ def _callback(path: str, command: Command) -> Callable[..., None]:
     requested = {field.name: option for field, option in options(command.settings)}
 
     def run(context: typer.Context, **values: Any) -> None:
-        output, as_json = values.pop("output", None), values.pop("as_json", False)
+        output, level = values.pop("output", None), _level(values)
         values.pop("overwrite", None)
-        if as_json:
+        if level == "json":
             binary_output()
         own = {field: _value(requested[field], value) for field, value in values.items()}
         settings = command.settings(**own)
@@ -248,7 +263,7 @@ def _callback(path: str, command: Command) -> Callable[..., None]:
             output = Path(command.output or f"{log}_{path.split()[-1].replace('-', '_')}")
         earlier = _stamp(output)
         given = _given(context)
-        with _progress() as report, recorded_as(_run(context, settings, given)):
+        with _progress(level == "quiet") as report, recorded_as(_run(context, settings, given)):
             if context.obj.is_process:
                 gc.freeze()  # what was imported is no garbage, and not looked through again
             offered = {"output": output, "report": report, "given": given}
@@ -260,11 +275,11 @@ def _callback(path: str, command: Command) -> Callable[..., None]:
 
                     log = Path(next((v for v in own.values() if isinstance(v, Path)), output)).stem
                     _show_failed(
-                        failed_figures(path, log, output, error, _stamp(output) != earlier), as_json
+                        failed_figures(path, log, output, error, _stamp(output) != earlier), level
                     )
                 raise
         if figures is not None:
-            _show_result(figures, output, as_json)
+            _show_result(figures, output, level)
             if command.fails:
                 _refuse_failed(figures)
         if command.after is not None:
@@ -294,8 +309,10 @@ def _parameters(command: Command, writes: bool) -> list[inspect.Parameter]:
             flag = typer.Option("--overwrite", help=f"{OVERWRITE}.")
             result.append(_keyword("overwrite", Annotated[bool, flag], False))
     if command.reports:
-        flag = typer.Option("--json", help="Print the report as a line of JSON, and nothing else.")
-        result.append(_keyword("as_json", Annotated[bool, flag], False))
+        result += [
+            _keyword(name, Annotated[bool, typer.Option(*flags, help=text)], False)
+            for name, (flags, text) in _LEVELS.items()
+        ]
     return result
 
 
@@ -326,6 +343,14 @@ def _keyword(
     return inspect.Parameter(name, kind, default=default, annotation=annotation)
 
 
+def _level(values: dict[str, Any]) -> Level:
+    """Return the requested level of output, and remove its options from the values."""
+    given: list[Level] = [level for level in _LEVELS if values.pop(level, False)]
+    if len(given) > 1:
+        raise InputError(f"--{given[0]} and --{given[1]}: give one of them")
+    return given[0] if given else "brief"
+
+
 def _value(option: Option, typed: Any) -> Any:
     """Return the value of a field for typed text."""
     if option.words is not None:
@@ -353,9 +378,9 @@ def _run(context: typer.Context, settings: Settings, given: set[str]) -> Run:
 
 
 @contextmanager
-def _progress() -> Iterator[Report]:
+def _progress(silent: bool) -> Iterator[Report]:
     """Yield a progress reporter: a bar on a terminal, nothing otherwise."""
-    if not sys.stderr.isatty():
+    if silent or not sys.stderr.isatty():
         yield quiet
         return
     from rich.console import Console
@@ -382,9 +407,9 @@ def _stamp(output: Path | None) -> int | None:
     return report.stat().st_mtime_ns if report.is_file() else None
 
 
-def _show_failed(figures: Figures | None, as_json: bool) -> None:
+def _show_failed(figures: Figures | None, level: Level) -> None:
     if figures is not None:
-        _show_result(figures, None, as_json)
+        _show_result(figures, None, level)
 
 
 def _refuse_failed(figures: Figures) -> None:
@@ -395,14 +420,14 @@ def _refuse_failed(figures: Figures) -> None:
         raise EstimationError(f"failed: {first['text'] if isinstance(first, dict) else first}")
 
 
-def _show_result(figures: Figures, output: Path | None, as_json: bool) -> None:
-    """Show the figures of a job as a table, or as one line of JSON if requested."""
+def _show_result(figures: Figures, output: Path | None, level: Level) -> None:
+    """Show the figures of a job as tables, or as one line of JSON if requested."""
     if sys.stdout is None:
         return
     with until_closed():
-        if as_json:
+        if level == "json":
             sys.stdout.write(json.dumps(dict(figures), default=float) + "\n")
             return
         from magfusion.results.screen import show
 
-        show(figures, output)
+        show(figures, output, level=level)

@@ -123,19 +123,36 @@ def test_with_json_the_report_is_all_that_is_printed(
         assert out.count("\n") == 1
 
 
-def test_the_screen_tells_the_errors_first_and_the_calibration_as_a_table(
+def test_the_screen_has_errors_and_sigmas_by_axis_in_a_few_lines(
     worked: Worked, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     run_command("smooth", worked.log, "-o", tmp_path / "run")
+    lines, report = capfd.readouterr().out.splitlines(), _report(tmp_path / "run")
+    assert lines[:2] == ["smooth of simulated_walk", "TRUSTWORTHY"]
+    assert len(lines) <= 12
+    rows = {line.split()[0]: line.split()[1:] for line in lines[2:5]}
+    assert " ".join(rows["rms"]) == "x mm y mm z mm rot x ° rot y ° yaw °"
+    for row in ("error", "sigma"):
+        expected = [1e3 * report[f"{row}_{axis}_m"] for axis in "xyz"]
+        expected += [report[f"{row}_{axis}_deg"] for axis in ("rot_x", "rot_y", "yaw")]
+        assert [float(value) for value in rows[row]] == pytest.approx(expected, rel=0.05, abs=0.1)
+    assert lines[-1] == f"results in {tmp_path / 'run'}"
+    assert not any("imu.time_offset" in line for line in lines)
+
+
+def test_with_verbose_the_screen_has_the_calibration_and_with_quiet_the_verdict_alone(
+    worked: Worked, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    run_command("smooth", worked.log, "-o", tmp_path / "run", "-v")
     lines = capfd.readouterr().out.splitlines()
-    assert lines[0] == "smooth of simulated_walk"
-    assert lines[1] == "TRUSTWORTHY"
-    table = next(k for k, line in enumerate(lines) if line.split()[:1] == ["rms"])
-    shown = lines[table + 1].split()[:3]
-    assert shown == ["position", "(m)", f"{_report(tmp_path / 'run')['ate_m']:.3g}"]
     row = next(line for line in lines if "imu.time_offset (s)" in line).split()
     assert row[-2:] == ["0.01", "yes"]
-    assert lines[-1] == f"results in {tmp_path / 'run'}"
+    run_command("check", worked.log, "--quiet")
+    assert capfd.readouterr().out == "check of simulated_walk: trustworthy\n"
+
+
+def test_verbose_and_quiet_exclude_each_other(worked: Worked, refuse: Refuse) -> None:
+    assert "give one of them" in refuse("check", worked.log, "-q", "-v")
 
 
 def test_evaluate_tells_what_smooth_told(worked: Worked, capfd: pytest.CaptureFixture[str]) -> None:

@@ -136,7 +136,7 @@ def test_beacons_of_any_name_are_in_the_report_and_on_the_screen(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     output = tmp_path / "run"
-    run_command(job[0], log, *job[1:], "-o", output)
+    run_command(job[0], log, *job[1:], "-o", output, "--verbose")
     screen = capfd.readouterr().out
     report = json.loads((output / "report.json").read_text())
     level = "residual_rms_{}" if job[0] == "smooth" else "distortion_{}"

@@ -98,10 +98,10 @@ ROOMS = {
             recording_file ros_messages shapes trend
             alignment coverage drift errors live_foxglove observability odometry_dds
             odometry_mavlink recording_plots records_dds truth_frame
-            refinement rest_figures shown transfer turn_guide verdict
-            coverage_colours design motion_coverage recording_layout recording_trust screen
-            plots recording recording_drift
-            page_motion recording_coverage recording_design recording_live
+            axes refinement rest_figures transfer turn_guide verdict
+            coverage_colours design motion_coverage recording_layout recording_trust shown
+            brief plots recording recording_drift
+            page_motion recording_coverage recording_design recording_live screen
             page recording_turns trajectory
             report
             smoothed

@@ -36,15 +36,17 @@ def run_demo(settings: DemoSettings, output: Path, report: Report = quiet) -> Fi
     from magfusion.estimation.batch.batch import SmootherSettings
     from magfusion.jobs.inputs import Job
 
+    site = demo_site()
     config = SimulationConfig(
         box_world=DEMO_BOX_WORLD,
         duration=settings.duration,
         motion="walk",
         rests=Rests(start=3.0, move=20.0, pause=2.0),
+        random_field=site.model_error,
     )
     with TemporaryDirectory() as directory:
         log = Path(directory) / "log"
-        run_simulate(demo_site(), config, log, settings.seed)
+        run_simulate(site, config, log, settings.seed)
         return run_smooth(Job(log, None, output), SmootherSettings(), report=report)
 
 

@@ -26,6 +26,7 @@ from magfusion.model.parameters import initial_calibration
 from magfusion.model.progress import Report, quiet
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Trust
+from magfusion.results.axes import axis_figures
 from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.rest_figures import rest_figures
 from magfusion.results.verdict import level_figures, trust_figures
@@ -194,7 +195,7 @@ def run_fix(
         trust |= Trust(rested.findings)
         dropped, of_rests = rested.dropped, rest_figures(rested)
     figures = heading("fix", log.name) | trust_figures(trust) | fix_figures(fixes, site)
-    figures |= dropped_figures(dropped) | level_figures(states) | of_rests
+    figures |= dropped_figures(dropped) | level_figures(states, len(site.beacons)) | of_rests
     figures |= Figures(where_found("gain_spread", result.gain_spread > 0.0, result.gain_spread))
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     with claimed as whole:
@@ -312,6 +313,8 @@ def write_fix_result(
 
     best = fixes.best()
     errors, compared = compared_with_truth(best if nearest is None else nearest, log)
+    if nearest is None:
+        compared = axis_figures(best, errors) | compared
     write_tum(best, directory / "trajectory.tum", log.epoch_ns)
     write_trajectory(best, directory / "trajectory.parquet", log.epoch_ns, states)
     write_hypotheses(

@@ -28,6 +28,7 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, StateTrust, Trust, Verdict
 from magfusion.model.without_imu import logged
+from magfusion.results.axes import Frame, axis_figures, survey_frame
 from magfusion.results.errors import TrajectoryErrors
 from magfusion.results.figures import (
     ErrorColumn,
@@ -188,9 +189,10 @@ def navigated(
     trust |= _without_levels(current.trust, navigator)
     estimates, refined = _calibration(navigator, log.name)
     errors, compared = compared_with_truth(states, comparable(log, states, site))
+    compared = axis_figures(states, errors, _frame(navigator)) | compared
     figures = heading("navigate", log.name) | trust_figures(trust)
     figures |= _settings_figures(navigator.settings) | _run_figures(navigator, states) | compared
-    figures |= level_figures(current.trust) | open_figures(site)
+    figures |= level_figures(current.trust, len(site.beacons)) | open_figures(site)
     lagged = _part(rows, _chosen(rows, trust, LAGGED), site)
     if lagged is not None:
         figures |= Figures(Figure("lagged_epochs", len(lagged.states), section=Section.REPORT))
@@ -225,6 +227,12 @@ def _calibration(navigator: Navigator, name: str) -> tuple[list[ParameterEstimat
     declared = initial_calibration(navigator.site, state.calibration.reference_time)
     estimates = parameter_estimates(declared, state.calibration, blocks, cov)
     return estimates, refined_site(state.calibration, blocks, cov, estimates, name)
+
+
+def _frame(navigator: Navigator) -> Frame | None:
+    """Return the uncertainty of the frame by the survey."""
+    blocks, _ = navigator.settings.blocks(navigator.site)
+    return survey_frame(navigator.state(-np.inf).calibration, blocks)
 
 
 def _settings_figures(settings: NavigatorSettings) -> Figures:

@@ -45,6 +45,7 @@ from magfusion.jobs.result_directory import found_in
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk, StateTrust, Trust, Verdict
+from magfusion.results.axes import axis_figures, survey_frame
 from magfusion.results.errors import TrajectoryErrors, trajectory_errors
 from magfusion.results.figures import ErrorColumn, Figure, Figures, Section, heading
 from magfusion.results.page_motion import MotionPage
@@ -144,7 +145,8 @@ def finished(
         | trust_figures(trust)
         | Figures(where_found("coupling", settings.coupling != "tight", settings.coupling))
     )
-    figures |= smoothed_figures(result) | level_figures(by_state) | open_figures(site)
+    figures |= smoothed_figures(result) | level_figures(by_state, len(site.beacons))
+    figures |= open_figures(site)
     further = None if correction is None else continued(correction, score)
     return Finished(site, result, trust, by_state, figures, None, possible, further)
 
@@ -193,7 +195,9 @@ def with_errors(
     result = done.result
     own = comparable(log, result.states, result.declared.site)
     errors, compared = compared_with_truth(result.states, own)
-    figures = done.figures | compared | placement_figures(placed, result.calibration.site)
+    frame = survey_frame(result.calibration, result.blocks)
+    figures = done.figures | axis_figures(result.states, errors, frame) | compared
+    figures |= placement_figures(placed, result.calibration.site)
     if errors is not None and not placed and fixed is not None:
         figures |= _fixed_survey_figures(log, *fixed, result)
     return replace(done, figures=figures, errors=errors)

@@ -24,6 +24,7 @@ class Section(StrEnum):
     TITLE = "title"
     VERDICT = "verdict"
     LOGS = "logs"  # the value has a row for each of several logs
+    AXES = "axes"  # errors and sigmas of each axis of the pose
     ERRORS = "errors"
     SUMMARY = "summary"
     CALIBRATION = "calibration"

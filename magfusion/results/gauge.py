@@ -72,6 +72,20 @@ def gauges(calibration: Calibration, blocks: tuple[Block, ...]) -> list[Gauge]:
     return result + _turns(beacons, blocks, (0, 1)) + _scale(beacons, blocks)
 
 
+def frame_directions(beacons: tuple[Beacon, ...], blocks: tuple[Block, ...]) -> Array | None:
+    """Return the motions of the world frame: all beacons shifted along x, y, z, and turned in yaw.
+
+    Returns
+    -------
+    ndarray, shape (dimension, 4), optional
+        Per metre and radian; None where a beacon is fixed, and the frame with it.
+    """
+    moves = [
+        gauge.direction for gauge in (*_shifts(beacons, blocks), *_turns(beacons, blocks, (2,)))
+    ]
+    return np.stack(moves, axis=1) if len(moves) == 4 else None
+
+
 def _scale(beacons: tuple[Beacon, ...], blocks: tuple[Block, ...]) -> list[Gauge]:
     """Return the scale gauge: a larger world, with moments growing with the cube."""
     parts: Parts = {}

@@ -21,6 +21,7 @@ from magfusion.results.page_style import STYLE
 from magfusion.results.provenance import Run, current_run, input_files, versions
 from magfusion.results.shown import (
     as_sure,
+    axis_rows,
     column_rows,
     findings,
     labelled,
@@ -180,7 +181,8 @@ def _unverified(figures: Figures) -> str:
 def _main(figures: Figures) -> str:
     errors = column_rows(figures.of(Section.ERRORS), "")
     transfer = column_rows(figures.of(Section.TRANSFER), "other part of the log")
-    tables = [_table(rows) for rows in (errors, transfer) if len(rows) > 1]
+    parts = (axis_rows(figures), errors, transfer)
+    tables = [_table(rows) for rows in parts if len(rows) > 1]
     summary = [list(row) for row in summary_rows(figures.of(Section.SUMMARY))]
     return "".join([*tables, _table([[], *summary]) if summary else ""])
 

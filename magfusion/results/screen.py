@@ -2,14 +2,17 @@
 
 from itertools import chain
 from pathlib import Path
+from typing import Literal
 
 from rich.console import Console
 from rich.table import Table
 
 from magfusion.model.trust import Verdict
+from magfusion.results.brief import is_brief, lines, next_step, remark_texts, table
 from magfusion.results.figures import Figure, Figures, ParameterEstimate, Section
 from magfusion.results.shown import (
     as_sure,
+    axis_rows,
     column_rows,
     findings,
     labelled,
@@ -28,7 +31,12 @@ _STYLES = {
 }
 
 
-def show(figures: Figures, output: Path | None, console: Console | None = None) -> None:
+def show(
+    figures: Figures,
+    output: Path | None,
+    console: Console | None = None,
+    level: Literal["quiet", "brief", "verbose"] = "brief",
+) -> None:
     """Print the figures of a job for a reader; ``report.json`` has all of them.
 
     Parameters
@@ -37,21 +45,58 @@ def show(figures: Figures, output: Path | None, console: Console | None = None) 
         Directory of the results.
     console : Console, optional
         By default the standard output.
+    level : 'quiet', 'brief' or 'verbose'
+        The verdict in one line; what a decision requires; or all.
     """
     console = Console(highlight=False, emoji=False) if console is None else console
     name = " of ".join(str(figure.value) for figure in figures.of(Section.TITLE))
+    if level == "quiet":
+        verdict = f": {figures['verdict']}" if "verdict" in figures else ""
+        console.print(f"{name}{verdict}", soft_wrap=True, markup=False)
+        return
     console.print(name, style="bold", soft_wrap=True, markup=False)
-    _show_verdict(figures, console)
-    tables = (
-        *(_of_logs(figure) for figure in figures.of(Section.LOGS)),
+    brief = level == "brief" and is_brief(figures)
+    _show_verdict(figures, console, brief=brief)
+    if brief:
+        _show_brief(figures, output, console)
+    else:
+        _show_all(figures, console)
+    if output is not None:
+        console.print(f"results in {output}", soft_wrap=True, markup=False)
+
+
+def _show_brief(figures: Figures, output: Path | None, console: Console) -> None:
+    """Print what a decision requires, and the next step."""
+    columns = _with_head(table(figures))
+    if columns.row_count:
+        for column in columns.columns[1:]:
+            column.justify = "right"
+        columns.columns[0].no_wrap = True
+        console.print(columns, markup=False)
+    rows = lines(figures)
+    width = max((len(label) for label, _ in rows), default=0)
+    for label, text in rows:
+        console.print(f" {label:<{width}}  {text}", soft_wrap=True, markup=False)
+    for sentence in [] if figures.get("job") == "drift" else notes(figures):
+        console.print(f"note: {sentence}", style="yellow", soft_wrap=True, markup=False)
+    step = next_step(figures, output)
+    if step:
+        console.print(f"next: {step}", soft_wrap=True, markup=False)
+
+
+def _show_all(figures: Figures, console: Console) -> None:
+    """Print all figures but those only of the report."""
+    parts = (
+        _with_head(axis_rows(figures)),
+        *(_with_head(log_rows(figure)) for figure in figures.of(Section.LOGS)),
         _table(figures.of(Section.ERRORS), ""),
         _summary(figures.of(Section.SUMMARY)),
         _calibration([f for f in figures.all if isinstance(f, ParameterEstimate)]),
         _table(figures.of(Section.TRANSFER), "other part of the log"),
     )
-    for table in tables:
-        if table.row_count:
-            console.print(table, markup=False)
+    for part in parts:
+        if part.row_count:
+            console.print(part, markup=False)
     for sentence in chain.from_iterable(map(sentences, figures.of(Section.DIRECTIONS))):
         console.print(sentence, soft_wrap=True, markup=False)
     for sentence in notes(figures):
@@ -60,11 +105,9 @@ def show(figures: Figures, output: Path | None, console: Console | None = None) 
         converged = sentences(figure) if figure.section is Section.REMARKS else []
         for sentence in [*converged, *filter(None, [figure.remark])]:
             console.print(sentence, soft_wrap=True, markup=False)
-    if output is not None:
-        console.print(f"results in {output}", soft_wrap=True, markup=False)
 
 
-def _show_verdict(figures: Figures, console: Console) -> None:
+def _show_verdict(figures: Figures, console: Console, *, brief: bool) -> None:
     """Print the verdict with its reasons, and unverified parameters."""
     if "verdict" not in figures:
         return
@@ -72,9 +115,12 @@ def _show_verdict(figures: Figures, console: Console) -> None:
     console.print(
         f"{verdict}".upper(), style=_STYLES[look_of(str(verdict))], soft_wrap=True, markup=False
     )
-    for key, lead in (("reasons", ""), ("remarks", "noticed: ")):
-        for one in findings(figures, key):
-            console.print(f"  {lead}{one['text']}", soft_wrap=True, markup=False)
+    for one in findings(figures, "reasons"):
+        console.print(f"  {one['text']}", soft_wrap=True, markup=False)
+    for text in remark_texts(figures, routine=not brief):
+        console.print(f"  noticed: {text}", soft_wrap=True, markup=False)
+    if brief:
+        return
     names = [str(one["parameter"]) for one in findings(figures, "unverified")]
     if names:
         sentence = f"fixed, not observable in this log: {', '.join(names)}"
@@ -83,16 +129,12 @@ def _show_verdict(figures: Figures, console: Console) -> None:
 
 def _table(figures: list[Figure], corner: str) -> Table:
     """Return a table of figures by their labels and columns."""
-    (_, *columns), *rows = column_rows(figures, corner)
-    table = Table(corner, *columns, box=None)
-    for row in rows:
-        table.add_row(*row)
-    return table
+    return _with_head(column_rows(figures, corner))
 
 
-def _of_logs(figure: Figure) -> Table:
-    """Return a table of several logs."""
-    head, *rows = log_rows(figure)
+def _with_head(table_rows: list[list[str]]) -> Table:
+    """Return a table whose first row is its head."""
+    head, *rows = table_rows or [[]]
     table = Table(*head, box=None)
     for row in rows:
         table.add_row(*row)

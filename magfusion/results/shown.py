@@ -2,7 +2,8 @@
 
 import math
 
-from magfusion.results.figures import ErrorColumn, Figure, Figures, Section, Value
+from magfusion.results.axes import AXES, ROWS
+from magfusion.results.figures import ErrorColumn, Figure, Figures, Section, Value, number
 
 # Codes of reasons with the same content as the note of a figure.
 _REPORTED_BY = {"residual_rms_{beacon}": {"field_residuals"}, "ambiguous": {"ambiguous"}}
@@ -52,6 +53,37 @@ def column_rows(figures: list[Figure], corner: str) -> list[list[str]]:
         rows.setdefault(labelled(figure), {})[figure.column] = number_text(figure.value)
     cells = [[label, *(row.get(c, "") for c in columns)] for label, row in rows.items()]
     return [[corner, *columns], *cells]
+
+
+def axis_rows(figures: Figures) -> list[list[str]]:
+    """Return the table of errors and sigmas by axis, its head first; empty without them."""
+    own = figures.of(Section.AXES)
+    if not own:
+        return []
+    lengths = [number(figure.value) for figure in own if figure.unit == "m"]
+    scale, unit = (1e3, "mm") if max(lengths, default=0.0) < 1.0 else (1.0, "m")
+    known = {figure.name: number(figure.value) for figure in own}
+    labels = {row: f.label for f in own for row in ROWS if f.name.startswith(f"{row}_x_")}
+    columns = [["rms", *labels.values()]]
+    for of, factor, shown in (("m", scale, unit), ("deg", 1.0, "°")):
+        axes = [axis for axis, own_unit in AXES if own_unit == of]
+        values = {a: [known.get(f"{row}_{a}_{of}") for row in labels] for a in axes}
+        sizes = [factor * abs(v) for column in values.values() for v in column if v]
+        decimals = _common_decimals(sizes)
+        for axis, column in values.items():
+            cells = [
+                "" if v is None else f"{factor * v:.{decimals}f}" if v else "0" for v in column
+            ]
+            columns.append([f"{axis.replace('_', ' ')} {shown}", *cells])
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _common_decimals(sizes: list[float]) -> int:
+    """Return two digits of the smallest, as far as the largest has five at most."""
+    if not sizes:
+        return 0
+    fine, coarse = (math.floor(math.log10(end(sizes))) for end in (min, max))
+    return max(0, min(1 - fine, 4 - coarse))
 
 
 # Columns of the table of logs on the screen, and their titles.

@@ -86,8 +86,14 @@ def _unverified(one: Unverified) -> dict[str, Any]:
     }
 
 
-def level_figures(states: StateTrust) -> Figures:
-    """Return the median protection levels, and in how many states beacons were excluded."""
+def level_figures(states: StateTrust, beacons: int | None = None) -> Figures:
+    """Return the median protection levels, and in how many states beacons were excluded.
+
+    Parameters
+    ----------
+    beacons : int, optional
+        Number of beacons of the site, for the cause of the level.
+    """
     known = np.isfinite(states.protection_level_m)
     deg = states.protection_level_deg[np.isfinite(states.protection_level_deg)]
     left_out = sum(1 for names in states.excluded if names)
@@ -104,6 +110,30 @@ def level_figures(states: StateTrust) -> Figures:
             "deg",
             label="protection level, attitude",
         ),
+        *(
+            ()
+            if beacons is None
+            else (
+                Figure(
+                    "protection_level_cause",
+                    _level_cause(states, beacons, bool(np.any(known))),
+                    section=Section.REPORT,
+                ),
+            )
+        ),
         Figure("states_without_level", int(np.sum(~known)), section=Section.REPORT),
         Figure("states_with_exclusion", left_out, section=Section.REPORT),
     )
+
+
+def _level_cause(states: StateTrust, beacons: int, known: bool) -> str:
+    """Return how many beacons bound the error where one of them is faulty, and a remedy."""
+    if not known:
+        few = "a single beacon has no other to be compared with; add two"
+        return few if beacons == 1 else "see the reasons of the verdict"
+    excluded = int(np.median([len(names) for names in states.excluded])) if states.excluded else 0
+    count = beacons - excluded
+    of = f"{count} of {beacons}" if excluded else f"{count}"
+    if count <= 2:
+        return f"{of} beacons: if one is faulty, the other alone bounds the error; add one"
+    return f"bounds the error if any one of {of} beacons is faulty"
