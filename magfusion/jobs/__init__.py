@@ -77,6 +77,10 @@ JOBS = {
         "design",
         "Design an installation: places, axes and frequencies of beacons for a hall.",
     ),
+    "accept": (
+        "accept",
+        "Accept an installation: fields at marks and check distances prove each beacon.",
+    ),
     "drift": (
         "drift",
         "Test the long-term stability of the online estimators on days of simulated data.",

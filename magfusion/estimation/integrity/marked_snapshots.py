@@ -9,30 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.integrity.field_snapshots import JointEstimate, Snapshots
 from magfusion.estimation.solve.batched import NormalEquations
+from magfusion.model.check_distance import CheckDistance
 from magfusion.model.parameters import BEACON_POSITION, Block, predict_channels
 from magfusion.units import Array
 
 HEADINGS = 36  # initial headings that are compared
 DETECTED = 10.0  # signal to noise from which a beacon decides on the heading
 CAP = 0.5  # largest share of a beacon's power that one contradicting beacon costs
-
-
-@dataclass(frozen=True)
-class CheckDistance:
-    """Distance between two beacons, or a beacon and a mark, measured by tape.
-
-    Parameters
-    ----------
-    begin, end : str
-        Names.
-    distance, sigma : float
-        (m)
-    """
-
-    begin: str
-    end: str
-    distance: float
-    sigma: float
 
 
 @dataclass(frozen=True, eq=False)
