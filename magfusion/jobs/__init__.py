@@ -77,6 +77,10 @@ JOBS = {
         "design",
         "Design an installation: places, axes and frequencies of beacons for a hall.",
     ),
+    "sheet": (
+        "sheet",
+        "Write a setting-out sheet: plan, coordinates, axes, tolerances, check distances (PDF).",
+    ),
     "accept": (
         "accept",
         "Accept an installation: fields at marks and check distances prove each beacon.",

@@ -12,8 +12,8 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.files.hall import load_hall
 from magfusion.files.site import load_site, save_site
-from magfusion.jobs.coverage import write_points
 from magfusion.jobs.budget_figures import PLACES, budget_figures, worst_and_median
+from magfusion.jobs.coverage import write_points
 from magfusion.jobs.design_figures import design_figures
 from magfusion.jobs.design_motion import run_motion
 from magfusion.jobs.design_settings import ALL, MOST_BEACONS, DesignSettings
@@ -32,8 +32,8 @@ from magfusion.results.design.need import (
 )
 from magfusion.results.design.pattern import ToneBand, template_of
 from magfusion.results.design.planning import Task, designed, with_moment
-from magfusion.results.error_budget import error_budget
 from magfusion.results.design.turns import cycle_of, is_in_turn
+from magfusion.results.error_budget import error_budget
 
 if TYPE_CHECKING:
     from collections.abc import Callable

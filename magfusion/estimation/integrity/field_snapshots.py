@@ -46,6 +46,7 @@ class JointEstimate:
     estimate: Array  # (dimension,) sum of the shared parameters' steps
 
     def moved(self, step: Array, blocks: tuple[Block, ...]) -> JointEstimate:
+        """Return the estimate after a step."""
         poses = step[: 6 * len(self.turn)].reshape(-1, 6)
         shared = step[6 * len(self.turn) :]
         return JointEstimate(
@@ -117,6 +118,7 @@ class Snapshots:
 
     @cached_property
     def weights(self) -> Array:
+        """Whitening of each phasor."""
         cov = measurement_cov(self.site, self.samples, survey_error=self.survey_error)
         return whitening(cov, self.samples.there)
 
@@ -218,6 +220,7 @@ class Snapshots:
 
 
 def is_significant(before: float, after: float, count: float, freedom: float, tests: int) -> bool:
+    """Return whether so many released parameters reduce chi square by more than chance does."""
     noise = max(1.0, after / max(freedom, 1.0))
     log_p = log_p_chi_square((before - after) / noise, count)
     return bool(log_p < np.log(TEST_BUDGET / tests))
@@ -226,6 +229,7 @@ def is_significant(before: float, after: float, count: float, freedom: float, te
 def wide_blocks(
     site: Site, parameters: Sequence[tuple[Parameter, str, float]]
 ) -> tuple[Block, ...]:
+    """Return blocks of parameters with an owner and a sigma each."""
     out = []
     for parameter, owner, sigma in parameters:
         width = len(parameter.sigma(site, owner))
