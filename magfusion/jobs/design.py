@@ -94,9 +94,10 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
             coverage(one, task.points, settings.window, risk=settings.risks)
             for one in (before, new)
         ]
+        of_sigma = settings.objective != "worst"
         panels = [
-            Panel(f"before: {words}", before, maps[0]),
-            Panel("after", new, maps[1]),
+            Panel(f"before: {words}", before, maps[0], of_sigma),
+            Panel("after", new, maps[1], of_sigma),
         ]
         rows = worst_and_median(maps[1])
         budget = error_budget(new, task.points[rows], settings.window) if len(rows) else None

@@ -1,6 +1,6 @@
 """A setting-out sheet: plan to scale, coordinates, axes, tolerances and check distances, as PDF."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,13 +12,15 @@ from matplotlib.figure import Figure
 from magfusion.model.hall import Hall
 from magfusion.model.site import Beacon, Site
 from magfusion.results.design.pattern import pattern_axis, peak_moment
-from magfusion.results.plots.plan import draw_beacons, draw_hall
+from magfusion.results.plots.plan import MARGIN, draw_beacons, draw_hall
 from magfusion.units import DEGREE, Array
 
 PAGE = (11.69, 8.27)  # inches; A4, landscape
 PLAN = (10.3, 5.6)  # inches for the plan
 INCH = 0.0254  # m
-SCALES = (10, 20, 50, 100, 200, 250, 500, 1000, 2000, 5000, 10_000, 100_000)
+SCALES = (10, 20, 50, 100, 200, 250, 300, 400, 500, 1000, 2000, 5000, 10_000, 100_000)
+DETAILED = 100  # scale of the pages of parts, where the whole has a smaller one
+MOST_PARTS = 12
 ROWS = 24  # of a table on a page
 TOLERANCE = 2.0  # sigmas
 
@@ -56,7 +58,8 @@ def write_sheet(
         Marks on the floor by their names, shape (3,) (m).
     """
     with PdfPages(path, metadata={"CreationDate": None}) as pages:
-        pages.savefig(_plan(site, hall, marks_world, title))
+        for figure in _plans(site, hall, marks_world, title):
+            pages.savefig(figure)
         beacons = [_beacon_row(beacon) for beacon in site.beacons]
         tables = [
             (
@@ -119,37 +122,78 @@ def _beacon_row(beacon: Beacon) -> tuple[str, ...]:
     )
 
 
-def _plan(site: Site, hall: Hall, marks_world: Mapping[str, Array], title: str) -> Figure:
+def _plans(
+    site: Site, hall: Hall, marks_world: Mapping[str, Array], title: str
+) -> Iterator[Figure]:
+    """Yield the plan of the whole hall, and of its parts where that is small."""
+    box = hall.room.box_world[:, :2]
+    box = box + MARGIN * float(np.max(box[1] - box[0])) * np.array([[-1.0], [1.0]])
+    size = box[1] - box[0]
+    scale = next(s for s in SCALES if np.all(size / s / INCH <= PLAN) or s == SCALES[-1])
+    yield _plan(site, hall, marks_world, box, scale, title)
+    if scale <= DETAILED:
+        return
+    part = np.array(PLAN) * INCH * DETAILED
+    count = np.ceil(np.ptp(hall.room.polygon, axis=0) / part).astype(int)
+    if np.prod(count) > MOST_PARTS:
+        return
+    step = np.ptp(hall.room.polygon, axis=0) / count
+    middle = hall.room.box_world[0, :2] + 0.5 * step
+    for k, (row, column) in enumerate(np.ndindex(count[1], count[0]), 1):
+        place = middle + step * np.array([column, row])
+        own = np.stack([place - 0.5 * part, place + 0.5 * part])
+        yield _plan(site, hall, marks_world, own, DETAILED, f"{title}, part {k}")
+
+
+def _plan(
+    site: Site,
+    hall: Hall,
+    marks_world: Mapping[str, Array],
+    box: Array,
+    scale: int,
+    title: str,
+) -> Figure:
+    """Return a page with a part of the plan, lower and upper corner (2, 2) (m), to scale."""
     figure = Figure(figsize=PAGE)
     FigureCanvasAgg(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     draw_hall(axes, hall)
-    size = np.array([axes.get_xlim()[1] - axes.get_xlim()[0], np.ptp(axes.get_ylim())])
-    scale = next(s for s in SCALES if np.all(size / s / INCH <= PLAN) or s == SCALES[-1])
-    width, height = size / scale / INCH / PAGE
-    axes.set_position((0.5 - 0.5 * width, 0.52 - 0.5 * height, width, height))
+    width, height = (box[1] - box[0]) / scale / INCH / PAGE
+    axes.set_position((0.5 - 0.5 * width, 0.5 - 0.5 * height, width, height))
+    axes.set(xlim=box[:, 0], ylim=box[:, 1])
     axes.grid(color="0.9", linewidth=0.5)
     axes.set_axisbelow(True)
-    if marks_world:
-        places = np.array([place[:2] for place in marks_world.values()])
+    inside = {
+        name: place
+        for name, place in marks_world.items()
+        if np.all((place[:2] >= box[0]) & (place[:2] <= box[1]))
+    }
+    if inside:
+        places = np.array([place[:2] for place in inside.values()])
         axes.scatter(*places.T, s=22, marker="+", c="tab:blue", linewidths=0.9, label="mark")
-        for name, place in zip(marks_world, places, strict=True):
-            axes.annotate(
-                name,
-                tuple(place),
-                xytext=(3, 3),
-                textcoords="offset points",
-                fontsize=5.5,
-                color="tab:blue",
-            )
-    draw_beacons(axes, site.beacons, float(np.max(np.ptp(hall.room.polygon, axis=0))))
+        for name, place in zip(inside, places, strict=True):
+            if scale <= DETAILED:
+                axes.annotate(
+                    name,
+                    tuple(place),
+                    xytext=(3, 3),
+                    textcoords="offset points",
+                    fontsize=8,
+                    color="tab:blue",
+                )
+    shown = [
+        beacon
+        for beacon in site.beacons
+        if np.all((beacon.position_world[:2] >= box[0]) & (beacon.position_world[:2] <= box[1]))
+    ]
+    draw_beacons(axes, shown, float(np.max(box[1] - box[0])))
     figure.legend(loc="lower center", ncols=4, fontsize=9, frameon=False)
-    figure.text(0.5, 0.95, f"Setting-out sheet: {title}", ha="center", fontsize=14)
+    figure.text(0.5, 0.955, f"Setting-out sheet: {title}", ha="center", fontsize=14)
     figure.text(
         0.5,
-        0.905,
-        f"Plan 1:{scale} on A4 printed at 100 %.  x and y as drawn, z upwards from the floor's"
-        f" zero; floor {hall.room.heights[0]:g} m, ceiling {hall.room.heights[1]:g} m.",
+        0.925,
+        f"Plan 1:{scale} on A4 printed at 100 %.  x and y as drawn, z upwards; floor at"
+        f" {hall.room.heights[0]:g} m, ceiling at {hall.room.heights[1]:g} m.",
         ha="center",
         fontsize=9,
     )
