@@ -25,7 +25,7 @@ ROOMS = {
     wing: rooms.split()
     for wing, rooms in {
         "model": """
-            arguments batches correlation drive field_map fixed_axes groups hall hermite
+            arguments batches check_distance correlation drive field_map fixed_axes groups hall hermite
             imu_intrinsics marks perturbation physics platform_motion probe progress quaternion
             region response rotor short_repr temperature time_division trust
             aiding magnetometer
@@ -42,7 +42,7 @@ ROOMS = {
             site_values standard_streams stray_stamps
             aiding_messages bag_reader bag_rows checkpoint correlation field_map kept lost_rows
             probe row_file survey table yaml_files
-            attitude_table audio drive_columns fields hall instruments readings_table
+            attitude_table audio distances drive_columns fields hall instruments readings_table
             site_casing site_correlation site_motion site_region site_response site_rotor
             site_temperature
             row_stamps trajectory_table wells_file

@@ -82,6 +82,14 @@ JOBS = {
         "Tabulate what a coil of wire gives: moment, volts, watts, warming, capacitor, fields.",
     ),
     "drive": ("drive", "Write a sound file that is played for the beacons of a site."),
+    "sheet": (
+        "sheet",
+        "Write a setting-out sheet: plan, coordinates, axes, tolerances, check distances (PDF).",
+    ),
+    "accept": (
+        "accept",
+        "Accept an installation: fields at marks and check distances prove each beacon.",
+    ),
     "drift": (
         "drift",
         "Test the long-term stability of the online estimators on days of simulated data.",

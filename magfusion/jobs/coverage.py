@@ -171,15 +171,21 @@ def _figures(
     return Figures(*figures)
 
 
-def need_figures(coverage: Coverage, limits: tuple[float, ...]) -> Figures:
+def need_figures(
+    coverage: Coverage, limits: tuple[float, ...], *, of_sigma: bool = False
+) -> Figures:
     """Return whether the protection levels that are needed are reached; nothing without a need.
 
     Parameters
     ----------
     limits : tuple of float
         Of position (m), and of attitude (deg) where it matters; empty without a need.
+    of_sigma : bool
+        Whether sigmas of position and attitude are needed instead.
     """
     level_m, level_deg = coverage.protection_level_m, coverage.protection_level_deg
+    if of_sigma:
+        level_m, level_deg = coverage.position_sigma, np.rad2deg(coverage.attitude_sigma)
     if not limits or level_m is None or level_deg is None:
         return Figures()
     levels = (level_m, level_deg)[: len(limits)]

@@ -12,10 +12,11 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.files.hall import load_hall
 from magfusion.files.site import load_site, save_site
+from magfusion.jobs.budget_figures import PLACES, budget_figures, worst_and_median
 from magfusion.jobs.coverage import write_points
 from magfusion.jobs.design_figures import design_figures
 from magfusion.jobs.design_motion import run_motion
-from magfusion.jobs.design_settings import ALL, DesignSettings
+from magfusion.jobs.design_settings import ALL, MOST_BEACONS, DesignSettings
 from magfusion.jobs.receiver_axes import three_axes
 from magfusion.jobs.settings import Command
 from magfusion.jobs.simulate import box_option
@@ -23,14 +24,23 @@ from magfusion.model.hall import Hall, Mounts, mounting_places, points_of_use, p
 from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Beacon, Site
 from magfusion.results.coverage import coverage, usual_box
+from magfusion.results.design.need import (
+    NeededDesign,
+    fewest_beacons,
+    least_moment,
+    most_beacons,
+)
 from magfusion.results.design.pattern import ToneBand, template_of
 from magfusion.results.design.planning import Task, designed, with_moment
 from magfusion.results.design.turns import cycle_of, is_in_turn
+from magfusion.results.error_budget import error_budget
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from magfusion.model.hall import Hall
     from magfusion.results.design.pattern import ToneBand
-    from magfusion.results.design.planning import Task
+    from magfusion.results.design.planning import Design, Task
     from magfusion.results.figures import Figures
     from magfusion.units import Array
 
@@ -48,6 +58,7 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
     """
     from magfusion.jobs.result_directory import claim
     from magfusion.results.plots.design import Panel, write_plot
+    from magfusion.results.plots.error_budget import write_budget_plot
     from magfusion.results.recording_design import write_design_recording
     from magfusion.results.report import write_report
 
@@ -60,15 +71,19 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
     first = None if settings.earlier is None else load_site(settings.earlier)
     task = _task(settings, site, hall, spacing)
     alone = len(site.beacons) < 2
-    result = designed(
-        task,
-        starts=settings.starts,
-        layouts=max(settings.random, LEAST_DRAWN if alone else 0),
-        rng=np.random.default_rng(settings.seed),
-        first=first,
-        in_time=lambda: time.monotonic() - begin < 60.0 * settings.minutes,
-        report=report,
-    )
+
+    def search(own: Task) -> Design:
+        return designed(
+            own,
+            starts=settings.starts,
+            layouts=max(settings.random, LEAST_DRAWN if alone else 0),
+            rng=np.random.default_rng(settings.seed),
+            first=first,
+            in_time=lambda: time.monotonic() - begin < 60.0 * settings.minutes,
+            report=report,
+        )
+
+    task, result = _for_need(settings, task, search)
     before = result.median_random if alone else site
     assert before is not None
     words = "the given site" if before is site else "a random layout, the median one"
@@ -79,16 +94,38 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
             coverage(one, task.points, settings.window, risk=settings.risks)
             for one in (before, new)
         ]
+        of_sigma = settings.objective != "worst"
         panels = [
-            Panel(f"before: {words}", before, maps[0]),
-            Panel("after", new, maps[1]),
+            Panel(f"before: {words}", before, maps[0], of_sigma),
+            Panel("after", new, maps[1], of_sigma),
         ]
+        rows = worst_and_median(maps[1])
+        budget = error_budget(new, task.points[rows], settings.window) if len(rows) else None
         figures = design_figures(settings, task, result, panels, spacing)
+        if budget is not None:
+            figures |= budget_figures(budget, maps[1].beacons[rows])
+            write_budget_plot(directory / "error_budget.png", budget, PLACES)
         write_points(directory / "coverage.parquet", maps[1])
         write_plot(directory / "design.png", hall, panels)
         write_design_recording(directory / "run.rrd", hall, panels, spacing)
         write_report(directory, figures)
     return figures
+
+
+def _for_need(
+    settings: DesignSettings, task: Task, search: Callable[[Task], Design]
+) -> tuple[Task, Design]:
+    """Return a design, of the number and moment of beacons that are needed where these are open."""
+    if not settings.limits:
+        return task, search(task)
+    need = settings.limits[0]
+    if settings.beacons is None:
+        found = fewest_beacons(task, need, most_beacons(task, MOST_BEACONS), search)
+    else:
+        found = NeededDesign(task, search(task), reached=True)
+    if settings.moment is None and settings.moment_budget is None:
+        found = least_moment(found, need)
+    return found.task, found.design
 
 
 def _hall(settings: DesignSettings, site: Site) -> tuple[Hall, float]:
@@ -133,13 +170,13 @@ def _task(settings: DesignSettings, site: Site, hall: Hall, spacing: float) -> T
     template = template_of(site, settings.template)
     moment = settings.moment
     if settings.moment_budget is not None:
-        moment = settings.moment_budget / settings.beacons
+        moment = settings.moment_budget / settings.count
     kept = _kept(site, settings.keep)
     _check_turns(settings, kept, template)
     return Task(
         site=kept,
         template=template if moment is None else with_moment(template, moment),
-        count=settings.beacons,
+        count=settings.count,
         places=mounting_places(hall, settings.grid or spacing),
         points=points,
         band=_band(settings, site),
@@ -162,10 +199,10 @@ def _check_turns(settings: DesignSettings, kept: Site, template: Beacon) -> None
         )
     if not is_in_turn(template):
         return
-    cycle = cycle_of(template, settings.beacons)
+    cycle = cycle_of(template, settings.count)
     if cycle is not None and settings.window < cycle * (1.0 - 1e-9):
         raise InputError(
-            f"--window {settings.window:g} s is shorter than a cycle of {settings.beacons} beacons"
+            f"--window {settings.window:g} s is shorter than a cycle of {settings.count} beacons"
             f" in time slots; give --window {cycle:.3g} or more"
         )
 

@@ -59,7 +59,9 @@ def design_figures(
         *(figure for beacon in result.new for figure in _of_beacon(beacon)),
         Figure("notes", notes, section=Section.NOTES),
     ]
-    head = heading("design", settings.site.stem) | need_figures(after, settings.limits)
+    head = heading("design", settings.site.stem) | need_figures(
+        after, settings.limits, of_sigma=settings.objective != "worst"
+    )
     return head | Figures(*figures)
 
 

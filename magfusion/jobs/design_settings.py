@@ -10,6 +10,7 @@ from magfusion.errors import InputError
 from magfusion.jobs.settings import NeedSettings, RandomSettings, argument, option
 
 ALL = "all"
+MOST_BEACONS, USUAL_BEACONS = 30, 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,7 +18,13 @@ class DesignSettings(NeedSettings, RandomSettings):
     """Hall, number and kind of beacons, and search time."""
 
     site: Path = argument("Site file: its platform, and a beacon of which copies are placed")
-    beacons: int = option(4, "New beacons to place", least=1, most=30)
+    beacons: int | None = option(
+        None,
+        "New beacons to place",
+        least=1,
+        most=MOST_BEACONS,
+        note="default: 4; with --need as few as reach it",
+    )
     hall: Path | None = option(
         None, "YAML file of the hall: walls, mounting, forbidden places, where to navigate"
     )
@@ -35,10 +42,10 @@ class DesignSettings(NeedSettings, RandomSettings):
     template: str | None = option(
         None, "Beacon of the site of which copies are placed", note="default: the first"
     )
-    objective: Literal["worst", "D", "A"] = option(
+    objective: Literal["worst", "sigma", "D", "A"] = option(
         "worst",
-        "Criterion to minimise: the worst protection level; the mean logarithm of the determinant"
-        " (D) or the mean trace (A) of the position's covariance",
+        "Criterion to minimise: the worst protection level; the worst position sigma; the mean"
+        " logarithm of the determinant (D) or the mean trace (A) of the position's covariance",
     )
     axes: Literal["3", "7", "13"] = option(
         "7", "Directions of a beacon's axis: the world's, and diagonals"
@@ -63,7 +70,7 @@ class DesignSettings(NeedSettings, RandomSettings):
         unit="A m^2",
         least=1e-6,
         most=1e6,
-        note="default: as the template",
+        note="default: as the template; with --need the smallest that reaches it",
     )
     moment_budget: float | None = option(
         None,
@@ -106,6 +113,13 @@ class DesignSettings(NeedSettings, RandomSettings):
             raise InputError("give --moment, or --moment-budget to distribute it; not both")
         if self.hall is not None and self.box is not None:
             raise InputError("give --hall, or --box where there is no file; not both")
+        if self.moment_budget is not None and self.beacons is None and self.limits:
+            raise InputError("--moment-budget with --need requires a number; give --beacons")
+
+    @property
+    def count(self) -> int:
+        """Number of new beacons, where it is not searched."""
+        return USUAL_BEACONS if self.beacons is None else self.beacons
 
     @property
     def poses_known(self) -> bool:

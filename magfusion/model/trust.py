@@ -107,6 +107,7 @@ CODES = {
     "noise_tuned": "noise or model error differ from the declared values",
     "not_at_rest": "a platform or sensor that should be at rest moved",
     "not_converged": "the last iteration still changed the result by more than its sigmas allow",
+    "not_proven": "the measurements are too few to prove a beacon's place",
     "other_site": "the fields contradict the site's file as a whole",
     "outside_region": "a pose is outside of the declared region or hemisphere",
     "phase": "the drive phase of a beacon is not as declared",

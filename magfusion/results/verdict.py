@@ -15,6 +15,8 @@ _LOOKS = {
     "unstable": Verdict.FAILED,
     "reached": Verdict.TRUSTWORTHY,
     "not reached": Verdict.FAILED,
+    "pass": Verdict.TRUSTWORTHY,
+    "not proven": Verdict.DOUBTFUL,
 }
 MOST_TEXTS = 3  # of findings of one code; more are counted
 

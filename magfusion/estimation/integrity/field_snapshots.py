@@ -1,5 +1,7 @@
 """Fields of a few dozen calm epochs, and how well a site explains them for any motion."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -35,7 +37,7 @@ ITERATIONS = 20
 
 
 @dataclass(frozen=True, eq=False)
-class _Guess:
+class JointEstimate:
     """Poses of all epochs, and shared parameters."""
 
     calibration: Calibration
@@ -43,10 +45,11 @@ class _Guess:
     place: Array  # (n, 3)
     estimate: Array  # (dimension,) sum of the shared parameters' steps
 
-    def moved(self, step: Array, blocks: tuple[Block, ...]) -> "_Guess":
+    def moved(self, step: Array, blocks: tuple[Block, ...]) -> JointEstimate:
+        """Return the estimate after a step."""
         poses = step[: 6 * len(self.turn)].reshape(-1, 6)
         shared = step[6 * len(self.turn) :]
-        return _Guess(
+        return JointEstimate(
             retract(self.calibration, blocks, shared),
             self.turn @ Rotation.from_rotvec(poses[:, :3]).as_matrix(),
             self.place + (self.turn @ poses[:, 3:, None])[..., 0],
@@ -90,17 +93,17 @@ class Snapshots:
         """Chi square of the fixes."""
         return float(np.sum(self.fixes.cost[:, 0]))
 
-    def of(self, site: Site) -> "Snapshots":
+    def of(self, site: Site) -> Snapshots:
         """Return the same epochs with another site."""
         return replace(self, calibration=replace(self.calibration, site=site))
 
-    def some(self, count: int) -> "Snapshots":
+    def some(self, count: int) -> Snapshots:
         """Return a subset of the epochs."""
         chosen = np.zeros(len(self.samples), dtype=bool)
         chosen[np.linspace(0, len(self.samples) - 1, count).round().astype(np.int64)] = True
         return replace(self, samples=self.samples.rows(chosen))
 
-    def without(self, name: str) -> "Snapshots":
+    def without(self, name: str) -> Snapshots:
         """Return the same epochs as if a beacon had not been received."""
         own = np.array([beacon == name for beacon, _ in self.samples.channels])
         phasor = np.where(own[:, None], np.nan, self.samples.phasor_sensor)
@@ -111,10 +114,11 @@ class Snapshots:
         at, place = fixes.world_from_body[:, 0], fixes.position_world[:, 0]
         phasor = predict_channels(self.calibration, self.samples.time, at, place)
         error = stacked(phasor - self.samples.phasor_sensor)
-        return whitened(self._weights, error[..., None]).reshape(error.shape)
+        return whitened(self.weights, error[..., None]).reshape(error.shape)
 
     @cached_property
-    def _weights(self) -> Array:
+    def weights(self) -> Array:
+        """Whitening of each phasor."""
         cov = measurement_cov(self.site, self.samples, survey_error=self.survey_error)
         return whitening(cov, self.samples.there)
 
@@ -130,7 +134,8 @@ class Snapshots:
         fixes : Fixes
             Initial poses.
         """
-        return self._minimised(_blocks(self.site, parameters), fixes)
+        cost, guess, _ = self.minimised(wide_blocks(self.site, parameters), *_best_poses(fixes))
+        return cost, guess.calibration
 
     @cached_property
     def joint_chi_square(self) -> float:
@@ -154,41 +159,41 @@ class Snapshots:
         The likelihood ratio of larger errors of them than their declared sigmas.
         """
         released = self._jointly(parameters)
-        count = sum(len(b.sigma) for b in _blocks(self.site, parameters))
-        return _is_significant(self.joint_chi_square, released, count, self.freedom, tests)
+        count = sum(len(b.sigma) for b in wide_blocks(self.site, parameters))
+        return is_significant(self.joint_chi_square, released, count, self.freedom, tests)
 
-    def rejects_rest(self, rest: "Snapshots", tests: int) -> bool:
+    def rejects_rest(self, rest: Snapshots, tests: int) -> bool:
         """Return whether what a subset leaves out contradicts it, one of so many tests."""
         count, after = self.freedom - rest.freedom, rest.joint_chi_square
-        return _is_significant(self.joint_chi_square, after, count, rest.freedom, tests)
+        return is_significant(self.joint_chi_square, after, count, rest.freedom, tests)
 
     def _jointly(self, parameters: Sequence[tuple[Parameter, str, float]]) -> float:
-        wide = _blocks(self.site, parameters)
+        wide = wide_blocks(self.site, parameters)
         released = {block.key for block in wide}
         groups = (*OF_SURVEY, "phase")
         survey = (b for b in choose_blocks(self.site, groups) if b.key not in released)
         own = replace(self, survey_error=False)
-        return own._minimised(placed([*survey, *wide]), self.fixes)[0]
+        return own.minimised(placed([*survey, *wide]), *_best_poses(self.fixes))[0]
 
-    def _minimised(self, blocks: tuple[Block, ...], fixes: Fixes) -> tuple[float, Calibration]:
-        start = _Guess(
-            self.calibration,
-            fixes.world_from_body[:, 0],
-            fixes.position_world[:, 0],
-            np.zeros(dimension(blocks)),
+    def minimised(
+        self, blocks: tuple[Block, ...], world_from_body: Array, position_world: Array
+    ) -> tuple[float, JointEstimate, Array]:
+        """Return chi square, estimate and information of all poses and some parameters."""
+        start = JointEstimate(
+            self.calibration, world_from_body, position_world, np.zeros(dimension(blocks))
         )
 
         def model(_: IntArray, state: AnyArray) -> NormalEquations:
-            return self._normal(state[0], blocks)
+            return self.normal(state[0], blocks)
 
         def move(state: AnyArray, step: Array) -> AnyArray:
             return _one(state[0].moved(step[0], blocks))
 
         result = minimise(model, _one(start), move, max_iterations=ITERATIONS, relative=1e-5)
-        guess: _Guess = result.state[0]
-        return float(result.cost[0]), guess.calibration
+        guess: JointEstimate = result.state[0]
+        return float(result.cost[0]), guess, result.information[0]
 
-    def _normal(self, at: _Guess, blocks: tuple[Block, ...]) -> NormalEquations:
+    def normal(self, at: JointEstimate, blocks: tuple[Block, ...]) -> NormalEquations:
         """Return the normal equations of all poses, and of the shared parameters."""
         time, n = self.samples.time, len(self.samples)
         value, by_pose, by_free = linearize_channels(
@@ -196,7 +201,7 @@ class Snapshots:
         )
         error = (value - stacked(self.samples.phasor_sensor))[..., None]
         every = np.concatenate([by_pose, by_free, error], axis=-1)
-        rows = whitened(self._weights, every).reshape(n, -1, every.shape[-1])
+        rows = whitened(self.weights, every).reshape(n, -1, every.shape[-1])
         square = np.swapaxes(rows, 1, 2) @ rows
         sigma = np.concatenate([np.zeros(0), *(block.sigma for block in blocks)])
         size = 6 * n + len(sigma)
@@ -214,13 +219,17 @@ class Snapshots:
         return NormalEquations(np.array([cost]), gradient[None], information[None])
 
 
-def _is_significant(before: float, after: float, count: float, freedom: float, tests: int) -> bool:
+def is_significant(before: float, after: float, count: float, freedom: float, tests: int) -> bool:
+    """Return whether so many released parameters reduce chi square by more than chance does."""
     noise = max(1.0, after / max(freedom, 1.0))
     log_p = log_p_chi_square((before - after) / noise, count)
     return bool(log_p < np.log(TEST_BUDGET / tests))
 
 
-def _blocks(site: Site, parameters: Sequence[tuple[Parameter, str, float]]) -> tuple[Block, ...]:
+def wide_blocks(
+    site: Site, parameters: Sequence[tuple[Parameter, str, float]]
+) -> tuple[Block, ...]:
+    """Return blocks of parameters with an owner and a sigma each."""
     out = []
     for parameter, owner, sigma in parameters:
         width = len(parameter.sigma(site, owner))
@@ -228,7 +237,11 @@ def _blocks(site: Site, parameters: Sequence[tuple[Parameter, str, float]]) -> t
     return placed(out)
 
 
-def _one(guess: _Guess) -> AnyArray:
+def _best_poses(fixes: Fixes) -> tuple[Array, Array]:
+    return fixes.world_from_body[:, 0], fixes.position_world[:, 0]
+
+
+def _one(guess: JointEstimate) -> AnyArray:
     state = np.empty(1, dtype=object)
     state[0] = guess
     return state

@@ -11,6 +11,7 @@ a layout is worse elsewhere, the points there are added, until there are none.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from typing import Literal
 
@@ -21,7 +22,7 @@ from magfusion.model.site import Beacon
 from magfusion.results.design.layout_information import LayoutInformation, added, pose_covariance
 from magfusion.units import Array, BoolArray, IntArray
 
-Objective = Literal["worst", "D", "A"]
+Objective = Literal["worst", "sigma", "D", "A"]
 LESS = 1e-4  # of the objective; an exchange that gains less is none
 FIRST_POINTS = 24  # compared from the start
 MORE_POINTS = 6  # added in a round, apart from each other
@@ -31,6 +32,7 @@ SWEEPS = 20
 DRAWN = 30  # random layouts, of which the best is a start
 STAGES = (3, 8)  # points at which candidates are compared, before all
 AT_ONCE = 3000  # informations in memory at once
+MOST_KEPT = 10_000_000  # numbers of all candidates at all points that are kept in memory
 TRIES = 2000  # random layouts in a row that do not keep their distance
 
 
@@ -89,9 +91,9 @@ class LayoutSearch:
     ----------
     information : LayoutInformation
         At all points.
-    objective : {'worst', 'D', 'A'}
-        Worst protection level (m); mean of the logarithm of the determinant of the position's
-        covariance; mean of its trace (m^2).
+    objective : {'worst', 'sigma', 'D', 'A'}
+        Worst protection level (m); worst position sigma (m); mean of the logarithm of the
+        determinant of the position's covariance; mean of its trace (m^2).
     in_time : callable
         Whether the time limit is not reached.
     """
@@ -106,19 +108,31 @@ class LayoutSearch:
 
     def __post_init__(self) -> None:
         """Select the first points: distributed evenly over all, or enough for a mean."""
-        maximum = FIRST_POINTS if self.objective == "worst" else 2 * FIRST_POINTS
+        maximum = FIRST_POINTS if _is_worst(self.objective) else 2 * FIRST_POINTS
         count = len(self.information.points)
         self.add(np.unique(np.linspace(0, count - 1, min(maximum, count)).astype(int)))
 
     def add(self, points: IntArray) -> None:
         """Add points at which candidates are compared."""
         part = self.information.at(self.information.points[points])
-        roots = np.stack([part.root(beacon) for beacon in self.candidates.beacons])
+        if self._everywhere is None:
+            roots = np.stack([part.root(beacon) for beacon in self.candidates.beacons])
+        else:
+            roots = self._everywhere[:, points]
         first = not len(self.active)
         self.roots = roots if first else np.concatenate([self.roots, roots], axis=1)
         standing = part.standing
         self.standing = standing if first else np.concatenate([self.standing, standing], axis=1)
         self.active = np.concatenate([self.active, points])
+
+    @cached_property
+    def _everywhere(self) -> Array | None:
+        """Roots of all candidates at all points; None where they are too many."""
+        beacons, information = self.candidates.beacons, self.information
+        size = information.root(beacons[0]).size
+        if len(beacons) * size > MOST_KEPT:
+            return None
+        return np.stack([information.root(beacon) for beacon in beacons])
 
     def value(self, chosen: Sequence[int]) -> float:
         """Return the objective of a layout at the compared points."""
@@ -146,7 +160,9 @@ class LayoutSearch:
         base = np.stack([rest, *parts], axis=1)  # (points, 1 + beacons, size, size)
         alone = pose_covariance(rest)  # without the one that is exchanged
         if self.objective != "worst":
-            result = self._compared(rows, base[:, :1], alone, np.arange(len(self.active)))
+            base = base[:, :1]
+        if not _is_worst(self.objective):
+            result = self._compared(rows, base, alone, np.arange(len(self.active)))
             means = np.mean(result, axis=1)
             best = int(np.argmin(means))
             return int(rows[best]), float(means[best])
@@ -215,14 +231,20 @@ def at_each_point(
 
 def _of_covariance(cov: Array, objective: Objective) -> Array:
     position = cov[..., 3:, 3:]
-    if objective == "A":
-        return np.asarray(np.trace(position, axis1=-2, axis2=-1))
+    if objective != "D":
+        trace = np.trace(position, axis1=-2, axis2=-1)
+        return np.asarray(trace if objective == "A" else np.sqrt(trace))
     return np.asarray(np.linalg.slogdet(position)[1])
 
 
 def of_points(each: Array, objective: Objective) -> float:
     """Return the objective from its values per point."""
-    return float(np.max(each) if objective == "worst" else np.mean(each))
+    return float(np.max(each) if _is_worst(objective) else np.mean(each))
+
+
+def _is_worst(objective: Objective) -> bool:
+    """Return whether the objective is the worst of all points, not their mean."""
+    return objective in ("worst", "sigma")
 
 
 def random_layout(
@@ -304,7 +326,7 @@ def _exchange_until_converged(search: LayoutSearch, layout: tuple[int, ...]) -> 
         value, each = search.value_everywhere(layout)
         if best is None or value < best.value:
             best = ExchangeResult(layout, value, complete=True)
-        enough = search.objective != "worst" or value <= search.value(layout) * (1.0 + LESS)
+        enough = not _is_worst(search.objective) or value <= search.value(layout) * (1.0 + LESS)
         full = len(search.active) + MORE_POINTS > MOST_COMPARED
         if enough or full or not search.in_time():
             break

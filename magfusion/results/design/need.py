@@ -1,0 +1,118 @@
+"""Number and moment of beacons for an accuracy that is needed."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.results.design.exchange import value_of
+from magfusion.results.design.layout_information import LayoutInformation
+from magfusion.results.design.pattern import peak_moment, stronger
+from magfusion.results.design.planning import Design, Task, with_beacons
+from magfusion.results.design.turns import is_in_turn
+
+FIRST = 2  # beacons; one leaves positions open
+GROWTH = 1.5  # of the number, until it suffices
+LARGEST, SMALLEST = 30.0, 0.01  # factor on the template's moment
+DIGITS = 2  # of a moment
+
+
+@dataclass(frozen=True, eq=False)
+class NeededDesign:
+    """The smallest design that reaches an accuracy, or the best that was found.
+
+    Parameters
+    ----------
+    task : Task
+        With its number and moment of beacons.
+    reached : bool
+    """
+
+    task: Task
+    design: Design
+    reached: bool
+
+
+def worst_of(task: Task, result: Design, factor: float = 1.0) -> float:
+    """Return the worst protection level or position sigma (m), by the task's objective.
+
+    Parameters
+    ----------
+    factor : float
+        On the moments of the new beacons.
+    """
+    information = LayoutInformation(
+        task.site, result.new[0], task.points, task.band.window, task.risk
+    )
+    objective = "worst" if task.objective == "worst" else "sigma"
+    return value_of(information, [stronger(b, factor) for b in result.new], objective)[0]
+
+
+def most_beacons(task: Task, limit: int) -> int:
+    """Return the largest number of new beacons that have separate tones, at most a limit."""
+    if is_in_turn(task.template):
+        return limit
+    kept = np.concatenate([np.zeros(0), *(b.tone_frequencies_hz for b in task.site.beacons)])
+    return min(limit, len(task.band.allowed(kept)) // len(task.template.tones))
+
+
+def fewest_beacons(
+    task: Task, need: float, most: int, design: Callable[[Task], Design]
+) -> NeededDesign:
+    """Find the fewest beacons that reach an accuracy, by bisection.
+
+    Parameters
+    ----------
+    need : float
+        Largest protection level or position sigma (m).
+    most : int
+        Largest number.
+    design : callable
+        `designed` of a task.
+    """
+    low, count = FIRST - 1, FIRST
+    while True:
+        best = _tried(task, need, count, design)
+        if best.reached or count == most or not best.design.complete:
+            break
+        low, count = count, min(max(count + 1, round(GROWTH * count)), most)
+    high = count
+    while best.reached and high - low > 1:
+        middle = (low + high) // 2
+        trial = _tried(task, need, middle, design)
+        if trial.reached:
+            high, best = middle, trial
+        else:
+            low = middle
+    return best
+
+
+def _tried(task: Task, need: float, count: int, design: Callable[[Task], Design]) -> NeededDesign:
+    own = replace(task, count=count)
+    result = design(own)
+    return NeededDesign(own, result, worst_of(own, result) <= need)
+
+
+def least_moment(found: NeededDesign, need: float) -> NeededDesign:
+    """Return a design with the smallest moments that reach an accuracy at the same places.
+
+    If no moment does, those of the design remain.
+    """
+    task, result = found.task, found.design
+    if worst_of(task, result, LARGEST) > need:
+        return replace(found, reached=False)
+    low, high = np.log(SMALLEST), np.log(LARGEST)
+    while high - low > 0.01:
+        middle = 0.5 * (low + high)
+        if worst_of(task, result, float(np.exp(middle))) <= need:
+            high = middle
+        else:
+            low = middle
+    # The moment that is ordered: rounded up, so that it still suffices.
+    old = max(peak_moment(beacon) for beacon in result.new)
+    scale = 10.0 ** (np.floor(np.log10(old * np.exp(high))) - DIGITS + 1)
+    factor = float(np.ceil(old * np.exp(high) / scale) * scale / old)
+    new = tuple(stronger(beacon, factor) for beacon in result.new)
+    site = with_beacons(task.site, new)
+    template = stronger(task.template, factor)
+    return NeededDesign(replace(task, template=template), replace(result, site=site, new=new), True)
