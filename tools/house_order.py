@@ -45,7 +45,7 @@ ROOMS = {
             attitude_table audio distances drive_columns fields hall instruments readings_table
             site_casing site_correlation site_motion site_region site_response site_rotor
             site_temperature
-            row_stamps trajectory_table wells_file
+            row_stamps steel_file trajectory_table wells_file
             aiding_tables bag depth_table fix_table marks_table result_states rotor_columns
             site_plain site_text
             temperature_table tum
@@ -70,8 +70,9 @@ ROOMS = {
         "simulation": """
             atmosphere demo_site ground layers magnetometers monte_carlo motion perturbed pipe shaft
             slots
-            aiding disturbance inertial rails rotor rotor_beacons
-            drift field wells
+            aiding inertial rotor rotor_beacons steel
+            disturbance rails
+            drift field steel_worlds wells
             waveform
             log
             endurance

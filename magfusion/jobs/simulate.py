@@ -12,6 +12,7 @@ from magfusion.errors import InputError
 from magfusion.files.audio import as_recording, write_audio
 from magfusion.files.log import write_log
 from magfusion.files.site import load_site, save_site
+from magfusion.files.steel_file import read_steel
 from magfusion.jobs.rotor_inputs import is_for_ranging
 from magfusion.jobs.settings import Command, option
 from magfusion.jobs.simulate_ranging import ShaftSettings, simulate_ranging
@@ -23,15 +24,17 @@ from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.disturbance import Ambient, FieldDrift, office_noise
 from magfusion.simulation.layers import layers_option
 from magfusion.simulation.log import EPOCH_NS, Reference, SimulationConfig, simulate_log
+from magfusion.simulation.pipe import Steel
 from magfusion.simulation.rails import laid, rails_option
 from magfusion.simulation.slots import Multiplexer
+from magfusion.simulation.steel import SteelStructure
+from magfusion.simulation.steel_worlds import KINDS, check_clear, draw_steel, structure_of
 from magfusion.simulation.waveform import usual_rate_hz
 
 if TYPE_CHECKING:
     from magfusion.model.samples import Log
     from magfusion.model.site import Magnetometer, Site
     from magfusion.simulation.log import Reference, SimulationConfig
-    from magfusion.simulation.pipe import Steel
     from magfusion.units import Array
 
 
@@ -114,6 +117,11 @@ class SimulateSettings(ShaftSettings):
         "Steel bars and tubes, radius[/wall]:x,y,z:x,y,z in m, separated by semicolons",
         note="e.g. 0.05:-5,3,0:20,3,0 for a rail, 0.1/0.008:3,4,-4:3,4,4 for a casing",
     )
+    steel: str | None = option(
+        None,
+        "Steel of the room: a file of spheres, bars and sheets, or a kind and a seed to draw it",
+        note=f"kinds: {', '.join(KINDS)}; e.g. mesh,3",
+    )
 
 
 def box_option(text: str | None) -> Array | None:
@@ -193,7 +201,7 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
             day_night=office_noise(EPOCH_NS) if settings.ambient == "day-night" else None,
             drift=FieldDrift(settings.drift, DRIFT_TIME) if settings.drift else None,
             layers=None if settings.ground is None else layers_option(settings.ground),
-            rails=_rails(settings.rails, box, site),
+            rails=_steel(settings, box, site),
             atmosphere=Atmosphere(settings.storms, settings.seed, settings.duration, 0.5 * rate_hz)
             if settings.storms
             else None,
@@ -202,18 +210,54 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
     return run_simulate(site, config, output, settings.seed, settings.full_scale)
 
 
-def _rails(text: str | None, box_world: Array, site: Site) -> Steel | None:
+def _steel(
+    settings: SimulateSettings, box_world: Array, site: Site
+) -> Steel | SteelStructure | None:
     """Return the requested steel around a room (m, shape (2, 3)) and its beacons."""
-    if text is None:
-        return None
     beacons_world = np.array([beacon.position_world for beacon in site.beacons]).reshape(-1, 3)
-    return laid(rails_option(text), box_world, beacons_world)
+    if settings.steel is not None:
+        if settings.rails is not None or settings.iron:
+            raise InputError("--steel: includes bars and spheres; omit --rails and --iron")
+        return steel_option(settings.steel, box_world, beacons_world)
+    if settings.rails is None:
+        return None
+    return laid(rails_option(settings.rails), box_world, beacons_world)
+
+
+def steel_option(text: str, box_world: Array, beacons_world: Array) -> SteelStructure:
+    """Read a file of steel, or draw it by ``kind,seed``.
+
+    Raises
+    ------
+    InputError
+    """
+    kind, comma, seed = text.rpartition(",")
+    if comma and kind in KINDS and seed.isdecimal():
+        return draw_steel(kind, np.random.default_rng(int(seed)), box_world, beacons_world)
+    if not Path(text).is_file():
+        raise InputError(
+            f"--steel {text!r}: found no such file; give a file, or kind,seed with one of"
+            f" {', '.join(KINDS)}, e.g. mesh,3"
+        )
+    structure = structure_of(read_steel(Path(text)))
+    check_clear(structure, box_world, beacons_world, text)
+    return structure
 
 
 def _simulate_ranging(settings: SimulateSettings, site: Site, output: Path) -> Figures:
     """Simulate passes of a magnet in a well, without incompatible options."""
     usual = SimulateSettings(seed=settings.seed)
-    without = ("motion", "box", "iron", "ambient", "drift", "storms", "reference", "random_field")
+    without: tuple[str, ...] = (
+        "motion",
+        "box",
+        "iron",
+        "ambient",
+        "drift",
+        "storms",
+        "reference",
+        "steel",
+    )
+    without += ("random_field",)
     for name in without:
         if getattr(settings, name) != getattr(usual, name):
             raise InputError(
@@ -289,7 +333,8 @@ def run_simulate(
             Figure("imu_samples", len(simulated.log.imu), label="IMU samples"),
             Figure("time_offset_s", simulated.time_offset, "s", section=Section.REPORT),
             Figure("iron_spheres", config.iron),
-            Figure("rails", 0 if rails is None else len(rails.pipes)),
+            Figure("rails", len(rails.pipes) if isinstance(rails, Steel) else 0),
+            Figure("steel_pieces", len(rails.bodies) if isinstance(rails, SteelStructure) else 0),
             Figure("random_field", config.random_field, section=Section.REPORT),
         )
     )

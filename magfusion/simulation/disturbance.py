@@ -10,6 +10,7 @@ from magfusion.model.physics.disturbance import induced_field, sphere_polarizabi
 from magfusion.simulation.atmosphere import Atmosphere
 from magfusion.simulation.layers import Layers
 from magfusion.simulation.pipe import STEEL_CONDUCTIVITY, STEEL_PERMEABILITY, Steel
+from magfusion.simulation.steel import SteelStructure
 from magfusion.units import DAY, AnyArray, Array, ComplexArray
 
 NOISIEST_TIME = 14.0 * 3600.0  # s of a day
@@ -281,7 +282,7 @@ class Ambient:
     drift: FieldDrift | None = None
     layers: Layers | None = None
     atmosphere: Atmosphere | None = None
-    rails: Steel | None = None
+    rails: Steel | SteelStructure | None = None
 
     def background_world(self, time: Array, rate_hz: float, rng: np.random.Generator) -> Array:
         """Return noise and drift at the samples of an instrument.

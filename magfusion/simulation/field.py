@@ -13,6 +13,7 @@ from magfusion.simulation.layers import Layers, layered_effect
 from magfusion.simulation.pipe import Steel
 from magfusion.simulation.rails import layered_at, secondary_world
 from magfusion.simulation.rotor_beacons import MagnetRotation
+from magfusion.simulation.steel import SteelStructure
 from magfusion.units import AnyArray, Array, ComplexArray
 
 
@@ -79,7 +80,7 @@ def phasors_world(
     point_world: Array,
     spheres: Spheres | None = None,
     layers: Layers | None = None,
-    rails: Steel | None = None,
+    rails: Steel | SteelStructure | None = None,
 ) -> ComplexArray:
     """Return the phasor of each tone without phase or drift of the drive, (n, tones, 3) (T).
 
@@ -105,7 +106,7 @@ def _primary_world(beacon: Beacon, point_world: Array, layers: Layers | None) ->
     return _by_tone(beacon, fields)
 
 
-def _at_rails(beacon: Beacon, rails: Steel, layers: Layers | None) -> ComplexArray:
+def _at_rails(beacon: Beacon, rails: Steel | SteelStructure, layers: Layers | None) -> ComplexArray:
     if layers is None:
         return _primary_world(beacon, rails.points_world(), None)
     still = beacon_fields_world(replace(beacon, conductivity=0.0), rails.points_world())

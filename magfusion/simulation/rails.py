@@ -12,6 +12,7 @@ from magfusion.errors import InputError
 from magfusion.model.site import Beacon
 from magfusion.simulation.layers import Layers, layered_effect_at
 from magfusion.simulation.pipe import Pipe, Steel, dipole_tensor
+from magfusion.simulation.steel import SteelStructure
 from magfusion.units import Array, ComplexArray
 
 FINE = 0.5  # of the distance to the platform and to beacons: length of a segment
@@ -131,7 +132,10 @@ def _check_apart(pipes: list[Pipe]) -> None:
 
 
 def secondary_world(
-    steel: Steel, at_segments_world: ComplexArray, frequencies_hz: Array, point_world: Array
+    steel: Steel | SteelStructure,
+    at_segments_world: ComplexArray,
+    frequencies_hz: Array,
+    point_world: Array,
 ) -> ComplexArray:
     """Return the phasors of steel at points.
 
@@ -169,7 +173,7 @@ def secondary_world(
     return out
 
 
-def layered_at(steel: Steel, beacon: Beacon, layers: Layers) -> ComplexArray:
+def layered_at(steel: Steel | SteelStructure, beacon: Beacon, layers: Layers) -> ComplexArray:
     """Return the contribution of layered ground at the segments, (n, coils, 3) (T).
 
     Segments may lie in any layer and at any distance: each is computed directly, by height.
@@ -189,7 +193,9 @@ def layered_at(steel: Steel, beacon: Beacon, layers: Layers) -> ComplexArray:
     return added
 
 
-def magnetised_world(steel: Steel, earth_field_world: Array, point_world: Array) -> Array:
+def magnetised_world(
+    steel: Steel | SteelStructure, earth_field_world: Array, point_world: Array
+) -> Array:
     """Return the field of steel magnetised by the Earth's field (T) at points (n, 3) (T)."""
     even = np.broadcast_to(earth_field_world, (len(steel.points_world()), 1, 3))
     return np.real(secondary_world(steel, even.astype(complex), np.zeros(1), point_world)[:, 0])
