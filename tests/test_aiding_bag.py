@@ -163,6 +163,9 @@ def test_a_vehicles_bag_is_smoothed_and_navigated_without_a_mapping(tmp_path):
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         assert "TRUSTWORTHY" in done.stdout
+    command = [sys.executable, "-m", "magfusion", "replay", "bag", "--site", "site.yaml"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert '"aiding": {"odom": {"time"' in done.stdout
 
 
 def _fix(k: int, status: int) -> Any:

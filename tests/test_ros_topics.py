@@ -181,7 +181,7 @@ def test_aiding_sensors_are_subscribed_to_by_their_names(domain: int) -> None:
         AidingSensor("wheels/odom", "velocity", 0.02),
         AidingSensor("visual", "velocity", 0.02),
         AidingSensor("uwb", "range", 0.1, point_world=np.zeros(3)),
-        AidingSensor("gnss", "position", 1.0, origin=(60.5, 25.25, 30.0)),
+        AidingSensor("gnss", "position", 1.0, origin=(60.5, 25.25, 10.0)),
     )
     said = io.StringIO()
     received = records_dds.subscribe(None, site, said)
@@ -192,11 +192,14 @@ def test_aiding_sensors_are_subscribed_to_by_their_names(domain: int) -> None:
         ),
         "/visual": ros.TwistWithCovarianceStampedMessage(HEADER, TWIST),
         "/uwb": ros.RangeMessage(HEADER, 0, 0.5, 0.25, 50.0, 4.125),
+        "/gnss": ros.NavSatFixMessage(
+            HEADER, ros.NavSatStatus(0, 1), 60.5, 25.25, 12.5, UNKNOWN, 2
+        ),
     }
     no_fix = ros.NavSatFixMessage(HEADER, ros.NavSatStatus(-1, 1), 0.0, 0.0, 0.0, UNKNOWN, 0)
     writers = [
         (DataWriter(participant, Topic(participant, f"rt{name}", type(one))), one)
-        for name, one in (sent | {"/gnss": no_fix}).items()
+        for name, one in [("/gnss", no_fix), *sent.items()]
     ]
     values: dict[str, Any] = {}
     begin = time.monotonic()
@@ -206,6 +209,7 @@ def test_aiding_sensors_are_subscribed_to_by_their_names(domain: int) -> None:
         record = next(received).record
         assert record is not None
         values |= {name: own.value[0].tolist() for name, own in (record.aiding or {}).items()}
+    assert values.pop("gnss") == pytest.approx([0.0, 0.0, 2.5], abs=1e-6)  # m
     assert values == {
         "wheels/odom": [0.5, 0.25, -0.125],
         "visual": [0.5, 0.25, -0.125],

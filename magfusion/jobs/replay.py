@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from magfusion.estimation.demodulation.drive_reference import cosines
 from magfusion.files.long_log import LongLog, long_log
 from magfusion.files.open import open_log
+from magfusion.files.site import load_site
 from magfusion.files.standard_streams import binary_output, until_closed
 from magfusion.files.stream_contents import (
     aiding_content,
@@ -25,7 +27,7 @@ from magfusion.files.stream_contents import (
     temperature_content,
     write_record,
 )
-from magfusion.jobs.settings import Command, PartSettings, ReplayedSettings
+from magfusion.jobs.settings import Command, PartSettings, ReplayedSettings, option
 from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.model.temperature import Temperatures
 from magfusion.units import Array, IntArray
@@ -272,6 +274,8 @@ def run_replay(log: Log | LongLog, sink: BinaryIO, form: Format, realtime: bool)
 class ReplaySettings(PartSettings, ReplayedSettings):
     """Settings of the replay."""
 
+    site: Path | None = option(None, "Site file, for a bag's topics of aiding sensors")
+
 
 def run(settings: ReplaySettings) -> None:
     """Print a log as records; see `run_replay`."""
@@ -279,7 +283,12 @@ def run(settings: ReplaySettings) -> None:
 
     sink = binary_output()
     part, topics = (settings.start, settings.end), topics_option(settings.topics)
-    result = long_log(settings.log, *part) or open_log(settings.log, *part, topics)
+    site = (
+        None
+        if settings.site is None
+        else load_site(settings.site, unknown=True, without=True, several=True)
+    )
+    result = long_log(settings.log, *part) or open_log(settings.log, *part, topics, site=site)
     with until_closed():
         run_replay(result, sink, settings.form, settings.realtime)
 

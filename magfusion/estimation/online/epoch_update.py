@@ -256,7 +256,7 @@ class EpochUpdate:
             *_of_place(self.site, state),
             *self._roll,
         )
-        findings = self.aiding.assessed(findings, state.time)
+        findings = self.aiding.assessed(findings, state.time, self.score.named)
         return findings if self.bank is None else self.bank.with_levels(findings, state)
 
     def _compare(self, samples: FieldSamples, state: State) -> None:

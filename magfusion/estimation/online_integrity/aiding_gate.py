@@ -1,7 +1,7 @@
 """Innovation test of aiding sensors: slips are left out, a long contradiction is named."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,10 +9,9 @@ from scipy.stats import chi2
 
 from magfusion.estimation.graph.measurement import Measurement, group_distances
 from magfusion.estimation.graph.state import MOTION, State, states_of
-from magfusion.estimation.integrity.suspects import CODE
 from magfusion.estimation.measurements.aiding import AidingMeasurement
 from magfusion.estimation.online_integrity.judgement import Judgement
-from magfusion.model.parameters import PARAMETERS, AidingParameter, Block
+from magfusion.model.parameters import Block
 from magfusion.model.trust import Finding, Verdict
 
 FALSE_REJECTIONS = 1e-3  # of true samples, which costs a thousandth of the information
@@ -22,7 +21,6 @@ SCORED_LOSS = "cauchy"  # of rejected samples in the score: slips do not name a 
 REJECTED_LONG = 5.0  # s of nothing but rejections; slips and reflections are shorter
 MEMORY = 0.995  # of the share of rejections, per sample
 CONTRADICTS = 0.25  # share beyond which a sensor is not as declared
-OF_PARAMETERS = frozenset(CODE[p] for p in PARAMETERS if isinstance(p, AidingParameter))
 FREEDOM = (1, 2, 3)
 GATE = {k: float(chi2.isf(FALSE_REJECTIONS, k)) for k in FREEDOM}
 GATE_AGAIN = {k: float(chi2.isf(FALSE_REJECTIONS_AGAIN, k)) for k in FREEDOM}
@@ -74,13 +72,18 @@ class AidingGate:
                 self.rejected += (replace(measurement, robust=SCORED_LOSS),)
         return explained
 
-    def assessed(self, judgement: Judgement, time: float) -> Judgement:
-        """Return a judgement with the sensors that contradict the state, if no cause is known."""
-        if any(finding.code in OF_PARAMETERS for finding in judgement.findings):
-            return judgement
+    def assessed(self, judgement: Judgement, time: float, explained: Collection[str]) -> Judgement:
+        """Return a judgement with the sensors that contradict the state without a known cause.
+
+        Parameters
+        ----------
+        explained : collection of str
+            Sensors of which a parameter is named by the score test.
+        """
         contradicting = {
             sensor: share
             for sensor, share in self.rejected_share.items()
+            if sensor not in explained
             if share > CONTRADICTS or time > self.rejected_since.get(sensor, time) + REJECTED_LONG
         }
         return judgement.with_findings(

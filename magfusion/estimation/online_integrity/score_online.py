@@ -58,6 +58,8 @@ class OnlineScore:
     ----------
     correction : Correction, optional
         Of the cause in the last result, if there is one.
+    named : tuple of str
+        Owners of the parameters in the last result: of the cause, and what explains it as well.
     """
 
     _sums: Sums | None
@@ -65,6 +67,7 @@ class OnlineScore:
     _scored_at: float
     _epochs_since_score: int  # epochs since the last result
     _judgement: Judgement
+    named: tuple[str, ...]
 
     def __init__(
         self,
@@ -81,6 +84,7 @@ class OnlineScore:
         self._epochs_since_score = 0
         self._detected_at = {}
         self.correction: Correction | None = None
+        self.named = ()
         self._steps = BeaconSteps(site, estimated)
         self._targets = self._targets_of(() if are_many(site) else [b.name for b in site.beacons])
 
@@ -227,9 +231,11 @@ class OnlineScore:
             return [*fixed, *self._steps.candidates(steps, information, gradient)]
 
         self.correction, first = None, next(causes_of(pose_cov, score, candidates), None)
+        self.named = ()
         if first is None:
             return Judgement()
         cause, rivals = first.cause, first.rivals
+        self.named = tuple(sorted({b.owner for one in (cause, *rivals) for b in one.fault.blocks}))
         turn, shift = np.linalg.norm(cause.moved[0].reshape(2, 3), axis=1)
         if cause.code == CHANGED:
             finding = change_finding(cause, prior_sigma(score.fixed))

@@ -1,5 +1,6 @@
-"""Protection levels with aiding sensors: none where a single sensor determines the position."""
+"""Integrity with aiding sensors: levels in a gap, rejected samples, sensors that contradict."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +10,18 @@ from test_aiding import ROOM, WHEELS, _simulated
 
 import magfusion as mf
 from magfusion.estimation.batch.settings import SmootherSettings
+from magfusion.estimation.graph.state import MOTION, State
 from magfusion.estimation.integrity.smoothed_separation import separate_sensors
+from magfusion.estimation.measurements.aiding_samples import aiding_measurement
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online_integrity.aiding_gate import AidingGate
+from magfusion.estimation.online_integrity.judgement import Judgement
+from magfusion.estimation.online_integrity.score_epochs import Sums
+from magfusion.estimation.online_integrity.score_online import OnlineScore
 from magfusion.jobs.replay import Replay, feed
+from magfusion.model.aiding import AidingSamples
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.model.trust import Risk
 from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
@@ -92,3 +102,42 @@ def test_a_smoothed_log_is_separated_from_that_without_the_wheels() -> None:
     body = np.einsum("nji,nj->ni", result.states.world_from_body[shared], moved)
     step = estimate.step[shared, 0, 3:]
     assert np.max(np.abs(body - step) / sigma[:, 3:]) < 0.2
+
+
+def _scored(*, used: bool, rejected: bool) -> Sums:
+    """Return the sums of a score after an epoch whose wheels are 10 % too fast."""
+    site = aided_site(WHEELS)
+    score = OnlineScore(site, (), (), steady=False)
+    size, cov = len(score.targets.unit), np.diag(np.repeat([0.02, 0.05, 0.05, 0.02, 0.002], 3) ** 2)
+    score._sums = Sums(np.zeros((size, size)), np.zeros(size), np.zeros((MOTION, size)), 0.0)
+    velocity = np.array([1.0, 0.0, 0.0])
+    rest = np.zeros(3), np.zeros(3), initial_calibration(site, 0.0), cov
+    states = [State(t, np.eye(3), t * velocity, velocity, *rest) for t in (0.0, 0.1)]
+    samples = AidingSamples("velocity", np.array([0.1]), np.array([[1.1, np.nan, np.nan]]))
+    wheels = aiding_measurement(WHEELS, samples)
+    imu = ImuSamples(np.array([0.05]), np.zeros((1, 3)), np.array([[0.0, 0.0, site.gravity]]))
+    score.predict(states[0], states[1], np.eye(MOTION), imu)
+    score.measured([wheels] if used else [], states[1], [wheels] if rejected else [])
+    sums = score.settle()
+    assert sums is not None
+    return sums
+
+
+def test_rejected_samples_are_scored_without_a_gain() -> None:
+    nothing, rejected = _scored(used=False, rejected=False), _scored(used=False, rejected=True)
+    used, both = _scored(used=True, rejected=False), _scored(used=True, rejected=True)
+    # They inform on the parameters of their sensor, but did not move the state.
+    assert np.any(rejected.gradient != nothing.gradient)
+    assert np.trace(rejected.information) > np.trace(nothing.information)
+    np.testing.assert_array_equal(rejected.response, nothing.response)
+    np.testing.assert_allclose(both.response, used.response, rtol=1e-12, atol=1e-15)
+    assert np.any(used.response != nothing.response)
+
+
+def test_a_named_parameter_hides_no_other_sensor_that_contradicts() -> None:
+    gate = AidingGate((), Counter())
+    gate.rejected_share = {"wheels": 0.5, "anchor": 0.4}
+    every = gate.assessed(Judgement(), 10.0, ())
+    assert [f.code for f in every.findings] == ["aiding_disagrees"] * 2
+    others = gate.assessed(Judgement(), 10.0, ("wheels",)).findings
+    assert [f.text.split()[0] for f in others] == ["anchor"]
