@@ -107,15 +107,16 @@ ROOMS = {
             smoothed
         """,
         "jobs": """
-            antenna_inputs fix_coil joint_kept receiver_axes region_option rotor_inputs state_rows
+            antenna_inputs fix_coil joint_kept listen_frames receiver_axes region_option
+            rotor_inputs state_rows
             listen_lines listen_sound stream_clocks stream_samples written
             inputs navigate_results result_directory
             allan_noise checkpoint failure magnetometer_trust magnetometer_turns orientation
             settings without_beacons
             allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
-            calibrate_magnetometer check coil design_settings drift_world drive evaluate export init_settings
-            listen live papers published_fix range_wells rates region replay rest_settings
-            simulate_ranging smooth_result survey view
+            calibrate_magnetometer check coil design_settings drift_world drive evaluate export
+            init_settings listen live papers published_fix range_wells rates region replay
+            rest_settings simulate_ranging smooth_result survey view
             antenna_fit demodulate design_motion drift_figures fix import_log init_questions
             joint_tasks match_trust navigate_settings simulate smooth_correction smooth_failure
             stream
