@@ -9,9 +9,16 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from page_blocks import blocks
 from test_sound_server import PROGRAMS, server
+
+from magfusion.errors import InputError
+from magfusion.files.audio import as_recording
+from magfusion.jobs.simulate import SimulateSettings
+from magfusion.jobs.simulate import run as run_simulation
+from magfusion.model.samples import Waveform
 
 PAGE = (Path(__file__).parents[1] / "docs" / "kit.md").read_text()
 PLAYED = re.search(r"^```\n(pactl .*\nparecord .*) &\n(paplay .*)\n```$", PAGE, re.M)
@@ -37,6 +44,20 @@ def test_at_most_twelve_commands() -> None:
     assert len(SHOWN) == 1
     played = sum(len(group.splitlines()) for group in PLAYED.groups())
     assert len(commands()) + played + len(SHOWN) <= MOST_COMMANDS
+
+
+def test_a_voltage_beyond_full_scale_is_refused() -> None:
+    wave = Waveform(np.arange(3.0) / 48e3, np.full((3, 3), 2e-6), ac_coupled=True)
+    with pytest.raises(
+        InputError, match=r"reaches 2 V, beyond the full scale of 1 V; set a larger"
+    ):
+        as_recording(wave, "a.wav", 1.0, 0)
+
+
+def test_a_sound_card_records_no_steady_field(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="a sound card records no steady field; declare coil"):
+        run_simulation(SimulateSettings(full_scale=1.0, duration=1.0), tmp_path / "walk")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
