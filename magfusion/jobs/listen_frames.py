@@ -19,8 +19,10 @@ HEAD, CHECK = struct.Struct("<ccHI"), struct.Struct("<I")
 KINDS = {b"i": "imu", b"m": "mag"}
 TYPES = {b"h": "<i2", b"i": "<i4", b"f": "<f4"}
 
+Parsed = tuple[str, int, int, Array]  # kind, counter of samples, of microseconds, values
 
-def parse_frame(frame: bytes) -> tuple[str, int, int, Array]:
+
+def parse_frame(frame: bytes) -> Parsed:
     """Return kind, both counters and values of a frame without its zero byte.
 
     Raises

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.jobs.listen_frames import check_package, parse_frame
+from magfusion.jobs.listen_frames import Parsed, check_package, parse_frame
 from magfusion.receiver.host_clock import HostClock
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def scales_of(options: tuple[str, ...]) -> dict[str, tuple[float, Array]]:
     return result
 
 
-def parse_line(line: bytes) -> tuple[str, int, int, Array]:
+def parse_line(line: bytes) -> Parsed:
     """Return kind, both counters and values of a line.
 
     Raises
@@ -118,10 +118,10 @@ class LineSource:
         encoding: Literal["lines", "frames"] = "lines",
     ) -> None:
         self.place, self._scales = place, scales
-        self._end, self._parse = (
-            (b"\n", parse_line) if encoding == "lines" else (b"\0", parse_frame)
-        )
-        if encoding == "frames":
+        lines = encoding == "lines"
+        self._end = b"\n" if lines else b"\0"
+        self._parse: Callable[[bytes], Parsed] = parse_line if lines else parse_frame
+        if not lines:
             check_package(place)
         way, _, self._port = place.partition(":")
         number = self._port.isdecimal() and 0 < int(self._port) < 1 << 16
