@@ -54,6 +54,12 @@ def test_a_voltage_beyond_full_scale_is_refused() -> None:
         as_recording(wave, "a.wav", 1.0, 0)
 
 
+def test_a_rate_that_no_card_has_is_refused() -> None:
+    wave = Waveform(np.arange(99.0) / 48_000.5, np.zeros((99, 3)), ac_coupled=True)
+    with pytest.raises(InputError, match=r"whole number of samples a second, not 48000\.5"):
+        as_recording(wave, "a.wav", 1.0, 0)
+
+
 def test_a_sound_card_records_no_steady_field(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="a sound card records no steady field; declare coil"):
         run_simulation(SimulateSettings(full_scale=1.0, duration=1.0), tmp_path / "walk")
