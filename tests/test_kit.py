@@ -9,9 +9,16 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from page_blocks import blocks
 from test_sound_server import PROGRAMS, server
+
+from magfusion.errors import InputError
+from magfusion.files.audio import as_recording
+from magfusion.jobs.simulate import SimulateSettings
+from magfusion.jobs.simulate import run as run_simulation
+from magfusion.model.samples import Waveform
 
 PAGE = (Path(__file__).parents[1] / "docs" / "kit.md").read_text()
 PLAYED = re.search(r"^```\n(pactl .*\nparecord .*) &\n(paplay .*)\n```$", PAGE, re.M)
@@ -39,12 +46,35 @@ def test_at_most_twelve_commands() -> None:
     assert len(commands()) + played + len(SHOWN) <= MOST_COMMANDS
 
 
+def test_a_voltage_beyond_full_scale_is_refused() -> None:
+    wave = Waveform(np.arange(3.0) / 48e3, np.full((3, 3), 2e-6), ac_coupled=True)
+    with pytest.raises(
+        InputError, match=r"reaches 2 V, beyond the full scale of 1 V; set a larger"
+    ):
+        as_recording(wave, "a.wav", 1.0, 0)
+
+
+def test_a_rate_that_no_card_has_is_refused() -> None:
+    wave = Waveform(np.arange(99.0) / 48_000.5, np.zeros((99, 3)), ac_coupled=True)
+    with pytest.raises(InputError, match=r"whole number of samples a second, not 48000\.5"):
+        as_recording(wave, "a.wav", 1.0, 0)
+
+
+def test_a_sound_card_records_no_steady_field(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="a sound card records no steady field; declare coil"):
+        run_simulation(SimulateSettings(full_scale=1.0, duration=1.0), tmp_path / "walk")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow
-@pytest.mark.skipif(not all(map(shutil.which, PROGRAMS)), reason="PulseAudio is not installed here")
-def test_a_stranger_plays_a_walk_and_finds_it(tmp_path: Path, server: dict[str, str]) -> None:
-    """All commands of the page, with what is heard in place of the simulated recording."""
+def test_a_stranger_plays_a_walk_and_finds_it(
+    tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """All commands of the page; where PulseAudio is there, with what is recorded of its sink."""
     assert PLAYED is not None
-    own = server | {"PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])}
+    plays = all(map(shutil.which, PROGRAMS))
+    own = request.getfixturevalue("server") if plays else dict(os.environ)
+    own |= {"PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])}
     for language, block in blocks(PAGE):
         if language == "yaml":
             (tmp_path / block.split()[1]).write_text(block, encoding="utf-8")
@@ -57,7 +87,7 @@ def test_a_stranger_plays_a_walk_and_finds_it(tmp_path: Path, server: dict[str, 
         return done.stdout
 
     for command in commands():
-        if command.startswith("magfusion import"):
+        if plays and command.startswith("magfusion import"):
             (load, record), play = PLAYED[1].splitlines(), PLAYED[2]
             run(load)
             with subprocess.Popen(record.split(), cwd=tmp_path, env=own) as recorder:

@@ -1,10 +1,11 @@
-"""Lines of a microcontroller by a serial port and UDP, and the clock of what arrives late."""
+"""Records of a microcontroller by a serial port and UDP, and the clock of what arrives late."""
 
 import json
 import os
 import pty
 import queue
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -14,9 +15,12 @@ from collections.abc import Callable
 from functools import reduce
 from operator import xor
 from pathlib import Path
+from typing import Literal
+from zlib import crc32
 
 import numpy as np
 import pytest
+from cobs import cobs
 
 from magfusion.errors import InputError
 from magfusion.jobs.listen_lines import LineSource, scales_of
@@ -36,13 +40,24 @@ def line(number: int) -> bytes:
     return body + f"*{reduce(xor, body):02X}\n".encode()
 
 
-def sent() -> list[bytes]:
-    """Return lines of which some are lost, doubled or garbled."""
+def frame(number: int) -> bytes:
+    """Return the same as a binary frame."""
+    count = (BEGIN_COUNT + number) % (1 << 16)
+    micros = (BEGIN_MICROS + number * 1_000_000 // RATE_HZ) % (1 << 32)
+    body = struct.pack("<ccHI3h", b"m", b"h", count, micros, 100 + number, -20, 4000)
+    return cobs.encode(body + struct.pack("<I", crc32(body))) + b"\0"
+
+
+RECORDS = {"lines": line, "frames": frame}
+
+
+def sent(encoding: str) -> list[bytes]:
+    """Return records of which some are lost, doubled or garbled."""
     result = []
     for number in range(LINES):
-        own = line(number)
+        own = RECORDS[encoding](number)
         if number in GARBLED:
-            own = own.replace(b"-20", b"-2\xff")
+            own = own[:9] + bytes([own[9] ^ 0x81 or 1]) + own[10:]
         result += [] if number in LOST else [own] * (1 + (number in DOUBLED))
     return result
 
@@ -73,17 +88,17 @@ def listened(source: LineSource, send: threading.Thread) -> list[dict[str, dict[
         result += own.records(content, arrival)
     send.join()
     assert sorted(source.close()) == sorted(
-        f"{source.place}: {count} {name or 'lines'} {fault}."
+        f"{source.place}: {count} {name or 'records'} {fault}."
         for (name, fault), count in FAULTS.items()
     )
     return result
 
 
-def paced(write: Callable[[list[bytes]], object]) -> threading.Thread:
-    """Return a thread that writes the lines at their rate, a few at once."""
+def paced(write: Callable[[list[bytes]], object], encoding: str) -> threading.Thread:
+    """Return a thread that writes the records at their rate, a few at once."""
 
     def run() -> None:
-        lines, begin = sent(), time.monotonic()
+        lines, begin = sent(encoding), time.monotonic()
         for k in range(0, len(lines), 8):
             time.sleep(max(begin + k / RATE_HZ - time.monotonic(), 0.0))
             write(lines[k : k + 8])
@@ -91,39 +106,53 @@ def paced(write: Callable[[list[bytes]], object]) -> threading.Thread:
     return threading.Thread(target=run)
 
 
-def test_lines_by_udp() -> None:
+@pytest.mark.parametrize("encoding", ["lines", "frames"])
+def test_records_by_udp(encoding: Literal["lines", "frames"]) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    source = LineSource(f"udp:{port}", scales_of(("magnetometer=1e-8,100,0,0",)))
+    source = LineSource(f"udp:{port}", scales_of(("magnetometer=1e-8,100,0,0",)), encoding)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
 
         def write(lines: list[bytes]) -> None:
             for one in lines:
                 sender.sendto(one, ("127.0.0.1", port))
 
-        records = listened(source, paced(write))
+        records = listened(source, paced(write, encoding))
     check_stamps(np.array([r["magnetometer"]["time"][0] for r in records]))
     assert records[150]["magnetometer"]["field"] == [pytest.approx([1.5e-6, -2e-7, 4e-5])]
 
 
-def test_lines_by_a_serial_port() -> None:
-    """The first line is lost: where it began is unknown."""
+@pytest.mark.parametrize("encoding", ["lines", "frames"])
+def test_records_by_a_serial_port(encoding: Literal["lines", "frames"]) -> None:
+    """The first record is lost: where it began is unknown."""
     pytest.importorskip("serial")
     ours, theirs = pty.openpty()
     tty.setraw(theirs)
-    source = LineSource(f"serial:{os.ttyname(theirs)}", {})
+    source = LineSource(f"serial:{os.ttyname(theirs)}", {}, encoding)
 
     def write(lines: list[bytes]) -> None:
-        begins = lines[0] == line(0)
-        text = b"20,4000*77\n" * begins + b"".join(lines)
-        os.write(ours, text[:37])  # a line in two parts
+        first = RECORDS[encoding](0)
+        text = first[7:] * (lines[0] == first) + b"".join(lines)
+        os.write(ours, text[:37])  # a record in two parts
         os.write(ours, text[37:])
 
-    records = listened(source, paced(write))
+    records = listened(source, paced(write, encoding))
     check_stamps(np.array([r["magnetometer"]["time"][0] for r in records]))
     os.close(ours)
     os.close(theirs)
+
+
+def test_a_device_that_restarts_is_followed() -> None:
+    """Its counters begin again: eight records later the host's clock goes on."""
+    source, times = LineSource("udp:9000", {}), []
+    for number in range(200):
+        again = number if number < 100 else number - 100
+        for one in source.records(line(again), 5.0 + number / RATE_HZ):
+            times += one["magnetometer"]["time"]
+    assert +source.faults == {("mag", "late"): 7, ("mag", "restarted"): 1}
+    kept = np.setdiff1d(np.arange(200), np.arange(100, 107))
+    assert np.max(np.abs(np.diff(times) - np.diff(kept) / RATE_HZ)) < 1e-4
 
 
 def test_the_command_prints_records_until_its_time_is_over(tmp_path: Path) -> None:

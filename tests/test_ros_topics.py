@@ -215,7 +215,7 @@ def test_aiding_sensors_are_subscribed_to_by_their_names(domain: int) -> None:
         "visual": [0.5, 0.25, -0.125],
         "uwb": [4.125],
     }
-    assert "/gnss: messages without a value (no fix) are left out, so far 1\n" in said.getvalue()
+    assert "/gnss: messages without a value (no fix) are left out, so far" in said.getvalue()
 
 
 def test_every_subscription_is_a_part_of_a_record_and_a_role() -> None:

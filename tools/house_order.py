@@ -108,7 +108,8 @@ ROOMS = {
             smoothed
         """,
         "jobs": """
-            antenna_inputs fix_coil joint_kept receiver_axes region_option rotor_inputs state_rows
+            antenna_inputs fix_coil joint_kept listen_frames receiver_axes region_option
+            rotor_inputs state_rows
             listen_lines listen_sound stream_clocks stream_samples written
             inputs navigate_results result_directory
             allan_noise checkpoint failure magnetometer_trust magnetometer_turns orientation

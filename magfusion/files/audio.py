@@ -29,6 +29,7 @@ SUFFIXES = (".wav", ".flac", ".w64", ".caf", ".aiff")
 PIECE = 1 << 14  # samples of every channel; 0.4 MB of three
 MOST_NAMED = 8  # slips in a sentence
 LEAST_PULSES = 3
+RATE_TOLERANCE = 1e-7  # of rounding
 EDGE_TOLERANCE = 1e-3  # s; of a pulse about the even clock: a GNSS receiver has 1e-7
 Count = Annotated[int, Field(ge=1)]
 Channel = Annotated[int, Field(ge=0, le=1023)]
@@ -113,7 +114,7 @@ def as_recording(
     Raises
     ------
     InputError
-        Where they exceed full scale.
+        Where they exceed full scale, or their rate is no whole number.
     """
     volts = waveform.measured_sensor / NOMINAL_T_PER_V
     highest = float(np.max(np.abs(volts), initial=0.0))
@@ -122,7 +123,12 @@ def as_recording(
             f"the receiver's voltage reaches {highest:.3g} V, beyond the full scale of"
             f" {full_scale_v:g} V; set a larger one, or a lower amplifier_gain in the site"
         )
-    rate_hz = round((len(waveform) - 1) / float(waveform.time[-1] - waveform.time[0]))
+    measured_hz = (len(waveform) - 1) / float(waveform.time[-1] - waveform.time[0])
+    rate_hz = round(measured_hz)
+    if abs(measured_hz - rate_hz) > RATE_TOLERANCE * rate_hz:
+        raise InputError(
+            f"a sound card has a whole number of samples a second, not {measured_hz:.9g}; give one"
+        )
     used = [k for k, axis in enumerate(AXES) if axis in waveform.axes]
     entry = AudioEntry(
         file=name,

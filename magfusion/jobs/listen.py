@@ -57,6 +57,9 @@ class ListenSettings(Settings):
         note="of imu.gyro (rad/s), imu.accel (m/s^2), magnetometer (T)",
         metavar="TABLE=UNIT[,X,Y,Z]",
     )
+    encoding: Literal["lines", "frames"] = option(
+        "lines", "Serial and UDP records: lines of text, or binary frames"
+    )
     duration: float | None = option(None, "Time after which to end, s", least=0.0, most=1e9)
     form: Literal["json", "msgpack"] = option("json", "Records in the pipe", name="format")
 
@@ -68,7 +71,7 @@ class ListenSettings(Settings):
         InputError
         """
         scales = scales_of(self.counts)
-        result: list[Source] = [LineSource(source, scales) for source in self.sources]
+        result: list[Source] = [LineSource(one, scales, self.encoding) for one in self.sources]
         if self.device is not None:
             if self.rate is None or self.channels is None or self.site is None:
                 raise InputError("--device: give its --rate and --channels, and the --site")

@@ -1,8 +1,9 @@
-"""Samples of microcontrollers: lines with counters and a checksum, from a serial port or UDP.
+"""Samples of microcontrollers: records with counters and a checksum, from a serial port or UDP.
 
 A line is ``imu,COUNT,MICROS,gx,gy,gz,ax,ay,az*HH`` or ``mag,COUNT,MICROS,bx,by,bz*HH``: a counter
 of its samples of at least 16 bits, one of microseconds of 32, both of which may wrap, the counts of
-the sensor, and the exclusive or of all bytes before the asterisk, in hexadecimal.
+the sensor, and the exclusive or of all bytes before the asterisk, in hexadecimal.  The same as
+binary frames: `magfusion.jobs.listen_frames`.
 """
 
 from __future__ import annotations
@@ -13,11 +14,12 @@ import time
 from collections import Counter
 from functools import reduce
 from operator import xor
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.jobs.listen_frames import Parsed, check_package, parse_frame
 from magfusion.receiver.host_clock import HostClock
 
 if TYPE_CHECKING:
@@ -34,6 +36,7 @@ TABLES = ("imu.gyro", "imu.accel", "magnetometer")
 COUNTER, MICROSECONDS = 1 << 16, 1 << 32
 LONGEST_LINE = 1 << 10  # bytes
 POLL = 0.1  # s
+RESTARTED = 8  # late samples one after the other: the counters began again
 BAUD = 115_200
 
 
@@ -60,18 +63,34 @@ def scales_of(options: tuple[str, ...]) -> dict[str, tuple[float, Array]]:
     return result
 
 
+def parse_line(line: bytes) -> Parsed:
+    """Return kind, both counters and values of a line.
+
+    Raises
+    ------
+    ValueError
+        Where it is garbled.
+    """
+    text, _, check = line.strip().partition(b"*")
+    if int(check, 16) != reduce(xor, text, 0) or len(check) != 2:
+        raise ValueError("the checksum differs")
+    name, count, micros, *values = text.decode("ascii").split(",")
+    return name, int(count), int(micros), np.array([float(value) for value in values])
+
+
 class _Counted:
-    """Counters of one kind of line."""
+    """Counters of one kind of record."""
 
     def __init__(self) -> None:
         self.count: int | None = None
+        self.late = 0  # one after the other
         self.micros = 0
         self.elapsed = 0  # microseconds, unwrapped
         self.clock = HostClock(1e-6)
 
 
 class LineSource:
-    """A serial port or UDP socket with lines.
+    """A serial port or UDP socket with records.
 
     Parameters
     ----------
@@ -79,11 +98,12 @@ class LineSource:
         ``serial:PORT[@BAUD]`` or ``udp:PORT``.
     scales : mapping
         As of `scales_of`.
+    encoding : {"lines", "frames"}
 
     Attributes
     ----------
     faults : Counter
-        Lines by kind and fault: lost, doubled, late, garbled.
+        Records by kind and fault: lost, doubled, late, garbled, restarted.
 
     Raises
     ------
@@ -91,8 +111,18 @@ class LineSource:
         Where the place is none.
     """
 
-    def __init__(self, place: str, scales: Mapping[str, tuple[float, Array]]) -> None:
+    def __init__(
+        self,
+        place: str,
+        scales: Mapping[str, tuple[float, Array]],
+        encoding: Literal["lines", "frames"] = "lines",
+    ) -> None:
         self.place, self._scales = place, scales
+        lines = encoding == "lines"
+        self._end = b"\n" if lines else b"\0"
+        self._parse: Callable[[bytes], Parsed] = parse_line if lines else parse_frame
+        if not lines:
+            check_package(place)
         way, _, self._port = place.partition(":")
         number = self._port.isdecimal() and 0 < int(self._port) < 1 << 16
         if not self._port or way not in ("serial", "udp") or (way == "udp" and not number):
@@ -138,7 +168,7 @@ class LineSource:
 
         def read() -> bytes:
             try:
-                return own.recv(1 << 16).rstrip(b"\n") + b"\n"
+                return own.recv(1 << 16).rstrip(self._end) + self._end
             except TimeoutError:
                 return b""
 
@@ -163,7 +193,7 @@ class LineSource:
 
     def records(self, content: bytes, arrival: float) -> Iterator[dict[str, Any]]:
         """Yield the samples of what arrived."""
-        lines = (self._rest + content).split(b"\n")
+        lines = (self._rest + content).split(self._end)
         self._rest = lines.pop()
         if not self._is_udp and not self._begun and lines:
             del lines[0]  # its beginning was before the port was opened
@@ -173,23 +203,18 @@ class LineSource:
             self.faults["", "garbled"] += 1
         for line in lines:
             if line.strip():
-                yield from self._sample(line.strip(), arrival)
+                yield from self._sample(line, arrival)
 
     def _sample(self, line: bytes, arrival: float) -> Iterator[dict[str, Any]]:
-        text, _, check = line.partition(b"*")
         try:
-            if int(check, 16) != reduce(xor, text, 0) or len(check) != 2:
-                raise ValueError
-            name, count, micros, *values = text.decode("ascii").split(",")
+            name, count, micros, numbers = self._parse(line)
             record, columns = KINDS[name]
-            numbers = np.array([float(value) for value in values])
             if len(numbers) != sum(size for _, size in columns) or not np.isfinite(numbers).all():
                 raise ValueError
-            counters = int(count), int(micros)
         except (ValueError, KeyError):
             self.faults["", "garbled"] += 1
             return
-        stamp = self._stamp(name, *counters, arrival)
+        stamp = self._stamp(name, count, micros, arrival)
         if stamp is None:
             return
         parts, at = {"time": [stamp]}, 0
@@ -205,18 +230,24 @@ class LineSource:
         known = self._kinds.setdefault(name, _Counted())
         if known.count is not None:
             ahead = (count - known.count) % COUNTER
-            if ahead == 0 or ahead >= COUNTER // 2:
+            is_late = ahead >= COUNTER // 2
+            known.late = known.late + 1 if is_late else 0
+            if ahead == 0 or (is_late and known.late < RESTARTED):
                 self.faults[name, "late" if ahead else "doubled"] += 1
                 return None
-            self.faults[name, "lost"] += ahead - 1
-            known.elapsed += (micros - known.micros) % MICROSECONDS
+            if is_late:  # the host's clock goes on
+                self.faults[name, "restarted"] += 1
+                known = self._kinds[name] = _Counted()
+            else:
+                self.faults[name, "lost"] += ahead - 1
+                known.elapsed += (micros - known.micros) % MICROSECONDS
         known.count, known.micros = count, micros
         return float(known.clock.stamps(np.array([float(known.elapsed)]), arrival)[0])
 
     def close(self) -> Iterator[str]:
-        """End, and report the lines that are missing."""
+        """End, and report the records that are missing."""
         self._ended.set()
         if self._thread is not None:
             self._thread.join()
         for (name, fault), count in sorted((+self.faults).items()):
-            yield f"{self.place}: {count} {name or 'lines'} {fault}."
+            yield f"{self.place}: {count} {name or 'records'} {fault}."
