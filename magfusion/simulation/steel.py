@@ -320,7 +320,7 @@ def _of_points(centre: Array, axis: Array, group: IntArray) -> Array:
     loop = np.flatnonzero(group < 0)
     if len(loop):
         # The nearest loop of the same sheet is a cell away.
-        apart = np.linalg.norm(centre[loop][:, None] - centre[loop], axis=2)
-        np.fill_diagonal(apart, np.inf)
-        out[loop, loop] = LATTICE * MU0_OVER_4PI / np.min(apart, axis=1) ** 3
+        separation = np.linalg.norm(centre[loop][:, None] - centre[loop], axis=2)
+        np.fill_diagonal(separation, np.inf)
+        out[loop, loop] = LATTICE * MU0_OVER_4PI / np.min(separation, axis=1) ** 3
     return np.asarray(out)

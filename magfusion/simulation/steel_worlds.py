@@ -22,13 +22,13 @@ UP = 2
 
 
 class _Room:
-    """Boxes that are taken in a room, and where the next piece may stand."""
+    """Boxes that pieces occupy in a room, and where the next piece may be."""
 
     def __init__(self, rng: np.random.Generator, box_world: Array, beacons_world: Array) -> None:
         self.rng, self._box, self._beacons = rng, box_world, beacons_world
         every = np.concatenate([box_world, beacons_world])
         self.low, self.high = every.min(axis=0) - 0.2, every.max(axis=0) + 0.2
-        self._taken: list[Array] = []
+        self._occupied: list[Array] = []
 
     def place(self, size: Array, standing: bool) -> Array:
         """Return the lower corner (m) of a free box of a size (3,) (m)."""
@@ -38,7 +38,7 @@ class _Room:
         for corner in self.rng.uniform(low, np.maximum(low, high), (ATTEMPTS, 3)):
             own = np.stack([corner, corner + size])
             if self._is_free(own):
-                self._taken.append(own)
+                self._occupied.append(own)
                 return np.asarray(corner)
         raise InputError(
             f"--steel: no room for a piece of {np.round(size, 1).tolist()} m around the range of"
@@ -48,7 +48,7 @@ class _Room:
     def _is_free(self, own: Array) -> bool:
         beacons = [np.stack([one, one]) for one in self._beacons]
         limits = [(self._box, CLEARANCE), *((one, BEACON_CLEARANCE) for one in beacons)]
-        limits += [(one, BODY_CLEARANCE) for one in self._taken]
+        limits += [(one, BODY_CLEARANCE) for one in self._occupied]
         return all(_gap(own, other) > least for other, least in limits)
 
 
