@@ -4,8 +4,8 @@ Forty rooms by seed: in the first twenty spheres and meshes, in the others racks
 cabinets; each with four and with eight beacons.  Errors by steel are common to a log, so that
 each log is one draw.  Of one estimate three covariances are compared, with the mean NEES over the
 log (6 is expected): without an error of the fields that is constant in place, with a kernel in
-place for each beacon that knows no physics, and with the fields of random steel as `smooth` has
-them.  The steel of the simulator is bars, sheets and spheres in each other's fields; the estimator
+place for each beacon that knows no physics, and as `smooth` has it.
+The steel of the simulator is bars, sheets and spheres in each other's fields; the estimator
 knows nothing of it.
 """
 
@@ -213,7 +213,7 @@ def report(rows: Sequence[Row]) -> str:
     """Return the table that a reader sees."""
     lines = [
         f"{'kind':9}{'seed':>5}{'beacons':>8}{'steel %':>8}{'mm':>7}{'deg':>7}"
-        f"{'white':>8}{'kernel':>8}{'steel':>8}"
+        f"{'white':>8}{'kernel':>8}{'smooth':>8}"
     ]
     for row in rows:
         lines.append(
