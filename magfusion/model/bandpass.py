@@ -80,8 +80,8 @@ class BandFilter:
         lowpass = _lowpass(PASS_HZ, PASS_HZ + transition, own_hz)
         elapsed = (np.arange(len(lowpass)) - len(lowpass) // 2) / own_hz
         carrier = np.exp(-2j * np.pi * elapsed[:, None] * tones_hz)
-        since = (np.arange(len(first)) - len(first) // 2) / rate_hz
-        passed = np.cos(2.0 * np.pi * since[:, None] * tones_hz).T @ first
+        elapsed_first = (np.arange(len(first)) - len(first) // 2) / rate_hz
+        passed = np.cos(2.0 * np.pi * elapsed_first[:, None] * tones_hz).T @ first
         taps = 2.0 * lowpass[:, None] * carrier / passed
         return BandFilter(tones_hz, rate_hz, decimation, taps, step, first)
 
