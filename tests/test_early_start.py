@@ -7,8 +7,16 @@ import pytest
 from time_slots_and_mains import tracker
 
 from magfusion.estimation.graph.state import State
-from magfusion.estimation.initialization.early import first_try, is_clear, next_try, open_start
+from magfusion.estimation.initialization.early import (
+    first_try,
+    is_clear,
+    is_open,
+    next_try,
+    open_start,
+)
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
+from magfusion.estimation.online_integrity.judgement import Judgement
+from magfusion.estimation.online_integrity.summary import Summary
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import Site, Slots
 from magfusion.model.trust import Finding, Trust, Verdict
@@ -62,5 +70,44 @@ def test_an_early_start_is_beyond_doubt(start: OnlineStart | NoStart, clear: boo
     assert is_clear(start) is clear
 
 
+def test_a_card_and_several_beacons_start_early() -> None:
+    site = demo_site()
+    magnetometer = replace(site.platform.magnetometer, ac_coupled=True)
+    site = replace(site, platform=replace(site.platform, magnetometer=magnetometer))
+    assert first_try(site, 6.0) == pytest.approx(2.0)
+    assert is_clear(_start(None), several=True)
+    doubt = Finding("inertial_residuals", "They err.", Verdict.DOUBTFUL)
+    assert not is_clear(_start(None, doubt), several=True)
+
+
+def test_a_later_try_may_be_doubtful() -> None:
+    doubt = Finding("inertial_residuals", "They err.", Verdict.DOUBTFUL)
+    assert is_clear(_start(100.0, doubt), again=True)
+    assert not is_clear(_start(15.0), again=True)
+    failed = Finding("no_solution", "There is none.", Verdict.FAILED)
+    assert not is_clear(_start(1e4, failed), again=True)
+
+
+@pytest.mark.parametrize(("rival", "waits"), [(None, False), (3.0, True), (12.0, False)])
+def test_a_pose_is_given_once_a_hypothesis_leads(rival: float | None, *, waits: bool) -> None:
+    assert is_open(_start(rival)) is waits
+
+
 def test_what_stays_open_is_said_to_be_ambiguous() -> None:
     assert [reason.code for reason in open_start(_start(5.0)).trust.reasons] == ["ambiguous"]
+
+
+def _summary(code: str, bad_s: float, end_s: float) -> Verdict:
+    """Return the verdict of a run with a doubt at its 5th second."""
+    summary, doubt = Summary(), Finding(code, "They err.", Verdict.DOUBTFUL)
+    for time in np.arange(0.0, end_s, 0.1):
+        is_bad = 5.0 <= time <= 5.0 + bad_s
+        summary.note(float(time), Judgement((doubt,) if is_bad else ()))
+    return summary.trust.verdict
+
+
+def test_one_bad_second_is_no_doubt_of_a_run() -> None:
+    assert _summary("inertial_residuals", 0.8, 20.0) is Verdict.TRUSTWORTHY
+    assert _summary("inertial_residuals", 0.8, 9.0) is Verdict.DOUBTFUL  # not long ago
+    assert _summary("inertial_residuals", 2.0, 20.0) is Verdict.DOUBTFUL
+    assert _summary("beacon_pose", 0.8, 20.0) is Verdict.DOUBTFUL

@@ -102,6 +102,7 @@ class MagnetometerEntry(StrictModel):
     name: Annotated[str, Field(min_length=1), AfterValidator(plain_name)] | None = None
     clock_offset_s: Annotated[float, between(-1e3, 1e3)] = Magnetometer.clock_offset
     clock_rate_ppm: Annotated[float, between(-1e4, 1e4)] = Magnetometer.clock_rate
+    clock_rate_sigma_ppm: Annotated[float, between(0.0, 1e4)] = Magnetometer.clock_rate_sigma
     range_t: Annotated[
         AboveZero, tesla(Magnetometer.field_range), between(1e-9, Magnetometer.field_range)
     ] = Magnetometer.field_range
@@ -195,6 +196,7 @@ def magnetometer_of(entry: MagnetometerEntry) -> Magnetometer:
         name=entry.name or Magnetometer.name,
         clock_offset=entry.clock_offset_s,
         clock_rate=entry.clock_rate_ppm / MILLION,
+        clock_rate_sigma=entry.clock_rate_sigma_ppm / MILLION,
         field_range=entry.range_t,
         ac_coupled=entry.ac_coupled or bool(entry.coil or entry.axis_coils),
     )
@@ -230,6 +232,8 @@ def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
         own["clock_offset_s"] = float(magnetometer.clock_offset)
     if magnetometer.clock_rate != Magnetometer.clock_rate:
         own["clock_rate_ppm"] = ppm(magnetometer.clock_rate)
+    if magnetometer.clock_rate_sigma != Magnetometer.clock_rate_sigma:
+        own["clock_rate_sigma_ppm"] = ppm(magnetometer.clock_rate_sigma)
     if magnetometer.field_range != Magnetometer.field_range:
         own["range_t"] = float(magnetometer.field_range)
     if magnetometer.ac_coupled:

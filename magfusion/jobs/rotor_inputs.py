@@ -128,5 +128,5 @@ def _wandering(site: Site) -> list[Beacon]:
         beacon
         for beacon in site.beacons
         if beacon.rotor is not None
-        and beacon.rotor.speed_sigma_hz > site.clock.drift_largest * beacon.frequency_hz
+        and beacon.rotor.speed_sigma_hz > site.relative_clock.drift_largest * beacon.frequency_hz
     ]

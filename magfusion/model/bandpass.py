@@ -22,6 +22,7 @@ PASS_HZ = 30.0
 WIDEST_HZ = 60.0  # of a transition: the delay is 42 ms
 NARROWEST_HZ = 20.0  # of a transition: the delay is 0.13 s
 STOP_DB = 80.0
+WIDE = 3.0  # samples of a first stage in a period of the highest frequency
 MIN_SPACING_HZ = 2.0 * PASS_HZ + NARROWEST_HZ
 
 
@@ -37,18 +38,23 @@ class BandFilter:
     decimation : int
         Samples of the recording for each that is kept.
     taps : complex ndarray, shape (length, tones)
-        Of the analytic signal in the middle of its samples.
+        Of the analytic signal in the middle of its samples, which are those of the first stage.
+    first_step : int
+        Samples of the recording for each of a first stage, which passes all bands.
+    first_taps : ndarray, shape (length,)
     """
 
     tones_hz: Array
     rate_hz: float
     decimation: int
     taps: ComplexArray
+    first_step: int
+    first_taps: Array
 
     @property
     def middle(self) -> int:
         """Samples before the first result: the delay."""
-        return len(self.taps) // 2
+        return len(self.first_taps) // 2 + self.first_step * (len(self.taps) // 2)
 
     @staticmethod
     def of_site(site: Site, rate_hz: float) -> "BandFilter | None":
@@ -67,12 +73,29 @@ class BandFilter:
         decimation = _decimation(tones_hz, rate_hz, between)
         if decimation < 2 or tones_hz[-1] + 0.5 * between > 0.5 * rate_hz:
             return None
-        length, beta = kaiserord(STOP_DB, transition / (0.5 * rate_hz))
-        cutoff = PASS_HZ + 0.5 * transition
-        lowpass = firwin(length | 1, cutoff, window=("kaiser", beta), fs=rate_hz)
-        elapsed = (np.arange(len(lowpass)) - len(lowpass) // 2) / rate_hz
+        highest = tones_hz[-1] + 0.5 * between
+        step = _first_step(decimation, rate_hz / highest)
+        first = np.ones(1) if step == 1 else _lowpass(highest, rate_hz / step - highest, rate_hz)
+        own_hz = rate_hz / step
+        lowpass = _lowpass(PASS_HZ, PASS_HZ + transition, own_hz)
+        elapsed = (np.arange(len(lowpass)) - len(lowpass) // 2) / own_hz
         carrier = np.exp(-2j * np.pi * elapsed[:, None] * tones_hz)
-        return BandFilter(tones_hz, rate_hz, decimation, 2.0 * lowpass[:, None] * carrier)
+        elapsed_first = (np.arange(len(first)) - len(first) // 2) / rate_hz
+        passed = np.cos(2.0 * np.pi * elapsed_first[:, None] * tones_hz).T @ first
+        taps = 2.0 * lowpass[:, None] * carrier / passed
+        return BandFilter(tones_hz, rate_hz, decimation, taps, step, first)
+
+
+def _lowpass(pass_hz: float, stop_hz: float, rate_hz: float) -> Array:
+    length, beta = kaiserord(STOP_DB, (stop_hz - pass_hz) / (0.5 * rate_hz))
+    cutoff = 0.5 * (pass_hz + stop_hz)
+    return np.asarray(firwin(length | 1, cutoff, window=("kaiser", beta), fs=rate_hz))
+
+
+def _first_step(decimation: int, oversampling: float) -> int:
+    """Return the decimation of a first stage: a divisor that leaves a wide transition."""
+    divisors = [k for k in range(1, decimation + 1) if decimation % k == 0]
+    return max(k for k in divisors if k == 1 or k <= oversampling / WIDE)
 
 
 def _decimation(tones_hz: Array, rate_hz: float, between_hz: float) -> int:
@@ -91,8 +114,10 @@ class BandSampler:
     """Reduces a recording, block by block."""
 
     def __init__(self, band: BandFilter) -> None:
-        self._band, self._samples = band, np.zeros((0, 0))
-        self._taps = np.concatenate([band.taps.real, band.taps.imag], axis=1)
+        self._band = band
+        self._first = _Windows(band.first_taps[:, None], band.first_step)
+        taps = np.concatenate([band.taps.real, band.taps.imag], axis=1)
+        self._second = _Windows(taps, band.decimation // band.first_step)
         self._next = band.middle
 
     def push(self, block: Array) -> tuple[Array, ComplexArray]:
@@ -110,19 +135,31 @@ class BandSampler:
         complex ndarray, shape (m, tones, columns)
             Its real part is the waveform of each tone's band.
         """
-        before = self._samples if len(self._samples) else block[:0]
-        samples = np.concatenate([before, block])
-        length, step = len(self._taps), self._band.decimation
-        count = max((len(samples) - length) // step + 1, 0)
-        place = self._next + step * np.arange(count, dtype=float)
-        self._next += step * count
-        self._samples = samples[step * count :]
+        if self._band.first_step > 1:
+            block = self._first.push(block)[..., 0]
+        parts = self._second.push(block)
+        place = self._next + self._band.decimation * np.arange(len(parts), dtype=float)
+        self._next += self._band.decimation * len(parts)
         tones = len(self._band.tones_hz)
-        if not count:
-            return place, np.zeros((0, tones, block.shape[1]), dtype=np.complex128)
-        windows = sliding_window_view(samples, length, axis=0)[::step]
-        parts = np.ascontiguousarray(windows) @ self._taps
         return place, np.swapaxes(parts[..., :tones] + 1j * parts[..., tones:], 1, 2)
+
+
+class _Windows:
+    """Applies filters to every so many samples, block by block."""
+
+    def __init__(self, taps: Array, step: int) -> None:
+        self._taps, self._step, self._samples = taps, step, np.zeros((0, 0))
+
+    def push(self, block: Array) -> Array:
+        """Return results of a block (n, columns), shape (m, columns, filters)."""
+        samples = np.concatenate([self._samples, block]) if len(self._samples) else block
+        length = len(self._taps)
+        count = max((len(samples) - length) // self._step + 1, 0)
+        self._samples = samples[self._step * count :]
+        if not count:
+            return np.zeros((0, block.shape[1], self._taps.shape[1]))
+        windows = sliding_window_view(samples, length, axis=0)[:: self._step]
+        return np.asarray(np.ascontiguousarray(windows) @ self._taps)
 
 
 def waveform_of_bands(time: Array, baseband: ComplexArray, tones_hz: Array) -> Array:

@@ -70,6 +70,8 @@ class Magnetometer:
     clock_rate : float
         Of a single magnetometer: a sample stamped t was taken at t (1 + clock_rate) on the clock
         of the drives.
+    clock_rate_sigma : float
+        Prior standard deviation of ``clock_rate``.
     field_range : float
         Largest value of each axis in size (T); by default a hundred times a fluxgate's.
     ac_coupled : bool
@@ -94,6 +96,7 @@ class Magnetometer:
     name: str = "magnetometer"
     clock_offset: float = 0.0
     clock_rate: float = 0.0
+    clock_rate_sigma: float = 0.0
     field_range: float = 0.1
     ac_coupled: bool = False
 

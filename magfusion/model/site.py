@@ -395,6 +395,15 @@ class Site:
         count = len(self.platform.magnetometers)
         return np.repeat(np.arange(count), len(self.channels) // count)
 
+    @property
+    def relative_clock(self) -> ClockModel:
+        """Return the clock of a drive relative to that of the magnetometer."""
+        own, clock = self.platform.magnetometer.clock_rate_sigma, self.clock
+        if not own:
+            return clock
+        sigma, largest = np.hypot(clock.drift_sigma, own), clock.drift_largest + 3.0 * own
+        return replace(clock, drift_sigma=float(sigma), drift_largest=float(largest))
+
     def of_sensor(self, sensor: int) -> slice:
         """Return the channels of one magnetometer."""
         count = len(self.channels) // len(self.platform.magnetometers)

@@ -8,17 +8,17 @@ from magfusion.model.bandpass import BandFilter, BandSampler
 from magfusion.model.site import Site
 from magfusion.model.slips import (
     INDEPENDENT,
+    LIKELIHOOD_RATIO,
     MIN_SNR,
     NEAR,
     POOR,
     SIDE,
-    LIKELIHOOD_RATIO,
     Slip,
     choose_length,
     locate_slip,
     log_likelihoods,
 )
-from magfusion.units import Array, ComplexArray, IntArray
+from magfusion.units import Array, ComplexArray
 
 LAG = 4e-3  # s; between the amplitudes from which the next is extrapolated
 JUMP = 0.01  # part of an amplitude; motion of 20 rad/s is 0.05 % off in its extrapolation
@@ -27,6 +27,9 @@ MEMORY = 0.5  # s; of the noise of the extrapolation
 MIN_AMPLITUDES = 5  # amplitudes on each side
 MARGIN = 8  # samples; by which a slip may be elsewhere
 EXTRAPOLATION = 20.0  # variance of 3 a - 3 b + c - d
+
+# Place in the recording, analytic signal, and the amplitude that is referred to the place.
+Kept = tuple[Array, ComplexArray, ComplexArray]
 
 
 def can_slip(site: Site) -> bool:
@@ -54,7 +57,7 @@ class SlipSampler:
         self.slips: list[Slip] = []
         self.unexplained = 0
         self._raw, self._raw_begin = np.zeros((0, 0)), 0
-        self._kept = _nothing(band, 0)
+        self._kept: Kept = _empty(band, 0)
         self._returned = self._checked = 0  # of those kept
         self._noise: Array | None = None  # variance of the extrapolation, of each tone
         self._step: int | None = None  # place of the first amplitude about a step
@@ -77,12 +80,11 @@ class SlipSampler:
 
     def _reduce(self, block: Array) -> None:
         place, tones = self._sampler.push(block)
-        if not len(self._kept[0]):
-            self._kept = _nothing(self._band, block.shape[1])
-        self._kept = (
-            np.concatenate([self._kept[0], place + self._begin]),
-            np.concatenate([self._kept[1], tones]),
-        )
+        place += self._begin
+        band = self._band
+        turn = np.exp(-2j * np.pi * place[:, None] * band.tones_hz / band.rate_hz)
+        own = place, tones, tones * turn[..., None]
+        self._kept = own if not len(self._kept[0]) else _appended(self._kept, own)
 
     def _advance(self, *, last: bool) -> Iterator[tuple[Array, ComplexArray]]:
         """Yield what is sure to be before a step, or after one that is understood."""
@@ -115,7 +117,7 @@ class SlipSampler:
         self._checked = len(self._kept[0])
         if not len(rows):
             return None
-        z = [self._amplitude(rows - k * lag) for k in range(4)]
+        z = [self._kept[2][rows - k * lag] for k in range(4)]
         off = np.mean(np.abs(z[0] - 3.0 * z[1] + 3.0 * z[2] - z[3]) ** 2, axis=2)
         if self._noise is None:
             self._noise = np.median(off, axis=0) / np.log(2.0)
@@ -127,12 +129,6 @@ class SlipSampler:
             part = min(len(calm) * band.decimation / (MEMORY * band.rate_hz), 1.0)
             self._noise = self._noise + part * (np.mean(calm, axis=0) - self._noise)
         return int(place[wrong[0]]) if len(wrong) else None
-
-    def _amplitude(self, rows: IntArray) -> ComplexArray:
-        """Return amplitudes that are kept, referred to the recording's numbers."""
-        band, (place, tones) = self._band, self._kept
-        turn = np.exp(-2j * np.pi * place[rows, None] * band.tones_hz / band.rate_hz)
-        return np.asarray(tones[rows] * turn[..., None])
 
     def _resolve(self, step: int, side: int) -> tuple[Array, ComplexArray]:
         """Return samples before a step if it is a slip, and begin again after it."""
@@ -157,7 +153,7 @@ class SlipSampler:
         self.slips.append(slip)
         self._begin = slip.place + MARGIN
         self._raw, self._raw_begin = self._raw[self._begin - self._raw_begin :], self._begin
-        self._sampler, self._kept = BandSampler(band), _nothing(band, columns)
+        self._sampler, self._kept = BandSampler(band), _empty(band, columns)
         self._returned = self._checked = 0
         self._reduce(self._raw)
         return released
@@ -172,7 +168,7 @@ class SlipSampler:
         after = np.flatnonzero((place >= end) & (place < end + side))[::every]
         if min(len(before), len(after)) < MIN_AMPLITUDES:
             return None
-        z = self._amplitude(before), self._amplitude(after)
+        z = self._kept[2][before], self._kept[2][after]
         detected = [np.mean(np.abs(part) ** 2, axis=(0, 2)) > (MIN_SNR * sigma) ** 2 for part in z]
         tones = detected[0] & detected[1]
         if not np.any(tones):
@@ -193,21 +189,31 @@ class SlipSampler:
     def _trim(self, side: int) -> None:
         """Discard what no step that comes can need."""
         band, place = self._band, self._kept[0]
-        newest = int(place[-1]) if len(place) else self._raw_begin
-        oldest = newest if self._step is None else self._step
-        if self._watched and len(place):
-            first = int(np.searchsorted(place, oldest - side - band.middle))
-            first = min(first, self._returned)
-            self._kept = place[first:], self._kept[1][first:]
-            self._returned, self._checked = self._returned - first, self._checked - first
-        elif len(place):
-            self._kept, self._returned = _nothing(band, self._raw.shape[1]), 0
-        if len(place):
-            self._raw, self._raw_begin = self._raw[oldest - self._raw_begin :], oldest
+        if not len(place):
+            return
+        oldest = int(place[-1]) if self._step is None else self._step
+        if oldest - place[0] < 2 * (side + band.middle) and self._watched:
+            return  # seldom is cheaper
+        first = int(np.searchsorted(place, oldest - side - band.middle))
+        first = min(first, self._returned)
+        place, tones, amplitude = self._kept
+        self._kept = place[first:], tones[first:], amplitude[first:]
+        self._returned, self._checked = self._returned - first, max(self._checked - first, 0)
+        self._raw, self._raw_begin = self._raw[oldest - self._raw_begin :], oldest
 
 
 def _nothing(band: BandFilter, columns: int) -> tuple[Array, ComplexArray]:
     return np.zeros(0), np.zeros((0, len(band.tones_hz), columns), dtype=np.complex128)
+
+
+def _empty(band: BandFilter, columns: int) -> Kept:
+    place, tones = _nothing(band, columns)
+    return place, tones, tones
+
+
+def _appended(kept: Kept, own: Kept) -> Kept:
+    place, tones, amplitude = (np.concatenate(pair) for pair in zip(kept, own, strict=True))
+    return place, tones, amplitude
 
 
 def _joined(

@@ -233,7 +233,7 @@ def _drifts(detected: DetectedFields) -> Array:
     if detected.beacon.synchronised:
         return np.zeros(1)
     turns = 2.0 * np.pi * float(np.max(detected.beacon.tone_frequencies_hz))
-    largest = detected.alone.site.clock.drift_largest
+    largest = detected.alone.site.relative_clock.drift_largest
     swept = turns * float(np.ptp(detected.poses.time)) * 2.0 * largest
     count = int(np.ceil(swept)) | 1
     return np.linspace(-largest, largest, count) if count > 1 else np.zeros(1)
@@ -288,7 +288,7 @@ def _polished(
     elapsed, sensor_world, weight, phasor = detected.thinned()
     free_parameters, largest = (
         not detected.beacon.synchronised,
-        detected.alone.site.clock.drift_largest,
+        detected.alone.site.relative_clock.drift_largest,
     )
     turns = 2.0 * np.pi * elapsed[:, None] * detected.beacon.tone_frequencies_hz
 

@@ -175,7 +175,7 @@ def start_phases(calibration: Calibration, time: Array, phase: Array) -> Calibra
             continue
         frequency = float(beacon.tone_frequencies_hz[0])
         drift[i] += _dominant_drift(
-            elapsed, phase[:, rows.start], frequency, calibration.site.clock
+            elapsed, phase[:, rows.start], frequency, calibration.site.relative_clock
         )
         rate = 2.0 * np.pi * beacon.tone_frequencies_hz * (drift[i] - calibration.drift[i])
         remaining = np.exp(1j * (phase[:, rows] - elapsed[:, None] * rate))

@@ -175,7 +175,10 @@ def _seeds(search: Search, k: int) -> Tracks:
     good = np.flatnonzero(np.isfinite(fixes.cost[0]))
     free_parameters, none = int(np.sum(phasors.free_phases)), np.zeros((len(good), 3))
     clock = (
-        search.site.clock.drift_sigma * 2.0 * np.pi * _frequencies(search.site)[phasors.free_phases]
+        search.site.relative_clock.drift_sigma
+        * 2.0
+        * np.pi
+        * _frequencies(search.site)[phasors.free_phases]
     )
     phases = [np.full(free_parameters, FIRST_PHASE), np.maximum(clock, 1e-9)]
     sigma = np.concatenate([_motion_sigma(search.site), *phases])

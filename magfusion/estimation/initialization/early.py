@@ -1,8 +1,12 @@
-"""Early start of a single tracker of unknown hemisphere, before a usual start has enough data.
+"""Early start, before a usual start has enough data.
 
-Its motion determines the hemisphere within a second or two, and clearly rejects a mirrored start.
-Less clear cases wait as long as all other starts do.
+The motion of a single tracker of unknown hemisphere determines it within a second or two, and
+clearly rejects a mirrored start.  A receiver of alternating fields alone has no steady field that
+needs checks over turns of the body; with several beacons each epoch determines its pose.  Less
+clear cases wait as long as all other starts do.
 """
+
+import numpy as np
 
 from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE, DECIDED
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
@@ -10,12 +14,14 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.receiver.slots import has_schedule
 
+LEADING = 2.0 * float(np.log(100.0))  # chi square of a rival: the odds against it are 100
+SEVERAL = 3  # beacons
 TRIES = 3  # in the time of other starts; after one second attitudes erred by three sigmas
 
 
 def first_try(site: Site, start_duration: float) -> float:
     """Return the duration of data before the first try of a start (s)."""
-    if has_schedule(site) and _is_mirrored(site):
+    if (has_schedule(site) and _is_mirrored(site)) or _is_alternating(site):
         return start_duration / TRIES
     return start_duration
 
@@ -25,14 +31,30 @@ def next_try(tried: float, start_duration: float) -> float:
     return min(tried + start_duration / TRIES, start_duration)
 
 
-def is_clear(start: OnlineStart | NoStart) -> bool:
-    """Return whether an early start is unambiguous: its rival needed no further comparison."""
-    return (
-        isinstance(start, OnlineStart)
-        and start.rival_chi_square is not None
-        and start.rival_chi_square > DECIDED * AMBIGUOUS_CHI_SQUARE
-        and start.trust.verdict is Verdict.TRUSTWORTHY
-    )
+def is_clear(start: OnlineStart | NoStart, *, several: bool = False, again: bool = False) -> bool:
+    """Return whether an early start is unambiguous: its rival needed no further comparison.
+
+    Parameters
+    ----------
+    several : bool
+        Whether there are several beacons, without a rival; then all tests must be passed.
+    again : bool
+        Whether it is a later try, where a start may be doubtful and its rival merely rejected.
+    """
+    if not isinstance(start, OnlineStart):
+        return False
+    passed = start.trust.verdict is Verdict.TRUSTWORTHY
+    if start.rival_chi_square is None:
+        return several and passed
+    if again:
+        return not start.ambiguous and start.trust.verdict is not Verdict.FAILED
+    return passed and start.rival_chi_square > DECIDED * AMBIGUOUS_CHI_SQUARE
+
+
+def is_open(start: OnlineStart) -> bool:
+    """Return whether no hypothesis leads by so much that its pose is given, as doubtful."""
+    rival = start.rival_chi_square
+    return bool(rival is not None and rival < LEADING)
 
 
 def open_start(start: OnlineStart) -> NoStart:
@@ -43,6 +65,11 @@ def open_start(start: OnlineStart) -> NoStart:
     )
     findings = Finding("ambiguous", text, Verdict.DOUBTFUL)
     return NoStart(text, Trust((findings, *start.trust.reasons)))
+
+
+def _is_alternating(site: Site) -> bool:
+    """Return whether a receiver without a steady field has several beacons."""
+    return site.platform.magnetometer.ac_coupled and len(site.beacons) >= SEVERAL
 
 
 def _is_mirrored(site: Site) -> bool:

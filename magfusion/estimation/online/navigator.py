@@ -27,7 +27,13 @@ from magfusion.estimation.graph.propagation import Propagated, propagate
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.graph.user_factors import UserFactors
 from magfusion.estimation.initialization.earlier_state import with_earlier
-from magfusion.estimation.initialization.early import first_try, is_clear, next_try, open_start
+from magfusion.estimation.initialization.early import (
+    first_try,
+    is_clear,
+    is_open,
+    next_try,
+    open_start,
+)
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
 from magfusion.estimation.integrity.correction import Correction, continued, spread_of
 from magfusion.estimation.measurements.aiding_samples import (
@@ -603,7 +609,10 @@ class Navigator:
         start = arrived.first_state(until, self.settings, diagnose=self._tried is None)
         self._possible = start.corrections
         longest = 4.0 * self.settings.start_duration
-        if self._next_start < self.settings.start_duration and not is_clear(start):
+        first = first_try(self.site, self.settings.start_duration)
+        several, again = len(self.site.beacons) > 1, self._next_start > first
+        early = self._next_start < self.settings.start_duration
+        if early and not is_clear(start, several=several, again=again):
             if isinstance(start, OnlineStart) and start.ambiguous:
                 self.why_no_start = open_start(start)
             self._next_start = next_try(self._next_start, self.settings.start_duration)
@@ -613,7 +622,7 @@ class Navigator:
             self._next_start *= 2.0 if start.trust.findings else 1.5
             arrived.limit_history(longest)
             return False
-        if start.ambiguous and self._next_start < longest:
+        if is_open(start) and self._next_start < longest:
             self.why_no_start = open_start(start)
             self._next_start += 0.5 * self.settings.start_duration
             return False

@@ -7,6 +7,14 @@ import numpy as np
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.model.trust import Finding, Trust, Unverified, Verdict
 
+# Of residuals against noise, which an impact or a motor nearby exceeds for a moment.  A mistake
+# of the site or the sensors does not pass.
+PASSING_CODES = frozenset(
+    {"field_innovations", "field_residuals", "inertial_residuals", "noise_tuned"}
+)
+PASSING_S = 1.0  # from the first to the last state that has such a finding
+SETTLED = 10.0  # times as long without it
+
 
 @dataclass(frozen=True)
 class Noted:
@@ -76,14 +84,29 @@ class Summary:
         states = before.states + (time > before.last)
         self._noted[finding.code] = Noted(strongest, before.first, time, states)
 
+    def _has_passed(self, noted: Noted) -> bool:
+        """Return whether a finding was momentary, and long ago."""
+        lasting = noted.last - noted.first
+        return (
+            noted.finding.code in PASSING_CODES
+            and lasting <= PASSING_S
+            and self._last - noted.last >= SETTLED * PASSING_S
+        )
+
     @property
     def trust(self) -> Trust:
-        """The worst findings of all states; a loss that was recovered only leaves a doubt."""
+        """The worst findings of all states.
+
+        A loss that was recovered only leaves a doubt, and residuals of one second long ago a
+        remark: the states of that second have their own verdicts.
+        """
         result = []
         for noted in self._noted.values():
             finding = noted.finding
             if finding.verdict is Verdict.FAILED and self._lost_since is None:
                 finding = replace(finding, verdict=Verdict.DOUBTFUL)
+            if self._has_passed(noted) and finding.verdict is Verdict.DOUBTFUL:
+                finding = replace(finding, verdict=Verdict.TRUSTWORTHY)
             share = f" ({noted.states} of {self._states} states,"
             share += f" {noted.first:.1f} to {noted.last:.1f} s)"
             result.append(replace(finding, text=finding.text + share))

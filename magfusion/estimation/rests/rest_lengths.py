@@ -26,7 +26,7 @@ def piece_length(
     for beacon in site.beacons:
         if not beacon.synchronised:
             highest = float(np.max(beacon.tone_frequencies_hz))
-            wanted = min(wanted, UNKNOWN_TURN / (site.clock.drift_largest * highest))
+            wanted = min(wanted, UNKNOWN_TURN / (site.relative_clock.drift_largest * highest))
     length = min(max(wanted, usual.window), maximum)
     return length if length >= usual.window else None
 

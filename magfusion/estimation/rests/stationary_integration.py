@@ -322,7 +322,9 @@ def _searches(result: Pieces, site: Site, nominal_hz: Array) -> dict[str, Freque
     for beacon in site.beacons:
         if not beacon.synchronised:
             tones = [c for c, (name, _) in enumerate(site.channels) if name == beacon.name]
-            searches[beacon.name] = searched(result, tones, nominal_hz, site.clock.drift_largest)
+            searches[beacon.name] = searched(
+                result, tones, nominal_hz, site.relative_clock.drift_largest
+            )
     return searches
 
 

@@ -198,7 +198,9 @@ class _Drift(_OfDrive):
     walk = "clock.drift_walk"
 
     def sigma(self, site: Site, owner: str) -> Array:
-        return np.array([0.0 if self.part(site, owner).synchronised else site.clock.drift_sigma])
+        return np.array(
+            [0.0 if self.part(site, owner).synchronised else site.relative_clock.drift_sigma]
+        )
 
     def names(self, site: Site) -> tuple[str, ...]:
         return tuple([beacon.name for beacon in site.beacons])
