@@ -99,7 +99,7 @@ ROOMS = {
             alignment coverage drift errors live_foxglove observability odometry_dds
             odometry_mavlink recording_plots records_dds truth_frame
             refinement rest_figures shown transfer turn_guide verdict
-            coverage_colours design motion_coverage recording_layout recording_trust screen
+            coverage_colours design error_budget motion_coverage recording_layout recording_trust screen
             plots recording recording_drift
             page_motion recording_coverage recording_design recording_live
             page recording_turns trajectory
@@ -111,11 +111,11 @@ ROOMS = {
             listen_lines listen_sound stream_clocks stream_samples written
             inputs navigate_results result_directory
             allan_noise checkpoint failure magnetometer_trust magnetometer_turns orientation
-            settings without_beacons
-            allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
+            budget_figures settings without_beacons
+            accept allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
             calibrate_magnetometer check design_settings drift_world evaluate export init_settings
             listen live papers published_fix range_wells rates region replay rest_settings
-            simulate_ranging smooth_result survey view
+            sheet simulate_ranging smooth_result survey view
             antenna_fit demodulate design_motion drift_figures fix import_log init_questions
             joint_tasks match_trust navigate_settings simulate smooth_correction smooth_failure
             stream
