@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.integrity.installation import InstallationCheck, check_installation
-from magfusion.estimation.integrity.marked_snapshots import MarkedSnapshots
+from magfusion.calibration.installation import InstallationCheck, check_installation
+from magfusion.calibration.marked_snapshots import MarkedSnapshots
 from magfusion.model.check_distance import CheckDistance
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import Beacon, BeaconSigma, Site

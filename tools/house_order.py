@@ -25,9 +25,9 @@ ROOMS = {
     wing: rooms.split()
     for wing, rooms in {
         "model": """
-            arguments batches check_distance correlation drive field_map fixed_axes groups hall hermite
-            imu_intrinsics marks perturbation physics platform_motion probe progress quaternion
-            region response rotor short_repr temperature time_division trust
+            arguments batches check_distance correlation drive field_map fixed_axes groups hall
+            hermite imu_intrinsics marks perturbation physics platform_motion probe progress
+            quaternion region response rotor short_repr temperature time_division trust
             aiding magnetometer
             site trajectory
             truth_poses
@@ -81,7 +81,8 @@ ROOMS = {
             integrity initialization online_integrity online orientation rests
         """,
         "calibration": """
-            allan antenna beacon fieldmap graph magnetometer steady_field stops
+            allan antenna beacon fieldmap graph magnetometer marked_snapshots steady_field stops
+            installation
             allan_fit antenna_graph antenna_observability antenna_probe antenna_site beacon_refined
             ellipsoid magnetometer_graph rest turn_coverage
             antenna_tracking magnetometer_start
@@ -99,7 +100,8 @@ ROOMS = {
             alignment coverage drift errors live_foxglove observability odometry_dds
             odometry_mavlink recording_plots records_dds truth_frame
             refinement rest_figures shown transfer turn_guide verdict
-            coverage_colours design error_budget motion_coverage recording_layout recording_trust screen
+            coverage_colours design error_budget motion_coverage recording_layout recording_trust
+            screen
             plots recording recording_drift
             page_motion recording_coverage recording_design recording_live
             page recording_turns trajectory
