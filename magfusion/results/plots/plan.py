@@ -61,9 +61,9 @@ def add_legend(figure: Figure, every: Sequence[Axes], unknown: str) -> None:
         fontsize=9,
         frameon=False,
     )
-    for handle in legend.legend_handles:  # a white cross would not be seen
-        if handle is not None and getattr(handle, "get_marker", str)() == "x":
-            handle.set(markeredgecolor="black")
+    for shown in legend.legend_handles:  # a white cross would not be seen
+        if shown is not None and getattr(shown, "get_marker", str)() == "x":
+            shown.set(markeredgecolor="black")
 
 
 def draw_hall(axes: Axes, hall: Hall) -> None:
