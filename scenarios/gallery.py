@@ -9,7 +9,7 @@ direction, wired backwards, or of half the turns.
 1. Each of ten installations as designed passes.
 2. In each of ten with a fault, that beacon is named, with its fault, and no other.
 3. The rms error of fixes of single windows at random places of the accepted installations is at
-   most 1.3 times the promised one, by the coverage of the design.
+   most 1.3 times the predicted one, by the coverage of the design.
 
 The rule, set before the first run: seeds 0 to 9.
 """
@@ -38,7 +38,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Risk
 from magfusion.results.coverage import coverage, phasor_variance
 from magfusion.results.design.check_marks import check_marks, check_pairs
-from magfusion.results.design.need import fewest_beacons, least_moment
+from magfusion.results.design.need import least_moment, min_beacons
 from magfusion.results.design.pattern import ToneBand
 from magfusion.results.design.planning import Task, designed
 from magfusion.simulation.demo_site import demo_site
@@ -84,7 +84,7 @@ class Row:
     named: dict[str, str]
     right: bool
     error_m: float
-    promised_m: float
+    predicted_m: float
 
 
 def gallery() -> Hall:
@@ -118,13 +118,13 @@ def designed_site(seed: int) -> Site:
         objective="sigma",
         axes=3,
     )
-    found = fewest_beacons(
+    needed = min_beacons(
         task,
         NEED,
         20,
         lambda own: designed(own, starts=1, layouts=0, rng=np.random.default_rng(seed)),
     )
-    return least_moment(found, NEED).design.site
+    return least_moment(needed, NEED).design.site
 
 
 def with_marks(site: Site) -> Site:
@@ -214,7 +214,7 @@ def write_distances(site: Site, true: Site, path: Path, rng: np.random.Generator
 def accuracy(
     site: Site, true: Site, bent: Bending, rng: np.random.Generator
 ) -> tuple[float, float]:
-    """Return the rms error of fixes at random places, and the promised one (m)."""
+    """Return the rms error of fixes at random places, and the predicted one (m)."""
     low, high = gallery().use.box_world
     inside = np.array([1.0, 1.0, 0.0])
     place = rng.uniform(low + inside, high - inside, (PLACES, 3))
@@ -245,11 +245,11 @@ def run_one(site: Site, kind: str, seed: int) -> Row:
     wanted = FAULTS[kind][1]
     if kind == "none":
         right = figures["verdict"] == "pass"
-        error, promised = accuracy(site, true, bent, rng)
+        error, predicted = accuracy(site, true, bent, rng)
     else:
         right = list(named) == [beacon] and named[beacon].split(", ")[0] == wanted
-        error = promised = float("nan")
-    return Row(seed, kind, beacon, str(figures["verdict"]), named, right, error, promised)
+        error = predicted = float("nan")
+    return Row(seed, kind, beacon, str(figures["verdict"]), named, right, error, predicted)
 
 
 def report(rows: list[Row]) -> str:
@@ -260,10 +260,10 @@ def report(rows: list[Row]) -> str:
         lines.append(f"{kind:10} {sum(row.right for row in own)} of {len(own)} right")
         lines += [f"  {row}" for row in own if not row.right]
     good = [row for row in rows if row.fault == "none"]
-    ratio = rms(np.array([r.error_m for r in good])) / rms(np.array([r.promised_m for r in good]))
+    ratio = rms(np.array([r.error_m for r in good])) / rms(np.array([r.predicted_m for r in good]))
     lines.append(
-        f"rms error {1e3 * rms(np.array([r.error_m for r in good])):.1f} mm, promised"
-        f" {1e3 * rms(np.array([r.promised_m for r in good])):.1f} mm: {ratio:.2f} times"
+        f"rms error {1e3 * rms(np.array([r.error_m for r in good])):.1f} mm, predicted"
+        f" {1e3 * rms(np.array([r.predicted_m for r in good])):.1f} mm: {ratio:.2f} times"
     )
     return "\n".join(lines)
 

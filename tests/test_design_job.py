@@ -13,7 +13,15 @@ from magfusion.files.site import load_site
 from magfusion.model.trust import Risk
 from magfusion.results.coverage import coverage
 
-FILES = {"coverage.parquet", "design.png", "report.html", "report.json", "run.rrd", "site.yaml"}
+FILES = {
+    "coverage.parquet",
+    "design.png",
+    "error_budget.png",
+    "report.html",
+    "report.json",
+    "run.rrd",
+    "site.yaml",
+}
 QUICK = ("--box", "0,6,0,5,0,3", "--spacing", 1.5, "--grid", 3, "--axes", 3, "--starts", 1)
 
 

@@ -25,9 +25,9 @@ ROOMS = {
     wing: rooms.split()
     for wing, rooms in {
         "model": """
-            arguments batches check_distance correlation drive field_map fixed_axes groups hall hermite
-            imu_intrinsics marks perturbation physics platform_motion probe progress quaternion
-            region response rotor short_repr temperature time_division trust
+            arguments batches check_distance correlation drive field_map fixed_axes groups hall
+            hermite imu_intrinsics marks perturbation physics platform_motion probe progress
+            quaternion region response rotor short_repr temperature time_division trust
             aiding magnetometer
             site trajectory
             truth_poses
@@ -82,7 +82,8 @@ ROOMS = {
             integrity initialization online_integrity online orientation rests
         """,
         "calibration": """
-            allan antenna beacon fieldmap graph magnetometer steady_field stops
+            allan antenna beacon fieldmap graph magnetometer marked_snapshots steady_field stops
+            installation
             allan_fit antenna_graph antenna_observability antenna_probe antenna_site beacon_refined
             ellipsoid magnetometer_graph rest turn_coverage
             antenna_tracking magnetometer_start
@@ -99,8 +100,8 @@ ROOMS = {
             recording_file ros_messages shapes trend
             alignment coverage drift errors live_foxglove observability odometry_dds
             odometry_mavlink recording_plots records_dds truth_frame
-            axes refinement rest_figures transfer turn_guide verdict
-            coverage_colours design motion_coverage recording_layout recording_trust shown
+            axes refinement rest_figures shown transfer turn_guide verdict
+            coverage_colours design error_budget motion_coverage recording_layout recording_trust
             brief plots recording recording_drift
             page_motion recording_coverage recording_design recording_live screen
             page recording_turns trajectory
@@ -113,12 +114,12 @@ ROOMS = {
             listen_lines listen_sound stream_clocks stream_samples written
             inputs navigate_results result_directory
             allan_noise checkpoint failure magnetometer_trust magnetometer_turns orientation
-            settings without_beacons
-            allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
+            budget_figures settings without_beacons
+            accept allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
             calibrate_magnetometer check coil design_settings drift_world drive evaluate export
             import_figures init_settings
             listen live papers published_fix range_wells rates region replay rest_settings
-            simulate_ranging smooth_result survey view
+            sheet simulate_ranging smooth_result survey view
             antenna_fit demodulate design_motion drift_figures fix import_log init_questions
             joint_tasks match_trust navigate_settings simulate smooth_correction smooth_failure
             stream

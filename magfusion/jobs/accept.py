@@ -17,8 +17,8 @@ from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
-    from magfusion.estimation.integrity.installation import BeaconCheck
-    from magfusion.estimation.integrity.marked_snapshots import MarkedSnapshots
+    from magfusion.calibration.installation import BeaconCheck
+    from magfusion.calibration.marked_snapshots import MarkedSnapshots
     from magfusion.model.aiding import AidingSensor
     from magfusion.model.check_distance import CheckDistance
     from magfusion.model.samples import Log
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from magfusion.receiver.windows import LockinSettings
     from magfusion.units import Array, IntArray
 
-FEWEST_MARKS = 3
+MIN_MARKS = 3
 TAPE_SIGMAS = 4.0  # of a distance's difference, from which it is named
 CODES = {
     "reversed": "coil_reversed",
@@ -61,7 +61,7 @@ def run_accept(
     InputError
         Where the log has no stops on marks of the site, or a file cannot be read.
     """
-    from magfusion.estimation.integrity.installation import check_installation
+    from magfusion.calibration.installation import check_installation
     from magfusion.files.distances import read_distances
     from magfusion.files.site import save_site
     from magfusion.jobs.inputs import named, read_job
@@ -117,12 +117,12 @@ def run_accept(
 
 
 def _mark_sensor(site: Site, path: Path) -> AidingSensor:
-    found = [sensor for sensor in site.aiding if sensor.quantity == "mark"]
-    if not found:
+    sensors = [sensor for sensor in site.aiding if sensor.quantity == "mark"]
+    if not sensors:
         raise InputError(
             f"{path}: declares no marks; add an aiding sensor of quantity: mark with marks_m"
         )
-    return found[0]
+    return sensors[0]
 
 
 def _at_marks(
@@ -133,8 +133,8 @@ def _at_marks(
     distances: tuple[CheckDistance, ...],
 ) -> tuple[MarkedSnapshots, int]:
     """Return one epoch of each stop on a mark, and the number of stops left out."""
+    from magfusion.calibration.marked_snapshots import MarkedSnapshots
     from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
-    from magfusion.estimation.integrity.marked_snapshots import MarkedSnapshots
     from magfusion.model.parameters import initial_calibration
 
     visits = _visits(log, sensor)
@@ -149,9 +149,9 @@ def _at_marks(
         if within and np.isfinite(gravity.sigma[near]):
             rows.append(near)
             marks.append(sensor.marks_world[name])
-    if len(rows) < FEWEST_MARKS:
+    if len(rows) < MIN_MARKS:
         raise InputError(
-            f"accept requires {FEWEST_MARKS} stops on marks, and the log has {len(rows)} at which"
+            f"accept requires {MIN_MARKS} stops on marks, and the log has {len(rows)} at which"
             " the platform rests; stop for some seconds on each mark"
         )
     order: IntArray = np.argsort(np.array(rows), kind="stable")
@@ -191,7 +191,7 @@ def _visits(log: Log, sensor: AidingSensor) -> list[tuple[float, str]]:
 
 
 def _finding(check: BeaconCheck) -> Finding:
-    from magfusion.estimation.integrity.installation import words_of
+    from magfusion.calibration.installation import words_of
 
     text = f"Beacon {check.name} is not as declared: {words_of(check)}."
     return Finding(CODES[check.faults[0]], text, Verdict.FAILED)

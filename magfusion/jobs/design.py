@@ -26,8 +26,8 @@ from magfusion.model.site import Beacon, Site
 from magfusion.results.coverage import coverage, usual_box
 from magfusion.results.design.need import (
     NeededDesign,
-    fewest_beacons,
     least_moment,
+    min_beacons,
     most_beacons,
 )
 from magfusion.results.design.pattern import ToneBand, template_of
@@ -120,12 +120,12 @@ def _for_need(
         return task, search(task)
     need = settings.limits[0]
     if settings.beacons is None:
-        found = fewest_beacons(task, need, most_beacons(task, MOST_BEACONS), search)
+        needed = min_beacons(task, need, most_beacons(task, MOST_BEACONS), search)
     else:
-        found = NeededDesign(task, search(task), reached=True)
+        needed = NeededDesign(task, search(task), reached=True)
     if settings.moment is None and settings.moment_budget is None:
-        found = least_moment(found, need)
-    return found.task, found.design
+        needed = least_moment(needed, need)
+    return needed.task, needed.design
 
 
 def _hall(settings: DesignSettings, site: Site) -> tuple[Hall, float]:

@@ -46,7 +46,7 @@ _MEANING = {
     "unstable": "It drifts, or its errors exceed their covariance.",
     "reached": "The protection level is within the limit at every point.",
     "not reached": "The protection level exceeds the limit at some points.",
-    "pass": "Every beacon is as declared, as far as the measurements tell.",
+    "pass": "Every beacon is as declared, within what the measurements detect.",
     "not proven": "No beacon contradicts its declaration; some need more measurements.",
 }
 NO_JUDGE = "This job has no verdict."

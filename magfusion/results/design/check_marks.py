@@ -19,15 +19,17 @@ def check_marks(site: Site, points_world: Array) -> dict[str, Array]:
     Parameters
     ----------
     points_world : ndarray, shape (n, 3)
-        Positions on which the platform can stand (m).
+        Positions where the platform can be (m).
     """
     chosen: list[int] = []
     for beacon in site.beacons:
         gap = np.linalg.norm(points_world - beacon.position_world, axis=1)
         near: list[int] = []
         for k in np.argsort(gap, kind="stable").tolist():
-            apart = (np.linalg.norm(points_world[k] - points_world[o]) for o in (*near, *chosen))
-            if gap[k] >= NEAREST and (k in chosen or all(d >= SEPARATE for d in apart)):
+            distances = (
+                np.linalg.norm(points_world[k] - points_world[o]) for o in (*near, *chosen)
+            )
+            if gap[k] >= NEAREST and (k in chosen or all(d >= SEPARATE for d in distances)):
                 near.append(k)
             if len(near) == PER_BEACON:
                 break

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.results.design.exchange import value_of
+from magfusion.results.design.exchange import Objective, value_of
 from magfusion.results.design.layout_information import LayoutInformation
 from magfusion.results.design.pattern import peak_moment, stronger
 from magfusion.results.design.planning import Design, Task, with_beacons
@@ -44,7 +44,7 @@ def worst_of(task: Task, result: Design, factor: float = 1.0) -> float:
     information = LayoutInformation(
         task.site, result.new[0], task.points, task.band.window, task.risk
     )
-    objective = "worst" if task.objective == "worst" else "sigma"
+    objective: Objective = "worst" if task.objective == "worst" else "sigma"
     return value_of(information, [stronger(b, factor) for b in result.new], objective)[0]
 
 
@@ -56,8 +56,8 @@ def most_beacons(task: Task, limit: int) -> int:
     return min(limit, len(task.band.allowed(kept)) // len(task.template.tones))
 
 
-def fewest_beacons(
-    task: Task, need: float, most: int, design: Callable[[Task], Design]
+def min_beacons(
+    task: Task, need: float, max_count: int, design: Callable[[Task], Design]
 ) -> NeededDesign:
     """Find the fewest beacons that reach an accuracy, by bisection.
 
@@ -65,7 +65,7 @@ def fewest_beacons(
     ----------
     need : float
         Largest protection level or position sigma (m).
-    most : int
+    max_count : int
         Largest number.
     design : callable
         `designed` of a task.
@@ -73,9 +73,9 @@ def fewest_beacons(
     low, count = FIRST - 1, FIRST
     while True:
         best = _tried(task, need, count, design)
-        if best.reached or count == most or not best.design.complete:
+        if best.reached or count == max_count or not best.design.complete:
             break
-        low, count = count, min(max(count + 1, round(GROWTH * count)), most)
+        low, count = count, min(max(count + 1, round(GROWTH * count)), max_count)
     high = count
     while best.reached and high - low > 1:
         middle = (low + high) // 2
@@ -93,14 +93,14 @@ def _tried(task: Task, need: float, count: int, design: Callable[[Task], Design]
     return NeededDesign(own, result, worst_of(own, result) <= need)
 
 
-def least_moment(found: NeededDesign, need: float) -> NeededDesign:
+def least_moment(needed: NeededDesign, need: float) -> NeededDesign:
     """Return a design with the smallest moments that reach an accuracy at the same places.
 
     If no moment does, those of the design remain.
     """
-    task, result = found.task, found.design
+    task, result = needed.task, needed.design
     if worst_of(task, result, LARGEST) > need:
-        return replace(found, reached=False)
+        return replace(needed, reached=False)
     low, high = np.log(SMALLEST), np.log(LARGEST)
     while high - low > 0.01:
         middle = 0.5 * (low + high)

@@ -43,8 +43,6 @@ def write_plot(path: Path, site: Site, coverage: Coverage, extra: Beacon | None)
         grey = np.where(np.isinf(sigma), 1.0, np.nan)
         axes.pcolormesh(x, y, grey, cmap=ListedColormap(["0.75"]), shading="nearest")
         mesh = axes.pcolormesh(x, y, shown, norm=norm, cmap=colours, shading="nearest")
-        if np.all(np.isfinite(sigma)) and min(sigma.shape) > 1:
-            axes.contour(x, y, sigma, levels=levels, colors="white", linewidths=0.6)
         axes.set(title=f"height {height:.3g} m", xlabel="x (m)", ylabel="y (m)", aspect="equal")
         axes.set(xlim=box[:, 0] + [-margin, margin], ylim=box[:, 1] + [-margin, margin])
     bar = figure.colorbar(mesh, ax=list(panels), ticks=levels, shrink=0.85)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -47,7 +48,7 @@ def add_legend(figure: Figure, every: Sequence[Axes], unknown: str) -> None:
     unknown : str
         Meaning of grey.
     """
-    entries: dict[str, object] = {}
+    entries: dict[str, Artist] = {}
     for axes in every:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
@@ -60,9 +61,9 @@ def add_legend(figure: Figure, every: Sequence[Axes], unknown: str) -> None:
         fontsize=9,
         frameon=False,
     )
-    for handle in legend.legend_handles:  # a white cross would not be seen
-        if handle is not None and getattr(handle, "get_marker", str)() == "x":
-            handle.set(markeredgecolor="black")
+    for shown in legend.legend_handles:  # a white cross would not be seen
+        if shown is not None and getattr(shown, "get_marker", str)() == "x":
+            shown.set(markeredgecolor="black")
 
 
 def draw_hall(axes: Axes, hall: Hall) -> None:
@@ -133,7 +134,8 @@ def draw_beacons(
             label=label,
         )
     axes.scatter(
-        *places.T,
+        places[:, 0],
+        places[:, 1],
         s=45,
         marker="^",
         c="red",
@@ -144,7 +146,8 @@ def draw_beacons(
     )
     if marked is not None:
         axes.scatter(
-            *marked.position_world[:2],
+            float(marked.position_world[0]),
+            float(marked.position_world[1]),
             s=220,
             marker="*",
             c="red",
@@ -162,7 +165,7 @@ def draw_labels(axes: Axes, places: Array, texts: Sequence[str], middle: Array) 
     """Write a text at each place, towards the outside, moved until none is on another."""
     figure = axes.figure
     figure.canvas.draw()  # lays out the axes, so that the sizes of texts are known
-    taken: list[Array] = []
+    used: list[Array] = []
     for place, text in zip(places, texts, strict=True):
         up = place[1] >= middle[1]
         best = None
@@ -184,10 +187,10 @@ def draw_labels(axes: Axes, places: Array, texts: Sequence[str], middle: Array) 
                     else None,
                 )
                 box = note.get_window_extent().get_points()
-                if all(np.any(box[1] < t[0]) or np.any(t[1] < box[0]) for t in taken):
+                if all(np.any(box[1] < t[0]) or np.any(t[1] < box[0]) for t in used):
                     best = box
                     break
                 note.remove()
             if best is not None:
-                taken.append(best)
+                used.append(best)
                 break

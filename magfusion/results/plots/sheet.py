@@ -61,7 +61,7 @@ def write_sheet(
         for figure in _plans(site, hall, marks_world, title):
             pages.savefig(figure)
         beacons = [_beacon_row(beacon) for beacon in site.beacons]
-        tables = [
+        tables: list[tuple[str, Sequence[str], list[tuple[str, ...]]]] = [
             (
                 f"Beacons: coordinates, axes and moments; tolerances are {TOLERANCE:g} sigmas",
                 _BEACON_COLUMNS,
@@ -170,7 +170,9 @@ def _plan(
     }
     if inside:
         places = np.array([place[:2] for place in inside.values()])
-        axes.scatter(*places.T, s=22, marker="+", c="tab:blue", linewidths=0.9, label="mark")
+        axes.scatter(
+            places[:, 0], places[:, 1], s=22, marker="+", c="tab:blue", linewidths=0.9, label="mark"
+        )
         for name, place in zip(inside, places, strict=True):
             if scale <= DETAILED:
                 axes.annotate(

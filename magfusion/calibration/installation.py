@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from magfusion.calibration.marked_snapshots import MarkedSnapshots
 from magfusion.estimation.integrity.field_snapshots import (
     OF_SURVEY,
     JointEstimate,
     is_significant,
     wide_blocks,
 )
-from magfusion.estimation.integrity.marked_snapshots import MarkedSnapshots
 from magfusion.model.parameters import (
     BEACON_POSITION,
     BEACON_ROTATION,
@@ -110,7 +110,8 @@ class _Released:
 
 def check_installation(marked: MarkedSnapshots) -> InstallationCheck:
     """Test each beacon of a site by fields at known marks and check distances."""
-    declared, released = marked, ()
+    declared = marked
+    released: tuple[str, ...] = ()
     poses = marked.initial_poses()
     sizes = sum(len(p.sigma(marked.site, marked.site.beacons[0].name)) for p, _ in WIDE)
     freedom = marked.freedom + 3.0 * len(marked.samples) + len(marked.distances)
@@ -128,12 +129,12 @@ def check_installation(marked: MarkedSnapshots) -> InstallationCheck:
             break
         check = _check_of(declared, worst)
         named[worst.name] = replace(check, contradicted=True, faults=_faults(declared, check))
-        found = worst.estimate.calibration
-        marked = replace(marked, calibration=found)
+        refined = worst.estimate.calibration
         # Other beacons stay as declared: only what was released has moved for good.
         others = {b.name: b for b in declared.site.beacons if b.name not in named}
-        beacons = tuple(others.get(b.name, b) for b in found.site.beacons)
-        marked = marked.of(replace(declared.site, beacons=beacons))
+        beacons = tuple(others.get(b.name, b) for b in refined.site.beacons)
+        site = replace(declared.site, beacons=beacons)
+        marked = replace(marked, calibration=replace(refined, site=site))
         released = (*released, worst.name)
         poses = worst.estimate.turn, worst.estimate.place
     every = named | {name: _check_of(declared, fit) for name, fit in fits.items()}
@@ -182,7 +183,7 @@ def _polarities(
 def _check_of(declared: MarkedSnapshots, fit: _Released) -> BeaconCheck:
     cov = np.linalg.inv(fit.information)
     start = 6 * len(fit.estimate.turn)
-    found = fit.estimate.calibration
+    refined = fit.estimate.calibration
 
     def of(parameter: Parameter) -> tuple[Array, Array]:
         block = next(b for b in fit.blocks if b.parameter == parameter and b.owner == fit.name)
@@ -191,7 +192,7 @@ def _check_of(declared: MarkedSnapshots, fit: _Released) -> BeaconCheck:
         before = declared.calibration
         if fit.polarity < 0.0 and parameter == LOG_MOMENT:
             before = declared.of(_reversed(before.site, fit.name)).calibration
-        return parameter.difference(before, found, fit.name), sigma
+        return parameter.difference(before, refined, fit.name), sigma
 
     step, step_sigma = of(BEACON_POSITION)
     rotation, rotation_sigma = of(BEACON_ROTATION)

@@ -11,7 +11,7 @@ from magfusion.estimation.integrity.field_snapshots import JointEstimate, Snapsh
 from magfusion.estimation.solve.batched import NormalEquations
 from magfusion.model.check_distance import CheckDistance
 from magfusion.model.parameters import BEACON_POSITION, Block, predict_channels
-from magfusion.units import Array
+from magfusion.units import Array, ComplexArray
 
 HEADINGS = 36  # initial headings that are compared
 DETECTED = 10.0  # signal to noise from which a beacon decides on the heading
@@ -78,7 +78,7 @@ class MarkedSnapshots(Snapshots):
     def _noise_power(self) -> Array:
         return np.asarray(np.nan_to_num(np.trace(self.samples.phasor_cov, axis1=-2, axis2=-1)))
 
-    def _phasors(self, turn: Array, place: Array) -> tuple[Array, Array, Array]:
+    def _phasors(self, turn: Array, place: Array) -> tuple[ComplexArray, ComplexArray, Array]:
         expected = predict_channels(self.calibration, self.samples.time, turn, place)
         measured = self.samples.phasor_sensor
         valid = np.all(np.isfinite(measured), axis=2)
