@@ -58,6 +58,8 @@ MOMENT = 20.0  # A m^2: received up to some 15 m
 NOISE = 3e-10  # T; of each part of a phasor
 DURATION = 8.0  # s, of a drive
 PART = 4.0  # m, half the side of the part of the hall that a log covers
+# Centres (m) of the parts, shape (16, 2).
+PARTS = np.stack(np.meshgrid(np.linspace(4.0, 62.0, 8), [6.0, 18.0]), axis=-1).reshape(-1, 2)
 BEGIN = datetime(2025, 1, 1, tzinfo=timezone.utc).timestamp()  # noqa: UP017
 DAY, DAYS = 86400.0, 365.0  # s; of the year
 CHANGED_BETWEEN = (45.0, 320.0)  # days
@@ -224,8 +226,10 @@ def main() -> None:
     """Print what was found; end with one JSON line."""
     parser = scenario_parser(__doc__, seed=0, output=None, parallel=True)
     parser.add_argument("--logs", type=int, default=100, help="of them all")
-    parser.add_argument("--real", type=int, default=24, help="simulated as drives, and smoothed")
+    parser.add_argument("--real", type=int, default=16, help="simulated as drives, and smoothed")
     options = parser.parse_args()
+    if options.real < len(PARTS):
+        parser.error(f"--real must be at least {len(PARTS)}, to cover the hall")
     scale = chosen_scale(options)
     rng = np.random.default_rng(options.seed)
     site = surveyed(rng)
@@ -253,7 +257,7 @@ def main() -> None:
         vehicle[:VEHICLES] = np.arange(VEHICLES)
         drives = []
         for i in range(real):
-            centre = np.array([PART + (i % 8) / 7.0 * (66.0 - 2.0 * PART), (6.0, 18.0)[i // 8 % 2]])
+            centre = PARTS[i % len(PARTS)]
             now = at_day(vehicles[vehicle[i]], changes, days[i])
             drives.append(Drive(now, place / f"log{i}", days[i], centre))
         hands.run(driven, drives, seed=1)
@@ -270,14 +274,14 @@ def main() -> None:
             stored = load_information(like.information(0))
             assert stored.blocks is not None
             v, names = int(vehicle[i]), stored.blocks.shared
-            own = plain.platforms[v].shared
-            truth = truth_of(own, at_day(vehicles[v], changes, days[i]), names)
-            local = local_shared(own, names)
+            of_vehicle = plain.platforms[v].shared
+            truth = truth_of(of_vehicle, at_day(vehicles[v], changes, days[i]), names)
+            local = local_shared(of_vehicle, names)
             kept = like.kept.with_stem(f"simulated{i}")
             tasks.append(SimulatedLog(kept.stem, jobs[v], SETTINGS, kept, like.key, v))
             blocks = LogBlocks(BEGIN + DAY * days[i], v, names, stored.blocks.considered)
-            known = drawn(stored.information, local, truth, rng)
-            save_information(tasks[-1].information(0), known, blocks)
+            drawn_log = drawn(stored.information, local, truth, rng)
+            save_information(tasks[-1].information(0), drawn_log, blocks)
         driver = Driver(Metered(hands.executor), tasks, files, quiet)
         began = time.perf_counter()
         driver, found = driver.with_changes()
