@@ -2,11 +2,11 @@
 
 A hall of 60 beacons, roughly surveyed, is driven through by three vehicles, each with its own
 magnetometer: 100 logs at random dates of a year, each in one part of the hall.  Two beacons are
-exchanged (other moments, the attitude within the survey's sigma), and one is moved; nobody tells.
-Some logs are real: simulated drives, smoothed with the survey, those after a change as well.  The
-others are simulated in condensed form: each has the information of a real one, at another date and
-by another vehicle, and a calibration drawn from it.  Search for changes, rounds, and report are
-those of ``magfusion calibrate log --calendar``.
+exchanged (other moments, the attitude within the survey's sigma), and one is moved; the site does
+not declare it.  Some logs are real: simulated drives, smoothed with the survey, those after a
+change as well.  The others are simulated in condensed form: each has the information of a real one,
+at another date and by another vehicle, and a calibration drawn from it.  Search for changes, rounds
+and report are those of ``magfusion calibrate log --calendar``.
 
 1. Which changes are found, and between which dates?
 2. How far is the common survey from the truth, in its declared sigmas, but for its common place?
@@ -122,16 +122,16 @@ def events(true: Site, rng: np.random.Generator) -> list[Event]:
         if cause == "moved":
             way = rng.standard_normal(3)
             axis = rng.standard_normal(3)
-            turned = Rotation.from_rotvec(MOVED_DEG * DEGREE * axis / np.linalg.norm(axis))
+            rotation = Rotation.from_rotvec(MOVED_DEG * DEGREE * axis / np.linalg.norm(axis))
             new = replace(
                 old,
                 position_world=old.position_world + MOVED_M * way / np.linalg.norm(way),
-                world_from_beacon=old.world_from_beacon @ turned.as_matrix(),
+                world_from_beacon=old.world_from_beacon @ rotation.as_matrix(),
             )
         else:
             change = rng.uniform(*EXCHANGED, 2) * rng.choice([-1.0, 1.0])
-            turned = Rotation.from_rotvec(0.5 * DEGREE * rng.standard_normal(3))
-            rotated = replace(old, world_from_beacon=old.world_from_beacon @ turned.as_matrix())
+            rotation = Rotation.from_rotvec(0.5 * DEGREE * rng.standard_normal(3))
+            rotated = replace(old, world_from_beacon=old.world_from_beacon @ rotation.as_matrix())
             new = scaled(rotated, np.exp(change))
         out.append(Event(float(day), str(cause), new))
     return out
@@ -284,7 +284,7 @@ def main() -> None:
             save_information(tasks[-1].information(0), drawn_log, blocks)
         driver = Driver(Metered(hands.executor), tasks, files, quiet)
         began = time.perf_counter()
-        driver, found = driver.with_changes()
+        driver, detected = driver.with_changes()
         search_s = time.perf_counter() - began
         sums = driver.first_sums()
         disagree = driver.agreement(sums)
@@ -293,7 +293,7 @@ def main() -> None:
         rounds_s = time.perf_counter() - began
         months = driver.months(sums)
     known, calendar = sums.known, driver.calendar
-    reports = [describe_change(one, calendar, known) for one in found]
+    reports = [describe_change(one, calendar, known) for one in detected]
     figures = {"logs": options.logs, "real": real, "failed": failed, "rounds": sums.rounds}
     figures |= {"moved_sigma": moved, "rows_by_month": len(months)}
     figures |= of_changes(reports, changes) | of_survey(calendar, known, vehicles, changes)

@@ -57,16 +57,16 @@ class Shared:
 
     def after(self, at: Array, step: Array) -> Array:
         """Return the step from the declared calibration after another step from ``at``."""
-        result, turned = at + step, self._rotations
-        first, second = (Rotation.from_rotvec(each[turned]) for each in (at, step))
-        result[turned] = (first * second).as_rotvec()
+        result, columns = at + step, self._rotations
+        first, second = (Rotation.from_rotvec(each[columns]) for each in (at, step))
+        result[columns] = (first * second).as_rotvec()
         return np.asarray(result)
 
     def between(self, before: Array, after: Array) -> Array:
         """Return the step from one calibration to another: the inverse of `after`."""
-        result, turned = after - before, self._rotations
-        first, second = (Rotation.from_rotvec(each[turned]) for each in (before, after))
-        result[turned] = (first.inv() * second).as_rotvec()
+        result, columns = after - before, self._rotations
+        first, second = (Rotation.from_rotvec(each[columns]) for each in (before, after))
+        result[columns] = (first.inv() * second).as_rotvec()
         return np.asarray(result)
 
 

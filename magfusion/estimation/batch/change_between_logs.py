@@ -21,8 +21,13 @@ from magfusion.estimation.batch.joint import (
     known_by,
     total_information,
 )
-from magfusion.estimation.data_checks.statistics import TEST_BUDGET, holm, log_p_chi_square
-from magfusion.estimation.integrity.priors_of_log import MIN_INFORMATION_RATIO, TOLERATED
+from magfusion.estimation.data_checks.statistics import (
+    MIN_INFORMATION_RATIO,
+    TEST_BUDGET,
+    TOLERATED,
+    holm,
+    log_p_chi_square,
+)
 from magfusion.estimation.posterior.marginalized_log import MarginalizedLog
 from magfusion.model.parameters import Block, prior_sigma
 from magfusion.units import Array, IntArray
@@ -89,8 +94,8 @@ def find_changes(
     at : callable
         Returns the linearisation point of a calendar's parameters, from the declared.
     """
-    found: list[FoundChange] = []
-    while len(found) < MAX_CHANGES:
+    accepted: list[FoundChange] = []
+    while len(accepted) < MAX_CHANGES:
         tests = change_tests(calendar, logs, load, at(calendar))
         significant = holm([test.log_p for test in tests], TEST_BUDGET)
         informative = [
@@ -101,10 +106,10 @@ def find_changes(
         if not informative:
             break
         best = min(informative, key=lambda test: test.log_p)
-        one = _found(calendar, logs, best, tests)
-        found.append(one)
+        one = _accepted(calendar, logs, best, tests)
+        accepted.append(one)
         calendar = replace(calendar, changes=(*calendar.changes, one.change))
-    return found
+    return accepted
 
 
 def change_tests(
@@ -290,7 +295,7 @@ def _score_test(score: _Score) -> tuple[float, int] | None:
     return float(projected @ np.linalg.solve(cov, projected)), determined.shape[1]
 
 
-def _found(
+def _accepted(
     calendar: Calendar, logs: Sequence[LogBlocks], best: ChangeTest, tests: list[ChangeTest]
 ) -> FoundChange:
     """Return the accepted change, with the times between which it lies."""
