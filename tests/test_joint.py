@@ -202,8 +202,8 @@ class AllLogs:
         return graph.moved(estimate, change)
 
 
-def in_one_graph(together: Together) -> list[GraphEstimate]:
-    """Return the solution of one graph of all logs, after comparing its calibration."""
+def test_the_joint_solution_is_that_of_one_graph_of_all_logs(together: Together) -> None:
+    """To a millionth of a sigma, from the solutions of the logs alone."""
     whole = AllLogs(together.shared, [done.graph for done in together.rounds])
     first = together.alone[0].calibration
     # One calibration of the site, beside what each log has of its own.
@@ -221,20 +221,6 @@ def in_one_graph(together: Together) -> list[GraphEstimate]:
     assert apart_in_sigmas(together.known.step, there, together.known.cov) < 1e-6
     alone = step_to(together.shared, first)
     assert apart_in_sigmas(alone, there, together.known.cov) > 0.1
-    return estimates
-
-
-@pytest.mark.slow
-def test_twenty_logs_are_one_graph_of_them_all() -> None:
-    """Short ones, of four beacons: to a millionth of a sigma."""
-    site = surveyed()
-    true = perturb_site(site, np.random.default_rng(6))
-    in_one_graph(refined(site, true, [log_of(true, which, 1.4) for which in range(20)], 12))
-
-
-def test_the_joint_solution_is_that_of_one_graph_of_all_logs(together: Together) -> None:
-    """To a millionth of a sigma, from the solutions of the logs alone."""
-    estimates = in_one_graph(together)
     for which, estimate in enumerate(estimates):
         done, blocks = together.rounds[which], together.alone[which].blocks
         cov = joint_posterior(together.kept[which], done, blocks).states.pose_cov
