@@ -2,11 +2,11 @@
 
 A hall of 60 beacons, roughly surveyed, is driven through by three vehicles, each with its own
 magnetometer: 100 logs at random dates of a year, each in one part of the hall.  Two beacons are
-exchanged (other moments, the attitude within the survey's sigma), and one is moved; nobody tells.
-Some logs are real: simulated drives, smoothed with the survey, those after a change as well.  The
-others are simulated in condensed form: each has the information of a real one, at another date and
-by another vehicle, and a calibration drawn from it.  Search for changes, rounds, and report are
-those of ``magfusion calibrate log --calendar``.
+exchanged (other moments, the attitude within the survey's sigma), and one is moved; the site does
+not declare it.  Some logs are real: simulated drives, smoothed with the survey, those after a
+change as well.  The others are simulated in condensed form: each has the information of a real one,
+at another date and by another vehicle, and a calibration drawn from it.  Search for changes, rounds
+and report are those of ``magfusion calibrate log --calendar``.
 
 1. Which changes are found, and between which dates?
 2. How far is the common survey from the truth, in its declared sigmas, but for its common place?
@@ -58,6 +58,8 @@ MOMENT = 20.0  # A m^2: received up to some 15 m
 NOISE = 3e-10  # T; of each part of a phasor
 DURATION = 8.0  # s, of a drive
 PART = 4.0  # m, half the side of the part of the hall that a log covers
+# Centres (m) of the parts, shape (16, 2).
+PARTS = np.stack(np.meshgrid(np.linspace(4.0, 62.0, 8), [6.0, 18.0]), axis=-1).reshape(-1, 2)
 BEGIN = datetime(2025, 1, 1, tzinfo=timezone.utc).timestamp()  # noqa: UP017
 DAY, DAYS = 86400.0, 365.0  # s; of the year
 CHANGED_BETWEEN = (45.0, 320.0)  # days
@@ -120,16 +122,16 @@ def events(true: Site, rng: np.random.Generator) -> list[Event]:
         if cause == "moved":
             way = rng.standard_normal(3)
             axis = rng.standard_normal(3)
-            turned = Rotation.from_rotvec(MOVED_DEG * DEGREE * axis / np.linalg.norm(axis))
+            rotation = Rotation.from_rotvec(MOVED_DEG * DEGREE * axis / np.linalg.norm(axis))
             new = replace(
                 old,
                 position_world=old.position_world + MOVED_M * way / np.linalg.norm(way),
-                world_from_beacon=old.world_from_beacon @ turned.as_matrix(),
+                world_from_beacon=old.world_from_beacon @ rotation.as_matrix(),
             )
         else:
             change = rng.uniform(*EXCHANGED, 2) * rng.choice([-1.0, 1.0])
-            turned = Rotation.from_rotvec(0.5 * DEGREE * rng.standard_normal(3))
-            rotated = replace(old, world_from_beacon=old.world_from_beacon @ turned.as_matrix())
+            rotation = Rotation.from_rotvec(0.5 * DEGREE * rng.standard_normal(3))
+            rotated = replace(old, world_from_beacon=old.world_from_beacon @ rotation.as_matrix())
             new = scaled(rotated, np.exp(change))
         out.append(Event(float(day), str(cause), new))
     return out
@@ -224,8 +226,10 @@ def main() -> None:
     """Print what was found; end with one JSON line."""
     parser = scenario_parser(__doc__, seed=0, output=None, parallel=True)
     parser.add_argument("--logs", type=int, default=100, help="of them all")
-    parser.add_argument("--real", type=int, default=24, help="simulated as drives, and smoothed")
+    parser.add_argument("--real", type=int, default=16, help="simulated as drives, and smoothed")
     options = parser.parse_args()
+    if options.real < len(PARTS):
+        parser.error(f"--real must be at least {len(PARTS)}, to cover the hall")
     scale = chosen_scale(options)
     rng = np.random.default_rng(options.seed)
     site = surveyed(rng)
@@ -253,7 +257,7 @@ def main() -> None:
         vehicle[:VEHICLES] = np.arange(VEHICLES)
         drives = []
         for i in range(real):
-            centre = np.array([PART + (i % 8) / 7.0 * (66.0 - 2.0 * PART), (6.0, 18.0)[i // 8 % 2]])
+            centre = PARTS[i % len(PARTS)]
             now = at_day(vehicles[vehicle[i]], changes, days[i])
             drives.append(Drive(now, place / f"log{i}", days[i], centre))
         hands.run(driven, drives, seed=1)
@@ -270,17 +274,17 @@ def main() -> None:
             stored = load_information(like.information(0))
             assert stored.blocks is not None
             v, names = int(vehicle[i]), stored.blocks.shared
-            own = plain.platforms[v].shared
-            truth = truth_of(own, at_day(vehicles[v], changes, days[i]), names)
-            local = local_shared(own, names)
+            of_vehicle = plain.platforms[v].shared
+            truth = truth_of(of_vehicle, at_day(vehicles[v], changes, days[i]), names)
+            local = local_shared(of_vehicle, names)
             kept = like.kept.with_stem(f"simulated{i}")
             tasks.append(SimulatedLog(kept.stem, jobs[v], SETTINGS, kept, like.key, v))
             blocks = LogBlocks(BEGIN + DAY * days[i], v, names, stored.blocks.considered)
-            known = drawn(stored.information, local, truth, rng)
-            save_information(tasks[-1].information(0), known, blocks)
+            drawn_log = drawn(stored.information, local, truth, rng)
+            save_information(tasks[-1].information(0), drawn_log, blocks)
         driver = Driver(Metered(hands.executor), tasks, files, quiet)
         began = time.perf_counter()
-        driver, found = driver.with_changes()
+        driver, detected = driver.with_changes()
         search_s = time.perf_counter() - began
         sums = driver.first_sums()
         disagree = driver.agreement(sums)
@@ -289,7 +293,7 @@ def main() -> None:
         rounds_s = time.perf_counter() - began
         months = driver.months(sums)
     known, calendar = sums.known, driver.calendar
-    reports = [describe_change(one, calendar, known) for one in found]
+    reports = [describe_change(one, calendar, known) for one in detected]
     figures = {"logs": options.logs, "real": real, "failed": failed, "rounds": sums.rounds}
     figures |= {"moved_sigma": moved, "rows_by_month": len(months)}
     figures |= of_changes(reports, changes) | of_survey(calendar, known, vehicles, changes)

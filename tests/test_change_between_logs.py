@@ -13,13 +13,13 @@ from magfusion.estimation.batch.calendar import (
     SiteChange,
     names_of,
 )
+from magfusion.estimation.batch.change_between_logs import find_changes, period_tests
 from magfusion.estimation.batch.joint import (
     LogInformation,
     apart_in_sigmas,
     known_by,
     total_information,
 )
-from magfusion.estimation.integrity.change_between_logs import find_changes, period_tests
 from magfusion.estimation.posterior.marginalized_log import MarginalizedLog
 from magfusion.jobs.joint_calendar import describe_change
 from magfusion.jobs.joint_tasks import considered_of, shared_of, together_settings

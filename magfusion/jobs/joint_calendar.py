@@ -11,14 +11,14 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.calendar import Calendar, LogBlocks
-from magfusion.estimation.batch.joint import LogInformation, SharedCalibration
-from magfusion.estimation.data_checks.statistics import log_p_chi_square, sigmas
-from magfusion.estimation.integrity.change_between_logs import (
+from magfusion.estimation.batch.change_between_logs import (
     FoundChange,
     PeriodTest,
     find_changes,
     period_tests,
 )
+from magfusion.estimation.batch.joint import LogInformation, SharedCalibration
+from magfusion.estimation.data_checks.statistics import log_p_chi_square, sigmas
 from magfusion.jobs.joint_kept import load_information
 from magfusion.jobs.joint_tasks import SiteFiles
 from magfusion.model.parameters import (
@@ -188,7 +188,7 @@ class ChangeReport(NamedTuple):
 
 
 def describe_change(
-    found: FoundChange, calendar: Calendar, known: SharedCalibration
+    detected: FoundChange, calendar: Calendar, known: SharedCalibration
 ) -> ChangeReport:
     """Return the cause and the size of a change.
 
@@ -197,18 +197,18 @@ def describe_change(
     known : SharedCalibration
         Of the parameters of all logs.
     """
-    change, blocks = found.change, calendar.shared.blocks
+    change, blocks = detected.change, calendar.shared.blocks
     row: dict[str, Any] = {
-        "owner": found.test.owner,
-        "after": str(_date(found.between[0])),
-        "before": str(_date(found.between[1])),
-        "chi_square": found.test.chi_square,
-        "freedom": found.test.freedom,
+        "owner": detected.test.owner,
+        "after": str(_date(detected.between[0])),
+        "before": str(_date(detected.between[1])),
+        "chi_square": detected.test.chi_square,
+        "freedom": detected.test.freedom,
     }
     by_name = {(b.parameter, b.owner): b.columns for b in blocks}
     cause, honest = "changed", known.honest
     for parameter, key, unit in _CHANGED:
-        new, old = (by_name.get((parameter, owner)) for owner in (change.name, found.test.owner))
+        new, old = (by_name.get((parameter, owner)) for owner in (change.name, detected.test.owner))
         if new is None or old is None:
             continue
         step = known.step[new] - known.step[old]

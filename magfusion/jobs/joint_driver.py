@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from magfusion.estimation.batch.calendar import Calendar
+from magfusion.estimation.batch.change_between_logs import FoundChange
 from magfusion.estimation.batch.joint import SharedCalibration, apart_in_sigmas, known_by
-from magfusion.estimation.integrity.change_between_logs import FoundChange
 from magfusion.estimation.integrity.logs_agree import Deviation, LogAgreement, agreement
 from magfusion.jobs.joint_calendar import CalendarTask, by_month, mean_step, search_changes
 from magfusion.jobs.joint_tasks import (

@@ -77,16 +77,16 @@ def save_information(
     path: Path, information: LogInformation, blocks: LogBlocks | None = None
 ) -> None:
     """Write the information of one log, or of several, on the shared calibration."""
-    arrays = {"step": information.step, **vars(information.part)}
-    facts = {"logs": information.logs, "blocks": blocks}
-    save_kept(path, "", StoredArrays(arrays, facts))
+    logs = np.broadcast_to(information.logs, information.step.shape)
+    arrays = {"step": information.step, "logs": logs, **vars(information.part)}
+    save_kept(path, "", StoredArrays(arrays, {"blocks": blocks}))
 
 
 def load_information(path: Path) -> StoredInformation:
     """Return the information of one log, or of several, on the shared calibration."""
     arrays, facts = written_by_worker(path, load_kept(path, ""))
-    part = MarginalizedLog(**{k: v for k, v in arrays.items() if k != "step"})
-    information = LogInformation(arrays["step"], part, facts["logs"])
+    part = MarginalizedLog(**{k: v for k, v in arrays.items() if k not in ("step", "logs")})
+    information = LogInformation(arrays["step"], part, arrays["logs"])
     if facts["blocks"] is None:
         return StoredInformation(information, None)
     time, platform, *names = facts["blocks"]

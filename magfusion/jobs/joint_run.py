@@ -14,10 +14,10 @@ from typing import Any
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.batch.batch import SmootherSettings
 from magfusion.estimation.batch.calendar import Calendar
+from magfusion.estimation.batch.change_between_logs import FoundChange
 from magfusion.estimation.batch.joint import (
     SharedCalibration,
 )
-from magfusion.estimation.integrity.change_between_logs import FoundChange
 from magfusion.estimation.integrity.logs_agree import LogAgreement
 from magfusion.estimation.posterior.noise_tuning import Tuned
 from magfusion.files.atomic import real

@@ -57,16 +57,16 @@ class Shared:
 
     def after(self, at: Array, step: Array) -> Array:
         """Return the step from the declared calibration after another step from ``at``."""
-        result, turned = at + step, self._rotations
-        first, second = (Rotation.from_rotvec(each[turned]) for each in (at, step))
-        result[turned] = (first * second).as_rotvec()
+        result, columns = at + step, self._rotations
+        first, second = (Rotation.from_rotvec(each[columns]) for each in (at, step))
+        result[columns] = (first * second).as_rotvec()
         return np.asarray(result)
 
     def between(self, before: Array, after: Array) -> Array:
         """Return the step from one calibration to another: the inverse of `after`."""
-        result, turned = after - before, self._rotations
-        first, second = (Rotation.from_rotvec(each[turned]) for each in (before, after))
-        result[turned] = (first.inv() * second).as_rotvec()
+        result, columns = after - before, self._rotations
+        first, second = (Rotation.from_rotvec(each[columns]) for each in (before, after))
+        result[columns] = (first.inv() * second).as_rotvec()
         return np.asarray(result)
 
 
@@ -123,13 +123,19 @@ class LogInformation:
     step : ndarray, shape (s,)
         From the declared calibration to the linearisation point.
     part : MarginalizedLog
-    logs : int
-        Number of logs in the sum.
+    logs : float or ndarray, shape (s,)
+        Number of logs in the sum, that have each parameter.
     """
 
     step: Array
     part: MarginalizedLog
-    logs: int = 1
+    logs: Array | float = 1.0
+
+    @property
+    def by_place(self) -> Array:
+        """Covariance of the gradient, as if all logs in one place had met the same iron."""
+        root = np.sqrt(np.broadcast_to(self.logs, self.step.shape))
+        return np.asarray(root[:, None] * self.part.by_place * root)
 
     def among(
         self, size: int, columns: IntArray, common: IntArray, considered: int
@@ -150,7 +156,8 @@ class LogInformation:
             return whole
 
         step, gradient, by_common = np.zeros(size), np.zeros(size), np.zeros((size, considered))
-        step[columns], gradient[columns] = self.step, self.part.gradient
+        logs = np.zeros(size)
+        step[columns], gradient[columns], logs[columns] = self.step, self.part.gradient, self.logs
         by_common[np.ix_(columns, common)] = self.part.by_common
         part = MarginalizedLog(
             spread(self.part.information),
@@ -159,7 +166,7 @@ class LogInformation:
             spread(self.part.by_place),
             spread(self.part.by_log),
         )
-        return LogInformation(step, part, self.logs)
+        return LogInformation(step, part, logs)
 
     def taken_at(self, shared: Shared, step: Array) -> "LogInformation":
         """Return the same information at another linearisation point."""
@@ -209,12 +216,12 @@ def known_by(shared: Shared, logs: LogInformation | None, at: Array) -> SharedCa
     information, gradient = prior.copy(), -prior @ at
     by_common, separate = np.zeros((len(at), 0)), np.zeros_like(prior)
     if logs is not None:
-        total = logs.taken_at(shared, at).part
+        logs = logs.taken_at(shared, at)
+        total = logs.part
         information += total.information
         gradient += total.gradient
         by_common = total.by_common
-        # Logs of one place may have met the same iron: as if all had met the same.
-        separate = logs.logs * total.by_place + total.by_log
+        separate = logs.by_place + total.by_log
     cov = np.linalg.inv(unit[:, None] * information * unit)
     cov = unit[:, None] * (0.5 * (cov + cov.T)) * unit
     step = shared.after(at, cov @ gradient)

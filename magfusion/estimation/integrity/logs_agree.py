@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from magfusion.estimation.batch.joint import LogInformation, Shared, known_by
-from magfusion.estimation.data_checks.statistics import TEST_BUDGET, holm, sigmas
-from magfusion.estimation.integrity.priors_of_log import TOLERATED, distance
+from magfusion.estimation.data_checks.statistics import TEST_BUDGET, TOLERATED, holm, sigmas
+from magfusion.estimation.integrity.priors_of_log import distance
 from magfusion.model.parameters import BeaconParameter
 from magfusion.model.trust import Finding
 from magfusion.units import Array

@@ -4,7 +4,9 @@ import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.data_checks.statistics import (
+    MIN_INFORMATION_RATIO,
     TEST_BUDGET,
+    TOLERATED,
     holm,
     log_p_chi_square,
     sigmas,
@@ -15,10 +17,6 @@ from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
 
-MIN_INFORMATION_RATIO = (
-    0.02  # of the prior's variance; below, a direction has no information from the data
-)
-TOLERATED = 2.0  # chi square per degree of freedom below which sigmas are acceptable
 ABSURD = 50.0  # sigmas of a bias that no sensor has: the data do not match the declaration
 
 

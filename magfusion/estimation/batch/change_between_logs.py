@@ -21,8 +21,13 @@ from magfusion.estimation.batch.joint import (
     known_by,
     total_information,
 )
-from magfusion.estimation.data_checks.statistics import TEST_BUDGET, holm, log_p_chi_square
-from magfusion.estimation.integrity.priors_of_log import MIN_INFORMATION_RATIO, TOLERATED
+from magfusion.estimation.data_checks.statistics import (
+    MIN_INFORMATION_RATIO,
+    TEST_BUDGET,
+    TOLERATED,
+    holm,
+    log_p_chi_square,
+)
 from magfusion.estimation.posterior.marginalized_log import MarginalizedLog
 from magfusion.model.parameters import Block, prior_sigma
 from magfusion.units import Array, IntArray
@@ -45,12 +50,18 @@ class ChangeTest(NamedTuple):
         Among the parameters of all logs.
     after : int
         Number of logs before, in the order of their times.
+    chi_square, freedom : float, int
+        With the errors of parameters that are only considered.
+    likelihood_ratio : float
+        Chi square of white noise alone: its difference between two times is that of the logs in
+        between.
     """
 
     owner: str
     after: int
     chi_square: float
     freedom: int
+    likelihood_ratio: float
 
     @property
     def log_p(self) -> float:
@@ -89,8 +100,8 @@ def find_changes(
     at : callable
         Returns the linearisation point of a calendar's parameters, from the declared.
     """
-    found: list[FoundChange] = []
-    while len(found) < MAX_CHANGES:
+    accepted: list[FoundChange] = []
+    while len(accepted) < MAX_CHANGES:
         tests = change_tests(calendar, logs, load, at(calendar))
         significant = holm([test.log_p for test in tests], TEST_BUDGET)
         informative = [
@@ -101,10 +112,10 @@ def find_changes(
         if not informative:
             break
         best = min(informative, key=lambda test: test.log_p)
-        one = _found(calendar, logs, best, tests)
-        found.append(one)
+        one = _accepted(calendar, logs, best, tests)
+        accepted.append(one)
         calendar = replace(calendar, changes=(*calendar.changes, one.change))
-    return found
+    return accepted
 
 
 def change_tests(
@@ -168,7 +179,7 @@ def period_tests(
             test = _score_test(score)
             if test is not None:
                 change = score.change(known.scale[known.columns[owner]])
-                one_test = PeriodTest(owner, detected[which, owner], *test, *change)
+                one_test = PeriodTest(owner, detected[which, owner], *test[:2], *change)
                 out.setdefault(which, []).append(one_test)
     return out
 
@@ -239,9 +250,7 @@ class _Estimate(NamedTuple):
         information -= gain @ information
         by_later = np.eye(len(scale)) - gain
         # As if all earlier logs had met the same iron, and all later ones another.
-        disturbed = [
-            units * (side.logs * side.part.by_place + side.part.by_log) for side in (before, after)
-        ]
+        disturbed = [units * (side.by_place + side.part.by_log) for side in (before, after)]
         noise = gain @ disturbed[0] @ gain.T + by_later @ disturbed[1] @ by_later.T
         common = by_later @ (scale[:, None] * after.part.by_common)
         common -= gain @ (scale[:, None] * before.part.by_common)
@@ -279,26 +288,31 @@ def columns_by_owner(blocks: Iterable[Block]) -> dict[str, IntArray]:
     return {owner: np.array(own) for owner, own in columns.items()}
 
 
-def _score_test(score: _Score) -> tuple[float, int] | None:
-    """Return chi square and freedom in the directions that the logs determine; None of none."""
+def _score_test(score: _Score) -> tuple[float, int, float] | None:
+    """Return chi square, freedom and likelihood ratio of determined directions; None of none."""
     value, vector = np.linalg.eigh(score.information)
     determined = vector[:, value > MIN_INFORMATION_RATIO]
     if not determined.shape[1]:
         return None
     cov = determined.T @ (score.information + score.noise) @ determined
     projected = determined.T @ score.gradient
-    return float(projected @ np.linalg.solve(cov, projected)), determined.shape[1]
+    square = float(projected @ np.linalg.solve(cov, projected))
+    return (
+        square,
+        len(projected),
+        float(np.sum(projected**2 / value[value > MIN_INFORMATION_RATIO])),
+    )
 
 
-def _found(
+def _accepted(
     calendar: Calendar, logs: Sequence[LogBlocks], best: ChangeTest, tests: list[ChangeTest]
 ) -> FoundChange:
     """Return the accepted change, with the times between which it lies."""
-    likely = {
-        test.after
-        for test in tests
-        if test.owner == best.owner and test.chi_square > best.chi_square - DATE_CHI_SQUARE
-    }
+    own = [test for test in tests if test.owner == best.owner]
+    best = max(own, key=lambda test: test.likelihood_ratio)
+    # Model errors, which reduce chi square, reduce the evidence of the logs in between as well.
+    least = DATE_CHI_SQUARE * max(1.0, best.likelihood_ratio / best.chi_square)
+    likely = {t.after for t in own if t.likelihood_ratio > best.likelihood_ratio - least}
     first = last = best.after
     while first - 1 in likely:
         first -= 1
