@@ -16,8 +16,10 @@ from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 WINDOW = (1600, 1000)  # of the viewer
+SHOT = "shot.png"
 SCREEN = "3400x2200x24"  # the pointer, at its centre, is outside the window
-WIDTH = 1200  # px
+WIDTH = 1200  # px, of the first picture of README
+PAGE_WIDTH = 900  # px, of others
 
 
 class Picture(NamedTuple):
@@ -41,7 +43,9 @@ PICTURES = {
         ".github/readme.png", ("magfusion demo --no-show",), "magfusion_demo/run.rrd"
     ),
     "check": Picture(
-        "docs/screenshots/check.png", _simulated("magfusion check log -o checked"), "checked/check.png"
+        "docs/screenshots/check.png",
+        _simulated("magfusion check log -o checked"),
+        "checked/check.png",
     ),
     "calibrate": Picture(
         "docs/screenshots/calibrate.png",
@@ -80,8 +84,12 @@ def make(picture: Picture) -> Path:
             subprocess.run(command.split(), cwd=directory, check=True)
         built = directory / picture.file
         if built.suffix == ".rrd":
-            built = _screenshot(built, directory / "shot.png")
-        save(built, place)
+            built = _screenshot(built, directory / SHOT)
+        save(
+            built,
+            place,
+            WIDTH if picture.page == "README.md" and built.name == SHOT else PAGE_WIDTH,
+        )
     return place
 
 
@@ -97,12 +105,12 @@ def _screenshot(recording: Path, png: Path) -> Path:
     return png
 
 
-def save(built: Path, place: Path) -> None:
-    """Save a picture with all its colours, no wider than a page."""
+def save(built: Path, place: Path, width: int) -> None:
+    """Save a picture with all its colours, no wider than a page has room."""
     image = Image.open(built).convert("RGB")
-    if image.width > WIDTH:
-        height = round(image.height * WIDTH / image.width)
-        image = image.resize((WIDTH, height), Image.Resampling.LANCZOS)
+    if image.width > 1.2 * width:
+        height = round(image.height * width / image.width)
+        image = image.resize((width, height), Image.Resampling.LANCZOS)
     place.parent.mkdir(parents=True, exist_ok=True)
     image.save(place, optimize=True)
 
