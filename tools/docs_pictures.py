@@ -1,6 +1,7 @@
 """Make the pictures of README and documentation by the commands that they illustrate.
 
-``python tools/docs_pictures.py [NAME ...]``; those of the viewer require xvfb-run.
+``python tools/docs_pictures.py [NAME ...]``; those of the viewer require xvfb-run, those of a
+page chromium.
 """
 
 import argparse
@@ -16,10 +17,11 @@ from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 WINDOW = (1600, 1000)  # of the viewer
+VIEWS = (0.036, 0.971)  # of the height: between the viewer's menu and its time
 SHOT = "shot.png"
 SCREEN = "3400x2200x24"  # the pointer, at its centre, is outside the window
-WIDTH = 1200  # px, of the first picture of README
-PAGE_WIDTH = 900  # px, of others
+PAGE_WINDOW = (1120, 1500)
+WIDTH = 860  # px
 
 
 class Picture(NamedTuple):
@@ -41,6 +43,9 @@ def _simulated(command: str) -> tuple[str, ...]:
 PICTURES = {
     "readme": Picture(
         ".github/readme.png", ("magfusion demo --no-show",), "magfusion_demo/run.rrd"
+    ),
+    "report": Picture(
+        ".github/report.png", _simulated("magfusion smooth log -o run"), "run/report.html"
     ),
     "check": Picture(
         "docs/screenshots/check.png",
@@ -85,11 +90,9 @@ def make(picture: Picture) -> Path:
         built = directory / picture.file
         if built.suffix == ".rrd":
             built = _screenshot(built, directory / SHOT)
-        save(
-            built,
-            place,
-            WIDTH if picture.page == "README.md" and built.name == SHOT else PAGE_WIDTH,
-        )
+        if built.suffix == ".html":
+            built = _page(built, directory / SHOT)
+        save(built, place)
     return place
 
 
@@ -102,10 +105,25 @@ def _screenshot(recording: Path, png: Path) -> Path:
     size = "x".join(map(str, WINDOW))
     display = [screen, "-a", "-s", f"-screen 0 {SCREEN}"]
     subprocess.run([*display, *viewer, "--window-size", size], check=True, timeout=300)
+    with Image.open(png) as image:
+        low, high = (round(share * image.height) for share in VIEWS)
+        image.crop((0, low, image.width, high)).save(png)
     return png
 
 
-def save(built: Path, place: Path, width: int) -> None:
+def _page(page: Path, png: Path) -> Path:
+    """Return the head of a page as a browser shows it."""
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        raise SystemExit("chromium is not installed; install it for pictures of pages")
+    size = ",".join(map(str, PAGE_WINDOW))
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+    shot = [f"--window-size={size}", f"--screenshot={png}", page.resolve().as_uri()]
+    subprocess.run([browser, *options, *shot], check=True, timeout=300)
+    return png
+
+
+def save(built: Path, place: Path, width: int = WIDTH) -> None:
     """Save a picture with all its colours, no wider than a page has room."""
     image = Image.open(built).convert("RGB")
     if image.width > 1.2 * width:

@@ -20,6 +20,7 @@ th,td{padding:3px 14px 3px 0;text-align:left;vertical-align:top;border-bottom:1p
 th{font-weight:600;color:#48525f}td.n,th.n{text-align:right}
 tr.far td{background:#fff6dd}
 .wide{overflow-x:auto}
+.charts>.wide{max-width:100%;padding-right:30px}
 .charts{display:flex;flex-wrap:wrap;gap:14px 10px;align-items:flex-start}
 figure{margin:0}figure img{max-width:100%;height:auto}
 figcaption{font-size:12px;color:#48525f;padding-left:62px}
