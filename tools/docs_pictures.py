@@ -60,7 +60,7 @@ PICTURES = {
     "drift": Picture(
         "docs/screenshots/drift.png",
         ("magfusion drift --hours 2 --estimator both -o drift",),
-        "drift/drift.png",
+        "drift/stability.png",
     ),
     "tracker": Picture(
         "docs/screenshots/tracker.png",

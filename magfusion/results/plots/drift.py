@@ -133,8 +133,10 @@ def _draw_allan(axes: Axes, course: EstimatorPlot) -> None:
             axes.loglog(result.tau / HOUR, deviation, label=label)
     axes.set_title("Allan deviation of each error; a drift makes it rise to the right", fontsize=9)
     axes.set(xlabel="averaged over (h)", ylabel="in the units of the legend")
+    axes.set_ylim(top=30.0 * axes.get_ylim()[1])  # room for the legend
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=7)
+    axes.legend(fontsize=7, ncols=4, loc="upper right")
 
 
 def _draw_pace(axes: Axes, course: EstimatorPlot) -> None:
