@@ -15,7 +15,7 @@ TIMELINE = "time"  # seconds since the log's epoch
 MAX_ROWS = 5000  # of each series: more than a screen can show
 SIGMA = (150, 150, 160)
 AXES = {"x": (235, 85, 85), "y": (90, 200, 90), "z": (95, 145, 255)}
-# Apart from each other also for colour-blind readers, and from the axes' red, green and blue.
+# Distinct also for colour-blind readers, and from the axes' red, green and blue.
 _BEACONS = ((245, 150, 30), (190, 120, 255), (40, 205, 190), (245, 232, 80), (255, 140, 190))
 
 

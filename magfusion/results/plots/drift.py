@@ -93,9 +93,10 @@ def write_stability(path: Path, courses: list[EstimatorPlot]) -> None:
 def _draw_length(axes: Axes, course: EstimatorPlot, quantity: Quantity) -> None:
     time = np.concatenate([w.time for w in course.worlds])
     length = quantity.scale * np.concatenate([w.size(quantity.part) for w in course.worlds])
+    width = 0.3 if len(course.worlds) > 3 else 0.9  # few worlds leave room for their lines
     for world in course.worlds:
         own = quantity.scale * world.size(quantity.part)
-        axes.plot(world.time / HOUR, own, linewidth=0.3, color="0.7")
+        axes.plot(world.time / HOUR, own, linewidth=width, color="0.6")
     edges = HOUR * np.arange(np.ceil(time.max() / HOUR) + 1)
     middle = 0.5 * (edges[1:] + edges[:-1]) / HOUR
     axes.plot(middle, in_windows(time, length, edges), color="tab:blue", linewidth=2.0)
