@@ -26,7 +26,6 @@ from magfusion.model.parameters import initial_calibration
 from magfusion.model.progress import Report, quiet
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Trust
-from magfusion.results.axes import axis_figures
 from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.rest_figures import rest_figures
 from magfusion.results.verdict import level_figures, trust_figures
@@ -307,6 +306,7 @@ def write_fix_result(
     nearest : Trajectory, optional
         Trajectory compared with the truth, if not that of the best hypotheses.
     """
+    from magfusion.results.axes import axis_figures
     from magfusion.results.page_motion import MotionPage
     from magfusion.results.recording import write_recording
     from magfusion.results.report import compared_with_truth, write_report

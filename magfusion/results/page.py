@@ -186,7 +186,8 @@ def _main(figures: Figures) -> str:
     parts = (axis_rows(figures), errors, transfer)
     tables = [_table(rows) for rows in parts if len(rows) > 1]
     summary = [list(row) for row in summary_rows(figures.of(Section.SUMMARY))]
-    return "".join([*tables, _table([[], *summary]) if summary else ""])
+    content = "".join([*tables, _table([[], *summary]) if summary else ""])
+    return f'<div class="charts">{content}</div>' if content else ""
 
 
 def _calibration(figures: Figures) -> str:

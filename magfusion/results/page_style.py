@@ -16,10 +16,11 @@ code{font-size:12px;color:#5b6675}
 .none{background:#eef1f5;border-color:#8793a3}
 table{border-collapse:collapse;margin:8px 0;font-variant-numeric:tabular-nums}
 th,td{padding:3px 14px 3px 0;text-align:left;vertical-align:top;border-bottom:1px solid #eceff3;
- overflow-wrap:anywhere}
+ overflow-wrap:break-word}
 th{font-weight:600;color:#48525f}td.n,th.n{text-align:right}
 tr.far td{background:#fff6dd}
 .wide{overflow-x:auto}
+.charts>.wide{max-width:100%;padding-right:30px}
 .charts{display:flex;flex-wrap:wrap;gap:14px 10px;align-items:flex-start}
 figure{margin:0}figure img{max-width:100%;height:auto}
 figcaption{font-size:12px;color:#48525f;padding-left:62px}
@@ -42,5 +43,7 @@ svg .name{fill:#1d2530;font-weight:600;paint-order:stroke;stroke:#fff;stroke-wid
 .expected{stroke:#1a7f37;stroke-dasharray:4 3}
 .beacon{fill:#7b3fb0;stroke:#fff}.start{fill:#1a7f37;stroke:#fff}
 details summary{cursor:pointer;color:#1f5fbf}
+@media (max-width:600px){.page{padding:0 12px 24px}th,td{padding-right:9px;font-size:13px}
+ .verdict{padding:10px 12px}figcaption{padding-left:0}}
 @media print{.page{max-width:none}figure,table{break-inside:avoid}}
 """

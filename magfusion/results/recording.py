@@ -279,7 +279,7 @@ def _log_legend(
         lines.append(f"| **blue ellipsoids** | 3-sigma position, {scale.sigma} x as large |")
     lines += [
         "| **arrows, loops** | moments and coils of a beacon |",
-        "| **grid** | 1 m, at height 0 |",
+        f"| **grid** | {scale.grid:g} m, at height 0 |",
         f"| **shells** (hidden) | where a beacon's RMS field is {COVERAGE * 1e9:g} nT |",
     ]
     document = rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
@@ -306,7 +306,7 @@ def scene_view(site: Site, scale: Scale, name: str = "Scene") -> rrb.Spatial3DVi
     return rrb.Spatial3DView(
         origin="world",
         name=name,
-        line_grid=rrb.LineGrid3D(spacing=1.0),
+        line_grid=rrb.LineGrid3D(spacing=scale.grid),
         eye_controls=eye_on(scale),
         overrides={f"{_beacon_place(b.name)}/coverage": hidden for b in site.beacons},
     )

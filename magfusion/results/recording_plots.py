@@ -15,7 +15,8 @@ TIMELINE = "time"  # seconds since the log's epoch
 MAX_ROWS = 5000  # of each series: more than a screen can show
 SIGMA = (150, 150, 160)
 AXES = {"x": (235, 85, 85), "y": (90, 200, 90), "z": (95, 145, 255)}
-_BEACONS = ((240, 165, 30), (205, 115, 220), (245, 100, 60), (240, 228, 66), (30, 190, 165))
+# Distinct also for colour-blind readers, and from the axes' red, green and blue.
+_BEACONS = ((245, 150, 30), (190, 120, 255), (40, 205, 190), (245, 232, 80), (255, 140, 190))
 
 
 def beacon_colour(index: int) -> tuple[int, int, int]:

@@ -9,6 +9,8 @@ from magfusion.model.site import Beacon, Coil, Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
+SMALLEST = 0.1  # m, of a scene: a tracker's
+
 
 class Scale(NamedTuple):
     """Position and size of the scene, and the magnification of sigmas.
@@ -27,12 +29,17 @@ class Scale(NamedTuple):
     size: float
     sigma: int
 
+    @property
+    def grid(self) -> float:
+        """Side of a square of the grid (m): a power of ten, some squares to the scene."""
+        return float(10.0 ** np.floor(np.log10(self.size / 2.5)))
+
 
 def scene_scale(site: Site, trajectory: Trajectory) -> Scale:
     """Return the scale of the scene with the beacons and the path."""
     places = np.vstack([trajectory.position_world, *(b.position_world for b in site.beacons)])
     low, high = places.min(axis=0), places.max(axis=0)
-    size = max(float(np.linalg.norm(high - low)), 1.0)
+    size = max(float(np.linalg.norm(high - low)), SMALLEST)
     magnification = 1
     if trajectory.pose_cov is not None:
         variance = np.trace(trajectory.pose_cov[:, 3:, 3:], axis1=1, axis2=2)

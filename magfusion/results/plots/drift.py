@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from magfusion.calibration.allan import AllanStream
 from magfusion.results.drift import (
@@ -29,7 +30,7 @@ def write_plot(path: Path, courses: list[EstimatorPlot], figures: Mapping[str, o
     for column, course in enumerate(courses):
         for row, quantity in enumerate(QUANTITIES):
             _draw_error(grid[row, column], course, quantity, figures)
-        title = f"{course.name}\n{grid[0, column].get_title()}"
+        title = f"estimator {course.name}, first world\n{grid[0, column].get_title()}"
         grid[0, column].set_title(title, fontsize=9)
         _draw_consistency(grid[-3, column], course)
         _draw_allan(grid[-2, column], course)
@@ -52,21 +53,20 @@ def _draw_error(
     hours = course.errors.time / HOUR
     error = quantity.scale * course.errors.error[:, quantity.part]
     sigma = 3.0 * quantity.scale * np.max(course.errors.sigma[:, quantity.part], axis=1)
-    axes.fill_between(hours, -sigma, sigma, color="0.88", linewidth=0, label="3 sigma")
+    axes.fill_between(hours, -sigma, sigma, color="0.88", linewidth=0, label="3 sigma estimated")
     for name, colour, component in zip("xyz", _AXES, error.T, strict=True):
         axes.plot(hours, component, color=colour, linewidth=0.5, label=name)
     key = f"{course.name}_{quantity.name}"
     slope = figures[f"{key}_slope_{quantity.unit}_per_day"]
     axes.set_title(
-        f"{quantity.name.replace('_', ' ')}: {slope:+.2g} +-"
-        f" {figures[f'{key}_slope_standard_error']:.1g} {quantity.unit} a day,"
-        f" {figures[f'{key}_drift_stability']}",
+        f"{quantity.name.replace('_', ' ')}: drift {slope:+.2g} ±"
+        f" {figures[f'{key}_slope_standard_error']:.1g} {quantity.symbol} a day, bound"
+        f" {quantity.limit:g}: {figures[f'{key}_drift_stability']}",
         fontsize=9,
     )
-    converged = hours >= float(str(figures["settled_after_h"]))
-    shown = np.concatenate([np.abs(error[converged]).ravel(), sigma[converged]])
-    bound = 1.3 * float(np.quantile(shown, 0.999))
-    axes.set(ylabel=f"({quantity.unit})", ylim=(-bound, bound), xlabel="time (h)")
+    bound = 1.05 * float(np.max(np.abs(np.column_stack([error, sigma]))))
+    axes.set(ylabel=f"error ({quantity.symbol})", ylim=(-bound, bound), xlabel="time (h)")
+    axes.axhline(0.0, color="0.5", linewidth=0.6)
     axes.legend(fontsize=7, ncols=4, loc="upper right")
 
 
@@ -93,13 +93,14 @@ def write_stability(path: Path, courses: list[EstimatorPlot]) -> None:
 def _draw_length(axes: Axes, course: EstimatorPlot, quantity: Quantity) -> None:
     time = np.concatenate([w.time for w in course.worlds])
     length = quantity.scale * np.concatenate([w.size(quantity.part) for w in course.worlds])
+    width = 0.3 if len(course.worlds) > 3 else 0.9  # few worlds leave room for their lines
     for world in course.worlds:
         own = quantity.scale * world.size(quantity.part)
-        axes.plot(world.time / HOUR, own, linewidth=0.3, color="0.7")
+        axes.plot(world.time / HOUR, own, linewidth=width, color="0.6")
     edges = HOUR * np.arange(np.ceil(time.max() / HOUR) + 1)
     middle = 0.5 * (edges[1:] + edges[:-1]) / HOUR
     axes.plot(middle, in_windows(time, length, edges), color="tab:blue", linewidth=2.0)
-    axes.set_ylim(0.0, 1.5 * float(np.quantile(length, 0.999)))
+    axes.set_ylim(0.0, 1.05 * float(np.max(length)))
 
 
 def _draw_consistency(axes: Axes, course: EstimatorPlot) -> None:
@@ -108,7 +109,15 @@ def _draw_consistency(axes: Axes, course: EstimatorPlot) -> None:
     for name, level in levels.items():
         axes.plot(hours, level, ".-", markersize=3, linewidth=0.8, label=name)
     axes.axhline(1.0, color="0.5", linewidth=0.8)
-    axes.set(xlabel="time (h)", ylabel="squared, over expected", yscale="log")
+    axes.set_title(
+        "hourly squared errors over their expectation; 1: the sigmas are right", fontsize=9
+    )
+    own = np.concatenate([level[np.isfinite(level)] for level in levels.values()])
+    limits = min(0.3, 0.8 * float(own.min())), max(3.0, 1.25 * float(own.max()))
+    end = float(course.errors.time[-1]) / HOUR
+    axes.set(xlabel="time (h)", ylabel="ratio", yscale="log", ylim=limits, xlim=(0.0, end))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
     axes.legend(fontsize=7, ncols=3)
 
 
@@ -120,18 +129,23 @@ def _draw_allan(axes: Axes, course: EstimatorPlot) -> None:
         stream.add(error)
         result = stream.result(course.interval)
         if len(result.tau):
-            label = f"{quantity.name.replace('_', ' ')} ({quantity.unit})"
+            label = f"{quantity.name.replace('_', ' ')} ({quantity.symbol})"
             deviation = np.sqrt(np.mean(result.variance, axis=1))
             axes.loglog(result.tau / HOUR, deviation, label=label)
-    axes.set(xlabel="averaged over (h)", ylabel="Allan deviation")
+    axes.set_title("Allan deviation of each error; a drift makes it rise to the right", fontsize=9)
+    axes.set(xlabel="averaged over (h)", ylabel="in the units of the legend")
+    axes.set_ylim(top=30.0 * axes.get_ylim()[1])  # room for the legend
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=7)
+    axes.legend(fontsize=7, ncols=4, loc="upper right")
 
 
 def _draw_pace(axes: Axes, course: EstimatorPlot) -> None:
     built = course.pace[course.pace[:, 2] > 0.0]
     axes.plot(built[:, 0] / HOUR, 1e3 * built[:, 1] / built[:, 2], ".", markersize=1, color="0.5")
+    axes.set_title("cost: processor time of an update (dots), memory (line)", fontsize=9)
     axes.set(xlabel="time (h)", ylabel="an update (ms)", yscale="log")
+    axes.yaxis.set_major_formatter("{x:g}")
     other = axes.twinx()
     other.plot(course.pace[:, 0] / HOUR, course.pace[:, 3], color="tab:purple")
     other.set_ylabel("memory (MiB)", color="tab:purple")

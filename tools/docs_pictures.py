@@ -1,0 +1,145 @@
+"""Make the pictures of README and documentation by the commands that they illustrate.
+
+``python tools/docs_pictures.py [NAME ...]``; those of the viewer require xvfb-run, those of a
+page chromium.
+"""
+
+import argparse
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parents[1]
+WINDOW = (1600, 1000)  # of the viewer
+VIEWS = (0.036, 0.971)  # of the height: between the viewer's menu and its time
+SHOT = "shot.png"
+SCREEN = "3400x2200x24"  # the pointer, at its centre, is outside the window
+PAGE_WINDOW = (1120, 1500)
+WIDTH = 860  # px
+
+
+class Picture(NamedTuple):
+    """A picture: its place, the commands that make it, and the file with it in their directory."""
+
+    place: str
+    commands: tuple[str, ...]
+    file: str
+    page: str = "README.md"  # whose sites the commands use
+
+
+def _simulated(command: str) -> tuple[str, ...]:
+    return (
+        "magfusion simulate --site site.yaml -o log --duration 60 --random-field 0.005",
+        command,
+    )
+
+
+PICTURES = {
+    "readme": Picture(
+        ".github/readme.png", ("magfusion demo --no-show",), "magfusion_demo/run.rrd"
+    ),
+    "report": Picture(
+        ".github/report.png", _simulated("magfusion smooth log -o run"), "run/report.html"
+    ),
+    "check": Picture(
+        "docs/screenshots/check.png",
+        _simulated("magfusion check log -o checked"),
+        "checked/check.png",
+    ),
+    "calibrate": Picture(
+        "docs/screenshots/calibrate.png",
+        _simulated("magfusion calibrate log log -o calibration"),
+        "calibration/calibration.png",
+    ),
+    "drift": Picture(
+        "docs/screenshots/drift.png",
+        ("magfusion drift --hours 2 --estimator both -o drift",),
+        "drift/stability.png",
+    ),
+    "tracker": Picture(
+        "docs/screenshots/tracker.png",
+        (
+            "magfusion simulate --site tracker.yaml --no-perturb -o head --duration 9"
+            " --motion turn --box 0.3,0.5,-0.15,0.15,-0.12,0.12 --seed 2",
+            "magfusion navigate head -o tracked --estimator ekf",
+        ),
+        "tracked/run.rrd",
+        "docs/tracker.md",
+    ),
+}
+
+
+def make(picture: Picture) -> Path:
+    """Make a picture in a directory of its own, and return its place."""
+    place = ROOT / picture.place
+    with TemporaryDirectory() as name:
+        directory = Path(name)
+        page = (ROOT / picture.page).read_text(encoding="utf-8")
+        for block in re.findall(r"^```yaml\n(.*?)^```$", page, re.M | re.S):
+            head = re.match(r"# (\S+\.yaml)", block)
+            if head:
+                (directory / head[1]).write_text(block, encoding="utf-8")
+        for command in picture.commands:
+            subprocess.run(command.split(), cwd=directory, check=True)
+        built = directory / picture.file
+        if built.suffix == ".rrd":
+            built = _screenshot(built, directory / SHOT)
+        if built.suffix == ".html":
+            built = _page(built, directory / SHOT)
+        save(built, place)
+    return place
+
+
+def _screenshot(recording: Path, png: Path) -> Path:
+    """Return what the viewer shows of a recording when it opens."""
+    screen = shutil.which("xvfb-run")
+    if screen is None:
+        raise SystemExit("xvfb-run is not installed; install it for pictures of the viewer")
+    viewer = [sys.executable, "-m", "rerun", str(recording), "--screenshot-to", str(png)]
+    size = "x".join(map(str, WINDOW))
+    display = [screen, "-a", "-s", f"-screen 0 {SCREEN}"]
+    subprocess.run([*display, *viewer, "--window-size", size], check=True, timeout=300)
+    with Image.open(png) as image:
+        low, high = (round(share * image.height) for share in VIEWS)
+        image.crop((0, low, image.width, high)).save(png)
+    return png
+
+
+def _page(page: Path, png: Path) -> Path:
+    """Return the head of a page as a browser shows it."""
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        raise SystemExit("chromium is not installed; install it for pictures of pages")
+    size = ",".join(map(str, PAGE_WINDOW))
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+    shot = [f"--window-size={size}", f"--screenshot={png}", page.resolve().as_uri()]
+    subprocess.run([browser, *options, *shot], check=True, timeout=300)
+    return png
+
+
+def save(built: Path, place: Path, width: int = WIDTH) -> None:
+    """Save a picture with all its colours, no wider than a page has room."""
+    image = Image.open(built).convert("RGB")
+    if image.width > 1.2 * width:
+        height = round(image.height * width / image.width)
+        image = image.resize((width, height), Image.Resampling.LANCZOS)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    image.save(place, optimize=True)
+
+
+def main() -> None:
+    """Make those that are named, or all."""
+    parser = argparse.ArgumentParser(description="Make the pictures of README and docs.")
+    parser.add_argument("names", nargs="*", choices=[*PICTURES, []])
+    for name in parser.parse_args().names or PICTURES:
+        print(make(PICTURES[name]))
+
+
+if __name__ == "__main__":
+    main()
