@@ -13,7 +13,7 @@ PASSING_CODES = frozenset(
     {"field_innovations", "field_residuals", "inertial_residuals", "noise_tuned"}
 )
 PASSING_S = 1.0  # from the first to the last state that has such a finding
-SETTLED = 10.0  # times as long without it
+QUIET_FACTOR = 10.0  # times as long without it
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Summary:
         return (
             noted.finding.code in PASSING_CODES
             and lasting <= PASSING_S
-            and self._last - noted.last >= SETTLED * PASSING_S
+            and self._last - noted.last >= QUIET_FACTOR * PASSING_S
         )
 
     @property
