@@ -250,7 +250,8 @@ def _callback(path: str, command: Command) -> Callable[..., None]:
     requested = {field.name: option for field, option in options(command.settings)}
 
     def run(context: typer.Context, **values: Any) -> None:
-        output, level = values.pop("output", None), _level(values)
+        output = values.pop("output", None)
+        level = _level(values) if command.reports else "brief"
         values.pop("overwrite", None)
         if level == "json":
             binary_output()

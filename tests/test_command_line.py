@@ -197,7 +197,7 @@ def _completed(*words: str) -> set[str]:
 
 
 def test_the_shell_completes_commands_options_and_choices() -> None:
-    assert _completed("s") == {"smooth", "survey", "simulate"}
+    assert _completed("s") == {"smooth", "survey", "sheet", "simulate"}
     assert _completed("calibrate", "f") == {"fieldmap"}
     assert _completed("calibrate", "log", "--cross") == {"--cross-validate"}
     assert _completed("smooth", "--coupling", "") == {"tight", "loose"}

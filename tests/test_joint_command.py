@@ -119,7 +119,7 @@ def test_logs_that_cannot_be_refined_together_are_refused(
             replace(site, gravity=site.gravity + 0.001 * which), tmp_path / f"log{which}/site.yaml"
         )
     other = refuse("calibrate", "log", tmp_path / "log0", tmp_path / "log1", *out)
-    assert "share its file: give it with --site" in other
+    assert "share its file but for the platform: give it with --site" in other
     assert "splits one log" in refuse(*command, "--cross-validate", 2)
     assert "nothing to refine together" in refuse(*command, "--estimate", "none")
     assert "nothing to refine together" in refuse(*command, "--estimate", "phase,time-offset")

@@ -14,6 +14,8 @@ def test_a_sheet_has_its_plan_marks_and_distances(
 ) -> None:
     site, place = worked.log / "site.yaml", tmp_path / "sheet"
     run_command("sheet", site, "-o", place)
+    run_command("sheet", site, "-o", place)
+    assert (tmp_path / "sheet.1" / "distances.csv").is_file()  # what was measured is kept
     assert {path.name for path in place.iterdir()} == {
         "distances.csv",
         "report.html",

@@ -310,7 +310,7 @@ def _recorded(path: Path, audio: AudioEntry) -> Counts:
     """Return the count and span of a recording's samples."""
     with open_audio(path) as recording:
         frames = recording.frames
-    true = frames - 1 + sum(lost for _, lost in audio.slips)
+    true = frames - 1 + sum(missing for _, missing in audio.slips)
     last = audio.begin_ns + round(true / audio.rate_hz / NANOSECOND)
     return Counts(read=frames, written=frames, first=audio.begin_ns, last=last)
 

@@ -48,6 +48,8 @@ WRITTEN = {
     "match": {"attitude.parquet", "attitude.png", "report.json"},
     "coverage": {"coverage.parquet", "coverage.png", "run.rrd", "report.json"},
     "design": _SITE
-    | {"coverage.parquet", "design.png", "run.rrd", "report.json"}
+    | {"coverage.parquet", "design.png", "error_budget.png", "run.rrd", "report.json"}
     | {"motion.parquet", "motion.png"},
+    "sheet": _SITE | {"distances.csv", "sheet.pdf", "report.json"},
+    "accept": _SITE | {"report.json", FAILED},
 }

@@ -36,7 +36,7 @@ _NEXT_OF = {
 def is_brief(figures: Figures) -> bool:
     """Return whether a result has a screen of a few lines."""
     has_axes = bool(figures.of(Section.AXES))
-    return has_axes or figures.get("job") == "drift" or "imu_rate_hz" in figures
+    return has_axes or figures.get("job") in ("check", "drift")
 
 
 def remark_texts(figures: Figures, *, routine: bool) -> list[str]:
