@@ -279,7 +279,9 @@ def main() -> None:
     for kind in FAULTS:
         for seed in range(given.seed, given.seed + runs):
             show_progress("installations", len(rows), runs * len(FAULTS))
-            rows.append(run_one(site, kind, seed))
+            row = run_one(site, kind, seed)
+            print(f"{kind:10} {seed} {row.answer:10} {'right' if row.right else row}", flush=True)
+            rows.append(row)
     conclude(report(rows), {"beacons": len(site.beacons), "rows": rows})
 
 
