@@ -1,6 +1,7 @@
 """The command that designs an installation: its files, and what it refuses."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from conftest import Refuse, Worked, run_command
 from magfusion.files.site import load_site
 from magfusion.model.trust import Risk
 from magfusion.results.coverage import coverage
+from magfusion.results.design.pattern import stronger
 
 FILES = {
     "coverage.parquet",
@@ -103,3 +105,21 @@ def test_an_option_that_cannot_be_is_refused(
     assert reported in refuse(
         "design", worked.log / "site.yaml", "-o", tmp_path / "d", *quick, *options
     )
+
+
+def test_an_accuracy_that_is_needed_has_the_smallest_moment(worked: Worked, tmp_path: Path) -> None:
+    """By `coverage` of the written site: its moment, rounded up to two digits, is the smallest."""
+    need, place = 0.01, tmp_path / "design"  # m
+    wanted = ("--beacons", 3, "--need", need, "--objective", "sigma")
+    run_command("design", worked.log / "site.yaml", "-o", place, *QUICK, *wanted)
+    report = json.loads((place / "report.json").read_text())
+    table = pyarrow.parquet.read_table(place / "coverage.parquet").to_pydict()
+    points = np.stack([table[f"position_{axis}"] for axis in "xyz"], axis=1)
+    built = load_site(place / "site.yaml")
+
+    def worst(factor: float) -> float:
+        site = replace(built, beacons=tuple(stronger(b, factor) for b in built.beacons))
+        return float(np.max(coverage(site, points, report["window_s"]).position_sigma))
+
+    assert worst(1.0) <= need
+    assert worst(0.89) > need
