@@ -31,5 +31,5 @@ def test_a_source_without_sigma_is_not_in_the_budget() -> None:
 def test_the_largest_source_is_named_as_the_limit() -> None:
     noisy = SOURCES["noise"](demo_site(), 20.0)
     budget = error_budget(noisy, POINTS, WINDOW)
-    assert "noise limits" in limiting(budget, 0, np.array([4, 4]))
+    assert "limited by noise" in limiting(budget, 0, np.array([4, 4]))
     assert "geometry limits" in limiting(budget, 0, np.array([2, 4]))

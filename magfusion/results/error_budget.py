@@ -162,4 +162,5 @@ def limiting(budget: ErrorBudget, row: int, beacons: IntArray) -> str:
     listed = [f"{budget.sources[k]} {100.0 * share[k]:.0f} %" for k in order[:3]]
     what = first if share[order[0]] >= DOMINANT else f"{first} and {budget.sources[order[1]]}"
     remedy = REMEDIES[first]
-    return f"{where} {what} limits ({', '.join(listed)} of the variance): {remedy} helps most."
+    shares = f"{', '.join(listed)} of the variance"
+    return f"{where} it is limited by {what} ({shares}): {remedy} helps most."

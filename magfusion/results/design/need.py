@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from magfusion.errors import InputError
 from magfusion.results.design.exchange import Objective, value_of
 from magfusion.results.design.layout_information import LayoutInformation
 from magfusion.results.design.pattern import peak_moment, stronger
@@ -70,13 +71,14 @@ def min_beacons(
     design : callable
         `designed` of a task.
     """
-    low, count = FIRST - 1, FIRST
-    while True:
-        best = _tried(task, need, count, design)
-        if best.reached or count == max_count or not best.design.complete:
+    low, high = FIRST - 1, FIRST
+    best = _tried(task, need, high, design)
+    while not best.reached and high < max_count and best.design.complete:
+        low, high = high, min(max(high + 1, round(GROWTH * high)), max_count)
+        try:
+            best = _tried(task, need, high, design)
+        except InputError:  # no more have places
             break
-        low, count = count, min(max(count + 1, round(GROWTH * count)), max_count)
-    high = count
     while best.reached and high - low > 1:
         middle = (low + high) // 2
         trial = _tried(task, need, middle, design)
