@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 from page_blocks import blocks
 from test_sound_server import PROGRAMS, server
 
@@ -94,8 +95,16 @@ def test_a_stranger_plays_a_walk_and_finds_it(
                 time.sleep(1.0)  # until it records
                 run(play)
                 recorder.terminate()
+            _end_with_walk(tmp_path / "heard.wav")
             command = command.replace("walk/recording.wav", "heard.wav")
         shown = run(f"{command} --json" if command.startswith("magfusion evaluate") else command)
     assert json.loads(shown)["ate_m"] < LARGEST_ERROR
     report = json.loads((tmp_path / "heard_run" / "report.json").read_text())
     assert report["verdict"] == "trustworthy"
+
+
+def _end_with_walk(path: Path) -> None:
+    """Cut the silence that a recorder on a busy machine records after the walk."""
+    samples, rate_hz = soundfile.read(path, dtype="int32")
+    last = np.flatnonzero(samples.any(axis=1))[-1]
+    soundfile.write(path, samples[: last + 1], rate_hz, subtype="PCM_24")
