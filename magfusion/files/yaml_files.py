@@ -13,7 +13,6 @@ from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
 
 LARGEST_YAML = 1 << 20  # bytes
-DEEPEST = 50  # collections within each other that are read natively
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -64,8 +63,15 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
-class _DistinctKeys(yaml.constructor.SafeConstructor):
-    """Construction that refuses repeated keys."""
+class _Loader(yaml.SafeLoader):
+    """Safe loading that reads ``1e-5`` as a number; no repeated keys, aliases or tags."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            self._refuse("aliases are not accepted")
+        if getattr(self.current_event, "tag", None) is not None:
+            self._refuse("tags are not accepted")
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
@@ -78,28 +84,13 @@ class _DistinctKeys(yaml.constructor.SafeConstructor):
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 
-
-class _Loader(_DistinctKeys, yaml.SafeLoader):
-    """Safe loading that reads ``1e-5`` as a number; no repeated keys, aliases or tags."""
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            self._refuse("aliases are not accepted")
-        if getattr(self.current_event, "tag", None) is not None:
-            self._refuse("tags are not accepted")
-        return super().compose_node(parent, index)
-
     def _refuse(self, problem: str) -> None:
         mark = self.current_event.start_mark
         raise yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
 
 
-class _NativeLoader(_DistinctKeys, yaml.CSafeLoader):
-    """The same by libyaml, for texts that are valid: ten times faster on sites of many beacons."""
-
-
 # YAML 1.1, which PyYAML follows, takes 1e-5 for text; YAML 1.2 and every engineer for a number.
-for _end in (_Loader, _NativeLoader, _Dumper):
+for _end in (_Loader, _Dumper):
     _end.add_implicit_resolver(
         "tag:yaml.org,2002:float",
         re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+\Z", re.ASCII),
@@ -132,8 +123,7 @@ def _text(path: Path) -> str:
 def _parse(text: str, path: Path) -> object:
     """Return the content of a text, cached, as a site is read more than once."""
     try:
-        # Errors are those of the loader in Python, which names the place of aliases and tags.
-        return yaml.load(text, Loader=_NativeLoader if _is_plain(text) else _Loader)
+        return yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f"line {mark.line + 1}: " if mark else ""
@@ -145,22 +135,6 @@ def _parse(text: str, path: Path) -> object:
         raise InputError(f"{path}: {reason}; correct the value.") from error
     except RecursionError as error:
         raise InputError(f"{path}: is nested too deeply; write the keys plainly.") from error
-
-
-def _is_plain(text: str) -> bool:
-    """Return whether a text is YAML without aliases, tags, and nesting that exhausts a stack."""
-    depth = 0
-    try:
-        for event in yaml.parse(text, Loader=yaml.CSafeLoader):
-            if isinstance(event, yaml.AliasEvent) or getattr(event, "tag", None) is not None:
-                return False
-            depth += isinstance(event, yaml.CollectionStartEvent)
-            depth -= isinstance(event, yaml.CollectionEndEvent)
-            if depth > DEEPEST:
-                return False
-    except yaml.YAMLError:
-        return False
-    return True
 
 
 # By the type of an error; the words of pydantic are of its own types, not of a file's.
