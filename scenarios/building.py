@@ -18,7 +18,7 @@ and report are those of ``magfusion calibrate log --calendar``.
 import tempfile
 import time
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -60,7 +60,7 @@ DURATION = 8.0  # s, of a drive
 PART = 4.0  # m, half the side of the part of the hall that a log covers
 # Centres (m) of the parts, shape (16, 2).
 PARTS = np.stack(np.meshgrid(np.linspace(4.0, 62.0, 8), [6.0, 18.0]), axis=-1).reshape(-1, 2)
-BEGIN = datetime(2025, 1, 1, tzinfo=timezone.utc).timestamp()  # noqa: UP017
+BEGIN = datetime(2025, 1, 1, tzinfo=UTC).timestamp()
 DAY, DAYS = 86400.0, 365.0  # s; of the year
 CHANGED_BETWEEN = (45.0, 320.0)  # days
 MOVED_M, MOVED_DEG = 0.3, 10.0

@@ -7,6 +7,7 @@ import pytest
 
 from magfusion.errors import InputError
 from magfusion.jobs.coil import CoilSettings, run
+from magfusion.results.figures import number
 
 BEACON: dict[str, Any] = {"wire": 5e-4, "turns": 100, "radius": 0.1, "amperes": 1.0}
 
@@ -18,10 +19,10 @@ def test_the_figures_agree_with_each_other() -> None:
     again = run(CoilSettings(**volts, frequency=1010.0, series="capacitor"))
     assert again["moment_a_m2"] == pytest.approx(figures["moment_a_m2"], rel=1e-5)
     omega = 2.0 * np.pi * 1010.0
-    resonance = omega**2 * figures["inductance_h"] * figures["capacitor_f"]  # type: ignore[operator]
+    resonance = omega**2 * number(figures["inductance_h"]) * number(figures["capacitor_f"])
     assert resonance == pytest.approx(1.0)
     assert figures["field_10m_t"] == pytest.approx(
-        2e-10 * figures["moment_a_m2"],  # type: ignore[operator]
+        2e-10 * number(figures["moment_a_m2"]),
         rel=2e-4,
     )
     untuned = run(CoilSettings(**BEACON, frequency=1010.0))

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,10 +35,10 @@ def sound_site(tones_hz: tuple[float, ...] = (1010.0, 1130.0, 1270.0, 1430.0)) -
     return replace(site, beacons=tuple(beacons), model_error=0.0)
 
 
-def played(site: Site, directory: Path, **options: object) -> Array:
+def played(site: Site, directory: Path, **options: Any) -> Array:
     """Return what the command writes for a site."""
     save_site(site, directory / "site.yaml")
-    run(DriveSettings(site=directory / "site.yaml", **options), directory / "drive")  # type: ignore[arg-type]
+    run(DriveSettings(site=directory / "site.yaml", **options), directory / "drive")
     samples, rate_hz = soundfile.read(directory / "drive" / "beacons.wav")
     assert rate_hz == options.get("rate", RATE_HZ)
     return samples

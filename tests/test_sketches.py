@@ -69,13 +69,13 @@ def test_the_micropython_sketch(monkeypatch: pytest.MonkeyPatch) -> None:
     """By CPython, with ticks that wrap after 30 bits as MicroPython's."""
     period, elapsed, sent = 1 << 30, itertools.count((1 << 30) - 100_000, 100), []
     clock = types.ModuleType("time")
-    clock.ticks_us = lambda: next(elapsed) % period  # type: ignore[attr-defined]
-    clock.ticks_add = lambda one, more: (one + more) % period  # type: ignore[attr-defined]
-    clock.ticks_diff = (  # type: ignore[attr-defined]
-        lambda one, other: (one - other + period // 2) % period - period // 2
+    vars(clock).update(
+        ticks_us=lambda: next(elapsed) % period,
+        ticks_add=lambda one, more: (one + more) % period,
+        ticks_diff=lambda one, other: (one - other + period // 2) % period - period // 2,
     )
     machine = types.ModuleType("machine")
-    machine.I2C = Bus  # type: ignore[attr-defined]
+    vars(machine).update(I2C=Bus)
     spec = importlib.util.spec_from_file_location("frames", HARDWARE / "frames.py")
     assert spec is not None
     assert spec.loader is not None

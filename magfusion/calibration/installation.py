@@ -8,7 +8,6 @@ much as the smallest displacement that it detects.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,7 +34,6 @@ from magfusion.units import DEGREE, Array
 WIDE = ((BEACON_POSITION, 1.0), (BEACON_ROTATION, 0.5), (LOG_MOMENT, 1.5))  # sigmas: m, rad, 1
 DETECTABLE = 4.13  # sigmas: Baarda's smallest detectable error, at 0.1 % false alarms, 80 % power
 CONTRADICTED = 4.0  # sigmas of a single quantity, from which it is named
-REVERSED_BELOW = 0.0  # gain from which the other polarity is tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,27 +155,13 @@ def _joint(site: Site, wide: tuple[str, ...]) -> tuple[Block, ...]:
 def _released(
     marked: MarkedSnapshots, beacon: Beacon, others: tuple[str, ...], poses: tuple[Array, Array]
 ) -> _Released:
-    fits = []
-    for polarity, site in _polarities(marked, beacon, poses):
-        blocks = _joint(site, (*others, beacon.name))
-        cost, estimate, information = marked.of(site).minimised(blocks, *poses)
-        fits.append(_Released(beacon.name, polarity, cost, estimate, information, blocks))
-    return min(fits, key=lambda fit: fit.cost)
-
-
-def _polarities(
-    marked: MarkedSnapshots, beacon: Beacon, poses: tuple[Array, Array]
-) -> Iterator[tuple[float, Site]]:
-    """Yield the site, and with the beacon's coils reversed where its field is."""
     number = [b.name for b in marked.site.beacons].index(beacon.name)
-    gain = float(marked.gains(*poses)[number])
-    if gain >= REVERSED_BELOW or not beacon.synchronised:
-        yield 1.0, marked.site
-        return
-    coils = tuple(replace(c, moment_beacon=-c.moment_beacon) for c in beacon.coils)
-    beacons = list(marked.site.beacons)
-    beacons[number] = replace(beacon, coils=coils)
-    yield -1.0, replace(marked.site, beacons=tuple(beacons))
+    is_reversed = beacon.synchronised and marked.gains(*poses)[number] < 0.0
+    site = _reversed(marked.site, beacon.name) if is_reversed else marked.site
+    blocks = _joint(site, (*others, beacon.name))
+    cost, estimate, information = marked.of(site).minimised(blocks, *poses)
+    polarity = -1.0 if is_reversed else 1.0
+    return _Released(beacon.name, polarity, cost, estimate, information, blocks)
 
 
 def _check_of(declared: MarkedSnapshots, fit: _Released) -> BeaconCheck:

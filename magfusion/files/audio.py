@@ -284,10 +284,10 @@ def describe_recording(
         if SYNC in named:
             edges = _edges(recording, named[SYNC])
             slips = tuple(_by_pulses(slip, edges, entry.rate_hz) for slip in slips)
-            entry = entry.model_copy(update={"slips": [[s.place, s.missing] for s in slips]})
+        entry = entry.model_copy(update={"slips": [[s.place, s.missing] for s in slips]})
+        if SYNC in named:
             rate_hz = _rate_by_pulses(path, entry, edges, named[SYNC])
             entry = entry.model_copy(update={"rate_hz": rate_hz})
-        entry = entry.model_copy(update={"slips": [[s.place, s.missing] for s in slips]})
     return entry, () if search is None else slip_remarks(
         slips, search.unexplained, float(recording.samplerate)
     )

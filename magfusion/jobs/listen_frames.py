@@ -8,6 +8,7 @@ counter of its samples (16 bits), one of microseconds (32 bits), and the values.
 from __future__ import annotations
 
 import struct
+from importlib.util import find_spec
 from zlib import crc32
 
 import numpy as np
@@ -51,9 +52,5 @@ def check_package(place: str) -> None:
     ------
     InputError
     """
-    try:
-        import cobs  # noqa: F401
-    except ImportError as error:
-        raise InputError(
-            f"{place}: cobs is not installed; pip install 'magfusion[serial]'"
-        ) from error
+    if find_spec("cobs") is None:
+        raise InputError(f"{place}: cobs is not installed; pip install 'magfusion[serial]'")

@@ -82,7 +82,7 @@ def draw_steel(
         raise InputError(f"--steel: found kind {kind!r}; give one of {', '.join(KINDS)}")
     if kind == "spheres":
         return _spheres(rng, box_world, beacons_world)
-    return SteelStructure(tuple(KINDS[kind](_Room(rng, box_world, beacons_world))))
+    return SteelStructure(tuple(_DRAWN[kind](_Room(rng, box_world, beacons_world))))
 
 
 def structure_of(entry: SteelEntry) -> SteelStructure:
@@ -216,10 +216,10 @@ def _cabinets(room: _Room) -> list[Body]:
     return out
 
 
-KINDS: dict[str, Callable[[_Room], list[Body]]] = {
-    "spheres": lambda room: [],  # noqa: ARG005 - placed by their own rule
+_DRAWN: dict[str, Callable[[_Room], list[Body]]] = {
     "mesh": _mesh,
     "racks": _racks,
     "pipes": _pipes,
     "cabinets": _cabinets,
 }
+KINDS = ("spheres", *_DRAWN)

@@ -208,8 +208,8 @@ class _Score(NamedTuple):
         cov = inverse @ (self.information + self.noise) @ inverse
         known = np.sum(vector[:, yes] ** 2, axis=1) > DETERMINED_SHARE
         sigma = np.sqrt(np.maximum(np.diagonal(cov), 0.0))
-        change = inverse @ self.gradient
-        return (np.where(known, scale * each, np.nan) for each in (change, sigma))  # type: ignore[return-value]
+        scale = np.where(known, scale, np.nan)
+        return scale * (inverse @ self.gradient), scale * sigma
 
 
 class _Estimate(NamedTuple):
