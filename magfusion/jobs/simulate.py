@@ -256,8 +256,8 @@ def _simulate_ranging(settings: SimulateSettings, site: Site, output: Path) -> F
         "storms",
         "reference",
         "steel",
+        "random_field",
     )
-    without += ("random_field",)
     for name in without:
         if getattr(settings, name) != getattr(usual, name):
             raise InputError(
