@@ -1,6 +1,6 @@
 """What the README says is what happens: its blocks run in their order, in an empty directory.
 
-The figures of its prose are those of `told_figures.yaml`: see `test_told_figures`.
+The figures of its prose are those of `figures.yaml`: see `test_told_figures`.
 """
 
 import re

@@ -1,0 +1,194 @@
+"""Compare the figures that the pages print with what their commands give.
+
+``figures.yaml`` lists commands and the sentences of a page that their results fill: a field
+``{rows.0.error_m * 1e3}`` is the number that the page prints there, and where the JSON line that
+ends the command's output has it.
+
+``python tools/figures.py`` runs what takes seconds or minutes; ``--release`` everything.  What is
+measured at a commit is kept in ``--results``, so that a run that was stopped goes on.
+"""
+
+import argparse
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Self
+
+from pydantic import model_validator
+
+from magfusion.files.yaml_files import StrictModel, read_yaml
+
+ROOT = Path(__file__).parents[1]
+LOGS = ROOT.parent / "shared" / "logs"
+FIELD = re.compile(r"\{([\w.]+)(?: \* ([\d.e+-]+))?\}")
+PRINTED = r"([-−+]?[\d,]*\.?\d+)"
+
+
+class Entry(StrictModel):
+    """Sentences of a page, and the command or the test that holds their figures.
+
+    Parameters
+    ----------
+    says : list of str
+        With a field for each figure of a command.
+    command : str, optional
+        ``{logs}`` are recorded logs that are not in the repository.
+    takes : {'seconds', 'minutes', 'hours'}
+    spread : float
+        Share by which a figure may differ, beyond the rounding of the page.
+    test : str, optional
+        That fails where the sentence is wrong.
+    """
+
+    page: str
+    says: list[str]
+    command: str | None = None
+    takes: Literal["seconds", "minutes", "hours"] = "seconds"
+    spread: float = 0.0
+    test: str | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if (self.command is None) == (self.test is None):
+            raise ValueError("give a command or a test")
+        return self
+
+
+class Register(StrictModel):
+    """What `figures.yaml` holds.
+
+    Parameters
+    ----------
+    given : list of str
+        Numbers of the README's prose that nobody measured.
+    """
+
+    figures: list[Entry]
+    given: list[str]
+
+
+class Figure(NamedTuple):
+    """A figure as it is printed and as it is measured."""
+
+    key: str
+    printed: str
+    measured: float
+    agrees: bool
+
+
+def register() -> Register:
+    """Return the sentences and what holds them."""
+    return read_yaml(Path(__file__).with_suffix(".yaml"), Register)
+
+
+@cache
+def flat(page: str) -> str:
+    """Return a page on one line."""
+    return " ".join((ROOT / page).read_text(encoding="utf-8").split())
+
+
+def printed(page: str, sentence: str) -> tuple[list[str], list[tuple[str, str]]]:
+    """Return what a page prints in the fields of a sentence, and the fields (key, factor).
+
+    Raises
+    ------
+    ValueError
+        If the page does not have the sentence exactly once.
+    """
+    parts = FIELD.split(sentence)
+    pattern = PRINTED.join(re.escape(text) for text in parts[::3])
+    found = re.findall(pattern, flat(page))
+    if len(found) != 1:
+        raise ValueError(f"{page} has {len(found)} times: {sentence}")
+    numbers = [found[0]] if isinstance(found[0], str) else list(found[0])
+    fields = list(zip(parts[1::3], (factor or "1" for factor in parts[2::3]), strict=True))
+    return numbers if fields else [], fields
+
+
+def compared(entry: Entry, result: Any) -> list[Figure]:
+    """Return all figures of an entry beside those of its command's result."""
+    out = []
+    for sentence in entry.says:
+        for number, (key, factor) in zip(*printed(entry.page, sentence), strict=True):
+            value = result
+            for part in key.split("."):
+                value = value[int(part) if isinstance(value, list) else part]
+            measured = float(factor) * float(value)
+            plain = number.replace(",", "").replace("−", "-")
+            rounding = 0.501 * 10.0 ** -len(plain.partition(".")[2])
+            within = rounding + entry.spread * abs(measured)
+            out.append(Figure(key, number, measured, abs(float(plain) - measured) <= within))
+    return out
+
+
+def measured(command: str, directory: Path) -> Any:
+    """Run a command in a directory; return what the last line of its output has in JSON."""
+    line = command.replace("{logs}", str(LOGS))
+    line = re.sub(r"\b(scenarios|tools)/", rf"{ROOT}/\1/", line)
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    done = subprocess.run(
+        shlex.split(line),
+        cwd=directory,
+        env=os.environ | {"PATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if not done.stdout.strip():
+        raise RuntimeError(f"{command}: {done.stderr[-2000:]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def main() -> int:
+    """Run the commands, print the table, and return 1 where a figure differs."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--release", action="store_true", help="also what takes hours")
+    parser.add_argument("--results", type=Path, default=ROOT / "figures_measured", help="directory")
+    options = parser.parse_args()
+    commit = _git("rev-parse", "--short", "HEAD") + ("+" if _git("status", "--porcelain") else "")
+    wrong = 0
+    print(f"{datetime.now(UTC):%Y-%m-%d}, commit {commit}\n")
+    print("| page | command | figure | printed | measured | |\n|---|---|---|---|---|---|")
+    for entry in register().figures:
+        if entry.command is None or (entry.takes == "hours" and not options.release):
+            continue
+        if "{logs}" in entry.command and not LOGS.is_dir():
+            print(f"| {entry.page} | `{entry.command}` | | | | no recorded logs here |")
+            continue
+        for one in compared(entry, _kept(entry.command, commit, options.results)):
+            wrong += not one.agrees
+            told = f"{one.key} | {one.printed} | {one.measured:.4g}"
+            mark = "" if one.agrees else "**differs**"
+            print(f"| {entry.page} | `{entry.command}` | {told} | {mark} |", flush=True)
+    return int(wrong > 0)
+
+
+def _kept(command: str, commit: str, results: Path) -> Any:
+    """Return the result of a command at a commit, measured once."""
+    results.mkdir(parents=True, exist_ok=True)
+    path = results / f"{re.sub(r'[^A-Za-z0-9]+', '_', command)}.json"
+    if path.is_file():
+        before = json.loads(path.read_text())
+        if before["commit"] == commit and not commit.endswith("+"):
+            return before["result"]
+    with tempfile.TemporaryDirectory() as directory:
+        result = measured(command, Path(directory))
+    path.write_text(json.dumps({"commit": commit, "command": command, "result": result}))
+    return result
+
+
+def _git(*words: str) -> str:
+    return subprocess.run(
+        ["git", *words], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.strip()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
