@@ -63,8 +63,7 @@ def test_what_a_page_says_is_what_happens(name: str, started: Path, tmp_path: Pa
 def test_the_figures_are_drawn_by_the_package(tmp_path: Path) -> None:
     from docs_figures import FIGURES, draw
 
-    shown = re.findall(r"\(figures/(\w+)\.png\)", "".join(PAGES.values()))
-    assert sorted(shown) == sorted(FIGURES)
-    assert {path.stem for path in (DOCS / "figures").iterdir()} == set(FIGURES)
-    for drawn in draw(shown, tmp_path):
+    shown = re.findall(r"\((?:\.\./)?figures/(\w+)\.png\)", "".join(PAGES.values()))
+    assert {path.stem for path in (DOCS / "figures").iterdir()} == set(shown) >= set(FIGURES)
+    for drawn in draw(list(FIGURES), tmp_path):
         assert drawn.stat().st_size > 10_000  # bytes; empty axes have fewer
