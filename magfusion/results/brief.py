@@ -85,6 +85,7 @@ def _pose_rows(figures: Figures) -> Rows:
         expected = nees.label.removeprefix("mean NEES ")
         spent += f"; NEES {number_text(nees.value, 2)} {expected}, {within:.3g} % within 3 sigma"
     rows.append(["consistency" if "nees_mean" in figures else "data", spent])
+    rows += [["survey", f.remark] for f in figures.all if f.name == "hypotheses_{beacon}"]
     unverified = _unverified(figures)
     return [*rows, ["not observable", unverified]] if unverified else rows
 
