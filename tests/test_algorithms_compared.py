@@ -19,7 +19,7 @@ from algorithms_figures import (
 )
 from algorithms_tried import FIX, MAPPED, METHODS, ML, PUBLISHED, AlgorithmOutcome
 
-DISTURBED = ("S1", "F1", "P0", "N1")  # one of each kind
+DISTURBED = ("S1", "N1")  # gains, and iron
 A1, A2, A3 = PUBLISHED
 UNMAPPED = tuple(name for name in METHODS if name != MAPPED)
 Trajectories = Mapping[str, Sequence[AlgorithmOutcome]]
@@ -149,7 +149,7 @@ def full() -> dict[str, list[AlgorithmOutcome]]:
 
 @pytest.fixture(scope="module")
 def mapped() -> dict[str, list[AlgorithmOutcome]]:
-    """Two rooms of each kind: a map takes five times as long to learn as all else."""
+    """Two rooms of two kinds: a map takes five times as long to learn as all else."""
     return run(Config(worlds=2, scenarios=DISTURBED))
 
 
@@ -171,6 +171,8 @@ def test_a_map_and_relative_weights_halve_the_best_published_error(
     mapped: Trajectories, scenario: str
 ) -> None:
     overall, worst = worst_ratio(mapped[scenario], MAPPED)
+    reported = report({scenario: mapped[scenario]}, {}).splitlines()
+    assert any(line.split()[:1] == [scenario] for line in reported)
     assert overall <= 0.5
     assert worst < 1.0  # better in every single room
 
@@ -186,13 +188,11 @@ def test_likelihood_meets_the_bound_over_all_quiet_rooms(full: Trajectories) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize(("scenario", "expected_m"), [("S1", 0.152), ("F1", 0.087), ("P0", 0.028)])
 def test_plain_likelihood_loses_to_algorithm_3_where_the_model_is_wrong(
-    full: Trajectories, mapped: Trajectories, scenario: str, expected_m: float
+    full: Trajectories, scenario: str, expected_m: float
 ) -> None:
     assert position(full[scenario], ML) == pytest.approx(expected_m, rel=0.35)
     assert position(full[scenario], ML) > position(full[scenario], A3)
     assert compared_with_algorithm_3(full[scenario], ML)[1] != "better"
-    reported = report({scenario: mapped[scenario]}, {}).splitlines()
-    assert any(line.split()[:1] == [scenario] for line in reported)
 
 
 @pytest.mark.slow
