@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from figures import LOGS, ROOT, Entry, compared, flat, measured, printed, register
+from figures import LOGS, MINUS, ROOT, Entry, compared, flat, measured, printed, register
 
 REGISTER = register()
 
@@ -39,7 +39,7 @@ def test_the_command_gives_the_figures(entry: Entry, tmp_path: Path) -> None:
 
 
 def test_a_figure_changed_by_hand_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("figures.flat", lambda _: "errs by 1.5 mm, 2,000 of −3 m")
+    monkeypatch.setattr("figures.flat", lambda _: f"errs by 1.5 mm, 2,000 of {MINUS}3 m")
     entry = Entry(
         page="page.md", command="x", says=["by {a.0 * 1e3} mm, {b} of {c} m"], spread=0.01
     )

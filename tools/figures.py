@@ -28,7 +28,8 @@ from magfusion.files.yaml_files import StrictModel, read_yaml
 ROOT = Path(__file__).parents[1]
 LOGS = ROOT.parent / "shared" / "logs"
 FIELD = re.compile(r"\{([\w.]+)(?: \* ([\d.e+-]+))?\}")
-PRINTED = r"([-−+]?[\d,]*\.?\d+)"
+MINUS = "\N{MINUS SIGN}"
+PRINTED = rf"([-{MINUS}+]?[\d,]*\.?\d+)"
 
 
 class Entry(StrictModel):
@@ -121,7 +122,7 @@ def compared(entry: Entry, result: Any) -> list[Figure]:
             for part in key.split("."):
                 value = value[int(part) if isinstance(value, list) else part]
             measured = float(factor) * float(value)
-            plain = number.replace(",", "").replace("−", "-")
+            plain = number.replace(",", "").replace(MINUS, "-")
             rounding = 0.501 * 10.0 ** -len(plain.partition(".")[2])
             within = rounding + entry.spread * abs(measured)
             out.append(Figure(key, number, measured, abs(float(plain) - measured) <= within))
