@@ -30,7 +30,7 @@ def test_a_design_beats_the_median_of_random_layouts_and_the_best_of_them() -> N
 def test_sigmas_of_a_design_are_at_most_those_of_the_best_random_layout(
     objective: Objective,
 ) -> None:
-    """Both the worst and the median one, of four beacons, against the best of 200 by what is asked."""
+    """Worst and median sigma of four beacons, against the best of 200 by what is asked."""
     task = replace(task_of(Config(spacing=2.0, grid=2.0)), objective=objective)
     result = designed(task, starts=3, layouts=200, rng=np.random.default_rng(0))
     assert result.best_random is not None
