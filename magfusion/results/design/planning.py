@@ -156,11 +156,12 @@ def designed(
     )
     worst: list[float] = []
     value: list[float] = []  # of the task's objective
+    of: list[tuple[Objective, list[float]]] = [("worst", worst), (task.objective, value)]
     for k, layout in enumerate(drawn):
         report("random layouts", k, len(drawn))
         beacons = [candidates.beacons[c] for c in layout or ()]
         new_information = np.stack([added(information.root(beacon)) for beacon in beacons])
-        for objective, values in (("worst", worst), (task.objective, value)):
+        for objective, values in of:
             each = at_each_point(information, new_information, information.standing, objective)
             values.append(of_points(each, objective))
 
