@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from design_hall import Config, report, run, task_of
 
+from magfusion.model.hall import Hall, Mounts, mounting_places, points_of_use, prism_of
 from magfusion.results.coverage import coverage
 from magfusion.results.design.exchange import Objective
 from magfusion.results.design.planning import designed
@@ -26,15 +27,22 @@ def test_a_design_beats_the_median_of_random_layouts_and_the_best_of_them() -> N
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("objective", ["sigma", "A"])
-def test_sigmas_of_a_design_are_at_most_those_of_the_best_random_layout(
-    objective: Objective,
+@pytest.mark.parametrize(("objective", "share"), [("sigma", 1.0), ("A", 0.5)])
+def test_a_design_is_no_worse_in_what_is_asked_than_the_best_random_layout(
+    objective: Objective, share: float
 ) -> None:
-    """Worst and median sigma of four beacons, against the best of 200 by what is asked."""
-    task = replace(task_of(Config(spacing=2.0, grid=2.0)), objective=objective)
-    result = designed(task, starts=3, layouts=200, rng=np.random.default_rng(0))
+    """Worst sigma by `sigma`, median one by `A`: four beacons in a room, the best of 200."""
+    room = prism_of(np.array([[0.0, 0.0, 0.0], [6.0, 5.0, 3.0]]))
+    hall = Hall(room, Mounts((0, 1, 2, 3), room.heights, ceiling=True), room, 0.5)
+    task = replace(
+        task_of(Config()),
+        places=mounting_places(hall, 1.5),
+        points=points_of_use(hall, 1.5),
+        objective=objective,
+        axes=3,
+    )
+    result = designed(task, starts=2, layouts=200, rng=np.random.default_rng(0))
     assert result.best_random is not None
     sites = (result.site, result.best_random)
     own, random = (coverage(s, task.points, task.band.window).position_sigma for s in sites)
-    assert np.max(own) <= np.max(random)
-    assert np.median(own) <= np.median(random)
+    assert np.quantile(own, share) <= np.quantile(random, share)
