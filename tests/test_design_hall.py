@@ -27,11 +27,11 @@ def test_a_design_beats_the_median_of_random_layouts_and_the_best_of_them() -> N
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("objective", "share"), [("sigma", 1.0), ("A", 0.5)])
+@pytest.mark.parametrize("objective", ["sigma", "A"])
 def test_a_design_is_no_worse_in_what_is_asked_than_the_best_random_layout(
-    objective: Objective, share: float
+    objective: Objective,
 ) -> None:
-    """Worst sigma by `sigma`, median one by `A`: four beacons in a room, the best of 200."""
+    """Worst sigma by `sigma`, mean variance by `A`: four beacons in a room, the best of 200."""
     room = prism_of(np.array([[0.0, 0.0, 0.0], [6.0, 5.0, 3.0]]))
     hall = Hall(room, Mounts((0, 1, 2, 3), room.heights, ceiling=True), room, 0.5)
     task = replace(
@@ -45,4 +45,8 @@ def test_a_design_is_no_worse_in_what_is_asked_than_the_best_random_layout(
     assert result.best_random is not None
     sites = (result.site, result.best_random)
     own, random = (coverage(s, task.points, task.band.window).position_sigma for s in sites)
-    assert np.quantile(own, share) <= np.quantile(random, share)
+    if objective == "sigma":
+        assert np.max(own) <= np.max(random)
+    else:
+        assert np.mean(own**2) <= np.mean(random**2)
+        assert np.max(own) <= np.max(random)
