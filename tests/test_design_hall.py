@@ -1,7 +1,15 @@
 """Four beacons in an L-shaped hall beat random layouts by what is asked of a design."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
-from design_hall import Config, report, run
+from design_hall import Config, report, run, task_of
+
+from magfusion.model.hall import Hall, Mounts, mounting_places, points_of_use, prism_of
+from magfusion.results.coverage import coverage
+from magfusion.results.design.exchange import Objective
+from magfusion.results.design.planning import designed
 
 
 @pytest.mark.slow
@@ -16,3 +24,29 @@ def test_a_design_beats_the_median_of_random_layouts_and_the_best_of_them() -> N
     assert 0.98 < middle < 1.02
     assert result.worst_sigma[2] < result.worst_sigma[0]  # for accuracy alone A is better
     assert "below the median" in report(result)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("objective", ["sigma", "A"])
+def test_a_design_is_no_worse_in_what_is_asked_than_the_best_random_layout(
+    objective: Objective,
+) -> None:
+    """Worst sigma by `sigma`, mean variance by `A`: four beacons in a room, the best of 200."""
+    room = prism_of(np.array([[0.0, 0.0, 0.0], [6.0, 5.0, 3.0]]))
+    hall = Hall(room, Mounts((0, 1, 2, 3), room.heights, ceiling=True), room, 0.5)
+    task = replace(
+        task_of(Config()),
+        places=mounting_places(hall, 1.5),
+        points=points_of_use(hall, 1.5),
+        objective=objective,
+        axes=3,
+    )
+    result = designed(task, starts=2, layouts=200, rng=np.random.default_rng(0))
+    assert result.best_random is not None
+    sites = (result.site, result.best_random)
+    own, random = (coverage(s, task.points, task.band.window).position_sigma for s in sites)
+    if objective == "sigma":
+        assert np.max(own) <= np.max(random)
+    else:
+        assert np.mean(own**2) <= np.mean(random**2)
+        assert np.max(own) <= np.max(random)

@@ -31,7 +31,8 @@ def test_the_command_writes_a_site_that_has_what_the_report_says(
     worked: Worked, tmp_path: Path
 ) -> None:
     site, place = worked.log / "site.yaml", tmp_path / "design"
-    keep = ("--beacons", 2, "--keep", "A", "--random", 5)
+    coil = ("--coil", "wire=1e-3,turns=100,radius=0.3")
+    keep = ("--beacons", 2, "--keep", "A", "--random", 5, *coil)
     run_command("design", site, "-o", place, *QUICK, *keep)
     # Goes on from an earlier result, and replaces it.
     run_command("design", site, "-o", place, *QUICK, *keep, "--continue", place / "site.yaml")
@@ -49,6 +50,10 @@ def test_the_command_writes_a_site_that_has_what_the_report_says(
     assert report["protection_level_m_worst"] == pytest.approx(np.max(result.protection_level_m))
     assert report["random_layouts"] == 5
     assert report["protection_level_m_worst"] < report["random_worst_level_m_median"]
+    assert report["position_sigma_m_median"] < report["random_best_position_sigma_m_worst"]
+    for beacon in built.beacons[1:]:
+        current, volts = (report[f"{beacon.name}.{name}"] for name in ("current_a", "voltage_v"))
+        assert 0.0 < report[f"{beacon.name}.power_w"] <= 0.5 * current * volts * (1.0 + 1e-9)
     assert report["search_complete"]
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import json
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import gtsam
 import numpy as np
@@ -20,6 +21,7 @@ from magfusion.jobs.inputs import read_estimate
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import StateTrust, Verdict
 
+LAYOUTS = Path(__file__).parents[1] / "docs" / "layouts"
 EPOCH_NS = 1_790_000_000_123_456_789
 FAILED = 2  # of the states, which has no pose
 N = 5
@@ -155,6 +157,42 @@ def test_pandas_reads_csv_and_so_do_we(result: Path, tmp_path: Path) -> None:
     again = read_estimate(path, EPOCH_NS)
     np.testing.assert_allclose(again.time, STATES.time[KEPT], rtol=0, atol=1e-12)
     np.testing.assert_allclose(again.pose_cov, STATES.pose_cov[KEPT], rtol=1e-15)
+
+
+def test_the_layout_of_foxglove_shows_what_a_bag_has(result: Path, tmp_path: Path) -> None:
+    run_command("export", result, "-o", tmp_path / "run.mcap")
+    topics = _read(tmp_path / "run.mcap")
+    panels = json.loads((LAYOUTS / "foxglove.json").read_text())["configById"].values()
+    paths = [path["value"] for panel in panels for path in panel.get("paths", ())]
+    assert paths
+    for path in paths:
+        topic, *fields = path.split(".")
+        value = topics[topic][0][1]
+        for name in fields:
+            name, _, number = name.partition("[")
+            value = getattr(value, name)
+            value = value[int(number.rstrip("]"))] if number else value
+        assert np.isfinite(value)
+    assert {topic for panel in panels for topic in panel.get("topics", ())} <= set(topics)
+
+
+def test_the_layout_of_plotjuggler_shows_what_a_table_has(tmp_path: Path) -> None:
+    zero = np.zeros((N, 3))
+    states = dataclasses.replace(STATES, gyro_bias_body=zero, accel_bias_body=zero)
+    trust = StateTrust((Verdict.TRUSTWORTHY,) * N, np.full(N, 0.1), np.full(N, 2.0), ((),) * N)
+    write_trajectory(states, tmp_path / "t.parquet", EPOCH_NS, trust)
+    run_command("export", tmp_path / "t.parquet", "-o", tmp_path / "run.csv")
+    columns = set(pandas.read_csv(tmp_path / "run.csv").columns)
+    layout = ElementTree.parse(LAYOUTS / "plotjuggler.xml").getroot()
+    computed = {snippet.get("name") for snippet in layout.iter("snippet")}
+    for snippet in layout.iter("snippet"):
+        sources = [snippet.find("linked_source"), *snippet.findall("additional_sources/*")]
+        assert {source.text for source in sources if source is not None} <= columns
+    curves = list(layout.iter("curve"))
+    assert curves
+    for curve in curves:
+        names = {curve.get(key) for key in ("curve_x", "curve_y") if key in curve.attrib}
+        assert (names or {curve.get("name")}) <= columns | computed
 
 
 def test_what_is_left_out_is_counted(

@@ -71,4 +71,4 @@ def test_the_readme_is_short_enough_to_be_read() -> None:
 
 
 def test_the_readmes_picture_is_small() -> None:
-    assert (ROOT / ".github" / "readme.png").stat().st_size <= 300_000  # bytes
+    assert (ROOT / ".github" / "readme.webp").stat().st_size <= 150_000  # bytes

@@ -141,10 +141,10 @@ def test_a_bug_report_asks_for_what_explains_it() -> None:
 
 def test_the_readme_of_a_package_index_has_absolute_links() -> None:
     relative = [link[2] for link in HOOK.RELATIVE_LINK.findall(README)]
-    assert {".github/readme.png", "docs/measured.md", "LICENSE"} <= set(relative)
+    assert {".github/readme.webp", "docs/measured.md", "LICENSE"} <= set(relative)
     shown = HOOK.absolute_links(README, "https://example.org/magfusion/", "v0.1.0")
     assert not HOOK.RELATIVE_LINK.search(shown)
-    assert "](https://example.org/magfusion/raw/v0.1.0/.github/readme.png)" in shown
+    assert "](https://example.org/magfusion/raw/v0.1.0/.github/readme.webp)" in shown
     assert "](https://example.org/magfusion/blob/v0.1.0/docs/formats.md#the-log)" in shown
     assert shown.count("https://example.org") == len(relative)
 

@@ -14,7 +14,7 @@ def test_a_sheet_has_its_plan_marks_and_distances(
 ) -> None:
     site, place = worked.log / "site.yaml", tmp_path / "sheet"
     run_command("sheet", site, "-o", place)
-    run_command("sheet", site, "-o", place)
+    run_command("sheet", site, "-o", place, "--coil", "wire=1e-3,turns=100,radius=0.3")
     assert (tmp_path / "sheet.1" / "distances.csv").is_file()  # what was measured is kept
     assert {path.name for path in place.iterdir()} == {
         "distances.csv",

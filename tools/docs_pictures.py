@@ -22,6 +22,7 @@ SHOT = "shot.png"
 SCREEN = "3400x2200x24"  # the pointer, at its centre, is outside the window
 PAGE_WINDOW = (1120, 1500)
 WIDTH = 860  # px
+QUALITY = 90  # of a WebP, in percent; a PNG is lossless
 
 
 class Picture(NamedTuple):
@@ -42,10 +43,13 @@ def _simulated(command: str) -> tuple[str, ...]:
 
 PICTURES = {
     "readme": Picture(
-        ".github/readme.png", ("magfusion demo --no-show",), "magfusion_demo/run.rrd"
+        ".github/readme.webp", ("magfusion demo --no-show",), "magfusion_demo/run.rrd"
+    ),
+    "recording": Picture(
+        "docs/screenshots/recording.webp", ("magfusion demo --no-show",), "magfusion_demo/run.rrd"
     ),
     "report": Picture(
-        ".github/report.png", _simulated("magfusion smooth log -o run"), "run/report.html"
+        ".github/report.webp", _simulated("magfusion smooth log -o run"), "run/report.html"
     ),
     "check": Picture(
         "docs/screenshots/check.png",
@@ -63,7 +67,7 @@ PICTURES = {
         "drift/stability.png",
     ),
     "tracker": Picture(
-        "docs/screenshots/tracker.png",
+        "docs/screenshots/tracker.webp",
         (
             "magfusion simulate --site tracker.yaml --no-perturb -o head --duration 9"
             " --motion turn --box 0.3,0.5,-0.15,0.15,-0.12,0.12 --seed 2",
@@ -130,7 +134,7 @@ def save(built: Path, place: Path, width: int = WIDTH) -> None:
         height = round(image.height * width / image.width)
         image = image.resize((width, height), Image.Resampling.LANCZOS)
     place.parent.mkdir(parents=True, exist_ok=True)
-    image.save(place, optimize=True)
+    image.save(place, optimize=True, quality=QUALITY)
 
 
 def main() -> None:

@@ -115,8 +115,10 @@ ROOMS = {
             inputs navigate_results result_directory
             allan_noise checkpoint failure magnetometer_trust magnetometer_turns orientation
             budget_figures settings without_beacons
+            coil
+            coil_drive
             accept allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
-            calibrate_magnetometer check coil design_settings drift_world drive evaluate export
+            calibrate_magnetometer check design_settings drift_world drive evaluate export
             import_figures init_settings
             listen live papers published_fix range_wells rates region replay rest_settings
             sheet simulate_ranging smooth_result survey view

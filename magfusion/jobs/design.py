@@ -14,7 +14,7 @@ from magfusion.files.hall import load_hall
 from magfusion.files.site import load_site, save_site
 from magfusion.jobs.budget_figures import PLACES, budget_figures, worst_and_median
 from magfusion.jobs.coverage import write_points
-from magfusion.jobs.design_figures import design_figures
+from magfusion.jobs.design_figures import best_random_figures, design_figures
 from magfusion.jobs.design_motion import run_motion
 from magfusion.jobs.design_settings import ALL, MOST_BEACONS, DesignSettings
 from magfusion.jobs.receiver_axes import three_axes
@@ -24,6 +24,7 @@ from magfusion.model.hall import Hall, Mounts, mounting_places, points_of_use, p
 from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Beacon, Site
 from magfusion.results.coverage import coverage, usual_box
+from magfusion.results.design.coil_drive import drive_figures
 from magfusion.results.design.need import (
     NeededDesign,
     least_moment,
@@ -68,6 +69,7 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
     if settings.motion is not None:
         return run_motion(settings, site, hall, _points(hall, spacing), output)
     claimed = claim(output, "design")
+    settings.drives(())  # a wrong text is rejected before the search
     first = None if settings.earlier is None else load_site(settings.earlier)
     task = _task(settings, site, hall, spacing)
     alone = len(site.beacons) < 2
@@ -102,6 +104,10 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
         rows = worst_and_median(maps[1])
         budget = error_budget(new, task.points[rows], settings.window) if len(rows) else None
         figures = design_figures(settings, task, result, panels, spacing)
+        if settings.random and result.best_random is not None:
+            best = coverage(result.best_random, task.points, settings.window)
+            figures |= best_random_figures(best)
+        figures |= drive_figures(settings.drives(result.new))
         if budget is not None:
             figures |= budget_figures(budget, maps[1].beacons[rows])
             write_budget_plot(directory / "error_budget.png", budget, PLACES)

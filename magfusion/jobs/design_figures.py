@@ -75,6 +75,16 @@ _OPEN = (
 )
 
 
+def best_random_figures(result: Coverage) -> Figures:
+    """Return the sigmas of the random layout that is best by the objective."""
+    return Figures(
+        *(
+            replace(f, name=f"random_best_{f.name}", label=f"best random layout: {f.title}")
+            for f in _sigma_figures(result)
+        )
+    )
+
+
 def _sigma_figures(result: Coverage) -> list[Figure]:
     return [
         Figure(

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from magfusion.errors import InputError
+from magfusion.jobs.coil_drive import DriveSettings
 from magfusion.jobs.settings import NeedSettings, RandomSettings, argument, option
 
 ALL = "all"
@@ -14,7 +15,7 @@ MOST_BEACONS, USUAL_BEACONS = 30, 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class DesignSettings(NeedSettings, RandomSettings):
+class DesignSettings(NeedSettings, DriveSettings, RandomSettings):
     """Hall, number and kind of beacons, and search time."""
 
     site: Path = argument("Site file: its platform, and a beacon of which copies are placed")

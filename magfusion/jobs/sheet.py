@@ -13,12 +13,14 @@ from magfusion.errors import InputError
 from magfusion.files.distances import FROM, MEASURED, TO
 from magfusion.files.hall import load_hall
 from magfusion.files.site import load_site, save_site
-from magfusion.jobs.settings import Command, Settings, argument, option
+from magfusion.jobs.coil_drive import DriveSettings
+from magfusion.jobs.settings import Command, argument, option
 from magfusion.model.aiding import AidingSensor
 from magfusion.model.hall import Hall, Mounts, Prism, points_of_use, prism_of
 from magfusion.model.trust import Trust
 from magfusion.results.coverage import usual_box
 from magfusion.results.design.check_marks import check_marks, check_pairs
+from magfusion.results.design.coil_drive import drive_figures
 from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.verdict import trust_figures
 
@@ -33,7 +35,7 @@ MOST_POINTS = 20_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class SheetSettings(Settings):
+class SheetSettings(DriveSettings):
     """Site and hall of a sheet, and how marks are chosen."""
 
     site: Path = argument("Site file of the installation, e.g. of design")
@@ -68,6 +70,7 @@ def run_sheet(settings: SheetSettings, output: Path) -> Figures:
     claimed = claim(output, "sheet")
     site = load_site(settings.site)
     hall = _hall(settings, site)
+    drives = settings.drives(site.beacons)
     site, marks = _with_marks(settings, site, hall)
     checks = check_rows(site, marks, settings.mark_sigma, settings.tape)
     figures = heading("sheet", settings.site.stem) | trust_figures(Trust())
@@ -76,6 +79,7 @@ def run_sheet(settings: SheetSettings, output: Path) -> Figures:
         Figure("marks", len(marks)),
         Figure("check_distances", len(checks)),
     )
+    figures |= drive_figures(drives)
     with claimed as directory:
         save_site(site, directory / "site.yaml")
         with (directory / "distances.csv").open("w", newline="", encoding="utf-8") as file:
@@ -85,7 +89,7 @@ def run_sheet(settings: SheetSettings, output: Path) -> Figures:
                 numbers = (f"{row.distance:.4f}", f"{row.tolerance:.4f}")
                 table.writerow((row.begin, row.end, *numbers, ""))
         title = f"{settings.site.stem}, {len(site.beacons)} beacons"
-        write_sheet(directory / "sheet.pdf", site, hall, marks, checks, title)
+        write_sheet(directory / "sheet.pdf", site, hall, marks, checks, title, drives)
         write_report(directory, figures)
     return figures
 

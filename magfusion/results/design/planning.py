@@ -14,11 +14,12 @@ from magfusion.results.design.exchange import (
     Candidates,
     LayoutSearch,
     Objective,
+    at_each_point,
     best_layout,
+    of_points,
     random_layout,
-    value_of,
 )
-from magfusion.results.design.layout_information import LayoutInformation
+from magfusion.results.design.layout_information import LayoutInformation, added
 from magfusion.results.design.pattern import (
     ToneBand,
     axes_offered,
@@ -92,6 +93,8 @@ class Design:
         Worst protection level of random layouts of the same candidates (m).
     median_random : Site, optional
         The random layout whose worst level is the median.
+    best_random : Site, optional
+        The random layout that is best by the task's objective.
     """
 
     site: Site
@@ -100,6 +103,7 @@ class Design:
     complete: bool
     random_worst_m: Array
     median_random: Site | None
+    best_random: Site | None
 
 
 def designed(
@@ -150,23 +154,31 @@ def designed(
     new = _finished(
         task, information, [candidates.beacons[c] for c in result.chosen], tones, allowed, in_time
     )
-    worst = []
+    worst: list[float] = []
+    value: list[float] = []  # of the task's objective
+    of: list[tuple[Objective, list[float]]] = [("worst", worst), (task.objective, value)]
     for k, layout in enumerate(drawn):
         report("random layouts", k, len(drawn))
         beacons = [candidates.beacons[c] for c in layout or ()]
-        worst.append(value_of(information, beacons, "worst")[0])
-    median = None
-    if worst:
-        middle = drawn[int(np.argsort(worst, kind="stable")[(len(worst) - 1) // 2])]
-        own = _with_own_channels(task, [candidates.beacons[c] for c in middle or ()], tones)
-        median = with_beacons(task.site, _named(list(own), task.site))
+        new_information = np.stack([added(information.root(beacon)) for beacon in beacons])
+        for objective, values in of:
+            each = at_each_point(information, new_information, information.standing, objective)
+            values.append(of_points(each, objective))
+
+    def site_of(number: int) -> Site:
+        beacons = [candidates.beacons[c] for c in drawn[number] or ()]
+        own = _with_own_channels(task, beacons, tones)
+        return with_beacons(task.site, _named(list(own), task.site))
+
+    middle = (len(worst) - 1) // 2
     return Design(
         with_beacons(task.site, new),
         new,
         len(candidates.beacons),
         result.complete,
         np.array(worst),
-        median,
+        site_of(int(np.argsort(worst, kind="stable")[middle])) if worst else None,
+        site_of(int(np.argmin(value))) if value else None,
     )
 
 

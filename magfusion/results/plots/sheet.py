@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from magfusion.model.hall import Hall
 from magfusion.model.site import Beacon, Site
+from magfusion.results.design.coil_drive import DriveRow
 from magfusion.results.design.pattern import pattern_axis, peak_moment
 from magfusion.results.plots.plan import MARGIN, draw_beacons, draw_hall
 from magfusion.units import DEGREE, Array
@@ -49,6 +50,7 @@ def write_sheet(
     marks_world: Mapping[str, Array],
     checks: Sequence[CheckRow],
     title: str,
+    drives: Sequence[DriveRow] = (),
 ) -> None:
     """Write the sheet.
 
@@ -56,6 +58,8 @@ def write_sheet(
     ----------
     marks_world : mapping
         Marks on the floor by their names, shape (3,) (m).
+    drives : sequence of DriveRow
+        Of the coils, if wire and form are known.
     """
     with PdfPages(path, metadata={"CreationDate": None}) as pages:
         for figure in _plans(site, hall, marks_world, title):
@@ -66,6 +70,11 @@ def write_sheet(
                 f"Beacons: coordinates, axes and moments; tolerances are {TOLERANCE:g} sigmas",
                 _BEACON_COLUMNS,
                 beacons,
+            ),
+            (
+                "Coils: drive, and temperature in still air",
+                _DRIVE_COLUMNS,
+                [_drive_row(row) for row in drives],
             ),
             (
                 "Marks: stop on each for some seconds, in any heading",
@@ -99,6 +108,26 @@ _BEACON_COLUMNS = (
     "± (%)",
     "frequency (Hz)",
 )
+
+
+_DRIVE_COLUMNS = (
+    "beacon",
+    "frequency (Hz)",
+    "moment (A m²)",
+    "peak current (A)",
+    "peak voltage (V)",
+    "power (W)",
+    "temperature (°C)",
+)
+
+
+def _drive_row(row: DriveRow) -> tuple[str, ...]:
+    head = (row.beacon, f"{row.frequency_hz:g}", f"{row.moment:.4g}")
+    if row.point is None:
+        return (*head, "-", "-", "-", "too hot")
+    point = row.point
+    numbers = (point.current, point.voltage, point.power, point.temperature_degc)
+    return (*head, *(f"{value:.3g}" for value in numbers))
 
 
 def _beacon_row(beacon: Beacon) -> tuple[str, ...]:
