@@ -1,5 +1,6 @@
 """Keys of magnetometers in a site's file."""
 
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -21,8 +22,12 @@ from magfusion.files.site_response import (
     AxisResponsesEntry,
     CoilEntry,
     Listed,
+    ResponseSigmaEntry,
     check_response,
+    check_response_sigma,
     response_entry,
+    response_sigma,
+    response_sigma_entry,
     responses_of,
 )
 from magfusion.files.site_temperature import SensorTemperatureEntry, temperature_entry
@@ -38,6 +43,7 @@ from magfusion.files.site_values import (
     PositionSigma,
     RotationSigma,
     array,
+    at_least_one,
     between,
     not_singular,
     plain_name,
@@ -66,6 +72,7 @@ class MagnetometerSigmaEntry(StrictModel):
     rotation_deg: RotationSigma = Field(default_factory=zeros)
     position_m: PositionSigma = Field(default_factory=zeros)
     clock_offset_s: Annotated[FromZero, between(0.0, 1.0)] = 0.0
+    response: Annotated[list[ResponseSigmaEntry], at_least_one("frequency")] | None = None
 
 
 class MountingEntry(StrictModel):
@@ -165,6 +172,8 @@ def check_tones(sensor: MagnetometerEntry, tones_hz: Array, at: tuple[str | int,
     if sensor.axis_responses is not None:
         for axis, entries in sensor.axis_responses.axes.items():
             check_response(entries, tones_hz, (*at, "axis_responses", axis))
+    if sensor.sigma.response is not None:
+        check_response_sigma(sensor.sigma.response, tones_hz, (*at, "sigma", "response"))
     highest = float(np.max(tones_hz, initial=0.0))
     if 2.0 * np.pi * highest * sensor.sigma.clock_offset_s > LARGEST_PHASE:
         maximum = LARGEST_PHASE / (2.0 * np.pi * highest)
@@ -183,7 +192,10 @@ def magnetometer_of(entry: MagnetometerEntry) -> Magnetometer:
         noise_density=entry.noise_density_t_rthz,
         matrix=entry.matrix,
         offset=entry.offset_t,
-        sigma=model_of(MagnetometerSigma, entry.sigma),
+        sigma=replace(
+            model_of(MagnetometerSigma, entry.sigma),
+            response=response_sigma(entry.sigma.response),
+        ),
         coil_centres_sensor=entry.coil_centres_m,
         offset_walk=entry.offset_walk_t,
         coil_kappa=entry.coil_kappa_m2,
@@ -258,6 +270,7 @@ def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
                 "rotation_deg": degree_sigma_entry(sigma.rotation_sensor),
                 "position_m": sigma_entry(sigma.position_body),
                 **clock,
+                **response_sigma_entry(sigma.response),
             },
         }
     )

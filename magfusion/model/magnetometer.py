@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from magfusion.model.physics.casing import Casing
-from magfusion.model.response import AxisResponses, FrequencyResponse
+from magfusion.model.response import AxisResponses, FrequencyResponse, ResponseSigma
 from magfusion.model.short_repr import short_repr
 from magfusion.model.temperature import SensorTemperatureModel
 from magfusion.units import Array
@@ -24,6 +24,8 @@ class MagnetometerSigma:
         Of the lever arm, body axes (m).
     clock_offset : float
         (s)
+    response : ResponseSigma, optional
+        Of y and z relative to x; None if known.
     """
 
     matrix: Array
@@ -31,6 +33,7 @@ class MagnetometerSigma:
     rotation_sensor: Array
     position_body: Array
     clock_offset: float = 0.0
+    response: ResponseSigma | None = None
 
 
 @dataclass(frozen=True, eq=False)

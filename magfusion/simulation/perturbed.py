@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.model.aiding import AidingSensor
 from magfusion.model.correlation import Component, Correlation
 from magfusion.model.physics.earth import earth_field_world
+from magfusion.model.response import changed_axes
 from magfusion.model.site import Beacon, Magnetometer, Site, rotor_coils
 from magfusion.units import Array
 
@@ -100,6 +101,12 @@ def _perturb_magnetometer(magnetometer: Magnetometer, draw: Draw, name: str | No
     if sigma.clock_offset:
         late = draw("time-offset", own, "clock_offset", np.array([sigma.clock_offset]))
         magnetometer = replace(magnetometer, clock_offset=magnetometer.clock_offset + late[0])
+    if sigma.response is not None:
+        gain = draw("magnetometer", own, "response_gain", sigma.response.gain)
+        phase = draw("magnetometer", own, "response_phase", sigma.response.phase)
+        nodes_hz, change = sigma.response.frequency_hz, gain + 1j * phase
+        response = changed_axes(magnetometer.response, nodes_hz, change)
+        magnetometer = replace(magnetometer, response=response)
     return replace(
         magnetometer,
         matrix=magnetometer.matrix + matrix,
