@@ -43,12 +43,12 @@ ROOMS = {
             aiding_messages bag_reader bag_rows checkpoint correlation field_map kept lost_rows
             probe row_file survey table yaml_files
             attitude_table audio distances drive_columns fields hall instruments readings_table
-            site_casing site_correlation site_motion site_region site_response site_rotor
+            site_casing site_correlation site_motion site_region site_rotor
             site_temperature
             row_stamps steel_file trajectory_table wells_file
             aiding_tables bag depth_table fix_table marks_table result_states rotor_columns
             site_plain site_text
-            temperature_table tum
+            site_response temperature_table tum
             inertial_tables odometry_bag site_magnetometer stream
             site_aiding trajectory_formats
             named_records named_samples site_schema stream_contents
