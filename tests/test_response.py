@@ -177,7 +177,7 @@ def test_a_site_keeps_the_sigmas_of_its_response(tmp_path: Path) -> None:
 def test_sigmas_of_a_tone_that_no_beacon_sends_are_refused(tmp_path: Path) -> None:
     save_site(uncertain(demo_site(), 0.2, 10.0), tmp_path / "site.yaml")
     text = (tmp_path / "site.yaml").read_text(encoding="utf-8")
-    text = re.sub(r"(response:\s+- frequency_hz: )20.0", r"\g<1>21.0", text)
+    text = re.sub(r"(response:\s+- \{?frequency_hz: )20.0", r"\g<1>21.0", text)
     (tmp_path / "site.yaml").write_text(text, encoding="utf-8")
     sentence = r"sigma.response: found \[21.*give one row for each tone: 20, 25, 30, 35 Hz"
     with pytest.raises(InputError, match=sentence):

@@ -82,7 +82,8 @@ ROOMS = {
             integrity initialization online_integrity online orientation rests
         """,
         "calibration": """
-            allan antenna beacon fieldmap graph magnetometer marked_snapshots steady_field stops
+            allan antenna beacon bench_response fieldmap graph magnetometer marked_snapshots
+            steady_field stops
             installation
             allan_fit antenna_graph antenna_observability antenna_probe antenna_site beacon_refined
             ellipsoid magnetometer_graph rest turn_coverage
@@ -116,8 +117,8 @@ ROOMS = {
             allan_noise checkpoint failure magnetometer_trust magnetometer_turns orientation
             budget_figures settings without_beacons
             accept allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
-            calibrate_magnetometer check coil design_settings drift_world drive evaluate export
-            import_figures init_settings
+            calibrate_magnetometer calibrate_response check coil design_settings drift_world drive
+            evaluate export import_figures init_settings
             listen live papers published_fix range_wells rates region replay rest_settings
             sheet simulate_ranging smooth_result survey view
             antenna_fit demodulate design_motion drift_figures fix import_log init_questions
