@@ -165,8 +165,14 @@ def test_slips_are_corrected_live(walk: Log, slips: list[tuple[int, int]], tmp_p
         for k in range(0, len(played), block):
             yield from source.records(played[k : k + block], (k + block) / RATE_HZ)
 
-    received = json.loads(json.dumps(list(records()), default=list))
+    remarks, received = [], []
+    for record in records():
+        received.append(json.loads(json.dumps(record, default=list)))
+        remarks += source.remarks()
+    for sentence, slip in zip(remarks, source.slips, strict=True):  # each by itself
+        assert sentence.startswith(f"card: {slip.missing} samples")
+        assert f"(sample {slip.place})" in sentence
     check_slips([(s.place - round(WARM_UP * RATE_HZ), s.missing) for s in source.slips], slips)
     states = navigated(walk, received, WARM_UP, tmp_path / "site.yaml")
     assert error_of(walk, states, WARM_UP) < LARGEST_ERROR
-    assert next(iter(source.close())).startswith("card: ")
+    assert not any("are lost at" in sentence for sentence in source.close())
