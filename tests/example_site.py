@@ -38,8 +38,8 @@ def mixed_site() -> Site:
             offset=np.full(3, 1e-8),
             rotation_sensor=0.02 * UNEVEN,
             position_body=0.003 * UNEVEN,
-            response=ResponseSigma(TONES_HZ, 0.1 * by_axis, 0.05 * by_axis),
         ),
+        response_sigma=ResponseSigma(TONES_HZ, 0.1 * by_axis, 0.05 * by_axis),
     )
     platform = replace(plain.platform, magnetometer=magnetometer)
     return replace(plain, beacons=beacons, platform=platform)

@@ -111,7 +111,7 @@ def test_a_coil_on_a_bench_finds_the_responses(
     assert np.max(np.abs(errors_of_axes(room(), true).real)) > 0.2
     assert np.sqrt(np.mean(error.real**2)) < 0.003
     assert np.sqrt(np.mean(error.imag**2)) < 0.2 * DEGREE
-    sigma = result.platform.magnetometer.sigma.response
+    sigma = result.platform.magnetometer.response_sigma
     assert sigma is not None
     # Places err alike at all tones: the gains are two numbers, the phases eight.
     assert np.max(np.abs(np.mean(error.real, axis=0)) / np.mean(sigma.gain, axis=0)) < 3.0
@@ -127,7 +127,7 @@ def test_a_receiver_that_is_known_is_refused(
 ) -> None:
     save_site(demo_site(), tmp_path / "known.yaml")
     settings = replace(given[0], site=tmp_path / "known.yaml")
-    with pytest.raises(InputError, match=r"sigma.response: is missing; declare how far"):
+    with pytest.raises(InputError, match=r"response_sigma: is missing; declare how far"):
         run_calibrate_response(settings, tmp_path / "response")
     assert not (tmp_path / "response").exists()
 

@@ -148,16 +148,16 @@ def uncertain(site: Site, gain: float, phase_deg: float) -> Site:
     by_axis = np.ones((len(tones_hz), 2))
     sensor = site.platform.magnetometer
     response = ResponseSigma(tones_hz, gain * by_axis, phase_deg * DEGREE * by_axis)
-    sigma = replace(sensor.sigma, matrix=np.zeros((3, 3)), response=response)
-    magnetometer = replace(sensor, sigma=sigma)
+    sigma = replace(sensor.sigma, matrix=np.zeros((3, 3)))
+    magnetometer = replace(sensor, sigma=sigma, response_sigma=response)
     return replace(site, platform=replace(site.platform, magnetometer=magnetometer))
 
 
 def errors_of_axes(result: Site, truth: Site) -> ComplexArray:
     """Return the errors of y and z relative to x at each tone: of log-gain and phase (rad)."""
     sensor = truth.platform.magnetometer
-    assert sensor.sigma.response is not None
-    tones_hz = sensor.sigma.response.frequency_hz
+    assert sensor.response_sigma is not None
+    tones_hz = sensor.response_sigma.frequency_hz
     both = (log_response(s.platform.magnetometer.response, tones_hz) for s in (result, truth))
     own, true = (log[:, 1:] - log[:, :1] for log in both)
     return own - true
@@ -166,8 +166,8 @@ def errors_of_axes(result: Site, truth: Site) -> ComplexArray:
 def test_a_site_keeps_the_sigmas_of_its_response(tmp_path: Path) -> None:
     site = uncertain(demo_site(), 0.2, 10.0)
     save_site(site, tmp_path / "site.yaml")
-    result = load_site(tmp_path / "site.yaml").platform.magnetometer.sigma.response
-    expected = site.platform.magnetometer.sigma.response
+    result = load_site(tmp_path / "site.yaml").platform.magnetometer.response_sigma
+    expected = site.platform.magnetometer.response_sigma
     assert result is not None
     assert expected is not None
     for name in ("frequency_hz", "gain", "phase"):
@@ -177,9 +177,9 @@ def test_a_site_keeps_the_sigmas_of_its_response(tmp_path: Path) -> None:
 def test_sigmas_of_a_tone_that_no_beacon_sends_are_refused(tmp_path: Path) -> None:
     save_site(uncertain(demo_site(), 0.2, 10.0), tmp_path / "site.yaml")
     text = (tmp_path / "site.yaml").read_text(encoding="utf-8")
-    text = re.sub(r"(response:\s+- \{?frequency_hz: )20.0", r"\g<1>21.0", text)
+    text = re.sub(r"(response_sigma:\s+- \{?frequency_hz: )20.0", r"\g<1>21.0", text)
     (tmp_path / "site.yaml").write_text(text, encoding="utf-8")
-    sentence = r"sigma.response: found \[21.*give one row for each tone: 20, 25, 30, 35 Hz"
+    sentence = r"response_sigma: found \[21.*give one row for each tone: 20, 25, 30, 35 Hz"
     with pytest.raises(InputError, match=sentence):
         load_site(tmp_path / "site.yaml")
 

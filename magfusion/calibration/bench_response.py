@@ -54,7 +54,7 @@ class BenchSnapshots(Snapshots):
         start = self.world_from_body, self.position_world
         cost, result, information = self.minimised(chosen, *start)
         own = 6 * len(self.samples)
-        return cost, result, np.linalg.inv(information)[own:, own:], chosen
+        return cost, result, np.asarray(np.linalg.inv(information)[own:, own:]), chosen
 
     def normal(self, at: JointEstimate, blocks: tuple[Block, ...]) -> NormalEquations:
         """Return the normal equations of the fields, with the known poses."""

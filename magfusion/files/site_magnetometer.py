@@ -1,6 +1,5 @@
 """Keys of magnetometers in a site's file."""
 
-from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -72,7 +71,6 @@ class MagnetometerSigmaEntry(StrictModel):
     rotation_deg: RotationSigma = Field(default_factory=zeros)
     position_m: PositionSigma = Field(default_factory=zeros)
     clock_offset_s: Annotated[FromZero, between(0.0, 1.0)] = 0.0
-    response: Annotated[list[ResponseSigmaEntry], at_least_one("frequency")] | None = None
 
 
 class MountingEntry(StrictModel):
@@ -100,6 +98,7 @@ class MagnetometerEntry(StrictModel):
     offset_walk_t: Annotated[NotNegative, tesla(LARGEST_OFFSET)] = 2e-8  # gained in an hour
     warming: SensorTemperatureEntry | None = None
     response: Listed | None = None
+    response_sigma: Annotated[list[ResponseSigmaEntry], at_least_one("frequency")] | None = None
     axis_responses: AxisResponsesEntry | None = None
     coil: CoilEntry | None = None
     axis_coils: AxisCoilsEntry | None = None
@@ -172,8 +171,8 @@ def check_tones(sensor: MagnetometerEntry, tones_hz: Array, at: tuple[str | int,
     if sensor.axis_responses is not None:
         for axis, entries in sensor.axis_responses.axes.items():
             check_response(entries, tones_hz, (*at, "axis_responses", axis))
-    if sensor.sigma.response is not None:
-        check_response_sigma(sensor.sigma.response, tones_hz, (*at, "sigma", "response"))
+    if sensor.response_sigma is not None:
+        check_response_sigma(sensor.response_sigma, tones_hz, (*at, "response_sigma"))
     highest = float(np.max(tones_hz, initial=0.0))
     if 2.0 * np.pi * highest * sensor.sigma.clock_offset_s > LARGEST_PHASE:
         maximum = LARGEST_PHASE / (2.0 * np.pi * highest)
@@ -192,10 +191,7 @@ def magnetometer_of(entry: MagnetometerEntry) -> Magnetometer:
         noise_density=entry.noise_density_t_rthz,
         matrix=entry.matrix,
         offset=entry.offset_t,
-        sigma=replace(
-            model_of(MagnetometerSigma, entry.sigma),
-            response=response_sigma(entry.sigma.response),
-        ),
+        sigma=model_of(MagnetometerSigma, entry.sigma),
         coil_centres_sensor=entry.coil_centres_m,
         offset_walk=entry.offset_walk_t,
         coil_kappa=entry.coil_kappa_m2,
@@ -203,6 +199,7 @@ def magnetometer_of(entry: MagnetometerEntry) -> Magnetometer:
         response=responses_of(
             entry.response or entry.coil, entry.axis_responses or entry.axis_coils
         ),
+        response_sigma=response_sigma(entry.response_sigma),
         casing=None if entry.casing is None else entry.casing.casing(),
         axes="".join(sorted(set(entry.axes or Magnetometer.axes))),
         name=entry.name or Magnetometer.name,
@@ -255,6 +252,7 @@ def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
         own
         | temperature_entry(magnetometer.temperature_model)
         | response_entry(magnetometer.response)
+        | response_sigma_entry(magnetometer.response_sigma)
         | casing_entry(magnetometer.casing)
         | {
             "body_from_sensor": {
@@ -270,7 +268,6 @@ def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
                 "rotation_deg": degree_sigma_entry(sigma.rotation_sensor),
                 "position_m": sigma_entry(sigma.position_body),
                 **clock,
-                **response_sigma_entry(sigma.response),
             },
         }
     )

@@ -110,7 +110,7 @@ def response_sigma_entry(sigma: ResponseSigma | None) -> dict[str, Any]:
     rows = zip(sigma.frequency_hz, sigma.gain, sigma.phase, strict=True)
     keys = tuple(ResponseSigmaEntry.model_fields)
     parts = ((float(f), sigma_entry(g), degree_sigma_entry(p)) for f, g, p in rows)
-    return {"response": [dict(zip(keys, row, strict=True)) for row in parts]}
+    return {"response_sigma": [dict(zip(keys, row, strict=True)) for row in parts]}
 
 
 def check_response_sigma(

@@ -30,7 +30,7 @@ class ResponseSettings(Settings):
     """Survey about a coil, and the uncertainty of its poses."""
 
     survey: Path = argument("Survey: phasors of the receiver at known poses about a coil")
-    site: Path = required("Site file of the bench: coil, and receiver with sigma: {response}")
+    site: Path = required("Site file of the bench: coil, and receiver with response_sigma")
     into: Path | None = option(
         None, "Site file to write the response into", note="default: that of the bench"
     )
@@ -61,9 +61,9 @@ def run_calibrate_response(settings: ResponseSettings, output: Path) -> Figures:
 
     claimed, path = claim(output, JOB), settings.survey
     site, survey = three_axes(load_site(settings.site), settings.site), read_survey(path)
-    if site.platform.magnetometer.sigma.response is None:
+    if site.platform.magnetometer.response_sigma is None:
         raise InputError(
-            f"{settings.site}: platform.magnetometer.sigma.response: is missing; declare how far"
+            f"{settings.site}: platform.magnetometer.response_sigma: is missing; declare how far"
             " the responses of y and z may be from those given"
         )
     target = None if settings.into is None else _target(settings.into, site)
@@ -149,10 +149,8 @@ def _target(path: Path, bench: Site) -> Site:
 
 def _with_response(site: Site, refined: Site) -> Site:
     sensor, own = site.platform.magnetometer, refined.platform.magnetometer
-    known, correlation = replace(sensor.sigma, response=own.sigma.response), site.correlation
-    platform = replace(
-        site.platform, magnetometer=replace(sensor, response=own.response, sigma=known)
-    )
+    sensor = replace(sensor, response=own.response, response_sigma=own.response_sigma)
+    correlation, platform = site.correlation, replace(site.platform, magnetometer=sensor)
     return replace(
         site,
         platform=platform,

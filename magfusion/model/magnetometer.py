@@ -24,8 +24,6 @@ class MagnetometerSigma:
         Of the lever arm, body axes (m).
     clock_offset : float
         (s)
-    response : ResponseSigma, optional
-        Of y and z relative to x; None if known.
     """
 
     matrix: Array
@@ -33,7 +31,6 @@ class MagnetometerSigma:
     rotation_sensor: Array
     position_body: Array
     clock_offset: float = 0.0
-    response: ResponseSigma | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +59,8 @@ class Magnetometer:
         Temperature dependence of matrix and offset.
     response : FrequencyResponse or AxisResponses, optional
         Response to alternating fields; None if equal to that of steady fields.
+    response_sigma : ResponseSigma, optional
+        Prior of the responses of y and z relative to x; None if known.
     axes : str
         Names of its axes.
     casing : Casing, optional
@@ -94,6 +93,7 @@ class Magnetometer:
     coil_kappa: float = 0.0
     temperature_model: SensorTemperatureModel | None = None
     response: FrequencyResponse | AxisResponses | None = None
+    response_sigma: ResponseSigma | None = None
     axes: str = "xyz"
     casing: Casing | None = None
     name: str = "magnetometer"

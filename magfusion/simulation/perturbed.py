@@ -101,10 +101,11 @@ def _perturb_magnetometer(magnetometer: Magnetometer, draw: Draw, name: str | No
     if sigma.clock_offset:
         late = draw("time-offset", own, "clock_offset", np.array([sigma.clock_offset]))
         magnetometer = replace(magnetometer, clock_offset=magnetometer.clock_offset + late[0])
-    if sigma.response is not None:
-        gain = draw("magnetometer", own, "response_gain", sigma.response.gain)
-        phase = draw("magnetometer", own, "response_phase", sigma.response.phase)
-        nodes_hz, change = sigma.response.frequency_hz, gain + 1j * phase
+    prior = magnetometer.response_sigma
+    if prior is not None:
+        gain = draw("magnetometer", own, "response_gain", prior.gain)
+        phase = draw("magnetometer", own, "response_phase", prior.phase)
+        nodes_hz, change = prior.frequency_hz, gain + 1j * phase
         response = changed_axes(magnetometer.response, nodes_hz, change)
         magnetometer = replace(magnetometer, response=response)
     return replace(

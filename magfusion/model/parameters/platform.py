@@ -124,10 +124,10 @@ class _Response(MagnetometerParameter):
 
     def owners(self, site: Site) -> tuple[str, ...]:
         every = super().owners(site)
-        return tuple(owner for owner in every if self.part(site, owner).sigma.response is not None)
+        return tuple(owner for owner in every if self.part(site, owner).response_sigma is not None)
 
     def _prior(self, site: Site, owner: str) -> ResponseSigma:
-        result = self.part(site, owner).sigma.response
+        result = self.part(site, owner).response_sigma
         assert result is not None
         return result
 
@@ -154,11 +154,11 @@ class _Response(MagnetometerParameter):
     def refined(self, site: Site, calibration: Calibration, owner: str, sigma: Array) -> Site:
         part = self.part(site, owner)
         prior = replace(self._prior(site, owner), **{self.attribute: sigma.reshape(-1, 2)})
-        return self.with_part(site, replace(part, sigma=replace(part.sigma, response=prior)))
+        return self.with_part(site, replace(part, response_sigma=prior))
 
     def own_jacobian(self, view: PhasorView) -> ComplexArray | None:
         platform = view.calibration.site.platform
-        prior = platform.magnetometers[view.sensor].sigma.response
+        prior = platform.magnetometers[view.sensor].response_sigma
         assert prior is not None
         tones_hz = view.beacon.tone_frequencies_hz
         node = np.argmin(np.abs(tones_hz[:, None] - prior.frequency_hz), axis=1)
