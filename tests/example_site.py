@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.model.response import ResponseSigma
 from magfusion.model.site import BeaconSigma, Coil, MagnetometerSigma, Site
 from magfusion.simulation.demo_site import demo_site
 
 UNEVEN = np.array([1.0, 2.0, 3.0])
+TONES_HZ = np.array([20.0, 22.0, 25.0, 28.0, 31.0, 35.0])
 
 
 def mixed_site() -> Site:
@@ -26,6 +28,7 @@ def mixed_site() -> Site:
         replace(beacon, sigma=BeaconSigma(0.01 * UNEVEN, 0.02 * UNEVEN, 0.01 * UNEVEN[:n]))
         for beacon, n in ((a, 2), (b, 3), (replace(c, synchronised=False), 1), (d, 2))
     )
+    by_axis = np.arange(1.0, 13.0).reshape(6, 2) / 12.0
     magnetometer = replace(
         plain.platform.magnetometer,
         body_from_sensor=Rotation.from_euler("xyz", (0.5, -1.2, 2.5)).as_matrix(),
@@ -36,6 +39,7 @@ def mixed_site() -> Site:
             rotation_sensor=0.02 * UNEVEN,
             position_body=0.003 * UNEVEN,
         ),
+        response_sigma=ResponseSigma(TONES_HZ, 0.1 * by_axis, 0.05 * by_axis),
     )
     platform = replace(plain.platform, magnetometer=magnetometer)
     return replace(plain, beacons=beacons, platform=platform)

@@ -418,7 +418,8 @@ def test_a_refined_site_survives_its_file_and_tells_what_was_determined(tmp_path
     assert record["log"] == "walk"
     assert record["determined"] == [f.key for f in reported]
     assert record["undetermined"] == []
-    drive = {f.key: [f.change, f.sigma] for f in reported if "phase" in f.name or "drift" in f.name}
+    of_drive = [f for f in reported if ".phase" in f.name or "drift" in f.name]
+    drive = {f.key: [f.change, f.sigma] for f in of_drive}
     assert len(drive) == 6
     assert record["drive"] == drive
 

@@ -1,5 +1,6 @@
 """A magnetometer that answers to a tone by less than to a steady field, and late."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,13 +15,14 @@ from magfusion.estimation.demodulation.demodulation import phasors
 from magfusion.estimation.integrity.judge import judge_result
 from magfusion.files.site import load_site, save_site
 from magfusion.model.parameters import initial_calibration, predict_channels
-from magfusion.model.response import AxisResponses, FrequencyResponse
+from magfusion.model.response import AxisResponses, FrequencyResponse, ResponseSigma, log_response
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Verdict
 from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
+from magfusion.units import DEGREE, ComplexArray
 
 RATE, CUT_OFF, THINNED = 4000.0, 200.0, 8  # Hz, Hz, samples
 FREQUENCIES = np.linspace(10.0, 190.0, 40)  # Hz
@@ -138,6 +140,63 @@ def test_a_table_that_cannot_be_is_refused(tmp_path: Path, rows: str, sentence: 
     (tmp_path / "site.yaml").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=sentence):
         load_site(tmp_path / "site.yaml")
+
+
+def uncertain(site: Site, gain: float, phase_deg: float) -> Site:
+    """Return the site with responses of y and z that are hardly known, and all else as declared."""
+    tones_hz = np.unique(site.tone_frequencies_hz)
+    by_axis = np.ones((len(tones_hz), 2))
+    sensor = site.platform.magnetometer
+    response = ResponseSigma(tones_hz, gain * by_axis, phase_deg * DEGREE * by_axis)
+    sigma = replace(sensor.sigma, matrix=np.zeros((3, 3)))
+    magnetometer = replace(sensor, sigma=sigma, response_sigma=response)
+    return replace(site, platform=replace(site.platform, magnetometer=magnetometer))
+
+
+def errors_of_axes(result: Site, truth: Site) -> ComplexArray:
+    """Return the errors of y and z relative to x at each tone: of log-gain and phase (rad)."""
+    sensor = truth.platform.magnetometer
+    assert sensor.response_sigma is not None
+    tones_hz = sensor.response_sigma.frequency_hz
+    both = (log_response(s.platform.magnetometer.response, tones_hz) for s in (result, truth))
+    own, true = (log[:, 1:] - log[:, :1] for log in both)
+    return own - true
+
+
+def test_a_site_keeps_the_sigmas_of_its_response(tmp_path: Path) -> None:
+    site = uncertain(demo_site(), 0.2, 10.0)
+    save_site(site, tmp_path / "site.yaml")
+    result = load_site(tmp_path / "site.yaml").platform.magnetometer.response_sigma
+    expected = site.platform.magnetometer.response_sigma
+    assert result is not None
+    assert expected is not None
+    for name in ("frequency_hz", "gain", "phase"):
+        np.testing.assert_allclose(getattr(result, name), getattr(expected, name), rtol=1e-9)
+
+
+def test_sigmas_of_a_tone_that_no_beacon_sends_are_refused(tmp_path: Path) -> None:
+    save_site(uncertain(demo_site(), 0.2, 10.0), tmp_path / "site.yaml")
+    text = (tmp_path / "site.yaml").read_text(encoding="utf-8")
+    text = re.sub(r"(response_sigma:\s+- \{?frequency_hz: )20.0", r"\g<1>21.0", text)
+    (tmp_path / "site.yaml").write_text(text, encoding="utf-8")
+    sentence = r"response_sigma: found \[21.*give one row for each tone: 20, 25, 30, 35 Hz"
+    with pytest.raises(InputError, match=sentence):
+        load_site(tmp_path / "site.yaml")
+
+
+@pytest.mark.slow
+def test_a_minute_of_walk_finds_the_responses() -> None:
+    site = uncertain(demo_site(), 0.2, 10.0)
+    walk = simulate_log(site, SimulationConfig(DEMO_BOX_WORLD), np.random.default_rng(0))
+    result, trust = judge_result(smooth(walk.log, site, SmootherSettings()), walk.log)
+    error = errors_of_axes(result.calibration.site, walk.true_site)
+    assert np.max(np.abs(errors_of_axes(site, walk.true_site).real)) > 0.2
+    assert np.sqrt(np.mean(error.real**2)) < 0.003
+    assert np.sqrt(np.mean(error.imag**2)) < 0.2 * DEGREE
+    sigma = {b.kind: np.sqrt(np.diag(result.calibration_cov))[b.columns] for b in result.blocks}
+    for part, kind in ((error.real, "response_gain"), (error.imag, "response_phase")):
+        assert np.sqrt(np.mean((part.ravel() / sigma[kind]) ** 2)) < 2.0  # of 8 numbers
+    assert trust.verdict is Verdict.TRUSTWORTHY
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,9 @@ from magfusion.jobs.smooth import run_smooth
 from magfusion.model.bandpass import BandFilter
 from magfusion.model.response import NOMINAL_T_PER_V
 from magfusion.model.samples import Log
+from magfusion.model.site import Site
 from magfusion.model.slip_sampler import SlipSampler
+from magfusion.results.figures import Figures
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.units import Array
@@ -32,6 +35,9 @@ soundfile = pytest.importorskip("soundfile")
 DURATION = 22.0  # s
 LARGEST_ERROR = 2e-3  # m
 TOLERANCE = 2  # samples
+FAST = 5e-5  # of a card's clock
+LARGEST_OF_FAST = 4e-4  # m
+LARGEST_NEES = 15.0  # of six numbers
 
 
 def moving_tones(rng: np.random.Generator, duration: float) -> Array:
@@ -123,15 +129,13 @@ def check_slips(found: list[tuple[int, int]], slips: list[tuple[int, int]]) -> N
     assert np.array(found) == pytest.approx(expected, abs=TOLERANCE)
 
 
-@pytest.mark.slow
-def test_a_recording_with_slips_is_smoothed(
-    walk: Log, slips: list[tuple[int, int]], tmp_path: Path
-) -> None:
+def smoothed(walk: Log, recorded: Array, site: Site, tmp_path: Path) -> tuple[Figures, Figures]:
+    """Import a recording and smooth it; return the figures of both."""
     assert walk.truth is not None
-    soundfile.write(tmp_path / "walk.flac", volts(walk, slips), RATE_HZ, subtype="PCM_24")
+    soundfile.write(tmp_path / "walk.flac", recorded, RATE_HZ, subtype="PCM_24")
     write_imu(walk.imu, tmp_path / "imu.parquet", 0)
     write_trajectory(walk.truth, tmp_path / "truth.parquet", 0)
-    save_site(exact_site(), tmp_path / "site.yaml")
+    save_site(site, tmp_path / "site.yaml")
     settings = ImportSettings(
         sources=(str(tmp_path / "walk.flac"),),
         imu=tmp_path / "imu.parquet",
@@ -142,31 +146,72 @@ def test_a_recording_with_slips_is_smoothed(
         epoch="0",
         site=tmp_path / "site.yaml",
     )
-    figures = run_import(settings, tmp_path / "log")
-    assert any("are lost at" in note for note in figures["notes"])
+    imported = run_import(settings, tmp_path / "log")
+    job = Job(tmp_path / "log", tmp_path / "site.yaml", tmp_path / "run")
+    return imported, run_smooth(job, SmootherSettings())
+
+
+@pytest.mark.slow
+def test_a_recording_with_slips_is_smoothed(
+    walk: Log, slips: list[tuple[int, int]], tmp_path: Path
+) -> None:
+    imported, figures = smoothed(walk, volts(walk, slips), exact_site(), tmp_path)
+    assert any("are lost at" in note for note in imported["notes"])
     header = yaml.safe_load((tmp_path / "log" / "log.yaml").read_text())
     check_slips(header["audio"]["slips"], slips)
-    job = Job(tmp_path / "log", tmp_path / "site.yaml", tmp_path / "run")
-    figures = run_smooth(job, SmootherSettings())
     assert figures["ate_m"] < LARGEST_ERROR
     assert figures["verdict"] == "trustworthy"
+
+
+def listened(source: SoundSource, recorded: Array) -> Iterator[dict]:
+    """Yield the records of a recording that begins after `WARM_UP`."""
+    block = RATE_HZ // 50
+    played = np.concatenate([np.zeros((round(WARM_UP * RATE_HZ), 3)), recorded])
+    for k in range(0, len(played), block):
+        for record in source.records(played[k : k + block], (k + block) / RATE_HZ):
+            yield json.loads(json.dumps(record, default=list))
+
+
+@pytest.mark.slow
+def test_a_walk_by_a_fast_card_is_navigated_as_it_is_smoothed(tmp_path: Path) -> None:
+    """All is on the clock of the card, by which the drives are slow, as `listen` stamps it."""
+    site = exact_site()
+    config = SimulationConfig(
+        DEMO_BOX_WORLD,
+        duration=DURATION,
+        magnetometer_rate_hz=RATE_HZ * (1.0 + FAST),
+        perturb=False,
+    )
+    log = simulate_log(site, config, np.random.default_rng(9)).log
+    assert log.truth is not None
+    imu, truth = (replace(part, time=(1.0 + FAST) * part.time) for part in (log.imu, log.truth))
+    log = replace(log, imu=imu, truth=truth)
+    sensor = replace(site.platform.magnetometer, clock_rate_sigma=FAST)
+    site = replace(site, platform=replace(site.platform, magnetometer=sensor))
+    _, figures = smoothed(log, volts(log, []), site, tmp_path)
+    source = SoundSource("card", RATE_HZ, "x,y,z", FULL_SCALE, site)
+    received = list(listened(source, volts(log, [])))
+    assert source.slips == []
+    states = navigated(log, received, WARM_UP, tmp_path / "site.yaml")
+    error = error_of(log, states, WARM_UP)
+    assert error < min(LARGEST_OF_FAST, 2.0 * figures["ate_m"])
+    assert figures["verdict"] == "trustworthy"
+    assert figures["nees_mean"] < LARGEST_NEES
+    assert {state["verdict"] for state in states} == {"trustworthy"}
 
 
 @pytest.mark.slow
 def test_slips_are_corrected_live(walk: Log, slips: list[tuple[int, int]], tmp_path: Path) -> None:
     save_site(exact_site(), tmp_path / "site.yaml")
     source = SoundSource("card", RATE_HZ, "x,y,z", FULL_SCALE, exact_site())
-    recorded = volts(walk, slips)
-
-    def records() -> Iterator[dict]:
-        silence, block = round(WARM_UP * RATE_HZ), RATE_HZ // 50
-        lead = np.zeros((silence, 3))
-        played = np.concatenate([lead, recorded])
-        for k in range(0, len(played), block):
-            yield from source.records(played[k : k + block], (k + block) / RATE_HZ)
-
-    received = json.loads(json.dumps(list(records()), default=list))
+    remarks, received = [], []
+    for record in listened(source, volts(walk, slips)):
+        received.append(record)
+        remarks += source.remarks()
+    for sentence, slip in zip(remarks, source.slips, strict=True):  # each by itself
+        assert sentence.startswith(f"card: {slip.missing} samples")
+        assert f"(sample {slip.place})" in sentence
     check_slips([(s.place - round(WARM_UP * RATE_HZ), s.missing) for s in source.slips], slips)
     states = navigated(walk, received, WARM_UP, tmp_path / "site.yaml")
     assert error_of(walk, states, WARM_UP) < LARGEST_ERROR
-    assert next(iter(source.close())).startswith("card: ")
+    assert not any("are lost at" in sentence for sentence in source.close())

@@ -43,12 +43,12 @@ ROOMS = {
             aiding_messages bag_reader bag_rows checkpoint correlation field_map kept lost_rows
             probe row_file survey table yaml_files
             attitude_table audio distances drive_columns fields hall instruments readings_table
-            site_casing site_correlation site_motion site_region site_response site_rotor
+            site_casing site_correlation site_motion site_region site_rotor
             site_temperature
             row_stamps steel_file trajectory_table wells_file
             aiding_tables bag depth_table fix_table marks_table result_states rotor_columns
             site_plain site_text
-            temperature_table tum
+            site_response temperature_table tum
             inertial_tables odometry_bag site_magnetometer stream
             site_aiding trajectory_formats
             named_records named_samples site_schema stream_contents
@@ -82,7 +82,8 @@ ROOMS = {
             integrity initialization online_integrity online orientation rests
         """,
         "calibration": """
-            allan antenna beacon fieldmap graph magnetometer marked_snapshots steady_field stops
+            allan antenna beacon bench_response fieldmap graph magnetometer marked_snapshots
+            steady_field stops
             installation
             allan_fit antenna_graph antenna_observability antenna_probe antenna_site beacon_refined
             ellipsoid magnetometer_graph rest turn_coverage
@@ -118,8 +119,8 @@ ROOMS = {
             coil
             coil_drive
             accept allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
-            calibrate_magnetometer check design_settings drift_world drive evaluate export
-            import_figures init_settings
+            calibrate_magnetometer calibrate_response check design_settings drift_world drive
+            evaluate export import_figures init_settings
             listen live papers published_fix range_wells rates region replay rest_settings
             sheet simulate_ranging smooth_result survey view
             antenna_fit demodulate design_motion drift_figures fix import_log init_questions

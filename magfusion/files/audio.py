@@ -224,14 +224,14 @@ def lost_finding(entry: AudioEntry | None) -> tuple[Finding, ...]:
     return (Finding("samples_lost", text, Verdict.TRUSTWORTHY),)
 
 
-def slip_text(slips: Sequence[Sequence[int]], rate_hz: float) -> str:
-    """Return lengths and times of slips (s after the first sample) as words."""
+def slip_text(slips: Sequence[Sequence[int]], rate_hz: float, first: int = 0) -> str:
+    """Return lengths, times (s after the first sample) and places of slips from one on as words."""
     before_each = np.cumsum([0, *(count for _, count in slips)])
     words = [
         f"{count} samples ({1e3 * count / rate_hz:.4g} ms) are lost at"
-        f" {(place + before) / rate_hz:.3f} s"
+        f" {(place + before) / rate_hz:.3f} s (sample {place})"
         for (place, count), before in zip(slips, before_each[:-1].tolist(), strict=True)
-    ]
+    ][first:]
     return ", ".join(words[:MOST_NAMED]) + f", and at {len(words) - MOST_NAMED} more places" * (
         len(words) > MOST_NAMED
     )
@@ -293,15 +293,18 @@ def describe_recording(
     )
 
 
-def slip_remarks(slips: Sequence[Slip], unexplained: int, rate_hz: float) -> tuple[str, ...]:
-    """Return sentences on slips, those that are ambiguous, and steps that are none."""
+def slip_remarks(
+    slips: Sequence[Slip], unexplained: int, rate_hz: float, first: int = 0
+) -> tuple[str, ...]:
+    """Return sentences on slips from one on, on ambiguous ones, and on steps that are none."""
     result = []
-    if slips:
-        result.append(f"{slip_text([[s.place, s.missing] for s in slips], rate_hz)}.")
+    if slips[first:]:
+        places = [[s.place, s.missing] for s in slips]
+        result.append(f"{slip_text(places, rate_hz, first)}.")
     result += [
         f"The slip after sample {slip.place} is ambiguous: {slip.missing} or"
         f" {' or '.join(map(str, slip.others))} samples explain the phases of the tones."
-        for slip in slips
+        for slip in slips[first:]
         if slip.others
     ]
     if unexplained:

@@ -21,8 +21,12 @@ from magfusion.files.site_response import (
     AxisResponsesEntry,
     CoilEntry,
     Listed,
+    ResponseSigmaEntry,
     check_response,
+    check_response_sigma,
     response_entry,
+    response_sigma,
+    response_sigma_entry,
     responses_of,
 )
 from magfusion.files.site_temperature import SensorTemperatureEntry, temperature_entry
@@ -38,6 +42,7 @@ from magfusion.files.site_values import (
     PositionSigma,
     RotationSigma,
     array,
+    at_least_one,
     between,
     not_singular,
     plain_name,
@@ -93,6 +98,7 @@ class MagnetometerEntry(StrictModel):
     offset_walk_t: Annotated[NotNegative, tesla(LARGEST_OFFSET)] = 2e-8  # gained in an hour
     warming: SensorTemperatureEntry | None = None
     response: Listed | None = None
+    response_sigma: Annotated[list[ResponseSigmaEntry], at_least_one("frequency")] | None = None
     axis_responses: AxisResponsesEntry | None = None
     coil: CoilEntry | None = None
     axis_coils: AxisCoilsEntry | None = None
@@ -165,6 +171,8 @@ def check_tones(sensor: MagnetometerEntry, tones_hz: Array, at: tuple[str | int,
     if sensor.axis_responses is not None:
         for axis, entries in sensor.axis_responses.axes.items():
             check_response(entries, tones_hz, (*at, "axis_responses", axis))
+    if sensor.response_sigma is not None:
+        check_response_sigma(sensor.response_sigma, tones_hz, (*at, "response_sigma"))
     highest = float(np.max(tones_hz, initial=0.0))
     if 2.0 * np.pi * highest * sensor.sigma.clock_offset_s > LARGEST_PHASE:
         maximum = LARGEST_PHASE / (2.0 * np.pi * highest)
@@ -191,6 +199,7 @@ def magnetometer_of(entry: MagnetometerEntry) -> Magnetometer:
         response=responses_of(
             entry.response or entry.coil, entry.axis_responses or entry.axis_coils
         ),
+        response_sigma=response_sigma(entry.response_sigma),
         casing=None if entry.casing is None else entry.casing.casing(),
         axes="".join(sorted(set(entry.axes or Magnetometer.axes))),
         name=entry.name or Magnetometer.name,
@@ -243,6 +252,7 @@ def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
         own
         | temperature_entry(magnetometer.temperature_model)
         | response_entry(magnetometer.response)
+        | response_sigma_entry(magnetometer.response_sigma)
         | casing_entry(magnetometer.casing)
         | {
             "body_from_sensor": {

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from magfusion.files.site_plain import degree_sigma_entry, sigma_entry
 from magfusion.files.site_values import (
     HIGHEST_FREQUENCY,
     LARGEST_ANGLE,
@@ -14,9 +15,10 @@ from magfusion.files.site_values import (
     at_least_one,
     between,
     refusal_at,
+    sigma_array,
 )
 from magfusion.files.yaml_files import StrictModel
-from magfusion.model.response import AxisResponses, FrequencyResponse, PickupCoil
+from magfusion.model.response import AxisResponses, FrequencyResponse, PickupCoil, ResponseSigma
 from magfusion.units import DEGREE, Array
 
 
@@ -29,6 +31,14 @@ class ResponseEntry(StrictModel):
 
 
 Listed = Annotated[list[ResponseEntry], at_least_one("frequency")]
+
+
+class ResponseSigmaEntry(StrictModel):
+    """Sigmas of the responses of y and z relative to x at one frequency."""
+
+    frequency_hz: Annotated[float, between(LOWEST_FREQUENCY, HIGHEST_FREQUENCY)]
+    gain: Annotated[Array, sigma_array(2, largest=1.0)]
+    phase_deg: Annotated[Array, sigma_array(2, largest=90.0)]
 
 
 class AxisResponsesEntry(StrictModel):
@@ -82,6 +92,42 @@ def _response(entries: list[ResponseEntry] | CoilEntry) -> FrequencyResponse:
         return entries.response()
     rows = sorted((e.frequency_hz, e.gain, e.phase_deg * DEGREE) for e in entries)
     return FrequencyResponse(*np.array(rows).T)
+
+
+def response_sigma(entries: list[ResponseSigmaEntry] | None) -> ResponseSigma | None:
+    """Return the sigmas of all entries, in order of frequency."""
+    if entries is None:
+        return None
+    rows = sorted(entries, key=lambda entry: entry.frequency_hz)
+    columns = zip(*((e.frequency_hz, e.gain, e.phase_deg * DEGREE) for e in rows), strict=True)
+    return ResponseSigma(*map(np.array, columns))
+
+
+def response_sigma_entry(sigma: ResponseSigma | None) -> dict[str, Any]:
+    """Return their entry of a site's file."""
+    if sigma is None:
+        return {}
+    rows = zip(sigma.frequency_hz, sigma.gain, sigma.phase, strict=True)
+    keys = tuple(ResponseSigmaEntry.model_fields)
+    parts = ((float(f), sigma_entry(g), degree_sigma_entry(p)) for f, g, p in rows)
+    return {"response_sigma": [dict(zip(keys, row, strict=True)) for row in parts]}
+
+
+def check_response_sigma(
+    entries: list[ResponseSigmaEntry], tones_hz: Array, at: tuple[str | int, ...]
+) -> None:
+    """Reject rows that do not belong to the tones, one to each.
+
+    Parameters
+    ----------
+    at : tuple
+        Their place in the site's file.
+    """
+    given = sorted(entry.frequency_hz for entry in entries)
+    tones = np.unique(tones_hz[tones_hz > 0.0]).tolist()
+    if given != tones:
+        known = ", ".join(f"{tone:g}" for tone in tones)
+        raise refusal_at(at, given, f"give one row for each tone: {known} Hz")
 
 
 def check_response(

@@ -48,7 +48,7 @@ def _fits(value: object, shape: tuple[int, ...]) -> bool:
     return abs(value) <= sys.float_info.max
 
 
-_LISTS = {(3,): "a list of 3 numbers", (3, 3): "3 lists of 3 numbers"}
+_LISTS = {(2,): "a list of 2 numbers", (3,): "a list of 3 numbers", (3, 3): "3 lists of 3 numbers"}
 
 
 def array(*shape: int, largest: float = math.inf, unit: str = "") -> PlainValidator:

@@ -115,6 +115,10 @@ JOBS = {
         "Calibrate a tracker's antennas at known poses: moments, axes and centres of all six"
         " coils.",
     ),
+    "calibrate response": (
+        "calibrate_response",
+        "Estimate gain and phase of a receiver's axes at each tone, by a coil on a bench.",
+    ),
     "calibrate attitude-database": (
         "attitude_database",
         "Tabulate the measured field over the attitude, for magfusion match.",

@@ -19,7 +19,7 @@ from magfusion.jobs.listen_sound import SoundSource
 from magfusion.jobs.settings import Command, Settings, option
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
 POLL = 0.1  # s; within which the process answers a signal
 
@@ -93,14 +93,14 @@ def run(settings: ListenSettings) -> None:
     begin = time.monotonic()
     end = begin + (float("inf") if settings.duration is None else settings.duration)
 
-    def closed(instrument: Source) -> None:
-        for sentence in instrument.close():
+    def report(sentences: Iterable[str]) -> None:
+        for sentence in sentences:
             write_message(messages, sentence)
 
     with until_closed(), ExitStack() as stack:
         for instrument in instruments:
             instrument.open(arrivals, begin)
-            stack.callback(closed, instrument)
+            stack.callback(lambda one: report(one.close()), instrument)
         while time.monotonic() < end:
             try:
                 source, content, arrival = arrivals.get(timeout=POLL)
@@ -112,6 +112,7 @@ def run(settings: ListenSettings) -> None:
                 arrival += sum(s.shift for s in instruments if isinstance(s, SoundSource))
             for record in source.records(content, arrival):
                 write_record(record, sink, settings.form)
+            report(source.remarks() if isinstance(source, SoundSource) else ())
             if arrivals.empty():
                 sink.flush()
 

@@ -76,6 +76,7 @@ class SoundSource:
             )
         self._band, self._sampler = band, SlipSampler(band, site)
         self._clock, self._received, self._overflows = HostClock(1.0 / rate_hz), 0, 0
+        self._reported = 0  # slips
         self._begin: float | None = None
         self.shift = 0.0
         self._stream: Any = None
@@ -153,11 +154,18 @@ class SoundSource:
         """Lost samples, as far as they are found."""
         return self._sampler.slips
 
+    def remarks(self) -> Iterator[str]:
+        """Report the slips that were found since the last call."""
+        first, self._reported = self._reported, len(self.slips)
+        for sentence in slip_remarks(self.slips, 0, self._rate_hz, first):
+            yield f"{self._device}: {sentence}"
+
     def close(self) -> Iterator[str]:
         """End the recording, and report blocks that were lost."""
         if self._stream is not None:
             self._stream.close()
-        for sentence in slip_remarks(self.slips, self._sampler.unexplained, self._rate_hz):
+        yield from self.remarks()
+        for sentence in slip_remarks((), self._sampler.unexplained, self._rate_hz):
             yield f"{self._device}: {sentence}"
         if self._overflows > len(self.slips):
             yield (

@@ -39,6 +39,7 @@ WRITTEN = {
     | {"calibration.png", "report.json", KEPT, LOGS_TABLE, PLATFORMS, CALENDAR_TABLE},
     "calibrate beacon": _SITE | {"beacon.png", "report.json"},
     "calibrate antenna": _SITE | {"antenna.png", "report.json"},
+    "calibrate response": _SITE | {"report.json"},
     "calibrate fieldmap": _SITE | {"field_map.png", "report.json"},
     "calibrate magnetometer": _SITE | {"magnetometer.png", "run.rrd", "report.json"},
     "calibrate attitude-database": {"attitudes.parquet", "attitudes.png", "report.json"},

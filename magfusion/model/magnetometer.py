@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from magfusion.model.physics.casing import Casing
-from magfusion.model.response import AxisResponses, FrequencyResponse
+from magfusion.model.response import AxisResponses, FrequencyResponse, ResponseSigma
 from magfusion.model.short_repr import short_repr
 from magfusion.model.temperature import SensorTemperatureModel
 from magfusion.units import Array
@@ -59,6 +59,8 @@ class Magnetometer:
         Temperature dependence of matrix and offset.
     response : FrequencyResponse or AxisResponses, optional
         Response to alternating fields; None if equal to that of steady fields.
+    response_sigma : ResponseSigma, optional
+        Prior of the responses of y and z relative to x; None if known.
     axes : str
         Names of its axes.
     casing : Casing, optional
@@ -91,6 +93,7 @@ class Magnetometer:
     coil_kappa: float = 0.0
     temperature_model: SensorTemperatureModel | None = None
     response: FrequencyResponse | AxisResponses | None = None
+    response_sigma: ResponseSigma | None = None
     axes: str = "xyz"
     casing: Casing | None = None
     name: str = "magnetometer"

@@ -118,5 +118,52 @@ class AxisResponses:
 
     def factor(self, frequency_hz: Array) -> ComplexArray:
         """Return the complex gain of each axis, shape (n, 3), at frequencies (n,)."""
-        parts = [axis.at(frequency_hz) for axis in self.axes]
-        return np.stack([np.exp(size + 1j * phase) for size, phase in parts], axis=-1)
+        return np.exp(log_response(self, frequency_hz))
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseSigma:
+    """Prior standard deviations of the responses of y and z relative to x; zero means known.
+
+    What all axes share cannot be distinguished from a beacon's moment and drive phase.
+
+    Parameters
+    ----------
+    frequency_hz : ndarray, shape (k,)
+        Increasing; of all tones at least (Hz).
+    gain : ndarray, shape (k, 2)
+        Of the logarithm.
+    phase : ndarray, shape (k, 2)
+        (rad)
+    """
+
+    frequency_hz: Array
+    gain: Array
+    phase: Array
+
+
+def log_response(
+    response: FrequencyResponse | AxisResponses | None, frequency_hz: Array
+) -> ComplexArray:
+    """Return log-gain + 1j phase of each axis, shape (n, 3), at frequencies (n,) (Hz)."""
+    if response is None:
+        return np.zeros((len(frequency_hz), 3), dtype=np.complex128)
+    parts = [axis.at(frequency_hz) for axis in response.axes]
+    return np.stack([size + 1j * phase for size, phase in parts], axis=-1)
+
+
+def changed_axes(
+    response: FrequencyResponse | AxisResponses | None, frequency_hz: Array, change: ComplexArray
+) -> AxisResponses:
+    """Return a response at the given frequencies with y and z changed.
+
+    Parameters
+    ----------
+    frequency_hz : ndarray, shape (k,)
+        Increasing (Hz).
+    change : complex ndarray, shape (k, 2)
+        Of log-gain + 1j phase.
+    """
+    log = log_response(response, frequency_hz)
+    log[:, 1:] += change
+    return AxisResponses(*(FrequencyResponse(frequency_hz, np.exp(a.real), a.imag) for a in log.T))

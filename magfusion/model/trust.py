@@ -88,6 +88,7 @@ CODES = {
     "magnetometer_clock": "the clock of one of several magnetometers is not as declared",
     "magnetometer_excluded": "one of several magnetometers is inconsistent with the others",
     "magnetometer_matrix": "the magnetometer's matrix, with nearby iron, is not as declared",
+    "magnetometer_response": "the response of the magnetometer's axes is not as declared",
     "magnetometer_offset": "the magnetometer's offset is not as declared",
     "magnetometer_silent": "one of several magnetometers receives no beacon",
     "magnetometers_contradict": "magnetometers are inconsistent, and none can be identified",

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.model.aiding import AidingSensor
 from magfusion.model.correlation import Component, Correlation
 from magfusion.model.physics.earth import earth_field_world
+from magfusion.model.response import changed_axes
 from magfusion.model.site import Beacon, Magnetometer, Site, rotor_coils
 from magfusion.units import Array
 
@@ -100,6 +101,13 @@ def _perturb_magnetometer(magnetometer: Magnetometer, draw: Draw, name: str | No
     if sigma.clock_offset:
         late = draw("time-offset", own, "clock_offset", np.array([sigma.clock_offset]))
         magnetometer = replace(magnetometer, clock_offset=magnetometer.clock_offset + late[0])
+    prior = magnetometer.response_sigma
+    if prior is not None:
+        gain = draw("magnetometer", own, "response_gain", prior.gain)
+        phase = draw("magnetometer", own, "response_phase", prior.phase)
+        nodes_hz, change = prior.frequency_hz, gain + 1j * phase
+        response = changed_axes(magnetometer.response, nodes_hz, change)
+        magnetometer = replace(magnetometer, response=response)
     return replace(
         magnetometer,
         matrix=magnetometer.matrix + matrix,

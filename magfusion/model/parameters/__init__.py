@@ -42,6 +42,8 @@ from magfusion.model.parameters.platform import CLOCK_RATE as CLOCK_RATE
 from magfusion.model.parameters.platform import DECLINATION as DECLINATION
 from magfusion.model.parameters.platform import MATRIX as MATRIX
 from magfusion.model.parameters.platform import OFFSET as OFFSET
+from magfusion.model.parameters.platform import RESPONSE_GAIN as RESPONSE_GAIN
+from magfusion.model.parameters.platform import RESPONSE_PHASE as RESPONSE_PHASE
 from magfusion.model.parameters.platform import SENSOR_POSITION as SENSOR_POSITION
 from magfusion.model.parameters.platform import SENSOR_ROTATION as SENSOR_ROTATION
 from magfusion.model.parameters.platform import STRENGTH as STRENGTH
@@ -64,6 +66,8 @@ PARAMETERS: tuple[Parameter, ...] = (
     PHASE,
     DRIFT,
     MATRIX,
+    RESPONSE_GAIN,
+    RESPONSE_PHASE,
     OFFSET,
     SENSOR_ROTATION,
     SENSOR_POSITION,

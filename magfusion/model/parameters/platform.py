@@ -22,6 +22,7 @@ from magfusion.model.parameters.parameter import (
     SiteParameter,
     SteadyView,
 )
+from magfusion.model.response import ResponseSigma, changed_axes, log_response
 from magfusion.model.site import Magnetometer, Site
 from magfusion.units import MICROTESLA, Array, ComplexArray
 
@@ -40,7 +41,7 @@ class MagnetometerParameter(SiteParameter):
 
     def sensor(self, site: Site, owner: str) -> int:
         """Return the index of the magnetometer."""
-        return self.owners(site).index(owner)
+        return MagnetometerParameter.owners(self, site).index(owner)
 
     def with_part(self, site: Site, part: Magnetometer) -> Site:
         """Return the site with the magnetometer of that name replaced."""
@@ -111,6 +112,75 @@ class _Offset(MagnetometerParameter):
 
     def steady_jacobian(self, view: SteadyView) -> Array | None:
         return MICROTESLA * view.observation.offset
+
+
+class _Response(MagnetometerParameter):
+    """Logarithms of the response of y and z at some frequencies, relative to that of x."""
+
+    group, owner = "magnetometer", "magnetometer"
+    factor_of_phasor = True
+    field_error = 2.0 / 3.0
+    factor: ClassVar[complex]
+
+    def owners(self, site: Site) -> tuple[str, ...]:
+        every = super().owners(site)
+        return tuple(owner for owner in every if self.part(site, owner).response_sigma is not None)
+
+    def _prior(self, site: Site, owner: str) -> ResponseSigma:
+        result = self.part(site, owner).response_sigma
+        assert result is not None
+        return result
+
+    def sigma(self, site: Site, owner: str) -> Array:
+        return np.ravel(getattr(self._prior(site, owner), self.attribute))
+
+    def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
+        site, part = calibration.site, self.part(calibration.site, owner)
+        nodes_hz, change = self._prior(site, owner).frequency_hz, step.reshape(-1, 2)
+        response = changed_axes(part.response, nodes_hz, np.asarray(self.factor * change))
+        return replace(calibration, site=self.with_part(site, replace(part, response=response)))
+
+    def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
+        before, after = (self.value(calibration, owner) for calibration in (old, new))
+        assert before is not None
+        assert after is not None
+        return after - before
+
+    def value(self, calibration: Calibration, owner: str) -> Array | None:
+        nodes_hz = self._prior(calibration.site, owner).frequency_hz
+        log = log_response(self.part(calibration.site, owner).response, nodes_hz)[:, 1:]
+        return np.ravel((log / self.factor).real)
+
+    def refined(self, site: Site, calibration: Calibration, owner: str, sigma: Array) -> Site:
+        part = self.part(site, owner)
+        prior = replace(self._prior(site, owner), **{self.attribute: sigma.reshape(-1, 2)})
+        return self.with_part(site, replace(part, response_sigma=prior))
+
+    def own_jacobian(self, view: PhasorView) -> ComplexArray | None:
+        platform = view.calibration.site.platform
+        prior = platform.magnetometers[view.sensor].response_sigma
+        assert prior is not None
+        tones_hz = view.beacon.tone_frequencies_hz
+        node = np.argmin(np.abs(tones_hz[:, None] - prior.frequency_hz), axis=1)
+        own = np.eye(len(prior.frequency_hz))[node]  # (tones, k)
+        columns = np.einsum("nta,ab,tk->ntakb", view.phasor, np.eye(3)[:, 1:], own)
+        return self.factor * columns.reshape(*view.phasor.shape, -1)
+
+    def called(self, site: Site, owner: str, i: int) -> str:
+        frequency_hz = self._prior(site, owner).frequency_hz[i // 2]
+        return f"{super().called(site, owner, i)} {AXES[1 + i % 2]} at {frequency_hz:g} Hz"
+
+
+class _ResponseGain(_Response):
+    kind, attribute, factor = "response_gain", "gain", 1.0
+    display_unit = PERCENT
+    words = by_turning = "the magnetometer's gain relative to x, of"
+
+
+class _ResponsePhase(_Response):
+    kind, attribute, factor = "response_phase", "phase", 1j
+    unit = display_unit = DEGREES
+    words = by_turning = "the magnetometer's phase relative to x, of"
 
 
 class _Rotation(MagnetometerParameter):
@@ -316,6 +386,7 @@ class _Strength(_EarthParameter):
 
 
 MATRIX, OFFSET = _Matrix(), _Offset()
+RESPONSE_GAIN, RESPONSE_PHASE = _ResponseGain(), _ResponsePhase()
 SENSOR_ROTATION, SENSOR_POSITION, CLOCK_OFFSET = _Rotation(), _Position(), _ClockOffset()
 TIME_OFFSET, CLOCK_RATE = _TimeOffset(), _ClockRate()
 DECLINATION, STRENGTH = _Declination(), _Strength()
