@@ -97,21 +97,22 @@ class Driver:
 
     def sums(self, rounds: int, at: Array, pool: Sequence[int] | None = None) -> Sums:
         """Return what the logs of a pool, or all, know; the workers add each group."""
+        place = self.tasks[0].kept.parent / ("sums" if pool is None else "sums_of_pool")
         pool = range(len(self.tasks)) if pool is None else pool
         paths = [self.tasks[i].information(rounds) for i in pool]
         size = math.isqrt(len(paths) - 1) + 1  # as many groups as logs in each
         groups = [paths[i : i + size] for i in range(0, len(paths), size)]
-        files = [self.tasks[0].kept.parent / "sums" / f"{i}.npz" for i in range(len(groups))]
+        files = [place / f"{i}.npz" for i in range(len(groups))]
         given = [SumTask(self.files, tuple(g), at, f) for g, f in zip(groups, files, strict=True)]
         sums = self.hands.run(sum_of, given)
         known = known_by(self.calendar.shared, added(self.calendar, sums, at), at)
         return Sums(rounds, known, groups, sums)
 
-    def tasks_given(self, sums: Sums, share: float = 1.0) -> list[RoundTask]:
-        """Return the tasks of all logs."""
+    def last_tasks(self, sums: Sums) -> list[RoundTask]:
+        """Return the tasks of the final pass: all logs, each with the others as its prior."""
         at, rounds = sums.known.step, sums.rounds
         return [
-            RoundTask(self.files, task, rounds, sums.others(task.information(rounds)), at, share)
+            RoundTask(self.files, task, rounds, sums.others(task.information(rounds)), at)
             for task in self.tasks
         ]
 
@@ -144,8 +145,12 @@ class Driver:
         moved, share = np.inf, 1.0
         while moved >= CONVERGED_STEP and sums.rounds < MOST_ROUNDS:
             self.report("refining together", sums.rounds, MOST_ROUNDS)
-            self.hands.run(one_round, self.tasks_given(sums, share))
-            known = sums.known
+            known, every = sums.known, tuple(sums.sums)
+            given = [
+                RoundTask(self.files, task, sums.rounds, every, known.step, share)
+                for task in self.tasks
+            ]
+            self.hands.run(one_round, given)
             self._discard(sums.rounds)
             sums = self.sums(sums.rounds + 1, known.step)
             after = sums.known

@@ -213,7 +213,7 @@ def refine(
         agreed = before if any(before.of_log) else driver.agreement(sums)
         given = [
             LastTask(one, agreed.excess, findings, writes, rate, risk)
-            for one, findings in zip(driver.tasks_given(sums), agreed.of_log, strict=True)
+            for one, findings in zip(driver.last_tasks(sums), agreed.of_log, strict=True)
         ]
         rows = hands.run(last, given, report=_staged(report, "each log in the joint solution"))
         months = driver.months(sums) if by_date else []

@@ -29,6 +29,7 @@ from magfusion.estimation.batch.joint import (
     SharedCalibration,
     between,
     known_by,
+    narrowed,
     total_information,
     uncoupled,
 )
@@ -159,15 +160,15 @@ def _calendar(
 
 @dataclass(frozen=True, eq=False)
 class RoundTask:
-    """One of several logs, and where to find the prior from the others.
+    """One of several logs, and where to find its prior from logs.
 
     Parameters
     ----------
     files : SiteFiles
     rounds : int
         Number of rounds before.
-    others : tuple of Path
-        Information of all other logs, each or in sums.
+    logs : tuple of Path
+        Information of all logs in a round, else of all others; each or in sums.
     at : ndarray, shape (s,)
         From the declared calibration to the linearisation point.
     share : float
@@ -177,7 +178,7 @@ class RoundTask:
     files: SiteFiles
     task: LogTask
     rounds: int
-    others: tuple[Path, ...]
+    logs: tuple[Path, ...]
     at: Array
     share: float = 1.0
 
@@ -188,9 +189,9 @@ class RoundTask:
         return log, site, shared, written_by_worker(path, load_log(path, self.task.key, site))
 
     def prior(self) -> SharedCalibration:
-        """Return the estimate of the log's parameters from all other logs and the survey."""
+        """Return the estimate of the log's parameters from these logs and the survey."""
         calendar = self.files.calendar()
-        known = known_by(calendar.shared, added(calendar, self.others, self.at), self.at)
+        known = known_by(calendar.shared, added(calendar, self.logs, self.at), self.at)
         blocks = load_information(self.task.information(self.rounds)).blocks
         assert blocks is not None
         return known.of(*calendar.columns(blocks))
@@ -306,10 +307,10 @@ def alone(task: LogTask, _rng: np.random.Generator) -> Alone:
 
 
 def one_round(given: RoundTask, _rng: np.random.Generator) -> None:
-    """Solve a log with the prior from the others, and store it."""
+    """Solve a log at the common calibration, and store it."""
     log, site, shared, kept = given.read()
     task, before = given.task, kept.log.information
-    done = solve_round(log, site, task.smoother, kept.log, shared, given.prior())
+    done = solve_round(log, site, task.smoother, kept.log, shared, narrowed(given.prior()))
     after = after_round(kept.log, done, shared)
     known = between(shared, before, after.information, given.share)
     save_log(
@@ -334,7 +335,7 @@ def sum_of(given: SumTask, _rng: np.random.Generator) -> Path:
 
 def from_others(given: RoundTask, _rng: np.random.Generator) -> Deviation:
     """Return the deviation of a log from the others."""
-    calendar, others = given.files.calendar(), given.others
+    calendar, others = given.files.calendar(), given.logs
     own = given.task.information(given.rounds)
     total = added(calendar, (own, *others), given.at)
     assert total is not None

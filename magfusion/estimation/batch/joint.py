@@ -1,9 +1,11 @@
 """The calibration that several logs share: estimated from all of them, and from all but one.
 
-Each log is solved with the survey and the other logs as its prior.  This gives the joint solution
-once the other logs are linearised at that solution; only one log is in memory at a time.  What the
-others know is added, never the own part subtracted from the sum over all: that would lose the
-directions that logs determine well.
+In each round all logs are linearised at one calibration, that of the sum over all: a round is a
+Gauss-Newton step of one graph of all logs, with only one log in memory at a time.  (Linearised each
+at its own solution, many short logs need three times the rounds: the errors of their linearisations
+then do not cancel.)  In the end each log is solved with the survey and the other logs as its prior.
+What the others know is added, never the own part subtracted from the sum over all: that would lose
+the directions that logs determine well.
 """
 
 from collections.abc import Iterable
@@ -19,6 +21,8 @@ from magfusion.model.parameters import Block, Calibration, prior_sigma, retract
 from magfusion.model.prior import parameters_of, prior_sqrt_information
 from magfusion.model.site import Site
 from magfusion.units import Array, IntArray
+
+NARROW = 1e-3  # of a sigma; a log does not move a prior so narrow
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,6 +241,11 @@ def between(
     before = vars(old.taken_at(shared, new.step).part)
     part = {k: share * v + (1.0 - share) * before[k] for k, v in vars(new.part).items()}
     return LogInformation(new.step, MarginalizedLog(**part))
+
+
+def narrowed(known: SharedCalibration) -> SharedCalibration:
+    """Return an estimate as the prior of logs that are all linearised there."""
+    return replace(known, cov=NARROW**2 * known.cov)
 
 
 def apart_in_sigmas(one: Array, other: Array, cov: Array) -> float:

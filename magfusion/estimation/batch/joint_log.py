@@ -57,7 +57,7 @@ class OfLog:
 
 
 class Round(NamedTuple):
-    """One log, solved with the other logs as its prior."""
+    """One log, solved with a prior from other logs."""
 
     log: PreprocessedLog
     graph: Graph
@@ -92,14 +92,14 @@ def solve_round(
     shared: Shared,
     prior: SharedCalibration,
 ) -> Round:
-    """Solve a log from its last states, with the survey and the other logs as its prior.
+    """Solve a log from its last states, with a prior of the shared calibration.
 
     The waveform is predicted again from these states; the noise estimated from it alone is kept.
 
     Parameters
     ----------
     prior : SharedCalibration
-        From all other logs and the survey.
+        In a round that of all logs, `narrowed`; in the end from the survey and all other logs.
 
     Raises
     ------
