@@ -10,9 +10,9 @@ from figures import LOGS, MINUS, ROOT, Entry, compared, flat, measured, printed,
 REGISTER = register()
 
 
-@pytest.mark.parametrize("entry", REGISTER.figures, ids=lambda entry: entry.says[0][:40])
+@pytest.mark.parametrize("entry", REGISTER.figures, ids=lambda entry: entry.sentences[0][:40])
 def test_the_sentences_are_printed_and_what_holds_them_is_there(entry: Entry) -> None:
-    for sentence in entry.says:
+    for sentence in entry.sentences:
         printed(entry.page, sentence)
     if entry.test is not None:
         path, _, name = entry.test.partition("::")
@@ -41,7 +41,7 @@ def test_the_command_gives_the_figures(entry: Entry, tmp_path: Path) -> None:
 def test_a_figure_changed_by_hand_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("figures.flat", lambda _: f"errs by 1.5 mm, 2,000 of {MINUS}3 m")
     entry = Entry(
-        page="page.md", command="x", says=["by {a.0 * 1e3} mm, {b} of {c} m"], spread=0.01
+        page="page.md", command="x", sentences=["by {a.0 * 1e3} mm, {b} of {c} m"], spread=0.01
     )
     agree = [one.agrees for one in compared(entry, {"a": [0.00146], "b": 2015, "c": -3.4})]
     assert agree == [True, True, True]
@@ -67,7 +67,7 @@ def test_every_number_in_the_prose_is_measured_or_given(name: str) -> None:
     prose = re.sub(r"^```.*?^```$", "", (ROOT / name).read_text(), flags=re.M | re.S)
     prose = _plain(re.sub(r"^#+.*$", " ", prose, flags=re.M))
     for entry in REGISTER.figures:
-        for sentence in entry.says if entry.page == name else ():
+        for sentence in entry.sentences if entry.page == name else ():
             for number in printed(name, sentence)[0]:
                 sentence = re.sub(r"\{[^}]*\}", number, sentence, count=1)
             prose = prose.replace(_plain(sentence), " ")

@@ -37,7 +37,7 @@ class Entry(StrictModel):
 
     Parameters
     ----------
-    says : list of str
+    sentences : list of str
         With a field for each figure of a command.
     command : str, optional
         ``{logs}`` are recorded logs that are not in the repository.
@@ -49,7 +49,7 @@ class Entry(StrictModel):
     """
 
     page: str
-    says: list[str]
+    sentences: list[str]
     command: str | None = None
     takes: Literal["seconds", "minutes", "hours"] = "seconds"
     spread: float = 0.0
@@ -68,7 +68,7 @@ class Register(StrictModel):
     Parameters
     ----------
     given : list of str
-        Numbers of the README's prose that nobody measured.
+        Numbers of the README's prose that are not measurements.
     """
 
     figures: list[Entry]
@@ -105,18 +105,18 @@ def printed(page: str, sentence: str) -> tuple[list[str], list[tuple[str, str]]]
     """
     parts = FIELD.split(sentence)
     pattern = PRINTED.join(re.escape(text) for text in parts[::3])
-    found = re.findall(pattern, flat(page))
-    if len(found) != 1:
-        raise ValueError(f"{page} has {len(found)} times: {sentence}")
-    numbers = [found[0]] if isinstance(found[0], str) else list(found[0])
+    matches = re.findall(pattern, flat(page))
+    if len(matches) != 1:
+        raise ValueError(f"{page} has {len(matches)} times: {sentence}")
+    numbers = [matches[0]] if isinstance(matches[0], str) else list(matches[0])
     fields = list(zip(parts[1::3], (factor or "1" for factor in parts[2::3]), strict=True))
     return numbers if fields else [], fields
 
 
 def compared(entry: Entry, result: Any) -> list[Figure]:
-    """Return all figures of an entry beside those of its command's result."""
+    """Return all figures of an entry with those of its command's result."""
     out = []
-    for sentence in entry.says:
+    for sentence in entry.sentences:
         for number, (key, factor) in zip(*printed(entry.page, sentence), strict=True):
             value = result
             for part in key.split("."):
@@ -165,9 +165,9 @@ def main() -> int:
             continue
         for one in compared(entry, _kept(entry.command, commit, options.results)):
             wrong += not one.agrees
-            told = f"{one.key} | {one.printed} | {one.measured:.4g}"
+            row = f"{one.key} | {one.printed} | {one.measured:.4g}"
             mark = "" if one.agrees else "**differs**"
-            print(f"| {entry.page} | `{entry.command}` | {told} | {mark} |", flush=True)
+            print(f"| {entry.page} | `{entry.command}` | {row} | {mark} |", flush=True)
     return int(wrong > 0)
 
 
