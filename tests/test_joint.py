@@ -231,7 +231,7 @@ def test_many_short_logs_are_one_graph_of_them_all() -> None:
     """To a millionth of a sigma, where each alone determines little."""
     site = surveyed()
     true = perturb_site(site, np.random.default_rng(6))
-    in_one_graph(refined(site, true, [log_of(true, which, 1.4) for which in range(8)]))
+    in_one_graph(refined(site, true, [log_of(true, which, 1.4) for which in range(20)]))
 
 
 def test_the_joint_solution_is_that_of_one_graph_of_all_logs(together: Together) -> None:
