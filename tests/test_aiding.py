@@ -362,7 +362,7 @@ def test_log_and_pipe_give_the_same_states(tmp_path):
     save_site(aided_site(WHEELS, sensors()[1]), tmp_path / "log" / "site.yaml")
     tool = [sys.executable, "-m", "magfusion"]
     replayed = subprocess.run([*tool, "replay", "log"], cwd=tmp_path, capture_output=True)
-    assert b'"aiding": {"wheels": {"time"' in replayed.stdout
+    assert b'"aiding":{"wheels":{"time"' in replayed.stdout
     piped = subprocess.run(
         [*tool, "navigate", "-", "--site", "log/site.yaml", "--estimator", "ekf"],
         cwd=tmp_path,

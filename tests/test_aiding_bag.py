@@ -165,7 +165,7 @@ def test_a_vehicles_bag_is_smoothed_and_navigated_without_a_mapping(tmp_path):
         assert "TRUSTWORTHY" in done.stdout
     command = [sys.executable, "-m", "magfusion", "replay", "bag", "--site", "site.yaml"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert '"aiding": {"odom": {"time"' in done.stdout
+    assert '"aiding":{"odom":{"time"' in done.stdout
 
 
 def _fix(k: int, status: int) -> Any:

@@ -116,7 +116,7 @@ def response_sigma_entry(sigma: ResponseSigma | None) -> dict[str, Any]:
 def check_response_sigma(
     entries: list[ResponseSigmaEntry], tones_hz: Array, at: tuple[str | int, ...]
 ) -> None:
-    """Reject rows that do not belong to the tones, one to each.
+    """Reject rows that are repeated, or a tone without one.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def check_response_sigma(
     """
     given = sorted(entry.frequency_hz for entry in entries)
     tones = np.unique(tones_hz[tones_hz > 0.0]).tolist()
-    if given != tones:
+    if len(set(given)) < len(given) or not set(tones) <= set(given):
         known = ", ".join(f"{tone:g}" for tone in tones)
         raise refusal_at(at, given, f"give one row for each tone: {known} Hz")
 
