@@ -40,7 +40,7 @@ pytestmark = [
 CHANNELS = "front-left,front-right,rear-left,rear-right"
 FORM = f"format=s24le rate={RATE_HZ} channels=4 channel_map={CHANNELS}"
 DURATION = 20.0  # s
-QUIET = 6.0  # s, within which the listener has begun
+QUIET = 1.0  # s of records before the walk
 LARGEST_ERROR = 4e-4  # m
 MATCHED = 37  # every so many samples are compared
 Sigma = TypeVar("Sigma", BeaconSigma, MagnetometerSigma)
@@ -80,9 +80,11 @@ def server(tmp_path: Path) -> Iterator[dict[str, str]]:
 def heard(site: Path, recording: Path, own: dict[str, str], output: Path) -> list[dict]:
     """Play a recording, and return the records of what is listened to."""
     words = ["--device", "pulse", "--rate", RATE_HZ, "--channels", "x,y,z,-", "--site", site]
-    words += ["--full-scale", FULL_SCALE, "--duration", DURATION + QUIET + 4.0]
+    words += ["--full-scale", FULL_SCALE, "--duration", DURATION + QUIET + 9.0]
     command = [sys.executable, "-m", "magfusion", "listen", *map(str, words)]
     with output.open("wb") as sink, subprocess.Popen(command, env=own, stdout=sink) as listener:
+        while listener.poll() is None and not output.stat().st_size:
+            time.sleep(0.1)  # a loaded machine takes seconds to begin
         time.sleep(QUIET)
         play = ["paplay", "--device=kit", f"--channel-map={CHANNELS}", "--no-remix", recording]
         subprocess.run(play, env=own, check=True, stderr=subprocess.DEVNULL)
