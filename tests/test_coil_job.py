@@ -81,8 +81,8 @@ def test_a_coil_that_burns_is_named_with_the_remedy() -> None:
     ("text", "sentence"),
     [
         ("wire=1e-3,turns=200", "--radius of a round coil or --side"),
-        ("wire=1e-3,turns=many,radius=1", "turns Input should be a valid integer"),
-        ("turns=200,radius=1", "wire Field required; give e.g. --coil wire="),
+        ("wire=1e-3,turns=many,radius=1", "turns=many cannot be used; give e.g."),
+        ("turns=200,radius=1", "wire is missing; give e.g. --coil wire="),
         ("wire=1e-3,turns=200,radius=1,amperes=2", "unknown 'amperes'; give wire, turns"),
         ("wire=9,turns=200,radius=1", "--wire must lie between"),
     ],

@@ -13,7 +13,9 @@ from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.demodulation.demodulation import phasors
 from magfusion.estimation.integrity.judge import judge_result
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.site import load_site, save_site
+from magfusion.jobs.replay import Replay, feed
 from magfusion.model.parameters import initial_calibration, predict_channels
 from magfusion.model.response import AxisResponses, FrequencyResponse, ResponseSigma, log_response
 from magfusion.model.samples import Log
@@ -174,7 +176,7 @@ def test_a_site_keeps_the_sigmas_of_its_response(tmp_path: Path) -> None:
         np.testing.assert_allclose(getattr(result, name), getattr(expected, name), rtol=1e-9)
 
 
-def test_sigmas_of_a_tone_that_no_beacon_sends_are_refused(tmp_path: Path) -> None:
+def test_a_tone_without_sigmas_is_refused(tmp_path: Path) -> None:
     save_site(uncertain(demo_site(), 0.2, 10.0), tmp_path / "site.yaml")
     text = (tmp_path / "site.yaml").read_text(encoding="utf-8")
     text = re.sub(r"(response_sigma:\s+- \{?frequency_hz: )20.0", r"\g<1>21.0", text)
@@ -195,8 +197,17 @@ def test_a_minute_of_walk_finds_the_responses() -> None:
     assert np.sqrt(np.mean(error.imag**2)) < 0.2 * DEGREE
     sigma = {b.kind: np.sqrt(np.diag(result.calibration_cov))[b.columns] for b in result.blocks}
     for part, kind in ((error.real, "response_gain"), (error.imag, "response_phase")):
-        assert np.sqrt(np.mean((part.ravel() / sigma[kind]) ** 2)) < 2.0  # of 8 numbers
+        # Of 8 numbers with common errors: 1 is expected.
+        assert 0.3 < np.sqrt(np.mean((part.ravel() / sigma[kind]) ** 2)) < 2.0
     assert trust.verdict is Verdict.TRUSTWORTHY
+    navigator = Navigator(site, NavigatorSettings(estimator="ekf"))
+    for _, piece in Replay(walk.log).pieces():
+        feed(navigator, piece)
+    last = navigator.take()[-1]
+    error = errors_of_axes(last.calibration.site, walk.true_site)
+    assert np.sqrt(np.mean(error.real**2)) < 0.003
+    assert np.sqrt(np.mean(error.imag**2)) < 0.2 * DEGREE
+    assert last.verdict is Verdict.TRUSTWORTHY
 
 
 @pytest.mark.slow

