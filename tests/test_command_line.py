@@ -30,7 +30,7 @@ from magfusion.model.trust import Risk
 from magfusion.receiver.windows import LockinSettings
 
 # What a job is, is known without these; of all jobs together, the list, without anything heavy.
-HEAVY = {"gtsam", "matplotlib", "rerun"}
+HEAVY = {"gtsam", "matplotlib", "rerun", "scipy.signal", "scipy.stats"}
 HEAVY_OF_ALL = HEAVY | {"filterpy", "msgpack", "numpy", "pandas", "pyarrow", "rosbags", "scipy"}
 MOST_MEMORY = 80.0  # MB
 HELP = """
@@ -48,7 +48,7 @@ finally:
 HELP_OF_EACH = """
 import os, sys
 from magfusion.cli import main
-import numpy, scipy.optimize, scipy.stats
+import numpy, pyarrow, scipy.interpolate, scipy.optimize, scipy.spatial
 for command in sys.argv[1:]:
     if os.fork():
         os.wait()

@@ -40,7 +40,7 @@ from magfusion.simulation.motion import random_walk_motion
 from magfusion.units import DEGREE
 
 RUNS = 40
-CHAINS = 24
+CHAINS = 12
 COMMON, OWN = 0.05, 0.002  # m; where all beacons stand, and where each stands among them
 FILE = "site_correlation.parquet"
 

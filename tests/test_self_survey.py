@@ -214,9 +214,8 @@ def test_the_command_places_a_beacon_and_writes_a_whole_site(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
-def test_two_minutes_place_every_beacon_to_3_cm_and_1_degree(seed: int) -> None:
-    rows = self_survey.run_walk(Config(), np.random.default_rng(seed))
+def test_two_minutes_place_every_beacon_to_3_cm_and_1_degree() -> None:
+    rows = self_survey.run_walk(Config(), np.random.default_rng(1))
     assert [row.beacon for row in rows] == ["A", "B", "C", "D"]
     assert max(row.position_m for row in rows) < 0.03
     assert max(row.rotation_deg for row in rows) < 1.0

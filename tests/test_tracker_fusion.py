@@ -42,9 +42,8 @@ def test_with_an_imu_a_turning_head_is_known_three_times_better_than_by_the_clos
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("imu_rate_hz", [200.0, 1000.0])
-def test_so_it_is_at_other_rates_of_the_imu(imu_rate_hz: float) -> None:
-    fused = moving.fuse(moving.Config(duration=8.0, seed=3), imu_rate_hz)
+def test_so_it_is_at_another_rate_of_the_imu() -> None:
+    fused = moving.fuse(moving.Config(duration=8.0, seed=3), imu_rate_hz=1000.0)
     assert fused.rate_deg_s > 85.0
     _check(fused)
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.signal import firwin, kaiserord
 
 from magfusion.model.detection_range import tones_of
 from magfusion.model.site import Site
@@ -87,6 +86,8 @@ class BandFilter:
 
 
 def _lowpass(pass_hz: float, stop_hz: float, rate_hz: float) -> Array:
+    from scipy.signal import firwin, kaiserord  # takes as long as all else to import
+
     length, beta = kaiserord(STOP_DB, (stop_hz - pass_hz) / (0.5 * rate_hz))
     cutoff = 0.5 * (pass_hz + stop_hz)
     return np.asarray(firwin(length | 1, cutoff, window=("kaiser", beta), fs=rate_hz))

@@ -8,7 +8,6 @@ of the neighbouring pieces, smoothed under the same random walk.
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.linalg import solveh_banded
-from scipy.signal import fftconvolve
 
 from magfusion.errors import InputError
 from magfusion.model.rotor import Rotor
@@ -68,6 +67,8 @@ def followed_angle(waveform: Waveform, frequency_hz: float, rotor: Rotor) -> Arr
 
 def _slow(waveform: Waveform, piece: float) -> Array:
     """Return the mean over a piece about each sample: the Earth's field."""
+    from scipy.signal import fftconvolve  # takes as long as all else to import
+
     step = float(np.median(np.diff(waveform.time)))
     width = max(2 * int(0.5 * piece / step) + 1, 3)
     kernel = np.hanning(width + 2)[1:-1, None]

@@ -6,7 +6,6 @@ from typing import Literal
 
 import gtsam
 import numpy as np
-from scipy.signal import correlate
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
@@ -167,6 +166,8 @@ def _correlation(first: tuple[Array, Array], second: Array) -> Array:
     first : tuple of ndarray
         Values, and where there is one; at the same even steps as ``second``.
     """
+    from scipy.signal import correlate  # takes as long as all else to import
+
     values, there = first
     ones = np.ones_like(second)
     count = np.maximum(np.rint(correlate(ones, there)), 1.0)

@@ -7,7 +7,6 @@ stretches nor where a run is resumed changes a sample.
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.signal import lfilter
 
 from magfusion.errors import InputError
 from magfusion.model.samples import FieldSamples, ImuSamples
@@ -370,6 +369,8 @@ def _continued_biases(
     walk += before.walk[:, None]
     if instability is None:
         return walk, Biases(walk[:, -1], before.wander)
+    from scipy.signal import lfilter  # takes as long as all else to import
+
     decay = instability.decay(rate_hz)
     sigma = _wander_sigma(instability)[..., None] * np.sqrt(1.0 - decay**2)
     drive = sigma * rng.standard_normal((2, count, 3))

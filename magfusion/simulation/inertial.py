@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 
 from magfusion.errors import InputError
 from magfusion.model.samples import ImuSamples
@@ -123,6 +122,8 @@ def _bias_walk(
 
 def _instability(rng: np.random.Generator, count: int, sigma: float, decay: float) -> Array:
     """Return a stationary first-order Gauss-Markov process, shape (count, 3)."""
+    from scipy.signal import lfilter  # takes as long as all else to import
+
     drive = rng.normal(0.0, sigma * np.sqrt(1.0 - decay**2), (count, 3))
     drive[0] = rng.normal(0.0, sigma, 3)
     return lfilter([1.0], [1.0, -decay], drive, axis=0)

@@ -5,7 +5,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from magfusion.estimation.graph.measurement import Measurement, group_distances
 from magfusion.estimation.graph.state import MOTION, State, states_of
@@ -22,8 +22,8 @@ REJECTED_LONG = 5.0  # s of nothing but rejections; slips and reflections are sh
 MEMORY = 0.995  # of the share of rejections, per sample
 CONTRADICTS = 0.25  # share beyond which a sensor is not as declared
 FREEDOM = (1, 2, 3)
-GATE = {k: float(chi2.isf(FALSE_REJECTIONS, k)) for k in FREEDOM}
-GATE_AGAIN = {k: float(chi2.isf(FALSE_REJECTIONS_AGAIN, k)) for k in FREEDOM}
+GATE = {k: float(chdtri(k, FALSE_REJECTIONS)) for k in FREEDOM}
+GATE_AGAIN = {k: float(chdtri(k, FALSE_REJECTIONS_AGAIN)) for k in FREEDOM}
 
 
 class AidingGate:

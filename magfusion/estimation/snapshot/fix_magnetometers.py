@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from magfusion.estimation.data_checks.magnetometers import of_sensors
 from magfusion.estimation.data_checks.statistics import P_CERTAIN
@@ -40,7 +40,7 @@ def contradicting_magnetometers(
     if len(sensors) == 1:
         return ()
     alone = [_alone(samples, calibration, k) for k in range(len(sensors))]
-    limit = float(chi2.isf(P_CERTAIN, 6))
+    limit = float(chdtri(6, P_CERTAIN))
     false: dict[tuple[int, int], float] = {}
     for i, j in combinations(range(len(sensors)), 2):
         separate = _squared_distances(alone[i], alone[j])
