@@ -30,7 +30,7 @@ from magfusion.simulation.log import (
 
 pytestmark = pytest.mark.slow
 
-RUNS = 16
+RUNS = 30
 INSTANTS = 5
 DURATION = 20.0  # s
 CONFIDENCE = 0.99
