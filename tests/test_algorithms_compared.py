@@ -144,7 +144,7 @@ def test_one_world_has_no_standard_error_and_is_refused(
 
 @pytest.fixture(scope="module")
 def full() -> dict[str, list[AlgorithmOutcome]]:
-    return run(Config(targets=100), methods=UNMAPPED)
+    return run(Config(), methods=UNMAPPED)
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,7 @@
 from pathlib import Path
 
 from magfusion.errors import InputError
-from magfusion.files.bag import read_bag
 from magfusion.files.bag_topics import Topics, is_bag
-from magfusion.files.foreign.euroc import is_euroc, read_euroc
 from magfusion.files.log import HEADER, is_log, read_log
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import Log
@@ -44,9 +42,14 @@ def open_log(
         raise InputError(f"{path}: there is no such file or directory; give the path of a log.")
     if is_log(path):
         return read_log(path, start, end, site)
+    # What reads other formats is not needed for a log of ours, and takes a third of a second.
+    from magfusion.files.foreign.euroc import is_euroc, read_euroc
+
     if is_euroc(path):
         return read_euroc(path, start, end)
     if is_bag(path):
+        from magfusion.files.bag import read_bag
+
         aiding = () if site is None else site.aiding
         return read_bag(path, start, end, topics, report, aiding)
     raise InputError(
