@@ -29,15 +29,19 @@ GYRO_BIAS = np.array([0.01, -0.02, 0.03])
 ACCEL_BIAS = np.array([0.1, 0.2, -0.3])
 
 
-def moving(seed: int, rate_rms: float = 1.5) -> SimulatedMotion:
+def moving(seed: int, rate_rms: float = 1.5, interval: float = 1.0) -> SimulatedMotion:
     rests = Rests(start=0.0, move=DURATION, pause=0.0)
     rng = np.random.default_rng(seed)
-    return turning_motion(rng, DURATION, BOX_WORLD, rate_rms=rate_rms, rests=rests)
+    return turning_motion(
+        rng, DURATION, BOX_WORLD, rate_rms=rate_rms, rests=rests, interval=interval
+    )
 
 
-def recorded(motion: SimulatedMotion, time_offset: float = 0.0) -> ImuSamples:
+def recorded(
+    motion: SimulatedMotion, time_offset: float = 0.0, rate_hz: float = 200.0
+) -> ImuSamples:
     rng = np.random.default_rng(0)
-    return simulate_imu(motion, SILENT, GRAVITY, 200.0, DURATION, rng, time_offset).samples
+    return simulate_imu(motion, SILENT, GRAVITY, rate_hz, DURATION, rng, time_offset).samples
 
 
 def biased(imu: ImuSamples) -> ImuSamples:
@@ -97,6 +101,23 @@ def test_preintegration_follows_the_exact_motion(
     epochs = np.arange(2.0033, 38.0, interval)  # never on a sample
     errors = prediction_errors(motion, biased(recorded(motion)), 0.0, epochs)
     assert np.all(errors < [rad, metre, metre_per_s]), errors
+
+
+def test_fast_turns_at_100_hz_are_integrated_to_below_the_noise_of_the_imu() -> None:
+    interval = 0.2  # s
+    motion = moving(7, rate_rms=5.0, interval=0.12)  # shaken by hand: the axis changes at 8 Hz
+    errors = [
+        prediction_errors(
+            motion, biased(recorded(motion, rate_hz=rate)), 0.0, np.arange(2.0033, 38.0, interval)
+        )
+        for rate in (100.0, 200.0)
+    ]
+    noise = np.sqrt(interval) * np.array(
+        [MEMS.gyro_noise, interval / np.sqrt(3.0) * MEMS.accel_noise, MEMS.accel_noise]
+    )
+    assert np.all(errors[0] < noise), errors[0] / noise
+    # A trapezoid is of second order: half the step leaves a quarter of the error.
+    assert np.all(errors[1][[0, 2]] < errors[0][[0, 2]] / 6.0), errors
 
 
 def test_preintegration_survives_more_than_one_turn() -> None:

@@ -92,8 +92,8 @@ def preintegrate_stream(
     while begin < len(epochs) - 1:
         reach = int(np.searchsorted(before, before[begin] + STRETCH))
         end = min(max(reach, begin + 1), len(epochs) - 1)
-        # With a sample beyond each end, and one more for the rounding of the offset.
-        rows = slice(max(int(before[begin]) - 2, 0), int(before[end]) + 2)
+        # With two samples beyond each end, and one more for the rounding of the offset.
+        rows = slice(max(int(before[begin]) - 3, 0), int(before[end]) + 3)
         here = slice(begin, end + 1)
         stream = ImuSamples(imu.time[rows], imu.gyro_body[rows], imu.accel_body[rows])
         increments = cut_at_epochs(stream, time_offset, epochs[here], usual)

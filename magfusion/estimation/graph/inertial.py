@@ -7,7 +7,12 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from magfusion.estimation.graph.preintegration import Increments, across_held, preintegrate
+from magfusion.estimation.graph.preintegration import (
+    SHORTEST_STEP,
+    Increments,
+    across_held,
+    preintegrate,
+)
 from magfusion.model.parameters import (
     Block,
     Calibration,
@@ -22,7 +27,6 @@ from magfusion.units import Array
 Preintegrated = gtsam.PreintegratedCombinedMeasurementsG
 STEP = 1e-2  # of a parameter's sigma, of the difference quotient
 ROWS = 15  # of an inertial factor
-SHORTEST_STEP = 1e-9  # s; the rounding of a time stamp, and no step
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from magfusion.model.platform_motion import HeldModel
+from magfusion.model.quaternion import cross
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import ImuModel
 from magfusion.model.trajectory import interpolated
@@ -19,6 +20,7 @@ BRIDGE_GYRO_NOISE = 1.0  # rad/s/sqrt(Hz)
 BRIDGE_ACCEL_NOISE = 3.0  # m/s^2/sqrt(Hz)
 RATE_SPAN = 0.08  # s; motion is slower, noise is not
 LEAST_HELD = 1e-4  # rad/s, and that per root s, about a fixed axis: no motion, but regular
+SHORTEST_STEP = 1e-9  # s; the rounding of a time stamp, and no step
 GAP_SAMPLES = 5.0  # a gap is this many times the usual sampling interval
 # s; a bias that walks by `white noise / LONGEST_WHITE` adds a third of the noise's variance to an
 # attitude or a velocity after this time. A slower one would tie states to the last digit.
@@ -75,8 +77,7 @@ def cut_at_epochs(
     new[0] = True
     np.not_equal(grid[1:], grid[:-1], out=new[1:])
     grid = grid[new]
-    both = interpolated(grid, time, np.concatenate([imu.gyro_body, imu.accel_body], axis=1))
-    mean = 0.5 * (both[:-1] + both[1:])
+    mean = _means(grid, interpolated(grid, time, _curvature_corrected(imu)))
     first = np.searchsorted(grid, epochs)
     gap_bridged = np.zeros(len(epochs) - 1, dtype=bool)
     if gap.any():
@@ -94,11 +95,11 @@ def cut_at_epochs(
 def _one_interval(imu: ImuSamples, time: Array, epochs: Array) -> Increments:
     """Return the steps between two epochs as online, without resampling."""
     rows = slice(time.searchsorted(epochs[0], side="right"), time.searchsorted(epochs[1]))
-    both = np.concatenate([imu.gyro_body, imu.accel_body], axis=1)
+    both = _curvature_corrected(imu)
     begin, end = interpolated(epochs, time, both)
     both = np.concatenate([begin[None], both[rows], end[None]])
     grid = np.concatenate([epochs[:1], time[rows], epochs[1:]])
-    mean = 0.5 * (both[:-1] + both[1:])
+    mean = _means(grid, both)
     return Increments(
         mean[:, :3].copy(),
         mean[:, 3:].copy(),
@@ -106,6 +107,38 @@ def _one_interval(imu: ImuSamples, time: Array, epochs: Array) -> Increments:
         np.array([0, len(mean)]),
         np.zeros(1, dtype=bool),
     )
+
+
+def _curvature_corrected(imu: ImuSamples) -> Array:
+    """Return rate and specific force, shape (n, 6), so that trapezoids integrate cubics.
+
+    A trapezoid exceeds the integral by a twelfth of the mean second difference at its samples.
+    """
+    both = np.concatenate([imu.gyro_body, imu.accel_body], axis=1)
+    if len(both) < 3:
+        return both
+    step = np.maximum(np.diff(imu.time), SHORTEST_STEP)[:, None]
+    before, after = step[:-1], step[1:]
+    # The smaller step squared: a gap, or a stamp that is early, does not enlarge it.
+    curved = np.diff(np.diff(both, axis=0) / step, axis=0) / (6.0 * (before + after))
+    curved *= np.minimum(before, after) ** 2
+    both[1:-1] -= curved
+    both[0] -= curved[0]
+    both[-1] -= curved[-1]
+    return both
+
+
+def _means(grid: Array, both: Array) -> Array:
+    """Return mean rate and specific force, (steps, 6), with second-order coning and sculling.
+
+    Constant over a step, they turn and accelerate the body as those that change linearly.
+    """
+    before, after = both[:-1].T, both[1:].T
+    mean = 0.5 * (before + after)
+    twelfth = (grid[1:] - grid[:-1]) / 12.0
+    mean[:3] += twelfth * cross(before[:3], after[:3])
+    mean[3:] += twelfth * (cross(before[:3], after[3:]) - cross(after[:3], before[3:]))
+    return np.asarray(mean.T)
 
 
 def _gaps(time: Array, reach: Array, usual: float) -> tuple[Array, BoolArray]:
