@@ -13,7 +13,7 @@ from magfusion.estimation.batch.settings import SmootherSettings
 from magfusion.estimation.demodulation.motion_compensation import MotionCompensated
 from magfusion.estimation.graph.graph import Graph, GraphEstimate, initial_estimate, read_states
 from magfusion.estimation.graph.gtsam_graph import NativeProblem
-from magfusion.estimation.measurements.zero_velocity import may_stand
+from magfusion.estimation.measurements.zero_velocity import may_stand, slow_enough_to_stand
 from magfusion.estimation.posterior.convergence import settled_at
 from magfusion.estimation.posterior.fixed_point_acceleration import Step, part_of_the_way
 from magfusion.estimation.posterior.noise_tuning import (
@@ -221,8 +221,9 @@ def _stationary_epochs(
 ) -> BoolArray:
     """Return which epochs with a quiet IMU have the platform at rest."""
     out = np.zeros(len(candidates), dtype=bool)
+    assert states.velocity_world is not None
+    candidates = candidates & slow_enough_to_stand(states.velocity_world, motion)
     if np.any(candidates):
-        assert states.velocity_world is not None
         tree = eliminate(graph.linearized(estimate), graph.ordering)
         rows = np.flatnonzero(candidates)
         cov = np.array([marginal(tree, V(i), 3) for i in rows.tolist()])

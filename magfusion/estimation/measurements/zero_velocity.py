@@ -76,6 +76,15 @@ def quiet_before(imu: ImuSamples, stamps: Array, motion: MotionModel) -> BoolArr
     return enough & covered & (silent[last - 1] == silent[first]) & still
 
 
+def slow_enough_to_stand(velocity_world: Array, motion: MotionModel) -> BoolArray:
+    """Return where `may_stand` holds for some covariance, which then need not be computed.
+
+    The variance of a known velocity is in no direction beyond its trace.
+    """
+    variance = 3.0 * motion.rest_known_speed**2 + motion.rest_speed_sigma**2
+    return np.asarray((velocity_world**2).sum(axis=-1) < REST_GATE * variance)
+
+
 def may_stand(velocity_world: Array, cov: Array, motion: MotionModel) -> BoolArray:
     """Return where the velocity estimate is consistent with rest.
 
