@@ -29,6 +29,7 @@ from magfusion.jobs.replay import Replay, feed
 from magfusion.model.aiding import QUANTITIES, AidingSamples, AidingSensor, AidingSigma
 from magfusion.model.parameters import (
     AIDING_CLOCK,
+    AIDING_SCALE,
     choose_blocks,
     dimension,
     initial_calibration,
@@ -328,6 +329,21 @@ def test_the_smoother_estimates_the_scale_of_wheels():
     assert abs(_scale_of(result.calibration) - 1.03) < 0.005
     error = result.states.position_world - simulated.motion.position_world(result.states.time)
     assert np.max(np.linalg.norm(error, axis=1)) < 0.02  # m
+
+
+def test_the_smoother_estimates_as_if_a_slip_had_no_samples():
+    """Of twenty samples the tail of Cauchy's loss would move the scale by two sigmas."""
+    simulated = _simulated(WHEELS, duration=14.0)
+    time = simulated.log.aiding["wheels"].time
+    slips = (time > 8.0) & (time < 10.0)
+    slipping = _wrong(
+        simulated, "wheels", lambda _, value: np.where(slips, 1.2, 1.0)[:, None] * value
+    )
+    without = replace(simulated.log, aiding={"wheels": simulated.log.aiding["wheels"].rows(~slips)})
+    one, other = (mf.smooth(log, aided_site(WHEELS)) for log in (slipping, without))
+    scale = next(b for b in one.blocks if b.key == (AIDING_SCALE, "wheels"))
+    sigma = float(np.sqrt(one.calibration_cov[scale.columns, scale.columns][0, 0]))
+    assert abs(_scale_of(one.calibration) - _scale_of(other.calibration)) < 0.5 * sigma
 
 
 def test_a_sensor_that_contradicts_for_long_is_named():

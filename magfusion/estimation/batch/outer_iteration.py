@@ -139,6 +139,8 @@ def solve_about(
     time, motion = now.states.time, log.declared.site.platform.motion
     tolerance = ON_THE_WAY if plan.short else CONVERGED
     roughly = plan.roughly
+    if now.done:
+        log = replace(log, others=tuple((t, m.near_solution()) for t, m in log.others))
     graph, gaps = graph_of(log, now.states, now.calibration, wave, now.standing, roughly=roughly)
     begun = initial_estimate(now.states, now.calibration, now.segments)
     result = _optimised(graph, begun, tolerance, plan.engine)

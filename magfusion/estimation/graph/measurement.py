@@ -160,6 +160,10 @@ class Measurement(ABC):
         """Return the measurement linearised at its states, if an update has it elsewhere."""
         return self
 
+    def near_solution(self) -> Self:
+        """Return the measurement as it is used once the states are near their solution."""
+        return self
+
     def rows(self, kept: BoolArray | slice) -> Self:
         """Return the measurement at some of its epochs."""
         return replace(

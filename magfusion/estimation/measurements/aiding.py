@@ -42,7 +42,7 @@ class AidingMeasurement(Measurement):
     ----------
     sensor : str
         Name.
-    robust : {None, 'huber', 'cauchy'}
+    robust : {None, 'huber', 'cauchy', 'geman-mcclure'}
     value, sigma : ndarray, shape (n, k)
         Measured; sigma is infinite for what is not.
     time_offset : ndarray, shape (n,)
@@ -70,6 +70,13 @@ class AidingMeasurement(Measurement):
     def with_inertial(self, inertial_body: Array) -> Self:
         """Return the measurement with the inertial samples of its epochs (n, 6)."""
         return replace(self, inertial_body=inertial_body)
+
+    def near_solution(self) -> Self:
+        """Return the measurement with a redescending loss instead of Cauchy's.
+
+        It rejects a slip, whose weighted residuals else add up; from afar it rejects a sensor.
+        """
+        return replace(self, robust="geman-mcclure") if self.robust == "cauchy" else self
 
     def linearize(
         self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
