@@ -112,7 +112,9 @@ def test_an_option_that_cannot_be_is_refused(
     )
 
 
-def test_an_accuracy_that_is_needed_has_the_smallest_moment(worked: Worked, tmp_path: Path) -> None:
+def test_an_accuracy_that_is_needed_has_the_smallest_moment(
+    worked: Worked, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     """By `coverage` of the written site: its moment, rounded up to two digits, is the smallest."""
     need, place = 0.01, tmp_path / "design"  # m
     wanted = ("--beacons", 3, "--need", need, "--objective", "sigma")
@@ -128,3 +130,11 @@ def test_an_accuracy_that_is_needed_has_the_smallest_moment(worked: Worked, tmp_
 
     assert worst(1.0) <= need
     assert worst(0.89) > need
+    screen = [line.strip() for line in capfd.readouterr().out.splitlines()]
+    assert screen[:2] == ["design of site", "REACHED"]
+    assert len(screen) <= 12
+    row = next(line for line in screen if line.startswith("design  "))
+    assert row.split()[1:3] == [f"{1e3 * report['position_sigma_m_worst']:.3g}", "mm"]
+    moment = f"{report['B1.moment_a_m2']:.3g} A m^2"
+    assert any(line.startswith("beacons") and f"3 of {moment} at" in line for line in screen)
+    assert screen[-2].startswith(f"next: magfusion sheet {place / 'site.yaml'}")

@@ -6,6 +6,7 @@
 from pathlib import Path
 
 from magfusion.model.trust import Verdict
+from magfusion.results.brief_plan import accuracy, is_design, length, plan_lines
 from magfusion.results.drift import QUANTITIES
 from magfusion.results.figures import Figures, Section, number
 from magfusion.results.shown import axis_rows, findings, number_text
@@ -30,13 +31,18 @@ _NEXT_OF = {
     ("drift", Verdict.TRUSTWORTHY): "magfusion view {output}, or open {output}/stability.png",
     ("drift", Verdict.DOUBTFUL): "run longer (--hours) or more worlds (--worlds 8)",
     ("drift", Verdict.FAILED): "open {output}/drift.png; the first failed line is the cause",
+    (
+        "design",
+        Verdict.TRUSTWORTHY,
+    ): "magfusion sheet {output}/site.yaml; open {output}/design.png",
+    ("design", Verdict.FAILED): "improve what limits, or lower --need; {output}/error_budget.png",
 }
 
 
 def is_brief(figures: Figures) -> bool:
     """Return whether a result has a screen of a few lines."""
     has_axes = bool(figures.of(Section.AXES))
-    return has_axes or figures.get("job") in ("check", "drift")
+    return has_axes or is_design(figures) or figures.get("job") in ("check", "drift")
 
 
 def remark_texts(figures: Figures, *, routine: bool) -> list[str]:
@@ -47,21 +53,25 @@ def remark_texts(figures: Figures, *, routine: bool) -> list[str]:
 
 def table(figures: Figures) -> Rows:
     """Return the table of a result, its head first; empty without one."""
+    if is_design(figures):
+        return accuracy(figures)
     return _slopes(figures) if figures.get("job") == "drift" else axis_rows(figures)
 
 
 def lines(figures: Figures) -> Rows:
     """Return the other lines of a result, each as its label and text."""
+    if is_design(figures):
+        return plan_lines(figures)
     if figures.get("job") == "drift":
         return _criteria(figures)
     return _pose_rows(figures) if figures.of(Section.AXES) else _check_rows(figures)
 
 
 def next_step(figures: Figures, output: Path | None) -> str:
-    """Return what to do next; empty where nothing is written, or there is no verdict."""
-    if "verdict" not in figures:
+    """Return what to do next; empty where nothing is written, or nothing is judged."""
+    if "verdict" not in figures and not is_design(figures):
         return ""
-    look = look_of(str(figures["verdict"]))
+    look = look_of(str(figures.get("verdict", Verdict.TRUSTWORTHY)))
     text = _NEXT_OF.get((str(figures.get("job")), look), _NEXT[look])
     return text.format(output=output) if output is not None or "{output}" not in text else ""
 
@@ -70,7 +80,7 @@ def _pose_rows(figures: Figures) -> Rows:
     level_m, level_deg = (figures.get(f"protection_level_median_{unit}") for unit in ("m", "deg"))
     rows = []
     if "protection_level_median_m" in figures:
-        level = "none" if level_m is None else _length(number(level_m))
+        level = "none" if level_m is None else length(number(level_m))
         level += "" if level_deg is None else f", {number_text(level_deg, 2)} deg"
         cause = figures.get("protection_level_cause")
         explained = any(one["code"] == "no_redundancy" for one in findings(figures, "remarks"))
@@ -88,10 +98,6 @@ def _pose_rows(figures: Figures) -> Rows:
     rows += [["survey", f.remark] for f in figures.all if f.name == "hypotheses_{beacon}"]
     unverified = _unverified(figures)
     return [*rows, ["not observable", unverified]] if unverified else rows
-
-
-def _length(metres: float) -> str:
-    return f"{1e3 * metres:.3g} mm" if metres < 1.0 else f"{metres:.3g} m"
 
 
 def _unverified(figures: Figures) -> str:
@@ -112,7 +118,7 @@ def _unverified(figures: Figures) -> str:
     rows.sort(key=lambda one: -effect[str(one["parameter"])])
     matters = [one for one in rows[:MOST_NAMED] if effect[str(one["parameter"])] > _MATTERS]
     words = [
-        f"{one['parameter']} (± {one['sigma']} moves poses by {_length(float(one['position_m']))},"
+        f"{one['parameter']} (± {one['sigma']} moves poses by {length(float(one['position_m']))},"
         f" {number_text(one['rotation_deg'], 2)} deg)"
         for one in matters
     ]
