@@ -71,7 +71,7 @@ def write_plot(path: Path, hall: Hall, panels: list[Panel]) -> None:
             mesh = axes.pcolormesh(x, y, shown, norm=norm, cmap=colours, shading="nearest")
             clip_to_hall(axes, hall)
             _mark_worst(axes, points, panel.level, float(height))
-            axes.set_title(f"{panel.words}; at height {height:.3g} m; {_worst(panel)}", fontsize=10)
+            axes.set_title(f"{panel.words}\nat height {height:.3g} m; {_worst(panel)}", fontsize=10)
     every = [axes for row in axes_of for axes in row]
     bar = figure.colorbar(mesh, ax=every, ticks=levels, shrink=0.7)
     bar.ax.set_yticklabels([length(level) for level in levels])

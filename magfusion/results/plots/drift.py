@@ -24,7 +24,7 @@ _AXES = ("tab:red", "tab:green", "tab:blue")
 def write_plot(path: Path, courses: list[EstimatorPlot], figures: Mapping[str, object]) -> None:
     """Write a PNG, a column for each estimator."""
     rows = len(QUANTITIES) + 3
-    figure = Figure(figsize=(1.0 + 6.5 * len(courses), 2.6 * rows), layout="constrained")
+    figure = Figure(figsize=(0.8 + 5.2 * len(courses), 2.4 * rows), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(rows, len(courses), squeeze=False)
     for column, course in enumerate(courses):
@@ -65,7 +65,7 @@ def _draw_error(
         fontsize=9,
     )
     bound = 1.05 * float(np.max(np.abs(np.column_stack([error, sigma]))))
-    axes.set(ylabel=f"error ({quantity.symbol})", ylim=(-bound, bound), xlabel="time (h)")
+    axes.set(ylabel=f"error ({quantity.symbol})", ylim=(-bound, 1.4 * bound), xlabel="time (h)")
     axes.axhline(0.0, color="0.5", linewidth=0.6)
     axes.legend(fontsize=7, ncols=4, loc="upper right")
 
@@ -75,7 +75,7 @@ def write_stability(path: Path, courses: list[EstimatorPlot]) -> None:
 
     The paper shows a stationary place; here the platform walks once an hour.
     """
-    figure = Figure(figsize=(1.0 + 6.5 * len(courses), 6.0), layout="constrained")
+    figure = Figure(figsize=(0.8 + 4.6 * len(courses), 5.6), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(2, len(courses), squeeze=False, sharex=True, sharey="row")
     for row, quantity in enumerate(QUANTITIES[:2]):
@@ -86,7 +86,8 @@ def write_stability(path: Path, courses: list[EstimatorPlot]) -> None:
     for axes in grid[-1]:
         axes.set_xlabel("time (h)")
     count = len(courses[0].worlds)
-    figure.suptitle(f"Does the error grow?  Each minute of {count} world(s); thick: hourly mean")
+    worlds = "one world" if count == 1 else f"{count} worlds"
+    figure.suptitle(f"Does the error grow?  Grey: each minute of {worlds}; blue: hourly mean")
     figure.savefig(path, dpi=100, metadata={"Software": None})
 
 
@@ -96,10 +97,10 @@ def _draw_length(axes: Axes, course: EstimatorPlot, quantity: Quantity) -> None:
     width = 0.3 if len(course.worlds) > 3 else 0.9  # few worlds leave room for their lines
     for world in course.worlds:
         own = quantity.scale * world.size(quantity.part)
-        axes.plot(world.time / HOUR, own, linewidth=width, color="0.6")
+        axes.plot(world.time / HOUR, own, linewidth=width, color="0.55")
     edges = HOUR * np.arange(np.ceil(time.max() / HOUR) + 1)
     middle = 0.5 * (edges[1:] + edges[:-1]) / HOUR
-    axes.plot(middle, in_windows(time, length, edges), color="tab:blue", linewidth=2.0)
+    axes.plot(middle, in_windows(time, length, edges), "o-", color="tab:blue", markersize=3)
     axes.set_ylim(0.0, 1.05 * float(np.max(length)))
 
 
@@ -115,7 +116,8 @@ def _draw_consistency(axes: Axes, course: EstimatorPlot) -> None:
     own = np.concatenate([level[np.isfinite(level)] for level in levels.values()])
     limits = min(0.3, 0.8 * float(own.min())), max(3.0, 1.25 * float(own.max()))
     end = float(course.errors.time[-1]) / HOUR
-    axes.set(xlabel="time (h)", ylabel="ratio", yscale="log", ylim=limits, xlim=(0.0, end))
+    axes.set(xlabel="time (h)", ylabel="ratio", yscale="log", yticks=[0.1, 0.3, 1, 3, 10])
+    axes.set(ylim=limits, xlim=(0.0, end))
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.legend(fontsize=7, ncols=3)
@@ -133,11 +135,11 @@ def _draw_allan(axes: Axes, course: EstimatorPlot) -> None:
             deviation = np.sqrt(np.mean(result.variance, axis=1))
             axes.loglog(result.tau / HOUR, deviation, label=label)
     axes.set_title("Allan deviation of each error; a drift makes it rise to the right", fontsize=9)
-    axes.set(xlabel="averaged over (h)", ylabel="in the units of the legend")
-    axes.set_ylim(top=30.0 * axes.get_ylim()[1])  # room for the legend
+    axes.set(xlabel="averaged over (h)", ylabel="see the legend")
+    axes.set_ylim(top=300.0 * axes.get_ylim()[1])  # room for the legend
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=7, ncols=4, loc="upper right")
+    axes.legend(fontsize=7, ncols=2, loc="upper right")
 
 
 def _draw_pace(axes: Axes, course: EstimatorPlot) -> None:

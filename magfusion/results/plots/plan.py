@@ -16,7 +16,7 @@ from magfusion.units import Array
 
 REACH = 0.035  # of the hall's longer side; half the length of an axis
 LONG = 0.5  # width over length, below which slices are below each other
-MARGIN = 0.07  # of it, around the hall
+MARGIN = 0.1  # of it, around the hall
 BOX = {"boxstyle": "round,pad=0.15", "facecolor": "white", "alpha": 0.8, "linewidth": 0}
 
 
@@ -32,8 +32,8 @@ def slices(size: Array, rows: int, columns: int) -> tuple[Figure, list[list[Axes
     is_long = shape < LONG
     across = 1 if is_long else columns
     down = rows * columns if is_long else rows
-    width = 11.0 if is_long else 6.0
-    tall = float(np.clip(width * shape, 1.3, 8.0)) + 0.9
+    width = 8.6 if is_long else 8.6 / columns  # text is readable on a page of 700 px
+    tall = float(np.clip(0.85 * width * shape, 1.3, 8.0)) + 0.9
     figure = Figure(figsize=(1.5 + width * across, 1.3 + tall * down), layout="constrained")
     FigureCanvasAgg(figure)
     every = figure.subplots(down, across, squeeze=False).ravel().tolist()
