@@ -1,7 +1,8 @@
-"""The example notebooks run as they stand, and stand without output in the repository."""
+"""The example notebooks run as they stand, and have the outputs of a run without its machine."""
 
 import json
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -12,14 +13,19 @@ NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_is_in_the_contents_without_output(path: Path) -> None:
+def test_a_notebook_is_in_the_contents_with_outputs_of_no_machine(path: Path) -> None:
     assert f": notebooks/{path.name}\n" in (ROOT / "mkdocs.yml").read_text()
-    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    text = path.read_text(encoding="utf-8")
+    assert len(text) < 300_000
+    cells = json.loads(text)["cells"]
     code = [cell for cell in cells if cell["cell_type"] == "code"]
-    assert code
+    assert any(cell["outputs"] for cell in code)
     for cell in code:
-        assert cell["outputs"] == []
-        assert cell["execution_count"] is None
+        assert cell["metadata"] == {}
+        for output in cell["outputs"]:
+            assert output["output_type"] != "error"
+            shown = json.dumps([output.get("text"), *output.get("data", {}).get("text/plain", [])])
+            assert not re.search(r"(/tmp|/home|/root|/Users)/|\\u001b|\\r", shown)
 
 
 @pytest.mark.slow
