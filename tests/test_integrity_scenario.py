@@ -37,7 +37,7 @@ def test_the_promise_is_kept_in_a_few_epochs() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("largest", [0.02, 0.2])
 def test_the_promise_is_kept(largest: float) -> None:
-    config = integrity.Config(epochs=300_000, largest=largest)
+    config = integrity.Config(epochs=100_000, largest=largest)
     result = integrity.figures(integrity.run(config), config)
     assert result.hazard_limit <= PROMISE.total
     assert result.false_alarm_limit <= 1e-3
