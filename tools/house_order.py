@@ -102,7 +102,8 @@ ROOMS = {
             alignment coverage drift errors live_foxglove observability odometry_dds
             odometry_mavlink recording_plots records_dds truth_frame
             axes refinement rest_figures shown transfer turn_guide verdict
-            coverage_colours design error_budget motion_coverage recording_layout recording_trust
+            brief_plan coverage_colours design error_budget motion_coverage recording_layout
+            recording_trust
             brief plots recording recording_drift
             page_motion recording_coverage recording_design recording_live screen
             page recording_turns trajectory
