@@ -104,7 +104,10 @@ def separate(one: State, other: State, navigator: Navigator) -> float:
 def test_carried_by_single_steps_is_integrated_directly(
     exceeding: tuple[Navigator, PropagationStart, ImuSamples], chunk: int
 ) -> None:
-    """Directly: by GTSAM's preintegration from the epoch on, as the estimators predict."""
+    """Directly: by GTSAM's preintegration from the epoch on, as the estimators predict.
+
+    That integrates cubics; of now there is no later sample, and single steps are trapezoids.
+    """
     navigator, start, imu = exceeding
     result = carried_in_chunks(start, imu, chunk)
     assert len(result) > 95
@@ -119,7 +122,7 @@ def test_carried_by_single_steps_is_integrated_directly(
             start.usual,
             start.blocks,
         ).state
-        assert separate(state, direct, navigator) < 1e-3
+        assert separate(state, direct, navigator) < 0.02  # sigma
         scale = np.sqrt(np.diagonal(direct.cov))
         assert np.max(np.abs(state.cov - direct.cov) / scale / scale[:, None]) < 5e-3
 
