@@ -21,7 +21,6 @@ from algorithms_tried import FIX, MAPPED, METHODS, ML, PUBLISHED, AlgorithmOutco
 
 DISTURBED = ("N1",)  # near iron, where a map is hardest to learn
 A1, A2, A3 = PUBLISHED
-UNMAPPED = tuple(name for name in METHODS if name != MAPPED)
 Trajectories = Mapping[str, Sequence[AlgorithmOutcome]]
 
 
@@ -144,7 +143,8 @@ def test_one_world_has_no_standard_error_and_is_refused(
 
 @pytest.fixture(scope="module")
 def full() -> dict[str, list[AlgorithmOutcome]]:
-    return run(Config(), methods=UNMAPPED)
+    scenarios = ("S0", "S1", "F1", "F2", "P0", "P1", "P2")
+    return run(Config(scenarios=scenarios), methods=(*PUBLISHED, ML, FIX))
 
 
 @pytest.fixture(scope="module")
