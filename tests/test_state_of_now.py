@@ -106,7 +106,7 @@ def test_carried_by_single_steps_is_integrated_directly(
 ) -> None:
     """Directly: by GTSAM's preintegration from the epoch on, as the estimators predict.
 
-    That integrates cubics; of now there is no later sample, and single steps are trapezoids.
+    That integrates cubics; a single step has no later sample, and is linear.
     """
     navigator, start, imu = exceeding
     result = carried_in_chunks(start, imu, chunk)

@@ -34,8 +34,11 @@ _NEXT_OF = {
     (
         "design",
         Verdict.TRUSTWORTHY,
-    ): "magfusion sheet {output}/site.yaml; open {output}/design.png",
-    ("design", Verdict.FAILED): "improve what limits, or lower --need; {output}/error_budget.png",
+    ): "magfusion sheet {output}/site.yaml, or open {output}/design.png",
+    (
+        "design",
+        Verdict.FAILED,
+    ): "improve what limits, or raise --need; open {output}/error_budget.png",
 }
 
 

@@ -77,7 +77,7 @@ def cut_at_epochs(
     new[0] = True
     np.not_equal(grid[1:], grid[:-1], out=new[1:])
     grid = grid[new]
-    mean = _means(grid, interpolated(grid, time, _curvature_corrected(imu)))
+    mean = step_means(grid, interpolated(grid, time, _curvature_corrected(imu)))
     first = np.searchsorted(grid, epochs)
     gap_bridged = np.zeros(len(epochs) - 1, dtype=bool)
     if gap.any():
@@ -99,7 +99,7 @@ def _one_interval(imu: ImuSamples, time: Array, epochs: Array) -> Increments:
     begin, end = interpolated(epochs, time, both)
     both = np.concatenate([begin[None], both[rows], end[None]])
     grid = np.concatenate([epochs[:1], time[rows], epochs[1:]])
-    mean = _means(grid, both)
+    mean = step_means(grid, both)
     return Increments(
         mean[:, :3].copy(),
         mean[:, 3:].copy(),
@@ -128,10 +128,21 @@ def _curvature_corrected(imu: ImuSamples) -> Array:
     return both
 
 
-def _means(grid: Array, both: Array) -> Array:
-    """Return mean rate and specific force, (steps, 6), with second-order coning and sculling.
+def step_means(grid: Array, both: Array) -> Array:
+    """Return the rate and specific force of steps, with second-order coning and sculling.
 
     Constant over a step, they turn and accelerate the body as those that change linearly.
+
+    Parameters
+    ----------
+    grid : ndarray, shape (n,)
+        (s)
+    both : ndarray, shape (n, 6)
+        Rate (rad/s) and specific force (m/s^2) at these times, body axes.
+
+    Returns
+    -------
+    ndarray, shape (n - 1, 6)
     """
     before, after = both[:-1].T, both[1:].T
     mean = 0.5 * (before + after)

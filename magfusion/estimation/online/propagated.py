@@ -11,7 +11,7 @@ import numpy as np
 
 from magfusion.estimation.graph.dead_reckoning_error import step_noise, step_transitions
 from magfusion.estimation.graph.inertial import STEP
-from magfusion.estimation.graph.preintegration import in_gap
+from magfusion.estimation.graph.preintegration import in_gap, step_means
 from magfusion.estimation.graph.process_noise import ProcessNoise
 from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, VELOCITY, State
 from magfusion.model.parameters import Block, corrected_imu, inertial_blocks, retract
@@ -142,7 +142,7 @@ def _along(
     bias = np.concatenate([state.gyro_bias_body, state.accel_bias_body])
     read = interpolated(grid, stamps, np.hstack([samples.gyro_body, samples.accel_body]) - bias)
     dt = np.diff(grid)
-    mean = 0.5 * (read[1:] + read[:-1])
+    mean = step_means(grid, read)
     rotated = steps_of(mean[:, :3], mean[:, 3:], dt)
     count = len(grid)
     rotation = np.empty((count, 3, 3))
