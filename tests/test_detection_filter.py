@@ -3,9 +3,15 @@
 import numpy as np
 
 from magfusion.estimation.data_checks.detection import DetectionFilter
-from magfusion.estimation.data_checks.signal import BeaconDetection, undetected_findings
+from magfusion.estimation.data_checks.signal import (
+    LEAST_SNR,
+    BeaconDetection,
+    undetected_findings,
+)
 from magfusion.model.samples import FieldSamples
+from magfusion.model.trust import Verdict
 from magfusion.simulation.demo_site import demo_site
+from magfusion.units import Array
 
 SIGMA = 1e-10  # T
 STEP, WINDOW = 0.4, 0.8  # s
@@ -36,3 +42,24 @@ def test_beacons_that_are_never_detected_have_one_sentence() -> None:
     (finding,) = undetected_findings(detection, demo_site())
     assert finding.text.startswith("beacons A (20 Hz), B (25 Hz), D (35 Hz) are never detected")
     assert "remove them from site.yaml" in finding.text
+
+
+def passing(range_m: Array) -> BeaconDetection:
+    """Return the reception of A, of 5 sigma at 40 m and by the cube of the range, and of B."""
+    field = np.maximum(5.0 * (40.0 / range_m) ** 3, 0.7)
+    snr = np.stack([field, np.full(len(field), 100.0)], axis=1)
+    time = STEP * np.arange(len(snr))
+    return BeaconDetection(time, ("A", "B"), snr, SIGMA * snr, snr > LEAST_SNR)
+
+
+def test_who_drives_out_of_range_is_not_told_that_a_beacon_was_switched_off() -> None:
+    away = 20.0 + 3.0 * STEP * np.arange(100)  # m, at 3 m/s
+    (finding,) = undetected_findings(passing(np.concatenate([away, away[::-1]])), demo_site())
+    assert (finding.code, finding.verdict) == ("low_signal", Verdict.TRUSTWORTHY)
+
+
+def test_a_beacon_that_falls_silent_in_reach_was_switched_off() -> None:
+    silent = passing(np.where(np.arange(100) < 50, 10.0, 1e3))
+    (finding,) = undetected_findings(silent, demo_site())
+    assert (finding.code, finding.verdict) == ("silent_beacon", Verdict.DOUBTFUL)
+    assert "19.8 to 39.8 s" in finding.text

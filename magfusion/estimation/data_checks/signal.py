@@ -24,6 +24,8 @@ HARDLY = 0.05  # share of the epochs; a beacon detected in fewer counts as silen
 MAX_UNDETECTED_SHARE = 0.1  # share of the epochs without any beacon, from which it casts doubt
 SILENCE = 1.0  # s; shorter silence is not reported
 FALLEN = 0.2  # of the neighbouring amplitude; below, a beacon is switched off
+NEAR = 10  # epochs beside a silence
+LEAST_SNR = (DETECTION_CHI_SQUARE / 6.0) ** 0.5  # that is detected
 LISTED = 3
 CERTAIN_DETECTION_RATIO = (
     3.0  # times the weakest detectable field: beyond, one of many beacons must be detected
@@ -247,11 +249,8 @@ def _never_detected(beacons: list[tuple[str, str]]) -> Finding:
 
 def _silences(detection: BeaconDetection, k: int, tones: str) -> Iterator[Finding]:
     there = np.isfinite(detection.snr[:, k])
-    time, strong, amplitude = (
-        detection.time[there],
-        detection.strong[there, k],
-        detection.amplitude[there, k],
-    )
+    time, strong = detection.time[there], detection.strong[there, k]
+    amplitude, snr = detection.amplitude[there, k], detection.snr[there, k]
     if len(time) < 2:
         return
     step = float(np.median(np.diff(time)))
@@ -260,11 +259,13 @@ def _silences(detection: BeaconDetection, k: int, tones: str) -> Iterator[Findin
     off: list[tuple[float, float]] = []
     masked: list[tuple[float, float]] = []
     for first, last in zip(quiet.first[long], quiet.last[long], strict=True):
-        others = np.concatenate(
-            [amplitude[max(first - 10, 0) : first], amplitude[last : last + 10]]
-        )
+        before, after = slice(max(first - NEAR, 0), first), slice(last, last + NEAR)
+        others = np.concatenate([amplitude[before], amplitude[after]])
         elapsed = not detection.passed_by
         elapsed &= float(np.median(amplitude[first:last])) < FALLEN * float(np.median(others))
+        # Who drives out of range leaves it at the weakest field that is detected.
+        sides = [float(np.median(snr[side])) for side in (before, after) if len(snr[side])]
+        elapsed &= max(sides, default=0.0) > CERTAIN_DETECTION_RATIO * LEAST_SNR
         stretch = (float(time[first] - 0.5 * step), float(time[last - 1] + 0.5 * step))
         (off if elapsed else masked).append(stretch)
     name = detection.beacons[k]
