@@ -305,6 +305,7 @@ def _scale_of(calibration):
     return float(calibration.site.aiding[0].scale)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["ekf", "smoother"])
 def test_online_the_scale_of_wheels_is_estimated_and_a_slip_left_out(estimator):
     simulated = _simulated(WHEELS)
@@ -322,6 +323,7 @@ def test_online_the_scale_of_wheels_is_estimated_and_a_slip_left_out(estimator):
     assert np.linalg.norm(error) < 0.02  # m
 
 
+@pytest.mark.slow
 def test_the_smoother_estimates_the_scale_of_wheels():
     simulated = _simulated(WHEELS)
     log = _wrong(simulated, "wheels", lambda _, value: 1.03 * value)
@@ -331,6 +333,7 @@ def test_the_smoother_estimates_the_scale_of_wheels():
     assert np.max(np.linalg.norm(error, axis=1)) < 0.02  # m
 
 
+@pytest.mark.slow
 def test_the_smoother_estimates_as_if_a_slip_had_no_samples():
     """Of twenty samples the tail of Cauchy's loss would move the scale by two sigmas."""
     simulated = _simulated(WHEELS, duration=14.0)
@@ -346,6 +349,7 @@ def test_the_smoother_estimates_as_if_a_slip_had_no_samples():
     assert abs(_scale_of(one.calibration) - _scale_of(other.calibration)) < 0.5 * sigma
 
 
+@pytest.mark.slow
 def test_a_sensor_that_contradicts_for_long_is_named():
     simulated = _simulated(WHEELS)
     log = _wrong(simulated, "wheels", lambda time, value: np.where(time > 10.0, -value, value))
@@ -372,6 +376,7 @@ def test_a_mark_that_the_site_lacks_is_refused():
         aiding_measurement(foot, samples)
 
 
+@pytest.mark.slow
 def test_log_and_pipe_give_the_same_states(tmp_path):
     simulated = _simulated(WHEELS, sensors()[1], duration=9.0)
     write_log(simulated.log, tmp_path / "log")
@@ -394,6 +399,7 @@ def test_log_and_pipe_give_the_same_states(tmp_path):
     assert max(np.linalg.norm(s.position_world - position[s.time]) for s in shared) < 1e-3  # m
 
 
+@pytest.mark.slow
 def test_a_navigator_goes_on_from_a_checkpoint():
     simulated = _simulated(WHEELS, duration=9.0)
     site, settings = aided_site(WHEELS), NavigatorSettings(estimator="ekf")

@@ -149,6 +149,7 @@ def _write_drive(path: Any, simulated: SimulatedLog) -> None:
         write("/odom", ODOMETRY, wheels.time, odometry)
 
 
+@pytest.mark.slow
 def test_a_vehicles_bag_is_smoothed_and_navigated_without_a_mapping(tmp_path):
     wheels = AidingSensor("odom", "velocity", 0.02)
     site = aided_site(wheels)

@@ -38,6 +38,7 @@ def quiet() -> list[AlgorithmOutcome]:
     return run(config, {"workers": 1}, (*PUBLISHED, "A2 kNN nT", ML, "MLrel"))["S0"]
 
 
+@pytest.mark.slow
 def test_in_noise_alone_likelihood_meets_the_bound(quiet: list[AlgorithmOutcome]) -> None:
     bound_m, bound_deg = bounds(quiet)
     sums = summary(quiet)
@@ -60,6 +61,7 @@ def test_in_noise_alone_each_method_errs_by_the_known_size(
     assert position(quiet, method) == pytest.approx(expected_m, rel=0.1)
 
 
+@pytest.mark.slow
 def test_attitude_by_likelihood_does_not_depend_on_the_attitude() -> None:
     errors = list(likelihood_at_tilts(Config(tilted=300)).values())
     assert np.mean(errors) == pytest.approx(0.040, rel=0.1)  # deg
@@ -77,6 +79,7 @@ def test_with_a_smooth_gain_error_plain_likelihood_loses_to_algorithm_3() -> Non
     assert position(kept, ML) > 1.5 * position(kept, A3)
 
 
+@pytest.mark.slow
 def test_the_size_of_the_coils_costs_the_published_algorithms_nothing_and_likelihood_much() -> None:
     small = Config(worlds=4, targets=100, scenarios=("S0", "P0"))
     kept = run(small, {"workers": 1}, (*PUBLISHED, ML))

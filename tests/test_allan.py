@@ -201,6 +201,7 @@ def resting(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return _rest(tmp_path_factory.mktemp("rest") / "log", 1800.0)
 
 
+@pytest.mark.slow
 def test_a_log_at_rest_gives_the_keys_of_a_site(
     resting: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -262,6 +263,7 @@ def _milliseconds(simulation: Arrays) -> None:
     simulation["time"] = 1e-3 * np.floor(simulation["time"] * 1e3 * RATE / 150.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("spoil", "rate_hz"), [(_bursts, RATE), (_milliseconds, 150.0)])
 def test_samples_of_a_coarse_or_late_clock_are_counted(
     spoil: Callable[[Arrays], None], rate_hz: float, tmp_path: Path
@@ -319,6 +321,7 @@ def test_what_spoils_a_log_is_said_and_left_out(
     assert fixed is white_holds
 
 
+@pytest.mark.slow
 def test_a_log_in_motion_fails(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     log = _rest(tmp_path / "log", 120.0, _propagate)
     with pytest.raises(SystemExit) as ended:

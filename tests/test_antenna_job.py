@@ -75,6 +75,7 @@ def run(arguments: list[str]) -> dict[str, object]:
     return dict(json.loads((directory / "report.json").read_text()))
 
 
+@pytest.mark.slow
 def test_the_refined_site_tracks_better(
     tmp_path: Path, true_site: Site, given: Callable[[Survey], list[str]]
 ) -> None:
@@ -107,6 +108,7 @@ def test_the_refined_site_tracks_better(
     assert errors[1] < errors[0] / 8.0
 
 
+@pytest.mark.slow
 def test_a_second_run_starts_where_the_first_ended(
     tmp_path: Path, true_site: Site, given: Callable[[Survey], list[str]]
 ) -> None:
@@ -119,6 +121,7 @@ def test_a_second_run_starts_where_the_first_ended(
     assert abs(float(str(second["matrix_change_largest"]))) < 2e-3
 
 
+@pytest.mark.slow
 def test_exact_poses_are_exact(true_site: Site, given: Callable[[Survey], list[str]]) -> None:
     arguments = given(make_survey(true_site, 30, 4, exact=True))
     options = ["--pose-rotation-deg", "0", "--pose-position-m", "0", "--beacon", "T"]
@@ -132,6 +135,7 @@ def test_exact_poses_are_exact(true_site: Site, given: Callable[[Survey], list[s
     assert abs(kappa) < 4.0 * sigma  # the coils are points
 
 
+@pytest.mark.slow
 def test_sizes_are_written_for_every_estimator(
     tmp_path: Path, true_site: Site, given: Callable[[Survey], list[str]]
 ) -> None:

@@ -107,6 +107,7 @@ def test_a_stream_that_is_none_is_refused_by_its_place(mistake: str, worked: Wor
     assert re.search(pattern, findings), findings
 
 
+@pytest.mark.slow
 def test_a_record_that_is_too_large_is_passed_over_where_that_is_asked(worked: Worked) -> None:
     given = b"0" * (LARGEST_RECORD + 10) + b"\n" + json.dumps(_IMU).encode() + b"\n"
     status, findings = _navigate(worked, given, "json", "--keep-going")
@@ -115,6 +116,7 @@ def test_a_record_that_is_too_large_is_passed_over_where_that_is_asked(worked: W
     assert "1 records were skipped" in findings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "findings"),
     [
@@ -231,6 +233,7 @@ def test_debug_shows_where_an_error_came_from(
     assert err.splitlines()[-1].startswith("magfusion: ")
 
 
+@pytest.mark.slow
 def test_sigterm_ends_with_143_and_tells_how_to_go_on(worked: Worked) -> None:
     site = str(worked.log / "site.yaml")
     command = [*MAGFUSION, "navigate", "-", "--site", site]

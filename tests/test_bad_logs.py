@@ -337,6 +337,7 @@ def test_an_acceleration_of_one_is_in_g_only_if_it_keeps_its_direction() -> None
         check_imu(_imu(gyro, still), "imu")
 
 
+@pytest.mark.slow
 def test_a_small_file_of_many_rows_is_refused_and_a_part_of_it_read(tmp_path: Path) -> None:
     walk, rows = tmp_path / "walk", MOST_ROWS + 1
     write_log(example_log(), walk)

@@ -39,6 +39,7 @@ def mean(errors: Errors, name: str) -> list[float]:
 
 
 # C1: the printed method with each component off by 1 %, in beacon axes, hemispheres known.
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "position", "angle"), [(3, 0.0107, 0.152), (4, 0.0080, 0.119)])
 def test_the_figures_of_the_paper_need_the_axes_of_the_beacon(
     errors: dict[tuple[str, int], Errors], count: int, position: float, angle: float
@@ -255,6 +256,7 @@ def misalignment(result: Array, true: Array) -> Array:
     return np.asarray(Rotation.from_matrix(np.swapaxes(result, -1, -2) @ true).as_rotvec())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["rotating", "one coil"])
 def test_the_sigmas_of_attitude_and_moments_are_those_of_the_errors(kind: str) -> None:
     declared = any_beacon(kind, synchronised=True)
@@ -351,6 +353,7 @@ def test_a_reading_is_the_papers_where_all_four_figures_round_to_its_own() -> No
     assert not readings(wrong)[0].is_the_papers
 
 
+@pytest.mark.slow
 def test_the_scenario_draws_and_ends_with_one_json_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -362,6 +365,7 @@ def test_the_scenario_draws_and_ends_with_one_json_line(
     assert (tmp_path / "beacon_calibration.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_the_scenario_gives_the_same_numbers_on_two_processes() -> None:
     config = Config(runs=8, block=4)
     here, there = (beacon_calibration.run(config, workers=n) for n in (1, 2))

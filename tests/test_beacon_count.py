@@ -26,6 +26,7 @@ def many() -> Mapping[int, Sequence[AlgorithmOutcome]]:
     return run(Config(worlds=60, targets=100), {"workers": 1}, (A3,))
 
 
+@pytest.mark.slow
 def test_more_beacons_help_algorithm_3(many: Mapping[int, Sequence[AlgorithmOutcome]]) -> None:
     error = errors(many, A3).mean(axis=1)
     assert np.all(shares(error) < 0.9)

@@ -60,6 +60,7 @@ def _navigated(small: SmallLog) -> Navigator:
     return navigator
 
 
+@pytest.mark.slow
 def test_the_columns_are_how_a_step_moves_the_estimate_and_its_innovations() -> None:
     """Two runs with the same noise, the second with a step of one millimetre."""
     still = _navigated(_walk_with_a_step(40, np.inf, np.zeros(3)))
@@ -84,6 +85,7 @@ def test_the_columns_are_how_a_step_moves_the_estimate_and_its_innovations() -> 
     np.testing.assert_allclose(gained, sums.information[own, own] @ unit, rtol=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(40, 42))
 def test_a_moved_beacon_is_named_and_one_at_rest_is_not(seed: int) -> None:
     at, shift = 15.0, np.array([0.06, -0.06, 0.0])  # s, m
@@ -99,6 +101,7 @@ def test_a_moved_beacon_is_named_and_one_at_rest_is_not(seed: int) -> None:
     assert all(s.verdict is Verdict.TRUSTWORTHY for s in still.take())
 
 
+@pytest.mark.slow
 def test_smoothing_names_a_beacon_moved_for_good_and_nothing_else() -> None:
     at, shift = 0.6 * EPOCHS * STEP, np.array([0.3, -0.3, 0.0])  # s, m
     small = _walk_with_a_step(41, at, shift)

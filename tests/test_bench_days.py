@@ -5,9 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 TOOL = Path(__file__).parents[1] / "tools" / "bench_days.py"
 
 
+@pytest.mark.slow
 def test_six_minutes_lead_to_states_in_bounded_memory() -> None:
     done = subprocess.run(
         [sys.executable, str(TOOL), "--hours", "0.1"], check=True, capture_output=True, text=True

@@ -7,6 +7,7 @@ from bench_fusion import make_scene
 from magfusion.estimation.graph.graph import initial_estimate
 
 
+@pytest.mark.slow
 def test_all_engines_have_the_error_and_the_sigma_of_our_loop() -> None:
     scene = make_scene(LAG + 5, 1)
     start = initial_estimate(scene.start, scene.declared)

@@ -74,6 +74,7 @@ def turn_deg(result: Beacon, true: Beacon) -> Array:
     return np.asarray(between.as_rotvec() / DEGREE)
 
 
+@pytest.mark.slow
 def test_the_command_finds_what_the_survey_of_the_site_missed(tmp_path: Path) -> None:
     site, true_site = written(tmp_path)
     options = ("--site", tmp_path / "site.yaml", "-o", tmp_path / "out")

@@ -81,6 +81,7 @@ def spread_of(log: Log, site: Site, sensor: Magnetometer) -> float:
     return spread(field_from_measured(measured, sensor.matrix, sensor.offset))
 
 
+@pytest.mark.slow
 def test_the_command_writes_site_picture_and_report(result: Path) -> None:
     assert {path.name for path in result.iterdir()} == FILES
     assert (result / "magnetometer.png").read_bytes().startswith(b"\x89PNG")
@@ -126,6 +127,7 @@ def test_the_refined_site_fed_back_in_changes_no_more(
     assert report["spread_after"] == pytest.approx(report["spread_before"], rel=0.1)
 
 
+@pytest.mark.slow
 def test_without_an_earth_field_the_scale_stays_and_the_report_says_so(
     rotated: tuple[SimulatedLog, Path], result: Path, tmp_path: Path
 ) -> None:
@@ -249,6 +251,7 @@ def test_the_size_of_the_field_speaks_against_a_small_spread(
     assert np.max(np.abs(result.offset - true.offset) / result.sigma.offset) < 3.5
 
 
+@pytest.mark.slow
 def test_twelve_stops_are_found_in_the_stream(tmp_path: Path) -> None:
     session = twelve_positions.record(twelve_positions.Config(), 12, np.random.default_rng(2))
     assert len(find_stops(session.log.imu, MotionModel())) == 12
@@ -371,6 +374,7 @@ def test_a_tone_too_low_to_average_out_is_refused() -> None:
         window_length(replace(site, beacons=(slow,)))
 
 
+@pytest.mark.slow
 @needs_shared_logs
 @pytest.mark.parametrize(
     ("name", "gain"),

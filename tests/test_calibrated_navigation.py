@@ -17,6 +17,7 @@ def reported() -> Table:
     return means(calibrated_navigation.run(Config(worlds=4, targets=60), workers=1))
 
 
+@pytest.mark.slow
 def test_what_calibration_takes_off_stands_beside_the_papers_share(reported: Table) -> None:
     printed = taken_off(PAPER["geometric"], PAPER["calibrated"])
     assert printed == pytest.approx((28.6, 62.8), abs=0.1)  # per cent

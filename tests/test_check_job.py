@@ -49,6 +49,7 @@ def test_a_good_log_is_trustworthy_and_nothing_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_report_and_picture_are_written_where_that_is_asked(worked: Worked, tmp_path: Path) -> None:
     run_command("check", worked.log, "-o", tmp_path / "look")
     run_command("check", worked.log, "-o", tmp_path / "look")  # an earlier one is replaced
@@ -67,6 +68,7 @@ def test_what_is_in_the_way_is_refused(worked: Worked, tmp_path: Path, refuse: R
     refuse(2, "mine", "check", worked.log, "-o", tmp_path / "mine")
 
 
+@pytest.mark.slow
 def test_a_failed_log_exits_with_one_and_says_why_first(
     spoiled: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -49,6 +49,7 @@ def same(one: State, other: State) -> bool:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["smoother", "ekf"])
 def test_a_restored_navigator_goes_on_to_the_last_bit(estimator: str) -> None:
     """What GTSAM preintegrated is in the checkpoint, with all its digits."""
@@ -68,6 +69,7 @@ def test_a_restored_navigator_goes_on_to_the_last_bit(estimator: str) -> None:
         assert twin.losses == navigator.losses
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("earth", [False, True])
 def test_a_navigator_of_raw_samples_goes_on_to_the_last_bit(worked: Worked, earth: bool) -> None:
     """What its receiver has admitted, and the calibration so far, are in the checkpoint."""
@@ -228,6 +230,7 @@ def test_killed_before_the_first_checkpoint_it_begins_again(
     ).read_bytes()
 
 
+@pytest.mark.slow
 def test_the_checkpoint_may_lie_elsewhere_and_goes_when_all_is_done(
     worked: Worked, tmp_path: Path
 ) -> None:
@@ -290,6 +293,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_former(
     assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.bin"]
 
 
+@pytest.mark.slow
 def test_a_stream_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     walk, site, place = online_log(3, 14.0), tmp_path / "site.yaml", tmp_path / "checkpoint"
     save_site(walk.site, site)

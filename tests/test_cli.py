@@ -57,6 +57,7 @@ def test_fixes_of_one_beacon_are_told_to_be_ambiguous(
     assert "epochs are ambiguous: fixes.parquet has every pose" in out
 
 
+@pytest.mark.slow
 def test_what_one_coil_leaves_open_is_told_and_not_smoothed_over(
     worked: Worked, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -123,6 +124,7 @@ def test_with_json_the_report_is_all_that_is_printed(
         assert out.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_the_screen_has_errors_and_sigmas_by_axis_in_a_few_lines(
     worked: Worked, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -140,6 +142,7 @@ def test_the_screen_has_errors_and_sigmas_by_axis_in_a_few_lines(
     assert not any("imu.time_offset" in line for line in lines)
 
 
+@pytest.mark.slow
 def test_with_verbose_the_screen_has_the_calibration_and_with_quiet_the_verdict_alone(
     worked: Worked, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -196,6 +199,7 @@ def test_a_truth_elsewhere_costs_the_comparison_and_not_the_trajectory(
     assert "ate_m" not in _report(tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_phasors_smooth_nearly_as_well_as_the_waveform(worked: Worked, tmp_path: Path) -> None:
     run_command("smooth", worked.phasors, "-o", tmp_path / "run")
     assert _report(tmp_path / "run")["ate_m"] < 2.0 * _report(worked.smoothed)["ate_m"] + 0.002  # m
@@ -214,6 +218,7 @@ def test_the_recording_can_be_read_back(worked: Worked) -> None:
     assert expected <= {chunk.entity_path for chunk in chunks}
 
 
+@pytest.mark.slow
 def test_the_refined_site_can_be_fed_back_in(worked: Worked, tmp_path: Path) -> None:
     site = worked.smoothed / "site.yaml"
     record = load_site(site).calibration
@@ -227,6 +232,7 @@ def test_the_refined_site_can_be_fed_back_in(worked: Worked, tmp_path: Path) -> 
     assert again["ate_m"] < 2.0 * first["ate_m"]
 
 
+@pytest.mark.slow
 def test_the_rate_of_the_imu_fills_the_gaps_between_epochs(worked: Worked, tmp_path: Path) -> None:
     run_command("smooth", worked.log, "-o", tmp_path / "run", "--rate", "imu")
     dense, truth = read_estimate(tmp_path / "run"), read_log(worked.log).truth
@@ -235,6 +241,7 @@ def test_the_rate_of_the_imu_fills_the_gaps_between_epochs(worked: Worked, tmp_p
     run_command("evaluate", tmp_path / "run", worked.log)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -254,6 +261,7 @@ def test_every_way_of_smoothing_finds_the_trajectory(
     assert figures["attitude_rmse_deg"] < 1.0  # deg
 
 
+@pytest.mark.slow
 def test_a_part_of_a_log_is_smoothed_alone(worked: Worked, tmp_path: Path) -> None:
     run_command("smooth", worked.log, "-o", tmp_path / "run", "--start", 3, "--end", 9)
     time = read_estimate(tmp_path / "run", read_log(worked.log).epoch_ns).time

@@ -110,6 +110,7 @@ def test_the_directions_of_a_window_are_those_of_its_phasors() -> None:
     assert np.max(np.abs(design.extra_design.T @ design.across)) < 1e-9
 
 
+@pytest.mark.slow
 def test_short_windows_have_the_say_and_leave_what_noise_does(smoothed: Smoothed) -> None:
     joint = joint_of(smoothed)
     (long,) = [m for m in smoothed.graph.measurements if isinstance(m, FieldPhasors)]

@@ -79,6 +79,7 @@ def test_the_list_of_commands_is_shown_without_anything_heavy() -> None:
     assert float(memory) < MOST_MEMORY
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks")
 def test_help_is_shown_without_what_only_the_work_needs() -> None:
     done = _child("-c", HELP_OF_EACH, *JOBS)
@@ -157,6 +158,7 @@ def test_the_defaults_of_options_are_those_of_the_estimators() -> None:
 # The window that is asked is the window that is used ------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_lockin_of_the_settings_is_used(worked: Worked, tmp_path: Path) -> None:
     """It was once overwritten by another of the job."""
     settings = SmootherSettings(lockin=LockinSettings(window=0.8, step=0.6))
@@ -166,6 +168,7 @@ def test_the_lockin_of_the_settings_is_used(worked: Worked, tmp_path: Path) -> N
     assert np.median(np.diff(time)) == pytest.approx(0.6, rel=0.01)
 
 
+@pytest.mark.slow
 def test_the_calibration_by_a_log_uses_the_window_that_is_asked(
     worked: Worked, tmp_path: Path
 ) -> None:
@@ -177,6 +180,7 @@ def test_the_calibration_by_a_log_uses_the_window_that_is_asked(
 # The program, and the shell -------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_module_is_the_program(worked: Worked) -> None:
     done = _child("-m", "magfusion", "evaluate", str(worked.smoothed), str(worked.log), "--json")
     assert (done.returncode, done.stderr) == (0, "")
@@ -196,6 +200,7 @@ def _completed(*words: str) -> set[str]:
     return set(answer.stdout.split())
 
 
+@pytest.mark.slow
 def test_the_shell_completes_commands_options_and_choices() -> None:
     assert _completed("s") == {"smooth", "survey", "sheet", "simulate"}
     assert _completed("calibrate", "f") == {"fieldmap"}
@@ -219,6 +224,7 @@ def test_the_script_for_the_shell_is_shown() -> None:
 # The names of the package ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_package_offers_its_names_and_loads_nothing_before_they_are_asked_for() -> None:
     lines = (
         "import sys, magfusion as mf",
@@ -239,6 +245,7 @@ def test_a_name_that_the_package_does_not_offer_is_told() -> None:
         _ = magfusion.smoothe
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("given", "threads"),
     [
@@ -269,6 +276,7 @@ assert os.environ.get("OPENBLAS_NUM_THREADS") == {threads!r}
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_who_imports_statistics_while_a_filter_is_made_has_all_of_them() -> None:
     reported = """
 import threading

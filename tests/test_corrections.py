@@ -64,6 +64,7 @@ def put(site: Any, key: str, value: object) -> None:
         site[int(last) if isinstance(site, list) else last] = value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mistake", "code"),
     [

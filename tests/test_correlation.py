@@ -178,6 +178,7 @@ def test_correlations_of_two_calibrations_stand_side_by_side() -> None:
     assert one.without(("beacons",), ["A"]) is None
 
 
+@pytest.mark.slow
 def test_the_simulator_draws_together_what_goes_together() -> None:
     site = moved_together(demo_site(coil_radius=None))
     rng = np.random.default_rng(0)

@@ -17,6 +17,7 @@ from magfusion.results.coverage_colours import COLOURS
 FILES = {"coverage.parquet", "coverage.png", "run.rrd", "report.html", "report.json"}
 
 
+@pytest.mark.slow
 def test_the_command_writes_table_picture_recording_and_report(
     worked: Worked, tmp_path: Path
 ) -> None:

@@ -200,6 +200,7 @@ def stream(tmp_path: Path) -> Interrupted:
     return Interrupted(place, lambda: run(b"", resume=True))
 
 
+@pytest.mark.slow
 def test_damaged_checkpoints_of_a_pipe_are_refused(stream: Interrupted, tmp_path: Path) -> None:
     whole = stream.place.read_bytes()
     stream.go_on()
@@ -254,6 +255,7 @@ def test_damaged_state_of_a_log_is_refused(log: Interrupted, tmp_path: Path) -> 
         refused(log, rows, whole[: rng.integers(0, size)] if k % 3 == 1 else content, tmp_path)
 
 
+@pytest.mark.slow
 def test_damaged_state_of_a_world_is_refused(tmp_path: Path) -> None:
     task = WorldTask(0, "ekf", 0.1, 1, place=str(tmp_path / "unfinished"))
     run_world(task)

@@ -135,6 +135,7 @@ def test_a_false_sample_at_an_end_is_left_out(stream: str, row: int) -> None:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stream", ["gyro", "accel"])
 def test_one_false_inertial_sample_does_not_move_the_trajectory(stream: str) -> None:
     log, site = walked(), demo_site(coil_radius=None)

@@ -27,6 +27,7 @@ FILES = {
 QUICK = ("--box", "0,6,0,5,0,3", "--spacing", 1.5, "--grid", 3, "--axes", 3, "--starts", 1)
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_site_that_has_what_the_report_says(
     worked: Worked, tmp_path: Path
 ) -> None:
@@ -112,6 +113,7 @@ def test_an_option_that_cannot_be_is_refused(
     )
 
 
+@pytest.mark.slow
 def test_an_accuracy_that_is_needed_has_the_smallest_moment(
     worked: Worked, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

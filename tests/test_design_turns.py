@@ -65,6 +65,7 @@ def test_what_the_search_minimises_is_what_coverage_says_of_the_site() -> None:
     np.testing.assert_allclose(phasor_variance(result.site, WINDOW), 7.0 * density**2 / WINDOW)
 
 
+@pytest.mark.slow
 def test_slots_go_through_the_job_and_what_cannot_be_is_refused(
     tmp_path: Path, refuse: Refuse
 ) -> None:

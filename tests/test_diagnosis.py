@@ -91,6 +91,7 @@ def _short() -> Case:
     return simulated(demo_site(coil_radius=None), config, seed=5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", QUICK)
 def test_a_mistake_names_itself(name: str) -> None:
     _names_itself(name, NAMED[name])
@@ -150,6 +151,7 @@ def test_unknown_drive_phases_are_no_contradiction() -> None:
     assert cause_of(case.log, case.site) is None
 
 
+@pytest.mark.slow
 def test_a_beacon_far_beyond_its_sigma_is_named() -> None:
     site = demo_site(coil_radius=None)
     beacons = tuple(with_sigma(b, 0.01, 0.5 * DEGREE, 0.01) for b in site.beacons)
@@ -187,6 +189,7 @@ def test_wide_windows_average_the_motion_of_either_sensor() -> None:
     assert chi_square < 1.3 * motion.freedom
 
 
+@pytest.mark.slow
 def test_nothing_is_tried_of_what_is_trustworthy_or_explains_itself() -> None:
     case = MISTAKES["gyro_sign"].change(_short())
     assert diagnosed(case.log, case.site, Trust()) is None
@@ -223,6 +226,7 @@ def test_what_says_why_comes_before_what_only_says_where() -> None:
     assert clearly_best([without, replace(clock, after=300.0)]) is without
 
 
+@pytest.mark.slow
 def test_a_line_that_is_seen_comes_before_a_beacon_that_is_only_false() -> None:
     case = MISTAKES["line_on_tone"].change(_short())
     line = Finding("undeclared_line", "A line beside the tone of beacon B.")
@@ -252,6 +256,7 @@ def test_errors_of_a_rough_survey_are_no_contradiction_of_the_inertial_sensor() 
     assert "time_offset" not in {one.code for one in reported}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lever_20cm", "survey_overconfident"])
 def test_a_mistake_names_itself_in_a_rough_survey(name: str) -> None:
     config = SimulationConfig(

@@ -177,6 +177,7 @@ def test_the_phasors_of_a_single_beacon_give_the_attitude_exactly() -> None:
     np.testing.assert_allclose(result, attitude, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_fix_errs_as_little_at_any_attitude_as_at_none() -> None:
     site = tilted_attitude.build(MOMENT)
     rng = np.random.default_rng(6)

@@ -370,6 +370,7 @@ def test_a_room_adds_its_background_to_the_waveform_turned_into_the_sensor() -> 
     np.testing.assert_allclose(wave.measured_sensor / 1e-8, world @ turn / 1e-8, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_bent_field_is_off_by_its_share_and_alike_nearby() -> None:
     rng = np.random.default_rng(3)
     start = rng.uniform(0.0, 3.0, (4500, 3))

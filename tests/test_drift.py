@@ -53,6 +53,7 @@ def test_the_interval_of_one_world_holds_however_long_its_errors_are_alike(hours
     assert outside(40, lambda: correlated(rng, 3600.0 * hours)[:180], 0.95) <= 0.154
 
 
+@pytest.mark.slow
 def test_a_line_through_a_walk_is_no_drift():
     """As a bias walks: with blocks taken for independent one in two such walks drifts."""
     rng = np.random.default_rng(5)
@@ -104,6 +105,7 @@ def test_a_slope_that_is_there_is_found_and_one_that_is_not_is_not():
 HOURS = 3600.0 * np.arange(48.0)
 
 
+@pytest.mark.slow
 def test_chance_alone_goes_beyond_three_standard_errors_as_rarely_as_it_says():
     rng = np.random.default_rng(9)
     correlations = np.array([[1.0, 0.0, 0.0], [0.9, 0.3, 0.0], [0.0, 0.5, 2.0]])

@@ -71,6 +71,7 @@ def smoothed() -> tuple[Site, Log, Smoothed]:
     return site, log, smooth(log, site)
 
 
+@pytest.mark.slow
 def test_each_segment_follows_the_drift(smoothed: tuple[Site, Log, Smoothed]) -> None:
     _, _, result = smoothed
     count = len(result.graph.segments)
@@ -87,6 +88,7 @@ def test_each_segment_follows_the_drift(smoothed: tuple[Site, Log, Smoothed]) ->
     assert np.all(difference(result.calibration, main, result.blocks) == 0.0)
 
 
+@pytest.mark.slow
 def test_the_drift_does_not_move_the_platform(
     smoothed: tuple[Site, Log, Smoothed], monkeypatch: pytest.MonkeyPatch
 ) -> None:

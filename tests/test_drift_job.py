@@ -224,6 +224,7 @@ def unfinished(output, settings):
     return task.progress
 
 
+@pytest.mark.slow
 def test_the_command_writes_report_picture_and_recording(tmp_path, capsys):
     output = tmp_path / "drift"
     unfinished(output, DriftSettings(seed=5))  # of another run: begun anew without --resume
@@ -330,6 +331,7 @@ def test_a_clock_that_is_believed_turns_the_attitude(tmp_path):
     assert slope > 1.0
 
 
+@pytest.mark.slow
 def test_a_bias_that_walks_as_declared_does_not_drift():
     """Of 100 worlds of four hours, whose errors are alike for hours, at most two fail."""
     rng = np.random.default_rng(3)

@@ -226,6 +226,7 @@ def test_the_steady_field_of_a_turning_window_is_that_of_its_centre(gap):
     assert np.max(np.abs(np.diff(steady.measured_sensor, axis=0))) > 1e-6
 
 
+@pytest.mark.slow
 def test_where_no_beacon_is_heard_the_smoother_goes_on_by_the_earth_field(gap):
     site, _, log = gap
     result = smooth(log, site, SmootherSettings(earth=True))
@@ -240,6 +241,7 @@ def test_where_no_beacon_is_heard_the_smoother_goes_on_by_the_earth_field(gap):
     assert np.rad2deg(np.max(sigma)) < 2.0
 
 
+@pytest.mark.slow
 def test_no_beacon_at_all_leaves_an_attitude_and_says_that_the_heading_is_the_fields():
     site, _, log = turning(2, 20.0, 0.0, 20.0)
     result = smooth(log, site, SmootherSettings(earth=True))
@@ -313,6 +315,7 @@ def test_the_filter_lets_a_disturbed_field_go_and_takes_it_up_again(seed):
     assert 98 <= navigator.counts["Earth field disturbed"] <= 115
 
 
+@pytest.mark.slow
 def test_a_disturbed_field_changes_nothing_where_beacons_hold_the_attitude():
     site, simulated, log = turning(3, 20.0, 30.0, 30.0)
     bent = disturbed(simulated, log, 6.0, 14.0)

@@ -265,6 +265,7 @@ def test_a_truth_that_stands_is_reported(walked: Trajectory, report: Any) -> Non
     assert "frozen" in str(report(positions(frozen, frozen.position_world))["notes"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ["positions", "attitudes"])
 def test_a_log_with_a_part_of_a_truth_is_smoothed_and_checked(
     part: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]

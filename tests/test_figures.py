@@ -126,6 +126,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("job", [("smooth",), ("navigate", "--lag", 2)])
 def test_beacons_of_any_name_are_in_the_report_and_on_the_screen(
     job: tuple[object, ...],

@@ -44,6 +44,7 @@ def mean_nees(site: Site, *, survey_error: bool) -> float:
     return float(np.mean(result))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("beacons", "synchronised"), [(2, True), (4, True), (4, False)])
 def test_the_covariance_of_a_fix_holds_the_error_of_the_survey(
     beacons: int, synchronised: bool
@@ -52,6 +53,7 @@ def test_the_covariance_of_a_fix_holds_the_error_of_the_survey(
     assert low < mean_nees(surveyed(beacons, synchronised=synchronised), survey_error=True) < high
 
 
+@pytest.mark.slow
 def test_a_fix_that_takes_the_survey_for_exact_is_found_out() -> None:
     _, high = average_nees_bounds(6, RUNS, 0.999)
     assert mean_nees(surveyed(4, synchronised=True), survey_error=False) > 10.0 * high

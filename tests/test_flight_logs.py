@@ -82,6 +82,7 @@ def turned(own: Log, log: Log) -> float:
     return float(np.sqrt(2.0 * np.max(1.0 - cosine)))
 
 
+@pytest.mark.slow
 def test_a_ulog_gives_its_samples_and_poses(flown: Path, flight: Flight, tmp_path: Path) -> None:
     path = write_ulog(tmp_path / "flight.ulg", px4_messages(flight))
     own, shown = imported(path, tmp_path / "log", "--site", str(flown / "site.yaml"))
@@ -104,6 +105,7 @@ def test_a_ulog_gives_its_samples_and_poses(flown: Path, flight: Flight, tmp_pat
     assert report["verdict"] == "trustworthy"
 
 
+@pytest.mark.slow
 def test_integrals_and_a_second_raw_magnetometer(
     flown: Path, flight: Flight, tmp_path: Path
 ) -> None:
@@ -122,6 +124,7 @@ def test_integrals_and_a_second_raw_magnetometer(
     assert "found vehicle_magnetometer, sensor_mag:1" in " ".join(done.stderr.split())
 
 
+@pytest.mark.slow
 def test_a_position_that_is_not_valid_is_left_out(flight: Flight, tmp_path: Path) -> None:
     messages = px4_messages(flight)
     local = messages["vehicle_local_position"][1]
@@ -132,6 +135,7 @@ def test_a_position_that_is_not_valid_is_left_out(flight: Flight, tmp_path: Path
     assert np.isfinite(own.truth.position_world).all()
 
 
+@pytest.mark.slow
 def test_a_ulog_without_its_package_or_contents_is_refused(flight: Flight, tmp_path: Path) -> None:
     messages = px4_messages(flight)
     path = write_ulog(tmp_path / "flight.ulg", messages)
@@ -149,6 +153,7 @@ def test_a_ulog_without_its_package_or_contents_is_refused(flight: Flight, tmp_p
     assert "is no PX4 ULog" in " ".join(done.stderr.split())
 
 
+@pytest.mark.slow
 def test_a_dataflash_log_gives_its_samples_and_poses(
     flown: Path, flight: Flight, tmp_path: Path
 ) -> None:
@@ -176,6 +181,7 @@ def test_a_dataflash_log_gives_its_samples_and_poses(
     np.testing.assert_allclose(moved, np.tile([3e-6, -3e-6, -3e-6], (len(moved), 1)), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_attitudes_of_a_dataflash_log_without_an_ekf(
     flown: Path, flight: Flight, tmp_path: Path
 ) -> None:
@@ -189,6 +195,7 @@ def test_attitudes_of_a_dataflash_log_without_an_ekf(
     assert np.isnan(own.truth.position_world).all()
 
 
+@pytest.mark.slow
 def test_a_dataflash_log_without_its_package_or_contents_is_refused(
     flight: Flight, tmp_path: Path
 ) -> None:

@@ -19,6 +19,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return example_inputs(tmp_path_factory.mktemp("inputs") / "inputs")
 
 
+@pytest.mark.slow
 def test_what_breaks_is_found(
     inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -106,6 +106,7 @@ def test_the_native_graph_has_the_cost_and_the_slope_of_the_problem(
     assert slope == pytest.approx((ahead - behind) / 2e-2, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_result_as_a_gtsam_graph_has_the_cost_of_the_last_pass(
     earth_result: mf.SmoothedLog,
 ) -> None:
@@ -245,6 +246,7 @@ def test_an_exported_graph_is_not_serialised(earth_result: mf.SmoothedLog) -> No
         graph.clone()
 
 
+@pytest.mark.slow
 def test_gtsams_optimiser_ends_at_the_same_trajectory(small: SmallLog) -> None:
     ours, theirs = (
         mf.smooth(small.log, small.site, mf.SmootherSettings(engine=engine))

@@ -15,6 +15,7 @@ from magfusion.files.site import save_site
 from magfusion.results.turn_guide import sphere_of_dots
 
 
+@pytest.mark.slow
 def test_a_hand_that_follows_ends_with_a_calibration_in_time(tmp_path: Path) -> None:
     hand = by_hand.Hand(by_hand.uncalibrated_site(), np.random.default_rng(45), follows=True)
     turned = by_hand.turn(hand, tmp_path)
@@ -31,6 +32,7 @@ def test_a_hand_that_follows_ends_with_a_calibration_in_time(tmp_path: Path) -> 
     assert len(report["determined"]) == 12
 
 
+@pytest.mark.slow
 def test_a_hand_that_turns_about_one_axis_is_told_what_is_missing(tmp_path: Path) -> None:
     hand = by_hand.Hand(by_hand.uncalibrated_site(), np.random.default_rng(46), follows=False)
     turned = by_hand.turn(hand, tmp_path, 20.0)
@@ -67,6 +69,7 @@ def test_the_sphere_shows_each_direction_on_its_side() -> None:
     assert "@" not in "\n".join(away)
 
 
+@pytest.mark.slow
 def test_without_inertial_samples_the_guidance_is_by_the_field(tmp_path: Path) -> None:
     hand = by_hand.Hand(by_hand.uncalibrated_site(), np.random.default_rng(47), follows=False)
     save_site(hand.site, tmp_path / "site.yaml")

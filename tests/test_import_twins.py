@@ -103,6 +103,7 @@ def axes(stem: str, unit: str = "", names: str = "XYZ") -> list[str]:
     return [f"{stem}{axis}{unit}" for axis in names]
 
 
+@pytest.mark.slow
 def test_an_inertial_module_holds_a_slow_and_late_magnetometer() -> None:
     motion = turning(times(9000, 100.0), 1)
     gyro, accel = inertial(motion, 2)
@@ -115,6 +116,7 @@ def test_an_inertial_module_holds_a_slow_and_late_magnetometer() -> None:
     assert_offset(field)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gyro_too", [True, False])
 def test_a_telephone_writes_a_table_a_sensor(gyro_too: bool) -> None:
     motion = turning(times(6000, 100.0), 3)
@@ -278,6 +280,7 @@ def test_a_magnetometer_alone_is_an_array_with_false_samples() -> None:
     assert_offset(field)
 
 
+@pytest.mark.slow
 def test_a_breakout_board_rests_for_half_a_minute() -> None:
     rate = 30.0
     time = times(900, rate)
@@ -350,6 +353,7 @@ def test_sixteen_coils_are_a_column_of_amplitudes() -> None:
     assert_fixed(world, 0.01, lever)
 
 
+@pytest.mark.slow
 def test_sixteen_coils_are_raw_samples_beside_a_marker() -> None:
     rate, burst, carrier = 96_000.0, 0.01, 4_000.0
     site = unsigned_amplitudes.floor()
@@ -377,6 +381,7 @@ def test_sixteen_coils_are_raw_samples_beside_a_marker() -> None:
     np.testing.assert_allclose(found, size * 1e-9, rtol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pulsed", [False, True])
 def test_a_tracker_of_three_coils(pulsed: bool) -> None:
     rng = np.random.default_rng(43)
@@ -449,6 +454,7 @@ def test_tables_by_rows_name_beacon_or_slot_and_axis() -> None:
         np.testing.assert_allclose(fields.phasor_cov[..., 0, 0], 1e-20, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_log_without_tones_has_a_site_without_beacons() -> None:
     motion = turning(times(3000, 100.0), 51)
     gyro, accel = inertial(motion, 52)
@@ -466,6 +472,7 @@ def test_a_log_without_tones_has_a_site_without_beacons() -> None:
     figures("calibrate", "magnetometer", "log", "--site", "new.yaml", output="out")
 
 
+@pytest.mark.slow
 def test_a_user_marks_missing_values() -> None:
     motion = turning(times(1000, 100.0), 55)
     field = measured(motion, 56)
@@ -483,6 +490,7 @@ def test_a_user_marks_missing_values() -> None:
     assert len(waveform.time) == 998
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gauss", [True, False])
 def test_several_bags_publish_vectors(gauss: bool) -> None:
     def message(k: int) -> Any:
@@ -505,6 +513,7 @@ def test_several_bags_publish_vectors(gauss: bool) -> None:
     assert len(log.imu) == N
 
 
+@pytest.mark.slow
 def test_columns_of_a_euroc_folder_are_those_of_its_header() -> None:
     motion = turning(times(500, 100.0), 57)
     stamps = 1_403_636_579_000_000_000 + np.arange(500) * 10_000_000

@@ -15,6 +15,7 @@ ROWS = [0, 1, 2, 6, 7, 8]  # gyro and accelerometer
 BENT = 0.01  # of the fields, constant in place
 
 
+@pytest.mark.slow
 def test_errors_constant_in_place_are_expected_to_turn_the_states_slowly() -> None:
     """They leave more than white errors of their size would, in each of several worlds."""
     ratios = []

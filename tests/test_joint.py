@@ -234,6 +234,7 @@ def test_many_short_logs_are_one_graph_of_them_all() -> None:
     in_one_graph(refined(site, true, [log_of(true, which, 1.4) for which in range(20)]))
 
 
+@pytest.mark.slow
 def test_the_joint_solution_is_that_of_one_graph_of_all_logs(together: Together) -> None:
     """To a millionth of a sigma, from the solutions of the logs alone."""
     estimates = in_one_graph(together)

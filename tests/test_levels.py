@@ -20,6 +20,7 @@ def _levels() -> list[Levels]:
     return [one for one in result if one is not None]
 
 
+@pytest.mark.slow
 def test_levels_found_together_are_those_found_alone() -> None:
     together, alone = _levels(), _levels()
     assert len(together) > 50
@@ -32,6 +33,7 @@ def test_levels_found_together_are_those_found_alone() -> None:
     assert len(set(known)) > 0.9 * len(known)
 
 
+@pytest.mark.slow
 def test_found_again_nothing_changes() -> None:
     levels = _levels()[-3:]
     before = [one.values for one in levels]
@@ -45,6 +47,7 @@ def test_none_are_no_levels() -> None:
     assert Levels((0.5, None)).values == (pytest.approx(0.5, abs=0.0), None)
 
 
+@pytest.mark.slow
 def test_a_state_that_waits_keeps_no_filters() -> None:
     requested = _levels()[-1].query
     assert requested is not None

@@ -128,6 +128,7 @@ def test_one_linearisation_of_a_wide_prediction_errs_by_many_sigma() -> None:
     assert errors[1] < 3.0
 
 
+@pytest.mark.slow
 def test_wide_predictions_have_a_consistent_nees() -> None:
     """Of 150 draws the mean NEES per degree of freedom has a sigma of sqrt(2 / 900)."""
     site, level = a_site(), []

@@ -155,6 +155,7 @@ def test_a_device_that_restarts_is_followed() -> None:
     assert np.max(np.abs(np.diff(times) - np.diff(kept) / RATE_HZ)) < 1e-4
 
 
+@pytest.mark.slow
 def test_the_command_prints_records_until_its_time_is_over(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))

@@ -289,6 +289,7 @@ def test_who_cannot_be_reached_stops_nothing() -> None:
     )  # one of them a heartbeat
 
 
+@pytest.mark.slow
 def test_the_replay_of_a_log_sends_them_too(
     log: Path,
     tmp_path: Path,

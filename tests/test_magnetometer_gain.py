@@ -97,6 +97,7 @@ def test_a_field_of_another_size_is_the_reason_and_not_the_rotation(
     np.testing.assert_allclose(sensor.offset, OFFSET, atol=1e-7, rtol=0)  # T
 
 
+@pytest.mark.slow
 def test_late_samples_are_the_reason_and_not_the_rotation() -> None:
     log = turned(0.8)
     assert log.waveform is not None
@@ -113,6 +114,7 @@ def test_without_an_imu_the_gain_is_found_too() -> None:
     np.testing.assert_allclose(sensor.offset, OFFSET, atol=1e-7, rtol=0)  # T
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not RECORDING.is_dir(), reason="the recordings are not beside the repository")
 def test_a_recorded_gain_is_found() -> None:
     site = load_site(RECORDING / "site.yaml", without=True)

@@ -134,6 +134,7 @@ def test_nothing_is_called_determined_and_wrong(imu: bool) -> None:
     assert not [scenario.line(row) for row in rows if row.wrong]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [pytest.param(1, marks=pytest.mark.slow), 5])
 def test_one_axis_and_a_field_of_unknown_size_determine_no_offset(seed: int) -> None:
     case = scenario.Case(90.0, 1, "bursts", "not declared", "room for iron", seed=seed)

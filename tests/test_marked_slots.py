@@ -228,6 +228,7 @@ def test_a_checkpoint_in_the_middle_of_a_burst_goes_on() -> None:
     assert np.array_equal(*(run.phasor_sensor for run in runs), equal_nan=True)
 
 
+@pytest.mark.slow
 def test_what_is_kept_does_not_grow() -> None:
     site, waveform, imu = _site(), _waveform(_marks(6.0), 6.0), _still(7.0)
     receiver, kept = MarkedReceiver(site), []

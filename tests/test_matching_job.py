@@ -74,6 +74,7 @@ def report(path: Path) -> dict[str, Any]:
     return reported
 
 
+@pytest.mark.slow
 def test_the_database_has_table_picture_and_report(logs: Path) -> None:
     result = logs / "nod_table"
     names = {"attitudes.parquet", "attitudes.png", "report.html", "report.json"}
@@ -87,6 +88,7 @@ def test_the_database_has_table_picture_and_report(logs: Path) -> None:
     assert reported["unexplained_by_a_uniform_field_t"] < 1e-8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "limit"), [("nearest", 2.0), ("interpolated", 0.3)])
 def test_roll_and_pitch_are_found_in_the_database_of_another_log(
     logs: Path, tmp_path: Path, method: str, limit: float
@@ -106,6 +108,7 @@ def test_roll_and_pitch_are_found_in_the_database_of_another_log(
     assert set(table["yaw_sigma_deg"]) == {0.0}
 
 
+@pytest.mark.slow
 def test_roll_is_found_by_its_database_and_in_closed_form(logs: Path, tmp_path: Path) -> None:
     run_command("match", logs / "turn_again", "--database", logs / "turn_table" /
                 "attitudes.parquet", "-o", tmp_path / "table")  # fmt: skip
@@ -226,6 +229,7 @@ def test_a_cell_that_is_no_cell_is_refused(
     assert "--step-deg" in refuse(*arguments, "-o", tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_a_log_without_truth_needs_a_reference(logs: Path, tmp_path: Path, refuse: Refuse) -> None:
     bare = tmp_path / "bare"
     bare.mkdir()

@@ -24,6 +24,7 @@ def attitudes() -> attitude_matching.Result:
     return attitude_matching.run(attitude_matching.Config())
 
 
+@pytest.mark.slow
 def test_the_printed_three_degrees_are_a_database_of_one_degree_and_3_mg(
     rolls: dict[tuple[str, float, float], roll_matching.Row],
 ) -> None:
@@ -60,6 +61,7 @@ def test_a_roll_at_twenty_turns_a_second_errs_as_at_rest() -> None:
         assert f"{value:.2f}" in reported
 
 
+@pytest.mark.slow
 def test_the_register_has_the_figures_of_the_scenarios(
     rolls: dict[tuple[str, float, float], roll_matching.Row], attitudes: attitude_matching.Result
 ) -> None:
@@ -148,6 +150,7 @@ def test_the_papers_angles_are_converted_as_its_axes_are() -> None:
     np.testing.assert_allclose(ours, by_axes, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", [roll_matching, attitude_matching])
 def test_a_scenario_draws_and_ends_with_one_json_line(
     scenario: object,

@@ -203,6 +203,7 @@ def navigated(
     return navigator, states
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_online_ranges_hold_the_platform_where_no_beacon_is(estimator: Estimator) -> None:
     log = online_log(6, 31.0)
@@ -243,6 +244,7 @@ def test_the_batch_finds_a_scale_factor_of_the_gyro() -> None:
     assert scale == pytest.approx(TRUE_SCALE, abs=4.0 * sigma)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_online_the_scale_factor_of_the_gyro_is_found(estimator: Estimator) -> None:
     log = scaled(online_log(8, 31.0))

@@ -30,6 +30,7 @@ ROW = Row(
 )
 
 
+@pytest.mark.slow
 def test_there_are_enough_and_every_one_can_be_made(tmp_path: Path) -> None:
     assert len(MISTAKES) >= 60
     good = good_case("moving", 1)

@@ -170,6 +170,7 @@ def nap(seconds: float, rng: np.random.Generator) -> float:
     return rng.normal()
 
 
+@pytest.mark.slow
 def test_tasks_wait_for_another_worker(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -191,6 +192,7 @@ def test_tasks_wait_for_another_worker(
     assert capsys.readouterr().err.count("no worker is left") == 1
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_ends_is_named() -> None:
     distributed = pytest.importorskip("distributed")
     started = distributed.LocalCluster(
@@ -211,6 +213,7 @@ def test_dask_that_is_missing_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> N
         run_many(same, INPUTS, cluster="tcp://127.0.0.1:9")
 
 
+@pytest.mark.slow
 def test_no_workers_are_refused() -> None:
     with pytest.raises(InputError, match="--workers must be at least 1"):
         run_many(same, INPUTS, workers=0)

@@ -29,6 +29,7 @@ def at_epochs(states: Trajectory, truth: Trajectory) -> Trajectory:
     return Trajectory(**{k: v[there] for k, v in vars(states).items() if v is not None})
 
 
+@pytest.mark.slow
 def test_it_leads_where_small_steps_lead_and_has_their_covariance() -> None:
     """The factor of the graph, integrated at 2 kHz, and one look of a third of a second."""
     prior, length = MotionPrior(0.7, 1.3), 0.3

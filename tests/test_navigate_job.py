@@ -48,6 +48,7 @@ def report(output: Path) -> dict[str, float]:
     return figures
 
 
+@pytest.mark.slow
 def test_it_writes_what_smooth_writes_and_the_lagged_states(smoothed: Path) -> None:
     names = {path.name for path in smoothed.iterdir()}
     assert names == {
@@ -83,6 +84,7 @@ def test_the_report_tells_errors_losses_latency_and_memory(smoothed: Path, worke
     assert "imu.time_offset_s" in figures["determined"]
 
 
+@pytest.mark.slow
 def test_the_current_states_are_those_that_the_navigator_made(
     phasors: Path, tmp_path: Path
 ) -> None:
@@ -101,6 +103,7 @@ def test_the_current_states_are_those_that_the_navigator_made(
     assert "lag_s" not in report(tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_the_lagged_states_are_better_than_the_current(phasors: Path, tmp_path: Path) -> None:
     run_command("navigate", phasors, "-o", tmp_path / "run", "--lag", 3)
     figures = report(tmp_path / "run")
@@ -111,6 +114,7 @@ def test_the_lagged_states_are_better_than_the_current(phasors: Path, tmp_path: 
     assert current.time[-1] - lagged.time[-1] == pytest.approx(3.0, abs=0.6)
 
 
+@pytest.mark.slow
 def test_what_was_refused_is_counted(phasors: Path, tmp_path: Path) -> None:
     log = read_log(phasors)
     assert log.fields is not None

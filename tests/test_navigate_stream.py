@@ -63,6 +63,7 @@ def answered(site: Path, given: bytes, settings: StreamSettings = EKF) -> tuple[
     return [json.loads(line) for line in sink.getvalue().splitlines()], reported.getvalue()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["json", "msgpack"])
 def test_a_stream_leads_to_the_states_of_the_log(walk: OnlineLog, site: Path, form: Format) -> None:
     navigator, expected = Navigator(walk.site, EKF.navigator), []
@@ -85,6 +86,7 @@ def test_a_stream_leads_to_the_states_of_the_log(walk: OnlineLog, site: Path, fo
     assert 5 <= len(waiting) <= 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["json", "msgpack"])
 def test_nan_and_null_are_missing_samples_as_in_tables(
     walk: OnlineLog, site: Path, form: Format
@@ -110,6 +112,7 @@ def test_nan_and_null_are_missing_samples_as_in_tables(
     )
 
 
+@pytest.mark.slow
 def test_samples_beyond_a_declared_range_are_missing_in_the_pipe(
     walk: OnlineLog, tmp_path: Path
 ) -> None:
@@ -258,6 +261,7 @@ def test_a_bad_line_is_refused_in_one_sentence(
     assert "\n" not in reported
 
 
+@pytest.mark.slow
 def test_bad_lines_are_counted_and_passed_over_where_that_is_asked(
     walk: OnlineLog, site: Path
 ) -> None:
@@ -282,6 +286,7 @@ def test_message_pack_that_breaks_off_inside_is_refused(site: Path) -> None:
         answered(site, good + msgpack.packb({"gyro": 1}), settings)
 
 
+@pytest.mark.slow
 def test_states_come_as_soon_as_their_records(walk: OnlineLog, site: Path) -> None:
     """A reader of the states waits for no more than has been written."""
     command = [SCRIPT, "navigate", "-", "--site", site, "--estimator", "ekf"]
@@ -300,6 +305,7 @@ def test_states_come_as_soon_as_their_records(walk: OnlineLog, site: Path) -> No
     assert b'"started": true' in rest or seen[-1]["started"]
 
 
+@pytest.mark.slow
 def test_messages_on_a_full_disk_do_not_end_navigation(walk: OnlineLog, site: Path) -> None:
     """A standard error that takes nothing: the states are those without it."""
     given = records(walk) + b"no record\n"
@@ -313,6 +319,7 @@ def test_messages_on_a_full_disk_do_not_end_navigation(walk: OnlineLog, site: Pa
     assert len(done.stdout.splitlines()) == len(expected)
 
 
+@pytest.mark.slow
 def test_a_reader_that_leaves_is_no_error(walk: OnlineLog, tmp_path: Path) -> None:
     write_log(as_log(walk), tmp_path / "log")
     command = f"{SCRIPT} replay {tmp_path / 'log'} | head -n 1"

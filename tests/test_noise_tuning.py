@@ -75,6 +75,7 @@ def plain(log: Log) -> Smoothed:
     return smooth(log, declared())
 
 
+@pytest.mark.slow
 def test_the_dipole_model_is_found_to_be_better_than_declared(log: Log, plain: Smoothed) -> None:
     """A coil of 0.1 m is a dipole within a thousandth here; half a per cent was declared."""
     error = tuned(plain, "model_error")
@@ -99,12 +100,14 @@ def test_densities_declared_too_small_are_found(log: Log) -> None:
     assert mean_nees(untuned, log) > mean_nees(result, log)
 
 
+@pytest.mark.slow
 def test_what_is_declared_too_large_of_the_imu_stays(log: Log) -> None:
     """Scale and vibration may be in it, which are not white."""
     result = smooth(log, declared(imu=3.0))
     assert tuned(result, "gyro_noise") == pytest.approx(3.0 * 3e-4)
 
 
+@pytest.mark.slow
 def test_a_result_is_the_same_again(log: Log, plain: Smoothed) -> None:
     again = smooth(log, declared())
     assert again.noise == plain.noise
@@ -191,6 +194,7 @@ def test_slope_and_curvature_of_the_likelihood_are_its_derivatives(
         assert given == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_no_quasi_newton_search_finds_a_likelier_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of parts that are there and of parts that are not, among them two that are much alike."""
     behind: list[float] = []

@@ -178,6 +178,7 @@ def test_what_does_not_fit_the_receiver_is_refused(
     assert "have one amplitude; declare the axes of the receiver" in findings
 
 
+@pytest.mark.slow
 def test_the_report_says_what_is_told_and_what_is_not(log: Path, tmp_path: Path) -> None:
     run_command("fix", log, "-o", tmp_path / "run", "--free", "gain", "--hemisphere", "C0=+z")
     report = (tmp_path / "run" / "report.json").read_text()

@@ -120,6 +120,7 @@ def test_the_prior_has_no_rate_about_the_coil(site: Site) -> None:
     assert not roll_is_open(other)
 
 
+@pytest.mark.slow
 def test_smooth_says_that_the_roll_is_open(site: Site, tmp_path: Path) -> None:
     write_log(scenario.moved(site, 5, 1.5), tmp_path / "log")
     save_site(site, tmp_path / "log" / "site.yaml")

@@ -56,6 +56,7 @@ def nominal(log: OnlineLog, settings: NavigatorSettings) -> float:
     return float(np.sqrt(np.mean(error[time > 12.0] ** 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_a_users_loop(raw: SimulatedLog, estimator: Estimator) -> None:
     imu, field, states = raw.log.imu, raw.log.waveform, []
@@ -77,6 +78,7 @@ def test_a_users_loop(raw: SimulatedLog, estimator: Estimator) -> None:
     assert navigator.losses == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_the_claimed_covariance_is_that_of_the_errors(estimator: Estimator) -> None:
     nees = []
@@ -111,6 +113,7 @@ def test_there_is_no_state_before_the_start(walk: OnlineLog) -> None:
         navigator.state()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_the_state_between_epochs_is_carried_on_by_the_imu(
     walk: OnlineLog, estimator: Estimator
@@ -129,6 +132,7 @@ def test_the_state_between_epochs_is_carried_on_by_the_imu(
     assert np.sqrt(np.mean(np.square(separate))) < 0.004  # m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 @pytest.mark.parametrize(
     ("missing", "during", "fixes"), [([1], 0.006, 0), ([0, 1, 3], 0.05, 0), ([0, 1, 2, 3], 3.0, 1)]
@@ -146,6 +150,7 @@ def test_beacons_vanish_and_come_back(
     assert set(navigator.losses) <= {"found by a fix", "lost and found again"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_without_any_field_the_clock_goes_on(walk: OnlineLog, estimator: Estimator) -> None:
     fields, gap = walk.fields, (walk.fields.time > 25.0) & (walk.fields.time < 60.0)
@@ -174,6 +179,7 @@ def _rows(fields: FieldSamples, kept: np.ndarray) -> FieldSamples:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_through_a_gap_of_the_imu_the_fields_carry_the_state(
     walk: OnlineLog, estimator: Estimator
@@ -213,6 +219,7 @@ def arriving(
     return navigator, states
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_late_and_disordered_samples_change_nothing_within_the_delay(estimator: Estimator) -> None:
     log = online_log(4, 16.0)
@@ -231,6 +238,7 @@ def test_late_and_disordered_samples_change_nothing_within_the_delay(estimator: 
         assert np.linalg.norm(separate) < 0.1 * state.position_sigma
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_what_comes_after_the_delay_is_counted_and_does_no_harm(estimator: Estimator) -> None:
     log = online_log(4, 24.0)
@@ -277,6 +285,7 @@ def test_samples_that_are_no_numbers_are_refused(walk: OnlineLog) -> None:
         navigator.add_imu(np.zeros(1), np.full((1, 3), np.nan), np.zeros((1, 3)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_outliers_are_refused_one_by_one(walk: OnlineLog, estimator: Estimator) -> None:
     settings = NavigatorSettings(estimator)
@@ -311,6 +320,7 @@ def test_a_platform_that_was_carried_away_is_found_again(estimator: Estimator) -
     assert np.max(error[time > moved[0] + 5.0]) < 0.006  # m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_an_update_that_fails_keeps_the_last_good_state(
     walk: OnlineLog, estimator: Estimator, monkeypatch: pytest.MonkeyPatch
@@ -348,6 +358,7 @@ def test_a_singular_update_of_the_filter_is_an_estimation_error(
     assert navigator.counts["update failed"] > 0
 
 
+@pytest.mark.slow
 def test_the_lagged_states_are_every_epoch_once_and_better(walk: OnlineLog) -> None:
     lagged: list[State] = []
     _, states = navigate(

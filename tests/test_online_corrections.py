@@ -48,6 +48,7 @@ def log() -> OnlineLog:
     return online_log(4, SECONDS, every=0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_a_reversed_coil_is_undone_before_the_first_state(
     log: OnlineLog, estimator: Estimator
@@ -74,6 +75,7 @@ def test_a_clean_log_is_not_corrected(log: OnlineLog) -> None:
     assert all(s.verdict is Verdict.TRUSTWORTHY for s in states)
 
 
+@pytest.mark.slow
 def test_a_lever_arm_is_undone_where_motion_shows_it(log: OnlineLog) -> None:
     """States of before are not given again, and the jump is counted."""
     platform = log.site.platform
@@ -91,6 +93,7 @@ def test_a_lever_arm_is_undone_where_motion_shows_it(log: OnlineLog) -> None:
     assert 0.5 < np.mean(nees) < 20.0
 
 
+@pytest.mark.slow
 def test_a_corrected_navigator_goes_on_from_its_checkpoint(log: OnlineLog) -> None:
     declared, settings = reversed_coil(log.site), NavigatorSettings("ekf")
     navigator, _ = walk(log, Navigator(declared, settings), end=15.0)
@@ -103,6 +106,7 @@ def test_a_corrected_navigator_goes_on_from_its_checkpoint(log: OnlineLog) -> No
         np.testing.assert_allclose(one.position_world, other.position_world, atol=1e-9)  # m
 
 
+@pytest.mark.slow
 def test_after_a_step_of_the_clock_the_declared_site_and_its_temperatures_remain(
     log: OnlineLog,
 ) -> None:

@@ -81,6 +81,7 @@ def fed(navigator: Navigator, simulation: SimulatedLog) -> list[State]:
     return list(navigator.take())
 
 
+@pytest.mark.slow
 def test_undeclared_beacons_are_found_in_the_beginning_of_a_stream(radiated: SimulatedLog) -> None:
     whole = demo_site(coil_radius=None)
     navigator = Navigator(replace(whole, beacons=whole.beacons[:2]), EKF)

@@ -197,6 +197,7 @@ def test_a_window_with_factors_ends_where_a_dense_solution_does(small: SmallLog,
     assert np.max(np.abs(pulled)) > 0.2
 
 
+@pytest.mark.slow
 def test_states_that_left_stay_as_clones_for_the_factors_on_them(small: SmallLog) -> None:
     given = CASES["several that overlap"](small)
     window = in_window(small, given, 2.0)
@@ -341,6 +342,7 @@ def test_the_navigator_creates_the_state_of_a_factor(
     assert there.position_sigma < 1.1e-4
 
 
+@pytest.mark.slow
 def test_the_navigator_makes_states_between_its_epochs_for_odometry() -> None:
     log, given = online_log(6, 16.0), list[float]()
 
@@ -392,6 +394,7 @@ def test_factors_on_states_that_the_estimator_has_not_are_refused(
         navigator.add_factor(graph, times)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_stores_no_factor() -> None:
     step = gtsam.BetweenFactorPose3(X(0), X(1), gtsam.Pose3(), SIGMA(6, 1.0))
     log = online_log(6, 15.0)

@@ -67,6 +67,7 @@ def _run(small: SmallLog, settings: NavigatorSettings = NAVIGATOR) -> Run:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["ekf", "smoother"])
 def test_clean_states_have_a_level_that_holds_and_is_of_use(estimator: str) -> None:
     small = _walk(11)
@@ -79,6 +80,7 @@ def test_clean_states_have_a_level_that_holds_and_is_of_use(estimator: str) -> N
     assert np.median(run.level[later] / (3.0 * sigma[later])) <= 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "ramp"), [(0.2, False), (0.03, False), (0.15, True)])
 def test_a_false_beacon_is_noticed_or_does_not_matter(size: float, ramp: bool) -> None:
     epoch = np.arange(EPOCHS)
@@ -90,6 +92,7 @@ def test_a_false_beacon_is_noticed_or_does_not_matter(size: float, ramp: bool) -
     assert refused or np.any(run.alarm) or np.nanmax(run.error / run.level) < 1.0
 
 
+@pytest.mark.slow
 def test_a_slow_fault_that_the_gate_takes_in_is_seen_by_the_filter_without_it() -> None:
     """Of three beacons a false one has much say."""
     share = 0.3 * np.clip((np.arange(EPOCHS) - 40) / 60.0, 0.0, 1.0)
@@ -103,6 +106,7 @@ def test_without_a_risk_there_are_no_levels() -> None:
     assert np.all(np.isnan(run.level))
 
 
+@pytest.mark.slow
 def test_one_beacon_has_no_level_and_that_is_no_reason() -> None:
     run = _run(_walk(15, beacons=1))
     codes = {f.code for s in run.states for f in s.judgement.reasons}
@@ -110,6 +114,7 @@ def test_one_beacon_has_no_level_and_that_is_no_reason() -> None:
     assert np.mean(np.isnan(run.level[20:])) > 0.9
 
 
+@pytest.mark.slow
 def test_a_run_from_a_checkpoint_is_the_same() -> None:
     small = _walk(16)
     whole, first = Navigator(small.site, NAVIGATOR), Navigator(small.site, NAVIGATOR)
@@ -123,6 +128,7 @@ def test_a_run_from_a_checkpoint_is_the_same() -> None:
     assert result == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_with_filters_of_another_shape_is_refused() -> None:
     small = _walk(17)
     navigator = Navigator(small.site, NAVIGATOR)

@@ -39,6 +39,7 @@ def smoothed(attached):
     return oriented(*attached)
 
 
+@pytest.mark.slow
 def test_the_errors_are_as_large_as_is_claimed(attached, smoothed):
     log, _ = attached
     heading, _, tilt = scenario.errors(smoothed.time, smoothed.world_from_body, log.truth)
@@ -139,6 +140,7 @@ def test_what_needs_a_position_is_refused(attached, tmp_path, refuse):
     assert "--horizon is not available for a site without beacons" in sentence
 
 
+@pytest.mark.slow
 def test_a_gap_is_bridged_by_gravity_and_field(attached):
     log, site = attached
     kept = (log.imu.time < 14.0) | (log.imu.time > 18.0)
@@ -169,6 +171,7 @@ def test_the_jobs_write_an_orientation_and_say_that_there_is_no_position(attache
     assert {p.name for p in Path(tmp_path / "out").iterdir()} >= {"trajectory.parquet", "run.rrd"}
 
 
+@pytest.mark.slow
 def test_the_pipe_tells_an_orientation_for_each_sample_and_no_position(attached):
     log, site = attached
     source, sink = io.BytesIO(), io.BytesIO()

@@ -209,6 +209,7 @@ def test_004_at_twice_its_size_a_short_coil_differs_by_9_percent() -> None:
     assert share == pytest.approx(0.087, abs=0.001)
 
 
+@pytest.mark.slow
 def test_004_phasors_use_the_samples_better_than_pairs() -> None:
     """115 A m^2 at 20 m and 45 degrees, a minute at 200 Hz, 3 nT: Eq 8 to 11 and the phasors."""
     rng = np.random.default_rng(14)
@@ -468,6 +469,7 @@ def test_002_a_coil_of_35_cm_at_twice_its_size_costs_14_mm() -> None:
     assert range_error == pytest.approx([14.2e-3, 8.3e-3, 5.0e-3], rel=0.05)  # m
 
 
+@pytest.mark.slow
 def test_002_an_offset_of_the_centre_stays_and_noise_outgrows_it() -> None:
     """Ranges to three beacons whose true centres are 3 cm from the assumed ones, by distance."""
     rng = np.random.default_rng(16)

@@ -34,6 +34,7 @@ def _with_location(page: str) -> str:
     return located
 
 
+@pytest.mark.slow
 def test_commands_run_on_a_site_with_a_location(tmp_path: Path) -> None:
     site = next(block for language, block in blocks(README) if language == "yaml")
     (tmp_path / "site.yaml").write_text(_with_location(site))
@@ -87,6 +88,7 @@ def tables(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_table_of_which_only_the_beginning_was_read_lets_the_process_end(tmp_path: Path) -> None:
     """Threads of Arrow's that came back to Python at its end aborted it, or it never ended."""
     rows = "".join(f"{k} 1.25 -20.75 3.125 0.0125 -0.0625 0.995609\n" for k in range(200_000))
@@ -103,6 +105,7 @@ def test_a_table_of_which_only_the_beginning_was_read_lets_the_process_end(tmp_p
         assert (done.returncode, done.stderr) == (2, "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_refused_commands_end_in_order(tables: Path, times: int) -> None:
     requested = [words for words in REFUSED for _ in range(times)]

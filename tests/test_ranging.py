@@ -73,6 +73,7 @@ def test_the_cost_of_a_followed_angle_falls_along_its_gradient(scene: scenario.S
         )
 
 
+@pytest.mark.slow
 def test_the_pose_is_found_within_its_sigmas_by_an_angle_that_is_followed(
     scene: scenario.Scene,
 ) -> None:
@@ -92,6 +93,7 @@ def ranged(scene: scenario.Scene) -> tuple[Ranged, RangingWindows]:
     return find_range(site, windows), windows
 
 
+@pytest.mark.slow
 def test_wells_are_those_of_the_poses_and_their_sigmas_of_differences(
     scene: scenario.Scene, ranged: tuple[Ranged, RangingWindows]
 ) -> None:
@@ -156,6 +158,7 @@ def _written(scene: scenario.Scene, directory: Path) -> Path:
     return directory / "log"
 
 
+@pytest.mark.slow
 def test_the_job_says_it_in_the_words_of_a_driller(scene: scenario.Scene, tmp_path: Path) -> None:
     log = _written(scene, tmp_path)
     run_command("range", log, "-o", tmp_path / "out")

@@ -171,6 +171,7 @@ def test_time_slots_lose_the_same_slots_for_the_same_reasons(
     assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.2
 
 
+@pytest.mark.slow
 def test_a_job_demodulates_as_its_settings_ask(tmp_path: Path) -> None:
     requested = LockinSettings(window=0.8, step=0.8)
     run_command("simulate", "-o", tmp_path / "log", "--duration", 20)

@@ -42,6 +42,7 @@ def both(simulation: SimulatedLog) -> tuple[IntegratedRests, IntegratedRests]:
     )
 
 
+@pytest.mark.slow
 def test_what_it_leaves_is_the_noise_of_two_instruments_and_the_covariance_is_true() -> None:
     nees = []
     for seed in range(5):

@@ -51,6 +51,7 @@ def test_a_sweep_leaves_what_the_tree_leaves(
     _compare(result, monkeypatch)
 
 
+@pytest.mark.slow
 def test_so_it_does_of_direct_current_whose_quadratures_nothing_explains(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

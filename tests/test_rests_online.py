@@ -107,6 +107,7 @@ def test_the_clock_of_a_reference_is_followed() -> None:
     np.testing.assert_allclose(line.of(at) - at, -0.4 + 3e-5 * at, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_rest_in_stretches_is_what_it_is_at_once_and_a_reference_that_fails_is_said() -> None:
     built = monitored_log(far_site(), 300.0, 4, FAR_AWAY, STORMS, LATE, RATE)
     site, reference = built.true_site, built.log.reference
@@ -142,6 +143,7 @@ def square_of(samples: FieldSamples, simulation: SimulatedLog) -> Array:
     return errors_in_sigmas(IntegratedRests(samples, none, none == 0.0, {}), simulation)
 
 
+@pytest.mark.slow
 def test_rests_go_through_log_and_pipe(tmp_path: Path, refuse: Refuse) -> None:
     site = far_site(2e4)
     config = SimulationConfig(

@@ -102,6 +102,7 @@ def test_the_bytes_are_those_of_ros(message: Any, kind: str) -> None:
     assert read.header.stamp.nanosec == HEADER.stamp.nanosec
 
 
+@pytest.mark.slow
 def test_a_walk_of_a_driver_is_navigated_as_in_the_pipe(log: Path, domain: int) -> None:
     topic = f"/robot_{uuid.uuid4().hex}/odometry"
     participant = DomainParticipant(domain)
@@ -149,6 +150,7 @@ def _piped(log: Path) -> list[dict[str, Any]]:
     return [state for state in states if state["started"]]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("domain")
 def test_topics_without_messages_are_reported_once(log: Path) -> None:
     command = ("navigate", "ros2:", "--site", log / "site.yaml", "--topics", "imu=/other/imu")

@@ -120,6 +120,7 @@ def test_other_stamps_stay(kind: str) -> None:
     assert wait <= (ENOUGH if kind == "lost" else 40) * 1.06 * STEP
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["batches", "rounded"])
 def test_a_pipe_is_as_accurate_with_stamps_of_batches(kind: str, tmp_path: Path) -> None:
     log = walked()

@@ -81,6 +81,7 @@ def test_an_epoch_that_measured_nothing_only_carries_the_response_on() -> None:
     np.testing.assert_allclose(result.information, kept * sums.information, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [0, 2])
 def test_the_response_is_how_the_estimate_moves_with_what_it_holds(axis: int) -> None:
     """The same data, with a beacon elsewhere in the site, against what the score carries on."""

@@ -116,6 +116,7 @@ def test_a_beacon_is_placed_by_a_short_walk_and_its_sigma_covers_the_error(
     assert placed[0].hypotheses[0].chi_square == 0.0
 
 
+@pytest.mark.slow
 def test_the_whole_log_decides_between_places(walk: SimulatedLog) -> None:
     """Even against what the first trajectory said: the wrong place comes first here."""
     lost_epochs, surveyed = with_unknown("B"), demo_site().beacons[1]
@@ -134,6 +135,7 @@ def test_the_whole_log_decides_between_places(walk: SimulatedLog) -> None:
     assert np.linalg.norm(estimate - walk.true_site.beacons[1].position_world) < 0.03
 
 
+@pytest.mark.slow
 def test_a_site_without_unknown_beacons_is_smoothed_as_ever(walk: SimulatedLog) -> None:
     site = demo_site()
     result, placed = smooth_and_place(walk.log, site, SmootherSettings(max_iterations=1), quiet)

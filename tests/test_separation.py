@@ -78,6 +78,7 @@ def test_the_step_is_that_of_the_least_squares_without_the_beacon():
     )
 
 
+@pytest.mark.slow
 def test_without_a_fault_alarms_come_no_more_often_than_promised():
     rng, risk, count = np.random.default_rng(4), Risk(false_alarm=0.02), 20_000
     result = _separated(_linear(rng, count), rng.standard_normal((count, len(OWNER))))

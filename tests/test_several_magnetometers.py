@@ -325,6 +325,7 @@ def walked(seed: int) -> tuple[Log, Site, SimulatedLog]:
     return replace(walk.log, waveforms={}, fields=fields), site, walk
 
 
+@pytest.mark.slow
 def test_the_clock_of_the_second_is_found_by_the_phases() -> None:
     log, site, walk = walked(3)
     result = smooth(log, site, SmootherSettings(tune=False))

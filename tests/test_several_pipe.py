@@ -75,6 +75,7 @@ def piped(
     return [state for state in reported if state["started"]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["raw", "demodulated"])
 def test_a_log_and_its_records_lead_to_the_same_states(
     kind: str, site: Site, tmp_path: Path, request: pytest.FixtureRequest

@@ -132,6 +132,7 @@ def test_phasors_are_those_of_the_true_motion(walk: SimulatedLog) -> None:
     assert np.nanmedian(error / size) < 0.01
 
 
+@pytest.mark.slow
 def test_demodulate_then_fix_is_fix(directory: Path, tmp_path: Path) -> None:
     run_demodulate(DemodulateSettings(log=directory), tmp_path / "phasors")
     report = json.loads((tmp_path / "phasors" / "report.json").read_text())

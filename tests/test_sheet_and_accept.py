@@ -4,11 +4,13 @@ import csv
 from pathlib import Path
 
 import numpy as np
+import pytest
 from conftest import Refuse, Worked, run_command
 
 from magfusion.files.site import load_site
 
 
+@pytest.mark.slow
 def test_a_sheet_has_its_plan_marks_and_distances(
     worked: Worked, tmp_path: Path, refuse: Refuse
 ) -> None:

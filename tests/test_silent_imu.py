@@ -76,6 +76,7 @@ def without_imu(log: Log, begin: float, end: float) -> Log:
     return replace(log, imu=imu)
 
 
+@pytest.mark.slow
 def test_a_batch_knows_where_it_is_in_a_gap_of_the_imu() -> None:
     built = simulated(rate_hz=200.0)
     begin, end = 5.0, 7.0

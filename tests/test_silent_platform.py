@@ -64,6 +64,7 @@ def sigmas(state: JudgedState) -> np.ndarray:
     return np.sqrt(np.diagonal(state.cov))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["ekf", pytest.param("smoother", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("silence", [MINUTES, DAY])
 def test_it_starts_again_with_the_biases_and_calibration_of_before(
@@ -93,6 +94,7 @@ def test_it_starts_again_with_the_biases_and_calibration_of_before(
     assert 1.0 < np.mean(errors.nees) < 14.0
 
 
+@pytest.mark.slow
 def test_what_was_known_is_forgotten_where_instruments_are_exchanged(log: OnlineLog) -> None:
     """A gyro with another bias contradicts the earlier one: the data decide."""
     navigator, before = walked(log, Navigator(log.site, NavigatorSettings("ekf")), 0.0, 15.0, 0.0)
@@ -103,6 +105,7 @@ def test_what_was_known_is_forgotten_where_instruments_are_exchanged(log: Online
     assert np.all(np.abs(change) < 5.0 * (sigmas(after[-1]) + sigmas(before[-1]))[GYRO_BIAS])
 
 
+@pytest.mark.slow
 def test_a_checkpoint_in_the_silence_keeps_what_was_known(log: OnlineLog) -> None:
     site, settings = declared(log), NavigatorSettings("ekf")
     navigator, _ = walked(log, Navigator(site, settings), 0.0, 15.0, 0.0)
@@ -114,6 +117,7 @@ def test_a_checkpoint_in_the_silence_keeps_what_was_known(log: OnlineLog) -> Non
         np.testing.assert_allclose(one.position_world, other.position_world, atol=1e-9)  # m
 
 
+@pytest.mark.slow
 def test_a_log_with_a_pause_of_minutes_is_navigated(log: OnlineLog, tmp_path: Path) -> None:
     def paused(time: np.ndarray) -> np.ndarray:
         return np.where(time < BEFORE, time, time + MINUTES)

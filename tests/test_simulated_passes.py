@@ -36,6 +36,7 @@ def _site(directory: Path, text: str = SITE) -> Path:
     return directory / "bit.yaml"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoder", [True, False])
 def test_a_site_alone_is_simulated_and_ranged(encoder: bool, tmp_path: Path) -> None:
     log, out = tmp_path / "log", tmp_path / "out"

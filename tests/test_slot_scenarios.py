@@ -13,6 +13,7 @@ from magfusion.papers.register import paper
 CONFIG = mains.Config(runs=40)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("slot", "attitude_deg"),  # hum of 0.15 uT at 50 Hz: nothing, subtracted, interpolated
     [(1e-3, (9.7, 6.1, 1.5)), (5e-3, (8.4, 14.0, 13.9))],
@@ -30,12 +31,14 @@ def test_pulses_under_hum_are_wrong_by_what_the_analysis_found(
         assert result["state"][1] < 1e-6
 
 
+@pytest.mark.slow
 def test_slots_of_a_mains_cycle_stand_hum_that_is_off_its_frequency() -> None:
     result = mains.pulsed(mains.Config(runs=12, cycles=9), 20e-3, 49.8)
     assert result["none"][1] == pytest.approx(0.037, abs=0.012)
     assert result["subtract"][1] < 0.004
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("carrier_hz", "slot", "taper", "left_db", "tolerance"),
     [
@@ -61,6 +64,7 @@ def test_three_carriers_at_once_go_through_the_ordinary_lock_in() -> None:
     assert row.attitude_deg < 1e-4
 
 
+@pytest.mark.slow
 def test_each_removal_costs_the_noise_that_it_should() -> None:
     noise = mains.noise_deg(mains.Config(runs=60))
     assert noise["none"] == pytest.approx(0.122, abs=0.012)
@@ -69,6 +73,7 @@ def test_each_removal_costs_the_noise_that_it_should() -> None:
     assert noise["none"] < noise["state"] < noise["interpolate"] < noise["subtract"]
 
 
+@pytest.mark.slow
 def test_what_coils_of_true_size_turn_the_closed_form_by_is_taken_off(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -90,6 +95,7 @@ def test_slots_at_their_own_times_have_no_skew(slot_ms: float, skew_deg: float) 
     assert result.apart_deg < 1e-6
 
 
+@pytest.mark.slow
 def test_the_register_has_the_figures_of_slots() -> None:
     reported = paper("000").select("claim 5")[0].entry.why
     noise = mains.noise_deg(mains.Config())

@@ -71,6 +71,7 @@ def test_subtracting_the_silent_slot_leaves_what_the_formula_says(
     assert _hum(slot, 50.0, "subtract") == pytest.approx(formula, abs=0.1)
 
 
+@pytest.mark.slow
 def test_slots_of_a_mains_cycle_average_the_mains_out() -> None:
     assert subtraction_gain(50.0, 20e-3, 1) < 1e-12
     assert max(_hum(20e-3, 50.0, "none", 12)) < -200.0
@@ -193,6 +194,7 @@ def test_a_carrier_needs_no_whole_number_of_cycles(taper: Any) -> None:
     assert _wrong(site, result, motion) < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("carrier_hz", "removal", "taper"),
     [

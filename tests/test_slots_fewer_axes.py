@@ -167,6 +167,7 @@ def measured_in_turn(
     return fields, ImuSamples(stamps, still, weight), place
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signed", [True, False])
 def test_a_coil_is_found_by_what_sixteen_others_send_in_turn(signed: bool) -> None:
     site = floor_in_turn()

@@ -76,6 +76,7 @@ def test_an_hour_in_one_place_is_two_epochs_and_halving_loses_nothing() -> None:
     assert np.all((share > 0.5) & (share < 2.0))
 
 
+@pytest.mark.slow
 def test_smooth_integrates_rests_and_refuses_what_it_cannot(tmp_path: Path, refuse: Refuse) -> None:
     site = far_site(2e4)
     config = SimulationConfig(

@@ -53,6 +53,7 @@ def remaining(log: Path, tmp_path: Path) -> Path:
     return place
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_result(
     log: Path, whole: Path, remaining: Path, tmp_path: Path
 ) -> None:

@@ -81,6 +81,7 @@ def plain() -> Run:
     return Run(site, built, smooth(built.log, site))
 
 
+@pytest.mark.slow
 def test_a_log_is_smoothed_without_any_hint_of_the_start(plain: Run) -> None:
     assert plain.result.converged
     assert len(plain.result.states) > 90
@@ -92,6 +93,7 @@ def test_a_log_is_smoothed_without_any_hint_of_the_start(plain: Run) -> None:
     assert plain.result.gap_bridged == 0
 
 
+@pytest.mark.slow
 def test_the_passes_settle_where_the_first_pass_was_not(plain: Run) -> None:
     first = smooth(plain.simulated.log, plain.site, SmootherSettings(max_iterations=1))
     assert not first.converged
@@ -217,6 +219,7 @@ def test_a_gap_in_the_magnetometer_is_bridged_by_the_imu(plain: Run) -> None:
     assert run.errors.inside_3_sigma > 0.95
 
 
+@pytest.mark.slow
 def test_a_gap_in_the_imu_is_bridged_and_counted(plain: Run) -> None:
     holed = without_imu(plain.simulated.log, 8.0, 9.0)
     result = smooth(holed, plain.site)
@@ -243,6 +246,7 @@ def test_a_log_of_phasors_alone_is_smoothed(plain: Run) -> None:
     assert run.errors.ate > plain.errors.ate  # the motion inside the windows is not taken off
 
 
+@pytest.mark.slow
 def test_overlapping_windows_are_not_counted_twice(plain: Run) -> None:
     samples, _ = phasors(plain.simulated.log, plain.site)
     assert overlap(samples) == pytest.approx(2.0)
@@ -285,6 +289,7 @@ def test_one_beacon_leaves_two_chains_of_which_one_is_right(seed: int) -> None:
     assert shares[1] > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_motion_decides_between_the_mirrors_of_one_beacon(seed: int) -> None:
     site, built = among_beacons(seed, 1)
@@ -295,6 +300,7 @@ def test_the_motion_decides_between_the_mirrors_of_one_beacon(seed: int) -> None
     assert run.result.rival_chi_square > 25.0
 
 
+@pytest.mark.slow
 def test_progress_is_told_from_first_to_last() -> None:
     site, built = simulated(7)
     reported: list[tuple[str, int, int]] = []

@@ -118,6 +118,7 @@ def _when() -> BoolArray:
     return np.asarray((epoch >= 40) & (epoch < 80))
 
 
+@pytest.mark.slow
 def test_the_sweep_agrees_with_the_graph_and_with_a_log_without_the_beacon() -> None:
     small = _walk(1)
     result = _smoothed(small, None)
@@ -167,6 +168,7 @@ def test_piece_by_piece_a_log_is_separated_as_at_once(monkeypatch: pytest.Monkey
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=0.0)
 
 
+@pytest.mark.slow
 def test_what_is_considered_is_taken_in_groups(monkeypatch: pytest.MonkeyPatch) -> None:
     result = _smoothed(_walk(1))
     known = separate_smoothed(result), _marginals(result)
@@ -221,6 +223,7 @@ def test_a_beacon_that_is_false_for_a_while_is_left_out(
     assert np.all(error < result.states.protection_level_m)
 
 
+@pytest.mark.slow
 def test_beacons_that_all_contradict_each_other_are_in_doubt() -> None:
     small = _walk(4)
     for beacon, share in enumerate((0.04, -0.04, 0.05, -0.03)):
@@ -233,6 +236,7 @@ def test_beacons_that_all_contradict_each_other_are_in_doubt() -> None:
     assert np.all(np.isnan(result.states.protection_level_m[doubtful]))
 
 
+@pytest.mark.slow
 def test_one_beacon_is_no_doubt_but_has_no_level() -> None:
     result = _smoothed(_walk(5, beacons=1))
     estimate = separated_smooth(result)
@@ -258,6 +262,7 @@ def test_clean_logs_have_alarms_no_more_often_than_promised() -> None:
     assert beyond == 0
 
 
+@pytest.mark.slow
 def test_the_chain_gives_the_covariance_of_the_tree(monkeypatch: pytest.MonkeyPatch) -> None:
     result = _smoothed(_walk(1))
     chain = _marginals(result)

@@ -278,6 +278,7 @@ def test_what_is_held_is_considered_as_dense_algebra_has_it(
     assert np.trace(poses[0][3:, 3:]) > 1.2 * np.trace(alone[0][3:, 3:])
 
 
+@pytest.mark.slow
 def test_a_considered_survey_covers_errors_of_the_survey() -> None:
     rng = np.random.default_rng(4)
     small = small_log(4, epochs=6, perturb=False)

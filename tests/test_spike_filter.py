@@ -74,6 +74,7 @@ def test_a_false_sample_at_an_end_of_a_stream_is_left_out(stream: str, row: int)
     assert missing_rows(log, result, stream) == [row % count]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", ["walk", "turn"])
 def test_a_stream_without_false_samples_passes_whole_and_at_once(motion: Any) -> None:
     site = demo_site(coil_radius=None)
@@ -148,6 +149,7 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stream", "estimator"),
     [("gyro", "ekf"), ("accel", "ekf"), ("field", "ekf"), ("gyro", "smoother")],

@@ -35,6 +35,7 @@ def test_a_lone_beacon_of_unknown_phase_is_found_by_tracks_alone(unknown_phase: 
     np.testing.assert_array_equal(result[0].states.time, case.samples.time[thinned(case.samples)])
 
 
+@pytest.mark.slow
 def test_the_drive_phase_goes_with_the_start(unknown_phase: Case) -> None:
     case = unknown_phase
     best = case.starts()
@@ -45,6 +46,7 @@ def test_the_drive_phase_goes_with_the_start(unknown_phase: Case) -> None:
     assert np.max(np.abs(lag)) < 0.1  # rad
 
 
+@pytest.mark.slow
 def test_the_smoother_takes_it_from_there(unknown_phase: Case) -> None:
     case = unknown_phase
     result = smooth(case.simulated.log, case.site, SmootherSettings(tune=False))
@@ -54,6 +56,7 @@ def test_the_smoother_takes_it_from_there(unknown_phase: Case) -> None:
     assert trajectory_errors(result.states, truth).ate < 0.05  # m
 
 
+@pytest.mark.slow
 def test_starts_of_the_same_trajectory_are_no_rivals() -> None:
     """Two chains that differ at most epochs may lead to one optimum."""
     case = single(2, 8.0)

@@ -263,6 +263,7 @@ def test_the_covariance_is_that_of_the_errors_unless_the_gyro_noise_is_wrong(
     assert np.mean(nees[3.0]) > 9.0
 
 
+@pytest.mark.slow
 def test_a_correction_enters_smoothly_and_its_rest_is_in_the_covariance(walk: OnlineLog) -> None:
     sudden, smooth = (
         propagated(walk, replace(IMU, correction_time=length, risk=Risk()))[1]
@@ -300,6 +301,7 @@ def test_levels_grow_with_the_covariance_while_a_state_is_carried(walk: OnlineLo
     assert np.all(grown >= (1.0 - 1e-9) * grown[0])
 
 
+@pytest.mark.slow
 def test_a_late_field_changes_the_past_and_is_carried_to_now(walk: OnlineLog) -> None:
     """However late it comes, the state of now is the one that it leads to in time."""
     now = []

@@ -60,6 +60,7 @@ def test_a_slow_clock_turns_the_attitude_where_the_phase_is_believed(
         assert ours.position_mean == pytest.approx(without.position_mean, rel=0.01)
 
 
+@pytest.mark.slow
 def test_one_world_shows_the_clock_and_its_remedy(world: World) -> None:
     case = "0.01 ppm clock"
     rotated = static_48h.slopes(COARSE, world[case, "ML+map"].attitude[None])

@@ -196,6 +196,7 @@ def test_what_cannot_be_integrated_is_refused(tmp_path: Path, refuse: Refuse) ->
     assert "--at-rest belongs to --method likelihood" in findings
 
 
+@pytest.mark.slow
 def test_rests_go_through_demodulate_and_fix_and_silence_is_said(
     tmp_path: Path, refuse: Refuse, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -62,6 +62,7 @@ def test_another_size_is_no_turn() -> None:
     assert "magnetometer's axes and scale" in off.finding.text
 
 
+@pytest.mark.slow
 def test_a_smoothed_log_is_doubted_where_the_survey_has_other_axes() -> None:
     rng = np.random.default_rng(3)
     log = simulate_log(SITE, SimulationConfig(DEMO_BOX_WORLD, duration=16.0), rng).log

@@ -64,6 +64,7 @@ def errors(walk: OnlineLog, states: list[dict[str, Any]], later: float = 0.0) ->
     return np.linalg.norm(np.array([s["position"] for s in states]) - truth, axis=1)
 
 
+@pytest.mark.slow
 def test_a_counter_of_microseconds_goes_on_where_it_wraps(
     walk: OnlineLog, site: Path, lines: list[dict[str, Any]]
 ) -> None:
@@ -77,6 +78,7 @@ def test_a_counter_of_microseconds_goes_on_where_it_wraps(
     assert np.max(errors(walk, started, -ahead)) < 0.05  # m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [-5.0, -40.0, 3600.0])
 def test_after_a_step_navigation_starts_anew(
     walk: OnlineLog, site: Path, lines: list[dict[str, Any]], step: float
@@ -97,6 +99,7 @@ def test_after_a_step_navigation_starts_anew(
     assert all(s["reset_counter"] == 1 for s in anew)
 
 
+@pytest.mark.slow
 def test_a_single_wrong_stamp_is_left_out_and_said(site: Path, lines: list[dict[str, Any]]) -> None:
     wrong = next(k for k, one in enumerate(lines) if "imu" in one and newest(one) > 8.0)
     spoiled = [*lines]
@@ -159,6 +162,7 @@ def test_a_temperature_makes_no_checkpoint_and_is_no_old_data(
     assert len(saved) == 1
 
 
+@pytest.mark.slow
 def test_data_after_a_step_back_behind_the_checkpoint_are_used(
     site: Path, lines: list[dict[str, Any]], tmp_path: Path
 ) -> None:
@@ -175,6 +179,7 @@ def test_data_after_a_step_back_behind_the_checkpoint_are_used(
     assert any(state["started"] for state in states)
 
 
+@pytest.mark.slow
 def test_a_start_that_waits_for_late_samples_has_streams_of_one_length() -> None:
     """The inertial samples of the time that it waits for are no difference of clocks."""
     log = simulate_log(

@@ -22,6 +22,7 @@ def other_rooms() -> Figures:
     return run(Config(seed=3))
 
 
+@pytest.mark.slow
 def test_more_than_four_neighbours_worsen_both_algorithms(
     figures: Figures, other_rooms: Figures
 ) -> None:

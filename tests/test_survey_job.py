@@ -133,6 +133,7 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return root / "log", root / "survey"
 
 
+@pytest.mark.slow
 def test_the_command_writes_survey_picture_and_report(surveyed: tuple[Path, Path]) -> None:
     log, place = surveyed
     assert {p.name for p in place.iterdir()} == {
@@ -153,6 +154,7 @@ def test_the_command_writes_survey_picture_and_report(surveyed: tuple[Path, Path
     assert np.max(np.min(separate, axis=0)) < 0.01  # m
 
 
+@pytest.mark.slow
 def test_the_poses_may_come_from_a_smoothed_result(worked: Worked, tmp_path: Path) -> None:
     by_truth, by_result = tmp_path / "truth", tmp_path / "result"
     points = ("--points", "epochs", "--spacing", 0.2)
@@ -193,6 +195,7 @@ def fixed(
     return reports
 
 
+@pytest.mark.slow
 def test_every_method_locates_a_users_log(fixed: dict[str, dict[str, Any]]) -> None:
     for method in PAPER:
         report = fixed[method]

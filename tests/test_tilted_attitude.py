@@ -14,6 +14,7 @@ def rows() -> dict[float, Row]:
     return {row.tilt_deg: row for row in tilted_attitude.run(Config(random_axes=100))}
 
 
+@pytest.mark.slow
 def test_a_level_sensor_hides_it(rows: dict[float, Row]) -> None:
     level = rows[0.0]
     pairs = [level.about_x, level.about_y, level.about_z, *level.about_random]
@@ -56,6 +57,7 @@ def test_all_phasors_are_exact_and_a_fix_errs_alike_at_every_tilt(rows: dict[flo
     assert np.ptp(errors) < 0.1 * np.mean(errors)  # 210 draws of noise, in sensor axes
 
 
+@pytest.mark.slow
 def test_the_scenario_ends_with_one_json_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

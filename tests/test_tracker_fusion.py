@@ -128,6 +128,7 @@ def _figures(directory: Path) -> dict[str, Any]:
     return result
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("carrier_hz", [0.0, 2e3])
 def test_the_ordinary_commands_read_a_slotted_tracker(tmp_path: Path, carrier_hz: float) -> None:
     log = _recorded(tmp_path / "log", carrier_hz)

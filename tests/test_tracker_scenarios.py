@@ -54,6 +54,7 @@ def test_rigid_calibration_does_not_help_independent_errors(independent: dict[st
     assert independent["P2"].ratio == pytest.approx(1.03, abs=0.06)
 
 
+@pytest.mark.slow
 def test_six_points_and_the_joint_fit_reach_the_papers_factor(independent: dict[str, Row]) -> None:
     ratios = [independent[level].ratio for level in ("P2", "P3", "P4", "P6", "J", "G")]
     assert ratios == sorted(ratios)
@@ -126,6 +127,7 @@ def test_uncertain_poses_belong_in_the_graph(snr_db: float, maximum: float) -> N
     assert result.nees == pytest.approx(39.0 / 40.0, abs=3.0 * np.sqrt(2.0 / 40.0 / 200.0))
 
 
+@pytest.mark.slow
 def test_uncertain_poses_belong_in_the_graph_on_a_few_antennas() -> None:
     result = tracker_table1.run_uncertain(replace(SCENARIO_E, antennas=30))
     assert result.graph_to_exact <= 0.8
@@ -135,6 +137,7 @@ def test_uncertain_poses_belong_in_the_graph_on_a_few_antennas() -> None:
     assert result.volume_attitude_deg < 0.16
 
 
+@pytest.mark.slow
 def test_the_dipole_errs_with_the_square_of_the_size(
     near: tuple[tracker_near_field.Row, ...],
 ) -> None:

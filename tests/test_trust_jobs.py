@@ -171,6 +171,7 @@ def calibrated_beacon(root: Path, declared_noise: float = 1.0) -> Path:
     return root / "out"
 
 
+@pytest.mark.slow
 def test_noise_three_times_as_declared_makes_a_beacon_doubtful_and_its_sigmas_larger(
     tmp_path: Path,
 ) -> None:
@@ -199,6 +200,7 @@ def test_a_beacon_far_from_where_the_site_has_it_fails(tmp_path: Path) -> None:
     assert "position" in reported["reasons"][0]["text"]
 
 
+@pytest.mark.slow
 def test_couplings_noisier_than_declared_make_an_antenna_doubtful(tmp_path: Path) -> None:
     true = tracker_site(np.random.default_rng(21))
     save_site(nominal(true), tmp_path / "site.yaml")
@@ -228,6 +230,7 @@ def rotated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+@pytest.mark.slow
 def test_a_field_of_another_size_fails_the_magnetometer(rotated: Path, tmp_path: Path) -> None:
     failing("calibrate", "magnetometer", rotated, "-o", tmp_path / "out")
     assert set(codes(contradicted(tmp_path / "out"))) & {"prior", "earth_field"}
@@ -240,6 +243,7 @@ def test_a_field_of_another_size_fails_matching(rotated: Path, tmp_path: Path) -
     assert [one["parameter"] for one in reported["unverified"]] == ["earth.field", "given.yaw"]
 
 
+@pytest.mark.slow
 def test_attitudes_of_another_clock_make_no_database(tmp_path: Path) -> None:
     time = np.arange(60.0 * RATE) / RATE
     log = open_log(write_turning(tmp_path / "good", 3, 0.35 * np.sin(0.4 * time)))
@@ -254,6 +258,7 @@ def test_attitudes_of_another_clock_make_no_database(tmp_path: Path) -> None:
     assert codes(contradicted(tmp_path / "none"))[0] == "earth_field"
 
 
+@pytest.mark.slow
 def test_a_map_of_exchanged_beacons_fails(tmp_path: Path) -> None:
     world = draw_world(S1, np.random.default_rng(5), replace(ROOM, spacing=1.5))
     survey = world.survey(np.random.default_rng(6))
@@ -266,6 +271,7 @@ def test_a_map_of_exchanged_beacons_fails(tmp_path: Path) -> None:
     assert codes(contradicted(tmp_path / "out"))[0] == "transfer"
 
 
+@pytest.mark.slow
 def test_a_log_that_contradicts_its_survey_is_told(worked: Worked, tmp_path: Path) -> None:
     site = load_site(worked.log / "site.yaml")
     first, *rest = site.beacons
@@ -278,6 +284,7 @@ def test_a_log_that_contradicts_its_survey_is_told(worked: Worked, tmp_path: Pat
     assert "prior" in codes(contradicted(tmp_path / "out"))
 
 
+@pytest.mark.slow
 def test_whatever_fails_leaves_a_report_that_says_so(
     worked: Worked,
     tmp_path: Path,

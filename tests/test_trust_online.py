@@ -67,6 +67,7 @@ def test_a_clean_log_is_trustworthy_from_the_first_state_to_the_last(
     assert all(state.judgement.honest(state.cov) is state.cov for state in states)
 
 
+@pytest.mark.slow
 def test_states_are_carried_with_the_noise_that_the_samples_have(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -93,6 +94,7 @@ def test_states_are_carried_with_the_noise_that_the_samples_have(
     assert without > 2.0 * nees
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_a_platform_that_nothing_explains_is_lost_until_it_is_found(
     walk: OnlineLog, estimator: str
@@ -149,6 +151,7 @@ def test_a_beacon_that_is_refused_again_and_again_is_named(walk: OnlineLog, esti
     assert np.max(np.linalg.norm(walk.errors(after).position_world, axis=1)) < 0.01  # m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_a_bias_that_no_such_instrument_has_is_said_and_covered(
     walk: OnlineLog, estimator: str
@@ -210,6 +213,7 @@ def written(walk: OnlineLog, path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_in_a_pipe_a_loss_gives_no_pose(walk: OnlineLog, tmp_path: Path) -> None:
     log = replace(walk, fields=rotated(walk.fields, 20.0, 24.0, slice(None)))
     save_site(walk.site, tmp_path / "site.yaml")

@@ -178,6 +178,7 @@ def test_the_noise_within_an_interval_is_that_of_white_accelerations() -> None:
     assert place == pytest.approx(p**2 * length**3 / 3.0, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["ekf", pytest.param("smoother", marks=pytest.mark.slow)])
 def test_a_navigator_needs_no_inertial_samples(estimator: str) -> None:
     site, log = by_hand(0, 8.5)
@@ -238,6 +239,7 @@ def bare(tmp_path: Path) -> Path:
     return tmp_path / "bare"
 
 
+@pytest.mark.slow
 def test_fix_and_survey_need_no_imu_and_smooth_says_what_it_needs(
     bare: Path, tmp_path: Path, refuse: Refuse
 ) -> None:
@@ -268,6 +270,7 @@ def test_a_smoothed_log_has_no_biases_and_no_inertial_rate(
     assert load_site(tmp_path / "run" / "site.yaml").gravity == exact().gravity
 
 
+@pytest.mark.slow
 def test_navigate_says_why_states_have_no_protection_level(tmp_path: Path) -> None:
     """Windows of 0.4 s are too far apart for the prior of a hand: each is a fix of its own."""
     run_command("simulate", "-o", tmp_path / "log", "--duration", 12, "--seed", 3)
