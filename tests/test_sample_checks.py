@@ -27,11 +27,11 @@ from spoiled_log import (
 )
 
 from magfusion.estimation.data_checks.data_quality import recorded
-from magfusion.estimation.data_checks.gravity_and_field_checks import still_means
 from magfusion.estimation.data_checks.inertial_noise import noisy_inertial, white_density
 from magfusion.estimation.data_checks.samples import clipped
 from magfusion.estimation.data_checks.spectrum import aliased, mains_of
 from magfusion.estimation.data_checks.stamps import timing
+from magfusion.estimation.data_checks.still_means import still_means
 from magfusion.estimation.integrity.quick_check import quick_check
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.trajectory import Trajectory

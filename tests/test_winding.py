@@ -8,7 +8,7 @@ import yaml
 
 from magfusion.errors import InputError
 from magfusion.files.site import load_site, save_site
-from magfusion.files.site_schema import WindingEntry
+from magfusion.files.site_beacon import WindingEntry
 from magfusion.model.coil_field import alone, coil_fields
 from magfusion.model.physics.dipole import dipole_field
 from magfusion.model.physics.finite_size import coil_coupling, coil_kappa

@@ -51,7 +51,7 @@ ROOMS = {
             site_response temperature_table tum
             inertial_tables odometry_bag site_magnetometer stream
             site_aiding trajectory_formats
-            named_records named_samples site_schema stream_contents
+            named_records named_samples site_beacon site_schema stream_contents
             log site
             foreign open site_changes
             table_stream

@@ -10,6 +10,7 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.files.field_map import read_field_maps, write_field_maps
 from magfusion.files.site_aiding import aiding_entries, aiding_sensor
+from magfusion.files.site_beacon import MARKED, BeaconEntry, SlotsEntry
 from magfusion.files.site_correlation import load_correlation, save_correlation
 from magfusion.files.site_ground import ground_entry, log_sigma
 from magfusion.files.site_magnetometer import magnetometer_entries, magnetometer_of, with_left_out
@@ -25,14 +26,7 @@ from magfusion.files.site_plain import (
 )
 from magfusion.files.site_region import region_entry
 from magfusion.files.site_rotor import rotor_entry
-from magfusion.files.site_schema import (
-    MARKED,
-    BeaconEntry,
-    ClockEntry,
-    EarthEntry,
-    SiteEntry,
-    SlotsEntry,
-)
+from magfusion.files.site_schema import ClockEntry, EarthEntry, SiteEntry
 from magfusion.files.site_temperature import temperature_entry
 from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
 from magfusion.model.arguments import check_arguments

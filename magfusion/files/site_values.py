@@ -192,6 +192,8 @@ def zeros() -> Array:
 
 AboveZero = Annotated[float, Field(gt=0.0)]
 FromZero = Annotated[float, Field(ge=0.0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Positive = Annotated[AboveZero, between(1e-12, 1e6)]
 NotNegative = Annotated[FromZero, between(0.0, 1e6)]
 Position = Annotated[Array, array(3, largest=LARGEST_DISTANCE, unit="m")]
 Angles = Annotated[Array, array(3, largest=LARGEST_ANGLE, unit="degrees")]

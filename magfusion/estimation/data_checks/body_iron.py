@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from magfusion.estimation.data_checks.gravity_and_field_checks import StillMeans
+from magfusion.estimation.data_checks.still_means import StillMeans
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array

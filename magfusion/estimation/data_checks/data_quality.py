@@ -6,10 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from magfusion.estimation.data_checks.body_iron import IRON_SPAN, iron_on_body
-from magfusion.estimation.data_checks.gravity_and_field_checks import (
-    gravity_and_field_findings,
-    still_means,
-)
+from magfusion.estimation.data_checks.gravity_and_field_checks import gravity_and_field_findings
 from magfusion.estimation.data_checks.inertial_noise import noisy_inertial
 from magfusion.estimation.data_checks.samples import (
     clipped_samples,
@@ -26,6 +23,7 @@ from magfusion.estimation.data_checks.signal import (
 )
 from magfusion.estimation.data_checks.spectrum import undeclared_lines
 from magfusion.estimation.data_checks.stamps import uneven_stamps
+from magfusion.estimation.data_checks.still_means import still_means
 from magfusion.estimation.data_checks.truth import truth_findings
 from magfusion.estimation.data_checks.turn_witness import turned_otherwise
 from magfusion.model.samples import Log

@@ -6,24 +6,26 @@ angle between them to a degree or two.  Wrong units, missing gravity, wrong sign
 rotated by 90 deg, or iron on the body therefore show within the first seconds.
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.data_checks.turning import agrees, axes, field_body
+from magfusion.estimation.data_checks.still_means import (
+    SPAN,
+    StillMeans,
+    angle_between,
+    still_means,
+)
+from magfusion.estimation.data_checks.turning import agrees, axes
 from magfusion.model.platform_motion import A_HAND
-from magfusion.model.quaternion import inverse, matrices, rotate
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Verdict
-from magfusion.receiver.turn import body_turn_of
-from magfusion.units import DEGREE, STANDARD_GRAVITY, Array, IntArray
+from magfusion.units import DEGREE, STANDARD_GRAVITY, Array
 
-SPAN = 4.0  # s; over which specific force and field are averaged
-FULL = 0.8  # share of a span's samples that must exist
 LIMIT = 6.0  # sigma
 FORCE_LIMIT = 5.0  # sigma of the accelerometer's bias
 MISSING = 0.35  # of gravity; less of it is no gravity
@@ -39,101 +41,6 @@ UNITS_OF_FORCE = (
     ("cm/s^2 (Gal)", 1e2),
     ("mm/s^2", 1e3),
 )
-
-
-@dataclass(frozen=True, eq=False)
-class StillMeans:
-    """Specific force and field, averaged over spans in gyro-stabilized axes.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Middle of each span, on the log's clock (s).
-    force_body, field_body : ndarray, shape (n, 3)
-        In body axes at that time (m/s^2, T); the field is NaN where none was measured.
-    still_from_body : ndarray, shape (n, 3, 3)
-        Attitude at that time, integrated from the gyroscope since the log's first sample.
-    attitude : callable
-        The same at other times, quaternions, as of `body_turn_of`.
-    """
-
-    time: Array
-    force_body: Array
-    field_body: Array
-    still_from_body: Array
-    attitude: Callable[[Array], Array]
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    @property
-    def angle(self) -> Array:
-        """Between vertical and field (rad), shape (n,)."""
-        return _angle(self.force_body, self.field_body)
-
-    def near(self, poses: Trajectory, limit: float) -> tuple[IntArray, IntArray, Array]:
-        """Return the spans with a pose nearer than a limit (s), these poses, and attitudes.
-
-        Returns
-        -------
-        spans, poses : ndarray, shape (m,)
-            Rows.
-        world_from_body : ndarray, shape (m, 3, 3)
-            At the middle of each span: that of the pose, rotated by the gyroscope.
-        """
-        nothing = np.zeros(0, dtype=np.int64)
-        if not len(poses) or not len(self):
-            return nothing, nothing, np.zeros((0, 3, 3))
-        after = np.clip(np.searchsorted(poses.time, self.time), 0, len(poses) - 1)
-        before = np.maximum(after - 1, 0)
-        closer = self.time - poses.time[before] < poses.time[after] - self.time
-        nearest = np.where(closer, before, after)
-        spans = np.flatnonzero(np.abs(poses.time[nearest] - self.time) < limit)
-        row = nearest[spans]
-        body_from_still = matrices(inverse(self.attitude(poses.time[row])))
-        return (
-            spans,
-            row,
-            poses.world_from_body[row] @ body_from_still @ self.still_from_body[spans],
-        )
-
-
-def still_means(log: Log, site: Site | None, span: float = SPAN) -> StillMeans:
-    """Average specific force and field over spans of a log (s)."""
-    imu = log.imu
-    offset = 0.0 if site is None else site.platform.imu.time_offset
-    time = imu.time + offset
-    attitude, none = body_turn_of(replace(imu, time=time)), np.zeros((0, 3))
-    nothing = StillMeans(np.zeros(0), none, none, np.zeros((0, 3, 3)), attitude)
-    if len(time) < 2 or not log.inertial:
-        return nothing
-    still_from_body = attitude(time)
-    force = rotate(still_from_body, imu.accel_body.T).T
-    field = np.full_like(force, np.nan)
-    if log.vectors is not None:
-        known = field_body(log, site)
-        body = [np.interp(time, log.vectors.time, c) for c in known.T]
-        field = rotate(still_from_body, np.stack(body)).T
-    number = np.floor((time - time[0]) / span).astype(np.int64)
-    count = np.bincount(number)
-    full = count > FULL * span / float(np.median(np.diff(time)))
-    if not np.any(full):
-        return nothing
-    middle = time[0] + span * (np.flatnonzero(full) + 0.5)
-    nearest = np.clip(np.searchsorted(time, middle), 0, len(time) - 1)
-    still_from_body = still_from_body[:, nearest]
-
-    def mean(value: Array) -> Array:
-        total = np.stack([np.bincount(number, column) for column in value.T], axis=1)
-        return rotate(inverse(still_from_body), (total[full] / count[full, None]).T).T
-
-    return StillMeans(time[nearest], mean(force), mean(field), matrices(still_from_body), attitude)
-
-
-def _angle(a: Array, b: Array) -> Array:
-    size = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
-    cosine = np.sum(a * b, axis=-1) / np.maximum(size, 1e-30)
-    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 def gravity_and_field_findings(
@@ -295,7 +202,7 @@ def wrong_dip(
         Whether the poses have the accelerometer's vertical pointing up; None where unknown.
     """
     assert site.earth_field_world is not None
-    declared = float(_angle(np.array([0.0, 0.0, 1.0]), site.earth_field_world))
+    declared = float(angle_between(np.array([0.0, 0.0, 1.0]), site.earth_field_world))
     angle, sigma = float(np.median(means.angle)), _dip_sigma(means, site)
     if not abs(angle - declared) > LIMIT * sigma:
         return
@@ -382,7 +289,7 @@ def _rotated(attitude: Array, vector_body: Array) -> Array:
 
 def _tilted(here: _InWorld, site: Site) -> Iterator[Finding]:
     """Yield an accelerometer's vertical that differs from that of the poses."""
-    tilt = float(np.median(_angle(here.up, np.array([0.0, 0.0, 1.0]))))
+    tilt = float(np.median(angle_between(here.up, np.array([0.0, 0.0, 1.0]))))
     sigma = float(np.hypot(site.platform.imu.accel_bias_sigma / site.gravity, TILT))
     if not tilt > LIMIT * sigma:
         return
@@ -416,8 +323,8 @@ def wrong_field(here: _InWorld, site: Site) -> Iterator[Finding]:
     field = np.median(here.field / np.linalg.norm(here.field, axis=1, keepdims=True), axis=0)
     size = float(np.linalg.norm(earth))
     across = float(np.hypot(earth[0], earth[1])) / size
-    dip = float(_angle(field, np.array([0.0, 0.0, 1.0])))
-    off_dip = dip - float(_angle(earth, np.array([0.0, 0.0, 1.0])))
+    dip = float(angle_between(field, np.array([0.0, 0.0, 1.0])))
+    off_dip = dip - float(angle_between(earth, np.array([0.0, 0.0, 1.0])))
     sensor = site.platform.magnetometer
     known = float(np.max(sensor.sigma.matrix)) + float(np.max(sensor.sigma.offset)) / size
     sigma = float(np.hypot(np.hypot(site.earth.strength_sigma, known), TILT))

@@ -8,7 +8,6 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_quality import recorded
-from magfusion.estimation.data_checks.gravity_and_field_checks import StillMeans, still_means
 from magfusion.estimation.data_checks.signal import BeaconDetection, detect_in_log, within_reach
 from magfusion.estimation.data_checks.spectrum import (
     SpectralLine,
@@ -19,6 +18,7 @@ from magfusion.estimation.data_checks.spectrum import (
     with_disturbing_lines,
 )
 from magfusion.estimation.data_checks.stamps import Timing, timings
+from magfusion.estimation.data_checks.still_means import StillMeans, still_means
 from magfusion.estimation.demodulation.beacon_selection import select_detected
 from magfusion.estimation.demodulation.burial_depth import depths_of
 from magfusion.estimation.demodulation.demodulation import phasors

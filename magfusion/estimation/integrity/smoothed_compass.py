@@ -3,8 +3,8 @@
 import numpy as np
 
 from magfusion.estimation.data_checks.data_quality import beginning
-from magfusion.estimation.data_checks.gravity_and_field_checks import SPAN, still_means
 from magfusion.estimation.data_checks.steady_field import OffEarth, off_earth
+from magfusion.estimation.data_checks.still_means import SPAN, still_means
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
