@@ -50,6 +50,7 @@ def test_the_figures_of_the_paper_need_the_axes_of_the_beacon(
 
 
 # C2: the same with white noise, and the fit of six unknowns.
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "printed", "exact"), [(3, 0.0268, 0.0089), (4, 0.0195, 0.0072)])
 def test_in_white_noise_the_exact_fit_is_three_times_as_good(
     errors: dict[tuple[str, int], Errors], count: int, printed: float, exact: float

@@ -34,6 +34,7 @@ def test_more_beacons_help_algorithm_3(many: Mapping[int, Sequence[AlgorithmOutc
     assert error[0] == pytest.approx(0.060, rel=0.15)  # m
 
 
+@pytest.mark.slow
 def test_more_beacons_lower_the_large_errors_as_well(
     many: Mapping[int, Sequence[AlgorithmOutcome]],
 ) -> None:

@@ -144,6 +144,7 @@ def test_what_cannot_be_cross_validated_is_refused(
     assert "too short for 3 parts" in refuse(*command, "--cross-validate", 3)
 
 
+@pytest.mark.slow
 def test_a_site_without_sigmas_has_nothing_to_calibrate(
     recorded: tuple[Path, SimulatedLog], tmp_path: Path, refuse: Refuse
 ) -> None:

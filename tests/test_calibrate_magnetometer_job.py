@@ -92,6 +92,7 @@ def test_the_command_writes_site_picture_and_report(result: Path) -> None:
     assert report["notes"] == []
 
 
+@pytest.mark.slow
 def test_sensor_and_mounting_together_are_found_within_their_sigmas(
     rotated: tuple[SimulatedLog, Path], result: Path
 ) -> None:
@@ -195,6 +196,7 @@ def test_a_large_hard_iron_is_found_where_its_sigma_allows_it(
     assert report["verdict"] != "failed"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("end", "field_world"),
     [

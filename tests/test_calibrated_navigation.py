@@ -31,6 +31,7 @@ def test_what_calibration_takes_off_stands_beside_the_papers_share(reported: Tab
     assert [float(cell) for cell in last[2:6:2]] == pytest.approx([-s for s in ours], abs=0.05)
 
 
+@pytest.mark.slow
 def test_calibration_leaves_nearly_what_exact_beacons_leave(reported: Table) -> None:
     for method in ("trilateration", "likelihood"):
         geometric, calibrated, true = (reported[s][method] for s in calibrated_navigation.SITES)

@@ -122,6 +122,7 @@ def test_short_windows_have_the_say_and_leave_what_noise_does(smoothed: Smoothed
     assert 0.4 < float(np.mean(remaining**2)) < 1.1
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences(smoothed: Smoothed) -> None:
     joint, at = one(smoothed, 9)
     rows = joint.linearize(at, smoothed.calibration, ())

@@ -83,6 +83,7 @@ def test_simulated_directions_obey_the_coefficients_of_either_method(
         np.testing.assert_allclose([row.eq7, row.tensor], law, rtol=0.07)
 
 
+@pytest.mark.slow
 def test_the_scenario_draws_and_ends_with_one_json_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -238,6 +238,7 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Interrupted:
     )
 
 
+@pytest.mark.slow
 def test_damaged_state_of_a_log_is_refused(log: Interrupted, tmp_path: Path) -> None:
     place, rows = (log.place.with_name(name) for name in log.names)
     whole = place.read_bytes()

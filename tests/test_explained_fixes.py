@@ -98,6 +98,7 @@ def test_gains_that_err_from_place_to_place_are_freed_unasked(
     assert np.mean(off < 3.0 * sigma) > 0.95
 
 
+@pytest.mark.slow
 def test_a_survey_that_gains_do_not_explain_stays_in_doubt_without_them(
     room: tuple[Site, FieldSamples, np.ndarray],
 ) -> None:

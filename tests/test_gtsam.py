@@ -119,6 +119,7 @@ def test_a_result_as_a_gtsam_graph_has_the_cost_of_the_last_pass(
         assert len(exported.values.atVector(C(i))) == len(block.sigma)
 
 
+@pytest.mark.slow
 def test_gtsam_has_nothing_to_improve_in_a_polished_result(earth_result: mf.SmoothedLog) -> None:
     exported = earth_result.to_gtsam(polish=True)
     graph, values = exported.graph, exported.values

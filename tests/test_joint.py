@@ -254,6 +254,7 @@ def test_the_joint_solution_is_that_of_one_graph_of_all_logs(together: Together)
             assert np.max(np.abs(bias)) < 1e-9
 
 
+@pytest.mark.slow
 def test_a_log_alone_condensed_says_what_its_own_posterior_says(together: Together) -> None:
     result, shared = together.alone[0], together.shared
     own = of_smoothed(result, shared).information

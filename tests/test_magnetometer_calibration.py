@@ -376,6 +376,7 @@ def test_the_comparison_ends_with_one_json_line(
         )
 
 
+@pytest.mark.slow
 def test_twelve_stops_in_a_stream_end_with_one_json_line_and_a_picture(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -155,6 +155,7 @@ def test_a_stream_in_odd_pieces_gives_what_the_log_gives(carrier_hz: float) -> N
             assert np.allclose(ours, neighbours, rtol=1e-9, atol=0.0, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_bursts_of_a_short_cycle_are_one_epoch_in_a_stream_too() -> None:
     site, waveform, imu = _site(), _waveform(_marks(1.0), 1.0), _still(2.0)
     assert joins(site, waveform.marks)

@@ -146,6 +146,7 @@ def test_roll_is_found_at_twenty_turns_a_second_with_the_gyroscope_clipped(tmp_p
     assert reported["roll_rms_deg"] == pytest.approx(0.003, abs=0.001)
 
 
+@pytest.mark.slow
 def test_gravity_adds_the_third_angle(logs: Path, tmp_path: Path) -> None:
     run_command("match", logs / "rests", "--gravity", "-o", tmp_path / "out")
     reported = report(tmp_path / "out")

@@ -34,6 +34,7 @@ def test_the_printed_three_degrees_are_a_database_of_one_degree_and_3_mg(
     assert rolls["vertical", 1, 5].median_max["nearest"] > roll_matching.PAPER_DEG
 
 
+@pytest.mark.slow
 def test_interpolation_in_a_coarse_database_equals_the_closed_form(
     rolls: dict[tuple[str, float, float], roll_matching.Row],
 ) -> None:
@@ -101,6 +102,7 @@ def test_the_calibrated_magnetometer_errs_as_twelve_positions_let_it() -> None:
     assert np.rad2deg(np.sqrt(np.mean(np.square(angles)))) == pytest.approx(0.225, abs=0.02)
 
 
+@pytest.mark.slow
 def test_the_printed_five_degrees_need_a_step_of_five_or_interpolation(
     attitudes: attitude_matching.Result,
 ) -> None:

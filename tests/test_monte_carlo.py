@@ -207,6 +207,7 @@ def test_a_scheduler_that_ends_is_named() -> None:
         )
 
 
+@pytest.mark.slow
 def test_dask_that_is_missing_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"pip install 'magfusion\[cluster\]'"):

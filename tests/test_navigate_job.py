@@ -68,6 +68,7 @@ def test_it_writes_what_smooth_writes_and_the_lagged_states(smoothed: Path) -> N
     assert refined.platform.imu.time_offset == pytest.approx(report(smoothed)["imu.time_offset_s"])
 
 
+@pytest.mark.slow
 def test_the_report_tells_errors_losses_latency_and_memory(smoothed: Path, worked: Worked) -> None:
     figures = report(smoothed)
     assert figures["job"] == "navigate"

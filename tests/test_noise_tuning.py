@@ -114,6 +114,7 @@ def test_a_result_is_the_same_again(log: Log, plain: Smoothed) -> None:
     assert np.array_equal(again.states.position_world, plain.states.position_world)
 
 
+@pytest.mark.slow
 def test_the_refined_site_has_what_was_found(plain: Smoothed, tmp_path: Path) -> None:
     save_site(result_site(plain, "a log"), tmp_path / "site.yaml")
     site = load_site(tmp_path / "site.yaml")

@@ -101,6 +101,7 @@ def test_a_slow_fault_that_the_gate_takes_in_is_seen_by_the_filter_without_it() 
     assert not np.any((run.error > run.level) & ~run.alarm & later)
 
 
+@pytest.mark.slow
 def test_without_a_risk_there_are_no_levels() -> None:
     run = _run(_walk(14), NavigatorSettings(estimator="ekf"))
     assert np.all(np.isnan(run.level))

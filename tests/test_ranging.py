@@ -57,6 +57,7 @@ def test_the_derivatives_are_those_of_differences(cased: bool, scene: scenario.S
         assert error < 2e-4, (*["rotation"] * 3, *["position"] * 3, *model.names)[k]
 
 
+@pytest.mark.slow
 def test_the_cost_of_a_followed_angle_falls_along_its_gradient(scene: scenario.Scene) -> None:
     """Its phases are projected out, with the gradient of what is left."""
     site = scenario.declared_site(cased=True)

@@ -145,6 +145,7 @@ def test_tones_lose_the_same_windows_for_the_same_reasons(fault: Fault, piece: f
     np.testing.assert_allclose(pieces.phasor_sensor, whole.phasor_sensor, atol=1e-18)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("carrier_hz", [0.0, pytest.param(1e3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("fault", FAULTS)
 def test_time_slots_lose_the_same_slots_for_the_same_reasons(

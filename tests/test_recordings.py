@@ -112,6 +112,7 @@ def test_a_recording_is_imported_and_smoothed(recorded: Path, tmp_path: Path) ->
     assert figures["nees_mean"] < 15.0
 
 
+@pytest.mark.slow
 def test_the_bands_of_a_recording_are_its_waveform(recorded: Path, tmp_path: Path) -> None:
     """Each sample that is kept is that of all samples, but for noise outside of the bands."""
     log, site = import_walk(recorded, "x,y,z,-", tmp_path / "log"), sound_site()

@@ -106,6 +106,7 @@ def test_the_passes_settle_where_the_first_pass_was_not(plain: Run) -> None:
     assert np.max(np.abs(converged)) < 1e-6  # m
 
 
+@pytest.mark.slow
 def test_the_start_is_the_right_hypothesis_at_every_epoch(plain: Run) -> None:
     truth = plain.simulated.motion.trajectory(plain.result.start.states.time)
     separate = plain.result.start.states.position_world - truth.position_world
@@ -127,6 +128,7 @@ def test_velocities_and_biases_are_the_true_ones(plain: Run) -> None:
     assert np.all(np.abs(bias) < 5e-4)  # rad/s; a tenth of its prior
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "time_offset", "clock_rate"), [(2, 0.012, 8e-5), (3, -0.009, -5e-5), (4, 0.0, 0.0)]
 )
@@ -148,6 +150,7 @@ def test_the_imus_clock_is_recovered_within_three_sigma(
     assert abs(float(result.calibration.imu_offset(np.array(middle))) - true) < 3.0 * there
 
 
+@pytest.mark.slow
 def test_unsynchronised_beacons_give_up_phase_and_drift() -> None:
     site, built = simulated(5, synchronised=False)
     run = Run(site, built, smooth(built.log, site))

@@ -201,6 +201,7 @@ def test_good_logs_stay_as_they_are_within_a_useful_level(seed: int) -> None:
     assert np.median(level / radius) <= 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", ["cauchy", None])
 @pytest.mark.parametrize(("size", "ramp"), [(0.2, False), (0.02, False), (0.1, True)])
 def test_a_beacon_that_is_false_for_a_while_is_left_out(

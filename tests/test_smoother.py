@@ -432,6 +432,7 @@ def test_a_robust_loss_survives_twenty_per_cent_of_outliers(loss: str) -> None:
     assert ate[None] > 5.0 * ate[loss]
 
 
+@pytest.mark.slow
 def test_a_robust_loss_survives_outliers_from_its_own_start() -> None:
     corrupted = with_outliers(small_log(8, epochs=40, perturb=False), 8, 0.2)
     result = {

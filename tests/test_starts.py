@@ -23,6 +23,7 @@ def unknown_phase() -> Case:
     return single(1, 8.0, synchronised=False, rpy_deg=(-85, 4, 20))
 
 
+@pytest.mark.slow
 def test_a_lone_beacon_of_unknown_phase_is_found_by_tracks_alone(unknown_phase: Case) -> None:
     case = unknown_phase
     calibration = initial_calibration(case.site, float(np.mean(case.samples.time)))

@@ -73,6 +73,7 @@ def test_one_world_shows_the_clock_and_its_remedy(world: World) -> None:
         assert np.mean(result.position) == pytest.approx(np.mean(unharmed.position), rel=0.1)
 
 
+@pytest.mark.slow
 def test_heat_moves_fixes_within_hours_and_a_free_gain_moves_them_back(world: World) -> None:
     for method in ("A3", "ML+map"):
         cold, warm = (world[case, method].position for case in ("current drive", "voltage drive"))

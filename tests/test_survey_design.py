@@ -32,6 +32,7 @@ def test_more_than_four_neighbours_worsen_both_algorithms(
             assert error["16"] > error["8"] > 1.2 * error["4"]
 
 
+@pytest.mark.slow
 def test_a_denser_survey_is_more_accurate(figures: Figures, other_rooms: Figures) -> None:
     for rooms in (figures, other_rooms):
         for algorithm in ("algorithm_2_by_spacing", "algorithm_3_by_spacing"):

@@ -165,6 +165,7 @@ def test_the_poses_may_come_from_a_smoothed_result(worked: Worked, tmp_path: Pat
     assert 0.0 < distance < 0.02  # m; the smoother's error
 
 
+@pytest.mark.slow
 def test_a_demodulated_log_can_be_surveyed_at_its_rests(
     worked: Worked, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -207,6 +208,7 @@ def test_every_method_locates_a_users_log(fixed: dict[str, dict[str, Any]]) -> N
     assert fixed["ours"]["ate_m"] < 0.2 * best
 
 
+@pytest.mark.slow
 def test_among_beacons_of_all_axes_no_attitude_is_given(fixed: dict[str, dict[str, Any]]) -> None:
     """Eq 18 would err by a right angle and more there."""
     for method in PAPER:

@@ -161,6 +161,7 @@ def test_the_register_has_the_figures_of_single_causes() -> None:
     assert f"the joint fit {gain['J']} and {tilt['J']}" in reported
 
 
+@pytest.mark.slow
 def test_the_register_has_the_figures_of_the_near_field(
     near: tuple[tracker_near_field.Row, ...],
 ) -> None:

@@ -128,6 +128,7 @@ def test_a_mirrored_fix_is_never_trusted_and_its_covariance_holds_both_poses(
     assert reported["inside_3_sigma"] > 0.9
 
 
+@pytest.mark.slow
 def test_a_beacon_that_is_not_where_it_should_be_is_left_out_and_told(
     worked: Worked, tmp_path: Path
 ) -> None:
@@ -188,6 +189,7 @@ def test_noise_three_times_as_declared_makes_a_beacon_doubtful_and_its_sigmas_la
         assert np.all(new.sigma.position_world > 0.6 * old.sigma.position_world)
 
 
+@pytest.mark.slow
 def test_a_beacon_far_from_where_the_site_has_it_fails(tmp_path: Path) -> None:
     site, _ = written(tmp_path)
     certain = replace(site.beacons[0].sigma, position_world=np.full(3, 1e-3))
@@ -236,6 +238,7 @@ def test_a_field_of_another_size_fails_the_magnetometer(rotated: Path, tmp_path:
     assert set(codes(contradicted(tmp_path / "out"))) & {"prior", "earth_field"}
 
 
+@pytest.mark.slow
 def test_a_field_of_another_size_fails_matching(rotated: Path, tmp_path: Path) -> None:
     failing("match", rotated, "--yaw-deg", 10, "-o", tmp_path / "out")
     reported = contradicted(tmp_path / "out")

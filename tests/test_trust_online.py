@@ -165,6 +165,7 @@ def test_a_bias_that_no_such_instrument_has_is_said_and_covered(
     assert states[-1].rotation_sigma > 0.8 * bias / walk.site.gravity
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_an_imu_that_comes_loose_is_noticed(walk: OnlineLog, estimator: str) -> None:
     """From upside down it feels gravity where it never was; fields alone would not tell."""

@@ -108,6 +108,7 @@ def test_a_clean_log_is_trusted_and_its_covariance_left_alone(seed: int) -> None
     assert nees(honest, log) < 12.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mistake", "code", "word"), WRONG.values(), ids=WRONG)
 def test_what_is_wrong_is_named_first_and_covered(
     mistake: Callable[[Site], Site], code: str, word: str
@@ -169,6 +170,7 @@ def test_at_rest_the_lever_arm_is_listed_as_unverified() -> None:
     assert lever.sigma == "0.1 cm"
 
 
+@pytest.mark.slow
 def test_the_score_foretells_what_solving_again_finds() -> None:
     """A step of the score is where the solution goes once the parameter is estimated."""
     log, site = a_log(4, perturb=False)

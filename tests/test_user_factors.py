@@ -58,6 +58,7 @@ def dense(result: mf.SmoothedLog) -> tuple[Array, Array]:
     return np.asarray(cov @ (jacobian.T @ right)), np.asarray(cov)
 
 
+@pytest.mark.slow
 def test_users_factors_move_a_result_as_a_dense_solution_does(small: SmallLog) -> None:
     graph, values = user_graph(small)
     alone = mf.smooth(small.log, small.site, SETTINGS)

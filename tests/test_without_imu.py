@@ -149,6 +149,7 @@ def mean_nees_of_samples(beacons: int, seeds: range, duration: float) -> float:
     return float(np.mean([nees(smooth(log, site).states, log.truth) for log, site in runs]))
 
 
+@pytest.mark.slow
 def test_the_covariance_holds_for_raw_samples() -> None:
     """Windows follow the poses, and their residuals are no measure of their noise."""
     assert 3.0 < mean_nees_of_samples(4, range(2), 8.0) < 9.0
@@ -196,6 +197,7 @@ def test_a_navigator_needs_no_inertial_samples(estimator: str) -> None:
         navigator.add_imu(np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))
 
 
+@pytest.mark.slow
 def test_the_pipe_tells_the_rate_of_the_body(tmp_path: Path) -> None:
     site, log = by_hand(0, 7.5)
     assert log.fields is not None
