@@ -42,6 +42,15 @@ def sensors() -> tuple[AidingSensor, ...]:
             offset=np.array(101325.0),
             sigmas=sigmas(100.0),
         ),
+        AidingSensor(
+            "keyframes",
+            "relative_pose",
+            0.005,
+            body_from_sensor=TURN,
+            scale=np.array(0.9),
+            rotation_sigma=0.002,
+            **mounted,
+        ),
         AidingSensor("compass", "heading", 0.01, sigmas=sigmas(0.05)),
     )
 

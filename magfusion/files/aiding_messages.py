@@ -18,14 +18,14 @@ from magfusion.files.messages import (
     sure_pose_row,
     vector_row,
 )
-from magfusion.model.aiding import AidingSensor, Quantity
+from magfusion.model.aiding import LONGEST_INTERVAL, AidingSensor, Quantity
 from magfusion.model.physics.earth import east_north_up
 from magfusion.units import Array
 
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 POSE_COLUMNS = 7  # position and quaternion; a twist follows
 SHORTEST_QUATERNION = 0.5  # an attitude that was left unfilled is zero
-LONGEST_STEP = 2.0  # periods of the sensor's rate between poses whose difference is a velocity
+LONGEST_STEP = 2.0  # periods of the sensor's rate between poses whose difference is a sample
 
 
 def _sure_twist_row(message: Any) -> list[float]:
@@ -80,6 +80,11 @@ _ROWS: Mapping[Quantity, Mapping[str, Row]] = {
         POSE: pose_row,
         POSE_WITH_COVARIANCE: sure_pose_row,
     },
+    "relative_pose": {
+        ODOMETRY: odometry_row,
+        POSE: pose_row,
+        POSE_WITH_COVARIANCE: sure_pose_row,
+    },
     "range": {"sensor_msgs/msg/Range": _range_row},
     "position": {
         ODOMETRY: _sure_position_row,
@@ -116,7 +121,8 @@ class SensorMessages:
     def samples(self, time: Array, rows: Array) -> tuple[Array, Array]:
         """Return times (s) and values of messages; those without a value are left out.
 
-        A velocity without a twist is that of the poses' differences, in the middle of each.
+        A velocity without a twist is that of the poses' differences, in the middle of each; a
+        relative pose is such a difference.
 
         Parameters
         ----------
@@ -127,16 +133,17 @@ class SensorMessages:
         there = ~np.isnan(rows).any(axis=1)
         self.without_value += int(np.sum(~there))
         time, rows = time[there], rows[there]
-        if self._sensor.quantity != "velocity" or rows.shape[1] < POSE_COLUMNS:
+        relative = self._sensor.quantity == "relative_pose"
+        if not (relative or self._sensor.quantity == "velocity") or rows.shape[1] < POSE_COLUMNS:
             return time, rows
         twist = rows[:, POSE_COLUMNS:]
-        if twist.any():
+        if twist.any() and not relative:
             return time, twist
         poses = np.hstack([time[:, None], rows[:, :POSE_COLUMNS]])
         return self._differences(np.concatenate([self._last, poses]))
 
     def _differences(self, poses: Array) -> tuple[Array, Array]:
-        """Return velocities in the axes of poses (n, 8), the first of each period of the rate."""
+        """Return what moves poses (n, 8) in their axes, the first of each period of the rate."""
         rate = self._sensor.rate_hz
         poses = poses[np.linalg.norm(poses[:, 4:], axis=1) > SHORTEST_QUATERNION]
         period = np.floor(poses[:, 0] * rate * (1.0 + 1e-9))
@@ -145,6 +152,11 @@ class SensorMessages:
         step, attitude = np.diff(poses[:, 0]), Rotation.from_quat(poses[:, 4:])
         near = step <= LONGEST_STEP / rate
         first, second = attitude[:-1], attitude[1:]
-        middle = first * Rotation.from_rotvec(0.5 * (first.inv() * second).as_rotvec())
-        velocity = middle.inv().apply(np.diff(poses[:, 1:4], axis=0) / step[:, None])
+        way, turn = np.diff(poses[:, 1:4], axis=0), (first.inv() * second).as_rotvec()
+        if self._sensor.quantity == "relative_pose":
+            near &= step <= LONGEST_INTERVAL
+            moved = np.hstack([step[:, None], first.inv().apply(way), turn])
+            return poses[1:, 0][near], moved[near]
+        middle = first * Rotation.from_rotvec(0.5 * turn)
+        velocity = middle.inv().apply(way / step[:, None])
         return (poses[:-1, 0] + 0.5 * step)[near], velocity[near]

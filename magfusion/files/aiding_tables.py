@@ -4,13 +4,16 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.files.readings_table import rows_by_name
 from magfusion.files.table import TIME, Span, Table, TableLayout, read_table, write_table
-from magfusion.model.aiding import AidingSamples, Quantity
+from magfusion.files.trajectory_table import QUATERNION, unit_rotation
+from magfusion.model.aiding import LONGEST_INTERVAL, AidingSamples, Quantity
 from magfusion.units import DEGREE, Array
 
 SENSOR, MARK = "sensor", "mark"
+TRANSLATION = ("translation_x", "translation_y", "translation_z")
 COLUMNS: dict[Quantity, tuple[str, ...]] = {
     "velocity": ("velocity_x", "velocity_y", "velocity_z"),
     "range": ("range",),
@@ -19,6 +22,7 @@ COLUMNS: dict[Quantity, tuple[str, ...]] = {
     "height": ("height",),
     "pressure": ("pressure",),
     "heading": ("heading_deg",),
+    "relative_pose": ("interval_s", *TRANSLATION, *QUATERNION),
 }
 UNIT = {"heading": DEGREE}
 
@@ -69,6 +73,11 @@ def _values(quantity: Quantity, table: Table) -> Array:
     for i, name in enumerate(COLUMNS[quantity]):
         if table.has((name,)):
             value[:, i] = table.numbers((name,), nan=quantity == "velocity")[:, 0]
+    if quantity == "relative_pose":
+        remedy = f"more than 0 s; of more than {LONGEST_INTERVAL:g} s they are not used"
+        table.refuse(value[:, 0] <= 0.0, "interval_s", value[:, 0], remedy)
+        turn = unit_rotation(table).as_rotvec()
+        return np.hstack([value[:, : -len(QUATERNION)], turn])
     return value * UNIT.get(quantity, 1.0)
 
 
@@ -80,6 +89,9 @@ def write_aiding(aiding: Mapping[str, AidingSamples], directory: Path, epoch_ns:
         value = np.concatenate([samples.value for samples in own.values()]) / UNIT.get(
             quantity, 1.0
         )
+        if quantity == "relative_pose":
+            turn = Rotation.from_rotvec(value[:, 4:]).as_quat(scalar_first=True)
+            value = np.hstack([value[:, :4], turn])
         order = np.argsort(time, kind="stable")
         names = np.repeat(list(own), [len(samples) for samples in own.values()])
         columns: dict[str, object] = {TIME: Span(epoch_ns).stamps(time[order])}

@@ -32,7 +32,9 @@ UNITS: dict[Quantity, str] = {
     "height": "m",
     "pressure": "pa",
     "heading": "deg",
+    "relative_pose": "m",
 }
+_MOVING: tuple[Quantity, ...] = ("velocity", "relative_pose")  # with scale and mounting
 DENSEST = 2e4  # kg/m^3; mercury has 13,600
 LARGEST_HEIGHT = 1e5  # m; the space begins there
 HIGHEST_PRESSURE = 1e9  # Pa; ten times that of the deepest sea
@@ -48,7 +50,7 @@ class _PositionSigma(_Sigma):
     position_m: PositionSigma = Field(default_factory=zeros)
 
 
-class _VelocitySigma(_PositionSigma):
+class _MovingSigma(_PositionSigma):
     rotation_deg: RotationSigma = Field(default_factory=zeros)
     scale: _Share = 0.0
 
@@ -85,7 +87,18 @@ class VelocityEntry(_Mounted):
     relative_noise: _Share = 0.0
     constraint_noise_m_s: AboveZero | None = None
     scale: Annotated[float, between(0.1, 10.0)] = 1.0
-    sigma: _VelocitySigma = Field(default_factory=_VelocitySigma)
+    sigma: _MovingSigma = Field(default_factory=_MovingSigma)
+
+
+class RelativePoseEntry(_Mounted):
+    """Translation and rotation of the sensor since an earlier time."""
+
+    quantity: Literal["relative_pose"]
+    noise_m: AboveZero
+    noise_deg: Annotated[AboveZero, between(0.0, 180.0)]
+    relative_noise: _Share = 0.0
+    scale: Annotated[float, between(0.1, 10.0)] = 1.0
+    sigma: _MovingSigma = Field(default_factory=_MovingSigma)
 
 
 class _WithOffset(_Mounted):
@@ -162,7 +175,8 @@ AidingEntry = Annotated[
     | MarkEntry
     | HeightEntry
     | PressureEntry
-    | HeadingEntry,
+    | HeadingEntry
+    | RelativePoseEntry,
     Field(discriminator="quantity"),
 ]
 
@@ -203,6 +217,7 @@ def aiding_sensor(entry: AidingEntry) -> AidingSensor:
             np.array(entry.sigma.time_offset_s),
         ),
         None if origin is None else (origin.latitude_deg, origin.longitude_deg, origin.height_m),
+        entry.noise_deg * DEGREE if isinstance(entry, RelativePoseEntry) else 0.0,
     )
 
 
@@ -236,7 +251,9 @@ def _entry(sensor: AidingSensor) -> dict[str, Any]:
         own["origin"] = dict(zip(OriginEntry.model_fields, sensor.origin, strict=True))
     if sensor.quantity == "pressure":
         own["density_kg_m3"] = float(-sensor.scale / STANDARD_GRAVITY)
-    if sensor.quantity == "velocity" and sensor.scale != 1.0:
+    if sensor.quantity == "relative_pose":
+        own["noise_deg"] = _number(sensor.rotation_sigma, DEGREE)
+    if sensor.quantity in _MOVING and sensor.scale != 1.0:
         own["scale"] = float(sensor.scale)
     turn = rpy_deg(sensor.body_from_sensor)
     if sensor.position_body.any() or any(turn):
@@ -250,11 +267,11 @@ def _sigma_entry(sensor: AidingSensor, unit: str, size: float) -> dict[str, Any]
     sigmas, entry = sensor.sigmas, dict[str, Any]()
     if sensor.quantity != "heading" and sigmas.position_body.any():
         entry["position_m"] = sigma_entry(sigmas.position_body)
-    if sensor.quantity == "velocity" and sigmas.rotation_sensor.any():
+    if sensor.quantity in _MOVING and sigmas.rotation_sensor.any():
         entry["rotation_deg"] = degree_sigma_entry(sigmas.rotation_sensor)
-    if sensor.quantity == "velocity" and sigmas.scale:
+    if sensor.quantity in _MOVING and sigmas.scale:
         entry["scale"] = float(sigmas.scale)
-    if sensor.quantity not in ("velocity", "position", "mark") and sigmas.offset:
+    if sensor.quantity not in (*_MOVING, "position", "mark") and sigmas.offset:
         entry[f"offset_{unit}"] = _number(sigmas.offset, size)
     if sigmas.time_offset:
         entry["time_offset_s"] = float(sigmas.time_offset)

@@ -18,7 +18,7 @@ from magfusion.files.marks_table import is_slot, slots_of
 from magfusion.files.site_temperature import COLDEST, HOTTEST
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS
 from magfusion.files.yaml_files import StrictModel, sentence
-from magfusion.model.aiding import AidingSamples, Quantity
+from magfusion.model.aiding import AidingSamples, Quantity, components
 from magfusion.model.drive import DriveSamples
 from magfusion.model.marks import UNKNOWN_SLOT
 from magfusion.model.samples import FieldSamples
@@ -89,9 +89,14 @@ def _series(value: object) -> Array:
 
 
 def _series_or_vectors(value: object) -> Array:
-    """Return numbers with one or three columns, (k, columns)."""
+    """Return numbers with one or several columns, (k, columns)."""
     nested = isinstance(value, list) and any(isinstance(row, list) for row in value)
-    return _vectors(value) if nested else _series(value)[:, None]
+    if not nested:
+        return _series(value)[:, None]
+    result = _numbers(value, "numbers, or rows of equally many", missing=True)
+    if result.ndim != 2:
+        raise PydanticCustomError("vectors", "it should be numbers, or rows of equally many")
+    return result
 
 
 def _slots(value: object) -> IntArray:
@@ -280,9 +285,9 @@ class MarksRecord(_Arrays):
 
 
 class AidingRecord(_Arrays):
-    """Samples of one aiding sensor: stamps (k,), and values (k,) or (k, 3), or names of marks (k,).
+    """Samples of one aiding sensor: stamps (k,), and values (k,), (k, 3) or (k, 7), or marks (k,).
 
-    Values are in m/s, m, Pa or rad; null where an axis is not measured.
+    Values are in m/s, m, Pa, rad or s; null where an axis is not measured.
     """
 
     time: Annotated[Array, PlainValidator(_times)]
@@ -470,7 +475,7 @@ def aiding_samples(entry: AidingRecord, quantity: Quantity) -> AidingSamples:
         return AidingSamples(
             quantity, entry.time, np.zeros((len(entry.time), 0)), tuple(entry.mark)
         )
-    columns = 3 if quantity in ("velocity", "position") else 1
+    columns = components(quantity)
     if quantity == "mark" or entry.value is None or entry.value.shape[1] != columns:
         wanted = "mark" if quantity == "mark" else f"value with {columns} numbers a sample"
         raise InputError(f"a sensor of {quantity} needs {wanted}")

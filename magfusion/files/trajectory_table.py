@@ -12,7 +12,7 @@ from magfusion.model.trust import StateTrust
 from magfusion.units import Array, IntArray
 
 _POSITION = ("position_x", "position_y", "position_z")
-_QUATERNION = ("qw", "qx", "qy", "qz")
+QUATERNION = ("qw", "qx", "qy", "qz")
 _VELOCITY = ("velocity_x", "velocity_y", "velocity_z")
 _GYRO_BIAS = ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")
 _ACCEL_BIAS = ("accel_bias_x", "accel_bias_y", "accel_bias_z")
@@ -20,8 +20,8 @@ _UPPER = np.triu_indices(6)
 _COV = tuple(f"cov_{i}{j}" for i, j in zip(*_UPPER, strict=True))
 _LAYOUT = TableLayout(
     numbers=(),
-    some=(*_POSITION, *_QUATERNION),
-    optional=(_POSITION, _QUATERNION, _VELOCITY, _GYRO_BIAS, _ACCEL_BIAS, _COV),
+    some=(*_POSITION, *QUATERNION),
+    optional=(_POSITION, QUATERNION, _VELOCITY, _GYRO_BIAS, _ACCEL_BIAS, _COV),
 )
 QUATERNION_TOLERANCE = 1e-3  # of its length from one
 
@@ -52,7 +52,7 @@ def trajectory_columns(trajectory: Trajectory, epoch_ns: int) -> dict[str, objec
         quaternion = trajectory.rotation.as_quat(scalar_first=True)
     parts: list[tuple[tuple[str, ...], Array | None]] = [
         (_POSITION, trajectory.position_world if trajectory.has_position else None),
-        (_QUATERNION, quaternion),
+        (QUATERNION, quaternion),
         (_VELOCITY, trajectory.velocity_world),
         (_GYRO_BIAS, trajectory.gyro_bias_body),
         (_ACCEL_BIAS, trajectory.accel_bias_body),
@@ -96,14 +96,8 @@ def read_trajectory(
     """
     table = read_table(path, _LAYOUT, Span(epoch_ns, start, end), content)
     rotation, position = np.full((len(table), 3, 3), np.nan), _numbers(table, _POSITION)
-    if table.has(_QUATERNION):
-        quaternion = table.numbers(_QUATERNION)
-        length = np.linalg.norm(quaternion, axis=1)
-        off = np.abs(length - 1.0) > QUATERNION_TOLERANCE
-        remedy = "the length of a rotation's quaternion is 1: scale it"
-        table.refuse(off, "qw to qz", length, remedy)
-        if len(table):
-            rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    if table.has(QUATERNION):
+        rotation = unit_rotation(table).as_matrix()
     cov = _numbers(table, _COV)
     return Trajectory(
         time=table.time,
@@ -114,6 +108,16 @@ def read_trajectory(
         accel_bias_body=_numbers(table, _ACCEL_BIAS),
         pose_cov=None if cov is None else _symmetric(cov),
     )
+
+
+def unit_rotation(table: Table) -> Rotation:
+    """Return the rotations of a table's rows; refuse quaternions that are not of unit length."""
+    quaternion = table.numbers(QUATERNION)
+    length = np.linalg.norm(quaternion, axis=1)
+    off = np.abs(length - 1.0) > QUATERNION_TOLERANCE
+    remedy = "the length of a rotation's quaternion is 1: scale it"
+    table.refuse(off, "qw to qz", length, remedy)
+    return Rotation.from_quat(quaternion, scalar_first=True)
 
 
 def _numbers(table: Table, names: tuple[str, ...]) -> Array | None:

@@ -10,9 +10,13 @@ from magfusion.errors import InputError
 from magfusion.model.short_repr import short_repr
 from magfusion.units import Array, BoolArray
 
-Quantity = Literal["velocity", "range", "position", "mark", "height", "pressure", "heading"]
+Quantity = Literal[
+    "velocity", "range", "position", "mark", "height", "pressure", "heading", "relative_pose"
+]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 AIDING_RATE = 10.0  # Hz; what a vehicle does between is measured by the IMU
+LONGEST_INTERVAL = 2.0  # s of a relative pose, in which the noise of an IMU is still small
+_COMPONENTS: dict[Quantity, int] = {"velocity": 3, "position": 3, "mark": 0, "relative_pose": 7}
 
 
 def _zero() -> Array:
@@ -48,11 +52,11 @@ class AidingSensor:
         ``velocity`` of the sensor in its own axes (m/s); ``range`` to ``point_world`` (m);
         ``position`` (m), or that of a named ``mark`` on which the sensor is; ``height`` above the
         world's zero (m), or as a ``pressure`` (Pa); ``heading`` of the body's x axis, clockwise
-        from the world's y axis (rad).
+        from the world's y axis (rad); ``relative_pose`` of the sensor since an earlier time (m).
     sigma : float
         Of white noise.
     relative_sigma : float
-        Noise of a velocity as a share of its size.
+        Noise of a velocity or translation as a share of its size.
     constraint_sigma : float, optional
         Standard deviation about zero of the axes of a velocity that are not measured, as of wheels
         that do not slide (nonholonomic constraint, m/s).
@@ -74,6 +78,8 @@ class AidingSensor:
     origin : tuple of float, optional
         Latitude, longitude (degrees) and ellipsoidal height (m) of the world's origin, for
         positions of GNSS; the world's axes are east, north and up there.
+    rotation_sigma : float
+        Of the rotation of a relative pose (rad).
     """
 
     __repr__ = short_repr
@@ -94,6 +100,7 @@ class AidingSensor:
     rate_hz: float = AIDING_RATE
     sigmas: AidingSigma = field(default_factory=AidingSigma)
     origin: tuple[float, float, float] | None = None
+    rotation_sigma: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,8 +114,9 @@ class AidingSamples:
     time : ndarray, shape (n,)
         Seconds since the log's epoch.
     value : ndarray, shape (n, components)
-        Three of a velocity or position, none of a mark, else one; NaN for an axis of a velocity
-        that is not measured.
+        As `components` has them; NaN for an axis of a velocity that is not measured.  A relative
+        pose until ``time`` has the length of its interval (s), the translation in the sensor's axes
+        at its beginning (m) and the rotation vector from there to the axes at its end (rad).
     marks : tuple of str
         Name of each sample's mark, if they are marks.
     """
@@ -121,7 +129,7 @@ class AidingSamples:
     marks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        columns = {"velocity": 3, "position": 3, "mark": 0}.get(self.quantity, 1)
+        columns = components(self.quantity)
         if self.value.shape != (len(self.time), columns):
             raise InputError(
                 f"{self.quantity}: the values have the shape {self.value.shape}; give {columns} for"
@@ -133,6 +141,8 @@ class AidingSamples:
             raise InputError(f"{self.quantity}: a sample has no finite value; leave it out")
         if self.quantity == "mark" and len(self.marks) != len(self.time):
             raise InputError("mark: give the name of a mark for each time")
+        if self.quantity == "relative_pose" and np.any(self.value[:, 0] <= 0.0):
+            raise InputError("relative_pose: an interval is not positive; give its length in s")
 
     def __len__(self) -> int:
         return len(self.time)
@@ -141,6 +151,11 @@ class AidingSamples:
         """Return some of the samples."""
         marks = tuple(np.array(self.marks, dtype=object)[kept]) if self.marks else ()
         return AidingSamples(self.quantity, self.time[kept], self.value[kept], marks)
+
+
+def components(quantity: Quantity) -> int:
+    """Return how many numbers a sample of a quantity has."""
+    return _COMPONENTS.get(quantity, 1)
 
 
 def sensor_named(

@@ -3,8 +3,9 @@
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from magfusion.model.aiding import AidingSamples, AidingSensor, Quantity
+from magfusion.model.aiding import LONGEST_INTERVAL, AidingSamples, AidingSensor, Quantity
 from magfusion.model.site import Site
 from magfusion.simulation.motion import SimulatedMotion
 from magfusion.units import HOUR, Array
@@ -41,6 +42,19 @@ def _heading(motion: SimulatedMotion, _: AidingSensor, time: Array) -> Array:
     return np.arctan2(forward[:, :1], forward[:, 1:2])
 
 
+def _relative_pose(motion: SimulatedMotion, sensor: AidingSensor, time: Array) -> Array:
+    """Return what it did in the period before: translation and rotation vector."""
+    before = time - _interval(sensor)
+    mounting = Rotation.from_matrix(sensor.body_from_sensor)
+    first, second = (motion.world_from_body(at) * mounting for at in (before, time))
+    way = _point_world(motion, sensor, time) - _point_world(motion, sensor, before)
+    return np.hstack([first.inv().apply(way), (first.inv() * second).as_rotvec()])
+
+
+def _interval(sensor: AidingSensor) -> float:
+    return min(1.0 / sensor.rate_hz, LONGEST_INTERVAL)
+
+
 IDEAL: dict[Quantity, Ideal] = {
     "velocity": _velocity,
     "range": _range,
@@ -48,6 +62,7 @@ IDEAL: dict[Quantity, Ideal] = {
     "height": _height,
     "pressure": _height,
     "heading": _heading,
+    "relative_pose": _relative_pose,
 }
 
 
@@ -70,6 +85,8 @@ def _record(
 ) -> AidingSamples:
     time = np.arange(1.0, duration * sensor.rate_hz) / sensor.rate_hz
     ideal = IDEAL[sensor.quantity](motion, sensor, time + sensor.time_offset)
+    if sensor.quantity == "relative_pose":
+        return _noisy_poses(sensor, time, ideal, rng)
     walk = sensor.offset_walk / np.sqrt(HOUR * sensor.rate_hz)
     offset = sensor.offset + np.cumsum(walk * rng.standard_normal(len(time)))
     speed = np.sqrt(np.nansum(ideal**2, axis=1, keepdims=True))
@@ -77,3 +94,16 @@ def _record(
     noise = np.hypot(sensor.sigma, share * speed) * rng.standard_normal(ideal.shape)
     value = sensor.scale * ideal + offset[:, None] + noise
     return AidingSamples(sensor.quantity, time, value)
+
+
+def _noisy_poses(
+    sensor: AidingSensor, time: Array, ideal: Array, rng: np.random.Generator
+) -> AidingSamples:
+    way = np.linalg.norm(ideal[:, :3], axis=1, keepdims=True)
+    noise = rng.standard_normal(ideal.shape)
+    sigma = np.hypot(sensor.sigma, sensor.relative_sigma * way)
+    translation = sensor.scale * ideal[:, :3] + sigma * noise[:, :3]
+    error = Rotation.from_rotvec(sensor.rotation_sigma * noise[:, 3:])
+    turn = (Rotation.from_rotvec(ideal[:, 3:]) * error).as_rotvec()
+    interval = np.full((len(time), 1), _interval(sensor))
+    return AidingSamples(sensor.quantity, time, np.hstack([interval, translation, turn]))

@@ -26,6 +26,7 @@ from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.model_error import epochs_sharing_error
 from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
 from magfusion.estimation.measurements.pose_fix import pose_fixes
+from magfusion.estimation.measurements.relative_pose import RelativePose
 from magfusion.estimation.measurements.signs import with_signs
 from magfusion.estimation.measurements.zero_rate import zero_rate
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
@@ -171,10 +172,7 @@ def graph_of(
         sigmas of the inertial factors may then be a tenth off.
     """
     links, gap_bridged = _links(log, states, calibration, roughly=roughly)
-    measurements = [
-        replace(measurement, epoch=np.searchsorted(states.time, time)[measurement.epoch])
-        for time, measurement in log.others
-    ]
+    measurements = [_at_states(log, *other, states, calibration) for other in log.others]
     if roll_is_open(log.declared.site):
         measurements.append(held_roll(log.declared.site, states))
     if standing is not None and np.any(standing):
@@ -227,6 +225,25 @@ def _links(
         preintegrated, calibration, blocks, lambda _: initial_estimate(states, calibration).values
     )
     return tuple(links), gap_bridged[0]
+
+
+def _at_states(
+    log: PreprocessedLog,
+    time: Array,
+    measurement: Measurement,
+    states: Trajectory,
+    calibration: Calibration,
+) -> Measurement:
+    """Return a measurement at the states of its times (s)."""
+    epoch = np.searchsorted(states.time, time)[measurement.epoch]
+    if isinstance(measurement, RelativePose):
+        assert states.accel_bias_body is not None
+        assert states.gyro_bias_body is not None
+        imu = calibration.on_log_rate(corrected_imu(calibration, log.blocks, log.imu))
+        bias = np.hstack([states.accel_bias_body, states.gyro_bias_body])[epoch]
+        offset, site, end = calibration.time_offset, log.declared.site, states.time[epoch]
+        measurement = measurement.over_interval(imu, offset, end, bias, site)
+    return replace(measurement, epoch=epoch)
 
 
 def _fixes(log: PreprocessedLog, fixes: Fixes) -> Measurement:

@@ -25,6 +25,8 @@ class Prediction:
         As of `Rows`.
     by_parameter : mapping
         By a parameter of the sensor, in SI units, shape (n, k, columns).
+    by_time : ndarray, shape (n, k), optional
+        By the time of the sample, where it is not that of the state's motion alone.
     """
 
     value: Array
@@ -32,6 +34,7 @@ class Prediction:
     by_velocity: Array | None = None
     by_bias: Array | None = None
     by_parameter: Mapping[AidingParameter, Array] = field(default_factory=dict)
+    by_time: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +90,9 @@ class AidingMeasurement(Measurement):
         rate_body = self.inertial_body[:, :3] - bias[:, 3:]
         force_body = self.inertial_body[:, 3:] - bias[:, :3]
         at = self.predicted(states, rate_body, sensor)
-        by_time = _by_time(at, states, rate_body, force_body, calibration.site.gravity)
+        by_time = at.by_time
+        if by_time is None:
+            by_time = _by_time(at, states, rate_body, force_body, calibration.site.gravity)
         late = sensor.time_offset - self.time_offset
         by_parameter = {**at.by_parameter, AIDING_CLOCK: by_time[..., None]}
         by_calibration = calibration_rows((len(states), self.value.shape[1]), blocks)

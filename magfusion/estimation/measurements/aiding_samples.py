@@ -12,10 +12,17 @@ from magfusion.estimation.measurements.heading import Heading
 from magfusion.estimation.measurements.height import Height
 from magfusion.estimation.measurements.point_position import PointPosition
 from magfusion.estimation.measurements.point_range import PointRange
-from magfusion.model.aiding import AidingSamples, AidingSensor, Quantity, sensor_named
+from magfusion.estimation.measurements.relative_pose import RelativePose, relative_pose
+from magfusion.model.aiding import (
+    LONGEST_INTERVAL,
+    AidingSamples,
+    AidingSensor,
+    Quantity,
+    sensor_named,
+)
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
-from magfusion.units import Array
+from magfusion.units import Array, BoolArray
 
 MEASUREMENTS: dict[Quantity, type[AidingMeasurement]] = {
     "velocity": BodyVelocity,
@@ -25,6 +32,7 @@ MEASUREMENTS: dict[Quantity, type[AidingMeasurement]] = {
     "height": Height,
     "pressure": Height,
     "heading": Heading,
+    "relative_pose": RelativePose,
 }
 
 
@@ -38,6 +46,8 @@ def aiding_measurement(
     InputError
         If a mark is none of the site's.
     """
+    if sensor.quantity == "relative_pose":
+        return relative_pose(sensor, samples, robust)
     value = _on_marks(sensor, samples) if sensor.quantity == "mark" else samples.value
     missing = np.isnan(value)
     speed = np.sqrt(np.nansum(value**2, axis=1))
@@ -87,6 +97,11 @@ def aiding_measurements(
         Its stamps on the log's clock.
     span : tuple of float
         First and last time of the states (s); samples outside are left out.
+
+    Raises
+    ------
+    InputError
+        If no interval of a relative pose can be used.
     """
     out = []
     for name, every in aiding.items():
@@ -95,10 +110,29 @@ def aiding_measurements(
         time = measured_time(sensor, samples)
         inside = (time >= span[0]) & (time <= span[1])
         samples, time = samples.rows(inside), time[inside]
+        if len(time) and sensor.quantity == "relative_pose":
+            there = _has_inertial(sensor, samples, time, site, imu)
+            samples, time = samples.rows(there), time[there]
         if len(time):
             measurement = aiding_measurement(sensor, samples, robust)
             out.append((time, measurement.with_inertial(inertial_at(imu, 0.0, time))))
     return tuple(out)
+
+
+def _has_inertial(
+    sensor: AidingSensor, samples: AidingSamples, time: Array, site: Site, imu: ImuSamples
+) -> BoolArray:
+    """Return which intervals have all their inertial samples; refuse a log without any."""
+    whole = relative_pose(sensor, samples).over_interval(
+        imu, 0.0, time, np.zeros((len(time), 6)), site
+    )
+    there = np.isfinite(whole.sigma[:, 0])
+    if not there.any():
+        raise InputError(
+            f"{sensor.name}: none of its {len(time)} intervals has at most {LONGEST_INTERVAL:g} s"
+            " and all its inertial samples; give poses relative to a nearer keyframe"
+        )
+    return np.asarray(there)
 
 
 def _on_marks(sensor: AidingSensor, samples: AidingSamples) -> Array:

@@ -140,7 +140,9 @@ class EpochUpdate:
         result = arrived.measured(
             before, state, samples, step, earth=earth, standing=standing, is_lost=lost_epochs
         )
-        measurements = self.aiding.passed(arrived.others_at(state.time), state)
+        others = arrived.others_at(state.time)
+        others = [arrived.with_inertial(one, state, self.blocks) for one in others]
+        measurements = self.aiding.passed(others, state)
         if standing:
             measurements.append(zero_velocity(NOW, self.site.platform.motion.rest_speed_sigma))
         point = None

@@ -25,6 +25,7 @@ from magfusion.estimation.measurements.aiding import AidingMeasurement
 from magfusion.estimation.measurements.earth import earth_measurement
 from magfusion.estimation.measurements.model_error import epochs_sharing_error_at
 from magfusion.estimation.measurements.phasors import field_phasors
+from magfusion.estimation.measurements.relative_pose import RelativePose, longest_interval
 from magfusion.estimation.measurements.signs import OPEN_SIGN, count_open, with_signs
 from magfusion.estimation.measurements.zero_velocity import (
     REACH,
@@ -36,7 +37,7 @@ from magfusion.estimation.online.measured import EpochMeasurements
 from magfusion.estimation.online.short_windows import ShortWindows
 from magfusion.files.named_records import magnetometer_number
 from magfusion.model.marks import Marks
-from magfusion.model.parameters import CLOCK_RATE, TIME_OFFSET, Block
+from magfusion.model.parameters import CLOCK_RATE, TIME_OFFSET, Block, corrected_imu
 from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
 from magfusion.model.trust import Finding
 from magfusion.receiver.lockin_receiver import LockinReceiver
@@ -410,7 +411,7 @@ class Arrivals:
 
     def discard_before(self, time: float) -> None:
         """Keep only the samples that are needed after a state (s)."""
-        reach = 2.0 + self.receiver.history
+        reach = 2.0 + self.receiver.history + longest_interval(self.receiver.site)
         self.imu.discard_before(time - reach, time - self.applied_offset - 1.0)
         self.imu_filler.discard_before(time - reach)
         self.waveform.discard_before(time - reach, time - reach)
@@ -440,17 +441,28 @@ class Arrivals:
         """Return the other measurements at a time (s), and remove them."""
         due = [measurement for when, measurement in self.others if when == time]
         self.others = [other for other in self.others if other[0] > time]
-        return [
-            self._with_inertial(one, time) if isinstance(one, AidingMeasurement) else one
-            for one in due
-        ]
+        return due
 
-    def _with_inertial(self, measurement: AidingMeasurement, time: float) -> AidingMeasurement:
-        stamp = time - self.applied_offset
+    def with_inertial(
+        self, measurement: Measurement, state: State, blocks: tuple[Block, ...]
+    ) -> Measurement:
+        """Return a measurement with the inertial samples that it needs at a predicted state."""
+        if not isinstance(measurement, AidingMeasurement):
+            return measurement
+        time, offset = state.time, self.applied_offset
+        stamp = time - offset
+        if isinstance(measurement, RelativePose):
+            begin = stamp - float(measurement.interval[0])
+            imu = self.inertial_samples(begin - RATE_SPAN, stamp + RATE_SPAN)
+            imu = corrected_imu(state.calibration, blocks, imu)
+            bias = np.hstack([state.accel_bias_body, state.gyro_bias_body])[None]
+            measurement = measurement.over_interval(
+                imu, offset, np.array([time]), bias, self.receiver.site, self.usual
+            )
         imu = self.inertial_samples(stamp - RATE_SPAN, stamp + RATE_SPAN)
         if not len(imu):
             return measurement
-        at = inertial_at(imu, self.applied_offset, np.array([time]))
+        at = inertial_at(imu, offset, np.array([time]))
         return measurement.with_inertial(at)
 
     def rests(self, state: State) -> bool:

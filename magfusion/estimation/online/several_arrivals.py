@@ -17,6 +17,7 @@ from magfusion.estimation.demodulation.several_demodulation import same_windows
 from magfusion.estimation.demodulation.temperature_compensation import refuse_warm
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.initialization.online import NoStart, OnlineStart, find_online_start
+from magfusion.estimation.measurements.relative_pose import longest_interval
 from magfusion.estimation.online.input_queue import LONGEST_WAIT, MARGIN, Arrivals
 from magfusion.estimation.online.measured import EpochMeasurements
 from magfusion.estimation.online.sensor_stream import SensorStream
@@ -342,6 +343,7 @@ class SeveralArrivals(Arrivals):
     def discard_before(self, time: float) -> None:
         """Keep only the samples that are needed after a state (s)."""
         reach = 2.0 + max(stream.receiver.history for stream in self.streams)
+        reach += longest_interval(self.receiver.site)
         self.imu.discard_before(time - reach, time - self.applied_offset - 1.0)
         for stream in self.streams:
             stream.samples.discard_before(time - reach, time - reach)

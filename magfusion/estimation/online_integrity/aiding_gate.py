@@ -21,7 +21,7 @@ SCORED_LOSS = "cauchy"  # of rejected samples in the score: slips do not name a 
 REJECTED_LONG = 5.0  # s of nothing but rejections; slips and reflections are shorter
 MEMORY = 0.995  # of the share of rejections, per sample
 CONTRADICTS = 0.25  # share beyond which a sensor is not as declared
-FREEDOM = (1, 2, 3)
+FREEDOM = (1, 2, 3, 6)
 GATE = {k: float(chdtri(k, FALSE_REJECTIONS)) for k in FREEDOM}
 GATE_AGAIN = {k: float(chdtri(k, FALSE_REJECTIONS_AGAIN)) for k in FREEDOM}
 
@@ -56,9 +56,12 @@ class AidingGate:
     def _is_explained(self, measurement: Measurement, state: State) -> bool:
         if not isinstance(measurement, AidingMeasurement):
             return True
+        measured = int((measurement.sigma < float("inf")).sum())
+        if not measured:
+            self.counts[f"interval of {measurement.sensor} without inertial samples"] += 1
+            return False
         rows = measurement.linearize(states_of([state]), state.calibration, self.blocks)
         gate = GATE_AGAIN if measurement.sensor in self.rejected_since else GATE
-        measured = int((measurement.sigma < float("inf")).sum())
         explained = bool(group_distances(rows, state.cov)[0, 0] <= gate[measured])
         sensor, before = measurement.sensor, self.rejected_share.get(measurement.sensor, 0.0)
         self.rejected_share[sensor] = MEMORY * before + (1.0 - MEMORY) * (not explained)

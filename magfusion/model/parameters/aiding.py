@@ -55,7 +55,7 @@ class _Scale(AidingParameter):
     kind = attribute = sigma_attribute = "scale"
     display_unit = PERCENT
     words = "the scale of {owner}"
-    of_quantities = ("velocity",)
+    of_quantities = ("velocity", "relative_pose")
 
 
 class _Offset(AidingParameter):
@@ -91,7 +91,7 @@ class _Rotation(AidingParameter):
     attribute, sigma_attribute, is_rotation = "body_from_sensor", "rotation_sensor", True
     unit = display_unit = DEGREES
     words = "the mounting of {owner}, turned about its {axis}"
-    of_quantities = ("velocity",)
+    of_quantities = ("velocity", "relative_pose")
 
 
 class _Position(AidingParameter):
@@ -99,7 +99,7 @@ class _Position(AidingParameter):
     attribute = sigma_attribute = "position_body"
     unit, display_unit = METRE, CENTIMETRE
     words = "the lever arm of {owner} along {axis}"
-    of_quantities = ("velocity", "range", "position", "mark", "height", "pressure")
+    of_quantities = tuple(kind for kind in QUANTITIES if kind != "heading")
 
 
 AIDING_SCALE, AIDING_OFFSET, AIDING_PRESSURE = _Scale(), _Offset(), _PressureOffset()
