@@ -115,7 +115,9 @@ class RelativePose(AidingMeasurement):
         for k in np.flatnonzero(np.isfinite(own.sigma[:, 0])).tolist():
             part = slice(first[k], last[k])
             stream = ImuSamples(imu.time[part], imu.gyro_body[part], imu.accel_body[part])
-            if len(stream) < 2 or not own._preintegrate(k, stream, time_offset, end[k], site, usual):
+            if len(stream) < 2 or not own._preintegrate(
+                k, stream, time_offset, end[k], site, usual
+            ):
                 own.sigma[k] = np.inf
         return replace(own, rate_begin=inertial_at(imu, time_offset, begin)[:, :3])
 
@@ -163,9 +165,9 @@ class RelativePose(AidingMeasurement):
         gained, passed = self.gained + change[:, 6:], self.passed + change[:, 3:6]
         body_from_world = np.swapaxes(states.world_from_body, 1, 2)
         up_world = self.gravity * UP_WORLD
-        carried = length * (states.velocity_world + 0.5 * length * up_world)
-        carried_body = _times(body_from_world, carried)
-        moved = _times(turn, carried_body + lever) - length * gained + passed - lever
+        gain_world = length * (states.velocity_world + 0.5 * length * up_world)
+        gain_body = _times(body_from_world, gain_world)
+        moved = _times(turn, gain_body + lever) - length * gained + passed - lever
         sensor_from_body = sensor.body_from_sensor.T
         translation = moved @ sensor_from_body.T
         rotation = sensor_from_body @ turn @ sensor.body_from_sensor
@@ -176,11 +178,11 @@ class RelativePose(AidingMeasurement):
 
         rotated_by_bias = _right_jacobian(change[:, :3]) @ self.by_bias[:, :3]
         by_pose, by_bias = np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
-        by_pose[:, :3, :3] = scaled @ turn @ skew(carried_body)
+        by_pose[:, :3, :3] = scaled @ turn @ skew(gain_body)
         by_velocity = np.zeros((count, 6, 3))
         by_velocity[:, :3] = length[..., None] * (scaled @ turn @ body_from_world)
         own = self.by_bias[:, 3:6] - length[..., None] * self.by_bias[:, 6:]
-        by_bias[:, :3] = scaled @ (own - turn @ skew(carried_body + lever) @ rotated_by_bias)
+        by_bias[:, :3] = scaled @ (own - turn @ skew(gain_body + lever) @ rotated_by_bias)
         by_bias[:, 3:] = by_rotation @ sensor_from_body @ rotated_by_bias
 
         begin = self.rate_begin - bias[:, 3:]
