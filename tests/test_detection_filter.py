@@ -1,5 +1,7 @@
 """Which beacons are detected, and how many sentences those have that are not."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from magfusion.estimation.data_checks.detection import DetectionFilter
@@ -8,6 +10,7 @@ from magfusion.estimation.data_checks.signal import (
     BeaconDetection,
     undetected_findings,
 )
+from magfusion.model.aiding import AidingSensor
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trust import Verdict
 from magfusion.simulation.demo_site import demo_site
@@ -45,15 +48,15 @@ def test_beacons_that_are_never_detected_have_one_sentence() -> None:
 
 
 def passing(range_m: Array) -> BeaconDetection:
-    """Return the reception of A, of 5 sigma at 40 m and by the cube of the range, and of B."""
-    field = np.maximum(5.0 * (40.0 / range_m) ** 3, 0.7)
+    """Return the reception of A, of 5 sigma at 20 m and by the cube of the range, and of B."""
+    field = np.maximum(5.0 * (20.0 / range_m) ** 3, 0.7)
     snr = np.stack([field, np.full(len(field), 100.0)], axis=1)
     time = STEP * np.arange(len(snr))
     return BeaconDetection(time, ("A", "B"), snr, SIGMA * snr, snr > LEAST_SNR)
 
 
 def test_who_drives_out_of_range_is_not_told_that_a_beacon_was_switched_off() -> None:
-    away = 20.0 + 3.0 * STEP * np.arange(100)  # m, at 3 m/s
+    away = 10.0 + 3.0 * STEP * np.arange(100)  # m, at 3 m/s
     (finding,) = undetected_findings(passing(np.concatenate([away, away[::-1]])), demo_site())
     assert (finding.code, finding.verdict) == ("low_signal", Verdict.TRUSTWORTHY)
 
@@ -63,3 +66,13 @@ def test_a_beacon_that_falls_silent_in_reach_was_switched_off() -> None:
     (finding,) = undetected_findings(silent, demo_site())
     assert (finding.code, finding.verdict) == ("silent_beacon", Verdict.DOUBTFUL)
     assert "19.8 to 39.8 s" in finding.text
+
+
+def test_epochs_without_a_beacon_are_a_doubt_unless_other_sensors_measure_the_motion() -> None:
+    here = passing(np.where(np.arange(100) < 50, 10.0, 1e3))
+    gap = replace(here, strong=here.strong & (np.arange(100) < 50)[:, None])
+    wheels = replace(demo_site(), aiding=(AidingSensor("wheels", "velocity", 0.01),))
+    for site, verdict in ((demo_site(), Verdict.DOUBTFUL), (wheels, Verdict.TRUSTWORTHY)):
+        first, *_ = undetected_findings(gap, site)
+        assert first.text.startswith("no beacon is detected in 50 % of the epochs")
+        assert first.verdict is verdict

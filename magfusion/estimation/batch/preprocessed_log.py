@@ -16,6 +16,8 @@ from magfusion.estimation.data_checks.detection import detected, only
 from magfusion.estimation.demodulation.demodulation import Demodulation, demodulated
 from magfusion.estimation.demodulation.several_demodulation import demodulated_several
 from magfusion.estimation.graph.measurement import Measurement
+from magfusion.estimation.graph.same_epoch import at_epochs
+from magfusion.estimation.graph.user_factors import UserFactors
 from magfusion.estimation.measurements.aiding_samples import aiding_measurements
 from magfusion.estimation.measurements.fixed_roll import without_roll
 from magfusion.estimation.measurements.zero_velocity import quiet_before
@@ -68,6 +70,7 @@ class _Demodulated(NamedTuple):
     time: Array
     calibration: Calibration
     measured: tuple[tuple[Array, Measurement], ...]
+    user: UserFactors | None
 
 
 def preprocess(log: Log, site: Site, settings: SmootherSettings, report: Report) -> PreprocessedLog:
@@ -154,13 +157,19 @@ def _demodulated(log: Log, site: Site, settings: SmootherSettings) -> _Demodulat
         steady, samples = demodulation.steady(calibration), only(samples, detected(samples))
     between = _in_gaps(samples, log.imu, calibration.time_offset, site.platform.motion)
     measured = (*settings.measurements, *_aiding(log, calibration, samples, settings.loss))
-    others = [time for time, _ in measured]
-    if settings.factors is not None:
-        others.append(settings.factors.time)
+    time = np.union1d(samples.time, between)
     if demodulation.close is not None and not loose:
-        others.append(demodulation.close.windows.centre)
-    time = np.unique(np.concatenate([samples.time, between, *others]))
-    return _Demodulated(log, demodulation, samples, steady, time, calibration, measured)
+        time = np.union1d(time, demodulation.close.windows.centre)
+    at = []
+    for stamps, measurement in measured:
+        stamps = at_epochs(stamps, time)
+        time = np.union1d(time, stamps)
+        at.append((stamps, measurement))
+    user = settings.factors
+    if user is not None:
+        user = replace(user, time=at_epochs(user.time, time))
+        time = np.union1d(time, user.time)
+    return _Demodulated(log, demodulation, samples, steady, time, calibration, tuple(at), user)
 
 
 def _aiding(
@@ -192,7 +201,7 @@ def _with_start(
         considered=considered,
         loss=settings.loss,
         others=selected.measured,
-        user=settings.factors,
+        user=selected.user,
         rival_chi_square=begun.rival_chi_square,
         rival=begun.rival,
     )

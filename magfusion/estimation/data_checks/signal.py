@@ -24,7 +24,7 @@ HARDLY = 0.05  # share of the epochs; a beacon detected in fewer counts as silen
 MAX_UNDETECTED_SHARE = 0.1  # share of the epochs without any beacon, from which it casts doubt
 SILENCE = 1.0  # s; shorter silence is not reported
 FALLEN = 0.2  # of the neighbouring amplitude; below, a beacon is switched off
-NEAR = 10  # epochs beside a silence
+NEAR, EDGE = 10, 3  # epochs beside a silence
 LEAST_SNR = (DETECTION_CHI_SQUARE / 6.0) ** 0.5  # that is detected
 LISTED = 3
 CERTAIN_DETECTION_RATIO = (
@@ -217,7 +217,7 @@ def undetected_findings(detection: BeaconDetection, site: Site) -> Iterator[Find
             "low_signal",
             f"no beacon is detected in {100.0 * alone:.0f} % of the epochs: all are far away there,"
             " or the noise is large.",
-            Verdict.DOUBTFUL,
+            Verdict.TRUSTWORTHY if site.aiding else Verdict.DOUBTFUL,
             100.0,
         )
     frequency = {b.name: b.tone_frequencies_hz for b in site.beacons}
@@ -259,13 +259,12 @@ def _silences(detection: BeaconDetection, k: int, tones: str) -> Iterator[Findin
     off: list[tuple[float, float]] = []
     masked: list[tuple[float, float]] = []
     for first, last in zip(quiet.first[long], quiet.last[long], strict=True):
-        before, after = slice(max(first - NEAR, 0), first), slice(last, last + NEAR)
-        others = np.concatenate([amplitude[before], amplitude[after]])
+        others = np.append(amplitude[max(first - NEAR, 0) : first], amplitude[last : last + NEAR])
         elapsed = not detection.passed_by
         elapsed &= float(np.median(amplitude[first:last])) < FALLEN * float(np.median(others))
         # Who drives out of range leaves it at the weakest field that is detected.
-        sides = [float(np.median(snr[side])) for side in (before, after) if len(snr[side])]
-        elapsed &= max(sides, default=0.0) > CERTAIN_DETECTION_RATIO * LEAST_SNR
+        edges = np.append(snr[max(first - EDGE, 0) : first], snr[last : last + EDGE])
+        elapsed &= float(np.max(edges, initial=0.0)) > CERTAIN_DETECTION_RATIO * LEAST_SNR
         stretch = (float(time[first] - 0.5 * step), float(time[last - 1] + 0.5 * step))
         (off if elapsed else masked).append(stretch)
     name = detection.beacons[k]

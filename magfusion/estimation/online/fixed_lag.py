@@ -21,6 +21,7 @@ from magfusion.estimation.graph.kalman import considered_share, partial_update
 from magfusion.estimation.graph.measurement import Measurement, joined
 from magfusion.estimation.graph.process_noise import ProcessNoise
 from magfusion.estimation.graph.propagation import Propagated
+from magfusion.estimation.graph.same_epoch import SAME_TIME
 from magfusion.estimation.graph.state import (
     MOTION,
     State,
@@ -34,7 +35,6 @@ from magfusion.model.parameters import Block, dimension, retract
 from magfusion.model.site import Site
 from magfusion.units import Array
 
-SAME_TIME = 1e-6  # s; stamps that differ by less are of one state
 ITERATIONS_FAR = 4  # where the prediction is too uncertain to linearise at
 LAST = slice(MOTION, 2 * MOTION)  # of the first state, the last and the calibration
 

@@ -19,6 +19,7 @@ from magfusion.estimation.demodulation.motion_compensation import (
 )
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.preintegration import RATE_SPAN, inertial_at
+from magfusion.estimation.graph.same_epoch import SAME_TIME
 from magfusion.estimation.graph.state import MOTION, VELOCITY, State, as_trajectory
 from magfusion.estimation.initialization.online import NoStart, OnlineStart, find_online_start
 from magfusion.estimation.measurements.aiding import AidingMeasurement
@@ -186,10 +187,11 @@ class Arrivals:
     def add_measurement(self, time: float, measurement: Measurement, after: float) -> bool:
         """Add any other measurement; return whether it is after a time (s)."""
         check_clock("measurement", np.array([time]), self.newest)
-        if time > after:
+        in_time = time > after + SAME_TIME
+        if in_time:
             self.others.append((time, measurement.at(0)))
             self.others.sort(key=lambda other: other[0])
-        return time > after
+        return in_time
 
     # Times
 
@@ -439,8 +441,8 @@ class Arrivals:
 
     def others_at(self, time: float) -> list[Measurement]:
         """Return the other measurements at a time (s), and remove them."""
-        due = [measurement for when, measurement in self.others if when == time]
-        self.others = [other for other in self.others if other[0] > time]
+        due = [measurement for when, measurement in self.others if when <= time + SAME_TIME]
+        self.others = [other for other in self.others if other[0] > time + SAME_TIME]
         return due
 
     def with_inertial(

@@ -24,6 +24,7 @@ from magfusion.estimation.demodulation.sensor_frame_samples import (
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.process_noise import calibration_process_noise
 from magfusion.estimation.graph.propagation import Propagated, propagate
+from magfusion.estimation.graph.same_epoch import SAME_TIME
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.graph.user_factors import UserFactors
 from magfusion.estimation.initialization.earlier_state import with_earlier
@@ -47,7 +48,7 @@ from magfusion.estimation.online.applied_corrections import AppliedCorrections
 from magfusion.estimation.online.arrivals import arrivals_of
 from magfusion.estimation.online.ekf import ErrorStateFilter
 from magfusion.estimation.online.epoch_update import EpochUpdate, Estimator
-from magfusion.estimation.online.fixed_lag import SAME_TIME, SlidingWindow
+from magfusion.estimation.online.fixed_lag import SlidingWindow
 from magfusion.estimation.online.input_history import InputHistory
 from magfusion.estimation.online.input_queue import Arrivals
 from magfusion.estimation.online.navigator_data import navigator_rules
@@ -664,10 +665,10 @@ class Navigator:
         arrived, delay = self._arrived, self.settings.delay
         arrived.receive(state, delay)
         inertial, other = arrived.awaited - delay, arrived.next_other
-        if other <= now:
+        if other <= now + SAME_TIME:
             self.counts["measurement too late"] += len(arrived.others_at(other))
             return True
-        if other <= inertial and other < arrived.next_field:
+        if other <= inertial and other < arrived.next_field - SAME_TIME:
             self._absorb(other, None)
             return True
         separate = arrived.short is not None and self._update.needs_separate_beacons(state)

@@ -32,7 +32,15 @@ from magfusion.units import Array, BoolArray
 MEMORY = 10.0  # s; of the innovations, gravity and static field
 LEAST_SPAN = 1.0  # s; of inertial data, before gravity is tested
 FADES = 20.0  # s; after which findings of the beginning that may have passed are dropped
-PASSING = {"not_converged", "diverged", "field_residuals", "geometry", "gap", "separation"}
+PASSING = {
+    "not_converged",
+    "diverged",
+    "field_residuals",
+    "geometry",
+    "gap",
+    "low_signal",
+    "separation",
+}
 RESTARTS_MEMORY = 60.0  # s
 LEAST_EXCESS = 2.5  # mean square; the noise is tuned on only a few seconds of the start
 DETECTION_SIGMAS = 6.0
