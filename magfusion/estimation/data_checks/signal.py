@@ -225,9 +225,29 @@ def undetected_findings(detection: BeaconDetection, site: Site) -> Iterator[Find
     never = np.flatnonzero(share < HARDLY).tolist()
     if never:
         yield _never_detected([(detection.beacons[k], tones[k]) for k in never])
+    masked = []
     for k in range(len(tones)):
-        if k not in never and not detection.across:
-            yield from _silences(detection, k, tones[k])
+        if k in never or detection.across:
+            continue
+        named = f"{detection.beacons[k]} ({tones[k]})"
+        off, far = _silences(detection, k)
+        if off:
+            yield Finding(
+                "silent_beacon",
+                f"beacon {named} is silent from {_places(off)}: it was switched off.",
+                Verdict.DOUBTFUL,
+                50.0 + sum(end - begin for begin, end in off),
+            )
+        if far:
+            masked.append(f"beacon {named} is below the noise from {_places(far)}")
+    if masked:
+        more = f"; and {len(masked) - LISTED} more for a while" if len(masked) > LISTED else ""
+        yield Finding(
+            "low_signal",
+            f"{'; '.join(masked[:LISTED])}{more}: far away there, or motion and other fields"
+            " dominate.",
+            Verdict.TRUSTWORTHY,
+        )
 
 
 def _never_detected(beacons: list[tuple[str, str]]) -> Finding:
@@ -247,17 +267,20 @@ def _never_detected(beacons: list[tuple[str, str]]) -> Finding:
     )
 
 
-def _silences(detection: BeaconDetection, k: int, tones: str) -> Iterator[Finding]:
+def _silences(
+    detection: BeaconDetection, k: int
+) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
+    """Return when a beacon was switched off, and when it was only not detected (s)."""
     there = np.isfinite(detection.snr[:, k])
     time, strong = detection.time[there], detection.strong[there, k]
     amplitude, snr = detection.amplitude[there, k], detection.snr[there, k]
+    off: list[tuple[float, float]] = []
+    masked: list[tuple[float, float]] = []
     if len(time) < 2:
-        return
+        return off, masked
     step = float(np.median(np.diff(time)))
     quiet = runs(~strong)
     long = (quiet.last - quiet.first) * step > SILENCE
-    off: list[tuple[float, float]] = []
-    masked: list[tuple[float, float]] = []
     for first, last in zip(quiet.first[long], quiet.last[long], strict=True):
         others = np.append(amplitude[max(first - NEAR, 0) : first], amplitude[last : last + NEAR])
         elapsed = not detection.passed_by
@@ -267,21 +290,7 @@ def _silences(detection: BeaconDetection, k: int, tones: str) -> Iterator[Findin
         elapsed &= float(np.max(edges, initial=0.0)) > CERTAIN_DETECTION_RATIO * LEAST_SNR
         stretch = (float(time[first] - 0.5 * step), float(time[last - 1] + 0.5 * step))
         (off if elapsed else masked).append(stretch)
-    name = detection.beacons[k]
-    if off:
-        yield Finding(
-            "silent_beacon",
-            f"beacon {name} ({tones}) is silent from {_places(off)}: it was switched off.",
-            Verdict.DOUBTFUL,
-            50.0 + sum(end - begin for begin, end in off),
-        )
-    if masked:
-        yield Finding(
-            "low_signal",
-            f"beacon {name} ({tones}) is below the noise from {_places(masked)}: it is far away"
-            " there, or motion and other fields dominate.",
-            Verdict.TRUSTWORTHY,
-        )
+    return off, masked
 
 
 def _places(stretches: list[tuple[float, float]]) -> str:
