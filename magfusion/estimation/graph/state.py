@@ -6,7 +6,7 @@ Tangent: rotation and position (body axes, right perturbation of the pose, GTSAM
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 
 import gtsam
 import numpy as np
@@ -172,6 +172,7 @@ def states_in(values: gtsam.Values) -> States:
     """Return the states in ``values`` as arrays, in order of their keys."""
     flat = gtsam.utilities.extractPose3(values)
 
+    @cache
     def biases() -> Array:
         return np.array([values.atConstantBias(B(i)).vector() for i in range(len(flat))])
 
