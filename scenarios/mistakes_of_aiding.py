@@ -1,6 +1,7 @@
 """What is wrongly declared of aiding sensors: scale, lever arm, frame, clock; and outliers.
 
-All rows are of one platform that has a sensor of several kinds besides its magnetometer.
+All rows are of one platform that has a sensor of several kinds besides its magnetometer; those of a
+relative pose are of one with such a sensor in addition.
 """
 
 from collections.abc import Callable
@@ -27,11 +28,20 @@ SENSORS = (
     AidingSensor("level", "height", 0.02, position_body=LEVER),
     AidingSensor("compass", "heading", 0.5 * DEGREE),
 )
+KEYFRAMES = AidingSensor(
+    "keyframes",
+    "relative_pose",
+    0.005,
+    position_body=LEVER,
+    body_from_sensor=SENSOR_ATTITUDE,
+    rate_hz=2.0,
+    rotation_sigma=0.2 * DEGREE,
+)
 
 
-def _aided(case: Case) -> Case:
+def _aided(case: Case, name: str = "") -> Case:
     """Return the case of a platform with aiding sensors, declared as they are."""
-    site = replace(case.site, aiding=SENSORS)
+    site = replace(case.site, aiding=(*SENSORS, KEYFRAMES) if name == KEYFRAMES.name else SENSORS)
     return replace(again(case, site), site=site)
 
 
@@ -39,7 +49,7 @@ def _declared(name: str, change: Callable[[AidingSensor], AidingSensor]) -> Chan
     """Return a mistake in the declaration of a sensor."""
 
     def changed(case: Case) -> Case:
-        aided = _aided(case)
+        aided = _aided(case, name)
         sensors = tuple(change(s) if s.name == name else s for s in aided.site.aiding)
         return replace(aided, site=replace(aided.site, aiding=sensors))
 
@@ -71,10 +81,11 @@ def _outliers(name: str, size: float) -> Change:
     """Return data of which one sample in twenty is wrong by up to a size."""
 
     def changed(case: Case) -> Case:
-        aided = _aided(case)
+        aided = _aided(case, name)
         samples = aided.log.aiding[name]
         hit = case.rng.random(len(samples)) < SHARE
         wrong: Array = case.rng.uniform(-size, size, samples.value.shape)
+        wrong[:, :1] *= samples.quantity != "relative_pose"  # its interval
         value = samples.value + hit[:, None] * wrong
         aiding = {**aided.log.aiding, name: replace(samples, value=value)}
         return replace(aided, log=replace(aided.log, aiding=aiding))
@@ -105,5 +116,15 @@ MISTAKES = (
     Mistake("height_outliers", "aiding", _outliers("level", 2.0), harmless=True),
     Mistake("heading_turned_3deg", "aiding", _declared("compass", _offset), ("aiding_offset",)),
     Mistake("heading_clock_200ms", "aiding", _declared("compass", _late), _CLOCK, REST),
+    *(
+        Mistake(f"relative_{kind}", "aiding", _declared("keyframes", change), (code,), REST)
+        for kind, change, code in (
+            ("scale_5pct", _scaled, "aiding_scale"),
+            ("lever_20cm", _levered, "aiding_lever_arm"),
+            ("turned_3deg", _rotated, "aiding_mounting"),
+            ("clock_200ms", _late, "aiding_clock"),
+        )
+    ),
+    Mistake("relative_outliers", "aiding", _outliers("keyframes", 0.3), harmless=True),
     Mistake("heading_outliers", "aiding", _outliers("compass", 90.0 * DEGREE), harmless=True),
 )

@@ -21,6 +21,7 @@ from magfusion.estimation.measurements.aiding_samples import aiding_measurement
 from magfusion.estimation.measurements.relative_pose import RelativePose
 from magfusion.estimation.online.ekf import ErrorStateFilter
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.restored import restored
 from magfusion.estimation.online_integrity.aiding_gate import AidingGate
 from magfusion.files.aiding_messages import SensorMessages
 from magfusion.files.log import read_log, write_log
@@ -276,6 +277,8 @@ def test_keyframes_lead_online_out_of_the_field(estimator: str) -> None:
         new = (samples.time >= begin) & (samples.time < begin + 0.5)
         navigator.add_aiding("keyframes", samples.rows(new))
         states += navigator.take()
+        if begin == 6.0:  # with poses in its window
+            navigator = restored(site, settings, navigator.checkpoint())
     last = states[-1]
     assert last.time == 7.5
     assert not [name for name in navigator.counts if "keyframes" in name]
