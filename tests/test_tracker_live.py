@@ -33,7 +33,7 @@ def test_a_plate_that_is_moved_beside_the_head_is_said_and_the_sigmas_hold() -> 
 @pytest.mark.slow
 def test_the_side_of_the_source_is_found_by_motion_or_said_to_be_ambiguous() -> None:
     result = live.run_without_hemisphere(Config(duration=RESTING + 2.5, seed=1))
-    assert result.first_s < 5.0
+    assert result.first_s < 4.0
     assert result.wrong == 0.0
     assert result.ambiguous < 1.0
     assert result.mm < 1.5

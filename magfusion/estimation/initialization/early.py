@@ -16,19 +16,21 @@ from magfusion.receiver.slots import has_schedule
 
 LEADING = 2.0 * float(np.log(100.0))  # chi square of a rival: the odds against it are 100
 SEVERAL = 3  # beacons
-TRIES = 3  # in the time of other starts; after one second attitudes erred by three sigmas
+FIRST_SHARE = 1.0 / 3.0  # of the time of other starts; after 1 s attitudes erred by three sigmas
+LATER = 1.4  # times the data of the try before: all tries cost less than three of the last
 
 
 def first_try(site: Site, start_duration: float) -> float:
     """Return the duration of data before the first try of a start (s)."""
     if (has_schedule(site) and _is_mirrored(site)) or _is_alternating(site):
-        return start_duration / TRIES
+        return start_duration * FIRST_SHARE
     return start_duration
 
 
 def next_try(tried: float, start_duration: float) -> float:
     """Return the duration of data before the next try, after an early one failed (s)."""
-    return min(tried + start_duration / TRIES, start_duration)
+    later = LATER * tried
+    return later if LATER * later <= start_duration else start_duration
 
 
 def is_clear(start: OnlineStart | NoStart, *, several: bool = False, again: bool = False) -> bool:
