@@ -6,15 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import run_command
 from scipy.spatial.transform import Rotation
 from test_response import errors_of_axes, uncertain
 
 from magfusion.errors import InputError
+from magfusion.files.log import write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.files.survey import Survey, write_survey
 from magfusion.jobs.calibrate_response import ResponseSettings, run_calibrate_response
 from magfusion.model.site import BeaconSigma, Coil, Site
-from magfusion.simulation.demo_site import demo_site
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.simulation.magnetometers import answered
 from magfusion.simulation.perturbed import perturb_site
 from magfusion.units import DEGREE
@@ -120,6 +123,29 @@ def test_a_coil_on_a_bench_finds_the_responses(
     report = json.loads((tmp_path / "response" / "report.json").read_text())
     assert report["verdict"] == "trustworthy"
     assert [b.name for b in result.beacons] == [b.name for b in room().beacons]
+
+
+@pytest.mark.slow
+def test_a_minute_of_walk_calibrates_the_responses(tmp_path: Path) -> None:
+    """Moments and drive phases are declared, so that they do not take the part of an axis."""
+    site = uncertain(demo_site(), 0.2, 10.0)
+    walk = simulate_log(site, SimulationConfig(DEMO_BOX_WORLD), np.random.default_rng(1))
+    write_log(walk.log, tmp_path / "log")
+    save_site(site, tmp_path / "log" / "site.yaml")
+    run_command("calibrate", "log", tmp_path / "log", "-o", tmp_path / "result")
+    result = load_site(tmp_path / "result" / "site.yaml")
+    before, error = (errors_of_axes(one, walk.true_site) for one in (site, result))
+    assert np.max(np.abs(before.real)) > 0.1
+    assert np.max(np.abs(before.imag)) > 5.0 * DEGREE
+    assert np.sqrt(np.mean(error.real**2)) < 0.003
+    assert np.sqrt(np.mean(error.imag**2)) < 0.2 * DEGREE
+    sigma = result.platform.magnetometer.response_sigma
+    assert sigma is not None
+    for part, own in ((error.real, sigma.gain), (error.imag, sigma.phase)):
+        # Of 8 numbers with common errors: 1 is expected.
+        assert 0.3 < np.sqrt(np.mean((part / own) ** 2)) < 2.0
+    report = json.loads((tmp_path / "result" / "report.json").read_text())
+    assert report["verdict"] == "trustworthy"
 
 
 def test_a_receiver_that_is_known_is_refused(
