@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from magfusion.model.slips import Slip
     from magfusion.units import Array
 
-BLOCK = 0.01  # s
+BLOCK = 6e-3  # s
 WARM_UP = 2.0  # s; in which the buffers of a sound server fill, and blocks arrive unevenly
 # Devices of PortAudio that are a sound server, which would remix and resample in silence.
 SERVERS = ("pulse", "default")

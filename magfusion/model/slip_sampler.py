@@ -113,16 +113,16 @@ class SlipSampler:
         """Return the place of the first amplitude that those before do not predict."""
         band = self._band
         lag = max(round(LAG * band.rate_hz / band.decimation), 1)
-        rows = np.arange(max(self._checked, 3 * lag), len(self._kept[0]))
-        self._checked = len(self._kept[0])
-        if not len(rows):
+        first, end = max(self._checked, 3 * lag), len(self._kept[0])
+        self._checked = end
+        if first >= end:
             return None
-        z = [self._kept[2][rows - k * lag] for k in range(4)]
-        off = np.mean(np.abs(z[0] - 3.0 * z[1] + 3.0 * z[2] - z[3]) ** 2, axis=2)
+        z = [self._kept[2][first - k * lag : end - k * lag] for k in range(4)]
+        off = _power(z[0] - 3.0 * z[1] + 3.0 * z[2] - z[3])
         if self._noise is None:
             self._noise = np.median(off, axis=0) / np.log(2.0)
-        limit = JUMP**2 * np.mean(np.abs(z[1]) ** 2, axis=2) + NOISE_FACTOR * self._noise
-        place = self._kept[0][rows]
+        limit = JUMP**2 * _power(z[1]) + NOISE_FACTOR * self._noise
+        place = self._kept[0][first:end]
         wrong = np.flatnonzero(np.any(off > limit, axis=1) & (place >= self._quiet))
         calm = off[: wrong[0]] if len(wrong) else off
         if len(calm):
@@ -200,6 +200,12 @@ class SlipSampler:
         self._kept = place[first:], tones[first:], amplitude[first:]
         self._returned, self._checked = self._returned - first, max(self._checked - first, 0)
         self._raw, self._raw_begin = self._raw[oldest - self._raw_begin :], oldest
+
+
+def _power(amplitude: ComplexArray) -> Array:
+    """Return the mean square of the axes' amplitudes (n, tones, axes), shape (n, tones)."""
+    square = amplitude.real**2 + amplitude.imag**2
+    return np.asarray(np.sum(square, axis=2)) / amplitude.shape[2]
 
 
 def _nothing(band: BandFilter, columns: int) -> tuple[Array, ComplexArray]:
