@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from magfusion.estimation.graph.measurement import Measurement, Rows
+from magfusion.estimation.graph.measurement import Measurement, Rows, times_spread
 from magfusion.estimation.graph.state import States
 from magfusion.model.parameters import Block, Calibration
 from magfusion.units import Array, IntArray
@@ -149,7 +149,7 @@ class Factors:
         parts = self._parts(rows)
         by_other = self.rows(states, calibration, others).by_calibration
         if by_other is not None:
-            parts.append((_constant(CONSIDERED_KEY), _flat(by_other) @ spread))
+            parts.append((_constant(CONSIDERED_KEY), times_spread(_flat(by_other), spread)))
         by_nuisance = self.rows(states, calibration, nuisance).by_calibration if nuisance else None
         if by_nuisance is not None:
             parts.append((_constant(NUISANCE_KEY), _flat(by_nuisance)))

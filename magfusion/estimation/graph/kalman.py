@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
+from scipy.linalg import inv
 
+from magfusion.estimation.graph.measurement import sparse_if_wide
 from magfusion.units import Array
 
 
@@ -93,7 +95,29 @@ class PartialUpdateFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterp
         """
         self.H, self.dim_z = H, len(z)
         self.R = np.eye(len(z)) if R is None else R
-        self.update(z, HJacobian=lambda _: H, Hx=lambda x: H @ x)
+        if self.share is None or np.any(self.share % 1.0):
+            self.update(z, HJacobian=lambda _: H, Hx=lambda x: H @ x)
+        else:
+            self._update_estimated(z)
+
+    def _update_estimated(self, z: Array) -> None:
+        """Update as filterpy where each share is zero or one: only rows of estimated ones."""
+        own, by = np.flatnonzero(self.share), sparse_if_wide(self.H)
+        across = by @ self.P
+        self.S = by @ across.T + self.R
+        self.SI = inv(self.S)
+        gain = across[:, own].T @ self.SI
+        self.K = np.zeros((len(self.x), len(z)))
+        self.K[own] = gain
+        self.z, self.y = z.copy(), z - self.H @ self.x
+        self.x = self.x + self.K @ self.y
+        half = self.P[own] - gain @ across
+        # Joseph's form, as filterpy's.
+        whole = half[:, own] - (half @ self.H.T - gain @ self.R) @ gain.T
+        self.P = self.P.copy()
+        self.P[own], self.P[:, own] = half, half.T
+        self.P[np.ix_(own, own)] = whole
+        self.x_post, self.P_post = self.x.copy(), self.P.copy()
 
     def update_from_far(self, z: Array, H: Array) -> None:
         """Update by whitened rows as `update_linear`, by QR for an ill-conditioned ``S``.

@@ -12,12 +12,13 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
+from scipy.linalg import solve_triangular
 
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.graph.considered import steps_of_others
 from magfusion.estimation.graph.factors import CALIBRATION_KEY, CONSIDERED_KEY, NUISANCE_KEY
 from magfusion.estimation.graph.graph import GraphEstimate
-from magfusion.estimation.graph.measurement import Rows
+from magfusion.estimation.graph.measurement import Rows, sparse_if_wide
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.integrity.fixed_parameter_columns import InertialColumns, inertial_columns
 from magfusion.estimation.integrity.score_chain import (
@@ -95,23 +96,27 @@ class Score:
         spread = self.spread
         if tolerance:
             spread = np.concatenate([spread, tolerance_of(self.fixed)], axis=1)
-        selected = self._applied(spread)
-        residual = self.information - self.information @ selected @ self.information
-        gradient = self.gradient - self.information @ (selected @ self.gradient)
-        return 0.5 * (residual + residual.T), gradient
+        return self._beyond(spread)
 
     def within_tolerance(self) -> Array:
         """Return the information with all tolerances applied, shape (h, h)."""
-        selected = self._applied(tolerance_of(self.fixed))
-        residual = self.information - self.information @ selected @ self.information
-        return np.asarray(0.5 * (residual + residual.T))
+        return self._beyond(tolerance_of(self.fixed))[0]
+
+    def _beyond(self, spread: Array) -> tuple[Array, Array]:
+        """Return information and gradient of errors beyond those of a spread."""
+        thin = sparse_if_wide(spread[:, spread.any(axis=0)])  # most parameters are known
+        across = thin.T @ np.column_stack([self.information, self.gradient])
+        inner = np.eye(len(across)) + thin.T @ across[:, :-1].T
+        half = solve_triangular(np.linalg.cholesky(inner), across, lower=True)
+        by = half[:, :-1].T
+        return self.information - by @ by.T, self.gradient - by @ half[:, -1]
 
     def allowed(self, step: Array) -> Array:
         """Return a step with the changes of all others that their declared sigmas allow."""
         return step + self._applied(self.spread) @ (self.gradient - self.information @ step)
 
     def _applied(self, spread: Array) -> Array:
-        spread = spread[:, spread.any(axis=0)]  # most parameters are known
+        spread = spread[:, spread.any(axis=0)]
         inner = np.eye(spread.shape[1]) + spread.T @ self.information @ spread
         return np.asarray(spread @ np.linalg.solve(inner, spread.T))
 

@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.estimation.graph.measurement import Measurement, measured_rows
+from magfusion.estimation.graph.measurement import Measurement, measured_rows, sparse_if_wide
 from magfusion.estimation.graph.propagation import Propagated
 from magfusion.estimation.graph.state import MOTION, State, between
 from magfusion.estimation.measurements.aiding import AidingMeasurement
@@ -132,28 +132,37 @@ class SubsetBank:
         step, cov, joint, common = self._propagated(predicted)
         count = cov.shape[1]
         own, considered = slice(0, count), slice(count, None)
-        of_common = jacobian[:, considered] @ common
+        by_own, by_common = jacobian[:, own], sparse_if_wide(jacobian[:, considered])
 
         def selected(rows: Array) -> Array:
             return self._selected(rows, owner, spans)
 
-        by_own, by_common = selected(jacobian[:, own]), selected(jacobian[:, considered])
-        back, back_common = (np.swapaxes(part, 1, 2) for part in (by_own, by_common))
-        spread = selected(np.swapaxes(selected(of_common @ jacobian[:, considered].T), 1, 2))
-        shared = cov[:, :, considered] @ back_common
-        crossed = by_own @ cov[:, :, own] + np.swapaxes(shared, 1, 2)
-        gain = self._gains(crossed, crossed @ back + by_own @ shared + spread)
-        rotated = np.swapaxes(gain, 1, 2)
+        def through(part: Array) -> Array:
+            """Return ``by_common`` times the transpose of each filter's part, (k, rows, own)."""
+            result = by_common @ part.reshape(len(part) * count, -1).T
+            return np.swapaxes(result.reshape(len(error), len(part), count), 0, 1)
+
+        shared = through(cov[:, :, considered])
+        crossed = by_own @ cov[:, :, own] + shared
+        spread = crossed @ by_own.T + by_own @ np.swapaxes(shared, 1, 2)
+        spread += by_common @ (by_common @ common).T
+        crossed = selected(crossed)
+        # The gain of excluded rows is zero: what it is multiplied with needs no selection.
+        gain = self._gains(crossed, selected(np.swapaxes(selected(spread), 1, 2)))
+        rotated, by_gain = np.swapaxes(gain, 1, 2), gain @ by_own
         step[:, own] -= (gain[1:] @ (error + step @ jacobian.T)[..., None])[..., 0]
         step[:, own] -= between(predicted.state, after, self._estimated)
         # Joseph's form, as the gain is not optimal with considered parameters.
-        half = cov - gain @ np.concatenate([crossed, by_own @ cov[:, :, considered]], axis=2)
-        half[:, :, considered] -= (gain @ by_common) @ common
-        spread = half[:, :, own] @ back + half[:, :, considered] @ back_common
-        whole = half[:, :, own] + (gain - spread) @ rotated
-        joint -= gain[1:] @ (by_own[1:] @ joint + by_common[1:] @ cov[0, :, considered].T)
-        across = joint @ back[0] + half[1:, :, considered] @ back_common[0]
-        joint += (gain[1:] - across) @ rotated[0]
+        half = cov.copy()
+        half[:, :, own] -= gain @ crossed
+        half[:, :, considered] -= by_gain @ cov[:, :, considered]
+        of_common = (by_common.T @ gain.reshape(len(gain) * count, -1).T).T @ common
+        half[:, :, considered] -= of_common.reshape(len(gain), count, -1)
+        later = np.swapaxes(through(half[:, :, considered]), 1, 2)
+        whole = half[:, :, own] @ (np.eye(count) - np.swapaxes(by_gain, 1, 2))
+        whole += (gain - later) @ rotated
+        joint -= by_gain[1:] @ joint + gain[1:] @ shared[0]
+        joint += (gain[1:] - later[1:]) @ rotated[0] - joint @ by_gain[0].T
         half[:, :, own] = 0.5 * (whole + np.swapaxes(whole, 1, 2))
         # Far from the estimate the fields are not linear: without a sensor whose absence leaves the
         # position open, a filter has only its uncertainty, until other sources determine it.
@@ -167,18 +176,19 @@ class SubsetBank:
         assert self._cov is not None
         assert self._joint is not None
         assert self._common is not None
-        motion, noise = predicted.transition[:MOTION], predicted.noise
+        motion, noise, common = predicted.transition[:MOTION], predicted.noise, self._common
         count = self._cov.shape[1]
         by_own, by_common, shared = motion[:, :count], motion[:, count:], self._cov[:, :, count:]
         step, cov, joint = (part.copy() for part in (self._step, self._cov, self._joint))
         step[:, :MOTION] = step @ motion.T
-        cov[:, :MOTION] = motion @ self._whole()
+        cov[:, :MOTION, :count] = by_own @ cov[:, :, :count] + by_common @ shared.swapaxes(1, 2)
+        cov[:, :MOTION, count:] = by_own @ shared + by_common @ common
         joint[:, :MOTION] = by_own @ joint + by_common @ shared[0].T
         joint[:, :, :MOTION] = np.concatenate([joint, cov[1:, :, count:]], axis=2) @ motion.T
         cov[:, :, :MOTION] = cov @ motion.T
         cov += noise[:count]
         joint += noise[:count, :count]
-        return step, cov, joint, self._common + noise[count:, count:]
+        return step, cov, joint, common + noise[count:, count:]
 
     def _whole(self) -> Array:
         """Return the whole covariance of each filter, shape (1 + groups, n, n)."""

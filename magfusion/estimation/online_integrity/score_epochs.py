@@ -9,7 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.graph.measurement import Measurement, Rows, joined, kind_of
+from magfusion.estimation.graph.measurement import (
+    Measurement,
+    Rows,
+    joined,
+    kind_of,
+    sparse_if_wide,
+)
 from magfusion.estimation.graph.state import MOTION, State, states_of
 from magfusion.estimation.integrity.suspects import Inertial, Stream
 from magfusion.estimation.measurements.earth import EarthField
@@ -17,7 +23,7 @@ from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
 from magfusion.estimation.online_integrity.score_targets import ScoreTargets
-from magfusion.model.parameters import Calibration
+from magfusion.model.parameters import Calibration, dimension
 from magfusion.model.samples import ImuSamples
 from magfusion.units import Array, BoolArray
 
@@ -101,21 +107,20 @@ def add_epochs(sums: Sums, epochs: Sequence[Epoch], targets: ScoreTargets) -> Su
     """Return the sums with the innovations of some consecutive epochs."""
     own, rest = slice(0, targets.size), targets.rest
     error, jacobian, is_used = _rows(epochs, targets)
-    by_state, by_held = (
-        jacobian[..., : targets.whole],
-        jacobian[..., targets.whole :] * targets.unit,
-    )
+    by_state = jacobian[..., : targets.whole]
+    by_held = jacobian[..., targets.columns] * targets.unit
     cov = np.array([epoch.predicted.cov for epoch in epochs])
-    by_own, across, noise = by_state[..., own], by_state @ cov, np.eye(error.shape[1])
+    by_own, sparse = by_state[..., own], [sparse_if_wide(rows) for rows in by_state]
+    across = np.array([rows @ one for rows, one in zip(sparse, cov, strict=True)])
+    spread = np.array([rows @ one.T for rows, one in zip(sparse, across, strict=True)])
     # Rejected rows have no gain, and no part in that of the others.
     both_used = is_used[:, :, None] * is_used[:, None, :]
-    updating = across @ np.swapaxes(by_state, 1, 2) * both_used + noise
+    updating = spread * both_used + np.eye(error.shape[1])
     alone = cov[:, own, own]
     if len(rest):
         considered = cov[:, rest]
         learnt = np.linalg.solve(considered[:, :, rest], considered[:, :, own])
         alone = alone - np.swapaxes(considered[:, :, own], 1, 2) @ learnt
-    known = by_own @ alone @ np.swapaxes(by_own, 1, 2) + noise
     gain = np.swapaxes(np.linalg.solve(updating, across[..., own] * is_used[..., None]), 1, 2)
     pushed, response = _pushed(epochs, targets), sums.response
     shown, fixed = np.empty((*error.shape, response.shape[1])), slice(0, len(targets.unit))
@@ -126,8 +131,10 @@ def add_epochs(sums: Sums, epochs: Sequence[Epoch], targets: ScoreTargets) -> Su
         shown[k] = by_own[k] @ response
         shown[k][:, fixed] -= by_held[k]
         response = response - gain[k] @ shown[k]
-    symmetric = 0.5 * (known + np.swapaxes(known, 1, 2))
-    solved = np.linalg.solve(symmetric, np.concatenate([shown, error[..., None]], axis=2))
+    # The inverse of the innovations' covariance, which is one plus that of few states.
+    columns, back = np.concatenate([shown, error[..., None]], axis=2), np.swapaxes(by_own, 1, 2)
+    inner = np.eye(targets.size) + alone @ back @ by_own
+    solved = columns - by_own @ np.linalg.solve(inner, alone @ (back @ columns))
     reported = np.swapaxes(shown, 1, 2) @ solved
     time = np.maximum.accumulate([sums.time, *(epoch.predicted.time for epoch in epochs)])
     kept = np.exp((time - time[-1]) / MEMORY)
@@ -163,11 +170,11 @@ def _pushed(epochs: Sequence[Epoch], targets: ScoreTargets) -> Array:
 
 
 def _rows(epochs: Sequence[Epoch], targets: ScoreTargets) -> tuple[Array, Array, BoolArray]:
-    """Return errors (epochs, m), Jacobians (epochs, m, whole + h), and which rows are used.
+    """Return errors (epochs, m), Jacobians by `targets.parameters`, and which rows are used.
 
     They are padded with zeros; rows without information on the state are zero.
     """
-    width, parts = targets.whole - MOTION + len(targets.unit), [list[_Row]() for _ in epochs]
+    width, parts = dimension(targets.parameters), [list[_Row]() for _ in epochs]
     shared: dict[object, list[tuple[int, bool, Measurement]]] = {}
     for k, epoch in enumerate(epochs):
         for number, measurement in enumerate((*epoch.measurements, *epoch.rejected)):

@@ -12,7 +12,7 @@ from magfusion.estimation.integrity.released_fault import gains
 from magfusion.estimation.integrity.suspects import Suspect, held_blocks, suspects
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.model.parameters import BeaconParameter, Block, dimension, prior_sigma
+from magfusion.model.parameters import BeaconParameter, Block, dimension, placed, prior_sigma
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.site import Site
 from magfusion.units import Array, IntArray
@@ -42,12 +42,14 @@ class ScoreTargets:
         self.site, self.fixed_blocks = site, held_blocks(site, estimated, steady=steady)
         self.names = tuple(beacon.name for beacon in site.beacons)
         self.unit, self.size = prior_sigma(self.fixed_blocks), MOTION + dimension(estimated)
-        at = MOTION + dimension((*estimated, *considered))
-        self.blocks = tuple(
-            b._replace(columns=slice(at - MOTION + b.columns.start, at - MOTION + b.columns.stop))
-            for b in self.fixed_blocks
-        )
-        self.parameters, self.whole = (*estimated, *considered, *self.blocks), at
+        in_state = (*estimated, *considered)
+        self.whole, known = MOTION + dimension(in_state), {b.key for b in in_state}
+        others = placed((b for b in self.fixed_blocks if b.key not in known), dimension(in_state))
+        self.parameters = (*in_state, *others)
+        # Columns of the fixed parameters: those that are considered have them in the state.
+        start = {b.key: MOTION + b.columns.start for b in self.parameters}
+        own = [start[b.key] + np.arange(len(b.sigma)) for b in self.fixed_blocks]
+        self.columns = np.concatenate([np.zeros(0, dtype=np.int64), *own])
         among = [b for b in considered if _is_of(b, self.names)]
         self.spread = self._declared(tuple(among))
         # Columns of a state's tangent with the considered parameters of these beacons.

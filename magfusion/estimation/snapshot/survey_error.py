@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from magfusion.estimation.graph.measurement import times_spread
 from magfusion.estimation.snapshot.problem import nuisance_blocks
 from magfusion.model.noise import measurement_cov, sensor_positions, whitening
 from magfusion.model.parameters import (
@@ -58,7 +59,7 @@ def survey_jacobians(
         calibration, placed((*nuisances, *survey)), time, world_from_body, position_world
     )
     by_found = np.concatenate([by_pose, by_calibration[..., :result]], axis=-1)
-    by_survey = by_calibration[..., result:] @ prior_sqrt_covariance(site, survey)
+    by_survey = times_spread(by_calibration[..., result:], prior_sqrt_covariance(site, survey))
     return whitened(sqrt_information, by_found), whitened(sqrt_information, by_survey)
 
 

@@ -207,16 +207,15 @@ def _linearize_detected(
     for rows, beacons in stretches(site, detected):
         if not len(beacons):
             continue
+        twist = None if twist_body is None else twist_body[rows]
+        place = time[rows], world_from_body[rows], position_world[rows], twist
+        if len(beacons) == len(site.beacons):
+            result = linearize_channels(calibration, blocks, *place)
+            value[rows], by_pose[rows], by_calibration[rows] = result
+            continue
         some = of_beacons(calibration, beacons)
         own, columns = _own_blocks(blocks, some.site)
-        result = linearize_channels(
-            some,
-            own,
-            time[rows],
-            world_from_body[rows],
-            position_world[rows],
-            None if twist_body is None else twist_body[rows],
-        )
+        result = linearize_channels(some, own, *place)
         into = channels_of(site, beacons)
         value[rows, into], by_pose[rows, into] = result[:2]
         spread = np.zeros((*result[2].shape[:-1], by_calibration.shape[-1]))
