@@ -12,6 +12,7 @@ from scipy.stats import multivariate_normal, norm
 from test_ekf import SEED, a_site, a_state, an_epoch, an_imu, one_interval
 
 from magfusion.errors import EstimationError
+from magfusion.estimation.graph import measurement
 from magfusion.estimation.graph.inertial import inertial_factor
 from magfusion.estimation.graph.kalman import PartialUpdateFilter, considered_share
 from magfusion.estimation.graph.measurement import measured_rows
@@ -208,6 +209,23 @@ def test_considered_parameters_of_a_state_are_those_whose_gain_is_zero() -> None
     assert separate(kalman.state.cov, expected, expected) < 1e-7
 
 
+def test_rows_of_the_estimated_alone_update_as_filterpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    cov, z, H = a_problem(3)
+    root = np.random.default_rng(3).normal(size=(ROWS, ROWS))
+    R, share = root @ root.T + np.eye(ROWS), considered_share(SIZE, 4)
+    whole = a_filter(cov, share)
+    whole.H, whole.dim_z = H, ROWS
+    whole.update(z, lambda _: H, lambda x: H @ x, R)
+    for sparse_from in (1, measurement.SPARSE_COLUMNS):
+        monkeypatch.setattr(measurement, "SPARSE_COLUMNS", sparse_from)
+        rows = a_filter(cov, share)
+        rows.update_linear(z, H, R)
+        for name in ("x", "P", "K", "S", "SI", "y", "z", "H", "x_post", "P_post", "dim_z"):
+            np.testing.assert_allclose(
+                getattr(rows, name), getattr(whole, name), rtol=0, atol=1e-11, err_msg=name
+            )
+
+
 @pytest.mark.parametrize("share", [None, considered_share(SIZE, 2)])
 def test_the_update_from_far_is_the_plain_one_where_both_apply(share: Array | None) -> None:
     cov, z, H = a_problem(2)
@@ -332,15 +350,28 @@ def test_the_filter_is_the_graph_with_process_noise_on_the_calibration() -> None
 # --- the bank ---
 
 
+def crossed(bank: SubsetBank, group: int) -> Array:
+    """Return the cross-covariance of a filter of the bank with the one of all beacons, (n, n)."""
+    assert bank._cov is not None
+    assert bank._joint is not None
+    result, count = bank._whole()[0], bank._cov.shape[1]
+    result[:count] = np.hstack([bank._joint[group], bank._cov[1 + group, :, count:]])
+    return result
+
+
+@pytest.mark.parametrize("sparse_from", [1, measurement.SPARSE_COLUMNS])
 @pytest.mark.parametrize("drifted", [0.0, 1e4])  # m
 @pytest.mark.parametrize("considered", [0, 2])
-def test_filters_of_the_bank_are_this_one_without_a_beacon(considered: int, drifted: float) -> None:
+def test_filters_of_the_bank_are_this_one_without_a_beacon(
+    monkeypatch: pytest.MonkeyPatch, considered: int, drifted: float, sparse_from: int
+) -> None:
+    monkeypatch.setattr(measurement, "SPARSE_COLUMNS", sparse_from)
     site = a_site()
     start, blocks, predicted, epoch = one_interval(GROUPS)
     bank = SubsetBank(site, blocks, considered)
     bank._begin(start)
     bank._cov[2, POSITION, POSITION] += drifted**2 * np.eye(3)
-    before = bank._whole()
+    before, across = bank._whole(), [crossed(bank, group) for group in range(bank.groups)]
     kalman = ErrorStateFilter(start, blocks, considered)
     kalman.absorb(predicted, epoch)
     bank.absorb(predicted, epoch, kalman.state)
@@ -355,3 +386,8 @@ def test_filters_of_the_bank_are_this_one_without_a_beacon(considered: int, drif
         assert separate(bank._whole()[1 + group], alone.P, alone.P) < close
         if group >= 0:
             assert separate(bank._step[group] + went, alone.x, alone.P) < close
+            one, every = alone.K @ np.eye(len(H))[owner != group], kalman.K
+            cross = alone.F @ across[group] @ alone.F.T + alone.Q
+            unit = np.eye(len(cross))
+            cross = (unit - one @ H) @ cross @ (unit - every @ H).T + one @ every.T
+            assert separate(crossed(bank, group), cross, alone.P) < close

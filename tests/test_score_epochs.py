@@ -7,6 +7,7 @@ import pytest
 from test_online_separation import NAVIGATOR, _feed
 from test_smoothed_separation import EPOCHS, _walk
 
+from magfusion.estimation.graph import measurement
 from magfusion.estimation.graph.state import between
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.estimation.online.navigator import Navigator
@@ -60,6 +61,14 @@ def test_epochs_together_tell_what_they_tell_one_by_one() -> None:
     _assert_alike(together, one_by_one)
     learnt = np.abs(together.information - sums.information)
     assert np.max(learnt) > 0.01 * np.max(np.abs(sums.information))
+
+
+def test_sparse_rows_of_many_parameters_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    navigator, sums, waiting = _waiting()
+    requested = navigator._update.score.targets
+    dense = add_epochs(sums, waiting, requested)
+    monkeypatch.setattr(measurement, "SPARSE_COLUMNS", 1)
+    _assert_alike(add_epochs(sums, waiting, requested), dense)
 
 
 def test_an_epoch_that_measured_nothing_only_carries_the_response_on() -> None:

@@ -1,7 +1,9 @@
 """What every suspect would explain, asked of all at once."""
 
 import numpy as np
+import pytest
 
+from magfusion.estimation.graph import measurement
 from magfusion.estimation.integrity.released_fault import gains, release_fault
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.online_integrity.score_targets import ScoreTargets
@@ -35,3 +37,26 @@ def test_all_at_once_gain_what_each_alone_does() -> None:
     np.testing.assert_allclose(score.gains(information, gradient), expected, atol=1e-6)
     nobody = gains(combine, 1e-6 * np.eye(size), gradient)
     np.testing.assert_array_equal(nobody, 0.0)
+
+
+@pytest.mark.parametrize("sparse_from", [1, measurement.SPARSE_COLUMNS])
+def test_beyond_declared_errors_is_what_a_marginal_knows(
+    monkeypatch: pytest.MonkeyPatch, sparse_from: int
+) -> None:
+    """Of an error and a declared one that acts as it does, by inverting the information on both."""
+    monkeypatch.setattr(measurement, "SPARSE_COLUMNS", sparse_from)
+    rng, targets = np.random.default_rng(5), ScoreTargets(demo_site(), (), (), steady=False)
+    size = len(targets.unit)
+    root = rng.standard_normal((size, 2 * size))
+    information, gradient = root @ root.T, rng.standard_normal(size)
+    spread = np.diag(rng.uniform(0.05, 0.2, size))[:, ::2]
+    nothing = np.zeros((1, 6, size)), np.zeros((0, size))
+    score = Score(targets.fixed_blocks, information, gradient, spread, *nothing)
+    both = np.hstack([np.eye(size), spread])
+    prior = np.diag((np.arange(both.shape[1]) >= size).astype(np.float64))
+    cov = np.linalg.inv(both.T @ information @ both + prior)
+    expected = np.linalg.inv(cov[:size, :size])
+    result, slope = score.with_declared(tolerance=False)
+    np.testing.assert_allclose(result, expected, atol=1e-9 * np.max(expected))
+    step = (cov @ both.T @ gradient)[:size]
+    np.testing.assert_allclose(slope, expected @ step, atol=1e-9 * np.max(np.abs(gradient)))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from magfusion.estimation.graph.factors import CONSIDERED_KEY
+from magfusion.estimation.graph.factors import CONSIDERED_KEY, NUISANCE_KEY
 from magfusion.estimation.graph.graph import Graph, GraphEstimate
 from magfusion.estimation.graph.prior_factor import prior_factor
 from magfusion.estimation.solve.bordered import eliminate_partial
@@ -57,13 +57,20 @@ def _conditional(
 
 
 def steps_of_others(
-    conditional: gtsam.GaussianBayesNet, count: int
+    conditional: gtsam.GaussianBayesNet, count: int, nuisance: int = 0
 ) -> Iterator[gtsam.VectorValues]:
     """Yield the step of every variable that a unit of each fixed parameter causes.
 
     One at a time: in a long log all of them take as much memory as the log.
+
+    Parameters
+    ----------
+    count, nuisance : int
+        Number of fixed parameters, and of nuisances of the system, which are zero.
     """
     for one in np.eye(count):
         given = gtsam.VectorValues()
         given.insert(CONSIDERED_KEY, one)
+        if nuisance:
+            given.insert(NUISANCE_KEY, np.zeros(nuisance))
         yield conditional.optimize(given)

@@ -220,31 +220,25 @@ def _by_elimination(
     """Return the same for any graph."""
     graph, estimate, size = result.graph, result.estimate, dimension(fixed)
     unit = np.diag(prior_sigma(fixed))
-    # One system after the other: for a long log each of them uses most of the memory.
-    residual = None
-    if result.field_errors:
-        # A field error that is constant in place resembles some of them; their effect on the
-        # estimate, which ignores such errors, is unchanged.
-        ordering = graph.ordering
-        ordering.push_back(NUISANCE_KEY)
-        errors = result.field_errors
-        _, residual = eliminate_partial(
-            graph.with_fixed_columns(
-                estimate, fixed, unit, by_others, explaining=True, nuisance=errors
-            ),
-            ordering,
-        )
-    conditional, rest = eliminate_partial(
-        graph.with_fixed_columns(estimate, fixed, unit, by_others, explaining=True), graph.ordering
+    errors = result.field_errors
+    linear = graph.with_fixed_columns(
+        estimate, fixed, unit, by_others, explaining=True, nuisance=errors
     )
-    rest = rest if residual is None else residual
+    conditional, rest = eliminate_partial(linear, graph.ordering)
+    if errors:
+        # A field error that is constant in place resembles some of them; their effect on the
+        # estimate, which ignores such errors, is that of none.
+        nuisance = gtsam.Ordering()
+        nuisance.push_back(NUISANCE_KEY)
+        _, rest = eliminate_partial(rest, nuisance)
     order = gtsam.Ordering()
     order.push_back(CONSIDERED_KEY)
     information, gradient = rest.hessian(order)
     keys = [key for i in range(graph.epochs) for key in (X(i), V(i), B(i))]
     by_state = np.empty((graph.epochs, MOTION, size))
     by_calibration = np.zeros((dimension(result.blocks), size))
-    for k, step in enumerate(steps_of_others(_without_error(conditional), size)):
+    steps = steps_of_others(_without_error(conditional), size, dimension(errors))
+    for k, step in enumerate(steps):
         by_state[:, :, k] = step.vector(keys).reshape(-1, MOTION)
         if result.blocks:
             by_calibration[:, k] = step.at(CALIBRATION_KEY)
