@@ -203,7 +203,8 @@ def of_survey(
     """Return the error of the site at the end of the year, with the first vehicle.
 
     In declared sigmas, root mean square over the beacons' parameters: the survey's, the estimate's,
-    that but for the common place, which no log determines; and the last in its own sigmas.
+    that but for the common place, which no log determines, as it is and as its covariance expects;
+    and the estimate's in its own sigmas.
     """
     shared = calendar.platforms[0].shared
     now = known.of(*calendar.columns(calendar.on(0, np.inf)))
@@ -212,12 +213,15 @@ def of_survey(
     rows = np.concatenate(
         [np.full(len(b.sigma), isinstance(b.parameter, BeaconParameter)) for b in shared.blocks]
     )
-    error = (now.step - truth) / prior_sigma(shared.blocks)
-    relative = error - gauge @ (gauge.T @ error)
+    unit = prior_sigma(shared.blocks)
+    relative = np.eye(len(unit)) - gauge @ gauge.T
+    error, cov = (now.step - truth) / unit, now.honest / unit / unit[:, None]
+    expected = np.diagonal(relative @ cov @ relative)
     return {
-        "survey_sigma": rms(truth_of(shared, vehicles[0])[rows] / prior_sigma(shared.blocks)[rows]),
+        "survey_sigma": rms(truth_of(shared, vehicles[0])[rows] / unit[rows]),
         "error_with_common_place_sigma": rms(error[rows]),
-        "error_sigma": rms(relative[rows]),
+        "error_sigma": rms((relative @ error)[rows]),
+        "expected_error_sigma": rms(np.sqrt(expected[rows])),
         "error_in_own_sigma": apart_in_sigmas(now.step, truth, now.honest),
     }
 

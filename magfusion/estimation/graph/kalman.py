@@ -9,7 +9,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.linalg import inv
 
 from magfusion.estimation.graph.measurement import sparse_if_wide
-from magfusion.units import Array
+from magfusion.units import Array, IntArray
 
 
 def partial_update(
@@ -98,11 +98,11 @@ class PartialUpdateFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterp
         if self.share is None or np.any(self.share % 1.0):
             self.update(z, HJacobian=lambda _: H, Hx=lambda x: H @ x)
         else:
-            self._update_estimated(z)
+            self._update_estimated(z, np.flatnonzero(self.share))
 
-    def _update_estimated(self, z: Array) -> None:
+    def _update_estimated(self, z: Array, own: IntArray) -> None:
         """Update as filterpy where each share is zero or one: only rows of estimated ones."""
-        own, by = np.flatnonzero(self.share), sparse_if_wide(self.H)
+        by = sparse_if_wide(self.H)
         across = by @ self.P
         self.S = by @ across.T + self.R
         self.SI = inv(self.S)

@@ -116,13 +116,13 @@ class ResidualProjection:
             residual = left_by_chain(graph, estimate, considered, fields, inertial)
         if residual is None:
             residual = left_by_tree(graph, estimate, considered, fields, inertial)
-        first = slice(1 + len(drawn) // draws)
-        every = [field / self._weight for field in residual[0][first]]
+        own_draw = slice(1 + len(drawn) // draws)
+        every = [field / self._weight for field in residual[0][own_draw]]
         # Squares of whitened remainders of all drawn errors, mean over intervals and draws,
         # (errors, 15).
         squares = np.mean(residual[1][1:] ** 2, axis=1)
         self.inertial_squares = np.mean(squares.reshape(draws, -1, ROWS), axis=0)
-        of_imu = [(self._unwhitening @ own[..., None])[..., 0] for own in residual[1][first]]
+        of_imu = [(self._unwhitening @ own[..., None])[..., 0] for own in residual[1][own_draw]]
         self._inertial = of_imu
         self._separate = self._without_pose(every)
 
