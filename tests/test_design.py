@@ -23,6 +23,7 @@ from magfusion.results.design.exchange import (
     LayoutSearch,
     Objective,
     best_layout,
+    search_value,
     value_of,
 )
 from magfusion.results.design.layout_information import LayoutInformation
@@ -118,6 +119,18 @@ def test_the_exchange_finds_the_best_of_all_pairs(objective: Objective) -> None:
     assert result is not None
     assert result.value == pytest.approx(min(every), rel=1e-3)
     assert result.value < np.median(every)
+
+
+def test_what_is_minimised_for_the_worst_sigma_is_a_smooth_bound_of_it() -> None:
+    """Hölder: at most the worst, at least that over the eighth root of the number of points."""
+    each = np.random.default_rng(3).lognormal(-5.0, 1.0, (40, 60))
+    value, worst = search_value(each, "sigma"), np.max(each, axis=1)
+    assert np.all(value < worst)
+    assert np.all(value > worst / 60.0 ** (1.0 / 8.0))
+    # Some of the points, as they are compared first, bound it from below.
+    parts = np.stack([search_value(each[:, :k], "sigma", 60) for k in (3, 8, 60)])
+    assert np.all(np.diff(parts, axis=0) > 0.0)
+    np.testing.assert_allclose(parts[-1], value, rtol=1e-12)
 
 
 def test_a_search_without_time_still_gives_a_layout() -> None:

@@ -1,7 +1,7 @@
 """Make the pictures of README and documentation by the commands that they illustrate.
 
 ``python tools/docs_pictures.py [NAME ...]``; those of the viewer require xvfb-run, those of a
-page chromium.
+page chromium; ``stability`` takes an hour.
 """
 
 import argparse
@@ -64,6 +64,11 @@ PICTURES = {
     "drift": Picture(
         "docs/screenshots/drift.png",
         ("magfusion drift --hours 2 --estimator both -o drift",),
+        "drift/stability.png",
+    ),
+    "stability": Picture(
+        ".github/stability.png",
+        ("magfusion drift --hours 48 --worlds 8 --estimator both --seed 11 -o drift",),
         "drift/stability.png",
     ),
     "tracker": Picture(

@@ -32,6 +32,14 @@ _NEXT_OF = {
     ("drift", Verdict.DOUBTFUL): "run longer (--hours) or more worlds (--worlds 8)",
     ("drift", Verdict.FAILED): "open {output}/drift.png; the first failed line is the cause",
     (
+        "coverage",
+        Verdict.TRUSTWORTHY,
+    ): "open {output}/coverage.png; to choose places of beacons, magfusion design SITE",
+    (
+        "coverage",
+        Verdict.FAILED,
+    ): "magfusion design SITE with the same --need; open {output}/coverage.png",
+    (
         "design",
         Verdict.TRUSTWORTHY,
     ): "magfusion sheet {output}/site.yaml, or open {output}/design.png",
@@ -72,7 +80,7 @@ def lines(figures: Figures) -> Rows:
 
 def next_step(figures: Figures, output: Path | None) -> str:
     """Return what to do next; empty where nothing is written, or nothing is judged."""
-    if "verdict" not in figures and not is_design(figures):
+    if not ("verdict" in figures or is_design(figures) or figures.get("job") == "coverage"):
         return ""
     look = look_of(str(figures.get("verdict", Verdict.TRUSTWORTHY)))
     text = _NEXT_OF.get((str(figures.get("job")), look), _NEXT[look])

@@ -58,15 +58,23 @@ def show(
     brief = level == "brief" and is_brief(figures)
     _show_verdict(figures, console, brief=brief)
     if brief:
-        _show_brief(figures, output, console)
+        _show_brief(figures, console)
     else:
         _show_all(figures, console)
+    if brief or figures.get("job") == "coverage":
+        _show_next(figures, output, console)
     if output is not None:
         console.print(f"results in {output}", soft_wrap=True, markup=False)
 
 
-def _show_brief(figures: Figures, output: Path | None, console: Console) -> None:
-    """Print what a decision requires, and the next step."""
+def _show_next(figures: Figures, output: Path | None, console: Console) -> None:
+    step = next_step(figures, output)
+    if step:
+        console.print(f"next: {step}", soft_wrap=True, markup=False)
+
+
+def _show_brief(figures: Figures, console: Console) -> None:
+    """Print what a decision requires."""
     columns = _with_head(table(figures))
     if columns.row_count:
         for column in columns.columns[1:]:
@@ -79,9 +87,6 @@ def _show_brief(figures: Figures, output: Path | None, console: Console) -> None
         console.print(f" {label:<{width}}  {text}", soft_wrap=True, markup=False)
     for sentence in [] if figures.get("job") == "drift" else notes(figures):
         console.print(f"note: {sentence}", style="yellow", soft_wrap=True, markup=False)
-    step = next_step(figures, output)
-    if step:
-        console.print(f"next: {step}", soft_wrap=True, markup=False)
 
 
 def _show_all(figures: Figures, console: Console) -> None:

@@ -4,9 +4,16 @@ V. V. Fedorov, Theory of Optimal Experiments (1972); H. P. Wynn, J. R. Statist. 
 each beacon in turn is exchanged for the candidate that lowers the objective most, until no
 exchange does.  That is a local optimum, so the search has several starts.
 
-For the worst protection level a candidate is rejected as soon as one point is worse than the best
-value so far: candidates are compared at the worst points first.  The initial points are few; where
-a layout is worse elsewhere, the points there are added, until there are none.
+For the worst position sigma the exchange minimises a power mean of the sigmas, a smooth bound: at
+most the worst, and at least that over the root of the number of points.  The worst alone is
+determined by one or two points: few exchanges lower it, and layouts that it cannot distinguish
+differ everywhere else.  Of the layouts of all starts that with the smallest product of worst and
+median is kept, a compound of equal weights (A. C. Atkinson, A. N. Donev, R. D. Tobias, Optimum
+Experimental Designs (2007), ch. 21).
+
+A candidate is rejected as soon as the points so far exceed the best value: candidates are compared
+at the worst points first.  For what is worst the initial points are few; where a layout is worse
+elsewhere, the points there are added, until there are none.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,6 +36,7 @@ MORE_POINTS = 6  # added in a round, apart from each other
 MOST_COMPARED = 64  # points, for the memory that all candidates take there
 ROUNDS = 8
 SWEEPS = 20
+POWER = 8  # of the mean of sigmas that stands for the worst one
 DRAWN = 30  # random layouts, of which the best is a start
 STAGES = (3, 8)  # points at which candidates are compared, before all
 AT_ONCE = 3000  # informations in memory at once
@@ -73,7 +81,7 @@ class ExchangeResult:
     chosen : tuple of int
         Indices of the candidates.
     value : float
-        Of the objective, at all points.
+        Of `layout_value`, at all points.
     complete : bool
         Whether the search ended before its time limit.
     """
@@ -135,20 +143,21 @@ class LayoutSearch:
         return np.stack([information.root(beacon) for beacon in beacons])
 
     def value(self, chosen: Sequence[int]) -> float:
-        """Return the objective of a layout at the compared points."""
-        return of_points(self._each(chosen), self.objective)
+        """Return the search value of a layout at the compared points."""
+        return float(search_value(self._each(chosen), self.objective))
 
     def _each(self, chosen: Sequence[int]) -> Array:
         new = added(self.roots[list(chosen)])
         return at_each_point(self.information, new, self.standing, self.objective)
 
     def value_everywhere(self, chosen: Sequence[int]) -> tuple[float, Array]:
-        """Return the objective of a layout at all points, and its value per point."""
+        """Return the `layout_value` of a layout, and the objective per point, of all points."""
         beacons = [self.candidates.beacons[c] for c in chosen]
-        return value_of(self.information, beacons, self.objective)
+        each = value_of(self.information, beacons, self.objective)[1]
+        return layout_value(each, self.objective), each
 
     def best_in_place_of(self, chosen: Sequence[int], slot: int, value: float) -> tuple[int, float]:
-        """Return the best candidate in place of a beacon, and the objective with it."""
+        """Return the best candidate in place of a beacon, and the search value with it."""
         others = [c for k, c in enumerate(chosen) if k != slot]
         rows = np.flatnonzero(self.candidates.far_from(others))
         new = added(self.roots[others])
@@ -161,24 +170,21 @@ class LayoutSearch:
         alone = pose_covariance(rest)  # without the one that is exchanged
         if self.objective != "worst":
             base = base[:, :1]
-        if not _is_worst(self.objective):
-            result = self._compared(rows, base, alone, np.arange(len(self.active)))
-            means = np.mean(result, axis=1)
-            best = int(np.argmin(means))
-            return int(rows[best]), float(means[best])
         now = self._each(chosen)
-        order = np.argsort(-now, kind="stable")
-        worst = np.zeros(len(rows))
-        starts = [0, *(s for s in STAGES if s < len(order)), len(order)]
+        count, order = len(now), np.argsort(-now, kind="stable")
+        stages = STAGES if self.objective != "D" else ()  # its sum has no lower bound
+        starts = [0, *(s for s in stages if s < count), count]
+        each = np.zeros((len(rows), 0))
         for start, end in pairwise(starts):
             result = self._compared(rows, base, alone, order[start:end])
-            worst = np.maximum(worst, np.max(result, axis=1))
-            kept = worst < value * (1.0 - LESS)
-            rows, worst = rows[kept], worst[kept]
+            each = np.concatenate([each, result], axis=1)
+            bound = search_value(each, self.objective, count)
+            kept = bound < _less(value)
+            rows, each, bound = rows[kept], each[kept], bound[kept]
             if not len(rows):
                 return chosen[slot], value
-        best = int(np.argmin(worst))
-        return int(rows[best]), float(worst[best])
+        best = int(np.argmin(bound))
+        return int(rows[best]), float(bound[best])
 
     def _compared(self, rows: IntArray, base: Array, alone: Array, points: IntArray) -> Array:
         """Return the objective per point with each candidate, (rows, points)."""
@@ -242,8 +248,35 @@ def of_points(each: Array, objective: Objective) -> float:
     return float(np.max(each) if _is_worst(objective) else np.mean(each))
 
 
+def search_value(each: Array, objective: Objective, count: int | None = None) -> Array:
+    """Return what an exchange minimises, from the objective per point, shape (..., n).
+
+    Parameters
+    ----------
+    count : int, optional
+        Number of points, of which the first n are given: a lower bound, but for D.
+    """
+    number = each.shape[-1] if count is None else count
+    if objective == "worst":
+        return np.asarray(np.max(each, axis=-1))
+    if objective != "sigma":
+        return np.asarray(np.sum(each, axis=-1) / number)
+    return np.asarray((np.sum(each**POWER, axis=-1) / number) ** (1.0 / POWER))
+
+
+def layout_value(each: Array, objective: Objective) -> float:
+    """Return by what layouts of several starts are compared, from the objective per point (n,)."""
+    value = of_points(each, objective)
+    return value * float(np.median(each)) if objective == "sigma" else value
+
+
+def _less(value: float) -> float:
+    """Return what an exchange must go below."""
+    return value - LESS * abs(value) if np.isfinite(value) else value
+
+
 def _is_worst(objective: Objective) -> bool:
-    """Return whether the objective is the worst of all points, not their mean."""
+    """Return whether the worst points count most, not the mean of all."""
     return objective in ("worst", "sigma")
 
 
@@ -266,7 +299,7 @@ def exchanged(search: LayoutSearch, chosen: tuple[int, ...]) -> tuple[int, ...]:
             break
         slot = turn % len(layout)
         selected, reached = search.best_in_place_of(layout, slot, value)
-        better = reached < value - LESS * abs(value) and selected != layout[slot]
+        better = reached < _less(value) and selected != layout[slot]
         if better:
             layout[slot], value = selected, reached
         unchanged = 0 if better else unchanged + 1
@@ -326,7 +359,8 @@ def _exchange_until_converged(search: LayoutSearch, layout: tuple[int, ...]) -> 
         value, each = search.value_everywhere(layout)
         if best is None or value < best.value:
             best = ExchangeResult(layout, value, complete=True)
-        enough = not _is_worst(search.objective) or value <= search.value(layout) * (1.0 + LESS)
+        reached = float(search_value(each, search.objective))
+        enough = not _is_worst(search.objective) or reached <= search.value(layout) * (1.0 + LESS)
         full = len(search.active) + MORE_POINTS > MOST_COMPARED
         if enough or full or not search.in_time():
             break

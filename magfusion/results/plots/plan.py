@@ -16,7 +16,8 @@ from magfusion.units import Array
 
 REACH = 0.035  # of the hall's longer side; half the length of an axis
 LONG = 0.5  # width over length, below which slices are below each other
-MARGIN = 0.1  # of it, around the hall
+MARGIN = 0.14  # of it, around the hall
+STAR = 8.0  # points; radius of the marker of one more beacon
 BOX = {"boxstyle": "round,pad=0.15", "facecolor": "white", "alpha": 0.8, "linewidth": 0}
 
 
@@ -158,14 +159,26 @@ def draw_beacons(
         )
     middle = 0.5 * (np.min(places, axis=0) + np.max(places, axis=0))
     texts = [f"{b.name} ({b.position_world[2]:.3g} m)" for b in beacons]
-    draw_labels(axes, places, texts, middle)
+    star = places[:0] if marked is None else marked.position_world[None, :2]
+    draw_labels(axes, places, texts, middle, star)
 
 
-def draw_labels(axes: Axes, places: Array, texts: Sequence[str], middle: Array) -> None:
-    """Write a text at each place, towards the outside, moved until none is on another."""
+def draw_labels(
+    axes: Axes, places: Array, texts: Sequence[str], middle: Array, stars: Array
+) -> None:
+    """Write a text at each place, towards the outside, moved until none is on another.
+
+    Parameters
+    ----------
+    stars : ndarray, shape (k, 2)
+        Places of large markers, on which no text is written (m).
+    """
     figure = axes.figure
     figure.canvas.draw()  # lays out the axes, so that the sizes of texts are known
-    used: list[Array] = []
+    radius = STAR * figure.dpi / 72.0
+    used: list[Array] = [
+        np.stack([at - radius, at + radius]) for at in axes.transData.transform(stars)
+    ]
     for place, text in zip(places, texts, strict=True):
         up = place[1] >= middle[1]
         best = None
