@@ -81,7 +81,7 @@ def server(tmp_path: Path) -> Iterator[dict[str, str]]:
 def heard(site: Path, recording: Path, own: dict[str, str], output: Path) -> list[dict]:
     """Play a recording, and return the records of what is listened to."""
     words = ["--device", "pulse", "--rate", RATE_HZ, "--channels", "x,y,z,-", "--site", site]
-    words += ["--full-scale", FULL_SCALE, "--duration", DURATION + QUIET + 9.0]
+    words += ["--full-scale", FULL_SCALE, "--duration", DURATION + QUIET + 15.0]
     command = [sys.executable, "-m", "magfusion", "listen", *map(str, words)]
     with output.open("wb") as sink, subprocess.Popen(command, env=own, stdout=sink) as listener:
         while listener.poll() is None and not output.stat().st_size:
