@@ -5,7 +5,6 @@ content from a user's file (a beacon's name, a path) is escaped.
 """
 
 import base64
-import re
 from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
@@ -37,7 +36,6 @@ from magfusion.results.verdict import look_of
 PAGE = "report.html"
 LARGEST = 4_500_000  # bytes, of which a mail takes one
 FAR = 3.0  # sigmas; a change beyond is marked
-_BREAK = re.compile(r"[._](?=[A-Za-z])")  # where a key may be broken in a narrow window
 _MEANING = {
     "trustworthy": "The data are consistent; the reported accuracy is valid.",
     "doubtful": "Use with care, for these reasons; the reported accuracy of a pose is enlarged to"
@@ -309,8 +307,6 @@ def _table(rows: Sequence[Sequence[str]], marked: Iterable[int] = ()) -> str:
     parts = ["<tr>", *(f"<th>{escape(cell)}</th>" for cell in head), "</tr>"] if head else []
     for k, row in enumerate(body):
         parts.append('<tr class="far">' if k in marked else "<tr>")
-        cells = list(map(escape, row))
-        cells[:1] = [_BREAK.sub(r"\g<0><wbr>", cell) for cell in cells[:1]]
-        parts += [f"<td>{cell}</td>" for cell in cells]
+        parts += [f"<td>{escape(cell)}</td>" for cell in row]
         parts.append("</tr>")
     return f'<div class="wide"><table>{"".join(parts)}</table></div>'
