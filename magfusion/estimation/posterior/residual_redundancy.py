@@ -67,8 +67,8 @@ class ResidualProjection:
     considered : tuple of Block
         Uncertain parameters that are not estimated elsewhere.  Here they are: the effect of their
         errors is no noise.
-    draws : int
-        Of errors; noise, models and remainders are those of the first.
+    seed : int
+        Of the drawn errors.
     """
 
     ordinary: BoolArray  # inertial intervals without a gap
@@ -81,9 +81,10 @@ class ResidualProjection:
         poses: Trajectory,
         windows: float,
         considered: tuple[Block, ...] = (),
-        draws: int = 1,
+        seed: int = 0,
     ) -> None:
-        self._samples = samples
+        # Reproducible for the same log.
+        self._samples, self._rng = samples, np.random.default_rng(seed)
         self._measured = next(m for m in graph.measurements if isinstance(m, FieldPhasors))
         site = estimate.calibration.site
         first = graph.native.size() - graph.epochs + 1
@@ -107,30 +108,23 @@ class ResidualProjection:
         )
         assert rows.by_pose is not None
         self._by_pose = rows.by_pose.reshape(len(error), -1, 6)
-        place, drawn = sensor_positions(site, poses), list[tuple[Array, Array]]()
-        for seed in range(draws):  # reproducible for the same log
-            drawn += self._drawn(site, place, windows, np.random.default_rng(seed))
+        drawn = self._drawn(site, sensor_positions(site, poses), windows)
         fields, inertial = [self._weight * own for own, _ in drawn], [own for _, own in drawn]
         residual = None
         if is_chain(graph, considered):
             residual = left_by_chain(graph, estimate, considered, fields, inertial)
         if residual is None:
             residual = left_by_tree(graph, estimate, considered, fields, inertial)
-        own_draw = slice(1 + len(drawn) // draws)
-        every = [field / self._weight for field in residual[0][own_draw]]
-        # Squares of whitened remainders of all drawn errors, mean over intervals and draws,
-        # (errors, 15).
-        squares = np.mean(residual[1][1:] ** 2, axis=1)
-        self.inertial_squares = np.mean(squares.reshape(draws, -1, ROWS), axis=0)
-        of_imu = [(self._unwhitening @ own[..., None])[..., 0] for own in residual[1][own_draw]]
+        every = [field / self._weight for field in residual[0]]
+        # Squares of whitened remainders of all drawn errors, mean over the intervals, (errors, 15).
+        self.inertial_squares = np.mean(residual[1][1:] ** 2, axis=1)
+        of_imu = [(self._unwhitening @ own[..., None])[..., 0] for own in residual[1]]
         self._inertial = of_imu
         self._separate = self._without_pose(every)
 
-    def _drawn(
-        self, site: Site, sensor_world: Array, windows: float, rng: np.random.Generator
-    ) -> list[tuple[Array, Array]]:
+    def _drawn(self, site: Site, sensor_world: Array, windows: float) -> list[tuple[Array, Array]]:
         """Return drawn errors of fields and inertial factors: noise, model errors, the IMU's."""
-        samples, root = self._samples, self._measured.sqrt_information[..., :3, :3]
+        rng, samples, root = self._rng, self._samples, self._measured.sqrt_information[..., :3, :3]
         unit = model_error_cov(np.nan_to_num(samples.phasor_sensor), 1.0)
         self._variance = [_spread(root, c) for c in (samples.phasor_cov, unit)]
         noise, model = np.array(self._size)[:, self._owner]
