@@ -121,7 +121,7 @@ def compared(log: Log, site: Site) -> Iterator[Comparison]:
 
 
 def main() -> None:
-    """Print the table, the medians, and one object with all of it."""
+    """Print the table, medians and means, and one object with all of it."""
     parser = scenario_parser(__doc__, seed=0, output=None)
     parser.add_argument("--twins", type=int, default=20, help="logs, of seeds from --seed on")
     arguments = parser.parse_args()
@@ -145,9 +145,13 @@ def main() -> None:
             "tilt_ratio": float(np.median([r.tilt_deg / r.vqf_tilt_deg for r in own_rows])),
             "heading_nees": float(np.median([r.heading_nees for r in own_rows])),
             "tilt_nees": float(np.median([r.tilt_nees for r in own_rows])),
+            "mean_total_deg": float(np.mean([r.total_deg for r in own_rows])),
+            "mean_vqf_total_deg": float(np.mean([r.vqf_total_deg for r in own_rows])),
+            "worse": sum(r.ratio > 1.0 for r in own_rows),
+            "worst_ratio": max(r.ratio for r in own_rows),
         }
     lines = [
-        f"median {way:7} " + ", ".join(f"{key} {value:.2f}" for key, value in median.items())
+        f"{way:7} " + ", ".join(f"{key} {value:.2f}" for key, value in median.items())
         for way, median in medians.items()
     ]
     conclude("\n".join(lines), {"rows": rows, "medians": medians})

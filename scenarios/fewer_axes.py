@@ -13,6 +13,7 @@ The rule, stated before the run, of every set of axes:
    in the median), and reported as undetermined without it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -137,6 +138,19 @@ def rows_of(seed: int, duration: float) -> list[Row]:
     return rows
 
 
+def pooled(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
+    """Return root mean squares and the mean NEES over the walks, by axes and estimator."""
+    out: dict[str, dict[str, dict[str, float]]] = {}
+    for axes, estimator in dict.fromkeys((row.axes, row.estimator) for row in rows):
+        own = [row for row in rows if (row.axes, row.estimator) == (axes, estimator)]
+        out.setdefault(axes, {})[estimator] = {
+            "position_mm": rms(np.array([row.position_mm for row in own])),
+            "attitude_deg": rms(np.array([row.attitude_deg for row in own])),
+            "nees": float(np.mean([row.nees for row in own])),
+        }
+    return out
+
+
 def faults_of(rows: list[Row]) -> list[str]:
     """Return in what the rule is not kept."""
     faults = []
@@ -174,7 +188,7 @@ def main() -> None:
     for row in sorted(rows, key=lambda r: (SETS.index(r.axes), r.estimator, r.seed)):
         errors = f"{row.position_mm:9.2f} mm{row.attitude_deg:8.3f} deg{row.nees:8.2f}"
         lines.append(f"{row.axes:6}{row.seed:5} {row.estimator:10}{errors}  {row.verdict}")
-    conclude("\n".join([*lines, *faults, "FAIL" if faults else "pass"]), rows)
+    conclude("\n".join([*lines, *faults, "FAIL" if faults else "pass"]), {"rows": rows, "pooled": pooled(rows)})
     if faults:
         raise SystemExit(1)
 

@@ -12,7 +12,7 @@ at most 9 where 6 are expected, nine in ten epochs are within three sigma, and n
 from dataclasses import dataclass, replace
 
 import numpy as np
-from fewer_axes import INSIDE, MAX_COUNT, Row, filtered, row_of, smoothed, with_axes
+from fewer_axes import INSIDE, MAX_COUNT, Row, filtered, pooled, row_of, smoothed, with_axes
 from harness import conclude, scenario_parser
 from scipy.spatial.transform import Rotation
 
@@ -137,7 +137,9 @@ def main() -> None:
         errors = f"{row.position_mm:9.2f} mm{row.attitude_deg:8.3f} deg{row.nees:8.2f}"
         reported = f"{row.verdict} {','.join(row.codes)}"
         lines.append(f"{row.world:6}{row.axes:5}{row.seed:5} {row.estimator:9}{errors}  {reported}")
-    conclude("\n".join([*lines, *faults, "FAIL" if faults else "pass"]), rows)
+    worlds_pooled = {name: pooled([row for row in rows if row.world == name]) for name in worlds}
+    text = "\n".join([*lines, *faults, "FAIL" if faults else "pass"])
+    conclude(text, {"rows": rows, "pooled": worlds_pooled})
     if faults:
         raise SystemExit(1)
 

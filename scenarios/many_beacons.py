@@ -214,6 +214,13 @@ def compared_spacing(minutes: float, seed: int) -> dict[str, Run]:
     return out
 
 
+def ratios(result: dict[str, Run]) -> dict[str, float]:
+    """Return the second case's errors and processor times over the first's."""
+    first, last = (vars(run) for run in result.values())
+    names = ("rms_m", "online_rms_m", "processor_s", "online_processor_s")
+    return {name: last[name] / first[name] for name in names}
+
+
 def report(result: dict[str, Run]) -> str:
     """Return the table that a reader sees."""
     lines = [
@@ -226,12 +233,10 @@ def report(result: dict[str, Run]) -> str:
             f"{run.processor_s:9.0f} s{1e3 * run.online_rms_m:8.2f} mm"
             f"{run.online_processor_s:9.0f} s"
         )
-    first, last = result.values()
+    ratio = ratios(result)
     lines.append(
-        f"  {'ratio':14}{'':16}{last.rms_m / first.rms_m:11.3f}{'':10}"
-        f"{last.processor_s / first.processor_s:11.2f}"
-        f"{last.online_rms_m / first.online_rms_m:11.3f}"
-        f"{last.online_processor_s / first.online_processor_s:11.2f}"
+        f"  {'ratio':14}{'':16}{ratio['rms_m']:11.3f}{'':10}{ratio['processor_s']:11.2f}"
+        f"{ratio['online_rms_m']:11.3f}{ratio['online_processor_s']:11.2f}"
     )
     return "\n".join(lines)
 
@@ -244,7 +249,7 @@ def main() -> None:
     given = parser.parse_args()
     minutes = 0.5 if given.quick else given.minutes
     result = (compared_spacing if given.spacing else compared_detection)(minutes, given.seed)
-    conclude(report(result), result)
+    conclude(report(result), {"cases": list(result.values()), "ratios": ratios(result)})
 
 
 if __name__ == "__main__":

@@ -201,7 +201,15 @@ def main() -> None:
     for seed in range(given.seed, given.seed + given.runs):
         rows.append(run_one(seed, alone=given.lone))
         print(rows[-1], file=sys.stderr, flush=True)
-    conclude(report(rows), {"rows": rows})
+    trusted = [row.nees for row in rows if row.verdict == str(Verdict.TRUSTWORTHY)]
+    figures = {
+        "logs": len(rows),
+        "right_starts": sum(row.success for row in rows),
+        "trusted": len(trusted),
+        "trusted_nees": float(np.mean(np.array(trusted, dtype=float))) if trusted else None,
+        "largest_nees": max((row.nees for row in rows if row.nees is not None), default=None),
+    }
+    conclude(report(rows), figures | {"rows": rows})
 
 
 if __name__ == "__main__":

@@ -76,6 +76,8 @@ class RestsResult:
     attitude_deg: float
     nees: float
     nees_each: list[float]
+    nees_least: float
+    nees_most: float
 
 
 def resting(site: Site, config: Config, seed: int) -> Log:
@@ -186,6 +188,7 @@ def run(config: Config) -> list[RestsResult]:
             parts.append(error)
             nees.append(own)
         error = np.concatenate([np.zeros((0, 6)), *parts])
+        each = [float(np.mean(own)) for own in nees]
         out.append(
             RestsResult(
                 name,
@@ -195,7 +198,9 @@ def run(config: Config) -> list[RestsResult]:
                 rms(np.linalg.norm(error[:, 3:], axis=1)),
                 rms(np.rad2deg(np.linalg.norm(error[:, :3], axis=1))),
                 float(np.mean(np.concatenate([np.zeros(0), *nees]))),
-                [float(np.mean(own)) for own in nees],
+                each,
+                min(each, default=np.nan),
+                max(each, default=np.nan),
             )
         )
     return out
@@ -207,7 +212,7 @@ def report(result: list[RestsResult]) -> str:
         f"{'':20}rests kept  logs failed, doubted   position  attitude  NEES (6)   of the logs"
     ]
     for one in result:
-        spread = f"{min(one.nees_each):.1f} to {max(one.nees_each):.1f}" if one.nees_each else "-"
+        spread = f"{one.nees_least:.1f} to {one.nees_most:.1f}"
         lines.append(
             f"{one.method:20}{one.findings:10}{one.failed:13}{one.doubted:9}{one.position_m:9.2f} m"
             f"{one.attitude_deg:6.2f} deg{one.nees:10.2f}   {spread}"

@@ -11,7 +11,7 @@ places is at most twice that with signs.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from fewer_axes import Row, filtered, row_of, smoothed
+from fewer_axes import Row, filtered, pooled, row_of, smoothed
 from harness import conclude, scenario_parser
 
 from magfusion.model.samples import FieldSamples, Log
@@ -128,7 +128,7 @@ def main() -> None:
     for row in sorted(rows, key=lambda r: (r.axes, r.estimator, r.seed)):
         errors = f"{row.position_mm:9.2f} mm{row.attitude_deg:8.3f} deg{row.nees:8.2f}"
         lines.append(f"{row.axes:12}{row.seed:5} {row.estimator:8}{errors}  {row.verdict}")
-    conclude("\n".join([*lines, *faults, "FAIL" if faults else "pass"]), rows)
+    conclude("\n".join([*lines, *faults, "FAIL" if faults else "pass"]), {"rows": rows, "pooled": pooled(rows)})
     if faults:
         raise SystemExit(1)
 

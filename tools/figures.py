@@ -2,7 +2,8 @@
 
 ``figures.yaml`` lists commands and the sentences of a page that their results fill: a field
 ``{rows.0.error_m * 1e3}`` is the number that the page prints there, and where the JSON line that
-ends the command's output has it.
+ends the command's output has it; ``{rows.smooth.both.error_m}`` is of the one of the rows that has
+both words among its values.  A row of a table is a sentence.
 
 ``python tools/figures.py`` runs what takes seconds or minutes; ``--release`` everything.  What is
 measured at a commit is kept in ``--results``, so that a run that was stopped goes on.
@@ -27,7 +28,7 @@ from magfusion.files.yaml_files import StrictModel, read_yaml
 
 ROOT = Path(__file__).parents[1]
 LOGS = ROOT.parent / "shared" / "logs"
-FIELD = re.compile(r"\{([\w.]+)(?: \* ([\d.e+-]+))?\}")
+FIELD = re.compile(r"\{([^{}*]+?)(?: \* ([\d.e+-]+))?\}")
 MINUS = "\N{MINUS SIGN}"
 PRINTED = rf"([-{MINUS}+]?[\d,]*\.?\d+)"
 
@@ -44,6 +45,8 @@ class Entry(StrictModel):
     takes : {'seconds', 'minutes', 'hours'}
     spread : float
         Share by which a figure may differ, beyond the rounding of the page.
+    why : str, optional
+        The reason for the spread.
     test : str, optional
         That fails where the sentence is wrong.
     """
@@ -53,12 +56,15 @@ class Entry(StrictModel):
     command: str | None = None
     takes: Literal["seconds", "minutes", "hours"] = "seconds"
     spread: float = 0.0
+    why: str | None = None
     test: str | None = None
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
         if (self.command is None) == (self.test is None):
             raise ValueError("give a command or a test")
+        if (self.spread > 0.0) == (self.why is None):
+            raise ValueError("give a spread with its reason")
         return self
 
 
@@ -118,15 +124,25 @@ def compared(entry: Entry, result: Any) -> list[Figure]:
     out = []
     for sentence in entry.sentences:
         for number, (key, factor) in zip(*printed(entry.page, sentence), strict=True):
-            value = result
-            for part in key.split("."):
-                value = value[int(part) if isinstance(value, list) else part]
-            measured = float(factor) * float(value)
+            measured = float(factor) * _value(result, key)
             plain = number.replace(",", "").replace(MINUS, "-")
             rounding = 0.501 * 10.0 ** -len(plain.partition(".")[2])
             within = rounding + entry.spread * abs(measured)
             out.append(Figure(key, number, measured, abs(float(plain) - measured) <= within))
     return out
+
+
+def _value(result: Any, key: str) -> float:
+    for part in key.split("."):
+        if not isinstance(result, list):
+            result = result[part]
+        elif part.isdigit():
+            result = result[int(part)]
+        elif len(result) == 1 and part in result[0]:
+            result = result[0][part]
+        else:
+            result = [row for row in result if part in row.values()]
+    return float(result)
 
 
 def measured(command: str, directory: Path) -> Any:
