@@ -41,7 +41,11 @@ def test_the_command_gives_the_figures(entry: Entry, tmp_path: Path) -> None:
 def test_a_figure_changed_by_hand_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("figures.flat", lambda _: f"errs by 1.5 mm, 2,000 of {MINUS}3 m")
     entry = Entry(
-        page="page.md", command="x", sentences=["by {a.0 * 1e3} mm, {b} of {c} m"], spread=0.01
+        page="page.md",
+        command="x",
+        sentences=["by {a.0 * 1e3} mm, {b} of {c} m"],
+        spread=0.01,
+        why="any",
     )
     agree = [one.agrees for one in compared(entry, {"a": [0.00146], "b": 2015, "c": -3.4})]
     assert agree == [True, True, True]
@@ -49,6 +53,21 @@ def test_a_figure_changed_by_hand_is_found(monkeypatch: pytest.MonkeyPatch) -> N
     assert agree == [False, False, False]
     with pytest.raises(ValueError, match="0 times"):
         printed("page.md", "by {a} cm")
+
+
+def test_a_row_of_a_table_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("figures.flat", lambda _: "|---|---| | one, alone | 1.5 m | 2 | | two | 3")
+    row = "| one, alone | {rows.one, alone.left.error_m} m | {rows.one, alone.right.error_m} |"
+    entry = Entry(page="page.md", command="x", sentences=[row, "| two | {}"])
+    cases = [("both", "left", 9.0), ("one, alone", "left", 1.52), ("one, alone", "right", 2.6)]
+    rows = [{"case": case, "side": side, "error_m": error} for case, side, error in cases]
+    assert [one.agrees for one in compared(entry, {"rows": rows})] == [True, False]
+
+
+def test_a_spread_has_its_reason() -> None:
+    for given in ({"spread": 0.1}, {"why": "ten draws"}):
+        with pytest.raises(ValueError, match="with its reason"):
+            Entry.model_validate({"page": "page.md", "command": "x", "sentences": [], **given})
 
 
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.,]*\d|(?<![\w.])\d\b")

@@ -3,7 +3,8 @@
 ``figures.yaml`` lists commands and the sentences of a page that their results fill: a field
 ``{rows.0.error_m * 1e3}`` is the number that the page prints there, and where the JSON line that
 ends the command's output has it; ``{rows.smooth.both.error_m}`` is of the one of the rows that has
-both words among its values.  A row of a table is a sentence.
+both words among its values.  A row of a table is a sentence; ``{}`` is a number that is compared by
+another command's.
 
 ``python tools/figures.py`` runs what takes seconds or minutes; ``--release`` everything.  What is
 measured at a commit is kept in ``--results``, so that a run that was stopped goes on.
@@ -28,7 +29,7 @@ from magfusion.files.yaml_files import StrictModel, read_yaml
 
 ROOT = Path(__file__).parents[1]
 LOGS = ROOT.parent / "shared" / "logs"
-FIELD = re.compile(r"\{([^{}*]+?)(?: \* ([\d.e+-]+))?\}")
+FIELD = re.compile(r"\{([^{}*]*?)(?: \* ([\d.e+-]+))?\}")
 MINUS = "\N{MINUS SIGN}"
 PRINTED = rf"([-{MINUS}+]?[\d,]*\.?\d+)"
 
@@ -124,6 +125,8 @@ def compared(entry: Entry, result: Any) -> list[Figure]:
     out = []
     for sentence in entry.sentences:
         for number, (key, factor) in zip(*printed(entry.page, sentence), strict=True):
+            if not key:
+                continue
             measured = float(factor) * _value(result, key)
             plain = number.replace(",", "").replace(MINUS, "-")
             rounding = 0.501 * 10.0 ** -len(plain.partition(".")[2])
