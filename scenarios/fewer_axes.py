@@ -188,7 +188,10 @@ def main() -> None:
     for row in sorted(rows, key=lambda r: (SETS.index(r.axes), r.estimator, r.seed)):
         errors = f"{row.position_mm:9.2f} mm{row.attitude_deg:8.3f} deg{row.nees:8.2f}"
         lines.append(f"{row.axes:6}{row.seed:5} {row.estimator:10}{errors}  {row.verdict}")
-    conclude("\n".join([*lines, *faults, "FAIL" if faults else "pass"]), {"rows": rows, "pooled": pooled(rows)})
+    conclude(
+        "\n".join([*lines, *faults, "FAIL" if faults else "pass"]),
+        {"rows": rows, "pooled": pooled(rows)},
+    )
     if faults:
         raise SystemExit(1)
 
