@@ -12,7 +12,6 @@ from scipy.stats import multivariate_normal, norm
 from test_ekf import SEED, a_site, a_state, an_epoch, an_imu, one_interval
 
 from magfusion.errors import EstimationError
-from magfusion.estimation.graph import measurement
 from magfusion.estimation.graph.inertial import inertial_factor
 from magfusion.estimation.graph.kalman import PartialUpdateFilter, considered_share
 from magfusion.estimation.graph.measurement import measured_rows
@@ -22,6 +21,7 @@ from magfusion.estimation.graph.state import MOTION, POSITION, State, between, m
 from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
 from magfusion.estimation.online.ekf import ErrorStateFilter
 from magfusion.estimation.online_integrity.bank import SubsetBank
+from magfusion.estimation.solve import sparse_rows
 from magfusion.files.plain_data import to_plain
 from magfusion.model.parameters import choose_blocks, dimension
 from magfusion.units import Array
@@ -216,8 +216,8 @@ def test_rows_of_the_estimated_alone_update_as_filterpy(monkeypatch: pytest.Monk
     whole = a_filter(cov, share)
     whole.H, whole.dim_z = H, ROWS
     whole.update(z, lambda _: H, lambda x: H @ x, R)
-    for sparse_from in (1, measurement.SPARSE_COLUMNS):
-        monkeypatch.setattr(measurement, "SPARSE_COLUMNS", sparse_from)
+    for sparse_from in (1, sparse_rows.SPARSE_COLUMNS):
+        monkeypatch.setattr(sparse_rows, "SPARSE_COLUMNS", sparse_from)
         rows = a_filter(cov, share)
         rows.update_linear(z, H, R)
         for name in ("x", "P", "K", "S", "SI", "y", "z", "H", "x_post", "P_post", "dim_z"):
@@ -359,13 +359,13 @@ def crossed(bank: SubsetBank, group: int) -> Array:
     return result
 
 
-@pytest.mark.parametrize("sparse_from", [1, measurement.SPARSE_COLUMNS])
+@pytest.mark.parametrize("sparse_from", [1, sparse_rows.SPARSE_COLUMNS])
 @pytest.mark.parametrize("drifted", [0.0, 1e4])  # m
 @pytest.mark.parametrize("considered", [0, 2])
 def test_filters_of_the_bank_are_this_one_without_a_beacon(
     monkeypatch: pytest.MonkeyPatch, considered: int, drifted: float, sparse_from: int
 ) -> None:
-    monkeypatch.setattr(measurement, "SPARSE_COLUMNS", sparse_from)
+    monkeypatch.setattr(sparse_rows, "SPARSE_COLUMNS", sparse_from)
     site = a_site()
     start, blocks, predicted, epoch = one_interval(GROUPS)
     bank = SubsetBank(site, blocks, considered)

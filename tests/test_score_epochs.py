@@ -7,7 +7,6 @@ import pytest
 from test_online_separation import NAVIGATOR, _feed
 from test_smoothed_separation import EPOCHS, _walk
 
-from magfusion.estimation.graph import measurement
 from magfusion.estimation.graph.state import between
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.estimation.online.navigator import Navigator
@@ -18,6 +17,7 @@ from magfusion.estimation.online_integrity.score_epochs import (
     add_epochs,
 )
 from magfusion.estimation.online_integrity.score_online import MOST_WAITING
+from magfusion.estimation.solve import sparse_rows
 from magfusion.model.parameters import BEACON_POSITION
 
 LAST = EPOCHS // 2
@@ -67,7 +67,7 @@ def test_sparse_rows_of_many_parameters_tell_the_same(monkeypatch: pytest.Monkey
     navigator, sums, waiting = _waiting()
     requested = navigator._update.score.targets
     dense = add_epochs(sums, waiting, requested)
-    monkeypatch.setattr(measurement, "SPARSE_COLUMNS", 1)
+    monkeypatch.setattr(sparse_rows, "SPARSE_COLUMNS", 1)
     _assert_alike(add_epochs(sums, waiting, requested), dense)
 
 

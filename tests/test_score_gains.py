@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from magfusion.estimation.graph import measurement
 from magfusion.estimation.integrity.released_fault import gains, release_fault
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.online_integrity.score_targets import ScoreTargets
+from magfusion.estimation.solve import sparse_rows
 from magfusion.simulation.demo_site import demo_site
 
 KNOWN, UNKNOWN = 50.0, 1e-4  # by how many typical errors a direction is told of, squared
@@ -39,12 +39,12 @@ def test_all_at_once_gain_what_each_alone_does() -> None:
     np.testing.assert_array_equal(nobody, 0.0)
 
 
-@pytest.mark.parametrize("sparse_from", [1, measurement.SPARSE_COLUMNS])
+@pytest.mark.parametrize("sparse_from", [1, sparse_rows.SPARSE_COLUMNS])
 def test_beyond_declared_errors_is_what_a_marginal_knows(
     monkeypatch: pytest.MonkeyPatch, sparse_from: int
 ) -> None:
     """Of an error and a declared one that acts as it does, by inverting the information on both."""
-    monkeypatch.setattr(measurement, "SPARSE_COLUMNS", sparse_from)
+    monkeypatch.setattr(sparse_rows, "SPARSE_COLUMNS", sparse_from)
     rng, targets = np.random.default_rng(5), ScoreTargets(demo_site(), (), (), steady=False)
     size = len(targets.unit)
     root = rng.standard_normal((size, 2 * size))

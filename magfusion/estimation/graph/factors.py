@@ -13,8 +13,9 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from magfusion.estimation.graph.measurement import Measurement, Rows, times_spread
+from magfusion.estimation.graph.measurement import Measurement, Rows
 from magfusion.estimation.graph.state import States
+from magfusion.estimation.solve.sparse_rows import times_spread
 from magfusion.model.parameters import Block, Calibration
 from magfusion.units import Array, IntArray
 

@@ -8,7 +8,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from scipy.linalg import inv
 
-from magfusion.estimation.graph.measurement import sparse_if_wide
+from magfusion.estimation.solve.sparse_rows import sparse_if_wide
 from magfusion.units import Array, IntArray
 
 

@@ -9,18 +9,16 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import repeat
-from math import prod
 from typing import Self
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from magfusion.estimation.graph.state import MOTION, State, States, states_of
+from magfusion.estimation.solve.sparse_rows import sparse_if_wide
 from magfusion.model.parameters import Block, Calibration, dimension
 from magfusion.units import Array, BoolArray, IntArray
 
-SPARSE_COLUMNS = 256  # of parameters; of so many, a row depends on few
 # 95 % efficient on white noise of one dimension; the last is for residuals that are not noise.
 ROBUST_WIDTH = {"huber": 1.345, "cauchy": 2.385, "geman-mcclure": 2.385}
 
@@ -216,18 +214,6 @@ def kind_of(part: Measurement) -> str:
 @cache
 def _compared(kind: type[Measurement]) -> tuple[str, ...]:
     return tuple(f.name for f in fields(kind) if f.compare)
-
-
-def sparse_if_wide(matrix: Array) -> "Array | csr_array":
-    """Return a matrix (m, n), sparse if it has the columns of many beacons."""
-    return csr_array(matrix) if matrix.shape[1] >= SPARSE_COLUMNS else matrix
-
-
-def times_spread(columns: Array, spread: Array) -> Array:
-    """Return columns (..., k) times a spread (k, h) of parameters, most of them independent."""
-    rows = prod(columns.shape[:-1]), len(spread)
-    result = columns.reshape(rows) @ sparse_if_wide(spread)
-    return np.asarray(result).reshape(*columns.shape[:-1], spread.shape[1])
 
 
 def group_distances(rows: Rows, cov: Array) -> Array:

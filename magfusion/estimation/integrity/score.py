@@ -18,7 +18,7 @@ from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.graph.considered import steps_of_others
 from magfusion.estimation.graph.factors import CALIBRATION_KEY, CONSIDERED_KEY, NUISANCE_KEY
 from magfusion.estimation.graph.graph import GraphEstimate
-from magfusion.estimation.graph.measurement import Rows, sparse_if_wide
+from magfusion.estimation.graph.measurement import Rows
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.integrity.fixed_parameter_columns import InertialColumns, inertial_columns
 from magfusion.estimation.integrity.score_chain import (
@@ -33,6 +33,7 @@ from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.posterior.marginals import is_chain
 from magfusion.estimation.posterior.native_rows import NativeRows
 from magfusion.estimation.solve.bordered import eliminate_partial
+from magfusion.estimation.solve.sparse_rows import sparse_if_wide
 from magfusion.model.parameters import (
     Block,
     Calibration,

@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.estimation.graph.measurement import Measurement, measured_rows, sparse_if_wide
+from magfusion.estimation.graph.measurement import Measurement, measured_rows
 from magfusion.estimation.graph.propagation import Propagated
 from magfusion.estimation.graph.state import MOTION, State, between
 from magfusion.estimation.measurements.aiding import AidingMeasurement
@@ -32,6 +32,7 @@ from magfusion.estimation.posterior.separation import (
     Separation,
     radii,
 )
+from magfusion.estimation.solve.sparse_rows import sparse_if_wide
 from magfusion.model.parameters import Block, dimension
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk, Verdict

@@ -9,13 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.graph.measurement import (
-    Measurement,
-    Rows,
-    joined,
-    kind_of,
-    sparse_if_wide,
-)
+from magfusion.estimation.graph.measurement import Measurement, Rows, joined, kind_of
 from magfusion.estimation.graph.state import MOTION, State, states_of
 from magfusion.estimation.integrity.suspects import Inertial, Stream
 from magfusion.estimation.measurements.earth import EarthField
@@ -23,6 +17,7 @@ from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
 from magfusion.estimation.online_integrity.score_targets import ScoreTargets
+from magfusion.estimation.solve.sparse_rows import sparse_if_wide
 from magfusion.model.parameters import Calibration, dimension
 from magfusion.model.samples import ImuSamples
 from magfusion.units import Array, BoolArray

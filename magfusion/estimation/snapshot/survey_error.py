@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from magfusion.estimation.graph.measurement import times_spread
 from magfusion.estimation.snapshot.problem import nuisance_blocks
+from magfusion.estimation.solve.sparse_rows import times_spread
 from magfusion.model.noise import measurement_cov, sensor_positions, whitening
 from magfusion.model.parameters import (
     CLOCK_OFFSET,
