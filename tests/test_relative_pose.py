@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -262,10 +263,10 @@ def test_a_log_whose_intervals_are_all_too_long_is_refused() -> None:
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "smoother"])
-def test_keyframes_lead_online_out_of_the_field(estimator: str) -> None:
+def test_keyframes_lead_online_out_of_the_field(estimator: Literal["ekf", "smoother"]) -> None:
     site = replace(surveyed_site(), aiding=(KEYFRAMES,))
     log, motion = _phasor_log(site)
-    settings = NavigatorSettings(estimator=estimator, start_duration=3.0)  # type: ignore[arg-type]
+    settings = NavigatorSettings(estimator=estimator, start_duration=3.0)
     navigator, samples = Navigator(site, settings), log.aiding["keyframes"]
     assert log.fields is not None
     states = []

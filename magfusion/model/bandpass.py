@@ -9,6 +9,7 @@ frequency.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from magfusion.model.detection_range import tones_of
 from magfusion.model.site import Site
@@ -152,16 +153,13 @@ class _Windows:
 
     def push(self, block: Array) -> Array:
         """Return results of a block (n, columns), shape (m, columns, filters)."""
-        before = self._samples
-        samples = np.concatenate([before, block]) if len(before) else np.ascontiguousarray(block)
+        samples = np.concatenate([self._samples, block]) if len(self._samples) else block
         length = len(self._taps)
         count = max((len(samples) - length) // self._step + 1, 0)
         self._samples = samples[self._step * count :]
         if not count:
             return np.zeros((0, block.shape[1], self._taps.shape[1]))
-        row, column = samples.strides  # sliding_window_view takes half as long as the product
-        shape, strides = (count, samples.shape[1], length), (self._step * row, column, row)
-        windows = np.ndarray(shape, samples.dtype, samples, strides=strides)
+        windows = sliding_window_view(samples, length, axis=0)[:: self._step]
         return np.asarray(np.ascontiguousarray(windows) @ self._taps)
 
 

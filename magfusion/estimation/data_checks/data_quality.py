@@ -26,6 +26,7 @@ from magfusion.estimation.data_checks.stamps import uneven_stamps
 from magfusion.estimation.data_checks.still_means import still_means
 from magfusion.estimation.data_checks.truth import truth_findings
 from magfusion.estimation.data_checks.turn_witness import turned_otherwise
+from magfusion.model.aiding import OF_MOTION
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -118,9 +119,10 @@ def _of_beacons(
     detection = detect_in_log(log, site) if detection is None else detection
     if detection is None:
         return
-    yield from undetected_findings(
-        detection if compensated is None else with_motion_compensation(detection, compensated), site
-    )
+    if compensated is not None:
+        detection = with_motion_compensation(detection, compensated)
+    aided = any(samples.quantity in OF_MOTION for samples in log.aiding.values())
+    yield from undetected_findings(detection, site, aided=aided)
 
 
 def _matters(line: Finding) -> bool:

@@ -24,7 +24,8 @@ HARDLY = 0.05  # share of the epochs; a beacon detected in fewer counts as silen
 MAX_UNDETECTED_SHARE = 0.1  # share of the epochs without any beacon, from which it casts doubt
 SILENCE = 1.0  # s; shorter silence is not reported
 FALLEN = 0.2  # of the neighbouring amplitude; below, a beacon is switched off
-NEAR, EDGE = 10, 3  # epochs beside a silence
+NEAR = 10  # epochs beside a silence that it is compared with
+EDGE = 3  # epochs in which the field of a beacon that is switched off falls
 LEAST_SNR = (DETECTION_CHI_SQUARE / 6.0) ** 0.5  # that is detected
 LISTED = 3
 CERTAIN_DETECTION_RATIO = (
@@ -193,8 +194,16 @@ def _share(detection: BeaconDetection) -> Array:
     return np.asarray(np.sum(detection.strong, axis=0) / reported)
 
 
-def undetected_findings(detection: BeaconDetection, site: Site) -> Iterator[Finding]:
-    """Yield the beacons that are silent, always or for a while, and epochs without any beacon."""
+def undetected_findings(
+    detection: BeaconDetection, site: Site, *, aided: bool = False
+) -> Iterator[Finding]:
+    """Yield the beacons that are silent, always or for a while, and epochs without any beacon.
+
+    Parameters
+    ----------
+    aided : bool
+        Whether another sensor measures the motion, so that epochs without a beacon are no doubt.
+    """
     if len(detection.time) == 0:
         return
     share = _share(detection)
@@ -217,7 +226,7 @@ def undetected_findings(detection: BeaconDetection, site: Site) -> Iterator[Find
             "low_signal",
             f"no beacon is detected in {100.0 * alone:.0f} % of the epochs: all are far away there,"
             " or the noise is large.",
-            Verdict.TRUSTWORTHY if site.aiding else Verdict.DOUBTFUL,
+            Verdict.TRUSTWORTHY if aided else Verdict.DOUBTFUL,
             100.0,
         )
     frequency = {b.name: b.tone_frequencies_hz for b in site.beacons}

@@ -9,6 +9,7 @@ count as a hundred independent measurements of it.
 
 import numpy as np
 
+from magfusion.estimation.graph.same_epoch import SAME_TIME
 from magfusion.estimation.measurements.model_error import cells
 from magfusion.model.noise import model_error, sensor_positions
 from magfusion.model.parameters import BeaconParameter, Block, placed
@@ -22,7 +23,6 @@ COLUMNS = 288  # of all beacons
 MATRIX = 9  # elements
 AT_ONCE = 5e8  # bytes of their Jacobian, in a long log
 MOST_CELLS = 1000
-SAME_TIME = 1e-6  # s
 
 
 class FieldError(BeaconParameter):

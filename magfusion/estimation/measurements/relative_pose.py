@@ -6,6 +6,7 @@ body was displaced, in its axes at the beginning, by ``T dR R^T (v + T g / 2) - 
 and v are attitude and velocity at the end, T is the length and g points up.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -32,7 +33,6 @@ from magfusion.units import Array
 
 UP_WORLD = np.array([0.0, 0.0, 1.0])
 ROUNDING = 1e-6  # of the longest interval
-SMALLEST_ANGLE = 1e-3  # rad; below, a series replaces the formula
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,10 +173,11 @@ class RelativePose(AidingMeasurement):
         rotation = sensor_from_body @ turn @ sensor.body_from_sensor
         error = Rotation.from_matrix(np.swapaxes(self.rotation_measured, 1, 2) @ rotation)
         residual = error.as_rotvec()
-        by_rotation = _by_right_turn(residual)
+        by_rotation = _of_each(gtsam.Rot3.LogmapDerivative, residual)
         scaled = float(sensor.scale) * sensor_from_body
 
-        rotated_by_bias = _right_jacobian(change[:, :3]) @ self.by_bias[:, :3]
+        turned_by_bias = _of_each(gtsam.Rot3.ExpmapDerivative, change[:, :3])
+        rotated_by_bias = turned_by_bias @ self.by_bias[:, :3]
         by_pose, by_bias = np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
         by_pose[:, :3, :3] = scaled @ turn @ skew(gain_body)
         by_velocity = np.zeros((count, 6, 3))
@@ -245,15 +246,6 @@ def _times(matrix: Array, vector: Array) -> Array:
     return np.asarray((matrix @ vector[..., None])[..., 0])
 
 
-def _right_jacobian(change: Array) -> Array:
-    """Return the derivative of small rotations by their vectors, (n, 3, 3), on the right."""
-    once = skew(change)
-    return np.asarray(np.eye(3) - once / 2.0 + once @ once / 6.0)
-
-
-def _by_right_turn(vector: Array) -> Array:
-    """Return the derivative of rotation vectors by a rotation on the right, (n, 3, 3)."""
-    once, angle = skew(vector), np.linalg.norm(vector, axis=1)
-    half = 0.5 * np.maximum(angle, SMALLEST_ANGLE)
-    share = np.where(angle < SMALLEST_ANGLE, 1.0 / 12.0, (1.0 - half / np.tan(half)) / half**2 / 4)
-    return np.asarray(np.eye(3) + once / 2.0 + share[:, None, None] * (once @ once))
+def _of_each(derivative: Callable[[Array], Array], vector: Array) -> Array:
+    """Return derivatives on the right at rotation vectors (n, 3), shape (n, 3, 3)."""
+    return np.array([derivative(one) for one in vector]).reshape(-1, 3, 3)

@@ -84,9 +84,7 @@ class ErrorStateFilter(PartialUpdateFilter):
             If the arithmetic fails; the state is then unchanged.
         """
         self.F, self.Q = predicted.transition, predicted.noise
-        # F P F' + Q, which the prediction has already formed.
-        self.P = predicted.state.cov
-        self.x_prior, self.P_prior = self.x.copy(), self.P.copy()
+        self.predict()
         try:
             state = self._update_nominal(predicted.state, measurements, linearization_point)
         except EstimationError:
