@@ -82,10 +82,10 @@ def test_a_card_and_several_beacons_start_early() -> None:
 
 def test_a_later_try_may_be_doubtful() -> None:
     doubt = Finding("inertial_residuals", "They err.", Verdict.DOUBTFUL)
-    assert is_clear(_start(100.0, doubt), again=True)
-    assert not is_clear(_start(15.0), again=True)
+    assert is_clear(_start(100.0, doubt), last=True)
+    assert not is_clear(_start(15.0), last=True)
     failed = Finding("no_solution", "There is none.", Verdict.FAILED)
-    assert not is_clear(_start(1e4, failed), again=True)
+    assert not is_clear(_start(1e4, failed), last=True)
 
 
 @pytest.mark.parametrize(("rival", "waits"), [(None, False), (3.0, True), (12.0, False)])

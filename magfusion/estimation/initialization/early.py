@@ -33,22 +33,22 @@ def next_try(tried: float, start_duration: float) -> float:
     return later if LATER * later <= start_duration else start_duration
 
 
-def is_clear(start: OnlineStart | NoStart, *, several: bool = False, again: bool = False) -> bool:
+def is_clear(start: OnlineStart | NoStart, *, several: bool = False, last: bool = False) -> bool:
     """Return whether an early start is unambiguous: its rival needed no further comparison.
 
     Parameters
     ----------
     several : bool
         Whether there are several beacons, without a rival; then all tests must be passed.
-    again : bool
-        Whether it is a later try, where a start may be doubtful and its rival merely rejected.
+    last : bool
+        Whether it is the last early try: its start may be doubtful, its rival merely rejected.
     """
     if not isinstance(start, OnlineStart):
         return False
     passed = start.trust.verdict is Verdict.TRUSTWORTHY
     if start.rival_chi_square is None:
         return several and passed
-    if again:
+    if last:
         return not start.ambiguous and start.trust.verdict is not Verdict.FAILED
     return passed and start.rival_chi_square > DECIDED * AMBIGUOUS_CHI_SQUARE
 

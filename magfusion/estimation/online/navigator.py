@@ -610,13 +610,12 @@ class Navigator:
         start = arrived.first_state(until, self.settings, diagnose=self._tried is None)
         self._possible = start.corrections
         longest = 4.0 * self.settings.start_duration
-        first = first_try(self.site, self.settings.start_duration)
-        several, again = len(self.site.beacons) > 1, self._next_start > first
-        early = self._next_start < self.settings.start_duration
-        if early and not is_clear(start, several=several, again=again):
+        usual, several = self.settings.start_duration, len(self.site.beacons) > 1
+        early, later = self._next_start < usual, next_try(self._next_start, usual)
+        if early and not is_clear(start, several=several, last=later >= usual):
             if isinstance(start, OnlineStart) and start.ambiguous:
                 self.why_no_start = open_start(start)
-            self._next_start = next_try(self._next_start, self.settings.start_duration)
+            self._next_start = later
             return False
         if isinstance(start, NoStart):
             self.why_no_start = start
