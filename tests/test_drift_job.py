@@ -2,7 +2,9 @@
 
 import json
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import fields, replace
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -310,12 +312,17 @@ def test_settings_that_cannot_be_are_refused(changes, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["ekf", "smoother"])
 def test_hours_leave_memory_as_it_was(estimator):
-    """The time of an update is judged by the job, whose machine is not busy with other tests."""
-    run = run_world(WorldTask(0, estimator, 2.0, 1))
+    """In a process of its own: another's heap shrinks and grows by what ran before.
+
+    Within any hour the resident memory varies by 9 MiB; in a run of 12 h its level is reached
+    after three.  Inertial samples that are kept would add 20 MiB in the hour that is compared.
+    """
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
+        run = alone.submit(run_world, WorldTask(0, estimator, 2.0, 1)).result()
     figures, findings = judge_runs(estimator, [run])
     reported = {f.name.removeprefix(f"{estimator}_"): f.verdict for f in findings}
     assert reported["memory"] == reported["lost"] == "pass"
-    assert figures[f"{estimator}_memory_growth_mib"] < 5.0
+    assert figures[f"{estimator}_memory_growth_mib"] < 10.0  # MiB
 
 
 @pytest.mark.slow
