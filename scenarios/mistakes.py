@@ -5,6 +5,8 @@ moving with an exact survey, moving with a rough one, and at rest.  `smooth` and
 estimators run as jobs, so that exit codes and ``report.json`` are judged.  A row is *silent* where
 the verdict is trustworthy, the mean NEES is above 20, and the parameter is not listed as
 unverified.  The log's truth has a part in this table only.
+With ``--remedies`` the first reason's remedy is followed wherever it is given as keys of the site's
+file, and the estimator runs again: the remedy works where that result is trustworthy and right.
 
 The workers of a ``--cluster`` need this directory on their PYTHONPATH.
 """
@@ -16,13 +18,14 @@ import tempfile
 import time
 import traceback
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from harness import Scale, chosen_scale, conclude, scenario_parser
 from mistake_case import LOGS, Mistake, good_case
 from mistake_list import GOOD, MISTAKES
+from mistake_remedy import follow_remedy
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.simulation.monte_carlo import run_many
@@ -40,6 +43,7 @@ class Config:
     logs: tuple[str, ...] = LOGS
     estimators: tuple[str, ...] = ESTIMATORS
     seed: int = 11
+    remedies: bool = False
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,7 @@ class Row:
     claimed_deg: float | None
     nees: float | None
     seconds: float
+    remedy: str = ""  # followed, it "works" or "fails"
 
     @property
     def known(self) -> Mistake:
@@ -106,12 +111,14 @@ class Task:
     log: str
     estimators: tuple[str, ...]
     seed: int
+    remedies: bool = False
 
 
 def run(config: Config, scale: Scale | None = None) -> list[Row]:
     """Return the rows of the table, those of the good log first."""
     names = ("good", *(name for name in config.mistakes if name != "good"))
-    tasks = [Task(n, log, config.estimators, config.seed) for log in config.logs for n in names]
+    settings = config.estimators, config.seed, config.remedies
+    tasks = [Task(name, log, *settings) for log in config.logs for name in names]
     result = run_many(judge, tasks, seed=config.seed, **(scale or {}))
     return [row for rows in result for row in rows]
 
@@ -132,14 +139,31 @@ def judge(task: Task, _rng: np.random.Generator) -> list[Row]:
         except InputError as error:  # not even a file can hold it
             return [_row(task, e, 2, {}, str(error), 0.0) for e in task.estimators]
         for estimator in task.estimators:
-            rows.append(_estimated(task, estimator, directory / "log", directory / estimator))
+            log, output = directory / "log", directory / estimator
+            row = _estimated(task, estimator, log, output)
+            rows.append(replace(row, remedy=_followed(task, row, log, output)))
     return rows
 
 
-def _estimated(task: Task, estimator: str, log: Path, output: Path) -> Row:
+def _followed(task: Task, row: Row, log: Path, output: Path) -> str:
+    """Return what the first reason's remedy gives; nothing where there is none to follow."""
+    report = output / "report.json"
+    reasons = json.loads(report.read_text())["reasons"] if report.is_file() else []
+    if not task.remedies or not reasons or "remedy" not in reasons[0]:
+        return ""
+    site = output.with_suffix(".yaml")
+    follow_remedy(log / "site.yaml", reasons[0]["remedy"], site)
+    again = _estimated(task, row.estimator, log, output.with_suffix(".again"), site)
+    right = again.nees is not None and again.nees <= SILENT_NEES
+    return "works" if again.verdict == "trustworthy" and right else "fails"
+
+
+def _estimated(
+    task: Task, estimator: str, log: Path, output: Path, site: Path | None = None
+) -> Row:
     began, code, findings = time.process_time(), 0, ""
     try:
-        _run_job(estimator, log, output)
+        _run_job(estimator, log, output, site)
     except InputError as error:
         code, findings = 2, str(error)
     except EstimationError as error:
@@ -152,16 +176,16 @@ def _estimated(task: Task, estimator: str, log: Path, output: Path) -> Row:
     return _row(task, estimator, code, report, findings, spent)
 
 
-def _run_job(estimator: str, log: Path, output: Path) -> None:
+def _run_job(estimator: str, log: Path, output: Path, site: Path | None) -> None:
     if estimator == "smooth":
         from magfusion.jobs import smooth
 
-        smooth.run(smooth.SmoothSettings(log=log), output)
+        smooth.run(smooth.SmoothSettings(log=log, site=site), output)
         return
     from magfusion.jobs.navigate import run_navigate
     from magfusion.jobs.navigate_settings import NavigateSettings
 
-    settings = NavigateSettings(log=log, estimator=estimator)
+    settings = NavigateSettings(log=log, site=site, estimator=estimator)
     run_navigate(settings, output)
 
 
@@ -198,6 +222,8 @@ class Summary:
     tracebacks: tuple[str, ...]
     slow: tuple[str, ...]
     false_alarms: tuple[str, ...]
+    remedies: int
+    failing_remedies: tuple[str, ...]
     wrong_cause: tuple[str, ...]
 
 
@@ -217,6 +243,8 @@ def summed(rows: Sequence[Row]) -> Summary:
         false_alarms=tuple(
             _named(r) for r in rows if r.mistake == "good" and r.verdict != "trustworthy"
         ),
+        remedies=sum(bool(row.remedy) for row in wrong),
+        failing_remedies=tuple(_named(row) for row in wrong if row.remedy == "fails"),
         wrong_cause=tuple(
             f"{_named(r)}: {', '.join(r.codes[:1])}" for r in requested if not r.right
         ),
@@ -253,6 +281,7 @@ def table(rows: Sequence[Row], texts: bool = False) -> str:
                 ("right", row.right),
                 ("other cause", row.diagnosable and not row.right and not row.silent),
                 ("listed", row.listed),
+                (f"remedy {row.remedy}", row.remedy),
             )
             if there
         ]
@@ -269,8 +298,9 @@ def table(rows: Sequence[Row], texts: bool = False) -> str:
         f"{result.rows} rows with a mistake; silent: {len(result.silent)}",
         f"right cause first in {100 * result.right_first:.0f} % of {result.diagnosable}"
         " diagnosable",
+        f"{result.remedies} remedies followed; failing: {len(result.failing_remedies)}",
     ]
-    for name in ("silent", "tracebacks", "slow", "false_alarms"):
+    for name in ("silent", "tracebacks", "slow", "false_alarms", "failing_remedies"):
         listed = getattr(result, name)
         lines.append(f"{name}: {len(listed)}" + "".join(f"\n    {one}" for one in listed))
     return "\n".join(lines)
@@ -297,6 +327,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--logs", help=f"of {','.join(LOGS)}")
     parser.add_argument("--estimators", help=f"of {','.join(ESTIMATORS)}")
     parser.add_argument("--texts", action="store_true", help="the first reason in full, too")
+    parser.add_argument("--remedies", action="store_true", help="follow them, and run again")
     parser.add_argument("--list", action="store_true", help="print the mistakes, and end")
     return parser
 
@@ -315,6 +346,7 @@ def main() -> None:
         logs=_chosen(given.logs, LOGS),
         estimators=_chosen(given.estimators, ESTIMATORS),
         seed=given.seed,
+        remedies=given.remedies,
     )
     rows = run(config, chosen_scale(given))
     figures = [asdict(row) | {"silent": row.silent, "right": row.right} for row in rows]

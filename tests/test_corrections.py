@@ -1,7 +1,6 @@
 """What is wrong with a site is found, undone and used; its remedy, followed, is trustworthy."""
 
 import json
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from conftest import run_command
+from mistake_remedy import set_key
 from scipy.spatial.transform import Rotation
 
 Mistake = Callable[[dict[str, Any]], None]
@@ -53,17 +53,6 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def put(site: Any, key: str, value: object) -> None:
-    """Set a key of a site as ``beacons[0].position_m``, or remove it."""
-    *path, last = re.findall(r"[^.\[\]]+", key)
-    for name in path:
-        site = site[int(name)] if isinstance(site, list) else site.setdefault(name, {})
-    if value is None:
-        del site[last]
-    else:
-        site[int(last) if isinstance(site, list) else last] = value
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("mistake", "code"),
@@ -89,7 +78,7 @@ def test_a_mistake_is_undone_and_its_remedy_works(
     assert found["ate_m"] < 0.02  # m
 
     for key, value in first["remedy"].items():
-        put(site, key, value)
+        set_key(site, key, value)
     again = smoothed(log, site, tmp_path / "again")
     assert again["verdict"] == "trustworthy"
     assert again["ate_m"] < 0.02  # m
