@@ -6,12 +6,14 @@ gives is the one with which this result was made.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import smooth
 from magfusion.estimation.integrity.correction import (
     MOST_SOLUTIONS,
+    REFINED,
     Correction,
     corrected_finding,
 )
@@ -70,7 +72,10 @@ def corrected(
             if done.continued is None:
                 break
         if done.continued is not None:
-            waiting.insert(0, done.continued._replace(finding=correction.finding))
+            known = correction.finding
+            if correction.fault is None:
+                known = replace(known, text=known.text + REFINED)
+            waiting.insert(0, done.continued._replace(finding=known))
     return best
 
 

@@ -21,6 +21,7 @@ LITTLE = 2.0  # chi square for each parameter, below which a correction is not c
 MOST_SOLUTIONS = 2  # beside the first: a wrong log takes three times as long as a good one
 CAUSE_FIRST = 1e6  # weight
 CORRECTED = " The result is corrected for it."
+REFINED = " The remedy has what the corrected log then still showed of it, too."
 CLEAR = 30.0  # ratio of chi square by which snapshots decide before the score, which is linear
 
 
@@ -155,6 +156,23 @@ def continued(correction: Correction, score: Score | None) -> Correction | None:
         return None
     assert correction.fault is not None
     return correction._replace(site=corrected_site(correction.site, correction.fault, rest.step))
+
+
+def refined(correction: Correction, remaining: Iterable[Correction]) -> Correction | None:
+    """Return a correction by snapshots with what the score of the corrected result adds to it.
+
+    Snapshots determine a parameter by the fields alone, the score by the whole motion.
+
+    Parameters
+    ----------
+    remaining : iterable of Correction
+        Of the corrected result.
+    """
+    if correction.fault is not None:
+        return None
+    code = correction.finding.code
+    rest = next((one for one in remaining if one.fault and one.finding.code == code), None)
+    return None if rest is None else rest._replace(clear=correction.clear)
 
 
 def spread_of(correction: Correction, score: Score | None) -> Array:
