@@ -74,3 +74,13 @@ def test_a_few_mistakes_on_each_log_make_no_traceback() -> None:
     assert not summed(rows).tracebacks
     assert all(row.exit == 2 for row in rows if row.mistake == "magnetometer_in_nt")
     assert set(code for row in rows for code in row.codes) <= set(CODES)
+
+
+@pytest.mark.slow
+def test_the_remedy_of_a_far_lever_arm_has_its_height_too() -> None:
+    """Snapshots of the fields along a level walk know it to centimetres, the motion does."""
+    few = Config(("lever_20cm",), ("moving",), ("smooth",), remedies=True)
+    row = run(few, {"workers": 1})[1]
+    assert row.codes == ("lever_arm",)
+    assert row.error_m < 0.01  # m
+    assert row.remedy == "works"
