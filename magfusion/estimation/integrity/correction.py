@@ -40,6 +40,8 @@ class Correction(NamedTuple):
         Covariance of the poses by other mistakes that would explain the log as well.
     clear : bool
         Whether snapshots of the fields alone are sure of it.
+    other : float
+        Of a mounting: probability that not it, but the IMU is turned, or the reverse.
     """
 
     finding: Finding
@@ -47,6 +49,7 @@ class Correction(NamedTuple):
     fault: Suspect | None = None
     spread: Array | None = None
     clear: bool = False
+    other: float = 0.5
 
 
 def corrections(
@@ -78,7 +81,8 @@ def corrections(
         result.append(Correction(finding, new_site, best.fault, spread))
     if diagnosis is not None and diagnosis.site is not None:
         clear = is_clear(diagnosis)
-        by_snapshots = Correction(diagnosis.finding, diagnosis.site, clear=clear)
+        known = diagnosis.finding, diagnosis.site
+        by_snapshots = Correction(*known, clear=clear, other=diagnosis.other)
         result.insert(0 if clear else len(result), by_snapshots)
     return [one._replace(spread=_with_turned_imu(site, one)) for one in result]
 
@@ -116,18 +120,29 @@ def is_clear(diagnosis: Diagnosis | None) -> bool:
 def _with_turned_imu(site: Site, correction: Correction) -> Array | None:
     """Return the spread of a correction, of a mounting with that of an IMU that is turned instead.
 
-    Nothing but the frame of the result distinguishes them: either is as likely.
+    Nothing but the frame of the result and the lever arm distinguish them.
     """
-    before, after = (one.platform.magnetometer.body_from_sensor for one in (site, correction.site))
-    turn = Rotation.from_matrix(after @ before.T)
+    before, after = (one.platform.magnetometer for one in (site, correction.site))
+    turn = Rotation.from_matrix(after.body_from_sensor @ before.body_from_sensor.T)
+    intrinsics = correction.site.platform.imu_intrinsics
+    if intrinsics is not None and intrinsics is not site.platform.imu_intrinsics:
+        turn *= _turn_of(intrinsics.gyro_matrix, intrinsics.accel_matrix)
     turn_body = turn.as_rotvec()
     if not turn_body.any():
         return correction.spread
     # The magnetometer stays where it is found; the body moves about it.
-    place, moved = (one.platform.magnetometer.position_body for one in (site, correction.site))
-    shift_body = moved - turn.apply(place)
+    shift_body = after.position_body - turn.apply(before.position_body)
     step = np.concatenate([turn_body, shift_body])[None]
-    return 0.5 * _outer(step) + (0.0 if correction.spread is None else correction.spread)
+    spread = correction.other * _outer(step)
+    return spread if correction.spread is None else spread + correction.spread
+
+
+def _turn_of(gyro: Array, accel: Array) -> Rotation:
+    """Return how the body would be turned whose axes are those of a turned IMU."""
+    rotated = np.array_equal(gyro, accel) and np.allclose(gyro @ gyro.T, np.eye(3))
+    if not rotated or np.linalg.det(gyro) < 0:
+        return Rotation.identity()
+    return Rotation.from_matrix(gyro.T)
 
 
 def _outer(step: Array) -> Array:

@@ -65,11 +65,14 @@ class Diagnosis(NamedTuple):
         In which it is undone, where it can be.
     ratio : float
         Of chi square before to that after.
+    other : float
+        As of `Explanation`.
     """
 
     finding: Finding
     site: Site | None
     ratio: float
+    other: float = 0.5
 
 
 def diagnosed(
@@ -103,7 +106,7 @@ def diagnosed(
     weight = OF_CATCH_ALL if one.catch_all else FIRST
     finding = Finding(one.code, text, trust.verdict, weight)
     ratio = one.before / max(one.after, 1e-9)
-    return Diagnosis(finding, None if several else one.site, ratio)
+    return Diagnosis(finding, None if several else one.site, ratio, one.other)
 
 
 def seen_in_streams(trust: Trust) -> bool:

@@ -38,6 +38,8 @@ class Explanation:
         there, and is no rival of what does say why.
     site : Site, optional
         In which the mistake is undone, where it can be.
+    other : float
+        Of a mounting: probability that not it, but the IMU is turned, or the reverse.
     """
 
     code: str
@@ -50,6 +52,7 @@ class Explanation:
     beacon: str = ""
     catch_all: bool = False
     site: Site | None = None
+    other: float = 0.5
 
     @property
     def score(self) -> float:

@@ -5,6 +5,7 @@ from itertools import pairwise, permutations, product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.special import expit
 
 from magfusion.estimation.integrity.corrected_site import (
     with_imu,
@@ -42,6 +43,7 @@ PARTS = 4  # of a log, in each of which a delay is sought
 UNUSUAL = 3.0  # sigmas of a declared time offset
 LARGEST_BIAS = {"gyro": 0.5, "accel": 1.5}  # rad/s, m/s^2; what is larger is no bias
 EYE = np.eye(3)
+OF_AXES = "Check the order and the signs of the IMU's axes, and body_from_sensor."
 
 
 def motion_causes(known: Compared, site: Site) -> Iterator[Explanation]:
@@ -61,6 +63,7 @@ def motion_causes(known: Compared, site: Site) -> Iterator[Explanation]:
         undone = with_intrinsics(site, *inverse) if gravity else None
         return Explanation(code, cause, remedy, before, after, known.freedom, site=undone)
 
+    yield from _turned(known, before, site)
     yield from _axes(tried)
     imu = "Check gyro_x/y/z and accel_x/y/z: right-handed axes, rad/s, m/s^2, +g on z at rest."
     for words, unit in ACCEL_UNITS.items():
@@ -76,6 +79,44 @@ def motion_causes(known: Compared, site: Site) -> Iterator[Explanation]:
     yield _scaled(known, before, site)
     yield from _accel_scaled(known, before, site)
     yield from _freed(known, before, site)
+
+
+def _turned(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
+    """Yield what quarter turns of the magnetometer in its mounting, or of the IMU, would explain.
+
+    Both rotate alike; but the lever arm, declared in the IMU's axes, turns with the IMU alone.
+    """
+    lever = site.platform.magnetometer.position_body
+    for axes in _signed_permutations():
+        if np.linalg.det(axes) < 0 or np.allclose(axes, EYE):
+            continue
+        mounted, _ = known.explained(axes, axes, lever=lever - axes @ lever)
+        turned, _ = known.explained(axes, axes)
+        probability = float(expit(0.5 * (mounted - turned)))
+        by = f"by {Rotation.from_matrix(axes).magnitude() / DEGREE:.0f} degrees"
+        right = axes.T @ site.platform.magnetometer.body_from_sensor
+        yield Explanation(
+            "mounting",
+            "the magnetometer's axes are turned in the IMU's against those that its mounting"
+            f" declares, {by}",
+            _mounting_remedy(site, axes),
+            before,
+            mounted,
+            known.freedom,
+            site=with_magnetometer(site, body_from_sensor=right),
+            other=probability,
+        )
+        yield Explanation(
+            "mounting",
+            f"the IMU's axes are turned against those that the mounting declares, {by}: x, y, z"
+            f" are {_named(axes)}",
+            OF_AXES,
+            before,
+            turned,
+            known.freedom,
+            site=with_intrinsics(site, axes.T, axes.T),
+            other=1.0 - probability,
+        )
 
 
 def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
@@ -132,7 +173,7 @@ def _mounting_remedy(site: Site, axes: Array) -> str:
     angles = Rotation.from_matrix(right).as_euler("xyz", degrees=True)
     return (
         "Check the axes of IMU and magnetometer; body_from_sensor would be rpy_deg"
-        f" [{', '.join(f'{a:.3g}' for a in angles + 0.0)}]."
+        f" [{', '.join(f'{a:.3g}' for a in np.round(angles, 3) + 0.0)}]."
     )
 
 
@@ -180,28 +221,20 @@ def _accel_scaled(known: Compared, before: float, site: Site) -> Iterator[Explan
 def _axes(
     tried: Callable[[str, str, str, Array, Array], Explanation],
 ) -> Iterator[Explanation]:
-    remedy = "Check the order and the signs of the IMU's axes, and body_from_sensor."
     for axes in _signed_permutations():
         words = _named(axes)
         if np.allclose(axes, EYE):
             continue
-        if np.linalg.det(axes) > 0:
-            angle = Rotation.from_matrix(axes)
-            cause = (
-                "the IMU's axes are turned against those that the mounting declares, by"
-                f" {angle.magnitude() / DEGREE:.0f} degrees: x, y, z are {words}"
-            )
-            yield tried("mounting", cause, remedy, axes, axes)
-        else:
-            yield tried("imu_axes", f"x, y, z of the IMU are {words}", remedy, axes, axes)
+        if np.linalg.det(axes) < 0:
+            yield tried("imu_axes", f"x, y, z of the IMU are {words}", OF_AXES, axes, axes)
         flips = np.allclose(np.abs(axes), EYE)
         gyro = "gyro_sign" if flips and np.linalg.det(axes) < 0 else "imu_axes"
-        yield tried(gyro, f"x, y, z of the gyro are {words}", remedy, axes, EYE)
+        yield tried(gyro, f"x, y, z of the gyro are {words}", OF_AXES, axes, EYE)
         accel = "gravity_sign" if np.allclose(axes, -EYE) else "imu_axes"
         cause = f"x, y, z of the accelerometer are {words}"
         if accel == "gravity_sign":
             cause = "the specific force has the wrong sign (-g on z at rest)"
-        yield tried(accel, cause, remedy, EYE, axes)
+        yield tried(accel, cause, OF_AXES, EYE, axes)
 
 
 def _signed_permutations() -> Iterator[Array]:

@@ -104,6 +104,7 @@ class Compared:
         accel_axes: Array,
         parameters: str | None = None,
         gravity: float = 1.0,
+        lever: Array | None = None,
     ) -> tuple[float, Array]:
         """Return chi square and the shared parameters for assumed axes.
 
@@ -115,6 +116,8 @@ class Compared:
             Which of `SHARED` has no prior.
         gravity : float
             Share of gravity that the specific force contains.
+        lever : ndarray, shape (3,), optional
+            By which the declared lever arm is too long (m).
         """
         by_gyro = self.gyro_turned @ gyro_axes.T
         turns = np.zeros((len(by_gyro), 3, WIDTH))
@@ -136,6 +139,8 @@ class Compared:
         curves = np.concatenate([curves, self.curve_by_survey], axis=2)
         up = np.array([0.0, 0.0, gravity * self.gravity])
         curve_error = self.curve_world + up - force
+        if lever is not None:
+            curve_error = curve_error + self.bent @ lever
         rows = np.concatenate(
             [
                 (turns / self.turn_sigma[:, None, None]).reshape(-1, turns.shape[2]),
