@@ -15,7 +15,6 @@ from magfusion.estimation.integrity.correction import (
     continued,
     corrections,
     is_clear,
-    refined,
     spread_of,
 )
 from magfusion.estimation.integrity.diagnosis import (
@@ -148,9 +147,7 @@ def finished(
     )
     figures |= smoothed_figures(result) | level_figures(by_state, len(site.beacons))
     figures |= open_figures(site)
-    further = None
-    if correction is not None:
-        further = continued(correction, score) or refined(correction, possible)
+    further = None if correction is None else continued(correction, score)
     return Finished(site, result, trust, by_state, figures, None, possible, further)
 
 

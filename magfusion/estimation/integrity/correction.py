@@ -40,6 +40,8 @@ class Correction(NamedTuple):
         Covariance of the poses by other mistakes that would explain the log as well.
     clear : bool
         Whether snapshots of the fields alone are sure of it.
+    found : bool
+        Whether they found values of parameters, and not one mistake among some.
     other : float
         Of a mounting: probability that not it, but the IMU is turned, or the reverse.
     """
@@ -49,6 +51,7 @@ class Correction(NamedTuple):
     fault: Suspect | None = None
     spread: Array | None = None
     clear: bool = False
+    found: bool = False
     other: float = 0.5
 
 
@@ -81,8 +84,13 @@ def corrections(
         result.append(Correction(finding, new_site, best.fault, spread))
     if diagnosis is not None and diagnosis.site is not None:
         clear = is_clear(diagnosis)
-        known = diagnosis.finding, diagnosis.site
-        by_snapshots = Correction(*known, clear=clear, other=diagnosis.other)
+        by_snapshots = Correction(
+            diagnosis.finding,
+            diagnosis.site,
+            clear=clear,
+            found=diagnosis.found,
+            other=diagnosis.other,
+        )
         result.insert(0 if clear else len(result), by_snapshots)
     return [one._replace(spread=_with_turned_imu(site, one)) for one in result]
 
@@ -150,12 +158,17 @@ def _outer(step: Array) -> Array:
 
 
 def _remaining(correction: Correction, score: Score | None) -> ReleaseGain | None:
-    """Return the estimate of what a corrected parameter is still wrong by."""
-    if correction.fault is None or score is None:
+    """Return the estimate of what a corrected parameter is still wrong by.
+
+    Snapshots determine a parameter by the fields alone, the score by the whole motion.
+    """
+    if score is None or not (correction.fault or correction.found):
         return None
-    name, every = correction.fault.name, suspects(correction.site, score.fixed)
-    fault = next((one for one in every if one.name == name), None)
-    return None if fault is None else release_gain(fault, *score.with_declared(tolerance=False))
+    name = "" if correction.fault is None else correction.fault.name
+    every = [one for one in suspects(correction.site, score.fixed) if name in ("", one.name)]
+    gains = [release_gain(one, *score.with_declared(tolerance=False)) for one in every]
+    own = [one for one in gains if one and (name or one.code == correction.finding.code)]
+    return max(own, key=lambda one: one.chi_square, default=None)
 
 
 def continued(correction: Correction, score: Score | None) -> Correction | None:
@@ -169,25 +182,8 @@ def continued(correction: Correction, score: Score | None) -> Correction | None:
     rest = _remaining(correction, score)
     if rest is None or rest.chi_square < LITTLE * rest.freedom:
         return None
-    assert correction.fault is not None
-    return correction._replace(site=corrected_site(correction.site, correction.fault, rest.step))
-
-
-def refined(correction: Correction, remaining: Iterable[Correction]) -> Correction | None:
-    """Return a correction by snapshots with what the score of the corrected result adds to it.
-
-    Snapshots determine a parameter by the fields alone, the score by the whole motion.
-
-    Parameters
-    ----------
-    remaining : iterable of Correction
-        Of the corrected result.
-    """
-    if correction.fault is not None:
-        return None
-    code = correction.finding.code
-    rest = next((one for one in remaining if one.fault and one.finding.code == code), None)
-    return None if rest is None else rest._replace(clear=correction.clear)
+    new_site = corrected_site(correction.site, rest.fault, rest.step)
+    return correction._replace(site=new_site, fault=rest.fault)
 
 
 def spread_of(correction: Correction, score: Score | None) -> Array:

@@ -65,6 +65,8 @@ class Diagnosis(NamedTuple):
         In which it is undone, where it can be.
     ratio : float
         Of chi square before to that after.
+    found : bool
+        Whether values of parameters were found.
     other : float
         As of `Explanation`.
     """
@@ -72,6 +74,7 @@ class Diagnosis(NamedTuple):
     finding: Finding
     site: Site | None
     ratio: float
+    found: bool = False
     other: float = 0.5
 
 
@@ -106,7 +109,7 @@ def diagnosed(
     weight = OF_CATCH_ALL if one.catch_all else FIRST
     finding = Finding(one.code, text, trust.verdict, weight)
     ratio = one.before / max(one.after, 1e-9)
-    return Diagnosis(finding, None if several else one.site, ratio, one.other)
+    return Diagnosis(finding, None if several else one.site, ratio, one.found > 0, one.other)
 
 
 def seen_in_streams(trust: Trust) -> bool:
