@@ -77,10 +77,24 @@ def test_a_few_mistakes_on_each_log_make_no_traceback() -> None:
 
 
 @pytest.mark.slow
-def test_the_remedy_of_a_far_lever_arm_has_its_height_too() -> None:
-    """Snapshots of the fields along a level walk know it to centimetres, the motion does."""
-    few = Config(("lever_20cm",), ("moving",), ("smooth",), remedies=True)
-    row = run(few, {"workers": 1})[1]
-    assert row.codes == ("lever_arm",)
-    assert row.error_m < 0.01  # m
-    assert row.remedy == "works"
+@pytest.mark.parametrize(
+    ("mistake", "log", "code"),
+    [
+        # Snapshots along a level walk know the lever arm's height to centimetres.
+        ("lever_20cm", "moving", "lever_arm"),
+        ("lever_in_cm", "rough", "lever_arm"),
+        # Only the lever arm tells in which of two frames the result is.
+        ("mounting_z90", "moving", "mounting"),
+        ("imu_z90", "moving", "mounting"),
+    ],
+)
+def test_what_motion_contradicts_is_corrected_as_if_it_had_been_right(
+    mistake: str, log: str, code: str
+) -> None:
+    few = Config((mistake,), (log,), ("smooth",), remedies=True)
+    good, wrong = run(few, {"workers": 1})
+    assert wrong.codes[0] == code
+    assert wrong.error_m < 2.0 * good.error_m
+    assert wrong.claimed_m < 2.0 * good.claimed_m
+    assert wrong.error_deg < 1.1 * good.error_deg
+    assert wrong.remedy == "works"

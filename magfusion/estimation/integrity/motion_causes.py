@@ -20,6 +20,7 @@ from magfusion.estimation.integrity.motion_comparison import (
     compared,
 )
 from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.files.site_plain import rpy_deg
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.units import DEGREE, Array
@@ -169,11 +170,10 @@ def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
 
 
 def _mounting_remedy(site: Site, axes: Array) -> str:
-    right = axes.T @ site.platform.magnetometer.body_from_sensor
-    angles = Rotation.from_matrix(right).as_euler("xyz", degrees=True)
+    angles = np.round(rpy_deg(axes.T @ site.platform.magnetometer.body_from_sensor), 3) + 0.0
     return (
         "Check the axes of IMU and magnetometer; body_from_sensor would be rpy_deg"
-        f" [{', '.join(f'{a:.3g}' for a in np.round(angles, 3) + 0.0)}]."
+        f" [{', '.join(f'{angle:.3g}' for angle in angles)}]."
     )
 
 
