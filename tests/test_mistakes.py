@@ -85,7 +85,7 @@ def test_a_few_mistakes_on_each_log_make_no_traceback() -> None:
         ("lever_in_cm", "rough", "lever_arm"),
         # Only the lever arm tells in which of two frames the result is.
         ("mounting_z90", "moving", "mounting"),
-        ("imu_z90", "moving", "mounting"),
+        ("imu_ned", "moving", "mounting"),
     ],
 )
 def test_what_motion_contradicts_is_corrected_as_if_it_had_been_right(

@@ -16,6 +16,7 @@ from magfusion.estimation.integrity.correction import (
     REFINED,
     Correction,
     corrected_finding,
+    with_rival_frame,
 )
 from magfusion.files.site_changes import changed_keys
 from magfusion.jobs.smooth_result import Finished, finished
@@ -54,11 +55,13 @@ def corrected(
         return None
     # What no key of the site's file describes cannot be corrected.
     waiting = [one for one in possible if changed_keys(site, one.site)]
-    best = None
+    best, again = None, False
     for _ in range(MOST_SOLUTIONS):
         if not waiting:
             break
         correction = waiting.pop(0)
+        if not again:
+            correction = correction._replace(spread=with_rival_frame(site, correction))
         finding = corrected_finding(correction, site, reasons)
         try:
             result = smooth(log, correction.site, settings, report)
@@ -67,16 +70,25 @@ def corrected(
         trial = correction._replace(finding=finding)
         used = correction.site, settings, result, risk
         done = finished(log, *used, findings=findings, correction=trial)
-        if len(done.trust.reasons) == 1 or _explains_most(correction, done):
+        alone = len(done.trust.reasons) == 1
+        if alone or ((again or best is None) and _explains_most(correction, done)):
             best = done
-            if done.continued is None:
-                break
+        again = done.continued is not None
         if done.continued is not None:
             known = correction.finding
             if correction.fault is None:
                 known = replace(known, text=known.text + REFINED)
             waiting.insert(0, done.continued._replace(finding=known))
+        elif best is done and (alone or not _has_rival(correction, waiting)):
+            break
+        else:
+            waiting = [one._replace(rival_probability=0.0) for one in waiting]
     return best
+
+
+def _has_rival(correction: Correction, waiting: list[Correction]) -> bool:
+    """Return whether another site with the same mistake undone is still to be tried."""
+    return any(one.finding.code == correction.finding.code for one in waiting)
 
 
 def _explains_most(correction: Correction, done: Finished) -> bool:

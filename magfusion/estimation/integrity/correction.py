@@ -42,7 +42,7 @@ class Correction(NamedTuple):
         Whether snapshots of the fields alone are sure of it.
     found : bool
         Whether they found values of parameters, and not one mistake among some.
-    other : float
+    rival_probability : float
         Of a mounting: probability that not it, but the IMU is turned, or the reverse.
     """
 
@@ -52,7 +52,7 @@ class Correction(NamedTuple):
     spread: Array | None = None
     clear: bool = False
     found: bool = False
-    other: float = 0.5
+    rival_probability: float = 0.5
 
 
 def corrections(
@@ -82,17 +82,22 @@ def corrections(
             spread += share * _outer(rival.moved - best.moved)
         new_site = corrected_site(site, best.fault, best.step)
         result.append(Correction(finding, new_site, best.fault, spread))
-    if diagnosis is not None and diagnosis.site is not None:
-        clear = is_clear(diagnosis)
-        by_snapshots = Correction(
-            diagnosis.finding,
-            diagnosis.site,
-            clear=clear,
-            found=diagnosis.found,
-            other=diagnosis.other,
-        )
-        result.insert(0 if clear else len(result), by_snapshots)
-    return [one._replace(spread=_with_turned_imu(site, one)) for one in result]
+    clear = is_clear(diagnosis)
+    by_snapshots = _by_snapshots(diagnosis, clear)
+    return by_snapshots + result if clear else result + by_snapshots
+
+
+def _by_snapshots(diagnosis: Diagnosis | None, clear: bool) -> list[Correction]:
+    """Return what snapshots explain, and its rival."""
+    if diagnosis is None or diagnosis.site is None:
+        return []
+    known, rival = diagnosis.rival_probability, diagnosis.rival
+    both = [(diagnosis, known)] + ([] if rival is None else [(rival, 1.0 - known)])
+    return [
+        Correction(d.finding, d.site, clear=clear, found=d.found, rival_probability=probability)
+        for d, probability in both
+        if d.site is not None
+    ]
 
 
 def corrected_finding(
@@ -125,10 +130,15 @@ def is_clear(diagnosis: Diagnosis | None) -> bool:
     return diagnosis is not None and diagnosis.ratio > CLEAR
 
 
-def _with_turned_imu(site: Site, correction: Correction) -> Array | None:
+def with_rival_frame(site: Site, correction: Correction) -> Array | None:
     """Return the spread of a correction, of a mounting with that of an IMU that is turned instead.
 
     Nothing but the frame of the result and the lever arm distinguish them.
+
+    Parameters
+    ----------
+    site : Site
+        As declared.
     """
     before, after = (one.platform.magnetometer for one in (site, correction.site))
     turn = Rotation.from_matrix(after.body_from_sensor @ before.body_from_sensor.T)
@@ -141,7 +151,7 @@ def _with_turned_imu(site: Site, correction: Correction) -> Array | None:
     # The magnetometer stays where it is found; the body moves about it.
     shift_body = after.position_body - turn.apply(before.position_body)
     step = np.concatenate([turn_body, shift_body])[None]
-    spread = correction.other * _outer(step)
+    spread = correction.rival_probability * _outer(step)
     return spread if correction.spread is None else spread + correction.spread
 
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.magnetometers import first_magnetometer
-from magfusion.estimation.integrity.likely_cause import cause_of
+from magfusion.estimation.integrity.explanation import Explanation
+from magfusion.estimation.integrity.likely_cause import OF_MOTION, cause_of
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
@@ -67,15 +68,16 @@ class Diagnosis(NamedTuple):
         Of chi square before to that after.
     found : bool
         Whether values of parameters were found.
-    other : float
-        As of `Explanation`.
+    rival : Diagnosis, optional
+        As of `Explanation`, with its probability.
     """
 
     finding: Finding
     site: Site | None
     ratio: float
     found: bool = False
-    other: float = 0.5
+    rival: "Diagnosis | None" = None
+    rival_probability: float = 0.5
 
 
 def diagnosed(
@@ -106,10 +108,19 @@ def diagnosed(
     if said is None:
         return None
     one, text = said
+    known = _diagnosis(one, text, trust.verdict, several)
+    if one.rival is None:
+        return known
+    rival = _diagnosis(one.rival, one.rival.text(OF_MOTION), trust.verdict, several)
+    return known._replace(rival=rival, rival_probability=one.rival_probability)
+
+
+def _diagnosis(one: Explanation, text: str, verdict: Verdict, several: bool) -> Diagnosis:
+    """Return an explanation as a finding; what several magnetometers share is not undone."""
     weight = OF_CATCH_ALL if one.catch_all else FIRST
-    finding = Finding(one.code, text, trust.verdict, weight)
+    finding = Finding(one.code, text, verdict, weight)
     ratio = one.before / max(one.after, 1e-9)
-    return Diagnosis(finding, None if several else one.site, ratio, one.found > 0, one.other)
+    return Diagnosis(finding, None if several else one.site, ratio, one.found > 0)
 
 
 def seen_in_streams(trust: Trust) -> bool:

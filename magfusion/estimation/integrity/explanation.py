@@ -3,6 +3,8 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from scipy.special import expit
+
 from magfusion.model.site import Site
 
 LEAST_FALL = 60.0  # of chi square, that an explanation must bring
@@ -38,8 +40,8 @@ class Explanation:
         there, and is no rival of what does say why.
     site : Site, optional
         In which the mistake is undone, where it can be.
-    other : float
-        Of a mounting: probability that not it, but the IMU is turned, or the reverse.
+    rival : Explanation, optional
+        Another site that explains the motion alike, of the same code: tried where this one fails.
     """
 
     code: str
@@ -52,7 +54,7 @@ class Explanation:
     beacon: str = ""
     catch_all: bool = False
     site: Site | None = None
-    other: float = 0.5
+    rival: "Explanation | None" = None
 
     @property
     def score(self) -> float:
@@ -63,6 +65,11 @@ class Explanation:
     def fall(self) -> float:
         """By how much chi square falls, less that price."""
         return self.before - self.score
+
+    @property
+    def rival_probability(self) -> float:
+        """Probability of the rival; a half where it is not known."""
+        return 0.5 if self.rival is None else float(expit(0.5 * (self.after - self.rival.after)))
 
     @property
     def clear(self) -> bool:

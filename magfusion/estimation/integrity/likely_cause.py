@@ -39,6 +39,7 @@ LONGEST = 100.0  # s; of a longer log parts are tried
 PARTS = 4
 FEWEST = 8  # epochs
 LEAST_WAY = 0.3  # m; who goes less far sees each beacon from one side
+OF_MOTION = "the motion by the fields against that by the inertial sensor"
 STRANGE = 1e3  # and above which it is no field of this site
 
 
@@ -69,9 +70,7 @@ def cause_of(
         # As declared the fields may be so: what explains them is weighed against what moves.
         of_motion = clearly_best(_of_motion(known, samples, part.imu))
     if of_motion is not None and (of_fields is None or of_motion.fall > of_fields.fall):
-        return of_motion, of_motion.text(
-            "the motion by the fields against that by the inertial sensor"
-        )
+        return of_motion, of_motion.text(OF_MOTION)
     if of_fields is not None:
         return of_fields, of_fields.text(f"the fields at {len(known.samples)} epochs")
     return None

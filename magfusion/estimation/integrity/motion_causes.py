@@ -1,11 +1,11 @@
 """What people get wrong of the inertial sensor and of how the magnetometer is mounted beside it."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import pairwise, permutations, product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import expit
 
 from magfusion.estimation.integrity.corrected_site import (
     with_imu,
@@ -91,33 +91,30 @@ def _turned(known: Compared, before: float, site: Site) -> Iterator[Explanation]
     for axes in _signed_permutations():
         if np.linalg.det(axes) < 0 or np.allclose(axes, EYE):
             continue
-        mounted, _ = known.explained(axes, axes, lever=lever - axes @ lever)
-        turned, _ = known.explained(axes, axes)
-        probability = float(expit(0.5 * (mounted - turned)))
         by = f"by {Rotation.from_matrix(axes).magnitude() / DEGREE:.0f} degrees"
         right = axes.T @ site.platform.magnetometer.body_from_sensor
-        yield Explanation(
+        mounted = Explanation(
             "mounting",
             "the magnetometer's axes are turned in the IMU's against those that its mounting"
             f" declares, {by}",
             _mounting_remedy(site, axes),
             before,
-            mounted,
+            known.explained(axes, axes, lever=lever - axes @ lever)[0],
             known.freedom,
             site=with_magnetometer(site, body_from_sensor=right),
-            other=probability,
         )
-        yield Explanation(
+        turned = Explanation(
             "mounting",
             f"the IMU's axes are turned against those that the mounting declares, {by}: x, y, z"
             f" are {_named(axes)}",
             OF_AXES,
             before,
-            turned,
+            known.explained(axes, axes)[0],
             known.freedom,
             site=with_intrinsics(site, axes.T, axes.T),
-            other=1.0 - probability,
         )
+        yield replace(mounted, rival=turned)
+        yield replace(turned, rival=mounted)
 
 
 def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
