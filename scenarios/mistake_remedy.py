@@ -1,4 +1,4 @@
-"""A remedy of a report, followed: keys of the site's file are set as it says."""
+"""A remedy of a report, followed: keys of the site's file are set to its values."""
 
 import re
 from collections.abc import Mapping

@@ -40,8 +40,8 @@ class Correction(NamedTuple):
         Covariance of the poses by other mistakes that would explain the log as well.
     clear : bool
         Whether snapshots of the fields alone are sure of it.
-    found : bool
-        Whether they found values of parameters, and not one mistake among some.
+    is_estimate : bool
+        Whether they estimate values of parameters, and do not choose among usual mistakes.
     rival_probability : float
         Of a mounting: probability that not it, but the IMU is turned, or the reverse.
     """
@@ -51,7 +51,7 @@ class Correction(NamedTuple):
     fault: Suspect | None = None
     spread: Array | None = None
     clear: bool = False
-    found: bool = False
+    is_estimate: bool = False
     rival_probability: float = 0.5
 
 
@@ -94,7 +94,7 @@ def _by_snapshots(diagnosis: Diagnosis | None, clear: bool) -> list[Correction]:
     known, rival = diagnosis.rival_probability, diagnosis.rival
     both = [(diagnosis, known)] + ([] if rival is None else [(rival, 1.0 - known)])
     return [
-        Correction(d.finding, d.site, clear=clear, found=d.found, rival_probability=probability)
+        Correction(d.finding, d.site, clear=clear, is_estimate=d.is_estimate, rival_probability=probability)
         for d, probability in both
         if d.site is not None
     ]
@@ -172,7 +172,7 @@ def _remaining(correction: Correction, score: Score | None) -> ReleaseGain | Non
 
     Snapshots determine a parameter by the fields alone, the score by the whole motion.
     """
-    if score is None or not (correction.fault or correction.found):
+    if score is None or not (correction.fault or correction.is_estimate):
         return None
     name = "" if correction.fault is None else correction.fault.name
     every = [one for one in suspects(correction.site, score.fixed) if name in ("", one.name)]

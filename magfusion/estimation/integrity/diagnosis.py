@@ -66,8 +66,8 @@ class Diagnosis(NamedTuple):
         In which it is undone, where it can be.
     ratio : float
         Of chi square before to that after.
-    found : bool
-        Whether values of parameters were found.
+    is_estimate : bool
+        Whether it has estimated values of parameters.
     rival : Diagnosis, optional
         As of `Explanation`, with its probability.
     """
@@ -75,7 +75,7 @@ class Diagnosis(NamedTuple):
     finding: Finding
     site: Site | None
     ratio: float
-    found: bool = False
+    is_estimate: bool = False
     rival: "Diagnosis | None" = None
     rival_probability: float = 0.5
 
