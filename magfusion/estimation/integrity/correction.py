@@ -94,7 +94,9 @@ def _by_snapshots(diagnosis: Diagnosis | None, clear: bool) -> list[Correction]:
     known, rival = diagnosis.rival_probability, diagnosis.rival
     both = [(diagnosis, known)] + ([] if rival is None else [(rival, 1.0 - known)])
     return [
-        Correction(d.finding, d.site, clear=clear, is_estimate=d.is_estimate, rival_probability=probability)
+        Correction(
+            d.finding, d.site, clear=clear, is_estimate=d.is_estimate, rival_probability=probability
+        )
         for d, probability in both
         if d.site is not None
     ]
