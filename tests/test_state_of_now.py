@@ -54,15 +54,15 @@ def propagated(
 
 
 def departure_at(navigator: Navigator, state: State) -> PropagationStart:
-    arrived = navigator._arrived
-    assert arrived.usual is not None
+    imu = navigator._arrived.imu
+    assert imu.usual is not None
     return PropagationStart(
         state,
         navigator.site,
         navigator.blocks,
-        navigator._process_noise,
-        arrived.applied_offset,
-        arrived.usual,
+        navigator._running.process_noise,
+        imu.offset,
+        imu.usual,
     )
 
 
@@ -74,7 +74,7 @@ def exceeding(walk: OnlineLog) -> tuple[Navigator, PropagationStart, ImuSamples]
     moving = replace(
         result, time=result.time - 1.0 + 0.0013, velocity_world=np.array([1.0, 0.3, -0.2])
     )
-    imu = navigator._arrived.inertial_samples(result.time - 1.5)
+    imu = navigator._arrived.imu.measured(result.time - 1.5)
     return navigator, departure_at(navigator, moving), imu
 
 
@@ -159,7 +159,7 @@ def test_a_parameter_of_the_imu_has_its_share_in_the_covariance(
     cov[MOTION:, MOTION:] *= 1e4
     state = replace(start.state, cov=cov)
     own = replace(
-        start, state=state, blocks=navigator.blocks, process_noise=navigator._process_noise
+        start, state=state, blocks=navigator.blocks, process_noise=navigator._running.process_noise
     )
     result = carried_in_chunks(own, imu, 9)[-1]
     direct = propagate(

@@ -122,7 +122,9 @@ def test_the_states_of_a_loss_that_is_not_told_yet_cover_their_errors(estimator:
 
     def propagate_passage(navigator: Navigator, now: float) -> None:
         if now == 15.0:
-            inner = navigator._estimator  # nothing that arrives could tell it so much nonsense
+            inner = (
+                navigator._running.estimator
+            )  # nothing that arrives could tell it so much nonsense
             assert inner is not None
             wrong = inner.state.position_world + np.array([1.0, -0.5, 0.3])
             inner.replace_state(replace(inner.state, position_world=wrong))

@@ -3,23 +3,27 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.errors import EstimationError
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.propagation import Propagated
-from magfusion.estimation.graph.state import POSITION, ROTATION, State
+from magfusion.estimation.graph.state import State
 from magfusion.estimation.initialization.online import OnlineStart
 from magfusion.estimation.integrity.region_test import of_place
 from magfusion.estimation.measurements.earth import EarthField, EarthWeight, speed_sigma
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
-from magfusion.estimation.measurements.linearization import is_curved, relinearized
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.estimation.online.ekf import ErrorStateFilter
+from magfusion.estimation.online.fix_comparison import FixComparison
 from magfusion.estimation.online.fixed_lag import SlidingWindow
-from magfusion.estimation.online.input_queue import Arrivals
-from magfusion.estimation.online.measured import EpochMeasurements
+from magfusion.estimation.online.loss_recovery import LossRecovery
+from magfusion.estimation.online.queue.arrivals import Arrivals
+from magfusion.estimation.online.queue.epoch_measurements import (
+    EpochMeasurements,
+    is_stationary,
+    with_inertial,
+)
 from magfusion.estimation.online_integrity.aiding_gate import AidingGate
 from magfusion.estimation.online_integrity.bank import SubsetBank
 from magfusion.estimation.online_integrity.dead_reckoning_check import DeadReckoningCheck
@@ -29,29 +33,13 @@ from magfusion.estimation.online_integrity.magnetometer_watch import Magnetomete
 from magfusion.estimation.online_integrity.near_metal import NearMetal
 from magfusion.estimation.online_integrity.online import EpochSummary, OnlineMonitor
 from magfusion.estimation.online_integrity.open_roll import roll_findings
-from magfusion.estimation.online_integrity.recovery import (
-    AgreedFix,
-    Attempts,
-    agreed_fix,
-    at_fix,
-    corroborated,
-    explains,
-    prior_of,
-    restarted,
-)
 from magfusion.estimation.online_integrity.score_online import OnlineScore
 from magfusion.model.parameters import Block
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding
-from magfusion.units import Array, BoolArray
 
-WIDE_POSITION, WIDE_ROTATION = 0.3, 0.2  # m, rad; beyond, the prediction is no linearization point
-LOST_POSITION = 10.0  # m; a larger sigma means that the state is lost, whatever is measured
-UNDETECTED = 1.0  # s without a beacon, longer than any window, before the sigma alone decides
 NOW = np.zeros(1, dtype=np.int64)  # the single epoch of a measurement
-AS_LIKELY = 20.0  # difference of chi square to the best hypothesis
-COMPARED_EVERY, COMPARED_EPOCHS = 30.0, 150  # s, epochs; between fixes without a request
 
 Estimator = SlidingWindow | ErrorStateFilter
 
@@ -77,13 +65,10 @@ class EpochUpdate:
     score: OnlineScore
     metal: NearMetal
     _dead_reckoning: DeadReckoningCheck
-    _attempts: Attempts
-    _pointing: Attempts
+    recovery: LossRecovery
+    _comparison: FixComparison
     _earth: EarthWeight | None
     bank: SubsetBank | None
-    _compared_at: float
-    _since_compared: int
-    _detected_at: float
 
     def __init__(
         self,
@@ -94,8 +79,7 @@ class EpochUpdate:
         lost_beyond: float,
         bank: SubsetBank | None = None,
     ) -> None:
-        self.site, self.blocks, self.bank, self._lost_beyond = site, blocks, bank, lost_beyond
-        self._detected_at = -np.inf
+        self.site, self.blocks, self.bank = site, blocks, bank
         self.gate = Gate(site.channels, blocks, MagnetometerWatch(site))
         self.aiding = AidingGate(blocks, self.gate.counts)
         self.of_currents: tuple[Finding, ...] = ()
@@ -103,9 +87,9 @@ class EpochUpdate:
         self.metal, self._dead_reckoning = NearMetal(site, blocks), DeadReckoningCheck(blocks)
         self.monitor = OnlineMonitor(site, estimated)
         self.score = OnlineScore(site, estimated, blocks[len(estimated) :], steady=earth)
-        self._attempts, self._pointing = Attempts(), Attempts()
+        self.recovery = LossRecovery(self.gate, blocks, lost_beyond)
+        self._comparison = FixComparison()
         self._earth = EarthWeight(blocks) if earth else None
-        self._compared_at, self._since_compared = -np.inf, COMPARED_EPOCHS
 
     def begin(self, start: OnlineStart) -> Judgement:
         """Judge a first state."""
@@ -113,7 +97,7 @@ class EpochUpdate:
         self.gate.watch.begin(start.excluded, start.findings)
         self.monitor.begin(start.state.time, findings, start.shared_offsets)
         self.score.begin(start.score, start.state.time)
-        self._detected_at = start.state.time
+        self.recovery.detected_at = start.state.time
         fitted = [f for f in start.trust.remarks if f.code == "fitted_line" and start.extra_lines]
         return self._judge_state(start.state, None).with_findings(*fitted)
 
@@ -135,13 +119,14 @@ class EpochUpdate:
         if predicted.gap_bridged:
             self.gate.counts["inertial gap bridged"] += 1
         step = max(state.time - arrived.last_epoch, 1e-6)
-        earth, standing = self._earth is not None, arrived.rests(state)
-        lost_epochs = self._needs_fix(state)
+        earth, standing = self._earth is not None, is_stationary(state, arrived.imu)
+        lost_epochs = self.recovery.needs_fix(state)
         result = arrived.measured(
             before, state, samples, step, earth=earth, standing=standing, is_lost=lost_epochs
         )
         others = arrived.others_at(state.time)
-        others = [arrived.with_inertial(one, state, self.blocks) for one in others]
+        own = self.site, self.blocks, arrived.imu
+        others = [with_inertial(one, state, *own) for one in others]
         measurements = self.aiding.passed(others, state)
         if standing:
             measurements.append(zero_velocity(NOW, self.site.platform.motion.rest_speed_sigma))
@@ -153,7 +138,7 @@ class EpochUpdate:
             if isinstance(passed, Judgement):  # nothing of it is to be used
                 return passed
             result, point = passed
-            self._detected_at = state.time
+            self.recovery.detected_at = state.time
         if result is not None:
             known = state if point is None else replace(point, cov=state.cov)
             measurements += self._of_fields(result, known, step)
@@ -219,8 +204,8 @@ class EpochUpdate:
         if point is not None:
             self.score.end()
             return
-        state, offset = predicted.state, arrived.applied_offset
-        imu = arrived.inertial_samples(before.time - offset, state.time - offset)
+        state, offset = predicted.state, arrived.imu.offset
+        imu = arrived.imu.measured(before.time - offset, state.time - offset)
         self.score.predict(before, state, predicted.transition, imu)
         self.score.measured(measurements, state, self.aiding.rejected)
 
@@ -265,34 +250,11 @@ class EpochUpdate:
         """Compare the state with a fix from time to time."""
         if self.metal.near:
             return
-        self._since_compared += 1
-        due = state.time >= self._compared_at + COMPARED_EVERY
-        due = due and self._since_compared >= COMPARED_EPOCHS
-        if not (due or self.monitor.needs_second_fix):
-            return
-        self._compared_at, self._since_compared = state.time, 0
-        fix = agreed_fix(samples, state.calibration)
-        lacking = self.site.platform.magnetometer.lacking
-        if fix is not None and lacking and not fix.fixes.determined[0, 0]:
-            return  # an undetermined roll is equally far from any state
-        if fix is not None and explains(fix, samples, state.calibration):
-            self.monitor.compared(*_distance_to_fix(state, fix))
+        requested = self.monitor.needs_second_fix
+        if (distance := self._comparison.compare(samples, state, requested=requested)) is not None:
+            self.monitor.compared(*distance)
 
     # Loss and recovery
-
-    def needs_separate_beacons(self, state: State) -> bool:
-        """Return whether jointly measured beacons do not suffice: each is needed separately."""
-        return self._needs_fix(state) or _wide(state)
-
-    def _needs_fix(self, state: State) -> bool:
-        """Return whether only a fix that is independent of the state can replace it."""
-        return self.gate.is_lost or not _no_wider(state.cov[POSITION, POSITION], LOST_POSITION)
-
-    def _is_lost(self, state: State) -> bool:
-        undetected = state.time > self._detected_at + UNDETECTED
-        if undetected and not _no_wider(state.cov[POSITION, POSITION], self._lost_beyond):
-            return True
-        return self._needs_fix(state)
 
     def _passed(
         self,
@@ -312,20 +274,16 @@ class EpochUpdate:
             Whether the state was lost before.
         """
         state = predicted.state
-        if is_lost and measured.is_sequential and self._found_again(estimator, measured, predicted):
+        if is_lost and self._found_again(estimator, measured, predicted):
             return self._judge_state(estimator.state, None)
-        measured, point, refused = self._linearization_point(measured, state)
+        measured, point, refused = self.recovery.linearization_point(measured, state)
         explained, valid = state if point is None else point, measured.samples.valid[0]
         phasors = self._weighed_phasors(measured, explained, requested=point is None)
         if self.metal.comes:
             return self._without_the_last(estimator, predicted)
         phasors = self.gate.passed(phasors, explained, valid, refused)
         measured = replace(measured, phasors=phasors)
-        if (
-            self.gate.is_lost
-            and measured.is_sequential
-            and self._found_again(estimator, measured, predicted)
-        ):
+        if self.gate.is_lost and self._found_again(estimator, measured, predicted):
             return self._judge_state(estimator.state, None)
         return measured, point
 
@@ -348,78 +306,30 @@ class EpochUpdate:
             return False
         return True
 
-    def _linearization_point(
-        self, measured: EpochMeasurements, state: State
-    ) -> tuple[EpochMeasurements, State | None, BoolArray]:
-        """Return fields as linearised, the fix that this needs, if any, and rejected channels."""
-        samples = measured.samples
-        nothing = np.zeros(len(samples.channels), dtype=bool)
-        # Of a state that is near enough, or whose windows were not requested.
-        if not isinstance(measured.phasors, FieldPhasors):
-            return measured, None, nothing
-        if not _wide(state):
-            self._pointing.over()
-            if not is_curved(state):
-                return measured, None, nothing
-            at = relinearized(measured.phasors, state, self.blocks)
-            return measured if at is None else replace(measured, phasors=at), None, nothing
-        if not self._pointing.due(state.time):
-            return measured, None, samples.valid[0]
-        fix = agreed_fix(samples, state.calibration, prior_of(state))
-        if fix is None:
-            return measured, None, nothing
-        if not explains(fix, samples, state.calibration):
-            return measured, None, samples.valid[0]
-        self.gate.counts["found by a fix"] += 1
-        self._pointing.over()
-        return measured, at_fix(state, fix), fix.refused
-
     def _found_again(
         self, estimator: Estimator, measured: EpochMeasurements, predicted: Propagated
     ) -> bool:
         """Restart from a fix, if the pose explains no measurement any more."""
-        state = predicted.state
-        if not self._attempts.due(state.time):
+        state = self.recovery.restarted(measured, predicted.state)
+        if state is None:
             return False
-        if not corroborated(measured.samples):
-            return False
-        fix = agreed_fix(measured.samples, state.calibration)
-        if fix is None or not fix.fixes.determined[0, 0]:
-            return False
-        if not explains(fix, measured.samples, state.calibration):
-            return False
-        estimator.replace_state(restarted(state, fix))
+        estimator.replace_state(state)
         self._dead_reckoning.reset()
         self.monitor.reset_motion()
         self.score.end()
-        self._separate(None, [], estimator.state)
-        self._end_loss(state.time)
+        self._separate(None, [], state)
+        self._end_loss(predicted.state.time)
         return True
 
     def _lost_since(self, state: State) -> float | None:
-        if self._is_lost(state):
-            return self._attempts.lost_at(state.time)
-        if self._attempts.lost_since is not None:
+        since, ended = self.recovery.lost_since(state)
+        if ended:
             self._end_loss(state.time)
-        return None
+        return since
 
     def _end_loss(self, time: float) -> None:
-        self.gate.counts["lost and found again"] += 1
-        self.gate.refused_in_a_row = 0
-        self._attempts.over()
+        self.recovery.over()
         self.monitor.uncertain("found_again", time)
-
-
-def _wide(state: State) -> bool:
-    """Return whether a state is too uncertain to linearise at."""
-    wide = (POSITION, WIDE_POSITION), (ROTATION, WIDE_ROTATION)
-    return not all(_no_wider(state.cov[part, part], sigma) for part, sigma in wide)
-
-
-def _no_wider(cov: Array, sigma: float) -> bool:
-    """Return whether no axis of a covariance (3, 3) has a larger sigma."""
-    # The trace bounds the variance of every axis, and costs less.
-    return bool(cov.trace() <= sigma**2 or np.linalg.eigvalsh(cov)[-1] <= sigma**2)
 
 
 def _of_place(site: Site, state: State) -> tuple[Finding, ...]:
@@ -427,20 +337,3 @@ def _of_place(site: Site, state: State) -> tuple[Finding, ...]:
         return ()
     at = np.array([state.time]), state.world_from_body[None], state.position_world[None]
     return of_place(site, *at, state.cov[None, :6, :6])
-
-
-def _distance_to_fix(state: State, fix: AgreedFix) -> tuple[float, float]:
-    """Return squared distance and offset (m) of a state from the nearest likely hypothesis.
-
-    A mirrored pose that explains the epoch equally well is no contradiction.
-    """
-    fixes, body_from_world = fix.fixes, state.world_from_body.T
-    best = (np.inf, np.inf)
-    for k in np.flatnonzero(fixes.cost[0] < fixes.cost[0, 0] + AS_LIKELY):
-        turn = Rotation.from_matrix(body_from_world @ fixes.world_from_body[0, k]).as_rotvec()
-        shift = body_from_world @ (fixes.position_world[0, k] - state.position_world)
-        offset = np.concatenate([turn, shift])
-        cov = fix.excess * fixes.pose_cov[0, k] + state.cov[:6, :6]
-        distance = float(offset @ np.linalg.solve(cov, offset))
-        best = min(best, (distance, float(np.linalg.norm(shift))))
-    return best

@@ -7,7 +7,6 @@ import numpy as np
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.online.constant_motion_model import ConstantMotionModel
 from magfusion.estimation.online.correction_smoothing import CorrectionSmoother
-from magfusion.estimation.online.input_queue import Arrivals
 from magfusion.estimation.online.motion_prior_prediction import ahead_by_prior
 from magfusion.estimation.online.navigator_settings import NavigatorSettings
 from magfusion.estimation.online.propagated import (
@@ -19,6 +18,7 @@ from magfusion.estimation.online.propagated import (
     propagate_passage,
     states_along,
 )
+from magfusion.estimation.online.queue.inertial_stream import InertialStream
 from magfusion.estimation.online_integrity.bank import SubsetBank
 from magfusion.estimation.online_integrity.judgement import (
     JudgedState,
@@ -88,7 +88,9 @@ class StateOfNow:
         self._last: Passage | None = None
         self._newest: State | None = None  # of the newest sample, before a correction
 
-    def restart_from(self, start: PropagationStart, report: EpochReport, arrived: Arrivals) -> None:
+    def restart_from(
+        self, start: PropagationStart, report: EpochReport, imu: InertialStream
+    ) -> None:
         """Continue from the state of a new epoch, which may include a correction."""
         jumped = report.reset_counter != self._report.reset_counter
         before = self._newest
@@ -96,70 +98,69 @@ class StateOfNow:
         if self.rate == "field":
             return
         if self._stamp == -np.inf:  # states start with the next sample
-            self._stamp = self._reached(arrived)
+            self._stamp = self._reached(imu)
         if self.horizon > 0.0:
-            self._motion_model.update(arrived.inertial_samples())
+            self._motion_model.update(imu.measured())
         if self._smoother.length == 0.0:
             return
         if jumped:
             self._smoother.reset()
         elif before is not None and before.time - self.horizon > start.state.time:
-            passage = self._passage(arrived, np.array([before.time - self.horizon]))
+            passage = self._passage(imu, np.array([before.time - self.horizon]))
             (corrected,) = states_along(start, self._ahead(passage, self.horizon))
             self._smoother.take(before, corrected)
 
-    def reach(self, arrived: Arrivals) -> None:
+    def reach(self, imu: InertialStream) -> None:
         """Propagate the state to the inertial samples that have arrived."""
         if self.rate == "field" or self._start is None:
             return
-        wanted = self._wanted(arrived)
+        wanted = self._wanted(imu)
         if len(wanted) == 0:
             return
         self._stamp = float(wanted[-1])
         if self.rate == "imu":
-            wanted = wanted + arrived.applied_offset
+            wanted = wanted + imu.offset
         # Another time offset may go back in time.
         wanted = wanted[wanted > max(self._start.state.time, self._until)]
         if len(wanted) == 0:
             return
         self._until = float(wanted[-1])
-        self.pending += self._judge_states(self._passage(arrived, wanted), self.horizon)
+        self.pending += self._judge_states(self._passage(imu, wanted), self.horizon)
         self._newest = self.pending[-1]
 
-    def at(self, arrived: Arrivals, time: float) -> JudgedState:
+    def at(self, imu: InertialStream, time: float) -> JudgedState:
         """Return the state at any time since the epoch (s)."""
         assert self._start is not None
-        newest = max(arrived.inertial, self._start.state.time)
-        passage = self._passage(arrived, np.array([min(time, newest)]))
+        newest = max(imu.reached, self._start.state.time)
+        passage = self._passage(imu, np.array([min(time, newest)]))
         if time > newest:
-            self._motion_model.update(arrived.inertial_samples())
+            self._motion_model.update(imu.measured())
         return self._judge_states(passage, max(time - newest, 0.0))[0]
 
-    def _reached(self, arrived: Arrivals) -> float:
-        return arrived.imu.newest if self.rate == "imu" else arrived.inertial
+    def _reached(self, imu: InertialStream) -> float:
+        return imu.newest if self.rate == "imu" else imu.reached
 
-    def _wanted(self, arrived: Arrivals) -> Array:
+    def _wanted(self, imu: InertialStream) -> Array:
         """Return the stamps of samples, or instants, for new states."""
         if self.rate == "imu":
-            stamps, _ = arrived.imu.rows()
+            stamps, _ = imu.buffer.rows()
             return stamps[np.searchsorted(stamps, self._stamp, side="right") :]
         assert not isinstance(self.rate, str)
         first = np.floor(self._stamp * self.rate + 1e-6) + 1.0
-        last = np.floor(arrived.inertial * self.rate + 1e-6)
+        last = np.floor(imu.reached * self.rate + 1e-6)
         return np.arange(first, last + 1.0) / self.rate
 
-    def _passage(self, arrived: Arrivals, wanted: Array) -> Passage:
+    def _passage(self, imu: InertialStream, wanted: Array) -> Passage:
         """Return the passage at some times, continued from the last propagation."""
         start, last = self._start, self._last
         assert start is not None
         if last is None or wanted[0] < last.time[0]:
             last = initial_passage(start)
         begin, offset = float(last.time[0]) - start.time_offset, start.time_offset
-        end = max(float(wanted[-1]) - offset, arrived.imu.newest)
-        imu = arrived.motion_samples(begin, end)
-        blind = arrived.imu_filler.covers(begin, end)
+        end = max(float(wanted[-1]) - offset, imu.newest)
+        blind = imu.is_filled(begin, end)
         passage, newest = propagate_passage(
-            start, last, imu, np.maximum(wanted, last.time), blind=blind
+            start, last, imu.filled(begin, end), np.maximum(wanted, last.time), blind=blind
         )
         if self._last is None or newest.time[0] > self._last.time[0]:
             self._last = newest

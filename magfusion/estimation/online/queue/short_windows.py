@@ -10,7 +10,7 @@ from magfusion.estimation.demodulation.motion_compensation import taken_off
 from magfusion.estimation.graph.state import State, as_trajectory
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.model_error import epochs_sharing_error_at
-from magfusion.estimation.online.measured import EpochMeasurements
+from magfusion.estimation.online.queue.epoch_measurements import EpochMeasurements
 from magfusion.model.parameters import predict_channels
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site

@@ -5,25 +5,24 @@ them except a silent one, which is reported.
 """
 
 from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.settings import EstimatorSettings
-from magfusion.estimation.data_checks.stream_buffer import check_clock
+from magfusion.estimation.data_checks.stream_buffer import Buffer, check_clock
 from magfusion.estimation.demodulation.motion_compensation import MotionCompensated
 from magfusion.estimation.demodulation.several_demodulation import same_windows
 from magfusion.estimation.demodulation.temperature_compensation import refuse_warm
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.initialization.online import NoStart, OnlineStart, find_online_start
-from magfusion.estimation.measurements.relative_pose import longest_interval
-from magfusion.estimation.online.input_queue import LONGEST_WAIT, MARGIN, Arrivals
-from magfusion.estimation.online.measured import EpochMeasurements
-from magfusion.estimation.online.sensor_stream import SensorStream
+from magfusion.estimation.online.queue.arrivals import LONGEST_WAIT, MARGIN, Arrivals
+from magfusion.estimation.online.queue.epoch_measurements import EpochMeasurements
+from magfusion.estimation.online.queue.sensor_stream import SensorStream
 from magfusion.files.fields import SAME_TIME, side_by_side
 from magfusion.files.named_records import magnetometer_number
-from magfusion.model.marks import Marks
 from magfusion.model.parameters import seen_by
 from magfusion.model.samples import FieldSamples, SteadyFields, Waveform
 from magfusion.model.site import Site
@@ -39,19 +38,16 @@ SILENCE = 1.0  # s; plus a window: the others do not wait for one that is silent
 
 
 class SeveralArrivals(Arrivals):
-    """Streams of a platform with several magnetometers, as `Arrivals`.
+    """Streams of a platform with several magnetometers.
 
     Attributes
     ----------
-    streams : list of SensorStream
-        Of each magnetometer; empty where fields are given.
     begun_at : float
         First stamp of any of them (s).
     without : Counter
         Number of epochs without each magnetometer, while it was silent.
     """
 
-    streams: list[SensorStream]
     begun_at: float
     without: Counter[str]
     _fields_to: dict[str, float]  # stamp of the newest fields of each (s)
@@ -59,43 +55,37 @@ class SeveralArrivals(Arrivals):
     _centre: float  # of the windows at the state that is to be predicted (s)
     _looked: float  # until when a first state was last searched (s)
 
-    def __init__(self, site: Site, lockin: LockinSettings | None, applied_offset: float) -> None:
+    def __init__(self, site: Site, lockin: LockinSettings | None) -> None:
         refuse_warm(site)
-        super().__init__(receiver_of(site, lockin), applied_offset)
-        self.site, sensors = site, site.platform.magnetometers
-        self._lockin = same_windows(site, lockin) if site.beacons else lockin
-        self.streams = []
-        for sensor in sensors:
-            alone = site.platform.with_magnetometers((replace(sensor, clock_offset=0.0),))
-            self.streams.append(SensorStream(replace(site, platform=alone), self._lockin))
+        lockin = same_windows(site, lockin) if site.beacons else lockin
+        self.sensors, streams = site.platform.magnetometers, []
+        for sensor in self.sensors:
+            platform = site.platform.with_magnetometers((replace(sensor, clock_offset=0.0),))
+            receiver = receiver_of(replace(site, platform=platform), lockin)
+            streams.append(SensorStream(receiver, f"magnetometer {sensor.name}"))
+        super().__init__(site, streams)
         self.begun_at, self.without = np.inf, Counter()
         self._fields_to, self._longest = {}, 0.0
         self._centre = self._looked = -np.inf
         self._delay = 0.0
 
+    @property
+    def _named(self) -> Iterator[tuple[str, SensorStream]]:
+        return zip((sensor.name for sensor in self.sensors), self.streams, strict=True)
+
     # Input
 
-    def add_magnetometer(
-        self, time: Array, measured_sensor: Array, magnetometer: str | None = None
-    ) -> None:
-        """Add raw samples of a magnetometer, stamped by itself."""
+    def _add_samples(self, stamps: Array, samples: Array, magnetometer: str | None) -> None:
         which = magnetometer_number(self.site, magnetometer, "samples")
         if self._fields_to:
             raise InputError(
                 f"magnetometer: samples of {magnetometer} are mixed with fields; use only one of"
                 " them for all magnetometers"
             )
-        stream, late = self.streams[which], self.site.platform.magnetometers[which].clock_offset
-        stamps = np.atleast_1d(time) + late
-        check_clock(stream.samples.name, stamps, self.newest)
-        stream.samples.add(stamps, np.atleast_2d(measured_sensor))
+        buffer, stamps = self.streams[which].samples, stamps + self.sensors[which].clock_offset
+        check_clock(buffer.name, stamps, self.newest)
+        buffer.add(stamps, samples)
         self.begun_at = min(self.begun_at, float(np.min(stamps, initial=np.inf)))
-
-    def add_marks(self, marks: Marks) -> None:
-        """Add bursts of coils, which every magnetometer receives."""
-        check_clock("marks", marks.end, self.newest)
-        for stream in self.streams:
-            stream.receiver.add_marks(marks)
 
     def add_slots(self, time: Array, slot: IntArray) -> None:  # noqa: ARG002
         """Reject slots of samples: each magnetometer would have its own."""
@@ -103,7 +93,7 @@ class SeveralArrivals(Arrivals):
             "magnetometer: slots of the samples of several are not supported; use records of marks"
         )
 
-    def add_fields(
+    def _add_epochs(
         self,
         samples: FieldSamples,
         steady: SteadyFields | None,  # noqa: ARG002
@@ -115,7 +105,6 @@ class SeveralArrivals(Arrivals):
                 "fields: they are mixed with samples of the magnetometers; use only one of them for"
                 " all magnetometers"
             )
-        check_clock("fields", samples.time, self.newest)
         late = 0
         for one in samples.epochs():
             self._take_fields(one)
@@ -123,7 +112,6 @@ class SeveralArrivals(Arrivals):
                 late += 1
             else:
                 self._put(one)
-        self.fields.sort(key=lambda s: float(s.time[0]))
         return late
 
     def _take_fields(self, one: FieldSamples) -> None:
@@ -154,8 +142,8 @@ class SeveralArrivals(Arrivals):
     def _last_times(self) -> dict[str, float]:
         """Return the time until which each magnetometer has sent samples (s)."""
         return {
-            stream.name: max(stream.samples.newest, self._fields_to.get(stream.name, self.begun_at))
-            for stream in self.streams
+            name: max(stream.samples.newest, self._fields_to.get(name, self.begun_at))
+            for name, stream in self._named
         }
 
     @property
@@ -165,7 +153,7 @@ class SeveralArrivals(Arrivals):
             return -np.inf
         detected, silent = self._last_times(), self._silent()
         waited = min(to for name, to in detected.items() if name not in silent)
-        return max(waited, self.inertial - LONGEST_WAIT)
+        return max(waited, self.imu.reached - LONGEST_WAIT)
 
     def _silent(self) -> list[str]:
         """Return the magnetometers that are not awaited."""
@@ -184,17 +172,10 @@ class SeveralArrivals(Arrivals):
         return self.complete
 
     @property
-    def first(self) -> float:
-        """Oldest stamp of the stored fields (s)."""
-        known = [stream.waveform.time[:1] for stream in self.streams]
-        known += [samples.time for samples in self.fields[:1]]
-        return float(np.min(np.concatenate(known), initial=np.inf))
-
-    @property
     def next_field(self) -> float:
         """Time of the next fields (s), as far as is known."""
         silent = self._silent()
-        live = [stream for stream in self.streams if stream.windows or stream.name not in silent]
+        live = [stream for name, stream in self._named if stream.windows or name not in silent]
         known = [float(samples.time[0]) for samples in self.fields[:1]]
         return min([*known, *(stream.next_centre for stream in live)], default=np.inf)
 
@@ -236,9 +217,8 @@ class SeveralArrivals(Arrivals):
     def losses(self) -> dict[str, int]:
         """Numbers of unused windows and samples, by magnetometer and reason."""
         result = super().losses
-        for stream in self.streams:
-            name = stream.name
-            counts = {f"window: {k}": v for k, v in stream.receiver.dropped.items()}
+        for name, stream in self._named:
+            counts = stream.dropped
             counts["window too late"] = stream.late
             counts["sample too late"] = stream.samples.late
             counts["epoch while it was silent"] = self.without[name]
@@ -246,12 +226,6 @@ class SeveralArrivals(Arrivals):
         return result
 
     # Processing
-
-    def settle(self) -> None:
-        """Sort the newest samples."""
-        super().settle()
-        for stream in self.streams:
-            stream.samples.rows()
 
     def gathered(self, delay: float, span: float) -> float | None:
         """Return until when to search for a first state (s), independent of the size of pieces."""
@@ -265,20 +239,17 @@ class SeveralArrivals(Arrivals):
         self, until: float, settings: EstimatorSettings, *, diagnose: bool
     ) -> OnlineStart | NoStart:
         """Return the first state from the measurements up to a time (s)."""
-        late = {sensor.name: sensor.clock_offset for sensor in self.site.platform.magnetometers}
         waves = {}
-        for stream in self.streams:
+        for sensor, stream in zip(self.sensors, self.streams, strict=True):
             wave = stream.waveform
             wave = wave.rows(wave.time <= until)
             if len(wave):
-                marks = stream.receiver.marks
-                waves[stream.name] = Waveform(
-                    wave.time - late[stream.name], wave.measured_sensor, marks
-                )
+                time, marks = wave.time - sensor.clock_offset, stream.receiver.marks
+                waves[sensor.name] = Waveform(time, wave.measured_sensor, marks)
         return find_online_start(
             self.site,
-            self.inertial_samples(end=until - self.applied_offset),
-            self.waveform,
+            self.imu.measured(end=until - self.imu.offset),
+            Buffer("magnetometer", 3),
             self.fields,
             [],
             until,
@@ -290,28 +261,23 @@ class SeveralArrivals(Arrivals):
 
     def limit_history(self, kept: float) -> None:
         """Keep only so much before the last search (s)."""
-        oldest = self._looked - kept
-        self.imu.discard_before(oldest, oldest)
-        self.fields = [s for s in self.fields if s.time[0] >= oldest]
-        for stream in self.streams:
-            stream.samples.discard_before(oldest, oldest)
-            stream.receiver.discard_marks(oldest)
+        self._keep_from(self._looked - kept)
 
-    def start(self, start: OnlineStart, delay: float) -> None:
-        """Continue from a first state, each receiver by its own samples."""
-        for stream in self.streams:
+    def _begin_receivers(self, start: OnlineStart, delay: float) -> None:
+        for name, stream in self._named:
             if isinstance(stream.receiver, LockinReceiver):
-                stream.receiver.extra_lines = start.lines.get(stream.name)
-        super().start(start, delay)
+                stream.receiver.extra_lines = start.lines.get(name)
+        self.discard_before(start.state.time)
         self.receive(start.state, delay)
 
     def receive(self, state: State, delay: float) -> None:
         """Check the windows of each that are complete and within a delay (s)."""
         self._delay = delay
-        imu = self.inertial_samples()
+        imu, offset = self.imu.measured(), self.imu.offset
         for k, stream in enumerate(self.streams):
+            stream.begin_late(imu)
             until = min(self.awaited, stream.samples.newest) - delay
-            result = stream.receive(imu, until, self.last_epoch, state, self.applied_offset)
+            result = stream.receive(imu, until, self.last_epoch, state, offset)
             if result is None:
                 continue
             for one in self._as_channels_of_all({k: result}).epochs():
@@ -323,7 +289,11 @@ class SeveralArrivals(Arrivals):
         none = FieldSamples.empty(self.streams[0].receiver.site.channels)
         return side_by_side([result.get(k, none) for k in range(len(self.streams))], self.site)
 
-    def next_window(self, state: State, *, is_lost: bool = False) -> float | None:  # noqa: ARG002
+    def next_window(
+        self,
+        state: State,  # noqa: ARG002
+        needs_separate: Callable[[State], bool],  # noqa: ARG002
+    ) -> float | None:
         """Advance to the next windows of all; return their centre (s), None where one may come."""
         centre = min(stream.next_admitted for stream in self.streams)
         grids = [s.receiver for s in self.streams if s.receiver.grid is not None]
@@ -339,14 +309,6 @@ class SeveralArrivals(Arrivals):
             mine = stream.next_admitted - centre < SAME_TIME
             stream.now = stream.windows.popleft() if mine else None
         return centre
-
-    def discard_before(self, time: float) -> None:
-        """Keep only the samples that are needed after a state (s)."""
-        reach = 2.0 + max(stream.receiver.history for stream in self.streams)
-        reach += longest_interval(self.receiver.site)
-        self.imu.discard_before(time - reach, time - self.applied_offset - 1.0)
-        for stream in self.streams:
-            stream.samples.discard_before(time - reach, time - reach)
 
     def fill_silence(self, state: State, time: float) -> None:
         """Do nothing where the IMU is silent: no single magnetometer's samples replace it."""
@@ -378,7 +340,7 @@ class SeveralArrivals(Arrivals):
             return None
         half = 0.5 * max(s.receiver.grid.length for s in self.streams if s.receiver.grid)
         begin, end = min(before.time, predicted.time - half), predicted.time + half
-        imu, offset = self.motion_samples(begin - MARGIN, end + MARGIN), self.applied_offset
+        imu, offset = self.imu.filled(begin - MARGIN, end + MARGIN), self.imu.offset
         result: dict[int, MotionCompensated] = {}
         for k, stream in enumerate(self.streams):
             if stream.now is None:

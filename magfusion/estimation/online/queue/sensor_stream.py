@@ -1,4 +1,4 @@
-"""Raw samples of one of several magnetometers as they arrive, and their windows."""
+"""Raw samples of a magnetometer as they arrive, and their windows."""
 
 from collections import deque
 from dataclasses import replace
@@ -12,11 +12,8 @@ from magfusion.estimation.demodulation.motion_compensation import (
 )
 from magfusion.estimation.graph.state import State
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
-from magfusion.model.site import Site
 from magfusion.receiver.lockin_receiver import LockinReceiver
 from magfusion.receiver.receiver import Receiver
-from magfusion.receiver.receivers import receiver_of
-from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array
 
 BEGINNING = 0.5  # s; of samples, to start a receiver that had none at the first state
@@ -27,14 +24,14 @@ class SensorStream:
 
     Parameters
     ----------
-    site : Site
-        With this magnetometer only, on the log's clock.
-    lockin : LockinSettings, optional
-        Of windows at the same times for all magnetometers.
+    receiver : Receiver
+        Of this magnetometer only, on the log's clock.  It begins with the first state, and never
+        where phasors are given.
+    name : str
+        Of the samples, for error messages.
 
     Attributes
     ----------
-    receiver : Receiver
     samples : Buffer
     windows : deque of int
         Numbers of windows that are admitted and not demodulated yet.
@@ -42,6 +39,8 @@ class SensorStream:
         Of the window at the state that is to be predicted.
     late : int
         Windows that arrived after the others were processed.
+    unseen : int
+        Windows without inertial samples.
     """
 
     receiver: Receiver
@@ -49,20 +48,21 @@ class SensorStream:
     windows: deque[int]
     now: int | None
     late: int
+    unseen: int
     _noise: list[Array]
     _noise_unseen: bool
 
-    def __init__(self, site: Site, lockin: LockinSettings | None) -> None:
-        self.name = site.platform.magnetometer.name
-        self.receiver = receiver_of(site, lockin)
-        self.samples = Buffer(f"magnetometer {self.name}", 3)
-        self.windows, self.now, self.late = deque(), None, 0
+    def __init__(self, receiver: Receiver, name: str) -> None:
+        self.receiver, self.samples = receiver, Buffer(name, 3)
+        self.windows, self.now = deque(), None
+        self.late = self.unseen = 0
         self._noise, self._noise_unseen = [], False
 
     @property
     def waveform(self) -> Waveform:
         """Stored samples."""
-        return Waveform(*self.samples.rows())
+        axes = self.receiver.site.platform.magnetometer.axes
+        return Waveform(*self.samples.rows(), axes=axes)
 
     @property
     def next_centre(self) -> float:
@@ -82,6 +82,19 @@ class SensorStream:
         """Whether a window is pending, or its samples have arrived."""
         return bool(self.windows) or self.receiver.complete(self.samples.newest)
 
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Numbers of unused windows, by reason."""
+        return {f"window: {reason}": count for reason, count in self.receiver.dropped.items()}
+
+    def begin_late(self, imu: ImuSamples) -> None:
+        """Begin a receiver that had no samples at the first state, once it has enough."""
+        wave = self.waveform
+        if self.receiver.grid is not None or len(wave) < 2 or len(imu) < 2:
+            return
+        if np.ptp(wave.time) >= BEGINNING:
+            self.receiver.begin(wave, imu)
+
     def receive(
         self, imu: ImuSamples, until: float, after: float, state: State, offset: float
     ) -> FieldSamples | None:
@@ -98,14 +111,11 @@ class SensorStream:
         offset : float
             Added to the IMU's stamps (s).
         """
-        receiver, wave = self.receiver, self.waveform
-        if receiver.grid is None:
-            if len(wave) < 2 or np.ptp(wave.time) < BEGINNING or len(imu) < 2:
-                return None
-            receiver.begin(wave, imu)
+        receiver = self.receiver
         if not receiver.complete(until):
             return None
         assert receiver.grid is not None
+        wave = self.waveform
         after += 0.25 * receiver.grid.step
         if isinstance(receiver, LockinReceiver):
             windows = receiver.admit(wave, imu, until)
@@ -119,23 +129,33 @@ class SensorStream:
         return result.rows(in_time)
 
     def demodulated(
-        self, before: State, predicted: State, imu: ImuSamples, offset: float, *, is_lost: bool
+        self,
+        before: State,
+        predicted: State,
+        imu: ImuSamples,
+        offset: float,
+        *,
+        blind: bool = False,
+        is_lost: bool,
     ) -> MotionCompensated:
         """Return the window at a prediction, by the calibration of this magnetometer.
 
         Parameters
         ----------
-        before, predicted, imu, offset, is_lost
+        before, predicted, imu, offset, blind, is_lost
             As of `magfusion.estimation.demodulation.motion_compensation.demodulate_predicted`.
         """
         receiver = self.receiver
         assert isinstance(receiver, LockinReceiver)
         assert self.now is not None
+        wave = self.waveform
         result = demodulate_predicted(
-            receiver, self.now, self.waveform, imu, before, predicted, offset, is_lost=is_lost
+            receiver, self.now, wave, imu, before, predicted, offset, blind=blind, is_lost=is_lost
         )
-        if result.unseen != self._noise_unseen:
-            self._noise, self._noise_unseen = [], result.unseen
+        unseen = result.unseen or blind
+        self.unseen += unseen
+        if unseen != self._noise_unseen:
+            self._noise, self._noise_unseen = [], unseen
         # The mean over neighbouring windows, as far as they are known.
         self._noise = [*self._noise, result.fields.phasor_cov][-receiver.settings.noise_windows :]
         cov = np.mean(self._noise, axis=0)
