@@ -18,7 +18,7 @@ from magfusion.estimation.online.queue.inertial_stream import InertialStream
 from magfusion.model.parameters import Block, corrected_imu
 from magfusion.model.samples import FieldSamples, SteadyFields
 from magfusion.model.site import Site
-from magfusion.units import Array, ComplexArray
+from magfusion.units import ComplexArray
 
 
 @dataclass(frozen=True, eq=False)
