@@ -15,8 +15,8 @@ from time_slots_and_mains import tracker
 from magfusion.errors import InputError
 from magfusion.files.log import read_log, write_log
 from magfusion.files.plain_data import resume, to_plain
+from magfusion.files.records import Record
 from magfusion.files.site import load_site, save_site
-from magfusion.files.stream import Record
 from magfusion.jobs.import_log import ImportSettings, run_import
 from magfusion.model.marks import SILENT, UNKNOWN_SLOT, Marks, SlotColumn, marks_of_column
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform

@@ -18,14 +18,10 @@ from online_log import OnlineLog, online_log
 from magfusion.errors import InputError
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.log import write_log
+from magfusion.files.record_samples import field_samples
+from magfusion.files.records import FieldsRecord
 from magfusion.files.site import save_site
-from magfusion.files.stream import (
-    FieldsRecord,
-    Format,
-    field_samples,
-    json_line,
-    read_records,
-)
+from magfusion.files.stream import Format, json_line, read_records
 from magfusion.files.stream_contents import fields_content
 from magfusion.jobs.replay import Replay, feed, run_replay
 from magfusion.jobs.stream import StreamSettings, run_stream, state_content

@@ -13,8 +13,8 @@ from magfusion.files.audio import describe_recording
 from magfusion.files.inertial_tables import write_imu
 from magfusion.files.named_records import with_waveform
 from magfusion.files.open import open_log
+from magfusion.files.records import Record
 from magfusion.files.site import load_site, save_site
-from magfusion.files.stream import Record
 from magfusion.files.stream_contents import baseband_content
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.jobs.import_log import ImportSettings, run_import

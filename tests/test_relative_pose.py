@@ -26,7 +26,8 @@ from magfusion.estimation.online.restored import restored
 from magfusion.estimation.online_integrity.aiding_gate import AidingGate
 from magfusion.files.aiding_messages import SensorMessages
 from magfusion.files.log import read_log, write_log
-from magfusion.files.stream import Record, aiding_samples
+from magfusion.files.record_samples import aiding_samples
+from magfusion.files.records import Record
 from magfusion.files.stream_contents import aiding_content
 from magfusion.model.aiding import AidingSamples, AidingSensor, AidingSigma
 from magfusion.model.parameters import choose_blocks, dimension, initial_calibration, prior_sigma

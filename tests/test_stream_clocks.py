@@ -13,8 +13,8 @@ from online_log import OnlineLog, online_log
 from test_navigate_stream import EKF, answered, records
 
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.files.records import Record
 from magfusion.files.site import save_site
-from magfusion.files.stream import Record
 from magfusion.jobs.checkpoint import REPORT_INTERVAL, CheckpointWriter
 from magfusion.jobs.replay import Replay, feed
 from magfusion.jobs.stream import StreamSettings

@@ -48,9 +48,9 @@ ROOMS = {
             row_stamps steel_file trajectory_table wells_file
             aiding_tables bag depth_table fix_table marks_table result_states rotor_columns
             site_plain site_text
-            site_response temperature_table tum
-            inertial_tables odometry_bag site_magnetometer stream
-            site_aiding trajectory_formats
+            record_values site_response temperature_table tum
+            inertial_tables odometry_bag records site_magnetometer
+            record_samples site_aiding stream trajectory_formats
             named_records named_samples site_beacon site_schema stream_contents
             log site
             foreign open site_changes

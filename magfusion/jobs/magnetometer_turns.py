@@ -12,7 +12,8 @@ from magfusion.calibration.magnetometer_log import LogCalibration
 from magfusion.calibration.turn_coverage import TurnCoverage, TurnStatus
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_cleaning import clean_log
-from magfusion.files.stream import NumberedRecord, Record
+from magfusion.files.records import Record
+from magfusion.files.stream import NumberedRecord
 from magfusion.jobs.inputs import named
 from magfusion.jobs.stream_clocks import StreamClocks
 from magfusion.jobs.stream_samples import StreamSamples

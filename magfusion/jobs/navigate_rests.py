@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from magfusion.estimation.rests.rest_stream import RestNavigator, RestState
-    from magfusion.files.stream import NumberedRecord, Record
+    from magfusion.files.records import Record
+    from magfusion.files.stream import NumberedRecord
     from magfusion.jobs.inputs import Job
     from magfusion.jobs.navigate_settings import NavigateSettings
     from magfusion.model.samples import Log

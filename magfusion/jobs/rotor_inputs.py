@@ -11,7 +11,7 @@ from magfusion.model.samples import Log
 from magfusion.model.site import Beacon, Site
 
 if TYPE_CHECKING:
-    from magfusion.files.stream import Record
+    from magfusion.files.records import Record
 
 MAX_WAIT = 2.0  # s of samples in a stream, after which the angle of a rotor is missed
 ALL = ""  # as the name of a current that flows through the coils of all

@@ -18,17 +18,11 @@ from magfusion.estimation.online.state_of_now import PropagatedState
 from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.checkpoint import run_key
 from magfusion.files.named_records import magnetometer_number, site_fields, with_waveform
+from magfusion.files.record_samples import aiding_samples, drive_samples
+from magfusion.files.records import Record
 from magfusion.files.site import load_site
 from magfusion.files.standard_streams import write_message
-from magfusion.files.stream import (
-    Format,
-    NumberedRecord,
-    Record,
-    aiding_samples,
-    drive_samples,
-    json_line,
-    read_records,
-)
+from magfusion.files.stream import Format, NumberedRecord, json_line, read_records
 from magfusion.jobs.checkpoint import CheckpointWriter, begin
 from magfusion.jobs.inputs import named
 from magfusion.jobs.live import LiveSettings, StateSink, state_sinks

@@ -8,7 +8,7 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.data_checks.stream_buffer import LARGEST_JUMP
-from magfusion.files.stream import Record
+from magfusion.files.records import Record
 from magfusion.units import Array
 
 LEAST_STEP = 1.0  # s back; a network delays a record by less

@@ -12,7 +12,8 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.files.aiding_messages import NAV_SAT_FIX, SensorMessages, aiding_rows
-from magfusion.files.stream import NumberedRecord, Record, checked_record
+from magfusion.files.records import Record
+from magfusion.files.stream import NumberedRecord, checked_record
 from magfusion.results.dds_domain import dds_name, join_domain
 
 if TYPE_CHECKING:
