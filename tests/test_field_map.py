@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from derivatives import central_difference, relative_to_group
 
-from magfusion.model.field import model_error_cov
 from magfusion.model.field_map import FieldMap
-from magfusion.model.noise import measurement_cov, model_error
+from magfusion.model.noise import measurement_cov, model_error, model_error_cov
 from magfusion.model.samples import FieldSamples
 from magfusion.simulation.demo_site import demo_site
 

@@ -11,7 +11,7 @@ from magfusion.estimation.measurements.model_error import (
     epochs_sharing_error_online,
 )
 from magfusion.estimation.measurements.phasors import field_phasors
-from magfusion.model.field import model_error_cov
+from magfusion.model.noise import model_error_cov
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trajectory import Trajectory
 from magfusion.results.errors import trajectory_errors

@@ -8,8 +8,9 @@ import pytest
 from derivatives import central_difference, relative_to_group
 from scipy.spatial.transform import Rotation
 
-from magfusion.model.field import model_error_cov, observe, predict, skew
+from magfusion.model.field import observe, predict, skew
 from magfusion.model.field_map import FieldMap
+from magfusion.model.noise import model_error_cov
 from magfusion.model.site import Beacon, BeaconSigma, Coil, Magnetometer, MagnetometerSigma
 
 STEP = 1e-5  # rad, m, 1; its square is the quotient's error where lengths are metres

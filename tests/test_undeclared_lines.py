@@ -8,7 +8,7 @@ import pytest
 
 from magfusion.estimation.batch.batch import SmootherSettings
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
-from magfusion.estimation.data_checks.spectrum import with_disturbing_lines
+from magfusion.estimation.data_checks.disturbing_lines import with_disturbing_lines
 from magfusion.estimation.demodulation.demodulation import phasors
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site

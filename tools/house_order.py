@@ -28,7 +28,7 @@ ROOMS = {
             arguments batches check_distance correlation drive field_map fixed_axes groups hall
             hermite imu_intrinsics marks perturbation physics platform_motion probe progress
             quaternion region response rotor short_repr temperature time_division trust
-            aiding magnetometer
+            aiding beacon magnetometer
             site trajectory
             truth_poses
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
@@ -74,6 +74,7 @@ ROOMS = {
             disturbance rails
             drift field steel_worlds wells
             waveform
+            config
             log
             endurance
         """,

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from magfusion.calibration.antenna import AntennaFit
 from magfusion.calibration.antenna_site import BodySurvey, of_site
 from magfusion.estimation.snapshot.likelihood import fix_epochs
-from magfusion.model.field import model_error_cov, skew
+from magfusion.model.field import skew
+from magfusion.model.noise import model_error_cov
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Beacon, Site

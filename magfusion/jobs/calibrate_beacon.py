@@ -17,7 +17,8 @@ from magfusion.files.site import load_site, save_site
 from magfusion.files.survey import read_survey
 from magfusion.jobs.receiver_axes import three_axes
 from magfusion.jobs.settings import Command, Settings, argument, option, required
-from magfusion.model.field import model_error_cov, predict
+from magfusion.model.field import predict
+from magfusion.model.noise import model_error_cov
 from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Beacon, Site
 from magfusion.model.trust import Finding, Trust, Verdict

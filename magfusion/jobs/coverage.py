@@ -11,8 +11,9 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.files.site import load_site
 from magfusion.files.table import write_table
+from magfusion.jobs.design_settings import NeedSettings
 from magfusion.jobs.receiver_axes import three_axes
-from magfusion.jobs.settings import Command, NeedSettings, argument, option
+from magfusion.jobs.settings import Command, argument, option
 from magfusion.jobs.simulate import box_option
 from magfusion.model.site import Site
 from magfusion.model.trust import Trust

@@ -8,10 +8,41 @@ from typing import Literal
 
 from magfusion.errors import InputError
 from magfusion.jobs.coil_drive import DriveSettings
-from magfusion.jobs.settings import NeedSettings, RandomSettings, argument, option
+from magfusion.jobs.settings import RandomSettings, RiskSettings, argument, option
 
 ALL = "all"
 MOST_BEACONS, USUAL_BEACONS = 30, 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeedSettings(RiskSettings):
+    """Protection levels that a user needs."""
+
+    need: str | None = option(
+        None,
+        "Protection level that is needed: position in m, and attitude in deg after a comma",
+        metavar="POSITION[,ATTITUDE]",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _ = self.limits
+
+    @property
+    def limits(self) -> tuple[float, ...]:
+        """Return the needed levels: of position (m), and of attitude (deg) where it is given."""
+        if self.need is None:
+            return ()
+        try:
+            result = tuple(float(part) for part in self.need.split(","))
+        except ValueError:
+            result = ()
+        if len(result) not in (1, 2) or not all(0.0 < value < 1e6 for value in result):
+            raise InputError(
+                f"--need {self.need!r}: give a length in m, and an angle in deg after a comma where"
+                " it matters, e.g. --need 0.1,2"
+            )
+        return result
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
-from magfusion.estimation.data_checks.spectrum import with_disturbing_lines
+from magfusion.estimation.data_checks.disturbing_lines import with_disturbing_lines
 from magfusion.files.checkpoint import claim_checkpoint, run_key
 from magfusion.files.row_file import RowFile, claim_rows
 from magfusion.files.site import load_site

@@ -28,8 +28,6 @@ from magfusion.model.receive_coils import (
 from magfusion.model.site import Beacon, Magnetometer
 from magfusion.units import AnyArray, Array, ComplexArray
 
-_IDENTITY = np.eye(3)  # covariance shape of components with equal, independent errors
-
 
 def _source(beacon: Beacon | Sources) -> Sources:
     return alone(beacon) if isinstance(beacon, Beacon) else beacon
@@ -376,29 +374,3 @@ def predict_earth(
     """Return the steady field that `observe_earth` returns, shape (..., 3) (T)."""
     in_sensor = earth_field_world @ world_from_body @ magnetometer.body_from_sensor
     return np.asarray(in_sensor @ magnetometer.matrix.T + magnetometer.offset)
-
-
-def model_error_cov(phasor_sensor: ComplexArray, model_error: float | Array) -> Array:
-    """Return the variance that a field-model error adds to each component of a phasor.
-
-    ``eps^2 |b|^2 / 3``, with ``|b|^2`` the mean square of the two quadratures: with weights for
-    white noise alone the nearest beacon's model error dominates (paper 004 re-examined).
-
-    Parameters
-    ----------
-    phasor_sensor : complex ndarray, shape (..., 3)
-        (T)
-    model_error : float or ndarray, shape (...)
-        Relative error of the field model, one sigma.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-        (T^2)
-    """
-    return power_error_cov(0.5 * np.sum(np.abs(phasor_sensor) ** 2, axis=-1), model_error)
-
-
-def power_error_cov(power: Array, model_error: float | Array) -> Array:
-    """Return the same of the field's mean square in either quadrature, shape (...) (T^2)."""
-    return (model_error**2 * power)[..., None, None] / 3.0 * _IDENTITY

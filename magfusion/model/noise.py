@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.model.field import power_error_cov, predict
+from magfusion.model.field import predict
 from magfusion.model.field_map import block_diagonal
 from magfusion.model.ground import conductivity_of, ground_error
 from magfusion.model.once import once_a_site
 from magfusion.model.parameters import BeaconParameter, MagnetometerParameter, candidates
+from magfusion.model.perturbation import by_matrix as by_matrix
+from magfusion.model.perturbation import skew as skew
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -322,3 +324,29 @@ def stacked(phasor: ComplexArray) -> Array:
     """Stack complex vectors as real part, then imaginary part; zero where they are NaN."""
     parts = np.concatenate([phasor.real, phasor.imag], axis=-1)
     return parts if np.isfinite(parts).all() else np.nan_to_num(parts)
+
+
+def model_error_cov(phasor_sensor: ComplexArray, model_error: float | Array) -> Array:
+    """Return the variance that a field-model error adds to each component of a phasor.
+
+    ``eps^2 |b|^2 / 3``, with ``|b|^2`` the mean square of the two quadratures: with weights for
+    white noise alone the nearest beacon's model error dominates (paper 004 re-examined).
+
+    Parameters
+    ----------
+    phasor_sensor : complex ndarray, shape (..., 3)
+        (T)
+    model_error : float or ndarray, shape (...)
+        Relative error of the field model, one sigma.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+        (T^2)
+    """
+    return power_error_cov(0.5 * np.sum(np.abs(phasor_sensor) ** 2, axis=-1), model_error)
+
+
+def power_error_cov(power: Array, model_error: float | Array) -> Array:
+    """Return the same of the field's mean square in either quadrature, shape (...) (T^2)."""
+    return (model_error**2 * power)[..., None, None] / 3.0 * np.eye(3)

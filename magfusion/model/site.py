@@ -1,16 +1,19 @@
 """The site: beacons, the moving platform, and the uncertainty of their calibration."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 
 from magfusion.model.aiding import AidingSensor
+from magfusion.model.beacon import Beacon as Beacon
+from magfusion.model.beacon import BeaconSigma as BeaconSigma
+from magfusion.model.beacon import Coil as Coil
+from magfusion.model.beacon import Unknown as Unknown
+from magfusion.model.beacon import rotor_coils as rotor_coils
 from magfusion.model.correlation import Correlation
 from magfusion.model.drive import DriveShares
-from magfusion.model.field_map import FieldMap
 from magfusion.model.imu_intrinsics import ImuIntrinsics
 from magfusion.model.magnetometer import Magnetometer as Magnetometer
 from magfusion.model.magnetometer import MagnetometerSigma as MagnetometerSigma
@@ -20,174 +23,10 @@ from magfusion.model.platform_motion import MotionModel as MotionModel
 from magfusion.model.region import Bounds, Region, bounds_of
 from magfusion.model.rotor import Rotor as Rotor
 from magfusion.model.short_repr import short_repr
-from magfusion.model.temperature import MomentTemperatureModel, Temperatures
+from magfusion.model.temperature import Temperatures
 from magfusion.model.time_division import MarkedSlots as MarkedSlots
 from magfusion.model.time_division import Slots as Slots
-from magfusion.units import Array, ComplexArray, IntArray
-
-Unknown = Literal["pose", "position", "attitude"]
-
-
-@dataclass(frozen=True, eq=False)
-class Coil:
-    """One coil of a beacon, driven by ``cos(2 pi f t + phase)``.
-
-    Parameters
-    ----------
-    moment_beacon : ndarray, shape (3,)
-        Peak moment (A m^2).
-    phase : float
-        Drive phase relative to the log clock (rad).
-    centre_beacon : ndarray, shape (3,)
-        Magnetic centre relative to the beacon's origin (m).
-    radius, length : float, optional
-        Finite size (m), see `magfusion.model.coil_field`; None for a dipole.
-    frequency_hz : float, optional
-        Drive frequency where it differs from the beacon's (frequency division).
-    slot : int, optional
-        Time slot, counted from 0, where coils are driven in turn (time division).
-    current : float, optional
-        Peak current of the declared moment (A).
-    """
-
-    moment_beacon: Array
-    phase: float = 0.0
-    centre_beacon: Array = field(default_factory=lambda: np.zeros(3))
-    radius: float | None = None
-    length: float | None = None
-    frequency_hz: float | None = None
-    slot: int | None = None
-    current: float | None = None
-
-
-def rotor_coils(rotor: Rotor, frequency_hz: float) -> tuple[Coil, ...]:
-    """Return the coils equivalent to a magnet on a shaft rotating at a frequency.
-
-    Their current is one; a measured angle is recorded as its cosine.
-    """
-    cosine, sine = rotor.turning_moments
-    turning = (Coil(cosine, current=1.0), Coil(sine, -np.pi / 2.0, current=1.0))
-    return turning + tuple(
-        Coil(one.moment_beacon, one.phase, frequency_hz=one.order * frequency_hz, current=1.0)
-        for one in rotor.harmonics
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class BeaconSigma:
-    """Prior standard deviations of a beacon's calibration; zero means known.
-
-    Parameters
-    ----------
-    position_world : ndarray, shape (3,)
-        Of the centre, world axes (m).
-    rotation_beacon : ndarray, shape (3,)
-        Of the attitude, beacon axes (rad).
-    log_moment : ndarray, shape (coils,)
-        Of the natural logarithm of each coil's moment.
-    """
-
-    position_world: Array
-    rotation_beacon: Array
-    log_moment: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Beacon:
-    """A magnetic source: one or more coils on a common rigid frame.
-
-    Parameters
-    ----------
-    position_world : ndarray, shape (3,)
-        Surveyed centre (m).
-    world_from_beacon : ndarray, shape (3, 3)
-        Rotation of the coil axes.
-    synchronised : bool
-        False where the drive phase relative to the log clock is unknown and drifts.
-    field_map : FieldMap, optional
-        Deviation of its field from the model where it was surveyed.
-    slots : Slots or MarkedSlots, optional
-        Time slots of its coils, if driven in turn on a known schedule; a frequency of zero then
-        means pulses of direct current.
-    unknown : {"pose", "position", "attitude"}, optional
-        Unsurveyed part, to be estimated from a log; its values are NaN.
-    model_error : float, optional
-        Of its own field; the site's if None.
-    noise_factor : float
-        Noise of its phasors relative to that measured near its tones.
-    temperature_model : MomentTemperatureModel, optional
-        Temperature dependence of its moments.
-    hemisphere_beacon : ndarray, shape (3,), optional
-        Direction, of any length, of the half space that contains the magnetometer.
-    conductivity : float
-        Of the surrounding ground or water (S/m), uniform, isotropic and unbounded; equal for all
-        beacons of a site.
-    rotor : Rotor, optional
-        Magnet on a shaft from which its coils are derived.
-    planned : bool
-        Whether its frequency is not chosen yet, so that it is shared with no other beacon.
-    """
-
-    __repr__ = short_repr
-
-    name: str
-    position_world: Array
-    world_from_beacon: Array
-    frequency_hz: float
-    coils: tuple[Coil, ...]
-    synchronised: bool
-    sigma: BeaconSigma
-    field_map: FieldMap | None = None
-    slots: Slots | MarkedSlots | None = None
-    unknown: Unknown | None = None
-    model_error: float | None = None
-    noise_factor: float = 1.0
-    hemisphere_beacon: Array | None = None
-    temperature_model: MomentTemperatureModel | None = None
-    conductivity: float = 0.0
-    rotor: Rotor | None = None
-    planned: bool = False
-
-    @cached_property
-    def tones(self) -> tuple[tuple[float, int | None], ...]:
-        """Distinct (frequency in Hz, slot) pairs in the order of the coils."""
-        return tuple(
-            dict.fromkeys((c.frequency_hz or self.frequency_hz, c.slot) for c in self.coils)
-        )
-
-    @cached_property
-    def tone_frequencies_hz(self) -> Array:
-        """Frequency of each tone (Hz), shape (tones,)."""
-        return np.array([frequency for frequency, _ in self.tones])
-
-    @cached_property
-    def excitation(self) -> ComplexArray:
-        """Complex drive of each coil in each tone, shape (coils, tones)."""
-        drive = np.zeros((len(self.coils), len(self.tones)), dtype=np.complex128)
-        for j, coil in enumerate(self.coils):
-            k = self.tones.index((coil.frequency_hz or self.frequency_hz, coil.slot))
-            drive[j, k] = np.exp(1j * coil.phase)
-        return drive
-
-    @cached_property
-    def tone_moments(self) -> Array:
-        """Magnitude of the complex moment of each tone (A m^2), shape (tones,)."""
-        return np.asarray(np.linalg.norm(self.moments_beacon.T @ self.excitation, axis=0))
-
-    @cached_property
-    def moments_beacon(self) -> Array:
-        """Peak moments (A m^2), shape (coils, 3)."""
-        return np.array([c.moment_beacon for c in self.coils])
-
-    @cached_property
-    def centres_beacon(self) -> Array:
-        """Magnetic centres of the coils (m), shape (coils, 3)."""
-        return np.array([c.centre_beacon for c in self.coils])
-
-    @cached_property
-    def concentric(self) -> bool:
-        """Whether all coils are at one place."""
-        return bool(np.all(self.centres_beacon == self.centres_beacon[0]))
+from magfusion.units import Array, IntArray
 
 
 @dataclass(frozen=True)

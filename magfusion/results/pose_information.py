@@ -13,10 +13,10 @@ import numpy as np
 from magfusion.estimation.posterior.protection_levels import protection_levels
 from magfusion.estimation.posterior.separation import Separation
 from magfusion.model.detection_range import owned_at
-from magfusion.model.field import model_error_cov
 from magfusion.model.noise import (
     magnetometers_sharing_error,
     model_error,
+    model_error_cov,
     paired_whitening,
     sensors_at,
 )

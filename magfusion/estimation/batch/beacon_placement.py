@@ -22,8 +22,7 @@ from magfusion.estimation.solve.batched import (
     minimise,
     normal_equations,
 )
-from magfusion.model.field import model_error_cov
-from magfusion.model.noise import paired_whitening, sensor_positions, stacked
+from magfusion.model.noise import model_error_cov, paired_whitening, sensor_positions, stacked
 from magfusion.model.parameters import (
     Calibration,
     choose_blocks,

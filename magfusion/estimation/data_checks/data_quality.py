@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from magfusion.estimation.data_checks.body_iron import IRON_SPAN, iron_on_body
+from magfusion.estimation.data_checks.disturbing_lines import undeclared_lines
 from magfusion.estimation.data_checks.gravity_and_field_checks import gravity_and_field_findings
 from magfusion.estimation.data_checks.inertial_noise import noisy_inertial
 from magfusion.estimation.data_checks.samples import (
@@ -21,7 +22,6 @@ from magfusion.estimation.data_checks.signal import (
     undetected_findings,
     with_motion_compensation,
 )
-from magfusion.estimation.data_checks.spectrum import undeclared_lines
 from magfusion.estimation.data_checks.stamps import uneven_stamps
 from magfusion.estimation.data_checks.still_means import still_means
 from magfusion.estimation.data_checks.truth import truth_findings

@@ -14,7 +14,7 @@ from magfusion.estimation.data_checks.detection import (
     STRONG_CHI_SQUARE,
     above_noise,
 )
-from magfusion.estimation.data_checks.spectrum import with_disturbing_lines
+from magfusion.estimation.data_checks.disturbing_lines import with_disturbing_lines
 from magfusion.estimation.demodulation.close_tones import joint_phasors
 from magfusion.estimation.graph.preintegration import low_passed_rate_at
 from magfusion.estimation.measurements.joint_phasors import JointPhasors, at_nearest

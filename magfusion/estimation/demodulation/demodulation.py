@@ -7,7 +7,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.detection import masked_phasors, without_silence
-from magfusion.estimation.data_checks.spectrum import with_disturbing_lines
+from magfusion.estimation.data_checks.disturbing_lines import with_disturbing_lines
 from magfusion.estimation.demodulation.burial_depth import refuse_too_deep
 from magfusion.estimation.demodulation.close_log import CloseLog
 from magfusion.estimation.demodulation.motion_compensation import (

@@ -11,7 +11,7 @@ from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.batch.settings import EstimatorSettings
-from magfusion.estimation.data_checks.spectrum import with_disturbing_lines
+from magfusion.estimation.data_checks.disturbing_lines import with_disturbing_lines
 from magfusion.estimation.data_checks.stream_buffer import Buffer
 from magfusion.estimation.demodulation.separate_demodulation import each_alone
 from magfusion.estimation.demodulation.several_demodulation import demodulated_several, same_windows

@@ -8,15 +8,9 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_quality import recorded
+from magfusion.estimation.data_checks.disturbing_lines import judged_lines, with_disturbing_lines
 from magfusion.estimation.data_checks.signal import BeaconDetection, detect_in_log, within_reach
-from magfusion.estimation.data_checks.spectrum import (
-    SpectralLine,
-    Spectrum,
-    judged_lines,
-    named_lines,
-    spectrum,
-    with_disturbing_lines,
-)
+from magfusion.estimation.data_checks.spectrum import SpectralLine, Spectrum, named_lines, spectrum
 from magfusion.estimation.data_checks.stamps import Timing, timings
 from magfusion.estimation.data_checks.still_means import StillMeans, still_means
 from magfusion.estimation.demodulation.beacon_selection import select_detected

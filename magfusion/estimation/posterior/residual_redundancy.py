@@ -13,8 +13,7 @@ from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.posterior.marginals import is_chain
 from magfusion.estimation.posterior.residual_covariance_chain import left_by_chain
 from magfusion.estimation.posterior.residual_tree import left_by_tree
-from magfusion.model.field import model_error_cov
-from magfusion.model.noise import cholesky, sensor_positions
+from magfusion.model.noise import cholesky, model_error_cov, sensor_positions
 from magfusion.model.parameters import Block
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site

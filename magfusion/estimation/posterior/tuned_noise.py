@@ -5,7 +5,7 @@ from collections.abc import Container, Iterator, Sequence
 import numpy as np
 
 from magfusion.estimation.posterior.noise_tuning import OF_MOTION, Tuned
-from magfusion.model.field import model_error_cov
+from magfusion.model.noise import model_error_cov
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict

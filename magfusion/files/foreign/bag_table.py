@@ -21,7 +21,7 @@ from magfusion.files.foreign.bag_transforms import (
     frame_pairs,
 )
 from magfusion.files.foreign.columns import STREAMS, TIME, VELOCITY, ColumnMapping, Term
-from magfusion.files.foreign.guess import likely_unit
+from magfusion.files.foreign.guess_by_values import likely_unit
 from magfusion.files.foreign.plan import Findings, ImportPlan, Rate, Terms
 from magfusion.files.foreign.source import ROWS, RowBlock, Source, SourceColumn
 from magfusion.files.foreign.units import SourceUnit, accepted, parse_unit

@@ -15,7 +15,8 @@ from magfusion.errors import InputError
 from magfusion.files.foreign.arrays import array_source
 from magfusion.files.foreign.columns import EULER, STREAMS, TIME, VELOCITY, Term, terms_by_place
 from magfusion.files.foreign.convert import converted_rows
-from magfusion.files.foreign.guess import likely_time_unit, named_columns
+from magfusion.files.foreign.guess import named_columns
+from magfusion.files.foreign.guess_by_values import likely_time_unit
 from magfusion.files.foreign.plan import ImportPlan, Terms, first_values
 from magfusion.files.foreign.source import Source
 from magfusion.files.foreign.text import text_source

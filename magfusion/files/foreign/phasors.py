@@ -15,7 +15,8 @@ from magfusion.files.foreign.columns import (
     place_of,
     term_of,
 )
-from magfusion.files.foreign.guess import likely_time_unit, named_columns, readings
+from magfusion.files.foreign.guess import named_columns, readings
+from magfusion.files.foreign.guess_by_values import likely_time_unit
 from magfusion.files.foreign.plan import Findings, Rate, first_values, shown
 from magfusion.files.foreign.source import Source, SourceColumn
 from magfusion.files.foreign.units import UNITS, Dimension, SourceUnit, parse_unit

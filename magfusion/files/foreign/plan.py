@@ -24,13 +24,11 @@ from magfusion.files.foreign.columns import (
 )
 from magfusion.files.foreign.guess import (
     Named,
-    by_place,
-    likely_time_unit,
-    likely_unit,
     named_columns,
     numbered_quaternion,
     two_column_stamp,
 )
+from magfusion.files.foreign.guess_by_values import by_place, likely_time_unit, likely_unit
 from magfusion.files.foreign.source import Source
 from magfusion.files.foreign.units import (
     ISO,
