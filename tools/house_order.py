@@ -114,7 +114,7 @@ ROOMS = {
         "jobs": """
             antenna_inputs fix_coil joint_kept listen_frames receiver_axes region_option
             rotor_inputs state_rows
-            listen_lines listen_sound stream_clocks stream_samples written
+            listen_lines listen_sound record_loop stream_clocks stream_samples written
             inputs navigate_results result_directory
             allan_noise checkpoint failure magnetometer_trust magnetometer_turns orientation
             budget_figures settings without_beacons

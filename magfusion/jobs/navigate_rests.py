@@ -14,10 +14,11 @@ from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.files.named_records import with_waveform
 from magfusion.files.site import load_site, save_site
-from magfusion.files.standard_streams import binary_output, until_closed, write_message
+from magfusion.files.standard_streams import binary_output, until_closed
 from magfusion.files.stream import json_line
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
+from magfusion.jobs.record_loop import process_records
 from magfusion.jobs.record_source import live_records
 from magfusion.jobs.stream_samples import StreamSamples
 from magfusion.model.progress import Report, quiet
@@ -240,28 +241,21 @@ def run_rests_stream(
     InputError
         Where a record is invalid and ``keep_going`` is not set.
     """
-    navigator, samples, refused = how.navigator(site), StreamSamples(site), 0
-    for numbered in records:
-        try:
-            if numbered.record is None:
-                raise InputError(numbered.refusal)
-            _process_record(navigator, with_waveform(numbered.record, site), samples)
-        except InputError as error:
-            sentence = numbered.located(error)
-            if not keep_going:
-                raise InputError(sentence) from error
-            refused += 1
-            write_message(messages, f"{sentence} (skipped)")
-            continue
+    navigator, samples = how.navigator(site), StreamSamples(site)
+
+    def process(record: Record) -> None:
+        _process_record(navigator, with_waveform(record, site), samples)
+
+    def write() -> None:
         for state in navigator.take():
             sink.write(json_line(rest_content(state)))
         sink.flush()
+
+    refused = process_records(records, process, write, messages, keep_going=keep_going)
     for stream, _, *remaining in samples.end():
         _add(navigator, stream, *remaining)
     navigator.end()
-    for state in navigator.take():
-        sink.write(json_line(rest_content(state)))
-    sink.flush()
+    write()
     samples.report(messages)
     return refused
 

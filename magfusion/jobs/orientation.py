@@ -18,11 +18,11 @@ from magfusion.estimation.orientation.online import ANYWHERE, TIMING, Orientatio
 from magfusion.estimation.orientation.remarks import doubts, remarks
 from magfusion.estimation.orientation.smoother import Oriented, oriented
 from magfusion.files.site import save_site
-from magfusion.files.standard_streams import write_message
 from magfusion.files.stream import NumberedRecord, json_line
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
 from magfusion.jobs.inputs import Job, named, read_job, require_imu
+from magfusion.jobs.record_loop import process_records
 from magfusion.jobs.result_directory import claim
 from magfusion.jobs.stream_samples import StreamSamples
 from magfusion.model.progress import Report
@@ -40,6 +40,7 @@ from magfusion.units import DEGREE, Array, Rate
 
 if TYPE_CHECKING:
     from magfusion.estimation.online_integrity.judgement import JudgedState
+    from magfusion.files.records import Record
 
 
 def run_orientation(name: str, job: Job, rate: Rate, *, back: bool, report: Report) -> Figures:
@@ -200,27 +201,18 @@ def run_orientation_stream(
     InputError
         Where a record is invalid and ``keep_going`` is not set.
     """
-    navigator, refused = OrientationNavigator(site), 0
+    navigator = OrientationNavigator(site)
     samples = StreamSamples(site, patient=False)  # each sample has a state
+
+    def process(record: Record) -> None:
+        _process_record(navigator, record, samples)
 
     def write() -> None:
         for state in navigator.take():
             sink.write(json_line(_state_row(navigator, state)))
         sink.flush()
 
-    for numbered in records:
-        try:
-            if numbered.record is None:
-                raise InputError(numbered.refusal)
-            _process_record(navigator, numbered.record, samples)
-        except InputError as error:
-            sentence = numbered.located(error)
-            if not keep_going:
-                raise InputError(sentence) from error
-            refused += 1
-            write_message(messages, f"{sentence} (skipped)")
-            continue
-        write()
+    refused = process_records(records, process, write, messages, keep_going=keep_going)
     for stream, _, *remaining in samples.end():
         _add(navigator, stream, *remaining)
     write()
@@ -236,7 +228,9 @@ def _add(navigator: OrientationNavigator, stream: str, time: Array, rows: Array)
         navigator.add_magnetometer(platform.on_drive_clock(time), rows)
 
 
-def _process_record(navigator: OrientationNavigator, record: Any, samples: StreamSamples) -> None:
+def _process_record(
+    navigator: OrientationNavigator, record: Record, samples: StreamSamples
+) -> None:
     if record.imu is not None:
         whole = samples.whole("imu", record.imu.time, record.imu.gyro, record.imu.accel)
         _add(navigator, "imu", *samples.tested("imu", *whole))

@@ -28,12 +28,11 @@ from magfusion.jobs.settings import (
     option,
 )
 from magfusion.model.progress import Report, quiet
-from magfusion.model.trust import Finding
 from magfusion.results.figures import Figure, Figures
 from magfusion.results.rest_figures import rest_figures
 
 if TYPE_CHECKING:
-    from magfusion.estimation.batch.batch import Smoothed, SmootherSettings
+    from magfusion.estimation.batch.batch import SmootherSettings
     from magfusion.estimation.batch.outer_iterations import PassFile
     from magfusion.estimation.rests.stationary_integration import IntegratedRests
     from magfusion.jobs.inputs import Job
@@ -41,7 +40,7 @@ if TYPE_CHECKING:
     from magfusion.jobs.smooth_result import Finished
     from magfusion.model.samples import Log
     from magfusion.model.site import Site
-    from magfusion.model.trust import Finding, Risk
+    from magfusion.model.trust import Risk
     from magfusion.units import Rate
 
 
@@ -185,6 +184,7 @@ def run_smooth(
         In the latter case the single-epoch fixes are saved in the output directory.
     """
     from magfusion.estimation.batch.self_survey import smooth_and_place
+    from magfusion.estimation.integrity.magnetometer_exclusion import agreed_smoothed
     from magfusion.jobs.inputs import named
     from magfusion.jobs.result_directory import claim, refuse_failed
     from magfusion.jobs.smooth_correction import corrected
@@ -207,7 +207,7 @@ def run_smooth(
     try:
         with named(job.log_path):
             result, placed = smooth_and_place(log, site, settings, report, iterations_file)
-            log, site, result, findings = _agreed(log, site, settings, result, risk)
+            log, site, result, findings = agreed_smoothed(result, log, site, settings, risk)
     except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
         estimate = _without_result(job, log, site, settings, risk, error, report)
         if isinstance(estimate, Failure):
@@ -344,27 +344,6 @@ def _with_gain(job: Job, log: Log, site: Site, settings: SmootherSettings) -> Si
     with named(job.log_path):
         fields, _ = fix_inputs(phasors(log, site, settings.lockin)[0], log, site)
         return with_found_gain(fields, site)
-
-
-def _agreed(
-    log: Log, site: Site, settings: SmootherSettings, result: Smoothed, risk: Risk | None
-) -> tuple[Log, Site, Smoothed, tuple[Finding, ...]]:
-    """Return the result without a contradicting magnetometer, and the findings on it."""
-    if not site.platform.further:
-        return log, site, result, ()
-    from magfusion.estimation.batch.batch import smooth
-    from magfusion.estimation.integrity.magnetometer_exclusion import agreed
-
-    plain = replace(settings, tune=False)
-    estimate = agreed(
-        result,
-        log,
-        site,
-        lambda log, site: smooth(log, site, settings),
-        lambda log, site: smooth(log, site, plain),
-        risk,
-    )
-    return estimate.log, estimate.site, estimate.result, estimate.findings
 
 
 COMMAND = Command(

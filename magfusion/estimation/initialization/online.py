@@ -21,7 +21,7 @@ from magfusion.estimation.initialization.handover import last_state
 from magfusion.estimation.integrity.correction import Correction, corrections
 from magfusion.estimation.integrity.diagnosis import diagnosed
 from magfusion.estimation.integrity.judge import judged_with_score
-from magfusion.estimation.integrity.magnetometer_exclusion import agreed
+from magfusion.estimation.integrity.magnetometer_exclusion import agreed_smoothed
 from magfusion.estimation.integrity.released_fault import ReleasedFault
 from magfusion.estimation.integrity.score import Score
 from magfusion.model.detection_range import are_many
@@ -235,7 +235,7 @@ def _smoothed(log: Log, site: Site, settings: EstimatorSettings) -> _Beginning:
         log = _of_cycles(log, log.waveform, site, settings)
     requested = {f.name: getattr(settings, f.name) for f in fields_of(EstimatorSettings)}
     how = SmootherSettings(loss="huber", **requested)
-    log, remaining, result, excluded = _agreed(smooth(log, site, how), log, site, how)
+    log, remaining, result, excluded = agreed_smoothed(smooth(log, site, how), log, site, how)
     honest, trust, score, causes = judged_with_score(result, log)
     state = last_state(result, result.considered)
     if result.calibration.site.undetected or site.platform.further:
@@ -272,23 +272,6 @@ def _start_of(
         tuple(sensor.name for sensor in site.platform.magnetometers if sensor.name not in kept),
         estimate.excluded,
     )
-
-
-def _agreed(
-    result: Smoothed, log: Log, site: Site, settings: SmootherSettings
-) -> tuple[Log, Site, Smoothed, tuple[Finding, ...]]:
-    """Return a start without a magnetometer that is inconsistent with the others, as offline."""
-    if not site.platform.further:
-        return log, site, result, ()
-    plain = replace(settings, tune=False)
-    estimate = agreed(
-        result,
-        log,
-        site,
-        lambda log, site: smooth(log, site, settings),
-        lambda log, site: smooth(log, site, plain),
-    )
-    return estimate.log, estimate.site, estimate.result, estimate.findings
 
 
 def _among_all(

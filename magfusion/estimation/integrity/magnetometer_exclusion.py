@@ -5,11 +5,12 @@ solution fits far better to itself, to the inertial samples and to gravity.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.data_checks.magnetometers import without_magnetometer
 from magfusion.estimation.demodulation.beacon_selection import select_detected
 from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
@@ -23,8 +24,7 @@ MIN_MISFIT_RATIO = 2.0  # ratio of two misfits, from which one of them is report
 Solve = Callable[[Log, Site], Smoothed]
 
 
-@dataclass(frozen=True, eq=False)
-class Agreed:
+class Agreed(NamedTuple):
     """A log, its site and its solution without a magnetometer that contradicts the others."""
 
     log: Log
@@ -67,6 +67,23 @@ def agreed(
         result = solve(log, site)
         findings.append(_excluded(sensors[which].name, names, worst))
     return Agreed(log, site, result, tuple(findings))
+
+
+def agreed_smoothed(
+    result: Smoothed, log: Log, site: Site, settings: SmootherSettings, risk: Risk | None = None
+) -> Agreed:
+    """Return the smoothed log without magnetometers that contradict the others."""
+    if not site.platform.further:
+        return Agreed(log, site, result, ())
+    plain = replace(settings, tune=False)
+    return agreed(
+        result,
+        log,
+        site,
+        lambda log, site: smooth(log, site, settings),
+        lambda log, site: smooth(log, site, plain),
+        risk,
+    )
 
 
 def _misfit(plain: Solve, log: Log, site: Site) -> float:

@@ -68,6 +68,8 @@ class Arrivals(ABC):
         Time of the last fields (s).
     open_signs : int
         Amplitudes that are dropped because their sign is undetermined.
+    without : Counter
+        Number of epochs without each magnetometer, while it was silent.
     """
 
     imu: InertialStream
@@ -77,6 +79,7 @@ class Arrivals(ABC):
     others: list[tuple[float, Measurement]]
     last_epoch: float
     open_signs: int
+    without: Counter[str]
     _detection: DetectionFilter
     _still: StillSamples
     _last_sample_times: dict[str, float]  # of each of several magnetometers (s)
@@ -87,6 +90,7 @@ class Arrivals(ABC):
         self.imu = InertialStream(site.platform.imu.time_offset)
         self.fields, self.steady, self.others = [], {}, []
         self.last_epoch, self.open_signs = -np.inf, 0
+        self.without = Counter()
         self._detection, self._still = DetectionFilter(), StillSamples()
         self._last_sample_times, self._aiding_until = {}, {}
 
@@ -222,6 +226,10 @@ class Arrivals(ABC):
     def window_to_come(self) -> bool:
         """Whether all samples of a window exist that awaits its inertial samples."""
 
+    def _silent(self) -> list[str]:
+        """Return the magnetometers that are not awaited."""
+        return []
+
     @property
     def remarks(self) -> tuple[Finding, ...]:
         """Findings on the streams."""
@@ -351,8 +359,12 @@ class Arrivals(ABC):
             Whether the platform is known to be stationary.
         """
         time = predicted.time
+        self.without.update(self._silent())
         by_offset, steady = None, self.steady.pop(time, None)
         if samples is None:
+            joint = self._measured_jointly(before, predicted, standing=standing)
+            if joint is not None:
+                return joint
             wave = self._demodulated(before, predicted, is_lost=is_lost)
             if wave is None:
                 return None  # only the clock went on
@@ -378,6 +390,16 @@ class Arrivals(ABC):
             earth=earth,
             standing=standing,
         )
+
+    def _measured_jointly(
+        self,
+        before: State,  # noqa: ARG002
+        predicted: State,  # noqa: ARG002
+        *,
+        standing: bool,  # noqa: ARG002
+    ) -> EpochMeasurements | None:
+        """Return the tones of a short window at a prediction; None where there is none."""
+        return None
 
     @abstractmethod
     def _demodulated(

@@ -4,7 +4,6 @@ Each has its own receiver and clock, and may be later than another.  An epoch wa
 them except a silent one, which is reported.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -19,7 +18,6 @@ from magfusion.estimation.demodulation.temperature_compensation import refuse_wa
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.initialization.online import NoStart, OnlineStart, find_online_start
 from magfusion.estimation.online.queue.arrivals import LONGEST_WAIT, MARGIN, Arrivals
-from magfusion.estimation.online.queue.epoch_measurements import EpochMeasurements
 from magfusion.estimation.online.queue.sensor_stream import SensorStream
 from magfusion.files.fields import SAME_TIME, side_by_side
 from magfusion.files.named_records import magnetometer_number
@@ -44,12 +42,9 @@ class SeveralArrivals(Arrivals):
     ----------
     begun_at : float
         First stamp of any of them (s).
-    without : Counter
-        Number of epochs without each magnetometer, while it was silent.
     """
 
     begun_at: float
-    without: Counter[str]
     _fields_to: dict[str, float]  # stamp of the newest fields of each (s)
     _longest: float  # of their windows (s)
     _centre: float  # of the windows at the state that is to be predicted (s)
@@ -64,7 +59,7 @@ class SeveralArrivals(Arrivals):
             receiver = receiver_of(replace(site, platform=platform), lockin)
             streams.append(SensorStream(receiver, f"magnetometer {sensor.name}"))
         super().__init__(site, streams)
-        self.begun_at, self.without = np.inf, Counter()
+        self.begun_at = np.inf
         self._fields_to, self._longest = {}, 0.0
         self._centre = self._looked = -np.inf
         self._delay = 0.0
@@ -314,23 +309,6 @@ class SeveralArrivals(Arrivals):
         """Do nothing where the IMU is silent: no single magnetometer's samples replace it."""
 
     # Output
-
-    def measured(
-        self,
-        before: State,
-        predicted: State,
-        samples: FieldSamples | None,
-        step: float,
-        *,
-        earth: bool,
-        standing: bool,
-        is_lost: bool = False,
-    ) -> EpochMeasurements | None:
-        """Return the measurements at a prediction, as `Arrivals.measured`."""
-        self.without.update(self._silent())
-        return super().measured(
-            before, predicted, samples, step, earth=earth, standing=standing, is_lost=is_lost
-        )
 
     def _demodulated(
         self, before: State, predicted: State, *, is_lost: bool

@@ -188,22 +188,12 @@ class SingleArrivals(Arrivals):
 
     # Output
 
-    def measured(
-        self,
-        before: State,
-        predicted: State,
-        samples: FieldSamples | None,
-        step: float,
-        *,
-        earth: bool,
-        standing: bool,
-        is_lost: bool = False,
+    def _measured_jointly(
+        self, before: State, predicted: State, *, standing: bool
     ) -> EpochMeasurements | None:
-        """Return what was measured at a prediction; the tones of a short window jointly."""
         time, short = predicted.time, self.short
-        if samples is not None or short is None or not short.at(time):
-            how = {"earth": earth, "standing": standing, "is_lost": is_lost}
-            return super().measured(before, predicted, samples, step, **how)
+        if short is None or not short.at(time):
+            return None
         begin, end = min(before.time, time - 0.5 * short.length), time + 0.5 * short.length
         imu = self.imu.filled(begin - MARGIN, end + MARGIN)
         rate_body = self.imu.rate_body(time) - predicted.gyro_bias_body
