@@ -64,14 +64,14 @@ def _navigated(small: SmallLog) -> Navigator:
 def test_the_columns_are_how_a_step_moves_the_estimate_and_its_innovations() -> None:
     """Two runs with the same noise, the second with a step of one millimetre."""
     still = _navigated(_walk_with_a_step(40, np.inf, np.zeros(3)))
-    sums = still._running.update.score.settle()
+    sums = still._loop.running.update.score.settle()
     assert sums is not None
     onset, shift = sums.onsets[1], 1e-3 * np.array([1.0, -1.0, 0.5])
     moved = _navigated(_walk_with_a_step(40, onset, shift))
-    other = moved._running.update.score.settle()
+    other = moved._loop.running.update.score.settle()
     assert other is not None
     assert other.onsets == sums.onsets
-    score = still._running.update.score
+    score = still._loop.running.update.score
     steps = score._steps.blocks(sums.onsets, len(score.targets.unit))
     kind = StepChange(BEACON_POSITION, onset)
     (own,) = (b.columns for b in steps if b.key == (kind, still.site.beacons[0].name))

@@ -102,7 +102,6 @@ def test_a_navigator_takes_them_off_what_arrives() -> None:
     corrected, plain = Navigator(site), Navigator(SMALL.site)
     corrected.propagate_imu(measured.time, measured.gyro_body, measured.accel_body)
     plain.propagate_imu(imu.time, imu.gyro_body, imu.accel_body)
-    for one, other in zip(
-        corrected._arrived.imu.buffer.rows(), plain._arrived.imu.buffer.rows(), strict=True
-    ):
+    buffers = (navigator._loop.arrived.imu.buffer for navigator in (corrected, plain))
+    for one, other in zip(*(buffer.rows() for buffer in buffers), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)

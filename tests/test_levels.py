@@ -59,7 +59,7 @@ def test_a_step_that_is_clearly_below_its_threshold_is_no_alarm_by_the_threshold
     small = _walk(32)
     navigator = Navigator(small.site, NAVIGATOR)
     _feed(navigator, small, 0, EPOCHS // 2)
-    bank, state = navigator._running.update.bank, navigator.take()[-1]
+    bank, state = navigator._loop.running.update.bank, navigator.take()[-1]
     assert bank is not None
     result = bank.separation(state)
     assert result is not None

@@ -306,7 +306,7 @@ def test_a_platform_that_was_carried_away_is_found_again(estimator: Estimator) -
     def propagate_passage(navigator: Navigator, now: float) -> None:
         if now == 15.0:
             inner = (
-                navigator._running.estimator
+                navigator._loop.running.estimator
             )  # nothing that arrives could tell it so much nonsense
             assert inner is not None
             wrong = inner.state.position_world + np.array([1.0, -0.5, 0.3])

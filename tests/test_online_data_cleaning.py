@@ -86,7 +86,7 @@ def test_undeclared_beacons_are_found_in_the_beginning_of_a_stream(radiated: Sim
     whole = demo_site(coil_radius=None)
     navigator = Navigator(replace(whole, beacons=whole.beacons[:2]), EKF)
     states = fed(navigator, radiated)
-    receiver = navigator._arrived.streams[0].receiver
+    receiver = navigator._loop.arrived.streams[0].receiver
     assert isinstance(receiver, LockinReceiver)
     np.testing.assert_allclose(sorted(receiver.settings.lines_hz), [30.0, 35.0], atol=0.05, rtol=0)
     findings = states[0].judgement.remarks
@@ -98,7 +98,7 @@ def test_undeclared_beacons_are_found_in_the_beginning_of_a_stream(radiated: Sim
     assert errors.ate < 0.02  # m; 7 cm where they leak into the tones
     assert np.mean(errors.nees) < 12.0
     again = restored(navigator.site, EKF, navigator.checkpoint())
-    assert again._arrived.streams[0].receiver.settings == receiver.settings
+    assert again._loop.arrived.streams[0].receiver.settings == receiver.settings
 
 
 @pytest.mark.parametrize("fixed", [1, 2, 3])

@@ -28,7 +28,7 @@ def _waiting() -> tuple[Navigator, Sums, list[Epoch]]:
     small = _walk(21)
     navigator = Navigator(small.site, NAVIGATOR)
     _feed(navigator, small, 0, LAST)
-    score = navigator._running.update.score
+    score = navigator._loop.running.update.score
     score.settle()
     score._scored_at = np.inf
     _feed(navigator, small, LAST, LAST + MOST_WAITING - 1)
@@ -47,7 +47,7 @@ def _assert_alike(result: Sums, expected: Sums) -> None:
 
 def test_epochs_together_tell_what_they_tell_one_by_one() -> None:
     navigator, sums, waiting = _waiting()
-    requested = navigator._running.update.score.targets
+    requested = navigator._loop.running.update.score.targets
     assert len(waiting) == MOST_WAITING - 1
     offsets = {epoch.predicted.calibration.time_offset for epoch in waiting}
     assert len(offsets) > 1  # what an epoch is linearised with changes from one to the next
@@ -65,7 +65,7 @@ def test_epochs_together_tell_what_they_tell_one_by_one() -> None:
 
 def test_sparse_rows_of_many_parameters_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     navigator, sums, waiting = _waiting()
-    requested = navigator._running.update.score.targets
+    requested = navigator._loop.running.update.score.targets
     dense = add_epochs(sums, waiting, requested)
     monkeypatch.setattr(sparse_rows, "SPARSE_COLUMNS", 1)
     _assert_alike(add_epochs(sums, waiting, requested), dense)
@@ -73,7 +73,7 @@ def test_sparse_rows_of_many_parameters_tell_the_same(monkeypatch: pytest.Monkey
 
 def test_an_epoch_that_measured_nothing_only_carries_the_response_on() -> None:
     navigator, sums, waiting = _waiting()
-    requested, last = navigator._running.update.score.targets, waiting[0]
+    requested, last = navigator._loop.running.update.score.targets, waiting[0]
     turns, none = (np.eye(3), np.eye(3)), np.zeros(3)
     size = len(last.predicted.cov)
     transition = np.eye(size)
@@ -102,7 +102,7 @@ def test_the_response_is_how_the_estimate_moves_with_what_it_holds(axis: int) ->
     for navigator in runs:
         _feed(navigator, small, 0, EPOCHS)
     states = [navigator.take()[-1] for navigator in runs]
-    score = runs[0]._running.update.score
+    score = runs[0]._loop.running.update.score
     sums, requested = score.settle(), score.targets
     assert sums is not None
     (block,) = (b for b in requested.fixed_blocks if b.key == (BEACON_POSITION, first.name))

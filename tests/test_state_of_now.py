@@ -54,13 +54,13 @@ def propagated(
 
 
 def departure_at(navigator: Navigator, state: State) -> PropagationStart:
-    imu = navigator._arrived.imu
+    imu = navigator._loop.arrived.imu
     assert imu.usual is not None
     return PropagationStart(
         state,
         navigator.site,
         navigator.blocks,
-        navigator._running.process_noise,
+        navigator._loop.running.process_noise,
         imu.offset,
         imu.usual,
     )
@@ -74,7 +74,7 @@ def exceeding(walk: OnlineLog) -> tuple[Navigator, PropagationStart, ImuSamples]
     moving = replace(
         result, time=result.time - 1.0 + 0.0013, velocity_world=np.array([1.0, 0.3, -0.2])
     )
-    imu = navigator._arrived.imu.measured(result.time - 1.5)
+    imu = navigator._loop.arrived.imu.measured(result.time - 1.5)
     return navigator, departure_at(navigator, moving), imu
 
 
@@ -158,9 +158,8 @@ def test_a_parameter_of_the_imu_has_its_share_in_the_covariance(
     cov = 1e-8 * np.eye(size)
     cov[MOTION:, MOTION:] *= 1e4
     state = replace(start.state, cov=cov)
-    own = replace(
-        start, state=state, blocks=navigator.blocks, process_noise=navigator._running.process_noise
-    )
+    noise = navigator._loop.running.process_noise
+    own = replace(start, state=state, blocks=navigator.blocks, process_noise=noise)
     result = carried_in_chunks(own, imu, 9)[-1]
     direct = propagate(
         state, imu, result.time, own.site, own.time_offset, None, own.usual, own.blocks

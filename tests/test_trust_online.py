@@ -123,7 +123,7 @@ def test_the_states_of_a_loss_that_is_not_told_yet_cover_their_errors(estimator:
     def propagate_passage(navigator: Navigator, now: float) -> None:
         if now == 15.0:
             inner = (
-                navigator._running.estimator
+                navigator._loop.running.estimator
             )  # nothing that arrives could tell it so much nonsense
             assert inner is not None
             wrong = inner.state.position_world + np.array([1.0, -0.5, 0.3])

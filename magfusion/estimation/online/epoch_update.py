@@ -124,7 +124,7 @@ class EpochUpdate:
         result = arrived.measured(
             before, state, samples, step, earth=earth, standing=standing, is_lost=lost_epochs
         )
-        others = arrived.others_at(state.time)
+        others = arrived.others.take(state.time)
         own = self.site, self.blocks, arrived.imu
         others = [with_inertial(one, state, *own) for one in others]
         measurements = self.aiding.passed(others, state)

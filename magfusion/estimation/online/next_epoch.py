@@ -47,9 +47,9 @@ def next_epoch(
     """
     now, delay = state.time, settings.delay
     arrived.receive(state, delay)
-    inertial, other = arrived.awaited - delay, arrived.next_other
+    inertial, other = arrived.awaited - delay, arrived.others.next
     if other <= now + SAME_TIME:
-        return TooLate("measurement too late", len(arrived.others_at(other)))
+        return TooLate("measurement too late", len(arrived.others.take(other)))
     if other <= inertial and other < arrived.next_field - SAME_TIME:
         return NextEpoch(other)
     centre = arrived.next_window(state, needs_separate)

@@ -36,7 +36,8 @@ def restored(
         If it is no checkpoint, or does not fit the site.
     """
     parts = checkpoint.get("parts") if isinstance(checkpoint, dict) else None
-    applied = parts.get("_corrections") if isinstance(parts, dict) else None
+    loop = parts.get("_loop") if isinstance(parts, dict) else None
+    applied = loop.get("corrections") if isinstance(loop, dict) else None
     content = applied.get("content") if isinstance(applied, dict) else None
     navigator = Navigator(site, settings)
     if isinstance(content, str):

@@ -18,14 +18,8 @@ from magfusion.estimation.demodulation.sensor_frame_samples import (
     sensor_frame_samples,
 )
 from magfusion.estimation.graph.measurement import Measurement
-from magfusion.estimation.graph.same_epoch import SAME_TIME
 from magfusion.estimation.graph.state import State, as_trajectory
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
-from magfusion.estimation.measurements.aiding_samples import (
-    aiding_measurement,
-    measured_time,
-    thinned,
-)
 from magfusion.estimation.measurements.relative_pose import longest_interval
 from magfusion.estimation.measurements.signs import OPEN_SIGN, count_open, with_signs
 from magfusion.estimation.online.queue.epoch_measurements import (
@@ -33,6 +27,7 @@ from magfusion.estimation.online.queue.epoch_measurements import (
     measurements_of_fields,
 )
 from magfusion.estimation.online.queue.inertial_stream import InertialStream
+from magfusion.estimation.online.queue.other_measurements import OtherMeasurements
 from magfusion.estimation.online.queue.sensor_stream import SensorStream
 from magfusion.estimation.online.queue.still_samples import StillSamples
 from magfusion.model.aiding import AidingSamples, sensor_named
@@ -62,8 +57,7 @@ class Arrivals(ABC):
         One epoch each, the oldest first.
     steady : dict
         By the time of the epoch (s), its static fields.
-    others : list of (float, Measurement)
-        Other measurements, with their times (s).
+    others : OtherMeasurements
     last_epoch : float
         Time of the last fields (s).
     open_signs : int
@@ -76,23 +70,22 @@ class Arrivals(ABC):
     streams: list[SensorStream]
     fields: list[FieldSamples]
     steady: dict[float, SteadyFields]
-    others: list[tuple[float, Measurement]]
+    others: OtherMeasurements
     last_epoch: float
     open_signs: int
     without: Counter[str]
     _detection: DetectionFilter
     _still: StillSamples
     _last_sample_times: dict[str, float]  # of each of several magnetometers (s)
-    _aiding_until: dict[str, float]  # time of each sensor's last sample (s)
 
     def __init__(self, site: Site, streams: list[SensorStream]) -> None:
         self.site, self.streams = site, streams
         self.imu = InertialStream(site.platform.imu.time_offset)
-        self.fields, self.steady, self.others = [], {}, []
+        self.fields, self.steady, self.others = [], {}, OtherMeasurements()
         self.last_epoch, self.open_signs = -np.inf, 0
         self.without = Counter()
         self._detection, self._still = DetectionFilter(), StillSamples()
-        self._last_sample_times, self._aiding_until = {}, {}
+        self._last_sample_times = {}
 
     # Input
 
@@ -155,27 +148,12 @@ class Arrivals(ABC):
 
     def add_measurement(self, time: float, measurement: Measurement, after: float) -> bool:
         """Add any other measurement; return whether it is after a time (s)."""
-        check_clock("measurement", np.array([time]), self.newest)
-        in_time = time > after + SAME_TIME
-        if in_time:
-            self.others.append((time, measurement.at(0)))
-            self.others.sort(key=lambda other: other[0])
-        return in_time
+        return self.others.add(time, measurement, after, self.newest)
 
     def add_aiding(self, sensor: str, samples: AidingSamples, after: float) -> Counter[str]:
         """Add samples of an aiding sensor; return how many are unused, by reason."""
         declared = sensor_named(self.site.aiding, sensor, samples.quantity)
-        used = thinned(declared, samples, self._aiding_until.get(sensor, -np.inf))
-        unused: Counter[str] = Counter()
-        if len(used) < len(samples):
-            unused[f"{sensor} sample beyond its rate"] = len(samples) - len(used)
-        if len(samples):
-            self._aiding_until[sensor] = float(samples.time[-1])
-        measurement = aiding_measurement(declared, used)
-        for i, time in enumerate(measured_time(declared, used).tolist()):
-            if not self.add_measurement(time, measurement.rows(slice(i, i + 1)), after):
-                unused["measurement too late"] += 1
-        return unused
+        return self.others.add_aiding(declared, samples, after, self.newest)
 
     # Times
 
@@ -201,11 +179,6 @@ class Arrivals(ABC):
             return float(self.fields[0].time[0])
         known = [stream.waveform.time[:1] for stream in self.streams]
         return float(np.min(np.concatenate(known), initial=np.inf))
-
-    @property
-    def next_other(self) -> float:
-        """Time of the next other measurement (s)."""
-        return self.others[0][0] if self.others else np.inf
 
     @property
     def reached(self) -> float:
@@ -287,7 +260,7 @@ class Arrivals(ABC):
         self.imu.begin(start.state)
         self.fields = [s for s in self.fields if s.time[0] > time]
         self.steady = {t: s for t, s in self.steady.items() if t > time}
-        self.others = [other for other in self.others if other[0] > time]
+        self.others.drop_until(time)
         self.last_epoch = time
         self._begin_receivers(start, delay)
 
@@ -325,12 +298,6 @@ class Arrivals(ABC):
             stream.samples.discard_before(time - reach, time - reach)
 
     # Output
-
-    def others_at(self, time: float) -> list[Measurement]:
-        """Return the other measurements at a time (s), and remove them."""
-        due = [measurement for when, measurement in self.others if when <= time + SAME_TIME]
-        self.others = [other for other in self.others if other[0] > time + SAME_TIME]
-        return due
 
     def measured(
         self,
