@@ -14,10 +14,9 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import MISSING, Field
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn, get_args, get_type_hints
+from typing import Annotated, Any, NamedTuple, NoReturn
 
 import typer
 from typer.core import TyperGroup
@@ -28,12 +27,12 @@ from magfusion.estimation.solve.memory import keep_memory
 from magfusion.files.blas_threads import use_one_thread
 from magfusion.files.standard_streams import binary_output, occupy_closed, until_closed
 from magfusion.jobs import GROUPS, JOBS
-from magfusion.jobs.settings import OVERWRITE, Command, Option, Settings, options
+from magfusion.jobs.settings import Command, Settings, options
+from magfusion.jobs.typer_options import LEVELS, Level, parameters, plain, typed_value
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figures
 from magfusion.results.provenance import Run, recorded_as
 
-Level = Literal["json", "quiet", "brief", "verbose"]
 DEBUG = "--debug"
 TERMINATED = (
     "terminated, and unfinished files are removed; repeat the command, with --resume where it had a"
@@ -41,14 +40,6 @@ TERMINATED = (
 )
 LONGEST_REASON = 200  # characters, of an error that was not foreseen
 _HELP = {"help_option_names": ["-h", "--help"]}
-# Options of how much is printed, by the level that they select.
-_LEVELS: dict[Level, tuple[tuple[str, ...], str]] = {
-    "verbose": (("--verbose", "-v"), "Print all figures, with the calibration."),
-    "quiet": (("--quiet", "-q"), "Print the verdict only, and no progress."),
-    "json": (("--json",), "Print the report as a line of JSON, and nothing else."),
-}
-_NAMED_BY_LOG = "; default: the log's name and the job's"
-_NOT_WRITTEN = "; default: nothing is written"
 
 
 class _Terminated(BaseException):
@@ -209,12 +200,7 @@ def _command(path: str) -> Any:
 
 def _example(command: str) -> str:
     """Return the last paragraph of a help text."""
-    return _plain(f"Example: {command}")
-
-
-def _plain(text: str) -> str:
-    """Return a text in which brackets are no markup."""
-    return text.replace("[", r"\[")
+    return plain(f"Example: {command}")
 
 
 def _print_version(wanted: bool) -> None:
@@ -255,7 +241,7 @@ def _callback(path: str, command: Command) -> Callable[..., None]:
         values.pop("overwrite", None)
         if level == "json":
             binary_output()
-        own = {field: _value(requested[field], value) for field, value in values.items()}
+        own = {field: typed_value(requested[field], value) for field, value in values.items()}
         settings = command.settings(**own)
         if output is None and "output" in wanted and not command.output_optional:
             # A log's name as given by the user, also for ".".
@@ -286,77 +272,18 @@ def _callback(path: str, command: Command) -> Callable[..., None]:
         if command.after is not None:
             command.after(settings, output)
 
-    parameters = [_keyword("context", typer.Context)]
-    parameters += _parameters(command, "output" in wanted)
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {p.name: p.annotation for p in parameters}
+    generated = parameters(command, "output" in wanted)
+    run.__signature__ = inspect.Signature(generated)  # type: ignore[attr-defined]
+    run.__annotations__ = {p.name: p.annotation for p in generated}
     return run
-
-
-def _parameters(command: Command, writes: bool) -> list[inspect.Parameter]:
-    hints = get_type_hints(command.settings)
-    result = [_parameter(f, option, hints[f.name]) for f, option in options(command.settings)]
-    if writes:
-        note = "" if command.output or command.output_required else _NAMED_BY_LOG
-        note = _NOT_WRITTEN if command.output_optional else note
-        info = typer.Option("--output", "-o", help=f"{command.output_help}{note}.")
-        default: Any = Path(command.output) if command.output else None
-        if command.output_required:
-            default = inspect.Parameter.empty
-        hint: Any = Path | None if default is None else Path
-        output = _keyword("output", Annotated[hint, info], default)
-        result.insert(0, output)
-        if not command.output_file:
-            flag = typer.Option("--overwrite", help=f"{OVERWRITE}.")
-            result.append(_keyword("overwrite", Annotated[bool, flag], False))
-    if command.reports:
-        result += [
-            _keyword(name, Annotated[bool, typer.Option(*flags, help=text)], False)
-            for name, (flags, text) in _LEVELS.items()
-        ]
-    return result
-
-
-def _parameter(field: Field[Any], option: Option, hint: Any) -> inspect.Parameter:
-    """Return the argument or option of typer for a field."""
-    default = field.default
-    if option.words is not None:
-        hint = Literal[tuple(option.words)]
-        default = next((w for w, value in option.words.items() if value == default), default)
-    elif hint in (tuple[str, ...], tuple[Path, ...]):
-        hint, default = (list[str] if str in get_args(hint) else list[Path]), []
-    if default is None:
-        hint = hint | None
-    if option.positional:
-        info = typer.Argument(help=_plain(option.sentence))
-    else:
-        name = option.name or field.name.replace("_", "-")
-        switch = f"--{name}/--no-{name}" if default is True else f"--{name}"
-        info = typer.Option(switch, help=_plain(option.sentence), metavar=option.metavar)
-    default = inspect.Parameter.empty if default is MISSING else default
-    return _keyword(field.name, Annotated[hint, info], default)
-
-
-def _keyword(
-    name: str, annotation: Any, default: Any = inspect.Parameter.empty
-) -> inspect.Parameter:
-    kind = inspect.Parameter.KEYWORD_ONLY
-    return inspect.Parameter(name, kind, default=default, annotation=annotation)
 
 
 def _level(values: dict[str, Any]) -> Level:
     """Return the requested level of output, and remove its options from the values."""
-    given: list[Level] = [level for level in _LEVELS if values.pop(level, False)]
+    given: list[Level] = [level for level in LEVELS if values.pop(level, False)]
     if len(given) > 1:
         raise InputError(f"--{given[0]} and --{given[1]}: give one of them")
     return given[0] if given else "brief"
-
-
-def _value(option: Option, typed: Any) -> Any:
-    """Return the value of a field for typed text."""
-    if option.words is not None:
-        return option.words.get(typed)
-    return tuple(typed) if isinstance(typed, list) else typed
 
 
 def _given(context: typer.Context) -> set[str]:

@@ -118,7 +118,7 @@ ROOMS = {
             inputs navigate_results result_directory
             allan_noise checkpoint failure magnetometer_trust magnetometer_turns orientation
             budget_figures settings without_beacons
-            coil
+            coil typer_options
             coil_drive
             accept allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
             calibrate_magnetometer calibrate_response check design_settings drift_world drive
