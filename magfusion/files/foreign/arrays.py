@@ -74,10 +74,6 @@ def _part(name: str) -> Callable[[AnyArray], AnyArray]:
     return lambda block: np.asarray(block[name])
 
 
-def _component(k: int) -> Callable[[AnyArray], AnyArray]:
-    return lambda block: block[:, k]
-
-
 def fields_of(name: str, array: Any, unit: str = "", by_column: bool = False) -> list[_Field]:
     """Return the columns of an array: none where it is no table of numbers.
 

@@ -319,14 +319,6 @@ def stamp_numbers(raw: Raw) -> Array:
     return values[np.isfinite(values)]
 
 
-def seconds_apart(stamps: IntArray) -> float:
-    """Return the median step of stamps (s), NaN of fewer than two."""
-    known = stamps[stamps != NO_STAMP]
-    steps = np.diff(known)
-    steps = steps[steps > 0]
-    return float(np.median(steps)) * NANOSECOND if len(steps) else float("nan")
-
-
 def is_date(raw: Raw) -> bool:
     """Return whether stamps are dates."""
     if isinstance(raw, pa.Array | pa.ChunkedArray) and not pa.types.is_string(raw.type):
