@@ -322,10 +322,10 @@ class EpochUpdate:
         return True
 
     def _lost_since(self, state: State) -> float | None:
-        since, ended = self.recovery.lost_since(state)
+        lost_since, ended = self.recovery.lost_since(state)
         if ended:
             self._end_loss(state.time)
-        return since
+        return lost_since
 
     def _end_loss(self, time: float) -> None:
         self.recovery.over()

@@ -146,7 +146,9 @@ class EstimationLoop:
             raise EstimationError("there is no state yet: the navigator is still gathering data")
         last, imu = self.running.estimator.state, self.arrived.imu
         wanted = imu.reached if time is None else time
-        return self.reports.judged(last) if wanted <= last.time else self.now.at(imu, wanted)
+        return (
+            self.reports.with_judgement(last) if wanted <= last.time else self.now.at(imu, wanted)
+        )
 
     def take_lagged(self) -> list[JudgedState]:
         """Return the states that left the smoother's window since the last call."""
@@ -154,7 +156,7 @@ class EstimationLoop:
         if not isinstance(window, SlidingWindow):
             return []
         outgoing, window.outgoing = window.outgoing, []
-        return [self.reports.judged_then(state) for state in outgoing]
+        return [self.reports.with_own_judgement(state) for state in outgoing]
 
     @property
     def losses(self) -> dict[str, int]:

@@ -104,8 +104,8 @@ class RunningEstimate:
             arrived.fill_silence(before, time)
         predicted = self._propagated(before, time, arrived.imu)
         judgement = self.update.process_epoch(self.estimator, arrived, predicted, samples)
-        bridged = predicted.gap_bridged
-        of_imu = imu_remarks(arrived.imu.frozen_since, before.time, time, gap_bridged=bridged)
+        gap_bridged = predicted.gap_bridged
+        of_imu = imu_remarks(arrived.imu.frozen_since, before.time, time, gap_bridged=gap_bridged)
         return predicted, judgement.with_findings(*of_imu, *arrived.remarks)
 
     def _propagated(self, state: State, time: float, imu: InertialStream) -> Propagated:

@@ -54,13 +54,13 @@ class StateReports:
     def store(self, state: State, judgement: Judgement) -> None:
         """Add the state of an epoch."""
         self.judgement = judgement
-        self._pending.append(self.judged(state))
+        self._pending.append(self.with_judgement(state))
         self.summary.note(state.time, judgement)
         if self._lagged:
             timed = TimedJudgement(state.time, judgement, self.reset_counter)
             self._timed_judgements.append(timed)
 
-    def judged(self, state: State) -> JudgedState:
+    def with_judgement(self, state: State) -> JudgedState:
         """Return a state with the judgement of the newest."""
         return judged_state(state, self.judgement, self.reset_counter)
 
@@ -74,7 +74,7 @@ class StateReports:
         """Drop states up to a time (s)."""
         self._pending = [state for state in self._pending if state.time > time]
 
-    def judged_then(self, state: State) -> JudgedState:
+    def with_own_judgement(self, state: State) -> JudgedState:
         """Return a state with the judgement of its own time; earlier judgements are discarded."""
         timed = self._timed_judgements
         while len(timed) > 1 and timed[1].time <= state.time:
