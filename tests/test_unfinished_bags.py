@@ -109,6 +109,24 @@ def test_zeros_behind_what_was_written_are_no_messages(tmp_path: Path, kind: str
     assert [finding.code for finding in log.noticed] == ["bag_unfinished"]
 
 
+def test_messages_lost_to_damage_are_counted(tmp_path: Path) -> None:
+    """The index is whole, and a record of a length that is none hides what follows it."""
+    path = _finished(tmp_path / "damaged", "mcap")
+    content = bytearray(path.read_bytes())
+    at = content.index(MEASURED[N // 2].tobytes())
+    content[at : at + 300] = bytes([34]) * 300  # a length below 2**63
+    path.write_bytes(content)
+    log = open_log(path)
+    np.testing.assert_array_equal(log.imu.gyro_body, GYRO)
+    (finding,) = log.noticed
+    assert finding.code == "bag_damaged"
+    assert f"{N // 2 + 1} of {N} messages of /imu/mag are read" in finding.text
+    assert str(path) in finding.text
+    by_import, figures = imported(tmp_path / "log", path)
+    assert len(by_import.imu) == N
+    assert figures["notes"] == [finding.text]
+
+
 def test_of_a_compressed_chunk_that_is_cut_the_beginning_is_read(tmp_path: Path) -> None:
     rng = np.random.default_rng(7)
 

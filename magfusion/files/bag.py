@@ -98,7 +98,7 @@ def read_bag(
     """
     with open_bag([path]) as reader:
         result = _read(reader, path, topics or Topics(), report, aiding)
-        notes = reader.notes
+        notes, damage = reader.notes, reader.damage
     imu, field, truth = (result.get(role) for role in ("imu", "magnetometer", "truth"))
     first = field if imu is None else imu
     if first is None:
@@ -108,6 +108,7 @@ def read_bag(
         )
     span = Span(int(first.time_ns[0]), start, end)
     declared = [Finding("bag_unfinished", note, Verdict.TRUSTWORTHY) for note in notes]
+    declared += [Finding("bag_damaged", note, Verdict.TRUSTWORTHY) for note in damage]
     imu, field, truth = (
         None if one is None else _measured(one.within(span), declared)
         for one in (imu, field, truth)

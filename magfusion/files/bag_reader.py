@@ -1,5 +1,6 @@
 """Bags opened by the library: one file or several of one recording, ROS 1 or 2."""
 
+from collections import Counter
 from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
@@ -41,9 +42,13 @@ class BagReader(AnyReader):
     ----------
     unfinished : dict
         Files that the recorder did not finish, by the place of their reader.
+    damage : list of str
+        Topics of which the messages that were read are fewer than the index counts: the library
+        passes over what it cannot read in a chunk.
     """
 
     unfinished: Mapping[int, Path] = {}
+    damage: Sequence[str] = ()
 
     @property
     def notes(self) -> list[str]:
@@ -61,12 +66,24 @@ class BagReader(AnyReader):
         start: int | None = None,
         stop: int | None = None,
     ) -> Generator[tuple[Connection, int, bytes], None, None]:
-        """Yield messages as `AnyReader` does."""
-        if not self.unfinished:
-            yield from super().messages(connections, start, stop)
-            return
-        for connection in connections or self.connections:
-            yield from super().messages([connection], start, stop)
+        """Yield messages as `AnyReader` does, and compare their number with that of the index."""
+        chosen = list(connections or self.connections)
+        read: Counter[str] = Counter()
+        for together in [[one] for one in chosen] if self.unfinished else [chosen]:
+            for message in super().messages(together, start, stop):
+                read[message[0].topic] += 1
+                yield message
+        if start is None and stop is None:
+            expected: Counter[str] = Counter()
+            for one in chosen:
+                expected[one.topic] += one.msgcount
+            place = place_of([Path(reader.path) for reader in self.readers])
+            self.damage = [
+                f"{place}: the file is damaged. {read[topic]} of {count} messages of {topic} are"
+                " read; the others are lost. Copy the file again."
+                for topic, count in expected.items()
+                if read[topic] < count
+            ]
 
 
 @contextmanager

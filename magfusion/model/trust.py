@@ -28,6 +28,7 @@ CODES = {
     "angle_units": "the attitudes of beacons are in another unit",
     "assumed": "an undeclared property was assumed",
     "attitude_refused": "the attitude of a paper's algorithm cannot be valid, and is omitted",
+    "bag_damaged": "messages of a bag that its index counts cannot be read",
     "bag_unfinished": "the recorder did not finish a bag, of which the whole part was read",
     "beacon_clock": "a beacon's clock is not as declared",
     "beacon_excluded": "a beacon is inconsistent with the others and was excluded meanwhile",

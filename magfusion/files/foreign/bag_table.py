@@ -131,7 +131,8 @@ def plan_bag(
                 else:
                     own = [c for c in reader.connections if c.topic == topic.name]
                     count = sum(connection.msgcount for connection in own)
-                    plans.append(_plan(paths, role, topic, unit, count, rates.get(role)))
+                    rate = rates.get(role)
+                    plans.append(_plan(paths, role, topic, unit, count, rate, declared.notes))
     return plans
 
 
@@ -244,13 +245,14 @@ def _plan(
     field_unit: SourceUnit,
     count: int,
     rate: Rate | None,
+    notes: list[str],
 ) -> ImportPlan:
     place = f"{place_of(paths)} topic {topic.name}"
     columns = _COLUMNS[role]
 
     def read(wanted: Sequence[int], _texts: Collection[int]) -> Iterator[RowBlock]:
         row = 0
-        for stamps, values in _rows(paths, place, role, topic):
+        for stamps, values in _rows(paths, place, role, topic, notes):
             table = [stamps, *values.T]
             yield RowBlock([table[k] for k in wanted], row + np.arange(len(stamps)))
             row += len(stamps)
@@ -290,9 +292,12 @@ def _moves(paths: Sequence[Path], place: str, topic: Topic) -> bool:
 
 
 def _rows(
-    paths: Sequence[Path], place: str, role: str, topic: Topic
+    paths: Sequence[Path], place: str, role: str, topic: Topic, notes: list[str] | None = None
 ) -> Iterator[tuple[IntArray, Array]]:
-    """Yield stamps (ns) and values of the messages of a topic, `ROWS` at a time."""
+    """Yield stamps (ns) and values of the messages of a topic, `ROWS` at a time.
+
+    Notes on a damaged file are added at the end.
+    """
     row = _ROWS[role].get(topic.msgtype)
     with open_bag(paths) as reader:
         connections = [c for c in reader.connections if c.topic == topic.name]
@@ -302,6 +307,8 @@ def _rows(
             parts = (p for _, p in read_parts(reader, {role: Wanted(place, connections, row)}))
         for part in _joined(parts):
             yield part.stamps, _complete(role, part.values)
+        if notes is not None:
+            notes += [note for note in reader.damage if note not in notes]
 
 
 def _joined(parts: Iterator[Messages]) -> Iterator[Messages]:
