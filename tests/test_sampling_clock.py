@@ -112,6 +112,21 @@ def test_lost_samples_of_rounded_stamps_are_counted() -> None:
     assert timed.resolution == 1e-3
 
 
+@pytest.mark.parametrize("rate_hz", [99.7, 166.6, 199.3, 249.7, 333.0, 340.0])
+@pytest.mark.parametrize("share_lost", [0.0, 0.03])
+def test_rounded_stamps_of_almost_equal_steps_are_counted(
+    rate_hz: float, share_lost: float
+) -> None:
+    """Steps of a sensor's own clock are a whole number of milliseconds for a second or more."""
+    rng = np.random.default_rng(1)
+    selected = np.arange(COUNT)[rng.random(COUNT) >= share_lost] / rate_hz
+    clock = sampling_clock(1e-3 * np.rint(1e3 * selected))
+    assert clock is not None
+    assert clock.lost_count == COUNT - len(selected)
+    assert clock.resolution == 1e-3
+    assert np.std(clock.time - selected) < 3e-5  # s; of the stamps 3e-4
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_samples_that_a_host_delivers_in_bursts_are_counted(seed: int) -> None:
     stamps = burst_stamps(COUNT, 99.0, np.random.default_rng(seed))

@@ -28,6 +28,7 @@ MIN_SAMPLES = 50  # samples
 ROUNDED = 0.05  # of a step, by which the mean of rounded stamps differs from their median
 MAX_ROUNDING_STEPS = 1.2  # resolutions; rounding is half of one, cutting off one
 MOST_STEPS = 10_000  # of which a common divisor is looked for
+ROUNDING_RMS = 0.29  # resolutions, 1/sqrt(12)
 MAX_ROUNDING = 0.6  # of the divisor; rms of rounding is 1/sqrt(12) of it, of cutting off 1/sqrt(3)
 
 
@@ -65,11 +66,13 @@ def sampling_clock(stamps: Array, bundled: bool = True) -> SamplingClock | None:
     bundled : bool
         Whether a bus may deliver several samples at a time.
     """
-    separate = spread_bursts(stamps) if bundled else None
-    clock = _scattered_clock(stamps) if separate is None else _counted_clock(stamps, separate)
+    separate, size = spread_bursts(stamps) if bundled else None, stamp_resolution(stamps)
+    if separate is None:
+        clock = _scattered_clock(stamps, ROUNDING_RMS * size)
+    else:
+        clock = _counted_clock(stamps, separate)
     if clock is None:
         return None
-    size = stamp_resolution(stamps)
     return clock._replace(resolution=size if clock.scatter < MAX_ROUNDING * size else 0.0)
 
 
@@ -100,18 +103,22 @@ def stamp_resolution(stamps: Array) -> float:
     return round(size, 9) if np.all(off <= 2.0 * exact) else 0.0
 
 
-def _scattered_clock(stamps: Array) -> SamplingClock | None:
+def _scattered_clock(stamps: Array, rounding: float) -> SamplingClock | None:
+    """Return the clock of stamps with a scatter due to rounding (s, root mean square)."""
     if len(stamps) < PIECE:
         return None
-    counted = _counted_step(stamps)
-    if counted is None and is_even(stamps, float(np.median(np.diff(stamps)))):
+    counted, median = _counted_step(stamps), float(np.median(np.diff(stamps)))
+    # Rounded steps are equal for a while, if they are nearly a whole number of resolutions.
+    rounded = EVEN * median < rounding < MOST_SCATTER * median
+    if counted is None and not rounded and is_even(stamps, median):
         return None
     step = counted or _usual_step(stamps)
-    if is_even(stamps, step):
+    if not rounded and is_even(stamps, step):
         return None
     whole = np.diff(stamps) / step
     breaks = np.flatnonzero(whole > GAP) + 1
-    parts = [_of_stretch(part, step) for part in np.split(stamps, breaks)]
+    floor = max(EVEN * step, rounding if rounded else 0.0)
+    parts = [_of_stretch(part, step, floor) for part in np.split(stamps, breaks)]
     off = np.concatenate([p.time for p in parts]) - stamps
     scatter = float(np.sqrt(np.mean(off**2)))
     if not EVEN * step < scatter < MOST_SCATTER * step:
@@ -172,14 +179,14 @@ def _phasor(stamps: Array, step: float) -> ComplexArray:
     return np.asarray(np.mean(np.exp(2j * np.pi * (stamps - stamps[..., :1]) / step), axis=-1))
 
 
-def _of_stretch(stamps: Array, step: float) -> SamplingClock:
-    tick = _ticks(stamps, step)
+def _of_stretch(stamps: Array, step: float, least_scatter: float) -> SamplingClock:
+    tick = _ticks(stamps, step, least_scatter)
     time = smooth_clock(tick, stamps)
     lost_epochs = int(tick[-1] - tick[0] + 1 - len(tick))
     return SamplingClock(time, step, 0.0, lost_epochs)
 
 
-def _ticks(stamps: Array, step: float) -> IntArray:
+def _ticks(stamps: Array, step: float, least_scatter: float) -> IntArray:
     """Return the tick of each sample, counted from the first, piece by piece."""
     tick = np.zeros(len(stamps), dtype=np.int64)
     begin = 0
@@ -191,7 +198,7 @@ def _ticks(stamps: Array, step: float) -> IntArray:
         else:
             slope, start = step, _phase(own, step) - step
         previous = int(tick[begin - 1]) if begin else -1
-        scatter = max(_scatter(own, slope), EVEN * step)
+        scatter = max(_scatter(own, slope), least_scatter)
         slip = lost_ticks((own - start) / slope - np.arange(1, len(own) + 1), scatter / slope)
         kept = len(own) if begin + PIECE >= len(stamps) else KEPT
         tick[begin : begin + kept] = previous + 1 + np.arange(kept) + slip[:kept]
