@@ -77,6 +77,14 @@ def test_even_stamps_stay(share_lost: float) -> None:
     assert sampling_clock(selected) is None
 
 
+@pytest.mark.parametrize("share_lost", [0.002, 0.03])
+@pytest.mark.parametrize("step", [0.002, 0.004, 0.005])
+def test_even_stamps_that_miss_some_are_not_rounded(step: float, share_lost: float) -> None:
+    """The largest common divisor of their steps is the step itself."""
+    rng = np.random.default_rng(2)
+    assert sampling_clock(step * np.arange(COUNT)[rng.random(COUNT) >= share_lost]) is None
+
+
 def test_stamps_without_a_clock_stay() -> None:
     rng = np.random.default_rng(2)
     assert sampling_clock(np.cumsum(rng.exponential(STEP, COUNT))) is None

@@ -29,6 +29,9 @@ ROUNDED = 0.05  # of a step, by which the mean of rounded stamps differs from th
 MAX_ROUNDING_STEPS = 1.2  # resolutions; rounding is half of one, cutting off one
 MOST_STEPS = 10_000  # of which a common divisor is looked for
 ROUNDING_RMS = 0.29  # resolutions, 1/sqrt(12)
+# Of a step; beyond, a loss and a rounded stamp look alike, and of even stamps with losses the step
+# itself divides all.
+MOST_ROUNDING = 0.12
 MAX_ROUNDING = 0.6  # of the divisor; rms of rounding is 1/sqrt(12) of it, of cutting off 1/sqrt(3)
 
 
@@ -109,7 +112,7 @@ def _scattered_clock(stamps: Array, rounding: float) -> SamplingClock | None:
         return None
     counted, median = _counted_step(stamps), float(np.median(np.diff(stamps)))
     # Rounded steps are equal for a while, if they are nearly a whole number of resolutions.
-    rounded = EVEN * median < rounding < MOST_SCATTER * median
+    rounded = EVEN * median < rounding < MOST_ROUNDING * median
     if counted is None and not rounded and is_even(stamps, median):
         return None
     step = counted or _usual_step(stamps)
