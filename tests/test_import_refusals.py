@@ -287,6 +287,7 @@ def test_the_axes_of_a_sensor_are_proposed_in_one_unit(
         rows_of(TIME, SHARP, rates),
     )
     text = reported(capfd, "mag.csv --imu part.csv")
+    assert "no table is given" not in text
     for option in ("accel_x=acc x[m/s^2]", "accel_y=acc y[m/s^2]", "gyro_y=gyr y[rad/s]"):
         assert f"--map 'imu.{option}'" in text
 

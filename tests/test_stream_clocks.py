@@ -99,6 +99,30 @@ def test_after_a_step_navigation_starts_anew(
     assert all(s["reset_counter"] == 1 for s in anew)
 
 
+def test_a_step_back_by_less_than_a_second_is_reported(lines: list[dict[str, Any]]) -> None:
+    """Its samples are older than those used, and are left out; one late record is no step."""
+
+    def reported(given: list[dict[str, Any]], delay: float = 0.0) -> list[str]:
+        clocks, result = StreamClocks(delay), []
+        for line in given:
+            record = Record.model_validate(line)
+            result += clocks.set_back(record)
+            clocks.check(record)
+        return result
+
+    inertial = [one for one in lines if "imu" in one]
+    back = [stamped(one, lambda t: t - 0.4) if newest(one) > 9.0 else one for one in inertial]
+    (sentence,) = reported(back)
+    ((by, before),) = re.findall(r"^imu: .* back by (\S+) s; samples before (\S+) s", sentence)
+    assert float(by) == pytest.approx(0.4, abs=0.03)  # s, a sample and rounding
+    assert float(before) == pytest.approx(9.0, abs=0.03)
+    assert reported(back, delay=0.5) == []
+    assert reported(inertial) == []
+    for k in range(40, 80, 4):  # exchanged, or sent twice
+        inertial[k : k + 3] = [inertial[k + 1], inertial[k], inertial[k]]
+    assert reported(inertial) == []
+
+
 @pytest.mark.slow
 def test_a_single_wrong_stamp_is_left_out_and_said(site: Path, lines: list[dict[str, Any]]) -> None:
     wrong = next(k for k, one in enumerate(lines) if "imu" in one and newest(one) > 8.0)

@@ -238,13 +238,11 @@ def _on_clock(
     record = with_waveform(clocks.unwrapped(numbered.record), site)
     step = clocks.step_in(record)
     if step is not None:
-        write_message(
-            messages,
-            f"{step.stream}: its clock stepped by {step.seconds:+.4g} s; navigation"
-            f" restarts at {step.time:.3f} s",
-        )
+        write_message(messages, step.sentence)
         _end(samples, output)
         output.restart()
+    for sentence in clocks.set_back(record):
+        write_message(messages, sentence)
     clocks.check(record)
     return replace(numbered, record=record)
 

@@ -27,15 +27,29 @@ class ClockStep(NamedTuple):
     time: float
     seconds: float
 
+    @property
+    def sentence(self) -> str:
+        """Return what is reported of it."""
+        return (
+            f"{self.stream}: its clock stepped by {self.seconds:+.4g} s; navigation restarts at"
+            f" {self.time:.3f} s"
+        )
+
 
 @dataclass
 class _Clock:
-    """Clock of a stream (s): the last stamp, the newest accepted one, and one far from it."""
+    """Clock of a stream (s): the last stamp, the newest accepted one, and one far from it.
+
+    Of records in a row that are behind the newest stamp it has the number, and by how much the
+    first is.
+    """
 
     last_stamp: float = -np.inf
     newest: float = -np.inf
     wrapped: float = 0.0
     unconfirmed: float | None = None
+    behind: int = 0
+    back: float = 0.0
 
 
 class StreamClocks:
@@ -48,7 +62,7 @@ class StreamClocks:
     """
 
     def __init__(self, delay: float) -> None:
-        self._least = max(LEAST_STEP, 2.0 * delay)
+        self._least, self._delay = max(LEAST_STEP, 2.0 * delay), delay
         self._clocks: dict[str, _Clock] = {}
 
     def unwrapped(self, record: Record) -> Record:
@@ -90,6 +104,26 @@ class StreamClocks:
                 }
                 return step
         return None
+
+    def set_back(self, record: Record) -> Iterator[str]:
+        """Yield a sentence of each stream of which records in a row are too old to be used.
+
+        It is reported at the second: a single one is late, or was sent twice.
+        """
+        for name, times in _streams(record):
+            clock = self._of(name)
+            if not clock.newest - float(np.max(times)) > self._delay or self._is_far(clock, times):
+                clock.behind = 0
+                continue
+            clock.behind += 1
+            if clock.behind == 1:
+                clock.back = clock.newest - float(times[0])
+            elif clock.behind == 2:
+                yield (
+                    f"{name}: its stamps go back by {clock.back:.3g} s; samples before"
+                    f" {clock.newest:.3f} s are left out. The clock stepped back (restart the"
+                    " run), or records are late (increase --delay) or sent twice"
+                )
 
     def check(self, record: Record) -> None:
         """Note the stamps of a record.

@@ -13,6 +13,7 @@ from magfusion.files.foreign.columns import FIELDS, STREAMS, Undecided, place_of
 from magfusion.files.foreign.euroc import euroc_tables, euroc_terms, is_euroc
 from magfusion.files.foreign.flight import FLIGHTS, plan_flight
 from magfusion.files.foreign.guess import streams_of
+from magfusion.files.foreign.halves import HALVES
 from magfusion.files.foreign.map_file import ImportRequest
 from magfusion.files.foreign.phasors import PhasorPlan, plan_phasors
 from magfusion.files.foreign.plan import Findings, ImportPlan, plan_stream
@@ -24,6 +25,7 @@ from magfusion.model.site import Site
 
 TEXTS = (".csv", ".tsv", ".txt", ".tum", ".dat", ".asc")
 _TUM = ("time", "position_x", "position_y", "position_z", "qx", "qy", "qz", "qw")
+INERTIAL = {"imu", *HALVES}
 
 
 @dataclass(eq=False)
@@ -108,7 +110,9 @@ def _report_absent(result: GatheredStreams, attempted: set[str]) -> None:
             "the magnetometer, of which no table is given (--magnetometer FILE): only allan takes a"
             " log without it"
         )
-    elif "magnetometer" in result.plans and not {"imu", "gyro", "accel"} & set(result.plans):
+    elif "magnetometer" in result.plans and not INERTIAL & (
+        set(result.plans) | (attempted if result.findings.problems else set())
+    ):
         result.passed_over.append(
             "the imu, of which no table is given (--imu FILE): the log has no inertial samples"
         )
