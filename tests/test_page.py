@@ -170,7 +170,7 @@ def test_the_verdict_comes_first_with_its_reasons(page: Page) -> None:
 
 def test_the_page_says_what_was_found_refused_and_how_it_was_run(page: Page) -> None:
     assert "-6.000 ± 0.05 -5.750 ± 0.01 +5.00 yes" in page.text  # 0.25 m of a sigma of 0.05
-    assert "declared ± 0.05 declared -0.100 ± 0.01 -2.00 yes" in page.text
+    assert "Δ 0 ± 0.05 Δ -0.100 ± 0.01 -2.00 yes" in page.text
     assert "windows dropped saturated 17" in page.text
     begin, end = map(page.text.index, ("Rejected or omitted data", "Command, inputs and versions"))
     refused = page.text[begin:end]

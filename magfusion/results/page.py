@@ -195,31 +195,35 @@ def _calibration(figures: Figures) -> str:
     estimates = [f for f in figures.all if isinstance(f, ParameterEstimate)]
     if not estimates:
         return ""
-    head = ["parameter", "before", "after", "change in sigmas", "determined by these data"]
+    head = ["parameter", "before", "after", "change in sigmas", "determined"]
     rows: list[list[str]] = []
     far: set[int] = set()
     for one in estimates:
         known = one.prior_sigma > 0.0
-        before = f"{_value(one, 0.0)} ± {number_text(one.prior_sigma, 2)}" if known else "not known"
+        before = _value(one, 0.0, one.prior_sigma) if known else "not known"
         change = one.change / one.prior_sigma if one.prior_sigma else None
         if change is not None and abs(change) > FAR:
             far.add(len(rows))
-        after = f"{_value(one, one.change)} ± {number_text(one.sigma, 2)}"
+        after = _value(one, one.change, one.sigma)
         reported = "" if change is None else f"{change:+.2f}"
         rows.append([one.key, before, after, reported, "yes" if one.determined else "no"])
     findings = (
-        "<p>Each with one sigma; the change is in sigmas of the declared value, and marked beyond"
-        f" {FAR:g}. Parameters that these data do not determine keep their uncertainty.</p>"
+        "<p>Each with one sigma; Δ is relative to the declared value. The change is in sigmas of"
+        f" the declared value, and marked beyond {FAR:g}. Parameters that these data do not"
+        " determine keep their uncertainty.</p>"
     )
     return findings + _table([head, *rows], far)
 
 
-def _value(one: ParameterEstimate, change: float) -> str:
-    """Return a parameter after a change, to the second digit of its smaller sigma."""
-    sigma = min(filter(None, (one.sigma, one.prior_sigma)), default=0.0)
+def _value(one: ParameterEstimate, change: float, sigma: float) -> str:
+    """Return a parameter after a change and its sigma, to the second digit of the smaller one."""
+    smaller = min(filter(None, (one.sigma, one.prior_sigma)), default=0.0)
     if one.declared is None:
-        return f"declared {as_sure(change, sigma)}" if change else "declared"
-    return as_sure(one.declared + change, sigma).removeprefix("+")
+        value = f"Δ {as_sure(change, smaller) if change else 0}"
+    else:
+        value = as_sure(one.declared + change, smaller).removeprefix("+")
+    # A narrow page breaks no line between a value and its sigma.
+    return f"{value} ± {number_text(sigma, 2)}".replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def _refused(figures: Figures, motion: MotionPage | None) -> str:

@@ -43,7 +43,8 @@ svg .name{fill:#1d2530;font-weight:600;paint-order:stroke;stroke:#fff;stroke-wid
 .expected{stroke:#1a7f37;stroke-dasharray:4 3}
 .beacon{fill:#7b3fb0;stroke:#fff}.start{fill:#1a7f37;stroke:#fff}
 details summary{cursor:pointer;color:#1f5fbf}
-@media (max-width:600px){.page{padding:0 12px 24px}th,td{padding-right:9px;font-size:13px}
- .verdict{padding:10px 12px}figcaption{padding-left:0}}
+@media (max-width:600px){.page{padding:0 12px 24px}th,td{padding-right:7px;font-size:12px}
+ .verdict{padding:10px 12px}figcaption{padding-left:0}
+ figure{overflow-x:auto}figure img{max-width:760px}}
 @media print{.page{max-width:none}figure,table{break-inside:avoid}}
 """
