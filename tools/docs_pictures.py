@@ -31,7 +31,7 @@ class Picture(NamedTuple):
     place: str
     commands: tuple[str, ...]
     file: str
-    page: str = "README.md"  # whose sites the commands use
+    page: str = "README.md"  # whose files the commands use, besides those of README
 
 
 def _simulated(command: str) -> tuple[str, ...]:
@@ -61,6 +61,20 @@ PICTURES = {
         _simulated("magfusion calibrate log log -o calibration"),
         "calibration/calibration.png",
     ),
+    "coverage": Picture(
+        "docs/figures/coverage.png",
+        ("magfusion coverage site.yaml -o coverage --extra-beacon --spacing 1",),
+        "coverage/coverage.png",
+    ),
+    "design": Picture(
+        "docs/figures/design.png",
+        (
+            "magfusion design site.yaml --beacons 3 --hall hall.yaml --spacing 1.5 --grid 2"
+            " --starts 2 --random 20 -o design",
+        ),
+        "design/design.png",
+        "docs/jobs/design.md",
+    ),
     "drift": Picture(
         "docs/screenshots/drift.png",
         ("magfusion drift --hours 2 --estimator both -o drift",),
@@ -89,11 +103,12 @@ def make(picture: Picture) -> Path:
     place = ROOT / picture.place
     with TemporaryDirectory() as name:
         directory = Path(name)
-        page = (ROOT / picture.page).read_text(encoding="utf-8")
-        for block in re.findall(r"^```yaml\n(.*?)^```$", page, re.M | re.S):
-            head = re.match(r"# (\S+\.yaml)", block)
-            if head:
-                (directory / head[1]).write_text(block, encoding="utf-8")
+        for page in ("README.md", picture.page):
+            text = (ROOT / page).read_text(encoding="utf-8")
+            for block in re.findall(r"^```yaml\n(.*?)^```$", text, re.M | re.S):
+                head = re.match(r"# (\S+\.yaml)", block)
+                if head:
+                    (directory / head[1]).write_text(block, encoding="utf-8")
         for command in picture.commands:
             subprocess.run(command.split(), cwd=directory, check=True)
         built = directory / picture.file

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Polygon
+from matplotlib.text import Annotation
 
 from magfusion.model.hall import Hall
 from magfusion.model.site import Beacon
@@ -58,7 +59,7 @@ def add_legend(figure: Figure, every: Sequence[Axes], unknown: str) -> None:
         list(entries.values()),
         list(entries),
         loc="outside lower center",
-        ncols=5,
+        ncols=5 if len(entries) < 5 else 3,
         fontsize=9,
         frameon=False,
     )
@@ -179,31 +180,46 @@ def draw_labels(
     used: list[Array] = [
         np.stack([at - radius, at + radius]) for at in axes.transData.transform(stars)
     ]
+    frame = axes.get_window_extent().get_points()
     for place, text in zip(places, texts, strict=True):
-        up = place[1] >= middle[1]
-        best = None
-        for step in range(8):
-            for sideways in (0, 1, -1):
-                offset = (38 * sideways, (9 + 11 * step) * (1 if up else -1))
-                note = axes.annotate(
-                    text,
-                    tuple(place),
-                    xytext=offset,
-                    textcoords="offset points",
-                    ha="center",
-                    va="bottom" if up else "top",
-                    fontsize=8,
-                    bbox=BOX,
-                    annotation_clip=False,
-                    arrowprops={"arrowstyle": "-", "color": "0.4", "linewidth": 0.6}
-                    if step or sideways
-                    else None,
-                )
-                box = note.get_window_extent().get_points()
-                if all(np.any(box[1] < t[0]) or np.any(t[1] < box[0]) for t in used):
-                    best = box
-                    break
-                note.remove()
-            if best is not None:
-                used.append(best)
-                break
+        outwards = 1 if place[1] >= middle[1] else -1
+        offsets = [
+            (38 * sideways, way * (9 + 11 * step))
+            for way in (outwards, -outwards)
+            for step in range(8)
+            for sideways in (0, 1, -1)
+        ]
+        boxes = []
+        for offset in offsets:
+            note = _label(axes, place, text, offset, leader=False)
+            boxes.append(note.get_window_extent().get_points())
+            note.remove()
+        free = [k for k, box in enumerate(boxes) if not any(_overlap(box, t) for t in used)]
+        inside = [k for k in free if np.all((boxes[k] > frame[0]) & (boxes[k] < frame[1]))]
+        if free:
+            k = (inside or free)[0]
+            _label(axes, place, text, offsets[k], leader=offsets[k] != (0, 9 * outwards))
+            used.append(boxes[k])
+
+
+def _overlap(one: Array, other: Array) -> bool:
+    """Return whether two boxes, each of a lower and an upper corner, have points in common."""
+    return bool(np.all(one[0] <= other[1]) and np.all(other[0] <= one[1]))
+
+
+def _label(
+    axes: Axes, place: Array, text: str, offset: tuple[float, float], leader: bool
+) -> Annotation:
+    """Write a text at an offset (points) from a place, with a line to it on request."""
+    return axes.annotate(
+        text,
+        (place[0], place[1]),
+        xytext=offset,
+        textcoords="offset points",
+        ha="center",
+        va="bottom" if offset[1] > 0 else "top",
+        fontsize=8,
+        bbox=BOX,
+        annotation_clip=False,
+        arrowprops={"arrowstyle": "-", "color": "0.4", "linewidth": 0.6} if leader else None,
+    )
