@@ -23,7 +23,7 @@ def test_the_sentences_are_printed_and_what_holds_them_is_there(entry: Entry) ->
 
 
 MEASURED = [
-    pytest.param(entry, id=entry.command, marks=[pytest.mark.slow] * (entry.takes != "seconds"))
+    pytest.param(entry, id=entry.command, marks=pytest.mark.slow)
     for entry in REGISTER.figures
     # What takes minutes on other pages, `python tools/figures.py` runs before a release.
     if entry.command and (entry.takes == "seconds" or entry.page == "README.md")
