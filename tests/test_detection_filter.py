@@ -3,8 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
-from magfusion.estimation.data_checks.detection import DetectionFilter
+from magfusion.estimation.data_checks.detection import DetectionFilter, switched, without_silence
 from magfusion.estimation.data_checks.signal import (
     LEAST_SNR,
     BeaconDetection,
@@ -33,6 +34,54 @@ def test_a_weak_tone_of_the_first_window_waits_until_it_has_lasted_a_window() ->
     detection = DetectionFilter()
     valid = [detection.of(epoch(STEP * k), STEP).valid[0].tolist() for k in range(4)]
     assert valid == [[True, False, False]] * 2 + [[True, True, False]] * 2
+
+
+def received(amplitude: Array, window: float) -> FieldSamples:
+    """Return phasors of beacons, of amplitudes (n, beacons) in sigma, NaN where not contained."""
+    rng = np.random.default_rng(3)
+    shape = (*amplitude.shape, 3)
+    phasor = rng.normal(0.0, SIGMA, shape) + 1j * rng.normal(0.0, SIGMA, shape)
+    phasor[..., 0] += SIGMA * amplitude
+    phasor[np.isnan(amplitude)] = np.nan
+    count, beacons = amplitude.shape
+    cov = np.broadcast_to(SIGMA**2 * np.eye(3), (count, beacons, 3, 3))
+    channels = tuple((name, 0) for name in "ABCD"[:beacons])
+    time = STEP * np.arange(count)
+    return FieldSamples(time, np.full(count, window), channels, phasor, cov)
+
+
+@pytest.mark.parametrize(("overlap", "first"), [(1, 20), (2, 19), (3, 18)])
+def test_the_windows_that_contain_a_switch_are_omitted_for_all_beacons(
+    overlap: int, first: int
+) -> None:
+    # On for ten seconds, off for eight; windows that overlap the switches contain a part.
+    time, window = STEP * np.arange(60), STEP * overlap
+    edges = time[:, None] + 0.5 * window * np.array([-1.0, 1.0])
+    share = 1.0 - np.clip(np.minimum(edges[:, 1], 16.1) - np.maximum(edges[:, 0], 8.1), 0, None) / (
+        window
+    )
+    samples = received(np.column_stack([np.full(60, 50.0), 40.0 * share]), window)
+    partial = (share > 1e-9) & (share < 1.0 - 1e-9)
+    assert np.flatnonzero(partial)[0] >= first
+    omitted = switched(samples)
+    assert np.all(omitted[partial])
+    assert np.sum(omitted) <= 4 * overlap  # two windows' length at each switch
+    valid = without_silence(samples).valid
+    assert np.array_equal(valid[:, 0], ~omitted)
+    assert without_silence(without_silence(samples)).valid.tolist() == valid.tolist()
+
+
+def test_a_beacon_out_of_range_or_in_another_slot_costs_the_others_no_window() -> None:
+    away = 1.0 + 0.05 * np.arange(100)  # times the least distance
+    fading = received(np.column_stack([np.full(100, 50.0), 300.0 * away**-3]), 2 * STEP)
+    assert not np.any(switched(fading))
+    on = np.where(np.arange(100) < 50, 60.0, 0.0)
+    slots = np.column_stack([np.full(100, 50.0), on])
+    slots[::2, 0] = slots[1::2, 1] = np.nan
+    taking_turns = received(slots, STEP)
+    lost = taking_turns.valid & ~without_silence(taking_turns).valid
+    assert np.sum(lost[:, 0]) == 0
+    assert np.sum(lost[:, 1]) == pytest.approx(25, abs=2)
 
 
 def test_beacons_that_are_never_detected_have_one_sentence() -> None:

@@ -8,6 +8,7 @@ import pytest
 from magfusion.estimation.batch.batch import smooth
 from magfusion.estimation.data_checks.detection import without_silence
 from magfusion.estimation.demodulation.demodulation import demodulated
+from magfusion.estimation.integrity.judge import judge_result
 from magfusion.model.samples import Waveform
 from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -43,7 +44,16 @@ def test_a_beacon_that_is_off_for_a_while_costs_no_more_than_its_share() -> None
     outside = (fields.time < OFF - 0.6) | (fields.time > ON + 0.6)
     assert not np.any(own[inside])
     assert np.all(own[outside])
-    errors = trajectory_errors(smooth(silent, site).states, log.truth)
+    # The lock-in assumes whole windows of a tone: what is left of it leaks into all others.
+    edges = fields.time[:, None] + 0.5 * fields.window[:, None] * np.array([-1.0, 1.0])
+    holds = ((edges[:, :1] < [OFF, ON]) & (edges[:, 1:] > [OFF, ON])).any(axis=1)
+    assert np.any(holds)
+    assert not np.any(fields.valid[holds])
+    assert np.all(fields.valid[outside])
+    result, trust = judge_result(smooth(silent, site), silent)
+    assert [finding.code for finding in trust.reasons] == []
+    assert "silent_beacon" in [finding.code for finding in trust.remarks]
+    errors = trajectory_errors(result.states, log.truth)
     whole = trajectory_errors(smooth(log, site).states, log.truth)
     assert errors.ate < 2.0 * whole.ate + 0.001  # m
     assert errors.inside_3_sigma is not None

@@ -95,6 +95,24 @@ def test_states_are_carried_with_the_noise_that_the_samples_have(
 
 
 @pytest.mark.slow
+def test_beacons_that_are_no_majority_cast_doubt_where_one_of_four_does_not(
+    walk: OnlineLog,
+) -> None:
+    def within(channels: list[int]) -> list[JudgedState]:
+        other = replace(walk, fields=rotated(walk.fields, 20.0, 60.0, channels))
+        _, states = navigated(other, "ekf")
+        return [state for state in states if 20.0 < state.time < 24.0]
+
+    one, two = within([1]), within([1, 2])
+    assert {state.judgement.excluded for state in two} == {("B", "C")}
+    # Five epochs in a row: one may be an impulse on both.
+    late = [state.verdict for state in two[5:]]
+    assert set(late) == {Verdict.DOUBTFUL}
+    assert {f.code for state in two[5:] for f in state.judgement.reasons} == {"field_innovations"}
+    assert {state.verdict for state in one[:8]} == {Verdict.TRUSTWORTHY}
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_a_platform_that_nothing_explains_is_lost_until_it_is_found(
     walk: OnlineLog, estimator: str

@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import binary_erosion
+from scipy.ndimage import binary_erosion, maximum_filter1d
 
 from magfusion.model.noise import whitening
 from magfusion.model.samples import FieldSamples
-from magfusion.units import BoolArray, IntArray
+from magfusion.units import Array, BoolArray, IntArray
 
 DETECTION_CHI_SQUARE = (
     100.0  # chi square of six components; of a log that is smoothed with the Earth field
@@ -26,12 +26,54 @@ def without_silence(samples: FieldSamples) -> FieldSamples:
     """Return samples without the stretches in which a beacon that is strong elsewhere is silent.
 
     Its phasor there is noise and contradicts the model.  A beacon that fades with distance loses
-    almost nothing.
+    almost nothing.  Windows in which a beacon is switched are omitted for all beacons.
     """
     received = detected(samples, DETECTION_CHI_SQUARE_ONLINE)
     strong = detected(samples, STRONG_CHI_SQUARE * DETECTION_CHI_SQUARE_ONLINE).any(axis=0)
     silent = samples.valid & ~received & strong
-    return only(samples, ~silent) if np.any(silent) else samples
+    if not np.any(silent):
+        return samples
+    return only(samples, ~(silent | switched(samples)[:, None]))
+
+
+def switched(samples: FieldSamples) -> BoolArray:
+    """Return the windows in which a strong beacon may have been switched, shape (n,).
+
+    The lock-in assumes that a tone lasts for the whole window; the spectrum of one that does not
+    leaks into all other tones.  A beacon was switched where it is undetected although its amplitude
+    a few windows before or after would be far above the noise there.
+    """
+    result = np.zeros(len(samples), dtype=bool)
+    present = above_noise(samples, DETECTION_CHI_SQUARE_ONLINE) | samples.partial
+    silent, reach = samples.valid & ~present, _overlapping(samples)
+    power = np.where(present, np.nansum(np.abs(samples.phasor_sensor) ** 2, axis=-1), 0.0)
+    near = maximum_filter1d(power, 4 * reach + 1, axis=0, mode="nearest")
+    off = silent & (near * _information(samples) > STRONG_CHI_SQUARE * DETECTION_CHI_SQUARE_ONLINE)
+    for channel in np.flatnonzero(off.any(axis=0)).tolist():
+        rows = np.flatnonzero(samples.valid[:, channel])  # of the slots, where coils take turns
+        quiet = silent[rows, channel]
+        edge = off[rows, channel]
+        falls = np.flatnonzero(edge[1:] & ~quiet[:-1]) + 1
+        rises = np.flatnonzero(edge[:-1] & ~quiet[1:])
+        begins = np.concatenate([falls - reach, rises - reach + 1])
+        inside = (begins[:, None] + np.arange(2 * reach)).ravel()
+        result[rows[inside[(inside >= 0) & (inside < len(rows))]]] = True
+    return result
+
+
+def _overlapping(samples: FieldSamples) -> int:
+    """Return the number of steps between windows that do not overlap."""
+    if len(samples) < 2:
+        return 1
+    step = float(np.median(np.diff(samples.time)))
+    return int(np.ceil(np.median(samples.window) / step - 1e-6))
+
+
+def _information(samples: FieldSamples) -> Array:
+    """Return the mean information on a component of each phasor, shape (n, channels) (1/T^2)."""
+    return np.asarray(
+        np.sum(whitening(samples.phasor_cov, samples.there) ** 2, axis=(-1, -2)) / 3.0
+    )
 
 
 def masked_phasors(samples: FieldSamples) -> BoolArray:
@@ -43,8 +85,8 @@ def masked_phasors(samples: FieldSamples) -> BoolArray:
     received = detected(samples, DETECTION_CHI_SQUARE_ONLINE)
     power = np.where(received, np.nansum(np.abs(samples.phasor_sensor) ** 2, axis=-1), np.nan)
     usual = np.nanmedian(np.where(received.any(axis=0), power, 0.0), axis=0)
-    share = np.sum(whitening(samples.phasor_cov, samples.there) ** 2, axis=(-1, -2)) / 3.0
-    return np.asarray(samples.valid & ~received & (usual * share <= DETECTION_CHI_SQUARE_ONLINE))
+    hidden = usual * _information(samples) <= DETECTION_CHI_SQUARE_ONLINE
+    return np.asarray(samples.valid & ~received & hidden)
 
 
 def above_noise(samples: FieldSamples, least: float) -> BoolArray:
@@ -71,9 +113,7 @@ def detected(samples: FieldSamples, least: float = DETECTION_CHI_SQUARE) -> Bool
     strong = above_noise(samples, least) | samples.partial
     if len(samples) < 2:
         return strong
-    step = float(np.median(np.diff(samples.time)))
-    reach = int(np.ceil(np.median(samples.window) / step - 1e-6))
-    whole = np.ones((2 * reach + 1, 1), dtype=bool)
+    whole = np.ones((2 * _overlapping(samples) + 1, 1), dtype=bool)
     # A tone that an epoch does not contain has not fallen silent.
     return strong & np.asarray(binary_erosion(strong | ~samples.valid, whole, border_value=1))
 

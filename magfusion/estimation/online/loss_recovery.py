@@ -76,7 +76,7 @@ class LossRecovery:
     def over(self) -> None:
         """Record that the state is recovered."""
         self._gate.counts["lost and found again"] += 1
-        self._gate.refused_in_a_row = 0
+        self._gate.refused_in_a_row = self._gate.outvoted_in_a_row = 0
         self._attempts.over()
 
     def restarted(self, measured: EpochMeasurements, state: State) -> State | None:

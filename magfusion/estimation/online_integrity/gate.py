@@ -29,6 +29,8 @@ class Gate:
         By beacon, running mean of the squared innovation in units of its expectation.
     refused_in_a_row : int
         Consecutive epochs with most channels rejected, up to now.
+    outvoted_in_a_row : int
+        Consecutive epochs in which no majority of the beacons was accepted.
     accepted, refused : dict of str to float
         Of the last epoch, by beacon, the mean squared innovation of the accepted and of the
         rejected channels, in the same units.
@@ -37,6 +39,7 @@ class Gate:
     counts: Counter[str]
     distortion: dict[str, float]
     refused_in_a_row: int
+    outvoted_in_a_row: int
     accepted: dict[str, float]
     refused: dict[str, float]
 
@@ -52,13 +55,18 @@ class Gate:
         self._number = np.array([self._names.index(name) for name, _ in channels], dtype=np.int64)
         self.counts = Counter()
         self.distortion = {}
-        self.refused_in_a_row = 0
+        self.refused_in_a_row = self.outvoted_in_a_row = 0
         self.accepted, self.refused = {}, {}
 
     @property
     def is_lost(self) -> bool:
         """Whether the state is probably wrong rather than the measurements."""
         return self.refused_in_a_row >= LOST_EPOCHS
+
+    @property
+    def has_no_majority(self) -> bool:
+        """Whether the accepted beacons are long outnumbered: they may be the false ones."""
+        return self.outvoted_in_a_row >= LOST_EPOCHS
 
     def passed(
         self, measurements: Phasors, state: State, valid: BoolArray, refused: BoolArray
@@ -82,6 +90,8 @@ class Gate:
             self.counts[f"outlier of {name}"] += 1
         maximum = np.sum(rejected & ~false) > 0.5 * np.sum(valid & ~false)
         self.refused_in_a_row = self.refused_in_a_row + 1 if maximum else 0
+        outvoted = len(self.refused.keys() - self.accepted.keys()) >= max(1, len(self.accepted))
+        self.outvoted_in_a_row = self.outvoted_in_a_row + 1 if outvoted else 0
         return measurements.without(rejected) if np.any(rejected) else measurements
 
     def nothing_measured(self) -> None:

@@ -231,13 +231,14 @@ class OnlineMonitor:
                 " Check the frequencies, phases and positions of the beacons in the site."
             )
             return Judgement((Finding("lost", text, Verdict.FAILED, 10.0),))
-        if gate.refused_in_a_row == 0 or not gate.refused:
+        if (gate.refused_in_a_row == 0 and not gate.has_no_majority) or not gate.refused:
             return Judgement()
         levels = [*gate.refused.values(), *gate.accepted.values()]
         excess = max(1.0, float(np.mean(levels)) if levels else 1.0)
         text = (
             f"The fields of {_listed(gate.refused)} were rejected together for"
-            f" {gate.refused_in_a_row} epochs: a disturbance, or the state is wrong."
+            f" {max(gate.refused_in_a_row, gate.outvoted_in_a_row)} epochs, and the other beacons"
+            " are no majority: a disturbance of all, or the state is wrong."
         )
         return Judgement((Finding("field_innovations", text, weight=excess),), inflation=excess)
 
