@@ -276,13 +276,14 @@ def draw(config: Config, path: Path) -> None:
             panels[k + 1].set(ylabel=f"error of {name} (deg)")
     panels[0].plot(time, roll_deg, ".", ms=2, label="roll")
     panels[0].plot(time, swing, label="pitch")
-    panels[0].set(ylabel="deg", title="Database of 5 degrees at yaw 0, interpolated; 3 mG")
+    figure.suptitle("Database of 5 degrees at yaw 0, interpolated; 3 mG")
+    panels[0].set(ylabel="attitude (deg)")
     for axes in panels[1:]:
-        for limit in (-PAPER_DEG, PAPER_DEG):
-            axes.axhline(limit, color="red", ls="--", lw=0.8)
+        for limit, label in ((-PAPER_DEG, None), (PAPER_DEG, f"paper 001: {PAPER_DEG:g} deg")):
+            axes.axhline(limit, color="red", ls="--", lw=0.8, label=label)
     for axes in panels:
-        axes.legend(loc="upper right")
-    panels[2].set(xlabel="time (s); red: the paper's claim")
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False)
+    panels[2].set(xlabel="time (s)")
     save_picture(figure, path)
 
 

@@ -218,17 +218,18 @@ def draw(config: Config, path: Path) -> None:
     fields, rolls, errors = figure.subplots(3, 1, sharex=True)
     for k, name in enumerate("xyz"):
         fields.plot(true_deg, measured[:, k] / MILLIGAUSS, label=f"field {name}")
-    fields.set(ylabel="mG", title="A calibrated magnetometer, 3 mG, on a vertical axis")
+    figure.suptitle("A calibrated magnetometer, 3 mG, on a vertical axis")
+    fields.set(ylabel="field (mG)")
     for match, name in ((match_nearest, "nearest"), (match_interpolated, "interpolated")):
         result = match(index, measured, 3.0 * MILLIGAUSS).rpy[:, 0, 0]
         rolls.plot(true_deg, result / DEGREE, ".", ms=2, label=name)
         errors.plot(true_deg, wrap(result - true_deg * DEGREE) / DEGREE, lw=0.7, label=name)
-    for limit in (-PAPER_DEG, PAPER_DEG):
-        errors.axhline(limit, color="red", ls="--", lw=0.8)
+    for limit, label in ((-PAPER_DEG, None), (PAPER_DEG, f"paper 001: {PAPER_DEG:g} deg")):
+        errors.axhline(limit, color="red", ls="--", lw=0.8, label=label)
     rolls.set(ylabel="roll found (deg)")
-    errors.set(xlabel="true roll (deg)", ylabel="error (deg); red: the paper's claim")
+    errors.set(xlabel="true roll (deg)", ylabel="error of roll (deg)")
     for axes in (fields, rolls, errors):
-        axes.legend(loc="upper right")
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False)
     save_picture(figure, path)
 
 

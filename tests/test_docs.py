@@ -70,3 +70,12 @@ def test_the_figures_are_drawn_by_the_package(tmp_path: Path) -> None:
     assert {path.stem for path in (DOCS / "figures").iterdir()} == set(shown) >= set(FIGURES)
     for drawn in draw(list(FIGURES), tmp_path):
         assert drawn.stat().st_size > 10_000  # bytes; empty axes have fewer
+
+
+def test_the_pictures_of_a_paper_are_drawn_by_a_scenario() -> None:
+    from docs_pictures import PAPERS
+
+    pages = {n: text for n, text in PAGES.items() if n.startswith("papers/")}
+    shown = re.findall(r"\]\((\w+)\.png\)", "".join(pages.values()))
+    assert {path.stem for path in (DOCS / "papers").glob("*.png")} == set(shown) == set(PAPERS)
+    assert all((ROOT / "scenarios" / one.split()[0]).is_file() for one, _ in PAPERS.values())

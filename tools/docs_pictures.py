@@ -97,6 +97,21 @@ PICTURES = {
     ),
 }
 
+# Of the pages of the papers: a scenario with its options, and its picture.
+PAPERS = {
+    "001_figure_2": ("twelve_positions.py", "twelve_positions"),
+    "001_figure_4": ("roll_matching.py", "roll_matching"),
+    "001_figure_6": ("attitude_matching.py", "attitude_matching"),
+}
+PICTURES |= {
+    name: Picture(
+        f"docs/papers/{name}.png",
+        (f"python scenarios/{scenario} -o drawn",),
+        f"drawn/{drawn}.png",
+    )
+    for name, (scenario, drawn) in PAPERS.items()
+}
+
 
 def make(picture: Picture) -> Path:
     """Make a picture in a directory of its own, and return its place."""
@@ -110,7 +125,8 @@ def make(picture: Picture) -> Path:
                 if head:
                     (directory / head[1]).write_text(block, encoding="utf-8")
         for command in picture.commands:
-            subprocess.run(command.split(), cwd=directory, check=True)
+            line = command.replace("scenarios/", f"{ROOT}/scenarios/")
+            subprocess.run(line.split(), cwd=directory, check=True)
         built = directory / picture.file
         if built.suffix == ".rrd":
             built = _screenshot(built, directory / SHOT)
