@@ -135,26 +135,29 @@ def _table(
 
 
 def draw(directory: Path, result: Mapping[str, Sequence[AlgorithmOutcome]]) -> None:
-    """Write the paper's figures 7 and 8 as PNGs, and bars of all rooms."""
+    """Write the paper's figures 7 and 8 as a PNG, and bars of all rooms."""
     shown = "F1" if "F1" in result else next(iter(result))
     colours = {name: f"C{i}" for i, name in enumerate(METHODS)}
-    for number, quantity, paper, label in (
-        (7, "position", PAPER_POSITION, "position error (m)"),
-        (8, "euler", PAPER_ATTITUDE_DEG, "attitude error of a level sensor, mean |Euler| (deg)"),
+    figure = blank_figure(11.0, 5.2)
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, quantity, paper, title, label in (
+        (panels[0], "position", PAPER_POSITION, "figure 7", "position error (m)"),
+        (panels[1], "euler", PAPER_ATTITUDE_DEG, "figure 8", "attitude error, Eq 31 (deg)"),
     ):
-        figure = blank_figure(7.0, 5.0)
-        axes = figure.subplots()
         for name, colour in colours.items():
             every = np.concatenate([getattr(o, quantity)[name] for o in result[shown]])
             share = np.arange(1, len(every) + 1) / len(every)
             axes.step(np.sort(every), share, where="post", c=colour, label=name)
+            axes.plot(np.mean(every), np.mean(every <= np.mean(every)), "o", c=colour)
         for name, value in paper.items():
-            axes.axvline(value, c=colours[name], ls=":", lw=1.0)
-        axes.set(xscale="log", xlabel=label, ylabel="share of targets", ylim=(0.0, 1.0))
-        axes.set_title(f"{shown}; dotted: means of the paper's figure {number}")
+            axes.axvline(value, c=colours[name], ls=":", label=f"paper 004, mean, {name}")
+        axes.set(xscale="log", xlabel=label, title=title, ylim=(0.0, 1.0))
         axes.grid(visible=True, alpha=0.3)
-        axes.legend(fontsize=8)
-        save_picture(figure, directory / f"figure_{number}.png")
+    panels[0].set_ylabel("share of targets")
+    figure.suptitle(f"Rooms {shown}; dots: means; dotted: means that paper 004 prints")
+    handles, names = panels[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=4, fontsize=8)
+    save_picture(figure, directory / "figures_7_8.png")
     _draw_bars(directory / "rooms.png", result, colours)
 
 

@@ -315,24 +315,28 @@ def failures() -> tuple[str, dict[str, Any]]:
 
 def draw(errors: dict[tuple[str, int], Errors], directory: Path) -> Path:
     """Draw the cumulative distributions of figures 5 and 6; return the picture's path."""
-    figure = blank_figure(11.0, 4.5)
-    remaining, right = figure.subplots(1, 2)
+    figure = blank_figure(11.0, 4.8)
+    panels = figure.subplots(1, 2, sharey=True)
     shown = [(noise, 0, f"C{i}") for i, noise in enumerate(dict.fromkeys(n for n, _ in errors))]
     shown.append((shown[0][0], 1, "0.2"))
     for count, style in zip(PAPER, ("-", "--"), strict=True):
         for noise, i, colour in shown:
             result = errors[noise, count]
-            share = (np.arange(result.position.shape[1]) + 1.0) / result.position.shape[1]
-            label = f"{METHODS[i]}, noise by {noise}, {count} magnetometers"
-            remaining.plot(np.sort(result.position[i]), share, style, color=colour, label=label)
             angle = np.mean(np.abs(result.angles[i]), axis=-1) / DEGREE
-            right.plot(np.sort(angle), share, style, color=colour)
-        remaining.axvline(PAPER[count][0], color="0.5", linestyle=style, linewidth=0.8)
-        right.axvline(PAPER[count][1], color="0.5", linestyle=style, linewidth=0.8)
-    remaining.set(xlabel="error of the centre (m)", ylabel="share of the runs", title="figure 5")
-    right.set(xlabel="mean error of the three angles (deg)", title="figure 6")
-    remaining.legend(fontsize=6)
-    figure.suptitle("Calibration of a beacon, 1 % noise; grey: mean that paper 002 reports")
+            label = f"{METHODS[i]}, noise by {noise}" if style == "-" else None
+            for axes, error in zip(panels, (result.position[i], angle), strict=True):
+                share = (np.arange(len(error)) + 1.0) / len(error)
+                axes.plot(np.sort(error), share, style, color=colour, label=label)
+                axes.plot(np.mean(error), np.mean(error <= np.mean(error)), "o", color=colour)
+        for axes, printed in zip(panels, PAPER[count], strict=True):
+            label = f"paper 002, mean, {count} magnetometers"
+            axes.axvline(printed, color="tab:red", linestyle=style, linewidth=1.0, label=label)
+    panels[0].set(xlabel="position error (m)", ylabel="share of the runs", title="figure 5")
+    panels[1].set(xlabel="attitude error, mean of three angles (deg)", title="figure 6")
+    panels[0].legend(fontsize=8, loc="lower right")
+    figure.suptitle(
+        "Calibration of a beacon, 1 % noise; dots: means; full: 3 magnetometers, broken: 4"
+    )
     path = directory / "beacon_calibration.png"
     save_picture(figure, path)
     return path

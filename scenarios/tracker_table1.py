@@ -24,10 +24,9 @@ cannot come out of its own Eq 13, and its rows 8 to 10 repeat uncalibrated value
 """
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
-from harness import between_deg, blank_figure, conclude, rms, save_picture, scenario_parser
+from harness import between_deg, conclude, rms, scenario_parser
 from tracker_antennas import (
     Config,
     Errors,
@@ -43,6 +42,14 @@ from tracker_antennas import (
     with_kappas,
 )
 from tracker_bench import general_antenna, measure, rigid_antenna
+from tracker_table1_printed import (
+    ROW_AT_THE_POLE,
+    TABLE,
+    draw,
+    draw_rows,
+    printed_ratios,
+    report_printed,
+)
 
 from magfusion.calibration.antenna import AntennaFit, AntennaSurvey, fit_at_known_poses
 from magfusion.calibration.antenna_graph import fit_at_uncertain_poses
@@ -50,26 +57,7 @@ from magfusion.model.antenna import Antenna, antenna_from_vector
 from magfusion.papers.p000_tracker.equations import attitude_from_angles, euler_angles
 from magfusion.units import DEGREE, Array
 
-# Yaw, pitch, roll (deg): target, antenna not calibrated, antenna calibrated.
-TABLE = np.array(
-    [
-        [[0, 0, 0], [0.21, 0.23, 0.33], [0.02, 0.05, 0.06]],
-        [[0, 30, 0], [0.21, 30.42, 0.33], [0.02, 30.06, 0.06]],
-        [[0, 60, 0], [0.22, 61.13, 0.32], [0.03, 60.23, 0.05]],
-        [[0, 90, 0], [0.22, 91.71, 0.32], [0.03, 90.36, 0.05]],
-        [[30, 0, 0], [30.41, 0.31, 0.23], [30.06, 0.03, 0.03]],
-        [[60, 0, 0], [60.63, 0.31, 0.23], [60.10, 0.04, 0.02]],
-        [[90, 0, 0], [91.92, 0.31, 0.23], [90.25, 0.06, 0.03]],
-        [[0, 0, 30], [0.21, 0.23, 29.24], [0.21, 0.23, 30.01]],
-        [[0, 0, 60], [0.22, 0.24, 59.43], [0.21, 0.23, 60.03]],
-        [[0, 0, 90], [0.25, 0.27, 89.89], [0.21, 0.23, 90.04]],
-        [[10, 20, 30], [10.26, 20.34, 29.54], [10.06, 20.04, 30.03]],
-        [[20, 40, 60], [20.34, 40.44, 59.61], [20.09, 40.08, 60.06]],
-        [[30, 60, 90], [30.44, 61.05, 89.86], [30.13, 60.18, 90.07]],
-    ]
-)
 POSITION_BEACON = np.array([0.45, 0.0, -0.10])  # m; the paper does not give its own
-ROW_AT_THE_POLE = 3
 NAMES = {
     "U": "not calibrated",
     "P1": "paper as printed (sum, 1 + [w]x)",
@@ -171,22 +159,7 @@ class Row:
     euler_deg: float  # RMS without the row at the pole
     euler_max_deg: float  # median over the antennas of the largest
     position_mm: float  # RMS
-
-
-def printed_ratios() -> dict[str, tuple[float, float, float]]:
-    """Return uncalibrated error, calibrated error and ratio of the printed table (deg)."""
-    before, after = np.abs(TABLE[:, 1] - TABLE[:, 0]), np.abs(TABLE[:, 2] - TABLE[:, 0])
-    attitudes = attitude_from_angles(TABLE * DEGREE)
-    turns = [between_deg(attitudes[:, k], attitudes[:, 0]) for k in (1, 2)]
-    rows = np.arange(len(TABLE)) != ROW_AT_THE_POLE
-    figures = {
-        "mean of 39 angles": (float(np.mean(before)), float(np.mean(after))),
-        "RMS of 39 angles": (rms(before), rms(after)),
-        "largest": (float(np.max(before)), float(np.max(after))),
-        "RMS without the pole": (rms(before[rows]), rms(after[rows])),
-        "geodesic RMS": (rms(turns[0]), rms(turns[1])),
-    }
-    return {name: (*pair, pair[0] / pair[1]) for name, pair in figures.items()}
+    each_deg: tuple[float, ...]  # geodesic RMS of each attitude of the table
 
 
 def run_levels(config: Config, *, graph: bool = True) -> tuple[Row, ...]:
@@ -220,6 +193,7 @@ def run_levels(config: Config, *, graph: bool = True) -> tuple[Row, ...]:
                 euler_deg=rms(euler),
                 euler_max_deg=float(np.median(np.max(np.abs(euler), axis=(1, 2)))),
                 position_mm=1e3 * rms(np.linalg.norm(place - POSITION_BEACON, axis=-1)),
+                each_deg=tuple(np.sqrt(np.mean(turn**2, axis=0)).tolist()),
             )
         )
     return tuple(rows)
@@ -326,14 +300,6 @@ def report_others(others: dict[str, tuple[Row, ...]]) -> str:
     return "\n".join(lines)
 
 
-def report_printed() -> str:
-    """Return the ratios of the printed table."""
-    lines = ["Paper 000, Table 1, as printed (deg)"]
-    for name, (before, after, ratio) in printed_ratios().items():
-        lines.append(f" {name:24}{before:7.3f} ->{after:7.3f}   x{ratio:.2f}")
-    return "\n".join(lines)
-
-
 def report_uncertain(result: Uncertain, config: Config) -> str:
     """Return what uncertain poses do."""
     return (
@@ -348,24 +314,6 @@ def report_uncertain(result: Uncertain, config: Config) -> str:
         f" {result.volume_attitude_deg:.3f} deg (another tracker's hardware, Anser EMT:"
         " 1.1 mm, 0.15 deg)"
     )
-
-
-def draw(path: Path, tables: dict[str, tuple[Row, ...]]) -> None:
-    """Write a PNG of the attitude errors of every level, with the printed ones."""
-    figure = blank_figure(5.0 * len(tables), 4.0)
-    before, after, _ = printed_ratios()["geodesic RMS"]
-    panels = figure.subplots(1, len(tables), squeeze=False, sharey=True)[0]
-    for axes, (title, rows) in zip(panels, tables.items(), strict=True):
-        middle = [row.attitude_deg for row in rows]
-        spread = [[row.attitude_deg - row.low_deg for row in rows]]
-        spread += [[row.high_deg - row.attitude_deg for row in rows]]
-        axes.bar([row.level for row in rows], middle, yerr=spread, color="0.7", capsize=3)
-        axes.axhline(before, color="tab:red", linestyle=":", label="Table 1, before")
-        axes.axhline(after, color="tab:blue", linestyle=":", label="Table 1, after")
-        axes.set(title=title, yscale="log")
-    panels[0].set_ylabel("attitude error, RMS (deg)")
-    panels[0].legend()
-    save_picture(figure, path)
 
 
 def main() -> None:
@@ -383,6 +331,7 @@ def main() -> None:
     result = [run_uncertain(config) for config in uncertain]
     if given.output is not None:
         draw(given.output / "tracker_table1.png", tables)
+        draw_rows(given.output / "tracker_table1_rows.png", dict(list(tables.items())[:2]))
     figures: dict[str, object] = {"printed": printed_ratios()}
     for name, rows in zip(("A", "F2", "common"), tables.values(), strict=True):
         figures[name] = {row.level: row for row in rows}

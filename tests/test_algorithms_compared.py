@@ -112,7 +112,7 @@ def test_the_report_tells_where_plain_likelihood_is_worse_and_draws_both_figures
     figures = json.loads(lines[-1])["scenarios"]["P0"]
     assert set(figures) == set(METHODS)
     assert figures[ML]["position_m"] == pytest.approx(plain, rel=1e-12)
-    for name in ("figure_7", "figure_8", "rooms"):
+    for name in ("figures_7_8", "rooms"):
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
 
 

@@ -19,7 +19,8 @@ from tracker_antennas import (
 )
 from tracker_bench import bench_points, helmert, measure
 from tracker_site import body_poses, in_beacon, tracker_site
-from tracker_table1 import POSITION_BEACON, TABLE, one_of
+from tracker_table1 import POSITION_BEACON, one_of
+from tracker_table1_printed import TABLE
 
 from magfusion.calibration.antenna import (
     AntennaFit,

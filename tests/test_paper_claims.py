@@ -11,7 +11,7 @@ import tracker_as_printed
 from paper_rooms import S0, draw_world
 from scipy.spatial.transform import Rotation
 from tracker_bench import bench_points, helmert, measure
-from tracker_table1 import TABLE
+from tracker_table1_printed import TABLE
 
 from magfusion.calibration.magnetometer import from_paper, to_paper
 from magfusion.model.physics.dipole import dipole_field

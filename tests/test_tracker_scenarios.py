@@ -13,6 +13,7 @@ from tracker_antennas import Config, Errors, bench_readings, couplings, nominal
 from tracker_bench import bench_points
 from tracker_near_field import learn_sizes
 from tracker_table1 import SCENARIO_A, SCENARIO_COMMON, SCENARIO_E, SCENARIO_F2, Row
+from tracker_table1_printed import printed_ratios
 
 from magfusion.model.physics.solenoid import loop_field
 from magfusion.papers.register import paper
@@ -44,7 +45,7 @@ def near() -> tuple[tracker_near_field.Row, ...]:
     ],
 )
 def test_the_printed_table_has_these_ratios(name: str, ratio: float) -> None:
-    assert tracker_table1.printed_ratios()[name][2] == pytest.approx(ratio, abs=0.01)
+    assert printed_ratios()[name][2] == pytest.approx(ratio, abs=0.01)
 
 
 @pytest.mark.slow
@@ -216,7 +217,8 @@ def test_table_1_ends_with_one_json_line_and_draws(
     options = ["--quick", "-o", str(tmp_path / "out")]
     result = _last_line("table1", tracker_table1.main, options, capsys, monkeypatch)
     assert result.keys() == {"printed", "A", "F2", "common", "E", "others"}
-    assert (tmp_path / "out" / "tracker_table1.png").stat().st_size > 10_000
+    for name in ("tracker_table1", "tracker_table1_rows"):
+        assert (tmp_path / "out" / f"{name}.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow

@@ -99,9 +99,12 @@ PICTURES = {
 
 # Of the pages of the papers: a scenario with its options, and its picture.
 PAPERS = {
+    "000_table_1": ("tracker_table1.py", "tracker_table1_rows"),
     "001_figure_2": ("twelve_positions.py", "twelve_positions"),
     "001_figure_4": ("roll_matching.py", "roll_matching"),
     "001_figure_6": ("attitude_matching.py", "attitude_matching"),
+    "002_figures_5_6": ("beacon_calibration.py", "beacon_calibration"),
+    "004_figure_6": ("coverage_radius.py", "coverage_radius"),
 }
 PICTURES |= {
     name: Picture(
