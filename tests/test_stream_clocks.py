@@ -103,7 +103,8 @@ def test_a_step_back_by_less_than_a_second_is_reported(lines: list[dict[str, Any
     """Its samples are older than those used, and are left out; one late record is no step."""
 
     def reported(given: list[dict[str, Any]], delay: float = 0.0) -> list[str]:
-        clocks, result = StreamClocks(delay), []
+        clocks = StreamClocks(delay)
+        result: list[str] = []
         for line in given:
             record = Record.model_validate(line)
             result += clocks.set_back(record)
