@@ -77,7 +77,7 @@ class BagReader(AnyReader):
             expected: Counter[str] = Counter()
             for one in chosen:
                 expected[one.topic] += one.msgcount
-            place = place_of([Path(reader.path) for reader in self.readers])
+            place = ", ".join(str(reader.path) for reader in self.readers)
             self.damage = [
                 f"{place}: the file is damaged. {read[topic]} of {count} messages of {topic} are"
                 " read; the others are lost. Copy the file again."
