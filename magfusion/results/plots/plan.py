@@ -189,17 +189,22 @@ def draw_labels(
             for step in range(8)
             for sideways in (0, 1, -1)
         ]
-        boxes = []
+        chosen: tuple[tuple[int, int], Array] | None = None
         for offset in offsets:
             note = _label(axes, place, text, offset, leader=False)
-            boxes.append(note.get_window_extent().get_points())
+            box = note.get_window_extent().get_points()
             note.remove()
-        free = [k for k, box in enumerate(boxes) if not any(_overlap(box, t) for t in used)]
-        inside = [k for k in free if np.all((boxes[k] > frame[0]) & (boxes[k] < frame[1]))]
-        if free:
-            k = (inside or free)[0]
-            _label(axes, place, text, offsets[k], leader=offsets[k] != (0, 9 * outwards))
-            used.append(boxes[k])
+            if any(_overlap(box, other) for other in used):
+                continue
+            inside = np.all((box > frame[0]) & (box < frame[1]))
+            if inside or chosen is None:
+                chosen = offset, box
+            if inside:
+                break
+        if chosen is not None:
+            offset, box = chosen
+            _label(axes, place, text, offset, leader=offset != (0, 9 * outwards))
+            used.append(box)
 
 
 def _overlap(one: Array, other: Array) -> bool:
@@ -208,7 +213,7 @@ def _overlap(one: Array, other: Array) -> bool:
 
 
 def _label(
-    axes: Axes, place: Array, text: str, offset: tuple[float, float], leader: bool
+    axes: Axes, place: Array, text: str, offset: tuple[int, int], leader: bool
 ) -> Annotation:
     """Write a text at an offset (points) from a place, with a line to it on request."""
     return axes.annotate(
