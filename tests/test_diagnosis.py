@@ -24,8 +24,8 @@ from magfusion.estimation.integrity.motion_causes import timing_causes
 from magfusion.estimation.integrity.motion_comparison import compared, surveyed
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.trust import CODES, Finding, Trust, Verdict
+from magfusion.simulation.config import MotionKind, SimulationConfig
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
-from magfusion.simulation.log import MotionKind, SimulationConfig
 from magfusion.simulation.motion import Rests
 from magfusion.units import DEGREE
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.integrity.correction import Correction, _with_turned_imu
+from magfusion.estimation.integrity.correction import Correction, with_rival_frame
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding
 from magfusion.simulation.demo_site import demo_site
@@ -26,7 +26,7 @@ def test_its_spread_has_the_motion_of_the_body_about_the_magnetometer() -> None:
     after, moved = turn.as_matrix() @ before, place + np.array([0.01, 0.0, -0.006])
     declared = mounted(demo_site(), before, place)
     correction = Correction(Finding("mounting", "It is turned."), mounted(declared, after, moved))
-    spread = _with_turned_imu(declared, correction)
+    spread = with_rival_frame(declared, correction)
     assert spread is not None
     # The magnetometer has one pose in the world; the body follows by either mounting.
     world_from_sensor, sensor_world = Rotation.random(random_state=rng).as_matrix(), np.ones(3)

@@ -94,6 +94,8 @@ def _counted_clock(stamps: Array, separate: Array) -> SamplingClock:
 
 def stamp_resolution(stamps: Array) -> float:
     """Return the common divisor of the steps (s), by which two of them differ; zero if none."""
+    if len(stamps) < 2:
+        return 0.0
     exact = 4.0 * max(NANOSECOND, float(np.spacing(np.max(np.abs(stamps)))))
     steps = np.sort(np.diff(stamps[:MOST_STEPS]))
     change = np.diff(steps, prepend=0.0)
