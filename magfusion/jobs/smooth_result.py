@@ -136,7 +136,8 @@ def finished(
     excluded = bool(changes)
     possible = corrections(site, trust.reasons, () if excluded else causes, cause)
     is_named = bool(causes) or any(f.code == "changed" for f in trust.reasons)
-    trust = with_explaining_cause(trust, None if is_named and not is_clear(cause) else cause)
+    clear = is_clear(cause)
+    trust = with_explaining_cause(trust, None if is_named and not clear else cause, clear)
     if correction is not None:
         trust |= Trust((_explaining(correction.finding, trust),))
     by_state = states_judged(separated, result, trust.verdict)

@@ -163,10 +163,15 @@ def with_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
     return Trust(findings if cause is None else (*findings, cause.finding), trust.unverified)
 
 
-def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
+def with_explaining_cause(trust: Trust, cause: Diagnosis | None, clear: bool = False) -> Trust:
     """Return the findings on a result that is not solved again with its cause undone.
 
     Reasons that a mistake explains are listed with it, not beside it.
+
+    Parameters
+    ----------
+    clear : bool
+        Whether the cause leaves so little that no parameter has changed during the log.
     """
     trust = with_cause(trust, cause)
     if cause is None:
@@ -180,9 +185,11 @@ def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
     # What only says where something is wrong explains no more than what follows of it there.
     every = first.code in NOT_MEASURED or (cause is not None and first.weight >= FIRST)
 
+    seen = SEEN - {"changed"} if clear else SEEN
+
     def is_explained(finding: Finding) -> bool:
         doubts = finding.verdict is not Verdict.TRUSTWORTHY and finding is not first
-        return doubts and finding.code not in SEEN and (every or finding.code in OF_FIELDS)
+        return doubts and finding.code not in seen and (every or finding.code in OF_FIELDS)
 
     codes = (f.code for f in trust.ordered if is_explained(f) and f.code != first.code)
     kept = tuple(f for f in trust.findings if f is not first and not is_explained(f))
