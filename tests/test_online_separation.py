@@ -135,7 +135,7 @@ def test_a_checkpoint_with_filters_of_another_shape_is_refused() -> None:
     navigator = Navigator(small.site, NAVIGATOR)
     _feed(navigator, small, 0, 60)
     kept = navigator.checkpoint()
-    kept["parts"]["_update"]["bank"]["_step"] = np.zeros((1, 3))
+    kept["parts"]["_loop"]["running"]["update"]["bank"]["_step"] = np.zeros((1, 3))
     with pytest.raises(InputError, match="filters of another shape"):
         restored(small.site, NAVIGATOR, kept)
 

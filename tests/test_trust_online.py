@@ -12,9 +12,9 @@ from online_log import OnlineLog, navigate, online_log
 from test_checkpoint import _rest, same
 from test_navigate_stream import answered, records
 
-import magfusion.estimation.online.navigator as navigator_module
 from magfusion.cli import main
 from magfusion.estimation.data_checks.running import nothing
+from magfusion.estimation.online import running_estimate
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online.restored import restored
 from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
@@ -88,7 +88,7 @@ def test_states_are_carried_with_the_noise_that_the_samples_have(
         "beacon_excluded" not in findings
     )  # a fix better than the states is no reason to refuse it
     assert nees < 9.0
-    monkeypatch.setattr(navigator_module, "measured_noise", lambda _, declared: (declared, []))
+    monkeypatch.setattr(running_estimate, "measured_noise", lambda _, declared: (declared, []))
     findings, without = result()
     assert "beacon_excluded" in findings
     assert without > 2.0 * nees
