@@ -6,17 +6,15 @@ gives is the one with which this result was made.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import smooth
 from magfusion.estimation.integrity.correction import (
-    MOST_SOLUTIONS,
-    REFINED,
     Correction,
+    Trial,
+    best_trial,
     corrected_finding,
-    with_rival_frame,
 )
 from magfusion.files.site_changes import changed_keys
 from magfusion.jobs.smooth_result import Finished, finished
@@ -53,44 +51,18 @@ def corrected(
     """
     if site.platform.further or any(beacon.unknown is not None for beacon in site.beacons):
         return None
-    # What no key of the site's file describes cannot be corrected.
-    waiting = [one for one in possible if changed_keys(site, one.site)]
-    best, again = None, False
-    for _ in range(MOST_SOLUTIONS):
-        if not waiting:
-            break
-        correction = waiting.pop(0)
-        if not again:
-            correction = correction._replace(spread=with_rival_frame(site, correction))
-        finding = corrected_finding(correction, site, reasons)
+
+    def tried(correction: Correction) -> Trial[Finished] | None:
+        used = log, correction.site, settings
         try:
-            result = smooth(log, correction.site, settings, report)
+            result = smooth(*used, report)
         except (RuntimeError, InputError):
-            continue
+            return None
+        finding = corrected_finding(correction, site, reasons)
         trial = correction._replace(finding=finding)
-        used = correction.site, settings, result, risk
-        done = finished(log, *used, findings=findings, correction=trial)
-        alone = len(done.trust.reasons) == 1
-        if alone or ((again or best is None) and _explains_most(correction, done)):
-            best = done
-        again = done.continued is not None
-        if done.continued is not None:
-            known = correction.finding
-            if correction.fault is None:
-                known = replace(known, text=known.text + REFINED)
-            waiting.insert(0, done.continued._replace(finding=known))
-        elif best is done and (alone or not _has_rival(correction, waiting)):
-            break
-        else:
-            waiting = [one._replace(rival_probability=0.0) for one in waiting]
-    return best
+        done = finished(*used, result, risk, findings=findings, correction=trial)
+        nearly = correction.clear and done.trust.verdict is not Verdict.FAILED
+        return Trial(done, len(done.trust.reasons) == 1, nearly, done.continued)
 
-
-def _has_rival(correction: Correction, waiting: list[Correction]) -> bool:
-    """Return whether another site with the same mistake undone is still to be tried."""
-    return any(one.finding.code == correction.finding.code for one in waiting)
-
-
-def _explains_most(correction: Correction, done: Finished) -> bool:
-    """Return whether a gross mistake is undone, with a small remainder."""
-    return correction.clear and done.trust.verdict is not Verdict.FAILED
+    # What no key of the site's file describes cannot be corrected.
+    return best_trial((one for one in possible if changed_keys(site, one.site)), tried)

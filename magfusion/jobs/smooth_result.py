@@ -14,7 +14,6 @@ from magfusion.estimation.integrity.correction import (
     Correction,
     continued,
     corrections,
-    is_clear,
     spread_of,
 )
 from magfusion.estimation.integrity.diagnosis import (
@@ -136,8 +135,9 @@ def finished(
     excluded = bool(changes)
     possible = corrections(site, trust.reasons, () if excluded else causes, cause)
     is_named = bool(causes) or any(f.code == "changed" for f in trust.reasons)
-    clear = is_clear(cause)
-    trust = with_explaining_cause(trust, None if is_named and not clear else cause, clear)
+    if is_named and cause is not None and not cause.is_clear:
+        cause = None
+    trust = with_explaining_cause(trust, cause)
     if correction is not None:
         trust |= Trust((_explaining(correction.finding, trust),))
     by_state = states_judged(separated, result, trust.verdict)

@@ -1,8 +1,8 @@
 """Corrections: mistakes that explain a log, each with the site in which it is undone."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,16 +13,18 @@ from magfusion.estimation.integrity.released_fault import ReleasedFault, Release
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.suspects import Suspect, suspects
 from magfusion.files.site_changes import changed_keys
+from magfusion.model.imu_intrinsics import ImuIntrinsics
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
+
+T = TypeVar("T")
 
 LITTLE = 2.0  # chi square for each parameter, below which a correction is not continued
 MOST_SOLUTIONS = 2  # beside the first: a wrong log takes three times as long as a good one
 CAUSE_FIRST = 1e6  # weight
 CORRECTED = " The result is corrected for it."
-REFINED = " The remedy has what the corrected log then still showed of it, too."
-CLEAR = 30.0  # ratio of chi square by which snapshots decide before the score, which is linear
+REFINED = " The remedy is refined by the inertial data."
 
 
 class Correction(NamedTuple):
@@ -42,8 +44,8 @@ class Correction(NamedTuple):
         Whether snapshots of the fields alone are sure of it.
     is_estimate : bool
         Whether they estimate values of parameters, and do not choose among usual mistakes.
-    rival_probability : float
-        Of a mounting: probability that not it, but the IMU is turned, or the reverse.
+    rival : Correction, optional
+        What is tried instead where the corrected result is contradicted.
     """
 
     finding: Finding
@@ -52,7 +54,26 @@ class Correction(NamedTuple):
     spread: Array | None = None
     clear: bool = False
     is_estimate: bool = False
-    rival_probability: float = 0.5
+    rival: "Correction | None" = None
+
+
+class Trial(NamedTuple, Generic[T]):
+    """A solution with a corrected site.
+
+    Parameters
+    ----------
+    explains_all : bool
+        Whether no test contradicts it.
+    explains_most : bool
+        Whether a gross mistake is undone, with a small rest.
+    remainder : Correction, optional
+        With the rest that it shows.
+    """
+
+    result: T
+    explains_all: bool
+    explains_most: bool
+    remainder: Correction | None
 
 
 def corrections(
@@ -81,25 +102,75 @@ def corrections(
         for rival, share in zip(rivals, weight / (1.0 + np.sum(weight)), strict=True):
             spread += share * _outer(rival.moved - best.moved)
         new_site = corrected_site(site, best.fault, best.step)
-        result.append(Correction(finding, new_site, best.fault, spread))
-    clear = is_clear(diagnosis)
-    by_snapshots = _by_snapshots(diagnosis, clear)
-    return by_snapshots + result if clear else result + by_snapshots
+        by_score = Correction(finding, new_site, best.fault, spread)
+        result.append(by_score._replace(spread=_with_rival_frame(site, by_score, 0.5)))
+    if diagnosis is not None and diagnosis.site is not None:
+        by_snapshots = _by_snapshots(site, diagnosis)
+        result.insert(0 if by_snapshots.clear else len(result), by_snapshots)
+    return result
 
 
-def _by_snapshots(diagnosis: Diagnosis | None, clear: bool) -> list[Correction]:
-    """Return what snapshots explain, and its rival."""
-    if diagnosis is None or diagnosis.site is None:
-        return []
-    known, rival = diagnosis.rival_probability, diagnosis.rival
-    both = [(diagnosis, known)] + ([] if rival is None else [(rival, 1.0 - known)])
-    return [
-        Correction(
-            d.finding, d.site, clear=clear, is_estimate=d.is_estimate, rival_probability=probability
-        )
-        for d, probability in both
-        if d.site is not None
-    ]
+def _by_snapshots(site: Site, diagnosis: Diagnosis) -> Correction:
+    """Return the correction that snapshots suggest, with its rival."""
+    assert diagnosis.site is not None
+    known = Correction(
+        diagnosis.finding,
+        diagnosis.site,
+        clear=diagnosis.is_clear,
+        is_estimate=diagnosis.is_estimate,
+    )
+    spread = _with_rival_frame(site, known, diagnosis.rival_probability)
+    other = diagnosis.rival
+    if other is None or other.site is None:
+        return known._replace(spread=spread)
+    # It is tried only where the first is contradicted: its frame is no longer in question.
+    return known._replace(
+        spread=spread, rival=known._replace(finding=other.finding, site=other.site)
+    )
+
+
+def best_trial(
+    possible: Iterable[Correction], tried: Callable[[Correction], Trial[T] | None]
+) -> T | None:
+    """Return the result by the correction that explains a log; None where none does.
+
+    Parameters
+    ----------
+    possible : iterable of Correction
+        The most likely first; a remainder, or a rival of what is contradicted, comes before others.
+    tried : callable
+        Returns the trial of a correction, None where it has no solution.
+    """
+    waiting, best, continues = list(possible), None, False
+    for _ in range(MOST_SOLUTIONS):
+        if not waiting:
+            break
+        correction = waiting.pop(0)
+        trial = tried(correction)
+        remainder = None if trial is None else trial.remainder
+        explains_all = trial is not None and trial.explains_all
+        explains_most = trial is not None and trial.explains_most
+        replaces = best is None or (continues and not best.explains_all)
+        if explains_all or (explains_most and replaces):
+            best = trial
+        continues = remainder is not None
+        if remainder is not None:
+            further: Correction | None = remainder._replace(finding=_refined(correction))
+        else:
+            further = None if explains_all else correction.rival
+        if further is not None:
+            waiting.insert(0, further)
+        elif best is not None and best is trial:
+            break
+    return None if best is None else best.result
+
+
+def _refined(correction: Correction) -> Finding:
+    """Return the finding of a correction that is continued: snapshots knew the value roughly."""
+    finding = correction.finding
+    if correction.fault is not None:
+        return finding
+    return replace(finding, text=finding.text + REFINED)
 
 
 def corrected_finding(
@@ -127,40 +198,38 @@ def corrected_finding(
     )
 
 
-def is_clear(diagnosis: Diagnosis | None) -> bool:
-    """Return whether snapshots decide, whatever the linear score."""
-    return diagnosis is not None and diagnosis.ratio > CLEAR
+def _with_rival_frame(site: Site, correction: Correction, probability: float) -> Array | None:
+    """Return the spread of a correction, with that of the other of two frames.
 
-
-def with_rival_frame(site: Site, correction: Correction) -> Array | None:
-    """Return the spread of a correction, of a mounting with that of an IMU that is turned instead.
-
-    Nothing but the frame of the result and the lever arm distinguish them.
+    A turned magnetometer and a turned IMU differ by the frame of the result and the lever arm only.
 
     Parameters
     ----------
     site : Site
         As declared.
+    probability : float
+        Of the other frame.
     """
-    before, after = (one.platform.magnetometer for one in (site, correction.site))
-    turn = Rotation.from_matrix(after.body_from_sensor @ before.body_from_sensor.T)
-    intrinsics = correction.site.platform.imu_intrinsics
-    if intrinsics is not None and intrinsics is not site.platform.imu_intrinsics:
-        turn *= _turn_of(intrinsics.gyro_matrix, intrinsics.accel_matrix)
+    before, after = (one.platform for one in (site, correction.site))
+    one, other = before.magnetometer, after.magnetometer
+    turn = Rotation.from_matrix(other.body_from_sensor @ one.body_from_sensor.T)
+    turn *= _turn_of_imu(before.imu_intrinsics, after.imu_intrinsics)
     turn_body = turn.as_rotvec()
     if not turn_body.any():
         return correction.spread
     # The magnetometer stays where it is found; the body moves about it.
-    shift_body = after.position_body - turn.apply(before.position_body)
-    step = np.concatenate([turn_body, shift_body])[None]
-    spread = correction.rival_probability * _outer(step)
+    shift_body = other.position_body - turn.apply(one.position_body)
+    spread = probability * _outer(np.concatenate([turn_body, shift_body])[None])
     return spread if correction.spread is None else spread + correction.spread
 
 
-def _turn_of(gyro: Array, accel: Array) -> Rotation:
-    """Return how the body would be turned whose axes are those of a turned IMU."""
-    rotated = np.array_equal(gyro, accel) and np.allclose(gyro @ gyro.T, np.eye(3))
-    if not rotated or np.linalg.det(gyro) < 0:
+def _turn_of_imu(before: ImuIntrinsics | None, after: ImuIntrinsics | None) -> Rotation:
+    """Return the rotation to the axes of an IMU that is corrected for being turned."""
+    known, result = before or ImuIntrinsics(), after or ImuIntrinsics()
+    gyro = np.linalg.solve(known.gyro_matrix, result.gyro_matrix)
+    accel = np.linalg.solve(known.accel_matrix, result.accel_matrix)
+    is_turned = np.allclose(gyro, accel) and np.allclose(gyro @ gyro.T, np.eye(3))
+    if not is_turned or np.linalg.det(gyro) < 0.0:
         return Rotation.identity()
     return Rotation.from_matrix(gyro.T)
 
@@ -176,11 +245,13 @@ def _remaining(correction: Correction, score: Score | None) -> ReleaseGain | Non
     """
     if score is None or not (correction.fault or correction.is_estimate):
         return None
-    name = "" if correction.fault is None else correction.fault.name
-    every = [one for one in suspects(correction.site, score.fixed) if name in ("", one.name)]
-    gains = [release_gain(one, *score.with_declared(tolerance=False)) for one in every]
-    own = [one for one in gains if one and (name or one.code == correction.finding.code)]
-    return max(own, key=lambda one: one.chi_square, default=None)
+    every = suspects(correction.site, score.fixed)
+    if correction.fault is not None:
+        own = [one for one in every if one.name == correction.fault.name]
+    else:
+        own = [one for one in every if one.finding_code == correction.finding.code]
+    gains = (release_gain(one, *score.with_declared(tolerance=False)) for one in own)
+    return max(filter(None, gains), key=lambda one: one.chi_square, default=None)
 
 
 def continued(correction: Correction, score: Score | None) -> Correction | None:

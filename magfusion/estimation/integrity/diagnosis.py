@@ -52,6 +52,7 @@ SEEN = OF_SAMPLES | {
     "silent_beacon",
     "undeclared_line",
 }
+CLEAR = 30.0  # ratio of chi square
 FIRST = 1e6  # weight: a cause comes before what it causes
 OF_SEEN = FIRST / 2.0  # and before what the streams show, which may be beside it
 OF_CATCH_ALL = FIRST / 4.0  # but what only says where something is wrong may be of what they show
@@ -78,6 +79,11 @@ class Diagnosis(NamedTuple):
     is_estimate: bool = False
     rival: "Diagnosis | None" = None
     rival_probability: float = 0.5
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether snapshots decide, whatever the score, which is linear, or a change explains."""
+        return self.ratio > CLEAR
 
 
 def diagnosed(
@@ -163,15 +169,10 @@ def with_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
     return Trust(findings if cause is None else (*findings, cause.finding), trust.unverified)
 
 
-def with_explaining_cause(trust: Trust, cause: Diagnosis | None, clear: bool = False) -> Trust:
+def with_explaining_cause(trust: Trust, cause: Diagnosis | None) -> Trust:
     """Return the findings on a result that is not solved again with its cause undone.
 
     Reasons that a mistake explains are listed with it, not beside it.
-
-    Parameters
-    ----------
-    clear : bool
-        Whether the cause leaves so little that no parameter has changed during the log.
     """
     trust = with_cause(trust, cause)
     if cause is None:
@@ -185,7 +186,8 @@ def with_explaining_cause(trust: Trust, cause: Diagnosis | None, clear: bool = F
     # What only says where something is wrong explains no more than what follows of it there.
     every = first.code in NOT_MEASURED or (cause is not None and first.weight >= FIRST)
 
-    seen = SEEN - {"changed"} if clear else SEEN
+    # Where hardly anything is left, no parameter has changed during the log.
+    seen = SEEN - {"changed"} if cause is not None and cause.is_clear else SEEN
 
     def is_explained(finding: Finding) -> bool:
         doubts = finding.verdict is not Verdict.TRUSTWORTHY and finding is not first

@@ -6,7 +6,7 @@ import numpy as np
 
 from magfusion.estimation.data_checks.statistics import log_p_chi_square
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.suspects import CODE, USUAL, Inertial, Suspect
+from magfusion.estimation.integrity.suspects import USUAL, Inertial, Suspect
 from magfusion.model.parameters import AidingParameter
 from magfusion.units import Array
 
@@ -53,7 +53,7 @@ class ReleaseGain:
     @property
     def code(self) -> str:
         """Code of its finding."""
-        return self.fault.code or CODE[self.fault.blocks[0].parameter]
+        return self.fault.finding_code
 
     @property
     def log_p(self) -> float:

@@ -249,6 +249,11 @@ class Suspect(NamedTuple):
     combine: Array
     code: str = ""
 
+    @property
+    def finding_code(self) -> str:
+        """Code of its finding."""
+        return self.code or CODE[self.blocks[0].parameter]
+
 
 def held_blocks(site: Site, estimated: tuple[Block, ...], *, steady: bool) -> tuple[Block, ...]:
     """Return every parameter that is not estimated, with its typical error for a sigma.

@@ -29,6 +29,7 @@ from magfusion.estimation.online.queue.epoch_measurements import (
 from magfusion.estimation.online.queue.inertial_stream import InertialStream
 from magfusion.estimation.online.queue.other_measurements import OtherMeasurements
 from magfusion.estimation.online.queue.sensor_stream import SensorStream
+from magfusion.estimation.online.queue.short_windows import ShortWindows
 from magfusion.estimation.online.queue.still_samples import StillSamples
 from magfusion.model.aiding import AidingSamples, sensor_named
 from magfusion.model.marks import Marks
@@ -60,6 +61,8 @@ class Arrivals(ABC):
     others : OtherMeasurements
     last_epoch : float
         Time of the last fields (s).
+    short : ShortWindows, optional
+        Of tones that are close, where one magnetometer measures them together.
     open_signs : int
         Amplitudes that are dropped because their sign is undetermined.
     without : Counter
@@ -72,6 +75,7 @@ class Arrivals(ABC):
     steady: dict[float, SteadyFields]
     others: OtherMeasurements
     last_epoch: float
+    short: ShortWindows | None
     open_signs: int
     without: Counter[str]
     _detection: DetectionFilter
@@ -83,7 +87,7 @@ class Arrivals(ABC):
         self.imu = InertialStream(site.platform.imu.time_offset)
         self.fields, self.steady, self.others = [], {}, OtherMeasurements()
         self.last_epoch, self.open_signs = -np.inf, 0
-        self.without = Counter()
+        self.short, self.without = None, Counter()
         self._detection, self._still = DetectionFilter(), StillSamples()
         self._last_sample_times = {}
 
@@ -329,9 +333,8 @@ class Arrivals(ABC):
         self.without.update(self._silent())
         by_offset, steady = None, self.steady.pop(time, None)
         if samples is None:
-            joint = self._measured_jointly(before, predicted, standing=standing)
-            if joint is not None:
-                return joint
+            if self.short is not None and self.short.at(time):
+                return self._measured_together(self.short, before, predicted, standing=standing)
             wave = self._demodulated(before, predicted, is_lost=is_lost)
             if wave is None:
                 return None  # only the clock went on
@@ -358,15 +361,16 @@ class Arrivals(ABC):
             standing=standing,
         )
 
-    def _measured_jointly(
-        self,
-        before: State,  # noqa: ARG002
-        predicted: State,  # noqa: ARG002
-        *,
-        standing: bool,  # noqa: ARG002
-    ) -> EpochMeasurements | None:
-        """Return the tones of a short window at a prediction; None where there is none."""
-        return None
+    def _measured_together(
+        self, short: ShortWindows, before: State, predicted: State, *, standing: bool
+    ) -> EpochMeasurements:
+        """Return the joint measurement of a short window's tones."""
+        time, half = predicted.time, 0.5 * short.length
+        imu = self.imu.filled(min(before.time, time - half) - MARGIN, time + half + MARGIN)
+        rate_body = self.imu.rate_body(time) - predicted.gyro_bias_body
+        self.last_epoch = time
+        clock = self.streams[0].waveform, imu, self.imu.offset
+        return short.measured(before, predicted, *clock, rate_body, standing=standing)
 
     @abstractmethod
     def _demodulated(

@@ -286,8 +286,8 @@ class SeveralArrivals(Arrivals):
 
     def next_window(
         self,
-        state: State,  # noqa: ARG002
-        needs_separate: Callable[[State], bool],  # noqa: ARG002
+        _state: State,
+        _needs_separate: Callable[[State], bool],
     ) -> float | None:
         """Advance to the next windows of all; return their centre (s), None where one may come."""
         centre = min(stream.next_admitted for stream in self.streams)

@@ -11,7 +11,6 @@ from magfusion.estimation.demodulation.motion_compensation import MotionCompensa
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.initialization.online import NoStart, OnlineStart, find_online_start
 from magfusion.estimation.online.queue.arrivals import MARGIN, Arrivals
-from magfusion.estimation.online.queue.epoch_measurements import EpochMeasurements
 from magfusion.estimation.online.queue.sensor_stream import SensorStream
 from magfusion.estimation.online.queue.short_windows import ShortWindows
 from magfusion.files.named_records import magnetometer_number
@@ -24,15 +23,7 @@ from magfusion.units import Array, IntArray
 
 
 class SingleArrivals(Arrivals):
-    """Streams of a platform with one magnetometer.
-
-    Attributes
-    ----------
-    short : ShortWindows, optional
-        Of tones that are close.
-    """
-
-    short: ShortWindows | None
+    """Streams of a platform with one magnetometer."""
 
     def __init__(self, site: Site, lockin: LockinSettings | None, *, short: bool) -> None:
         self.receiver = receiver_of(site, lockin)
@@ -187,19 +178,6 @@ class SingleArrivals(Arrivals):
         imu.filler.fill(state, until, *streams, imu.offset, receiver.admission)
 
     # Output
-
-    def _measured_jointly(
-        self, before: State, predicted: State, *, standing: bool
-    ) -> EpochMeasurements | None:
-        time, short = predicted.time, self.short
-        if short is None or not short.at(time):
-            return None
-        begin, end = min(before.time, time - 0.5 * short.length), time + 0.5 * short.length
-        imu = self.imu.filled(begin - MARGIN, end + MARGIN)
-        rate_body = self.imu.rate_body(time) - predicted.gyro_bias_body
-        self.last_epoch = time
-        clock = self.stream.waveform, imu, self.imu.offset
-        return short.measured(before, predicted, *clock, rate_body, standing=standing)
 
     def _demodulated(
         self, before: State, predicted: State, *, is_lost: bool
