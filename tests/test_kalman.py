@@ -146,17 +146,22 @@ def test_the_likelihood_is_exact_whatever_the_innovation_spans(far: bool) -> Non
     assert kalman.mahalanobis == pytest.approx(np.sqrt(4.0 + 1.5**2 / 2.0), rel=1e-9)
 
 
-def test_all_is_as_in_filterpy() -> None:
+@pytest.mark.parametrize("constant", [0, 3])
+def test_all_is_as_in_filterpy(constant: int) -> None:
     cov, z, H = a_problem()
+    transition = np.eye(SIZE) + 0.1 * np.eye(SIZE, k=1)
+    transition[SIZE - constant :] = np.eye(SIZE)[SIZE - constant :]
     kalman, others = a_filter(cov), ExtendedKalmanFilter(SIZE, ROWS)
     others.x, others.P, R = np.zeros(SIZE), cov, np.diag(np.arange(1.0, 1.0 + ROWS))
     for filter_ in (kalman, others):
-        filter_.F, filter_.Q = np.eye(SIZE) + 0.1 * np.eye(SIZE, k=1), 0.2 * np.eye(SIZE)
+        filter_.F, filter_.Q = transition, 0.2 * np.eye(SIZE)
         filter_.predict()
     kalman.update_linear(z, H, R)
     others.update(z, lambda _: H, lambda x: H @ x, R)
     for name in ("x", "P", "K", "S", "SI", "y", "z", "x_post", "P_post", "x_prior", "P_prior"):
-        np.testing.assert_array_equal(getattr(kalman, name), getattr(others, name), name)
+        np.testing.assert_allclose(
+            getattr(kalman, name), getattr(others, name), rtol=1e-12, atol=1e-14, err_msg=name
+        )
     for name in ("log_likelihood", "mahalanobis", "likelihood"):
         assert getattr(kalman, name) == pytest.approx(getattr(others, name), rel=1e-12)
     before = kalman.P

@@ -9,7 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.estimation.demodulation.beacon_selection import select_detected
+from magfusion.estimation.demodulation.beacon_selection import (
+    MOST_AT_START,
+    select_detected,
+    select_strongest,
+)
 from magfusion.files.site import load_site, save_site
 from magfusion.model.detection_range import are_many, largest_fields, owned_at, tones_of
 from magfusion.model.parameters import (
@@ -165,6 +169,27 @@ def test_few_beacons_are_left_as_they_are(building: Site) -> None:
     few = replace(building, beacons=building.beacons[:4])
     log = log_of(simulate_fields(few, walk(3, (3.0, 3.0)), SIGMA, np.random.default_rng(0)))
     assert select_detected(log, few) == (log, few)
+
+
+def test_the_strongest_of_many_start_and_the_others_wait(building: Site) -> None:
+    states = walk(20, (30.0, 22.0))
+    beacons = tuple(
+        replace(b, frequency_hz=20.0 + 2.5 * k) for k, b in enumerate(building.beacons[:40])
+    )
+    site = replace(building, beacons=beacons)
+    fields = simulate_fields(site, states, SIGMA, np.random.default_rng(0))
+    log, some = select_strongest(log_of(fields), site)
+    assert len(some.beacons) == MOST_AT_START
+    assert some.every_beacon == site.beacons
+    assert log.fields is not None
+    assert log.fields.channels == some.channels
+    power = np.sum(np.abs(fields.phasor_sensor) ** 2, axis=(0, 2))
+    weakest = min(power[site.owner == beacons.index(b)].sum() for b in some.beacons)
+    assert all(power[site.owner == k].sum() <= weakest for k, _ in some.undetected)
+    # What a start must estimate cannot wait.
+    unsynchronised = replace(beacons[-1], synchronised=False)
+    unready = replace(site, beacons=(*beacons[:-1], unsynchronised))
+    assert select_strongest(log_of(fields), unready)[1] is unready
 
 
 def test_some_beacons_are_predicted_as_among_all(building: Site) -> None:

@@ -18,6 +18,7 @@ from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import IntArray
 
+MOST_AT_START = 16  # beacons; with more, a start takes longer and is no better
 DETECTION_SIGMAS = 1.0  # sigmas of a phasor: a beacon below it everywhere is not detected
 
 
@@ -43,21 +44,47 @@ def select_detected(
         raise InputError(
             f"none of the site's {len(site.beacons)} beacons is detected; reduce the distance"
         )
-    every, kept = dict(enumerate(site.beacons)), set(detected.tolist())
-    some = replace(
-        site,
-        beacons=tuple(every[k] for k in sorted(kept)),
-        undetected=tuple((k, beacon) for k, beacon in every.items() if k not in kept),
-    )
     fields = log.fields
     if fields is not None:
         fields = samples_of(fields, channels_of(site, detected))
     text = (
-        f"{len(detected)} of the site's {len(every)} beacons are detected. The others are not"
-        " estimated: they remain as declared."
+        f"{len(detected)} of the site's {len(site.beacons)} beacons are detected. The others are"
+        " not estimated: they remain as declared."
     )
     findings = Finding("beacons_unheard", text, Verdict.TRUSTWORTHY, 0.0)
-    return replace(log, fields=fields, noticed=(*log.noticed, findings)), some
+    log = replace(log, fields=fields, noticed=(*log.noticed, findings))
+    return log, _with_beacons(site, detected)
+
+
+def may_wait(site: Site) -> bool:
+    """Return whether a start may leave some of many beacons for later.
+
+    Not those of which it must estimate the phase or the place, or choose the owner of a tone.
+    """
+    ready = all(beacon.synchronised and beacon.unknown is None for beacon in site.beacons)
+    alone = not has_schedule(site) and not tones_of(site).reused
+    return are_many(site) and not site.undetected and ready and alone
+
+
+def select_strongest(log: Log, site: Site) -> tuple[Log, Site]:
+    """Return a log of phasors and its site with the strongest beacons, where others can wait."""
+    if log.fields is None or not may_wait(site):
+        return log, site
+    power = np.nansum(np.abs(log.fields.phasor_sensor) ** 2, axis=(0, 2))
+    by_beacon = np.bincount(site.owner, power, len(site.beacons))
+    strongest = np.sort(np.argsort(-by_beacon, kind="stable")[:MOST_AT_START])
+    fields = samples_of(log.fields, channels_of(site, strongest))
+    return replace(log, fields=fields), _with_beacons(site, strongest)
+
+
+def _with_beacons(site: Site, kept: IntArray) -> Site:
+    """Return a site with some of its beacons, given by index; the others as undetected."""
+    every, some = dict(enumerate(site.beacons)), set(kept.tolist())
+    return replace(
+        site,
+        beacons=tuple(every[k] for k in sorted(some)),
+        undetected=tuple((k, beacon) for k, beacon in every.items() if k not in some),
+    )
 
 
 def _detected_beacons(log: Log, site: Site, settings: LockinSettings | None) -> IntArray:

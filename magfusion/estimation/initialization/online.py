@@ -13,6 +13,8 @@ from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.batch.settings import EstimatorSettings
 from magfusion.estimation.data_checks.disturbing_lines import with_disturbing_lines
 from magfusion.estimation.data_checks.stream_buffer import Buffer
+from magfusion.estimation.demodulation.beacon_selection import may_wait, select_strongest
+from magfusion.estimation.demodulation.demodulation import demodulated
 from magfusion.estimation.demodulation.separate_demodulation import each_alone
 from magfusion.estimation.demodulation.several_demodulation import demodulated_several, same_windows
 from magfusion.estimation.graph.state import POSITION, ROTATION, State
@@ -231,11 +233,15 @@ def _smoothed(log: Log, site: Site, settings: EstimatorSettings) -> _Beginning:
     """Smooth the beginning and test it."""
     if log.waveforms and are_many(site):  # selected by detection
         log = replace(log, fields=demodulated_several(log, site, settings.lockin).fields)
+    elif may_wait(site) and log.fields is None and not settings.earth:
+        # All tones together, so that those left for later do not leak into the others.
+        log = replace(log, fields=demodulated(log, site, settings.lockin).fields, waveform=None)
     if log.waveform is not None and has_schedule(site) and joins(site, log.waveform.marks):
         log = _of_cycles(log, log.waveform, site, settings)
     requested = {f.name: getattr(settings, f.name) for f in fields_of(EstimatorSettings)}
     how = SmootherSettings(loss="huber", **requested)
-    log, remaining, result, excluded = agreed_smoothed(smooth(log, site, how), log, site, how)
+    log, some = select_strongest(log, site)
+    log, remaining, result, excluded = agreed_smoothed(smooth(log, some, how), log, some, how)
     honest, trust, score, causes = judged_with_score(result, log)
     state = last_state(result, result.considered)
     if result.calibration.site.undetected or site.platform.further:
@@ -258,7 +264,7 @@ def _start_of(
     result = estimate.result
     kept = [sensor.name for sensor in estimate.site.platform.magnetometers]
     lined = given is not None and len(given.lines_hz) > 0
-    others = given if lined else with_disturbing_lines(estimate.log, site, given)
+    others = given if lined else with_disturbing_lines(detected, site, given)
     return OnlineStart(
         estimate.state,
         detected.waveform,
