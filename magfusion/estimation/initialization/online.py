@@ -32,6 +32,7 @@ from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields,
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.receiver.cycles import cycle_of, cycles, joins
+from magfusion.receiver.joint import joint_settings
 from magfusion.receiver.receivers import receiver_of, windowed
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.turn import on_clock, turn_of
@@ -233,7 +234,7 @@ def _smoothed(log: Log, site: Site, settings: EstimatorSettings) -> _Beginning:
     """Smooth the beginning and test it."""
     if log.waveforms and are_many(site):  # selected by detection
         log = replace(log, fields=demodulated_several(log, site, settings.lockin).fields)
-    elif may_wait(site) and log.fields is None and not settings.earth:
+    elif may_wait(site) and log.fields is None and not _needs_samples(site, settings):
         # All tones together, so that those left for later do not leak into the others.
         log = replace(log, fields=demodulated(log, site, settings.lockin).fields, waveform=None)
     if log.waveform is not None and has_schedule(site) and joins(site, log.waveform.marks):
@@ -247,6 +248,11 @@ def _smoothed(log: Log, site: Site, settings: EstimatorSettings) -> _Beginning:
     if result.calibration.site.undetected or site.platform.further:
         state, score = _among_all(state, score, result, site, settings)
     return _Beginning(log, remaining, result, honest, state, trust, score, excluded, causes)
+
+
+def _needs_samples(site: Site, settings: EstimatorSettings) -> bool:
+    """Return whether phasors alone do not contain what an estimator uses of the samples."""
+    return settings.earth or joint_settings(site, settings.lockin) is not None
 
 
 def _start_of(
