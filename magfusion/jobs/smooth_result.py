@@ -30,6 +30,7 @@ from magfusion.estimation.integrity.smoothed_exclusion import (
     states_judged,
     with_long_exclusions,
 )
+from magfusion.estimation.integrity.steel_test import STEEL
 from magfusion.estimation.online_integrity.open_roll import (
     comparable,
     roll_findings,
@@ -132,7 +133,9 @@ def finished(
     trust = with_long_exclusions(trust | separated.trust | Trust(findings))
     trust = with_changed_beacons(trust, changes)
     cause = diagnosed(log, site, trust, settings.lockin) if correction is None else None
-    excluded = bool(changes)
+    excluded, is_steel = bool(changes), any(f.code == STEEL for f in trust.reasons)
+    if is_steel and cause is not None and not cause.is_clear:
+        cause = None
     possible = corrections(site, trust.reasons, () if excluded else causes, cause)
     is_named = bool(causes) or any(f.code == "changed" for f in trust.reasons)
     if is_named and cause is not None and not cause.is_clear:

@@ -131,6 +131,7 @@ CODES = {
     "silent_beacon": "a beacon is not detected, at all or for a while",
     "site_changed": "a beacon was moved or exchanged between logs, or a platform changed",
     "stamp_resolution": "the stamps of a stream are coarser than nanoseconds",
+    "steel": "steel near the path distorts the fields of all beacons",
     "stray_stamps": "samples have stamps far from all others",
     "streams_apart": "inertial sensor and magnetometer were not recorded at the same time",
     "stuck_axis": "an axis is constant",

@@ -29,6 +29,7 @@ from magfusion.estimation.integrity.score import (
     scores_of,
 )
 from magfusion.estimation.integrity.smoothed_compass import compass
+from magfusion.estimation.integrity.steel_test import STEEL
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.estimation.posterior.tuned_noise import covered_beacons, tuned_noise
 from magfusion.estimation.solve.memory import give_back_memory
@@ -128,9 +129,12 @@ def _run_tests(case: Case) -> Iterator[TestResult]:
     cause = max(cause, _weight(change))
     if causes < len(of_held.named) and rest:  # residuals that none of them explains
         of_held = replace(of_held, findings=of_held.findings[:causes])
-    if (causes or change.findings) and cause > prior:
+    is_steel = any(finding.code == STEEL for finding in of_held.findings)
+    if is_steel or ((causes or change.findings) and cause > prior):
         residuals = [_traces(findings, 10.0 * cause) for findings in residuals]
-    if prior > STRONGER * cause:
+    if is_steel:
+        priors = _traces(priors, 10.0 * cause)
+    elif prior > STRONGER * cause:
         of_held = _traces(of_held, prior)
     yield of_held
     yield from residuals

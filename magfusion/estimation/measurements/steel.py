@@ -24,7 +24,7 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, ComplexArray
 
-SHARED, OWN = 80, 12  # modes of all beacons together, and of each tone
+SHARED, OWN = 160, 12  # modes of all beacons together, and of each tone
 UNIT = 0.01  # relative distortion by a sigma of all modes, rms over path and beacons
 COARSEST, FINEST = 2.0, 0.5  # m; edges of voxels
 CLEAR = 0.4  # m; no steel nearer to path or beacon

@@ -1,0 +1,154 @@
+"""Test for steel: a distortion of space that all beacons share, in place of other causes.
+
+Its amplitudes have the prior of `magfusion.estimation.measurements.steel`, so that its evidence is on
+the scale of `ReleaseGain.gain`: the decrease of -2 log likelihood, marginalised over their values.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import logsumexp
+
+from magfusion.estimation.integrity.score import Score, answered, scores_of
+from magfusion.estimation.integrity.test_result import Case
+from magfusion.estimation.measurements.steel import UNIT, SteelModes, steel_modes
+from magfusion.files.site_changes import changed_keys
+from magfusion.model.parameters import Block
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Finding, Verdict
+from magfusion.units import Array
+
+STEEL = "steel"  # code
+# Relative distortion in units of `UNIT`, of shared modes and of those of each tone.
+SIZES = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
+NO_SIZE = 1e-6
+DRAWS = 64  # of the amplitudes, for the place of the strongest steel
+FAR = 1.5  # m; a place less certain than this is not given
+ROUNDED_UP = (1.0, 2.0, 3.0, 5.0, 10.0)  # steps of the remedy
+
+
+class SteelEstimate(NamedTuple):
+    """Steel that explains a log.
+
+    Parameters
+    ----------
+    distortion : float
+        Of the fields, relative, rms over beacons and path.
+    place_world : ndarray, shape (3,)
+        Of the strongest steel (m).
+    place_sigma : float
+        (m)
+    gain : float
+        Decrease of -2 log likelihood, marginalised over amplitudes and size.
+    spread : ndarray, shape (states, 6, 6)
+        Second moment of the effect on the poses, given the residuals.
+    """
+
+    distortion: float
+    place_world: Array
+    place_sigma: float
+    gain: float
+    spread: Array
+
+    def finding(self, case: Case) -> Finding:
+        """Return the finding: a remark where the site declares so much."""
+        site = case.result.declared.site
+        where, declared = "beside the path", 100.0 * site.model_error
+        if self.place_sigma < FAR:
+            x, y, z = self.place_world
+            where = f"near ({x:.1f}, {y:.1f}, {z:.1f}) m, ± {self.place_sigma:.1f} m,"
+        text = (
+            f"Steel {where} distorts the fields of all beacons by about"
+            f" {100.0 * self.distortion:.2g} % along the path (declared {declared:.2g} %)."
+        )
+        weight = float(np.sqrt(max(self.gain, 0.0)))
+        if self.distortion <= site.model_error:
+            text += " The covariance includes its effect."
+            return Finding(STEEL, text, Verdict.TRUSTWORTHY, weight)
+        needed = _rounded_up(self.distortion)
+        text += (
+            " No error of single parameters explains the log as well. Map the field (magfusion"
+            f" calibrate fieldmap), or declare world.model_error {needed:.2g}."
+        )
+        remedy = changed_keys(site, replace(site, model_error=needed))
+        return Finding(STEEL, text, Verdict.DOUBTFUL, weight, remedy=remedy)
+
+
+def estimate_steel(case: Case, least: float) -> SteelEstimate | None:
+    """Return the steel that would explain a log; None if its gain is less than a least one."""
+    result = case.result
+    here = {k: v[result.epoch] for k, v in vars(result.states).items() if v is not None}
+    poses = Trajectory(**here)
+    modes = steel_modes(result.calibration.site, poses.time, poses)
+    scores = scores_of(result, case.log.imu, modes) if modes else None
+    if scores is None:
+        return None
+    block = scores.every.fixed[-1]
+    assert isinstance(block.parameter, SteelModes)
+    shared = np.arange(block.parameter.columns) < block.parameter.shared
+    gain, sigma = best_size(*_own(scores.every, block), shared)
+    if gain < least:
+        return None
+    return _estimated(answered(result, scores.every, case.log.imu), block, gain, sigma)
+
+
+def best_size(information: Array, gradient: Array, shared: Array) -> tuple[float, Array]:
+    """Return the gain, averaged over sizes of the distortion, and the likeliest sigmas.
+
+    Parameters
+    ----------
+    information, gradient : ndarray, shape (k, k), (k,)
+        Of amplitudes.
+    shared : bool ndarray, shape (k,)
+        Which are shared by all beacons.
+    """
+    sizes = [(a, b) for a in SIZES for b in SIZES if a or b]
+    sigmas = [np.where(shared, *(max(s, NO_SIZE) for s in pair)) for pair in sizes]
+    gains = np.array([_gain(information, gradient, sigma) for sigma in sigmas])
+    mean = 2.0 * (logsumexp(0.5 * gains) - np.log(len(gains)))
+    return float(mean), sigmas[int(np.argmax(gains))]
+
+
+def _gain(information: Array, gradient: Array, sigma: Array) -> float:
+    inner = np.eye(len(sigma)) + sigma[:, None] * information * sigma
+    root = np.linalg.cholesky(inner)
+    half = np.linalg.solve(root, sigma * gradient)
+    return float(half @ half - 2.0 * np.sum(np.log(np.diagonal(root))))
+
+
+def _own(score: Score, block: Block) -> tuple[Array, Array]:
+    """Return information and gradient of a block, others varying as declared."""
+    information, gradient = score.with_declared(tolerance=False)
+    return information[block.columns, block.columns], gradient[block.columns]
+
+
+def _estimated(score: Score, block: Block, gain: float, sigma: Array) -> SteelEstimate:
+    information, gradient = _own(score, block)
+    inner = np.eye(len(sigma)) + sigma[:, None] * information * sigma
+    cov = sigma[:, None] * np.linalg.inv(inner) * sigma
+    mean = cov @ gradient
+    by_pose = score.by_pose[..., block.columns]
+    moved = by_pose @ mean
+    spread = moved[:, :, None] * moved[:, None, :] + by_pose @ cov @ np.swapaxes(by_pose, 1, 2)
+    assert isinstance(block.parameter, SteelModes)
+    place, place_sigma = _strongest(block.parameter, mean, cov)
+    distortion = UNIT * float(np.hypot(sigma[0], sigma[-1]))
+    return SteelEstimate(distortion, place, place_sigma, gain, spread)
+
+
+def _strongest(modes: SteelModes, mean: Array, cov: Array) -> tuple[Array, float]:
+    """Return the place of the largest polarisability over draws of amplitudes, and its sigma."""
+    root = np.linalg.cholesky(cov + 1e-12 * np.eye(len(cov)))
+    noise = np.random.default_rng(0).standard_normal((len(mean), DRAWS))
+    each = np.abs(modes.polarisability @ (mean[:, None] + root @ noise))
+    strength = np.sqrt(np.mean(np.sum(each**2, axis=2), axis=1))  # (v, draws)
+    places = modes.voxels.centre_world[np.argmax(strength, axis=0)]
+    place = np.mean(places, axis=0)
+    return place, float(np.sqrt(np.mean(np.sum((places - place) ** 2, axis=1))))
+
+
+def _rounded_up(value: float) -> float:
+    """Return the next of 1, 2, 3, 5 times a power of ten."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(power * next(step for step in ROUNDED_UP if step * power >= value * 0.999))

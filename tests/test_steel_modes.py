@@ -1,0 +1,93 @@
+"""Steel beside the path: its modes are fields of steel, and its evidence is a likelihood."""
+
+import numpy as np
+import pytest
+
+from magfusion.estimation.integrity.steel_test import best_size
+from magfusion.estimation.measurements import steel
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.parameters.parameter import PhasorView
+from magfusion.model.trajectory import Trajectory
+from magfusion.simulation.demo_site import demo_site
+from magfusion.units import Array, ComplexArray
+
+EPOCHS = 16
+
+
+def _walk() -> Trajectory:
+    """Return a circle at 1.2 m above the floor, with a turn about the vertical."""
+    angle = np.linspace(0.0, 2.0 * np.pi, EPOCHS)
+    place = np.array([3.0, 2.5, 1.2]) + np.stack(
+        [1.5 * np.cos(angle), 1.2 * np.sin(angle), 0.2 * np.sin(2.0 * angle)], axis=1
+    )
+    c, s, o, i = np.cos(angle), np.sin(angle), np.zeros(EPOCHS), np.ones(EPOCHS)
+    turn = np.stack([c, -s, o, s, c, o, o, o, i], axis=1).reshape(-1, 3, 3)
+    return Trajectory(np.arange(EPOCHS) * 0.2, turn, place)
+
+
+def _sphere_field(source: ComplexArray, centre: Array, point: Array, volume: float) -> ComplexArray:
+    """Return the field of a small sphere magnetised by a source field, shape (n, tones, 3)."""
+    offset = point - centre
+    distance = np.linalg.norm(offset, axis=1)[:, None, None]
+    along = (offset / distance[:, 0])[:, None]
+    inside = np.sum(along * source, axis=-1, keepdims=True)
+    return np.asarray(volume * (3.0 * along * inside - source) / (4.0 * np.pi * distance**3))
+
+
+def test_the_field_of_a_sphere_is_a_sum_of_modes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a small sphere in the middle of a voxel, in the sensor's axes and the drive's phase."""
+    monkeypatch.setattr(steel, "SHARED", 10_000)
+    site, poses = demo_site(coil_radius=None), _walk()
+    (block,) = steel.steel_modes(site, poses.time, poses)
+    assert isinstance(block.parameter, steel.SteelModes)
+    sensor, centres = site.platform.magnetometer, block.parameter.voxels.centre_world
+    place = poses.position_world + poses.world_from_body @ sensor.position_body
+    away = np.min(np.linalg.norm(centres[:, None] - place, axis=2), axis=1)
+    assert np.min(away) > steel.CLEAR
+    centre = centres[[np.argmin(np.abs(away - 1.0))]]
+    added = _sphere_field(steel.beacon_fields(site, centre), centre[0], place, 0.1)
+    source = steel.beacon_fields(site, place)
+    turn = np.swapaxes(poses.world_from_body @ sensor.body_from_sensor, 1, 2)
+    calibration, first, rows, true = initial_calibration(site, 0.0), 0, [], []
+    for beacon in site.beacons:
+        tones = slice(first, first + len(beacon.tones))
+        first, drive = tones.stop, np.exp(0.7j)
+        seen, bent = (
+            drive * np.einsum("nak,ntk->nta", turn, field[:, tones]) for field in (source, added)
+        )
+        view = PhasorView(calibration, beacon, poses.time, seen, None)
+        columns = block.parameter.phasor_jacobian(view, "site")
+        size = np.linalg.norm(source[:, tones], axis=2)[..., None]
+        rows.append((columns / size[..., None]).reshape(-1, columns.shape[-1]))
+        true.append((bent / size).ravel())
+    # Steel responds in phase: amplitudes are real.
+    basis, wanted = (np.concatenate([*map(np.real, x), *map(np.imag, x)]) for x in (rows, true))
+    fit = np.linalg.lstsq(basis, wanted, rcond=None)[0]
+    assert np.linalg.norm(basis @ fit - wanted) < 0.01 * np.linalg.norm(wanted)
+
+
+def test_the_gain_is_a_ratio_of_marginal_likelihoods() -> None:
+    """Of white noise of unit variance against the same with amplitudes of known sizes."""
+    rng = np.random.default_rng(3)
+    columns, shared = 0.8 * rng.standard_normal((30, 6)), np.arange(6) < 4
+    measured = rng.standard_normal(30) + columns @ rng.standard_normal(6)
+    gain, sigma = best_size(columns.T @ columns, columns.T @ measured, shared)
+
+    def likelihood(cov: Array) -> float:
+        return -float(measured @ np.linalg.solve(cov, measured) + np.linalg.slogdet(cov)[1])
+
+    alone = likelihood(np.eye(30))
+    best = likelihood(np.eye(30) + (columns * sigma**2) @ columns.T) - alone
+    assert gain < best < gain + 2.0 * np.log(48.0)
+    assert len(np.unique(sigma)) <= 2
+
+
+def test_noise_alone_is_no_steel() -> None:
+    """Of white noise the mean evidence is below zero, and hardly ever enough to name a cause."""
+    rng, gains = np.random.default_rng(5), []
+    shared = np.arange(20) < 12
+    for _ in range(40):
+        columns = 2.0 * rng.standard_normal((100, 20))
+        gains.append(best_size(columns.T @ columns, columns.T @ rng.standard_normal(100), shared)[0])
+    assert np.mean(gains) < 0.0
+    assert np.max(gains) < 10.0
