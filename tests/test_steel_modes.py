@@ -88,6 +88,8 @@ def test_noise_alone_is_no_steel() -> None:
     shared = np.arange(20) < 12
     for _ in range(40):
         columns = 2.0 * rng.standard_normal((100, 20))
-        gains.append(best_size(columns.T @ columns, columns.T @ rng.standard_normal(100), shared)[0])
+        gains.append(
+            best_size(columns.T @ columns, columns.T @ rng.standard_normal(100), shared)[0]
+        )
     assert np.mean(gains) < 0.0
     assert np.max(gains) < 10.0

@@ -185,11 +185,12 @@ def changed(case: Case) -> TestResult:
         return NOTHING  # it was wrong from the beginning
     moved = cause.moved[:, :, None] * cause.moved[:, None, :]
     certain = wide.by_pose @ cause.known_cov @ np.swapaxes(wide.by_pose, 1, 2)
-    return TestResult((change_finding(cause, prior_sigma(every)),), spread=moved + certain)
+    finding = change_finding(cause, prior_sigma(every))
+    return TestResult((finding,), spread=moved + certain, gain=cause.gain)
 
 
-def changed_beacon(result: Smoothed, log: Log, name: str, onset: float) -> Finding | None:
-    """Return the finding on a beacon that changed at a known time (s); None if none explains it.
+def changed_beacon(result: Smoothed, log: Log, name: str, onset: float) -> TestResult | None:
+    """Return the test of a beacon that changed at a known time (s); None if none explains it.
 
     Parameters
     ----------
@@ -214,12 +215,11 @@ def changed_beacon(result: Smoothed, log: Log, name: str, onset: float) -> Findi
     causes = [one for one in released if one is not None and one.gain > LEAST_EVIDENCE]
     if not causes:
         return None
-    finding = change_finding(max(causes, key=lambda one: one.gain), prior_sigma(score.fixed))
-    return replace(
-        finding,
-        text=f"{finding.text} Its fields are excluded from then on.",
-        verdict=Verdict.DOUBTFUL,
-    )
+    cause = max(causes, key=lambda one: one.gain)
+    finding = change_finding(cause, prior_sigma(score.fixed))
+    text = f"{finding.text} Its fields are excluded from then on."
+    known = replace(finding, text=text, verdict=Verdict.DOUBTFUL)
+    return TestResult((known,), gain=cause.gain)
 
 
 def _changes(parts: dict[float, list[Block]], every: tuple[Block, ...]) -> list[Suspect]:

@@ -19,7 +19,6 @@ from magfusion.estimation.integrity.score import (
     field_residual,
     moved_estimate,
 )
-from magfusion.estimation.integrity.steel_test import estimate_steel
 from magfusion.estimation.integrity.suspects import (
     STRETCH,
     TILT,
@@ -59,10 +58,6 @@ def check_fixed_parameters(case: Case) -> TestResult:
     )
     if not causes:
         return TestResult(unverified=unverified)
-    # One distortion of space explains what else takes errors of several parameters.
-    steel = estimate_steel(case, MARGIN + sum(one.cause.gain for one in causes))
-    if steel is not None:
-        return TestResult((steel.finding(case),), unverified, spread=steel.spread)
     spread = np.zeros_like(case.pose_cov)
     for one in causes:
         moved, known_cov = one.cause.moved, one.cause.known_cov
@@ -74,6 +69,7 @@ def check_fixed_parameters(case: Case) -> TestResult:
         spread=spread,
         named=tuple(one.total for one in causes),
         causes=(causes[0].cause, *causes[0].rivals),
+        gain=sum(one.cause.gain for one in causes),
     )
 
 

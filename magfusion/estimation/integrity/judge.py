@@ -29,7 +29,7 @@ from magfusion.estimation.integrity.score import (
     scores_of,
 )
 from magfusion.estimation.integrity.smoothed_compass import compass
-from magfusion.estimation.integrity.steel_test import STEEL
+from magfusion.estimation.integrity.steel_test import steel
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.estimation.posterior.tuned_noise import covered_beacons, tuned_noise
 from magfusion.estimation.solve.memory import give_back_memory
@@ -120,21 +120,22 @@ def _run_tests(case: Case) -> Iterator[TestResult]:
     )
     biases = biases if case.log.inertial else NOTHING
     change = changed(case)
+    if (
+        bent := steel(case, max(of_held.gain, change.gain), doubted=bool(priors.findings))
+    ) is not None:
+        yield from _beside_steel(case, bent, of_held, priors, biases)
+        return
     if change.findings:  # it explains more than whatever is wrong throughout
         of_held = TestResult(unverified=of_held.unverified)
     after, causes = _explained(case, of_held.named)
-    ends = [field_residual(case.result, after, raw=raw) for raw in (True, False)]
-    residuals = [fields(case, *ends), inertial(case, after)]
+    residuals = _residuals(case, after)
     cause, prior, rest = (_weight(findings) for findings in (of_held, priors, residuals[0]))
     cause = max(cause, _weight(change))
     if causes < len(of_held.named) and rest:  # residuals that none of them explains
         of_held = replace(of_held, findings=of_held.findings[:causes])
-    is_steel = any(finding.code == STEEL for finding in of_held.findings)
-    if is_steel or ((causes or change.findings) and cause > prior):
+    if (causes or change.findings) and cause > prior:
         residuals = [_traces(findings, 10.0 * cause) for findings in residuals]
-    if is_steel:
-        priors = _traces(priors, 10.0 * cause)
-    elif prior > STRONGER * cause:
+    if prior > STRONGER * cause:
         of_held = _traces(of_held, prior)
     yield of_held
     yield from residuals
@@ -144,6 +145,25 @@ def _run_tests(case: Case) -> Iterator[TestResult]:
     yield _traces(biases, cause)
     for monitor in (fixes, together, convergence, geometry, rivals):
         yield monitor(case)
+
+
+def _beside_steel(case: Case, bent: TestResult, *others: TestResult) -> Iterator[TestResult]:
+    """Yield all test results where steel explains those of fields and parameters."""
+    of_held, priors, biases = others
+    cause = _weight(bent)
+    yield replace(bent, unverified=of_held.unverified)
+    for findings in (*_residuals(case, case.result.estimate), priors):
+        yield _traces(findings, 10.0 * cause)
+    yield _traces(compass(case), cause)
+    yield _traces(biases, cause)
+    for monitor in (fixes, together, convergence, geometry, rivals):
+        yield monitor(case)
+
+
+def _residuals(case: Case, after: GraphEstimate) -> list[TestResult]:
+    """Return the tests of residuals at an estimate."""
+    ends = [field_residual(case.result, after, raw=raw) for raw in (True, False)]
+    return [fields(case, *ends), inertial(case, after)]
 
 
 def _explained(case: Case, named: tuple[Array, ...]) -> tuple[GraphEstimate, int]:

@@ -57,7 +57,9 @@ class SeparatedSmooth(NamedTuple):
     trust: Trust
 
 
-def separated_smooth(result: Smoothed, risk: Risk | None = None) -> SeparatedSmooth:
+def separated_smooth(
+    result: Smoothed, risk: Risk | None = None, *, excluding: bool = True
+) -> SeparatedSmooth:
     """Compare a smoothed trajectory with those without each beacon; exclude false fields."""
     risk = Risk() if risk is None else risk
     names = tuple(beacon.name for beacon in result.declared.site.beacons)
@@ -65,7 +67,9 @@ def separated_smooth(result: Smoothed, risk: Risk | None = None) -> SeparatedSmo
     if estimate is None or result.states.pose_cov is None:
         return _without_level(result)
     first = estimate
-    result, estimate, out = _without_false(result, estimate, names, risk)
+    out = np.zeros((len(result.fields.time), len(names)), dtype=bool)
+    if excluding:
+        result, estimate, out = _without_false(result, estimate, names, risk)
     sources = [f"beacon {name}" for name in names]
     if (by_sensor := separate_sensors(result)) is not None:
         estimate |= by_sensor

@@ -10,13 +10,19 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import logsumexp
 
+from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.integrity.fixed_parameter_test import LEAST_EVIDENCE, MARGIN
+from magfusion.estimation.integrity.released_fault import release_gain
 from magfusion.estimation.integrity.score import Score, answered, scores_of
-from magfusion.estimation.integrity.test_result import Case
+from magfusion.estimation.integrity.suspects import suspects
+from magfusion.estimation.integrity.test_result import Case, TestResult
 from magfusion.estimation.measurements.steel import UNIT, SteelModes, steel_modes
 from magfusion.files.site_changes import changed_keys
 from magfusion.model.parameters import Block
+from magfusion.model.samples import Log
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Verdict
+from magfusion.model.without_imu import logged
 from magfusion.units import Array
 
 STEEL = "steel"  # code
@@ -73,6 +79,42 @@ class SteelEstimate(NamedTuple):
         )
         remedy = changed_keys(site, replace(site, model_error=needed))
         return Finding(STEEL, text, Verdict.DOUBTFUL, weight, remedy=remedy)
+
+
+def steel(case: Case, rival: float, *, doubted: bool = False) -> TestResult | None:
+    """Test for steel; None if it does not explain a log better than other causes.
+
+    Parameters
+    ----------
+    rival : float
+        Gain of the causes that are named.
+    doubted : bool
+        Whether it is tested even where no parameter would explain anything.
+    """
+    rival = max(rival, _best_parameter(case))
+    if rival < LEAST_EVIDENCE and not doubted:
+        return None
+    estimate = estimate_steel(case, max(rival + MARGIN, LEAST_EVIDENCE))
+    if estimate is None:
+        return None
+    return TestResult((estimate.finding(case),), spread=estimate.spread, gain=estimate.gain)
+
+
+def _best_parameter(case: Case) -> float:
+    """Return the gain of the fixed parameter that explains most, mistake or not."""
+    if case.score is None:
+        return 0.0
+    declared = case.score.with_declared(tolerance=False)
+    every = suspects(case.result.declared.site, case.score.fixed)
+    return max(
+        (one.gain for fault in every if (one := release_gain(fault, *declared))), default=0.0
+    )
+
+
+def is_beside_steel(result: Smoothed, log: Log, rival: float) -> bool:
+    """Return whether steel explains a log better than a rival cause of a known gain."""
+    cov, (log, _) = result.states.pose_cov, logged(log, result.declared.site)
+    return cov is not None and steel(Case(result, log, None, cov), rival) is not None
 
 
 def estimate_steel(case: Case, least: float) -> SteelEstimate | None:

@@ -47,6 +47,8 @@ class TestResult:
         Steps of the fixed parameters: by the first cause, by the first two, and so on.
     causes : tuple of ReleasedFault
         The first cause, and what explains the log as well.
+    gain : float
+        Decrease of -2 log likelihood by what the findings name.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -55,6 +57,7 @@ class TestResult:
     spread: Array | None = field(default=None)
     named: tuple[Array, ...] = ()
     causes: tuple[ReleasedFault, ...] = ()
+    gain: float = 0.0
 
 
 NOTHING = TestResult()
