@@ -110,10 +110,10 @@ _FAULT = ("beacon_fault", "field_residuals", "beacon_excluded")
 _LINE = ("undeclared_line", "mains")
 
 MISTAKES = (
-    Mistake("iron_4pct", "world", _iron(0.3), ("iron", "field_residuals")),
-    Mistake("iron_10pct", "world", _iron(0.4), ("iron", "field_residuals")),
-    Mistake("rails", "world", _rails(_TRACK), ("iron", "field_residuals")),
-    Mistake("casing_beside", "world", _rails(_CASING), ("iron", "field_residuals")),
+    Mistake("iron_4pct", "world", _iron(0.3), ("steel", "iron", "field_residuals")),
+    Mistake("iron_10pct", "world", _iron(0.4), ("steel", "iron", "field_residuals")),
+    Mistake("rails", "world", _rails(_TRACK), ("steel", "iron", "field_residuals")),
+    Mistake("casing_beside", "world", _rails(_CASING), ("steel", "iron", "field_residuals")),
     Mistake("false_1pct_15s", "world", _false("B", _during(0.01)), _FAULT),
     Mistake("false_5pct_15s", "world", _false("B", _during(0.05)), _FAULT),
     Mistake("false_20pct_15s", "world", _false("B", _during(0.2)), _FAULT),

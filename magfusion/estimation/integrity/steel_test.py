@@ -1,7 +1,7 @@
 """Test for steel: a distortion of space that all beacons share, in place of other causes.
 
-Its amplitudes have the prior of `magfusion.estimation.measurements.steel`, so that its evidence is on
-the scale of `ReleaseGain.gain`: the decrease of -2 log likelihood, marginalised over their values.
+Its amplitudes have the prior of `magfusion.estimation.measurements.steel`, so that its evidence is
+on the scale of `ReleaseGain.gain`: the decrease of -2 log likelihood, marginalised over amplitudes.
 """
 
 from dataclasses import replace
@@ -130,8 +130,8 @@ def estimate_steel(case: Case, least: float) -> SteelEstimate | None:
     assert isinstance(block.parameter, SteelModes)
     shared = np.arange(block.parameter.columns) < block.parameter.shared
     gain, sigma = best_size(*_own(scores.every, block), shared)
-    if gain < least:
-        return None
+    if gain < least or np.max(sigma) >= SIZES[-1]:
+        return None  # the largest size stands for gross mistakes that no mode explains
     return _estimated(answered(result, scores.every, case.log.imu), block, gain, sigma)
 
 

@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-
 from scipy.spatial import cKDTree
 
 from magfusion.estimation.graph.same_epoch import SAME_TIME
@@ -94,7 +93,7 @@ class SteelModes(Parameter):
         """Number of amplitudes."""
         return int(self.polarisability.shape[-1])
 
-    def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray:  # noqa: ARG002
+    def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray:
         """Return the columns of a beacon's phasors."""
         time, name = view.calibration.reference_time + view.elapsed, view.beacon.name
         at = np.searchsorted(self._time, time - SAME_TIME)
