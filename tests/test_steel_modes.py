@@ -9,7 +9,7 @@ from magfusion.model.parameters import initial_calibration
 from magfusion.model.parameters.parameter import PhasorView
 from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import demo_site
-from magfusion.units import Array, ComplexArray
+from magfusion.units import AnyArray, Array
 
 EPOCHS = 16
 
@@ -22,10 +22,10 @@ def _walk() -> Trajectory:
     )
     c, s, o, i = np.cos(angle), np.sin(angle), np.zeros(EPOCHS), np.ones(EPOCHS)
     turn = np.stack([c, -s, o, s, c, o, o, o, i], axis=1).reshape(-1, 3, 3)
-    return Trajectory(np.arange(EPOCHS) * 0.2, turn, place)
+    return Trajectory(0.2 * np.arange(EPOCHS, dtype=float), turn, place)
 
 
-def _sphere_field(source: ComplexArray, centre: Array, point: Array, volume: float) -> ComplexArray:
+def _sphere_field(source: AnyArray, centre: Array, point: Array, volume: float) -> AnyArray:
     """Return the field of a small sphere magnetised by a source field, shape (n, tones, 3)."""
     offset = point - centre
     distance = np.linalg.norm(offset, axis=1)[:, None, None]

@@ -23,7 +23,7 @@ from magfusion.model.samples import Log
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Verdict
 from magfusion.model.without_imu import logged
-from magfusion.units import Array
+from magfusion.units import Array, BoolArray
 
 STEEL = "steel"  # code
 # Relative distortion in units of `UNIT`, of shared modes and of those of each tone.
@@ -135,7 +135,7 @@ def estimate_steel(case: Case, least: float) -> SteelEstimate | None:
     return _estimated(answered(result, scores.every, case.log.imu), block, gain, sigma)
 
 
-def best_size(information: Array, gradient: Array, shared: Array) -> tuple[float, Array]:
+def best_size(information: Array, gradient: Array, shared: BoolArray) -> tuple[float, Array]:
     """Return the gain, averaged over sizes of the distortion, and the likeliest sigmas.
 
     Parameters

@@ -21,7 +21,7 @@ from magfusion.model.parameters import Block, Parameter, placed
 from magfusion.model.parameters.parameter import PhasorView
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.units import Array, ComplexArray
+from magfusion.units import AnyArray, Array, ComplexArray
 
 SHARED, OWN = 160, 12  # modes of all beacons together, and of each tone
 UNIT = 0.01  # relative distortion by a sigma of all modes, rms over path and beacons
@@ -77,11 +77,11 @@ class SteelModes(Parameter):
     def __init__(
         self,
         time: Array,
-        fields: Mapping[str, ComplexArray],
-        sources: Mapping[str, ComplexArray],
+        fields: Mapping[str, AnyArray],
+        sources: Mapping[str, AnyArray],
         sensor_from_world: Array,
         voxels: Voxels,
-        polarisability: ComplexArray,
+        polarisability: AnyArray,
         shared: int,
     ) -> None:
         self._time, self._fields, self._sources = time, fields, sources
@@ -120,8 +120,6 @@ def steel_modes(site: Site, time: Array, poses: Trajectory) -> tuple[Block, ...]
     sensor, place = site.platform.magnetometer, sensor_positions(site, poses)[:, 0]
     voxels = voxels_around(np.concatenate([place, [b.position_world for b in site.beacons]]))
     at_path, at_voxels = (beacon_fields(site, point) for point in (place, voxels.centre_world))
-    if not np.any(at_path.imag) and not np.any(at_voxels.imag):
-        at_path, at_voxels = at_path.real, at_voxels.real
     root = voxels.edge[:, None, None, None] ** 1.5
     moment = np.einsum("kij,vtj->vtik", TENSORS, at_voxels) * root
     moments = [_modes(place, at_path, voxels, moment, SHARED)]
@@ -162,8 +160,11 @@ def voxels_around(point_world: Array) -> Voxels:
     return Voxels(np.concatenate([c for c, _ in out]), np.concatenate([e for _, e in out]))
 
 
-def beacon_fields(site: Site, point_world: Array) -> ComplexArray:
-    """Return the field of every tone at points, world axes (T), shape (n, tones, 3)."""
+def beacon_fields(site: Site, point_world: Array) -> AnyArray:
+    """Return the field of every tone at points, world axes (T), shape (n, tones, 3).
+
+    Real where the coils of each beacon are in phase.
+    """
     sensor, along = site.platform.magnetometer, np.eye(3)
     point = replace(
         sensor, position_body=np.zeros(3), matrix=along, body_from_sensor=along, coil_kappa=0.0
@@ -171,7 +172,8 @@ def beacon_fields(site: Site, point_world: Array) -> ComplexArray:
     point = replace(point, coil_centres_sensor=None, casing=None)
     turn = np.broadcast_to(along, (len(point_world), 3, 3))
     fields = [predict(beacon, point, turn, point_world) for beacon in site.beacons]
-    return np.concatenate(fields, axis=1)
+    every = np.concatenate(fields, axis=1)
+    return every if np.any(every.imag) else every.real
 
 
 def _dipole_tensors(point_world: Array, centre_world: Array) -> Array:
@@ -183,7 +185,7 @@ def _dipole_tensors(point_world: Array, centre_world: Array) -> Array:
     return np.asarray(square / (4.0 * np.pi * distance[..., None] ** 3))
 
 
-def _fields(place: Array, voxels: Voxels, moment: ComplexArray) -> ComplexArray:
+def _fields(place: Array, voxels: Voxels, moment: AnyArray) -> AnyArray:
     """Return the field of moments (v, tones, 3, k) over mu0 at places, (n, tones, 3, k)."""
     source = np.swapaxes(moment, 1, 2).reshape(-1, moment.shape[1] * moment.shape[3])
     parts = []
@@ -195,8 +197,8 @@ def _fields(place: Array, voxels: Voxels, moment: ComplexArray) -> ComplexArray:
 
 
 def _modes(
-    place: Array, at_path: ComplexArray, voxels: Voxels, moment: ComplexArray, count: int
-) -> ComplexArray:
+    place: Array, at_path: AnyArray, voxels: Voxels, moment: AnyArray, count: int
+) -> AnyArray:
     """Return the moments of the strongest modes of relative distortion, (v, tones, 3, modes).
 
     Parameters
