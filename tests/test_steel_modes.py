@@ -1,4 +1,4 @@
-"""Steel beside the path: its modes are fields of steel, and its evidence is a likelihood."""
+"""Steel near the path: its modes are fields of steel, and its evidence is a likelihood."""
 
 import numpy as np
 import pytest

@@ -30,7 +30,7 @@ from magfusion.estimation.integrity.smoothed_exclusion import (
     states_judged,
     with_long_exclusions,
 )
-from magfusion.estimation.integrity.steel_test import STEEL, is_beside_steel
+from magfusion.estimation.integrity.steel_test import STEEL, steel_explains
 from magfusion.estimation.online_integrity.open_roll import (
     comparable,
     roll_findings,
@@ -121,7 +121,7 @@ def finished(
         for name, onset in excluded_to_the_end(separated).items()
         if (test := changed_beacon(result, log, name, onset)) is not None
     }
-    if tests and is_beside_steel(result, log, max(test.gain for test in tests.values())):
+    if tests and steel_explains(result, log, max(test.gain for test in tests.values())):
         separated, tests = separated_smooth(result, risk, excluding=False), {}
     changes = {name: test.findings[0] for name, test in tests.items()}
     give_back_memory()

@@ -15,13 +15,12 @@ from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorde
 from magfusion.estimation.data_checks.signal import detected_in
 from magfusion.estimation.graph.graph import GraphEstimate
 from magfusion.estimation.integrity.change_detection import candidate_steps, changed
-from magfusion.estimation.integrity.close_residuals import together
 from magfusion.estimation.integrity.convergence_report import convergence, geometry, rivals
 from magfusion.estimation.integrity.fixed_parameter_test import check_fixed_parameters
 from magfusion.estimation.integrity.priors_of_log import bias_change, calibration_change
 from magfusion.estimation.integrity.region_test import of_place
 from magfusion.estimation.integrity.released_fault import ReleasedFault
-from magfusion.estimation.integrity.residual_blocks import fields, fixes, inertial
+from magfusion.estimation.integrity.residual_blocks import fields, fixes, inertial, together
 from magfusion.estimation.integrity.score import (
     Score,
     field_residual,
@@ -123,7 +122,7 @@ def _run_tests(case: Case) -> Iterator[TestResult]:
     if (
         bent := steel(case, max(of_held.gain, change.gain), doubted=bool(priors.findings))
     ) is not None:
-        yield from _beside_steel(case, bent, of_held, priors, biases)
+        yield from _with_steel(case, bent, of_held, priors, biases)
         return
     if change.findings:  # it explains more than whatever is wrong throughout
         of_held = TestResult(unverified=of_held.unverified)
@@ -147,12 +146,12 @@ def _run_tests(case: Case) -> Iterator[TestResult]:
         yield monitor(case)
 
 
-def _beside_steel(case: Case, bent: TestResult, *others: TestResult) -> Iterator[TestResult]:
+def _with_steel(case: Case, bent: TestResult, *others: TestResult) -> Iterator[TestResult]:
     """Yield all test results where steel explains those of fields and parameters."""
     of_held, priors, biases = others
     cause = _weight(bent)
     yield replace(bent, unverified=of_held.unverified)
-    for findings in (*_residuals(case, case.result.estimate), priors):
+    for findings in (*_residuals(case, _explained(case, ())[0]), priors):
         yield _traces(findings, 10.0 * cause)
     yield _traces(compass(case), cause)
     yield _traces(biases, cause)

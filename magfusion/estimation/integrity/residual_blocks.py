@@ -1,4 +1,4 @@
-"""Tests of field and inertial residuals, by beacon, by axis and by time.
+"""Tests of field and inertial residuals, by beacon, by axis, by time and in short windows.
 
 Each is a chi square with the effective number of independent residuals, from their measured
 autocorrelation.  Field residuals are taken after all uncertain parameters have moved as far as
@@ -23,9 +23,12 @@ from magfusion.estimation.graph.state import states_in
 from magfusion.estimation.integrity.inertial_misfit import expected_squares, inertial_errors
 from magfusion.estimation.integrity.smoothed_exclusion import LEFT_OUT
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.pose_fix import PoseFix
+from magfusion.estimation.snapshot.priors import NOTHING_EXPLAINED
 from magfusion.model.trust import Finding, Verdict
+from magfusion.receiver.windows import LONGEST_WINDOW
 from magfusion.units import Array, BoolArray
 
 BLOCK, MOST_BLOCKS = 10.0, 24  # s; stretches that are tested separately
@@ -34,6 +37,8 @@ MOST_SHORT = 1800  # of them, in an hour
 INDEPENDENT = 3.0  # of a phasor's six numbers: one model error affects several
 TOLERATED = 1.2**2  # mean square below which sigmas are acceptable
 TOLERATED_INERTIAL = 1.5**2
+EXPLAINED_SQUARE = 1.5  # mean square in short windows, one where noise and model are as declared
+MIN_WINDOWS = 3  # per mean
 AXES = {0: "gyroscope x", 1: "gyroscope y", 2: "gyroscope z"} | {
     6: "accelerometer x",
     7: "accelerometer y",
@@ -300,4 +305,34 @@ def inertial(case: Case, estimate: GraphEstimate) -> TestResult:
     for one in informative:
         rows = np.append(one.rows, one.rows[-1]) | np.insert(one.rows, 0, one.rows[0])
         factor[rows] = np.maximum(factor[rows], one.square)
+    return TestResult((finding,), factor=factor)
+
+
+def together(case: Case) -> TestResult:
+    """Test the short windows, in which close tones are measured jointly, in pieces of seconds."""
+    graph = case.result.graph
+    measured = next((m for m in graph.measurements if isinstance(m, JointPhasors)), None)
+    if measured is None or len(measured.time) < MIN_WINDOWS:
+        return NOTHING
+    residual = graph.residual(measured, case.result.estimate)
+    square = np.mean(residual**2, axis=(1, 2))
+    piece = np.floor((measured.time - measured.time[0]) / LONGEST_WINDOW).astype(np.int64)
+    count = np.bincount(piece)
+    mean = np.bincount(piece, square) / np.maximum(count, 1)
+    mean = np.where(count >= MIN_WINDOWS, mean, np.mean(square))
+    worst = float(np.max(mean))
+    if worst <= EXPLAINED_SQUARE:
+        return NOTHING
+    time = case.result.states.time
+    at = np.floor((time - measured.time[0]) / LONGEST_WINDOW).astype(np.int64)
+    factor = np.maximum(mean[np.clip(at, 0, len(mean) - 1)], 1.0)
+    rms, share = np.sqrt(worst), 100.0 * float(np.mean(mean > EXPLAINED_SQUARE))
+    finding = Finding(
+        "field_residuals",
+        f"The jointly measured fields deviate by up to {rms:.2g} times the noise and model error,"
+        f" in {share:.0f} % of the log. A beacon is not as declared, iron is near the path, or the"
+        " start is wrong. Record a longer log to identify the beacon.",
+        Verdict.FAILED if rms > NOTHING_EXPLAINED else Verdict.DOUBTFUL,
+        20.0 + rms,
+    )
     return TestResult((finding,), factor=factor)

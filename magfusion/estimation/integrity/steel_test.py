@@ -60,7 +60,7 @@ class SteelEstimate(NamedTuple):
     def finding(self, case: Case) -> Finding:
         """Return the finding: a remark where the site declares so much."""
         site = case.result.declared.site
-        where, declared = "beside the path", 100.0 * site.model_error
+        where, declared = "near the path", 100.0 * site.model_error
         if self.place_sigma < FAR:
             x, y, z = self.place_world
             where = f"near ({x:.1f}, {y:.1f}, {z:.1f}) m, ± {self.place_sigma:.1f} m,"
@@ -111,7 +111,7 @@ def _best_parameter(case: Case) -> float:
     )
 
 
-def is_beside_steel(result: Smoothed, log: Log, rival: float) -> bool:
+def steel_explains(result: Smoothed, log: Log, rival: float) -> bool:
     """Return whether steel explains a log better than a rival cause of a known gain."""
     cov, (log, _) = result.states.pose_cov, logged(log, result.declared.site)
     return cov is not None and steel(Case(result, log, None, cov), rival) is not None

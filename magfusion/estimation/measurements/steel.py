@@ -1,8 +1,8 @@
-"""Distortion of the beacons' fields by steel beside the path, as amplitudes of physical modes.
+"""Distortion of the beacons' fields by steel near the path, as amplitudes of physical modes.
 
 Steel at a place c is magnetised by the field of each beacon there, and adds the field of a dipole
 ``G(r - c) A B(c)``.  The polarisability A of a voxel is a symmetric tensor that all beacons share;
-a smaller moment of each beacon's own stands for long bodies, which conduct flux from elsewhere.
+a smaller moment of each tone's own represents long bodies, which conduct flux from elsewhere.
 All are independent, with a variance proportional to the volume, and are seen on the path through
 their strongest modes.  Each is free of curl and divergence, as the field of steel is.
 """
