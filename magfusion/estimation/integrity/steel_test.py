@@ -136,7 +136,7 @@ def estimate_steel(case: Case, least: float) -> SteelEstimate | None:
 
 
 def best_size(information: Array, gradient: Array, shared: BoolArray) -> tuple[float, Array]:
-    """Return the gain, averaged over sizes of the distortion, and the likeliest sigmas.
+    """Return the gain, averaged over sizes of the distortion, and the most probable sigmas.
 
     Parameters
     ----------
