@@ -1,14 +1,23 @@
 """Steel near the path: its modes are fields of steel, and its evidence is a likelihood."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from magfusion.estimation.batch.batch import smooth
+from magfusion.estimation.integrity.judge import judge_result
 from magfusion.estimation.integrity.steel_test import best_size
 from magfusion.estimation.measurements import steel
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.parameters.parameter import PhasorView
 from magfusion.model.trajectory import Trajectory
-from magfusion.simulation.demo_site import demo_site
+from magfusion.model.trust import Trust
+from magfusion.results.errors import trajectory_errors
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.disturbance import Ambient
+from magfusion.simulation.log import SimulationConfig, simulate_log
+from magfusion.simulation.steel_worlds import draw_steel
 from magfusion.units import AnyArray, Array
 
 EPOCHS = 16
@@ -93,3 +102,44 @@ def test_noise_alone_is_no_steel() -> None:
         )
     assert np.mean(gains) < 0.0
     assert np.max(gains) < 10.0
+
+
+def _judged(*, steel_there: bool, displaced_m: float) -> tuple[Trust, float]:
+    """Return the trust of a walk in the demo's room, and its mean NEES."""
+    site, rng = demo_site(coil_radius=None), np.random.default_rng([40, 4])
+    places = np.array([beacon.position_world for beacon in site.beacons])
+    drawn = draw_steel("spheres", rng, DEMO_BOX_WORLD, places) if steel_there else None
+    config = SimulationConfig(
+        DEMO_BOX_WORLD,
+        duration=60.0,
+        imu_rate_hz=100.0,
+        magnetometer_rate_hz=160.0,
+        ambient=Ambient(rails=drawn),
+    )
+    log = simulate_log(site, config, rng).log
+    first, *others = site.beacons
+    wrong = first.position_world + np.array([0.0, displaced_m, 0.0])
+    declared = replace(site, beacons=(replace(first, position_world=wrong), *others))
+    assert log.truth is not None
+    result = smooth(replace(log, truth=None), replace(declared, model_error=0.003))
+    judged, trust = judge_result(result, log)
+    nees = trajectory_errors(judged.states, log.truth).nees
+    assert nees is not None
+    return trust, float(np.mean(nees))
+
+
+@pytest.mark.slow
+def test_spheres_are_named_steel_and_covered() -> None:
+    trust, nees = _judged(steel_there=True, displaced_m=0.0)
+    first = trust.reasons[0]
+    assert first.code == "steel"
+    assert first.remedy is not None
+    assert list(first.remedy) == ["world.model_error"]
+    assert nees < 12.6  # 95 % of chi square of six
+
+
+@pytest.mark.slow
+def test_a_displaced_beacon_in_a_clean_room_is_not_steel() -> None:
+    trust, _ = _judged(steel_there=False, displaced_m=0.05)
+    assert trust.reasons[0].code == "beacon_pose"
+    assert f"beacon {demo_site().beacons[0].name}" in trust.reasons[0].text
