@@ -72,6 +72,7 @@ def test_its_modes_are_what_bends_a_field() -> None:
         np.ones((4, 1, 1)),
         np.full((4, 1, 1), 0.01),
         np.broadcast_to(turn.T, (4, 1, 3, 3)),
+        np.eye(3)[None],
     )
     calibration = initial_calibration(site, 0.0)
     view = PhasorView(calibration, site.beacons[0], np.arange(4.0), field_world @ turn, None)

@@ -54,7 +54,7 @@ def test_a_mode_moves_the_estimate_as_its_response_says() -> None:
     block = result.field_errors[0]
     site, fields = result.calibration.site, result.fields
     poses = result.states
-    column = 13  # of the second mode
+    column = 1  # of the second combination
     steps = list(responses(result.graph, result.estimate, result.uncertain))
     first = result.uncertain[-len(result.field_errors)].columns.start
     response = steps[first + column]

@@ -70,6 +70,5 @@ def _drawn_squares(result: Smoothed) -> Array:
     rows = {k: v[result.epoch] for k, v in vars(result.states).items() if v is not None}
     known = result.graph, result.estimate, result.fields, Trajectory(**rows)
     parts = *known, overlap(result.fields), result.considered
-    drawn = [ResidualProjection(*parts, seed).inertial_squares for seed in range(DRAWS)]
-    noise, rough, smooth, own = np.mean(drawn, axis=0)
+    noise, rough, smooth, own = ResidualProjection(*parts, draws=DRAWS).inertial_squares
     return np.asarray(noise + np.maximum(rough, smooth) + own)

@@ -35,6 +35,7 @@ OF_IMU = ("gyro_noise", "accel_noise")  # a beacon may be called "imu", too
 OF_MOTION = {"angular_accel_density": "gyro_bias_walk", "accel_density": "accel_noise"}
 WALK = slice(12, 15)
 PLAUSIBLE = 6.0  # by a larger factor, either way, white noise is a fault
+DRAWN_EPOCHS = 128  # of drawn errors, of fewer several: else the noise of the shares prevails
 MIN_REMAINING = 1e-3  # of an error; a smaller remainder is not informative
 
 
@@ -130,7 +131,8 @@ def tune(
     considered : tuple of Block
         Parameters that are not estimated: the effect of their errors on residuals is no noise.
     """
-    system = ResidualProjection(graph, estimate, samples, poses, windows, considered)
+    draws = max(1, -(-DRAWN_EPOCHS // len(samples)))
+    system = ResidualProjection(graph, estimate, samples, poses, windows, considered, draws=draws)
     now = estimate.calibration.site
     lag = max(1, round(windows))
     prior = declared.beacons

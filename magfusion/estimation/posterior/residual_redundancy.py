@@ -20,6 +20,7 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
+KINDS = 4  # of drawn errors
 WAVES = 64  # of a random model error
 MIN_CHANNELS = 3  # of an epoch; the pose of fewer explains too much
 LOOSE = 1e-9  # of the fields' information on a pose
@@ -36,7 +37,7 @@ class ChannelErrors:
         Rows of the samples.
     seen : ndarray, shape (m, 6)
         Residuals.
-    residuals : tuple of ndarray, shape (m, 6)
+    residuals : tuple of ndarray, shape (m, 6 * draws)
         Remainders of drawn noise, of a rough and of a smooth drawn model error, and of drawn
         inertial noise.
     variance : tuple of ndarray, shape (m,)
@@ -68,6 +69,8 @@ class ResidualProjection:
         errors is no noise.
     seed : int
         Of the drawn errors.
+    draws : int
+        Number of drawn errors of each kind.
     """
 
     ordinary: BoolArray  # inertial intervals without a gap
@@ -81,6 +84,7 @@ class ResidualProjection:
         windows: float,
         considered: tuple[Block, ...] = (),
         seed: int = 0,
+        draws: int = 1,
     ) -> None:
         # Reproducible for the same log.
         self._samples, self._rng = samples, np.random.default_rng(seed)
@@ -107,7 +111,7 @@ class ResidualProjection:
         )
         assert rows.by_pose is not None
         self._by_pose = rows.by_pose.reshape(len(error), -1, 6)
-        drawn = self._drawn(site, sensor_positions(site, poses), windows)
+        drawn = self._drawn_errors(site, sensor_positions(site, poses), windows, draws)
         fields, inertial = [self._weight * own for own, _ in drawn], [own for _, own in drawn]
         residual = None
         if is_chain(graph, considered):
@@ -115,11 +119,20 @@ class ResidualProjection:
         if residual is None:
             residual = left_by_tree(graph, estimate, considered, fields, inertial)
         every = [field / self._weight for field in residual[0]]
+        of_motion = residual[1]
         # Squares of whitened remainders of all drawn errors, mean over the intervals, (errors, 15).
-        self.inertial_squares = np.mean(residual[1][1:] ** 2, axis=1)
-        of_imu = [(self._unwhitening @ own[..., None])[..., 0] for own in residual[1]]
-        self._inertial = of_imu
-        self._separate = self._without_pose(every)
+        self.inertial_squares = np.mean(_of_kinds(of_motion[1:] ** 2), axis=(1, 2))
+        seen, *others = (self._unwhitening @ of_motion[..., None])[..., 0]
+        self._inertial = [seen, *np.sqrt(np.mean(_of_kinds(np.array(others) ** 2), axis=1))]
+        self._seen, *others = self._without_pose(every)
+        self._separate = np.moveaxis(_of_kinds(np.array(others)), 1, 3)
+
+    def _drawn_errors(
+        self, site: Site, sensor_world: Array, windows: float, draws: int
+    ) -> list[tuple[Array, Array]]:
+        """Return all drawn errors, those of each kind one after the other."""
+        drawn = [self._drawn(site, sensor_world, windows) for _ in range(draws)]
+        return [one for kind in zip(*drawn, strict=True) for one in kind]
 
     def _drawn(self, site: Site, sensor_world: Array, windows: float) -> list[tuple[Array, Array]]:
         """Return drawn errors of fields and inertial factors: noise, model errors, the IMU's."""
@@ -173,8 +186,7 @@ class ResidualProjection:
             rows = np.flatnonzero(self._samples.valid[:, channel])
             turn = self._world_from_sensor[rows, self._sensor[channel]]
             seen, noise, rough, smooth, inertial = (
-                np.einsum("nij,npj->npi", turn, e[rows, channel].reshape(-1, 2, 3)).reshape(-1, 6)
-                for e in self._separate
+                _turned(e[rows, channel], turn) for e in (self._seen, *self._separate)
             )
             by_noise, by_model = (v[rows, channel] for v in self._variance)
             size = (float(self._size[0][beacon]), float(self._size[1][beacon]))
@@ -185,9 +197,22 @@ class ResidualProjection:
     def inertial(self) -> list[Array]:
         """Return inertial residuals, and remainders of noise, model errors and the IMU's own.
 
-        Each of shape (intervals, 15): rotation, position, velocity, biases.
+        Each of shape (intervals, 15): rotation, position, velocity, biases; the remainders are root
+        mean squares of all draws.
         """
         return self._inertial
+
+
+def _of_kinds(drawn: Array) -> Array:
+    """Return drawn errors by kind, shape (4, draws, ...)."""
+    return drawn.reshape(KINDS, len(drawn) // KINDS, *drawn.shape[1:])
+
+
+def _turned(parts: Array, turn: Array) -> Array:
+    """Return turned errors, shape (m, 6 * draws); given of shape (m, 6) or (m, draws, 6)."""
+    width = int(np.prod(parts.shape[1:]))
+    vectors = parts.reshape(len(parts), width // 3, 3)
+    return (vectors @ np.swapaxes(turn, 1, 2)).reshape(len(parts), width)
 
 
 def _root(factor: gtsam.NonlinearFactor) -> Array:

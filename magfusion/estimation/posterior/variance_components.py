@@ -5,7 +5,7 @@ place.  Its smoothness is not declared; so a rough and a smooth kind are separat
 change from epoch to epoch, and both together have the declared size as their prior.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple
@@ -18,6 +18,7 @@ from magfusion.units import Array
 
 PRIOR = float(np.log(2.0))  # of the logarithm of a declared sigma
 MIN_FACTOR, MAX_FACTOR = 0.1, 1e3  # of a factor; no log can determine a smaller noise
+COMPONENTS = 6  # of a residual
 STUDENT = 4.0  # degrees of freedom: faults have little weight
 # Gain, by components, with which that distribution finds the variance of normal residuals.
 NORMAL = {3: 1.322946, 6: 1.224631}
@@ -84,13 +85,15 @@ def parts_of(
     """
     fitted = _fitted(beacons, shared_by, lag)
     bent = [k for k, (log, _) in enumerate(fitted) if len(log) and beacons[k].bent]
-    drawn = [_drawn(beacons[k], *fitted[k]) for k in bent]
-    again = dict(zip(bent, _fitted(drawn, shared_by, lag), strict=True))
+    drawn = [(k, one) for k in bent for one in _drawn(beacons[k], *fitted[k])]
+    again: dict[int, list[Array]] = {k: [] for k in bent}
+    for (k, _), (log, _) in zip(drawn, _fitted([b for _, b in drawn], shared_by, lag), strict=True):
+        again[k].append(log[1:3])
     result: list[BeaconParts | None] = []
     for k, (log, white) in enumerate(fitted):
         if k in again:
             model, smooth = _total(log), float(np.exp(2.0 * (log[2] - _logarithm(log[1:3]))))
-            selected = _total(again[k][0]) / model
+            selected = float(np.exp(np.mean([_logarithm(own) for own in again[k]]))) / model
             result.append(BeaconParts(beacons[k].sizes, white, model, smooth, selected))
         else:
             result.append(BeaconParts(beacons[k].sizes, white) if len(log) else None)
@@ -106,17 +109,20 @@ def _logarithm(log: Array) -> float:
     return float(0.5 * np.logaddexp.reduce(2.0 * log))
 
 
-def _drawn(beacon: BeaconErrors, log: Array, white: float) -> BeaconErrors:
-    """Return drawn errors of these sizes in place of the residuals."""
+def _drawn(beacon: BeaconErrors, log: Array, white: float) -> Iterator[BeaconErrors]:
+    """Yield drawn errors of these sizes in place of the residuals."""
     of_noise, usual = white * beacon.sizes[0], beacon.sizes[1]
     of_rough, of_smooth = np.exp(log[1:3]) * usual
-    drawn = []
+    errors = []
     for own in beacon.channels:
         noise, rough, smooth, inertial = own.residuals
         size, model = own.size
         bent = (of_rough * rough + of_smooth * smooth) / model
-        drawn.append(replace(own, seen=of_noise / size * noise + bent + inertial))
-    return replace(beacon, channels=drawn)
+        errors.append(of_noise / size * noise + bent + inertial)
+    for draw in range(0, errors[0].shape[1], COMPONENTS):
+        seen = [error[:, draw : draw + COMPONENTS] for error in errors]
+        channels = [replace(a, seen=b) for a, b in zip(beacon.channels, seen, strict=True)]
+        yield replace(beacon, channels=channels)
 
 
 def _fitted(
@@ -204,8 +210,9 @@ def by_scale(
         shape = (-1, SCALES, lag)
         squares = []
         for v in (own.seen, *own.residuals):
-            rows = np.einsum("hs,bslk->hblk", every, v[:used].reshape(*shape, 6))
-            squares.append(np.sum(rows**2, axis=3).reshape(SCALES, -1))
+            rows = np.einsum("hs,bslk->hblk", every, v[:used].reshape(*shape, v.shape[1]))
+            draws = v.shape[1] / COMPONENTS
+            squares.append(np.sum(rows**2, axis=3).reshape(SCALES, -1) / draws)
         seen.append(squares[0])
         residual.append(np.stack(squares[1:]))
         given.append([np.mean(v[:used].reshape(shape), axis=1).ravel() for v in own.variance])
