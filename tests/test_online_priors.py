@@ -58,7 +58,7 @@ def test_what_was_only_considered_moves_what_is_estimated(
 ) -> None:
     state, block, monitor = state_with(moved, sigma)
     shared_offsets = {block.name: np.full(3, share * sigma**2)}
-    monitor.begin(0.0, Judgement(), shared_offsets)
+    monitor.begin(0.0, Judgement(), shared_offsets, {})
     gate = Gate(SITE.channels, (), MagnetometerWatch(SITE))
     detected = monitor.judgement(state, gate, None, Judgement())
     assert any(f.code == "prior" and "C.position" in f.text for f in detected.findings) == findings

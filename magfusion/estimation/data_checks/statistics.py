@@ -8,7 +8,7 @@ Probabilities are logarithms, since those of real faults underflow.
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import chdtrc, gammaln, ndtri_exp
+from scipy.special import chdtrc, chdtri, fdtri, gammaln, ndtri_exp
 
 from magfusion.units import Array, BoolArray
 
@@ -46,6 +46,22 @@ def log_p_chi_square(value: Array | float, freedom: Array | float) -> Array:
         excess = np.maximum(half - shape + 1.0, 1.0)
         tail = shape * np.log(np.maximum(half, 1e-300)) - half - np.log(excess) - gammaln(shape)
     return np.where((exact > _UNDERFLOW) | (half < shape), exact, np.minimum(tail, 0.0))
+
+
+def largest_mean_square(probability: float, freedom: float, noise_freedom: float) -> float:
+    """Return the mean square that chance exceeds with a probability, relative to its expectation.
+
+    Parameters
+    ----------
+    freedom : float
+        Degrees of freedom of the mean square.
+    noise_freedom : float
+        Of its expectation if that is estimated, and the ratio has Fisher's F distribution;
+        infinite if it is known.
+    """
+    if np.isinf(noise_freedom):
+        return float(chdtri(freedom, probability)) / freedom
+    return float(fdtri(freedom, noise_freedom, 1.0 - probability))
 
 
 def sigmas(log_p: Array | float) -> Array:

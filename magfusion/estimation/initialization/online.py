@@ -10,6 +10,7 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
+from magfusion.estimation.batch.log_graph import overlap
 from magfusion.estimation.batch.settings import EstimatorSettings
 from magfusion.estimation.data_checks.disturbing_lines import with_disturbing_lines
 from magfusion.estimation.data_checks.stream_buffer import Buffer
@@ -69,6 +70,8 @@ class OnlineStart:
         Increase of the uncertainty of attitude (rad) and position (m), one sigma an axis.
     shared_offsets : mapping of str to ndarray
         Variance of estimated parameters, by name, due to considered ones.
+    noise_freedom : mapping of str to float
+        Degrees of freedom of the estimated noise of each beacon's fields.
     corrections : tuple of Correction
         What may be wrong with the site, the most likely first.
     """
@@ -83,6 +86,7 @@ class OnlineStart:
     extra_lines: LockinSettings | None = None
     lines: Mapping[str, LockinSettings] = field(default_factory=dict)
     shared_offsets: Mapping[str, Array] = field(default_factory=dict)
+    noise_freedom: Mapping[str, float] = field(default_factory=dict)
     excluded: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
     corrections: tuple[Correction, ...] = ()
@@ -281,9 +285,27 @@ def _start_of(
         None if others is given else others,
         _lines_of_each(detected, site, given) if detected.waveforms else {},
         {b.name: np.sum(result.calibration_response[b.columns] ** 2, 1) for b in result.blocks},
+        noise_freedom(result),
         tuple(sensor.name for sensor in site.platform.magnetometers if sensor.name not in kept),
         estimate.excluded,
     )
+
+
+def noise_freedom(result: Smoothed) -> dict[str, float]:
+    """Return the degrees of freedom of each beacon's estimated noise; nothing if it is declared.
+
+    The pose of an epoch takes six of its numbers, or half where they are few.
+    """
+    if not result.noise:
+        return {}
+    known = np.isfinite(result.residual).all(axis=2)
+    channels = np.sum(known, axis=1, keepdims=True)
+    free = np.where(known, 6.0 * (1.0 - 1.0 / np.maximum(channels, 2)), 0.0)
+    own = np.sum(free, axis=0) / (overlap(result.fields) if len(known) > 1 else 1.0)
+    beacons: dict[str, float] = {}
+    for (name, _), freedom in zip(result.fields.channels, own.tolist(), strict=False):
+        beacons[name] = beacons.get(name, 0.0) + freedom
+    return {name: freedom for name, freedom in beacons.items() if freedom > 0.0}
 
 
 def _among_all(

@@ -95,7 +95,8 @@ class EpochUpdate:
         """Judge a first state."""
         findings = Judgement(start.trust.reasons, turn=start.turn, shift=start.shift)
         self.gate.watch.begin(start.excluded, start.findings)
-        self.monitor.begin(start.state.time, findings, start.shared_offsets)
+        known = start.shared_offsets, start.noise_freedom
+        self.monitor.begin(start.state.time, findings, *known)
         self.score.begin(start.score, start.state.time)
         self.recovery.detected_at = start.state.time
         fitted = [f for f in start.trust.remarks if f.code == "fitted_line" and start.extra_lines]

@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtri, erfc
 
 from magfusion.estimation.data_checks.running import DecayingSums, nothing
+from magfusion.estimation.data_checks.statistics import largest_mean_square
 from magfusion.estimation.data_checks.steady_field import DOUBT, off_earth
 from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, State
 from magfusion.estimation.online_integrity.gate import Gate
@@ -42,10 +43,12 @@ PASSING = {
     "separation",
 }
 RESTARTS_MEMORY = 60.0  # s
-LEAST_EXCESS = 2.5  # mean square; the noise is tuned on only a few seconds of the start
+LEAST_EXCESS = 2.5  # mean square that is no doubt, however many epochs show it
+P_EXCESS = float(erfc(DOUBT / np.sqrt(2.0)))  # of a mean square by chance
 DETECTION_SIGMAS = 6.0
 BEYOND_HELP = 0.2  # rad; a bias that tilts the vertical more makes inflation useless
 TURN_INTERVAL = 1.0  # s; of a gyro bias, before the fields correct it
+LEAST_WORTH = 0.2  # epochs
 LEAST_GAIN = 0.05  # of a prior variance; a barely determined parameter does not move by itself
 OFTEN_REFUSED = 0.5  # of a beacon's epochs
 MANY_RESTARTS = 3.0
@@ -98,6 +101,7 @@ class OnlineMonitor:
     _began: float
     _beginning: Judgement
     _shared_offsets: dict[str, Array]
+    _noise_freedom: dict[str, float]
     _prior_at: float
     _prior: Judgement
 
@@ -111,20 +115,29 @@ class OnlineMonitor:
         self._began, self._prior_at, self._prior = 0.0, -np.inf, Judgement()
         self._beginning = Judgement()
         self._declared: Calibration | None = None
-        self._shared_offsets = {}
+        self._shared_offsets, self._noise_freedom = {}, {}
         self._shared_variance: Array | None = None
 
     # Input
 
-    def begin(self, time: float, findings: Judgement, shared_offsets: Mapping[str, Array]) -> None:
+    def begin(
+        self,
+        time: float,
+        findings: Judgement,
+        shared_offsets: Mapping[str, Array],
+        noise_freedom: Mapping[str, float],
+    ) -> None:
         """Start at a first state (s), with the judgement of the smoothed beginning.
 
         Parameters
         ----------
         shared_offsets : mapping of str to ndarray
             Variance of estimated parameters that is due to considered ones.
+        noise_freedom : mapping of str to float
+            Degrees of freedom of each beacon's estimated noise; one without is known.
         """
         self._began, self._beginning, self._shared_offsets = time, findings, dict(shared_offsets)
+        self._noise_freedom = dict(noise_freedom)
         self._shared_variance = None
 
     def update(self, state: State, gate: Gate, epoch: EpochSummary) -> None:
@@ -246,7 +259,8 @@ class OnlineMonitor:
         result, inflation = [], 1.0
         for name, level in self._level.items():
             mean, worth = float(level.mean[0]), level.count / self._repeats
-            limit = 1.0 + DOUBT * np.sqrt(2.0 / (6.0 * self.channels[name] * max(worth, 0.2)))
+            freedom = 6.0 * self.channels[name] * max(worth, LEAST_WORTH)
+            limit = largest_mean_square(P_EXCESS, freedom, self._noise_freedom.get(name, np.inf))
             limit = max(limit, LEAST_EXCESS)
             if mean > limit:
                 inflation = max(inflation, self._repeats * mean)

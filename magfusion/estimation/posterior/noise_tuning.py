@@ -35,7 +35,8 @@ OF_IMU = ("gyro_noise", "accel_noise")  # a beacon may be called "imu", too
 OF_MOTION = {"angular_accel_density": "gyro_bias_walk", "accel_density": "accel_noise"}
 WALK = slice(12, 15)
 PLAUSIBLE = 6.0  # by a larger factor, either way, white noise is a fault
-DRAWN_EPOCHS = 128  # of drawn errors, of fewer several: else the noise of the shares prevails
+DRAWN_EPOCHS = 2048  # of drawn errors; of few, their own noise is in the tuned noise
+MAX_DRAWS = 16
 MIN_REMAINING = 1e-3  # of an error; a smaller remainder is not informative
 
 
@@ -131,7 +132,7 @@ def tune(
     considered : tuple of Block
         Parameters that are not estimated: the effect of their errors on residuals is no noise.
     """
-    draws = max(1, -(-DRAWN_EPOCHS // len(samples)))
+    draws = int(np.clip(DRAWN_EPOCHS // len(samples), 1, MAX_DRAWS))
     system = ResidualProjection(graph, estimate, samples, poses, windows, considered, draws=draws)
     now = estimate.calibration.site
     lag = max(1, round(windows))

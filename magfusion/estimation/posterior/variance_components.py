@@ -5,7 +5,7 @@ place.  Its smoothness is not declared; so a rough and a smooth kind are separat
 change from epoch to epoch, and both together have the declared size as their prior.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple
@@ -14,11 +14,12 @@ import numpy as np
 
 from magfusion.estimation.posterior.residual_redundancy import ChannelErrors
 from magfusion.estimation.solve.bounded import minimise_curved
-from magfusion.units import Array
+from magfusion.units import Array, IntArray
 
 PRIOR = float(np.log(2.0))  # of the logarithm of a declared sigma
 MIN_FACTOR, MAX_FACTOR = 0.1, 1e3  # of a factor; no log can determine a smaller noise
 COMPONENTS = 6  # of a residual
+DRAWN_BLOCKS = 16  # drawn errors of a stretch with one share
 STUDENT = 4.0  # degrees of freedom: faults have little weight
 # Gain, by components, with which that distribution finds the variance of normal residuals.
 NORMAL = {3: 1.322946, 6: 1.224631}
@@ -85,15 +86,13 @@ def parts_of(
     """
     fitted = _fitted(beacons, shared_by, lag)
     bent = [k for k, (log, _) in enumerate(fitted) if len(log) and beacons[k].bent]
-    drawn = [(k, one) for k in bent for one in _drawn(beacons[k], *fitted[k])]
-    again: dict[int, list[Array]] = {k: [] for k in bent}
-    for (k, _), (log, _) in zip(drawn, _fitted([b for _, b in drawn], shared_by, lag), strict=True):
-        again[k].append(log[1:3])
+    drawn = [_drawn(beacons[k], *fitted[k]) for k in bent]
+    again = dict(zip(bent, _fitted(drawn, shared_by, lag), strict=True))
     result: list[BeaconParts | None] = []
     for k, (log, white) in enumerate(fitted):
         if k in again:
             model, smooth = _total(log), float(np.exp(2.0 * (log[2] - _logarithm(log[1:3]))))
-            selected = float(np.exp(np.mean([_logarithm(own) for own in again[k]]))) / model
+            selected = _total(again[k][0]) / model
             result.append(BeaconParts(beacons[k].sizes, white, model, smooth, selected))
         else:
             result.append(BeaconParts(beacons[k].sizes, white) if len(log) else None)
@@ -109,20 +108,17 @@ def _logarithm(log: Array) -> float:
     return float(0.5 * np.logaddexp.reduce(2.0 * log))
 
 
-def _drawn(beacon: BeaconErrors, log: Array, white: float) -> Iterator[BeaconErrors]:
-    """Yield drawn errors of these sizes in place of the residuals."""
+def _drawn(beacon: BeaconErrors, log: Array, white: float) -> BeaconErrors:
+    """Return the first drawn errors, of these sizes, in place of the residuals."""
     of_noise, usual = white * beacon.sizes[0], beacon.sizes[1]
     of_rough, of_smooth = np.exp(log[1:3]) * usual
-    errors = []
+    drawn = []
     for own in beacon.channels:
-        noise, rough, smooth, inertial = own.residuals
+        noise, rough, smooth, inertial = (part[:, :COMPONENTS] for part in own.residuals)
         size, model = own.size
         bent = (of_rough * rough + of_smooth * smooth) / model
-        errors.append(of_noise / size * noise + bent + inertial)
-    for draw in range(0, errors[0].shape[1], COMPONENTS):
-        seen = [error[:, draw : draw + COMPONENTS] for error in errors]
-        channels = [replace(a, seen=b) for a, b in zip(beacon.channels, seen, strict=True)]
-        yield replace(beacon, channels=channels)
+        drawn.append(replace(own, seen=of_noise / size * noise + bent + inertial))
+    return replace(beacon, channels=drawn)
 
 
 def _fitted(
@@ -204,31 +200,57 @@ def by_scale(
     near : ndarray, shape (m,)
         Share that is independent, where model error prevails.
     """
-    every, seen, residual, given, near = _haar(SCALES), [], [], [], []
+    every, seen, parts, near = _haar(SCALES), [], [], []
     for own in channels:
         used = len(own.seen) // (SCALES * lag) * SCALES * lag
-        shape = (-1, SCALES, lag)
+        shape, draws = (-1, SCALES, lag), own.residuals[0].shape[1] // COMPONENTS
         squares = []
         for v in (own.seen, *own.residuals):
             rows = np.einsum("hs,bslk->hblk", every, v[:used].reshape(*shape, v.shape[1]))
-            draws = v.shape[1] / COMPONENTS
-            squares.append(np.sum(rows**2, axis=3).reshape(SCALES, -1) / draws)
+            squares.append(np.sum(rows**2, axis=3).reshape(SCALES, -1))
         seen.append(squares[0])
-        residual.append(np.stack(squares[1:]))
-        given.append([np.mean(v[:used].reshape(shape), axis=1).ravel() for v in own.variance])
+        given = [np.mean(v[:used].reshape(shape), axis=1).ravel() for v in own.variance]
+        parts.append(_expected(np.stack(squares[1:]) / draws, np.array(given), own.size, draws))
         close = np.mean(shared_by[own.epoch][:used].reshape(shape), axis=1).ravel()
         near.append(np.minimum(SCALES * lag / close, 1.0))
-    drawn = np.concatenate(given, axis=1)
-    # The effect of a wrong motion increases with the field, too.
-    drawn = np.stack([*drawn, drawn[1], drawn[1]])
-    noise, model = channels[0].size
-    total = np.array([noise, model, model, 1.0]) ** 2 * np.sum(drawn, axis=1)
-    kept = np.sum(np.concatenate(residual, axis=2), axis=2)
-    share = np.divide(kept, total[:, None], out=np.ones((4, SCALES)), where=total[:, None] > 0.0)
-    parts = share[:, :, None] * drawn[:, None] / 6.0
-    white = share[0][:, None] * drawn[1] / 6.0
-    expected = np.stack([*parts[:3], white, parts[3]]).reshape(5, -1)
+    expected = np.concatenate(parts, axis=2).reshape(5, -1)
     return np.concatenate(seen, axis=1).ravel(), expected, np.tile(np.concatenate(near), SCALES)
+
+
+def _expected(residual: Array, given: Array, size: tuple[float, float], draws: int) -> Array:
+    """Return the expected square of a component by each kind of error, (5, scales, blocks).
+
+    The share of an error in a scale depends on the motion: it is determined for each stretch of
+    as few blocks as the number of draws allows.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (4, scales, blocks)
+        Squares of the remainders of drawn errors, mean of the draws.
+    given : ndarray, shape (2, blocks)
+        Variance by noise and by a model error of size one.
+    size : tuple of float
+        Of the drawn noise and model error.
+    """
+    if residual.shape[2] == 0:
+        return np.zeros((5, SCALES, 0))
+    # The effect of a wrong motion increases with the field, too.
+    drawn = np.stack([*given, given[1], given[1]])
+    begin, stretch = _stretches(drawn.shape[1], draws)
+    total = np.array([size[0], size[1], size[1], 1.0]) ** 2
+    total = total[:, None, None] * np.add.reduceat(drawn, begin, axis=1)[:, None]
+    kept = np.add.reduceat(residual, begin, axis=2)
+    share = np.divide(kept, total, out=np.ones_like(kept), where=total > 0.0)[..., stretch]
+    parts = share * drawn[:, None] / COMPONENTS
+    white = share[0] * drawn[1] / COMPONENTS
+    return np.stack([*parts[:3], white, parts[3]])
+
+
+def _stretches(blocks: int, draws: int) -> tuple[IntArray, IntArray]:
+    """Return the first block of each stretch, and the stretch of each block."""
+    count = int(np.clip(blocks * draws // DRAWN_BLOCKS, 1, blocks))
+    stretch = np.arange(blocks) * count // blocks
+    return np.searchsorted(stretch, np.arange(count)), stretch
 
 
 @cache
