@@ -62,6 +62,38 @@ def test_its_size_is_found_whether_it_is_rough_or_smooth(smooth: bool, true: flo
     assert (np.mean(shares) > 0.5) == smooth
 
 
+def test_it_is_no_noise_where_a_platform_rests_and_runs() -> None:
+    """With one share of all speeds in each scale, the noise seemed up to three times as large."""
+    rng, draws, white, models = np.random.default_rng(6), 16, [], []
+    speed = np.repeat([0.0, 0.24, 0.0, 0.24], 40)  # m between epochs
+    for _ in range(12):
+        heading = np.cumsum(0.3 * rng.standard_normal((160, 3)), axis=0)
+        heading /= np.linalg.norm(heading, axis=1, keepdims=True)
+        place = np.cumsum(speed[:, None] * heading, axis=0)
+
+        def noise(size: float = 0.02) -> Array:
+            return size * rng.standard_normal((160, 6))
+
+        seen = errors(rng, place, smooth=True) + noise()
+        of_noise = np.hstack([noise() for _ in range(draws)])
+        rough, bent = (
+            np.hstack([errors(rng, place, smooth=kind) for _ in range(draws)])
+            for kind in (False, True)
+        )
+        remaining = of_noise, rough, bent, np.zeros_like(bent)
+        variance = np.full(160, 6 * 0.02**2), np.full(160, 6.0 / DECLARED**2)
+        own = ChannelErrors(np.arange(160), seen, remaining, variance, (1.0, DECLARED))
+        given = BeaconErrors([own], (1.0, DECLARED), bent=True)
+        parts = parts_of([given], epochs_sharing_error(place, LENGTH), 1)[0]
+        assert parts is not None
+        assert parts.model is not None
+        white.append(parts.white)
+        models.append(parts.model)
+    assert np.exp(np.mean(np.log(white))) == pytest.approx(1.0, rel=0.1)
+    assert max(white) < 1.5
+    assert np.exp(np.mean(np.log(models))) == pytest.approx(1.0, rel=0.25)
+
+
 def test_its_modes_are_what_bends_a_field() -> None:
     """By the simulator's own bending, which is a matrix of the place for each beacon."""
     site, rng = demo_site(coil_radius=None), np.random.default_rng(1)

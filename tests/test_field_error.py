@@ -9,7 +9,7 @@ from gtsam.symbol_shorthand import X
 from magfusion.estimation.batch.batch import SmootherSettings, smooth, solved_again
 from magfusion.estimation.graph.considered import responses
 from magfusion.estimation.graph.state import states_in
-from magfusion.estimation.measurements.field_error import modes_in_place
+from magfusion.estimation.measurements.field_error import largest_combinations, modes_in_place
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.model.noise import stacked
 from magfusion.model.parameters.parameter import PhasorView
@@ -43,6 +43,23 @@ def test_fewer_modes_are_those_with_most_variance() -> None:
     walk = np.cumsum(0.05 * rng.standard_normal((300, 3)), axis=0)
     few, more = (np.sum(modes_in_place(walk, LENGTH, n) ** 2) for n in (3, 9))
     assert 0.2 * 300 < few < more < 300.0
+
+
+def test_combinations_are_all_that_bends_more_than_independent_errors() -> None:
+    """Against the covariance of the bent field itself, in which matrix and field are multiplied."""
+    rng = np.random.default_rng(7)
+    walk = np.cumsum(0.1 * rng.standard_normal((120, 3)), axis=0)
+    field_world = np.cumsum(0.2 * rng.standard_normal((120, 1, 1, 3)), axis=0) * (1.0 + 0.0j)
+    modes = modes_in_place(walk, LENGTH, 120)
+    combine = largest_combinations(modes[:, None], field_world, 1000)
+    unit = field_world[:, 0, 0].real
+    unit *= np.sqrt(2.0) / np.linalg.norm(unit, axis=1, keepdims=True)
+    value = np.linalg.eigvalsh((modes @ modes.T) * (unit @ unit.T))[::-1]
+    kept = np.einsum("nm,nj,mjk->nk", modes, unit, combine)
+    assert combine.shape == (modes.shape[1], 3, np.sum(value > 1.0))
+    assert np.sum(kept**2, axis=0) == pytest.approx(value[value > 1.0], rel=1e-9)
+    few = largest_combinations(modes[:, None], field_world, 4)
+    assert np.allclose(few, combine[..., :4], rtol=0.0, atol=1e-12)
 
 
 def test_a_mode_moves_the_estimate_as_its_response_says() -> None:
