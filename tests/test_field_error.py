@@ -49,7 +49,8 @@ def test_combinations_are_all_that_bends_more_than_independent_errors() -> None:
     """Against the covariance of the bent field itself, in which matrix and field are multiplied."""
     rng = np.random.default_rng(7)
     walk = np.cumsum(0.1 * rng.standard_normal((120, 3)), axis=0)
-    field_world = np.cumsum(0.2 * rng.standard_normal((120, 1, 1, 3)), axis=0) * (1.0 + 0.0j)
+    path = np.cumsum(0.2 * rng.standard_normal((120, 1, 1, 3)), axis=0)
+    field_world = path.astype(np.complex128)
     modes = modes_in_place(walk, LENGTH, 120)
     combine = largest_combinations(modes[:, None], field_world, 1000)
     unit = field_world[:, 0, 0].real

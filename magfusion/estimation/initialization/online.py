@@ -300,12 +300,12 @@ def noise_freedom(result: Smoothed) -> dict[str, float]:
         return {}
     known = np.isfinite(result.residual).all(axis=2)
     channels = np.sum(known, axis=1, keepdims=True)
-    free = np.where(known, 6.0 * (1.0 - 1.0 / np.maximum(channels, 2)), 0.0)
-    own = np.sum(free, axis=0) / (overlap(result.fields) if len(known) > 1 else 1.0)
-    beacons: dict[str, float] = {}
-    for (name, _), freedom in zip(result.fields.channels, own.tolist(), strict=False):
-        beacons[name] = beacons.get(name, 0.0) + freedom
-    return {name: freedom for name, freedom in beacons.items() if freedom > 0.0}
+    each = np.where(known, 6.0 * (1.0 - 1.0 / np.maximum(channels, 2)), 0.0)
+    shared = overlap(result.fields) if len(result.fields) > 1 else 1.0
+    total: dict[str, float] = {}
+    for (name, _), own in zip(result.fields.channels, np.sum(each, axis=0).tolist(), strict=False):
+        total[name] = total.get(name, 0.0) + own / shared
+    return {name: freedom for name, freedom in total.items() if freedom > 0.0}
 
 
 def _among_all(

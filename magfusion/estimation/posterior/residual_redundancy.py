@@ -186,7 +186,7 @@ class ResidualProjection:
             rows = np.flatnonzero(self._samples.valid[:, channel])
             turn = self._world_from_sensor[rows, self._sensor[channel]]
             seen, noise, rough, smooth, inertial = (
-                _turned(e[rows, channel], turn) for e in (self._seen, *self._separate)
+                _rotated(e[rows, channel], turn) for e in (self._seen, *self._separate)
             )
             by_noise, by_model = (v[rows, channel] for v in self._variance)
             size = (float(self._size[0][beacon]), float(self._size[1][beacon]))
@@ -208,8 +208,8 @@ def _of_kinds(drawn: Array) -> Array:
     return drawn.reshape(KINDS, len(drawn) // KINDS, *drawn.shape[1:])
 
 
-def _turned(parts: Array, turn: Array) -> Array:
-    """Return turned errors, shape (m, 6 * draws); given of shape (m, 6) or (m, draws, 6)."""
+def _rotated(parts: Array, turn: Array) -> Array:
+    """Return rotated errors, shape (m, 6 * draws); given of shape (m, 6) or (m, draws, 6)."""
     width = int(np.prod(parts.shape[1:]))
     vectors = parts.reshape(len(parts), width // 3, 3)
     return (vectors @ np.swapaxes(turn, 1, 2)).reshape(len(parts), width)
