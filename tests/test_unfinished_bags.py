@@ -86,6 +86,35 @@ def test_a_bag_that_is_cut_is_read_up_to_there(tmp_path: Path, kind: str) -> Non
     assert finding.text in figures["notes"]
 
 
+@pytest.mark.parametrize("metadata", [True, False])
+@pytest.mark.parametrize("damage", ["cut", "zeros"])
+def test_rows_of_a_damaged_database_are_read(
+    tmp_path: Path, damage: str, metadata: bool
+) -> None:
+    """As ``.recover`` of SQLite does: pages that are cut or overwritten lose their own rows."""
+    bag = write_bag(tmp_path / "run", SENSORS, StoragePlugin.SQLITE3)
+    path = bag / "run.db3"
+    content = path.read_bytes()
+    at = content.index(MEASURED[N // 2].tobytes())
+    page = at // 4096 * 4096
+    overwritten = content[:page] + bytes(4096) + content[page + 4096 :]
+    path.write_bytes(overwritten if damage == "zeros" else content[:at])
+    if not metadata:
+        (bag / "metadata.yaml").unlink()
+    log = open_log(bag)
+    np.testing.assert_array_equal(log.imu.gyro_body, GYRO)
+    assert log.waveform is not None
+    measured = log.waveform.measured_sensor
+    assert all((row == MEASURED).all(axis=1).any() for row in measured)
+    assert N // 2 - 12 <= len(measured) < N  # twelve messages a page
+    (finding,) = log.noticed
+    assert finding.code == "bag_damaged"
+    assert f"{N + len(measured)} messages in " in finding.text
+    by_import, figures = imported(tmp_path / "log", bag)
+    assert len(by_import.imu) == N
+    assert finding.text in figures["notes"]
+
+
 @pytest.mark.parametrize("kind", ["mcap", "zstd", "bag"])
 def test_a_bag_without_its_end_is_read_whole(tmp_path: Path, kind: str) -> None:
     path = _finished(tmp_path / "cut", kind)

@@ -44,7 +44,7 @@ class BagReader(AnyReader):
         Files that the recorder did not finish, by the place of their reader.
     damage : list of str
         Topics of which the messages that were read are fewer than the index counts: the library
-        passes over what it cannot read in a chunk.
+        passes over what it cannot read in a chunk; and databases of which some rows cannot be read.
     """
 
     unfinished: Mapping[int, Path] = {}
@@ -78,12 +78,13 @@ class BagReader(AnyReader):
             for one in chosen:
                 expected[one.topic] += one.msgcount
             place = ", ".join(str(reader.path) for reader in self.readers)
-            self.damage = [
+            lost = [
                 f"{place}: the file is damaged. {read[topic]} of {count} messages of {topic} are"
                 " read; the others are lost. Copy the file again."
                 for topic, count in expected.items()
                 if read[topic] < count
             ]
+            self.damage = list(dict.fromkeys([*self.damage, *lost]))
 
 
 @contextmanager
@@ -110,9 +111,15 @@ def open_bag(paths: Sequence[Path]) -> Iterator[BagReader]:
         readable = [file for path in paths for file in _readable(path)]
         copies = [copy.path for _, copy in readable]
         with BagReader(copies, default_typestore=get_typestore(Stores.LATEST)) as reader:
-            reader.unfinished = {
-                k: path for k, (path, copy) in enumerate(readable) if not copy.whole
-            }
+            cut = {k: path for k, (path, copy) in enumerate(readable) if not copy.whole}
+            reader.unfinished = {k: path for k, path in cut.items() if path.suffix != ".db3"}
+            reader.damage = [
+                f"{path}: the file is damaged. {reader.readers[k].message_count} messages in"
+                f" {reader.readers[k].duration * 1e-9:.4g} s are read; the others are lost. Copy"
+                " the file again."
+                for k, path in cut.items()
+                if path.suffix == ".db3"
+            ]
             yield reader
     except InputError:
         raise

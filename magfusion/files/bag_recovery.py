@@ -1,15 +1,18 @@
 """Bags that a recorder did not finish: a copy with all that is whole, for the library to read.
 
-What SQLite has in its log is merged by SQLite.  An MCAP file is closed after its last whole record,
-as ``mcap recover`` does, and the messages of ROS 1 get an index, as by ``rosbag reindex``.
+What SQLite has in its log is merged by SQLite, and of a damaged database the rows are copied that can
+be read, as by its ``.recover``.  An MCAP file is closed after its last whole record, as ``mcap
+recover`` does, and the messages of ROS 1 get an index, as by ``rosbag reindex``.
 """
 
 import io
+import os
 import shutil
 import sqlite3
 import struct
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,6 +30,7 @@ _NONE, _FOOTER, _CHUNK, _DATA_END = 0x00, 0x02, 0x06, 0x0F
 # Of a chunk, before the name of the compression: times, size and checksum of the records, and the
 # length of the name.
 _CHUNK_HEAD = struct.Struct("<QQQII")
+_MAX_ROWID = 2**63 - 1
 _ROS1 = b"#ROSBAG V2.0\n"
 _OF_MESSAGE, _OF_CHUNK, _OF_CONNECTION = b"\x02", b"\x05", b"\x07"
 
@@ -63,7 +67,8 @@ def _sidecars(path: Path) -> list[Path]:
 
 def _is_unfinished(path: Path) -> bool:
     if path.suffix == ".db3":
-        return bool(_sidecars(path))
+        stat = path.stat()
+        return bool(_sidecars(path)) or not _is_whole(path, stat.st_size, stat.st_mtime_ns)
     with path.open("rb") as file:
         if path.suffix == ".mcap":
             begins = file.read(len(_MCAP)) == _MCAP
@@ -88,14 +93,64 @@ def _recovered(path: Path, _size: int, _modified: int) -> Recovered:
     directory = TemporaryDirectory(prefix="magfusion-bag-")
     copy = Path(directory.name) / path.name.removesuffix(".active")
     if path.suffix == ".db3":
+        if not _sidecars(path):
+            _copy_rows(Path(shutil.copyfile(path, copy.with_suffix(".damaged"))), copy)
+            return Recovered(copy, False, directory)
         for file in (path, *_sidecars(path)):
             shutil.copyfile(file, copy.with_name(file.name))
-        with sqlite3.connect(copy) as database:
+        with closing(sqlite3.connect(copy)) as database:
             database.execute("PRAGMA journal_mode=DELETE")
-        database.close()
         return Recovered(copy, True, directory)
     (_close_mcap if path.suffix == ".mcap" else _index_ros1)(path, copy)
     return Recovered(copy, False, directory)
+
+
+@lru_cache
+def _is_whole(path: Path, _size: int, _modified: int) -> bool:
+    """Return whether no page of a database is cut or overwritten."""
+    try:
+        with closing(_opened(path)) as database:
+            return database.execute("PRAGMA quick_check(1)").fetchone() == ("ok",)
+    except sqlite3.DatabaseError:
+        return False
+
+
+def _opened(path: Path) -> sqlite3.Connection:
+    """Open a database for reading alone."""
+    return sqlite3.connect(f"{path.resolve().as_uri()}?immutable=1", uri=True)
+
+
+def _copy_rows(damaged: Path, copy: Path) -> None:
+    """Write a database with the rows that can be read of a damaged one, which loses a cut page."""
+    with closing(_opened(damaged)) as source:
+        (page,) = source.execute("PRAGMA page_size").fetchone()
+    os.truncate(damaged, damaged.stat().st_size // page * page)
+    with closing(_opened(damaged)) as source, closing(sqlite3.connect(copy)) as target:
+        source.execute("PRAGMA writable_schema = ON")  # of a file shorter than its header states
+        schema = "SELECT name, sql FROM sqlite_master WHERE type = 'table'"
+        for name, create in source.execute(schema).fetchall():
+            target.execute(create)
+            for row in _readable_rows(source, name):
+                places = ", ".join("?" * len(row))
+                target.execute(f'INSERT OR IGNORE INTO "{name}" VALUES ({places})', row)
+        target.commit()
+
+
+def _readable_rows(source: sqlite3.Connection, table: str) -> Iterator[tuple[object, ...]]:
+    """Yield the rows of a table; where one cannot be read, a growing number is passed over."""
+    last, step = -1, 1
+    while last < _MAX_ROWID:
+        try:
+            rows = source.execute(
+                f'SELECT rowid, * FROM "{table}" WHERE rowid > ? ORDER BY rowid', (last,)
+            )
+            for number, *row in rows:
+                if number > last:  # else of a page that is cut, and has zeros there
+                    yield tuple(row)
+                    last, step = number, 1
+            return
+        except sqlite3.DatabaseError:
+            last, step = last + step, 2 * step
 
 
 def _decompressed(data: bytes, compression: str) -> bytes:
