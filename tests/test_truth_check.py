@@ -78,6 +78,29 @@ def test_a_wrong_truth_is_reported_with_its_cause(
     assert re.search(cause, finding.text)
 
 
+@pytest.mark.parametrize("late", [0.15, -0.06, 0.6])
+def test_a_late_truth_is_reported_with_its_delay(recorded: Log, late: float) -> None:
+    truth = recorded.truth
+    assert truth is not None
+    poses = replace(truth, time=truth.time + late)
+    (finding,) = truth_findings(replace(recorded, truth=poses))
+    word = "late" if late > 0.0 else "early"
+    found = re.search(rf"(\d+) ms {word}", finding.text)
+    assert found is not None
+    assert abs(1e-3 * float(found[1]) - abs(late)) < 0.015  # the search's step
+    assert f"--offset truth={-late:.2f}"[:-1] in finding.text
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_mirrored_positions_are_reported(recorded: Log, axis: int) -> None:
+    truth = recorded.truth
+    assert truth is not None
+    mirrored = truth.position_world * np.where(np.arange(3) == axis, -1.0, 1.0)
+    poses = Trajectory(truth.time, truth.world_from_body, mirrored)
+    (finding,) = truth_findings(replace(recorded, truth=poses))
+    assert f"mirrored along {'xyz'[axis]}" in finding.text
+
+
 @pytest.mark.parametrize("every", [1, 20, 40])
 def test_a_right_truth_of_any_rate_is_not_reported(recorded: Log, every: int) -> None:
     truth = recorded.truth

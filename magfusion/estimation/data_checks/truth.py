@@ -1,4 +1,4 @@
-"""Check of a truth with the rotation of the gyroscope and the direction of gravity.
+"""Check of a truth with the gyroscope, the specific force and the direction of gravity.
 
 A truth is no part of an estimate: what is wrong with it is a remark that explains the errors.
 """
@@ -6,7 +6,8 @@ A truth is no part of an estimate: what is wrong with it is a remark that explai
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.integrate import cumulative_trapezoid
+from scipy.spatial.transform import Rotation, Slerp
 
 from magfusion.model.samples import Log
 from magfusion.model.strapdown import attitude_from_gyro_at
@@ -26,6 +27,10 @@ MAX_TILT = 5.0 * DEGREE  # of the mean specific force; accelerometers and motion
 DOWN = 150.0 * DEGREE
 DOWN_AXES = np.diag([1.0, -1.0, -1.0])
 CONVENTION = 15.0 * DEGREE  # from the axes of a convention
+MAX_DELAY, DELAY_STEP = 1.0, 0.01  # s; searched either way, and in steps
+LEAST_DELAY = 0.03  # s; filters of gyroscopes delay by less
+EXPLAINED = 0.5  # of the squared errors that a delay leaves
+MIRRORED = 0.3  # of the squared errors of right-handed axes, which mirrored ones leave
 # The components w, x, y, z that are meant, by their places among those that were read.
 ORDERS = {
     "w, x, y, z read as x, y, z, w": (1, 2, 3, 0),
@@ -46,11 +51,11 @@ def truth_findings(log: Log) -> Iterator[Finding]:
     turn = attitude_from_gyro_at(log.imu.time, log.imu.gyro_body, poses.time)
     if len(rows) >= MIN_SPANS:
         gyro = (turn[rows[:, 0]].inv() * turn[rows[:, 1]]).as_rotvec()
-        text = _rotation_text(poses.rotation, rows, gyro)
+        text = _delay_text(log, poses, rows) or _rotation_text(poses.rotation, rows, gyro)
         if text:
             yield _finding(text)
             return
-    text = _gravity_text(log, poses)
+    text = _gravity_text(log, poses) or _mirrored_text(log, poses, rows)
     if text:
         yield _finding(text)
 
@@ -74,6 +79,72 @@ def _spans(time: Array) -> IntArray:
     first = np.flatnonzero(after < len(time))
     pairs = np.stack([first, after[first]], axis=1)
     return pairs[time[pairs[:, 1]] - time[pairs[:, 0]] < MAX_GAP]
+
+
+def _delay_text(log: Log, truth: Trajectory, rows: IntArray) -> str:
+    """Return by how much the truth's clock is late, where that makes its turn the gyroscope's."""
+    time, gyro = log.imu.time, log.imu.gyro_body
+    begin, end = truth.time[rows].T
+    inside = (begin > time[0] + MAX_DELAY) & (end < time[-1] - MAX_DELAY)
+    rows, begin, end = rows[inside], begin[inside], end[inside]
+    if len(rows) < MIN_SPANS:
+        return ""
+    angle = cumulative_trapezoid(gyro, time, axis=0, initial=0.0)
+    change = np.linalg.norm(_changes(truth.rotation, rows), axis=1)
+    delays = np.arange(-MAX_DELAY, MAX_DELAY + 0.5 * DELAY_STEP, DELAY_STEP)
+    errors = np.empty(len(delays))
+    for k, delay in enumerate(delays):
+        turn = [
+            np.interp(end - delay, time, axis) - np.interp(begin - delay, time, axis)
+            for axis in angle.T
+        ]
+        errors[k] = np.mean((change - np.linalg.norm(turn, axis=0)) ** 2)
+    best = int(np.argmin(errors))
+    delay, now = float(delays[best]), errors[len(delays) // 2]
+    if abs(delay) < LEAST_DELAY or abs(delay) > MAX_DELAY - DELAY_STEP:
+        return ""
+    if errors[best] > EXPLAINED * now or now - errors[best] < np.var(change) / len(rows):
+        return ""
+    return (
+        f"its clock is {1e3 * abs(delay):.0f} ms {'late' if delay > 0.0 else 'early'} against the"
+        f" gyroscope. Import it with --offset truth={-delay:.2f}, or evaluate with --align-time."
+    )
+
+
+def _mirrored_text(log: Log, truth: Trajectory, rows: IntArray) -> str:
+    """Return whether its positions accelerate as the mirror image of the specific force."""
+    if not truth.has_position:
+        return ""
+    imu, known = log.imu, truth.time
+    between = (imu.time >= known[0]) & (imu.time <= known[-1])
+    time = imu.time[between]
+    force = Slerp(known, truth.rotation)(time).apply(imu.accel_body[between])
+    path = force - force.mean(axis=0)
+    for _ in range(2):
+        path = cumulative_trapezoid(path, time, axis=0, initial=0.0)
+    inertial = np.stack([np.interp(known, time, axis) for axis in path.T], axis=1)
+    length = int(np.median(rows[:, 1] - rows[:, 0]))
+    span = known[2 * length :] - known[: -2 * length]
+    even = np.abs(span - np.median(span)) < 0.01 * SPAN
+    if np.sum(even) < MIN_SPANS:
+        return ""
+    bends = (
+        p[2 * length :] - 2.0 * p[length:-length] + p[: -2 * length]
+        for p in (truth.position_world, inertial)
+    )
+    moved, expected = (bend[even] - bend[even].mean(axis=0) for bend in bends)
+    left, size, right = np.linalg.svd(moved.T @ expected)
+    hand = float(np.sign(np.linalg.det(left @ right)))
+    total = np.sum(moved**2) + np.sum(expected**2)
+    mirrored, proper = (total - 2.0 * (size[0] + size[1] + sign * size[2]) for sign in (1.0, -1.0))
+    if hand > 0.0 or mirrored > MIRRORED * proper:
+        return ""
+    axes = left @ right
+    axis = "xyz"[int(np.argmin(np.diag(axes)))]
+    return (
+        f"its positions are mirrored along {axis}: they accelerate as a left-handed copy of the"
+        f" specific force. Change the sign of its {axis}, e.g. by --map."
+    )
 
 
 def _rotation_text(attitude: Rotation, rows: IntArray, gyro: Array) -> str:
