@@ -30,7 +30,7 @@ CONVENTION = 15.0 * DEGREE  # from the axes of a convention
 MAX_DELAY, DELAY_STEP = 1.0, 0.01  # s; searched either way, and in steps
 LEAST_DELAY = 0.03  # s; filters of gyroscopes delay by less
 EXPLAINED = 0.5  # of the squared errors that a delay leaves
-MIRRORED = 0.3  # of the squared errors of right-handed axes, which mirrored ones leave
+MIN_CORRELATION = 0.8  # of accelerations along the axis of least motion; noise has none
 # The components w, x, y, z that are meant, by their places among those that were read.
 ORDERS = {
     "w, x, y, z read as x, y, z, w": (1, 2, 3, 0),
@@ -87,27 +87,30 @@ def _delay_text(log: Log, truth: Trajectory, rows: IntArray) -> str:
     begin, end = truth.time[rows].T
     inside = (begin > time[0] + MAX_DELAY) & (end < time[-1] - MAX_DELAY)
     rows, begin, end = rows[inside], begin[inside], end[inside]
-    if len(rows) < MIN_SPANS:
+    if len(rows) < MIN_SPANS or end[-1] - begin[0] < MIN_SPANS * SPAN:
         return ""
     angle = cumulative_trapezoid(gyro, time, axis=0, initial=0.0)
-    change = np.linalg.norm(_changes(truth.rotation, rows), axis=1)
+    change = _changes(truth.rotation, rows)
     delays = np.arange(-MAX_DELAY, MAX_DELAY + 0.5 * DELAY_STEP, DELAY_STEP)
     errors = np.empty(len(delays))
     for k, delay in enumerate(delays):
-        turn = [
+        turn = (
             np.interp(end - delay, time, axis) - np.interp(begin - delay, time, axis)
             for axis in angle.T
-        ]
-        errors[k] = np.mean((change - np.linalg.norm(turn, axis=0)) ** 2)
-    best = int(np.argmin(errors))
-    delay, now = float(delays[best]), errors[len(delays) // 2]
+        )
+        off = change - np.stack(list(turn), axis=1)
+        errors[k] = np.mean(np.var(off, axis=0))  # a bias of the gyroscope is the mean
+    best, now = int(np.argmin(errors)), errors[len(delays) // 2]
+    before, least, after = errors[np.clip([best - 1, best, best + 1], 0, len(delays) - 1)]
+    bend = max(before - 2.0 * least + after, 1e-30)
+    delay = float(delays[best] + 0.5 * DELAY_STEP * (before - after) / bend)
     if abs(delay) < LEAST_DELAY or abs(delay) > MAX_DELAY - DELAY_STEP:
         return ""
-    if errors[best] > EXPLAINED * now or now - errors[best] < np.var(change) / len(rows):
+    if least > EXPLAINED * now or now - least < np.var(change) / len(rows):
         return ""
     return (
         f"its clock is {1e3 * abs(delay):.0f} ms {'late' if delay > 0.0 else 'early'} against the"
-        f" gyroscope. Import it with --offset truth={-delay:.2f}, or evaluate with --align-time."
+        f" gyroscope. Import it with --offset truth={-delay:.3f}, or evaluate with --align-time."
     )
 
 
@@ -126,7 +129,7 @@ def _mirrored_text(log: Log, truth: Trajectory, rows: IntArray) -> str:
     length = int(np.median(rows[:, 1] - rows[:, 0]))
     span = known[2 * length :] - known[: -2 * length]
     even = np.abs(span - np.median(span)) < 0.01 * SPAN
-    if np.sum(even) < MIN_SPANS:
+    if np.sum(even) < MIN_SPANS or known[-1] - known[0] < MIN_SPANS * SPAN:
         return ""
     bends = (
         p[2 * length :] - 2.0 * p[length:-length] + p[: -2 * length]
@@ -134,12 +137,10 @@ def _mirrored_text(log: Log, truth: Trajectory, rows: IntArray) -> str:
     )
     moved, expected = (bend[even] - bend[even].mean(axis=0) for bend in bends)
     left, size, right = np.linalg.svd(moved.T @ expected)
-    hand = float(np.sign(np.linalg.det(left @ right)))
-    total = np.sum(moved**2) + np.sum(expected**2)
-    mirrored, proper = (total - 2.0 * (size[0] + size[1] + sign * size[2]) for sign in (1.0, -1.0))
-    if hand > 0.0 or mirrored > MIRRORED * proper:
-        return ""
     axes = left @ right
+    norms = np.linalg.norm(moved @ left[:, 2]) * np.linalg.norm(expected @ right[2])
+    if np.linalg.det(axes) > 0.0 or size[2] < MIN_CORRELATION * norms:
+        return ""
     axis = "xyz"[int(np.argmin(np.diag(axes)))]
     return (
         f"its positions are mirrored along {axis}: they accelerate as a left-handed copy of the"
