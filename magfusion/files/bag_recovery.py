@@ -1,7 +1,7 @@
 """Bags that a recorder did not finish: a copy with all that is whole, for the library to read.
 
-What SQLite has in its log is merged by SQLite, and of a damaged database the rows are copied that can
-be read, as by its ``.recover``.  An MCAP file is closed after its last whole record, as ``mcap
+What SQLite has in its log is merged by SQLite, and of a damaged database the rows are copied that
+can be read, as by its ``.recover``.  An MCAP file is closed after its last whole record, as ``mcap
 recover`` does, and the messages of ROS 1 get an index, as by ``rosbag reindex``.
 """
 

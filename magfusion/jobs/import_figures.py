@@ -62,6 +62,12 @@ def import_figures(
     notes += filter(None, remarks)
     notes += [f"{stream}: {one.batches}" for stream, one in counts.items() if one.batches]
     notes += [
+        f"{stream}: its times wrap as a counter of 32 bits does; they go on by"
+        f" {one.wrapped * NANOSECOND:.6g} s."
+        for stream, one in counts.items()
+        if one.wrapped
+    ]
+    notes += [
         f"{stream}: quaternions up to {100.0 * one.scaled:.2g} % off were scaled to unit length."
         for stream, one in counts.items()
         if one.scaled > QUATERNION_TOLERANCE

@@ -9,11 +9,10 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.estimation.data_checks.stream_buffer import LARGEST_JUMP
 from magfusion.files.records import Record
+from magfusion.model.counters import lost_by_wrapping
 from magfusion.units import Array
 
 LEAST_STEP = 1.0  # s back; a network delays a record by less
-PERIODS = (2.0**32 * 1e-6, 2.0**32 * 1e-3)  # s; of counters of microseconds and milliseconds
-NEAR_END = 1.0  # s; of a counter's period, before and after it wraps
 
 
 class ClockJump(InputError):
@@ -73,21 +72,23 @@ class StreamClocks:
             names = [name for name in ("time", "start", "end") if hasattr(part, name)]
             if not names or not np.size(getattr(part, names[0])):
                 continue
-            wrapped = self._wrapped(_name(record, kind), np.atleast_1d(getattr(part, names[0])))
-            if wrapped:
-                stamps = {name: getattr(part, name) + wrapped for name in names}
+            times = np.atleast_1d(getattr(part, names[0]))
+            wrapped = self._wrapped(_name(record, kind), times)
+            if np.any(wrapped):
+                lost = wrapped if np.ndim(getattr(part, names[0])) else float(wrapped[0])
+                stamps = {name: getattr(part, name) + lost for name in names}
                 changed[kind] = part.model_copy(update=stamps)
         return record.model_copy(update=changed) if changed else record
 
-    def _wrapped(self, name: str, times: Array) -> float:
-        """Return what a stream's counter has lost by wrapping (s)."""
-        clock = self._of(name)
-        for period in PERIODS:
-            near = abs((clock.last_stamp + 0.5 * period) % period - 0.5 * period) < NEAR_END
-            if near and abs(float(times[0]) + clock.wrapped - clock.last_stamp + period) < NEAR_END:
-                clock.wrapped += period
-        clock.last_stamp = float(np.max(times)) + clock.wrapped
-        return clock.wrapped
+    def _wrapped(self, name: str, times: Array) -> Array:
+        """Return what a stream's counter has lost by wrapping (s), at each of its stamps."""
+        new, clock = name not in self._clocks, self._of(name)
+        if new:  # the counter is that of the other streams
+            other = max(self._clocks.values(), key=lambda one: one.last_stamp)
+            clock.last_stamp, clock.wrapped = other.last_stamp, other.wrapped
+        lost = lost_by_wrapping(times, clock.last_stamp - clock.wrapped, clock.wrapped)
+        clock.last_stamp, clock.wrapped = float(times[-1] + lost[-1]), float(lost[-1])
+        return lost
 
     def step_in(self, record: Record) -> ClockStep | None:
         """Return the step of a stream's clock: it is seen in the second record after it."""

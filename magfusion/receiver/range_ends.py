@@ -43,7 +43,8 @@ class RangeEnds:
 
 def still(waveform: Waveform, first: IntArray, last: IntArray) -> BoolArray:
     """Return in which windows all samples are equal; arguments as of `saturated`."""
-    changes = np.concatenate([[0], np.cumsum(_changed(waveform.measured_sensor))])
+    # An empty window may begin behind the last sample.
+    changes = np.concatenate([[0], np.cumsum(_changed(waveform.measured_sensor)), [-1]])
     fixed = changes[np.maximum(last - 1, first)] == changes[first]
     return np.asarray(fixed & (last > first + 1))
 

@@ -40,7 +40,7 @@ class RunningEstimate:
     """
 
     update: EpochUpdate
-    _white: list[float]
+    _white: tuple[float, float]
     _early: list[UserFactors]
 
     def __init__(self, site: Site, settings: NavigatorSettings) -> None:
@@ -58,7 +58,7 @@ class RunningEstimate:
         of_site = site, self.estimated, self.blocks
         self.update = EpochUpdate(*of_site, settings.earth, settings.lost_beyond, bank)
         self.process_noise = calibration_process_noise(site, self.blocks, self._considered)
-        self._white = [site.platform.imu.gyro_noise, site.platform.imu.accel_noise]
+        self._white = (site.platform.imu.gyro_noise, site.platform.imu.accel_noise)
         self._early = []
 
     @property
@@ -69,7 +69,7 @@ class RunningEstimate:
     def begin(self, start: OnlineStart, imu: InertialStream) -> None:
         """Start the estimator at a first state, with the white noise that the samples show."""
         model, _ = measured_noise(imu.measured(), self.site.platform.imu)
-        self._white = [model.gyro_noise, model.accel_noise]
+        self._white = (model.gyro_noise, model.accel_noise)
         self.start_at(start.state)
 
     def start_at(self, state: State) -> None:

@@ -25,6 +25,7 @@ from magfusion.files.stray_stamps import (
 )
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, ROWS_PER_GROUP
 from magfusion.files.table import TIME as TIME_NS
+from magfusion.model.counters import lost_by_wrapping
 from magfusion.units import NANOSECOND, AnyArray, Array, BoolArray, IntArray
 
 MOST_BACK = 1.0  # s; further back, a clock was set or wrapped around
@@ -58,6 +59,8 @@ class Counts:
         What became of samples of which several have one stamp; empty where none did.
     first, last : int
         Stamps (ns).
+    newest, wrapped : int
+        Stamp of the last row that was read, and what its counter lost by wrapping until then (ns).
     """
 
     read: int = 0
@@ -70,6 +73,8 @@ class Counts:
     left_out: dict[str, int] = field(default_factory=dict)
     first: int = LARGEST_TIME_NS
     last: int = -LARGEST_TIME_NS
+    newest: int = -LARGEST_TIME_NS
+    wrapped: int = 0
 
     def leave_out(self, reason: str, count: int) -> None:
         """Count rows that are not written."""
@@ -211,6 +216,7 @@ def _kept(
         keep &= ~missing
         if QUATERNION[0] in names:
             keep &= _is_rotation(values, [names.index(q) for q in QUATERNION], keep, counts)
+    stamps = _unwrapped(stamps, keep, counts)
     keep[keep] = ~_strays(plan.stream, stamps[keep], counts)
     stamps, values, rows, missing = stamps[keep], values[keep], rows[keep], missing[keep]
     if not len(stamps):
@@ -244,6 +250,19 @@ def _is_rotation(values: Array, places: list[int], rows: BoolArray, counts: Coun
     values[np.ix_(good, places)] /= length[good, None]
     counts.scaled = max(counts.scaled, float(np.max(np.abs(length[good] - 1.0), initial=0.0)))
     return good
+
+
+def _unwrapped(stamps: IntArray, rows: BoolArray, counts: Counts) -> IntArray:
+    """Return stamps (ns) that go on where a counter of 32 bits wraps; some rows have none."""
+    if not rows.any():
+        return stamps
+    seconds, last = stamps[rows] * NANOSECOND, (counts.newest - counts.wrapped) * NANOSECOND
+    before = -np.inf if counts.newest == -LARGEST_TIME_NS else last
+    lost = np.rint(lost_by_wrapping(seconds, before, counts.wrapped * NANOSECOND) / NANOSECOND)
+    result = stamps.copy()
+    result[rows] += lost.astype(np.int64)
+    counts.newest, counts.wrapped = int(result[rows][-1]), int(lost[-1])
+    return result
 
 
 def _strays(stream: str, stamps: IntArray, counts: Counts) -> BoolArray:

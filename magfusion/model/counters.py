@@ -1,0 +1,36 @@
+"""Counters of 32 bits as clocks: where they wrap, the stamps go on."""
+
+import numpy as np
+
+from magfusion.units import Array
+
+PERIODS = (2.0**32 * 1e-9, 2.0**32 * 1e-6, 2.0**32 * 1e-3)  # s; of nanoseconds and coarser units
+NEAR_END, NEAR_SHARE = 1.0, 0.05  # s, of a period, at most; before and after it wraps
+
+
+def lost_by_wrapping(raw: Array, last: float, wrapped: float) -> Array:
+    """Return what a counter has lost by wrapping (s), at each of its stamps.
+
+    Parameters
+    ----------
+    raw : ndarray, shape (n,)
+        Stamps (s).
+    last : float
+        The one before them; minus infinity before the first.
+    wrapped : float
+        What the counter had lost until then (s); a late stamp may be of before it wrapped.
+    """
+    step = np.diff(raw, prepend=last if np.isfinite(last) else raw[0])
+    result = np.full(len(raw), wrapped)
+    if not np.any(np.abs(step) > 0.5 * PERIODS[0]):
+        return result
+    for period in PERIODS:
+        near = min(NEAR_END, NEAR_SHARE * period)
+        from_end = np.abs((raw + 0.5 * period) % period - 0.5 * period)
+        turns = -np.round(step / period)
+        turns[(np.abs(turns) != 1.0) | (np.abs(step + turns * period) > near)] = 0.0
+        turns[from_end > near] = 0.0
+        lost = wrapped + period * np.cumsum(turns)
+        if np.any(turns) and np.min(lost) >= 0.0:
+            result = result + lost - wrapped
+    return result
