@@ -144,6 +144,13 @@ def test_one_false_inertial_sample_does_not_move_the_trajectory(stream: str) -> 
     assert trajectory_errors(corrupted.states, log.truth).ate < 1.2 * whole.ate + 2e-4  # m
 
 
+def test_of_two_false_samples_two_apart_both_are_left_out() -> None:
+    log, site = walked(), demo_site(coil_radius=None)
+    good = clean_log(with_spikes(log, "gyro", [900, 902], 35.0), site)
+    kept = np.delete(log.imu.time, [900, 902])
+    np.testing.assert_array_equal(good.imu.time, kept)
+
+
 def test_fast_motion_and_knocks_lose_nothing() -> None:
     log, site = walked(), demo_site(coil_radius=None)
     time, gyro, accel = log.imu.time, log.imu.gyro_body.copy(), log.imu.accel_body.copy()

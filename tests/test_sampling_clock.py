@@ -10,6 +10,7 @@ from spoiled_log import burst_stamps
 from magfusion.estimation.data_checks.stamps import timing, uneven_stamps
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.receiver.even_clocks import on_even_clocks
+from magfusion.model.batches import spread_batches
 from magfusion.receiver.sampling_clock import sampling_clock
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
@@ -186,3 +187,26 @@ def test_the_tones_tell_a_host_that_stamps_late_from_a_sampler_that_samples_unev
     np.testing.assert_array_equal(kept.waveform.time, at)
     assert not kept.clocks["magnetometer"].replaced
     assert on_even_clocks(log, site) is log
+
+
+@pytest.mark.parametrize("rate", [400.0, 600.0])
+def test_a_tenth_of_rounded_stamps_may_be_lost(rate: float) -> None:
+    rng = np.random.default_rng(11)
+    tick = np.flatnonzero(rng.random(8000) > 0.1)
+    clock = sampling_clock(np.round(tick / rate, 3))
+    assert clock is not None
+    assert clock.lost_count == tick[-1] - tick[0] + 1 - len(tick)
+    off = clock.time - tick / rate
+    assert np.std(off) < 0.25e-3  # s; of stamps .29 ms, of a wrong step .5 to .9 ms
+
+
+@pytest.mark.parametrize("size", [4, 8, 10])
+def test_rounded_stamps_of_batches_are_counted(size: int) -> None:
+    """Within a batch the steps are even; their error builds up over batches."""
+    time = np.arange(4000) / 333.0
+    last = np.append(np.arange(size - 1, len(time) - 1, size), len(time) - 1)
+    stamps = np.repeat(np.round(time[last], 3), np.diff(last, prepend=-1))
+    clock = sampling_clock(spread_batches(stamps, last))
+    assert clock is not None
+    off = clock.time[size:] - time[size:]
+    assert np.max(np.abs(off - np.median(off))) < 0.05e-3  # s; of the stamps .5 ms

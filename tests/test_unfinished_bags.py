@@ -88,9 +88,7 @@ def test_a_bag_that_is_cut_is_read_up_to_there(tmp_path: Path, kind: str) -> Non
 
 @pytest.mark.parametrize("metadata", [True, False])
 @pytest.mark.parametrize("damage", ["cut", "zeros"])
-def test_rows_of_a_damaged_database_are_read(
-    tmp_path: Path, damage: str, metadata: bool
-) -> None:
+def test_rows_of_a_damaged_database_are_read(tmp_path: Path, damage: str, metadata: bool) -> None:
     """As ``.recover`` of SQLite does: pages that are cut or overwritten lose their own rows."""
     bag = write_bag(tmp_path / "run", SENSORS, StoragePlugin.SQLITE3)
     path = bag / "run.db3"

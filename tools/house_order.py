@@ -25,8 +25,8 @@ ROOMS = {
     wing: rooms.split()
     for wing, rooms in {
         "model": """
-            arguments batches check_distance correlation counters drive field_map fixed_axes groups hall
-            hermite imu_intrinsics marks perturbation physics platform_motion probe progress
+            arguments batches check_distance correlation counters drive field_map fixed_axes groups
+            hall hermite imu_intrinsics marks perturbation physics platform_motion probe progress
             quaternion region response rotor short_repr temperature time_division trust
             aiding beacon magnetometer
             site trajectory

@@ -22,7 +22,8 @@ GAP = 10.0  # steps
 LOSS = 8.0  # log-likelihood ratio that a lost sample costs
 MEMORY = 2000  # samples that predict the next ticks
 MOST_PIECES = 40  # used for the median step
-SEARCHED = 0.08  # of the median step, either way
+SEARCHED = 0.08  # of the median and of the mean step, either way
+MOST_LOST_SHARE = 0.2  # by which the mean step may be longer
 KNOT = 10.0  # s; a clock's rate changes more slowly
 MIN_SAMPLES = 50  # samples
 ROUNDED = 0.05  # of a step, by which the mean of rounded stamps differs from their median
@@ -135,9 +136,22 @@ def _scattered_clock(stamps: Array, rounding: float) -> SamplingClock | None:
 
 
 def is_even(stamps: Array, step: float) -> bool:
-    """Return whether stamps are whole steps apart."""
+    """Return whether stamps are whole steps apart, and stay so where none is lost."""
     whole = np.diff(stamps) / step
-    return bool(np.sqrt(np.mean((whole - np.round(whole)) ** 2)) < EVEN)
+    if not np.sqrt(np.mean((whole - np.round(whole)) ** 2)) < EVEN:
+        return False
+    count = len(stamps) // PIECE
+    complete = np.all(np.round(whole[: count * PIECE - 1]) == 1.0) if count else False
+    return not complete or bool(np.sqrt(np.mean(_off_lines(stamps) ** 2)) < EVEN * step)
+
+
+def _off_lines(stamps: Array) -> Array:
+    """Return the deviations of stamps from a straight line in each piece, shape (`PIECE`, m)."""
+    count = len(stamps) // PIECE
+    pieces = stamps[: count * PIECE].reshape(count, PIECE).T
+    pieces = pieces - pieces[0]
+    lines = np.polyfit(np.arange(PIECE), pieces, 1)
+    return np.asarray(pieces - np.outer(np.arange(PIECE), lines[0]) - lines[1])
 
 
 def _counted_step(stamps: Array) -> float | None:
@@ -150,11 +164,7 @@ def _counted_step(stamps: Array) -> float | None:
     mean = float(np.mean(steps[steps <= GAP * median]))
     if abs(mean - median) < ROUNDED * median:
         return None
-    count = len(stamps) // PIECE
-    pieces = stamps[: count * PIECE].reshape(count, PIECE).T
-    pieces = pieces - pieces[0]
-    lines = np.polyfit(np.arange(PIECE), pieces, 1)
-    off = pieces - np.outer(np.arange(PIECE), lines[0]) - lines[1]
+    off = _off_lines(stamps)
     rounding = min(stamp_resolution(stamps) or median, median)  # a loss is a whole step
     return mean if np.max(np.abs(off)) < MAX_ROUNDING_STEPS * rounding else None
 
@@ -171,7 +181,8 @@ def _usual_step(stamps: Array) -> float:
     count = len(stamps) // PIECE
     pieces = stamps[: count * PIECE].reshape(count, PIECE)[:MOST_PIECES]
     near = np.linspace(-SEARCHED, SEARCHED, 161)
-    tried = np.concatenate([median * (1.0 + near), mean * (1.0 + near)])
+    losing = np.linspace(-MOST_LOST_SHARE, SEARCHED, 281)
+    tried = np.concatenate([median * (1.0 + near), mean * (1.0 + losing)])
     for width in (0.1 * SEARCHED, 0.01 * SEARCHED, 0.0):
         kept = [float(np.sum(np.abs(_phasor(pieces, step)) ** 2)) for step in tried]
         usual = float(tried[int(np.argmax(kept))])

@@ -35,6 +35,8 @@ PILE = 5.0  # an extreme value this many times as frequent as its neighbours is 
 LEAST_PILE, LEAST_RUN = 12, 3  # samples at a limit, and of them in a row, at least once
 SPIKE, CERTAIN_SPIKE = 15.0, 50.0  # times the local scatter; the latter is no knock's
 LEAST_SPIKES, SPIKE_SHARE = 5, 2e-4  # fewer may be knocks
+# Deviations over the differences of the neighbours, and of all but an outer one that may be false.
+AGREEMENT, AGREEMENT_BUT_ONE = 3.0, 30.0
 EVEN_GAIN = 70.0**0.5 / 6.0  # of noise, in a sample less the cubic: weights -1, 4, 4, -1 sixths
 SMOOTH_TONE = 0.15  # cycles a sample; above, neighbours do not predict a sample
 BLOCK = 128  # samples in which the scatter is measured
@@ -318,13 +320,13 @@ def deviations(time: Array, x: Array, step: float) -> Deviations:
         curve += own[:, None] * x[at]
     before, after = x[near[1]], x[near[2]]
     centre = 0.5 * (before + after)
-    outer = np.maximum(np.abs(x[near[0]] - centre), np.abs(x[near[3]] - centre))
-    separate = np.maximum(np.abs(after - before), outer)
+    outer = np.abs(x[near[0]] - centre), np.abs(x[near[3]] - centre)
+    separate = np.maximum(np.abs(after - before), np.maximum(*outer))
+    others = np.maximum(np.abs(after - before), np.minimum(*outer))
     from_curve = np.abs(x - curve)
     off = np.minimum(from_curve, np.abs(x - centre))
-    return Deviations(
-        np.where(off > 3.0 * separate, off, 0.0), from_curve / noise, widening, centre
-    )
+    alone = (off > AGREEMENT * separate) | (off > AGREEMENT_BUT_ONE * others)
+    return Deviations(np.where(alone, off, 0.0), from_curve / noise, widening, centre)
 
 
 def _cubic(time: Array, near: list[IntArray], step: float) -> tuple[list[Array], Array, Array]:
