@@ -62,6 +62,7 @@ def test_its_size_is_found_whether_it_is_rough_or_smooth(smooth: bool, true: flo
     assert (np.mean(shares) > 0.5) == smooth
 
 
+@pytest.mark.slow
 def test_it_is_no_noise_where_a_platform_rests_and_runs() -> None:
     """With one share of all speeds in each scale, the noise seemed up to three times as large."""
     rng, draws, white, models = np.random.default_rng(6), 16, [], []
