@@ -8,9 +8,9 @@ import pytest
 from spoiled_log import burst_stamps
 
 from magfusion.estimation.data_checks.stamps import timing, uneven_stamps
+from magfusion.model.batches import spread_batches
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.receiver.even_clocks import on_even_clocks
-from magfusion.model.batches import spread_batches
 from magfusion.receiver.sampling_clock import sampling_clock
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log

@@ -78,13 +78,13 @@ class BagReader(AnyReader):
             for one in chosen:
                 expected[one.topic] += one.msgcount
             place = ", ".join(str(reader.path) for reader in self.readers)
-            lost = [
+            missing = [
                 f"{place}: the file is damaged. {read[topic]} of {count} messages of {topic} are"
                 " read; the others are lost. Copy the file again."
                 for topic, count in expected.items()
                 if read[topic] < count
             ]
-            self.damage = list(dict.fromkeys([*self.damage, *lost]))
+            self.damage = list(dict.fromkeys([*self.damage, *missing]))
 
 
 @contextmanager

@@ -75,8 +75,8 @@ class StreamClocks:
             times = np.atleast_1d(getattr(part, names[0]))
             wrapped = self._wrapped(_name(record, kind), times)
             if np.any(wrapped):
-                lost = wrapped if np.ndim(getattr(part, names[0])) else float(wrapped[0])
-                stamps = {name: getattr(part, name) + lost for name in names}
+                missing = wrapped if np.ndim(getattr(part, names[0])) else float(wrapped[0])
+                stamps = {name: getattr(part, name) + missing for name in names}
                 changed[kind] = part.model_copy(update=stamps)
         return record.model_copy(update=changed) if changed else record
 
@@ -86,9 +86,9 @@ class StreamClocks:
         if new:  # the counter is that of the other streams
             other = max(self._clocks.values(), key=lambda one: one.last_stamp)
             clock.last_stamp, clock.wrapped = other.last_stamp, other.wrapped
-        lost = lost_by_wrapping(times, clock.last_stamp - clock.wrapped, clock.wrapped)
-        clock.last_stamp, clock.wrapped = float(times[-1] + lost[-1]), float(lost[-1])
-        return lost
+        missing = lost_by_wrapping(times, clock.last_stamp - clock.wrapped, clock.wrapped)
+        clock.last_stamp, clock.wrapped = float(times[-1] + missing[-1]), float(missing[-1])
+        return missing
 
     def step_in(self, record: Record) -> ClockStep | None:
         """Return the step of a stream's clock: it is seen in the second record after it."""

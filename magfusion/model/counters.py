@@ -30,7 +30,7 @@ def lost_by_wrapping(raw: Array, last: float, wrapped: float) -> Array:
         turns = -np.round(step / period)
         turns[(np.abs(turns) != 1.0) | (np.abs(step + turns * period) > near)] = 0.0
         turns[from_end > near] = 0.0
-        lost = wrapped + period * np.cumsum(turns)
-        if np.any(turns) and np.min(lost) >= 0.0:
-            result = result + lost - wrapped
+        missing = wrapped + period * np.cumsum(turns)
+        if np.any(turns) and np.min(missing) >= 0.0:
+            result = result + missing - wrapped
     return result

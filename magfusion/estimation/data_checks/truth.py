@@ -136,9 +136,9 @@ def _mirrored_text(log: Log, truth: Trajectory, rows: IntArray) -> str:
         for p in (truth.position_world, inertial)
     )
     moved, expected = (bend[even] - bend[even].mean(axis=0) for bend in bends)
-    left, size, right = np.linalg.svd(moved.T @ expected)
-    axes = left @ right
-    norms = np.linalg.norm(moved @ left[:, 2]) * np.linalg.norm(expected @ right[2])
+    columns, size, rows_t = np.linalg.svd(moved.T @ expected)
+    axes = columns @ rows_t
+    norms = np.linalg.norm(moved @ columns[:, 2]) * np.linalg.norm(expected @ rows_t[2])
     if np.linalg.det(axes) > 0.0 or size[2] < MIN_CORRELATION * norms:
         return ""
     axis = "xyz"[int(np.argmin(np.diag(axes)))]

@@ -256,12 +256,13 @@ def _unwrapped(stamps: IntArray, rows: BoolArray, counts: Counts) -> IntArray:
     """Return stamps (ns) that go on where a counter of 32 bits wraps; some rows have none."""
     if not rows.any():
         return stamps
-    seconds, last = stamps[rows] * NANOSECOND, (counts.newest - counts.wrapped) * NANOSECOND
+    seconds: Array = np.asarray(stamps[rows] * NANOSECOND)
+    last = (counts.newest - counts.wrapped) * NANOSECOND
     before = -np.inf if counts.newest == -LARGEST_TIME_NS else last
-    lost = np.rint(lost_by_wrapping(seconds, before, counts.wrapped * NANOSECOND) / NANOSECOND)
+    missing = lost_by_wrapping(seconds, before, counts.wrapped * NANOSECOND) / NANOSECOND
     result = stamps.copy()
-    result[rows] += lost.astype(np.int64)
-    counts.newest, counts.wrapped = int(result[rows][-1]), int(lost[-1])
+    result[rows] += np.rint(missing).astype(np.int64)
+    counts.newest, counts.wrapped = int(result[rows][-1]), round(missing[-1])
     return result
 
 
