@@ -94,7 +94,11 @@ def _recovered(path: Path, _size: int, _modified: int) -> Recovered:
     copy = Path(directory.name) / path.name.removesuffix(".active")
     if path.suffix == ".db3":
         if not _sidecars(path):
-            _copy_rows(Path(shutil.copyfile(path, copy.with_suffix(".damaged"))), copy)
+            try:
+                _copy_rows(Path(shutil.copyfile(path, copy.with_suffix(".damaged"))), copy)
+            except sqlite3.DatabaseError:
+                directory.cleanup()
+                raise
             return Recovered(copy, False, directory)
         for file in (path, *_sidecars(path)):
             shutil.copyfile(file, copy.with_name(file.name))
@@ -134,6 +138,9 @@ def _copy_rows(damaged: Path, copy: Path) -> None:
                 places = ", ".join("?" * len(row))
                 target.execute(f'INSERT OR IGNORE INTO "{name}" VALUES ({places})', row)
         target.commit()
+        (messages,) = target.execute("SELECT COUNT(*) FROM messages").fetchone()
+        if not messages:
+            raise sqlite3.DatabaseError("none of its messages is whole")
 
 
 def _readable_rows(source: sqlite3.Connection, table: str) -> Iterator[tuple[object, ...]]:

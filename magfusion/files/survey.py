@@ -116,12 +116,12 @@ def read_survey(path: Path, list_of_poses: Path | None = None) -> Survey:
     pose = None if list_of_poses is not None else poses(table, path)
     values = ("amplitude",) if "amplitude" in table.column_names else _PHASOR
     number = {name: numbers(table, name, path) for name in (*values, "sigma")}
+    for name in {"amplitude", "sigma"} & number.keys():
+        refuse_rows(number[name] <= 0.0, path, f"column {name}", number[name], "a positive number")
     for name, value in number.items():
         large = np.abs(value) > Magnetometer.field_range
         wanted = f"a field in T, at most {Magnetometer.field_range:g}"
         refuse_rows(large, path, f"column {name}", value, wanted)
-    for name in {"amplitude", "sigma"} & number.keys():
-        refuse_rows(number[name] <= 0.0, path, f"column {name}", number[name], "a positive number")
     point, tone = (integers(table, name, path) for name in ("point", "tone"))
     refuse_rows(tone < 0, path, "column tone", tone, "an integer from 0")
     names = [str(name) for name in column(table, "beacon", path).to_pylist()]

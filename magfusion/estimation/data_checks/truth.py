@@ -116,10 +116,12 @@ def _delay_text(log: Log, truth: Trajectory, rows: IntArray) -> str:
 
 def _mirrored_text(log: Log, truth: Trajectory, rows: IntArray) -> str:
     """Return whether its positions accelerate as the mirror image of the specific force."""
-    if not truth.has_position:
+    if not truth.has_position or len(rows) < MIN_SPANS:
         return ""
     imu, known = log.imu, truth.time
     between = (imu.time >= known[0]) & (imu.time <= known[-1])
+    if not np.any(between):
+        return ""
     time = imu.time[between]
     force = Slerp(known, truth.rotation)(time).apply(imu.accel_body[between])
     path = force - force.mean(axis=0)
