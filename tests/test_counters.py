@@ -26,3 +26,8 @@ def test_a_late_stamp_is_of_before_the_counter_wrapped() -> None:
 def test_a_step_of_a_clock_is_none_of_a_counter(step: float) -> None:
     raw = 1.7e9 + np.array([0.0, 0.01, 0.02 + step, 0.03 + step])
     assert not np.any(lost_by_wrapping(raw, -np.inf, 0.0))
+
+
+def test_a_clock_set_back_by_a_period_but_not_from_its_end_is_no_counter() -> None:
+    raw = np.array([8.74, 8.75, 8.76 - PERIODS[0], 8.77 - PERIODS[0]])
+    assert not np.any(lost_by_wrapping(raw, -np.inf, 0.0))

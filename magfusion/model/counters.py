@@ -26,10 +26,10 @@ def lost_by_wrapping(raw: Array, last: float, wrapped: float) -> Array:
         return result
     for period in PERIODS:
         near = min(NEAR_END, NEAR_SHARE * period)
-        from_end = np.abs((raw + 0.5 * period) % period - 0.5 * period)
         turns = -np.round(step / period)
         turns[(np.abs(turns) != 1.0) | (np.abs(step + turns * period) > near)] = 0.0
-        turns[from_end > near] = 0.0
+        ends = np.minimum(raw, raw - step), np.maximum(raw, raw - step) - period
+        turns[np.maximum(*map(np.abs, ends)) > near] = 0.0
         missing = wrapped + period * np.cumsum(turns)
         if np.any(turns) and np.min(missing) >= 0.0:
             result = result + missing - wrapped
