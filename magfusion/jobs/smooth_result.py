@@ -136,11 +136,8 @@ def finished(
     trust = with_long_exclusions(trust | separated.trust | Trust(findings))
     trust = with_changed_beacons(trust, changes)
     cause = diagnosed(log, site, trust, settings.lockin) if correction is None else None
-    excluded, is_steel = bool(changes), any(f.code == STEEL for f in trust.reasons)
-    if is_steel and cause is not None and not cause.is_clear:
-        cause = None
-    possible = corrections(site, trust.reasons, () if excluded else causes, cause)
-    is_named = bool(causes) or any(f.code == "changed" for f in trust.reasons)
+    possible = corrections(site, trust.reasons, () if changes else causes, cause)
+    is_named = bool(causes) or any(f.code in {"changed", STEEL} for f in trust.reasons)
     if is_named and cause is not None and not cause.is_clear:
         cause = None
     trust = with_explaining_cause(trust, cause)

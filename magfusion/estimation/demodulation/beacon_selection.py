@@ -18,7 +18,7 @@ from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import IntArray
 
-MOST_AT_START = 16  # beacons; with more, a start takes longer and is no better
+MOST_AT_START = 16  # beacons; with more, a start takes longer, and sigmas stay
 DETECTION_SIGMAS = 1.0  # sigmas of a phasor: a beacon below it everywhere is not detected
 
 
