@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from derivatives import central_difference, relative_to_group
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
 
 from magfusion.estimation.batch.batch import Smoothed, smooth
 from magfusion.estimation.demodulation.close_tones import _of_channels
@@ -18,7 +19,6 @@ from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.online.navigator import Navigator
 from magfusion.estimation.online.navigator_settings import NavigatorSettings
 from magfusion.estimation.online.restored import restored
-from magfusion.estimation.online_integrity.gate import GATE
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Verdict
@@ -27,6 +27,7 @@ from magfusion.receiver.windows import default_settings
 
 BOX_WORLD = np.array([[2.0, 2.0, 0.9], [10.0, 6.0, 1.4]])  # m
 RATE_HZ = 600.0
+LIMIT = float(chdtri(6, 1e-6))
 
 
 def room(spacing: float = 0.5) -> Site:
@@ -176,8 +177,8 @@ def test_what_is_left_out_says_nothing_and_what_is_false_is_named(smoothed: Smoo
         cov,
     )
     assert len(cov) == MOTION
-    assert np.flatnonzero(false.distances(state, (), GATE) > GATE).tolist() == [channel]
-    assert not np.any(joint.distances(state, (), GATE) > GATE)
+    assert np.flatnonzero(false.distances(state, (), LIMIT) > LIMIT).tolist() == [channel]
+    assert not np.any(joint.distances(state, (), LIMIT) > LIMIT)
 
 
 def test_there_are_no_protection_levels_of_beacons_told_together(smoothed: Smoothed) -> None:

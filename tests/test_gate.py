@@ -100,6 +100,24 @@ def test_a_clean_epoch_is_hardly_ever_refused_and_eight_sigma_nearly_always() ->
     assert sum(mostly.counts.values()) > 0.95 * np.prod(shape)
 
 
+def test_noise_estimated_from_few_epochs_refuses_no_more() -> None:
+    """By twenty degrees of freedom, 3 % of variances are estimated at less than half."""
+    rng, freedom, starts, epochs = np.random.default_rng(7), 20.0, 300, 30
+    shape = (starts, epochs, len(SITE.channels))
+    squared = rng.chisquare(COMPONENTS, shape)
+    squared *= freedom / rng.chisquare(freedom, (starts, 1, 1))
+    refused = []
+    for estimated in ({}, dict.fromkeys([b.name for b in SITE.beacons], freedom)):
+        gates = [a_gate() for _ in range(starts)]
+        for gate, own in zip(gates, squared, strict=True):
+            gate.begin(estimated)
+            levels(gate, own)
+        refused.append(sum(sum(gate.counts.values()) for gate in gates))
+    known, of_freedom = refused
+    assert known > 20
+    assert of_freedom <= 3
+
+
 def test_the_distortion_is_a_mean_of_some_forty_epochs() -> None:
     """It scatters by a tenth about one, and follows what changes in 45 epochs."""
     rng, beacons = np.random.default_rng(6), len(SITE.channels)

@@ -136,23 +136,25 @@ class JointPhasors(Measurement):
         unit = np.einsum("ncrp,ab->ncrapb", whole, np.eye(3))
         return np.asarray(self.whitening[:, None] @ unit.reshape(n, -1, 3 * directions, 6))
 
-    def distances(self, state: State, blocks: tuple[Block, ...], gate: float = np.inf) -> Array:
+    def distances(
+        self, state: State, blocks: tuple[Block, ...], limit: Array | float = np.inf
+    ) -> Array:
         """Return the squared distance of each channel's innovation of an epoch, (channels,).
 
         Decrease of the total distance by an arbitrary phasor of that channel.  As neighbours are
-        only partly separable, the worst beyond a gate is excluded before the others are
+        only partly separable, the worst beyond its limit is excluded before the others are
         evaluated, and so on.
         """
         result, out = (
             self._distances(state, blocks),
             np.zeros(self.is_predicted.shape[1], dtype=bool),
         )
-        worst = int(np.argmax(result))
-        while result[worst] > gate and 2 * np.sum(out) < np.sum(self.is_predicted):
-            out[worst] = True
+        excess = result / limit
+        while np.max(excess) > 1.0 and 2 * np.sum(out) < np.sum(self.is_predicted):
+            out[np.argmax(excess)] = True
             remaining = self.without(out)._distances(state, blocks)
             result = np.where(out, result, remaining)
-            worst = int(np.argmax(np.where(out, 0.0, remaining)))
+            excess = np.where(out, 0.0, remaining / limit)
         return result
 
     def _distances(self, state: State, blocks: tuple[Block, ...]) -> Array:

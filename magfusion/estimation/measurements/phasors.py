@@ -232,7 +232,9 @@ class FieldPhasors(Measurement):
         by_pose[..., :3] -= by_place @ skew(swing_body)
         return value, by_pose, by_velocity, by_calibration
 
-    def distances(self, state: State, blocks: tuple[Block, ...], _gate: float = np.inf) -> Array:
+    def distances(
+        self, state: State, blocks: tuple[Block, ...], _limit: Array | float = np.inf
+    ) -> Array:
         """Return the squared distance of each channel's innovation of an epoch, (channels,)."""
         rows = self.linearize(states_of([state]), state.calibration, blocks)
         return group_distances(rows, state.cov)[0]

@@ -94,6 +94,7 @@ class EpochUpdate:
     def begin(self, start: OnlineStart) -> Judgement:
         """Judge a first state."""
         findings = Judgement(start.trust.reasons, turn=start.turn, shift=start.shift)
+        self.gate.begin(start.noise_freedom)
         self.gate.watch.begin(start.excluded, start.findings)
         known = start.shared_offsets, start.noise_freedom
         self.monitor.begin(start.state.time, findings, *known)

@@ -1,10 +1,11 @@
 """Innovation gate: rejects channels that the prediction does not explain; tracks distortion."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from magfusion.estimation.data_checks.statistics import largest_mean_square
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
@@ -12,7 +13,8 @@ from magfusion.estimation.online_integrity.magnetometer_watch import Magnetomete
 from magfusion.model.parameters import Block
 from magfusion.units import Array, BoolArray
 
-GATE = 38.3  # chi square of six components, one in a million
+COMPONENTS = 6.0  # of a phasor
+FALSE_REJECTIONS = 1e-6  # of the channels of an epoch
 LOST_EPOCHS = 5  # consecutive epochs with most channels rejected: the state is wrong, not they
 Phasors = FieldPhasors | JointPhasors
 MEMORY = 0.95  # of the running mean of the distortion, per epoch
@@ -42,6 +44,7 @@ class Gate:
     outvoted_in_a_row: int
     accepted: dict[str, float]
     refused: dict[str, float]
+    _limit: Array
 
     def __init__(
         self,
@@ -57,6 +60,19 @@ class Gate:
         self.distortion = {}
         self.refused_in_a_row = self.outvoted_in_a_row = 0
         self.accepted, self.refused = {}, {}
+        self.begin({})
+
+    def begin(self, noise_freedom: Mapping[str, float]) -> None:
+        """Set the limits by the degrees of freedom of each beacon's estimated noise.
+
+        Parameters
+        ----------
+        noise_freedom : mapping of str to float
+            By beacon; the noise of one without is known.
+        """
+        freedom = [noise_freedom.get(name, np.inf) for name in self._names]
+        limit = [COMPONENTS * largest_mean_square(FALSE_REJECTIONS, COMPONENTS, f) for f in freedom]
+        self._limit = np.array(limit)[self._number]
 
     @property
     def is_lost(self) -> bool:
@@ -80,9 +96,10 @@ class Gate:
         valid, refused : bool ndarray, shape (channels,)
             Channels that the epoch contains, and those that are already rejected.
         """
-        distance = measurements.alone().distances(state, self.blocks, GATE)
-        false = self.watch.update(distance > GATE, valid)
-        rejected: BoolArray = np.asarray((distance > GATE) | refused | false) & valid
+        distance = measurements.alone().distances(state, self.blocks, self._limit)
+        beyond: BoolArray = np.asarray(distance > self._limit)
+        false = self.watch.update(beyond, valid)
+        rejected: BoolArray = np.asarray(beyond | refused | false) & valid
         self._note(distance, valid)
         self.accepted = self._by_beacon(distance, valid & ~rejected)
         self.refused = self._by_beacon(distance, rejected)
@@ -103,7 +120,7 @@ class Gate:
         count = np.bincount(own, minlength=len(self._names)).tolist()
         total = np.bincount(own, distance[chosen], len(self._names)).tolist()
         each = zip(self._names, total, count, strict=True)
-        return {name: whole / number / 6.0 for name, whole, number in each if number}
+        return {name: whole / number / COMPONENTS for name, whole, number in each if number}
 
     def _note(self, distance: Array, valid: BoolArray) -> None:
         for name, level in self._by_beacon(distance, valid).items():

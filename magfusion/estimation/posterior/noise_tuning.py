@@ -37,9 +37,6 @@ WALK = slice(12, 15)
 PLAUSIBLE = 6.0  # by a larger factor, either way, white noise is a fault
 DRAWN_EPOCHS = 2048  # of drawn errors; of few, their own noise is in the tuned noise
 MAX_DRAWS = 16
-# Of fewer epochs one draw overestimates the noise, by a tenth in the mean, as gates that take it as
-# known need: several draws are right in the mean, but not for a start of little noise.
-LEAST_EPOCHS = 64
 MIN_REMAINING = 1e-3  # of an error; a smaller remainder is not informative
 
 
@@ -135,8 +132,7 @@ def tune(
     considered : tuple of Block
         Parameters that are not estimated: the effect of their errors on residuals is no noise.
     """
-    few = len(samples) < LEAST_EPOCHS
-    draws = 1 if few else int(np.clip(DRAWN_EPOCHS // len(samples), 1, MAX_DRAWS))
+    draws = int(np.clip(DRAWN_EPOCHS // len(samples), 1, MAX_DRAWS))
     system = ResidualProjection(graph, estimate, samples, poses, windows, considered, draws=draws)
     now = estimate.calibration.site
     lag = max(1, round(windows))
