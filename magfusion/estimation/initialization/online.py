@@ -247,7 +247,7 @@ def _smoothed(log: Log, site: Site, settings: EstimatorSettings) -> _Beginning:
     how = SmootherSettings(loss="huber", **requested)
     log, some = select_strongest(log, site)
     log, remaining, result, excluded = agreed_smoothed(smooth(log, some, how), log, some, how)
-    honest, trust, score, causes = judged_with_score(result, log)
+    honest, trust, score, causes = judged_with_score(result, log, site)
     state = last_state(result, result.considered)
     if result.calibration.site.undetected or site.platform.further:
         state, score = _among_all(state, score, result, site, settings)

@@ -28,12 +28,13 @@ from magfusion.estimation.integrity.score import (
     scores_of,
 )
 from magfusion.estimation.integrity.smoothed_compass import compass
-from magfusion.estimation.integrity.steel_test import steel
+from magfusion.estimation.integrity.steel_test import score_with_steel, steel
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.estimation.posterior.tuned_noise import covered_beacons, tuned_noise
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.model.arguments import check_arguments
 from magfusion.model.samples import Log
+from magfusion.model.site import Site
 from magfusion.model.trust import Trust, Verdict
 from magfusion.model.without_imu import logged
 from magfusion.units import Array
@@ -79,8 +80,14 @@ def judge_result(result: R, log: Log) -> tuple[R, Trust]:
     return estimate.result, estimate.trust
 
 
-def judged_with_score(result: R, log: Log) -> JudgedResult[R]:
-    """Return the same, with the score of all fixed parameters of the result."""
+def judged_with_score(result: R, log: Log, online: Site | None = None) -> JudgedResult[R]:
+    """Return the same, with the score of all fixed parameters of the result.
+
+    Parameters
+    ----------
+    online : Site, optional
+        Of an estimate that continues the result: its region's steel is tested, and in the score.
+    """
     log, _ = logged(log, result.declared.site)
     alone = result.earth_residual is None
     states = result.states if alone else None  # else they depend on the Earth field
@@ -98,7 +105,8 @@ def judged_with_score(result: R, log: Log) -> JudgedResult[R]:
     trust |= Trust(place)
     scores = scores_of(result, log.imu, candidate_steps(result))
     score, wide = (None, None) if scores is None else scores
-    case = Case(result, log, score, pose_cov, wide)
+    in_region = None if online is None else score_with_steel(score, result, log, online)
+    case = Case(result, log, score, pose_cov, wide, in_region)
     factor, spread = np.ones(len(pose_cov)), np.zeros_like(pose_cov)
     causes: tuple[ReleasedFault, ...] = ()
     for findings in _run_tests(case):
@@ -107,7 +115,8 @@ def judged_with_score(result: R, log: Log) -> JudgedResult[R]:
         factor = factor if findings.factor is None else np.maximum(factor, findings.factor)
         spread = spread if findings.spread is None else spread + findings.spread
     widened = replace(result.states, pose_cov=factor[:, None, None] * pose_cov + spread)
-    return JudgedResult(replace(result, states=widened, trust=trust), trust, score, causes)
+    judged = replace(result, states=widened, trust=trust)
+    return JudgedResult(judged, trust, score if in_region is None else in_region, causes)
 
 
 def _run_tests(case: Case) -> Iterator[TestResult]:

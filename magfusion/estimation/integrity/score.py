@@ -142,7 +142,9 @@ class Scores(NamedTuple):
     every: Score
 
 
-def scores_of(result: Smoothed, imu: ImuSamples, columns: Sequence[Block] = ()) -> Scores | None:
+def scores_of(
+    result: Smoothed, imu: ImuSamples, columns: Sequence[Block] = (), *, responses: bool = False
+) -> Scores | None:
     """Return the score of all fixed parameters of a result; None if there is nothing to test.
 
     Parameters
@@ -151,6 +153,8 @@ def scores_of(result: Smoothed, imu: ImuSamples, columns: Sequence[Block] = ()) 
         As recorded.
     columns : sequence of Block
         Additional parameters to test in the same sweep.
+    responses : bool
+        Whether the responses of the states include those to these.
     """
     graph = result.graph
     if not graph.measurements or result.fix_response is not None:
@@ -164,11 +168,11 @@ def scores_of(result: Smoothed, imu: ImuSamples, columns: Sequence[Block] = ()) 
         return None
     every = placed((*fixed, *columns))
     inertial = inertial_columns(result, every, imu)
-    estimate = _by_chain(result, fixed, every, inertial)
+    estimate = _by_chain(result, every if responses else fixed, every, inertial)
     if estimate is None:
         estimate = _by_elimination(result, every, inertial.of(slice(None)))
-    residual, responses = estimate
-    wide = Score(every, *residual, _declared(result, every), *responses)
+    residual, by = estimate
+    wide = Score(every, *residual, _declared(result, every), *by)
     return Scores(_first(wide, fixed), wide)
 
 

@@ -16,10 +16,18 @@ from magfusion.estimation.integrity.released_fault import release_gain
 from magfusion.estimation.integrity.score import Score, answered, scores_of
 from magfusion.estimation.integrity.suspects import suspects
 from magfusion.estimation.integrity.test_result import Case, TestResult
-from magfusion.estimation.measurements.steel import UNIT, SteelModes, steel_modes
+from magfusion.estimation.measurements.steel import (
+    UNIT,
+    SteelBasis,
+    SteelModes,
+    along_path,
+    region_modes,
+    steel_modes,
+)
 from magfusion.files.site_changes import changed_keys
-from magfusion.model.parameters import Block
+from magfusion.model.parameters import Block, placed
 from magfusion.model.samples import Log
+from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Verdict
 from magfusion.model.without_imu import logged
@@ -57,9 +65,8 @@ class SteelEstimate(NamedTuple):
     gain: float
     spread: Array
 
-    def finding(self, case: Case) -> Finding:
+    def finding(self, site: Site) -> Finding:
         """Return the finding: a remark where the site declares so much."""
-        site = case.result.declared.site
         where, declared = "near the path", 100.0 * site.model_error
         if self.place_sigma < FAR:
             x, y, z = self.place_world
@@ -94,10 +101,13 @@ def steel(case: Case, rival: float, *, doubted: bool = False) -> TestResult | No
     rival = max(rival, _best_parameter(case))
     if rival < LEAST_EVIDENCE and not doubted:
         return None
-    estimate = estimate_steel(case, max(rival + MARGIN, LEAST_EVIDENCE))
+    if case.in_region is None:
+        estimate = estimate_steel(case, rival)
+    else:
+        estimate = steel_of_score(case.in_region, rival)
     if estimate is None:
         return None
-    return TestResult((estimate.finding(case),), spread=estimate.spread, gain=estimate.gain)
+    return TestResult((estimate.finding(case.result.declared.site),), spread=estimate.spread, gain=estimate.gain)
 
 
 def _best_parameter(case: Case) -> float:
@@ -117,22 +127,59 @@ def steel_explains(result: Smoothed, log: Log, rival: float) -> bool:
     return cov is not None and steel(Case(result, log, None, cov), rival) is not None
 
 
-def estimate_steel(case: Case, least: float) -> SteelEstimate | None:
-    """Return the steel that would explain a log; None if its gain is less than a least one."""
+def estimate_steel(case: Case, rival: float) -> SteelEstimate | None:
+    """Return the steel that explains a log; None if not better than a rival cause of a gain."""
     result = case.result
-    here = {k: v[result.epoch] for k, v in vars(result.states).items() if v is not None}
-    poses = Trajectory(**here)
+    poses = _poses_of_fields(result)
     modes = steel_modes(result.calibration.site, poses.time, poses)
     scores = scores_of(result, case.log.imu, modes) if modes else None
+    known = None if scores is None else best_explanation(scores.every, rival)
+    if scores is None or known is None:
+        return None
+    return _estimated(answered(result, scores.every, case.log.imu), *known)
+
+
+def score_with_steel(score: Score | None, result: Smoothed, log: Log, site: Site) -> Score | None:
+    """Return a score with the `region_modes` of a site, as continued online; None without any."""
+    modes = region_modes(site)
+    if score is None or not modes or result.calibration.site.channels != site.channels:
+        return None
+    poses, parameter = _poses_of_fields(result), modes[-1].parameter
+    assert isinstance(parameter, SteelModes)
+    here = along_path(parameter.basis, result.calibration.site, poses.time, poses)
+    scores = scores_of(result, log.imu, here, responses=True)
     if scores is None:
         return None
-    block = scores.every.fixed[-1]
+    return replace(scores.every, fixed=placed((*score.fixed, *modes)))
+
+
+def steel_of_score(score: Score, rival: float) -> SteelEstimate | None:
+    """Return the steel of a score's last block of `SteelModes`, with the effect on its poses.
+
+    None if it does not explain the data better than a rival cause of a known gain.
+    """
+    known = best_explanation(score, rival)
+    return None if known is None else _estimated(score, *known)
+
+
+def best_explanation(score: Score, rival: float) -> tuple[float, Array] | None:
+    """Return gain and sigmas of the amplitudes of steel; None if a rival cause is as good."""
+    block = _block_of(score)
     assert isinstance(block.parameter, SteelModes)
-    shared = np.arange(block.parameter.columns) < block.parameter.shared
-    gain, sigma = best_size(*_own(scores.every, block), shared)
-    if gain < least or np.max(sigma) >= SIZES[-1]:
+    shared = np.arange(block.parameter.columns) < block.parameter.basis.shared
+    gain, sigma = best_size(*_own(score, block), shared)
+    if gain < max(rival + MARGIN, LEAST_EVIDENCE) or np.max(sigma) >= SIZES[-1]:
         return None  # the largest size stands for gross mistakes that no mode explains
-    return _estimated(answered(result, scores.every, case.log.imu), block, gain, sigma)
+    return gain, sigma
+
+
+def _block_of(score: Score) -> Block:
+    return next(b for b in reversed(score.fixed) if isinstance(b.parameter, SteelModes))
+
+
+def _poses_of_fields(result: Smoothed) -> Trajectory:
+    here = {k: v[result.epoch] for k, v in vars(result.states).items() if v is not None}
+    return Trajectory(**here)
 
 
 def best_size(information: Array, gradient: Array, shared: BoolArray) -> tuple[float, Array]:
@@ -165,7 +212,8 @@ def _own(score: Score, block: Block) -> tuple[Array, Array]:
     return information[block.columns, block.columns], gradient[block.columns]
 
 
-def _estimated(score: Score, block: Block, gain: float, sigma: Array) -> SteelEstimate:
+def _estimated(score: Score, gain: float, sigma: Array) -> SteelEstimate:
+    block = _block_of(score)
     information, gradient = _own(score, block)
     inner = np.eye(len(sigma)) + sigma[:, None] * information * sigma
     cov = sigma[:, None] * np.linalg.inv(inner) * sigma
@@ -174,12 +222,12 @@ def _estimated(score: Score, block: Block, gain: float, sigma: Array) -> SteelEs
     moved = by_pose @ mean
     spread = moved[:, :, None] * moved[:, None, :] + by_pose @ cov @ np.swapaxes(by_pose, 1, 2)
     assert isinstance(block.parameter, SteelModes)
-    place, place_sigma = _strongest(block.parameter, mean, cov)
+    place, place_sigma = _strongest(block.parameter.basis, mean, cov)
     distortion = UNIT * float(np.hypot(sigma[0], sigma[-1]))
     return SteelEstimate(distortion, place, place_sigma, gain, spread)
 
 
-def _strongest(modes: SteelModes, mean: Array, cov: Array) -> tuple[Array, float]:
+def _strongest(modes: SteelBasis, mean: Array, cov: Array) -> tuple[Array, float]:
     """Return the place of the largest polarisability over draws of amplitudes, and its sigma."""
     root = np.linalg.cholesky(cov + 1e-12 * np.eye(len(cov)))
     noise = np.random.default_rng(0).standard_normal((len(mean), DRAWS))

@@ -24,6 +24,8 @@ class Case(NamedTuple):
         As claimed by the estimator.
     wide : Score, optional
         Including possible steps of parameters, as of `scores_of`.
+    in_region : Score, optional
+        Including steel in the site's region instead of near the path.
     """
 
     result: Smoothed
@@ -31,6 +33,7 @@ class Case(NamedTuple):
     score: Score | None
     pose_cov: Array
     wide: Score | None = None
+    in_region: Score | None = None
 
 
 @dataclass(frozen=True, eq=False)

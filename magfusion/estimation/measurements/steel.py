@@ -5,6 +5,9 @@ Steel at a place c is magnetised by the field of each beacon there, and adds the
 a smaller moment of each tone's own represents long bodies, which conduct flux from elsewhere.
 All are independent, with a variance proportional to the volume, and are seen on the path through
 their strongest modes.  Each is free of curl and divergence, as the field of steel is.
+
+A running estimate does not know its path before: its modes are those of a site's region, fewer, of
+voxels that the path may enter, where their field is softened.  The site alone determines them.
 """
 
 from collections.abc import Mapping
@@ -15,9 +18,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from magfusion.estimation.graph.same_epoch import SAME_TIME
+from magfusion.model.detection_range import are_many
 from magfusion.model.field import predict
-from magfusion.model.noise import sensor_positions
-from magfusion.model.parameters import Block, Parameter, placed
+from magfusion.model.noise import sensor_positions, sensors_at
+from magfusion.model.once import once_a_site
+from magfusion.model.parameters import Block, Calibration, Parameter, placed
 from magfusion.model.parameters.parameter import PhasorView
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -30,6 +35,12 @@ CLEAR = 0.4  # m; no steel nearer to path or beacon
 MARGIN = 2.5  # m; of the voxels around path and beacons
 PLACES = 60  # on the path, at which modes are determined
 MAX_EPOCHS = 4000
+REGION_SHARED, REGION_OWN = 40, 3  # the same of a region
+REGION_EDGE, MAX_VOXELS = 1.0, 600  # m; coarser voxels where there would be more
+REGION_MARGIN = 1.0  # m; of places around beacons in a plane, and of voxels
+REGION_ROWS, LEAST_PLACES = 160, 10  # places times tones, at which its modes are determined
+SOFTENING = 0.5  # of the edge
+LOW_DISCREPANCY = np.array([0.8191725, 0.6710436, 0.5497005])  # of an additive recurrence
 ROOT = np.sqrt(0.5)
 # A symmetric tensor of unit norm for each of its six components.
 TENSORS = np.zeros((6, 3, 3))
@@ -52,23 +63,63 @@ class Voxels(NamedTuple):
     edge: Array
 
 
-class SteelModes(Parameter):
-    """Amplitudes of the modes: first those shared by all beacons, then those of each tone.
+class SteelBasis(NamedTuple):
+    """Modes of steel at any place: first those shared by all beacons, then those of each tone.
 
     Parameters
     ----------
+    voxels : Voxels
+    moment : ndarray, shape (v, tones, 3, modes)
+        Moment of each voxel by a unit of each, times mu0 (T m^3).
+    polarisability : ndarray, shape (v, tones, 3, modes)
+        The same over the field of the tone there.
+    shared : int
+        Number of shared modes.
+    softening : float
+        Distance below which the field of a voxel is no more that of a dipole, over its edge.
+    """
+
+    voxels: Voxels
+    moment: AnyArray
+    polarisability: AnyArray
+    shared: int
+    softening: float
+
+    def fields(self, place_world: Array) -> AnyArray:
+        """Return the field of a unit of each at places, world axes (T), (n, tones, 3, modes)."""
+        moment, softening = self.moment, self.softening * self.voxels.edge
+        source = np.swapaxes(moment, 1, 2).reshape(-1, moment.shape[1] * moment.shape[3])
+        parts = []
+        for some in np.array_split(place_world, max(len(place_world) // PLACES, 1)):
+            tensors = _dipole_tensors(some, self.voxels.centre_world, softening)
+            field = np.swapaxes(tensors, 1, 2).reshape(3 * len(some), -1) @ source
+            parts.append(field.reshape(len(some), 3, moment.shape[1], moment.shape[3]))
+        return np.swapaxes(np.concatenate(parts), 1, 2)
+
+    def phasors(
+        self, calibration: Calibration, time: Array, world_from_body: Array, position_world: Array
+    ) -> ComplexArray:
+        """Return the phasors of a unit of each, sensor axes (T), (n, channels, 3, modes)."""
+        site = calibration.site
+        place = sensors_at(site, world_from_body, position_world)[:, 0]
+        turn = np.swapaxes(world_from_body @ site.platform.magnetometer.body_from_sensor, 1, 2)
+        drive = calibration.gain_at(time) * np.exp(1j * calibration.drive_phase(time))
+        return np.asarray(drive[..., None, None] * (turn[:, None] @ self.fields(place)))
+
+
+class SteelModes(Parameter):
+    """Amplitudes of the modes of a basis.
+
+    Parameters
+    ----------
+    basis : SteelBasis
     time : ndarray, shape (n,)
-        Of the epochs (s).
+        Of epochs (s).
     fields : mapping of str to ndarray, shape (n, tones, 3, modes)
-        Added to each beacon's field by a unit of each, world axes (T).
+        Added to each beacon's field by a unit of each, world axes (T); of none, without a column.
     sources : mapping of str to ndarray, shape (n, tones, 3)
         The beacons' fields of the same drive phase, world axes (T).
     sensor_from_world : ndarray, shape (n, 3, 3)
-    voxels : Voxels
-    polarisability : ndarray, shape (v, tones, 3, modes)
-        Moment of each voxel by a unit of each, over the field of the tone there.
-    shared : int
-        Number of shared modes.
     """
 
     group = kind = "steel"
@@ -76,25 +127,24 @@ class SteelModes(Parameter):
 
     def __init__(
         self,
+        basis: SteelBasis,
         time: Array,
         fields: Mapping[str, AnyArray],
         sources: Mapping[str, AnyArray],
         sensor_from_world: Array,
-        voxels: Voxels,
-        polarisability: AnyArray,
-        shared: int,
     ) -> None:
-        self._time, self._fields, self._sources = time, fields, sources
-        self._sensor_from_world, self.voxels = sensor_from_world, voxels
-        self.polarisability, self.shared = polarisability, shared
+        self.basis, self._time, self._fields, self._sources = basis, time, fields, sources
+        self._sensor_from_world = sensor_from_world
 
     @property
     def columns(self) -> int:
         """Number of amplitudes."""
-        return int(self.polarisability.shape[-1])
+        return int(self.basis.moment.shape[-1])
 
-    def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray:
+    def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray | None:
         """Return the columns of a beacon's phasors."""
+        if not self._fields:
+            return None
         time, name = view.calibration.reference_time + view.elapsed, view.beacon.name
         at = np.searchsorted(self._time, time - SAME_TIME)
         turn, source = self._sensor_from_world[at], self._sources[name][at]
@@ -117,38 +167,95 @@ def steel_modes(site: Site, time: Array, poses: Trajectory) -> tuple[Block, ...]
     """
     if site.platform.further or not site.beacons or not 1 < len(time) <= MAX_EPOCHS:
         return ()
-    sensor, place = site.platform.magnetometer, sensor_positions(site, poses)[:, 0]
+    place = sensor_positions(site, poses)[:, 0]
     voxels = voxels_around(np.concatenate([place, [b.position_world for b in site.beacons]]))
-    at_path, at_voxels = (beacon_fields(site, point) for point in (place, voxels.centre_world))
-    root = voxels.edge[:, None, None, None] ** 1.5
-    moment = np.einsum("kij,vtj->vtik", TENSORS, at_voxels) * root
-    moments = [_modes(place, at_path, voxels, moment, SHARED)]
-    shared, strength = moments[0].shape[-1], np.linalg.norm(at_voxels, axis=2)
-    for tone in range(at_path.shape[1]):
-        own = strength[:, [tone], None, None] * np.eye(3) * root
-        some = _modes(place, at_path[:, [tone]], voxels, own, OWN)
-        every = np.zeros((*at_voxels.shape, some.shape[-1]), dtype=some.dtype)
-        every[:, [tone]] = some
-        moments.append(every)
-    dipoles = np.concatenate(moments, axis=-1)
-    added = _fields(place, voxels, dipoles)
+    rows = np.unique(np.linspace(0, len(place) - 1, min(len(place), PLACES)).astype(int))
+    basis = _basis(site, place[rows], voxels, (SHARED, OWN), 0.0)
+    return along_path(basis, site, time, poses)
+
+
+def along_path(
+    basis: SteelBasis, site: Site, time: Array, poses: Trajectory
+) -> tuple[Block, ...]:
+    """Return the block of the amplitudes of a basis for a log, as `steel_modes`."""
+    place = sensor_positions(site, poses)[:, 0]
+    added, at_path = basis.fields(place), beacon_fields(site, place)
     fields, sources, start = {}, {}, 0
     for beacon in site.beacons:
         tones = slice(start, start + len(beacon.tones))
         fields[beacon.name], sources[beacon.name] = added[:, tones], at_path[:, tones]
         start = tones.stop
-    turn = np.swapaxes(poses.world_from_body @ sensor.body_from_sensor, 1, 2)
-    polarisability = dipoles / strength[..., None, None]
-    modes = SteelModes(time, fields, sources, turn, voxels, polarisability, shared)
+    from_body = site.platform.magnetometer.body_from_sensor
+    turn = np.swapaxes(poses.world_from_body @ from_body, 1, 2)
+    return _block(SteelModes(basis, time, fields, sources, turn))
+
+
+def region_modes(site: Site) -> tuple[Block, ...]:
+    """Return the block of the amplitudes of a site's region, without columns of its own.
+
+    They are equal whenever they are determined, up to rounding; none for what it does not model.
+    """
+    basis = _region_basis(site)
+    return () if basis is None else _block(SteelModes(basis, np.zeros(0), {}, {}, np.zeros(0)))
+
+
+def _block(modes: SteelModes) -> tuple[Block, ...]:
     return placed([Block(modes, modes.owner, slice(0), np.full(modes.columns, UNIT))])
+
+
+@once_a_site
+def _region_basis(site: Site) -> SteelBasis | None:
+    beacon = np.array([b.position_world for b in site.beacons])
+    if site.platform.further or len(beacon) < 2 or are_many(site):
+        return None
+    if not np.all(np.isfinite(beacon)):
+        return None
+    low, high = beacon.min(axis=0), beacon.max(axis=0)
+    half = np.maximum(0.5 * (high - low), REGION_MARGIN)
+    low, high = 0.5 * (low + high) - half, 0.5 * (low + high) + half
+    if site.region is not None and (box := site.region.box_world) is not None:
+        low, high = (np.where(np.isfinite(b), b, e) for b, e in zip(box, (low, high), strict=True))
+    count = max(REGION_ROWS // len(site.channels), LEAST_PLACES)
+    place = low + (high - low) * (np.arange(1, count + 1)[:, None] * LOW_DISCREPANCY % 1.0)
+    place = place[cKDTree(beacon).query(place)[0] > CLEAR]
+    low, high, edge = low - REGION_MARGIN, high + REGION_MARGIN, REGION_EDGE
+    edge = max(edge, float(np.prod(high - low) / MAX_VOXELS) ** (1.0 / 3.0))
+    centre = _grid(low, high, edge)
+    centre = centre[cKDTree(beacon).query(centre)[0] > SOFTENING * edge]
+    if not len(place) or not len(centre):
+        return None
+    voxels = Voxels(centre, np.full(len(centre), edge))
+    basis = _basis(site, place, voxels, (REGION_SHARED, REGION_OWN), SOFTENING)
+    # An eigenvector's sign is arbitrary, and a checkpoint may be resumed elsewhere.
+    moment = basis.moment.real.reshape(-1, basis.moment.shape[-1])
+    sign = np.where(np.cos(np.arange(len(moment))) @ moment < 0.0, -1.0, 1.0)
+    return basis._replace(moment=sign * basis.moment, polarisability=sign * basis.polarisability)
+
+
+def _basis(
+    site: Site, place: Array, voxels: Voxels, count: tuple[int, int], softening: float
+) -> SteelBasis:
+    """Return the strongest modes at places: of all beacons together, and of each tone."""
+    at_place, at_voxels = (beacon_fields(site, point) for point in (place, voxels.centre_world))
+    tensors = _dipole_tensors(place, voxels.centre_world, softening * voxels.edge)
+    root = voxels.edge[:, None, None, None] ** 1.5
+    moment = np.einsum("kij,vtj->vtik", TENSORS, at_voxels) * root
+    moments = [_modes(tensors, at_place, moment, count[0])]
+    shared, strength = moments[0].shape[-1], np.linalg.norm(at_voxels, axis=2)
+    for tone in range(at_place.shape[1]):
+        own = strength[:, [tone], None, None] * np.eye(3) * root
+        some = _modes(tensors, at_place[:, [tone]], own, count[1])
+        every = np.zeros((*at_voxels.shape, some.shape[-1]), dtype=some.dtype)
+        every[:, [tone]] = some
+        moments.append(every)
+    dipoles = np.concatenate(moments, axis=-1)
+    return SteelBasis(voxels, dipoles, dipoles / strength[..., None, None], shared, softening)
 
 
 def voxels_around(point_world: Array) -> Voxels:
     """Return an octree of voxels around points, finer near to them, and clear of them."""
     low, high = point_world.min(axis=0) - MARGIN, point_world.max(axis=0) + MARGIN
-    count = np.ceil((high - low) / COARSEST).astype(int)
-    grid = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, 3)
-    centre, edge, out = low + (grid + 0.5) * COARSEST, COARSEST, []
+    centre, edge, out = _grid(low, high, COARSEST), COARSEST, []
     corners = np.stack(np.meshgrid(*[(-0.25, 0.25)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     while len(centre):
         away = cKDTree(point_world).query(centre)[0]
@@ -158,6 +265,13 @@ def voxels_around(point_world: Array) -> Voxels:
         centre = (centre[divided][:, None] + edge * corners).reshape(-1, 3)
         edge *= 0.5
     return Voxels(np.concatenate([c for c, _ in out]), np.concatenate([e for _, e in out]))
+
+
+def _grid(low: Array, high: Array, edge: float) -> Array:
+    """Return the centres of equal voxels that fill a box, shape (v, 3) (m)."""
+    count = np.ceil((high - low) / edge).astype(int)
+    grid = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.asarray(low + (grid + 0.5) * edge)
 
 
 def beacon_fields(site: Site, point_world: Array) -> AnyArray:
@@ -176,39 +290,30 @@ def beacon_fields(site: Site, point_world: Array) -> AnyArray:
     return every if np.any(every.imag) else every.real
 
 
-def _dipole_tensors(point_world: Array, centre_world: Array) -> Array:
-    """Return the field over mu0 of unit moments, shape (n, v, 3, 3) (1/m^3)."""
+def _dipole_tensors(point_world: Array, centre_world: Array, softening: Array) -> Array:
+    """Return the field over mu0 of unit moments, shape (n, v, 3, 3) (1/m^3).
+
+    Softened, it has no curl; divergence is near the voxel only, within the softening (m).
+    """
     offset = point_world[:, None] - centre_world
-    distance = np.linalg.norm(offset, axis=2)[..., None]
-    along = offset / distance
-    square = 3.0 * along[..., :, None] * along[..., None, :] - np.eye(3)
-    return np.asarray(square / (4.0 * np.pi * distance[..., None] ** 3))
+    square = np.sum(offset**2, axis=2) + softening**2
+    tensor = 3.0 * offset[..., :, None] * offset[..., None, :] - square[..., None, None] * np.eye(3)
+    return np.asarray(tensor / (4.0 * np.pi * square**2.5)[..., None, None])
 
 
-def _fields(place: Array, voxels: Voxels, moment: AnyArray) -> AnyArray:
-    """Return the field of moments (v, tones, 3, k) over mu0 at places, (n, tones, 3, k)."""
-    source = np.swapaxes(moment, 1, 2).reshape(-1, moment.shape[1] * moment.shape[3])
-    parts = []
-    for some in np.array_split(place, max(len(place) // PLACES, 1)):
-        tensors = np.swapaxes(_dipole_tensors(some, voxels.centre_world), 1, 2)
-        field = tensors.reshape(3 * len(some), -1) @ source
-        parts.append(field.reshape(len(some), 3, moment.shape[1], moment.shape[3]))
-    return np.swapaxes(np.concatenate(parts), 1, 2)
-
-
-def _modes(
-    place: Array, at_path: AnyArray, voxels: Voxels, moment: AnyArray, count: int
-) -> AnyArray:
+def _modes(tensors: Array, at_place: AnyArray, moment: AnyArray, count: int) -> AnyArray:
     """Return the moments of the strongest modes of relative distortion, (v, tones, 3, modes).
 
     Parameters
     ----------
+    tensors : ndarray, shape (n, v, 3, 3)
+        Field of a unit moment of each voxel at places.
+    at_place : ndarray, shape (n, tones, 3)
+        The beacons' fields there.
     moment : ndarray, shape (v, tones, 3, k)
         Of each voxel, by a sigma of each of its k independent amplitudes.
     """
-    rows = np.unique(np.linspace(0, len(place) - 1, min(len(place), PLACES)).astype(int))
-    tensors = _dipole_tensors(place[rows], voxels.centre_world)
-    size = np.linalg.norm(at_path[rows], axis=2)[..., None]
+    size = np.linalg.norm(at_place, axis=2)[..., None]
     relative = np.stack(
         [tensors @ moment[:, tone] / size[:, [tone], None] for tone in range(moment.shape[1])],
         axis=1,
@@ -219,5 +324,5 @@ def _modes(
     value, vector = np.linalg.eigh(flat @ flat.T)
     kept = np.flatnonzero(value > 1e-9 * value[-1])[::-1][:count]
     amplitude = flat.T @ (vector[:, kept] / np.sqrt(value[kept]))
-    amplitude = amplitude.reshape(len(voxels.edge), 1, moment.shape[3], -1)
+    amplitude = amplitude.reshape(len(moment), 1, moment.shape[3], -1)
     return np.asarray(moment @ amplitude / unit)

@@ -10,15 +10,16 @@ from typing import NamedTuple
 import numpy as np
 
 from magfusion.estimation.graph.measurement import Measurement, Rows, joined, kind_of
-from magfusion.estimation.graph.state import MOTION, State, states_of
+from magfusion.estimation.graph.state import MOTION, State, States, states_of
 from magfusion.estimation.integrity.suspects import Inertial, Stream
 from magfusion.estimation.measurements.earth import EarthField
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.measurements.steel import SteelModes
 from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
 from magfusion.estimation.online_integrity.score_targets import ScoreTargets
 from magfusion.estimation.solve.sparse_rows import sparse_if_wide
-from magfusion.model.parameters import Calibration, dimension
+from magfusion.model.parameters import Block, Calibration, dimension
 from magfusion.model.samples import ImuSamples
 from magfusion.units import Array, BoolArray
 
@@ -230,5 +231,21 @@ def _linearized(parts: list[Measurement], states: list[State], targets: ScoreTar
         own = (s.calibration.imu_offset(t) for s, t in zip(states, whole.time, strict=True))
         more = calibration.imu_offset(whole.time) - np.array(list(own))
         whole = replace(whole, applied_offset=whole.applied_offset + more)
-    rows = whole.linearize(states_of(states), calibration, targets.parameters)
+    at = states_of(states)
+    rows = whole.linearize(at, calibration, targets.parameters)
+    for block in targets.steel if isinstance(whole, FieldPhasors) else ():
+        rows = _with_steel(rows, whole, at, calibration, block)
     return rows.weighed(whole.loss)[0]
+
+
+def _with_steel(
+    rows: Rows, measured: FieldPhasors, states: States, calibration: Calibration, block: Block
+) -> Rows:
+    """Return rows with the last columns of the calibration filled by those of steel."""
+    assert isinstance(block.parameter, SteelModes)
+    assert rows.by_calibration is not None
+    place = states.world_from_body, states.position_world
+    phasors = block.parameter.basis.phasors(calibration, measured.time, *place)
+    by = measured.sqrt_information @ np.concatenate([phasors.real, phasors.imag], axis=2)
+    others = rows.by_calibration[..., : -by.shape[-1]]
+    return replace(rows, by_calibration=np.concatenate([others, by], axis=-1))

@@ -12,13 +12,20 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from magfusion.estimation.graph.measurement import Measurement
-from magfusion.estimation.graph.state import MOTION, State, states_of
+from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, State, states_of
 from magfusion.estimation.integrity.change_detection import CHANGED, change_finding
 from magfusion.estimation.integrity.correction import Correction, corrections
-from magfusion.estimation.integrity.fixed_parameter_test import causes_of, finding_of
+from magfusion.estimation.integrity.fixed_parameter_test import (
+    LEAST_EVIDENCE,
+    NamedCause,
+    causes_of,
+    finding_of,
+)
 from magfusion.estimation.integrity.score import Score
+from magfusion.estimation.integrity.steel_test import steel_of_score
 from magfusion.estimation.integrity.suspects import Suspect
 from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.measurements.steel import region_modes
 from magfusion.estimation.online_integrity.beacon_steps import BeaconSteps
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.estimation.online_integrity.score_epochs import (
@@ -85,7 +92,7 @@ class OnlineScore:
         self._detected_at = {}
         self.correction: Correction | None = None
         self.named = ()
-        self._steps = BeaconSteps(site, estimated)
+        self._steps, self._steel = BeaconSteps(site, estimated), region_modes(site)
         self._targets = self._targets_of(() if are_many(site) else [b.name for b in site.beacons])
 
     @property
@@ -98,7 +105,8 @@ class OnlineScore:
     def _targets_of(self, names: Iterable[str]) -> ScoreTargets:
         estimated, considered = self._tangent
         site = of_beacons_named(self.site, names)
-        return ScoreTargets(site, estimated, considered, steady=self._steady)
+        steel = self._steel
+        return ScoreTargets(site, estimated, considered, steady=self._steady, steel=steel)
 
     def begin(self, score: Score | None, time: float) -> None:
         """Continue from the score of the smoothed beginning, at its last state (s)."""
@@ -230,11 +238,13 @@ class OnlineScore:
             fixed = [one._replace(combine=np.pad(one.combine, more)) for one in known]
             return [*fixed, *self._steps.candidates(steps, information, gradient)]
 
-        self.correction, first = None, next(causes_of(pose_cov, score, candidates), None)
-        self.named = ()
-        if first is None:
+        causes = list(causes_of(pose_cov, score, candidates))
+        self.correction, self.named = None, ()
+        if targets.steel and (bent := self._steel_of(score, causes)) is not None:
+            return bent
+        if not causes:
             return Judgement()
-        cause, rivals = first.cause, first.rivals
+        cause, rivals = causes[0].cause, causes[0].rivals
         self.named = tuple(sorted({b.owner for one in (cause, *rivals) for b in one.fault.blocks}))
         turn, shift = np.linalg.norm(cause.moved[0].reshape(2, 3), axis=1)
         if cause.code == CHANGED:
@@ -246,3 +256,16 @@ class OnlineScore:
         spread = uncertainty if correction.spread is None else correction.spread + uncertainty
         self.correction = correction._replace(spread=spread)
         return Judgement((finding,), turn=float(turn), shift=float(shift))
+
+    def _steel_of(self, score: Score, named: Sequence[NamedCause]) -> Judgement | None:
+        """Return the judgement by steel; None if it does not explain the data better."""
+        best = np.max(self.targets.gains(*score.with_declared(tolerance=False)), initial=0.0)
+        rival = max(float(best), sum(one.cause.gain for one in named))
+        estimate = None if rival < LEAST_EVIDENCE else steel_of_score(score, rival)
+        if estimate is None:
+            return None
+        largest = [
+            np.linalg.eigvalsh(estimate.spread[0, part, part])[-1] for part in (ROTATION, POSITION)
+        ]
+        turn, shift = np.sqrt(np.maximum(largest, 0.0)).tolist()
+        return Judgement((estimate.finding(self.site),), turn=turn, shift=shift)

@@ -29,6 +29,8 @@ class ScoreTargets:
         Calibration parameters in the state's tangent, of all beacons.
     steady : bool
         Whether the static field is measured.
+    steel : tuple of Block
+        Amplitudes of `magfusion.estimation.measurements.steel.region_modes`, tested last.
     """
 
     def __init__(
@@ -38,8 +40,10 @@ class ScoreTargets:
         considered: tuple[Block, ...],
         *,
         steady: bool,
+        steel: tuple[Block, ...] = (),
     ) -> None:
-        self.site, self.fixed_blocks = site, held_blocks(site, estimated, steady=steady)
+        self.site, held = site, held_blocks(site, estimated, steady=steady)
+        self.fixed_blocks, self.steel = placed((*held, *steel)) if held else (), steel
         self.names = tuple(beacon.name for beacon in site.beacons)
         self.unit, self.size = prior_sigma(self.fixed_blocks), MOTION + dimension(estimated)
         in_state = (*estimated, *considered)
@@ -50,6 +54,7 @@ class ScoreTargets:
         start = {b.key: MOTION + b.columns.start for b in self.parameters}
         own = [start[b.key] + np.arange(len(b.sigma)) for b in self.fixed_blocks]
         self.columns = np.concatenate([np.zeros(0, dtype=np.int64), *own])
+        self.of_steel = slice(len(self.columns) - dimension(steel), len(self.columns))
         among = [b for b in considered if _is_of(b, self.names)]
         self.spread = self._declared(tuple(among))
         # Columns of a state's tangent with the considered parameters of these beacons.
