@@ -30,7 +30,7 @@ from magfusion.estimation.integrity.smoothed_exclusion import (
     states_judged,
     with_long_exclusions,
 )
-from magfusion.estimation.integrity.steel_test import STEEL, steel_explains
+from magfusion.estimation.integrity.steel_test import steel_explains
 from magfusion.estimation.online_integrity.open_roll import (
     comparable,
     roll_findings,
@@ -137,7 +137,7 @@ def finished(
     trust = with_changed_beacons(trust, changes)
     cause = diagnosed(log, site, trust, settings.lockin) if correction is None else None
     possible = corrections(site, trust.reasons, () if changes else causes, cause)
-    is_named = bool(causes) or any(f.code in {"changed", STEEL} for f in trust.reasons)
+    is_named = bool(causes) or any(f.code == "changed" for f in trust.reasons)
     if is_named and cause is not None and not cause.is_clear:
         cause = None
     trust = with_explaining_cause(trust, cause)

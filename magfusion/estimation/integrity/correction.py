@@ -11,7 +11,6 @@ from magfusion.estimation.integrity.corrected_site import corrected_site
 from magfusion.estimation.integrity.diagnosis import Diagnosis
 from magfusion.estimation.integrity.released_fault import ReleasedFault, ReleaseGain, release_gain
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.steel_test import STEEL
 from magfusion.estimation.integrity.suspects import Suspect, suspects
 from magfusion.files.site_changes import changed_keys
 from magfusion.model.imu_intrinsics import ImuIntrinsics
@@ -92,11 +91,9 @@ def corrections(
     causes : tuple of ReleasedFault
         The cause by the score of fixed parameters, and what explains the log as well.
     diagnosis : Diagnosis, optional
-        By snapshots of the fields and by the motion; without effect where steel is named, unless it
-        is clear.
+        By snapshots of the fields and by the motion.
     """
     result: list[Correction] = []
-    is_steel = any(f.code == STEEL for f in findings)
     finding = next((f for f in findings if causes and f.code == causes[0].code), None)
     if finding is not None:
         best, *rivals = causes
@@ -107,8 +104,6 @@ def corrections(
         new_site = corrected_site(site, best.fault, best.step)
         by_score = Correction(finding, new_site, best.fault, spread)
         result.append(by_score._replace(spread=_with_rival_frame(site, by_score, 0.5)))
-    if diagnosis is not None and is_steel and not diagnosis.is_clear:
-        diagnosis = None
     if diagnosis is not None and diagnosis.site is not None:
         by_snapshots = _by_snapshots(site, diagnosis)
         result.insert(0 if by_snapshots.clear else len(result), by_snapshots)

@@ -14,6 +14,7 @@ from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.magnetometers import first_magnetometer
 from magfusion.estimation.integrity.explanation import Explanation
 from magfusion.estimation.integrity.likely_cause import OF_MOTION, cause_of
+from magfusion.estimation.integrity.steel_test import STEEL
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
@@ -94,7 +95,8 @@ def diagnosed(
     Parameters
     ----------
     trust : Trust
-        What they say; where it is trustworthy, nothing is tried.
+        What they say; where it is trustworthy, nothing is tried, and only what is clear outweighs
+        steel.
     settings : LockinSettings, optional
         Of the estimator.
     """
@@ -115,6 +117,8 @@ def diagnosed(
         return None
     one, text = said
     known = _diagnosis(one, text, trust.verdict, several)
+    if not known.is_clear and any(finding.code == STEEL for finding in trust.reasons):
+        return None
     if one.rival is None:
         return known
     rival = _diagnosis(one.rival, one.rival.text(OF_MOTION), trust.verdict, several)

@@ -122,8 +122,9 @@ class EstimationLoop:
     def _process(self, estimator: Estimator, epoch: NextEpoch) -> None:
         """Propagate to an epoch, process its measurements, and report its state."""
         predicted, judgement = self.running.process(epoch.time, epoch.samples, self.arrived)
-        if (correction := self.running.update.score.correction) is not None:
-            self.possible = (correction,)
+        score = self.running.update.score
+        if score.correction is not None or score.is_steel:
+            self.possible = () if score.correction is None else (score.correction,)
         state: State = estimator.state
         reports, counts = self.reports, self.counts
         restarts = counts["lost and found again"]

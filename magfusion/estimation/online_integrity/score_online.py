@@ -22,7 +22,7 @@ from magfusion.estimation.integrity.fixed_parameter_test import (
     finding_of,
 )
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.steel_test import steel_of_score
+from magfusion.estimation.integrity.steel_test import STEEL, steel_of_score
 from magfusion.estimation.integrity.suspects import Suspect
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.steel import region_modes
@@ -94,6 +94,11 @@ class OnlineScore:
         self.named = ()
         self._steps, self._steel = BeaconSteps(site, estimated), region_modes(site)
         self._targets = self._targets_of(() if are_many(site) else [b.name for b in site.beacons])
+
+    @property
+    def is_steel(self) -> bool:
+        """Whether the last result is steel."""
+        return any(finding.code == STEEL for finding in self._judgement.findings)
 
     @property
     def targets(self) -> ScoreTargets:
