@@ -1,16 +1,22 @@
 """Steel near the path: its modes are fields of steel, and its evidence is a likelihood."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import run_command
 
 from magfusion.estimation.batch.batch import smooth
 from magfusion.estimation.integrity.judge import judge_result
 from magfusion.estimation.integrity.steel_test import best_size
 from magfusion.estimation.measurements import steel
-from magfusion.model.parameters import initial_calibration
+from magfusion.files.log import write_log
+from magfusion.files.site import save_site
+from magfusion.model.parameters import initial_calibration, predict_channels
 from magfusion.model.parameters.parameter import PhasorView
+from magfusion.model.samples import Log
 from magfusion.model.trajectory import Trajectory
 from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -48,7 +54,7 @@ def test_the_field_of_a_sphere_is_a_sum_of_modes(monkeypatch: pytest.MonkeyPatch
     site, poses = demo_site(coil_radius=None), _walk()
     (block,) = steel.steel_modes(site, poses.time, poses)
     assert isinstance(block.parameter, steel.SteelModes)
-    sensor, centres = site.platform.magnetometer, block.parameter.voxels.centre_world
+    sensor, centres = site.platform.magnetometer, block.parameter.basis.voxels.centre_world
     place = poses.position_world + poses.world_from_body @ sensor.position_body
     away = np.min(np.linalg.norm(centres[:, None] - place, axis=2), axis=1)
     assert np.min(away) > steel.CLEAR
@@ -103,19 +109,71 @@ def test_noise_alone_is_no_steel() -> None:
     assert np.max(gains) < 10.0
 
 
+def test_modes_of_a_region_have_no_curl_and_act_as_those_of_a_path() -> None:
+    site, poses, step = demo_site(coil_radius=None), _walk(), 1e-4
+    (block,) = steel.region_modes(site)
+    assert isinstance(block.parameter, steel.SteelModes)
+    basis = block.parameter.basis
+    assert block.parameter.columns == steel.REGION_SHARED + 4 * steel.REGION_OWN
+
+    def slope(place: Array) -> AnyArray:
+        """Return the derivative of the field at one place, shape (3, 3, tones, modes)."""
+        ends = (basis.fields(place + sign * step * np.eye(3)) for sign in (1.0, -1.0))
+        return np.asarray(np.subtract(*ends).swapaxes(1, 2) / (2.0 * step))
+
+    for place in (np.array([3.0, 2.5, 1.2]), np.array([3.0, 2.5, 9.0])):
+        own = slope(place)
+        assert np.max(np.abs(own - own.swapaxes(0, 1))) < 1e-5 * np.max(np.abs(own))
+    assert np.max(np.abs(np.trace(own))) < 0.1 * np.max(np.abs(own))  # outside of the voxels
+    calibration = replace(initial_calibration(site, 0.0), phase=np.full(4, 0.3))
+    place = poses.world_from_body, poses.position_world
+    expected = basis.phasors(calibration, poses.time, *place)
+    (along,) = steel.along_path(basis, site, poses.time, poses)
+    seen = predict_channels(calibration, poses.time, *place)
+    for k, beacon in enumerate(site.beacons):
+        view = PhasorView(calibration, beacon, poses.time, seen[:, [k]], None)
+        columns = along.parameter.phasor_jacobian(view, "site")
+        np.testing.assert_allclose(columns, expected[:, [k]], atol=1e-6 * np.max(np.abs(expected)))
+
+
+def _log(kind: str | None, duration: float) -> Log:
+    """Return a walk in the demo's room with steel of a kind."""
+    site, rng = demo_site(coil_radius=None), np.random.default_rng([40, 4])
+    places = np.array([beacon.position_world for beacon in site.beacons])
+    rails = None if kind is None else draw_steel(kind, rng, DEMO_BOX_WORLD, places)
+    config = SimulationConfig(
+        DEMO_BOX_WORLD,
+        duration=duration,
+        imu_rate_hz=100.0,
+        magnetometer_rate_hz=160.0,
+        ambient=Ambient() if rails is None else Ambient(rails=rails),
+    )
+    return simulate_log(site, config, rng).log
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "code"), [("spheres", "steel"), (None, "beacon_pose")])
+def test_online_steel_and_a_displaced_beacon_are_named(
+    kind: str | None, code: str, tmp_path: Path
+) -> None:
+    """The beacon is 8 cm from where the site has it."""
+    site, log = replace(demo_site(coil_radius=None), model_error=0.003), _log(kind, 40.0)
+    if kind is None:
+        first, *others = site.beacons
+        moved = replace(first, position_world=first.position_world + np.array([0.08, 0.0, 0.0]))
+        site = replace(site, beacons=(moved, *others))
+    write_log(replace(log, truth=None), tmp_path / "log")
+    save_site(site, tmp_path / "log" / "site.yaml")
+    result = tmp_path / "result"
+    run_command("navigate", tmp_path / "log", "-o", result, "--estimator", "ekf")
+    report = json.loads((result / "report.json").read_text())
+    assert report["reasons"][0]["code"] == code
+
+
 @pytest.mark.slow
 def test_spheres_are_named_steel_and_covered() -> None:
     """Of a walk in the demo's room, whose site declares less distortion."""
-    site, rng = demo_site(coil_radius=None), np.random.default_rng([40, 4])
-    places = np.array([beacon.position_world for beacon in site.beacons])
-    config = SimulationConfig(
-        DEMO_BOX_WORLD,
-        duration=60.0,
-        imu_rate_hz=100.0,
-        magnetometer_rate_hz=160.0,
-        ambient=Ambient(rails=draw_steel("spheres", rng, DEMO_BOX_WORLD, places)),
-    )
-    log = simulate_log(site, config, rng).log
+    site, log = demo_site(coil_radius=None), _log("spheres", 60.0)
     assert log.truth is not None
     result = smooth(replace(log, truth=None), replace(site, model_error=0.003))
     judged, trust = judge_result(result, log)
