@@ -71,6 +71,7 @@ def test_the_field_of_a_sphere_is_a_sum_of_modes(monkeypatch: pytest.MonkeyPatch
         )
         view = PhasorView(calibration, beacon, poses.time, seen, None)
         columns = block.parameter.phasor_jacobian(view, "site")
+        assert columns is not None
         size = np.linalg.norm(source[:, tones], axis=2)[..., None]
         rows.append((columns / size[..., None]).reshape(-1, columns.shape[-1]))
         true.append((bent / size).ravel())
@@ -126,13 +127,14 @@ def test_modes_of_a_region_have_no_curl_and_act_as_those_of_a_path() -> None:
         assert np.max(np.abs(own - own.swapaxes(0, 1))) < 1e-5 * np.max(np.abs(own))
     assert np.max(np.abs(np.trace(own))) < 0.1 * np.max(np.abs(own))  # outside of the voxels
     calibration = replace(initial_calibration(site, 0.0), phase=np.full(4, 0.3))
-    place = poses.world_from_body, poses.position_world
-    expected = basis.phasors(calibration, poses.time, *place)
+    pose = poses.world_from_body, poses.position_world
+    expected = basis.phasors(calibration, poses.time, *pose)
     (along,) = steel.along_path(basis, site, poses.time, poses)
-    seen = predict_channels(calibration, poses.time, *place)
+    seen = predict_channels(calibration, poses.time, *pose)
     for k, beacon in enumerate(site.beacons):
         view = PhasorView(calibration, beacon, poses.time, seen[:, [k]], None)
         columns = along.parameter.phasor_jacobian(view, "site")
+        assert columns is not None
         np.testing.assert_allclose(columns, expected[:, [k]], atol=1e-6 * np.max(np.abs(expected)))
 
 

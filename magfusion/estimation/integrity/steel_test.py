@@ -107,7 +107,8 @@ def steel(case: Case, rival: float, *, doubted: bool = False) -> TestResult | No
         estimate = steel_of_score(case.in_region, rival)
     if estimate is None:
         return None
-    return TestResult((estimate.finding(case.result.declared.site),), spread=estimate.spread, gain=estimate.gain)
+    finding = estimate.finding(case.result.declared.site)
+    return TestResult((finding,), spread=estimate.spread, gain=estimate.gain)
 
 
 def _best_parameter(case: Case) -> float:

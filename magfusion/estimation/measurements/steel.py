@@ -174,9 +174,7 @@ def steel_modes(site: Site, time: Array, poses: Trajectory) -> tuple[Block, ...]
     return along_path(basis, site, time, poses)
 
 
-def along_path(
-    basis: SteelBasis, site: Site, time: Array, poses: Trajectory
-) -> tuple[Block, ...]:
+def along_path(basis: SteelBasis, site: Site, time: Array, poses: Trajectory) -> tuple[Block, ...]:
     """Return the block of the amplitudes of a basis for a log, as `steel_modes`."""
     place = sensor_positions(site, poses)[:, 0]
     added, at_path = basis.fields(place), beacon_fields(site, place)

@@ -54,7 +54,6 @@ class ScoreTargets:
         start = {b.key: MOTION + b.columns.start for b in self.parameters}
         own = [start[b.key] + np.arange(len(b.sigma)) for b in self.fixed_blocks]
         self.columns = np.concatenate([np.zeros(0, dtype=np.int64), *own])
-        self.of_steel = slice(len(self.columns) - dimension(steel), len(self.columns))
         among = [b for b in considered if _is_of(b, self.names)]
         self.spread = self._declared(tuple(among))
         # Columns of a state's tangent with the considered parameters of these beacons.
