@@ -115,8 +115,8 @@ def judged_with_score(result: R, log: Log, online: Site | None = None) -> Judged
         factor = factor if findings.factor is None else np.maximum(factor, findings.factor)
         spread = spread if findings.spread is None else spread + findings.spread
     widened = replace(result.states, pose_cov=factor[:, None, None] * pose_cov + spread)
-    judged = replace(result, states=widened, trust=trust)
-    return JudgedResult(judged, trust, score if in_region is None else in_region, causes)
+    score = score if in_region is None else in_region
+    return JudgedResult(replace(result, states=widened, trust=trust), trust, score, causes)
 
 
 def _run_tests(case: Case) -> Iterator[TestResult]:

@@ -42,8 +42,8 @@ class ScoreTargets:
         steady: bool,
         steel: tuple[Block, ...] = (),
     ) -> None:
-        self.site, held = site, held_blocks(site, estimated, steady=steady)
-        self.fixed_blocks, self.steel = placed((*held, *steel)) if held else (), steel
+        fixed = held_blocks(site, estimated, steady=steady)
+        self.site, self.fixed_blocks, self.steel = site, placed((*fixed, *steel)), steel
         self.names = tuple(beacon.name for beacon in site.beacons)
         self.unit, self.size = prior_sigma(self.fixed_blocks), MOTION + dimension(estimated)
         in_state = (*estimated, *considered)
