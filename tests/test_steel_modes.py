@@ -48,9 +48,21 @@ def _sphere_field(source: AnyArray, centre: Array, point: Array, volume: float) 
     return np.asarray(volume * (3.0 * along * inside - source) / (4.0 * np.pi * distance**3))
 
 
+@pytest.mark.parametrize("far", [50.0, 2e3, 1e9, np.nan])
+def test_a_path_of_kilometres_has_no_modes(far: float) -> None:
+    """An estimate that has diverged costs no memory."""
+    poses = _walk()
+    place = poses.position_world.copy()
+    place[-1] = far
+    site = demo_site(coil_radius=None)
+    assert steel.steel_modes(site, poses.time, replace(poses, position_world=place)) == ()
+    assert len(steel.steel_modes(site, poses.time, poses)) == 1
+
+
 def test_the_field_of_a_sphere_is_a_sum_of_modes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a small sphere in the middle of a voxel, in the sensor's axes and the drive's phase."""
     monkeypatch.setattr(steel, "SHARED", 10_000)
+    monkeypatch.setattr(steel, "MAX_MOMENTS", np.inf)
     site, poses = demo_site(coil_radius=None), _walk()
     (block,) = steel.steel_modes(site, poses.time, poses)
     assert isinstance(block.parameter, steel.SteelModes)

@@ -35,6 +35,7 @@ CLEAR = 0.4  # m; no steel nearer to path or beacon
 MARGIN = 2.5  # m; of the voxels around path and beacons
 PLACES = 60  # on the path, at which modes are determined
 MAX_EPOCHS = 4000
+MAX_MOMENTS = 5e7  # numbers, .4 GB; the path of a wrong estimate may span kilometres
 REGION_SHARED, REGION_OWN = 40, 3  # the same of a region
 REGION_EDGE, MAX_VOXELS = 1.0, 600  # m; coarser voxels where there would be more
 REGION_MARGIN = 1.0  # m; of places around beacons in a plane, and of voxels
@@ -168,7 +169,11 @@ def steel_modes(site: Site, time: Array, poses: Trajectory) -> tuple[Block, ...]
     if site.platform.further or not site.beacons or not 1 < len(time) <= MAX_EPOCHS:
         return ()
     place = sensor_positions(site, poses)[:, 0]
-    voxels = voxels_around(np.concatenate([place, [b.position_world for b in site.beacons]]))
+    channels = len(site.channels)
+    limit = MAX_MOMENTS / (3 * channels * (SHARED + OWN * channels))
+    voxels = voxels_around(np.concatenate([place, [b.position_world for b in site.beacons]]), limit)
+    if voxels is None:
+        return ()
     rows = np.unique(np.linspace(0, len(place) - 1, min(len(place), PLACES)).astype(int))
     basis = _basis(site, place[rows], voxels, (SHARED, OWN), 0.0)
     return along_path(basis, site, time, poses)
@@ -250,9 +255,14 @@ def _basis(
     return SteelBasis(voxels, dipoles, dipoles / strength[..., None, None], shared, softening)
 
 
-def voxels_around(point_world: Array) -> Voxels:
-    """Return an octree of voxels around points, finer near to them, and clear of them."""
+def voxels_around(point_world: Array, limit: float) -> Voxels | None:
+    """Return an octree of voxels around points, finer near to them, and clear of them.
+
+    None if there would be more voxels than a limit.
+    """
     low, high = point_world.min(axis=0) - MARGIN, point_world.max(axis=0) + MARGIN
+    if not np.prod((high - low) / COARSEST) <= limit:
+        return None
     centre, edge, out = _grid(low, high, COARSEST), COARSEST, []
     corners = np.stack(np.meshgrid(*[(-0.25, 0.25)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     while len(centre):
@@ -262,7 +272,8 @@ def voxels_around(point_world: Array) -> Voxels:
         out.append((centre[kept], np.full(np.sum(kept), edge)))
         centre = (centre[divided][:, None] + edge * corners).reshape(-1, 3)
         edge *= 0.5
-    return Voxels(np.concatenate([c for c, _ in out]), np.concatenate([e for _, e in out]))
+    voxels = Voxels(np.concatenate([c for c, _ in out]), np.concatenate([e for _, e in out]))
+    return voxels if len(voxels.edge) <= limit else None
 
 
 def _grid(low: Array, high: Array, edge: float) -> Array:
