@@ -319,15 +319,15 @@ def test_the_mean_nees_is_honest_whatever_was_declared(factor: float) -> None:
         config = SimulationConfig(DEMO_BOX_WORLD, duration=15.0, motion="walk")
         log = simulate_log(demo_site(), config, np.random.default_rng(seed)).log
         values.append(mean_nees(smooth(log, site), log))
-        if seed < 6:
+        if factor > 1.0 and seed < 6:
             raw = smooth(log, site, SmootherSettings(tune=False))
             untuned.append(mean_nees(raw, log))
     # On the safe side: what the survey's errors leave in the residuals is counted as model error,
     # and a density of the IMU is never taken for smaller than it was declared.
     low, high = 2.8, 7.0
-    assert low < np.mean(values) < high, (np.mean(values), np.mean(untuned))
+    assert low < np.mean(values) < high
     if factor > 1.0:
-        assert np.mean(untuned) < low, np.mean(untuned)
+        assert np.mean(untuned) < low
 
 
 def test_noise_that_the_declared_model_error_covers_is_no_doubt() -> None:

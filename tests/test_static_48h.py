@@ -162,8 +162,12 @@ def test_slopes_are_those_of_the_settled_part() -> None:
 
 @pytest.mark.slow
 def test_the_scenario_draws_and_ends_with_one_json_line(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    world: World,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
+    monkeypatch.setattr(static_48h, "run_many", lambda *_, **__: [world, world])
     given = ["static_48h.py", "--quick", "--workers", "1", "-o", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", given)
     static_48h.main()
