@@ -16,6 +16,7 @@ from magfusion.estimation.integrity.released_fault import release_gain
 from magfusion.estimation.integrity.score import Score, answered, scores_of
 from magfusion.estimation.integrity.suspects import suspects
 from magfusion.estimation.integrity.test_result import Case, TestResult
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.steel import (
     UNIT,
     SteelBasis,
@@ -131,6 +132,8 @@ def steel_explains(result: Smoothed, log: Log, rival: float) -> bool:
 def estimate_steel(case: Case, rival: float) -> SteelEstimate | None:
     """Return the steel that explains a log; None if not better than a rival cause of a gain."""
     result = case.result
+    if any(isinstance(m, JointPhasors) for m in result.graph.measurements):
+        return None  # the samples of short windows are not at the epochs, where the modes are
     poses = _poses_of_fields(result)
     modes = steel_modes(result.calibration.site, poses.time, poses)
     scores = scores_of(result, case.log.imu, modes) if modes else None
