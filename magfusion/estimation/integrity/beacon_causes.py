@@ -39,7 +39,8 @@ WIDE = (0.5, 1.0, 0.7, 3.0)  # sigmas: position (m), rotation (rad), log moment,
 
 def beacon_causes(known: Snapshots) -> Iterator[Explanation]:
     """Yield what would be explained by a mistake in one beacon."""
-    names = [beacon.name for beacon in known.site.beacons]
+    site, measured = known.site, np.any(known.samples.is_measured, axis=0)
+    names = [site.beacons[k].name for k in np.unique(site.owner[measured]).tolist()]
     if len(names) < FEWEST:
         return
     left = {name: known.without(name) for name in names}

@@ -15,6 +15,7 @@ from magfusion.units import Array, BoolArray
 
 COMPONENTS = 6.0  # of a phasor
 FALSE_REJECTIONS = 1e-6  # of the channels of an epoch
+NOISE_FACTOR = 2.0  # within which declared noise is right, however few data estimate it
 LOST_EPOCHS = 5  # consecutive epochs with most channels rejected: the state is wrong, not they
 Phasors = FieldPhasors | JointPhasors
 MEMORY = 0.95  # of the running mean of the distortion, per epoch
@@ -72,7 +73,8 @@ class Gate:
         """
         freedom = [noise_freedom.get(name, np.inf) for name in self._names]
         limit = [COMPONENTS * largest_mean_square(FALSE_REJECTIONS, COMPONENTS, f) for f in freedom]
-        self._limit = np.array(limit)[self._number]
+        known = COMPONENTS * largest_mean_square(FALSE_REJECTIONS, COMPONENTS, np.inf)
+        self._limit = np.minimum(limit, NOISE_FACTOR**2 * known)[self._number]
 
     @property
     def is_lost(self) -> bool:
