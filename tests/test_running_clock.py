@@ -107,6 +107,26 @@ def test_rounded_stamps_of_a_host_that_jitters_and_loses_samples(
     assert np.std(time[distinct][ENOUGH:] - whole.time[ENOUGH:]) < 2e-4  # s
 
 
+@pytest.mark.parametrize("rate_hz", [250.25, 333.0])
+@pytest.mark.parametrize("lost", [0.0, 0.1])
+def test_rounded_stamps_that_look_even_at_first_are_counted(rate_hz: float, lost: float) -> None:
+    """Of 333 Hz in milliseconds, the first 166 steps are of 3 ms."""
+    rng = np.random.default_rng(3)
+    selected = (np.arange(COUNT) / rate_hz)[rng.random(COUNT) >= lost]
+    time, clock, _ = timed(np.round(selected, 3))
+    assert clock.stamping == "rounded"
+    assert np.std((time - selected)[1000:]) < 1e-4  # s; of the stamps 2.9e-4
+
+
+@pytest.mark.parametrize("rate_hz", [400.0, 600.0])
+def test_pairs_of_losses_among_rounded_stamps_are_two(rate_hz: float) -> None:
+    """A sample between two losses is not delayed, where many samples are lost."""
+    rng = np.random.default_rng(3)
+    selected = (np.arange(COUNT) / rate_hz)[rng.random(COUNT) >= 0.1]
+    time, _, _ = timed(np.round(selected, 3))
+    assert np.std((time - selected)[ENOUGH:]) < 1e-4  # s; of the stamps 2.9e-4
+
+
 @pytest.mark.parametrize("kind", ["even", "lost", "jitter"])
 def test_other_stamps_stay(kind: str) -> None:
     rng = np.random.default_rng(1)

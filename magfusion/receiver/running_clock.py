@@ -9,7 +9,13 @@ import numpy as np
 
 from magfusion.model.batches import PAUSE, spread_batches
 from magfusion.receiver.bursts import LONGEST, SHARE, TOGETHER, spread_bursts
-from magfusion.receiver.sampling_clock import is_even, lost_ticks, sampling_clock, stamp_resolution
+from magfusion.receiver.sampling_clock import (
+    GAP,
+    is_even,
+    lost_ticks,
+    sampling_clock,
+    stamp_resolution,
+)
 from magfusion.units import Array, BoolArray, IntArray
 
 MIN_SAMPLES = 32  # that show whether stamps are even
@@ -52,12 +58,17 @@ class RunningClock:
         self._origin, self._pause, self._fitted = 0.0, np.inf, -np.inf
         self._points, self._width = np.empty((2, 0)), 0
         self._scatter, self._rounding = 0.0, 0.0
+        # Even stamps that may turn out to be rounded, and how many come before another look.
+        self._watched: Array | None = None
+        self._patience = 0
 
     def push(self, stamps: Array, rows: Array) -> tuple[Array, Array]:
         """Add samples (k,) with their stamps (s); return sampling times (s) of those known."""
         self._width = rows.shape[1]
-        if self.stamping == "stamps" or not len(stamps):
+        if not len(stamps):
             return stamps, rows
+        if self.stamping == "stamps":
+            return self._watch(stamps), rows
         if self.stamping is None:
             return self._gather(stamps, rows)
         gap = np.flatnonzero(np.diff(stamps, prepend=self._stamp) > self._pause)
@@ -90,6 +101,8 @@ class RunningClock:
         """Find the clock of the first samples, and return them on it."""
         self._waiting, self.stamping = None, "stamps"
         if len(stamps) < MIN_SAMPLES or not _is_candidate(stamps):
+            if len(stamps) >= MIN_SAMPLES and stamp_resolution(stamps) > 0.0:
+                self._watched = stamps
             return stamps, rows
         together = np.diff(stamps) == 0.0
         if np.mean(together) > 0.5 * SHARE:
@@ -106,8 +119,38 @@ class RunningClock:
         clock = sampling_clock(stamps)
         self._rounding = stamp_resolution(stamps)
         if clock is None or not self._rounding or clock.scatter > CLEAR * clock.step:
+            self._watched = stamps if self._rounding else None
             return stamps, rows
         return self._start("rounded", stamps, clock.time, np.arange(len(stamps))), rows
+
+    def _watch(self, stamps: Array) -> Array:
+        """Return further stamps, or times of a clock (s) once they are seen to be rounded.
+
+        The steps of 333 Hz in whole milliseconds are equal until one of them is longer.
+        """
+        if self._watched is None:
+            return stamps
+        seen, before = np.append(self._watched, stamps)[-MEMORY:], float(self._watched[-1])
+        self._watched, self._patience = seen, self._patience - len(stamps)
+        if len(seen) < ENOUGH or self._patience > 0:
+            return stamps
+        self._patience, steps = ENOUGH, np.diff(seen)
+        if np.min(steps) <= 0.0 or np.max(steps) > GAP * np.median(steps):
+            self._watched = stamps
+            return stamps
+        resolution = stamp_resolution(seen)
+        if resolution > 0.5 * np.min(steps):
+            return stamps
+        clock = sampling_clock(seen) if resolution else None
+        if clock is None or not clock.resolution or clock.scatter > CLEAR * clock.step:
+            self._watched = seen if len(seen) < MEMORY and resolution else None
+            return stamps
+        self._watched, self._rounding = None, resolution
+        time = self._start("rounded", seen, clock.time, np.arange(len(seen)))[-len(stamps) :]
+        least = before + LEAST_ADVANCE * self.step * np.arange(1, len(time) + 1)
+        time = np.maximum(time, least)
+        self._newest = float(time[-1])
+        return np.asarray(time)
 
     def _start(self, stamping: Stamping, stamps: Array, time: Array, last: IntArray) -> Array:
         """Begin a clock with approximate times (n,); return them on it (s).

@@ -19,7 +19,8 @@ PIECE = 200  # samples assigned to ticks at once
 KEPT = 150  # of them: those at the end may belong to another tick
 MOST_LOST = 40  # ticks in a piece; a longer silence is a gap
 GAP = 10.0  # steps
-LOSS = 8.0  # log-likelihood ratio that a lost sample costs
+LOSS = 8.0  # log-likelihood ratio that a lost sample costs, where few are lost
+MANY_LOST = 0.05  # of the samples; beyond, a loss costs what this share of losses does
 MEMORY = 2000  # samples that predict the next ticks
 MOST_PIECES = 40  # used for the median step
 SEARCHED = 0.08  # of the median and of the mean step, either way
@@ -101,12 +102,13 @@ def stamp_resolution(stamps: Array) -> float:
     steps = np.sort(np.diff(stamps[:MOST_STEPS]))
     change = np.diff(steps, prepend=0.0)
     separate = change[change > exact]
-    size = float(np.min(separate, initial=np.inf))
-    if not size > 10.0 * exact:
-        return 0.0
-    size = float(steps[-1] / np.round(steps[-1] / size))
-    off = np.abs(steps - size * np.round(steps / size))
-    return round(size, 9) if np.all(off <= 2.0 * exact) else 0.0
+    while len(separate) and (least := float(np.min(separate))) > 10.0 * exact:
+        size = float(steps[-1] / np.round(steps[-1] / least))
+        if np.all(np.abs(steps - size * np.round(steps / size)) <= 2.0 * exact):
+            return round(size, 9)
+        separate = np.abs(separate - least * np.round(separate / least))  # Euclid's algorithm
+        separate = separate[separate > exact]
+    return 0.0
 
 
 def _scattered_clock(stamps: Array, rounding: float) -> SamplingClock | None:
@@ -249,12 +251,13 @@ def lost_ticks(late: Array, sigma: float) -> IntArray:
     if np.max(np.abs(late)) < 0.5:
         return np.zeros(len(late), dtype=np.int64)
     lost_epochs = np.arange(MOST_LOST + 1)
-    cost = np.where(lost_epochs == 0, 0.0, LOSS)
+    loss = -np.log(MANY_LOST) if late[-1] > MANY_LOST * len(late) else LOSS
+    cost = np.where(lost_epochs == 0, 0.0, loss)
     came = np.zeros((len(late), len(lost_epochs)), dtype=np.int64)
     for k, own in enumerate(late):
         best = np.minimum.accumulate(cost)
         at = np.maximum.accumulate(np.where(cost == best, lost_epochs, 0))
-        fewer = np.concatenate([[np.inf], best[:-1]]) + LOSS
+        fewer = np.concatenate([[np.inf], best[:-1]]) + loss
         jump = fewer < cost
         came[k] = np.where(jump, np.concatenate([[0], at[:-1]]), lost_epochs)
         cost = np.where(jump, fewer, cost) + 0.5 * np.minimum((own - lost_epochs) / sigma, 5.0) ** 2
