@@ -216,3 +216,24 @@ def test_a_start_that_waits_for_late_samples_has_streams_of_one_length() -> None
     states = navigator.take()
     assert states
     assert not any(state.judgement.reasons for state in states)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("behind", [0.0, 100.0])
+def test_records_before_a_checkpoint_are_counted_and_change_nothing(
+    site: Path, lines: list[dict[str, Any]], tmp_path: Path, behind: float
+) -> None:
+    """A sender that repeats what was sent, or what it kept of an earlier run."""
+    settings = StreamSettings(EKF.navigator, checkpoint=tmp_path / "state", every=1.0)
+    answered(site, sent([one for one in lines if newest(one) < 9.0]), settings)
+    kept = (tmp_path / "state").read_bytes()
+    rest = [one for one in lines if newest(one) >= 9.0]
+    old = [stamped(one, lambda t: t - behind) for one in lines if newest(one) < 7.0]
+    expected, nothing = answered(site, sent(rest), replace(settings, resume=True))
+    (tmp_path / "state").write_bytes(kept)
+    states, reported = answered(site, sent([*old, *rest]), replace(settings, resume=True))
+    assert nothing == ""
+    assert "run without --resume" in reported
+    assert reported.endswith(f"{len(old)} records before the checkpoint are not used\n")
+    assert states == expected
+    assert len([one for one in states if one["started"]]) > 10

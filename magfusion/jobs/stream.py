@@ -28,7 +28,7 @@ from magfusion.jobs.inputs import named
 from magfusion.jobs.live import LiveSettings, StateSink, state_sinks
 from magfusion.jobs.region_option import ANYWHERE, Where
 from magfusion.jobs.rotor_inputs import AwaitedAngles, check_streamed_rotors
-from magfusion.jobs.stream_clocks import ClockJump, StreamClocks
+from magfusion.jobs.stream_clocks import ClockJump, OlderRecords, StreamClocks
 from magfusion.jobs.stream_samples import StreamSamples
 from magfusion.model.aiding import sensor_named
 from magfusion.model.marks import Marks
@@ -133,8 +133,8 @@ def _navigate(
     refused, saved, reached = 0, -np.inf, -np.inf
     output, angles = _StateWriter(navigator, sink, others), AwaitedAngles(site)
     kept = None if place is None else CheckpointWriter(place, key, messages)
-    clocks = StreamClocks(settings.navigator.delay)
-    for numbered in records:
+    clocks, older = StreamClocks(settings.navigator.delay), OlderRecords(navigator.time)
+    for numbered in older.skipped(records, messages):
         try:
             numbered = _on_clock(numbered, site, clocks, samples, output, messages)
             newest = _process_record(output.navigator, site, numbered, samples, output)
@@ -145,10 +145,6 @@ def _navigate(
             refused += 1
             write_message(messages, f"{sentence} (skipped)")
             continue
-        if -np.inf < newest < output.resumed:
-            at = f"{output.resumed:.3f} s"
-            write_message(messages, f"data before the checkpoint ({at}) are not used")
-            output.resumed = -np.inf
         angles.see(numbered.record)
         navigator = output.navigator = corrected(output.navigator)
         output.epochs()
@@ -165,6 +161,7 @@ def _navigate(
     if output.reference:
         write_message(messages, f"reference: {NOT_ONLINE}")
     samples.report(messages)
+    older.report(messages)
     if refused:
         write_message(messages, f"{refused} records were skipped")
     return refused
@@ -181,16 +178,13 @@ class _StateWriter:
     Attributes
     ----------
     navigator : Navigator
-    resumed : float
-        Time of the checkpoint (s), older data are not used; infinitely early without one.
     reference : bool
         Whether samples of a reference sensor have arrived, which are not used here.
     """
 
     def __init__(self, navigator: Navigator, sink: BinaryIO, others: tuple[StateSink, ...]) -> None:
         self.navigator, self._sink, self._others = navigator, sink, others
-        self._newest, self.resumed = -np.inf, navigator.time
-        self.reference = False
+        self._newest, self.reference = -np.inf, False
 
     def write(self, state: JudgedState | None, output: dict[str, Any]) -> None:
         """Write a state, or the status before the first (None)."""
@@ -201,7 +195,7 @@ class _StateWriter:
     def restart(self) -> None:
         """Navigate on another clock."""
         self.navigator = self.navigator.restarted()
-        self._newest = self.resumed = -np.inf
+        self._newest = -np.inf
 
     def now(self) -> None:
         """Write the current states, before any other processing."""

@@ -1,14 +1,16 @@
 """Clocks of the records in a pipe: counters of 32 bits are unwrapped, steps are found."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TextIO
 
 import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.data_checks.stream_buffer import LARGEST_JUMP
 from magfusion.files.records import Record
+from magfusion.files.standard_streams import write_message
+from magfusion.files.stream import NumberedRecord
 from magfusion.model.counters import lost_by_wrapping
 from magfusion.units import Array
 
@@ -156,6 +158,56 @@ class StreamClocks:
         """Return whether all stamps are behind the newest, or ahead of those of all streams."""
         behind = float(np.max(times)) < clock.newest - self._least
         return behind or -np.inf < self._newest < float(np.min(times)) - LARGEST_JUMP
+
+
+class OlderRecords:
+    """Records before a checkpoint, with which the stream of a resumed run may begin.
+
+    Parameters
+    ----------
+    until : float
+        Time of the checkpoint (s); infinitely early without one.
+
+    Attributes
+    ----------
+    count : int
+    """
+
+    def __init__(self, until: float) -> None:
+        self._until, self.count = until, 0
+
+    def skipped(
+        self, records: Iterable[NumberedRecord], messages: TextIO
+    ) -> Iterator[NumberedRecord]:
+        """Yield the other records, and count these; report the first."""
+        for numbered in records:
+            if not self._contains(numbered.record):
+                yield numbered
+                continue
+            self.count += 1
+            if self.count == 1:
+                at = f"{self._until:.3f} s"
+                write_message(
+                    messages,
+                    f"data before the checkpoint ({at}) are not used; if the clock began anew, run"
+                    " without --resume",
+                )
+
+    def _contains(self, record: Record | None) -> bool:
+        """Return whether a record is one of them; the first newer one ends them."""
+        newest = -np.inf if record is None else max(_newest_stamps(record), default=-np.inf)
+        if newest >= self._until:
+            self._until = -np.inf
+        return -np.inf < newest < self._until
+
+    def report(self, messages: TextIO) -> None:
+        """Write how many there were."""
+        if self.count:
+            write_message(messages, f"{self.count} records before the checkpoint are not used")
+
+
+def _newest_stamps(record: Record) -> Iterator[float]:
+    return (float(np.max(times)) for _, times in _streams(record))
 
 
 def _streams(record: Record) -> Iterator[tuple[str, Array]]:
