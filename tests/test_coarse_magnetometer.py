@@ -11,6 +11,7 @@ from magfusion.estimation.data_checks.samples import (
     frozen_samples,
     repeated_samples,
 )
+from magfusion.estimation.integrity.likely_cause import cause_of
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -97,3 +98,18 @@ def test_pauses_of_a_multiplexer_are_no_freeze() -> None:
     assert "frozen_magnetometer" in codes(held(log, pauses[10]))
     uneven = [(1.0, 1.3), (3.0, 4.1), (9.0, 9.4), (15.0, 15.3), (21.0, 23.0), (26.0, 26.5)]
     assert "frozen_magnetometer" in codes(held(log, *uneven))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [None, *STEPS])
+def test_fields_distorted_by_steps_are_no_iron(step: float | None) -> None:
+    site = demo_site()
+    config = SimulationConfig(DEMO_BOX_WORLD, duration=20.0, quantisation=step)
+    log = simulate_log(site, config, np.random.default_rng(4)).log
+    cause = cause_of(log, site)
+    if step is None:
+        assert cause is None
+        return
+    assert cause is not None
+    assert cause[0].code == "quantised"
+    assert "Choose a smaller range" in cause[1]

@@ -131,14 +131,19 @@ def test_the_covariance_holds_for_a_hand_and_the_prior_helps() -> None:
     assert np.mean(smoothed**2) < np.mean(alone**2)
 
 
+def of_moments(sigma: float, site: Site) -> Site:
+    """Return a site whose moments are uncertain (sigma of the logarithm)."""
+    beacons = tuple(
+        replace(b, sigma=replace(b.sigma, log_moment=np.full(len(b.coils), sigma)))
+        for b in site.beacons
+    )
+    return replace(site, beacons=beacons)
+
+
 def of_samples(seed: int, beacons: int, duration: float) -> tuple[Log, Site]:
     """Return raw samples of a walk among beacons whose moments alone are uncertain, by 5 %."""
-    site = exact()
-    chosen = tuple(
-        replace(b, sigma=replace(b.sigma, log_moment=np.full(len(b.coils), 0.05)))
-        for b in site.beacons[:beacons]
-    )
-    site = replace(site, beacons=chosen)
+    site = of_moments(0.05, exact())
+    site = replace(site, beacons=site.beacons[:beacons])
     config = SimulationConfig(DEMO_BOX_WORLD, duration=duration, magnetometer_rate_hz=400.0)
     return simulate_log(site, config, np.random.default_rng(seed)).log, site
 
@@ -153,6 +158,22 @@ def mean_nees_of_samples(beacons: int, seeds: range, duration: float) -> float:
 def test_the_covariance_holds_for_raw_samples() -> None:
     """Windows follow the poses, and their residuals are no measure of their noise."""
     assert 3.0 < mean_nees_of_samples(4, range(2), 8.0) < 9.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_uncertain_moments_do_not_move_the_trajectory(seed: int) -> None:
+    """A log determines moments better than a sigma of 5 % does, and as well as known ones."""
+    uncertain = of_moments(0.05, exact())
+    config = SimulationConfig(DEMO_BOX_WORLD, duration=12.0, magnetometer_rate_hz=400.0)
+    simulated = simulate_log(uncertain, config, np.random.default_rng(seed))
+    log, errors = simulated.log, []
+    assert log.truth is not None
+    for site in (uncertain, of_moments(0.0, simulated.true_site)):
+        result, trust = judge_result(smooth(log, site), log)
+        assert trust.verdict == "trustworthy"
+        errors.append(trajectory_errors(result.states, log.truth).ate)
+    assert errors[0] < 1.2 * errors[1]
 
 
 @pytest.mark.slow

@@ -58,9 +58,9 @@ class RunningClock:
         self._origin, self._pause, self._fitted = 0.0, np.inf, -np.inf
         self._points, self._width = np.empty((2, 0)), 0
         self._scatter, self._rounding = 0.0, 0.0
-        # Even stamps that may turn out to be rounded, and how many come before another look.
+        # Even stamps that may turn out to be rounded, and how many come before a check.
         self._watched: Array | None = None
-        self._patience = 0
+        self._until_check = 0
 
     def push(self, stamps: Array, rows: Array) -> tuple[Array, Array]:
         """Add samples (k,) with their stamps (s); return sampling times (s) of those known."""
@@ -131,10 +131,10 @@ class RunningClock:
         if self._watched is None:
             return stamps
         seen, before = np.append(self._watched, stamps)[-MEMORY:], float(self._watched[-1])
-        self._watched, self._patience = seen, self._patience - len(stamps)
-        if len(seen) < ENOUGH or self._patience > 0:
+        self._watched, self._until_check = seen, self._until_check - len(stamps)
+        if len(seen) < ENOUGH or self._until_check > 0:
             return stamps
-        self._patience, steps = ENOUGH, np.diff(seen)
+        self._until_check, steps = ENOUGH, np.diff(seen)
         if np.min(steps) <= 0.0 or np.max(steps) > GAP * np.median(steps):
             self._watched = stamps
             return stamps

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from magfusion.estimation.data_checks.resolution import step_of_axes
 from magfusion.estimation.demodulation.demodulation import demodulated
 from magfusion.estimation.integrity.beacon_causes import (
     MISFIT,
@@ -40,6 +41,7 @@ PARTS = 4
 FEWEST = 8  # epochs
 LEAST_WAY = 0.3  # m; who goes less far sees each beacon from one side
 OF_MOTION = "the motion by the fields against that by the inertial sensor"
+DISTORTION = 0.3  # of a step, in phasors: 1/sqrt(12) of each sample
 STRANGE = 1e3  # and above which it is no field of this site
 
 
@@ -64,7 +66,7 @@ def cause_of(
     of_fields, of_motion = clearly_best(tried), None
     if of_fields is None and any(one.clear for one in tried):
         return None  # it is of the fields, whichever it is: no inertial sensor explains it
-    if of_fields is None and (rest := _unexplained(known)) is not None:
+    if of_fields is None and (rest := _unexplained(known, part, samples)) is not None:
         return rest
     if of_fields is None or known.excess < MISFIT:
         # As declared the fields may be so: what explains them is weighed against what moves.
@@ -76,7 +78,9 @@ def cause_of(
     return None
 
 
-def _unexplained(known: Snapshots) -> tuple[Explanation, str] | None:
+def _unexplained(
+    known: Snapshots, part: Log, samples: FieldSamples
+) -> tuple[Explanation, str] | None:
     """Return what is to be said of fields that no single mistake explains."""
     before, freedom, excess = known.joint_chi_square, max(known.freedom, 1.0), known.excess
     if excess < MISFIT or not _moves(known):
@@ -89,6 +93,8 @@ def _unexplained(known: Snapshots) -> tuple[Explanation, str] | None:
             " expected), and no single usual mistake explains it. Check that the site is that of"
             " this room, with these beacons at these frequencies.",
         )
+    elif rounded := _rounded(part, samples, known.site, rms * known.site.model_error):
+        code, text = "quantised", rounded
     else:
         share = 100.0 * rms * known.site.model_error
         code, text = (
@@ -99,6 +105,26 @@ def _unexplained(known: Snapshots) -> tuple[Explanation, str] | None:
             f" world.model_error {0.01 * share:.2g}.",
         )
     return Explanation(code, text, "", before, before, freedom, catch_all=True), text
+
+
+def _rounded(log: Log, samples: FieldSamples, site: Site, share: float) -> str | None:
+    """Return what is to be said of fields distorted by the steps of the magnetometer.
+
+    Steps below the noise only add to it; larger ones distort, by less than a step.
+    """
+    wave, density = log.waveform, site.platform.magnetometer.noise_density
+    if wave is None or len(wave) < FEWEST:
+        return None
+    step = float(np.max(step_of_axes(wave.measured_sensor)))
+    rounding = step * np.sqrt(float(np.median(np.diff(wave.time))) / 6.0)  # T/sqrt(Hz), one-sided
+    size = float(np.nanmedian(np.linalg.norm(samples.phasor_sensor, axis=2)))
+    if rounding < density or share * size > DISTORTION * step:
+        return None
+    return (
+        f"The magnetometer's steps of {step:.2g} T are larger than its noise, and distort the"
+        f" fields by about {100.0 * share:.2g} %. Choose a smaller range, or declare"
+        f" noise_density_t_rthz {rounding:.2g} and world.model_error {share:.2g}."
+    )
 
 
 def _demodulated(log: Log, site: Site, settings: LockinSettings | None) -> FieldSamples:
