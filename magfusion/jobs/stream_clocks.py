@@ -189,7 +189,7 @@ class OlderRecords:
                 at = f"{self._until:.3f} s"
                 write_message(
                     messages,
-                    f"data before the checkpoint ({at}) are not used; if the clock began anew, run"
+                    f"data before the checkpoint ({at}) are not used; if the clock began again, run"
                     " without --resume",
                 )
 
