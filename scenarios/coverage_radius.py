@@ -295,7 +295,7 @@ def draw(path: Path, outcomes: RadiusOutcome) -> None:
         ylim=(2e-3, 2e4),
         xlabel="range (m)",
         ylabel="mean square of the direction's error (deg²)",
-        title="Reach of one beacon, 45° from its axis; dotted: the law",
+        title="Reach of one beacon, 45° from its axis; dotted: Eq 7 to first order",
     )
     axes.legend(fontsize=8, loc="lower right")
     save_picture(figure, path)

@@ -55,7 +55,7 @@ def dipole(figure: Figure) -> None:
     field = dipole_field(places, np.array([0.0, 220.0, 0.0]))
     colour = np.log10(np.linalg.norm(field, axis=-1) / NANOTESLA)
     remaining.streamplot(along, along, field[..., 0], field[..., 1], color=colour, density=1.2)
-    _titled(remaining, "field of one coil, its moment upwards", "x (m)", "y (m)")
+    _titled(remaining, "field of one coil, its moment upwards; yellow: strong", "x (m)", "y (m)")
     site = demo_site(coil_radius=None)
     beacon = replace(site.beacons[0], position_world=np.zeros(3), world_from_beacon=np.eye(3))
     magnetometer = replace(
@@ -94,7 +94,7 @@ def inertial(figure: Figure) -> None:
     fixes = fix_epochs(samples, initial_calibration(site, 0.0))
     fixed = np.median(np.linalg.norm(fixes.position_world[:, 0] - truth.position_world, axis=1))
     axes.axhline(fixed, color=GOOD, label="one fix among four beacons, median error")
-    _titled(axes, "how far the position is known", "time without fields (s)", "m")
+    _titled(axes, "sigma of the position", "time without fields (s)", "position (m)")
     axes.legend(fontsize=8)
 
 
@@ -140,7 +140,12 @@ def score(figure: Figure) -> None:
     axes.set_yticks(rows, names, fontsize=8)
     axes.set_xscale("log")
     axes.set_xlim(left=0.1)
-    _titled(axes, "gain of estimating it (1: chance)", "fall of cost, each degree", "")
+    _titled(
+        axes,
+        "gain of estimating a parameter (1: by chance)",
+        "decrease of cost per degree of freedom",
+        "",
+    )
     axes.legend(fontsize=8, loc="center right")
 
 
@@ -162,10 +167,16 @@ def separation(figure: Figure) -> None:
         levels.append(1e3 * np.nanmedian(separated.states.protection_level_m))
     axes = figure.subplots()
     axes.loglog(100.0 * shares[1:], errors[1:], "o-", color=WRONG, label="all beacons")
-    axes.loglog(100.0 * shares[1:], kept[1:], "o-", color=GOOD, label="what separation leaves")
+    axes.loglog(100.0 * shares[1:], kept[1:], "o-", color=GOOD, label="without the excluded beacon")
     axes.loglog(100.0 * shares[1:], levels[1:], "k--", label="protection level")
-    axes.axhline(errors[0], color="k", linestyle=":", label="no fault")
-    _titled(axes, "one of four beacons is false (medians)", "by (%)", "position (mm)")
+    axes.axhline(errors[0], color="k", linestyle=":", label="all beacons, no fault")
+    axes.set_ylim(bottom=0.6 * errors[0])
+    _titled(
+        axes,
+        "one of four beacons has a scale error (medians)",
+        "scale error (%)",
+        "position error (mm)",
+    )
     axes.legend(fontsize=8)
 
 

@@ -41,6 +41,11 @@ def _simulated(command: str) -> tuple[str, ...]:
     )
 
 
+_DESIGN = (
+    "magfusion design site.yaml --beacons 3 --hall hall.yaml --spacing 1.5 --grid 2"
+    " --starts 2 --random 20 -o design"
+)
+
 PICTURES = {
     "readme": Picture(
         ".github/readme.webp", ("magfusion demo --no-show",), "magfusion_demo/run.rrd"
@@ -68,11 +73,14 @@ PICTURES = {
     ),
     "design": Picture(
         "docs/figures/design.png",
-        (
-            "magfusion design site.yaml --beacons 3 --hall hall.yaml --spacing 1.5 --grid 2"
-            " --starts 2 --random 20 -o design",
-        ),
+        (_DESIGN,),
         "design/design.png",
+        "docs/jobs/design.md",
+    ),
+    "error_budget": Picture(
+        "docs/figures/error_budget.png",
+        (_DESIGN,),
+        "design/error_budget.png",
         "docs/jobs/design.md",
     ),
     "drift": Picture(

@@ -99,7 +99,7 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
         of_sigma = settings.objective != "worst"
         panels = [
             Panel(f"before: {words}", before, maps[0], of_sigma),
-            Panel("after", new, maps[1], of_sigma),
+            Panel("after: the design", new, maps[1], of_sigma),
         ]
         rows = worst_and_median(maps[1])
         budget = error_budget(new, task.points[rows], settings.window) if len(rows) else None

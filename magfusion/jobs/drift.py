@@ -16,7 +16,7 @@ from magfusion.files.checkpoint import read_position
 from magfusion.jobs.settings import Command, RandomSettings, option
 from magfusion.model.progress import Report
 from magfusion.model.trust import Finding, Trust
-from magfusion.results.drift import QUANTITIES, EstimatorPlot, settled_after
+from magfusion.results.drift import QUANTITIES, EstimatorPlot, settled_after, worlds_text
 from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
 from magfusion.simulation.monte_carlo import run_many
@@ -168,7 +168,7 @@ def summarise(settings: DriftSettings, runs: list[WorldRun]) -> Figures:
         ]
         for quantity in QUANTITIES
     }
-    head = heading("drift", f"{settings.hours:g} h in {settings.worlds} world(s)")
+    head = heading("drift", f"{settings.hours:g} h in {worlds_text(settings.worlds)}")
     answer = STABILITY[overall([one.verdict for one in judgements])]
     head |= trust_figures(trust, answer) | Figures(
         *(

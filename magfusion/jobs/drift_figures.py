@@ -23,6 +23,7 @@ from magfusion.results.drift import (
     settled_after,
     slope_over_worlds,
     within,
+    worlds_text,
 )
 from magfusion.results.figures import Figure, Figures, Section
 from magfusion.simulation.endurance import BLOCK
@@ -258,7 +259,7 @@ def _consistency(runs: list[WorldRun]) -> tuple[list[Figure], list[Criterion]]:
                 verdict,
                 f"the estimated standard deviations of the {name} are {word}: NEES per degree of"
                 f" freedom {mean:.3g} ({halves[0]:.3g} in the first half, {halves[1]:.3g} in the"
-                f" last), limits {low:.3g} and {high:.3g} for {len(runs)} world(s)",
+                f" last), limits {low:.3g} and {high:.3g} for {worlds_text(len(runs))}",
             )
         )
     innovation = np.concatenate([run.pace[:, DISTORTION] for run in runs])

@@ -6,7 +6,15 @@
 from pathlib import Path
 
 from magfusion.model.trust import Verdict
-from magfusion.results.brief_plan import accuracy, is_design, length, plan_lines
+from magfusion.results.brief_plan import (
+    accuracy,
+    bounds,
+    coverage_lines,
+    is_coverage,
+    is_design,
+    length,
+    plan_lines,
+)
 from magfusion.results.drift import QUANTITIES
 from magfusion.results.figures import Figures, Section, number
 from magfusion.results.shown import axis_rows, findings, number_text
@@ -31,6 +39,7 @@ _NEXT_OF = {
     ("drift", Verdict.TRUSTWORTHY): "magfusion view {output}, or open {output}/stability.png",
     ("drift", Verdict.DOUBTFUL): "run longer (--hours) or more worlds (--worlds 8)",
     ("drift", Verdict.FAILED): "open {output}/drift.png; the first failed line is the cause",
+    ("simulate", Verdict.TRUSTWORTHY): "magfusion smooth {output}",
     (
         "coverage",
         Verdict.TRUSTWORTHY,
@@ -53,7 +62,8 @@ _NEXT_OF = {
 def is_brief(figures: Figures) -> bool:
     """Return whether a result has a screen of a few lines."""
     has_axes = bool(figures.of(Section.AXES))
-    return has_axes or is_design(figures) or figures.get("job") in ("check", "drift")
+    is_plan = is_design(figures) or is_coverage(figures)
+    return has_axes or is_plan or figures.get("job") in ("check", "drift")
 
 
 def remark_texts(figures: Figures, *, routine: bool) -> list[str]:
@@ -66,6 +76,8 @@ def table(figures: Figures) -> Rows:
     """Return the table of a result, its head first; empty without one."""
     if is_design(figures):
         return accuracy(figures)
+    if is_coverage(figures):
+        return bounds(figures)
     return _slopes(figures) if figures.get("job") == "drift" else axis_rows(figures)
 
 
@@ -73,6 +85,8 @@ def lines(figures: Figures) -> Rows:
     """Return the other lines of a result, each as its label and text."""
     if is_design(figures):
         return plan_lines(figures)
+    if is_coverage(figures):
+        return coverage_lines(figures)
     if figures.get("job") == "drift":
         return _criteria(figures)
     return _pose_rows(figures) if figures.of(Section.AXES) else _check_rows(figures)
@@ -80,7 +94,7 @@ def lines(figures: Figures) -> Rows:
 
 def next_step(figures: Figures, output: Path | None) -> str:
     """Return what to do next; empty where nothing is written, or nothing is judged."""
-    if not ("verdict" in figures or is_design(figures) or figures.get("job") == "coverage"):
+    if not ("verdict" in figures or is_design(figures) or is_coverage(figures)):
         return ""
     look = look_of(str(figures.get("verdict", Verdict.TRUSTWORTHY)))
     text = _NEXT_OF.get((str(figures.get("job")), look), _NEXT[look])

@@ -14,16 +14,18 @@ def is_design(figures: Figures) -> bool:
     return "beacons_placed" in figures
 
 
+def is_coverage(figures: Figures) -> bool:
+    """Return whether a result is the coverage of an installation."""
+    return "share_below_10_cm" in figures
+
+
 def accuracy(figures: Figures) -> Rows:
     """Return position sigmas and protection levels, and those of what it is compared with."""
     rows = [["", "sigma, worst", "median", "level, worst", "median"]]
     for label, prefix in (("design", ""), ("before", "before_")):
         sigma, level = f"{prefix}position_sigma_m", f"{prefix}protection_level"
         row = [length(figures.get(f"{sigma}_{of}")) for of in ("worst", "median")]
-        for of in ("worst", "median"):
-            angle = figures.get(f"{level}_deg_{of}")
-            text = length(figures.get(f"{level}_m_{of}"))
-            row.append(text if angle is None else f"{text}, {number_text(angle, 2)} deg")
+        row += [_level(figures, level, of) for of in ("worst", "median")]
         rows.append([label, *row])
     if "random_layouts" in figures:
         best = [
@@ -39,11 +41,7 @@ def plan_lines(figures: Figures) -> Rows:
     rows = []
     if "need_m" in figures:
         what = "protection level" if figures["objective"] == "worst" else "position sigma"
-        limits = [length(figures["need_m"])]
-        limits += [f"{number_text(figures['need_deg'])} deg"] if "need_deg" in figures else []
-        share = 100.0 * number(figures["share_reached"])
-        points = f"{share:.3g} % of {figures['points']} points"
-        rows.append(["need", f"{what} {', '.join(limits)}: reached at {points}"])
+        rows.append(_need(what, figures))
     kept = f"; {figures['beacons_kept']} kept" if figures["beacons_kept"] else ""
     moments, tones = (
         _span([number(f.value) for f in figures.all if f.name.startswith(key)], unit)
@@ -59,6 +57,55 @@ def plan_lines(figures: Figures) -> Rows:
         rows.append(["coils", f"at most {', '.join(drive)}"])
     limit = figures.get("limit")
     return [*rows, ["limit", number_text(limit)]] if limit else rows
+
+
+def bounds(figures: Figures) -> Rows:
+    """Return sigmas and protection levels over a volume."""
+    rows = [["", "median", "90th percentile", "worst"]]
+    for name, unit, shown in (("position", "m", length), ("attitude", "deg", _angle)):
+        values = (shown(figures.get(f"{name}_sigma_{unit}_{of}")) for of in ("median", "p90"))
+        rows.append([f"{name} sigma", *values, ""])
+    level = [_level(figures, "protection_level", of) for of in ("median", "worst")]
+    return [*rows, ["protection level", level[0], "", level[1]]]
+
+
+def coverage_lines(figures: Figures) -> Rows:
+    """Return where the position is determined, and what one more beacon gains."""
+    determined, cm, dm = (
+        f"{100.0 * number(figures.get(key)):.3g} %"
+        for key in ("share_determined", "share_below_1_cm", "share_below_10_cm")
+    )
+    within = f"position determined at {determined}, sigma below 10 cm at {dm}, 1 cm at {cm}"
+    spacing = length(figures["spacing_m"])
+    rows = [["points", f"{figures['points']}, {spacing} apart: {within}"]]
+    if "need_m" in figures:
+        rows.append(_need("protection level", figures))
+    protected = 100.0 * number(figures.get("share_with_level"))
+    least = f"at least {figures['beacons_heard_least']} beacons"
+    rows.append(["in range", f"{least}; with a protection level: {protected:.3g} % of the points"])
+    if "extra_beacon_x_m" in figures:
+        place = ", ".join(number_text(figures[f"extra_beacon_{axis}_m"]) for axis in "xyz")
+        before, after = (length(figures[f"median_{of}_extra_m"]) for of in ("without", "with"))
+        gain = f"the median position sigma is {after} instead of {before}"
+        rows.append(["one more", f"with a beacon at ({place}) m {gain}"])
+    return rows
+
+
+def _need(what: str, figures: Figures) -> list[str]:
+    limits = [length(figures["need_m"])]
+    limits += [f"{number_text(figures['need_deg'])} deg"] if "need_deg" in figures else []
+    share = 100.0 * number(figures["share_reached"])
+    points = f"{share:.3g} % of {figures['points']} points"
+    return ["need", f"{what} {', '.join(limits)}: reached at {points}"]
+
+
+def _level(figures: Figures, key: str, of: str) -> str:
+    text, angle = length(figures.get(f"{key}_m_{of}")), figures.get(f"{key}_deg_{of}")
+    return text if angle is None else f"{text}, {_angle(angle)}"
+
+
+def _angle(degrees: Value) -> str:
+    return "none" if degrees is None else f"{number_text(degrees, 2)} deg"
 
 
 def length(metres: Value) -> str:

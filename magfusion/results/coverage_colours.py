@@ -34,4 +34,4 @@ def colour_of(coverage: Coverage) -> IntArray:
 
 def length(metres: float) -> str:
     """Return a sigma as printed."""
-    return f"{1e3 * metres:.3g} mm" if metres < 0.1 else f"{metres:.3g} m"
+    return f"{1e3 * metres:.3g} mm" if metres < 1.0 else f"{metres:.3g} m"

@@ -299,3 +299,8 @@ class EstimatorPlot:
         detected = self.pace[np.isfinite(self.pace[:, 4])]
         levels["innovation"] = in_windows(detected[:, 0], detected[:, 4], edges)
         return 0.5 * (edges[1:] + edges[:-1]) / HOUR, levels
+
+
+def worlds_text(count: object) -> str:
+    """Return a number of worlds as printed."""
+    return "1 world" if count == 1 else f"{count} worlds"

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 
+from magfusion.results.brief import table
 from magfusion.results.figures import Figures, ParameterEstimate, Section, Value
 from magfusion.results.page_motion import (
     MotionPage,
@@ -21,7 +22,6 @@ from magfusion.results.page_style import STYLE
 from magfusion.results.provenance import Run, current_run, input_files, versions
 from magfusion.results.shown import (
     as_sure,
-    axis_rows,
     column_rows,
     findings,
     labelled,
@@ -51,6 +51,7 @@ _MEANING = {
 }
 NO_JUDGE = "This job has no verdict."
 _CAPTIONS = {
+    "allan": "Allan deviation of each axis",
     "antenna": "Antennas: residuals and estimates",
     "attitude": "Estimated angles over time, and their errors against the truth, if any",
     "attitudes": "Attitudes in the database",
@@ -59,6 +60,7 @@ _CAPTIONS = {
     "check": "Spectrum, signal to noise, gravity and static field",
     "coverage": "Where the installation can navigate",
     "design": "Protection levels before and after",
+    "error_budget": "Error budget: share of each source in the variance of the position",
     "drift": "Errors and their sigmas over the days",
     "field_map": "Deviation of the beacons' fields from their model",
     "magnetometer": "Magnetometer: field before and after",
@@ -183,7 +185,7 @@ def _unverified(figures: Figures) -> str:
 def _main(figures: Figures) -> str:
     errors = column_rows(figures.of(Section.ERRORS), "")
     transfer = column_rows(figures.of(Section.TRANSFER), "other part of the log")
-    parts = (axis_rows(figures), errors, transfer)
+    parts = (table(figures), errors, transfer)
     tables = [_table(rows) for rows in parts if len(rows) > 1]
     summary = [list(row) for row in summary_rows(figures.of(Section.SUMMARY))]
     content = "".join([*tables, _table([[], *summary]) if summary else ""])

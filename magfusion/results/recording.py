@@ -129,22 +129,20 @@ def write_recording(
 
 
 def _summary(trajectory: Trajectory, errors: TrajectoryErrors | None) -> str:
-    """Return the path's length, its sigmas, and its errors."""
+    """Return the path's length, and errors and sigmas on the same terms."""
     time = trajectory.time
     findings = [f"{len(time)} poses in {time[-1] - time[0]:.3g} s"]
-    if trajectory.pose_cov is not None:
-        widest = [
-            3.0 * float(np.sqrt(np.median(np.linalg.eigvalsh(trajectory.pose_cov[:, p, p])[:, -1])))
-            for p in (slice(3, 6), slice(0, 3))
-        ]
-        findings.append(
-            f"3 sigma {1e3 * widest[0]:.2g} mm and {np.rad2deg(widest[1]):.2g} deg (median)"
-        )
     if errors is not None:
         met = [f"{1e3 * errors.ate:.2g} mm"] * errors.has_position
         met += [f"{errors.attitude_rmse_deg:.2g} deg"] * errors.has_attitude
-        findings.append(f"errors {' and '.join(met)} rms against the truth")
-    return "; ".join(findings)
+        findings.append(f"error {' and '.join(met)}")
+    if trajectory.pose_cov is not None:
+        place, turn = (
+            float(np.sqrt(np.mean(np.trace(trajectory.pose_cov[:, p, p], axis1=1, axis2=2))))
+            for p in (slice(3, 6), slice(0, 3))
+        )
+        findings.append(f"sigma {1e3 * place:.2g} mm and {np.rad2deg(turn):.2g} deg")
+    return "; ".join(findings) + (" (rms, three axes together)" if len(findings) > 1 else "")
 
 
 def open_viewer(path: Path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from magfusion.results.drift import QUANTITIES, EstimatorPlot, Quantity
+from magfusion.results.drift import QUANTITIES, EstimatorPlot, Quantity, worlds_text
 from magfusion.results.recording_file import whole_recording
 from magfusion.results.recording_layout import about_zero, layout, plot, readable_range, span_of
 from magfusion.results.recording_trust import BANNER, banner_text
@@ -43,7 +43,7 @@ def _write(recording: rr.RecordingStream, place: str, text: str) -> None:
 
 
 def _banner(figures: Mapping[str, object], notes: list[str]) -> str:
-    run = f"{figures['hours']:g} h, {figures['worlds']} world(s)"
+    run = f"{figures['hours']:g} h, {worlds_text(figures['worlds'])}"
     lines = [f"- {run}; errors of the first world, all judgements on the right"]
     failed = [note for note in notes if note.startswith("FAIL")]
     return banner_text(str(figures["verdict"]), [*lines, *(f"- **{note}**" for note in failed)])

@@ -61,7 +61,7 @@ def show(
         _show_brief(figures, console)
     else:
         _show_all(figures, console)
-    if brief or figures.get("job") == "coverage":
+    if brief or figures.get("job") == "simulate":
         _show_next(figures, output, console)
     if output is not None:
         console.print(f"results in {output}", soft_wrap=True, markup=False)

@@ -52,5 +52,6 @@ def write_check_plot(path: Path, look: Look) -> None:
             middle.axvspan(begin, end, color="0.9")
             bottom.axvspan(begin, end, color="0.9")
     verdict = str(look.trust.verdict)
-    figure.suptitle(f"{verdict}: {look.trust.reasons[0].code}" if look.trust.reasons else verdict)
+    reason = f" ({look.trust.reasons[0].code})" if look.trust.reasons else ""
+    figure.suptitle(f"Check of a log: {verdict}{reason}")
     figure.savefig(path, dpi=100, metadata={"Software": None})

@@ -80,7 +80,7 @@ def write_plot(path: Path, hall: Hall, panels: list[Panel]) -> None:
     for row, panel in enumerate(panels):
         for axes in axes_of[row]:
             draw_beacons(axes, panel.site.beacons, float(np.max(size)))
-    add_legend(figure, every, unknown=f"no {what}")
+    add_legend(figure, every, unknown=f"no {what}", blank="hall: no point of use")
     figure.suptitle(
         "Position sigma of a fix, three axes together"
         if panels[0].of_sigma

@@ -15,6 +15,7 @@ from magfusion.results.drift import (
     EstimatorPlot,
     Quantity,
     in_windows,
+    worlds_text,
 )
 from magfusion.units import HOUR
 
@@ -40,7 +41,7 @@ def write_plot(path: Path, courses: list[EstimatorPlot], figures: Mapping[str, o
         for axes in grid[row]:
             axes.set_ylim(limits[:, 0].min(), limits[:, 1].max())
     figure.suptitle(
-        f"{figures['hours']:g} h, {figures['worlds']} world(s), {figures['drive']} drive, phase"
+        f"{figures['hours']:g} h, {worlds_text(figures['worlds'])}, {figures['drive']} drive, phase"
         f" {figures['phase']}, clock {figures['clock_ppm']:g} ppm: {figures['verdict']}"
     )
     figure.savefig(path, dpi=100, metadata={"Software": None})
@@ -85,8 +86,7 @@ def write_stability(path: Path, courses: list[EstimatorPlot]) -> None:
         grid[row, 0].set_ylabel(f"error ({quantity.unit})")
     for axes in grid[-1]:
         axes.set_xlabel("time (h)")
-    count = len(courses[0].worlds)
-    worlds = "one world" if count == 1 else f"{count} worlds"
+    worlds = worlds_text(len(courses[0].worlds))
     figure.suptitle(f"Does the error grow?  Grey: each minute of {worlds}; blue: hourly mean")
     figure.savefig(path, dpi=100, metadata={"Software": None})
 

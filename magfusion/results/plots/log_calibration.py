@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator
 
-from magfusion.results.figures import ParameterEstimate
+from magfusion.results.figures import DETERMINED_RATIO, ParameterEstimate
 from magfusion.units import Array
 
 _PRIOR, _POSTERIOR, _REST = "0.75", "tab:blue", "tab:orange"
@@ -38,13 +39,19 @@ def write_log_calibration_plot(
     ratio = np.array([e.sigma / e.prior_sigma for e in estimates])
     remaining.barh(rows, np.ones(len(estimates)), color=_PRIOR, label="survey")
     remaining.barh(rows, ratio, color=_POSTERIOR, height=0.55, label="after the log")
-    remaining.plot(ratio_but_for_gauge, rows, "o", ms=4, c=_REST, label="without the gauge")
+    remaining.plot(ratio_but_for_gauge, rows, "o", ms=4, c=_REST, label="without the common frame")
     labels = [f"{e.key}   {e.prior_sigma:.2g} → {e.sigma:.2g}" for e in estimates]
     remaining.set_yticks(rows, labels, fontsize=7)
-    remaining.set(xscale="log", xlabel="sigma over the survey's", ylim=(len(estimates) - 0.5, -0.5))
+    remaining.set(ylim=(len(estimates) - 0.5, -0.5))
     right.plot(direction_ratio, np.arange(len(direction_ratio)) + 1, ".-", c=_POSTERIOR)
-    right.axvline(0.5, c="0.5", lw=0.8)
-    right.set(xscale="log", xlabel="sigma over the survey's", ylabel="direction, best first")
-    figure.legend(loc="outside lower center", ncols=3, fontsize=8)
+    right.set(ylabel="direction in the space of all parameters, best first")
+    for axes in (remaining, right):
+        axes.set(xscale="log", xlabel="sigma after the log, of that of the survey")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda share, _: f"{share:g}"))
+        axes.xaxis.set_minor_formatter("")
+        axes.axvline(DETERMINED_RATIO, c="0.2", ls="--", lw=1.0)
+    remaining.plot([], [], c="0.2", ls="--", lw=1.0, label="below: determined by the log")
+    figure.legend(loc="outside lower center", ncols=4, fontsize=9)
     figure.suptitle("Observability of the calibration from the log")
     figure.savefig(path, dpi=110, metadata={"Software": None})

@@ -42,19 +42,23 @@ def slices(size: Array, rows: int, columns: int) -> tuple[Figure, list[list[Axes
     return figure, [every[columns * k : columns * (k + 1)] for k in range(rows)]
 
 
-def add_legend(figure: Figure, every: Sequence[Axes], unknown: str) -> None:
+def add_legend(figure: Figure, every: Sequence[Axes], unknown: str, blank: str = "") -> None:
     """Add one legend for all axes.
 
     Parameters
     ----------
     unknown : str
         Meaning of grey.
+    blank : str
+        Meaning of white in a hall, if any.
     """
     entries: dict[str, Artist] = {}
     for axes in every:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     entries[unknown] = Patch(facecolor="0.75")
+    if blank:
+        entries[blank] = Patch(facecolor="white", edgecolor="0.5")
     legend = figure.legend(
         list(entries.values()),
         list(entries),
