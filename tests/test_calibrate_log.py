@@ -130,8 +130,9 @@ def test_the_screen_tells_what_is_open(
     run_command("calibrate", "log", recorded[0], "-o", tmp_path / "out", "--end", 12)
     shown = capfd.readouterr().out
     assert "directions of the calibration are determined" in shown
-    assert "open: all beacons shifted together along x" in shown
-    assert "missing motion: The platform was never stationary" in shown
+    assert "all beacons shifted together along x" in shown
+    assert "next: magfusion smooth LOG" in shown
+    assert "The platform was never stationary" in shown
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["job"] == "calibrate log"
 

@@ -24,7 +24,7 @@ def worst_and_median(coverage: Coverage) -> IntArray:
     if not len(known):
         return known
     order = known[np.argsort(coverage.position_sigma[known], kind="stable")]
-    return np.array([order[-1], order[(len(order) - 1) // 2]])
+    return np.array([order[-1], order[len(order) // 2]])
 
 
 def budget_figures(budget: ErrorBudget, beacons: IntArray) -> Figures:

@@ -16,8 +16,8 @@ from magfusion.results.brief_plan import (
     plan_lines,
 )
 from magfusion.results.drift import QUANTITIES
-from magfusion.results.figures import Figures, Section, number
-from magfusion.results.shown import axis_rows, findings, number_text
+from magfusion.results.figures import Figures, ParameterEstimate, Section, number
+from magfusion.results.shown import as_sure, axis_rows, findings, number_text, sentences
 from magfusion.results.verdict import look_of
 
 Rows = list[list[str]]
@@ -39,6 +39,7 @@ _NEXT_OF = {
     ("drift", Verdict.TRUSTWORTHY): "magfusion view {output}, or open {output}/stability.png",
     ("drift", Verdict.DOUBTFUL): "run longer (--hours) or more worlds (--worlds 8)",
     ("drift", Verdict.FAILED): "open {output}/drift.png; the first failed line is the cause",
+    ("calibrate log", Verdict.TRUSTWORTHY): "magfusion smooth LOG --site {output}/site.yaml",
     ("simulate", Verdict.TRUSTWORTHY): "magfusion smooth {output}",
     (
         "coverage",
@@ -62,7 +63,7 @@ _NEXT_OF = {
 def is_brief(figures: Figures) -> bool:
     """Return whether a result has a screen of a few lines."""
     has_axes = bool(figures.of(Section.AXES))
-    is_plan = is_design(figures) or is_coverage(figures)
+    is_plan = is_design(figures) or is_coverage(figures) or _is_site(figures)
     return has_axes or is_plan or figures.get("job") in ("check", "drift")
 
 
@@ -78,6 +79,8 @@ def table(figures: Figures) -> Rows:
         return accuracy(figures)
     if is_coverage(figures):
         return bounds(figures)
+    if _is_site(figures):
+        return _changes(figures)
     return _slopes(figures) if figures.get("job") == "drift" else axis_rows(figures)
 
 
@@ -89,6 +92,8 @@ def lines(figures: Figures) -> Rows:
         return coverage_lines(figures)
     if figures.get("job") == "drift":
         return _criteria(figures)
+    if _is_site(figures):
+        return [*_pose_rows(figures), *_directions(figures)]
     return _pose_rows(figures) if figures.of(Section.AXES) else _check_rows(figures)
 
 
@@ -128,6 +133,8 @@ def _pose_rows(figures: Figures) -> Rows:
 def _unverified(figures: Figures) -> str:
     """Return the fixed parameters of most effect on a pose, and the number of the others."""
     rows = findings(figures, "unverified")
+    if not figures.of(Section.AXES):
+        return ", ".join(str(one["parameter"]) for one in rows)
     part = {"m": ("x", "y", "z"), "deg": ("rot_x", "rot_y", "yaw")}
     total = {
         unit: sum(number(figures.get(f"sigma_{axis}_{unit}")) ** 2 for axis in axes) ** 0.5
@@ -149,6 +156,40 @@ def _unverified(figures: Figures) -> str:
     ]
     others = len(rows) - len(matters)
     return ", ".join([*words, f"{others} of less effect (--verbose)"] if others else words)
+
+
+def _is_site(figures: Figures) -> bool:
+    """Return whether a result is a site that one log refined."""
+    return bool(figures.of(Section.DIRECTIONS)) and not figures.of(Section.LOGS)
+
+
+def _changes(figures: Figures) -> Rows:
+    """Return the largest change of each beacon and sensor, by its declared sigma."""
+    owners: dict[str, list[ParameterEstimate]] = {}
+    for one in figures.all:
+        if isinstance(one, ParameterEstimate):
+            owners.setdefault(one.beacon or one.key.split(".")[0], []).append(one)
+    rows = [["", "largest change", "declared", "determined"]]
+    for owner, own in owners.items():
+        most = max(own, key=lambda one: abs(one.change) / one.prior_sigma if one.prior_sigma else 0)
+        what = most.key.removeprefix(f"{owner}.")
+        change = f"{what} {as_sure(most.change, most.sigma)} ± {number_text(most.sigma, 2)}"
+        declared = f"± {number_text(most.prior_sigma, 2)}" if most.prior_sigma else "not known"
+        rows.append([owner, change, declared, f"{sum(e.determined for e in own)} of {len(own)}"])
+    return rows
+
+
+def _directions(figures: Figures) -> Rows:
+    """Return how much is determined, and of what is not the first of each kind."""
+    rows = []
+    for figure in figures.of(Section.DIRECTIONS):
+        if not isinstance(figure.value, list):
+            rows.append(["directions", *sentences(figure)])
+        elif figure.value:
+            others = len(figure.value) - 1
+            more = f" ({others} more: --verbose)" if others else ""
+            rows.append([figure.label or "open", f"{figure.value[0]}{more}"])
+    return rows
 
 
 def _check_rows(figures: Figures) -> Rows:
