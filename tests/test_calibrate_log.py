@@ -127,12 +127,11 @@ def test_a_calibration_of_one_part_serves_the_other(report: dict[str, Any]) -> N
 def test_the_screen_tells_what_is_open(
     recorded: tuple[Path, SimulatedLog], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    run_command("calibrate", "log", recorded[0], "-o", tmp_path / "out", "--end", 12)
+    run_command("calibrate", "log", recorded[0], "-o", tmp_path / "out", "--end", 12, "-v")
     shown = capfd.readouterr().out
     assert "directions of the calibration are determined" in shown
-    assert "all beacons shifted together along x" in shown
-    assert "next: magfusion smooth LOG" in shown
-    assert "The platform was never stationary" in shown
+    assert "open: all beacons shifted together along x" in shown
+    assert "missing motion: The platform was never stationary" in shown
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["job"] == "calibrate log"
 

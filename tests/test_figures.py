@@ -126,6 +126,20 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+def test_the_screen_of_a_calibration_names_the_largest_change_of_each_beacon() -> None:
+    known = {"prior_sigma": 0.02, "sigma": 0.005}
+    figures = heading("calibrate log", "walk") | Figures(
+        ParameterEstimate("{beacon}.position_x_m", 0.004, "m", "B.2", **known),
+        ParameterEstimate("{beacon}.position_y_m", -0.03, "m", "B.2", **known),
+        Figure(
+            "directions", ["A shifted.", "B shifted."], section=Section.DIRECTIONS, label="open"
+        ),
+    )
+    [line] = [x.split() for x in shown(figures).splitlines() if x.startswith(" B.2")]
+    assert line == ["B.2", "position_y_m", "-0.0300", "±", "0.005", "±", "0.02", "2", "of", "2"]
+    assert "open  A shifted. (1 more: --verbose)" in shown(figures)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("job", [("smooth",), ("navigate", "--lag", 2)])
 def test_beacons_of_any_name_are_in_the_report_and_on_the_screen(

@@ -171,10 +171,11 @@ def _changes(figures: Figures) -> Rows:
             owners.setdefault(one.beacon or one.key.split(".")[0], []).append(one)
     rows = [["", "largest change", "declared", "determined"]]
     for owner, own in owners.items():
-        most = max(own, key=lambda one: abs(one.change) / one.prior_sigma if one.prior_sigma else 0)
-        what = most.key.removeprefix(f"{owner}.")
-        change = f"{what} {as_sure(most.change, most.sigma)} ± {number_text(most.sigma, 2)}"
-        declared = f"± {number_text(most.prior_sigma, 2)}" if most.prior_sigma else "not known"
+        # Parameters without a declared sigma have no change to compare.
+        one = max(own, key=lambda e: abs(e.change) / e.prior_sigma if e.prior_sigma else 0.0)
+        sigma = number_text(one.sigma, 2)
+        change = f"{one.key.removeprefix(f'{owner}.')} {as_sure(one.change, one.sigma)} ± {sigma}"
+        declared = f"± {number_text(one.prior_sigma, 2)}" if one.prior_sigma else "not known"
         rows.append([owner, change, declared, f"{sum(e.determined for e in own)} of {len(own)}"])
     return rows
 
