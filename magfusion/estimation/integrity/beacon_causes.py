@@ -39,7 +39,7 @@ WIDE = (0.5, 1.0, 0.7, 3.0)  # sigmas: position (m), rotation (rad), log moment,
 
 def beacon_causes(known: Snapshots) -> Iterator[Explanation]:
     """Yield what would be explained by a mistake in one beacon."""
-    site, measured = known.site, np.any(known.samples.is_measured, axis=0)
+    site, measured = known.site, np.any(known.samples.is_measured, axis=(0, 2))
     names = [site.beacons[k].name for k in np.unique(site.owner[measured]).tolist()]
     if len(names) < FEWEST:
         return
