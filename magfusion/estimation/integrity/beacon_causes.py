@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.data_checks.detection import DETECTION_CHI_SQUARE_ONLINE, above_noise
 from magfusion.estimation.integrity.explanation import Explanation
 from magfusion.estimation.integrity.field_causes import (
     LENGTH_FACTORS,
@@ -16,12 +17,14 @@ from magfusion.estimation.integrity.field_causes import (
 )
 from magfusion.estimation.integrity.field_snapshots import Snapshots
 from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.model.detection_range import are_many
 from magfusion.model.parameters import (
     BEACON_POSITION,
     BEACON_ROTATION,
     LOG_MOMENT,
     MATRIX,
     PHASE,
+    beacons_of,
     predict_channels,
 )
 from magfusion.model.site import Beacon, Site
@@ -39,8 +42,11 @@ WIDE = (0.5, 1.0, 0.7, 3.0)  # sigmas: position (m), rotation (rad), log moment,
 
 def beacon_causes(known: Snapshots) -> Iterator[Explanation]:
     """Yield what would be explained by a mistake in one beacon."""
-    site, measured = known.site, np.any(known.samples.is_measured, axis=(0, 2))
-    names = [site.beacons[k].name for k in np.unique(site.owner[measured]).tolist()]
+    site = known.site
+    names = [beacon.name for beacon in site.beacons]
+    if are_many(site):  # those that are not detected explain nothing
+        detected = np.any(above_noise(known.samples, DETECTION_CHI_SQUARE_ONLINE), axis=0)
+        names = [names[k] for k in beacons_of(site, detected).tolist()]
     if len(names) < FEWEST:
         return
     left = {name: known.without(name) for name in names}
