@@ -233,8 +233,9 @@ def _linearized(parts: list[Measurement], states: list[State], targets: ScoreTar
         whole = replace(whole, applied_offset=whole.applied_offset + more)
     at = states_of(states)
     rows = whole.linearize(at, calibration, targets.parameters)
-    for block in targets.steel if isinstance(whole, FieldPhasors) else ():
-        rows = _with_steel(rows, whole, at, calibration, block)
+    if isinstance(whole, FieldPhasors):
+        for block in targets.steel:
+            rows = _with_steel(rows, whole, at, calibration, block)
     return rows.weighed(whole.loss)[0]
 
 
