@@ -285,8 +285,8 @@ def draw(path: Path, outcomes: RadiusOutcome) -> None:
     axes.axhline(1.0, color="0.4", linewidth=0.8)
     axes.text(40.0, 1.15, "one degree rms", color="0.3", fontsize=8, ha="right")
     for place, name in (
-        (PAPER_RADIUS, "paper: simulated radius"),
-        (PAPER_RADIUS_MEASURED, "paper: radius in experiments"),
+        (PAPER_RADIUS, "paper, simulated"),
+        (PAPER_RADIUS_MEASURED, "paper, measured"),
     ):
         axes.axvline(place, color="0.4", linewidth=0.8)
         axes.text(place + 0.2, 1.5e4, name, rotation=90, color="0.3", fontsize=8, va="top")
