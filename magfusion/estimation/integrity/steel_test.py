@@ -26,7 +26,7 @@ from magfusion.estimation.measurements.steel import (
     steel_modes,
 )
 from magfusion.files.site_changes import changed_keys
-from magfusion.model.parameters import Block, placed
+from magfusion.model.parameters import Block, dimension, placed
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -132,8 +132,8 @@ def steel_explains(result: Smoothed, log: Log, rival: float) -> bool:
 def estimate_steel(case: Case, rival: float) -> SteelEstimate | None:
     """Return the steel that explains a log; None if not better than a rival cause of a gain."""
     result = case.result
-    if any(isinstance(m, JointPhasors) for m in result.graph.measurements):
-        return None  # the samples of short windows are not at the epochs, where the modes are
+    if _has_close_tones(result):
+        return None
     poses = _poses_of_fields(result)
     modes = steel_modes(result.calibration.site, poses.time, poses)
     scores = scores_of(result, case.log.imu, modes) if modes else None
@@ -148,6 +148,8 @@ def score_with_steel(score: Score | None, result: Smoothed, log: Log, site: Site
     modes = region_modes(site)
     if score is None or not modes or result.calibration.site.channels != site.channels:
         return None
+    if _has_close_tones(result):
+        return _without_evidence(score, modes)
     poses, parameter = _poses_of_fields(result), modes[-1].parameter
     assert isinstance(parameter, SteelModes)
     here = along_path(parameter.basis, result.calibration.site, poses.time, poses)
@@ -155,6 +157,25 @@ def score_with_steel(score: Score | None, result: Smoothed, log: Log, site: Site
     if scores is None:
         return None
     return replace(scores.every, fixed=placed((*score.fixed, *modes)))
+
+
+def _has_close_tones(result: Smoothed) -> bool:
+    """Return whether samples of short windows are not at the epochs, where the modes are."""
+    return any(isinstance(m, JointPhasors) for m in result.graph.measurements)
+
+
+def _without_evidence(score: Score, more: tuple[Block, ...]) -> Score:
+    """Return a score with more parameters, which affect nothing."""
+    fixed = placed((*score.fixed, *more))
+    last = (0, dimension(fixed) - dimension(score.fixed))
+    return Score(
+        fixed,
+        np.pad(score.information, (last, last)),
+        np.pad(score.gradient, last),
+        np.pad(score.spread, (last, (0, 0))),
+        np.pad(score.by_state, ((0, 0), (0, 0), last)),
+        np.pad(score.by_calibration, ((0, 0), last)),
+    )
 
 
 def steel_of_score(score: Score, rival: float) -> SteelEstimate | None:
