@@ -95,6 +95,7 @@ class EpochUpdate:
         """Judge a first state."""
         findings = Judgement(start.trust.reasons, turn=start.turn, shift=start.shift)
         self.gate.begin(start.noise_freedom)
+        self.metal.begin(start.noise_freedom)
         self.gate.watch.begin(start.excluded, start.findings)
         known = start.shared_offsets, start.noise_freedom
         self.monitor.begin(start.state.time, findings, *known)

@@ -7,6 +7,7 @@ over time, and weighted as an error shared by neighbouring epochs: the inertial 
 passing disturbance, and the covariance grows.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -33,7 +34,9 @@ DETECTION_SIGMAS = 5.0  # sigma
 class NearMetal:
     """The share of a single beacon's field that is caused by nearby metal."""
 
-    _squared_share: DecayingSums  # squared share, and its variance without metal
+    # Squared share; without metal its variance, and its change by a relative one of the noise's.
+    _squared_share: DecayingSums
+    _noise_freedom: float
     _kept: float  # squared share that is used
     _time: float
     _quiet: float  # s
@@ -42,8 +45,13 @@ class NearMetal:
     def __init__(self, site: Site, blocks: tuple[Block, ...]) -> None:
         self.site, self.blocks = site, blocks
         self.single = len(site.beacons) == 1
-        self._squared_share, self._kept = nothing(2), 0.0
+        self._squared_share, self._kept = nothing(3), 0.0
+        self._noise_freedom = np.inf
         self._time, self._quiet, self._metal_since = -np.inf, 0.0, None
+
+    def begin(self, noise_freedom: Mapping[str, float]) -> None:
+        """Start with the degrees of freedom of each beacon's estimated noise."""
+        self._noise_freedom = min(noise_freedom.values(), default=np.inf)
 
     @property
     def comes(self) -> bool:
@@ -95,13 +103,15 @@ class NearMetal:
         weight = np.linalg.solve(spread, np.column_stack([along, error]))
         shared, seen = weight[:, :-1], weight[:, -1]
         information = float(np.sum(shared * shared.T))
-        share = (float(seen @ along @ seen) - float(np.trace(shared))) / information
-        result = np.array([share, 2.0 / information])
+        of_noise = float(np.trace(shared)) / information
+        share = float(seen @ along @ seen) / information - of_noise
+        result = np.array([share, 2.0 / information, of_noise])
         self._squared_share = self._squared_share.with_sample(result, state.time, MEMORY)
 
     def _update_verdict(self, step: float) -> None:
-        share, variance = self._squared_share.mean
-        sigma = np.sqrt(variance / max(self._squared_share.count, 1.0))
+        share, variance, of_noise = self._squared_share.mean
+        variance = variance / max(self._squared_share.count, 1.0)
+        sigma = np.sqrt(variance + of_noise**2 * 2.0 / self._noise_freedom)
         usual = BEYOND * float(np.max(model_error(self.site)))
         self._kept *= float(np.exp(-2.0 * step / RELEASE))
         if share > max(usual**2, DETECTION_SIGMAS * sigma) and self._squared_share.count > 3.0:
