@@ -104,12 +104,15 @@ def test_a_moved_beacon_is_named_and_one_at_rest_is_not(seed: int) -> None:
 @pytest.mark.slow
 def test_smoothing_names_a_beacon_moved_for_good_and_nothing_else() -> None:
     at, shift = 0.6 * EPOCHS * STEP, np.array([0.3, -0.3, 0.0])  # s, m
-    small = _walk_with_a_step(41, at, shift)
-    result = smooth(small.log, small.site, SmootherSettings())
-    separated = separated_smooth(result)
-    onsets = excluded_to_the_end(separated)
-    name = small.site.beacons[0].name
-    assert onsets == {name: pytest.approx(at, abs=2.5)}
+    onsets = []
+    for seed in (44, 43, 42, 41):
+        small = _walk_with_a_step(seed, at, shift)
+        result = smooth(small.log, small.site, SmootherSettings())
+        name = small.site.beacons[0].name
+        onset = excluded_to_the_end(separated_smooth(result))
+        assert list(onset) == [name]
+        onsets.append(onset[name])
+    assert np.mean(onsets) == pytest.approx(at, abs=2.5)
     (reason,) = finished(small.log, small.site, SmootherSettings(), result, None).trust.reasons
     assert reason.code == "changed"  # as navigation calls it
     assert f" of beacon {name} by" in reason.text
