@@ -13,6 +13,7 @@ from magfusion.estimation.graph.state import between
 from magfusion.estimation.integrity.change_detection import StepChange
 from magfusion.estimation.integrity.diagnosis import with_changed_beacons
 from magfusion.estimation.integrity.smoothed_exclusion import (
+    TOGETHER,
     excluded_to_the_end,
     separated_smooth,
 )
@@ -112,7 +113,9 @@ def test_smoothing_names_a_beacon_moved_for_good_and_nothing_else() -> None:
         onset = excluded_to_the_end(separated_smooth(result))
         assert list(onset) == [name]
         onsets.append(onset[name])
-    assert np.mean(onsets) == pytest.approx(at, abs=2.5)
+    # Closer stretches are one; the errors of several worlds have no common sign.
+    assert np.max(np.abs(np.array(onsets) - at)) < TOGETHER
+    assert np.mean(onsets) == pytest.approx(at, abs=1.5)  # s
     (reason,) = finished(small.log, small.site, SmootherSettings(), result, None).trust.reasons
     assert reason.code == "changed"  # as navigation calls it
     assert f" of beacon {name} by" in reason.text

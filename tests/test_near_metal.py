@@ -64,10 +64,16 @@ def _state(time: float, cov: Array) -> State:
     )
 
 
-def _findings(share: Array) -> list[tuple[bool, bool]]:
-    """Return of epochs at rest whether metal is near, and comes; it makes a share of the field."""
+def _findings(
+    share: Array, site: Site = SITE, noise: float = 1e-3, freedom: float = np.inf
+) -> list[tuple[bool, bool]]:
+    """Return of epochs at rest whether metal is near, and comes; it makes a share of the field.
+
+    The noise, relative to the field, is taken for 1e-3, with some degrees of freedom.
+    """
     rng = np.random.default_rng(3)
-    metal, shape = NearMetal(SITE, ()), rng.standard_normal((3, 3)) / np.sqrt(3.0)
+    metal, shape = NearMetal(site, ()), rng.standard_normal((3, 3)) / np.sqrt(3.0)
+    metal.begin({site.beacons[0].name: freedom})
     cov = np.diag(np.repeat([3e-4, 2e-4, 1e-3, 1e-3, 1e-4], 3)) ** 2
     out = []
     for k, part in enumerate(share):
@@ -76,17 +82,17 @@ def _findings(share: Array) -> list[tuple[bool, bool]]:
         pose = poses.world_from_body, poses.position_world
         phasor = predict_channels(state.calibration, poses.time, *pose)
         size = np.linalg.norm(phasor, axis=2, keepdims=True)
-        noise = 1e-3 * size * rng.standard_normal(phasor.shape)
+        error = noise * size * rng.standard_normal(phasor.shape)
         cov_t2 = (1e-3 * size[..., None]) ** 2 * np.eye(3)
         samples = FieldSamples(
             time=poses.time,
             window=np.full(1, 6e-3),
-            channels=SITE.channels,
-            phasor_sensor=phasor + noise + part * size * shape,
+            channels=site.channels,
+            phasor_sensor=phasor + error + part * size * shape,
             phasor_cov=cov_t2,
         )
         now = np.zeros(1, dtype=np.int64)
-        result = field_phasors(SITE, samples, now, poses, np.zeros((1, 3)), np.zeros(1), 1.0)
+        result = field_phasors(site, samples, now, poses, np.zeros((1, 3)), np.zeros(1), 1.0)
         weighed = metal.weighed(result, state, samples.valid[0])
         assert metal.near or weighed is result
         out.append((metal.near, metal.comes))
@@ -107,6 +113,15 @@ def test_metal_is_noticed_when_it_comes_and_forgotten_when_it_has_gone() -> None
 def test_what_was_there_from_the_beginning_has_not_come() -> None:
     findings = _findings(np.full(80, 0.03))
     assert not any(near for near, _ in findings)
+
+
+def test_noise_that_few_epochs_estimate_too_small_is_no_metal() -> None:
+    """Of 60 degrees of freedom a sigma errs by 9 %; here it is 20 % too small."""
+    site, nothing = replace(SITE, model_error=1e-6), np.zeros(400)
+    assert any(near for near, _ in _findings(nothing, site, 1.2e-3))
+    assert not any(near for near, _ in _findings(nothing, site, 1.2e-3, freedom=60.0))
+    share = np.where(np.arange(400) > 200, 0.03, 0.0)
+    assert _findings(share, site, freedom=60.0)[210][0]
 
 
 def test_what_is_taken_back_is_where_the_inertial_data_lead() -> None:

@@ -122,8 +122,7 @@ def _rounded(log: Log, samples: FieldSamples, site: Site, share: float) -> str |
         return None
     return (
         f"The magnetometer's steps of {step:.2g} T are larger than its noise, and distort the"
-        f" fields by about {100.0 * share:.2g} %. Choose a smaller range, or declare"
-        f" noise_density_t_rthz {rounding:.2g} and world.model_error {share:.2g}."
+        f" fields by about {100.0 * share:.2g} %. Choose a smaller range, or more digits."
     )
 
 

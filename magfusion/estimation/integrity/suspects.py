@@ -9,6 +9,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from magfusion.estimation.measurements.steel import SteelModes
 from magfusion.model.ground import conductivity_of
 from magfusion.model.parameters import (
     AIDING_CLOCK,
@@ -289,8 +290,8 @@ def suspects(site: Site, held: tuple[Block, ...]) -> Iterator[Suspect]:
         columns = np.concatenate([np.arange(size)[b.columns] for b in chosen])
         return Suspect(name, tuple(chosen), np.eye(size)[:, columns])
 
-    # Steel, which has no code here, is compared with them by `steel_test`.
-    yield from (together(spoken_name(b), [b]) for b in held if b.parameter in CODE)
+    single = (b for b in held if not isinstance(b.parameter, SteelModes))  # `steel_test` has those
+    yield from (together(spoken_name(b), [b]) for b in single)
     poses = {b.name: f"the pose of beacon {b.name}" for b in site.beacons}
     sets = {
         f"the positions of {_beacons(site)}": (BEACON_POSITION,),

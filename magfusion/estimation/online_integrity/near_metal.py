@@ -27,7 +27,7 @@ MEMORY = 0.15  # s; over which the share is averaged
 RELEASE = 1.0  # s; time constant of its decay, as a passing object may return
 COMMON = 2.0  # s; correlation time of the error of a hand-held object
 QUIET = 1.0  # s; undisturbed time before an onset can be detected
-BEYOND = 2.0  # times the declared model error
+BEYOND = 2.0  # times the model error, which a start estimates
 DETECTION_SIGMAS = 5.0  # sigma
 
 
