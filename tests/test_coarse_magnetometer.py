@@ -1,9 +1,12 @@
 """A magnetometer with coarse steps, or behind a multiplexer, does not hang; one that hangs does."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import run_command
 
 from magfusion.estimation.data_checks.samples import (
     clipped_samples,
@@ -12,8 +15,12 @@ from magfusion.estimation.data_checks.samples import (
     repeated_samples,
 )
 from magfusion.estimation.integrity.likely_cause import cause_of
+from magfusion.estimation.integrity.quick_check import quick_check
+from magfusion.files.log import write_log
+from magfusion.files.site import save_site
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
+from magfusion.model.trust import Verdict
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.units import Array
@@ -106,10 +113,27 @@ def test_fields_distorted_by_steps_are_no_iron(step: float | None) -> None:
     site = demo_site()
     config = SimulationConfig(DEMO_BOX_WORLD, duration=20.0, quantisation=step)
     log = simulate_log(site, config, np.random.default_rng(4)).log
-    cause = cause_of(log, site)
+    cause, look = cause_of(log, site), quick_check(log, site)
     if step is None:
         assert cause is None
+        assert look.trust.findings == ()
         return
     assert cause is not None
     assert cause[0].code == "quantised"
     assert "Choose a smaller range" in cause[1]
+    (noted,) = look.trust.findings
+    assert noted.code == "quantised"
+    assert noted.text.partition(" by ")[0] == cause[1].partition(" by ")[0]
+    assert noted.verdict is Verdict.TRUSTWORTHY  # the bound is above what motion leaves of it
+
+
+@pytest.mark.slow
+def test_navigation_names_steps_before_the_moments_that_they_falsify(tmp_path: Path) -> None:
+    """A parameter that absorbs the distortion is estimated, but it is not the cause."""
+    site = demo_site()
+    config = SimulationConfig(DEMO_BOX_WORLD, duration=20.0, quantisation=STEPS[1])
+    write_log(simulate_log(site, config, np.random.default_rng(4)).log, tmp_path / "log")
+    save_site(site, tmp_path / "log" / "site.yaml")
+    run_command("navigate", tmp_path / "log", "-o", tmp_path / "run", "--estimator", "ekf")
+    reasons = json.loads((tmp_path / "run" / "report.json").read_text())["reasons"]
+    assert reasons[0]["code"] == "quantised"

@@ -11,6 +11,7 @@ from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorde
 from magfusion.estimation.data_checks.signal import Detected
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.initialization.online import NoStart
+from magfusion.estimation.integrity.correction import CAUSE_FIRST
 from magfusion.estimation.integrity.diagnosis import (
     diagnosed,
     with_corrected,
@@ -178,10 +179,13 @@ def navigated(
     )
     findings = _without_repeated(navigator.summary.trust, detected)
     trust = findings | Trust(detected)
-    if navigator.corrected:
-        trust = with_corrected(trust, navigator.corrected)
+    cause = diagnosed(log, navigator.declared, trust, settings.lockin)
+    if not navigator.corrected:
+        trust = with_explaining_cause(trust, cause)
     else:
-        trust = with_explaining_cause(trust, diagnosed(log, site, trust, settings.lockin))
+        trust = with_corrected(trust, navigator.corrected)
+        if cause is not None and cause.finding.code == "quantised":  # nothing undoes it
+            trust |= Trust((replace(cause.finding, weight=2.0 * CAUSE_FIRST),))
     own = _chosen(rows, trust, CURRENT)
     current, lagged = _part(rows, own, site), None
     assert current is not None

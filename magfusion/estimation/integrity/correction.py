@@ -94,6 +94,8 @@ def corrections(
         By snapshots of the fields and by the motion.
     """
     result: list[Correction] = []
+    if diagnosis is not None and diagnosis.finding.code == "quantised":
+        return result  # no parameter undoes what steps distort
     finding = next((f for f in findings if causes and f.code == causes[0].code), None)
     if finding is not None:
         best, *rivals = causes

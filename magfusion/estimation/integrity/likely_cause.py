@@ -108,9 +108,15 @@ def _unexplained(
 
 
 def _rounded(log: Log, samples: FieldSamples, site: Site, share: float) -> str | None:
-    """Return what is to be said of fields distorted by the steps of the magnetometer.
+    """Return what is to be said of fields distorted by the steps of the magnetometer."""
+    known = coarse_steps(log, samples, site)
+    return of_steps(known[0], share) if known is not None and share <= known[1] else None
 
-    Steps below the noise only add to it; larger ones distort, by less than a step.
+
+def coarse_steps(log: Log, samples: FieldSamples, site: Site) -> tuple[float, float] | None:
+    """Return the magnetometer's steps (T) where larger than its noise; share that they distort.
+
+    Steps below the noise only add to it; larger ones distort the fields, by less than a step.
     """
     wave, density = log.waveform, site.platform.magnetometer.noise_density
     if wave is None or len(wave) < FEWEST:
@@ -118,11 +124,14 @@ def _rounded(log: Log, samples: FieldSamples, site: Site, share: float) -> str |
     step = float(np.max(step_of_axes(wave.measured_sensor)))
     rounding = step * np.sqrt(float(np.median(np.diff(wave.time))) / 6.0)  # T/sqrt(Hz), one-sided
     size = float(np.nanmedian(np.linalg.norm(samples.phasor_sensor, axis=2)))
-    if rounding < density or share * size > DISTORTION * step:
-        return None
+    return None if rounding < density else (step, DISTORTION * step / size)
+
+
+def of_steps(step: float, share: float, about: str = "about") -> str:
+    """Return what is to be said of steps (T) that distort the fields by a share."""
     return (
         f"The magnetometer's steps of {step:.2g} T are larger than its noise, and distort the"
-        f" fields by about {100.0 * share:.2g} %. Choose a smaller range, or more digits."
+        f" fields by {about} {100.0 * share:.2g} %. Choose a smaller range, or more digits."
     )
 
 

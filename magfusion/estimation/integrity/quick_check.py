@@ -1,6 +1,6 @@
 """Quick check of a log in seconds: all tests that need no solution."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
@@ -17,6 +17,7 @@ from magfusion.estimation.demodulation.beacon_selection import select_detected
 from magfusion.estimation.demodulation.burial_depth import depths_of
 from magfusion.estimation.demodulation.demodulation import phasors
 from magfusion.estimation.integrity.diagnosis import Diagnosis, diagnosed, with_explaining_cause
+from magfusion.estimation.integrity.likely_cause import coarse_steps, of_steps
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.detection_range import are_many
@@ -122,8 +123,17 @@ def quick_check(log: Log, site: Site | None, lockin: LockinSettings | None = Non
     if trust.reasons and trust.reasons[0].code in SYMPTOMS:
         cause = diagnosed(log, site, trust, lockin)
         trust = with_explaining_cause(trust, cause)
+    if cause is None:
+        trust |= Trust(tuple(_coarse(log, samples, site)))
     depths = depths_of(samples, site)
     return Look(trust, *look, detection, result, seen, fixes, depths, cause)
+
+
+def _coarse(log: Log, samples: FieldSamples, site: Site) -> Iterator[Finding]:
+    """Yield that steps may distort the fields by more than the model's error explains."""
+    known = coarse_steps(log, samples, site) if len(samples) else None
+    if known is not None and known[1] > UNEXPLAINED * site.model_error:
+        yield Finding("quantised", of_steps(*known, about="up to"), Verdict.TRUSTWORTHY, known[1])
 
 
 def _harmless_lines(
