@@ -205,6 +205,54 @@ def test_data_after_a_step_back_behind_the_checkpoint_are_used(
 
 
 @pytest.mark.slow
+def test_a_resumed_run_navigates_on_a_clock_that_began_again(
+    walk: OnlineLog, site: Path, lines: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    """Nobody knows how long the device was off: neither the state nor its biases are used."""
+    settings = StreamSettings(EKF.navigator, checkpoint=tmp_path / "state", every=1.0)
+    later = [stamped(one, lambda t: t + 5e3) for one in lines if newest(one) < 9.0]
+    answered(site, sent(later), settings)
+    states, reported = answered(site, sent(lines), replace(settings, resume=True))
+    (begun,) = re.findall(r"the clock began again; navigation restarts at (\S+) s", reported)
+    assert float(begun) == pytest.approx(10.0, abs=0.1)  # s
+    anew = [s for s in states if s["started"]]
+    assert len(anew) > 5
+    assert np.max(errors(walk, anew)) < 0.05  # m
+    assert all(s["reset_counter"] == 1 for s in anew)
+
+
+@pytest.mark.slow
+def test_a_run_resumed_after_long_starts_anew(
+    walk: OnlineLog, site: Path, lines: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    settings = StreamSettings(EKF.navigator, checkpoint=tmp_path / "state", every=1.0)
+    answered(site, sent([one for one in lines if newest(one) < 9.0]), settings)
+    later = [stamped(one, lambda t: t + 100.0) for one in lines if newest(one) >= 9.0]
+    states, reported = answered(site, sent(later), replace(settings, resume=True))
+    assert re.search(r"imu: its clock stepped by \+10\d s; navigation restarts", reported)
+    anew = [s for s in states if s["started"]]
+    assert len(anew) > 5
+    assert np.max(errors(walk, anew, -100.0)) < 0.05  # m
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wraps_at", [5.0, 9.0])
+def test_a_counter_that_wrapped_before_the_resumption_goes_on(
+    walk: OnlineLog, site: Path, lines: list[dict[str, Any]], tmp_path: Path, wraps_at: float
+) -> None:
+    """Before the checkpoint, or between it and the resumption."""
+    ahead = WRAP - wraps_at
+    settings = StreamSettings(EKF.navigator, checkpoint=tmp_path / "state", every=1.0)
+    given = [(newest(one), stamped(one, lambda t: (t + ahead) % WRAP)) for one in lines]
+    answered(site, sent([one for time, one in given if time < 9.0]), settings)
+    rest = sent([one for time, one in given if time >= 9.0])
+    states, reported = answered(site, rest, replace(settings, resume=True))
+    assert reported == ""
+    assert len(states) > 20
+    assert np.max(errors(walk, states, -ahead)) < 0.05  # m
+
+
+@pytest.mark.slow
 def test_a_start_that_waits_for_late_samples_has_streams_of_one_length() -> None:
     """The inertial samples of the time that it waits for are no difference of clocks."""
     log = simulate_log(

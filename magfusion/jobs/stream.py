@@ -9,6 +9,7 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
+from magfusion.estimation.data_checks.stream_buffer import LARGEST_JUMP
 from magfusion.estimation.graph.state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
 from magfusion.estimation.initialization.online import NoStart
 from magfusion.estimation.measurements.signs import along_axis
@@ -129,12 +130,21 @@ def _navigate(
     others: tuple[StateSink, ...],
 ) -> int:
     key, place = run_key("stream", site, settings.navigator), settings.checkpoint
-    navigator = begin(place, key, site, settings.navigator, None, resume=settings.resume).navigator
+    begun = begin(place, key, site, settings.navigator, 0.0, resume=settings.resume)
+    navigator = begun.navigator
     refused, saved, reached = 0, -np.inf, -np.inf
     output, angles = _StateWriter(navigator, sink, others), AwaitedAngles(site)
     kept = None if place is None else CheckpointWriter(place, key, messages)
-    clocks, older = StreamClocks(settings.navigator.delay), OlderRecords(navigator.time)
-    for numbered in older.skipped(records, messages):
+    if not 0.0 <= begun.extra <= max(navigator.newest + LARGEST_JUMP, 0.0):
+        raise InputError(f"{place}: the time that a counter lost is wrong; run without --resume")
+    clocks = StreamClocks(settings.navigator.delay, navigator.newest, begun.extra)
+
+    def restart() -> None:
+        clocks.reset()
+        output.restart(without_prior=True)
+
+    older = OlderRecords(navigator.time if navigator.started else navigator.newest, restart)
+    for numbered in older.skipped(clocks.all_unwrapped(records), messages):
         try:
             numbered = _on_clock(numbered, site, clocks, samples, output, messages)
             newest = _process_record(output.navigator, site, numbered, samples, output)
@@ -154,7 +164,7 @@ def _navigate(
             reached = newest
         sink.flush()
         if kept is not None and measured and not saved <= newest < saved + settings.every:
-            kept.save(output.navigator, numbered.number, None)
+            kept.save(output.navigator, numbered.number, clocks.wrapped)
             saved = newest
     with named("standard input"):
         _end(samples, output)
@@ -192,9 +202,9 @@ class _StateWriter:
         for other in self._others:
             other.take(state, output)
 
-    def restart(self) -> None:
-        """Navigate on another clock."""
-        self.navigator = self.navigator.restarted()
+    def restart(self, *, without_prior: bool = False) -> None:
+        """Navigate on another clock; parameters as `Navigator.restarted`."""
+        self.navigator = self.navigator.restarted(without_prior=without_prior)
         self._newest = -np.inf
 
     def now(self) -> None:
@@ -229,7 +239,7 @@ def _on_clock(
     """
     if numbered.record is None:
         return numbered
-    record = with_waveform(clocks.unwrapped(numbered.record), site)
+    record = with_waveform(numbered.record, site)
     step = clocks.step_in(record)
     if step is not None:
         write_message(messages, step.sentence)

@@ -1,7 +1,7 @@
 """Clocks of the records in a pipe: counters of 32 bits are unwrapped, steps are found."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TextIO
 
 import numpy as np
@@ -11,10 +11,11 @@ from magfusion.estimation.data_checks.stream_buffer import LARGEST_JUMP
 from magfusion.files.records import Record
 from magfusion.files.standard_streams import write_message
 from magfusion.files.stream import NumberedRecord
-from magfusion.model.counters import lost_by_wrapping
+from magfusion.model.counters import NEAR_END, lost_by_wrapping
 from magfusion.units import Array
 
 LEAST_STEP = 1.0  # s back; a network delays a record by less
+NEW_CLOCK = 10.0  # s of data, all before a checkpoint, are of a clock that began again
 
 
 class ClockJump(InputError):
@@ -60,11 +61,28 @@ class StreamClocks:
     ----------
     delay : float
         Largest delay of samples that are still sorted in (s).
+    last, wrapped : float
+        Of a resumed run, the last stamp (s) before it, and what counters had lost by wrapping.
     """
 
-    def __init__(self, delay: float) -> None:
+    def __init__(self, delay: float, last: float = -np.inf, wrapped: float = 0.0) -> None:
         self._least, self._delay = max(LEAST_STEP, 2.0 * delay), delay
         self._clocks: dict[str, _Clock] = {}
+        self._resumed = _Clock(last_stamp=last, wrapped=wrapped)
+
+    def reset(self) -> None:
+        """Discard all stamps before, of a clock that began again."""
+        self._clocks, self._resumed = {}, _Clock()
+
+    @property
+    def wrapped(self) -> float:
+        """What the counters have lost by wrapping (s)."""
+        return max((one.wrapped for one in self._clocks.values()), default=self._resumed.wrapped)
+
+    def all_unwrapped(self, records: Iterable[NumberedRecord]) -> Iterator[NumberedRecord]:
+        """Yield records as `unwrapped`."""
+        for one in records:
+            yield one if one.record is None else replace(one, record=self.unwrapped(one.record))
 
     def unwrapped(self, record: Record) -> Record:
         """Return a record whose stamps go on where a counter of 32 bits began again."""
@@ -88,7 +106,8 @@ class StreamClocks:
         if new:  # the counter is that of the other streams
             other = max(self._clocks.values(), key=lambda one: one.last_stamp)
             clock.last_stamp, clock.wrapped = other.last_stamp, other.wrapped
-        missing = lost_by_wrapping(times, clock.last_stamp - clock.wrapped, clock.wrapped)
+        near = LARGEST_JUMP if new else NEAR_END
+        missing = lost_by_wrapping(times, clock.last_stamp - clock.wrapped, clock.wrapped, near)
         clock.last_stamp, clock.wrapped = float(times[-1] + missing[-1]), float(missing[-1])
         return missing
 
@@ -100,7 +119,9 @@ class StreamClocks:
                 clock.unconfirmed is not None and 0.0 <= first - clock.unconfirmed < LARGEST_JUMP
             )
             if follows and self._is_far(clock, times):
-                step = ClockStep(name, first, first - clock.newest)
+                seen = clock.newest if clock.newest > -np.inf else self._newest
+                step = ClockStep(name, first, first - seen)
+                self._resumed = _Clock()
                 self._clocks = {
                     name: _Clock(last_stamp=one.last_stamp, wrapped=one.wrapped)
                     for name, one in self._clocks.items()
@@ -148,11 +169,12 @@ class StreamClocks:
             raise ClockJump(f"{name}: its clock jumped {way} by {by:.4g} s; the record is left out")
 
     def _of(self, name: str) -> _Clock:
-        return self._clocks.setdefault(name, _Clock())
+        return self._clocks.setdefault(name, replace(self._resumed))
 
     @property
     def _newest(self) -> float:
-        return max((known.newest for known in self._clocks.values()), default=-np.inf)
+        newest = max((known.newest for known in self._clocks.values()), default=-np.inf)
+        return max(newest, self._resumed.last_stamp)
 
     def _is_far(self, clock: _Clock, times: Array) -> bool:
         """Return whether all stamps are behind the newest, or ahead of those of all streams."""
@@ -167,14 +189,17 @@ class OlderRecords:
     ----------
     until : float
         Time of the checkpoint (s); infinitely early without one.
+    restart : callable
+        Called where a clock began again: records of `NEW_CLOCK` seconds are far before it.
 
     Attributes
     ----------
     count : int
     """
 
-    def __init__(self, until: float) -> None:
-        self._until, self.count = until, 0
+    def __init__(self, until: float, restart: Callable[[], None]) -> None:
+        self._until, self._restart, self.count = until, restart, 0
+        self._newest, self._span = -np.inf, 0.0
 
     def skipped(
         self, records: Iterable[NumberedRecord], messages: TextIO
@@ -190,15 +215,30 @@ class OlderRecords:
                 write_message(
                     messages,
                     f"data before the checkpoint ({at}) are not used; if the clock began again, run"
-                    " without --resume",
+                    f" without --resume, or wait {NEW_CLOCK:.0f} s",
                 )
+            if self._span > NEW_CLOCK:
+                self._until = -np.inf
+                write_message(
+                    messages,
+                    f"the clock began again; navigation restarts at {self._newest:.3f} s, without"
+                    " the state of the checkpoint",
+                )
+                self._restart()
 
     def _contains(self, record: Record | None) -> bool:
         """Return whether a record is one of them; the first newer one ends them."""
         newest = -np.inf if record is None else max(_newest_stamps(record), default=-np.inf)
         if newest >= self._until:
             self._until = -np.inf
-        return -np.inf < newest < self._until
+        older = -np.inf < newest < self._until
+        if older:
+            step = newest - self._newest
+            far = newest < self._until - LARGEST_JUMP
+            single = not abs(step) < LARGEST_JUMP
+            self._span = self._span + max(step, 0.0) if far and not single else 0.0
+            self._newest = newest if single else max(newest, self._newest)
+        return older
 
     def report(self, messages: TextIO) -> None:
         """Write how many there were."""

@@ -8,7 +8,7 @@ PERIODS = (2.0**32 * 1e-9, 2.0**32 * 1e-6, 2.0**32 * 1e-3)  # s; of nanoseconds 
 NEAR_END, NEAR_SHARE = 1.0, 0.05  # s, of a period, at most; before and after it wraps
 
 
-def lost_by_wrapping(raw: Array, last: float, wrapped: float) -> Array:
+def lost_by_wrapping(raw: Array, last: float, wrapped: float, near_end: float = NEAR_END) -> Array:
     """Return what a counter has lost by wrapping (s), at each of its stamps.
 
     Parameters
@@ -19,13 +19,15 @@ def lost_by_wrapping(raw: Array, last: float, wrapped: float) -> Array:
         The one before them; minus infinity before the first.
     wrapped : float
         What the counter had lost until then (s); a late stamp may be of before it wrapped.
+    near_end : float
+        As `NEAR_END` (s); more after a silence.
     """
     step = np.diff(raw, prepend=last if np.isfinite(last) else raw[0])
     result = np.full(len(raw), wrapped)
     if not np.any(np.abs(step) > 0.5 * PERIODS[0]):
         return result
     for period in PERIODS:
-        near = min(NEAR_END, NEAR_SHARE * period)
+        near = min(near_end, NEAR_SHARE * period)
         turns = -np.round(step / period)
         turns[(np.abs(turns) != 1.0) | (np.abs(step + turns * period) > near)] = 0.0
         ends = np.minimum(raw, raw - step), np.maximum(raw, raw - step) - period

@@ -268,6 +268,11 @@ class Navigator:
         return self._loop.running.time
 
     @property
+    def newest(self) -> float:
+        """Newest time of its input (s); minus infinity before any."""
+        return self._loop.arrived.newest
+
+    @property
     def judgement(self) -> Judgement:
         """Judgement of the newest state."""
         return self._loop.reports.judgement
@@ -336,18 +341,25 @@ class Navigator:
         """
         return self._loop.take_lagged()
 
-    def restarted(self) -> "Navigator":
+    def restarted(self, *, without_prior: bool = False) -> "Navigator":
         """Return a navigator that starts again, where the clock has stepped or all was silent.
 
         It keeps the biases and the calibration of a trustworthy state, with their random walks.
+
+        Parameters
+        ----------
+        without_prior : bool
+            Whether to keep none of them: how long ago they were estimated is unknown.
         """
         result = Navigator(self._readings.on(self.declared), self.settings)
         result._loop.follow(self._loop)
+        if without_prior:
+            result._loop.search.earlier = None
         return result
 
     def is_after_silence(self, time: float) -> bool:
         """Return whether all streams were silent for so long before a time (s) that it restarts."""
-        return -np.inf < self._loop.arrived.newest < time - LARGEST_JUMP
+        return -np.inf < self.newest < time - LARGEST_JUMP
 
     # Corrections
 
