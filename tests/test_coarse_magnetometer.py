@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from conftest import run_command
 
+from magfusion.estimation.data_checks.pauses import repeated_samples
 from magfusion.estimation.data_checks.samples import (
     clipped_samples,
     false_samples,
     frozen_samples,
-    repeated_samples,
 )
 from magfusion.estimation.integrity.likely_cause import cause_of
 from magfusion.estimation.integrity.quick_check import quick_check

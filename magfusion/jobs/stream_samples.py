@@ -7,6 +7,7 @@ from typing import TextIO
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.estimation.data_checks.pauses import PauseFilter
 from magfusion.estimation.data_checks.spike_filter import SpikeFilter
 from magfusion.files.plausible import RANGE_KEYS, beyond_range, declared_range, exceeds
 from magfusion.files.standard_streams import write_message
@@ -39,6 +40,8 @@ class StreamSamples:
         self._replaced: dict[str, str] = {}
         self._clocks: dict[tuple[str, str | None], RunningClock] = {}
         self._filters: dict[tuple[str, str | None], SpikeFilter] = {}
+        self._pauses: dict[tuple[str, str | None], PauseFilter] = {}
+        self._repeated: Counter[str] = Counter()
 
     def whole(
         self, stream: str, time: Array, *values: Array, name: str | None = None
@@ -94,7 +97,12 @@ class StreamSamples:
             self._filters[key] = SpikeFilter(
                 _INSTRUMENTS[stream], self._site, patient=self._patient
             )
-        return self._filters[key].push(*self._clocks[key].push(time, rows))
+            if stream == "magnetometer":
+                self._pauses[key] = PauseFilter(patient=self._patient)
+        time, rows = self._clocks[key].push(time, rows)
+        if key in self._pauses:
+            time, rows = self._pauses[key].push(time, rows)
+        return self._filters[key].push(time, rows)
 
     def end(self) -> Iterator[tuple[str, str | None, Array, Array]]:
         """Yield the samples that wait for others, by stream and name, at the end of the streams.
@@ -104,7 +112,11 @@ class StreamSamples:
         filters, self._filters = self._filters, {}
         for (stream, name), own in filters.items():
             clock = self._clocks.pop((stream, name))
-            for time, rows in (own.push(*clock.end()), own.end()):
+            last = clock.end()
+            if (pauses := self._pauses.pop((stream, name), None)) is not None:
+                last = pauses.push(*last, final=True)
+                self._repeated[stream] += pauses.left_out
+            for time, rows in (own.push(*last), own.end()):
                 if len(time):
                     yield stream, name, time, rows
             self._false[stream] += own.left_out
@@ -124,6 +136,11 @@ class StreamSamples:
             write_message(messages, f"{instrument}: {text}. They are left out.")
         for stream, text in self._replaced.items():
             write_message(messages, f"{stream}: {text}.")
+        for stream, count in (+self._repeated).items():
+            text = (
+                f"{count} samples repeat the last one, as while a multiplexer reads another channel"
+            )
+            write_message(messages, f"{stream}: {text}. They are left out.")
         for stream, count in (+self._false).items():
             text = f"{count} isolated samples are off their neighbours, probably by bit errors"
             write_message(messages, f"{stream}: {text}. They are left out.")

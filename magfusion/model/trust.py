@@ -119,7 +119,7 @@ CODES = {
     "reference_hears": "the reference sensor receives a beacon, or may",
     "reference_unused": "the reference sensor does not reduce the noise, or is not used",
     "region_edge": "a pose is too near the edge of its region to exclude its mirror image",
-    "repeated_samples": "an instrument is read faster than it measures",
+    "repeated_samples": "an instrument repeats samples: it is read too fast, or pauses",
     "repeated_stamps": "samples have duplicate stamps",
     "restarts": "fields and inertial data diverge repeatedly",
     "roll_open": "a receiver of one axis does not determine the roll about it",

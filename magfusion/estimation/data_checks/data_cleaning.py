@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.estimation.data_checks.pauses import pause_rows, repeated_samples
 from magfusion.estimation.data_checks.samples import (
     false_rows,
     false_samples,
@@ -36,6 +37,7 @@ def clean_log(log: Log, site: Site) -> Log:
         Where most samples of an instrument are beyond its declared range.
     """
     log = _without_freeze(on_even_clocks(_within_range(log, site), site), site)
+    log = _without_pauses(log, site)
     result = {stream.name: false_rows(stream, site) for stream in streams(log)}
     if not any(len(rows) for rows in result.values()):
         return log
@@ -87,6 +89,16 @@ def _without_inertial(log: Log, rows: IntArray) -> Log:
     )
     assert imu is not None
     return replace(log, imu=imu, recorded_imu=recorded)
+
+
+def _without_pauses(log: Log, site: Site) -> Log:
+    """Return a log without the samples of a magnetometer that repeat the last one in a pause."""
+    rows = [pause_rows(s) for s in streams(log) if s.name == "magnetometer"]
+    if not any(map(len, rows)):
+        return log
+    noticed = next(f for f in repeated_samples(log, site) if f.text.startswith("magnetometer"))
+    noticed = replace(noticed, text=f"{noticed.text} They are left out.")
+    return replace(_without(log, {"magnetometer": rows[0]}), noticed=(*log.noticed, noticed))
 
 
 def _without_freeze(log: Log, site: Site) -> Log:

@@ -1,4 +1,4 @@
-"""Checks of single samples: frozen, repeated, clipped and false ones.
+"""Checks of single samples: frozen, clipped and false ones.
 
 Instruments quantize, so that consecutive samples may be equal; the log itself shows how often.
 A magnetometer that is read faster than it measures repeats values without being saturated.
@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from magfusion.estimation.data_checks.resolution import (
-    is_coarse,
     is_scheduled,
     reached_in_steps,
     step_of_axes,
@@ -28,8 +27,6 @@ from magfusion.units import Array, BoolArray, IntArray
 CHANCE = 1e-7  # probability of a false alarm per stream
 SHORTEST_FREEZE, DOUBTFUL_FREEZE = 0.15, 0.25  # s; below the latter one epoch is missed
 DEAD = 0.5  # share of the log from which a frozen axis is a dead one
-MAX_REPEATED_SHARE = 0.05  # share of repeated samples from which it is reported
-OFTEN = 0.4  # share from which the values are late by more than a step
 ALWAYS = 0.98  # share of the samples
 PILE = 5.0  # an extreme value this many times as frequent as its neighbours is a limit
 LEAST_PILE, LEAST_RUN = 12, 3  # samples at a limit, and of them in a row, at least once
@@ -117,7 +114,7 @@ def frozen(stream: InstrumentStream, axes: tuple[int, ...]) -> Runs:
 def frozen_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
     """Yield the axes that are constant for longer than an instrument can be."""
     for stream in streams(log):
-        whole = _all_frozen(stream)
+        whole = all_frozen(stream)
         if len(whole):
             yield _freeze(stream, "all axes", whole)
             continue
@@ -127,7 +124,8 @@ def frozen_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
                 yield _freeze(stream, f"axis {stream.axes[axis]}", alone)
 
 
-def _all_frozen(stream: InstrumentStream) -> Runs:
+def all_frozen(stream: InstrumentStream) -> Runs:
+    """Return the stretches in which all axes are frozen."""
     return frozen(stream, tuple(range(len(stream.axes))))
 
 
@@ -171,35 +169,10 @@ def frozen_rows(stream: InstrumentStream) -> IntArray:
 
     Empty for a stream that is frozen most of the time: it cannot be bridged.
     """
-    result = _all_frozen(stream)
+    result = all_frozen(stream)
     rows = [np.arange(a + 1, b + 1) for a, b in zip(result.first, result.last, strict=True)]
     hung = np.concatenate([np.zeros(0, dtype=np.int64), *rows])
     return hung if len(hung) < DEAD * len(stream.time) else hung[:0]
-
-
-def repeated_samples(log: Log, site: Site | None) -> Iterator[Finding]:
-    """Yield the instruments that are read faster than they measure."""
-    for stream in streams(log):
-        same, still = stream.value[1:] == stream.value[:-1], _all_frozen(stream)
-        for first, last in zip(still.first, still.last, strict=True):
-            same[first:last] = False
-        share = float(np.mean(np.all(same, axis=1)))
-        # Coarse steps repeat by chance, independently per axis.
-        by_chance = float(np.prod(np.mean(same, axis=0))) if same.shape[1] > 1 else 0.0
-        fixed = (share - by_chance) / (1.0 - by_chance) if by_chance < 1.0 else 1.0
-        if fixed < MAX_REPEATED_SHARE or share > 0.98 or is_coarse(stream.value):
-            continue
-        rate_hz = 1.0 / float(np.median(np.diff(stream.time)))
-        own = (1.0 - share) * rate_hz
-        timed = stream.name == "magnetometer" and site is not None and len(site.beacons) > 0
-        yield Finding(
-            "repeated_samples",
-            f"{stream.name}: {100.0 * share:.0f} % of the samples repeat their predecessor: it is"
-            f" read at {rate_hz:.4g} Hz and measures at about {own:.3g} Hz, so that values are late"
-            " by up to a step. Read it when a new measurement is ready.",
-            Verdict.DOUBTFUL if timed or share > OFTEN else Verdict.TRUSTWORTHY,
-            100.0 + share / MAX_REPEATED_SHARE,
-        )
 
 
 def clipped_samples(log: Log, site: Site | None) -> Iterator[Finding]:
@@ -209,7 +182,7 @@ def clipped_samples(log: Log, site: Site | None) -> Iterator[Finding]:
 
 
 def _clipped_axes(stream: InstrumentStream, site: Site | None) -> Iterator[Finding]:
-    value, still = stream.value, _all_frozen(stream)
+    value, still = stream.value, all_frozen(stream)
     if len(still):
         kept = np.ones(len(stream.time), dtype=bool)
         for first, last in zip(still.first, still.last, strict=True):

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import median_filter
 
+from magfusion.estimation.data_checks.resolution import is_scheduled
 from magfusion.estimation.data_checks.turning import field_body
 from magfusion.model.bandpass import is_bandpass
 from magfusion.model.quaternion import rotate
@@ -89,7 +90,7 @@ def still_field(log: Log, site: Site | None) -> Array:
 def spectrum(log: Log, site: Site | None) -> Spectrum | None:
     """Return the mean spectrum of a waveform in gyro-stabilized axes.
 
-    None if it is too short, or has the bands of tones alone.
+    None if it is too short, has the bands of tones alone, or pauses regularly: that makes lines.
     """
     wave = log.waveform
     if wave is None or len(wave) < 2:
@@ -104,6 +105,10 @@ def spectrum(log: Log, site: Site | None) -> Spectrum | None:
         return None
     field = still_field(log, site)
     if np.max(np.abs(np.diff(wave.time) - step)) > 1e-3 * step:
+        row = np.rint((wave.time - wave.time[0]) / step).astype(np.int64)
+        gap = np.flatnonzero(np.diff(row) > 1)
+        if is_scheduled(row[gap], row[gap + 1]):
+            return None
         even = wave.time[0] + step * np.arange(count)
         field = np.stack([np.interp(even, wave.time, c) for c in field.T], axis=1)
     window = np.hanning(length + 1)[:-1, None]

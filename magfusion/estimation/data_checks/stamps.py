@@ -133,8 +133,10 @@ def timings(log: Log, site: Site | None = None) -> tuple[Timing, ...]:
 def uneven_stamps(log: Log, site: Site | None) -> Iterator[Finding]:
     """Yield the defects of a log's time stamps."""
     result = timings(log, site)
+    paused = any(f.code == "repeated_samples" for f in log.noticed)
     for one in result:
-        yield from _of_one(one)
+        explained = {"samples_lost"} if paused and one.stream == "magnetometer" else set()
+        yield from (f for f in _of_one(one) if f.code not in explained)
     for stream, clock in log.clocks.items():
         if clock.replaced and clock.resolution:
             yield _rounded(stream, clock.resolution, clock.step)
