@@ -69,6 +69,9 @@ class SmoothSettings(
     tune: bool = option(
         True, "Estimate noise and model error from the residuals, with the declared as a prior"
     )
+    map_steel: bool = option(
+        False, "Map the steel near the path, and use the map if it predicts beacons left out"
+    )
     checkpoint: Path | None = option(
         None, "File that stores the result of each pass over the log, while the job runs"
     )
@@ -84,16 +87,12 @@ class SmoothSettings(
         if self.free not in (None, "gain"):
             raise InputError(f"--free {self.free!r}: smooth estimates gain only; write --free gain")
         if self.at_rest:
-            if self.more:
-                raise InputError(
-                    "--at-rest integrates one log; make phasors of each with magfusion demodulate"
-                    " --at-rest, and smooth these together"
-                )
-            if self.earth or self.free:
-                raise InputError(
-                    "--at-rest gives phasors of whole rests, which do not support the Earth field"
-                    " or a common gain; omit --earth and --free"
-                )
+            self._check_rests()
+        if self.map_steel and (self.more or self.at_rest or self.coupling == "loose"):
+            raise InputError(
+                "--map-steel maps the steel along one log by its fields; omit --at-rest and"
+                " --coupling loose, and give one log"
+            )
         if self.more and self.engine != "bordered":
             raise InputError(
                 "--engine gtsam solves one log; omit it, or smooth the logs one by one"
@@ -107,6 +106,18 @@ class SmoothSettings(
             )
         if self.free and self.more:
             raise InputError("--free gain uses one log; smooth the logs one by one")
+
+    def _check_rests(self) -> None:
+        if self.more:
+            raise InputError(
+                "--at-rest integrates one log; make phasors of each with magfusion demodulate"
+                " --at-rest, and smooth these together"
+            )
+        if self.earth or self.free:
+            raise InputError(
+                "--at-rest gives phasors of whole rests, which do not support the Earth field"
+                " or a common gain; omit --earth and --free"
+            )
 
     def smoother(self, job: Job) -> SmootherSettings:
         """Return the settings of the estimator."""
@@ -147,6 +158,7 @@ def run(settings: SmoothSettings, output: Path, report: Report = quiet) -> Figur
         free_gain=settings.free is not None,
         rest=settings if settings.at_rest else None,
         kept=None if place is None else (place, settings.resume),
+        mapping=settings.map_steel,
         report=report,
     )
 
@@ -160,6 +172,7 @@ def run_smooth(
     free_gain: bool = False,
     rest: RestSettings | None = None,
     kept: tuple[Path, bool] | None = None,
+    mapping: bool = False,
     report: Report = quiet,
 ) -> Figures:
     """Smooth a log: trajectory, refined site, report and recording.
@@ -177,6 +190,8 @@ def run_smooth(
         Settings for integration of whole rests, instead of windows.
     kept : tuple of (Path, bool), optional
         File with the result of each pass, and whether to resume from it.
+    mapping : bool
+        Whether steel near the path is mapped.
 
     Raises
     ------
@@ -219,7 +234,7 @@ def run_smooth(
     else:
         give_back_memory()
         findings += () if rested is None else beyond(recording, log, site)
-        done = finished(log, site, settings, result, risk, findings=findings)
+        done = finished(log, site, settings, result, risk, findings=findings, mapping=mapping)
         parts = done.corrections, done.trust.reasons, findings, report
         done = corrected(log, site, settings, risk, *parts) or done
     figures = done.figures | Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))

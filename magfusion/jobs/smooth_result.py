@@ -30,7 +30,8 @@ from magfusion.estimation.integrity.smoothed_exclusion import (
     states_judged,
     with_long_exclusions,
 )
-from magfusion.estimation.integrity.steel_test import steel_explains
+from magfusion.estimation.integrity.steel_map import SteelMap, map_steel
+from magfusion.estimation.integrity.steel_test import STEEL, steel_explains
 from magfusion.estimation.online_integrity.open_roll import (
     comparable,
     roll_findings,
@@ -38,6 +39,7 @@ from magfusion.estimation.online_integrity.open_roll import (
 )
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.files.site import save_site
+from magfusion.files.steel_map import STEEL_MAP, write_steel_map
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
 from magfusion.jobs.failure import reason_of
@@ -60,6 +62,7 @@ from magfusion.results.report import (
     where_found,
     write_report,
 )
+from magfusion.results.steel_map import steel_figures
 from magfusion.results.verdict import level_figures, trust_figures
 from magfusion.units import Array, Rate
 
@@ -81,6 +84,8 @@ class Finished:
         What may be wrong with the site, where something is.
     continued : Correction, optional
         That of a corrected site, which is not large enough.
+    steel : SteelMap, optional
+        Of the steel near the path.
     """
 
     site: Site
@@ -91,6 +96,7 @@ class Finished:
     errors: TrajectoryErrors | None
     corrections: list[Correction] = field(default_factory=list)
     continued: Correction | None = None
+    steel: SteelMap | None = None
 
 
 def finished(
@@ -103,6 +109,7 @@ def finished(
     excess: float = 1.0,
     findings: tuple[Finding, ...] = (),
     correction: Correction | None = None,
+    mapping: bool = False,
 ) -> Finished:
     """Assess a smoothed log.
 
@@ -114,6 +121,8 @@ def finished(
         From other logs.
     correction : Correction, optional
         By which the site was corrected: it is the reason why the result is doubtful.
+    mapping : bool
+        Whether steel is mapped.
     """
     separated = separated_smooth(result, risk)
     tests = {
@@ -126,6 +135,13 @@ def finished(
     changes = {name: test.findings[0] for name, test in tests.items()}
     give_back_memory()
     result, trust, score, causes = judged_with_score(separated.result, log)
+    bent = None
+    if mapping and any(f.code == STEEL for f in trust.findings):
+        bent = map_steel(separated.result, log.imu)
+    if bent is not None:
+        others = (f for f in trust.findings if f.code != STEEL)
+        trust = Trust((bent.finding(site), *others), trust.unverified)
+        result = replace(bent.applied(separated.result), trust=trust) if bent.is_used else result
     if correction is not None:
         result = _with_uncertainty(result, correction, score)
     trust |= Trust((*open_signs(result), *roll_findings(site)))
@@ -152,7 +168,9 @@ def finished(
     figures |= smoothed_figures(result) | level_figures(by_state, len(site.beacons))
     figures |= open_figures(site)
     further = None if correction is None else continued(correction, score)
-    return Finished(site, result, trust, by_state, figures, None, possible, further)
+    if bent is not None:
+        figures |= steel_figures(bent)
+    return Finished(site, result, trust, by_state, figures, None, possible, further, bent)
 
 
 def _explaining(finding: Finding, trust: Trust) -> Finding:
@@ -235,7 +253,11 @@ def write_finished(whole: Path, log: Log, done: Finished, *, rate: Rate) -> None
         innovations=innovations,
         trust=done.trust,
         states=by_state,
+        steel=done.steel,
     )
+    if done.steel is not None:
+        voxels = done.steel.basis.voxels
+        write_steel_map(directory / STEEL_MAP, *voxels, *done.steel.polarisability)
     motion = MotionPage(refined, result.states, log.truth, done.errors, innovations, by_state)
     write_report(whole, done.figures, motion)
 

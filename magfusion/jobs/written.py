@@ -1,5 +1,6 @@
 """Files that each job writes, by name; those of one job may block another."""
 
+from magfusion.files.steel_map import STEEL_MAP
 from magfusion.model.aiding import QUANTITIES
 from magfusion.results.report import FAILED
 
@@ -26,7 +27,7 @@ UNFINISHED = {
     "calibrate log": {KEPT},
 }
 WRITTEN = {
-    "smooth": _RESULT | {"fixes.parquet", KEPT, LOGS, LOGS_TABLE, PLATFORMS},
+    "smooth": _RESULT | {"fixes.parquet", STEEL_MAP, KEPT, LOGS, LOGS_TABLE, PLATFORMS},
     "fix": _RESULT | {"fixes.parquet"},
     "navigate": _RESULT | {"lagged.parquet"} | UNFINISHED["navigate"],
     "drift": {"drift.png", "stability.png", "run.rrd", "report.json"} | UNFINISHED["drift"],

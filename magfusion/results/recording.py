@@ -12,6 +12,7 @@ import rerun.blueprint as rrb
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.integrity.steel_map import SteelMap
 from magfusion.files.atomic import real
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -55,6 +56,7 @@ from magfusion.results.shapes import (
     ellipsoids,
     scene_scale,
 )
+from magfusion.results.steel_map import log_steel
 from magfusion.units import Array
 
 ELLIPSOIDS = 30  # along the path
@@ -77,6 +79,7 @@ def write_recording(
     trust: Trust | None = None,
     states: StateTrust | None = None,
     propagated: Trajectory | None = None,
+    steel: SteelMap | None = None,
 ) -> None:
     """Write a recording with its layout, complete or not at all.
 
@@ -99,10 +102,14 @@ def write_recording(
         Of the states of the trajectory: protection levels and doubtful states.
     propagated : Trajectory, optional
         The states between those of the trajectory: the body moves along them.
+    steel : SteelMap, optional
+        Of the steel near the path.
     """
     scale = scene_scale(site, trajectory)
     with whole_recording(path, real(path).parent.name) as recording:
         log_beacons(recording, site, scale)
+        if steel is not None:
+            log_steel(recording, steel)
         _log_path(recording, "world/estimate", trajectory, _ESTIMATE, 1.2)
         _log_body(recording, trajectory if propagated is None else propagated, scale)
         if propagated is not None:

@@ -202,20 +202,26 @@ def _false_stretches(result: Smoothed, separated: Separation, beacon: int) -> Bo
 
 def _resolved(result: Smoothed, name: str, false: BoolArray) -> Smoothed | None:
     """Return the result without a beacon at some field epochs; None if there is no solution."""
-    own = np.array([owner == name for owner, _ in result.fields.channels])
-    phasors = _phasors(result)
-    left_out = (false[:, None] & own)[..., None, None]
-    kept = replace(phasors, sqrt_information=np.where(left_out, 0.0, phasors.sqrt_information))
     try:
-        return solved_again(
-            result,
-            tuple(_without_beacon(m, phasors, kept, false, own) for m in result.graph.measurements),
-        )
+        return solved_again(result, without_beacon(result, name, false))
     except RuntimeError:  # GTSAM's: without it the pose is undetermined
         return None
 
 
-def _without_beacon(
+def without_beacon(
+    result: Smoothed, name: str, false: BoolArray | None = None
+) -> tuple[Measurement, ...]:
+    """Return the measurements of a result without a beacon, at some field epochs or at all."""
+    phasors = _phasors(result)
+    false = np.ones(len(phasors.time), dtype=bool) if false is None else false
+    own = np.array([owner == name for owner, _ in result.fields.channels])
+    left_out = (false[:, None] & own)[..., None, None]
+    kept = replace(phasors, sqrt_information=np.where(left_out, 0.0, phasors.sqrt_information))
+    every = result.graph.measurements
+    return tuple(_without_part(m, phasors, kept, false, own) for m in every)
+
+
+def _without_part(
     measurement: Measurement,
     phasors: FieldPhasors,
     kept: FieldPhasors,

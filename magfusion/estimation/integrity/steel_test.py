@@ -66,27 +66,35 @@ class SteelEstimate(NamedTuple):
     gain: float
     spread: Array
 
-    def finding(self, site: Site) -> Finding:
-        """Return the finding: a remark where the site declares so much."""
+    def described(self, site: Site) -> str:
+        """Return a sentence on the steel."""
         where, declared = "near the path", 100.0 * site.model_error
         if self.place_sigma < FAR:
             x, y, z = self.place_world
             where = f"near ({x:.1f}, {y:.1f}, {z:.1f}) m, ± {self.place_sigma:.1f} m,"
-        text = (
+        return (
             f"Steel {where} distorts the fields of all beacons by about"
             f" {100.0 * self.distortion:.2g} % along the path (declared {declared:.2g} %)."
         )
-        weight = float(np.sqrt(max(self.gain, 0.0)))
+
+    @property
+    def weight(self) -> float:
+        """Weight of its finding: the evidence in sigma."""
+        return float(np.sqrt(max(self.gain, 0.0)))
+
+    def finding(self, site: Site) -> Finding:
+        """Return the finding: a remark where the site declares so much."""
+        text = self.described(site)
         if self.distortion <= site.model_error:
             text += " The covariance includes its effect."
-            return Finding(STEEL, text, Verdict.TRUSTWORTHY, weight)
+            return Finding(STEEL, text, Verdict.TRUSTWORTHY, self.weight)
         needed = _rounded_up(self.distortion)
         text += (
             " No error of single parameters explains the log as well. Map the field (magfusion"
             f" calibrate fieldmap), or declare world.model_error {needed:.2g}."
         )
         remedy = changed_keys(site, replace(site, model_error=needed))
-        return Finding(STEEL, text, Verdict.DOUBTFUL, weight, remedy=remedy)
+        return Finding(STEEL, text, Verdict.DOUBTFUL, self.weight, remedy=remedy)
 
 
 def steel(case: Case, rival: float, *, doubted: bool = False) -> TestResult | None:
@@ -132,15 +140,15 @@ def steel_explains(result: Smoothed, log: Log, rival: float) -> bool:
 def estimate_steel(case: Case, rival: float) -> SteelEstimate | None:
     """Return the steel that explains a log; None if not better than a rival cause of a gain."""
     result = case.result
-    if _has_close_tones(result):
+    if has_close_tones(result):
         return None
-    poses = _poses_of_fields(result)
+    poses = poses_of_fields(result)
     modes = steel_modes(result.calibration.site, poses.time, poses)
     scores = scores_of(result, case.log.imu, modes) if modes else None
     known = None if scores is None else best_explanation(scores.every, rival)
     if scores is None or known is None:
         return None
-    return _estimated(answered(result, scores.every, case.log.imu), *known)
+    return estimated_steel(answered(result, scores.every, case.log.imu), *known)
 
 
 def score_with_steel(score: Score | None, result: Smoothed, log: Log, site: Site) -> Score | None:
@@ -148,9 +156,9 @@ def score_with_steel(score: Score | None, result: Smoothed, log: Log, site: Site
     modes = region_modes(site)
     if score is None or not modes or result.calibration.site.channels != site.channels:
         return None
-    if _has_close_tones(result):
+    if has_close_tones(result):
         return _without_evidence(score, modes)
-    poses, parameter = _poses_of_fields(result), modes[-1].parameter
+    poses, parameter = poses_of_fields(result), modes[-1].parameter
     assert isinstance(parameter, SteelModes)
     here = along_path(parameter.basis, result.calibration.site, poses.time, poses)
     scores = scores_of(result, log.imu, here, responses=True)
@@ -159,7 +167,7 @@ def score_with_steel(score: Score | None, result: Smoothed, log: Log, site: Site
     return replace(scores.every, fixed=placed((*score.fixed, *modes)))
 
 
-def _has_close_tones(result: Smoothed) -> bool:
+def has_close_tones(result: Smoothed) -> bool:
     """Return whether samples of short windows are not at the epochs, where the modes are."""
     return any(isinstance(m, JointPhasors) for m in result.graph.measurements)
 
@@ -184,12 +192,12 @@ def steel_of_score(score: Score, rival: float) -> SteelEstimate | None:
     None if it does not explain the data better than a rival cause of a known gain.
     """
     known = best_explanation(score, rival)
-    return None if known is None else _estimated(score, *known)
+    return None if known is None else estimated_steel(score, *known)
 
 
 def best_explanation(score: Score, rival: float) -> tuple[float, Array] | None:
     """Return gain and sigmas of the amplitudes of steel; None if a rival cause is as good."""
-    block = _block_of(score)
+    block = block_of(score)
     assert isinstance(block.parameter, SteelModes)
     shared = np.arange(block.parameter.columns) < block.parameter.basis.shared
     gain, sigma = best_size(*_own(score, block), shared)
@@ -198,11 +206,13 @@ def best_explanation(score: Score, rival: float) -> tuple[float, Array] | None:
     return gain, sigma
 
 
-def _block_of(score: Score) -> Block:
+def block_of(score: Score) -> Block:
+    """Return the last block of steel's amplitudes."""
     return next(b for b in reversed(score.fixed) if isinstance(b.parameter, SteelModes))
 
 
-def _poses_of_fields(result: Smoothed) -> Trajectory:
+def poses_of_fields(result: Smoothed) -> Trajectory:
+    """Return the poses at the fields."""
     here = {k: v[result.epoch] for k, v in vars(result.states).items() if v is not None}
     return Trajectory(**here)
 
@@ -237,12 +247,10 @@ def _own(score: Score, block: Block) -> tuple[Array, Array]:
     return information[block.columns, block.columns], gradient[block.columns]
 
 
-def _estimated(score: Score, gain: float, sigma: Array) -> SteelEstimate:
-    block = _block_of(score)
-    information, gradient = _own(score, block)
-    inner = np.eye(len(sigma)) + sigma[:, None] * information * sigma
-    cov = sigma[:, None] * np.linalg.inv(inner) * sigma
-    mean = cov @ gradient
+def estimated_steel(score: Score, gain: float, sigma: Array) -> SteelEstimate:
+    """Return the steel of a score with the responses of the poses to it."""
+    block = block_of(score)
+    mean, cov = amplitudes(score, sigma)
     by_pose = score.by_pose[..., block.columns]
     moved = by_pose @ mean
     spread = moved[:, :, None] * moved[:, None, :] + by_pose @ cov @ np.swapaxes(by_pose, 1, 2)
@@ -250,6 +258,14 @@ def _estimated(score: Score, gain: float, sigma: Array) -> SteelEstimate:
     place, place_sigma = _strongest(block.parameter.basis, mean, cov)
     distortion = UNIT * float(np.hypot(sigma[0], sigma[-1]))
     return SteelEstimate(distortion, place, place_sigma, gain, spread)
+
+
+def amplitudes(score: Score, sigma: Array) -> tuple[Array, Array]:
+    """Return mean and covariance of the amplitudes of steel, given their sigmas before."""
+    information, gradient = _own(score, block_of(score))
+    inner = np.eye(len(sigma)) + sigma[:, None] * information * sigma
+    cov = sigma[:, None] * np.linalg.inv(inner) * sigma
+    return cov @ gradient, cov
 
 
 def _strongest(modes: SteelBasis, mean: Array, cov: Array) -> tuple[Array, float]:

@@ -15,6 +15,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import eigh
 from scipy.spatial import cKDTree
 
 from magfusion.estimation.graph.same_epoch import SAME_TIME
@@ -156,7 +157,13 @@ class SteelModes(Parameter):
         return np.asarray(drive[..., None, None] * added)
 
 
-def steel_modes(site: Site, time: Array, poses: Trajectory) -> tuple[Block, ...]:
+def steel_modes(
+    site: Site,
+    time: Array,
+    poses: Trajectory,
+    count: tuple[int, int] = (SHARED, OWN),
+    places: int = PLACES,
+) -> tuple[Block, ...]:
     """Return the block of steel's amplitudes for a log; none for what it does not model.
 
     Parameters
@@ -165,17 +172,21 @@ def steel_modes(site: Site, time: Array, poses: Trajectory) -> tuple[Block, ...]
         Of the fields (s).
     poses : Trajectory
         Poses at these times.
+    count : tuple of int
+        Number of modes of all beacons together, and of each tone.
+    places : int
+        On the path, at which they are determined.
     """
     if site.platform.further or not site.beacons or not 1 < len(time) <= MAX_EPOCHS:
         return ()
     place = sensor_positions(site, poses)[:, 0]
     channels = len(site.channels)
-    limit = MAX_MOMENTS / (3 * channels * (SHARED + OWN * channels))
+    limit = MAX_MOMENTS / (3 * channels * (count[0] + count[1] * channels))
     voxels = voxels_around(np.concatenate([place, [b.position_world for b in site.beacons]]), limit)
     if voxels is None:
         return ()
-    rows = np.unique(np.linspace(0, len(place) - 1, min(len(place), PLACES)).astype(int))
-    basis = _basis(site, place[rows], voxels, (SHARED, OWN), 0.0)
+    rows = np.unique(np.linspace(0, len(place) - 1, min(len(place), places)).astype(int))
+    basis = _basis(site, place[rows], voxels, count, 0.0)
     return along_path(basis, site, time, poses)
 
 
@@ -330,8 +341,9 @@ def _modes(tensors: Array, at_place: AnyArray, moment: AnyArray, count: int) -> 
     unit = float(np.sqrt(np.sum(np.abs(relative) ** 2) / size.size))
     flat = np.moveaxis(relative, 3, 2).reshape(3 * size.size, -1)
     flat = np.concatenate([flat.real, flat.imag]) if np.iscomplexobj(flat) else flat
-    value, vector = np.linalg.eigh(flat @ flat.T)
-    kept = np.flatnonzero(value > 1e-9 * value[-1])[::-1][:count]
+    last = len(flat) - 1
+    value, vector = eigh(flat @ flat.T, subset_by_index=(max(last + 1 - count, 0), last))
+    kept = np.flatnonzero(value > 1e-9 * value[-1])[::-1]
     amplitude = flat.T @ (vector[:, kept] / np.sqrt(value[kept]))
     amplitude = amplitude.reshape(len(moment), 1, moment.shape[3], -1)
     return np.asarray(moment @ amplitude / unit)
