@@ -6,7 +6,7 @@ each log is one draw.  Of one estimate three covariances are compared, with the 
 log (6 is expected): without an error of the fields that is constant in place, with a kernel in
 place for each beacon that knows no physics, and as `smooth` has it.
 The steel of the simulator is bars, sheets and spheres in each other's fields; the estimator
-knows nothing of it.
+knows nothing of it.  With `--map`, the steel is mapped, too (`smooth --map-steel`).
 """
 
 from collections.abc import Sequence
@@ -17,6 +17,7 @@ from harness import Scale, chosen_scale, conclude, scenario_parser
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.batch.batch import Smoothed, smooth
+from magfusion.estimation.integrity.steel_map import SteelMap, map_steel
 from magfusion.estimation.measurements.model_error import cells
 from magfusion.estimation.posterior.marginals import marginals
 from magfusion.model.noise import model_error
@@ -56,6 +57,7 @@ class Walk:
     seed: int
     beacons: int
     duration: float  # s
+    mapping: bool = False
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,11 @@ class Row:
     nees_white: float
     nees_kernel: float
     nees: float
+    map_error_ratio: float | None = None  # of beacons left out; None without a map
+    map_used: bool = False
+    map_position_mm: float | None = None
+    map_attitude_deg: float | None = None
+    map_nees: float | None = None
 
 
 def kind_of(seed: int) -> str:
@@ -122,17 +129,32 @@ def judge(walk: Walk, _: np.random.Generator) -> Row:
             result.states.pose_cov,
         )
     ]
-    errors = trajectory_errors(result.states, truth)
     few = truth.position_world[::50]
+    steel_map = map_steel(result, built.log.imu) if walk.mapping else None
     return Row(
         kind,
         walk.seed,
         walk.beacons,
         100.0 * _distortion(site, few, steel),
-        1e3 * float(np.sqrt(np.mean(np.sum(errors.position_world**2, axis=1)))),
-        float(np.sqrt(np.mean(errors.attitude**2))) / DEGREE,
+        *_errors(result.states, truth),
         *nees,
+        *(_mapped(steel_map, result, truth) if steel_map else ()),
     )
+
+
+def _errors(states: Trajectory, truth: Trajectory) -> tuple[float, float]:
+    """Return the errors of position (mm) and attitude (degrees), rms."""
+    errors = trajectory_errors(states, truth)
+    position_mm = 1e3 * float(np.sqrt(np.mean(np.sum(errors.position_world**2, axis=1))))
+    return position_mm, float(np.sqrt(np.mean(errors.attitude**2))) / DEGREE
+
+
+def _mapped(
+    steel: SteelMap, result: Smoothed, truth: Trajectory
+) -> tuple[float, bool, float, float, float]:
+    """Return the columns of a row that a map has, whether it is used or not."""
+    states = steel.applied(result).states
+    return steel.ratio, steel.is_used, *_errors(states, truth), _mean_nees(states, truth)
 
 
 def _distortion(site: Site, point_world: Array, steel: SteelStructure) -> float:
@@ -188,10 +210,15 @@ def kernel_errors(result: Smoothed) -> tuple[Block, ...]:
 
 
 def run(
-    seeds: Sequence[int], beacons: Sequence[int], duration: float, scale: Scale | None = None
+    seeds: Sequence[int],
+    beacons: Sequence[int],
+    duration: float,
+    scale: Scale | None = None,
+    *,
+    mapping: bool = False,
 ) -> list[Row]:
     """Return what came out of each log."""
-    walks = [Walk(seed, count, duration) for count in beacons for seed in seeds]
+    walks = [Walk(seed, count, duration, mapping) for count in beacons for seed in seeds]
     return run_many(judge, walks, **(scale or {}))
 
 
@@ -221,6 +248,11 @@ def report(rows: Sequence[Row]) -> str:
             f"{row.position_mm:7.1f}{row.attitude_deg:7.3f}"
             f"{row.nees_white:8.1f}{row.nees_kernel:8.1f}{row.nees:8.1f}"
         )
+        if row.map_error_ratio is not None:
+            lines[-1] += (
+                f" map {'used' if row.map_used else 'not '} at {row.map_error_ratio:.3f}:"
+                f"{row.map_position_mm:7.1f}{row.map_attitude_deg:7.3f}{row.map_nees:8.1f}"
+            )
     for count in sorted({row.beacons for row in rows}):
         for name, one in figures([row for row in rows if row.beacons == count]).items():
             lines.append(
@@ -236,11 +268,13 @@ def main() -> None:
     parser = scenario_parser(__doc__, 0, "two walks of 20 s", output=None, parallel=True)
     parser.add_argument("--worlds", type=int, default=WORLDS)
     parser.add_argument("--beacons", type=int, nargs="+", default=[4, 8], choices=(4, 8))
+    parser.add_argument("--map", action="store_true", help="map the steel, too")
     parser.add_argument("--duration", type=float, default=60.0, help="of a walk (s)")
     given = parser.parse_args()
     seeds = range(given.seed, given.seed + (2 if given.quick else given.worlds))
     beacons = [4] if given.quick else given.beacons
-    rows = run(seeds, beacons, 20.0 if given.quick else given.duration, chosen_scale(given))
+    duration = 20.0 if given.quick else given.duration
+    rows = run(seeds, beacons, duration, chosen_scale(given), mapping=given.map)
     conclude(report(rows), {"figures": figures(rows), "rows": [asdict(row) for row in rows]})
 
 

@@ -85,7 +85,7 @@ class Finished:
     continued : Correction, optional
         That of a corrected site, which is not large enough.
     steel : SteelMap, optional
-        Of the steel near the path.
+        Of the steel near the path, where it is used.
     """
 
     site: Site
@@ -135,13 +135,12 @@ def finished(
     changes = {name: test.findings[0] for name, test in tests.items()}
     give_back_memory()
     result, trust, score, causes = judged_with_score(separated.result, log)
-    bent = None
-    if mapping and any(f.code == STEEL for f in trust.findings):
-        bent = map_steel(separated.result, log.imu)
-    if bent is not None:
-        others = (f for f in trust.findings if f.code != STEEL)
-        trust = Trust((bent.finding(site), *others), trust.unverified)
-        result = replace(bent.applied(separated.result), trust=trust) if bent.is_used else result
+    steel = None
+    if mapping and _may_be_mapped(trust):
+        steel = map_steel(separated.result, log.imu)
+    if steel is not None:
+        trust = _with_map(trust, steel, site)
+        result = replace(steel.applied(separated.result), trust=trust) if steel.is_used else result
     if correction is not None:
         result = _with_uncertainty(result, correction, score)
     trust |= Trust((*open_signs(result), *roll_findings(site)))
@@ -168,9 +167,23 @@ def finished(
     figures |= smoothed_figures(result) | level_figures(by_state, len(site.beacons))
     figures |= open_figures(site)
     further = None if correction is None else continued(correction, score)
-    if bent is not None:
-        figures |= steel_figures(bent)
-    return Finished(site, result, trust, by_state, figures, None, possible, further, bent)
+    if steel is not None:
+        figures |= steel_figures(steel)
+    used = steel if steel is not None and steel.is_used else None
+    return Finished(site, result, trust, by_state, figures, None, possible, further, used)
+
+
+def _may_be_mapped(trust: Trust) -> bool:
+    """Return whether nothing but steel contradicts a result."""
+    return all(f.code == STEEL for f in trust.reasons[:1])
+
+
+def _with_map(trust: Trust, steel: SteelMap, site: Site) -> Trust:
+    """Return findings with that of a map in place of that of steel; a map not used adds none."""
+    others = tuple(f for f in trust.findings if f.code != STEEL)
+    if len(others) == len(trust.findings) and not steel.is_used:
+        return trust
+    return Trust((steel.finding(site), *others), trust.unverified)
 
 
 def _explaining(finding: Finding, trust: Trust) -> Finding:

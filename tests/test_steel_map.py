@@ -1,0 +1,131 @@
+"""Map of steel from the log itself: used only where it predicts beacons that it does not know."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+from conftest import Refuse, run_command
+
+from magfusion.estimation.integrity.steel_map import USED, SteelMap
+from magfusion.estimation.integrity.steel_test import SteelEstimate
+from magfusion.estimation.measurements.steel import UNIT, SteelBasis, Voxels
+from magfusion.files.log import write_log
+from magfusion.files.site import save_site
+from magfusion.model.site import Site
+from magfusion.model.trust import Verdict
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.disturbance import Ambient
+from magfusion.simulation.log import SimulationConfig, simulate_log
+from magfusion.simulation.steel_worlds import draw_steel
+
+SHARED_STEEL = Path(__file__).parents[1].parent / "shared" / "logs" / "steel"
+
+
+def _map(ratio: float) -> SteelMap:
+    """Return a map of one voxel in one mode, of two tones."""
+    moment = np.full((1, 2, 3, 1), 1e-3)
+    basis = SteelBasis(Voxels(np.zeros((1, 3)), np.ones(1)), moment, moment, 1, 0.0)
+    steel = SteelEstimate(0.02, np.zeros(3), 0.3, 900.0, np.zeros((1, 6, 6)))
+    held_out = {"A": ratio, "B": ratio}
+    return SteelMap(steel, basis, np.array([2.0]), np.array([[0.25]]), np.ones((1, 6, 1)), held_out)
+
+
+def test_a_map_that_predicts_no_other_beacon_is_not_used() -> None:
+    """The finding is a remark with the map, and the reason for doubt without it."""
+    site = replace(demo_site(coil_radius=None), model_error=0.005)
+    good, bad = _map(USED - 0.05), _map(USED + 0.05)
+    assert good.is_used
+    assert good.finding(site).verdict is Verdict.TRUSTWORTHY
+    assert not bad.is_used
+    known = bad.finding(site)
+    assert known.verdict is Verdict.DOUBTFUL
+    assert known.remedy == {"world.model_error": 0.02}
+
+
+def test_the_polarisability_is_that_of_the_amplitudes() -> None:
+    """Two sigma of the mode in the mean, half a sigma unsure."""
+    mean, sigma = _map(0.5).polarisability
+    unit = UNIT * np.sqrt(3.0) * 1e-3  # m^3, of three equal components
+    np.testing.assert_allclose(mean, 2.0 * unit, rtol=1e-9)
+    np.testing.assert_allclose(sigma, 0.5 * unit, rtol=1e-9)
+
+
+def _surveyed_exactly(site: Site) -> Site:
+    """Return a site whose errors are not drawn."""
+    beacons = tuple(
+        replace(
+            beacon,
+            sigma=replace(
+                beacon.sigma,
+                position_world=np.zeros(3),
+                rotation_beacon=np.zeros(3),
+                log_moment=np.zeros(2),
+            ),
+        )
+        for beacon in site.beacons
+    )
+    sensor, none = site.platform.magnetometer, np.zeros(3)
+    known = replace(sensor.sigma, matrix=np.zeros((3, 3)), rotation_sensor=none, position_body=none)
+    platform = replace(site.platform, magnetometer=replace(sensor, sigma=known))
+    return replace(site, beacons=beacons, platform=platform)
+
+
+def _mapped(kind: str, place: Path) -> dict[str, Any]:
+    """Return the report of a walk of a minute among steel of a kind."""
+    site = replace(demo_site(coil_radius=None), model_error=0.005)
+    rng = np.random.default_rng(0)
+    beacons = np.array([beacon.position_world for beacon in site.beacons])
+    steel = draw_steel(kind, rng, DEMO_BOX_WORLD, beacons)
+    config = SimulationConfig(
+        DEMO_BOX_WORLD,
+        duration=60.0,
+        imu_rate_hz=100.0,
+        magnetometer_rate_hz=160.0,
+        ambient=Ambient(rails=steel),
+    )
+    write_log(simulate_log(_surveyed_exactly(site), config, rng).log, place / "log")
+    save_site(site, place / "log" / "site.yaml")
+    run_command("smooth", place / "log", "-o", place / "run", "--map-steel")
+    report: dict[str, Any] = json.loads((place / "run" / "report.json").read_text())
+    return report
+
+
+@pytest.mark.slow
+def test_a_mesh_is_mapped_and_the_sigmas_are_right(tmp_path: Path) -> None:
+    report = _mapped("mesh", tmp_path)
+    assert report["verdict"] == "trustworthy"
+    assert report["steel_map_used"]
+    assert report["attitude_rmse_deg"] < 0.06
+    assert report["ate_m"] < 0.004
+    assert 1.0 < report["nees_mean"] < 12.6  # 95 % of chi square of six
+    voxels = pyarrow.parquet.read_table(tmp_path / "run" / "steel.parquet").to_pandas()
+    assert np.all(voxels.polarisability_sigma_m3 > 0.0)
+
+
+@pytest.mark.slow
+def test_a_map_of_racks_is_wrong_and_not_used(tmp_path: Path) -> None:
+    """Long rods conduct the flux of a beacon to places where its field is weak."""
+    report = _mapped("racks", tmp_path)
+    assert not report["steel_map_used"]
+    assert not (tmp_path / "run" / "steel.parquet").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not SHARED_STEEL.is_dir(), reason="the shared logs are not here")
+def test_a_log_of_rebar_by_another_program_is_mapped(tmp_path: Path) -> None:
+    """Less than two thirds of the error without a map (10 mm, 0.33 degrees)."""
+    run_command("smooth", SHARED_STEEL / "rebar_first", "-o", tmp_path / "run", "--map-steel")
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["steel_map_used"]
+    assert report["ate_m"] < 0.0067
+    assert report["attitude_rmse_deg"] < 0.22
+    assert 1.0 < report["nees_mean"] < 12.6
+
+
+def test_whole_rests_are_not_mapped(log: Path, refuse: Refuse) -> None:
+    findings = refuse("smooth", log, "--map-steel", "--at-rest", "-o", "run")
+    assert "--map-steel maps the steel along one log" in findings
