@@ -45,7 +45,7 @@ ROOMS = {
             attitude_table audio distances drive_columns fields hall instruments readings_table
             site_casing site_correlation site_motion site_region site_rotor
             site_temperature
-            row_stamps steel_file trajectory_table wells_file
+            row_stamps steel_file steel_map trajectory_table wells_file
             aiding_tables bag depth_table fix_table marks_table result_states rotor_columns
             site_plain site_text
             record_values site_response temperature_table tum
@@ -99,7 +99,7 @@ ROOMS = {
         """,
         "results": """
             association dds_domain figures gauge odometry page_style pose_information provenance
-            recording_file ros_messages shapes trend
+            recording_file recording_steel ros_messages shapes trend
             alignment coverage drift errors live_foxglove observability odometry_dds
             odometry_mavlink recording_plots records_dds truth_frame
             axes refinement rest_figures shown transfer turn_guide verdict

@@ -52,6 +52,7 @@ from magfusion.results.errors import TrajectoryErrors, trajectory_errors
 from magfusion.results.figures import ErrorColumn, Figure, Figures, Section, heading
 from magfusion.results.page_motion import MotionPage
 from magfusion.results.recording import write_recording
+from magfusion.results.recording_steel import steel_figures
 from magfusion.results.refinement import result_site
 from magfusion.results.report import (
     compared_with_truth,
@@ -62,7 +63,6 @@ from magfusion.results.report import (
     where_found,
     write_report,
 )
-from magfusion.results.steel_map import steel_figures
 from magfusion.results.verdict import level_figures, trust_figures
 from magfusion.units import Array, Rate
 

@@ -41,6 +41,7 @@ from magfusion.results.recording_plots import (
     log_position,
     rows_of,
 )
+from magfusion.results.recording_steel import log_steel
 from magfusion.results.recording_trust import (
     LEVELS,
     has_levels,
@@ -56,7 +57,6 @@ from magfusion.results.shapes import (
     ellipsoids,
     scene_scale,
 )
-from magfusion.results.steel_map import log_steel
 from magfusion.units import Array
 
 ELLIPSOIDS = 30  # along the path

@@ -20,14 +20,19 @@ from magfusion.estimation.integrity.fixed_parameter_test import check_fixed_para
 from magfusion.estimation.integrity.priors_of_log import bias_change, calibration_change
 from magfusion.estimation.integrity.region_test import of_place
 from magfusion.estimation.integrity.released_fault import ReleasedFault
-from magfusion.estimation.integrity.residual_blocks import fields, fixes, inertial, together
+from magfusion.estimation.integrity.residual_blocks import (
+    compass,
+    fields,
+    fixes,
+    inertial,
+    together,
+)
 from magfusion.estimation.integrity.score import (
     Score,
     field_residual,
     moved_estimate,
     scores_of,
 )
-from magfusion.estimation.integrity.smoothed_compass import compass
 from magfusion.estimation.integrity.steel_test import score_with_steel, steel
 from magfusion.estimation.integrity.test_result import NOTHING, Case, TestResult
 from magfusion.estimation.posterior.tuned_noise import covered_beacons, tuned_noise

@@ -1,5 +1,7 @@
 """Tests of field and inertial residuals, by beacon, by axis, by time and in short windows.
 
+The static field is tested at the poses of a log that does not use the Earth field.
+
 Each is a chi square with the effective number of independent residuals, from their measured
 autocorrelation.  Field residuals are taken after all uncertain parameters have moved as far as
 their declared sigmas allow, and after the reported causes.
@@ -11,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.data_checks.data_quality import beginning
 from magfusion.estimation.data_checks.statistics import (
     TEST_BUDGET,
     effective_number,
@@ -18,6 +21,8 @@ from magfusion.estimation.data_checks.statistics import (
     log_p_chi_square,
     sigmas,
 )
+from magfusion.estimation.data_checks.steady_field import OffEarth, off_earth
+from magfusion.estimation.data_checks.still_means import SPAN, still_means
 from magfusion.estimation.graph.graph import GraphEstimate
 from magfusion.estimation.graph.state import states_in
 from magfusion.estimation.integrity.inertial_misfit import expected_squares, inertial_errors
@@ -27,6 +32,7 @@ from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.pose_fix import PoseFix
 from magfusion.estimation.snapshot.priors import NOTHING_EXPLAINED
+from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.windows import LONGEST_WINDOW
 from magfusion.units import Array, BoolArray
@@ -39,6 +45,8 @@ TOLERATED = 1.2**2  # mean square below which sigmas are acceptable
 TOLERATED_INERTIAL = 1.5**2
 EXPLAINED_SQUARE = 1.5  # mean square in short windows, one where noise and model are as declared
 MIN_WINDOWS = 3  # per mean
+SPANS_TOGETHER = 3  # whose mean is tested; about the memory of the same test online
+NEAR = 0.5 * SPAN + 1.0  # s; largest distance of a state from the middle of a span
 AXES = {0: "gyroscope x", 1: "gyroscope y", 2: "gyroscope z"} | {
     6: "accelerometer x",
     7: "accelerometer y",
@@ -336,3 +344,42 @@ def together(case: Case) -> TestResult:
         20.0 + rms,
     )
     return TestResult((finding,), factor=factor)
+
+
+def compass(case: Case) -> TestResult:
+    """Test the static field at the poses, and doubt the poses of the spans where it differs."""
+    site, states, log = case.result.declared.site, case.result.states, case.log
+    if case.result.earth_residual is not None or site.earth_field_world is None:
+        return NOTHING
+    if log.vectors is None or len(site.platform.magnetometer.axes) < 3 or not len(states):
+        return NOTHING
+    means = still_means(beginning(log), site)
+    near, row, attitude = means.near(states, NEAR)
+    field_body = means.field_body[near]
+    if len(row) < SPANS_TOGETHER or not np.all(np.isfinite(field_body)):
+        return NOTHING
+    residual = np.einsum("nij,nj->ni", attitude, field_body) - site.earth_field_world
+    cov = attitude @ case.pose_cov[row, :3, :3] @ np.swapaxes(attitude, 1, 2)
+    result = [
+        off_earth(site, np.mean(residual[k : k + SPANS_TOGETHER], axis=0), cov[k])
+        for k in range(len(row) - SPANS_TOGETHER + 1)
+    ]
+    off = [one for one in result if one is not None]
+    if not off:
+        return NOTHING
+    worst = max(off, key=lambda one: one.score)
+    return TestResult((worst.finding,), spread=_spread_of_spans(states, means.time[near], result))
+
+
+def _spread_of_spans(states: Trajectory, time: Array, result: list[OffEarth | None]) -> Array:
+    """Return the possible errors of the poses nearest to each span, shape (states, 6, 6)."""
+    middle = time[SPANS_TOGETHER // 2 : len(time) - SPANS_TOGETHER // 2]
+    nearest = np.argmin(np.abs(states.time[:, None] - middle), axis=1)
+    spread = np.zeros((len(states), 6, 6))
+    for k, one in enumerate(result):
+        if one is None:
+            continue
+        for row in np.flatnonzero(nearest == k).tolist():
+            spread[row, :3, :3] = one.turn**2 * np.eye(3)
+            spread[row, 3:, 3:] = one.shift(states.position_world[row]) ** 2 * np.eye(3)
+    return spread

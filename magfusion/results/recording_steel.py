@@ -6,7 +6,7 @@ import rerun as rr
 from magfusion.estimation.integrity.steel_map import SteelMap
 from magfusion.results.figures import Figure, Figures, Section
 
-SURE = 2.0  # sigma; a voxel less certain than this is drawn grey
+DRAWN_SIGMAS = 2.0  # sigma; a voxel less certain than this is drawn grey
 LEAST = 0.05  # of the largest polarisability; less is not drawn
 _STEEL, _UNSURE = (235, 120, 60), (140, 140, 140)
 
@@ -30,6 +30,6 @@ def log_steel(recording: rr.RecordingStream, steel: SteelMap) -> None:
     drawn = size > LEAST * np.max(size)
     # A sphere of iron has a polarisability of three times its volume.
     radius = np.cbrt(size[drawn] / (4.0 * np.pi))
-    colours = np.where((size > SURE * sigma)[drawn, None], _STEEL, _UNSURE)
+    colours = np.where((size > DRAWN_SIGMAS * sigma)[drawn, None], _STEEL, _UNSURE)
     points = rr.Points3D(voxels.centre_world[drawn], radii=radius, colors=colours)
     recording.log("world/steel", points, static=True)
