@@ -66,6 +66,8 @@ from magfusion.results.report import (
 from magfusion.results.verdict import level_figures, trust_figures
 from magfusion.units import Array, Rate
 
+OF_STEEL = ("noise_tuned", "field_residuals")  # codes of findings that steel explains
+
 
 @dataclass(frozen=True, eq=False)
 class Finished:
@@ -150,7 +152,10 @@ def finished(
         result = replace(result, states=replace(result.states, pose_cov=wider))
     trust = with_long_exclusions(trust | separated.trust | Trust(findings))
     trust = with_changed_beacons(trust, changes)
-    cause = diagnosed(log, site, trust, settings.lockin) if correction is None else None
+    mapped = steel is not None and steel.is_used
+    cause = None
+    if correction is None and not mapped:
+        cause = diagnosed(log, site, trust, settings.lockin)
     possible = corrections(site, trust.reasons, () if changes else causes, cause)
     is_named = bool(causes) or any(f.code == "changed" for f in trust.reasons)
     if is_named and cause is not None and not cause.is_clear:
@@ -169,13 +174,13 @@ def finished(
     further = None if correction is None else continued(correction, score)
     if steel is not None:
         figures |= steel_figures(steel)
-    used = steel if steel is not None and steel.is_used else None
+    used = steel if mapped else None
     return Finished(site, result, trust, by_state, figures, None, possible, further, used)
 
 
 def _may_be_mapped(trust: Trust) -> bool:
-    """Return whether nothing but steel contradicts a result."""
-    return all(f.code == STEEL for f in trust.reasons[:1])
+    """Return whether the first reason for doubt, if there is one, may be steel."""
+    return all(f.code in (STEEL, *OF_STEEL) for f in trust.reasons[:1])
 
 
 def _with_map(trust: Trust, steel: SteelMap, site: Site) -> Trust:
@@ -183,6 +188,9 @@ def _with_map(trust: Trust, steel: SteelMap, site: Site) -> Trust:
     others = tuple(f for f in trust.findings if f.code != STEEL)
     if len(others) == len(trust.findings) and not steel.is_used:
         return trust
+    if steel.is_used:
+        remark = Verdict.TRUSTWORTHY
+        others = tuple(replace(f, verdict=remark) if f.code in OF_STEEL else f for f in others)
     return Trust((steel.finding(site), *others), trust.unverified)
 
 

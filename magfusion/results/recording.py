@@ -130,7 +130,8 @@ def write_recording(
         if states is not None:
             log_doubtful(recording, trajectory, states, 0.008 * scale.size)
             log_levels(recording, trajectory, states, errors)
-        _log_legend(recording, trajectory, truth is not None, propagated is not None, scale)
+        known = truth is not None, propagated is not None
+        _log_legend(recording, trajectory, *known, scale, has_steel=steel is not None)
         plots = trajectory, errors, innovations or {}, states
         recording.send_blueprint(_blueprint(site, *plots, scale, banner))
 
@@ -270,6 +271,8 @@ def _log_legend(
     has_truth: bool,
     has_propagated: bool,
     scale: Scale,
+    *,
+    has_steel: bool,
 ) -> None:
     lines = [
         "| drawn | meaning |",
@@ -282,6 +285,8 @@ def _log_legend(
         lines.append("| **green beads** | true path, with its gaps |")
     if trajectory.pose_cov is not None:
         lines.append(f"| **blue ellipsoids** | 3-sigma position, {scale.sigma} x as large |")
+    if has_steel:
+        lines.append("| **orange spheres** | steel, iron of this size; grey: below two sigma |")
     lines += [
         "| **arrows, loops** | moments and coils of a beacon |",
         f"| **grid** | {scale.grid:g} m, at height 0 |",
