@@ -61,10 +61,9 @@ def test_a_path_of_kilometres_has_no_modes(far: float) -> None:
 
 def test_the_field_of_a_sphere_is_a_sum_of_modes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a small sphere in the middle of a voxel, in the sensor's axes and the drive's phase."""
-    monkeypatch.setattr(steel, "SHARED", 10_000)
     monkeypatch.setattr(steel, "MAX_MOMENTS", np.inf)
     site, poses = demo_site(coil_radius=None), _walk()
-    (block,) = steel.steel_modes(site, poses.time, poses)
+    (block,) = steel.steel_modes(site, poses.time, poses, (10_000, steel.OWN))
     assert isinstance(block.parameter, steel.SteelModes)
     sensor, centres = site.platform.magnetometer, block.parameter.basis.voxels.centre_world
     place = poses.position_world + poses.world_from_body @ sensor.position_body
