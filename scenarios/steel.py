@@ -236,6 +236,24 @@ def figures(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     return out
 
 
+def map_figures(rows: Sequence[Row]) -> dict[str, float]:
+    """Return what the maps that are used do: errors over those without, and the mean NEES."""
+    used = [row for row in rows if row.map_used]
+    position = [(row.map_position_mm or 0.0) / row.position_mm for row in used]
+    attitude = [(row.map_attitude_deg or 0.0) / row.attitude_deg for row in used]
+    nees = [row.map_nees or 0.0 for row in used]
+    return {
+        "logs": len(rows),
+        "used": len(used),
+        "used_compact": sum(row.kind in COMPACT for row in used),
+        "position_ratio": float(np.median(position)),
+        "largest_position_ratio": float(np.max(position)),
+        "attitude_ratio": float(np.median(attitude)),
+        "nees": float(np.median(nees)),
+        "nees_without": float(np.median([row.nees for row in used])),
+    }
+
+
 def report(rows: Sequence[Row]) -> str:
     """Return the table that a reader sees."""
     lines = [
@@ -260,6 +278,8 @@ def report(rows: Sequence[Row]) -> str:
                 f" {one['above']}, above {LIMITS[2]:g}: {one['far_above']},"
                 f" largest {one['largest']:.1f}"
             )
+    if any(row.map_used for row in rows):
+        lines.append(", ".join(f"{name} {v:.3g}" for name, v in map_figures(rows).items()))
     return "\n".join(lines)
 
 
@@ -275,7 +295,10 @@ def main() -> None:
     beacons = [4] if given.quick else given.beacons
     duration = 20.0 if given.quick else given.duration
     rows = run(seeds, beacons, duration, chosen_scale(given), mapping=given.map)
-    conclude(report(rows), {"figures": figures(rows), "rows": [asdict(row) for row in rows]})
+    measured = {"figures": figures(rows), "rows": [asdict(row) for row in rows]}
+    if any(row.map_used for row in rows):
+        measured["maps"] = map_figures(rows)
+    conclude(report(rows), measured)
 
 
 if __name__ == "__main__":
