@@ -40,7 +40,6 @@ from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.simulation.motion import Rests
-from magfusion.units import Array
 
 REAL = Path(__file__).parents[2] / "shared" / "logs" / "turn_miscalibrated"
 PUBLISHED_DEG = (2.9, 5.0)
@@ -127,17 +126,7 @@ def navigated(log: Log, site: Site, estimate: tuple[str, ...]) -> Trajectory:
         navigator.add_fields(log.fields.rows(part), log.steady.rows(part))
         detected = stop
     states = as_trajectory(navigator.take())
-    return _rows(states, states.time > log.imu.time[0] + CONVERGED_STEP)
-
-
-def _rows(states: Trajectory, kept: Array) -> Trajectory:
-    assert states.pose_cov is not None
-    return Trajectory(
-        states.time[kept],
-        states.world_from_body[kept],
-        states.position_world[kept],
-        pose_cov=states.pose_cov[kept],
-    )
+    return states.rows(states.time > log.imu.time[0] + CONVERGED_STEP)
 
 
 def row(name: str, magnetometer: str, estimator: str, states: Trajectory, truth: Trajectory) -> Row:

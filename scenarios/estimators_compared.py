@@ -135,10 +135,7 @@ def batch_up_to_now(log: Log, site: Site, instants: Array) -> Trajectory:
 def at(result: Trajectory, time: Array) -> Trajectory:
     """Return the states nearest to some times."""
     rows = np.array([np.argmin(np.abs(result.time - t)) for t in time])
-    cov = None if result.pose_cov is None else result.pose_cov[rows]
-    return Trajectory(
-        result.time[rows], result.world_from_body[rows], result.position_world[rows], pose_cov=cov
-    )
+    return result.rows(rows)
 
 
 def row(log: Log, estimator: str, result: Trajectory) -> Row:
@@ -160,10 +157,7 @@ def row(log: Log, estimator: str, result: Trajectory) -> Row:
 
 def _of_part(result: Trajectory, log: Log, part: Array) -> TrajectoryErrors:
     assert log.truth is not None
-    chosen = Trajectory(
-        result.time[part], result.world_from_body[part], result.position_world[part]
-    )
-    return trajectory_errors(chosen, log.truth)
+    return trajectory_errors(result.rows(part), log.truth)
 
 
 def compare(log: Log, site: Site, config: Config) -> Iterator[Row]:

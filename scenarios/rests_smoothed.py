@@ -135,15 +135,8 @@ def smoothed(log: Log, site: Site) -> Poses:
     own = rested.log(log)
     honest, trust = judge_result(smooth(own, site, SmootherSettings()), own)
     states = honest.states
-    assert states.pose_cov is not None
     near = np.abs(states.time - rested.fields.time[:, None]).argmin(axis=1)
-    poses = Trajectory(
-        states.time[near],
-        states.world_from_body[near],
-        states.position_world[near],
-        pose_cov=states.pose_cov[near],
-    )
-    return poses, trust
+    return states.rows(near), trust
 
 
 METHODS: dict[str, Callable[[Log, Site], Poses]] = {

@@ -114,10 +114,7 @@ def _thinned(states: Trajectory, rate: Rate) -> Trajectory:
         return states
     wanted = np.arange(states.time[0], states.time[-1], 1.0 / rate)
     rows = np.unique(np.clip(np.searchsorted(states.time, wanted), 0, len(states) - 1))
-    parts: dict[str, Any] = {
-        key: None if value is None else value[rows] for key, value in vars(states).items()
-    }
-    return Trajectory(**parts)
+    return states.rows(rows)
 
 
 def _figures(result: Oriented, states: Trajectory, elapsed: float) -> Figures:

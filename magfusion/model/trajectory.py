@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from magfusion.model.short_repr import one_line
-from magfusion.units import Array, BoolArray
+from magfusion.units import Array, BoolArray, IntArray
 
 # Of one pose, by the name of each part.
 _SHAPES: tuple[tuple[str, tuple[int, ...]], ...] = (
@@ -91,6 +91,11 @@ class Trajectory(PoseAccess):
         spans = [f"{self.time[0]:g} to {self.time[-1]:g} s"] if len(self) else []
         known = [n for n, _ in _SHAPES[3:] if getattr(self, n) is not None]
         return one_line(type(self).__name__, [f"{len(self)} poses", *spans, *known])
+
+    def rows(self, chosen: IntArray | BoolArray | slice) -> "Trajectory":
+        """Return some of the poses, with all that is known of them."""
+        own = {name: None if part is None else part[chosen] for name, part in vars(self).items()}
+        return Trajectory(**own)
 
     @property
     def has_position(self) -> bool:

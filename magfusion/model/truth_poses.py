@@ -88,7 +88,7 @@ def _usable_steps(truth: Trajectory) -> BoolArray:
     errors = np.full((len(truth), 2), np.nan)
     for first in (0, 1):
         others = slice(1 - first, None, 2)
-        kept = _rows(truth, slice(first, None, 2))
+        kept = truth.rows(slice(first, None, 2))
         predicted = _cubic(kept, truth.time[others])
         turn = np.swapaxes(truth.world_from_body[others], 1, 2) @ predicted.world_from_body
         off = predicted.position_world - truth.position_world[others]
@@ -118,10 +118,6 @@ def _reason(truth: Trajectory, time: Array, inside: BoolArray, covered: BoolArra
             f" {MAX_ROTATION_ERROR / DEGREE:.1g} deg"
         )
     return " and ".join(parts)
-
-
-def _rows(truth: Trajectory, rows: slice) -> Trajectory:
-    return Trajectory(truth.time[rows], truth.world_from_body[rows], truth.position_world[rows])
 
 
 def _cubic(truth: Trajectory, time: Array) -> Trajectory:

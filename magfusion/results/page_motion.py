@@ -211,11 +211,7 @@ def _truth_within(motion: MotionPage) -> Trajectory | None:
     if truth is None or not truth.has_position:
         return None
     inside = (truth.time >= time[0]) & (truth.time <= time[-1])
-    if not inside.any():
-        return None
-    return Trajectory(
-        truth.time[inside], truth.world_from_body[inside], truth.position_world[inside]
-    )
+    return truth.rows(inside) if inside.any() else None
 
 
 def _interrupted(states: Trajectory) -> Array:

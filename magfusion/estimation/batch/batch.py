@@ -313,7 +313,7 @@ def posterior(
     errors: tuple[Block, ...] = ()
     if log.fixes is None:
         measured = log.measured_at(graph.measurements)
-        here = Trajectory(**{k: v[measured] for k, v in vars(states).items() if v is not None})
+        here = states.rows(measured)
         errors = field_errors(estimate.calibration.site, here.time, here)
     uncertain = placed((*log.considered, *errors))
     pose_cov, calibration_cov, moved = marginals(graph, estimate, uncertain)

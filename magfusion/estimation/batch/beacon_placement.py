@@ -129,9 +129,7 @@ def detected_along(
     phasor = samples.phasor_sensor[ours][:, columns]
     cov = samples.phasor_cov[ours][:, columns] * windows_per_sample
     cov = cov + model_error_cov(phasor, TRAJECTORY_ERROR)
-    poses = Trajectory(
-        states.time[others], states.world_from_body[others], states.position_world[others]
-    )
+    poses = states.rows(others)
     alone = initial_calibration(_alone(beacon, calibration.site), float(np.mean(poses.time)))
     sensor = calibration.site.platform.magnetometer
     body_from_measured = sensor.body_from_sensor @ np.linalg.inv(sensor.matrix)

@@ -27,7 +27,6 @@ from magfusion.estimation.solve.bordered import Optimised, eliminate, optimise
 from magfusion.model.parameters import Block, Calibration, difference, dimension, retract
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
-from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray
 
 
@@ -146,7 +145,7 @@ def after_round(kept: OfLog, done: Round, shared: Shared) -> OfLog:
     estimate, log = done.solution.estimate, done.log
     states = read_states(estimate.values, log.states.time)
     measured = log.measured_at(done.graph.measurements)
-    here = Trajectory(**{k: v[measured] for k, v in vars(states).items() if v is not None})
+    here = states.rows(measured)
     errors = field_errors(estimate.calibration.site, here.time, here)
     part = marginalize(done.graph, estimate, log.considered, errors)
     information = LogInformation(

@@ -96,8 +96,7 @@ class PreprocessedLog:
 
     def at_fields(self, states: Trajectory) -> Trajectory:
         """Return the states at the field epochs."""
-        rows = {k: v[self.epoch] for k, v in vars(states).items() if v is not None}
-        return Trajectory(**rows)
+        return states.rows(self.epoch)
 
     def measured_at(self, measurements: tuple[Measurement, ...]) -> IntArray:
         """Return the states at which fields were measured, in long windows or short ones."""

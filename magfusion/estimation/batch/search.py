@@ -121,7 +121,7 @@ def search(
     kept = thinned(samples)
     some = samples.rows(kept)
     offset, site = calibration.time_offset, calibration.site
-    at = Fixes(**{name: value[kept] for name, value in vars(fixes).items()})
+    at = fixes.rows(kept)
     search = Search(
         some,
         track_phasors(some, calibration),
@@ -174,15 +174,12 @@ def _seeds(search: Search, k: int) -> Tracks:
     )
     good = np.flatnonzero(np.isfinite(fixes.cost[0]))
     free_parameters, none = int(np.sum(phasors.free_phases)), np.zeros((len(good), 3))
-    clock = (
-        search.site.relative_clock.drift_sigma
-        * 2.0
-        * np.pi
-        * _frequencies(search.site)[phasors.free_phases]
-    )
+    site = search.site
+    drift_sigma = site.relative_clock.drift_sigma * 2.0 * np.pi
+    clock = drift_sigma * site.tone_frequencies_hz[phasors.free_phases]
     phases = [np.full(free_parameters, FIRST_PHASE), np.maximum(clock, 1e-9)]
-    sigma = np.concatenate([_motion_sigma(search.site), *phases])
-    mine = search.site.of_sensor(0)
+    sigma = np.concatenate([_motion_sigma(site), *phases])
+    mine = site.of_sensor(0)
     own = phasors.calibration.drive_phase(phasors.time[k])[mine]
     tracks = Tracks(
         rotation=fixes.world_from_body[0, good],
@@ -214,10 +211,6 @@ def _motion_sigma(site: Site) -> Array:
     return np.repeat(sigma, 3)
 
 
-def _frequencies(site: Site) -> Array:
-    return np.concatenate([beacon.tone_frequencies_hz for beacon in site.beacons])
-
-
 def follow_tracks(search: Search, tracks: Tracks, order: Sequence[int]) -> _Followed:
     """Return tracks propagated and updated over epochs, in the order of a range."""
     phasors, backward = search.phasors, order[0] > order[-1]
@@ -231,17 +224,13 @@ def follow_tracks(search: Search, tracks: Tracks, order: Sequence[int]) -> _Foll
         tracks = propagate_tracks(tracks, search.strides, min(k, order[i - 1]), phasors, backward)
         tracks = replace(tracks, parent=np.arange(len(tracks)))
         tracks = updated(tracks, phasors, k)
-        spent, selected = (
-            spent + float(np.min(tracks.cost)) - before,
-            selected + phasors.components[k],
-        )
+        spent = spent + float(np.min(tracks.cost)) - before
+        selected += phasors.components[k]
         # Noise above the declared one increases every difference as well.
         level = max(1.0, spent / max(selected, 1.0))
         if abs(time[k] - restarted) >= RESTART_INTERVAL and phasors.components[k] > 0.0:
             restarted, begun = time[k], begun + 1
-            fresh = (
-                not backward and begun <= PHASE_RESTART_EPOCHS and bool(np.any(phasors.free_phases))
-            )
+            fresh = not backward and begun <= PHASE_RESTART_EPOCHS
             tracks = _with_others(search, tracks, k, level, fresh=fresh)
         tracks, met = _merged(tracks, i)
         meetings += [m for m in met if m.worse < WORSE * level]
@@ -262,7 +251,7 @@ def _with_others(search: Search, tracks: Tracks, k: int, level: float, *, fresh:
     best = int(np.argmin(tracks.cost))
     price, parent = tracks.cost[best] + LEAP * level, tracks.parent[best]
     others = [_restart(search, tracks, best, k)]
-    if fresh:
+    if fresh and np.any(search.phasors.free_phases):
         others.append(_seeds(search, k))
     for other in others:
         if len(other):
@@ -365,8 +354,7 @@ def _trajectories(search: Search, followed: _Followed) -> list[FoundTrajectory]:
     last = len(followed.visits) - 1
     order = np.argsort(followed.visits[-1].cost)
     paths = [(float(followed.visits[-1].cost[r]), followed.path(int(r), last)) for r in order]
-    best = float(paths[0][0])
-    paths += list(_by_stretch(followed, paths[0][1], best))
+    paths += list(_by_stretch(followed, *paths[0]))
     out: list[FoundTrajectory] = []
     for cost, path in sorted(paths, key=lambda pair: pair[0]):
         result = _read(search, followed, path, cost)
@@ -376,7 +364,7 @@ def _trajectories(search: Search, followed: _Followed) -> list[FoundTrajectory]:
 
 
 def _by_stretch(
-    followed: _Followed, path: list[tuple[int, int]], cost: float
+    followed: _Followed, cost: float, path: list[tuple[int, int]]
 ) -> Iterator[tuple[float, list[tuple[int, int]]]]:
     """Yield paths that separate from the best before one of its merges."""
     row_at = dict(path)

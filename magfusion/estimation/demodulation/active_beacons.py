@@ -49,9 +49,7 @@ class ActiveBeacons:
             return self.calibration
         site, few = self.calibration.site, len(motion) <= SEEN_EVERY
         some = slice(None, None, 1 if few else SEEN_EVERY)
-        poses = Trajectory(
-            motion.time[some], motion.world_from_body[some], motion.position_world[some]
-        )
-        largest = np.max(largest_fields(site, sensor_positions(site, poses)[:, 0]), axis=0)
+        place = sensor_positions(site, motion.rows(some))[:, 0]
+        largest = np.max(largest_fields(site, place), axis=0)
         beacons = beacons_of(site, largest > self.least)
         return of_beacons(self.calibration, beacons if len(beacons) else np.arange(1))

@@ -89,8 +89,7 @@ class CloseLog(NamedTuple):
         assert states.gyro_bias_body is not None
         centre = self.windows.centre
         epoch = np.searchsorted(states.time, centre)
-        rows = {k: v[epoch] for k, v in vars(states).items() if v is not None}
-        here, offset = Trajectory(**rows), calibration.time_offset
+        here, offset = states.rows(epoch), calibration.time_offset
         assert here.gyro_bias_body is not None
         rate_body = low_passed_rate_at(imu, offset, centre) - here.gyro_bias_body
         bias = interpolated(imu.time + offset, states.time, states.gyro_bias_body)

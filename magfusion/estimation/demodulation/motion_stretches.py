@@ -79,9 +79,8 @@ def stretches(
     for first in range(0, len(time), STRETCH):
         last = min(first + STRETCH, len(time))
         states, samples = _about(time[first:last], path.time, stamps, margin)
-        here = {k: v[states] for k, v in vars(path).items() if v is not None}
         own = ImuSamples(imu.time[samples], imu.gyro_body[samples], imu.accel_body[samples])
-        shape = MotionShape.of(Trajectory(**here), own, time_offset, gravity, reach)
+        shape = MotionShape.of(path.rows(states), own, time_offset, gravity, reach)
         start_time = float(time[first]) if first > 0 else -np.inf
         until = float(time[last]) if last < len(time) else np.inf
         yield SampleStretch(first, last, start_time, until, shape)

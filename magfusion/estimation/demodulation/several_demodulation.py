@@ -69,9 +69,8 @@ class SeveralDemodulation(Demodulation):
         by_offset = np.zeros_like(phasor)
         for part in self.parts:
             log = replace(part.demodulation.log, imu=self.log.imu)
-            here = {k: v[part.rows] for k, v in vars(states).items() if v is not None}
             known = replace(part.demodulation, log=log)
-            result = known.compensated(seen_by(calibration, part.sensor), Trajectory(**here))
+            result = known.compensated(seen_by(calibration, part.sensor), states.rows(part.rows))
             own = part.rows, calibration.site.of_sensor(part.sensor)
             phasor[own], cov[own] = result.fields.phasor_sensor, result.fields.phasor_cov
             by_offset[own] = result.by_time_offset

@@ -104,7 +104,7 @@ class _Result:
         """Replace the fixes without one beacon each, where they have no alarm."""
         good = np.flatnonzero(~levels.bad)
         kept = rows[good]
-        some = Fixes(**{name: value[good] for name, value in vars(fixes).items()})
+        some = fixes.rows(good)
         self.fixes = _replaced(self.fixes, kept, some)
         self.level_m[kept], self.level_deg[kept] = levels.position_m[good], levels.degrees[good]
         self.excluded[kept, chosen[good]] = True
@@ -297,7 +297,7 @@ def _replaced(fixes: Fixes, rows: IntArray, new: Fixes) -> Fixes:
 def _covering(fixes: Fixes, how: _How, alarmed: BoolArray) -> Fixes:
     """Inflate covariances to cover the fixes without each beacon, where there is an alarm."""
     rows = np.flatnonzero(alarmed)
-    some = Fixes(**{name: value[rows] for name, value in vars(fixes).items()})
+    some = fixes.rows(rows)
     nothing = np.zeros((len(rows), len(how.names)), dtype=bool)
     result = _separation(how.without(rows, nothing), some)
     known = np.flatnonzero(np.any(result.determined, axis=0))

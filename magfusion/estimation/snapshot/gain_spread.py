@@ -15,7 +15,7 @@ from magfusion.model.noise import measurement_cov, whitening
 from magfusion.model.parameters import Calibration
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trajectory import Trajectory
-from magfusion.units import Array, BoolArray, IntArray
+from magfusion.units import Array, BoolArray
 
 MIN_LOG_GAIN, MAX_LOG_GAIN = 0.003, 1.0  # of a log-gain; less is no spread, and more no beacon
 ENOUGH = 200  # epochs used, spread over a log
@@ -59,7 +59,7 @@ def gain_spread(
         return GAIN_SIGMA
     rows = rows[:: max(1, -(-len(rows) // ENOUGH))]
     requested = _GainLikelihood(
-        samples.rows(rows), calibration, _poses(fixes, rows), survey_error, free_parameters
+        samples.rows(rows), calibration, fixes.best().rows(rows), survey_error, free_parameters
     )
     own = None if gravity is None else gravity.rows(rows)
     widest, determined = requested.evidence(MAX_LOG_GAIN, own)
@@ -116,9 +116,3 @@ class _GainLikelihood:
         volume = np.linalg.slogdet(result.pose_cov[:, 0])[1]
         gains = np.sum(np.log1p(spread**2 * self.known), axis=1)
         return result.cost[:, 0] - volume + gains, result.determined[:, 0]
-
-
-def _poses(fixes: Fixes, rows: IntArray) -> Trajectory:
-    return Trajectory(
-        fixes.time[rows], fixes.world_from_body[rows, 0], fixes.position_world[rows, 0]
-    )

@@ -38,7 +38,7 @@ def fix_parts(
             whole_fixes(fixed(rows, some, known, up), calibration, channels_of(site, beacons))
         )
     maximum = max(fixes.cost.shape[1] for fixes in result)
-    return joined([_with_hypotheses(fixes, maximum) for fixes in result])
+    return joined([fixes.padded(maximum) for fixes in result])
 
 
 def whole_fixes(fixes: Fixes, calibration: Calibration, channels: IntArray) -> Fixes:
@@ -67,14 +67,3 @@ def by_beacon(result: list[tuple[Array, IntArray]], beacons: int) -> Array:
         every[:, numbers] = own
         out.append(every)
     return np.concatenate(out)
-
-
-def _with_hypotheses(fixes: Fixes, count: int) -> Fixes:
-    """Return fixes with more hypotheses, the last repeated with zero probability."""
-    known = fixes.cost.shape[1]
-    if known == count:
-        return fixes
-    chosen = np.minimum(np.arange(count), known - 1)
-    values = {k: v if v.ndim == 1 else v[:, chosen] for k, v in vars(fixes).items()}
-    values["cost"][:, known:] = np.inf
-    return Fixes(**values)
