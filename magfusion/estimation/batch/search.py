@@ -121,12 +121,11 @@ def search(
     kept = thinned(samples)
     some = samples.rows(kept)
     offset, site = calibration.time_offset, calibration.site
-    at = fixes.rows(kept)
     search = Search(
         some,
         track_phasors(some, calibration),
         strides_between(imu, offset, some.time),
-        at,
+        fixes.rows(kept),
         upright(imu, offset, some.time, site),
     )
     count = len(some)
@@ -134,10 +133,9 @@ def search(
     last = ahead.visits[-1]
     best = last.rows(np.argsort(last.cost)[:RETURNING])
     # The backward search uses the forward data again: that gives only its start.
-    again = replace(best, cov=4.0 * best.cov, cost=np.zeros(len(best)))
-    back = follow_tracks(
-        search, replace(again, parent=np.arange(len(again))), range(count - 1, -1, -1)
-    )
+    parent = np.arange(len(best))
+    again = replace(best, cov=4.0 * best.cov, cost=np.zeros(len(best)), parent=parent)
+    back = follow_tracks(search, again, range(count - 1, -1, -1))
     return _trajectories(search, back)
 
 
@@ -168,13 +166,12 @@ def upright(imu: ImuSamples, time_offset: float, time: Array, site: Site) -> Gra
 
 def _seeds(search: Search, k: int) -> Tracks:
     """Return tracks that begin at the fixes of an epoch, with their drive phases."""
-    phasors, rows = search.phasors, np.array([k])
+    phasors, site, rows = search.phasors, search.site, np.array([k])
     fixes = fix_epochs(
         search.samples.rows(rows), phasors.calibration, gravity=search.gravity.rows(rows)
     )
     good = np.flatnonzero(np.isfinite(fixes.cost[0]))
     free_parameters, none = int(np.sum(phasors.free_phases)), np.zeros((len(good), 3))
-    site = search.site
     drift_sigma = site.relative_clock.drift_sigma * 2.0 * np.pi
     clock = drift_sigma * site.tone_frequencies_hz[phasors.free_phases]
     phases = [np.full(free_parameters, FIRST_PHASE), np.maximum(clock, 1e-9)]
@@ -222,8 +219,7 @@ def follow_tracks(search: Search, tracks: Tracks, order: Sequence[int]) -> _Foll
         k = order[i]
         before = float(np.min(tracks.cost))
         tracks = propagate_tracks(tracks, search.strides, min(k, order[i - 1]), phasors, backward)
-        tracks = replace(tracks, parent=np.arange(len(tracks)))
-        tracks = updated(tracks, phasors, k)
+        tracks = updated(replace(tracks, parent=np.arange(len(tracks))), phasors, k)
         spent = spent + float(np.min(tracks.cost)) - before
         selected += phasors.components[k]
         # Noise above the declared one increases every difference as well.
@@ -276,8 +272,7 @@ def _restart(search: Search, tracks: Tracks, best: int, k: int) -> Tracks:
 
     Its motion is not used, since that may be the cause of its error.
     """
-    phasors = search.phasors
-    fixes, row = search.fixes, k
+    phasors, fixes, row = search.phasors, search.fixes, k
     if np.any(phasors.free_phases) and not np.all(
         fixes.determined[row, np.isfinite(fixes.cost[row])]
     ):
