@@ -17,6 +17,11 @@ from magfusion.estimation.data_checks.statistics import largest_mean_square
 from magfusion.estimation.data_checks.steady_field import DOUBT, off_earth
 from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, State
 from magfusion.estimation.online_integrity.gate import Gate
+from magfusion.estimation.online_integrity.imu_checks import (
+    LEAST_GAIN,
+    judge_biases,
+    judge_gravity,
+)
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.model.parameters import (
     Block,
@@ -31,7 +36,6 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array, BoolArray
 
 MEMORY = 10.0  # s; of the innovations, gravity and static field
-LEAST_SPAN = 1.0  # s; of inertial data, before gravity is tested
 FADES = 20.0  # s; after which findings of the beginning that may have passed are dropped
 PASSING = {
     "not_converged",
@@ -45,11 +49,7 @@ PASSING = {
 RESTARTS_MEMORY = 60.0  # s
 LEAST_EXCESS = 2.5  # mean square that is no doubt, however many epochs show it
 P_EXCESS = float(erfc(DOUBT / np.sqrt(2.0)))  # of a mean square by chance
-DETECTION_SIGMAS = 6.0
-BEYOND_HELP = 0.2  # rad; a bias that tilts the vertical more makes inflation useless
-TURN_INTERVAL = 1.0  # s; of a gyro bias, before the fields correct it
 LEAST_WORTH = 0.2  # epochs
-LEAST_GAIN = 0.05  # of a prior variance; a barely determined parameter does not move by itself
 OFTEN_REFUSED = 0.5  # of a beacon's epochs
 MANY_RESTARTS = 3.0
 PRIOR_EVERY = 1.0  # s
@@ -207,9 +207,9 @@ class OnlineMonitor:
             self._of_the_beginning(state.time),
             self._of_being_lost(state, gate, lost_since),
             self._of_fields(),
-            self._of_biases(state),
+            judge_biases(self.site, state, state.time - self._began),
             self._of_calibration(state),
-            self._of_gravity(),
+            judge_gravity(self.site, self._gravity, MEMORY),
             self._of_earth(state),
             self._of_what_happened(state.time),
             self._of_fixes(),
@@ -280,40 +280,6 @@ class OnlineMonitor:
                 result.append(Finding("beacon_excluded", text, weight=often / OFTEN_REFUSED))
         return Judgement(tuple(result), inflation=inflation)
 
-    def _of_biases(self, state: State) -> Judgement:
-        if not self.site.platform.inertial:
-            return Judgement()
-        imu, elapsed = self.site.platform.imu, state.time - self._began
-        result, inflation, turn, variance = [], 1.0, 0.0, state.cov.diagonal()
-        for code, name, bias, sigma, walk, first, unit in (
-            ("accel_bias", "accelerometer", state.accel_bias_body, imu.accel_bias_sigma,
-             imu.accel_bias_walk, 9, "m/s^2"),
-            ("gyro_bias", "gyro", state.gyro_bias_body, imu.gyro_bias_sigma, imu.gyro_bias_walk,
-             12, "rad/s"),
-        ):  # fmt: skip
-            prior = sigma**2 + walk**2 * elapsed
-            own = variance[first : first + 3]
-            score = np.abs(bias) / np.sqrt(np.maximum(prior - own, LEAST_GAIN * prior))
-            axis = int(score.argmax())
-            worst = float(score[axis])
-            if worst < DOUBT:
-                continue
-            size = float(np.linalg.norm(bias))
-            off = size / self.site.gravity if code == "accel_bias" else size * TURN_INTERVAL
-            verdict = (
-                Verdict.FAILED
-                if worst > DETECTION_SIGMAS and off > BEYOND_HELP
-                else Verdict.DOUBTFUL
-            )
-            text = (
-                f"The bias of the {name}'s {'xyz'[axis]} axis is {bias[axis]:.3g} {unit},"
-                f" {worst:.0f} times what is declared: axes, signs or units of the IMU, its"
-                " mounting to the magnetometer, or a declared sigma that is too small."
-            )
-            result.append(Finding("imu_bias", text, verdict, worst / DOUBT))
-            inflation, turn = max(inflation, worst**2), max(turn, off)
-        return Judgement(tuple(result), inflation=inflation, turn=turn)
-
     def _of_calibration(self, state: State) -> Judgement:
         if not self.estimated:
             return self._prior
@@ -372,26 +338,6 @@ class OnlineMonitor:
     @cached_property
     def _declared_variance(self) -> Array:
         return np.asarray(prior_sigma(self.estimated) ** 2)
-
-    def _of_gravity(self) -> Judgement:
-        """Test the residual of the mean specific force: no platform falls for seconds."""
-        span = self._gravity.weight  # s of data, without the gaps of the IMU
-        if span < LEAST_SPAN or not self.site.platform.inertial:
-            return Judgement()
-        remaining = float(np.linalg.norm(self._gravity.mean))
-        motion, imu = self.site.platform.motion, self.site.platform.imu
-        sigma = np.hypot(np.sqrt(2.0) * motion.speed_sigma / span, imu.accel_bias_sigma)
-        score = remaining / sigma
-        if score < DOUBT:
-            return Judgement()
-        angle = remaining / self.site.gravity
-        verdict = Verdict.FAILED if angle > 2.0 * BEYOND_HELP else Verdict.DOUBTFUL
-        text = (
-            f"The mean specific force of the last {MEMORY:g} s deviates by {remaining:.2g} m/s^2"
-            " from gravity at the estimated attitude: axes or signs of the IMU, its mounting to"
-            " the magnetometer, or gravity removed from its data."
-        )
-        return Judgement((Finding("gravity_direction", text, verdict, score / DOUBT),), turn=angle)
 
     def _of_earth(self, state: State) -> Judgement:
         if self._earth.weight < 5.0:
