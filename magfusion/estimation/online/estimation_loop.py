@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from magfusion.estimation.online.start_search import StartSearch
 from magfusion.estimation.online.state_of_now import EpochReport, StateOfNow
 from magfusion.estimation.online.state_reports import StateReports
 from magfusion.estimation.online_integrity.judgement import JudgedState
+from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
 from magfusion.model.site import Site
 from magfusion.model.trust import Verdict
 
@@ -83,6 +85,19 @@ class EstimationLoop:
         imu, reports = self.arrived.imu, self.reports
         report = EpochReport(reports.judgement, reports.reset_counter, self.running.update.bank)
         self.now.restart_from(self.running.propagation_start(imu), report, imu)
+
+    def plain_estimator(self, rules: Rules) -> Any:
+        """Return the estimator as plain data, after all that was postponed has been computed."""
+        self.arrived.settle()
+        self.running.update.score.settle()
+        return to_plain(self.running.estimator, rules)
+
+    def resume_estimator(self, data: Any, rules: Rules) -> None:
+        """Load the estimator of `plain_estimator`."""
+        state = data.get("state") if isinstance(data, dict) else None
+        self.running.start_at(from_plain(State, state, "estimator.state", rules))
+        resume(self.running.estimator, data, "estimator", rules)
+        self.restart_propagation()
 
     def _begin(self) -> bool:
         """Find the first state, once enough data have arrived."""

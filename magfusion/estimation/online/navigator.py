@@ -14,7 +14,6 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.estimation.data_checks.stream_buffer import LARGEST_JUMP, check_clock
 from magfusion.estimation.graph.measurement import Measurement
-from magfusion.estimation.graph.state import State
 from magfusion.estimation.graph.user_factors import UserFactors
 from magfusion.estimation.initialization.online import NoStart
 from magfusion.estimation.integrity.correction import Correction
@@ -26,13 +25,10 @@ from magfusion.estimation.online.navigator_data import navigator_rules
 from magfusion.estimation.online.navigator_settings import NavigatorSettings as NavigatorSettings
 from magfusion.estimation.online.site_readings import SiteReadings
 from magfusion.estimation.online.state_of_now import PropagatedState
-from magfusion.estimation.online_integrity.judgement import (
-    JudgedState,
-    Judgement,
-)
+from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
 from magfusion.estimation.online_integrity.summary import Summary
 from magfusion.files.blas_threads import warn_about_threads
-from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
+from magfusion.files.plain_data import Rules, resume, to_plain
 from magfusion.model.aiding import AidingSamples
 from magfusion.model.arguments import check_arguments
 from magfusion.model.drive import DriveSamples
@@ -329,11 +325,6 @@ class Navigator:
         """By beacon, running mean of the squared innovation over its expectation."""
         return self._loop.running.update.gate.distortion
 
-    @property
-    def lagged(self) -> State | None:
-        """State that left the smoother's window last; for the filter, the current one."""
-        return None if self._loop.running.estimator is None else self._loop.running.estimator.lagged
-
     def take_lagged(self) -> list[JudgedState]:
         """Return the states that left the smoother's window since the last call.
 
@@ -403,9 +394,7 @@ class Navigator:
     def checkpoint(self) -> dict[str, Any]:
         """Return the complete state as plain data, from which `restored` makes a navigator."""
         rules = navigator_rules(self.site, self.blocks)
-        self._loop.arrived.settle()
-        self._loop.running.update.score.settle()
-        own = to_plain(self._loop.running.estimator, rules)
+        own = self._loop.plain_estimator(rules)
         return {"parts": to_plain(self, rules), "estimator": own}
 
     def go_on_from(self, data: Any, rules: Rules) -> None:
@@ -413,12 +402,8 @@ class Navigator:
         if not isinstance(data, dict) or data.keys() != {"parts", "estimator"}:
             raise InputError("contains no state of a navigator; run without --resume")
         resume(self, data["parts"], "navigator", rules)
-        own = data["estimator"]
-        if own is not None:
-            state = own.get("state") if isinstance(own, dict) else None
-            self._loop.running.start_at(from_plain(State, state, "estimator.state", rules))
-            resume(self._loop.running.estimator, own, "estimator", rules)
-            self._loop.restart_propagation()
+        if data["estimator"] is not None:
+            self._loop.resume_estimator(data["estimator"], rules)
 
     def advance(self) -> None:
         """Process all complete data; the methods that add data call it."""
