@@ -193,7 +193,7 @@ def refine(
         used = [
             (one.time, task)
             for task, one in zip(tasks, first, strict=True)
-            if one.solved and one.facts["verdict"] != Verdict.FAILED
+            if one.facts["verdict"] != Verdict.FAILED
         ]
         if not used:
             raise EstimationError(

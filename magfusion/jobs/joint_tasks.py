@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -57,12 +57,9 @@ from magfusion.jobs.result_directory import claim
 from magfusion.model.parameters import GROUPS, Block, initial_calibration
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
-from magfusion.model.trust import Finding, Trust, Verdict
+from magfusion.model.trust import Finding, Risk, Trust, Verdict
 from magfusion.results.errors import trajectory_errors
 from magfusion.units import Array, Rate
-
-if TYPE_CHECKING:
-    from magfusion.model.trust import Risk
 
 ROUNDS = "rounds"  # directory beside the kept solutions
 
@@ -106,7 +103,6 @@ class Alone(NamedTuple):
 
     Parameters
     ----------
-    solved : bool
     time : float
         Of its first sample (s, Unix).
     noise : tuple of Tuned
@@ -114,7 +110,6 @@ class Alone(NamedTuple):
         Of the table of logs.
     """
 
-    solved: bool
     time: float
     noise: tuple[Tuned, ...]
     facts: dict[str, Any]
@@ -224,7 +219,7 @@ class LastTask:
     ----------
     excess : float
         Factor on the variances, as the logs contradict each other.
-    `findings` : tuple of Finding
+    findings : tuple of Finding
         On the consistency of this log with the others.
     writes : bool
         Whether its trajectory is written.
@@ -274,14 +269,9 @@ def considered_of(site: Site, smoother: SmootherSettings) -> tuple[Block, ...]:
 def blocks_of(log: Log, site: Site, shared: Shared, task: LogTask) -> LogBlocks:
     """Return the names of a log's parameters."""
     considered = considered_of(site, task.smoother)
-    time = 1e-9 * log.epoch_ns + first_time(log)
-    return LogBlocks(time, task.platform, names_of(shared.blocks), names_of(considered))
-
-
-def first_time(log: Log) -> float:
-    """Return the time of a log's first sample since its epoch (s)."""
     streams = [s.time for s in (log.imu, log.waveform, log.fields) if s is not None]
-    return min(float(time[0]) for time in streams if len(time))
+    time = 1e-9 * log.epoch_ns + min(float(time[0]) for time in streams if len(time))
+    return LogBlocks(time, task.platform, names_of(shared.blocks), names_of(considered))
 
 
 def alone(task: LogTask, _rng: np.random.Generator) -> Alone:
@@ -294,16 +284,15 @@ def alone(task: LogTask, _rng: np.random.Generator) -> Alone:
                 result = smooth(log, site, task.smoother)
         except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
             reason = {"code": "no_solution", "reason": reason_of(error)}
-            return Alone(False, blocks.time, (), {"verdict": str(Verdict.FAILED), **reason})
-        detected = np.any(result.fields.valid, axis=0).tolist()
-        channels = zip(result.fields.channels, detected, strict=True)
-        names = {name for (name, _), yes in channels if yes}
+            return Alone(blocks.time, (), {"verdict": str(Verdict.FAILED), **reason})
+        detected = np.flatnonzero(np.any(result.fields.valid, axis=0))
+        names = {result.fields.channels[c][0] for c in detected}
         honest, trust = judge_result(result, log)
         facts = table_facts(honest, trust, log) | {"heard": sorted(names)}
         kept = Kept(of_smoothed(result, shared), facts)
         save_log(task.kept, task.key, kept)
     save_information(task.information(0), kept.log.information, blocks)
-    return Alone(True, blocks.time, kept.log.noise, kept.facts)
+    return Alone(blocks.time, kept.log.noise, kept.facts)
 
 
 def one_round(given: RoundTask, _rng: np.random.Generator) -> None:
@@ -347,9 +336,8 @@ def last(given: LastTask, _rng: np.random.Generator) -> dict[str, Any]:
     """Assess a log in the joint solution, write its results, and return its row of the table."""
     own = given.round
     log, site, shared, kept = own.read()
-    blocks, _ = own.task.smoother.blocks(site)
     done = solve_round(log, site, own.task.smoother, kept.log, shared, own.prior())
-    result = joint_posterior(kept.log, done, blocks)
+    result = joint_posterior(kept.log, done, own.task.smoother.blocks(site)[0])
     if given.writes:
         result, trust = _written(result, log, site, given)
     else:
