@@ -21,7 +21,7 @@ from magfusion.estimation.rests.reference_noise_cancellation import (
 from magfusion.estimation.rests.rest_lengths import coherent, piece_length, walk
 from magfusion.model.detection_range import tones_of
 from magfusion.model.samples import FieldSamples, Log, Waveform
-from magfusion.model.site import Beacon, Site
+from magfusion.model.site import Site
 from magfusion.model.strapdown import resting
 from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.hum import hum_of
@@ -175,7 +175,7 @@ def integrate_rests(
     if log.reference is not None:
         gain = np.array([[tone.gain for tone in part.tones] for part in parts])
         findings += reference_findings([part.tones for part in parts], site)
-    free_parameters = np.array([not _beacon(site, name).synchronised for name, _ in site.channels])
+    free_parameters = np.array([not site.beacons[k].synchronised for k in site.owner])
     elapsed = free_parameters & ~detected
     phasor = np.where(elapsed[..., None], np.nan, fields.phasor_sensor)
     fields = replace(fields, phasor_sensor=phasor)
@@ -228,10 +228,6 @@ def rests(log: Log, site: Site) -> list[tuple[float, float]]:
         if not turns and span[1] > span[0]:
             result.append(span)
     return result
-
-
-def _beacon(site: Site, name: str) -> Beacon:
-    return next(b for b in site.beacons if b.name == name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,8 +295,8 @@ def rest_epoch(
     phase = np.exp(2j * np.pi * (sent_hz - nominal_hz) * time)
     cov = np.stack(
         [
-            one.cov + _wandered(one, site, float(nominal_hz[c]), span[1] - span[0], name)
-            for c, (one, (name, _)) in enumerate(zip(single, site.channels, strict=True))
+            one.cov + _wandered(one, site, float(nominal_hz[c]), span[1] - span[0], site.owner[c])
+            for c, one in enumerate(single)
         ]
     )
     fields = FieldSamples(
@@ -342,12 +338,12 @@ def _at_declared_drives(result: Pieces, site: Site, time: float) -> Pieces:
 
 
 def _wandered(
-    one: Integrated, site: Site, frequency_hz: float, duration: float, name: str
+    one: Integrated, site: Site, frequency_hz: float, duration: float, owner: int
 ) -> Array:
     """Return the covariance by drive phase drift within a rest, shape (3, 3) (T^2)."""
     variance = walk(site, frequency_hz, duration)
     square = np.real(np.outer(one.phasor, np.conj(one.phasor)))
-    if not _beacon(site, name).synchronised:
+    if not site.beacons[owner].synchronised:
         solved = np.linalg.solve(one.cov, one.phasor)
         ratio = float(np.real(np.conj(one.phasor) @ solved))
         variance += (one.centroid / one.spread) ** 2 / max(ratio, 1.0)
