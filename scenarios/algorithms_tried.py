@@ -4,10 +4,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from paper_rooms import Scenario, SceneLayout, SimulatedWorld, draw_world
+from paper_rooms import Scenario, SceneLayout, SimulatedWorld, draw_world, mapped
 from scipy.spatial.transform import Rotation
 
-from magfusion.calibration.fieldmap import MapPoints, learn_field_map
 from magfusion.estimation.snapshot.explained_fixes import explained_fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.files.survey import Survey
@@ -143,12 +142,7 @@ def by_default(trial: Trial) -> Poses:
 
 def by_map(trial: Trial) -> Poses:
     """Maximum likelihood on the model with a map of the survey."""
-    survey = trial.survey
-    assert survey.phasor_sensor is not None
-    points = MapPoints(
-        survey.world_from_body, survey.position_world, survey.phasor_sensor, survey.sigma
-    )
-    return fixed(trial.samples, learn_field_map(trial.world.site, points).site)
+    return fixed(trial.samples, mapped(trial.world.site, trial.survey))
 
 
 METHODS: dict[str, Method] = {

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from magfusion.calibration.fieldmap import MapPoints, learn_field_map
 from magfusion.files.survey import Survey
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Beacon, BeaconSigma, Coil, MagnetometerSigma, Platform, Site
@@ -272,6 +273,15 @@ class SimulatedWorld:
             sigma=np.sqrt(samples.phasor_cov[..., 0, 0]),
             phasor_sensor=samples.phasor_sensor,
         )
+
+
+def mapped(site: Site, survey: Survey) -> Site:
+    """Return the site with the field map of a survey."""
+    assert survey.phasor_sensor is not None
+    points = MapPoints(
+        survey.world_from_body, survey.position_world, survey.phasor_sensor, survey.sigma
+    )
+    return learn_field_map(site, points).site
 
 
 def detection_reach(radius: float, layout: SceneLayout, receiver: SimulatedReceiver) -> float:

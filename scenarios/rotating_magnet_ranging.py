@@ -60,8 +60,6 @@ WINDOW_DEPTH = READING * float(np.sqrt(2.0 / 3.0 * np.sum(SHARE**2)))
 LAYERS = Layers((300.0, 20.0, -15.0), (0.02, 0.005, 0.1))
 CONDUCTIVITY = 0.01  # S/m, as declared
 RAIL_FROM, RAIL_TO, RAIL_LENGTH = 4.0, 8.0, 20.0  # m, from the sensor, sideways
-
-
 CASING = Casing(
     RADIUS - 0.5 * WALL, WALL, PERMEABILITY, STEEL_CONDUCTIVITY, THIN, THIN_PHASE, *STEEL_SIGMA
 )
@@ -119,13 +117,11 @@ class Config:
     layers: bool = True
 
 
-def declared_site(*, cased: bool, axis: Array | None = None) -> Site:
+def declared_site(*, cased: bool) -> Site:
     """Return what a driller declares."""
     plain = demo_site()
-    first = np.array([1.0, 0.0, 0.0]) if axis is None else axis
-    rotor = Rotor(
-        MOMENT, first, np.array([0.0, 0.0, 1.0]), ellipse_sigma=ELLIPSE, length=Shaft.length
-    )
+    axis, zero = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    rotor = Rotor(MOMENT, axis, zero, ellipse_sigma=ELLIPSE, length=Shaft.length)
     sigma = BeaconSigma(np.zeros(3), np.zeros(3), np.full(2, MOMENT_SIGMA))
     beacon = Beacon(
         "bit",
@@ -188,7 +184,7 @@ def draw_world(case: Case, config: Config, rng: np.random.Generator) -> World:
     turn, ahead = rng.uniform(-np.pi, np.pi), rng.uniform(-2.0, 2.0)
     way = case.well_distance, case.reach, case.speed
     wells = TwoWells(distance, angle, dip, (right, up), turn, ahead, *way)
-    max_iterations = wells.transits_of(rng.uniform(-np.pi, np.pi, 2))
+    transits = wells.transits_of(rng.uniform(-np.pi, np.pi, 2))
     # An error of the angle twice a turn makes an ellipse of half its size.
     first, second = 2.0 * ELLIPSE * rng.standard_normal(2)
     shaft = Shaft(
@@ -204,7 +200,7 @@ def draw_world(case: Case, config: Config, rng: np.random.Generator) -> World:
         STRETCH * rng.standard_normal(),
         READING,
     )
-    return World(site, shaft, wells, max_iterations, around)
+    return World(site, shaft, wells, transits, around)
 
 
 def draw(case: Case, config: Config, seed: int) -> Scene:
@@ -320,6 +316,7 @@ def run_one(case: Case, config: Config, seed: int) -> Row:
         distances.append(distance)
         sigmas.append(one.distance_sigma)
     error = np.mean(errors, axis=0)
+    pose = pose_error(scene, reported.windows, result, measured=config.encoder)
     return Row(
         case=case.name,
         angle="measured" if config.encoder else "followed",
@@ -329,11 +326,7 @@ def run_one(case: Case, config: Config, seed: int) -> Row:
         sigma_m=float(np.mean(sigmas)),
         direction_error_deg=float(error[1]),
         depth_error_m=float(error[2]),
-        nees=nees(
-            pose_error(scene, reported.windows, result, measured=config.encoder),
-            result,
-            measured=config.encoder,
-        ),
+        nees=nees(pose, result, measured=config.encoder),
         residual_rms=float(np.sqrt(result.chi_square / result.freedom)),
         converged=result.converged,
     )

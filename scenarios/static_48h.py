@@ -27,10 +27,9 @@ from pathlib import Path
 
 import numpy as np
 from harness import blank_figure, chosen_scale, conclude, save_picture, scenario_parser
-from paper_rooms import F1, SimulatedReceiver, SimulatedWorld, draw_world
+from paper_rooms import F1, SimulatedReceiver, SimulatedWorld, draw_world, mapped
 from scipy.spatial.transform import Rotation
 
-from magfusion.calibration.fieldmap import MapPoints, learn_field_map
 from magfusion.estimation.snapshot.refine import refine
 from magfusion.files.survey import Survey
 from magfusion.model.parameters import initial_calibration
@@ -219,16 +218,6 @@ def draw_surroundings(
     return Surroundings(1.0 + fresh, white[0] + 1j * white[1] + leaked, sigma)
 
 
-def mapped(site: Site, survey: Survey) -> Site:
-    """Return the site with the field map of a survey."""
-    assert survey.phasor_sensor is not None
-    assert survey.sigma is not None
-    points = MapPoints(
-        survey.world_from_body, survey.position_world, survey.phasor_sensor, survey.sigma
-    )
-    return learn_field_map(site, points).site
-
-
 def locate(
     world: SimulatedWorld, survey: Survey, site: Site, samples: FieldSamples
 ) -> dict[str, Trajectory]:
@@ -297,8 +286,9 @@ def summarise(config: Config, worlds: list[dict[tuple[str, str], Errors]]) -> tu
     converged = config.time > config.settled_hours * HOUR
     rows = []
     for case, method in worlds[0]:
-        position = np.stack([world[case, method].position for world in worlds])
-        attitude = np.stack([world[case, method].attitude for world in worlds])
+        errors = [world[case, method] for world in worlds]
+        position = np.stack([one.position for one in errors])
+        attitude = np.stack([one.attitude for one in errors])
         by_position, by_attitude = (slopes(config, error) for error in (position, attitude))
         share = 1.0 / np.sqrt(len(worlds))
         rows.append(
@@ -311,12 +301,8 @@ def summarise(config: Config, worlds: list[dict[tuple[str, str], Errors]]) -> tu
                 position_slope_se=float(share * np.std(by_position, ddof=1)),
                 attitude_slope=float(np.mean(by_attitude)),
                 attitude_slope_se=float(share * np.std(by_attitude, ddof=1)),
-                position_components=components(
-                    config, [world[case, method].position_world for world in worlds]
-                ),
-                attitude_components=components(
-                    config, [world[case, method].turn_world for world in worlds]
-                ),
+                position_components=components(config, [one.position_world for one in errors]),
+                attitude_components=components(config, [one.turn_world for one in errors]),
             )
         )
     return tuple(rows)
@@ -354,18 +340,14 @@ def by_components(rows: tuple[Row, ...]) -> list[str]:
         place, turn = row.position_components, row.attitude_components
         if place is None or turn is None:
             return [*lines, f" takes {MIN_COMMON} worlds: no verdict"]
+        columns = (place, 1e3, "6.2f", "4.2f"), (turn, 1.0, "6.3f", "5.3f")
         cells = "".join(
             f"{scale * slope:+{digits}} +-{scale * error:<{width}} "
-            for part, scale, digits, width in (
-                (place, 1e3, "6.2f", "4.2f"),
-                (turn, 1.0, "6.3f", "5.3f"),
-            )
+            for part, scale, digits, width in columns
             for slope, error in zip(part.per_day, part.standard_error, strict=True)
         )
-        tests = 2 * len(rows)
-        drifting = [
-            name for name, part in (("position", place), ("attitude", turn)) if part.drifts(tests)
-        ]
+        parts = {"position": place, "attitude": turn}
+        drifting = [name for name, part in parts.items() if part.drifts(2 * len(rows))]
         verdict = f"{' and '.join(drifting)} DRIFTS" if drifting else "no drift"
         lines.append(f" {row.case:16}{row.method:20}{cells}  {verdict}")
     return lines
@@ -406,8 +388,7 @@ def main() -> None:
     config = Config(seed=given.seed)
     if given.quick:
         config = replace(config, worlds=2, interval=1800.0)
-    tasks = [config] * config.worlds
-    worlds = run_many(run_world, tasks, seed=config.seed, **chosen_scale(given))
+    worlds = run_many(run_world, [config] * config.worlds, seed=config.seed, **chosen_scale(given))
     rows = summarise(config, worlds)
     if given.output is not None:
         draw(given.output / "static_48h.png", config, worlds)

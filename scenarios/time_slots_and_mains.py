@@ -245,8 +245,7 @@ def pulsed(
         waveform, imu = recorded(site, room, config.pulsed_rate_hz, length, mains)
         true = true_phasors(site, room)
         for removal, parts in result.items():
-            settings = SlotSettings(removal, "rectangular")
-            slots, _ = received(waveform, imu, site, settings)
+            slots, _ = received(waveform, imu, site, SlotSettings(removal, "rectangular"))
             samples = whole_cycles(slots, imu, site)
             inner = slice(1, -1)  # the first cycle has no silent slot before it
             residual, attitude = errors(site, room, true, samples)
@@ -287,20 +286,18 @@ def carrier_row(config: Config, carrier_hz: float, duration: float, taper: str) 
     return CarrierRow(carrier_hz, 1e3 * duration, taper, decibel(residual), attitude)
 
 
-def frequency_division(config: Config, carrier_hz: float = 1e4) -> CarrierRow:
+def frequency_division(config: Config) -> CarrierRow:
     """Demodulate three carriers at once through the ordinary lock-in."""
-    site = tracker(carrier_hz, None)
+    site = tracker(1e4, None)
     settings = default_settings(site)
     parts = []
     for room in rooms(config):
         mains = _mains(config, room, 50.0)
-        length = 3.0 * settings.window
-        waveform, imu = recorded(site, room, config.carrier_rate_hz, length, mains)
+        waveform, imu = recorded(site, room, config.carrier_rate_hz, 3.0 * settings.window, mains)
         samples, _ = received(waveform, imu, site, settings)
         parts.append(errors(site, room, true_phasors(site, room), samples))
     residual, attitude = rms([p[0] for p in parts]), rms([p[1] for p in parts])
-    window_ms = 1e3 * settings.window
-    return CarrierRow(carrier_hz, window_ms, "three at once", decibel(residual), attitude)
+    return CarrierRow(1e4, 1e3 * settings.window, "three at once", decibel(residual), attitude)
 
 
 def carrier_rows(config: Config) -> Iterator[CarrierRow]:
@@ -332,10 +329,7 @@ def taken_for_dipoles_deg(config: Config) -> dict[str, float]:
 
 
 def report(
-    rows: list[Row],
-    carriers: list[CarrierRow],
-    noise: dict[str, float],
-    size: dict[str, float],
+    rows: list[Row], carriers: list[CarrierRow], noise: dict[str, float], size: dict[str, float]
 ) -> str:
     """Return the tables that a reader sees."""
     lines = [
@@ -350,8 +344,8 @@ def report(
     lines.append("worst phase by the formula, slots 1/2/3, silent slot subtracted (dB):")
     for row in rows:
         if row.removal == "subtract" and row.formula_db is not None:
-            printed_cell = "/".join(f"{db:+.1f}" for db in row.formula_db)
-            lines.append(f"{row.slot_ms:5g}ms{row.mains_hz:7g}  {printed_cell}")
+            slots = "/".join(f"{db:+.1f}" for db in row.formula_db)
+            lines.append(f"{row.slot_ms:5g}ms{row.mains_hz:7g}  {slots}")
     lines.append("carriers, no silent slot, hum of 50 Hz: RMS residual (dB), attitude")
     for carrier in carriers:
         lines.append(
