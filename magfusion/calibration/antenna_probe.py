@@ -19,6 +19,7 @@ from magfusion.model.probe import ProbeReadings
 from magfusion.model.site import Beacon
 from magfusion.units import Array, IntArray
 
+FOLDS = 6  # parts of the points, each predicted by a fit of the others
 MOMENTS, CENTRES, SIZES = slice(0, 9), slice(9, 18), slice(18, None)  # of one antenna's vector
 
 
@@ -161,7 +162,6 @@ def left_out_errors(
     start: Array,
     sigma: Array,
     predict: Predict = read_of_term,
-    folds: int = 6,
 ) -> tuple[Array, Array]:
     """Return leave-one-point-out errors relative to the field there, of the start and of fits.
 
@@ -169,7 +169,7 @@ def left_out_errors(
     """
     where = np.column_stack([readings.coil, np.round(readings.position, 6)])
     point = np.unique(where, axis=0, return_inverse=True)[1].ravel()
-    fold = point % folds
+    fold = point % FOLDS
     size = np.sqrt(np.bincount(point, readings.reading**2))[point]
     before = (predict(start, readings) - readings.reading) / size
     after = np.empty(len(readings))

@@ -26,8 +26,8 @@ def _number(value: object) -> bool:
     )
 
 
-def _numbers(value: object, count: int) -> bool:
-    return isinstance(value, list) and len(value) == count and all(_number(v) for v in value)
+def _pair(value: object) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(_number(v) for v in value)
 
 
 def _polygon(value: object) -> Array:
@@ -35,7 +35,7 @@ def _polygon(value: object) -> Array:
     if (
         isinstance(value, list)
         and 3 <= len(value) <= MOST_CORNERS
-        and all(_numbers(corner, 2) for corner in value)
+        and all(_pair(corner) for corner in value)
     ):
         corners = np.array(value, dtype=float)
         edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
@@ -76,7 +76,7 @@ def _meet(one: Array, other: Array) -> bool:
 
 def _heights(value: object) -> Array:
     """Read a lowest and a highest height."""
-    if _numbers(value, 2):
+    if _pair(value):
         low, high = np.array(value, dtype=float)
         if low <= high:
             return np.array([low, high])

@@ -65,7 +65,7 @@ class Place:
     date: str
 
 
-def beacon_draft(text: str, place: str = "--beacon") -> BeaconDraft:
+def beacon_draft(text: str) -> BeaconDraft:
     """Read the given values of a beacon: its name, and ``key=value`` with the keys of a site.
 
     Raises
@@ -75,7 +75,7 @@ def beacon_draft(text: str, place: str = "--beacon") -> BeaconDraft:
     """
     named, *parts = text.split() or [""]
     name = named.removeprefix("name=")
-    where = f"{place} {text!r}"
+    where = f"--beacon {text!r}"
     if not name or "=" in name:
         raise InputError(f"{where}: begin with the beacon's name, as in {EXAMPLE}")
     declared: dict[str, str] = {}

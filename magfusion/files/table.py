@@ -117,12 +117,12 @@ class TableLayout(NamedTuple):
         missing = [name for name in wanted if name not in result]
         if missing:
             raise InputError(
-                f"{path}: {_listed('column', missing)} missing (found {', '.join(result)});"
+                f"{path}: {_listed(missing)} missing (found {', '.join(result)});"
                 " add what is missing."
             )
         repeated = [name for name in wanted if list(result).count(name) > 1]
         if repeated:
-            raise InputError(f"{path}: {_listed('column', repeated)} repeated; keep one of each.")
+            raise InputError(f"{path}: {_listed(repeated)} repeated; keep one of each.")
         return wanted
 
     def csv_type(self, name: str) -> pa.DataType:
@@ -390,6 +390,6 @@ def _refuse_empty(rows: int, path: Path) -> None:
         raise InputError(f"{path}: holds no rows; record at least one, or remove the file.")
 
 
-def _listed(noun: str, names: Sequence[str]) -> str:
+def _listed(names: Sequence[str]) -> str:
     plural = len(names) > 1
-    return f"{noun}{'s' if plural else ''} {', '.join(names)} {'are' if plural else 'is'}"
+    return f"column{'s' if plural else ''} {', '.join(names)} {'are' if plural else 'is'}"

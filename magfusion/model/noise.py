@@ -178,7 +178,6 @@ def measurement_cov(
     *,
     survey_error: bool = False,
     sensor_world: Array | None = None,
-    windows: float = 1.0,
     shared_by: Array | float = 1.0,
     neighbours: bool = True,
 ) -> Array:
@@ -192,8 +191,6 @@ def measurement_cov(
         Add the effect of the calibration sigmas, for a solver that does not estimate them.
     sensor_world : ndarray, shape (n, magnetometers, 3), optional
         Their approximate positions (m), for the uncertainty of a field map.
-    windows : float
-        Number of windows that contain each sample, and its noise.
     shared_by : ndarray, shape (n,), or float
         Number of epochs that share a model error.
     neighbours : bool
@@ -205,7 +202,7 @@ def measurement_cov(
     ndarray, shape (n, channels, 3, 3)
         (T^2), measured axes.
     """
-    ways = ((windows, shared_by),)
+    ways = ((1.0, shared_by),)
     (total,), square, power = _covs(site, samples, sensor_world, ways, neighbours=neighbours)
     if survey_error:
         relative = _relative_error(site, square)

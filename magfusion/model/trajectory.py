@@ -94,8 +94,7 @@ class Trajectory(PoseAccess):
 
     def rows(self, chosen: IntArray | BoolArray | slice) -> "Trajectory":
         """Return some of the poses, with all that is known of them."""
-        own = {name: None if part is None else part[chosen] for name, part in vars(self).items()}
-        return Trajectory(**own)
+        return Trajectory(**{k: v[chosen] for k, v in vars(self).items() if v is not None})
 
     @property
     def has_position(self) -> bool:

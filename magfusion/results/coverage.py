@@ -228,7 +228,6 @@ def best_extra_beacon(
     box_world: Array,
     bound: Callable[[Site, Array], Coverage],
     position_world: Array,
-    share: float = 0.5,
 ) -> ExtraBeacon:
     """Find the best position of one more beacon of the first's kind, on the boundary of a box.
 
@@ -239,9 +238,7 @@ def best_extra_beacon(
     bound : callable
         `coverage` of a site at given points.
     position_world : ndarray, shape (n, 3)
-        Positions of the platform to navigate at (m).
-    share : float
-        Share of the points whose position sigma is minimised: 0.5 for the median.
+        Positions of the platform to navigate at (m); the median of their sigmas is minimised.
     """
     step = -(-len(position_world) // COMPARED)
     points = position_world[step // 2 :: step]
@@ -252,11 +249,11 @@ def best_extra_beacon(
             continue
         beacon = _copy(site, place)
         sigma = bound(replace(site, beacons=(*site.beacons, beacon)), points).position_sigma
-        reached = _quantile(sigma, share)
+        reached = _quantile(sigma, 0.5)
         if best is None or reached < best[0]:
             best = reached, beacon
     assert best is not None  # no twenty-six beacons stand on one boundary
-    return ExtraBeacon(best[1], bound(site, points).position_quantile(share), best[0])
+    return ExtraBeacon(best[1], bound(site, points).position_quantile(0.5), best[0])
 
 
 def boundary_places(box_world: Array) -> Array:

@@ -59,9 +59,9 @@ def write_report(directory: Path, figures: Figures, motion: MotionPage | None = 
     write_page(failed if failed.is_dir() else directory, figures, motion)
 
 
-def where_found(name: str, result: bool, value: Value, label: str = "") -> Figure:
+def where_found(name: str, result: bool, value: Value) -> Figure:
     """Return a figure that the screen shows only where it matters."""
-    return Figure(name, value, section=_SUMMARY if result else _REPORT, label=label)
+    return Figure(name, value, section=_SUMMARY if result else _REPORT)
 
 
 def error_figures(

@@ -19,6 +19,7 @@ from magfusion.simulation.pipe import Steel
 from magfusion.simulation.shaft import Shaft, moment_orders, shaft_angle, turned_moment
 from magfusion.units import Array, ComplexArray
 
+PAUSE = 30.0  # s; unrecorded, between two passes
 NODES_APART = 0.08  # of the distance, between places where steel and layers are calculated
 
 
@@ -76,7 +77,6 @@ def simulate_transits(
     around: Surroundings,
     rate_hz: float,
     rng: np.random.Generator,
-    gap: float = 30.0,
     encoder: bool = True,
 ) -> Log:
     """Return a log of consecutive passes.
@@ -86,8 +86,6 @@ def simulate_transits(
     site : Site
         The true site: its only beacon is a rotor, whose position and attitude are those of the
         passes.
-    gap : float
-        Unrecorded interval between two passes (s).
     encoder : bool
         Whether the angle of the shaft is recorded.
     """
@@ -107,7 +105,7 @@ def simulate_transits(
         error = around.depth_sigma * rng.standard_normal(len(reported))
         depths.append(np.stack([reported, (1.0 + around.depth_scale) * true + error]))
         places.append(np.array([[time[0], time[-1]], [own.sensor_depth] * 2]))
-        begin = float(time[-1]) + gap
+        begin = float(time[-1]) + PAUSE
     wave = Waveform(
         np.concatenate([w.time for w in waves]), np.concatenate([w.measured_sensor for w in waves])
     )

@@ -246,15 +246,13 @@ def gravity_at_rest(imu: ImuSamples, site: Site, time: Array) -> Gravity | None:
     return Gravity(up, np.where(known, sigma, np.inf))
 
 
-def first_fixes(
-    samples: FieldSamples, log: Log, calibration: Calibration, free_parameters: tuple[str, ...] = ()
-) -> Fixes:
+def first_fixes(samples: FieldSamples, log: Log, calibration: Calibration) -> Fixes:
     """Return the fix of every epoch, with gravity where the platform rests.
 
     With time-multiplexed coils a whole cycle is one epoch.
     """
     epochs, gravity = fix_inputs(samples, log, calibration.site)
-    return fix_epochs(epochs, calibration, gravity=gravity, free_parameters=free_parameters)
+    return fix_epochs(epochs, calibration, gravity=gravity)
 
 
 def fix_inputs(samples: FieldSamples, log: Log, site: Site) -> tuple[FieldSamples, Gravity | None]:

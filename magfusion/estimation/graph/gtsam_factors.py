@@ -247,7 +247,6 @@ def measurement_factors(
     measurement: Measurement,
     keys: CalibrationKeys,
     values: gtsam.Values,
-    motion_keys: Callable[[int], MotionKeys] = lambda k: MotionKeys(X(k), V(k), B(k)),
 ) -> Iterator[gtsam.NoiseModelFactor]:
     """Yield a factor of every group of rows of every epoch that carries information.
 
@@ -255,11 +254,10 @@ def measurement_factors(
     ----------
     values : gtsam.Values
         Those variables are keys of a factor whose derivative is not zero here.
-    motion_keys : callable
-        Returns the keys of an epoch.
     """
     for i, epoch in enumerate(measurement.epoch.tolist()):
-        shared = EpochRows(measurement.rows(slice(i, i + 1)), keys, motion_keys(epoch))
+        motion_keys = MotionKeys(X(epoch), V(epoch), B(epoch))
+        shared = EpochRows(measurement.rows(slice(i, i + 1)), keys, motion_keys)
         rows = shared.rows(values)
         for group in range(rows.error.shape[1]):
             used = [key for key, by in shared.parts(rows, group) if by.any()]

@@ -247,12 +247,12 @@ def _one(guess: JointEstimate) -> AnyArray:
     return state
 
 
-def calm_epochs(samples: FieldSamples, imu: ImuSamples, count: int = EPOCHS) -> FieldSamples:
+def calm_epochs(samples: FieldSamples, imu: ImuSamples) -> FieldSamples:
     """Return epochs spread over a log, of each stretch the one with the least rate.
 
     The size of the rate depends on no axis and no sign; its unit does not matter either.
     """
-    if len(samples) <= count:
+    if len(samples) <= EPOCHS:
         return samples
     rate = np.linalg.norm(imu.gyro_body, axis=1)
     nearest = np.clip(np.searchsorted(imu.time, samples.time), 0, len(imu) - 1)
@@ -260,7 +260,7 @@ def calm_epochs(samples: FieldSamples, imu: ImuSamples, count: int = EPOCHS) -> 
     order = np.lexsort((rate[nearest], -maximum))  # by number of beacons, then by rate
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
-    stretches = np.array_split(np.arange(len(samples)), count)
+    stretches = np.array_split(np.arange(len(samples)), EPOCHS)
     kept = np.array([stretch[np.argmin(rank[stretch])] for stretch in stretches])
     chosen = np.zeros(len(samples), dtype=bool)
     chosen[kept] = True

@@ -111,7 +111,6 @@ class RestNavigator:
         self._running: RunningMean | None = None
         self._known = ReferenceHistory()
         self._pending: list[RestState] = []
-        self.too_short = 0
 
     # Input
 
@@ -199,7 +198,6 @@ class RestNavigator:
     def _stretch(self, log: Log, running: RunningMean, span: tuple[float, float]) -> RunningMean:
         length = piece_length(self.site, self._usual, self._lockin, span[1] - span[0])
         if length is None:
-            self.too_short += 1
             return replace(running, end=span[1])
         mains_hz = (self._lockin or self._usual).mains_hz
         parts = (log, span, self.site, length, mains_hz, self._false_alarm, self._known)

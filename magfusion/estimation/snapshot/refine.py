@@ -41,7 +41,6 @@ def refine(
     start: Trajectory,
     *,
     gravity: Gravity | None = None,
-    prior: Trajectory | None = None,
     survey_error: bool = True,
     free_parameters: tuple[str, ...] = (),
     gain_sigma: float = GAIN_SIGMA,
@@ -56,7 +55,7 @@ def refine(
         Channels in the site's order.
     start : Trajectory
         Poses at the same times.
-    gravity, prior, survey_error, free_parameters, gain_sigma
+    gravity, survey_error, free_parameters, gain_sigma
         As in `magfusion.estimation.snapshot.likelihood.fix_epochs`.
 
     Returns
@@ -74,7 +73,7 @@ def refine(
         samples,
         calibration,
         gravity=gravity,
-        prior=prior,
+        prior=None,
         survey_error=survey_error,
         free_parameters=free_parameters,
         gain_sigma=gain_sigma,

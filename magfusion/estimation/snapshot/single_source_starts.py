@@ -21,7 +21,6 @@ from magfusion.model.site import Site
 from magfusion.units import Array, BoolArray, ComplexArray
 
 FLAT = 1e-6  # of the largest singular value; coils of which one adds no direction
-POSES = 4
 REFERENCE = 1.0  # m; distance at which the source is first evaluated
 _TINY = 1e-300
 

@@ -14,6 +14,7 @@ from magfusion.units import Array, BoolArray, IntArray
 
 MAX_ITERATIONS = 100  # a bound; the few that creep along a valley need more than 25
 MIN_COST_DECREASE = 1e-11  # relative decrease of the cost below which a problem is solved
+DIFFERENCE = 1e-6  # of a state of size one, on either side
 ROUNDING = 1e-13  # relative increase of the cost that is rounding
 DAMPING_START, DAMPING_LEAST, DAMPING_STOP = 1e-3, 1e-12, 1e9
 DAMPING_DECREASE, TIGHTENED = (
@@ -177,9 +178,7 @@ def conditioning(jacobian: Array) -> Array:
     return size[..., -1] / np.maximum(size[..., 0], np.finfo(np.float64).tiny)
 
 
-def by_differences(
-    residual: Callable[[Array], Array], state: Array, step: float = 1e-6
-) -> tuple[Array, Array]:
+def by_differences(residual: Callable[[Array], Array], state: Array) -> tuple[Array, Array]:
     """Return residuals (k, d) and their Jacobian (k, d, n) by central differences.
 
     Parameters
@@ -189,9 +188,9 @@ def by_differences(
     state : ndarray, shape (k, n)
     """
     n = state.shape[-1]
-    sides = state[:, None] + step * np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
+    sides = state[:, None] + DIFFERENCE * np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
     value = residual(sides.reshape(-1, n)).reshape(len(state), 2 * n + 1, -1)
-    slope = (value[:, 1 : n + 1] - value[:, n + 1 :]) / (2.0 * step)
+    slope = (value[:, 1 : n + 1] - value[:, n + 1 :]) / (2.0 * DIFFERENCE)
     return value[:, 0], np.swapaxes(slope, -1, -2)
 
 

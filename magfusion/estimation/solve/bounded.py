@@ -14,6 +14,7 @@ LONGEST = 2.0  # of the steps of `minimise_curved`: beyond, a curvature is not v
 SUFFICIENT = 1e-4  # share of the decrease that the slope predicts
 FLATTEST = 1e-10  # of the largest curvature
 LINEAR = 0.05  # share of a slope by which a curvature may differ from that of a pure variance
+MAX_STEPS = 200
 MIN_STEP = 1e-2  # of a logarithm; a smaller step is near the minimum
 SHORTEST = 1e-9  # of a step; if that does not decrease the cost, the rest is rounding
 DIFFERENCE = 1e-3  # of an unknown: rounding of a cost that solves large systems is far below it
@@ -23,7 +24,6 @@ def minimise_bounded(
     cost: Callable[[Array], float],
     start: Array,
     limits: Array,
-    steps: int = 200,
     decrease: float = DECREASE,
 ) -> Array:
     """Return the minimum of a cost by a quasi-Newton method (SciPy's L-BFGS-B).
@@ -38,8 +38,6 @@ def minimise_bounded(
     start : ndarray, shape (n,)
     limits : ndarray, shape (n, 2)
         Lower and upper bound of each unknown.
-    steps : int
-        Maximum number.
     decrease : float
         Of the cost, relative; a step that decreases it by less is the last.
     """
@@ -49,7 +47,7 @@ def minimise_bounded(
         slopes = [(cost(at + one) - cost(at - one)) / (2.0 * DIFFERENCE) for one in lateral]
         return cost(at), np.array(slopes)
 
-    options = {"maxiter": steps, "ftol": decrease}
+    options = {"maxiter": MAX_STEPS, "ftol": decrease}
     result = minimize(sloped, start, jac=True, method="L-BFGS-B", bounds=limits, options=options)
     return np.asarray(result.x)
 

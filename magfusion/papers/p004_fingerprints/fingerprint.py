@@ -136,7 +136,6 @@ def locate_by_differential_range(
     database: FingerprintDatabase,
     amplitude: Array,
     neighbours: int = NEIGHBOURS,
-    slope: Array | None = None,
 ) -> Array:
     """Return the positions (n, 3) of the sensor (m) by algorithm 3, with Eq 28 and 29 corrected.
 
@@ -145,13 +144,11 @@ def locate_by_differential_range(
         r_i(j) = |P_j - M_i| exp((ln F_t,i - ln F_j,i) / k_i)
         min_P  sum_i (|P - M_i| - mean_j r_i(j))^2
 
-    The slopes k (beacons,) are by default those of all fingerprints; other arguments as in
-    `nearest`.
+    The slopes k (beacons,) are those of all fingerprints; arguments as in `nearest`.
     """
     _, point = nearest(database, amplitude, neighbours)
     reach = distances(database.position_world, database.beacons_world)
-    if slope is None:
-        slope = fit_lines(reach, database.amplitude).slope
+    slope = fit_lines(reach, database.amplitude).slope
     ranges = eq_28_range(reach[point], amplitude[:, None], database.amplitude[point], slope)
     start = np.mean(database.position_world[point], axis=1)
     return trilaterate_from_both_sides(np.mean(ranges, axis=1), database.beacons_world, start)
