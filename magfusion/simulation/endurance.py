@@ -321,7 +321,7 @@ def draw_endurance(site: Site, config: EnduranceConfig, seed: tuple[int, ...]) -
     )
     edges = BLOCK * np.arange(config.blocks + 1, dtype=float)
     drawn = draw_drift(config.drift, edges, len(site.beacons), drift_rng)
-    tones_hz = np.concatenate([b.tone_frequencies_hz for b in site.beacons])
+    tones_hz = site.tone_frequencies_hz
     drives = draw_drives(site, clock_rng)
     tones = [len(b.tones) for b in site.beacons]
     own = [

@@ -261,7 +261,7 @@ def simulate_fields(
     drives = drives or synchronised_drives(site)
     time = trajectory.time
     drifts = np.repeat(drives.drift, [len(b.tones) for b in site.beacons])
-    frequencies_hz = np.concatenate([b.tone_frequencies_hz for b in site.beacons])
+    frequencies_hz = site.tone_frequencies_hz
     phase = drives.phase + 2.0 * np.pi * drifts * frequencies_hz * time[:, None]
     parts = []
     for magnetometer in site.platform.magnetometers:

@@ -201,7 +201,7 @@ def _predicted(
     value, by_pose, _ = linearize_channels(
         calibration, (), at, world_from_body[None], position_world[None]
     )
-    frequencies = np.concatenate([b.tone_frequencies_hz for b in calibration.site.beacons])
+    frequencies = calibration.site.tone_frequencies_hz
     angle = 2.0 * np.pi * frequencies * time
     carrier = np.stack([np.cos(angle), -np.sin(angle)], axis=-1)
     parts = value[0].reshape(-1, 2, 3), by_pose[0].reshape(-1, 2, 3, 6)

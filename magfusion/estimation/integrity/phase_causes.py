@@ -40,7 +40,7 @@ def phase_causes(known: Snapshots, every: FieldSamples) -> Iterator[Explanation]
     lower = float(np.sum(loose.cost[:, 0]))
     if known.chi_square - lower < LEAST_FALL or known.chi_square < CLEARLY * lower:
         return
-    tones_hz = np.concatenate([beacon.tone_frequencies_hz for beacon in known.site.beacons])
+    tones_hz = known.site.tone_frequencies_hz
     rate = _rates(known, every, tones_hz)
     phase = loose.phase[:, 0]
     mean = np.angle(np.nansum(np.exp(1j * phase), axis=0))
