@@ -41,6 +41,7 @@ def refine(
     start: Trajectory,
     *,
     gravity: Gravity | None = None,
+    prior: Trajectory | None = None,
     survey_error: bool = True,
     free_parameters: tuple[str, ...] = (),
     gain_sigma: float = GAIN_SIGMA,
@@ -55,7 +56,7 @@ def refine(
         Channels in the site's order.
     start : Trajectory
         Poses at the same times.
-    gravity, survey_error, free_parameters, gain_sigma
+    gravity, prior, survey_error, free_parameters, gain_sigma
         As in `magfusion.estimation.snapshot.likelihood.fix_epochs`.
 
     Returns
@@ -73,7 +74,7 @@ def refine(
         samples,
         calibration,
         gravity=gravity,
-        prior=None,
+        prior=prior,
         survey_error=survey_error,
         free_parameters=free_parameters,
         gain_sigma=gain_sigma,
