@@ -126,6 +126,13 @@ def test_a_log_of_rebar_by_another_program_is_mapped(tmp_path: Path) -> None:
     assert 1.0 < report["nees_mean"] < 12.6
 
 
+def test_a_log_without_steel_is_not_mapped(log: Path, tmp_path: Path) -> None:
+    run_command("smooth", log, "-o", tmp_path / "run", "--map-steel")
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["verdict"] == "trustworthy"
+    assert any(remark["text"].startswith("No steel is mapped") for remark in report["remarks"])
+
+
 def test_whole_rests_are_not_mapped(log: Path, refuse: Refuse) -> None:
     findings = refuse("smooth", log, "--map-steel", "--at-rest", "-o", "run")
     assert "--map-steel maps the steel along one log" in findings

@@ -66,6 +66,10 @@ from magfusion.results.report import (
 from magfusion.results.verdict import level_figures, trust_figures
 from magfusion.units import Array, Rate
 
+NOT_MAPPED = (
+    "No steel is mapped: the log shows none, or contradicts something else first, or has fewer than"
+    " four beacons, several magnetometers, no IMU or close tones."
+)
 OF_STEEL = ("noise_tuned", "field_residuals")  # codes of findings that steel explains
 
 
@@ -138,11 +142,8 @@ def finished(
     give_back_memory()
     result, trust, score, causes = judged_with_score(separated.result, log)
     steel = None
-    if mapping and _may_be_mapped(trust):
-        steel = map_steel(separated.result, log.imu)
-    if steel is not None:
-        trust = _with_map(trust, steel, site)
-        result = replace(steel.applied(separated.result), trust=trust) if steel.is_used else result
+    if mapping:
+        result, trust, steel = _with_map(separated.result, result, trust, log)
     if correction is not None:
         result = _with_uncertainty(result, correction, score)
     trust |= Trust((*open_signs(result), *roll_findings(site)))
@@ -183,15 +184,28 @@ def _may_be_mapped(trust: Trust) -> bool:
     return all(f.code in (STEEL, *OF_STEEL) for f in trust.reasons[:1])
 
 
-def _with_map(trust: Trust, steel: SteelMap, site: Site) -> Trust:
-    """Return findings with that of a map in place of that of steel; a map not used adds none."""
+def _with_map(
+    before: Smoothed, result: Smoothed, trust: Trust, log: Log
+) -> tuple[Smoothed, Trust, SteelMap | None]:
+    """Return a result and its findings with the map of steel, and the map.
+
+    Parameters
+    ----------
+    before : Smoothed
+        Whose covariance no test has widened.
+    """
+    steel = map_steel(before, log.imu) if _may_be_mapped(trust) else None
+    if steel is None:
+        remark = Finding(STEEL, NOT_MAPPED, Verdict.TRUSTWORTHY)
+        return result, trust | Trust((remark,)), None
     others = tuple(f for f in trust.findings if f.code != STEEL)
-    if len(others) == len(trust.findings) and not steel.is_used:
-        return trust
     if steel.is_used:
-        remark = Verdict.TRUSTWORTHY
-        others = tuple(replace(f, verdict=remark) if f.code in OF_STEEL else f for f in others)
-    return Trust((steel.finding(site), *others), trust.unverified)
+        result, remarked = steel.applied(before), Verdict.TRUSTWORTHY
+        others = tuple(replace(f, verdict=remarked) if f.code in OF_STEEL else f for f in others)
+    elif len(others) == len(trust.findings):  # no reason, so that none is added
+        return result, trust, steel
+    trust = Trust((steel.finding(before.declared.site), *others), trust.unverified)
+    return replace(result, trust=trust), trust, steel
 
 
 def _explaining(finding: Finding, trust: Trust) -> Finding:
