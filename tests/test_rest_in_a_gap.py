@@ -100,6 +100,22 @@ def test_between_the_epochs_the_covariance_meets_that_of_the_epochs(
         np.testing.assert_allclose(near, known, rtol=0.02)
 
 
+def test_what_a_test_adds_to_the_covariance_is_claimed_between_the_epochs(
+    resting: tuple[Log, Smoothed, Trajectory],
+) -> None:
+    """Four times the variance at the epochs is at least that at every sample."""
+    log, result, dense = resting
+    assert result.states.pose_cov is not None
+    assert dense.pose_cov is not None
+    wider = replace(result.states, pose_cov=4.0 * result.states.pose_cov)
+    after = at_rate(replace(result, states=wider), log, "imu")
+    assert after.pose_cov is not None
+    added = np.trace(after.pose_cov - dense.pose_cov, axis1=1, axis2=2)
+    own = np.trace(result.states.pose_cov, axis1=1, axis2=2)
+    between = np.interp(dense.time, result.states.time, 3.0 * own)
+    np.testing.assert_allclose(added, between, rtol=1e-6, atol=1e-12)
+
+
 def test_in_motion_the_gap_is_no_rest_and_the_claim_holds() -> None:
     log = silent_log(3, "walk", Rests(start=0.0, move=60.0, pause=0.0))
     result = smooth(log, demo_site(coil_radius=None))

@@ -10,11 +10,13 @@ import pyarrow.parquet
 import pytest
 from conftest import Refuse, run_command
 
-from magfusion.estimation.integrity.steel_map import USED, SteelMap
+from magfusion.estimation.integrity.score import Score
+from magfusion.estimation.integrity.steel_map import LARGEST_RATIO, SteelMap
 from magfusion.estimation.integrity.steel_test import SteelEstimate
-from magfusion.estimation.measurements.steel import UNIT, SteelBasis, Voxels
+from magfusion.estimation.measurements.steel import UNIT, SteelBasis, SteelModes, Voxels
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
+from magfusion.model.parameters import Block
 from magfusion.model.site import Site
 from magfusion.model.trust import Verdict
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -29,15 +31,19 @@ def _map(ratio: float) -> SteelMap:
     """Return a map of one voxel in one mode, of two tones."""
     moment = np.full((1, 2, 3, 1), 1e-3)
     basis = SteelBasis(Voxels(np.zeros((1, 3)), np.ones(1)), moment, moment, 1, 0.0)
+    modes = SteelModes(basis, np.zeros(0), {}, {}, np.zeros(0))
+    block = Block(modes, "site", slice(0, 1), np.array([UNIT]))
+    empty = np.zeros((1, 6, 1)), np.zeros((0, 1))
+    score = Score((block,), np.eye(1), np.zeros(1), np.zeros((1, 0)), *empty)
     steel = SteelEstimate(0.02, np.zeros(3), 0.3, 900.0, np.zeros((1, 6, 6)))
     held_out = {"A": ratio, "B": ratio}
-    return SteelMap(steel, basis, np.array([2.0]), np.array([[0.25]]), np.ones((1, 6, 1)), held_out)
+    return SteelMap(steel, np.array([2.0]), np.array([[0.25]]), score, held_out)
 
 
 def test_a_map_that_predicts_no_other_beacon_is_not_used() -> None:
     """The finding is a remark with the map, and the reason for doubt without it."""
     site = replace(demo_site(coil_radius=None), model_error=0.005)
-    good, bad = _map(USED - 0.05), _map(USED + 0.05)
+    good, bad = _map(LARGEST_RATIO - 0.05), _map(LARGEST_RATIO + 0.05)
     assert good.is_used
     assert good.finding(site).verdict is Verdict.TRUSTWORTHY
     assert not bad.is_used
@@ -130,7 +136,10 @@ def test_a_log_without_steel_is_not_mapped(log: Path, tmp_path: Path) -> None:
     run_command("smooth", log, "-o", tmp_path / "run", "--map-steel")
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["verdict"] == "trustworthy"
-    assert any(remark["text"].startswith("No steel is mapped") for remark in report["remarks"])
+    assert any(
+        remark["text"].startswith("The steel is not mapped: the log shows none")
+        for remark in report["remarks"]
+    )
 
 
 def test_whole_rests_are_not_mapped(log: Path, refuse: Refuse) -> None:

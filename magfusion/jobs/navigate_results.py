@@ -17,6 +17,7 @@ from magfusion.estimation.integrity.diagnosis import (
     with_corrected,
     with_explaining_cause,
 )
+from magfusion.estimation.integrity.likely_cause import QUANTISED, coarse_steps
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online_integrity.open_roll import comparable
 from magfusion.files.site import save_site
@@ -179,12 +180,14 @@ def navigated(
     )
     findings = _without_repeated(navigator.summary.trust, detected)
     trust = findings | Trust(detected)
-    cause = diagnosed(log, navigator.declared, trust, settings.lockin)
+    parts = log, navigator.declared, trust, settings.lockin
     if not navigator.corrected:
-        trust = with_explaining_cause(trust, cause)
+        trust = with_explaining_cause(trust, diagnosed(*parts))
     else:
         trust = with_corrected(trust, navigator.corrected)
-        if cause is not None and cause.finding.code == "quantised":  # nothing undoes it
+        # Steps were unknown as the site was corrected, which does not undo them.
+        cause = None if coarse_steps(log, site) is None else diagnosed(*parts)
+        if cause is not None and cause.finding.code == QUANTISED:
             trust |= Trust((replace(cause.finding, weight=2.0 * CAUSE_FIRST),))
     own = _chosen(rows, trust, CURRENT)
     current, lagged = _part(rows, own, site), None

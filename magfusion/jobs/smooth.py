@@ -236,7 +236,7 @@ def run_smooth(
         findings += () if rested is None else beyond(recording, log, site)
         done = finished(log, site, settings, result, risk, findings=findings, mapping=mapping)
         parts = done.corrections, done.trust.reasons, findings, report
-        done = corrected(log, site, settings, risk, *parts) or done
+        done = corrected(log, site, settings, risk, *parts, mapping=mapping) or done
     figures = done.figures | Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     figures |= Figures() if rested is None else rest_figures(rested)
     done = with_errors(replace(done, figures=figures), log, placed, (done.site, settings))

@@ -37,6 +37,8 @@ def corrected(
     reasons: tuple[Finding, ...],
     findings: tuple[Finding, ...] = (),
     report: Report = quiet,
+    *,
+    mapping: bool = False,
 ) -> Finished | None:
     """Return the result with a corrected site; None where no correction explains the log.
 
@@ -46,7 +48,7 @@ def corrected(
         The most likely first.
     reasons : tuple of Finding
         Why the result without a correction is not trustworthy.
-    findings : tuple of Finding
+    findings, mapping
         As of `finished`.
     """
     if site.platform.further or any(beacon.unknown is not None for beacon in site.beacons):
@@ -60,7 +62,7 @@ def corrected(
             return None
         finding = corrected_finding(correction, site, reasons)
         trial = correction._replace(finding=finding)
-        done = finished(*used, result, risk, findings=findings, correction=trial)
+        done = finished(*used, result, risk, findings=findings, correction=trial, mapping=mapping)
         nearly = correction.clear and done.trust.verdict is not Verdict.FAILED
         return Trial(done, len(done.trust.reasons) == 1, nearly, done.continued)
 

@@ -66,10 +66,6 @@ from magfusion.results.report import (
 from magfusion.results.verdict import level_figures, trust_figures
 from magfusion.units import Array, Rate
 
-NOT_MAPPED = (
-    "No steel is mapped: the log shows none, or contradicts something else first, or has fewer than"
-    " four beacons, several magnetometers, no IMU or close tones."
-)
 OF_STEEL = ("noise_tuned", "field_residuals")  # codes of findings that steel explains
 
 
@@ -179,11 +175,6 @@ def finished(
     return Finished(site, result, trust, by_state, figures, None, possible, further, used)
 
 
-def _may_be_mapped(trust: Trust) -> bool:
-    """Return whether the first reason for doubt, if there is one, may be steel."""
-    return all(f.code in (STEEL, *OF_STEEL) for f in trust.reasons[:1])
-
-
 def _with_map(
     before: Smoothed, result: Smoothed, trust: Trust, log: Log
 ) -> tuple[Smoothed, Trust, SteelMap | None]:
@@ -194,9 +185,10 @@ def _with_map(
     before : Smoothed
         Whose covariance no test has widened.
     """
-    steel = map_steel(before, log.imu) if _may_be_mapped(trust) else None
-    if steel is None:
-        remark = Finding(STEEL, NOT_MAPPED, Verdict.TRUSTWORTHY)
+    other = next((f.code for f in trust.reasons if f.code not in (STEEL, *OF_STEEL)), None)
+    steel = f"{other} is a reason for doubt, too" if other else map_steel(before, log.imu)
+    if isinstance(steel, str):
+        remark = Finding(STEEL, f"The steel is not mapped: {steel}.", Verdict.TRUSTWORTHY)
         return result, trust | Trust((remark,)), None
     others = tuple(f for f in trust.findings if f.code != STEEL)
     if steel.is_used:
@@ -271,7 +263,7 @@ def write_finished(whole: Path, log: Log, done: Finished, *, rate: Rate) -> None
     if rate != "field":
         from magfusion.estimation.batch.between_epochs import at_rate
 
-        written = with_open_roll(at_rate(done.result, log, rate), result.declared.site)
+        written = at_rate(done.result, log, rate)
     if not log.inertial:
         written = replace(written, gyro_bias_body=None, accel_bias_body=None)
     directory = found_in(whole, done.trust)
@@ -291,7 +283,7 @@ def write_finished(whole: Path, log: Log, done: Finished, *, rate: Rate) -> None
         steel=done.steel,
     )
     if done.steel is not None:
-        voxels = done.steel.basis.voxels
+        voxels = done.steel.voxels
         write_steel_map(directory / STEEL_MAP, *voxels, *done.steel.polarisability)
     motion = MotionPage(refined, result.states, log.truth, done.errors, innovations, by_state)
     write_report(whole, done.figures, motion)

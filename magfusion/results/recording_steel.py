@@ -26,7 +26,7 @@ def steel_figures(steel: SteelMap) -> Figures:
 
 def log_steel(recording: rr.RecordingStream, steel: SteelMap) -> None:
     """Draw the voxels with steel, each as large as its polarisability: grey where it is unsure."""
-    voxels, (size, sigma) = steel.basis.voxels, steel.polarisability
+    voxels, (size, sigma) = steel.voxels, steel.polarisability
     drawn = size > LEAST * np.max(size)
     # A sphere of iron has a polarisability of three times its volume.
     radius = np.cbrt(size[drawn] / (4.0 * np.pi))

@@ -30,7 +30,7 @@ CHUNK = 16_384  # samples at a time: their covariances fit the memory
 def at_rate(result: Smoothed, log: Log, rate: Literal["imu"] | float) -> Trajectory:
     """Return the smoothed motion between the first and the last epoch, at another rate.
 
-    Includes the covariance of the poses.
+    Includes the covariance of the poses, with what the tests of the result have added to it.
 
     Parameters
     ----------
@@ -60,6 +60,11 @@ def at_rate(result: Smoothed, log: Log, rate: Literal["imu"] | float) -> Traject
     gyro_bias = line(states.time, states.gyro_bias_body)
     accel_bias = line(states.time, states.accel_bias_body)
     stream = ImuSamples(passed, line(stamps, imu.gyro_body), line(stamps, imu.accel_body))
+    joint = _joint_cov(result)
+    own = np.concatenate([joint[:, :6, :6], joint[-1:, MOTION : MOTION + 6, MOTION : MOTION + 6]])
+    assert states.pose_cov is not None
+    added = line(states.time, (states.pose_cov - own).reshape(-1, 36)).reshape(-1, 6, 6)
+    pose_cov = _pose_cov(result, joint, dense, stream, accel_bias) + added
     return Trajectory(
         time=passed[requested],
         world_from_body=dense.world_from_body[requested],
@@ -67,7 +72,7 @@ def at_rate(result: Smoothed, log: Log, rate: Literal["imu"] | float) -> Traject
         velocity_world=None if dense.velocity_world is None else dense.velocity_world[requested],
         gyro_bias_body=gyro_bias[requested],
         accel_bias_body=accel_bias[requested],
-        pose_cov=_pose_cov(result, dense, stream, accel_bias)[requested],
+        pose_cov=pose_cov[requested],
     )
 
 
@@ -92,10 +97,17 @@ class _Steps(NamedTuple):
     gap_bridged: BoolArray
 
 
-def _pose_cov(result: Smoothed, dense: Trajectory, stream: ImuSamples, accel_bias: Array) -> Array:
-    """Return the covariance of the poses between the epochs, shape (samples, 6, 6)."""
+def _pose_cov(
+    result: Smoothed, joint: Array, dense: Trajectory, stream: ImuSamples, accel_bias: Array
+) -> Array:
+    """Return the covariance of the poses between the epochs, shape (samples, 6, 6).
+
+    Parameters
+    ----------
+    joint : ndarray, shape (epochs - 1, 30, 30)
+        Of every two successive states.
+    """
     epochs, imu = result.states.time, result.declared.site.platform.imu
-    joint = _joint_cov(result)
     force = stream.accel_body - accel_bias
     usual = float(np.median(np.diff(stream.time)))
     remaining = np.clip(np.searchsorted(epochs, stream.time, side="right") - 1, 0, len(epochs) - 2)

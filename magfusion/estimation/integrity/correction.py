@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.integrity.corrected_site import corrected_site
 from magfusion.estimation.integrity.diagnosis import Diagnosis
+from magfusion.estimation.integrity.likely_cause import QUANTISED
 from magfusion.estimation.integrity.released_fault import ReleasedFault, ReleaseGain, release_gain
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.suspects import Suspect, suspects
@@ -94,7 +95,7 @@ def corrections(
         By snapshots of the fields and by the motion.
     """
     result: list[Correction] = []
-    if diagnosis is not None and diagnosis.finding.code == "quantised":
+    if diagnosis is not None and diagnosis.finding.code == QUANTISED:
         return result  # no parameter undoes what steps distort
     finding = next((f for f in findings if causes and f.code == causes[0].code), None)
     if finding is not None:

@@ -41,6 +41,7 @@ PARTS = 4
 FEWEST = 8  # epochs
 LEAST_WAY = 0.3  # m; who goes less far sees each beacon from one side
 OF_MOTION = "the motion by the fields against that by the inertial sensor"
+QUANTISED = "quantised"  # code
 DISTORTION = 0.3  # of a step, in phasors: 1/sqrt(12) of each sample
 STRANGE = 1e3  # and above which it is no field of this site
 
@@ -94,7 +95,7 @@ def _unexplained(
             " this room, with these beacons at these frequencies.",
         )
     elif rounded := _rounded(part, samples, known.site, rms * known.site.model_error):
-        code, text = "quantised", rounded
+        code, text = QUANTISED, rounded
     else:
         share = 100.0 * rms * known.site.model_error
         code, text = (
@@ -109,12 +110,14 @@ def _unexplained(
 
 def _rounded(log: Log, samples: FieldSamples, site: Site, share: float) -> str | None:
     """Return what is to be said of fields distorted by the steps of the magnetometer."""
-    known = coarse_steps(log, samples, site)
-    return of_steps(known[0], share) if known is not None and share <= known[1] else None
+    step = coarse_steps(log, site)
+    if step is None or share > distorted_by(step, samples):
+        return None
+    return of_steps(step, share)
 
 
-def coarse_steps(log: Log, samples: FieldSamples, site: Site) -> tuple[float, float] | None:
-    """Return the magnetometer's steps (T) where larger than its noise; share that they distort.
+def coarse_steps(log: Log, site: Site) -> float | None:
+    """Return the magnetometer's steps (T) if they are larger than its noise.
 
     Steps below the noise only add to it; larger ones distort the fields, by less than a step.
     """
@@ -123,8 +126,12 @@ def coarse_steps(log: Log, samples: FieldSamples, site: Site) -> tuple[float, fl
         return None
     step = float(np.max(step_of_axes(wave.measured_sensor)))
     rounding = step * np.sqrt(float(np.median(np.diff(wave.time))) / 6.0)  # T/sqrt(Hz), one-sided
-    size = float(np.nanmedian(np.linalg.norm(samples.phasor_sensor, axis=2)))
-    return None if rounding < density else (step, DISTORTION * step / size)
+    return None if rounding < density else step
+
+
+def distorted_by(step: float, samples: FieldSamples) -> float:
+    """Return the largest share of the fields that steps (T) distort."""
+    return DISTORTION * step / float(np.nanmedian(np.linalg.norm(samples.phasor_sensor, axis=2)))
 
 
 def of_steps(step: float, share: float, about: str = "about") -> str:

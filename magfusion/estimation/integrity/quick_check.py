@@ -17,7 +17,12 @@ from magfusion.estimation.demodulation.beacon_selection import select_detected
 from magfusion.estimation.demodulation.burial_depth import depths_of
 from magfusion.estimation.demodulation.demodulation import phasors
 from magfusion.estimation.integrity.diagnosis import Diagnosis, diagnosed, with_explaining_cause
-from magfusion.estimation.integrity.likely_cause import coarse_steps, of_steps
+from magfusion.estimation.integrity.likely_cause import (
+    QUANTISED,
+    coarse_steps,
+    distorted_by,
+    of_steps,
+)
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.detection_range import are_many
@@ -131,9 +136,11 @@ def quick_check(log: Log, site: Site | None, lockin: LockinSettings | None = Non
 
 def _coarse(log: Log, samples: FieldSamples, site: Site) -> Iterator[Finding]:
     """Yield that steps may distort the fields by more than the model's error explains."""
-    known = coarse_steps(log, samples, site) if len(samples) else None
-    if known is not None and known[1] > UNEXPLAINED * site.model_error:
-        yield Finding("quantised", of_steps(*known, about="up to"), Verdict.TRUSTWORTHY, known[1])
+    step = coarse_steps(log, site) if len(samples) else None
+    share = 0.0 if step is None else distorted_by(step, samples)
+    if step is not None and share > UNEXPLAINED * site.model_error:
+        text = of_steps(step, share, about="up to")
+        yield Finding(QUANTISED, text, Verdict.TRUSTWORTHY, share)
 
 
 def _harmless_lines(

@@ -11,9 +11,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.batch.batch import Smoothed, solved_again
+from magfusion.estimation.graph.graph import read_states
 from magfusion.estimation.integrity.score import (
     Score,
     field_residual,
@@ -25,6 +25,7 @@ from magfusion.estimation.integrity.steel_test import (
     STEEL,
     SteelEstimate,
     amplitudes,
+    basis_of,
     best_explanation,
     block_of,
     estimated_steel,
@@ -32,7 +33,7 @@ from magfusion.estimation.integrity.steel_test import (
     poses_of_fields,
 )
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.measurements.steel import UNIT, SteelBasis, SteelModes, steel_modes
+from magfusion.estimation.measurements.steel import MAX_EPOCHS, UNIT, Voxels, steel_modes
 from magfusion.model.parameters import Block
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
@@ -40,8 +41,8 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
 
 SHARED, OWN, PLACES = 400, 30, 150  # modes of a map: of all beacons, and of each tone
-LEAST_BEACONS = 3  # without one, the others determine the pose
-USED = 0.97  # largest error of a beacon left out, with the map over that without
+LEAST_BEACONS = 4  # without one, three determine the pose
+LARGEST_RATIO = 0.97  # of errors of beacons left out, with the map over those without
 
 
 class SteelMap(NamedTuple):
@@ -50,22 +51,25 @@ class SteelMap(NamedTuple):
     Parameters
     ----------
     steel : SteelEstimate
-    basis : SteelBasis
     mean : ndarray, shape (modes,)
         Amplitudes (1).
     cov : ndarray, shape (modes, modes)
-    by_pose : ndarray, shape (states, 6, modes)
-        Effect of a unit of each on the poses.
+    score : Score
+        Whose last block they are.
     held_out : dict
         Error of each beacon's field as predicted by a map of the others, over that without a map.
     """
 
     steel: SteelEstimate
-    basis: SteelBasis
     mean: Array
     cov: Array
-    by_pose: Array
+    score: Score
     held_out: dict[str, float]
+
+    @property
+    def voxels(self) -> Voxels:
+        """Places of possible steel."""
+        return basis_of(self.score).voxels
 
     @property
     def ratio(self) -> float:
@@ -75,7 +79,7 @@ class SteelMap(NamedTuple):
     @property
     def is_used(self) -> bool:
         """Whether the map predicts beacons that it does not know."""
-        return self.ratio < USED
+        return self.ratio < LARGEST_RATIO
 
     def finding(self, site: Site) -> Finding:
         """Return the finding in place of that of the test for steel."""
@@ -89,41 +93,45 @@ class SteelMap(NamedTuple):
         known = self.steel.finding(site)
         text = (
             " Its map is not used: made without a beacon, it predicts its fields with"
-            f" {percent:.0f} % of the error without a map (at most {100.0 * USED:.0f} %)."
+            f" {percent:.0f} % of the error without a map (at most {100.0 * LARGEST_RATIO:.0f} %)."
         )
         return replace(known, text=known.text + text)
 
     @property
     def polarisability(self) -> tuple[Array, Array]:
-        """Mean polarisability of each voxel over tones, rms, and its sigma, shape (v,) (m^3)."""
-        basis = self.basis.polarisability
-        mean = np.linalg.norm(basis @ (UNIT * self.mean), axis=2)
-        spread = np.sqrt(np.sum(np.abs(basis @ (UNIT * _root(self.cov))) ** 2, axis=(2, 3)))
-        return tuple(np.sqrt(np.mean(part**2, axis=1)) for part in (mean, spread))
+        """Polarisability of each voxel, rms over tones, and its sigma, shape (v,) (m^3)."""
+        unit = UNIT * basis_of(self.score).polarisability
+        mean = np.sum(np.abs(unit @ self.mean) ** 2, axis=2)
+        variance = np.sum(((unit @ self.cov) * unit.conj()).real, axis=(2, 3))
+        return np.sqrt(np.mean(mean, axis=1)), np.sqrt(np.mean(variance, axis=1))
 
     def applied(self, result: Smoothed) -> Smoothed:
-        """Return a result whose poses are those with the map."""
-        states, cov = result.states, result.states.pose_cov
+        """Return a result whose states and calibration are those with the map."""
+        cov, own = result.states.pose_cov, block_of(self.score).columns
         assert cov is not None
-        step = self.by_pose @ self.mean
-        turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
-        shift_world = (states.world_from_body @ step[:, 3:, None])[..., 0]
-        moved = replace(
-            states,
-            world_from_body=states.world_from_body @ turn,
-            position_world=states.position_world + shift_world,
-            pose_cov=cov + self.by_pose @ self.cov @ np.swapaxes(self.by_pose, 1, 2),
+        estimate = moved_estimate(result, self.score, step_of(self.score, self.mean))
+        states = read_states(estimate.values, result.states.time)
+        by_pose, by_calibration = (
+            by[..., own] for by in (self.score.by_pose, self.score.by_calibration)
         )
-        return replace(result, states=moved)
+        return replace(
+            result,
+            states=replace(states, pose_cov=cov + by_pose @ self.cov @ np.swapaxes(by_pose, 1, 2)),
+            calibration=estimate.calibration,
+            calibration_cov=result.calibration_cov + by_calibration @ self.cov @ by_calibration.T,
+            estimate=estimate,
+        )
 
 
-def _root(cov: Array) -> Array:
-    value, vector = np.linalg.eigh(cov)
-    return np.asarray(vector * np.sqrt(np.maximum(value, 0.0)))
+def step_of(score: Score, mean: Array) -> Array:
+    """Return the step of all parameters of a score by amplitudes of steel."""
+    step = np.zeros(len(score.gradient))
+    step[block_of(score).columns] = mean
+    return step
 
 
-def map_steel(result: Smoothed, imu: ImuSamples) -> SteelMap | None:
-    """Return the map of the steel near a path; None if there is none, or none can be tested.
+def map_steel(result: Smoothed, imu: ImuSamples) -> SteelMap | str:
+    """Return the map of the steel near a path, or why there is none.
 
     Parameters
     ----------
@@ -133,65 +141,62 @@ def map_steel(result: Smoothed, imu: ImuSamples) -> SteelMap | None:
         As recorded.
     """
     site = result.calibration.site
-    if has_close_tones(result) or len(site.beacons) <= LEAST_BEACONS:
-        return None
+    if len(site.beacons) < LEAST_BEACONS:
+        return f"it needs {LEAST_BEACONS} beacons, the log has {len(site.beacons)}"
+    if has_close_tones(result):
+        return "its tones are too close to be received apart"
+    if site.platform.further:
+        return "the platform has several magnetometers"
     poses = poses_of_fields(result)
+    if len(poses) > MAX_EPOCHS:
+        return f"the log has {len(poses)} epochs, {MAX_EPOCHS} are supported; shorten it by --end"
     modes = steel_modes(site, poses.time, poses, (SHARED, OWN), PLACES)
-    estimate = _estimate(result, imu, modes) if modes else None
-    if estimate is None:
-        return None
-    score, known, mean, cov = estimate
-    block = block_of(score)
-    assert isinstance(block.parameter, SteelModes)
+    if not modes:
+        return "path and beacons span too much for the memory"
+    scores = scores_of(result, imu, modes, responses=True)
+    known = None if scores is None else best_explanation(scores.every, 0.0)
+    if scores is None or known is None:
+        return "the log shows none"
     held_out = {}
     for beacon in site.beacons:
         ratio = _held_out(result, imu, modes, beacon.name)
         if ratio is None:
-            return None
+            return f"without beacon {beacon.name} the poses are undetermined"
         held_out[beacon.name] = ratio
-    by_pose = score.by_pose[..., block.columns]
-    return SteelMap(known, block.parameter.basis, mean, cov, by_pose, held_out)
-
-
-def _estimate(
-    result: Smoothed, imu: ImuSamples, modes: tuple[Block, ...]
-) -> tuple[Score, SteelEstimate, Array, Array] | None:
-    """Return the score, the steel by it, and mean and covariance of its amplitudes."""
-    scores = scores_of(result, imu, modes, responses=True)
-    known = None if scores is None else best_explanation(scores.every, 0.0)
-    if scores is None or known is None:
-        return None
-    every, (gain, sigma) = scores.every, known
-    return every, estimated_steel(every, gain, sigma), *amplitudes(every, sigma)
+    score, (gain, sigma) = scores.every, known
+    steel = estimated_steel(score, gain, sigma)
+    return SteelMap(steel, *amplitudes(score, sigma), score, held_out)
 
 
 def _held_out(
     result: Smoothed, imu: ImuSamples, modes: tuple[Block, ...], name: str
 ) -> float | None:
-    """Return the error of a beacon's field by a map of the others, over that without a map."""
+    """Return the error of a beacon's field by a map of the others, over that without a map.
+
+    None where the others do not determine the poses.
+    """
     try:
         others = solved_again(result, without_beacon(result, name))
     except RuntimeError:  # GTSAM's: without it the pose is undetermined
         return None
-    every = replace(others, graph=result.graph)
-    own = np.array([owner == name for owner, _ in result.fields.channels])
-    before = field_residual(every, others.estimate, raw=True)[:, own]
-    estimate = _estimate(others, imu, modes)
-    if estimate is None:
+    scores = scores_of(others, imu, modes, responses=True)
+    known = None if scores is None else best_explanation(scores.every, 0.0)
+    if scores is None or known is None:
         return 1.0
-    score, _, mean, _ = estimate
-    block = block_of(score)
-    assert isinstance(block.parameter, SteelModes)
-    step = np.zeros(len(score.gradient))
-    step[block.columns] = mean
-    after = field_residual(every, moved_estimate(others, score, step), raw=True)[:, own]
-    shared = np.where(np.arange(len(mean)) < block.parameter.basis.shared, UNIT * mean, 0.0)
-    phasors = next(m for m in result.graph.measurements if isinstance(m, FieldPhasors)).alone()
-    poses = poses_of_fields(others)
-    added = block.parameter.basis.phasors(
+    score, every = scores.every, replace(others, graph=result.graph)
+    mean, _ = amplitudes(score, known[1])
+    basis = basis_of(score)
+    poses, own = poses_of_fields(others), [owner == name for owner, _ in result.fields.channels]
+    phasors = basis.phasors(
         others.calibration, poses.time, poses.world_from_body, poses.position_world
     )
-    field = (added @ shared)[:, own]
+    # The moments of each tone's own are unknown of a beacon that is left out.
+    field = phasors[..., : basis.shared] @ (UNIT * mean[: basis.shared])
+    measured = next(m for m in result.graph.measurements if isinstance(m, FieldPhasors)).alone()
     parts = np.concatenate([field.real, field.imag], axis=-1)
-    after = after + (phasors.sqrt_information[:, own] @ parts[..., None])[..., 0]
-    return float(np.sqrt(np.nansum(after**2) / np.nansum(before**2)))
+    moved = moved_estimate(others, score, step_of(score, mean))
+    after = field_residual(every, moved, raw=True)
+    after = after + (measured.sqrt_information @ parts[..., None])[..., 0]
+    before = field_residual(every, others.estimate, raw=True)
+    square = [np.nansum(error[:, own] ** 2) for error in (after, before)]
+    return float(np.sqrt(square[0] / square[1]))

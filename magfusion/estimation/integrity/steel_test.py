@@ -198,8 +198,7 @@ def steel_of_score(score: Score, rival: float) -> SteelEstimate | None:
 def best_explanation(score: Score, rival: float) -> tuple[float, Array] | None:
     """Return gain and sigmas of the amplitudes of steel; None if a rival cause is as good."""
     block = block_of(score)
-    assert isinstance(block.parameter, SteelModes)
-    shared = np.arange(block.parameter.columns) < block.parameter.basis.shared
+    shared = np.arange(len(block.sigma)) < basis_of(score).shared
     gain, sigma = best_size(*_own(score, block), shared)
     if gain < max(rival + MARGIN, LEAST_EVIDENCE) or np.max(sigma) >= SIZES[-1]:
         return None  # the largest size stands for gross mistakes that no mode explains
@@ -211,10 +210,16 @@ def block_of(score: Score) -> Block:
     return next(b for b in reversed(score.fixed) if isinstance(b.parameter, SteelModes))
 
 
+def basis_of(score: Score) -> SteelBasis:
+    """Return the modes of that block."""
+    parameter = block_of(score).parameter
+    assert isinstance(parameter, SteelModes)
+    return parameter.basis
+
+
 def poses_of_fields(result: Smoothed) -> Trajectory:
     """Return the poses at the fields."""
-    here = {k: v[result.epoch] for k, v in vars(result.states).items() if v is not None}
-    return Trajectory(**here)
+    return result.states.rows(result.epoch)
 
 
 def best_size(information: Array, gradient: Array, shared: BoolArray) -> tuple[float, Array]:
@@ -249,13 +254,11 @@ def _own(score: Score, block: Block) -> tuple[Array, Array]:
 
 def estimated_steel(score: Score, gain: float, sigma: Array) -> SteelEstimate:
     """Return the steel of a score with the responses of the poses to it."""
-    block = block_of(score)
     mean, cov = amplitudes(score, sigma)
-    by_pose = score.by_pose[..., block.columns]
+    by_pose = score.by_pose[..., block_of(score).columns]
     moved = by_pose @ mean
     spread = moved[:, :, None] * moved[:, None, :] + by_pose @ cov @ np.swapaxes(by_pose, 1, 2)
-    assert isinstance(block.parameter, SteelModes)
-    place, place_sigma = _strongest(block.parameter.basis, mean, cov)
+    place, place_sigma = _strongest(basis_of(score), mean, cov)
     distortion = UNIT * float(np.hypot(sigma[0], sigma[-1]))
     return SteelEstimate(distortion, place, place_sigma, gain, spread)
 

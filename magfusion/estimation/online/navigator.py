@@ -240,7 +240,7 @@ class Navigator:
         """
         factors = UserFactors.of(factor, values, times)
         self._loop.running.check_factor_times(factors.time)
-        check_clock("factor", factors.time, self._loop.arrived.newest)
+        check_clock("factor", factors.time, self.newest)
         self.receive_factors(factors)
 
     def receive_factors(self, factors: UserFactors) -> None:
@@ -335,12 +335,8 @@ class Navigator:
     def restarted(self, *, without_prior: bool = False) -> "Navigator":
         """Return a navigator that starts again, where the clock has stepped or all was silent.
 
-        It keeps the biases and the calibration of a trustworthy state, with their random walks.
-
-        Parameters
-        ----------
-        without_prior : bool
-            Whether to keep none of them: how long ago they were estimated is unknown.
+        It keeps the biases and the calibration of a trustworthy state, with their random walks, or
+        none of them (``without_prior``), where it is unknown how long ago they were estimated.
         """
         result = Navigator(self._readings.on(self.declared), self.settings)
         result._loop.follow(self._loop)
