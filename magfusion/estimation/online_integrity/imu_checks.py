@@ -12,8 +12,8 @@ from magfusion.model.trust import Finding, Verdict
 LEAST_SPAN = 1.0  # s; of inertial data, before gravity is tested
 DETECTION_SIGMAS = 6.0
 BEYOND_HELP = 0.2  # rad; a bias that tilts the vertical more makes inflation useless
+LEAST_SIGMA = 1e-9  # m/s^2, rad/s; of a bias that is declared as known
 TURN_INTERVAL = 1.0  # s; of a gyro bias, before the fields correct it
-LEAST_GAIN = 0.05  # of a prior variance; a barely determined parameter does not move by itself
 
 
 def judge_biases(site: Site, state: State, elapsed: float) -> Judgement:
@@ -21,16 +21,14 @@ def judge_biases(site: Site, state: State, elapsed: float) -> Judgement:
     if not site.platform.inertial:
         return Judgement()
     imu = site.platform.imu
-    result, inflation, turn, variance = [], 1.0, 0.0, state.cov.diagonal()
-    for code, name, bias, sigma, walk, first, unit in (
+    result, inflation, turn = [], 1.0, 0.0
+    for code, name, bias, sigma, walk, unit in (
         ("accel_bias", "accelerometer", state.accel_bias_body, imu.accel_bias_sigma,
-         imu.accel_bias_walk, 9, "m/s^2"),
+         imu.accel_bias_walk, "m/s^2"),
         ("gyro_bias", "gyro", state.gyro_bias_body, imu.gyro_bias_sigma, imu.gyro_bias_walk,
-         12, "rad/s"),
+         "rad/s"),
     ):  # fmt: skip
-        prior = sigma**2 + walk**2 * elapsed
-        own = variance[first : first + 3]
-        score = np.abs(bias) / np.sqrt(np.maximum(prior - own, LEAST_GAIN * prior))
+        score = np.abs(bias) / max(np.hypot(sigma, walk * np.sqrt(elapsed)), LEAST_SIGMA)
         axis = int(score.argmax())
         worst = float(score[axis])
         if worst < DOUBT:

@@ -18,7 +18,6 @@ from magfusion.estimation.data_checks.steady_field import DOUBT, off_earth
 from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, State
 from magfusion.estimation.online_integrity.gate import Gate
 from magfusion.estimation.online_integrity.imu_checks import (
-    LEAST_GAIN,
     judge_biases,
     judge_gravity,
 )
@@ -54,6 +53,7 @@ OFTEN_REFUSED = 0.5  # of a beacon's epochs
 MANY_RESTARTS = 3.0
 PRIOR_EVERY = 1.0  # s
 LARGEST_INFLATION = 1e8
+LEAST_GAIN = 0.05  # of a prior variance; a barely determined parameter does not move by itself
 PROBATION = 2.0  # s; after a recovery or a failed update
 
 
