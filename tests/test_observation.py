@@ -12,6 +12,7 @@ from magfusion.model.field import observe, predict, skew
 from magfusion.model.field_map import FieldMap
 from magfusion.model.noise import model_error_cov
 from magfusion.model.site import Beacon, BeaconSigma, Coil, Magnetometer, MagnetometerSigma
+from magfusion.model.steel_field import SteelField
 
 STEP = 1e-5  # rad, m, 1; its square is the quotient's error where lengths are metres
 AGREE = 1e-8  # relative; the quotient's rounding is 1e-16 / STEP
@@ -45,6 +46,13 @@ FIELD_MAP = FieldMap(
     rotation_sigma=0.15,
     residual=0.01,
 )
+STEEL = SteelField(
+    centre_world=np.array([[3.0, 0.9, 1.2], [2.4, 2.5, 1.9]]),
+    radius=np.array([0.2, 0.3]),
+    moment_world=np.array(
+        [[[3.0, 1.0, -2.0], [0.5, 4.0, 1.0]], [[-1.0, 2.0, 6.0], [2.0, 0.0, 5.0]]]
+    ),
+)
 BEACONS = {
     "two axes": beacon(
         (
@@ -62,6 +70,10 @@ BEACONS = {
     "two axes with a field map": replace(
         beacon((Coil(np.array([220.0, 3.0, -2.0])), Coil(np.array([-4.0, 180.0, 5.0]), -1.5))),
         field_map=FIELD_MAP,
+    ),
+    "two axes beside steel": replace(
+        beacon((Coil(np.array([220.0, 3.0, -2.0])), Coil(np.array([-4.0, 180.0, 5.0]), -1.5))),
+        steel=STEEL,
     ),
     "coils of true size": beacon(
         (
@@ -267,7 +279,7 @@ def test_the_value_is_what_a_magnetometer_sees_of_magpylibs_sources(source, rotv
         own.rotate(Rotation.from_matrix(source.world_from_beacon), anchor=0)
         sources.append(own.move(source.position_world))
     fields_world = np.array([s.getB(sensor_world) for s in sources])
-    bare = replace(source, field_map=None, conductivity=0.0)
+    bare = replace(source, field_map=None, steel=None, conductivity=0.0)
     value = seen_from(bare, rotvec).phasor_sensor
     # The currents and the field are followed as functions of time over a cycle.
     cycle = np.linspace(0.0, 2.0 * np.pi, 7)

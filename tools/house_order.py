@@ -27,7 +27,7 @@ ROOMS = {
         "model": """
             arguments batches check_distance correlation counters drive field_map fixed_axes groups
             hall hermite imu_intrinsics marks perturbation physics platform_motion probe progress
-            quaternion region response rotor short_repr temperature time_division trust
+            quaternion region response rotor short_repr steel_field temperature time_division trust
             aiding beacon magnetometer
             site trajectory
             truth_poses

@@ -28,6 +28,7 @@ from magfusion.files.site_region import region_entry
 from magfusion.files.site_rotor import rotor_entry
 from magfusion.files.site_schema import ClockEntry, EarthEntry, SiteEntry
 from magfusion.files.site_temperature import temperature_entry
+from magfusion.files.steel_map import read_steel_fields, write_steel_fields
 from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
 from magfusion.model.arguments import check_arguments
 from magfusion.model.field_map import FieldMap
@@ -48,6 +49,7 @@ from magfusion.model.site import (
     Slots,
     rotor_coils,
 )
+from magfusion.model.steel_field import SteelField
 from magfusion.model.without_imu import as_declared
 from magfusion.units import DEGREE, Array
 
@@ -102,14 +104,16 @@ def site_of_entry(entry: SiteEntry, path: Path) -> Site:
     """Return the site that a file describes."""
     location, field_world = _location_and_field(entry, path)
     maps, ground = _field_maps(entry, path), entry.world.conductivity_s_m
+    beacons = tuple(map(_beacon, entry.beacons))
+    steel = _steel(entry, beacons, path)
     sensors = tuple(map(magnetometer_of, entry.platform.every))
     site = Site(
         gravity=entry.world.gravity_m_s2,
         model_error=entry.world.model_error,
         model_error_length=entry.world.model_error_correlation_m,
         beacons=tuple(
-            replace(_beacon(b), field_map=maps.get(b.name), conductivity=ground)
-            for b in entry.beacons
+            replace(b, field_map=maps.get(b.name), steel=steel.get(b.name), conductivity=ground)
+            for b in beacons
         ),
         log_conductivity_sigma=log_sigma(ground, entry.world.sigma.conductivity_s_m),
         platform=Platform(
@@ -169,7 +173,8 @@ def save_site(site: Site, path: Path | str) -> None:
     ----------
     path : Path
         Replaced as a whole, or left as it was if anything fails.  Field maps are written next to
-        it, as ``<stem>_field_map.parquet``, a correlation as ``<stem>_correlation.parquet``.
+        it, as ``<stem>_field_map.parquet``, a map of steel as ``<stem>_steel.parquet``, a
+        correlation as ``<stem>_correlation.parquet``.
 
     Raises
     ------
@@ -184,6 +189,11 @@ def save_site(site: Site, path: Path | str) -> None:
     if maps:
         content["world"]["field_map"] = others.name
         write_field_maps(maps, others)
+    steel = {b.name: b.steel for b in site.every_beacon if b.steel is not None}
+    if steel:
+        fields = path.with_name(f"{path.stem}_steel.parquet")
+        content["world"]["steel"] = fields.name
+        write_steel_fields(fields, steel)
     if site.correlation is not None:
         correlation = path.with_name(f"{path.stem}_correlation.parquet")
         content["correlation"] = correlation.name
@@ -229,6 +239,13 @@ def _field_maps(entry: SiteEntry, path: Path) -> dict[str, FieldMap]:
                 f"{', '.join(known)}); learn the map of this site."
             )
     return maps
+
+
+def _steel(entry: SiteEntry, beacons: tuple[Beacon, ...], path: Path) -> dict[str, SteelField]:
+    if entry.world.steel is None:
+        return {}
+    coils = {beacon.name: len(beacon.coils) for beacon in beacons}
+    return read_steel_fields(path.parent / entry.world.steel, coils)
 
 
 def _reference_field(location: Location) -> Array:

@@ -44,7 +44,9 @@ def with_content(site: Site, content: str) -> Site:
         site,
         gravity=other.gravity,
         platform=other.platform,
-        beacons=tuple(replace(beacons[b.name], field_map=b.field_map) for b in site.beacons),
+        beacons=tuple(
+            replace(beacons[b.name], field_map=b.field_map, steel=b.steel) for b in site.beacons
+        ),
     )
 
 

@@ -94,6 +94,7 @@ class WorldEntry(StrictModel):
     model_error: Share = 0.005
     model_error_correlation_m: NotNegative = Site.model_error_length
     field_map: Annotated[str, Field(min_length=1)] | None = None
+    steel: Annotated[str, Field(min_length=1)] | None = None
     earth_field_t: Annotated[Array, array(3), tesla(LARGEST_EARTH_FIELD)] | None = None
     location: LocationEntry | None = None
     earth: EarthEntry = EarthEntry()

@@ -1,14 +1,30 @@
-"""Map of steel as a Parquet file: a row for each voxel of possible steel."""
+"""Maps of steel as Parquet files.
+
+``steel.parquet`` has a row for each voxel of possible steel, with its polarisability.  The file
+next to a site has a row for each voxel and coil, with the moment by which the field is predicted.
+"""
 
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 
+from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
-from magfusion.units import Array
+from magfusion.files.plain_table import (
+    POSITION,
+    column,
+    integers,
+    numbers,
+    read_whole,
+    refuse_rows,
+)
+from magfusion.model.steel_field import SteelField
+from magfusion.units import AnyArray, Array
 
 STEEL_MAP = "steel.parquet"
+_MOMENT = ("moment_x_a_m2", "moment_y_a_m2", "moment_z_a_m2")
 
 
 def write_steel_map(
@@ -25,8 +41,64 @@ def write_steel_map(
     polarisability, sigma : ndarray, shape (v,)
         Moment over the magnetising field, rms over the beacons, and its sigma (m^3).
     """
-    names = ("position_x", "position_y", "position_z")
-    columns = dict(zip(names, centre_world.T, strict=True))
+    columns = dict(zip(POSITION, centre_world.T, strict=True))
     columns |= {"edge_m": edge, "polarisability_m3": polarisability}
+    _write(path, columns | {"polarisability_sigma_m3": sigma})
+
+
+def write_steel_fields(path: Path, steel: dict[str, SteelField]) -> None:
+    """Write the steel of beacons by name."""
+    parts = [_rows(name, coil, own) for name, own in steel.items() for coil in range(own.coils)]
+    _write(path, {key: np.concatenate([part[key] for part in parts]) for key in parts[0]})
+
+
+def _rows(beacon: str, coil: int, steel: SteelField) -> dict[str, AnyArray]:
+    count = len(steel.radius)
+    return {
+        "beacon": np.full(count, beacon, dtype=object),
+        "coil": np.full(count, coil),
+        **dict(zip(POSITION, steel.centre_world.T, strict=True)),
+        "radius_m": steel.radius,
+        **dict(zip(_MOMENT, steel.moment_world[:, coil].T, strict=True)),
+    }
+
+
+def read_steel_fields(path: Path, coils: dict[str, int]) -> dict[str, SteelField]:
+    """Read the steel of beacons by name.
+
+    Parameters
+    ----------
+    coils : dict of str to int
+        Names of the site's beacons, and how many coils each has.
+
+    Raises
+    ------
+    InputError
+        Where the file is missing or unreadable, lacks a column, or is of other beacons.
+    """
+    table = read_whole(path, "map of steel")
+    beacon = np.array([str(name) for name in column(table, "beacon", path).to_pylist()])
+    coil = integers(table, "coil", path)
+    centre, moment = (
+        np.stack([numbers(table, name, path) for name in names], axis=1)
+        for names in (POSITION, _MOMENT)
+    )
+    radius = numbers(table, "radius_m", path)
+    refuse_rows(radius <= 0.0, path, "column radius_m", radius, "a positive number")
+    result = {}
+    for name in dict.fromkeys(beacon.tolist()):
+        rows = [np.flatnonzero((beacon == name) & (coil == k)) for k in range(coils.get(name, 0))]
+        if len({len(own) for own in rows}) != 1 or sum(map(len, rows)) != np.sum(beacon == name):
+            raise InputError(
+                f"{path}: beacon {name} has other coils here than in the site (which has beacons"
+                f" {', '.join(coils)}); map the steel of this site."
+            )
+        first = rows[0]
+        moment_world = np.stack([moment[own] for own in rows], axis=1)
+        result[name] = SteelField(centre[first], radius[first], moment_world)
+    return result
+
+
+def _write(path: Path, columns: dict[str, AnyArray]) -> None:
     with whole_file(path) as unfinished:
-        pa.parquet.write_table(pa.table(columns | {"polarisability_sigma_m3": sigma}), unfinished)
+        pa.parquet.write_table(pa.table(columns), unfinished)

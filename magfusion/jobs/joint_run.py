@@ -40,7 +40,7 @@ from magfusion.jobs.joint_tasks import (
     last,
     shared_of,
 )
-from magfusion.jobs.written import KEPT
+from magfusion.jobs.written import KEPT, SITE_FILES
 from magfusion.model.progress import Report
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk, Trust, Verdict
@@ -49,7 +49,6 @@ from magfusion.simulation.monte_carlo import worker_pool
 from magfusion.units import Rate
 
 UNSETTLED = 0.1  # sigmas that the last round may have moved it by
-_SITE_FILES = ("site.yaml", "site_field_map.parquet", "site_correlation.parquet")
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +96,7 @@ def tasks_of(jobs: Sequence[Job], smoother: SmootherSettings, output: Path) -> l
     names, seen = _names([job.log_path for job in jobs]), dict[str, Path]()
     tasks = []
     for job, name, platform in zip(jobs, names, platforms, strict=True):
-        content = digest_of_files([job.log_path], without=frozenset(_SITE_FILES))
+        content = digest_of_files([job.log_path], without=frozenset(SITE_FILES))
         if content in seen:
             raise InputError(
                 f"{job.log_path}: is the same log as {seen[content]} and would count twice; give"
@@ -118,7 +117,7 @@ def _one_site(jobs: Sequence[Job], smoother: SmootherSettings) -> tuple[list[str
     first, platforms = read_site(jobs[0]), []
     for job in jobs:
         path = job.declared_path
-        others = [path.with_name(name) for name in _SITE_FILES[1:]]
+        others = [path.with_name(name) for name in SITE_FILES[1:]]
         digest = digest_of_files([path, *others])
         if digest not in digests:
             other = [key for key in changed_keys(first, read_site(job)) if not _of_platform(key)]

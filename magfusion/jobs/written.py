@@ -4,7 +4,8 @@ from magfusion.files.steel_map import STEEL_MAP
 from magfusion.model.aiding import QUANTITIES
 from magfusion.results.report import FAILED
 
-_SITE = {"site.yaml", "site_field_map.parquet", "site_correlation.parquet"}
+SITE_FILES = "site.yaml", "site_field_map.parquet", "site_steel.parquet", "site_correlation.parquet"
+_SITE = set(SITE_FILES)
 _RESULT = {"trajectory.tum", "trajectory.parquet", *_SITE, "run.rrd", "report.json", FAILED}
 _TABLES = {
     *("imu.parquet", "magnetometer.parquet", "fields.parquet", "truth.parquet"),

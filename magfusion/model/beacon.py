@@ -9,6 +9,7 @@ import numpy as np
 from magfusion.model.field_map import FieldMap
 from magfusion.model.rotor import Rotor
 from magfusion.model.short_repr import short_repr
+from magfusion.model.steel_field import SteelField
 from magfusion.model.temperature import MomentTemperatureModel
 from magfusion.model.time_division import MarkedSlots, Slots
 from magfusion.units import Array, ComplexArray
@@ -94,6 +95,8 @@ class Beacon:
         False where the drive phase relative to the log clock is unknown and drifts.
     field_map : FieldMap, optional
         Deviation of its field from the model where it was surveyed.
+    steel : SteelField, optional
+        What the steel of the room adds to its field.
     slots : Slots or MarkedSlots, optional
         Time slots of its coils, if driven in turn on a known schedule; a frequency of zero then
         means pulses of direct current.
@@ -126,6 +129,7 @@ class Beacon:
     synchronised: bool
     sigma: BeaconSigma
     field_map: FieldMap | None = None
+    steel: SteelField | None = None
     slots: Slots | MarkedSlots | None = None
     unknown: Unknown | None = None
     model_error: float | None = None

@@ -29,6 +29,7 @@ from magfusion.model.physics.dipole import (
 )
 from magfusion.model.physics.loop import loop_field, loop_field_and_gradient
 from magfusion.model.site import Beacon, Coil, Site
+from magfusion.model.steel_field import SteelField
 from magfusion.units import AnyArray, Array, ComplexArray
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
@@ -58,6 +59,8 @@ class Sources(NamedTuple):
         All coils of a beacon are at one place.
     field_map : FieldMap, optional
         Of one beacon.
+    steel : SteelField, optional
+        Of one beacon.
     decay : complex ndarray, shape (loops,) or (beacons, 1, loops), optional
         Of each loop's field in conducting ground (1/m); None without conduction.
     """
@@ -68,7 +71,13 @@ class Sources(NamedTuple):
     loops: Loops
     concentric: bool
     field_map: FieldMap | None = None
+    steel: SteelField | None = None
     decay: ComplexArray | None = None
+
+    @property
+    def is_mapped(self) -> bool:
+        """Whether its field depends on the place in the room."""
+        return self.field_map is not None or self.steel is not None
 
 
 # Cached as long as beacon and site live: an estimator creates others at every step.
@@ -93,6 +102,7 @@ def _source(beacon: Beacon) -> Sources:
         loops=_loops(beacon),
         concentric=beacon.concentric,
         field_map=beacon.field_map,
+        steel=beacon.steel,
         decay=None if beacon.conductivity == 0.0 else _decay(beacon),
     )
 
@@ -105,7 +115,7 @@ def _decay(beacon: Beacon) -> ComplexArray:
 
 
 def side_by_side(site: Site) -> Groups:
-    """Return a site's beacons in few sources: those of one form together, one with a map alone.
+    """Return a site's beacons in few sources: those of one form together, mapped ones alone.
 
     With few points, the field of several beacons costs as much as that of one.
 
@@ -140,7 +150,7 @@ def _with_moments(source: Sources, moments_beacon: list[Array]) -> Sources:
 def _grouped(sources: list[Sources]) -> Groups:
     of_form: dict[object, list[int]] = {}
     for k, source in enumerate(sources):
-        loops, mapped = source.loops, k if source.field_map is not None else None
+        loops, mapped = source.loops, k if source.is_mapped else None
         shape = source.excitation.shape, loops.first, loops.centre.shape, loops.radius is None
         shared = (*shape, source.concentric, mapped, source.decay is None)
         of_form.setdefault(shared, []).append(k)
@@ -281,6 +291,24 @@ def coil_fields_and_gradients(source: Sources, offset_beacon: Array) -> tuple[An
         np.asarray(np.add.reduceat(field, loops.first, axis=-2)),
         np.asarray(np.add.reduceat(gradient, loops.first, axis=-3)),
     )
+
+
+def steel_fields(source: Sources, offset_beacon: Array) -> Array:
+    """Return what steel adds to `coil_fields`."""
+    assert source.steel is not None
+    return source.steel.fields(_in_room(source, offset_beacon)) @ source.world_from_beacon
+
+
+def steel_fields_and_gradients(source: Sources, offset_beacon: Array) -> tuple[Array, Array]:
+    """Return what steel adds to `coil_fields_and_gradients`."""
+    assert source.steel is not None
+    turn = source.world_from_beacon
+    field, gradient = source.steel.fields_and_gradients(_in_room(source, offset_beacon))
+    return field @ turn, turn.T @ gradient @ turn
+
+
+def _in_room(source: Sources, offset_beacon: Array) -> Array:
+    return np.asarray(source.position_world + offset_beacon @ source.world_from_beacon.T)
 
 
 class Driven(NamedTuple):

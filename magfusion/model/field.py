@@ -15,6 +15,8 @@ from magfusion.model.coil_field import (
     coil_fields_and_gradients,
     coil_fields_by_log_conductivity,
     driven_dipoles,
+    steel_fields,
+    steel_fields_and_gradients,
 )
 from magfusion.model.perturbation import by_matrix as by_matrix
 from magfusion.model.perturbation import skew as skew
@@ -46,17 +48,32 @@ def _rotated(excitation: ComplexArray, phase: Array | None) -> ComplexArray:
 
 
 class _Mapped(NamedTuple):
-    """Effect of a field map on the model, beacon axes."""
+    """Effect of a field map and of steel on the model, beacon axes."""
 
-    model_beacon: AnyArray  # (..., coils, 3), field of each coil without the map
+    model_beacon: AnyArray  # (..., coils, 3), field of each coil without them
     correction: Array  # (..., 1, 3, 3), multiplies it
     slope: AnyArray  # (..., coils, 3, 3), contribution of the map's gradient to the field gradient
+    added: Array | float = 0.0  # (..., coils, 3), field of steel
+
+    @property
+    def coils_beacon(self) -> AnyArray:
+        """Field of each coil with them, shape (..., coils, 3)."""
+        return (self.correction @ self.model_beacon[..., None])[..., 0] + self.added
 
 
 def _mapped(source: Sources, offset_beacon: Array, model_beacon: AnyArray) -> _Mapped | None:
-    """Evaluate the beacon's map at the sensor; None without a map."""
-    if source.field_map is None:
-        return None
+    """Evaluate the beacon's map and its steel at the sensor; None without both."""
+    result = None if source.field_map is None else _by_map(source, offset_beacon, model_beacon)
+    if source.steel is None:
+        return result
+    added, slope = steel_fields_and_gradients(source, offset_beacon)
+    if result is None:
+        return _Mapped(model_beacon, np.eye(3), slope, added)
+    return result._replace(slope=result.slope + slope, added=added)
+
+
+def _by_map(source: Sources, offset_beacon: Array, model_beacon: AnyArray) -> _Mapped:
+    assert source.field_map is not None
     world_from_beacon = source.world_from_beacon
     sensor_world = source.position_world + offset_beacon @ world_from_beacon.T
     value, gradient = source.field_map.mean(sensor_world)
@@ -88,9 +105,10 @@ def predict(
     source = _source(beacon)
     offset = _offset_beacon(source, magnetometer, world_from_body, position_world)
     coils = coil_fields(source, offset)
-    mapped = _mapped(source, offset, coils)
-    if mapped is not None:
-        coils = (mapped.correction @ coils[..., None])[..., 0]
+    if source.field_map is not None:
+        coils = _by_map(source, offset, coils).coils_beacon
+    if source.steel is not None:
+        coils = coils + steel_fields(source, offset)
     in_beacon = np.swapaxes(_rotated(source.excitation, phase), -1, -2) @ coils
     body_from_beacon = _times(np.swapaxes(world_from_body, -1, -2), source.world_from_beacon)
     in_body = in_beacon @ np.swapaxes(body_from_beacon, -1, -2)
@@ -152,7 +170,7 @@ def observe(
     by_body = platform_pose[..., 3:]
     by_beacon_offset = by_body @ seen.body_from_beacon[..., None, :, :]
     rotated = measured_from_beacon @ skew(field_beacon)
-    if seen.mapped is not None:  # the map does not move with the beacon
+    if seen.mapped is not None:  # map and steel do not move with the beacon
         flat = seen.mapped.slope.reshape(*seen.mapped.slope.shape[:-2], 9)
         slope = (seen.tones_from_coils @ flat).reshape(*field_beacon.shape, 3)
         by_beacon_offset = by_beacon_offset - measured_from_beacon @ slope
@@ -160,7 +178,8 @@ def observe(
         rotated = measured_from_beacon @ seen.mapped.correction @ skew(model_beacon)
     beacon_rotation = by_beacon_offset @ skew(seen.offset_beacon)[..., None, :, :] - rotated
     # (..., tones, coils, 3)
-    by_coil = seen.coils_beacon[..., None, :, :] * seen.tones_from_coils[..., None]
+    driven = seen.coils_beacon if seen.mapped is None else seen.coils_beacon - seen.mapped.added
+    by_coil = driven[..., None, :, :] * seen.tones_from_coils[..., None]
     by_time_offset: ComplexArray | None = None
     if twist_body is not None:
         twist = twist_body.astype(np.complex128)[..., None, :, None]
@@ -242,7 +261,7 @@ def _seen(
     # Each coil's field is real without conduction; only their sum in a tone is complex.
     mapped = _mapped(source, offset_beacon, coils)
     if mapped is not None:
-        coils = (mapped.correction @ coils[..., None])[..., 0]
+        coils = mapped.coils_beacon
         gradients = mapped.correction @ gradients + mapped.slope
     in_body = coils @ beacon_from_body
     # All coils at once: one product per pose instead of many.
@@ -289,7 +308,7 @@ def driven_field(
     world_from_beacon = source.world_from_beacon
     offset = (position_world - source.position_world) @ world_from_beacon
     along = None if along_world is None else along_world @ world_from_beacon
-    whole = source.loops.radius is not None or source.field_map is not None
+    whole = source.loops.radius is not None or source.is_mapped
     if whole or source.decay is not None:
         driven = _driven_coils(source, offset, current, along)
     else:
@@ -303,7 +322,7 @@ def _driven_coils(source: Sources, offset: Array, current: AnyArray, along: Arra
     coils, gradients = coil_fields_and_gradients(source, offset)
     mapped = _mapped(source, offset, coils)
     if mapped is not None:
-        coils = (mapped.correction @ coils[..., None])[..., 0]
+        coils = mapped.coils_beacon
         gradients = mapped.correction @ gradients + mapped.slope
     field = np.real(np.einsum("...nc,...ncx->...nx", current, coils))
     if along is None:

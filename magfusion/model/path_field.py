@@ -23,14 +23,14 @@ def field_along_path(
 ) -> Driven:
     """Return the field of a source at points of a path, as `driven_field`.
 
-    With a field map, or where points are too far apart, they are evaluated one by one.
+    With a map of field or steel, or where points are too far apart, they are evaluated one by one.
 
     Parameters
     ----------
     position_world : ndarray, shape (n, 3)
         In the order of the path (m).
     """
-    if source.field_map is not None or len(position_world) < MIN_POINTS:
+    if source.is_mapped or len(position_world) < MIN_POINTS:
         return driven_field(source, position_world, current, along_world)
     result = []
     for begin in range(0, len(position_world), AT_ONCE):

@@ -208,6 +208,16 @@ class Site:
             every.insert(number, beacon)
         return tuple(every)
 
+    def without_steel(self) -> "Site":
+        """Return the site without a map of steel; itself if it has none."""
+        if all(beacon.steel is None for beacon in self.every_beacon):
+            return self
+        return replace(
+            self,
+            beacons=tuple(replace(b, steel=None) for b in self.beacons),
+            undetected=tuple((number, replace(b, steel=None)) for number, b in self.undetected),
+        )
+
     @cached_property
     def channels(self) -> tuple[tuple[str, int], ...]:
         """(beacon, tone) of each phasor, in site order: the channel axis of `FieldSamples`.

@@ -132,6 +132,7 @@ CODES = {
     "site_changed": "a beacon was moved or exchanged between logs, or a platform changed",
     "stamp_resolution": "the stamps of a stream are coarser than nanoseconds",
     "steel": "steel near the path distorts the fields of all beacons",
+    "steel_moved": "the map of steel in the site is not that of the log",
     "stray_stamps": "samples have stamps far from all others",
     "streams_apart": "inertial sensor and magnetometer were not recorded at the same time",
     "stuck_axis": "an axis is constant",

@@ -176,6 +176,8 @@ def demodulate_about(
     motion : KnownMotion, optional
         Along the samples, if known.
     """
+    # The field of steel varies within a window by some ten-thousandths of that of the beacons.
+    calibration = replace(calibration, site=calibration.site.without_steel())
     site, known = calibration.site, states if path is None else path
     samples = Waveform(operator.designs.time, measured_sensor)
     window = operator.designs.settings.window

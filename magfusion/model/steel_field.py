@@ -1,0 +1,151 @@
+"""Field that one beacon adds by the steel of its room, as dipoles at known places.
+
+Each voxel of steel is a uniformly magnetised sphere: a dipole outside, and of constant flux density
+inside.  `magfusion.estimation.integrity.steel_map` estimates them from a log.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.units import MU0_OVER_4PI, Array
+
+AT_ONCE = 1 << 18  # pairs of points and voxels
+
+
+@dataclass(frozen=True, eq=False)
+class SteelField:
+    """Voxels of steel and their moments.
+
+    They neither move with the beacon nor grow with its moments, which change by little.
+
+    Parameters
+    ----------
+    centre_world : ndarray, shape (v, 3)
+        (m)
+    radius : ndarray, shape (v,)
+        (m)
+    moment_world : ndarray, shape (v, coils, 3)
+        By each coil at its peak current (A m^2).
+    """
+
+    centre_world: Array
+    radius: Array
+    moment_world: Array
+
+    @property
+    def coils(self) -> int:
+        """Number of coils."""
+        return int(self.moment_world.shape[1])
+
+    def joined(self, other: "SteelField") -> "SteelField":
+        """Return the steel with that of another map."""
+        return SteelField(
+            np.concatenate([self.centre_world, other.centre_world]),
+            np.concatenate([self.radius, other.radius]),
+            np.concatenate([self.moment_world, other.moment_world]),
+        )
+
+    def fields(self, position_world: Array) -> Array:
+        """Return the field, as `fields_and_gradients`."""
+        parts = [some.field(self._centred) for some in self._near(position_world)]
+        return np.concatenate(parts).reshape(*position_world.shape[:-1], -1, 3)
+
+    def fields_and_gradients(self, position_world: Array) -> tuple[Array, Array]:
+        """Return the field and its gradient.
+
+        Parameters
+        ----------
+        position_world : ndarray, shape (..., 3)
+            (m)
+
+        Returns
+        -------
+        field : ndarray, shape (..., coils, 3)
+            World axes (T).
+        gradient : ndarray, shape (..., coils, 3, 3)
+            ``[i, j] = d field_i / d position_j`` (T/m).
+        """
+        near = list(self._near(position_world))
+        shape = *position_world.shape[:-1], -1, 3
+        field = np.concatenate([some.field(self._centred) for some in near])
+        gradient = np.concatenate([some.gradient(self._centred) for some in near])
+        return field.reshape(shape), gradient.reshape(*shape, 3)
+
+    @cached_property
+    def _origin_world(self) -> Array:
+        return np.mean(self.centre_world, axis=0)
+
+    @cached_property
+    def _centred(self) -> "_Voxels":
+        centre, moment = self.centre_world - self._origin_world, self.moment_world
+        return _Voxels(
+            centre,
+            moment.reshape(len(moment), -1),
+            np.einsum("vci,vi->cv", moment, centre),
+            np.einsum("vi,vcj->vcij", centre, moment).reshape(len(moment), -1),
+            np.einsum("vi,vj->vij", centre, centre).reshape(len(moment), -1),
+        )
+
+    def _near(self, position_world: Array) -> Iterator["_Points"]:
+        """Yield points with what all voxels are to them, some points at a time."""
+        flat = position_world.reshape(-1, 3) - self._origin_world
+        voxels, coils = self._centred, self.coils
+        by_moment = np.ascontiguousarray(self.moment_world.transpose(2, 1, 0)).reshape(3, -1)
+        for point in np.array_split(flat, max(1, len(flat) * len(self.radius) // AT_ONCE)):
+            square = np.sum(point**2, axis=1)[:, None] + np.sum(voxels.centre**2, axis=1)
+            square -= 2.0 * point @ voxels.centre.T
+            inside = square < self.radius**2
+            inverse = 1.0 / np.maximum(square, self.radius**2)
+            cube = MU0_OVER_4PI * inverse * np.sqrt(inverse)
+            direct, radial = -cube, 3.0 * cube * inverse
+            direct[inside] *= -2.0
+            radial[inside] = 0.0
+            along = (point @ by_moment).reshape(len(point), coils, -1) - voxels.along
+            yield _Points(point, inverse, direct, radial, along * radial[:, None])
+
+
+class _Voxels(NamedTuple):
+    """Voxels about their mean, so that products of places lose no digits."""
+
+    centre: Array  # (v, 3)
+    moment: Array  # (v, coils * 3)
+    along: Array  # (coils, v), of the centre times the moment
+    outer: Array  # (v, coils * 9), the same as matrices
+    radial: Array  # (v, 9), of the centre times itself
+
+
+class _Points(NamedTuple):
+    """Some points, and for each of them and each voxel the factors of its field.
+
+    A sum over voxels of the offset's products is one of the centre's: matrix products alone.
+    """
+
+    point: Array  # (n, 3)
+    inverse: Array  # (n, v), of the squared distance
+    direct: Array  # (n, v), multiplies the moment
+    radial: Array  # (n, v), multiplies moment and offset
+    along: Array  # (n, coils, v), the same times the moment along the offset
+
+    def field(self, voxels: _Voxels) -> Array:
+        """Return the field of all voxels, shape (n, coils, 3)."""
+        by_moment = (self.direct @ voxels.moment).reshape(len(self.point), -1, 3)
+        total = np.sum(self.along, axis=2)[..., None]
+        return total * self.point[:, None] - self.along @ voxels.centre + by_moment
+
+    def gradient(self, voxels: _Voxels) -> Array:
+        """Return its gradient, shape (n, coils, 3, 3)."""
+        count, place = len(self.point), self.point[:, None, :, None]
+        moment = (self.radial @ voxels.moment).reshape(count, -1, 1, 3)
+        outer = place * moment - (self.radial @ voxels.outer).reshape(count, -1, 3, 3)
+        steeper = 5.0 * self.along * self.inverse[:, None]
+        cross = place * (steeper @ voxels.centre)[:, :, None]
+        total = np.sum(steeper, axis=2)[..., None, None]
+        radial = total * place * self.point[:, None, None]
+        radial += (steeper @ voxels.radial).reshape(radial.shape)
+        radial -= cross + np.swapaxes(cross, 2, 3)
+        isotropic = np.sum(self.along, axis=2)[..., None, None] * np.eye(3)
+        return np.asarray(outer + np.swapaxes(outer, 2, 3) + isotropic - radial)
