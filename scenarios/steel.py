@@ -6,26 +6,31 @@ each log is one draw.  Of one estimate three covariances are compared, with the 
 log (6 is expected): without an error of the fields that is constant in place, with a kernel in
 place for each beacon that knows no physics, and as `smooth` has it.
 The steel of the simulator is bars, sheets and spheres in each other's fields; the estimator
-knows nothing of it.  With `--map`, the steel is mapped, too (`smooth --map-steel`).
+knows nothing of it.  With `--map`, the steel is mapped, too (`smooth --map-steel`), and where the
+map is used, a second walk in the room is smoothed by the site that the first refined, with the map
+and without it.
 """
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from harness import Scale, chosen_scale, conclude, scenario_parser
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.batch.batch import Smoothed, smooth
-from magfusion.estimation.integrity.steel_map import SteelMap, map_steel
+from magfusion.estimation.integrity.steel_map import SteelMap, explained_without_map, map_steel
 from magfusion.estimation.measurements.model_error import cells
 from magfusion.estimation.posterior.marginals import marginals
 from magfusion.model.noise import model_error
 from magfusion.model.parameters import BeaconParameter, Block, placed
 from magfusion.model.parameters.parameter import PhasorView
-from magfusion.model.site import Beacon, Site
+from magfusion.model.samples import Log
+from magfusion.model.site import Beacon, BeaconSigma, MagnetometerSigma, Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.results.errors import trajectory_errors
+from magfusion.results.refinement import result_site
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.disturbance import Ambient
 from magfusion.simulation.field import phasors_world
@@ -78,6 +83,11 @@ class Row:
     map_position_mm: float | None = None
     map_attitude_deg: float | None = None
     map_nees: float | None = None
+    second_position_mm: float | None = None  # of the next log, by the refined site
+    second_map_position_mm: float | None = None  # with the map
+    second_map_attitude_ratio: float | None = None
+    second_map_nees: float | None = None
+    second_map_kept: bool = False  # the next log is explained better with it
 
 
 def kind_of(seed: int) -> str:
@@ -121,24 +131,32 @@ def judge(walk: Walk, _: np.random.Generator) -> Row:
     assert truth is not None
     result = smooth(replace(built.log, truth=None), site)
     kernel = placed((*result.considered, *kernel_errors(result)))
-    nees = [
+    nees_white, nees_kernel, nees = (
         _mean_nees(replace(result.states, pose_cov=cov), truth)
         for cov in (
             marginals(result.graph, result.estimate, result.considered)[0],
             marginals(result.graph, result.estimate, kernel)[0],
             result.states.pose_cov,
         )
-    ]
+    )
     few = truth.position_world[::50]
     steel_map = map_steel(result, built.log.imu) if walk.mapping else None
+    mapped: dict[str, Any] = {}
+    if isinstance(steel_map, SteelMap):
+        mapped = _mapped(steel_map, result, truth)
+        if steel_map.is_used:
+            again = simulate_log(_as_built(built.true_site), config, rng).log
+            mapped |= _second(steel_map, result, again)
     return Row(
         kind,
         walk.seed,
         walk.beacons,
         100.0 * _distortion(site, few, steel),
         *_errors(result.states, truth),
-        *nees,
-        *(_mapped(steel_map, result, truth) if steel_map else ()),
+        nees_white,
+        nees_kernel,
+        nees,
+        **mapped,
     )
 
 
@@ -149,12 +167,44 @@ def _errors(states: Trajectory, truth: Trajectory) -> tuple[float, float]:
     return position_mm, float(np.sqrt(np.mean(errors.attitude**2))) / DEGREE
 
 
-def _mapped(
-    steel: SteelMap, result: Smoothed, truth: Trajectory
-) -> tuple[float, bool, float, float, float]:
+def _mapped(steel: SteelMap, result: Smoothed, truth: Trajectory) -> dict[str, float]:
     """Return the columns of a row that a map has, whether it is used or not."""
     states = steel.applied(result).states
-    return steel.ratio, steel.is_used, *_errors(states, truth), _mean_nees(states, truth)
+    position_mm, attitude_deg = _errors(states, truth)
+    return {
+        "map_error_ratio": steel.ratio,
+        "map_used": steel.is_used,
+        "map_position_mm": position_mm,
+        "map_attitude_deg": attitude_deg,
+        "map_nees": _mean_nees(states, truth),
+    }
+
+
+def _second(steel: SteelMap, result: Smoothed, again: Log) -> dict[str, float]:
+    """Return the columns of a row that the next log in the room has."""
+    truth, alone = again.truth, replace(again, truth=None)
+    assert truth is not None
+    plain = smooth(alone, result_site(result, again.name))
+    known = smooth(alone, steel.on(result_site(steel.applied(result), again.name)))
+    before, after = (_errors(each.states, truth) for each in (plain, known))
+    return {
+        "second_position_mm": before[0],
+        "second_map_position_mm": after[0],
+        "second_map_attitude_ratio": after[1] / before[1],
+        "second_map_nees": _mean_nees(known.states, truth),
+        "second_map_kept": not explained_without_map(known),
+    }
+
+
+def _as_built(site: Site) -> Site:
+    """Return a true site of which nothing is drawn again."""
+    none, sensor = np.zeros(3), site.platform.magnetometer
+    sensor = replace(sensor, sigma=MagnetometerSigma(np.zeros((3, 3)), none, none, none))
+    beacons = tuple(
+        replace(beacon, sigma=BeaconSigma(none, none, np.zeros(len(beacon.coils))))
+        for beacon in site.beacons
+    )
+    return replace(site, beacons=beacons, platform=replace(site.platform, magnetometer=sensor))
 
 
 def _distortion(site: Site, point_world: Array, steel: SteelStructure) -> float:
@@ -251,7 +301,18 @@ def map_figures(rows: Sequence[Row]) -> dict[str, float]:
         "attitude_ratio": float(np.median(attitude)),
         "nees": float(np.median(nees)),
         "nees_without": float(np.median([row.nees for row in used])),
+        "second_kept": sum(row.second_map_kept for row in used),
+        "second_position_ratio": float(np.median(_ratios_of_second(used))),
+        "largest_second_position_ratio": float(np.max(_ratios_of_second(used))),
+        "second_attitude_ratio": float(
+            np.median([row.second_map_attitude_ratio or 0.0 for row in used])
+        ),
+        "second_nees": float(np.median([row.second_map_nees or 0.0 for row in used])),
     }
+
+
+def _ratios_of_second(rows: Sequence[Row]) -> list[float]:
+    return [(row.second_map_position_mm or 0.0) / (row.second_position_mm or 1.0) for row in rows]
 
 
 def report(rows: Sequence[Row]) -> str:
@@ -270,6 +331,11 @@ def report(rows: Sequence[Row]) -> str:
             lines[-1] += (
                 f" map {'used' if row.map_used else 'not '} at {row.map_error_ratio:.3f}:"
                 f"{row.map_position_mm:7.1f}{row.map_attitude_deg:7.3f}{row.map_nees:8.1f}"
+            )
+        if row.second_position_mm is not None:
+            lines[-1] += (
+                f"; next log{row.second_position_mm:7.1f} ->{row.second_map_position_mm:7.1f}"
+                f"{row.second_map_nees:8.1f}{'' if row.second_map_kept else ' not used'}"
             )
     for count in sorted({row.beacons for row in rows}):
         for name, one in figures([row for row in rows if row.beacons == count]).items():

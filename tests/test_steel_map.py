@@ -13,16 +13,25 @@ from conftest import Refuse, run_command
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.steel_map import LARGEST_RATIO, SteelMap
 from magfusion.estimation.integrity.steel_test import SteelEstimate
-from magfusion.estimation.measurements.steel import UNIT, SteelBasis, SteelModes, Voxels
+from magfusion.estimation.measurements.steel import (
+    UNIT,
+    SteelBasis,
+    SteelModes,
+    Voxels,
+    steel_modes,
+)
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
-from magfusion.model.parameters import Block
-from magfusion.model.site import Site
+from magfusion.model.field import predict
+from magfusion.model.parameters import Block, initial_calibration
+from magfusion.model.site import Beacon, Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Verdict
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.disturbance import Ambient
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.simulation.steel_worlds import draw_steel
+from magfusion.units import Array
 
 SHARED_STEEL = Path(__file__).parents[1].parent / "shared" / "logs" / "steel"
 
@@ -31,13 +40,59 @@ def _map(ratio: float) -> SteelMap:
     """Return a map of one voxel in one mode, of two tones."""
     moment = np.full((1, 2, 3, 1), 1e-3)
     basis = SteelBasis(Voxels(np.zeros((1, 3)), np.ones(1)), moment, moment, 1, 0.0)
-    modes = SteelModes(basis, np.zeros(0), {}, {}, np.zeros(0))
-    block = Block(modes, "site", slice(0, 1), np.array([UNIT]))
-    empty = np.zeros((1, 6, 1)), np.zeros((0, 1))
-    score = Score((block,), np.eye(1), np.zeros(1), np.zeros((1, 0)), *empty)
+    return _of_basis(basis, np.array([2.0]), ratio)
+
+
+def _of_basis(basis: SteelBasis, mean: Array, ratio: float) -> SteelMap:
+    modes, size = SteelModes(basis, np.zeros(0), {}, {}, np.zeros(0)), len(mean)
+    block = Block(modes, "site", slice(0, size), np.full(size, UNIT))
+    empty = np.zeros((1, 6, size)), np.zeros((0, size))
+    score = Score((block,), np.eye(size), np.zeros(size), np.zeros((size, 0)), *empty)
     steel = SteelEstimate(0.02, np.zeros(3), 0.3, 900.0, np.zeros((1, 6, 6)))
-    held_out = {"A": ratio, "B": ratio}
-    return SteelMap(steel, np.array([2.0]), np.array([[0.25]]), score, held_out)
+    return SteelMap(steel, mean, 0.25 * np.eye(size), score, {"A": ratio, "B": ratio})
+
+
+@pytest.mark.parametrize("quadrature", [True, False])
+def test_a_site_with_the_map_predicts_what_its_modes_add(quadrature: bool) -> None:
+    """Of beacons whose coils share a tone, and of coils with a tone each."""
+    site, rng = demo_site(coil_radius=None), np.random.default_rng(4)
+    if not quadrature:
+        site = replace(site, beacons=tuple(map(_tone_each, site.beacons)))
+    poses = Trajectory(
+        np.arange(30.0),
+        np.broadcast_to(np.eye(3), (30, 3, 3)),
+        rng.uniform([2.0, 1.5, 0.8], [4.0, 3.5, 1.6], (30, 3)),
+    )
+    (block,) = steel_modes(site, poses.time, poses, (40, 4))
+    assert isinstance(block.parameter, SteelModes)
+    basis = block.parameter.basis
+    mean = rng.normal(size=block.parameter.columns)
+    known = _of_basis(basis, mean, 0.5).on(site)
+    place = poses.world_from_body, poses.position_world
+    added = np.concatenate(
+        [
+            predict(now, site.platform.magnetometer, *place)
+            - predict(before, site.platform.magnetometer, *place)
+            for now, before in zip(known.beacons, site.beacons, strict=True)
+        ],
+        axis=1,
+    )
+    wanted = basis.phasors(initial_calibration(site, 0.0), poses.time, *place) @ (UNIT * mean)
+    np.testing.assert_allclose(added, wanted, rtol=1e-6, atol=1e-9 * np.max(np.abs(wanted)))
+    again = _of_basis(basis, mean, 0.5).on(known)
+    twice = predict(again.beacons[0], site.platform.magnetometer, *place)
+    once = predict(known.beacons[0], site.platform.magnetometer, *place)
+    np.testing.assert_allclose(
+        twice - once, added[:, : once.shape[1]], rtol=1e-6, atol=1e-9 * np.max(np.abs(wanted))
+    )
+
+
+def _tone_each(beacon: Beacon) -> Beacon:
+    coils = (
+        replace(coil, phase=0.0, frequency_hz=beacon.frequency_hz + k)
+        for k, coil in enumerate(beacon.coils)
+    )
+    return replace(beacon, coils=tuple(coils))
 
 
 def test_a_map_that_predicts_no_other_beacon_is_not_used() -> None:
@@ -80,29 +135,38 @@ def _surveyed_exactly(site: Site) -> Site:
     return replace(site, beacons=beacons, platform=platform)
 
 
-def _mapped(kind: str, place: Path) -> dict[str, Any]:
-    """Return the report of a walk of a minute among steel of a kind."""
+def _walks(kind: str, place: Path) -> dict[str, Any]:
+    """Return the report of a walk of a minute among steel of a kind, mapped.
+
+    ``second`` is another walk there, ``moved`` one without the steel.
+    """
     site = replace(demo_site(coil_radius=None), model_error=0.005)
     rng = np.random.default_rng(0)
     beacons = np.array([beacon.position_world for beacon in site.beacons])
     steel = draw_steel(kind, rng, DEMO_BOX_WORLD, beacons)
-    config = SimulationConfig(
-        DEMO_BOX_WORLD,
-        duration=60.0,
-        imu_rate_hz=100.0,
-        magnetometer_rate_hz=160.0,
-        ambient=Ambient(rails=steel),
-    )
-    write_log(simulate_log(_surveyed_exactly(site), config, rng).log, place / "log")
-    save_site(site, place / "log" / "site.yaml")
-    run_command("smooth", place / "log", "-o", place / "run", "--map-steel")
-    report: dict[str, Any] = json.loads((place / "run" / "report.json").read_text())
+    for name, rails in (("log", steel), ("second", steel), ("moved", None)):
+        config = SimulationConfig(
+            DEMO_BOX_WORLD,
+            duration=60.0,
+            imu_rate_hz=100.0,
+            magnetometer_rate_hz=160.0,
+            ambient=Ambient(rails=rails),
+        )
+        write_log(simulate_log(_surveyed_exactly(site), config, rng).log, place / name)
+        save_site(site, place / name / "site.yaml")
+    return _report(place / "run", "smooth", place / "log", "--map-steel")
+
+
+def _report(place: Path, *command: object) -> dict[str, Any]:
+    run_command(*command, "-o", place)
+    report: dict[str, Any] = json.loads((place / "report.json").read_text())
     return report
 
 
 @pytest.mark.slow
 def test_a_mesh_is_mapped_and_the_sigmas_are_right(tmp_path: Path) -> None:
-    report = _mapped("mesh", tmp_path)
+    """Of the log, and of the next one by `smooth` and by the filter, which take the map."""
+    report = _walks("mesh", tmp_path)
     assert report["verdict"] == "trustworthy"
     assert report["steel_map_used"]
     assert report["attitude_rmse_deg"] < 0.06
@@ -110,12 +174,27 @@ def test_a_mesh_is_mapped_and_the_sigmas_are_right(tmp_path: Path) -> None:
     assert 1.0 < report["nees_mean"] < 12.6  # 95 % of chi square of six
     voxels = pyarrow.parquet.read_table(tmp_path / "run" / "steel.parquet").to_pandas()
     assert np.all(voxels.polarisability_sigma_m3 > 0.0)
+    site = "--site", tmp_path / "run" / "site.yaml"
+    ratio = {}
+    for name, command in (("smooth", ("smooth",)), ("ekf", ("navigate", "--estimator", "ekf"))):
+        plain = _report(tmp_path / f"{name}_plain", *command, tmp_path / "second")
+        mapped = _report(tmp_path / name, *command, tmp_path / "second", *site)
+        assert mapped["verdict"] == "trustworthy"
+        assert not any(remark["code"] == "steel_moved" for remark in mapped["remarks"])
+        assert 1.0 < mapped["nees_mean"] < 12.6
+        ratio[name] = mapped["ate_m"] / plain["ate_m"]
+    assert ratio["smooth"] < 1.0
+    assert ratio["ekf"] < 0.8
+    plain = _report(tmp_path / "moved_plain", "smooth", tmp_path / "moved")
+    mapped = _report(tmp_path / "moved_mapped", "smooth", tmp_path / "moved", *site)
+    assert any(remark["code"] == "steel_moved" for remark in mapped["remarks"])
+    assert mapped["ate_m"] < 1.1 * plain["ate_m"]
 
 
 @pytest.mark.slow
 def test_a_map_of_racks_is_wrong_and_not_used(tmp_path: Path) -> None:
     """Long rods conduct the flux of a beacon to places where its field is weak."""
-    report = _mapped("racks", tmp_path)
+    report = _walks("racks", tmp_path)
     assert not report["steel_map_used"]
     assert not (tmp_path / "run" / "steel.parquet").exists()
 

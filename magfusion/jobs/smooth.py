@@ -200,6 +200,7 @@ def run_smooth(
     """
     from magfusion.estimation.batch.self_survey import smooth_and_place
     from magfusion.estimation.integrity.magnetometer_exclusion import agreed_smoothed
+    from magfusion.estimation.integrity.steel_map import MOVED, explained_without_map
     from magfusion.jobs.inputs import named
     from magfusion.jobs.result_directory import claim, refuse_failed
     from magfusion.jobs.smooth_correction import corrected
@@ -222,6 +223,10 @@ def run_smooth(
     try:
         with named(job.log_path):
             result, placed = smooth_and_place(log, site, settings, report, iterations_file)
+            moved = explained_without_map(result)
+            if moved:
+                site = site.without_steel()
+                result, placed = smooth_and_place(log, site, settings, report)
             log, site, result, findings = agreed_smoothed(result, log, site, settings, risk)
     except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
         estimate = _without_result(job, log, site, settings, risk, error, report)
@@ -234,6 +239,7 @@ def run_smooth(
     else:
         give_back_memory()
         findings += () if rested is None else beyond(recording, log, site)
+        findings += (MOVED,) if moved else ()
         done = finished(log, site, settings, result, risk, findings=findings, mapping=mapping)
         parts = done.corrections, done.trust.reasons, findings, report
         done = corrected(log, site, settings, risk, *parts, mapping=mapping) or done

@@ -259,6 +259,8 @@ def write_finished(whole: Path, log: Log, done: Finished, *, rate: Rate) -> None
         states = replace(result.states, gyro_bias_body=None, accel_bias_body=None)
         result = replace(result, states=states)
     refined, innovations = result_site(result, log.name), _innovations(result)
+    if done.steel is not None:
+        refined = done.steel.on(refined)
     written = result.states
     if rate != "field":
         from magfusion.estimation.batch.between_epochs import at_rate

@@ -106,6 +106,9 @@ def diagnosed(
         return None
     if not site.beacons or any(beacon.unknown is not None for beacon in site.beacons):
         return None
+    is_steel = any(finding.code == STEEL for finding in trust.reasons)
+    if is_steel and site.without_steel() is not site:
+        return None  # its map is not of what is there
     several = bool(site.platform.further)
     log, site = first_magnetometer(log, site)
     # Of all that can be wrong nothing is needed where nothing is.
@@ -117,7 +120,7 @@ def diagnosed(
         return None
     one, text = said
     known = _diagnosis(one, text, trust.verdict, several)
-    if not known.is_clear and any(finding.code == STEEL for finding in trust.reasons):
+    if not known.is_clear and is_steel:
         return None
     if one.rival is None:
         return known

@@ -14,6 +14,7 @@ import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed, solved_again
 from magfusion.estimation.graph.graph import read_states
+from magfusion.estimation.integrity.fixed_parameter_test import MARGIN
 from magfusion.estimation.integrity.score import (
     Score,
     field_residual,
@@ -37,11 +38,18 @@ from magfusion.estimation.measurements.steel import MAX_EPOCHS, UNIT, Voxels, st
 from magfusion.model.parameters import Block
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
+from magfusion.model.steel_field import SteelField
 from magfusion.model.trust import Finding, Verdict
-from magfusion.units import Array
+from magfusion.units import MU0, Array
 
 SHARED, OWN, PLACES = 400, 30, 150  # modes of a map: of all beacons, and of each tone
 LEAST_BEACONS = 4  # without one, three determine the pose
+MOVED = Finding(
+    "steel_moved",
+    "The log is explained better without the map of steel in its site: steel was moved, or the map"
+    " is of another room. The map is not used. Map the steel again (magfusion smooth --map-steel).",
+    Verdict.TRUSTWORTHY,
+)
 LARGEST_RATIO = 0.97  # of errors of beacons left out, with the map over those without
 
 
@@ -105,6 +113,23 @@ class SteelMap(NamedTuple):
         variance = np.sum(((unit @ self.cov) * unit.conj()).real, axis=(2, 3))
         return np.sqrt(np.mean(mean, axis=1)), np.sqrt(np.mean(variance, axis=1))
 
+    def on(self, site: Site) -> Site:
+        """Return a site whose beacons have the steel of the map, besides what they had."""
+        voxels, start, beacons = self.voxels, 0, []
+        of_tones = basis_of(self.score).moment @ (UNIT / MU0 * self.mean)
+        for beacon in site.beacons:
+            moment = of_tones[:, start : start + len(beacon.tones)]
+            start += len(beacon.tones)
+            # Coils' moments are real; a tone in quadrature has those of two coils.
+            drive = np.concatenate([beacon.excitation.real, beacon.excitation.imag], axis=1).T
+            parts = np.concatenate([moment.real, moment.imag], axis=1)
+            of_coils = np.linalg.pinv(drive) @ parts
+            steel = SteelField(voxels.centre_world, 0.5 * voxels.edge, of_coils)
+            known = beacon.steel
+            steel = steel if known is None else known.joined(steel)
+            beacons.append(replace(beacon, steel=steel))
+        return replace(site, beacons=tuple(beacons))
+
     def applied(self, result: Smoothed) -> Smoothed:
         """Return a result whose states and calibration are those with the map."""
         cov, own = result.states.pose_cov, block_of(self.score).columns
@@ -121,6 +146,23 @@ class SteelMap(NamedTuple):
             calibration_cov=result.calibration_cov + by_calibration @ self.cov @ by_calibration.T,
             estimate=estimate,
         )
+
+
+def explained_without_map(result: Smoothed) -> bool:
+    """Return whether a log is explained better without its site's map of steel."""
+    if result.declared.site.without_steel() is result.declared.site:
+        return False
+    estimate = result.estimate
+    bare, *segments = (
+        replace(known, site=known.site.without_steel())
+        for known in (estimate.calibration, *estimate.segments)
+    )
+    start = replace(estimate, calibration=bare, segments=tuple(segments))
+    try:
+        other = solved_again(replace(result, estimate=start), result.graph.measurements)
+    except RuntimeError:  # GTSAM's: without it the poses are undetermined
+        return False
+    return 2.0 * (result.cost - other.cost) > MARGIN
 
 
 def step_of(score: Score, mean: Array) -> Array:
