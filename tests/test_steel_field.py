@@ -3,12 +3,13 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import magpylib
 import numpy as np
 import pyarrow.parquet
 import pytest
-from conftest import change_table
+from conftest import change_table, run_command
 from derivatives import central_difference, relative_to_group
 
 from magfusion.errors import InputError
@@ -39,6 +40,7 @@ def _site() -> Site:
 def test_a_voxel_is_a_uniformly_magnetised_sphere() -> None:
     """As magpylib has it, outside and inside."""
     steel, rng = _steel(), np.random.default_rng(1)
+    magnets: Any = magpylib.magnet
     place = CENTRE_WORLD[0] + rng.uniform(-0.3, 0.3, (40, 3))
     distance = np.linalg.norm(place[:, None] - CENTRE_WORLD, axis=2)
     assert np.sum(distance < RADIUS) > 3  # inside
@@ -46,7 +48,7 @@ def test_a_voxel_is_a_uniformly_magnetised_sphere() -> None:
     for centre, radius, moment in zip(CENTRE_WORLD, RADIUS, steel.moment_world, strict=True):
         volume = 4.0 / 3.0 * np.pi * radius**3
         for k in range(2):
-            sphere = magpylib.magnet.Sphere(
+            sphere = magnets.Sphere(
                 diameter=2.0 * radius, position=centre, magnetization=moment[k] / volume
             )
             wanted[:, k] += sphere.getB(place)
@@ -125,6 +127,15 @@ def test_a_wrong_map_of_steel_is_refused(
         load_site(tmp_path / "site.yaml")
     assert str(error.value).startswith(f"{tmp_path / 'site_steel.parquet'}: ")
     assert said in str(error.value)
+
+
+def test_a_simulated_log_has_no_map_of_steel(tmp_path: Path) -> None:
+    """The simulator does not know the estimators' model."""
+    save_site(_site(), tmp_path / "site.yaml")
+    simulate = "simulate", "--site", tmp_path / "site.yaml", "--duration", 2
+    run_command(*simulate, "-o", tmp_path / "log")
+    assert load_site(tmp_path / "log" / "site.yaml").beacons[0].steel is None
+    assert not (tmp_path / "log" / "site_steel.parquet").exists()
 
 
 def test_the_file_has_a_row_for_each_voxel_and_coil(tmp_path: Path) -> None:

@@ -177,7 +177,8 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
         site = load_site(settings.site, several=True, unknown=True)
         if is_for_ranging(site):
             return _simulate_ranging(settings, site, output)
-        site = load_site(settings.site, several=True)
+        # The simulator has no model of the estimator's, and --steel has the steel of the room.
+        site = load_site(settings.site, several=True).without_steel()
     _refuse_wells(settings, site)
     box = box_option(settings.box)
     box = DEMO_BOX_WORLD if box is None else box
