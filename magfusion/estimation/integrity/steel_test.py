@@ -89,11 +89,12 @@ class SteelEstimate(NamedTuple):
             text += " The covariance includes its effect."
             return Finding(STEEL, text, Verdict.TRUSTWORTHY, self.weight)
         needed = _rounded_up(self.distortion)
-        again = "" if site.without_steel() is site else " again, as its map does not explain it"
+        new = site.without_steel() is site
         text += (
-            " No error of single parameters explains the log as well. Map it"
-            f" (magfusion smooth --map-steel){again}, map the field (magfusion calibrate fieldmap),"
-            f" or declare world.model_error {needed:.2g}."
+            " No error of single parameters explains the log as well."
+            f" {'Map it' if new else 'The map of the site does not explain it: map it again'}"
+            " (magfusion smooth --map-steel), map the field (magfusion calibrate fieldmap), or"
+            f" declare world.model_error {needed:.2g}."
         )
         remedy = changed_keys(site, replace(site, model_error=needed))
         return Finding(STEEL, text, Verdict.DOUBTFUL, self.weight, remedy=remedy)

@@ -26,7 +26,7 @@ class Calibration:
 
     Parameters
     ----------
-    phase : ndarray, shape (channels,)
+    phase : ndarray, shape (channels,) or (poses, channels)
         Drive phase of each channel at ``reference_time`` beyond the coils' own (rad), the same of
         every magnetometer.
     drift : ndarray, shape (beacons,)
@@ -35,7 +35,7 @@ class Calibration:
         An IMU sample stamped t was taken at t + time_offset (s), at ``imu_begin``.
     reference_time : float
         Reference of ``phase`` (s).
-    log_gain : ndarray, shape (channels,)
+    log_gain : ndarray, shape (channels,) or (poses, channels)
         Logarithm of the ratio of each channel's phasor to that of the site.
     others : mapping
         Values of parameters without a field here, by ``owner.kind``; absent means zero.
@@ -44,8 +44,6 @@ class Calibration:
         Seconds of the log's clock per second of the IMU's, less one.
     imu_begin : float
         IMU stamp at which its time offset is defined (s): the first.
-
-    ``phase`` and ``log_gain`` may have one row for each pose.
     """
 
     __repr__ = short_repr
