@@ -14,17 +14,21 @@ from test_navigate_stream import answered, records
 
 from magfusion.cli import main
 from magfusion.estimation.data_checks.running import nothing
+from magfusion.estimation.graph.state import State
 from magfusion.estimation.online import running_estimate
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.online.restored import restored
+from magfusion.estimation.online_integrity.imu_checks import judge_biases
 from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
 from magfusion.estimation.online_integrity.recovery import LONGEST_WAIT, Attempts
 from magfusion.estimation.online_integrity.summary import Summary
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.jobs.stream import StreamSettings
+from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import FieldSamples, ImuSamples, Log
 from magfusion.model.trust import Finding, Verdict
+from magfusion.simulation.demo_site import demo_site
 
 BOTH = ["smoother", "ekf"]
 
@@ -183,6 +187,29 @@ def test_a_bias_that_no_such_instrument_has_is_said_and_covered(
     assert all("imu_bias" in codes([state]) for state in states)
     assert all(state.verdict is Verdict.DOUBTFUL for state in states)
     assert states[-1].rotation_sigma > 0.8 * bias / walk.site.gravity
+
+
+def test_a_bias_that_is_barely_determined_is_measured_by_its_declaration() -> None:
+    """Two sigma are no doubt, however little the estimate is known to have gained; six are."""
+    site = demo_site()
+    imu, kept = site.platform.imu, 0.99  # share of the prior that remains
+    cov = np.eye(15)
+    cov[9:12, 9:12] = kept * imu.accel_bias_sigma**2 * np.eye(3)
+    cov[12:, 12:] = kept * imu.gyro_bias_sigma**2 * np.eye(3)
+    for sigmas, wanted in ((2.0, []), (6.0, ["imu_bias"])):
+        bias = np.array([0.0, sigmas * imu.accel_bias_sigma, 0.0])
+        state = State(
+            0.0,
+            np.eye(3),
+            np.zeros(3),
+            np.zeros(3),
+            bias,
+            np.zeros(3),
+            initial_calibration(site, 0.0),
+            cov,
+        )
+        judgement = judge_biases(site, state, 0.0)
+        assert [finding.code for finding in judgement.findings] == wanted
 
 
 @pytest.mark.slow
