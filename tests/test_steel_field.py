@@ -63,6 +63,7 @@ def test_the_gradient_is_that_of_the_field() -> None:
     assert relative_to_group(gradient, expected) < 1e-8
     # Neither curl nor divergence.
     np.testing.assert_allclose(gradient, np.swapaxes(gradient, 1, 2), rtol=1e-9, atol=1e-18)
+    assert steel.fields_and_gradients(np.zeros((0, 3)))[1].shape == (0, 2, 3, 3)
     np.testing.assert_allclose(np.trace(gradient, axis1=1, axis2=2), 0.0, rtol=0.0, atol=1e-15)
 
 

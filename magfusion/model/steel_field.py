@@ -52,7 +52,7 @@ class SteelField:
     def fields(self, position_world: Array) -> Array:
         """Return the field, as `fields_and_gradients`."""
         parts = [some.field(self._centred) for some in self._near(position_world)]
-        return np.concatenate(parts).reshape(*position_world.shape[:-1], -1, 3)
+        return np.concatenate(parts).reshape(*position_world.shape[:-1], self.coils, 3)
 
     def fields_and_gradients(self, position_world: Array) -> tuple[Array, Array]:
         """Return the field and its gradient.
@@ -70,7 +70,7 @@ class SteelField:
             ``[i, j] = d field_i / d position_j`` (T/m).
         """
         near = list(self._near(position_world))
-        shape = *position_world.shape[:-1], -1, 3
+        shape = *position_world.shape[:-1], self.coils, 3
         field = np.concatenate([some.field(self._centred) for some in near])
         gradient = np.concatenate([some.gradient(self._centred) for some in near])
         return field.reshape(shape), gradient.reshape(*shape, 3)
@@ -93,7 +93,7 @@ class SteelField:
     def _near(self, position_world: Array) -> Iterator["_Points"]:
         """Yield points with what all voxels are to them, some points at a time."""
         flat = position_world.reshape(-1, 3) - self._origin_world
-        voxels, coils = self._centred, self.coils
+        voxels = self._centred
         by_moment = np.ascontiguousarray(self.moment_world.transpose(2, 1, 0)).reshape(3, -1)
         for point in np.array_split(flat, max(1, len(flat) * len(self.radius) // AT_ONCE)):
             square = np.sum(point**2, axis=1)[:, None] + np.sum(voxels.centre**2, axis=1)
@@ -104,7 +104,7 @@ class SteelField:
             direct, radial = -cube, 3.0 * cube * inverse
             direct[inside] *= -2.0
             radial[inside] = 0.0
-            along = (point @ by_moment).reshape(len(point), coils, -1) - voxels.along
+            along = (point @ by_moment).reshape(len(point), *voxels.along.shape) - voxels.along
             yield _Points(point, inverse, direct, radial, along * radial[:, None])
 
 
@@ -132,15 +132,15 @@ class _Points(NamedTuple):
 
     def field(self, voxels: _Voxels) -> Array:
         """Return the field of all voxels, shape (n, coils, 3)."""
-        by_moment = (self.direct @ voxels.moment).reshape(len(self.point), -1, 3)
+        by_moment = (self.direct @ voxels.moment).reshape(*self.along.shape[:2], 3)
         total = np.sum(self.along, axis=2)[..., None]
         return total * self.point[:, None] - self.along @ voxels.centre + by_moment
 
     def gradient(self, voxels: _Voxels) -> Array:
         """Return its gradient, shape (n, coils, 3, 3)."""
-        count, place = len(self.point), self.point[:, None, :, None]
-        moment = (self.radial @ voxels.moment).reshape(count, -1, 1, 3)
-        outer = place * moment - (self.radial @ voxels.outer).reshape(count, -1, 3, 3)
+        shape, place = self.along.shape[:2], self.point[:, None, :, None]
+        moment = (self.radial @ voxels.moment).reshape(*shape, 1, 3)
+        outer = place * moment - (self.radial @ voxels.outer).reshape(*shape, 3, 3)
         steeper = 5.0 * self.along * self.inverse[:, None]
         cross = place * (steeper @ voxels.centre)[:, :, None]
         total = np.sum(steeper, axis=2)[..., None, None]
