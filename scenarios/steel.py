@@ -27,7 +27,7 @@ from magfusion.model.noise import model_error
 from magfusion.model.parameters import BeaconParameter, Block, placed
 from magfusion.model.parameters.parameter import PhasorView
 from magfusion.model.samples import Log
-from magfusion.model.site import Beacon, BeaconSigma, MagnetometerSigma, Site
+from magfusion.model.site import Beacon, Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.results.errors import trajectory_errors
 from magfusion.results.refinement import result_site
@@ -145,7 +145,7 @@ def judge(walk: Walk, _: np.random.Generator) -> Row:
     if isinstance(steel_map, SteelMap):
         mapped = _mapped(steel_map, result, truth)
         if steel_map.is_used:
-            again = simulate_log(_as_built(built.true_site), config, rng).log
+            again = simulate_log(built.true_site, replace(config, perturb=False), rng).log
             mapped |= _second(steel_map, result, again)
     return Row(
         kind,
@@ -194,17 +194,6 @@ def _second(steel: SteelMap, result: Smoothed, again: Log) -> dict[str, float]:
         "second_map_nees": _mean_nees(known.states, truth),
         "second_map_kept": not explained_without_map(known),
     }
-
-
-def _as_built(site: Site) -> Site:
-    """Return a true site of which nothing is drawn again."""
-    none, sensor = np.zeros(3), site.platform.magnetometer
-    sensor = replace(sensor, sigma=MagnetometerSigma(np.zeros((3, 3)), none, none, none))
-    beacons = tuple(
-        replace(beacon, sigma=BeaconSigma(none, none, np.zeros(len(beacon.coils))))
-        for beacon in site.beacons
-    )
-    return replace(site, beacons=beacons, platform=replace(site.platform, magnetometer=sensor))
 
 
 def _distortion(site: Site, point_world: Array, steel: SteelStructure) -> float:

@@ -76,7 +76,7 @@ class Sources(NamedTuple):
 
     @property
     def is_mapped(self) -> bool:
-        """Whether its field depends on the place in the room."""
+        """Whether it has a map of its field, or of steel."""
         return self.field_map is not None or self.steel is not None
 
 

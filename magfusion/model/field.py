@@ -52,7 +52,7 @@ class _Mapped(NamedTuple):
 
     model_beacon: AnyArray  # (..., coils, 3), field of each coil without them
     correction: Array  # (..., 1, 3, 3), multiplies it
-    slope: AnyArray  # (..., coils, 3, 3), contribution of the map's gradient to the field gradient
+    slope: AnyArray  # (..., coils, 3, 3), contribution of both to the field gradient
     added: Array | float = 0.0  # (..., coils, 3), field of steel
 
     @property

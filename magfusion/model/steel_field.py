@@ -85,6 +85,7 @@ class SteelField:
         return _Voxels(
             centre,
             moment.reshape(len(moment), -1),
+            np.ascontiguousarray(moment.transpose(2, 1, 0)).reshape(3, -1),
             np.einsum("vci,vi->cv", moment, centre),
             np.einsum("vi,vcj->vcij", centre, moment).reshape(len(moment), -1),
             np.einsum("vi,vj->vij", centre, centre).reshape(len(moment), -1),
@@ -94,7 +95,6 @@ class SteelField:
         """Yield points with what all voxels are to them, some points at a time."""
         flat = position_world.reshape(-1, 3) - self._origin_world
         voxels = self._centred
-        by_moment = np.ascontiguousarray(self.moment_world.transpose(2, 1, 0)).reshape(3, -1)
         for point in np.array_split(flat, max(1, len(flat) * len(self.radius) // AT_ONCE)):
             square = np.sum(point**2, axis=1)[:, None] + np.sum(voxels.centre**2, axis=1)
             square -= 2.0 * point @ voxels.centre.T
@@ -104,7 +104,7 @@ class SteelField:
             direct, radial = -cube, 3.0 * cube * inverse
             direct[inside] *= -2.0
             radial[inside] = 0.0
-            along = (point @ by_moment).reshape(len(point), *voxels.along.shape) - voxels.along
+            along = (point @ voxels.by_coil).reshape(len(point), *voxels.along.shape) - voxels.along
             yield _Points(point, inverse, direct, radial, along * radial[:, None])
 
 
@@ -113,9 +113,10 @@ class _Voxels(NamedTuple):
 
     centre: Array  # (v, 3)
     moment: Array  # (v, coils * 3)
+    by_coil: Array  # (3, coils * v), the same
     along: Array  # (coils, v), of the centre times the moment
-    outer: Array  # (v, coils * 9), the same as matrices
-    radial: Array  # (v, 9), of the centre times itself
+    outer: Array  # (v, coils * 9), their outer product
+    radial: Array  # (v, 9), outer product of the centre
 
 
 class _Points(NamedTuple):
