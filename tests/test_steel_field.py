@@ -9,6 +9,7 @@ import magpylib
 import numpy as np
 import pyarrow.parquet
 import pytest
+import yaml
 from conftest import change_table, run_command
 from derivatives import central_difference, relative_to_group
 
@@ -16,6 +17,7 @@ from magfusion.errors import InputError
 from magfusion.files.site import load_site, save_site
 from magfusion.model.site import Site
 from magfusion.model.steel_field import SteelField
+from magfusion.results.design.pattern import template_of
 from magfusion.simulation.demo_site import demo_site
 
 CENTRE_WORLD = np.array([[1.0, 2.0, 0.5], [3.0, 1.0, 1.5], [2.0, 2.5, 2.0]])  # m
@@ -114,8 +116,8 @@ def _drop_coil(path: Path) -> None:
     [
         (_change_radius, "column radius_m, row 0: found 0.0; write a positive number"),
         (_drop_moment, "column moment_y_a_m2 is missing"),
-        (_rename_beacon, "beacon Z has other coils here than in the site"),
-        (_drop_coil, "beacon A has other coils here than in the site"),
+        (_rename_beacon, "has the steel of beacon Z, which the site does not have, and none of"),
+        (_drop_coil, "beacon A has other coils here than in the site; omit world.steel and map"),
         (Path.unlink, "there is no such file; give the path of a map of steel"),
     ],
 )
@@ -128,6 +130,28 @@ def test_a_wrong_map_of_steel_is_refused(
         load_site(tmp_path / "site.yaml")
     assert str(error.value).startswith(f"{tmp_path / 'site_steel.parquet'}: ")
     assert said in str(error.value)
+
+
+def test_a_removed_beacon_takes_its_steel_with_it(tmp_path: Path) -> None:
+    """Its moments are of no other beacon's field; one of a new name may be the same, renamed."""
+    save_site(_site(), tmp_path / "site.yaml")
+    content = yaml.safe_load((tmp_path / "site.yaml").read_text())
+    first, second = content["beacons"][:2]
+    (tmp_path / "site.yaml").write_text(yaml.safe_dump(content | {"beacons": [second]}))
+    (known,) = load_site(tmp_path / "site.yaml").beacons
+    assert known.steel is not None
+    assert len(known.steel.radius) == 2 * len(RADIUS)
+    renamed = content | {"beacons": [first | {"name": "Z"}, second]}
+    (tmp_path / "site.yaml").write_text(yaml.safe_dump(renamed))
+    with pytest.raises(InputError, match=r"beacon A, .* none of beacon Z; .* omit world\.steel"):
+        load_site(tmp_path / "site.yaml")
+    del renamed["world"]["steel"]
+    (tmp_path / "site.yaml").write_text(yaml.safe_dump(renamed))
+    assert load_site(tmp_path / "site.yaml").beacons[1].steel is None
+
+
+def test_a_copied_beacon_induces_nothing_in_the_steel_of_its_model() -> None:
+    assert template_of(_site(), "A").steel is None
 
 
 def test_a_simulated_log_has_no_map_of_steel(tmp_path: Path) -> None:

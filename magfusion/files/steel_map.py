@@ -24,6 +24,7 @@ from magfusion.model.steel_field import SteelField
 from magfusion.units import AnyArray, Array
 
 STEEL_MAP = "steel.parquet"
+_AGAIN = "omit world.steel and map the steel again (magfusion smooth --map-steel)."
 _MOMENT = ("moment_x_a_m2", "moment_y_a_m2", "moment_z_a_m2")
 
 
@@ -71,6 +72,11 @@ def read_steel_fields(path: Path, coils: dict[str, int]) -> dict[str, SteelField
     coils : dict of str to int
         Names of the site's beacons, and how many coils each has.
 
+    Returns
+    -------
+    dict
+        Without beacons that were removed from the site.
+
     Raises
     ------
     InputError
@@ -85,13 +91,19 @@ def read_steel_fields(path: Path, coils: dict[str, int]) -> dict[str, SteelField
     )
     radius = numbers(table, "radius_m", path)
     refuse_rows(radius <= 0.0, path, "column radius_m", radius, "a positive number")
+    mapped = list(dict.fromkeys(beacon.tolist()))
+    removed, new = [n for n in mapped if n not in coils], [n for n in coils if n not in mapped]
+    if removed and new:
+        raise InputError(
+            f"{path}: has the steel of beacon {removed[0]}, which the site does not have, and none"
+            f" of beacon {new[0]}; name the beacons of the site as in the map, or {_AGAIN}"
+        )
     result = {}
-    for name in dict.fromkeys(beacon.tolist()):
-        rows = [np.flatnonzero((beacon == name) & (coil == k)) for k in range(coils.get(name, 0))]
+    for name in [n for n in mapped if n in coils]:
+        rows = [np.flatnonzero((beacon == name) & (coil == k)) for k in range(coils[name])]
         if len({len(own) for own in rows}) != 1 or sum(map(len, rows)) != np.sum(beacon == name):
             raise InputError(
-                f"{path}: beacon {name} has other coils here than in the site (which has beacons"
-                f" {', '.join(coils)}); map the steel of this site."
+                f"{path}: beacon {name} has other coils here than in the site; {_AGAIN}"
             )
         first = rows[0]
         moment_world = np.stack([moment[own] for own in rows], axis=1)

@@ -144,7 +144,7 @@ def template_of(site: Site, name: str | None) -> Beacon:
             f"--template {name}: the site has no such beacon; it has {', '.join(names)}"
         )
     result = site.beacons[0 if name is None else names.index(name)]
-    return replace(result, field_map=None, hemisphere_beacon=None, unknown=None)
+    return replace(result, field_map=None, steel=None, hemisphere_beacon=None, unknown=None)
 
 
 def frequencies_for(
