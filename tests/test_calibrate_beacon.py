@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.files.site import load_site, save_site
 from magfusion.files.survey import Survey, write_survey
 from magfusion.model.site import Beacon, BeaconSigma, Site
+from magfusion.model.steel_field import SteelField
 from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.log import draw_drives, perturb_site, simulate_fields
@@ -119,6 +120,25 @@ def test_an_unknown_drive_phase_leaves_the_turn_about_the_axis(tmp_path: Path) -
     np.testing.assert_allclose(
         refined.beacons[1].position_world, site.beacons[1].position_world, rtol=0.0, atol=0.0
     )
+
+
+def test_a_map_of_steel_is_not_of_the_beacon_that_a_survey_refines(tmp_path: Path) -> None:
+    """As its field map it goes, and the survey alone decides; another beacon keeps its own."""
+    site, _ = written(tmp_path)
+    steel = SteelField(np.array([[2.0, 1.0, 1.0]]), np.array([0.2]), np.full((1, 2, 3), 5.0))
+    mapped = replace(site, beacons=tuple(replace(b, steel=steel) for b in site.beacons))
+    save_site(mapped, tmp_path / "mapped.yaml")
+    results = []
+    for name in ("site", "mapped"):
+        run_command(
+            "calibrate", "beacon", tmp_path / "survey.parquet", "--beacon", "A",
+            "--site", tmp_path / f"{name}.yaml", "-o", tmp_path / name,
+        )  # fmt: skip
+        results.append(load_site(tmp_path / name / "site.yaml").beacons)
+    (plain, _), (refined, other) = results
+    np.testing.assert_array_equal(refined.position_world, plain.position_world)
+    assert refined.steel is None
+    assert other.steel is not None
 
 
 def corrupted(root: Path, survey: Survey) -> tuple[object, ...]:

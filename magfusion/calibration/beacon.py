@@ -204,7 +204,7 @@ def _columns(measured: BeaconMeasurements, centre: Array) -> tuple[Array, Array]
             replace(coil, moment_beacon=axis, phase=0.0, slot=slot, radius=None, length=None)
             for slot, axis in enumerate(beacon.world_from_beacon)
         )
-        alone = replace(beacon, position_world=np.zeros(3), coils=axes, field_map=None)
+        alone = replace(beacon, position_world=np.zeros(3), coils=axes, field_map=None, steel=None)
         seen, by_pose = observe_from(alone, measured.magnetometer, bodies, offset)
         by_place = -by_pose[..., 3:] @ np.swapaxes(rotated, -1, -2)[:, None]
         value[:, :, tone][..., own] = np.einsum("ua,kpai->kpiu", units[own, tone], seen)

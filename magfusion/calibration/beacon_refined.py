@@ -163,6 +163,7 @@ def refine(measured: BeaconMeasurements, fits: BeaconFits, run: int = 0) -> Refi
         ),
         sigma=sigma,
         field_map=None,  # it corrected the beacon as it was declared
+        steel=None,  # the moments that this beacon induced
     )
     return RefinedBeacon(result, phase[0], free_parameters)
 

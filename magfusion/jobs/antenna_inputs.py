@@ -56,10 +56,10 @@ def tracker(site: Site, name: str | None) -> Beacon:
             f"beacon {result[0].name} is not synchronised: the sign of its couplings is unknown;"
             " survey it with synchronised: true"
         )
-    if result[0].field_map is not None:
+    if result[0].field_map is not None or result[0].steel is not None:
         raise InputError(
-            f"beacon {result[0].name} has a field map of the old antennas; calibrate the antennas"
-            " first, then calibrate the map again"
+            f"beacon {result[0].name} has a map of its field or of steel with the old antennas; omit"
+            " world.field_map and world.steel, calibrate the antennas, then map again"
         )
     return result[0]
 
