@@ -9,9 +9,15 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 from conftest import Refuse, run_command
+from small_problem import small_log
 
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.steel_map import LARGEST_RATIO, SteelMap
+from magfusion.estimation.integrity.steel_map import (
+    LARGEST_RATIO,
+    SteelMap,
+    explained_without_map,
+)
 from magfusion.estimation.integrity.steel_test import SteelEstimate
 from magfusion.estimation.measurements.steel import (
     UNIT,
@@ -25,6 +31,7 @@ from magfusion.files.site import save_site
 from magfusion.model.field import predict
 from magfusion.model.parameters import Block, initial_calibration
 from magfusion.model.site import Beacon, Site
+from magfusion.model.steel_field import SteelField
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Verdict
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -219,6 +226,17 @@ def test_a_log_without_steel_is_not_mapped(log: Path, tmp_path: Path) -> None:
         remark["text"].startswith("The steel is not mapped: the log shows none")
         for remark in report["remarks"]
     )
+
+
+def test_fixes_in_a_graph_do_not_test_a_map() -> None:
+    """They contain it, and the graph has no fields that could contradict it."""
+    small = small_log(10)
+    steel = SteelField(np.array([[2.0, 1.0, -1.0]]), np.array([0.2]), np.full((1, 2, 3), 1e-3))
+    beacons = tuple(replace(beacon, steel=steel) for beacon in small.site.beacons)
+    result = smooth(
+        small.log, replace(small.site, beacons=beacons), SmootherSettings(coupling="loose")
+    )
+    assert not explained_without_map(result)
 
 
 def test_whole_rests_are_not_mapped(log: Path, refuse: Refuse) -> None:

@@ -149,8 +149,13 @@ class SteelMap(NamedTuple):
 
 
 def explained_without_map(result: Smoothed) -> bool:
-    """Return whether a log is explained better without its site's map of steel."""
+    """Return whether a log is explained better without its site's map of steel.
+
+    False of a graph of fixes, which compares no fields.
+    """
     if result.declared.site.without_steel() is result.declared.site:
+        return False
+    if not any(isinstance(m, FieldPhasors) for m in result.graph.measurements):
         return False
     estimate = result.estimate
     bare, *segments = (
