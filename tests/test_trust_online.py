@@ -212,6 +212,23 @@ def test_a_bias_that_is_barely_determined_is_measured_by_its_declaration() -> No
         assert [finding.code for finding in judgement.findings] == wanted
 
 
+@pytest.mark.parametrize("walk", [1e-3, 0.0])
+def test_a_bias_declared_as_zero_walks_before_the_first_state(walk: float) -> None:
+    """As declared, or as the estimators let it so that states are not tied to the last digit."""
+    site = demo_site()
+    imu = replace(
+        site.platform.imu, accel_bias_sigma=0.0, gyro_bias_sigma=0.0, accel_bias_walk=walk
+    )
+    site = replace(site, platform=replace(site.platform, imu=imu))
+    for size, wanted in ((2e-5, []), (0.02, ["imu_bias"])):  # m/s^2
+        bias, calibration = np.array([size, 0.0, 0.0]), initial_calibration(site, 0.0)
+        state = State(
+            0.0, np.eye(3), np.zeros(3), np.zeros(3), bias, np.zeros(3), calibration, np.eye(15)
+        )
+        judgement = judge_biases(site, state, 0.0)
+        assert [finding.code for finding in judgement.findings] == wanted
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_an_imu_that_comes_loose_is_noticed(walk: OnlineLog, estimator: str) -> None:

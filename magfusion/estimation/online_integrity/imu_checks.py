@@ -4,6 +4,7 @@ import numpy as np
 
 from magfusion.estimation.data_checks.running import DecayingSums
 from magfusion.estimation.data_checks.steady_field import DOUBT
+from magfusion.estimation.graph.preintegration import bias_walks
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.model.site import Site
@@ -12,23 +13,26 @@ from magfusion.model.trust import Finding, Verdict
 LEAST_SPAN = 1.0  # s; of inertial data, before gravity is tested
 DETECTION_SIGMAS = 6.0
 BEYOND_HELP = 0.2  # rad; a bias that tilts the vertical more makes inflation useless
-LEAST_SIGMA = 1e-9  # m/s^2, rad/s; of a bias that is declared as known
+START_SPAN = 6.0  # s; of the data before the first state, over which a bias walks, too
 TURN_INTERVAL = 1.0  # s; of a gyro bias, before the fields correct it
 
 
 def judge_biases(site: Site, state: State, elapsed: float) -> Judgement:
-    """Test the biases against their declared sigmas and random walks since the start (s)."""
+    """Test the biases against their declared sigmas and random walks since the start (s).
+
+    The walks are those of the estimators, in which even a bias of sigma zero moves.
+    """
     if not site.platform.inertial:
         return Judgement()
     imu = site.platform.imu
+    gyro_walk, accel_walk = bias_walks(imu)
     result, inflation, turn = [], 1.0, 0.0
     for code, name, bias, sigma, walk, unit in (
         ("accel_bias", "accelerometer", state.accel_bias_body, imu.accel_bias_sigma,
-         imu.accel_bias_walk, "m/s^2"),
-        ("gyro_bias", "gyro", state.gyro_bias_body, imu.gyro_bias_sigma, imu.gyro_bias_walk,
-         "rad/s"),
+         accel_walk, "m/s^2"),
+        ("gyro_bias", "gyro", state.gyro_bias_body, imu.gyro_bias_sigma, gyro_walk, "rad/s"),
     ):  # fmt: skip
-        score = np.abs(bias) / max(np.hypot(sigma, walk * np.sqrt(elapsed)), LEAST_SIGMA)
+        score = np.abs(bias) / np.hypot(sigma, walk * np.sqrt(START_SPAN + elapsed))
         axis = int(score.argmax())
         worst = float(score[axis])
         if worst < DOUBT:
