@@ -59,6 +59,19 @@ def _of_basis(basis: SteelBasis, mean: Array, ratio: float) -> SteelMap:
     return SteelMap(steel, mean, 0.25 * np.eye(size), score, {"A": ratio, "B": ratio})
 
 
+def test_the_remedy_replaces_the_model_errors_of_a_refined_site() -> None:
+    """Each beacon then has one of its own, which the world's does not change."""
+    site = replace(demo_site(coil_radius=None), model_error=0.005)
+    beacons = tuple(replace(beacon, model_error=0.003) for beacon in site.beacons)
+    refined = replace(site, beacons=beacons)
+    plain, own = (_map(0.9).steel.finding(known) for known in (site, refined))
+    assert "declare world.model_error 0.02." in plain.text
+    assert "declare world.model_error 0.02 and omit that of the beacons." in own.text
+    assert plain.remedy == {"world.model_error": 0.02}
+    changed = {f"beacons[{i}].model_error": None for i in range(len(beacons))}
+    assert own.remedy == plain.remedy | changed
+
+
 @pytest.mark.parametrize("quadrature", [True, False])
 def test_a_site_with_the_map_predicts_what_its_modes_add(quadrature: bool) -> None:
     """Of beacons whose coils share a tone, and of coils with a tone each."""
@@ -109,6 +122,7 @@ def test_a_map_that_predicts_no_other_beacon_is_not_used() -> None:
     assert good.is_used
     assert good.finding(site).verdict is Verdict.TRUSTWORTHY
     assert not bad.is_used
+    assert "--map-steel" not in bad.finding(site).text  # which made this map
     known = bad.finding(site)
     assert known.verdict is Verdict.DOUBTFUL
     assert known.remedy == {"world.model_error": 0.02}

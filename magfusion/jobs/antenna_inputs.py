@@ -58,8 +58,8 @@ def tracker(site: Site, name: str | None) -> Beacon:
         )
     if result[0].field_map is not None or result[0].steel is not None:
         raise InputError(
-            f"beacon {result[0].name} has a map of its field or of steel with the old antennas; omit"
-            " world.field_map and world.steel, calibrate the antennas, then map again"
+            f"beacon {result[0].name} has a map of its field or of steel with the old antennas;"
+            " omit world.field_map and world.steel, calibrate the antennas, then map again"
         )
     return result[0]
 

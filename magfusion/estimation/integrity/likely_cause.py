@@ -28,6 +28,7 @@ from magfusion.estimation.integrity.motion_causes import (
 )
 from magfusion.estimation.integrity.motion_comparison import compared, surveyed
 from magfusion.estimation.integrity.phase_causes import phase_causes
+from magfusion.model.noise import model_error
 from magfusion.model.samples import FieldSamples, ImuSamples, Log
 from magfusion.model.site import Site
 from magfusion.model.without_imu import logged
@@ -87,6 +88,8 @@ def _unexplained(
     if excess < MISFIT or not _moves(known):
         return None
     rms = float(np.sqrt(excess))
+    # Relative; a refined site has an error of each beacon, in place of the world's.
+    share = rms * float(np.sqrt(np.mean(model_error(known.site) ** 2)))
     if excess > STRANGE:
         code, text = (
             "other_site",
@@ -94,18 +97,23 @@ def _unexplained(
             " expected), and no single usual mistake explains it. Check that the site is that of"
             " this room, with these beacons at these frequencies.",
         )
-    elif rounded := _rounded(part, samples, known.site, rms * known.site.model_error):
+    elif rounded := _rounded(part, samples, known.site, share):
         code, text = QUANTISED, rounded
     else:
-        share = 100.0 * rms * known.site.model_error
         code, text = (
             "iron",
-            f"The fields deviate from the beacons' by about {share:.2g} % from place to place, and"
-            " neither another survey nor other moments explain it: as iron in the room does, or a"
-            " line near a tone. Learn a field map (magfusion calibrate fieldmap), or declare"
-            f" world.model_error {0.01 * share:.2g}.",
+            f"The fields deviate from the beacons' by about {100.0 * share:.2g} % from place to"
+            " place, and neither another survey nor other moments explain it: as iron in the room"
+            " does, or a line near a tone. Learn a field map (magfusion calibrate fieldmap), or"
+            f" declare {world_model_error(known.site, share)}.",
         )
     return Explanation(code, text, "", before, before, freedom, catch_all=True), text
+
+
+def world_model_error(site: Site, share: float) -> str:
+    """Return the words by which a site declares a share of the field as model error."""
+    own = any(beacon.model_error is not None for beacon in site.beacons)
+    return f"world.model_error {share:.2g}" + (" and omit that of the beacons" if own else "")
 
 
 def _rounded(log: Log, samples: FieldSamples, site: Site, share: float) -> str | None:

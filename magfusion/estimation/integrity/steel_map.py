@@ -98,7 +98,7 @@ class SteelMap(NamedTuple):
                 f" {percent:.0f} % of the error without a map."
             )
             return Finding(STEEL, text, Verdict.TRUSTWORTHY, self.steel.weight)
-        known = self.steel.finding(site)
+        known = self.steel.finding(site, mapped=True)
         text = (
             " Its map is not used: made without a beacon, it predicts its fields with"
             f" {percent:.0f} % of the error without a map (at most {100.0 * LARGEST_RATIO:.0f} %)."

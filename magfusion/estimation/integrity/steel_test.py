@@ -12,6 +12,7 @@ from scipy.special import logsumexp
 
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.integrity.fixed_parameter_test import LEAST_EVIDENCE, MARGIN
+from magfusion.estimation.integrity.likely_cause import world_model_error
 from magfusion.estimation.integrity.released_fault import release_gain
 from magfusion.estimation.integrity.score import Score, answered, scores_of
 from magfusion.estimation.integrity.suspects import suspects
@@ -82,21 +83,25 @@ class SteelEstimate(NamedTuple):
         """Weight of its finding: the evidence in sigma."""
         return float(np.sqrt(max(self.gain, 0.0)))
 
-    def finding(self, site: Site) -> Finding:
-        """Return the finding: a remark where the site declares so much."""
+    def finding(self, site: Site, *, mapped: bool = False) -> Finding:
+        """Return the finding: a remark where the site declares so much.
+
+        Without the advice to map it where it was ``mapped``.
+        """
         text = self.described(site)
         if self.distortion <= site.model_error:
             text += " The covariance includes its effect."
             return Finding(STEEL, text, Verdict.TRUSTWORTHY, self.weight)
         needed = _rounded_up(self.distortion)
         new = site.without_steel() is site
+        again = "Map it" if new else "The map of the site does not explain it: map it again"
         text += (
             " No error of single parameters explains the log as well."
-            f" {'Map it' if new else 'The map of the site does not explain it: map it again'}"
-            " (magfusion smooth --map-steel), map the field (magfusion calibrate fieldmap), or"
-            f" declare world.model_error {needed:.2g}."
+            f" {'Map' if mapped else f'{again} (magfusion smooth --map-steel), map'} the field"
+            f" (magfusion calibrate fieldmap), or declare {world_model_error(site, needed)}."
         )
-        remedy = changed_keys(site, replace(site, model_error=needed))
+        beacons = tuple(replace(beacon, model_error=None) for beacon in site.beacons)
+        remedy = changed_keys(site, replace(site, model_error=needed, beacons=beacons))
         return Finding(STEEL, text, Verdict.DOUBTFUL, self.weight, remedy=remedy)
 
 
