@@ -13,11 +13,14 @@ from conftest import Refuse, run_command
 from test_joint import log_of, surveyed
 
 from magfusion.cli import main
+from magfusion.estimation.batch.batch import SmootherSettings
 from magfusion.estimation.integrity.logs_agree import LogAgreement
 from magfusion.files.kept import digest_of_files
 from magfusion.files.log import write_log
 from magfusion.files.site import load_site, save_site
-from magfusion.jobs.joint_run import trust_of_all
+from magfusion.jobs.inputs import Job
+from magfusion.jobs.joint_run import tasks_of, trust_of_all
+from magfusion.model.steel_field import SteelField
 from magfusion.model.trust import Finding
 from magfusion.simulation.log import perturb_site
 
@@ -131,6 +134,20 @@ def test_logs_that_cannot_be_refined_together_are_refused(
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
     assert "holds other files" in refuse(*command[:-1], tmp_path / "full")
+
+
+def test_a_solution_is_kept_for_one_map_whatever_its_name(recorded: Path, tmp_path: Path) -> None:
+    """Steel with other moments is another model of the fields."""
+    keys = []
+    for moment in (1.0, 1.0, 2.0):  # A m^2
+        steel = SteelField(np.zeros((1, 3)), np.ones(1), np.full((1, 2, 3), moment))
+        first, *others = surveyed().beacons
+        mapped = (replace(first, steel=steel), *others)
+        save_site(replace(surveyed(), beacons=mapped), tmp_path / "room.yaml")
+        jobs = [Job(recorded / f"log{i}", tmp_path / "room.yaml", tmp_path) for i in range(2)]
+        keys.append([task.key for task in tasks_of(jobs, SmootherSettings(), tmp_path / "out")])
+    assert keys[0] == keys[1]
+    assert not set(keys[0]) & set(keys[2])
 
 
 def test_a_digest_sees_content_and_names_but_not_places(tmp_path: Path) -> None:

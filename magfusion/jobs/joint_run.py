@@ -116,11 +116,10 @@ def _one_site(jobs: Sequence[Job], smoother: SmootherSettings) -> tuple[list[str
     digests: dict[str, Path] = {}
     first, platforms = read_site(jobs[0]), []
     for job in jobs:
-        path = job.declared_path
-        others = [path.with_name(name) for name in SITE_FILES[1:]]
-        digest = digest_of_files([path, *others])
+        path, site = job.declared_path, read_site(job)
+        digest = run_key("site", site)  # with its maps, whatever their files are named
         if digest not in digests:
-            other = [key for key in changed_keys(first, read_site(job)) if not _of_platform(key)]
+            other = [key for key in changed_keys(first, site) if not _of_platform(key)]
             if other:
                 raise InputError(
                     f"{path}: {other[0]} differs from {jobs[0].declared_path}; logs that refine one"

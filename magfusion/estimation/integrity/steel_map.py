@@ -47,7 +47,8 @@ LEAST_BEACONS = 4  # without one, three determine the pose
 MOVED = Finding(
     "steel_moved",
     "The log is explained better without the map of steel in its site: steel was moved, or the map"
-    " is of another room. The map is not used. Map the steel again (magfusion smooth --map-steel).",
+    " is of another room. The map is not used. Map the steel again (magfusion smooth --map-steel),"
+    " or omit world.steel.",
     Verdict.TRUSTWORTHY,
 )
 LARGEST_RATIO = 0.97  # of errors of beacons left out, with the map over those without
