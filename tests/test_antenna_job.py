@@ -16,6 +16,7 @@ from magfusion.files.survey import Survey, write_survey
 from magfusion.model.coil_field import as_points
 from magfusion.model.field import predict
 from magfusion.model.site import Site
+from magfusion.model.steel_field import SteelField
 from magfusion.units import DEGREE, MU0_OVER_4PI
 
 POSE_SIGMA = 0.1 * DEGREE, 0.5e-3  # rad, m
@@ -241,6 +242,21 @@ def test_bad_sites_and_options_are_refused_in_one_sentence(
     changed = replace(site.beacons[0], **change)  # type: ignore[arg-type]
     save_site(replace(site, beacons=(changed,)), tmp_path / "site.yaml")
     assert sentence in refuse(*arguments, *options)
+
+
+@pytest.mark.slow
+def test_a_map_of_steel_by_the_old_antennas_is_refused(
+    tmp_path: Path, refuse: Refuse, true_site: Site, given: Callable[[Survey], list[str]]
+) -> None:
+    """A bench is another room; without the map the same command runs."""
+    command = given(make_survey(true_site, 10, 6))
+    steel = SteelField(np.ones((1, 3)), np.array([0.2]), np.full((1, 3, 3), 1e-3))
+    (beacon,) = nominal(true_site).beacons
+    mapped = replace(nominal(true_site), beacons=(replace(beacon, steel=steel),))
+    save_site(mapped, tmp_path / "site.yaml")
+    assert "omit world.field_map and world.steel, calibrate the antennas" in refuse(*command)
+    save_site(mapped.without_steel(), tmp_path / "site.yaml")
+    run_command(*command)
 
 
 def test_a_site_without_a_tracker_is_refused(

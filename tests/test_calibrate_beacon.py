@@ -122,6 +122,7 @@ def test_an_unknown_drive_phase_leaves_the_turn_about_the_axis(tmp_path: Path) -
     )
 
 
+@pytest.mark.slow
 def test_a_map_of_steel_is_not_of_the_beacon_that_a_survey_refines(tmp_path: Path) -> None:
     """As its field map it goes, and the survey alone decides; another beacon keeps its own."""
     site, _ = written(tmp_path)
