@@ -13,11 +13,7 @@ from small_problem import small_log
 
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.steel_map import (
-    LARGEST_RATIO,
-    SteelMap,
-    explained_without_map,
-)
+from magfusion.estimation.integrity.steel_map import SteelMap, explained_without_map
 from magfusion.estimation.integrity.steel_test import SteelEstimate
 from magfusion.estimation.measurements.steel import (
     UNIT,
@@ -46,7 +42,8 @@ SHARED_STEEL = Path(__file__).parents[1].parent / "shared" / "logs" / "steel"
 def _map(ratio: float) -> SteelMap:
     """Return a map of one voxel in one mode, of two tones."""
     moment = np.full((1, 2, 3, 1), 1e-3)
-    basis = SteelBasis(Voxels(np.zeros((1, 3)), np.ones(1)), moment, moment, 1, 0.0)
+    tensor = np.ones((1, 6, 1))
+    basis = SteelBasis(Voxels(np.zeros((1, 3)), np.ones(1)), moment, moment, tensor, 0.0)
     return _of_basis(basis, np.array([2.0]), ratio)
 
 
@@ -118,7 +115,7 @@ def _tone_each(beacon: Beacon) -> Beacon:
 def test_a_map_that_predicts_no_other_beacon_is_not_used() -> None:
     """The finding is a remark with the map, and the reason for doubt without it."""
     site = replace(demo_site(coil_radius=None), model_error=0.005)
-    good, bad = _map(LARGEST_RATIO - 0.05), _map(LARGEST_RATIO + 0.05)
+    good, bad = _map(0.95), _map(1.05)
     assert good.is_used
     assert good.finding(site).verdict is Verdict.TRUSTWORTHY
     assert not bad.is_used

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from magfusion.estimation.batch.batch import Smoothed, solved_again
 from magfusion.estimation.graph.graph import read_states
@@ -25,17 +26,28 @@ from magfusion.estimation.integrity.smoothed_exclusion import without_beacon
 from magfusion.estimation.integrity.steel_test import (
     STEEL,
     SteelEstimate,
+    amplitude_evidence,
     amplitudes,
     basis_of,
     best_explanation,
+    best_size,
     block_of,
+    distortion_of,
     estimated_steel,
     has_close_tones,
     poses_of_fields,
 )
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.measurements.steel import MAX_EPOCHS, UNIT, Voxels, steel_modes
-from magfusion.model.parameters import Block
+from magfusion.estimation.measurements.sparse_steel import voxel_variances, with_variances
+from magfusion.estimation.measurements.steel import (
+    MAX_EPOCHS,
+    UNIT,
+    SteelBasis,
+    Voxels,
+    steel_modes,
+    without_columns,
+)
+from magfusion.model.parameters import Block, dimension, placed
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.model.steel_field import SteelField
@@ -51,7 +63,7 @@ MOVED = Finding(
     " or omit world.steel.",
     Verdict.TRUSTWORTHY,
 )
-LARGEST_RATIO = 0.97  # of errors of beacons left out, with the map over those without
+LEAST_SIZE = 0.5  # of the distortion, from which the variances of voxels are sought
 
 
 class SteelMap(NamedTuple):
@@ -88,7 +100,7 @@ class SteelMap(NamedTuple):
     @property
     def is_used(self) -> bool:
         """Whether the map predicts beacons that it does not know."""
-        return self.ratio < LARGEST_RATIO
+        return self.ratio < 1.0
 
     def finding(self, site: Site) -> Finding:
         """Return the finding in place of that of the test for steel."""
@@ -102,7 +114,7 @@ class SteelMap(NamedTuple):
         known = self.steel.finding(site, mapped=True)
         text = (
             " Its map is not used: made without a beacon, it predicts its fields with"
-            f" {percent:.0f} % of the error without a map (at most {100.0 * LARGEST_RATIO:.0f} %)."
+            f" {percent:.0f} % of the error without a map."
         )
         return replace(known, text=known.text + text)
 
@@ -211,9 +223,47 @@ def map_steel(result: Smoothed, imu: ImuSamples) -> SteelMap | str:
         if ratio is None:
             return f"without beacon {beacon.name} the poses are undetermined"
         held_out[beacon.name] = ratio
-    score, (gain, sigma) = scores.every, known
-    steel = estimated_steel(score, gain, sigma)
+    gain, sigma = known
+    distortion, (score, sigma) = distortion_of(sigma), _sparse(scores.every, sigma, site)
+    steel = estimated_steel(score, gain, sigma, distortion)
     return SteelMap(steel, *amplitudes(score, sigma), score, held_out)
+
+
+def _sparse(score: Score, sigma: Array, site: Site) -> tuple[Score, Array]:
+    """Return a score with the steel in as few voxels as explain it, and sigmas of its amplitudes.
+
+    Parameters
+    ----------
+    sigma : ndarray, shape (modes,)
+        Of the amplitudes, with the steel in all voxels alike.
+    """
+    basis, shared = basis_of(score), slice(0, basis_of(score).shared)
+    information, gradient = amplitude_evidence(score)
+    # Of the shared amplitudes, with those of each tone as uncertain as they are.
+    across, own = information[shared, shared.stop :], information[shared.stop :, shared.stop :]
+    inner = own + np.diag(sigma[shared.stop :] ** -2)
+    by = across @ np.linalg.solve(inner, np.column_stack([across.T, gradient[shared.stop :]]))
+    information, gradient = information[shared, shared] - by[:, :-1], gradient[shared] - by[:, -1]
+    variance = voxel_variances(basis, information, gradient, max(float(sigma[0]), LEAST_SIZE))
+    few = _with_basis(score, *with_variances(basis, site, variance))
+    is_shared = np.arange(len(block_of(few).sigma)) < basis_of(few).shared
+    return few, best_size(*amplitude_evidence(few), is_shared)[1]
+
+
+def _with_basis(score: Score, basis: SteelBasis, old_by_new: Array) -> Score:
+    """Return a score with other shared modes, linear in those before."""
+    block, size = block_of(score), len(score.gradient)
+    fixed = placed((*(b for b in score.fixed if b is not block), *without_columns(basis)))
+    first, last = block.columns.start, block.columns.start + len(old_by_new)
+    by = block_diag(np.eye(first), old_by_new, np.eye(size - last))
+    return Score(
+        fixed,
+        by.T @ score.information @ by,
+        by.T @ score.gradient,
+        np.pad(score.spread[:first], ((0, dimension(fixed) - first), (0, 0))),
+        score.by_state @ by,
+        score.by_calibration @ by,
+    )
 
 
 def _held_out(
@@ -231,20 +281,29 @@ def _held_out(
     known = None if scores is None else best_explanation(scores.every, 0.0)
     if scores is None or known is None:
         return 1.0
-    score, every = scores.every, replace(others, graph=result.graph)
-    mean, _ = amplitudes(score, known[1])
-    basis = basis_of(score)
-    poses, own = poses_of_fields(others), [owner == name for owner, _ in result.fields.channels]
+    whole = replace(others, graph=result.graph)
+    own = np.array([owner == name for owner, _ in result.fields.channels])
+    before = field_residual(whole, others.estimate, raw=True)[:, own]
+    few = _sparse(scores.every, known[1], others.calibration.site)
+    after = _predicted_error(whole, *few)[:, own]
+    return float(np.sqrt(np.nansum(after**2) / np.nansum(before**2)))
+
+
+def _predicted_error(result: Smoothed, score: Score, sigma: Array) -> Array:
+    """Return whitened errors of the fields with the shared modes of a score, (n, channels, 6).
+
+    The moments of each tone's own are unknown of a beacon that is left out.
+    """
+    basis, (mean, _) = basis_of(score), amplitudes(score, sigma)
+    poses = poses_of_fields(result)
     phasors = basis.phasors(
-        others.calibration, poses.time, poses.world_from_body, poses.position_world
+        result.calibration, poses.time, poses.world_from_body, poses.position_world
     )
-    # The moments of each tone's own are unknown of a beacon that is left out.
     field = phasors[..., : basis.shared] @ (UNIT * mean[: basis.shared])
-    measured = next(m for m in result.graph.measurements if isinstance(m, FieldPhasors)).alone()
     parts = np.concatenate([field.real, field.imag], axis=-1)
-    moved = moved_estimate(others, score, step_of(score, mean))
-    after = field_residual(every, moved, raw=True)
-    after = after + (measured.sqrt_information @ parts[..., None])[..., 0]
-    before = field_residual(every, others.estimate, raw=True)
-    square = [np.nansum(error[:, own] ** 2) for error in (after, before)]
-    return float(np.sqrt(square[0] / square[1]))
+    moved = moved_estimate(result, score, step_of(score, mean))
+    measured = next(m for m in result.graph.measurements if isinstance(m, FieldPhasors)).alone()
+    return (
+        field_residual(result, moved, raw=True)
+        + ((measured.sqrt_information @ parts[..., None])[..., 0])
+    )

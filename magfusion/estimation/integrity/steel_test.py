@@ -156,7 +156,8 @@ def estimate_steel(case: Case, rival: float) -> SteelEstimate | None:
     known = None if scores is None else best_explanation(scores.every, rival)
     if scores is None or known is None:
         return None
-    return estimated_steel(answered(result, scores.every, case.log.imu), *known)
+    score = answered(result, scores.every, case.log.imu)
+    return estimated_steel(score, *known, distortion_of(known[1]))
 
 
 def score_with_steel(score: Score | None, result: Smoothed, log: Log, site: Site) -> Score | None:
@@ -200,14 +201,14 @@ def steel_of_score(score: Score, rival: float) -> SteelEstimate | None:
     None if it does not explain the data better than a rival cause of a known gain.
     """
     known = best_explanation(score, rival)
-    return None if known is None else estimated_steel(score, *known)
+    return None if known is None else estimated_steel(score, *known, distortion_of(known[1]))
 
 
 def best_explanation(score: Score, rival: float) -> tuple[float, Array] | None:
     """Return gain and sigmas of the amplitudes of steel; None if a rival cause is as good."""
     block = block_of(score)
     shared = np.arange(len(block.sigma)) < basis_of(score).shared
-    gain, sigma = best_size(*_own(score, block), shared)
+    gain, sigma = best_size(*amplitude_evidence(score), shared)
     if gain < max(rival + MARGIN, LEAST_EVIDENCE) or np.max(sigma) >= SIZES[-1]:
         return None  # the largest size stands for gross mistakes that no mode explains
     return gain, sigma
@@ -254,26 +255,31 @@ def _gain(information: Array, gradient: Array, sigma: Array) -> float:
     return float(half @ half - 2.0 * np.sum(np.log(np.diagonal(root))))
 
 
-def _own(score: Score, block: Block) -> tuple[Array, Array]:
-    """Return information and gradient of a block, others varying as declared."""
+def amplitude_evidence(score: Score) -> tuple[Array, Array]:
+    """Return information and gradient of the amplitudes of steel, others varying as declared."""
+    own = block_of(score).columns
     information, gradient = score.with_declared(tolerance=False)
-    return information[block.columns, block.columns], gradient[block.columns]
+    return information[own, own], gradient[own]
 
 
-def estimated_steel(score: Score, gain: float, sigma: Array) -> SteelEstimate:
+def distortion_of(sigma: Array) -> float:
+    """Return the relative distortion, rms, by the sigmas of `best_explanation`."""
+    return UNIT * float(np.hypot(sigma[0], sigma[-1]))
+
+
+def estimated_steel(score: Score, gain: float, sigma: Array, distortion: float) -> SteelEstimate:
     """Return the steel of a score with the responses of the poses to it."""
     mean, cov = amplitudes(score, sigma)
     by_pose = score.by_pose[..., block_of(score).columns]
     moved = by_pose @ mean
     spread = moved[:, :, None] * moved[:, None, :] + by_pose @ cov @ np.swapaxes(by_pose, 1, 2)
     place, place_sigma = _strongest(basis_of(score), mean, cov)
-    distortion = UNIT * float(np.hypot(sigma[0], sigma[-1]))
     return SteelEstimate(distortion, place, place_sigma, gain, spread)
 
 
 def amplitudes(score: Score, sigma: Array) -> tuple[Array, Array]:
     """Return mean and covariance of the amplitudes of steel, given their sigmas before."""
-    information, gradient = _own(score, block_of(score))
+    information, gradient = amplitude_evidence(score)
     inner = np.eye(len(sigma)) + sigma[:, None] * information * sigma
     cov = sigma[:, None] * np.linalg.inv(inner) * sigma
     return cov @ gradient, cov

@@ -75,8 +75,9 @@ class SteelBasis(NamedTuple):
         Moment of each voxel by a unit of each, times mu0 (T m^3).
     polarisability : ndarray, shape (v, tones, 3, modes)
         The same over the field of the tone there.
-    shared : int
-        Number of shared modes.
+    tensor : ndarray, shape (v, 6, shared)
+        Polarisability of each voxel by a unit of each shared mode, over the root of its volume, by
+        component of `TENSORS`.
     softening : float
         Distance below which the field of a voxel is no more that of a dipole, over its edge.
     """
@@ -84,8 +85,13 @@ class SteelBasis(NamedTuple):
     voxels: Voxels
     moment: AnyArray
     polarisability: AnyArray
-    shared: int
+    tensor: Array
     softening: float
+
+    @property
+    def shared(self) -> int:
+        """Number of shared modes."""
+        return int(self.tensor.shape[-1])
 
     def fields(self, place_world: Array) -> AnyArray:
         """Return the field of a unit of each at places, world axes (T), (n, tones, 3, modes)."""
@@ -210,7 +216,12 @@ def region_modes(site: Site) -> tuple[Block, ...]:
     They are equal whenever they are determined, up to rounding; none for what it does not model.
     """
     basis = _region_basis(site)
-    return () if basis is None else _block(SteelModes(basis, np.zeros(0), {}, {}, np.zeros(0)))
+    return () if basis is None else without_columns(basis)
+
+
+def without_columns(basis: SteelBasis) -> tuple[Block, ...]:
+    """Return the block of the amplitudes of a basis, without columns of its own."""
+    return _block(SteelModes(basis, np.zeros(0), {}, {}, np.zeros(0)))
 
 
 def _block(modes: SteelModes) -> tuple[Block, ...]:
@@ -243,7 +254,13 @@ def _region_basis(site: Site) -> SteelBasis | None:
     # An eigenvector's sign is arbitrary, and a checkpoint may be resumed elsewhere.
     moment = basis.moment.real.reshape(-1, basis.moment.shape[-1])
     sign = np.where(np.cos(np.arange(len(moment))) @ moment < 0.0, -1.0, 1.0)
-    return basis._replace(moment=sign * basis.moment, polarisability=sign * basis.polarisability)
+    return SteelBasis(
+        voxels,
+        sign * basis.moment,
+        sign * basis.polarisability,
+        sign[: basis.shared] * basis.tensor,
+        SOFTENING,
+    )
 
 
 def _basis(
@@ -252,18 +269,29 @@ def _basis(
     """Return the strongest modes at places: of all beacons together, and of each tone."""
     at_place, at_voxels = (beacon_fields(site, point) for point in (place, voxels.centre_world))
     tensors = _dipole_tensors(place, voxels.centre_world, softening * voxels.edge)
-    root = voxels.edge[:, None, None, None] ** 1.5
-    moment = np.einsum("kij,vtj->vtik", TENSORS, at_voxels) * root
-    moments = [_modes(tensors, at_place, moment, count[0])]
-    shared, strength = moments[0].shape[-1], np.linalg.norm(at_voxels, axis=2)
+    moment, root = unit_moments(voxels, at_voxels), voxels.edge[:, None, None, None] ** 1.5
+    tensor = _modes(tensors, at_place, moment, count[0])
+    moments, strength = [moment @ tensor[:, None]], np.linalg.norm(at_voxels, axis=2)
     for tone in range(at_place.shape[1]):
         own = strength[:, [tone], None, None] * np.eye(3) * root
-        some = _modes(tensors, at_place[:, [tone]], own, count[1])
+        some = own @ _modes(tensors, at_place[:, [tone]], own, count[1])[:, None]
         every = np.zeros((*at_voxels.shape, some.shape[-1]), dtype=some.dtype)
         every[:, [tone]] = some
         moments.append(every)
     dipoles = np.concatenate(moments, axis=-1)
-    return SteelBasis(voxels, dipoles, dipoles / strength[..., None, None], shared, softening)
+    return SteelBasis(voxels, dipoles, dipoles / strength[..., None, None], tensor, softening)
+
+
+def unit_moments(voxels: Voxels, at_voxels: AnyArray) -> AnyArray:
+    """Return the moments by a unit of each component of the tensors, (v, tones, 3, 6) (T m^3).
+
+    Parameters
+    ----------
+    at_voxels : ndarray, shape (v, tones, 3)
+        The beacons' fields there (T).
+    """
+    root = voxels.edge[:, None, None, None] ** 1.5
+    return np.asarray(np.einsum("kij,vtj->vtik", TENSORS, at_voxels) * root)
 
 
 def voxels_around(point_world: Array, limit: float) -> Voxels | None:
@@ -321,8 +349,8 @@ def _dipole_tensors(point_world: Array, centre_world: Array, softening: Array) -
     return np.asarray(tensor / (4.0 * np.pi * square**2.5)[..., None, None])
 
 
-def _modes(tensors: Array, at_place: AnyArray, moment: AnyArray, count: int) -> AnyArray:
-    """Return the moments of the strongest modes of relative distortion, (v, tones, 3, modes).
+def _modes(tensors: Array, at_place: AnyArray, moment: AnyArray, count: int) -> Array:
+    """Return the amplitudes of each voxel in the strongest modes of distortion, (v, k, modes).
 
     Parameters
     ----------
@@ -345,5 +373,4 @@ def _modes(tensors: Array, at_place: AnyArray, moment: AnyArray, count: int) -> 
     value, vector = eigh(flat @ flat.T, subset_by_index=(max(last + 1 - count, 0), last))
     kept = np.flatnonzero(value > 1e-9 * value[-1])[::-1]
     amplitude = flat.T @ (vector[:, kept] / np.sqrt(value[kept]))
-    amplitude = amplitude.reshape(len(moment), 1, moment.shape[3], -1)
-    return np.asarray(moment @ amplitude / unit)
+    return np.asarray(amplitude.reshape(len(moment), moment.shape[3], -1) / unit)

@@ -1,0 +1,74 @@
+"""Steel in few places: the variances of voxels, estimated from the amplitudes of their modes.
+
+Each voxel has a variance of its own, besides one that all share, of largest evidence: most vanish
+(sparse Bayesian learning, M. E. Tipping, J. Mach. Learn. Res. 1, 2001; the fixed point is that of
+D. J. C. MacKay, Neural Comput. 4, 1992).  With the same variance for all, what explains the fields
+of one beacon spreads over voxels where it has no part in those of the others.  All that the data
+determine of voxels they determine of the modes, so that no other derivatives are needed.
+"""
+
+import numpy as np
+from scipy.linalg import eigh
+
+from magfusion.estimation.measurements.steel import SteelBasis, beacon_fields, unit_moments
+from magfusion.model.site import Site
+from magfusion.units import Array
+
+ROUNDS = 10  # of the fixed point; more change the evidence by less than one
+NEGLIGIBLE = 1e-9  # of the largest variance, and of the strongest mode
+
+
+def voxel_variances(basis: SteelBasis, information: Array, gradient: Array, sigma: float) -> Array:
+    """Return the most probable variance of each voxel, of unit amplitudes of the modes, (v,).
+
+    Parameters
+    ----------
+    information, gradient : ndarray, shape (shared, shared), (shared,)
+        Of the amplitudes of the shared modes, all others eliminated.
+    sigma : float
+        Of these amplitudes, from which it is sought: all voxels have the same variance.
+    """
+    by_mode = basis.tensor / np.linalg.norm(basis.tensor[..., 0])  # orthonormal
+    common, own = 0.5 * sigma**2, np.full(len(by_mode), 0.5 * sigma**2)
+    for _ in range(ROUNDS):
+        kept = np.flatnonzero(own > NEGLIGIBLE * np.max(own))
+        tensor = by_mode[kept]
+        flat = tensor.reshape(-1, basis.shared)
+        prior = flat.T @ (np.repeat(own[kept], 6)[:, None] * flat)
+        inner = np.eye(basis.shared) + information @ (common * np.eye(basis.shared) + prior)
+        solved = np.linalg.solve(inner, np.column_stack([information, gradient]))
+        beyond, step = solved[:, :-1], solved[:, -1]
+        # Of the gradient by each voxel: its square, over that which these variances make expected.
+        expected = np.sum((flat @ beyond) * flat, axis=1).reshape(-1, 6).sum(axis=1)
+        own[kept] *= np.sum((tensor @ step) ** 2, axis=1) / expected
+        common *= float(step @ step / np.trace(beyond))
+    return common + own
+
+
+def with_variances(basis: SteelBasis, site: Site, variance: Array) -> tuple[SteelBasis, Array]:
+    """Return a basis whose shared modes have other variances of the voxels.
+
+    Parameters
+    ----------
+    variance : ndarray, shape (v,)
+        As of `voxel_variances`.
+
+    Returns
+    -------
+    SteelBasis
+        Of amplitudes of unit variance; without modes that the basis did not know.
+    old_by_new : ndarray, shape (shared, fewer)
+        Amplitudes of the shared modes by a unit of each.
+    """
+    unit = np.linalg.norm(basis.tensor[..., 0])
+    of_all = variance[:, None, None] * basis.tensor / unit
+    value, vector = eigh(np.tensordot(basis.tensor / unit, of_all, axes=((0, 1), (0, 1))))
+    known = value > NEGLIGIBLE * value[-1]
+    strength, vector = np.sqrt(value[known]), vector[:, known]
+    tensor = unit * of_all @ (vector / strength)
+    at_voxels = beacon_fields(site, basis.voxels.centre_world)
+    shared = unit_moments(basis.voxels, at_voxels) @ tensor[:, None]
+    moment = np.concatenate([shared, basis.moment[..., basis.shared :]], axis=-1)
+    strength_there = np.linalg.norm(at_voxels, axis=2)[..., None, None]
+    new = basis._replace(moment=moment, polarisability=moment / strength_there, tensor=tensor)
+    return new, vector * strength
