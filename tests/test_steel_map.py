@@ -210,11 +210,13 @@ def test_a_mesh_is_mapped_and_the_sigmas_are_right(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_map_of_racks_is_wrong_and_not_used(tmp_path: Path) -> None:
+def test_racks_are_mapped_and_the_sigmas_hold(tmp_path: Path) -> None:
     """Long rods conduct the flux of a beacon to places where its field is weak."""
-    report = _walks("racks", tmp_path)
-    assert not report["steel_map_used"]
-    assert not (tmp_path / "run" / "steel.parquet").exists()
+    mapped = _walks("racks", tmp_path)
+    plain = _report(tmp_path / "plain", "smooth", tmp_path / "log")
+    assert mapped["ate_m"] < 0.6 * plain["ate_m"]
+    assert mapped["attitude_rmse_deg"] < 0.6 * plain["attitude_rmse_deg"]
+    assert 0.5 < mapped["nees_mean"] < 12.6  # 95 % of chi square of six
 
 
 @pytest.mark.slow
