@@ -295,15 +295,12 @@ def _predicted_error(result: Smoothed, score: Score, sigma: Array) -> Array:
     The moments of each tone's own are unknown of a beacon that is left out.
     """
     basis, (mean, _) = basis_of(score), amplitudes(score, sigma)
-    poses = poses_of_fields(result)
-    phasors = basis.phasors(
-        result.calibration, poses.time, poses.world_from_body, poses.position_world
-    )
-    field = phasors[..., : basis.shared] @ (UNIT * mean[: basis.shared])
+    moment = basis.moment[..., : basis.shared] @ (UNIT * mean[: basis.shared, None])
+    poses, added = poses_of_fields(result), basis._replace(moment=moment)
+    place = poses.world_from_body, poses.position_world
+    field = added.phasors(result.calibration, poses.time, *place)[..., 0]
     parts = np.concatenate([field.real, field.imag], axis=-1)
     moved = moved_estimate(result, score, step_of(score, mean))
     measured = next(m for m in result.graph.measurements if isinstance(m, FieldPhasors)).alone()
-    return (
-        field_residual(result, moved, raw=True)
-        + ((measured.sqrt_information @ parts[..., None])[..., 0])
-    )
+    steel = (measured.sqrt_information @ parts[..., None])[..., 0]
+    return np.asarray(field_residual(result, moved, raw=True) + steel)
