@@ -40,13 +40,7 @@ def layout_of(quantity: Quantity) -> TableLayout:
 
 
 def read_aiding(tables: Mapping[Quantity, Path | None], span: Span) -> dict[str, AidingSamples]:
-    """Read the samples of every aiding sensor; one without a name has that of its quantity.
-
-    Raises
-    ------
-    InputError
-        As `read_table`; or where two samples of a sensor have one time.
-    """
+    """Read the samples of every aiding sensor; one without a name has that of its quantity."""
     out: dict[str, AidingSamples] = {}
     for quantity, path in tables.items():
         if path is not None:

@@ -15,13 +15,7 @@ UNFINISHED, FORMER = "unfinished", "former"  # what is written, and what it repl
 
 
 def refuse_in_the_way(path: Path, replaces: Callable[[Path], bool]) -> None:
-    """Refuse a path at which no directory can be written, before any work is done for it.
-
-    Raises
-    ------
-    InputError
-        As `whole_directory`.
-    """
+    """Refuse a path at which no directory can be written, before any work is done for it."""
     if path.is_symlink() and not path.exists():
         raise InputError(f"{path}: is a symbolic link that leads nowhere; give another path.")
     if path.exists() and not path.is_dir():
@@ -42,10 +36,7 @@ def real(path: Path) -> Path:
 def naming(path: Path, unfinished: Path | None = None) -> Iterator[None]:
     """Name the path in errors of a system that do not name the file.
 
-    Parameters
-    ----------
-    unfinished : Path, optional
-        What it is called while it is written; a user knows no such name.
+    `unfinished`: what it is called while it is written; a user knows no such name.
     """
     try:
         yield
@@ -124,17 +115,9 @@ def whole_directory(
 ) -> Iterator[Path]:
     """Yield a temporary directory next to ``path`` that replaces it only on success.
 
-    Parameters
-    ----------
-    replaces : callable
-        Whether the directory that is there may be replaced; an empty one always may.
-    backup : callable, optional
-        The path to which it is moved then; None removes it.
-
-    Raises
-    ------
-    InputError
-        Where something else is at ``path``, or nothing can be written there.
+    `replaces`: whether the directory that is there may be replaced; an empty one always may.
+    `backup`: the path to which it is moved then; None removes it. Raises InputError where something
+    else is at ``path``, or nothing can be written there.
     """
     path = real(path)
     refuse_in_the_way(path, replaces)

@@ -71,11 +71,8 @@ def write_database(database: AttitudeDatabase, path: Path) -> None:
 def read_database(path: Path) -> AttitudeDatabase:
     """Read and check a database.
 
-    Raises
-    ------
-    InputError
-        Where the file is absent, is no such database or of another version, holds too few
-        entries, or a number that is not finite, no angle or no field of the Earth.
+    Raises InputError where the file is absent, is no such database or of another version, holds too
+    few entries, or a number that is not finite, no angle or no field of the Earth.
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; give an attitude database (Parquet).")

@@ -76,10 +76,7 @@ class AudioEntry(StrictModel):
 def open_audio(path: Path) -> Iterator["SoundFile"]:
     """Open a recording.
 
-    Raises
-    ------
-    InputError
-        Where the package that reads it is missing, or the file is no recording.
+    Raises InputError where the package that reads it is missing, or the file is no recording.
     """
     soundfile = _soundfile(path)
     if not path.is_file():
@@ -97,10 +94,7 @@ def open_audio(path: Path) -> Iterator["SoundFile"]:
 def write_audio(path: Path, samples: Array, rate_hz: int) -> None:
     """Write samples (n, channels) from -1 to 1 as 24 bit.
 
-    Raises
-    ------
-    InputError
-        Where the package that writes it is missing.
+    Raises InputError where the package that writes it is missing.
     """
     soundfile = _soundfile(path)
     soundfile.write(path, samples, rate_hz, subtype="PCM_24")
@@ -111,10 +105,7 @@ def as_recording(
 ) -> tuple[AudioEntry, Array]:
     """Return the entry of a receiver's recording, and its samples as a sound card has them.
 
-    Raises
-    ------
-    InputError
-        Where they exceed full scale, or their rate is no whole number.
+    Raises InputError where they exceed full scale, or their rate is no whole number.
     """
     volts = waveform.measured_sensor / NOMINAL_T_PER_V
     highest = float(np.max(np.abs(volts), initial=0.0))
@@ -155,17 +146,8 @@ def read_audio(
 ) -> Waveform | None:
     """Return the samples of a recording within a span; None where there is none.
 
-    Volts are read as `magfusion.model.response.NOMINAL_T_PER_V`.
-
-    Parameters
-    ----------
-    site : Site, optional
-        Only the bands of its tones are kept, where they are far enough apart.
-
-    Raises
-    ------
-    InputError
-        As `open_audio`, or where the file lacks a channel.
+    Volts are read as `magfusion.model.response.NOMINAL_T_PER_V`. `site`: only the bands of its
+    tones are kept, where they are far enough apart.
     """
     path, begin = directory / entry.file, (entry.begin_ns - span.epoch_ns) * NANOSECOND
     band = None if site is None else BandFilter.of_site(site, entry.rate_hz)
@@ -254,17 +236,9 @@ def describe_recording(
 ) -> tuple[AudioEntry, tuple[str, ...]]:
     """Return the entry of a recording for the header of a log, and remarks on lost samples.
 
-    Parameters
-    ----------
-    names : str
-        Of its channels, in their order: x, y, z, sync (pulses at whole seconds, by which the rate
-        of the samples is measured), or - for one that is not used.
-    site : Site, optional
-        By whose tones lost samples are found.
-
-    Raises
-    ------
-    InputError
+    `names`: of its channels, in their order: x, y, z, sync (pulses at whole seconds, by which the
+    rate of the samples is measured), or - for one that is not used. `site`: by whose tones lost
+    samples are found.
     """
     named, count = channels_of(names)
     with open_audio(path) as recording:
@@ -330,10 +304,7 @@ def _by_pulses(slip: Slip, edges: Array, rate_hz: float) -> Slip:
 def channels_of(names: str) -> tuple[dict[str, int], int]:
     """Return the channels that are used by their names, and the number of all.
 
-    Raises
-    ------
-    InputError
-        Where a name is unknown or given twice, or no axis is named.
+    Raises InputError where a name is unknown or given twice, or no axis is named.
     """
     listed = [name.strip() for name in names.split(",")]
     used = {name: k for k, name in enumerate(listed) if name != "-"}

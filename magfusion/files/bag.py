@@ -69,8 +69,10 @@ def read_bag(
     """Read inertial samples, magnetometer and truth of a bag.
 
     Times are those of the messages' headers, and the first inertial one is the log's epoch, or the
-    first of the magnetometer where there is no inertial sensor. Poses
-    are taken for those of the IMU's axes in the world; the twist of an odometry is in body axes.
+    first of the magnetometer where there is no inertial sensor. Poses are taken for those of the
+    IMU's axes in the world; the twist of an odometry is in body axes. Raises InputError where the
+    bag cannot be read, has no topic of a sensor or several of one kind of which none was named, or
+    holds messages that no instrument gives.
 
     Parameters
     ----------
@@ -89,12 +91,6 @@ def read_bag(
     Log
         Without the streams for which the bag has no topic, and without messages that hold NaN or
         the stamp of another; ``noticed`` has their number.
-
-    Raises
-    ------
-    InputError
-        Where the bag cannot be read, has no topic of a sensor or several of one kind of which
-        none was named, or holds messages that no instrument gives.
     """
     with open_bag([path]) as reader:
         result = _read(reader, path, topics or Topics(), report, aiding)

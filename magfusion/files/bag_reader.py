@@ -91,15 +91,8 @@ class BagReader(AnyReader):
 def open_bag(paths: Sequence[Path]) -> Iterator[BagReader]:
     """Open bags as one recording.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        Directories of bags, or their files.
-
-    Raises
-    ------
-    InputError
-        Where a bag cannot be read, also while its messages are read.
+    `paths`: directories of bags, or their files. Raises InputError where a bag cannot be read, also
+    while its messages are read.
     """
     files = [file for path in paths for file in bag_files(path)]
     if len(set(map(_is_ros1_file, files))) > 1:
@@ -140,12 +133,7 @@ def _readable(path: Path) -> list[tuple[Path, Recovered]]:
 
 
 def refuse_overlap(reader: AnyReader, topic: str) -> None:
-    """Refuse files that hold a topic at the same time: they are no parts of one recording.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse files that hold a topic at the same time: they are no parts of one recording."""
     spans = sorted(
         (one.start_time, one.end_time, str(one.path))
         for one in reader.readers

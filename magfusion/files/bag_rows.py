@@ -98,16 +98,8 @@ def read_parts(
 ) -> Iterator[tuple[str, Messages]]:
     """Yield the messages of topics in the order of their arrival, `PART` of one at a time.
 
-    Parameters
-    ----------
-    wanted : mapping of str to Wanted
-        By the name that goes with their parts.
-
-    Raises
-    ------
-    InputError
-        Where a message is marked as not measured; or whatever the library raises of a bag that is
-        damaged.
+    `wanted`: by the name that goes with their parts. Raises InputError where a message is marked as
+    not measured; or whatever the library raises of a bag that is damaged.
     """
     name_of = {c.topic: name for name, one in wanted.items() for c in one.connections}
     every = [c for one in wanted.values() for c in one.connections]

@@ -56,11 +56,8 @@ class Checkpoint:
 def run_key(*identity: object) -> str:
     """Return the SHA-256 of what two runs share that may go on from each other's checkpoints.
 
-    Parameters
-    ----------
-    *identity : object
-        Numbers, texts, arrays, and mappings, sequences and dataclasses of them, however deep; of
-        any other object only its type counts.
+    `*identity`: numbers, texts, arrays, and mappings, sequences and dataclasses of them, however
+    deep; of any other object only its type counts.
     """
     digest = sha256()
 
@@ -89,10 +86,7 @@ def run_key(*identity: object) -> str:
 def claim_checkpoint(path: Path) -> None:
     """See that a checkpoint may be written here: over nothing, an empty file or an earlier one.
 
-    Raises
-    ------
-    InputError
-        Where something else is there.
+    Raises InputError where something else is there.
     """
     if not os.path.lexists(path):
         return
@@ -118,15 +112,8 @@ def write_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
 def read_position(path: Path, key: str | None = None) -> int:
     """Return the position in the header of a checkpoint; 0 where there is none.
 
-    Parameters
-    ----------
-    key : str, optional
-        Of the reading run.
-
-    Raises
-    ------
-    InputError
-        Where it is no checkpoint of this version, or of another run.
+    `key`: of the reading run. Raises InputError where it is no checkpoint of this version, or of
+    another run.
     """
     return _header(_read(path, _HEADER.size + _DIGEST), path, key)[0] if path.exists() else 0
 
@@ -134,15 +121,8 @@ def read_position(path: Path, key: str | None = None) -> int:
 def read_checkpoint(path: Path, key: str | None = None) -> Checkpoint | None:
     """Read a checkpoint; None where there is none.
 
-    Parameters
-    ----------
-    key : str, optional
-        Of the reading run.
-
-    Raises
-    ------
-    InputError
-        Where it is damaged, of another run or another version, or no checkpoint at all.
+    `key`: of the reading run. Raises InputError where it is damaged, of another run or another
+    version, or no checkpoint at all.
     """
     if not os.path.lexists(path):
         return None

@@ -37,10 +37,8 @@ def write_correlation(correlation: Correlation, sigma: Array, path: Path) -> Non
 def read_correlation(path: Path) -> tuple[Correlation, Array]:
     """Read a correlation and the sigmas that it was found with.
 
-    Raises
-    ------
-    InputError
-        Where the file is missing or unreadable, lacks a column, or holds no correlation.
+    Raises InputError where the file is missing or unreadable, lacks a column, or holds no
+    correlation.
     """
     again = "write the site again by smooth or calibrate log, or take the correlation out of it."
     if not path.is_file():

@@ -10,13 +10,7 @@ DEEPEST = 2e4  # m
 
 
 def read_depths(path: Path | None, epoch_ns: int) -> Depths | None:
-    """Read all depths: also those before and after the part of a log that is used.
-
-    Raises
-    ------
-    InputError
-        As `read_readings`.
-    """
+    """Read all depths: also those before and after the part of a log that is used."""
     if path is None:
         return None
     remedy = f"write measured depth in metres, from {-DEEPEST:g} to {DEEPEST:g}"

@@ -16,16 +16,7 @@ FROM, TO, MEASURED = "from", "to", "measured_m"
 def read_distances(path: Path, names: frozenset[str], sigma: float) -> tuple[CheckDistance, ...]:
     """Read check distances; rows without a measurement are not used.
 
-    Parameters
-    ----------
-    names : frozenset of str
-        Beacons and marks of the site.
-    sigma : float
-        Of a distance (m).
-
-    Raises
-    ------
-    InputError
+    `names`: beacons and marks of the site. `sigma`: of a distance (m).
     """
     table = read_whole(path, "table of check distances")
     ends = [[str(v) for v in column(table, one, path).to_pylist()] for one in (FROM, TO)]

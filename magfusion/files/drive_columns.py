@@ -44,13 +44,7 @@ def column_names(path: Path) -> list[str]:
 
 
 def read_drive(path: Path | None, span: Span) -> DriveSamples | None:
-    """Read the currents recorded with a magnetometer's samples; None where there are none.
-
-    Raises
-    ------
-    InputError
-        As `read_table`; or where a current is no finite number. One that is missing is NaN.
-    """
+    """Read the currents recorded with a magnetometer's samples; None where there are none."""
     names = () if path is None else drive_columns(path)
     if path is None or not names:
         return None

@@ -58,10 +58,8 @@ def _table(path: Path) -> pa.Table:
 def read_field_maps(path: Path) -> dict[str, FieldMap]:
     """Read the maps of beacons by name.
 
-    Raises
-    ------
-    InputError
-        Where the file is missing or unreadable, lacks a column, or holds what no map holds.
+    Raises InputError where the file is missing or unreadable, lacks a column, or holds what no map
+    holds.
     """
     table = _table(path)
     try:

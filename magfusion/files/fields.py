@@ -64,13 +64,6 @@ def read_fields(path: Path, span: Span) -> FieldSamples:
     has its own; the covariance is
     ``sigma**2`` times the identity where the file does not hold one.  A receiver of fewer axes
     leaves columns out, which are NaN; one without signs gives amplitudes, here along x.
-
-    Raises
-    ------
-    InputError
-        As `read_table`; or where a number is not finite, a channel has two rows in one window,
-        the rows of one window differ in its length, a sigma, window or covariance is not
-        positive, or a component measured nothing in any row.
     """
     table = read_table(path, _LAYOUT, span)
     axes, signed = _measured(table, path)
@@ -107,12 +100,8 @@ def order_channels(fields: FieldSamples, site: Site) -> FieldSamples:
     """Arrange the channels as the site names them; those never measured are NaN.
 
     What several magnetometers measured is stamped, and its phases are referred, by the log's clock.
-
-    Raises
-    ------
-    InputError
-        Where a channel, or a magnetometer, is unknown to the site, or the fields do not specify
-        which of several measured them.
+    Raises InputError where a channel, or a magnetometer, is unknown to the site, or the fields do
+    not specify which of several measured them.
     """
     sensors = site.platform.magnetometers
     names = tuple(dict.fromkeys(fields.magnetometers))

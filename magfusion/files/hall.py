@@ -149,11 +149,9 @@ class HallEntry(StrictModel):
 def load_hall(path: Path) -> Hall:
     """Read a hall from its YAML file.
 
-    Raises
-    ------
-    InputError
-        Where a key is unknown, missing or out of range, or where what is used or mounted on is not
-        in the hall; the sentence names the file, the key, what was found and the remedy.
+    Raises InputError where a key is unknown, missing or out of range, or where what is used or
+    mounted on is not in the hall; the sentence names the file, the key, what was found and the
+    remedy.
     """
     entry = read_yaml(path, HallEntry)
     room = Prism(entry.hall.polygon_m, entry.hall.height_m)

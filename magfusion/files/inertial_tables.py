@@ -46,11 +46,6 @@ def read_imu(
     -------
     ImuSamples, tuple of Finding
         Without rows that hold NaN or of repeated time, and their number.
-
-    Raises
-    ------
-    InputError
-        As `read_table` and `check_imu`; or where the span holds no sample.
     """
     table = read_table(path, IMU_LAYOUT, span, content)
     if not len(table):
@@ -80,11 +75,6 @@ def read_waveform(
     -------
     Waveform or None, tuple of Finding
         As `read_imu`; None where there is no file or no row within the span.
-
-    Raises
-    ------
-    InputError
-        As `read_table` and `check_field`.
     """
     if path is None:
         return None, ()
@@ -108,10 +98,8 @@ def measured_rows(
 ) -> tuple[Array, Array, tuple[Finding, ...]]:
     """Return times (s) and columns of the rows that hold a sample, and what the others are.
 
-    Parameters
-    ----------
-    spread : bool
-        Whether samples of batches with one stamp are spread: where no other column has the stamps.
+    `spread`: whether samples of batches with one stamp are spread: where no other column has the
+    stamps.
     """
     values = table.numbers(names, nan=True)
     separate = separate_stamps(table.time_ns, values) if spread else None

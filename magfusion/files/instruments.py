@@ -162,12 +162,7 @@ class MagnetometerSheet:
 def bias_walk(density: float, in_run: float | None) -> float:
     """Return the random walk of a bias, by the rule of this module, in density's unit per second.
 
-    Parameters
-    ----------
-    density : float
-        One-sided, of the white noise.
-    in_run : float, optional
-        The least Allan deviation.
+    `density`: one-sided, of the white noise. `in_run`: the least Allan deviation.
     """
     white = density / math.sqrt(2.0)
     if in_run is None:
@@ -215,10 +210,7 @@ def magnetometers() -> Mapping[str, MagnetometerSheet]:
 def named_imu(name: str) -> ImuSheet:
     """Return an inertial sensor, in whatever way its name is written.
 
-    Raises
-    ------
-    InputError
-        Where none has this name.
+    Raises InputError where none has this name.
     """
     return _named(imus(), name, "--imu", "--list-imus")
 
@@ -226,10 +218,7 @@ def named_imu(name: str) -> ImuSheet:
 def named_magnetometer(name: str) -> MagnetometerSheet:
     """Return a magnetometer, in whatever way its name is written.
 
-    Raises
-    ------
-    InputError
-        Where none has this name.
+    Raises InputError where none has this name.
     """
     return _named(magnetometers(), name, "--magnetometer", "--list-magnetometers")
 

@@ -23,10 +23,7 @@ class StoredArrays(NamedTuple):
 def save_kept(path: Path, key: str, kept: StoredArrays) -> None:
     """Write what was done.
 
-    Parameters
-    ----------
-    key : str
-        Of all that made it.
+    `key`: of all that made it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     facts = np.array(json.dumps({"key": key, "facts": kept.facts}))
@@ -49,10 +46,7 @@ def load_kept(path: Path, key: str) -> StoredArrays | None:
 def digest_of_files(paths: Iterable[Path], *, without: frozenset[str] = frozenset()) -> str:
     """Return a digest of the content of files, and of all files in directories.
 
-    Parameters
-    ----------
-    without : set of str
-        Names of files that do not count.
+    `without`: names of files that do not count.
     """
     every: list[tuple[str, Path]] = []
     for path in paths:

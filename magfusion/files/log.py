@@ -73,6 +73,9 @@ def read_log(
 ) -> Log:
     """Read and check a log, or the part of it with start <= time < end.
 
+    Raises InputError where a file is missing, cannot be read or holds what no instrument gives, or
+    where the span holds no inertial samples or no field.
+
     Parameters
     ----------
     path : Path
@@ -87,12 +90,6 @@ def read_log(
     Log
         Streams without a row in the span are None; without a table of inertial samples there are
         none.
-
-    Raises
-    ------
-    InputError
-        Where a file is missing, cannot be read or holds what no instrument gives, or where the
-        span holds no inertial samples or no field.
     """
     if not path.is_dir():
         result = "is a file" if path.exists() else "there is no such directory"
@@ -144,17 +141,9 @@ def read_log(
 def write_log(log: Log, path: Path, audio: AudioEntry | None = None) -> None:
     """Write a log as a directory of Parquet files; a log that is there is replaced.
 
-    Files of other names that lie in the former log are kept.
-
-    Parameters
-    ----------
-    audio : AudioEntry, optional
-        Of the recording that has its samples.
-
-    Raises
-    ------
-    InputError
-        Where something that is no log is at ``path``, or nothing can be written there.
+    Files of other names that lie in the former log are kept. `audio`: of the recording that has its
+    samples. Raises InputError where something that is no log is at ``path``, or nothing can be
+    written there.
     """
     with whole_directory(path, replaces=is_log) as unfinished:
         if path.is_dir():

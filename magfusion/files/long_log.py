@@ -132,15 +132,7 @@ class LongLog:
 def long_log(path: Path, start: float | None = None, end: float | None = None) -> LongLog | None:
     """Return a log of magfusion with a stream of more than `LONG` rows; None of any other.
 
-    Parameters
-    ----------
-    start, end : float, optional
-        The part with start <= time < end, in seconds since the log's epoch.
-
-    Raises
-    ------
-    InputError
-        As the readers of tables; of the raw streams when they are read.
+    `start`, `end`: the part with start <= time < end, in seconds since the log's epoch.
     """
     if not is_log(path) or max(_rows(path, name) for name in _COLUMNS) <= LONG:
         return None

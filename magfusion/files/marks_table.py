@@ -30,13 +30,7 @@ _REMEDY = f"write the number of a coil's slot, or {SILENT} where none is driven"
 
 
 def read_marks(magnetometer: Path | None, bursts: Path | None, span: Span) -> Marks | None:
-    """Read the bursts of a log, in either form; None where there are none.
-
-    Raises
-    ------
-    InputError
-        As `read_table`; or where both ways are gone, a slot is none, or bursts overlap.
-    """
+    """Read the bursts of a log, in either form; None where there are none."""
     others = magnetometer is not None and SLOT in column_names(magnetometer)
     if bursts is not None and others:
         raise InputError(

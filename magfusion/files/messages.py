@@ -77,12 +77,7 @@ def stamp_ns(header: Any) -> int:
 
 
 def refuse_absent(message: Any, place: str) -> None:
-    """Refuse what the publisher marked as not measured (sensor_msgs/Imu: covariance of -1).
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse what the publisher marked as not measured (sensor_msgs/Imu: covariance of -1)."""
     for part in ("angular_velocity", "linear_acceleration"):
         cov = getattr(message, f"{part}_covariance", None)
         if cov is not None and cov[0] == -1.0:

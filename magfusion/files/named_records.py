@@ -23,10 +23,7 @@ if TYPE_CHECKING:
 def magnetometer_number(site: Site, name: str | None, what: str) -> int:
     """Return which of the platform's magnetometers something is of.
 
-    Raises
-    ------
-    InputError
-        Where the site has none of that name, or several and no name is given.
+    Raises InputError where the site has none of that name, or several and no name is given.
     """
     names = [sensor.name for sensor in site.platform.magnetometers]
     if name is None and len(names) == 1:
@@ -47,10 +44,8 @@ def magnetometer_number(site: Site, name: str | None, what: str) -> int:
 def with_waveform(record: Record, site: Site) -> Record:
     """Return a record with the waveform of the tones whose complex amplitudes it holds.
 
-    Raises
-    ------
-    InputError
-        Where they are not the tones of the site, or its receiver is not of alternating fields.
+    Raises InputError where they are not the tones of the site, or its receiver is not of
+    alternating fields.
     """
     bands = record.baseband
     if bands is None:
@@ -67,13 +62,7 @@ def with_waveform(record: Record, site: Site) -> Record:
 
 
 def site_fields(entry: FieldsRecord, site: Site) -> FieldSamples:
-    """Return the phasors of a record in the order of the site's channels, by the log's clock.
-
-    Raises
-    ------
-    InputError
-        As `magnetometer_number` and `field_samples`.
-    """
+    """Return the phasors of a record in the order of the site's channels, by the log's clock."""
     which = magnetometer_number(site, entry.magnetometer, "fields")
     sensors = site.platform.magnetometers
     if len(sensors) == 1:

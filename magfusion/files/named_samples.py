@@ -38,11 +38,6 @@ def read_waveforms(
     dict, tuple of Finding
         As `magfusion.files.inertial_tables.read_waveform`, of each; those without a row within the
         span are not there.
-
-    Raises
-    ------
-    InputError
-        As `read_table` and `check_field`; or where currents, slots or angles are in the same table.
     """
     assert path is not None
     others = [n for n in column_names(path) if n == SLOT]

@@ -49,17 +49,9 @@ def write_bag(
     """Write ``odometry`` and ``pose`` below the namespace, in one file.
 
     Velocities are in body axes, as the child frame's are to be.  The rate of turning is no part of
-    a result: it is zero with `UNKNOWN_VARIANCE`, and so is the variance of velocity.
-
-    Parameters
-    ----------
-    report : callable
-        Called from time to time with the number of states written.
-
-    Raises
-    ------
-    InputError
-        Where a stamp is none of ROS.
+    a result: it is zero with `UNKNOWN_VARIANCE`, and so is the variance of velocity. `report`:
+    called from time to time with the number of states written. Raises InputError where a stamp is
+    none of ROS.
     """
     stamps = states.stamp_ns
     wrong = stamps[(stamps < 0) | (stamps >= _LAST_STAMP)]

@@ -18,12 +18,7 @@ BATCH = 1 << 17  # rows decoded at once
 def refuse_unfolding(
     file: pa.parquet.ParquetFile, names: list[str], groups: Sequence[Any], path: Path
 ) -> None:
-    """Refuse columns of lists and the like, and what a little file unfolds to beyond the memory.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse columns of lists and the like, and what a little file unfolds to beyond the memory."""
     for name in names:
         result = file.schema_arrow.field(name).type
         if pa.types.is_nested(result):
@@ -51,20 +46,13 @@ def read_batches(
 ) -> tuple[pa.Table, int]:
     """Return the rows of a span of a file with more rows than are kept in memory.
 
-    Parameters
-    ----------
-    skipped : int
-        Rows of the file before these groups.
+    `skipped`: rows of the file before these groups. Raises InputError where the span has too many
+    rows, too.
 
     Returns
     -------
     pyarrow.Table, int
         And in which row of the file it begins.
-
-    Raises
-    ------
-    InputError
-        Where the span has too many rows, too.
     """
     begin, end = bounds_ns
     kept: list[pa.RecordBatch] = []

@@ -65,17 +65,9 @@ def to_plain(value: object, rules: Rules | None = None) -> Any:
 def from_plain(kind: type[Kind], data: Any, place: str, rules: Rules | None = None) -> Kind:
     """Return the value of plain data.
 
-    Parameters
-    ----------
-    kind : type
-        As annotated: a dataclass, an array, a number, or a collection of them.
-    place : str
-        Where in the state the data are, for refusals.
-
-    Raises
-    ------
-    InputError
-        Where the data are of another type, or break a rule.
+    `kind`: as annotated: a dataclass, an array, a number, or a collection of them. `place`: where
+    in the state the data are, for refusals. Raises InputError where the data are of another type,
+    or break a rule.
     """
     return _Reader(rules or Rules()).value(kind, data, place)
 
@@ -83,10 +75,7 @@ def from_plain(kind: type[Kind], data: Any, place: str, rules: Rules | None = No
 def resume(part: object, data: Any, place: str, rules: Rules | None = None) -> None:
     """Give a running part, as it was made, the state that plain data hold.
 
-    Raises
-    ------
-    InputError
-        Where the data are of another type, or break a rule.
+    Raises InputError where the data are of another type, or break a rule.
     """
     _Reader(rules or Rules()).value(type(part), data, place, part)
 

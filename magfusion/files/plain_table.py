@@ -18,13 +18,7 @@ ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")  # R = Rz(yaw) Ry(pitch) Rx(roll)
 
 
 def refuse_damaged_text(table: pa.Table) -> None:
-    """Refuse names of columns, and texts in them, that are not UTF-8.
-
-    Raises
-    ------
-    pyarrow.ArrowInvalid
-    UnicodeDecodeError
-    """
+    """Refuse names of columns, and texts in them, that are not UTF-8."""
     table.validate(full=True)
     if not table.column_names:  # which are decoded here
         raise pa.ArrowInvalid("it has no columns")
@@ -33,14 +27,7 @@ def refuse_damaged_text(table: pa.Table) -> None:
 def read_whole(path: Path, what: str) -> pa.Table:
     """Read a table that must have a row.
 
-    Parameters
-    ----------
-    what : str
-        The table is, for a refusal: "survey".
-
-    Raises
-    ------
-    InputError
+    `what`: the table is, for a refusal: "survey".
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; give the path of a {what}.")
@@ -95,11 +82,8 @@ def has_angles(names: list[str]) -> bool:
 def poses(table: pa.Table, path: Path) -> tuple[Array, Array]:
     """Return positions (n, 3) (m) and attitudes (n, 3, 3), by quaternions or by angles.
 
-    Raises
-    ------
-    InputError
-        Where a column is missing, a position is beyond the Earth, or a quaternion is not of unit
-        length.
+    Raises InputError where a column is missing, a position is beyond the Earth, or a quaternion is
+    not of unit length.
     """
     position = np.stack([numbers(table, name, path) for name in POSITION], axis=1)
     farthest = np.max(np.abs(position), axis=1)

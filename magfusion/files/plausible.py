@@ -52,10 +52,7 @@ def beyond_range(values: Array) -> BoolArray:
 def declared_range(instrument: str, platform: Platform, name: str | None = None) -> float:
     """Return the range of an instrument, named as in `RANGE_KEYS`; infinite if none is declared.
 
-    Parameters
-    ----------
-    name : str, optional
-        Of one of several magnetometers.
+    `name`: of one of several magnetometers.
     """
     if instrument == "magnetometer":
         every = {sensor.name: sensor for sensor in platform.magnetometers}
@@ -82,10 +79,7 @@ def reaches(values: Array, largest: float) -> BoolArray:
 def check_imu(imu: ImuSamples, place: str) -> None:
     """Refuse inertial samples that are in deg/s, in g, or whose times are not nanoseconds.
 
-    Raises
-    ------
-    InputError
-        Naming ``place``, what was found and the likely factor.
+    Raises InputError naming ``place``, what was found and the likely factor.
     """
     # A few false samples are not the unit's fault.
     turning = np.sum(imu.gyro_body**2, axis=1)
@@ -153,10 +147,7 @@ def _keeps_its_direction(imu: ImuSamples) -> bool:
 def check_field(size: Array, place: str) -> None:
     """Refuse fields of a size (T) that is no beacon's and not the Earth's.
 
-    Raises
-    ------
-    InputError
-        Naming ``place``, what was found and the likely factor.
+    Raises InputError naming ``place``, what was found and the likely factor.
     """
     field = float(np.median(size)) if len(size) else 0.0
     if field > LARGEST_FIELD:

@@ -26,16 +26,13 @@ FIELD = ("field_x", "field_y", "field_z")
 def read_probe(path: Path) -> dict[Side, ProbeReadings]:
     """Read and check what a probe of one or three axes read, in Parquet or CSV.
 
+    Raises InputError where a column is missing or of the wrong type, a number is not finite, a coil
+    is none of three, an axis has no direction, or a sigma is not positive.
+
     Returns
     -------
     dict
         Readings of the antennas next to which it was placed.
-
-    Raises
-    ------
-    InputError
-        Where a column is missing or of the wrong type, a number is not finite, a coil is none of
-        three, an axis has no direction, or a sigma is not positive.
     """
     table = read_whole(path, "table of probe readings")
     coil = integers(table, "coil", path)

@@ -29,11 +29,6 @@ def read_readings(
     -------
     dict
         Of each part times (s) and values, shape (2, n).
-
-    Raises
-    ------
-    InputError
-        As `read_table`; or where a value is out of bounds, or a part has two at one time.
     """
     layout = TableLayout(numbers=(column,), texts=(PART,), repeats=True)
     table = read_table(path, layout, Span(epoch_ns))

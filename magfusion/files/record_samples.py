@@ -14,10 +14,7 @@ from magfusion.units import Array
 def field_samples(entry: FieldsRecord, channels: tuple[tuple[str, int], ...]) -> FieldSamples:
     """Return the phasors in the order of the site's channels; those not detected are NaN.
 
-    Raises
-    ------
-    InputError
-        Where a beacon or a tone is unknown to the site.
+    Raises InputError where a beacon or a tone is unknown to the site.
     """
     phasor = np.full((len(channels), 3), np.nan, dtype=complex)
     cov = np.full((len(channels), 3, 3), np.nan)
@@ -51,10 +48,7 @@ def _noise(entry: FieldsRecord, name: str, tone: int) -> Array:
 def aiding_samples(entry: AidingRecord, quantity: Quantity) -> AidingSamples:
     """Return the samples of a record of a sensor of some quantity, without those that are missing.
 
-    Raises
-    ------
-    InputError
-        If they are of another.
+    Raises InputError if they are of another.
     """
     if quantity == "mark" and entry.mark is not None:
         return AidingSamples(

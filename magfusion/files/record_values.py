@@ -14,10 +14,7 @@ MAX_TIME_S = 1e-9 * LARGEST_TIME_NS  # s
 def numbers(value: object, what: str, *, missing: bool = False) -> Array:
     """Return finite numbers as an array; NumPy alone would take text and truth values too.
 
-    Parameters
-    ----------
-    missing : bool
-        Whether null and NaN are taken, for a sample that is not there.
+    `missing`: whether null and NaN are taken, for a sample that is not there.
     """
     try:
         result = np.asarray(value)

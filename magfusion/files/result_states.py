@@ -41,13 +41,7 @@ class ResultStates:
 
 
 def read_result_states(path: Path) -> ResultStates:
-    """Read a table of states, Parquet or CSV, and leave out those that failed.
-
-    Raises
-    ------
-    InputError
-        As `magfusion.files.trajectory_table.read_trajectory`, or where no state has a pose.
-    """
+    """Read a table of states, Parquet or CSV, and leave out those that failed."""
     stamps = read_table(path, TableLayout(numbers=()), Span(0)).time_ns
     trajectory = read_trajectory(path, int(stamps[0]))
     columns = pa.csv.read_csv(path) if path.suffix == ".csv" else pa.parquet.read_table(path)

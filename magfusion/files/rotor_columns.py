@@ -19,13 +19,7 @@ def rotor_columns(path: Path) -> tuple[str, ...]:
 
 
 def read_rotation(path: Path | None, span: Span) -> RotorAngles | None:
-    """Read the angles recorded with a magnetometer's samples (rad); None where there are none.
-
-    Raises
-    ------
-    InputError
-        As `read_table`.  A row without an angle is left out.
-    """
+    """Read the angles recorded with a magnetometer's samples (rad); None where there are none."""
     names = () if path is None else rotor_columns(path)
     if path is None or not names:
         return None

@@ -42,10 +42,7 @@ class RowPosition:
 def claim_rows(path: Path) -> None:
     """See that rows may be written here: over nothing, an empty file or earlier rows.
 
-    Raises
-    ------
-    InputError
-        Where something else is there.
+    Raises InputError where something else is there.
     """
     if not os.path.lexists(path):
         return

@@ -26,10 +26,7 @@ def changed_keys(before: Site, after: Site) -> dict[str, Any]:
 def with_content(site: Site, content: str) -> Site:
     """Return a site with the beacons, platform and gravity of another one's content, as JSON.
 
-    Raises
-    ------
-    InputError
-        Where the content is invalid, or of other beacons.
+    Raises InputError where the content is invalid, or of other beacons.
     """
     try:
         other = site_of_entry(SiteEntry.model_validate_json(content), Path())

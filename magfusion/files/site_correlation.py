@@ -35,12 +35,8 @@ def save_correlation(site: Site, path: Path) -> None:
 def load_correlation(site: Site, path: Path) -> Correlation | None:
     """Read the correlation that belongs to a site.
 
-    A parameter whose sigma was changed since, or whose beacon is gone, is independent now.
-
-    Raises
-    ------
-    InputError
-        Where the file is none of a correlation.
+    A parameter whose sigma was changed since, or whose beacon is gone, is independent now. Raises
+    InputError where the file is none of a correlation.
     """
     correlation, sigma = read_correlation(path)
     then = dict(zip(correlation.parameters, sigma, strict=True))

@@ -68,10 +68,7 @@ class Place:
 def beacon_draft(text: str) -> BeaconDraft:
     """Read the given values of a beacon: its name, and ``key=value`` with the keys of a site.
 
-    Raises
-    ------
-    InputError
-        Where a key is unknown or its value is none, with an example.
+    Raises InputError where a key is unknown or its value is none, with an example.
     """
     named, *parts = text.split() or [""]
     name = named.removeprefix("name=")
@@ -154,10 +151,7 @@ def _truth(where: str, value: str | None) -> bool | None:
 def numbers(where: str, text: str, counts: tuple[int, ...]) -> Numbers:
     """Read numbers between commas.
 
-    Raises
-    ------
-    InputError
-        Where one is none, or their count is not among those wanted.
+    Raises InputError where one is none, or their count is not among those wanted.
     """
     try:
         result = tuple(float(part) for part in text.strip("[]()").split(","))
@@ -173,12 +167,7 @@ def numbers(where: str, text: str, counts: tuple[int, ...]) -> Numbers:
 
 
 def place_of(text: str) -> Place:
-    """Read ``LAT,LON,HEIGHT,DATE``.
-
-    Raises
-    ------
-    InputError
-    """
+    """Read ``LAT,LON,HEIGHT,DATE``."""
     parts = [part.strip() for part in text.split(",")]
     if len(parts) != 4:
         raise InputError(

@@ -158,10 +158,7 @@ def _check_single(one: MagnetometerEntry | None) -> None:
 def check_tones(sensor: MagnetometerEntry, tones_hz: Array, at: tuple[str | int, ...]) -> None:
     """Refuse a response that does not reach all tones, and a clock that leaves no phase known.
 
-    Parameters
-    ----------
-    at : tuple
-        Place of the magnetometer in the site's file.
+    `at`: place of the magnetometer in the site's file.
     """
     given = [key for key in RESPONSE_KEYS if getattr(sensor, key) is not None]
     if len(given) > 1:

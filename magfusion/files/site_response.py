@@ -118,10 +118,7 @@ def check_response_sigma(
 ) -> None:
     """Reject rows that are repeated, or a tone without one.
 
-    Parameters
-    ----------
-    at : tuple
-        Their place in the site's file.
+    `at`: their place in the site's file.
     """
     given = sorted(entry.frequency_hz for entry in entries)
     tones = np.unique(tones_hz[tones_hz > 0.0]).tolist()
@@ -135,10 +132,7 @@ def check_response(
 ) -> None:
     """Reject a repeated frequency, and tones beyond those that are given.
 
-    Parameters
-    ----------
-    at : tuple
-        Their place in the site's file.
+    `at`: their place in the site's file.
     """
     given = [entry.frequency_hz for entry in entries]
     for k, frequency in enumerate(given):

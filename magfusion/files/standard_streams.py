@@ -27,10 +27,7 @@ def occupy_closed() -> None:
 def binary_input() -> BinaryIO:
     """Return standard input.
 
-    Raises
-    ------
-    InputError
-        Where it is closed.
+    Raises InputError where it is closed.
     """
     if sys.stdin is None:
         raise InputError("standard input: is closed; pipe the records into it")
@@ -40,10 +37,7 @@ def binary_input() -> BinaryIO:
 def binary_output() -> BinaryIO:
     """Return standard output.
 
-    Raises
-    ------
-    InputError
-        Where it is closed.
+    Raises InputError where it is closed.
     """
     if sys.stdout is None:
         raise InputError("standard output: is closed; lead it into a file or a pipe")

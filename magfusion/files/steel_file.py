@@ -71,11 +71,5 @@ class SteelEntry(StrictModel):
 
 
 def read_steel(path: Path) -> SteelEntry:
-    """Read the steel of a room.
-
-    Raises
-    ------
-    InputError
-        As `read_yaml`.
-    """
+    """Read the steel of a room."""
     return read_yaml(path, SteelEntry)

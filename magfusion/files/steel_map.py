@@ -67,20 +67,9 @@ def _rows(beacon: str, coil: int, steel: SteelField) -> dict[str, AnyArray]:
 def read_steel_fields(path: Path, coils: dict[str, int]) -> dict[str, SteelField]:
     """Read the steel of beacons by name.
 
-    Parameters
-    ----------
-    coils : dict of str to int
-        Names of the site's beacons, and how many coils each has.
-
-    Returns
-    -------
-    dict
-        Without beacons that were removed from the site.
-
-    Raises
-    ------
-    InputError
-        Where the file is missing or unreadable, lacks a column, or is of other beacons.
+    `coils`: names of the site's beacons, and how many coils each has. Raises InputError where the
+    file is missing or unreadable, lacks a column, or is of other beacons. Beacons that were
+    removed from the site are left out.
     """
     table = read_whole(path, "map of steel")
     beacon = np.array([str(name) for name in column(table, "beacon", path).to_pylist()])

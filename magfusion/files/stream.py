@@ -44,10 +44,8 @@ class NumberedRecord:
 def read_records(stream: BinaryIO, form: Format) -> Iterator[NumberedRecord]:
     """Yield the records of a stream as they come; blank lines are passed over.
 
-    Raises
-    ------
-    InputError
-        Where MessagePack is none, or a record of it too large: it is unknown where the next begins.
+    Raises InputError where MessagePack is none, or a record of it too large: it is unknown where
+    the next begins.
     """
     return _json_records(stream) if form == "json" else _msgpack_records(stream)
 

@@ -99,18 +99,11 @@ def write_survey(survey: Survey, path: Path) -> None:
 def read_survey(path: Path, list_of_poses: Path | None = None) -> Survey:
     """Read and check a survey in Parquet or CSV.
 
-    Parameters
-    ----------
-    list_of_poses : Path, optional
-        Table with the pose of each ``point``, as a turntable or a robot gives them, where the
-        survey's rows have none.
-
-    Raises
-    ------
-    InputError
-        Where a column is missing or of the wrong type, a number is not finite, an amplitude or
-        sigma is not positive, a quaternion is not of unit length, a row is repeated, the rows
-        of one point disagree on its pose, or a point is not in the list of poses.
+    `list_of_poses`: table with the pose of each ``point``, as a turntable or a robot gives them,
+    where the survey's rows have none. Raises InputError where a column is missing or of the wrong
+    type, a number is not finite, an amplitude or sigma is not positive, a quaternion is not of unit
+    length, a row is repeated, the rows of one point disagree on its pose, or a point is not in the
+    list of poses.
     """
     table = read_whole(path, "survey")
     pose = None if list_of_poses is not None else poses(table, path)

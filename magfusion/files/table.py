@@ -166,10 +166,7 @@ class Table:
     def numbers(self, names: Sequence[str], *, nan: bool = False) -> Array:
         """Return columns side by side, shape (n, names); refuse what is not a finite number.
 
-        Parameters
-        ----------
-        nan : bool
-            Whether a number may be missing: NaN or null in the table, NaN of what is returned.
+        `nan`: whether a number may be missing: NaN or null in the table, NaN of what is returned.
         """
         values = np.empty((len(self), len(names)))
         for k, name in enumerate(names):
@@ -232,18 +229,9 @@ def read_table(
 ) -> Table:
     """Read the columns of a layout and the rows of a span.
 
-    A Parquet file is mapped, and only the row groups that the span needs are decoded.
-
-    Parameters
-    ----------
-    content : pyarrow.Table, optional
-        What the file holds, where another reader has read it.
-
-    Raises
-    ------
-    InputError
-        Where the file is absent, no such table, empty, lacks a column, or its times are no
-        integers or not sorted.
+    A Parquet file is mapped, and only the row groups that the span needs are decoded. `content`:
+    what the file holds, where another reader has read it. Raises InputError where the file is
+    absent, no such table, empty, lacks a column, or its times are no integers or not sorted.
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; give the path of a table.")
@@ -280,10 +268,7 @@ def read_table(
 def refuse_jump(table: Table, before: int | None) -> None:
     """Refuse a row that is more than an hour after the row above.
 
-    Parameters
-    ----------
-    before : int, optional
-        Time of the row above the first (ns).
+    `before`: time of the row above the first (ns).
     """
     first = table.time_ns[:1] if before is None else before
     jumped = np.diff(table.time_ns, prepend=first) * NANOSECOND > LONGEST_GAP

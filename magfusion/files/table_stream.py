@@ -57,11 +57,6 @@ def pieces(
     """Yield a stream of a log, ``imu`` or ``magnetometer``; nothing where the log has none.
 
     A log's own tables are read piece by piece; an EuRoC folder and a bag are read whole first.
-
-    Raises
-    ------
-    InputError
-        As the readers of tables and logs.
     """
     if not is_log(path):
         yield from _whole(path, stream, start, end, topics)
@@ -90,13 +85,7 @@ def _whole(
 
 
 def table_pieces(path: Path, layout: TableLayout, span: Span) -> Iterator[Table]:
-    """Yield the rows of a span, in tables of at most `BATCH` rows.
-
-    Raises
-    ------
-    InputError
-        As `read_table`, when the row is reached.
-    """
+    """Yield the rows of a span, in tables of at most `BATCH` rows."""
     begin, end = span.bounds_ns
     row, last = 0, None
     try:

@@ -10,13 +10,7 @@ DEGC = "temperature_degc"
 
 
 def read_temperatures(path: Path | None, epoch_ns: int) -> Temperatures | None:
-    """Read all readings: also those before and after the part of a log that is used.
-
-    Raises
-    ------
-    InputError
-        As `read_readings`.
-    """
+    """Read all readings: also those before and after the part of a log that is used."""
     if path is None:
         return None
     remedy = f"write degrees Celsius, from {COLDEST:g} to {HOTTEST:g}"

@@ -30,12 +30,7 @@ def format_of(path: Path) -> Format | None:
 
 
 def refuse_place(path: Path) -> None:
-    """Refuse a path at which no file can be written.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a path at which no file can be written."""
     if path.is_dir():
         raise InputError(f"{path}: is a directory; give the path of a file to write")
     if not path.absolute().parent.is_dir():
@@ -51,17 +46,7 @@ def write_states(
 ) -> None:
     """Write states, stamped with the log's clock, as one whole file or none.
 
-    Parameters
-    ----------
-    frames : Frames, optional
-        Of a bag.
-    report : callable, optional
-        Called with the number of states written, of a bag.
-
-    Raises
-    ------
-    InputError
-        As `magfusion.files.odometry_bag.write_bag`.
+    `frames`: of a bag. `report`: called with the number of states written, of a bag.
     """
     with whole_file(path) as unfinished:
         if form == "csv":
@@ -77,15 +62,8 @@ def write_states(
 def save_trajectory(trajectory: Trajectory, path: Path, epoch_ns: int) -> None:
     """Write a trajectory as its file's name ends: .parquet, or one of `FORMATS`.
 
-    Parameters
-    ----------
-    epoch_ns : int
-        Zero of the clock of its times.
-
-    Raises
-    ------
-    InputError
-        Where the name ends otherwise, nothing can be written there or there is no pose.
+    `epoch_ns`: zero of the clock of its times. Raises InputError where the name ends otherwise,
+    nothing can be written there or there is no pose.
     """
     form = format_of(path)
     if form is None and path.suffix.lower() != PARQUET:

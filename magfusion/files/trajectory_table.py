@@ -31,13 +31,9 @@ def write_trajectory(
 ) -> None:
     """Write a trajectory as Parquet: ``trajectory.parquet`` of a run, ``truth.parquet`` of a log.
 
-    Parts that the trajectory does not have are left out.
-
-    Parameters
-    ----------
-    trust : StateTrust, optional
-        Of each state: ``verdict``, ``protection_level_m`` and ``protection_level_deg`` (null where
-        there is none), and ``excluded`` (names of beacons).
+    Parts that the trajectory does not have are left out. `trust`: of each state: ``verdict``,
+    ``protection_level_m`` and ``protection_level_deg`` (null where there is none), and ``excluded``
+    (names of beacons).
     """
     columns = trajectory_columns(trajectory, epoch_ns)
     if trust is not None:
@@ -88,11 +84,6 @@ def read_trajectory(
     A truth may have positions alone or attitudes alone; the other part is NaN then.
 
     ``content`` as in `read_table`.
-
-    Raises
-    ------
-    InputError
-        As `read_table`; or where a number is not finite or a quaternion not of unit length.
     """
     table = read_table(path, _LAYOUT, Span(epoch_ns, start, end), content)
     rotation, position = np.full((len(table), 3, 3), np.nan), _numbers(table, _POSITION)

@@ -39,14 +39,9 @@ def write_tum(trajectory: Trajectory, path: Path, epoch_ns: int) -> None:
 def read_tum(path: Path, epoch_ns: int = 0) -> Trajectory:
     """Read and check a TUM file; times are seconds since ``epoch_ns``.
 
-    Attitudes of a file with positions alone are NaN.
-
-    Raises
-    ------
-    InputError
-        Where the file is absent, not text, empty, a line does not hold eight finite numbers (or
-        four, of positions alone: as many as the first line), a
-        quaternion is not of unit length, or the times do not increase.
+    Attitudes of a file with positions alone are NaN. Raises InputError where the file is absent,
+    not text, empty, a line does not hold eight finite numbers (or four, of positions alone: as many
+    as the first line), a quaternion is not of unit length, or the times do not increase.
     """
     lines = _lines(path)
     count = len(_POSITIONS.split() if len(lines[0][1].split()) == 4 else _COLUMNS.split())

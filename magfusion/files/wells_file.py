@@ -34,11 +34,5 @@ class WellsEntry(StrictModel):
 
 
 def read_wells(path: Path | None) -> WellsEntry:
-    """Read two wells; without a file as usual.
-
-    Raises
-    ------
-    InputError
-        As `read_yaml`.
-    """
+    """Read two wells; without a file as usual."""
     return WellsEntry() if path is None else read_yaml(path, WellsEntry)

@@ -26,11 +26,8 @@ class StrictModel(BaseModel):
 def read_yaml(path: Path, model: type[Model]) -> Model:
     """Read a YAML file and check it against a model.
 
-    Raises
-    ------
-    InputError
-        Where the file cannot be read, is larger than a file written by hand can be, is not one
-        YAML mapping of plain values, repeats a key, or does not fit the model.
+    Raises InputError where the file cannot be read, is larger than a file written by hand can be,
+    is not one YAML mapping of plain values, repeats a key, or does not fit the model.
     """
     content = _parse(_text(path), path)
     if not isinstance(content, dict):

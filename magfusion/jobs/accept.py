@@ -54,13 +54,7 @@ class AcceptSettings(LogSettings, WindowSettings):
 def run_accept(
     settings: AcceptSettings, output: Path | None = None, report: Report = quiet
 ) -> Figures:
-    """Test each beacon of an installation, and name what to correct.
-
-    Raises
-    ------
-    InputError
-        Where the log has no stops on marks of the site, or a file cannot be read.
-    """
+    """Test each beacon of an installation, and name what to correct."""
     from magfusion.calibration.installation import check_installation
     from magfusion.files.distances import read_distances
     from magfusion.files.site import save_site

@@ -31,11 +31,6 @@ def run_allan(settings: AllanSettings, output: Path, report: Report = quiet) -> 
     """Estimate white noise, instability and random walk of the instruments of a log at rest.
 
     The log is read in blocks; memory does not grow with its length.
-
-    Raises
-    ------
-    InputError
-        Where the log cannot be read, or is too short for any estimate.
     """
     from magfusion.jobs.allan_noise import measured
     from magfusion.jobs.result_directory import claim, found_in

@@ -131,12 +131,7 @@ class _StreamFindings:
 
 
 def measured(job: Job, site: Site | None, report: Report) -> MeasuredNoise:
-    """Estimate the noise of a log at rest.
-
-    Raises
-    ------
-    InputError
-    """
+    """Estimate the noise of a log at rest."""
     motion = MotionModel() if site is None else site.platform.motion
     findings: list[Finding] = []
     instruments: list[Instrument] = []
@@ -181,10 +176,7 @@ def measured(job: Job, site: Site | None, report: Report) -> MeasuredNoise:
 def _gathered(job: Job, stream: str, width: int) -> tuple[RestStream, _StreamFindings]:
     """Return the samples of a stream at rest, and the findings of its blocks.
 
-    Raises
-    ------
-    InputError
-        Where there are too few samples.
+    Raises InputError where there are too few samples.
     """
     rest, findings = RestStream(width), _StreamFindings()
     for piece in _pieces(job, stream):

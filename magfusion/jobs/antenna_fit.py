@@ -101,10 +101,7 @@ def declared_sigma(start: Antenna, *, sizes: bool) -> Array:
 def solved(bench: Bench, settings: AntennaSettings) -> AntennaSolution:
     """Return the maximum-likelihood antennas of all readings.
 
-    Raises
-    ------
-    EstimationError
-        Where a fit does not converge.
+    Raises EstimationError where a fit does not converge.
     """
     mean = bench.start.vector()
     cov = np.diag(declared_sigma(bench.start, sizes=settings.sizes) ** 2)

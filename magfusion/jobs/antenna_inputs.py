@@ -32,10 +32,7 @@ MIN_POSES = 5  # four determine the antenna; with less than one to spare nothing
 def tracker(site: Site, name: str | None) -> Beacon:
     """Return the site's beacon that is a tracker's source.
 
-    Raises
-    ------
-    InputError
-        Where there is none, or more than one.
+    Raises InputError where there is none, or more than one.
     """
     names = ", ".join(b.name for b in site.beacons)
     trackers = [b for b in site.beacons if len(b.coils) == 3 and len(b.tones) == 3]
@@ -67,10 +64,7 @@ def tracker(site: Site, name: str | None) -> Beacon:
 def couplings(survey: Survey, beacon: Beacon) -> tuple[BodySurvey, int]:
     """Return a survey's couplings at poses of the body, and how many poses lack one.
 
-    Raises
-    ------
-    InputError
-        Where it has no phasors of the tracker, or too few poses with all of them.
+    Raises InputError where it has no phasors of the tracker, or too few poses with all of them.
     """
     if survey.phasor_sensor is None:
         raise InputError("contains amplitudes, but antennas require phasors; survey again")
@@ -104,12 +98,7 @@ def couplings(survey: Survey, beacon: Beacon) -> tuple[BodySurvey, int]:
 
 
 def refuse_swapped(survey: BodySurvey, antenna: Antenna) -> None:
-    """Raise an error for couplings that match no pose of the declared antenna.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise an error for couplings that match no pose of the declared antenna."""
     receiver = np.asarray(np.linalg.inv(antenna.sensitivities_sensor))
     try:
         locate_by_svd(eq_09_whitened(survey.coupling, receiver, antenna.moments_beacon.T))
@@ -140,12 +129,7 @@ def mounted_by_fixes(survey: BodySurvey, site: Site, beacon: Beacon) -> Site:
 
 
 def probed(paths: tuple[Path, ...]) -> dict[Side, ProbeReadings]:
-    """Return the readings of several files together.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return the readings of several files together."""
     result: dict[Side, ProbeReadings] = {}
     for path in paths:
         for side, readings in read_probe(path).items():

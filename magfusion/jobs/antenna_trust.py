@@ -28,11 +28,8 @@ def judge_fit(
 ) -> tuple[AntennaFit, Trust]:
     """Return a fit with a covariance consistent with its tests, and their findings.
 
-    Parameters
-    ----------
-    errors : tuple of PoseErrors, optional
-        Of fixes at surveyed poses with the declared antenna, and with one fitted without the pose;
-        None without a survey.
+    `errors`: of fixes at surveyed poses with the declared antenna, and with one fitted without the
+    pose; None without a survey.
     """
     fit = result.fit
     fitted = unexplained(

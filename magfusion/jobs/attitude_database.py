@@ -97,14 +97,7 @@ class Steady(NamedTuple):
 
 
 def run_attitude_database(settings: DatabaseSettings, output: Path) -> Figures:
-    """Build the database of a log with known attitudes: table, picture and report.
-
-    Raises
-    ------
-    InputError
-        Where the log has no reference, an angle varies that one vector cannot determine, or
-        ``output`` is in the way.
-    """
+    """Build the database of a log with known attitudes: table, picture and report."""
     from magfusion.jobs.inputs import named, read_job
     from magfusion.jobs.result_directory import claim, found_in, refuse_failed
     from magfusion.results.plots.match import write_database_plot
@@ -202,10 +195,7 @@ def _reference(job: Job, log: Log, trajectory: Path | None) -> tuple[Trajectory,
 def steady(log: Log, site: Site, sampling: Sampling) -> Steady:
     """Return the calibrated static field of a log in body axes.
 
-    Raises
-    ------
-    InputError
-        Where the log has no waveform, or no stretch of it is long enough.
+    Raises InputError where the log has no waveform, or no stretch of it is long enough.
     """
     if log.waveform is None:
         raise InputError(

@@ -46,16 +46,7 @@ JOB = "calibrate antenna"
 
 
 def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
-    """Calibrate the antennas of a beacon and of the magnetometer: site, picture and report.
-
-    Raises
-    ------
-    InputError
-        Where a file cannot be read, the site has no tracker, the survey does not fit it, its poses
-        are too few, a wire is swapped, or ``output`` is in the way.
-    EstimationError
-        Where the fit does not converge.
-    """
+    """Calibrate the antennas of a beacon and of the magnetometer: site, picture and report."""
     from magfusion.jobs.inputs import named
     from magfusion.jobs.result_directory import claim, found_in, refuse_failed
     from magfusion.results.plots.antenna import write_antenna_plot

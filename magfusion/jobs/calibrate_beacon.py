@@ -74,11 +74,6 @@ def run_calibrate_beacon(settings: BeaconSettings, output: Path, report: Report 
 
     A beacon that is not synchronised must have had one drive phase at all points, as with
     magnetometers that record simultaneously.
-
-    Raises
-    ------
-    InputError
-        Where a file cannot be used, a beacon was not surveyed, or it is not determined.
     """
     from magfusion.jobs.inputs import named
     from magfusion.jobs.result_directory import claim, found_in, refuse_failed

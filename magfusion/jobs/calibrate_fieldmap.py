@@ -56,12 +56,7 @@ class MapSettings(Settings):
 
 
 def run_calibrate_fieldmap(settings: MapSettings, output: Path, report: Report = quiet) -> Figures:
-    """Estimate the field map of a site's beacons; write the site with the map.
-
-    Raises
-    ------
-    InputError
-    """
+    """Estimate the field map of a site's beacons; write the site with the map."""
     from magfusion.jobs.result_directory import claim, found_in, refuse_failed
     from magfusion.results.plots.fieldmap import write_plot
     from magfusion.results.report import write_report
@@ -100,10 +95,7 @@ def run_calibrate_fieldmap(settings: MapSettings, output: Path, report: Report =
 def judge_map(fit: MapFit, streams: tuple[Finding, ...] = ()) -> Trust:
     """Return whether a map is valid at points not used in it.
 
-    Parameters
-    ----------
-    streams : tuple of Finding
-        Of the log that the points come from.
+    `streams`: of the log that the points come from.
     """
     result = []
     for beacon, error in fit.error_with.items():
@@ -142,10 +134,7 @@ def _from_survey(settings: MapSettings, path: Path) -> tuple[Site, MapPoints, Fi
 def points_of(survey: Survey, site: Site, path: Path) -> MapPoints:
     """Return a survey's points with the channels in the site's order.
 
-    Raises
-    ------
-    InputError
-        Where the survey has amplitudes only, or channels that are not in the site.
+    Raises InputError where the survey has amplitudes only, or channels that are not in the site.
     """
     if survey.phasor_sensor is None:
         raise InputError(f"{path}: has amplitudes, but a field map requires phasors; survey again")

@@ -100,15 +100,7 @@ class LogCalibrationSettings(LogsSettings, WindowSettings, EstimateSettings):
 def run_calibrate_log(
     settings: LogCalibrationSettings, output: Path, report: Report = quiet
 ) -> Figures:
-    """Calibrate a site with a log of ordinary motion, or with several together.
-
-    Raises
-    ------
-    InputError
-        Where the log or the site is not usable, or no parameter is to be calibrated.
-    EstimationError
-        Where the smoother fails, or the verdict is failed.
-    """
+    """Calibrate a site with a log of ordinary motion, or with several together."""
     from magfusion.estimation.batch.batch import SmootherSettings
     from magfusion.estimation.batch.self_survey import smooth_and_place
     from magfusion.estimation.integrity.judge import judge_result
@@ -211,10 +203,7 @@ def grown(result: Smoothed, honest: Smoothed) -> float:
 def against_site(result: Smoothed, least: float = 1.0) -> tuple[Smoothed, Trust]:
     """Return a result with calibration sigmas consistent with its fit, and the findings.
 
-    Parameters
-    ----------
-    least : float
-        Minimum factor on the covariance of the calibration.
+    `least`: minimum factor on the covariance of the calibration.
     """
     from magfusion.results.refinement import parameter_estimates
 

@@ -74,15 +74,7 @@ def run(settings: MagnetometerSettings, output: Path, given: set[str]) -> Figure
 
 
 def run_guided(settings: MagnetometerSettings, output: Path) -> Figures:
-    """Guide a rotation by the records on standard input, and calibrate as from a log.
-
-    Raises
-    ------
-    InputError
-        Where there is no site, or a record is invalid.
-    EstimationError
-        Where the records end before the calibration is certain.
-    """
+    """Guide a rotation by the records on standard input, and calibrate as from a log."""
     from magfusion.jobs.magnetometer_turns import guide
     from magfusion.jobs.result_directory import claim
     from magfusion.results.recording_turns import open_turn_view
@@ -109,20 +101,8 @@ def run_guided(settings: MagnetometerSettings, output: Path) -> Figures:
 def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
     """Calibrate the magnetometer of a log: refined site, picture and report.
 
-    Parameters
-    ----------
-    job : Job
-        Its log has the raw waveform; inertial samples add to the field's magnitude.
-    positions : bool
-        Use only the stops, at least twelve, instead of the whole rotation.
-
-    Raises
-    ------
-    InputError
-        For invalid input: no waveform, NaN or a wrong unit in it, too few orientations, no rest
-        for ``positions``, or ``job.output`` in the way.
-    EstimationError
-        Where the calibration has no solution.
+    `job`: its log has the raw waveform; inertial samples add to the field's magnitude. `positions`:
+    use only the stops, at least twelve, instead of the whole rotation.
     """
     from magfusion.jobs.inputs import named, read_job, require_imu
     from magfusion.jobs.result_directory import claim, refuse_failed

@@ -47,11 +47,6 @@ def run_calibrate_response(settings: ResponseSettings, output: Path) -> Figures:
 
     A coil that is not synchronised must have had one drive phase at all points, as of a card that
     plays and records by one clock.
-
-    Raises
-    ------
-    InputError
-        Where a file cannot be used, the survey does not fit the site, or no response is uncertain.
     """
     from magfusion.estimation.snapshot.priors import contradiction, trust_of, unexplained
     from magfusion.jobs.result_directory import claim, found_in, refuse_failed

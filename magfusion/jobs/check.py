@@ -37,14 +37,7 @@ def run_check(
 ) -> Figures:
     """Check a log: consistency of its streams, fields, compass and first fixes.
 
-    Parameters
-    ----------
-    output : Path, optional
-        Directory of report and picture; by default nothing is written.
-
-    Raises
-    ------
-    InputError
+    `output`: directory of report and picture; by default nothing is written.
     """
     from magfusion.estimation.demodulation.separate_demodulation import by_name, each_recorded
     from magfusion.estimation.integrity.quick_check import quick_check

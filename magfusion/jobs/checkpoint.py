@@ -52,6 +52,9 @@ def begin(
 ) -> ResumedRun[Extra]:
     """Return the navigator of a checkpoint, or a new one where there is none.
 
+    Raises InputError where the checkpoint is damaged or of another run, or the place is not a
+    checkpoint.
+
     Parameters
     ----------
     place : Path, optional
@@ -62,11 +65,6 @@ def begin(
         Other state of a new run; that in the checkpoint has the same type.
     resume : bool
         If false, the run starts from the beginning, and an existing checkpoint is overwritten.
-
-    Raises
-    ------
-    InputError
-        Where the checkpoint is damaged or of another run, or the place is not a checkpoint.
     """
     result = read_checkpoint(place, key) if place is not None and resume else None
     if place is None or result is None:

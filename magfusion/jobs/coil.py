@@ -43,12 +43,7 @@ class CoilSettings(Settings):
     air: float = option(20.0, "Temperature of the air", unit="°C", least=-60.0, most=100.0)
 
     def coil(self) -> WireCoil:
-        """Return the coil.
-
-        Raises
-        ------
-        InputError
-        """
+        """Return the coil."""
         from magfusion.model.physics.wire_coil import WireCoil
 
         if (self.radius is None) == (self.side is None):
@@ -71,10 +66,7 @@ class CoilSettings(Settings):
 def run(settings: CoilSettings) -> Figures:
     """Return what a coil gives, when its temperature no longer rises.
 
-    Raises
-    ------
-    InputError
-        Where it has no such temperature.
+    Raises InputError where it has no such temperature.
     """
     from magfusion.model.physics.wire_coil import HOTTEST_DEGC, operating_point
 

@@ -33,10 +33,7 @@ class DriveSettings(Settings):
     def drives(self, beacons: Sequence[Beacon]) -> list[DriveRow]:
         """Return the drive of beacons; none without a coil.
 
-        Raises
-        ------
-        InputError
-            Where the text specifies no coil.
+        Raises InputError where the text specifies no coil.
         """
         from magfusion.results.design.coil_drive import drive_rows
 
@@ -48,12 +45,7 @@ class DriveSettings(Settings):
 
 
 def _coil_settings(text: str) -> CoilSettings:
-    """Return the settings of `magfusion coil` for a text, with any current.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return the settings of `magfusion coil` for a text, with any current."""
     from pydantic import TypeAdapter, ValidationError
 
     parts = [part.strip().partition("=") for part in text.split(",")]

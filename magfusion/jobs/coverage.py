@@ -63,13 +63,7 @@ class CoverageSettings(NeedSettings):
 
 
 def run_coverage(settings: CoverageSettings, output: Path) -> Figures:
-    """Bound the pose over a volume: table, picture, recording and report.
-
-    Raises
-    ------
-    InputError
-        Where the site cannot be read, the settings do not fit, or ``output`` is in the way.
-    """
+    """Bound the pose over a volume: table, picture, recording and report."""
     from magfusion.jobs.result_directory import claim
     from magfusion.results.plots.coverage import write_plot
     from magfusion.results.recording_coverage import write_coverage_recording
@@ -177,12 +171,8 @@ def need_figures(
 ) -> Figures:
     """Return whether the protection levels that are needed are reached; nothing without a need.
 
-    Parameters
-    ----------
-    limits : tuple of float
-        Of position (m), and of attitude (deg) where it matters; empty without a need.
-    of_sigma : bool
-        Whether sigmas of position and attitude are needed instead.
+    `limits`: of position (m), and of attitude (deg) where it matters; empty without a need.
+    `of_sigma`: whether sigmas of position and attitude are needed instead.
     """
     level_m, level_deg = coverage.protection_level_m, coverage.protection_level_deg
     if of_sigma:

@@ -26,13 +26,7 @@ class DemoSettings(RandomSettings):
 
 
 def run_demo(settings: DemoSettings, output: Path, report: Report = quiet) -> Figures:
-    """Simulate a walk among the demo's beacons, smooth it, and write the result.
-
-    Raises
-    ------
-    InputError
-        Where ``output`` is in the way.
-    """
+    """Simulate a walk among the demo's beacons, smooth it, and write the result."""
     from magfusion.estimation.batch.batch import SmootherSettings
     from magfusion.jobs.inputs import Job
 

@@ -34,13 +34,7 @@ class DemodulateSettings(LogSettings, WindowSettings, RestSettings):
 
 
 def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = quiet) -> Figures:
-    """Demodulate a waveform: a log with phasors instead.
-
-    Raises
-    ------
-    InputError
-        Where the log has no waveform, or no window of it is usable.
-    """
+    """Demodulate a waveform: a log with phasors instead."""
     from magfusion.estimation.demodulation.demodulation import phasors
     from magfusion.estimation.demodulation.separate_demodulation import demodulated_apart
     from magfusion.jobs.inputs import named, read_job
@@ -106,10 +100,7 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
 def _phasor_figures(samples: FieldSamples, every: bool) -> Figures:
     """Return the number of phasors, and their sigmas.
 
-    Parameters
-    ----------
-    every : bool
-        Whether a tone that is in no window is reported.
+    `every`: whether a tone that is in no window is reported.
     """
     sigma = np.sqrt(np.trace(samples.phasor_cov, axis1=2, axis2=3) / 3.0)
     return Figures(

@@ -50,13 +50,7 @@ LEAST_DRAWN = 15  # random layouts, of which the median is drawn where nothing e
 
 
 def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -> Figures:
-    """Place beacons: a site, maps before and after, table, recording and report.
-
-    Raises
-    ------
-    InputError
-        Where a file cannot be read, the settings do not fit, or ``output`` is in the way.
-    """
+    """Place beacons: a site, maps before and after, table, recording and report."""
     from magfusion.jobs.result_directory import claim
     from magfusion.results.plots.design import Panel, write_plot
     from magfusion.results.plots.error_budget import write_budget_plot

@@ -26,12 +26,7 @@ def design_figures(
 ) -> Figures:
     """Return the report of a design: its accuracy, before and after, and its beacons.
 
-    Parameters
-    ----------
-    panels : list of Panel
-        Before and after.
-    spacing : float
-        Of the points (m).
+    `panels`: before and after. `spacing`: of the points (m).
     """
     before, after = (panel.coverage for panel in panels)
     notes = [] if result.complete else [_OUT_OF_TIME]

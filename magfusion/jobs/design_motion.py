@@ -26,13 +26,7 @@ if TYPE_CHECKING:
 def run_motion(
     settings: DesignSettings, site: Site, hall: Hall, points: Array, output: Path
 ) -> Figures:
-    """Choose stops for a calibration: table, picture and report.
-
-    Raises
-    ------
-    InputError
-        Where the site declares all parameters as known, or ``output`` is in the way.
-    """
+    """Choose stops for a calibration: table, picture and report."""
     from magfusion.jobs.result_directory import claim
     from magfusion.results.plots.motion import write_motion_plot
     from magfusion.results.report import write_report

@@ -94,13 +94,6 @@ def run_drift(settings: DriftSettings, output: Path, report: Report | None = Non
     """Run estimators through days of simulated worlds and assess them.
 
     Until all runs are complete, ``output`` contains the files needed to resume.
-
-    Raises
-    ------
-    InputError
-        Where the settings do not fit, or ``output`` is in the way.
-    EstimationError
-        Where an estimator does not start.
     """
     from magfusion.jobs.drift_world import claim_place, run_world
     from magfusion.jobs.result_directory import claim

@@ -68,12 +68,7 @@ STABILITY = {"pass": "stable", "fail": "unstable", "undecided": "inconclusive"}
 def judge_runs(name: str, runs: list[WorldRun]) -> tuple[Figures, list[Criterion]]:
     """Return figures of one estimator's runs, each key beginning with its name, and the judgements.
 
-    Parameters
-    ----------
-    name : str
-        Of the estimator.
-    runs : list of WorldRun
-        One of each world.
+    `name`: of the estimator. `runs`: one of each world.
     """
     figures: list[Figure] = []
     judgements: list[Criterion] = []

@@ -165,13 +165,7 @@ def draw_task(task: WorldTask) -> EnduranceWorld:
 
 
 def run_world(task: WorldTask, _rng: np.random.Generator | None = None) -> WorldRun:
-    """Navigate through a world, from the last checkpoint if there is one.
-
-    Raises
-    ------
-    EstimationError
-        Where the navigator does not start.
-    """
+    """Navigate through a world, from the last checkpoint if there is one."""
     if task.place is None:
         with TemporaryDirectory() as place:
             return replace(run_world(replace(task, place=place)), task=task)
@@ -307,12 +301,7 @@ def stretches_done(tasks: list[WorldTask]) -> int:
 
 
 def claim_place(place: Path) -> None:
-    """Check that a directory contains only files of unfinished runs.
-
-    Raises
-    ------
-    InputError
-    """
+    """Check that a directory contains only files of unfinished runs."""
     for path in (p for p in sorted(place.rglob("*")) if not p.is_dir()):
         if path.name == _PROGRESS:
             claim_checkpoint(path)

@@ -42,10 +42,7 @@ class DriveSettings(Settings):
 def run(settings: DriveSettings, output: Path) -> Figures:
     """Write a file that is played again and again without a step.
 
-    Raises
-    ------
-    InputError
-        Where a sound card cannot play it, or ``output`` is in the way.
+    Raises InputError where a sound card cannot play it, or ``output`` is in the way.
     """
     from magfusion.jobs.result_directory import claim
     from magfusion.results.report import write_report

@@ -52,13 +52,7 @@ class EvaluateSettings(TopicSettings):
 
 
 def run_evaluate(settings: EvaluateSettings) -> Figures:
-    """Compare a trajectory with a truth.
-
-    Raises
-    ------
-    InputError
-        Where one of the two cannot be read, or they do not overlap in time.
-    """
+    """Compare a trajectory with a truth."""
     from magfusion.jobs.inputs import named
     from magfusion.results.association import associate
     from magfusion.results.errors import trajectory_errors

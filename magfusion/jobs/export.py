@@ -39,12 +39,7 @@ class ExportSettings(FrameSettings):
             raise InputError(f"--namespace must be of the form /robot/nav; got {self.namespace!r}")
 
     def format_of(self, output: Path) -> Format:
-        """Return the format of a file.
-
-        Raises
-        ------
-        InputError
-        """
+        """Return the format of a file."""
         if self.format is not None:
             return self.format
         form = format_of(output)
@@ -57,13 +52,7 @@ class ExportSettings(FrameSettings):
 
 
 def run_export(settings: ExportSettings, output: Path, report: Report = quiet) -> Figures:
-    """Write the states of a result that have a pose, with stamps of the log's clock.
-
-    Raises
-    ------
-    InputError
-        Where there is no result, none of its states has a pose, or a directory is in the way.
-    """
+    """Write the states of a result that have a pose, with stamps of the log's clock."""
     from magfusion.jobs.inputs import named
 
     form = settings.format_of(output)

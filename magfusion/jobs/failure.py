@@ -20,12 +20,8 @@ def failed_figures(
 ) -> Figures | None:
     """Return the figures of a job that raised, and write them to its output.
 
-    Parameters
-    ----------
-    job, log : str
-        As in the heading of a report.
-    written : bool
-        Whether the job has written its report itself.
+    `job`, `log`: as in the heading of a report. `written`: whether the job has written its report
+    itself.
 
     Returns
     -------
@@ -64,10 +60,7 @@ def _read(path: Path) -> Figures:
 def reason_of(error: RuntimeError) -> str:
     """Return the reason of a failed estimate.
 
-    Raises
-    ------
-    RuntimeError
-        The same error, where the reason is unknown.
+    Raises RuntimeError the same error, where the reason is unknown.
     """
     if isinstance(error, EstimationError):
         return str(error)

@@ -150,10 +150,6 @@ def run_fix(
         Specification of the protection levels.
     rest : RestSettings, optional
         Settings by which each rest is one epoch.
-
-    Raises
-    ------
-    InputError, EstimationError
     """
     from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
     from magfusion.jobs.inputs import named

@@ -66,17 +66,9 @@ def find_coil(
 ) -> FoundCoil:
     """Fix every epoch of a receiver of one axis.
 
-    Parameters
-    ----------
-    fields : FieldSamples
-        Channels in the site's order.
-    free_parameters : tuple of str
-        ``gain`` where the gain is unknown, ``phase`` where drive phases are unknown.
-
-    Raises
-    ------
-    EstimationError
-        Where no epoch has enough channels.
+    `fields`: channels in the site's order. `free_parameters`: ``gain`` where the gain is unknown,
+    ``phase`` where drive phases are unknown. Raises EstimationError where no epoch has enough
+    channels.
     """
     began = time.perf_counter()
     report("fixing", 1, 3)

@@ -138,13 +138,7 @@ class ImportSettings(Settings):
 
 
 def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -> Figures:
-    """Import a recording: a log in ``output``, and the findings of its check.
-
-    Raises
-    ------
-    InputError
-        With all problems, and options that would resolve ambiguities.
-    """
+    """Import a recording: a log in ``output``, and the findings of its check."""
     from magfusion.jobs.result_directory import claim
     from magfusion.results.report import write_report
 

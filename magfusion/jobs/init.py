@@ -42,14 +42,7 @@ NEAR_HZ = 0.5  # of a declared frequency, a line is that beacon
 def run_init(settings: InitSettings, output: Path) -> Figures | None:
     """Write a commented site file, in which undeclared values are marked.
 
-    Parameters
-    ----------
-    output : Path
-        File to write; an existing file is not overwritten.
-
-    Raises
-    ------
-    InputError
+    `output`: file to write; an existing file is not overwritten.
     """
     if settings.list_imus or settings.list_magnetometers:
         _list(settings)
@@ -257,12 +250,7 @@ def _bare_site(settings: InitSettings) -> Site:
 
 
 def _write(text: str, output: Path) -> None:
-    """Write a site file after validation.
-
-    Raises
-    ------
-    InputError
-    """
+    """Write a site file after validation."""
     with whole_file(output) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
         try:

@@ -36,10 +36,7 @@ def recording() -> Path | None:
 def answered(settings: InitSettings, tones: Iterable[Tone]) -> InitSettings:
     """Prompt for all values of a site.
 
-    Parameters
-    ----------
-    tones : iterable of Tone
-        Of the recording; the name of each is a question.
+    `tones`: of the recording; the name of each is a question.
     """
     detected = list(tones)
     beacons: list[str] = []

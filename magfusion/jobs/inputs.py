@@ -86,12 +86,7 @@ def named(place: Path | str) -> Iterator[None]:
 
 
 def topics_option(text: str | None) -> Topics | None:
-    """Parse ``role=name,...``.
-
-    Raises
-    ------
-    InputError
-    """
+    """Parse ``role=name,...``."""
     if text is None:
         return None
     roles = [part.strip().partition("=") for part in text.split(",")]
@@ -117,10 +112,6 @@ def read_site(
         Whether it accepts a site without beacons.
     several : bool
         Whether it accepts several magnetometers.
-
-    Raises
-    ------
-    InputError
     """
     if job.site_path is None and not job.declared_path.is_file():
         # A missing log is the more direct cause.
@@ -151,6 +142,8 @@ def read_job(
 ) -> tuple[Log, Site]:
     """Read the log and the site of a job, and check their consistency.
 
+    Raises InputError for invalid content of either file.
+
     Parameters
     ----------
     unknown : bool
@@ -177,11 +170,6 @@ def read_job(
         Demodulation settings for the samples of several magnetometers.
     `select_beacons` : bool
         Whether only the beacons detected in a window are used, of many.
-
-    Raises
-    ------
-    InputError
-        For invalid content of either file.
     """
     site = read_site(job, unknown=unknown, without=without, several=several)
     log = _as_known(job, _open(job, report, site), site)
@@ -241,12 +229,7 @@ def _as_known(job: Job, log: Log, site: Site) -> Log:
 
 
 def require_imu(job: Job, log: Log, what: str) -> None:
-    """Raise an error for a log without inertial samples.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise an error for a log without inertial samples."""
     if not log.inertial:
         raise InputError(
             f"{job.log_path}: has no imu.parquet or imu.csv, and {what}; record the inertial sensor"
@@ -255,12 +238,7 @@ def require_imu(job: Job, log: Log, what: str) -> None:
 
 
 def read_recording(job: Job, report: Report = quiet) -> tuple[Log, Site | None]:
-    """Read a log, and its site if there is one: a log alone can be checked too.
-
-    Raises
-    ------
-    InputError
-    """
+    """Read a log, and its site if there is one: a log alone can be checked too."""
     if job.site_path is not None or job.declared_path.is_file():
         site = load_site(job.declared_path, unknown=True, without=True, several=True)
         if site.beacons or site.platform.further:
@@ -299,10 +277,7 @@ def _open(job: Job, report: Report = quiet, site: Site | None = None) -> Log:
 def read_estimate(path: Path, epoch_ns: int = 0) -> Trajectory:
     """Read a trajectory from a result's directory, a TUM file, or a table (Parquet, CSV).
 
-    Raises
-    ------
-    InputError
-        Where there is none, or it has positions or attitudes alone.
+    Raises InputError where there is none, or it has positions or attitudes alone.
     """
     return whole_poses(read_any_poses(path, epoch_ns), path)
 
@@ -310,10 +285,7 @@ def read_estimate(path: Path, epoch_ns: int = 0) -> Trajectory:
 def whole_poses(poses: Trajectory, path: Path) -> Trajectory:
     """Return poses, e.g. a log's truth, that have positions and attitudes.
 
-    Raises
-    ------
-    InputError
-        Where one of them is unknown.
+    Raises InputError where one of them is unknown.
     """
     if not poses.has_poses:
         alone = "positions" if poses.has_position else "attitudes"

@@ -143,12 +143,7 @@ def _date(time: float) -> np.datetime64:
 
 
 def check_dates(times: Sequence[float], names: Sequence[str]) -> None:
-    """Raise an error for a log without a date.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise an error for a log without a date."""
     for time, name in zip(times, names, strict=True):
         if time < EARLIEST:
             raise InputError(
@@ -192,10 +187,7 @@ def describe_change(
 ) -> ChangeReport:
     """Return the cause and the size of a change.
 
-    Parameters
-    ----------
-    known : SharedCalibration
-        Of the parameters of all logs.
+    `known`: of the parameters of all logs.
     """
     change, blocks = detected.change, calendar.shared.blocks
     row: dict[str, Any] = {

@@ -97,10 +97,7 @@ def load_information(path: Path) -> StoredInformation:
 def written_by_worker(path: Path, stored: File | None) -> File:
     """Return what was stored in a file that a worker has written.
 
-    Raises
-    ------
-    InputError
-        Where there is nothing.
+    Raises InputError where there is nothing.
     """
     if stored is None:
         raise InputError(

@@ -55,19 +55,8 @@ def run_joint(
 ) -> Figures:
     """Refine one site with several logs together.
 
-    Parameters
-    ----------
-    command : {'smooth', 'calibrate log'}
-        The former writes the trajectory of each log too.
-    by_date : bool
-        Whether changes between the logs are searched.
-
-    Raises
-    ------
-    InputError
-        Where a log or the site cannot be used, or the cluster not be reached.
-    EstimationError
-        Where no log can be used.
+    `command`: the former writes the trajectory of each log too. `by_date`: whether changes between
+    the logs are searched.
     """
     writes = command == "smooth"
     claimed = claim(output, *(("smooth", "fix") if writes else (command,)))

@@ -83,12 +83,7 @@ class Joint:
 
 
 def tasks_of(jobs: Sequence[Job], smoother: SmootherSettings, output: Path) -> list[LogTask]:
-    """Return the tasks of some logs, after checking that they are different logs of one site.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return the tasks of some logs, after checking that they are different logs of one site."""
     for job in jobs:
         if not job.log_path.exists():
             read_job(job)  # which says so
@@ -171,19 +166,10 @@ def refine(
 ) -> Joint:
     """Refine one site with all logs together.
 
-    Parameters
-    ----------
-    writes : bool
-        Whether the trajectory of each log is written, to its job's output.
-    by_date : bool
-        Whether changes between the logs are searched, and what changed has new parameters.
-
-    Raises
-    ------
-    InputError
-        Where a log cannot be used, or the cluster not be reached.
-    EstimationError
-        Where no log remains.
+    `writes`: whether the trajectory of each log is written, to its job's output. `by_date`: whether
+    changes between the logs are searched, and what changed has new parameters. Raises InputError
+    where a log cannot be used, or the cluster not be reached. Raises EstimationError where no log
+    remains.
     """
     files = site_files(tasks)
     with worker_pool(len(tasks), cluster=cluster, workers=workers) as hands:

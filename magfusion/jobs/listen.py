@@ -64,12 +64,7 @@ class ListenSettings(Settings):
     form: Literal["json", "msgpack"] = option("json", "Records in the pipe", name="format")
 
     def instruments(self) -> list[Source]:
-        """Return what is to be listened to.
-
-        Raises
-        ------
-        InputError
-        """
+        """Return what is to be listened to."""
         scales = scales_of(self.counts)
         result: list[Source] = [LineSource(one, scales, self.encoding) for one in self.sources]
         if self.device is not None:

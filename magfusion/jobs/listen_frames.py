@@ -26,10 +26,7 @@ Parsed = tuple[str, int, int, Array]  # kind, counter of samples, of microsecond
 def parse_frame(frame: bytes) -> Parsed:
     """Return kind, both counters and values of a frame without its zero byte.
 
-    Raises
-    ------
-    ValueError
-        Where it is garbled.
+    Raises ValueError where it is garbled.
     """
     from cobs import cobs
 
@@ -46,11 +43,6 @@ def parse_frame(frame: bytes) -> Parsed:
 
 
 def check_package(place: str) -> None:
-    """Raise an error if the package that decodes frames is missing.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise an error if the package that decodes frames is missing."""
     if find_spec("cobs") is None:
         raise InputError(f"{place}: cobs is not installed; pip install 'magfusion[serial]'")

@@ -41,12 +41,7 @@ BAUD = 115_200
 
 
 def scales_of(options: tuple[str, ...]) -> dict[str, tuple[float, Array]]:
-    """Return unit of a count, and counts at zero (3,), of each table that is given.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return unit of a count, and counts at zero (3,), of each table that is given."""
     result = {}
     for line in options:
         table, _, text = line.partition("=")
@@ -66,10 +61,7 @@ def scales_of(options: tuple[str, ...]) -> dict[str, tuple[float, Array]]:
 def parse_line(line: bytes) -> Parsed:
     """Return kind, both counters and values of a line.
 
-    Raises
-    ------
-    ValueError
-        Where it is garbled.
+    Raises ValueError where it is garbled.
     """
     text, _, check = line.strip().partition(b"*")
     if int(check, 16) != reduce(xor, text, 0) or len(check) != 2:
@@ -136,10 +128,7 @@ class LineSource:
     def open(self, arrivals: queue.Queue[tuple[Any, Any, float]], begin: float) -> None:
         """Begin to read.
 
-        Raises
-        ------
-        InputError
-            Where the port cannot be opened.
+        Raises InputError where the port cannot be opened.
         """
         read, close = self._socket() if self._is_udp else self._serial()
 

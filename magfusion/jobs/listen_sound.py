@@ -84,10 +84,7 @@ class SoundSource:
     def open(self, arrivals: queue.Queue[tuple[Any, Any, float]], begin: float) -> None:
         """Begin to record.
 
-        Raises
-        ------
-        InputError
-            Where there is no such device, or it cannot record so.
+        Raises InputError where there is no such device, or it cannot record so.
         """
         try:
             import sounddevice
@@ -177,10 +174,7 @@ class SoundSource:
 def served(device: str) -> tuple[tuple[int, int], str]:
     """Return channels and rate (Hz) of the source that PulseAudio would record, and its name.
 
-    Raises
-    ------
-    InputError
-        Where they are unknown.
+    Raises InputError where they are unknown.
     """
     try:
         source = _pactl("get-default-source").strip()

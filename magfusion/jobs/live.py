@@ -64,15 +64,8 @@ def state_sinks(
 ) -> Iterator[tuple[StateSink, ...]]:
     """Yield the outputs of the states, and report their errors at the end.
 
-    Parameters
-    ----------
-    epoch_ns : int
-        Zero of the states' time (ns since 1970).
-
-    Raises
-    ------
-    InputError
-        Where one cannot be opened.
+    `epoch_ns`: zero of the states' time (ns since 1970). Raises InputError where one cannot be
+    opened.
     """
     sinks: list[StateSink] = []
     try:

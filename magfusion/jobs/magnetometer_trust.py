@@ -65,13 +65,7 @@ def estimates_of(calibration: LogCalibration, declared: Magnetometer) -> list[Pa
 
 
 def calibrated(log: Log, site: Site, *, positions: bool = False) -> tuple[LogCalibration, Trust]:
-    """Return the calibration from a log's waveform, and findings on it.
-
-    Raises
-    ------
-    InputError, EstimationError
-        As `run_calibrate_magnetometer`.
-    """
+    """Return the calibration from a log's waveform, and findings on it."""
     from magfusion.calibration.magnetometer_log import calibrate_log
     from magfusion.calibration.magnetometer_size import calibrate_alone
 

@@ -207,6 +207,9 @@ def guide(
 ) -> GuidedCalibration:
     """Read records until the calibration is certain, and show which orientations are missing.
 
+    Raises InputError for an invalid record. Raises EstimationError where the stream ends before;
+    with what is missing.
+
     Parameters
     ----------
     calibrate : callable
@@ -217,13 +220,6 @@ def guide(
         Receives the status every quarter of a second of the stream.
     messages : file
         Receives messages on samples that are left out.
-
-    Raises
-    ------
-    InputError
-        For an invalid record.
-    EstimationError
-        Where the stream ends before; with what is missing.
     """
     turning = _Turning(site, calibrate, limit)
     for numbered in records:

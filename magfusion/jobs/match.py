@@ -77,14 +77,7 @@ class _Matched(NamedTuple):
 
 
 def run_match(settings: MatchSettings, output: Path) -> Figures:
-    """Estimate the attitude of every epoch from the Earth's field: table, picture and report.
-
-    Raises
-    ------
-    InputError
-        Where more angles are requested than the vectors determine, with a remedy; where a file
-        cannot be read, or ``output`` is in the way.
-    """
+    """Estimate the attitude of every epoch from the Earth's field: table, picture and report."""
     from magfusion.jobs.inputs import named, read_job, require_imu
     from magfusion.jobs.result_directory import claim, found_in, refuse_failed
     from magfusion.results.plots.match import write_match_plot

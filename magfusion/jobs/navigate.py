@@ -100,15 +100,7 @@ def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
 
 
 def run_navigate(settings: NavigateSettings, output: Path, report: Report = quiet) -> Figures:
-    """Navigate along a log: trajectories, refined site, report and recording.
-
-    Raises
-    ------
-    InputError
-        For invalid input.
-    EstimationError
-        Where the log gives no state.
-    """
+    """Navigate along a log: trajectories, refined site, report and recording."""
     from magfusion.jobs.inputs import named, read_job
     from magfusion.jobs.navigate_results import motion_of, write_navigated
     from magfusion.jobs.result_directory import claim, found_in, refuse_failed

@@ -84,12 +84,7 @@ def run_at_rest(
 
 
 def refuse_other(given: set[str]) -> None:
-    """Reject options of `navigate` that do not apply.
-
-    Raises
-    ------
-    InputError
-    """
+    """Reject options of `navigate` that do not apply."""
     other = sorted(given - READERS)
     if other:
         raise InputError(
@@ -123,13 +118,7 @@ def replayed(log: Log, navigator: RestNavigator, report: Report = quiet) -> list
 
 
 def run_rests(job: Job, how: How, report: Report = quiet) -> Figures:
-    """Navigate the rests of a log: a pose after every stretch of a rest, with the data so far.
-
-    Raises
-    ------
-    InputError, EstimationError
-        Where it does not rest, or no beacon is detected.
-    """
+    """Navigate the rests of a log: a pose after every stretch of a rest, with the data so far."""
     from magfusion.jobs.inputs import named, read_job
     from magfusion.jobs.result_directory import claim, refuse_failed
 
@@ -235,11 +224,6 @@ def run_rests_stream(
     -------
     int
         Number of skipped records.
-
-    Raises
-    ------
-    InputError
-        Where a record is invalid and ``keep_going`` is not set.
     """
     navigator, samples = how.navigator(site), StreamSamples(site)
 

@@ -163,12 +163,7 @@ def navigated(
 ) -> tuple[Figures, NavigateResults]:
     """Return figures and results of a navigation.
 
-    Parameters
-    ----------
-    rows : mapping
-        Of `row_columns`, all rows.
-    elapsed : float
-        (s)
+    `rows`: of `row_columns`, all rows. `elapsed`: (s).
     """
     site, settings = navigator.site, navigator.settings
     log, _ = logged(log, site)

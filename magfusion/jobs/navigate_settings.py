@@ -104,10 +104,7 @@ class NavigateSettings(
     def live_site(self, given: set[str]) -> Path:
         """Return the site's file of data that arrive while it runs.
 
-        Raises
-        ------
-        InputError
-            Where it is not given, or an option that such data do not have.
+        Raises InputError where it is not given, or an option that such data do not have.
         """
         if self.site is None:
             raise InputError(

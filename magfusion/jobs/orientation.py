@@ -54,10 +54,6 @@ def run_orientation(name: str, job: Job, rate: Rate, *, back: bool, report: Repo
         a second (Hz).
     back : bool
         Whether later samples are used too.
-
-    Raises
-    ------
-    InputError
     """
     claimed = claim(job.output, name)
     log, site = read_job(job, without=True, report=report)
@@ -192,11 +188,6 @@ def run_orientation_stream(
     -------
     int
         Number of skipped records.
-
-    Raises
-    ------
-    InputError
-        Where a record is invalid and ``keep_going`` is not set.
     """
     navigator = OrientationNavigator(site)
     samples = StreamSamples(site, patient=False)  # each sample has a state

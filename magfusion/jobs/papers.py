@@ -31,13 +31,7 @@ class PapersSettings(Settings):
 
 
 def run_papers(settings: PapersSettings) -> None:
-    """Print the register of all papers, of one, or of one entry.
-
-    Raises
-    ------
-    InputError
-        Where there is no such paper or entry.
-    """
+    """Print the register of all papers, of one, or of one entry."""
     if settings.paper is None:
         result = papers()
         text, content = "\n\n".join(map(_head, result)), [_paper_row(one) for one in result]

@@ -55,13 +55,6 @@ def run_published_fix(
     The poses have no covariance, because the algorithms give none.  Epochs at which the beacons'
     axes or the accelerometer show that Eq 18 cannot hold have no attitude, and as the lever arm
     requires one, only the position of the magnetometer (``positions.parquet``).
-
-    Raises
-    ------
-    InputError
-        Where the survey has a beacon that is not in the site, both share fewer than three rotating
-        beacons, or as many are detected in no epoch.
-    EstimationError
     """
     claimed = claim(job.output, "smooth", "fix")
     log, site = read_job(job)

@@ -45,13 +45,7 @@ class RangeSettings(LogSettings):
 
 
 def run_range(settings: RangeSettings, output: Path) -> Figures:
-    """Estimate the position of a rotating magnet's well relative to that of a sensor at rest.
-
-    Raises
-    ------
-    InputError
-        Where the site has no rotor, or other beacons; or the log lacks data for ranging.
-    """
+    """Estimate the position of a rotating magnet's well relative to that of a sensor at rest."""
     from magfusion.jobs.inputs import named, read_job
     from magfusion.jobs.result_directory import claim, found_in, refuse_failed
     from magfusion.results.plots.ranging import RangePicture, write_range_plot

@@ -51,11 +51,6 @@ class RateSettings(Settings):
 
 
 def refuse_rate(path: Path, log: Log, rate: Rate) -> None:
-    """Reject states at inertial samples for a log without any.
-
-    Raises
-    ------
-    InputError
-    """
+    """Reject states at inertial samples for a log without any."""
     if rate == "imu" and not log.inertial:
         raise InputError(f"{path}: has no inertial samples for the states; give --rate HZ")

@@ -51,10 +51,7 @@ def _other_axes(log: Log, declared: str) -> Iterator[tuple[str, str]]:
 def three_axes(site: Site, path: Path) -> Site:
     """Return a site whose receiver has all three axes.
 
-    Raises
-    ------
-    InputError
-        Where it has fewer.
+    Raises InputError where it has fewer.
     """
     declared = site.platform.magnetometer.axes
     if len(declared) < len("xyz"):

@@ -24,10 +24,7 @@ def process_records(
 ) -> int:
     """Process each record, and write what follows from it; return how many are skipped.
 
-    Raises
-    ------
-    InputError
-        Where a record is invalid and ``keep_going`` is not set.
+    Raises InputError where a record is invalid and ``keep_going`` is not set.
     """
     refused = 0
     for numbered in records:

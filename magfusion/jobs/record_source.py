@@ -20,15 +20,8 @@ def live_records(
 ) -> Iterator[NumberedRecord]:
     """Return the records of the source that the settings name, as they come.
 
-    Parameters
-    ----------
-    messages : file
-        Receives a sentence on a topic that is silent.
-
-    Raises
-    ------
-    InputError
-        Where it cannot be read.
+    `messages`: receives a sentence on a topic that is silent. Raises InputError where it cannot be
+    read.
     """
     if str(settings.log) == ROS2:
         from magfusion.jobs.inputs import topics_option

@@ -38,10 +38,5 @@ class RegionSettings(LogSettings):
         return Where(self.hemisphere, self.region)
 
     def job(self, output: Path) -> Job:
-        """Return inputs and output of a job on a log.
-
-        Raises
-        ------
-        InputError
-        """
+        """Return inputs and output of a job on a log."""
         return dataclasses.replace(super().job(output), where=self.where)

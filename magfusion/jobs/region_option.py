@@ -34,12 +34,7 @@ class Where:
     region: str | None = None
 
     def bounded(self, site: Site) -> Site:
-        """Return the site with the constraints.
-
-        Raises
-        ------
-        InputError
-        """
+        """Return the site with the constraints."""
         for text in self.hemisphere:
             site = _in_front(site, text)
         if self.region is None:

@@ -34,15 +34,7 @@ class RestSettings(Settings):
     ) -> IntegratedRests | None:
         """Return the requested rests of a log; None if not requested.
 
-        Parameters
-        ----------
-        least : int
-            Minimum number of epochs.
-
-        Raises
-        ------
-        InputError
-            As `magfusion.estimation.rests.stationary_integration.integrate_rests`.
+        `least`: minimum number of epochs.
         """
         if not self.at_rest:
             return None

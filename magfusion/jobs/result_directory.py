@@ -37,17 +37,9 @@ def _may_be_replaced(path: Path, kinds: tuple[str, ...]) -> bool:
 def claim(output: Path, *kinds: str, overwrite: bool = False) -> AbstractContextManager[Path]:
     """Return a context whose directory becomes ``output`` only on success.
 
-    An obstacle raises an error at once, before the work.
-
-    Parameters
-    ----------
-    overwrite : bool
-        Whether an earlier result is removed, as with ``--overwrite``, rather than moved.
-
-    Raises
-    ------
-    InputError
-        Where ``output`` contains anything but an earlier result of these jobs.
+    An obstacle raises an error at once, before the work. `overwrite`: whether an earlier result is
+    removed, as with ``--overwrite``, rather than moved. Raises InputError where ``output`` contains
+    anything but an earlier result of these jobs.
     """
 
     def replaces(path: Path) -> bool:
@@ -83,10 +75,7 @@ def _backup_path(path: Path, kinds: tuple[str, ...]) -> Path | None:
 def keep_results(whole: Path, logs: list[tuple[str, Path, Path]]) -> None:
     """Copy the files of several logs into the directory that becomes the output.
 
-    Parameters
-    ----------
-    logs : list of (str, Path, Path)
-        Name of each, its file, and the directory of its results.
+    `logs`: name of each, its file, and the directory of its results.
     """
     (whole / KEPT).mkdir()
     for name, kept, results in logs:
@@ -107,10 +96,7 @@ def found_in(directory: Path, trust: Trust) -> Path:
 def refuse_failed(place: Path, output: Path, trust: Trust) -> None:
     """Raise an error for a failed verdict, after its report is written.
 
-    Raises
-    ------
-    EstimationError
-        With the first reason.
+    Raises EstimationError with the first reason.
     """
     if trust.verdict is Verdict.FAILED:
         raise EstimationError(

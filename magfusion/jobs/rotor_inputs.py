@@ -29,16 +29,7 @@ def is_for_ranging(site: Site) -> bool:
 def check_rotors(place: Path, log_path: Path, log: Log, site: Site, *, separately: bool) -> None:
     """Reject rotors without a required angle, and sites for ranging only.
 
-    Parameters
-    ----------
-    place : Path
-        File of the site.
-    separately : bool
-        Whether each epoch may have a separate phase.
-
-    Raises
-    ------
-    InputError
+    `place`: file of the site. `separately`: whether each epoch may have a separate phase.
     """
     if is_for_ranging(site):
         raise InputError(
@@ -75,12 +66,7 @@ def check_rotors(place: Path, log_path: Path, log: Log, site: Site, *, separatel
 
 
 def check_streamed_rotors(place: Path, site: Site) -> None:
-    """Reject rotors whose angle cannot be known from a stream.
-
-    Raises
-    ------
-    InputError
-    """
+    """Reject rotors whose angle cannot be known from a stream."""
     for beacon in _wandering(site):
         if not beacon.synchronised:
             raise InputError(
@@ -99,10 +85,7 @@ class AwaitedAngles:
     def see(self, record: Record | None) -> None:
         """Check a record.
 
-        Raises
-        ------
-        InputError
-            Where samples have arrived for some time without an angle.
+        Raises InputError where samples have arrived for some time without an angle.
         """
         if record is None or not self._awaited:
             return

@@ -69,12 +69,7 @@ class Option(NamedTuple):
         return (f"{text}; {self.note}" if self.note else text) + "."
 
     def check(self, name: str, value: float) -> None:
-        """Raise an error for a number out of bounds, or NaN.
-
-        Raises
-        ------
-        InputError
-        """
+        """Raise an error for a number out of bounds, or NaN."""
         unit = f" {self.unit}" if self.unit else ""
         least, most, above = self.least, self.most, self.above
         if least is not None and most is not None:
@@ -207,12 +202,7 @@ class LogSettings(PartSettings):
     site: Path | None = option(None, "Site file", note="default: site.yaml in the log")
 
     def job(self, output: Path) -> Job:
-        """Return inputs and output of a job on a log.
-
-        Raises
-        ------
-        InputError
-        """
+        """Return inputs and output of a job on a log."""
         from magfusion.jobs.inputs import Job, topics_option
 
         if self.start is not None and self.end is not None and not self.start < self.end:
@@ -238,12 +228,7 @@ class LogsSettings(LogSettings):
             raise InputError("--cluster and --workers are for several logs; one log was given")
 
     def jobs(self, output: Path) -> list[Job]:
-        """Return a job for every log.
-
-        Raises
-        ------
-        InputError
-        """
+        """Return a job for every log."""
         first = self.job(output)
         return [first, *(dataclasses.replace(first, log_path=path) for path in self.more)]
 
@@ -268,10 +253,7 @@ class WindowSettings(Settings):
     def lockin(self, job: Job) -> LockinSettings | None:
         """Return window and step for the site of a job; None selects the default.
 
-        Raises
-        ------
-        InputError
-            Where they do not suit the site's tones.
+        Raises InputError where they do not suit the site's tones.
         """
         if 0.0 < self.mains_hz < LOWEST_MAINS:
             raise InputError(
@@ -314,12 +296,7 @@ class EstimateSettings(Settings):
 
     @property
     def groups(self) -> tuple[str, ...] | None:
-        """Groups of calibration parameters.
-
-        Raises
-        ------
-        InputError
-        """
+        """Groups of calibration parameters."""
         if self.estimate is None:
             return None
         chosen = tuple(part.strip() for part in self.estimate.split(",") if part.strip())

@@ -56,13 +56,7 @@ class SheetSettings(DriveSettings):
 
 
 def run_sheet(settings: SheetSettings, output: Path) -> Figures:
-    """Write sheet, table of check distances, and the site with its marks.
-
-    Raises
-    ------
-    InputError
-        Where a file cannot be read, or ``output`` is in the way.
-    """
+    """Write sheet, table of check distances, and the site with its marks."""
     from magfusion.jobs.result_directory import claim
     from magfusion.results.plots.sheet import write_sheet
     from magfusion.results.report import write_report

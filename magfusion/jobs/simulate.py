@@ -125,12 +125,7 @@ class SimulateSettings(ShaftSettings):
 
 
 def box_option(text: str | None) -> Array | None:
-    """Parse ``xmin,xmax,ymin,ymax,zmin,zmax`` (m) to lower and upper corner, shape (2, 3).
-
-    Raises
-    ------
-    InputError
-    """
+    """Parse ``xmin,xmax,ymin,ymax,zmin,zmax`` (m) to lower and upper corner, shape (2, 3)."""
     if text is None:
         return None
     try:
@@ -150,12 +145,7 @@ def box_option(text: str | None) -> Array | None:
 
 
 def reference_option(text: str | None) -> Reference | None:
-    """Parse ``x,y,z`` (m).
-
-    Raises
-    ------
-    InputError
-    """
+    """Parse ``x,y,z`` (m)."""
     if text is None:
         return None
     try:
@@ -226,12 +216,7 @@ def _steel(
 
 
 def steel_option(text: str, box_world: Array, beacons_world: Array) -> SteelStructure:
-    """Read a file of steel, or draw it by ``kind,seed``.
-
-    Raises
-    ------
-    InputError
-    """
+    """Read a file of steel, or draw it by ``kind,seed``."""
     kind, comma, seed = text.rpartition(",")
     if comma and kind in KINDS and seed.isdecimal():
         return draw_steel(kind, np.random.default_rng(int(seed)), box_world, beacons_world)
@@ -302,17 +287,8 @@ def run_simulate(
 ) -> Figures:
     """Simulate a log, with truth.
 
-    Parameters
-    ----------
-    site : Site
-        The user's declared site; written with the log as ``site.yaml``.
-    full_scale_v : float, optional
-        Of the sound card that records the magnetometer (V); numbers are written if None.
-
-    Raises
-    ------
-    InputError
-        Where ``output`` is in the way, or the configuration does not fit the site.
+    `site`: the user's declared site; written with the log as ``site.yaml``. `full_scale_v`: of the
+    sound card that records the magnetometer (V); numbers are written if None.
     """
     from magfusion.jobs.result_directory import claim
     from magfusion.results.report import write_report

@@ -192,11 +192,6 @@ def run_smooth(
         File with the result of each pass, and whether to resume from it.
     mapping : bool
         Whether steel near the path is mapped.
-
-    Raises
-    ------
-    InputError, EstimationError
-        In the latter case the single-epoch fixes are saved in the output directory.
     """
     from magfusion.estimation.batch.self_survey import smooth_and_place
     from magfusion.estimation.integrity.magnetometer_exclusion import agreed_smoothed

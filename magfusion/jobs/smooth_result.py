@@ -180,10 +180,7 @@ def _with_map(
 ) -> tuple[Smoothed, Trust, SteelMap | None]:
     """Return a result and its findings with the map of steel, and the map.
 
-    Parameters
-    ----------
-    before : Smoothed
-        Whose covariance no test has widened.
+    `before`: whose covariance no test has widened.
     """
     other = next((f.code for f in trust.reasons if f.code not in (STEEL, *OF_STEEL)), None)
     steel = f"{other} is a reason for doubt, too" if other else map_steel(before, log.imu)
@@ -236,10 +233,8 @@ def with_errors(
 ) -> Finished:
     """Return a result with its errors against the truth, where there is one.
 
-    Parameters
-    ----------
-    fixed : Site and SmootherSettings, optional
-        With which the log is smoothed again, the survey fixed, to show the gain of estimating it.
+    `fixed`: with which the log is smoothed again, the survey fixed, to show the gain of estimating
+    it.
     """
     result = done.result
     own = comparable(log, result.states, result.declared.site)

@@ -80,22 +80,13 @@ def run_stream(
 ) -> int:
     """Navigate from the records of a stream; write one line of JSON for each state.
 
-    Parameters
-    ----------
-    source, sink : file
-        Binary; each line is flushed.
-    messages : file
-        Receives messages on skipped records.
+    `source`, `sink`: binary; each line is flushed. `messages`: receives messages on skipped
+    records.
 
     Returns
     -------
     int
         Number of skipped records.
-
-    Raises
-    ------
-    InputError
-        Where the site cannot be read, or a record is invalid and ``keep_going`` is not set.
     """
     records = read_records(source, settings.form)
     return navigate_records(site_path, settings, records, sink, messages)
@@ -232,10 +223,7 @@ def _on_clock(
 ) -> NumberedRecord:
     """Return a record on the clock of the others; after a step, navigation restarts.
 
-    Raises
-    ------
-    InputError
-        Where its stamps are far from the others', and no further record follows it.
+    Raises InputError where its stamps are far from the others', and no further record follows it.
     """
     if numbered.record is None:
         return numbered

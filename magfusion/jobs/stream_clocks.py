@@ -152,11 +152,8 @@ class StreamClocks:
     def check(self, record: Record) -> None:
         """Note the stamps of a record.
 
-        Raises
-        ------
-        InputError
-            Where they are far from those before: the record is an error of its own, or the first
-            after a step.
+        Raises InputError where they are far from those before: the record is an error of its own,
+        or the first after a step.
         """
         for name, times in _streams(record):
             clock, last = self._of(name), float(np.max(times))

@@ -48,15 +48,8 @@ class StreamSamples:
     ) -> tuple[Array, Array]:
         """Return the samples that are whole and within range, values in one array; count others.
 
-        Parameters
-        ----------
-        name : str, optional
-            Of one of several magnetometers.
-
-        Raises
-        ------
-        InputError
-            Where the first `FIRST` are all larger than any instrument measures, or than declared.
+        `name`: of one of several magnetometers. Raises InputError where the first `FIRST` are all
+        larger than any instrument measures, or than declared.
         """
         rows = np.hstack(values)
         large = beyond_range(rows)
@@ -84,11 +77,7 @@ class StreamSamples:
         """Return the samples at their times that pass the test for single false ones.
 
         It needs the next two; stamps that are not of samples wait for their clock at the beginning.
-
-        Parameters
-        ----------
-        name : str, optional
-            Of one of several magnetometers.
+        `name`: of one of several magnetometers.
         """
         key = stream, name
         if key not in self._filters:

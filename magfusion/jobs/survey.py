@@ -56,13 +56,7 @@ class _Point(NamedTuple):
 
 
 def run_survey(settings: SurveySettings, output: Path) -> Figures:
-    """Make a survey of the fields at known poses: table, picture and report.
-
-    Raises
-    ------
-    InputError
-        Where the log has no pose, none of its epochs can be a point, or ``output`` is in the way.
-    """
+    """Make a survey of the fields at known poses: table, picture and report."""
     from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
     from magfusion.jobs.inputs import named, read_job
     from magfusion.jobs.result_directory import claim

@@ -28,10 +28,7 @@ def plain(text: str) -> str:
 def parameters(command: Command, writes: bool) -> list[inspect.Parameter]:
     """Return the parameters of a command's function, from which Typer makes its options.
 
-    Parameters
-    ----------
-    writes : bool
-        Whether it has an output.
+    `writes`: whether it has an output.
     """
     hints = get_type_hints(command.settings)
     result = [_parameter(f, option, hints[f.name]) for f, option in options(command.settings)]

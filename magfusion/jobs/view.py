@@ -15,13 +15,7 @@ class ViewSettings(Settings):
 
 
 def run_view(settings: ViewSettings) -> None:
-    """Open a recording in a separate viewer.
-
-    Raises
-    ------
-    InputError
-        Where there is none.
-    """
+    """Open a recording in a separate viewer."""
     from magfusion.results.recording import open_viewer
 
     result = settings.result

@@ -126,10 +126,7 @@ class WindowGrid:
 def usual_step(time: Array, stream: str) -> float:
     """Return the median time between two samples (s).
 
-    Raises
-    ------
-    InputError
-        Where there are less than two samples.
+    Raises InputError where there are less than two samples.
     """
     if len(time) < 2:
         raise InputError(f"{stream}: found {len(time)} samples; record at least one window")
@@ -139,10 +136,7 @@ def usual_step(time: Array, stream: str) -> float:
 def sample_rate_hz(waveform: Waveform) -> float:
     """Return the median sampling rate (Hz).
 
-    Raises
-    ------
-    InputError
-        Where there are less than two samples.
+    Raises InputError where there are less than two samples.
     """
     return 1.0 / usual_step(waveform.time, "magnetometer")
 
@@ -249,10 +243,7 @@ def longest_step(step: float) -> float:
 def silences(imu_time: Array, step: float, margin: float) -> tuple[Array, Array]:
     """Return begin and end of each gap of an inertial stream; the last follows its end (s).
 
-    Parameters
-    ----------
-    step, margin : float
-        As of `Admission` (s).
+    `step`, `margin`: as of `Admission` (s).
     """
     gap = (imu_time[1:] - imu_time[:-1] > longest_step(step)).nonzero()[0]
     begin = np.concatenate([imu_time[gap], imu_time[-1:] + margin])

@@ -25,12 +25,7 @@ STRETCH = 4  # largest extension of the state where that separates mains and dri
 def subtraction_gain(frequency_hz: float, duration: float, slots_apart: int) -> float:
     """Return the worst-case gain for a tone of subtracting a silent slot.
 
-    Parameters
-    ----------
-    duration : float
-        Length of a slot (s).
-    slots_apart : int
-        Slots from the driven to the silent one.
+    `duration`: length of a slot (s). `slots_apart`: slots from the driven to the silent one.
     """
     averaged = abs(np.sinc(frequency_hz * duration))
     return float(averaged * 2.0 * abs(np.sin(np.pi * frequency_hz * slots_apart * duration)))

@@ -81,11 +81,7 @@ class _Grid(NamedTuple):
 def way_of(samples: FieldSamples, site: Site) -> SensorPath:
     """Return the most probable track of a log through its site.
 
-    Parameters
-    ----------
-    samples : FieldSamples
-        Of all channels: several on one frequency have the same phasor.
-
+    `samples`: of all channels: several on one frequency have the same phasor.
     """
     tones, grid = tones_of(site), _grid_of(site)
     rows = _thinned(samples.time, EVERY)
@@ -187,10 +183,7 @@ def _both_ways(cost: Array, time: Array, pitch: float) -> Array:
 def owned_by(samples: FieldSamples, site: Site) -> FieldSamples:
     """Assign phasors to beacons where several share a frequency.
 
-    Raises
-    ------
-    InputError
-        Where the amplitudes do not determine which beacons are received.
+    Raises InputError where the amplitudes do not determine which beacons are received.
     """
     if not tones_of(site).reused or len(samples) == 0:
         return samples

@@ -20,10 +20,7 @@ LONGEST_PAUSE = 4.0  # usual ones; a longer one ends a marked cycle
 def joins(site: Site, marks: Marks | None = None) -> bool:
     """Return whether a cycle is short enough to be one epoch while the platform moves.
 
-    Parameters
-    ----------
-    marks : Marks, optional
-        Of slots without a schedule: whether most of their cycles are short enough.
+    `marks`: of slots without a schedule: whether most of their cycles are short enough.
     """
     if is_marked(site):
         if marks is None:
@@ -42,24 +39,13 @@ def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSam
 
     The gyro rotates the fields to the mean time of the slots.  For a receiver that lacks axes,
     ``turned`` has that rotation instead.  The translation of the body within the cycle remains;
-    ``ahead`` has the time of each measurement.
-
-    Parameters
-    ----------
-    samples : FieldSamples
-        Channels in the site's order.
-    site : Site
-        With a schedule.
+    ``ahead`` has the time of each measurement. `samples`: channels in the site's order. `site`:
+    with a schedule. Raises InputError where there is no such cycle.
 
     Returns
     -------
     FieldSamples
         The cycles that hold every channel.
-
-    Raises
-    ------
-    InputError
-        Where there is no such cycle.
     """
     result = cycles(samples, turn_of(on_clock(imu, site.platform.imu.time_offset), site), site)
     whole: BoolArray = np.all(result.valid, axis=1)
@@ -154,10 +140,8 @@ def _marked(
 ) -> IntArray:
     """Return the cycle of each burst: a repeated coil begins a new one.
 
-    Parameters
-    ----------
-    longest, pause : float
-        Longest time from the first to the last burst of a cycle, and between two (s).
+    `longest`, `pause`: longest time from the first to the last burst of a cycle, and between two
+    (s).
     """
     cycle = np.zeros(len(time), dtype=np.int64)
     selected: set[int] = set()

@@ -45,11 +45,8 @@ class Channel(NamedTuple):
 def drive_channels(site: Site, columns: Mapping[str, object]) -> tuple[Channel, ...]:
     """Return the tones whose currents are recorded in columns.
 
-    Raises
-    ------
-    InputError
-        Where a column names no beacon, a coil has no current declared, or the beginning of the
-        time slots is not known.
+    Raises InputError where a column names no beacon, a coil has no current declared, or the
+    beginning of the time slots is not known.
     """
     names = {beacon.name for beacon in site.beacons}
     for column in columns:
@@ -122,13 +119,7 @@ class DriveReceiver:
         self.next_number, self.step, self.noise = None, 0.0, {}
 
     def push(self, samples: DriveSamples) -> None:
-        """Add samples after the earlier ones; the columns must not change.
-
-        Raises
-        ------
-        InputError
-            As `drive_channels`; or where the columns change.
-        """
+        """Add samples after the earlier ones; the columns must not change."""
         columns = tuple(samples.current)
         if not self.columns:
             drive_channels(self._site, samples.current)
@@ -218,10 +209,7 @@ def _currents(
 ) -> tuple[ComplexArray, float]:
     """Return the phasors of tones at a window's centre (A), and the noise of one component.
 
-    Parameters
-    ----------
-    bends : int
-        Power of time up to which phasors change within the window.
+    `bends`: power of time up to which phasors change within the window.
     """
     direct = all(channel.frequency_hz == 0.0 for channel in channels)
     ones = np.ones_like(elapsed)

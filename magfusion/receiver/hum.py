@@ -43,10 +43,7 @@ class Hum:
 def hum_of(waveform: Waveform, mains_hz: float) -> Hum | None:
     """Return the mains of a stationary waveform, tracked; None if they do not exceed the noise.
 
-    Parameters
-    ----------
-    mains_hz : float
-        Nominal frequency; zero for none.
+    `mains_hz`: nominal frequency; zero for none.
     """
     step = float(np.median(np.diff(waveform.time)))
     orders = np.arange(1.0, MOST_ORDERS + 1.0)

@@ -60,12 +60,8 @@ class Integrated:
 def trace_chance(trace: float, freedom: int) -> float:
     """Return the probability of a larger Lawley-Hotelling trace of two vectors of three.
 
-    McKeon's approximation by F, with the moments of the trace.
-
-    Parameters
-    ----------
-    freedom : int
-        Of the covariance; more than five.
+    McKeon's approximation by F, with the moments of the trace. `freedom`: of the covariance; more
+    than five.
     """
     p, q = 3, 2
     half = 0.5 * (freedom - p - 1)
@@ -78,10 +74,7 @@ def trace_chance(trace: float, freedom: int) -> float:
 def integrated(result: Pieces, tone: int, time: float) -> Integrated:
     """Return one tone of a stationary interval, integrated over its pieces.
 
-    Parameters
-    ----------
-    time : float
-        Reference time of centroid and spread (s).
+    `time`: reference time of centroid and spread (s).
     """
     phasor, elapsed = result.phasor[:, tone], result.centre - time
     there = np.isfinite(phasor).all(axis=1)
@@ -188,14 +181,8 @@ def _loudness(
 def chance_of_any(chances: list[float], trials: float) -> float:
     """Return the probability of such power by noise alone at any searched frequency.
 
-    Davies' bound on the maximum of a chi-square process.
-
-    Parameters
-    ----------
-    chances : list of float
-        Of each tone of a beacon, at its frequency.
-    trials : float
-        As of `FrequencySearch`.
+    Davies' bound on the maximum of a chi-square process. `chances`: of each tone of a beacon, at
+    its frequency. `trials`: as of `FrequencySearch`.
     """
     square = float(sum(chdtri(6, max(c, 1e-300)) for c in chances))
     degrees = 6 * len(chances)

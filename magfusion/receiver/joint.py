@@ -35,10 +35,7 @@ CLEAR = 1.5  # resolutions between a probe and a line
 def joint_settings(site: Site, requested: LockinSettings | None) -> LockinSettings | None:
     """Return the settings for joint reception of a site's close tones; None if they are not close.
 
-    Parameters
-    ----------
-    requested : LockinSettings, optional
-        Requested windows; then there is no joint reception.
+    `requested`: requested windows; then there is no joint reception.
     """
     usual = _long(site, requested)
     if usual is None or bool(site.platform.further) or bool(site.platform.magnetometer.lacking):
@@ -49,10 +46,7 @@ def joint_settings(site: Site, requested: LockinSettings | None) -> LockinSettin
 def long_windows(site: Site, requested: LockinSettings | None) -> tuple[Finding, ...]:
     """Return a finding, with the reason, if close tones are received separately.
 
-    Parameters
-    ----------
-    requested : LockinSettings, optional
-        As of `joint_settings`.
+    `requested`: as of `joint_settings`.
     """
     usual = _long(site, requested)
     if usual is None or joint_settings(site, requested) is not None:

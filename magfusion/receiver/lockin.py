@@ -289,10 +289,7 @@ def designs_of(
 def unexplained(log: Log, site: Site, settings: LockinSettings) -> Array:
     """Return the residual power of a series of windows, shape (windows,) (T^2).
 
-    Parameters
-    ----------
-    log : Log
-        With a waveform.
+    `log`: with a waveform.
     """
     waveform, half = log.waveform, 0.5 * settings.window
     assert waveform is not None

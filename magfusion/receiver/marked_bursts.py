@@ -55,10 +55,7 @@ class Bursts:
     def add(self, marks: Marks) -> None:
         """Add bursts after the earlier ones.
 
-        Raises
-        ------
-        InputError
-            Where they are not in order, or a slot has no coil.
+        Raises InputError where they are not in order, or a slot has no coil.
         """
         self._check(marks)
         if len(marks) == 0:
@@ -126,10 +123,7 @@ class Bursts:
     def last(self, until: float, next_number: int) -> int:
         """Return the number of the last burst whose epoch is complete at a time (s).
 
-        Parameters
-        ----------
-        next_number : int
-            First burst not returned yet.
+        `next_number`: first burst not returned yet.
         """
         begin = max(next_number - self.first, 0)
         own = slice(begin, None)

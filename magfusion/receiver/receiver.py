@@ -86,21 +86,14 @@ class Receiver(ABC):
 
     @abstractmethod
     def check(self) -> None:
-        """Reject drives that cannot be separated, and settings that do not suit them.
-
-        Raises
-        ------
-        InputError
-        """
+        """Reject drives that cannot be separated, and settings that do not suit them."""
 
     @abstractmethod
     def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
         """Set up the grid from the first samples.
 
-        Raises
-        ------
-        InputError
-            Where the sampling rate does not suit the drives, or a stream has less than two samples.
+        Raises InputError where the sampling rate does not suit the drives, or a stream has less
+        than two samples.
         """
 
     @abstractmethod
@@ -109,12 +102,8 @@ class Receiver(ABC):
     ) -> tuple[FieldSamples, IntArray]:
         """Return the phasors of windows, and the number of each row's window.
 
-        Parameters
-        ----------
-        imu : ImuSamples
-            As from `magfusion.receiver.turn.on_clock`.
-        site : Site
-            With the calibration of the magnetometer.
+        `imu`: as from `magfusion.receiver.turn.on_clock`. `site`: with the calibration of the
+        magnetometer.
         """
 
     def pushed(
@@ -122,10 +111,7 @@ class Receiver(ABC):
     ) -> tuple[FieldSamples, int]:
         """Return the phasors of windows from a number on, and the number of these windows.
 
-        Parameters
-        ----------
-        windows : Windows
-            Including the earlier ones that these need.
+        `windows`: including the earlier ones that these need.
         """
         result, number = self.phasors(waveform, imu, windows, self.site)
         result = result.rows(number >= first_number)
@@ -139,10 +125,7 @@ class Receiver(ABC):
     def add_marks(self, marks: Marks) -> None:  # noqa: B027
         """Add marked bursts; drives with a schedule ignore them.
 
-        Raises
-        ------
-        InputError
-            Where they are not in order, or a slot has no coil.
+        Raises InputError where they are not in order, or a slot has no coil.
         """
 
     def add_slots(self, time: Array, slot: IntArray) -> None:  # noqa: B027
@@ -203,10 +186,7 @@ class Receiver(ABC):
     def whole(self, waveform: Waveform, imu: ImuSamples) -> tuple[Windows, FieldSamples]:
         """Return the usable windows of a whole log, and their phasors.
 
-        Raises
-        ------
-        InputError
-            Where no window is usable.
+        Raises InputError where no window is usable.
         """
         if len(imu):
             imu = initial_calibration(self.site, 0.0, float(imu.time[0])).on_log_rate(imu)
@@ -258,10 +238,7 @@ class Receiver(ABC):
     def admit(self, waveform: Waveform, imu: ImuSamples, until: float | None = None) -> Windows:
         """Return the windows that have become complete and can be demodulated.
 
-        Parameters
-        ----------
-        waveform, imu, until
-            As of `push`; no time means the end of the log.
+        `waveform`, `imu`, `until`: as of `push`; no time means the end of the log.
         """
         assert self.grid is not None
         assert self.admission is not None

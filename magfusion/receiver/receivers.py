@@ -16,10 +16,7 @@ from magfusion.receiver.windows import LockinSettings, default_settings
 def receiver_of(site: Site, settings: LockinSettings | SlotSettings | None = None) -> Receiver:
     """Return the receiver for the drives of a site.
 
-    Parameters
-    ----------
-    settings : LockinSettings or SlotSettings, optional
-        None derives them from the tones or the time slots.
+    `settings`: none derives them from the tones or the time slots.
     """
     if is_marked(site):
         return MarkedReceiver(site, settings)
@@ -31,10 +28,7 @@ def receiver_of(site: Site, settings: LockinSettings | SlotSettings | None = Non
 def windowed(receiver: Receiver) -> LockinReceiver:
     """Return a receiver whose windows include a steady field, the Earth's.
 
-    Raises
-    ------
-    InputError
-        Where it is of time slots.
+    Raises InputError where it is of time slots.
     """
     if isinstance(receiver, LockinReceiver):
         return receiver
@@ -46,10 +40,7 @@ def windowed(receiver: Receiver) -> LockinReceiver:
 def usual_lockin(site: Site, mains_hz: float = 50.0) -> LockinSettings:
     """Return the default window and step of a site; of time slots, theirs.
 
-    Raises
-    ------
-    InputError
-        Where its drives cannot be separated.
+    Raises InputError where its drives cannot be separated.
     """
     return (slot_lockin if has_schedule(site) else default_settings)(site, mains_hz)
 
@@ -62,15 +53,7 @@ def received(
 ) -> tuple[FieldSamples, Counter[str]]:
     """Return the phasors of a whole waveform, and how many windows were dropped for which reason.
 
-    Parameters
-    ----------
-    settings : LockinSettings or SlotSettings, optional
-        As of `receiver_of`.
-
-    Raises
-    ------
-    InputError
-        Where no window is usable.
+    `settings`: as of `receiver_of`. Raises InputError where no window is usable.
     """
     receiver = receiver_of(site, settings)
     _, result = receiver.whole(waveform, imu)

@@ -186,10 +186,7 @@ class ReferenceNormalEquations:
     def later(self, turn: float) -> "ReferenceNormalEquations":
         """Return their contribution to later pieces, after a clock correction by ``turn``.
 
-        Parameters
-        ----------
-        turn : float
-            Decrease of the reference's phase (rad).
+        `turn`: decrease of the reference's phase (rad).
         """
         return ReferenceNormalEquations(MEMORY * self.other, MEMORY * np.exp(1j * turn) * self.both)
 

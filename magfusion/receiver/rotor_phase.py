@@ -27,10 +27,7 @@ MOST_SPEEDS = 2000
 def followed_angle(waveform: Waveform, frequency_hz: float, rotor: Rotor) -> Array:
     """Estimate the angle at each sample (rad), from an unknown zero.
 
-    Raises
-    ------
-    InputError
-        Where the log is too short, or the magnet is not detected above the noise.
+    Raises InputError where the log is too short, or the magnet is not detected above the noise.
     """
     piece = TURNS / frequency_hz
     time, half = waveform.time, 0.5 * piece

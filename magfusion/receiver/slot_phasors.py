@@ -151,12 +151,8 @@ def demodulate_slots(
 ) -> tuple[FieldSamples, IntArray]:
     """Turn the slots of a tracker into one phasor for each driven slot.
 
-    Pulses of direct current give a real phasor, the field itself.
-
-    Parameters
-    ----------
-    measured_from_still : Turn
-        As from `magfusion.receiver.turn.turn_of`.
+    Pulses of direct current give a real phasor, the field itself. `measured_from_still`: as from
+    `magfusion.receiver.turn.turn_of`.
 
     Returns
     -------

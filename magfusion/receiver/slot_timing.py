@@ -39,10 +39,7 @@ def is_searched(site: Site) -> bool:
 def check_timing_declared(site: Site) -> None:
     """Reject pulses of unknown timing.
 
-    Raises
-    ------
-    InputError
-        Folded at the cycle, the Earth's field looks like that of a coil.
+    Raises InputError folded at the cycle, the Earth's field looks like that of a coil.
     """
     free_running = [beacon.name for beacon in site.beacons if not beacon.synchronised]
     if free_running and is_pulsed(site):
@@ -61,12 +58,7 @@ def informative_share(slots: Slots) -> float:
 def slot_start(waveform: Waveform, site: Site, rate_hz: float) -> float | None:
     """Return the begin of the first cycle in the samples (s); None if it is ambiguous.
 
-    Parameters
-    ----------
-    waveform : Waveform
-        Its end is used.
-    rate_hz : float
-        Median sampling rate.
+    `waveform`: its end is used. `rate_hz`: median sampling rate.
     """
     slots = schedule(site)
     part = waveform.time >= waveform.time[-1] - informative_share(slots)

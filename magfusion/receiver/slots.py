@@ -52,13 +52,7 @@ def is_marked(site: Site) -> bool:
 
 
 def schedule(site: Site) -> Slots:
-    """Return the schedule that all beacons of the site keep.
-
-    Raises
-    ------
-    InputError
-        As `check_kept`.
-    """
+    """Return the schedule that all beacons of the site keep."""
     slots = check_kept(site)
     assert isinstance(slots, Slots)
     return slots
@@ -77,11 +71,8 @@ def places(site: Site) -> int:
 def check_kept(site: Site) -> Slots | MarkedSlots:
     """Return the schedule of all beacons of the site.
 
-    Raises
-    ------
-    InputError
-        Where a beacon has none or another one, or two coils that do not belong together are
-        driven in one slot.
+    Raises InputError where a beacon has none or another one, or two coils that do not belong
+    together are driven in one slot.
     """
     first = next(beacon for beacon in site.beacons if beacon.slots is not None)
     assert first.slots is not None
@@ -121,13 +112,7 @@ def default_slot_settings(site: Site, mains_hz: float = 50.0) -> SlotSettings:
 
 
 def slot_lockin(site: Site, mains_hz: float = 50.0) -> LockinSettings:
-    """Return window and step for a site with a schedule: its slots.
-
-    Raises
-    ------
-    InputError
-        As `schedule`.
-    """
+    """Return window and step for a site with a schedule: its slots."""
     if is_marked(site):
         check_kept(site)
         return LockinSettings(0.0, 0.0, mains_hz)  # each burst has a length of its own
@@ -138,10 +123,7 @@ def slot_lockin(site: Site, mains_hz: float = 50.0) -> LockinSettings:
 def slot_settings_of(site: Site, lockin: LockinSettings | None) -> SlotSettings:
     """Return the settings for the options of a lock-in.
 
-    Raises
-    ------
-    InputError
-        Where the options select a window that is not a slot.
+    Raises InputError where the options select a window that is not a slot.
     """
     if lockin is None:
         return default_slot_settings(site)
@@ -189,12 +171,7 @@ def carriers_hz(site: Site, count: int) -> Array:
 
 
 def check_carriers(site: Site, rate_hz: float, settings: SlotSettings) -> None:
-    """Reject slots and carriers that the sampling rate or the settings do not suit.
-
-    Raises
-    ------
-    InputError
-    """
+    """Reject slots and carriers that the sampling rate or the settings do not suit."""
     slots = schedule(site)
     carrier = carriers_hz(site, slots.count)
     if slots.duration * rate_hz < LEAST_SAMPLES * (1.0 - 1e-6):

@@ -103,12 +103,8 @@ def zero_rate_filler(imu: ImuSamples, silence: tuple[Array, Array]) -> ImuSample
 def turn_of(imu: ImuSamples, site: Site) -> Turn:
     """Return the rotation of a field.
 
-    The non-rotating axes are those of the body at the first inertial sample.
-
-    Parameters
-    ----------
-    imu : ImuSamples
-        As from `on_clock`.
+    The non-rotating axes are those of the body at the first inertial sample. `imu`: as from
+    `on_clock`.
     """
     return Turn(body_turn_of(imu), measured_from_body(site))
 

@@ -52,13 +52,9 @@ class LockinSettings:
 def default_settings(site: Site, mains_hz: float = 50.0) -> LockinSettings:
     """Choose window and step from the spacing of the tones.
 
-    Two periods of the closest pair (of tones, of a tone and the mains, of a tone and zero)
-    separate them even with a ramp in each; windows overlap by half.
-
-    Raises
-    ------
-    InputError
-        Where two beacons share a frequency, or a beacon is driven in time slots.
+    Two periods of the closest pair (of tones, of a tone and the mains, of a tone and zero) separate
+    them even with a ramp in each; windows overlap by half. Raises InputError where two beacons
+    share a frequency, or a beacon is driven in time slots.
     """
     frequencies = sent_frequencies_hz(site)
     lines = np.sort(np.concatenate([[0.0], frequencies]))

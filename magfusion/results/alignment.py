@@ -31,12 +31,8 @@ def tracked_point(
 ) -> Trajectory:
     """Return the poses of the frame that the truth tracks, with their covariance.
 
-    Parameters
-    ----------
-    lever_body : sequence of float
-        From the body to the tracked point, three numbers (m).
-    mounting : Rotation
-        ``body_from_tracked``.
+    `lever_body`: from the body to the tracked point, three numbers (m). `mounting`:
+    ``body_from_tracked``.
     """
     lever, body_from_tracked = np.asarray(lever_body), mounting.as_matrix()
     cov = estimate.pose_cov
@@ -56,10 +52,7 @@ def tracked_point(
 def from_ned(truth: Trajectory) -> Trajectory:
     """Return poses with z up: of a body forward, left, up in a world east, north, up.
 
-    Parameters
-    ----------
-    truth : Trajectory
-        Of a body forward, right, down in a world north, east, down.
+    `truth`: of a body forward, right, down in a world north, east, down.
     """
     enu_from_ned = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     frd_from_flu = np.diag([1.0, -1.0, -1.0])
@@ -70,16 +63,8 @@ def from_ned(truth: Trajectory) -> Trajectory:
 def align_world(estimate: Trajectory, pairs: AssociatedPoses, kind: Alignment) -> Trajectory:
     """Return an estimate moved to fit the positions of pairs best, or else their attitudes.
 
-    Parameters
-    ----------
-    kind : {"none", "se3", "yaw"}
-        Rotation and translation as evo's ``--align`` (Umeyama 1991, no scale), or a rotation about
-        the vertical and a translation.
-
-    Raises
-    ------
-    InputError
-        Where the platform hardly moves.
+    `kind`: rotation and translation as evo's ``--align`` (Umeyama 1991, no scale), or a rotation
+    about the vertical and a translation. Raises InputError where the platform hardly moves.
     """
     if kind == "none":
         return estimate
@@ -119,12 +104,8 @@ def clock_offset(estimate: Trajectory, truth: Trajectory) -> float:
     """Return the constant to add to the estimate's times (s).
 
     The rates of rotation, or else the speeds, are the same in all frames: their correlation gives
-    the offset to a step; the least error after alignment refines it.
-
-    Raises
-    ------
-    InputError
-        Where the motions do not determine it.
+    the offset to a step; the least error after alignment refines it. Raises InputError where the
+    motions do not determine it.
     """
     if min(len(estimate), len(truth)) < 3:
         raise InputError("--align-time: estimate and truth need three poses each")

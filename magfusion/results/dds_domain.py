@@ -18,15 +18,8 @@ _LAST_DOMAIN = 232  # its ports are the last ones that there are
 def join_domain(option: str) -> DomainParticipant:
     """Join the domain ``ROS_DOMAIN_ID``.
 
-    Parameters
-    ----------
-    option : str
-        That requires it, for errors.
-
-    Raises
-    ------
-    InputError
-        Where the domain is invalid, cyclonedds is not installed, or DDS does not start.
+    `option`: that requires it, for errors. Raises InputError where the domain is invalid,
+    cyclonedds is not installed, or DDS does not start.
     """
     text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
     if not text.isdecimal() or int(text) > _LAST_DOMAIN:
@@ -50,10 +43,7 @@ def join_domain(option: str) -> DomainParticipant:
 def dds_name(option: str, topic: str) -> str:
     """Return the name by which DDS knows a topic of ROS.
 
-    Raises
-    ------
-    InputError
-        Where it is none.
+    Raises InputError where it is none.
     """
     if not _TOPIC.fullmatch(topic):
         raise InputError(f"{option} {topic!r}: is not a topic; write one like /robot/odometry")

@@ -140,17 +140,14 @@ class CommonSlope:
 def common_slope(times: Sequence[Array], values: Sequence[Array]) -> CommonSlope:
     """Return the mean slope of the components of an error over worlds.
 
+    Raises ValueError with fewer than `MIN_COMMON` worlds, for which the scatter of three components
+    is unknown.
+
     Parameters
     ----------
     times : sequence of ndarray, shape (n,)
         One per world (s).
     values : sequence of ndarray, shape (n, 3)
-
-    Raises
-    ------
-    ValueError
-        With fewer than `MIN_COMMON` worlds, for which the scatter of three components is
-        unknown.
     """
     worlds = len(values)
     if worlds < MIN_COMMON:
@@ -166,16 +163,13 @@ def common_slope(times: Sequence[Array], values: Sequence[Array]) -> CommonSlope
 def slope_of_one(time: Array, value: Array) -> Slope:
     """Return the slope of one world's errors, for any correlation time.
 
+    Raises ValueError where fewer than three blocks have any value.
+
     Parameters
     ----------
     time : ndarray, shape (n,)
         (s)
     value : ndarray, shape (n,)
-
-    Raises
-    ------
-    ValueError
-        Where fewer than three blocks have any value.
     """
     return Slope(*trend(time / DAY, value))
 

@@ -59,10 +59,7 @@ class Gauge(NamedTuple):
 def gauges(calibration: Calibration, blocks: tuple[Block, ...]) -> list[Gauge]:
     """Return the gauge directions of the estimated parameters, the approximate ones last.
 
-    Parameters
-    ----------
-    blocks : tuple of Block
-        Estimated blocks; a gauge that would change other parameters is omitted.
+    `blocks`: estimated blocks; a gauge that would change other parameters is omitted.
     """
     beacons = calibration.site.beacons
     result = [*_shifts(beacons, blocks), *_turns(beacons, blocks, (2,))]

@@ -58,10 +58,7 @@ def motion_coverage(
 ) -> MotionCoverage:
     """Return the range of a motion.
 
-    Parameters
-    ----------
-    imu : ImuSamples
-        Used to find rests.
+    `imu`: used to find rests.
     """
     sensor_world = sensor_positions(calibration.site, states)[:, 0]
     nearest, spread = {}, {}

@@ -41,10 +41,7 @@ class Odometry:
 def odometry_of(state: State, epoch_ns: int = 0) -> Odometry:
     """Return the odometry of a state.
 
-    Parameters
-    ----------
-    epoch_ns : int
-        Zero of the states' time (ns since 1970); no format has earlier stamps.
+    `epoch_ns`: zero of the states' time (ns since 1970); no format has earlier stamps.
     """
     world_from_body = state.world_from_body
     velocity_body = world_from_body.T @ state.velocity_world

@@ -18,10 +18,7 @@ _DEPTH = 10  # messages that a reader may be late by, as the default of ROS
 def odometry_message(odometry: Odometry, frame: str, child: str) -> Any:
     """Return a message; angular rates, which no state has, are zero with a huge variance.
 
-    Parameters
-    ----------
-    frame, child : str
-        Names of world and body.
+    `frame`, `child`: names of world and body.
     """
     twist_cov = UNKNOWN_VARIANCE * np.eye(6)
     twist_cov[:3, :3] = odometry.velocity_cov_body

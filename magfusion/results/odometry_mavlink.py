@@ -38,12 +38,8 @@ def odometry_message(odometry: Odometry, quality: int, discontinuities: int) -> 
     """Return a message ODOMETRY, from MAV_FRAME_BODY_FRD to MAV_FRAME_LOCAL_FRD.
 
     Both frames are ours rotated by half a turn about x.  The local one has an arbitrary heading, as
-    our world: it is not north.  Angular rates, which no state has, are NaN.
-
-    Parameters
-    ----------
-    discontinuities : int
-        Number of jumps of the estimate.
+    our world: it is not north.  Angular rates, which no state has, are NaN. `discontinuities`:
+    number of jumps of the estimate.
     """
     from pymavlink.dialects.v20 import common
 

@@ -74,10 +74,7 @@ _CAPTIONS = {
 def write_page(directory: Path, figures: Figures, motion: MotionPage | None = None) -> None:
     """Write ``report.html`` with the pictures (``.png``) in the directory.
 
-    Parameters
-    ----------
-    motion : MotionPage, optional
-        The estimated motion, if any.
+    `motion`: the estimated motion, if any.
     """
     blocks = _head(figures)
     if motion is not None:
@@ -109,10 +106,7 @@ def write_page(directory: Path, figures: Figures, motion: MotionPage | None = No
 def head_in_notebook(figures: Figures, unjudged: str = NO_JUDGE) -> str:
     """Return the head of the page as a part of another page, with its style in its own scope.
 
-    Parameters
-    ----------
-    unjudged : str
-        Shown where there is no verdict.
+    `unjudged`: shown where there is no verdict.
     """
     parts = "\n".join(filter(None, _head(figures, unjudged)))
     # The rules of a style sheet nested in a class apply to elements inside it.

@@ -156,12 +156,7 @@ def _summary(trajectory: Trajectory, errors: TrajectoryErrors | None) -> str:
 def open_viewer(path: Path) -> None:
     """Show a recording in a separate viewer, and return at once.
 
-    Raises
-    ------
-    InputError
-        Where there is no such file.
-    EstimationError
-        Where there is no display.
+    Raises InputError where there is no such file. Raises EstimationError where there is no display.
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; give the path of a recording (.rrd).")

@@ -23,12 +23,7 @@ def write_coverage_recording(
 ) -> None:
     """Write a recording of the points, coloured by position sigma, among the beacons.
 
-    Parameters
-    ----------
-    spacing : float
-        Of the points (m).
-    extra : Beacon, optional
-        Best position of one more beacon.
+    `spacing`: of the points (m). `extra`: best position of one more beacon.
     """
     places = np.vstack([coverage.position_world, *(b.position_world for b in site.beacons)])
     low, high = places.min(axis=0), places.max(axis=0)

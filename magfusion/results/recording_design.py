@@ -23,10 +23,7 @@ _WALLS, _FORBIDDEN, _OPEN, _BEACON = (90, 90, 90), (200, 60, 60), (120, 120, 120
 def write_design_recording(path: Path, hall: Hall, panels: list[Panel], spacing: float) -> None:
     """Write a recording of layouts in their hall, each point in the colour of its level.
 
-    Parameters
-    ----------
-    spacing : float
-        Of the points (m).
+    `spacing`: of the points (m).
     """
     low, high = hall.room.box_world
     scale = Scale(0.5 * (low + high), max(float(np.linalg.norm(high - low)), 1.0), 1)

@@ -13,12 +13,8 @@ from magfusion.files.atomic import whole_file
 def whole_recording(path: Path, name: str) -> Iterator[rr.RecordingStream]:
     """Yield a recording that is written to ``path`` if nothing fails.
 
-    It is kept in memory until then: rerun's own file sink only logs a full disk.
-
-    Parameters
-    ----------
-    name : str
-        Shown in the viewer.
+    It is kept in memory until then: rerun's own file sink only logs a full disk. `name`: shown in
+    the viewer.
     """
     recording = rr.RecordingStream("magfusion")
     memory = recording.memory_recording()

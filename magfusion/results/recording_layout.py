@@ -110,12 +110,8 @@ def layout(
 ) -> rrb.Blueprint:
     """Return a layout of parts side by side, with the viewer's own panels collapsed.
 
-    Parameters
-    ----------
-    banner : tuple of str, optional
-        Entity of the text above them, and this text, which determines its height.
-    play : {'paused', 'following'}
-        Whether the time is paused, or follows the data.
+    `banner`: entity of the text above them, and this text, which determines its height. `play`:
+    whether the time is paused, or follows the data.
     """
     body: rrb.Container = rrb.Horizontal(*parts, column_shares=list(shares))
     if banner is not None:

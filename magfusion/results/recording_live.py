@@ -92,10 +92,7 @@ def _innovation(beacon: str) -> str:
 def spawned() -> rr.RecordingStream:
     """Open a viewer; return a recording that is connected to it.
 
-    Raises
-    ------
-    InputError
-        Where no viewer can be started.
+    Raises InputError where no viewer can be started.
     """
     recording = rr.RecordingStream("magfusion")
     try:

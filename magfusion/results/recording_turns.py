@@ -47,10 +47,7 @@ class TurnView:
 def open_turn_view() -> TurnView:
     """Open a viewer for statuses.
 
-    Raises
-    ------
-    InputError
-        Where no viewer can be started.
+    Raises InputError where no viewer can be started.
     """
     return TurnView(spawned())
 

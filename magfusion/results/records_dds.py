@@ -125,7 +125,8 @@ def _aiding_content(
 def subscribe(topics: Topics | None, site: Site, messages: TextIO) -> Iterator[NumberedRecord]:
     """Return the samples of topics as they arrive, in the domain ``ROS_DOMAIN_ID``.
 
-    Stamps are those of the headers, in seconds since 1970.
+    Stamps are those of the headers, in seconds since 1970. Raises InputError where a topic or the
+    domain is invalid, or cyclonedds is not installed.
 
     Parameters
     ----------
@@ -135,11 +136,6 @@ def subscribe(topics: Topics | None, site: Site, messages: TextIO) -> Iterator[N
         Of a platform without an IMU only the magnetometer is subscribed to.
     messages : file
         Receives a sentence on a topic without messages.
-
-    Raises
-    ------
-    InputError
-        Where a topic or the domain is invalid, or cyclonedds is not installed.
     """
     if topics is not None and topics.truth is not None:
         raise InputError("--topics: truth is of a log; omit it with ros2:")

@@ -48,10 +48,7 @@ _REPORT, _ERRORS, _SUMMARY = Section.REPORT, Section.ERRORS, Section.SUMMARY
 def write_report(directory: Path, figures: Figures, motion: MotionPage | None = None) -> None:
     """Write ``report.json``, and ``report.html`` with the result: in `FAILED` if that exists.
 
-    Parameters
-    ----------
-    motion : MotionPage, optional
-        Content of the page in addition to the figures and the pictures in the directory.
+    `motion`: content of the page in addition to the figures and the pictures in the directory.
     """
     text = json.dumps(dict(figures), indent=1, allow_nan=False, default=float)
     (directory / "report.json").write_text(text + "\n")
@@ -69,12 +66,8 @@ def error_figures(
 ) -> Figures:
     """Return the errors against the truth: absolute, aligned, relative, and their consistency.
 
-    Parameters
-    ----------
-    column : ErrorColumn
-        Of the screen's table; consistency is shown only for errors of the result itself.
-    prefix : str
-        Of the keys.
+    `column`: of the screen's table; consistency is shown only for errors of the result itself.
+    `prefix`: of the keys.
     """
     own, aligned = (_REPORT, _REPORT) if prefix else (_SUMMARY, _ERRORS)
     relative, attitude_deg = errors.relative, errors.aligned_attitude_rmse_deg
@@ -220,10 +213,7 @@ def _earth_figures(result: Smoothed) -> Figures:
 def smoothed_figures(result: Smoothed, directions: Section = _REPORT) -> Figures:
     """Return the figures of a smoothed log.
 
-    Parameters
-    ----------
-    directions : Section
-        Section of the determined and undetermined directions of the calibration.
+    `directions`: section of the determined and undetermined directions of the calibration.
     """
     states = result.states
     estimates = parameter_estimates(

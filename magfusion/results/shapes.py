@@ -63,10 +63,7 @@ def coil_loop(coil: Coil, usual_radius: float) -> Array:
 def coverage_shell(beacon: Beacon, level: float) -> list[Array]:
     """Return the equator and two meridians of the surface at a level of the field.
 
-    Parameters
-    ----------
-    level : float
-        Root mean square of the field over time (T).
+    `level`: root mean square of the field over time (T).
 
     Returns
     -------

@@ -23,13 +23,9 @@ def agreement(first: Estimated, second: Estimated) -> Array:
 
     Both start at the same survey, and keep it where a log adds no information: such directions, the
     gauge among them, agree without proof and are omitted.  In the others the pull of the survey is
-    removed from the sigma of the difference: with ``K = I - P P0^-1`` it has the covariance
-    ``(K1 - K2) P0 (K1 - K2)^T + sum(P - P P0^-1 P)``, which is less than the sum of the posteriors.
-
-    Parameters
-    ----------
-    first, second : Estimated
-        With the same parameters and priors.
+    removed from the sigma of the difference: with ``K = I - P P0^-1`` it has the covariance ``(K1 -
+    K2) P0 (K1 - K2)^T + sum(P - P P0^-1 P)``, which is less than the sum of the posteriors.
+    `first`, `second`: with the same parameters and priors.
 
     Returns
     -------

@@ -16,10 +16,7 @@ _WIDE, _HIGH = 9, 4  # half axes of a hemisphere (characters)
 def guide_line(status: TurnStatus, limit: float) -> str:
     """Return the guidance in a line.
 
-    Parameters
-    ----------
-    limit : float
-        Offset sigma that is required (T).
+    `limit`: offset sigma that is required (T).
     """
     following = f"next: {status.target}; " if status.target else "all orientations visited; "
     if status.offset_sigma is None or status.matrix_sigma is None:

@@ -29,10 +29,7 @@ def look_of(answer: str) -> Verdict:
 def trust_figures(trust: Trust, answer: str | None = None) -> Figures:
     """Return verdict, reasons, remarks and unverified parameters, for the head of a report.
 
-    Parameters
-    ----------
-    answer : str, optional
-        In place of the verdict, of a job that does not judge an estimate.
+    `answer`: in place of the verdict, of a job that does not judge an estimate.
     """
     verdict = str(trust.verdict) if answer is None else answer
     return Figures(
@@ -91,10 +88,7 @@ def _unverified(one: Unverified) -> dict[str, Any]:
 def level_figures(states: StateTrust, beacons: int | None = None) -> Figures:
     """Return the median protection levels, and in how many states beacons were excluded.
 
-    Parameters
-    ----------
-    beacons : int, optional
-        Number of beacons of the site, for the cause of the level.
+    `beacons`: number of beacons of the site, for the cause of the level.
     """
     known = np.isfinite(states.protection_level_m)
     deg = states.protection_level_deg[np.isfinite(states.protection_level_deg)]

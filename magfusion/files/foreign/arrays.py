@@ -37,10 +37,7 @@ class _Field:
 def array_source(path: Path) -> Source:
     """Return a table whose file holds arrays; the suffix gives the format.
 
-    Raises
-    ------
-    InputError
-        Where it cannot be read or holds no numbers.
+    Raises InputError where it cannot be read or holds no numbers.
     """
     opened = {
         ".npy": _npy,
@@ -77,12 +74,8 @@ def _part(name: str) -> Callable[[AnyArray], AnyArray]:
 def fields_of(name: str, array: Any, unit: str = "", by_column: bool = False) -> list[_Field]:
     """Return the columns of an array: none where it is no table of numbers.
 
-    Parameters
-    ----------
-    array
-        What has ``shape`` and ``dtype`` and is sliced, as an array or a data set of HDF5.
-    by_column : bool
-        Whether the array was written column after column, as MATLAB does.
+    `array`: what has ``shape`` and ``dtype`` and is sliced, as an array or a data set of HDF5.
+    `by_column`: whether the array was written column after column, as MATLAB does.
     """
     shape, dtype = array.shape, array.dtype
     parts = _COMPLEX if _is_complex(dtype) else {"": np.asarray} if _numeric(dtype) else {}

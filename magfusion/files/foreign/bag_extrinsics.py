@@ -45,18 +45,9 @@ class Extrinsics(NamedTuple):
 def read_extrinsics(path: Path, topics: Topics | None = None) -> Extrinsics:
     """Return the mounting of a bag's magnetometer against its IMU.
 
-    The frames are those of the messages' headers.
-
-    Parameters
-    ----------
-    topics : Topics, optional
-        Of a bag with several IMUs or magnetometers.
-
-    Raises
-    ------
-    InputError
-        Where the bag lacks a sensor or has several, or its static transforms give no chain
-        between their frames, or more than one.
+    The frames are those of the messages' headers. `topics`: of a bag with several IMUs or
+    magnetometers. Raises InputError where the bag lacks a sensor or has several, or its static
+    transforms give no chain between their frames, or more than one.
     """
     with open_bag([path]) as reader:
         frames = tuple(_frame(reader, path, role, topics) for role in ("imu", "magnetometer"))

@@ -70,10 +70,7 @@ class Topic:
 def first_stamp(paths: Sequence[Path], topic: str) -> int:
     """Return the stamp of the first message of a topic (ns); without a header, its arrival.
 
-    Raises
-    ------
-    InputError
-        Where the bag has no such topic.
+    Raises InputError where the bag has no such topic.
     """
     with open_bag(paths) as reader:
         connections = [c for c in reader.connections if c.topic == topic]
@@ -94,6 +91,8 @@ def plan_bag(
 ) -> list[ImportPlan]:
     """Return how the topics of a bag become streams; what is undecided is added to ``declared``.
 
+    Raises InputError where the bag cannot be read.
+
     Parameters
     ----------
     paths : sequence of Path
@@ -104,11 +103,6 @@ def plan_bag(
         Of streams whose messages are counted, whatever their stamps.
     others : collection of str
         Streams that come from elsewhere.
-
-    Raises
-    ------
-    InputError
-        Where the bag cannot be read.
     """
     plans, place = [], place_of(paths)
     with open_bag(paths) as reader:

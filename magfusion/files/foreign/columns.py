@@ -106,10 +106,7 @@ class Undecided(ValueError):
 def parse_entry(text: str) -> list[ColumnMapping]:
     """Read one option; an entry for several columns becomes several entries.
 
-    Raises
-    ------
-    InputError
-        Where it is none, or names an unknown stream or column.
+    Raises InputError where it is none, or names an unknown stream or column.
     """
     name, equals, value = (part.strip() for part in text.partition("="))
     stream, _, column = name.partition(".")
@@ -167,10 +164,7 @@ def dimension_of(stream: str, column: str) -> Dimension:
 def resolve(entry: ColumnMapping, columns: Sequence[SourceColumn]) -> tuple[Term, ...]:
     """Return the columns of the file that an entry means; stamps may be a sum of several.
 
-    Raises
-    ------
-    Undecided
-        With the reason, for a column that is not there or a unit that is not given.
+    Raises Undecided with the reason, for a column that is not there or a unit that is not given.
     """
     dimension = dimension_of(entry.stream, entry.column)
     parts = [entry.value]
@@ -182,13 +176,7 @@ def resolve(entry: ColumnMapping, columns: Sequence[SourceColumn]) -> tuple[Term
 def term_of(
     text: str, columns: Sequence[SourceColumn], dimension: Dimension, entry: ColumnMapping
 ) -> Term:
-    """Return the column, sign and unit that a text means.
-
-    Raises
-    ------
-    Undecided
-        As `resolve`.
-    """
+    """Return the column, sign and unit that a text means."""
     for sign, lead in ((1.0, ""), (1.0, "+"), (-1.0, "-")):
         if not text.startswith(lead):
             continue
@@ -213,10 +201,7 @@ def term_of(
 def place_of(name: str, columns: Sequence[SourceColumn]) -> int | None:
     """Return the place of the column that a name means, or None.
 
-    Raises
-    ------
-    Undecided
-        Where several columns have it.
+    Raises Undecided where several columns have it.
     """
     exact = [k for k, column in enumerate(columns) if column.name == name]
     bare = [k for k, c in enumerate(columns) if _loose(c.name) == _loose(name)]

@@ -87,17 +87,9 @@ def write_stream(
 ) -> Counts:
     """Write the table of a stream as Parquet, sorted by time.
 
-    Parameters
-    ----------
-    shared : bool
-        Whether the table holds other streams, too: rows without any number of this one are theirs.
-    report : callable, optional
-        Called after each part with the number of rows read.
-
-    Raises
-    ------
-    InputError
-        Naming file, column and row, where the table is no recording of one clock.
+    `shared`: whether the table holds other streams, too: rows without any number of this one are
+    theirs. `report`: called after each part with the number of rows read. Raises InputError naming
+    file, column and row, where the table is no recording of one clock.
     """
     counts = Counts()
     mapped = [name for name in plan.terms if name != TIME]
@@ -142,10 +134,7 @@ def converted_rows(
 def stamps_of(plan: ImportPlan, raw: dict[int, Raw], part: RowBlock) -> IntArray:
     """Return the times of some rows (ns), `NO_STAMP` if absent.
 
-    Raises
-    ------
-    InputError
-        Where a text is no time.
+    Raises InputError where a text is no time.
     """
     if plan.rate is not None:
         start = plan.shift_ns + round((plan.rate.start_s or 0) * 10**9)

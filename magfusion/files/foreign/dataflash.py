@@ -18,14 +18,8 @@ _ANGLES = ("Yaw", "Pitch", "Roll")
 def read_dataflash(path: Path, names: Collection[str]) -> dict[str, dict[str, AnyArray]]:
     """Return the columns of messages; a further instance of a message is NAME:INSTANCE.
 
-    Attitudes in angles have the quaternion, too.
-
-    Raises
-    ------
-    InputError
-        Where pymavlink is not installed.
-    ValueError
-        Where the file is no such log.
+    Attitudes in angles have the quaternion, too. Raises InputError where pymavlink is not
+    installed. Raises ValueError where the file is no such log.
     """
     try:
         from pymavlink.DFReader import DFReader_binary

@@ -64,17 +64,8 @@ class Dialect:
 def find_dialect(path: Path, delimiter: str | None = None, markers: Sequence[str] = ()) -> Dialect:
     """Return how a file of text is written.
 
-    Parameters
-    ----------
-    delimiter : str, optional
-        One of `WORDS` or a character; found where it is not given.
-    markers : sequence of str
-        Of missing values, in addition to `MISSING`.
-
-    Raises
-    ------
-    InputError
-        Where no table is found in it.
+    `delimiter`: one of `WORDS` or a character; found where it is not given. `markers`: of missing
+    values, in addition to `MISSING`. Raises InputError where no table is found in it.
     """
     content = _head(path)
     encoding, mark = _encoding(content, path)

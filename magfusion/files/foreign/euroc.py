@@ -54,18 +54,8 @@ def read_euroc(path: Path, start: float | None = None, end: float | None = None)
     """Read a EuRoC folder: inertial samples, and magnetometer and ground truth where they are.
 
     The first inertial stamp is the log's epoch, or the magnetometer's where there is no IMU.
-
-    Parameters
-    ----------
-    path : Path
-        The directory that holds ``mav0``.
-    start, end : float, optional
-        Seconds since the first inertial sample.
-
-    Raises
-    ------
-    InputError
-        Where a file cannot be read or holds what no instrument gives.
+    `path`: the directory that holds ``mav0``. `start`, `end`: seconds since the first inertial
+    sample. Raises InputError where a file cannot be read or holds what no instrument gives.
     """
     tables = {stream: _read(stream, table) for stream, table in euroc_tables(path).items()}
     first = next(iter(tables.values()))
@@ -93,10 +83,7 @@ def read_euroc(path: Path, start: float | None = None, end: float | None = None)
 def euroc_tables(path: Path) -> dict[str, Path]:
     """Return the tables of a EuRoC folder by stream, the one that gives the epoch first.
 
-    Raises
-    ------
-    InputError
-        Where there are several magnetometers, whatever their folders are called.
+    Raises InputError where there are several magnetometers, whatever their folders are called.
     """
     inertial, fields = path / "mav0" / "imu0" / "data.csv", _magnetometers(path)
     if len(fields) > 1:
@@ -114,12 +101,7 @@ def euroc_terms(stream: str, source: Source) -> Terms:
     """Return the columns of a stream by their header, or by their places where it names them not.
 
     Units are those of the header, or else of EuRoC. Stamps are nanoseconds, but where only another
-    unit makes a plausible rate.
-
-    Raises
-    ------
-    InputError
-        Where columns are missing.
+    unit makes a plausible rate. Raises InputError where columns are missing.
     """
     columns = {name: unit for name, unit in STREAMS[stream].items() if name not in EULER}
     columns |= _BIASES if stream == "truth" else {}

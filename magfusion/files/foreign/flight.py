@@ -99,17 +99,9 @@ def plan_flight(
 ) -> list[ImportPlan]:
     """Return how messages of a flight log become streams; problems are added to ``declared``.
 
-    Parameters
-    ----------
-    entries : mapping of sequence of ColumnMapping
-        The user's choice of messages (``magnetometer=sensor_mag:1``) and columns.
-    others : collection of str
-        Streams that come from elsewhere.
-
-    Raises
-    ------
-    InputError
-        Where the log cannot be read, or the package that reads it is not installed.
+    `entries`: the user's choice of messages (``magnetometer=sensor_mag:1``) and columns. `others`:
+    streams that come from elsewhere. Raises InputError where the log cannot be read, or the package
+    that reads it is not installed.
     """
     form = FLIGHTS[path.suffix.lower()]
     try:

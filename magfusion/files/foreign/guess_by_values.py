@@ -57,10 +57,7 @@ def likely_unit(dimension: Dimension, values: Array) -> SourceUnit:
 def likely_time_unit(raw: Raw, usual: str = "s") -> SourceUnit:
     """Return the unit in which stamps would have a plausible rate, or else be a date of today.
 
-    Parameters
-    ----------
-    usual : str
-        The unit that is preferred among several plausible ones.
+    `usual`: the unit that is preferred among several plausible ones.
     """
     values = stamp_numbers(raw)
     if not len(values):

@@ -38,12 +38,8 @@ def join_halves(directory: Path, counts: dict[str, Counts]) -> Joined:
     """Write ``imu.parquet`` from ``gyro.parquet`` and ``accel.parquet``, and remove these.
 
     The samples are those of the faster half; the slower one is interpolated linearly, which keeps
-    its response at frequencies that it resolves.
-
-    Raises
-    ------
-    InputError
-        Where they have no moment in common.
+    its response at frequencies that it resolves. Raises InputError where they have no moment in
+    common.
     """
     gyro_leads = _rate(counts["gyro"]) > MIN_RATE_RATIO * _rate(counts["accel"])
     fast, slow = HALVES if gyro_leads else HALVES[::-1]

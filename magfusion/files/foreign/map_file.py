@@ -85,10 +85,7 @@ def read_request(
 ) -> ImportRequest:
     """Return the requests of the options, and those of a file.
 
-    Raises
-    ------
-    InputError
-        Where the file is none.
+    Raises InputError where the file is none.
     """
     model = MapFile(**{}) if map_file is None else read_yaml(map_file, MapFile)
     root = Path() if map_file is None else map_file.parent

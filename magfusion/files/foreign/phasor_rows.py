@@ -45,10 +45,7 @@ class _Measured:
 def write_phasors(plan: PhasorPlan, path: Path) -> Counts:
     """Write the fields of a table as Parquet, sorted by time.
 
-    Raises
-    ------
-    InputError
-        Where the table holds no phasor, or names coils that the site does not have.
+    Raises InputError where the table holds no phasor, or names coils that the site does not have.
     """
     stamps, columns = _columns(plan)
     counts = Counts(read=len(stamps))

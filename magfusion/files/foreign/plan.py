@@ -143,12 +143,7 @@ def plan_stream(
 ) -> ImportPlan | None:
     """Return how a table becomes a stream, or None with the reasons in ``declared``.
 
-    Parameters
-    ----------
-    entries : sequence of ColumnMapping
-        The user's mapping of this stream.
-    usual : mapping, optional
-        Columns that the format itself defines.
+    `entries`: the user's mapping of this stream. `usual`: columns that the format itself defines.
     """
     own = _Planning(stream, source, declared, rate)
     given = {entry.column: entry for entry in entries}

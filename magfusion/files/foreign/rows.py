@@ -15,12 +15,7 @@ from magfusion.units import BoolArray
 def rows_where(source: Source, place: int, value: str) -> Source:
     """Return a table of the rows that have a value in a column.
 
-    Parameters
-    ----------
-    place : int
-        Of the column.
-    value : str
-        As it is written in the file.
+    `place`: of the column. `value`: as it is written in the file.
     """
 
     def read(wanted: Sequence[int], texts: Collection[int]) -> Iterator[RowBlock]:

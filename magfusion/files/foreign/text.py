@@ -24,10 +24,7 @@ TORN = "not of as many cells as the others"
 def text_source(path: Path, delimiter: str | None = None, markers: Sequence[str] = ()) -> Source:
     """Return a table of text.
 
-    Raises
-    ------
-    InputError
-        Where it holds no table.
+    Raises InputError where it holds no table.
     """
     dialect = find_dialect(path, delimiter, markers)
 

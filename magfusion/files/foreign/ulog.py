@@ -19,12 +19,8 @@ def read_ulog(path: Path, names: Collection[str]) -> dict[str, dict[str, AnyArra
     """Return the columns of messages; a further instance of a message is NAME:INSTANCE.
 
     Times of means are the middle of their interval; integrals become means, in their columns.
-    Attitudes have the local position, interpolated to their times.
-
-    Raises
-    ------
-    InputError
-        Where pyulog is not installed.
+    Attitudes have the local position, interpolated to their times. Raises InputError where pyulog
+    is not installed.
     """
     try:
         from pyulog import ULog

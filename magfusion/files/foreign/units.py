@@ -168,12 +168,8 @@ def to_nanoseconds(raw: Raw, unit: SourceUnit) -> IntArray:
     """Return stamps as whole nanoseconds, `NO_STAMP` where there is none.
 
     Integers and decimal fractions are scaled without rounding on the way: a double resolves the
-    seconds since 1970 to a quarter of a microsecond.
-
-    Raises
-    ------
-    ValueError
-        With the text that is no stamp.
+    seconds since 1970 to a quarter of a microsecond. Raises ValueError with the text that is no
+    stamp.
     """
     if unit.name == ISO:
         return _dates(raw)

@@ -28,10 +28,7 @@ def drive_rows(
 ) -> list[DriveRow]:
     """Return the drive of the strongest coil of each beacon, at its highest tone.
 
-    Parameters
-    ----------
-    tuned : bool
-        Whether a capacitor cancels the inductance.
+    `tuned`: whether a capacitor cancels the inductance.
     """
     rows = []
     for beacon in beacons:

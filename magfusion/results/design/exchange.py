@@ -251,10 +251,7 @@ def of_points(each: Array, objective: Objective) -> float:
 def search_value(each: Array, objective: Objective, count: int | None = None) -> Array:
     """Return what an exchange minimises, from the objective per point, shape (..., n).
 
-    Parameters
-    ----------
-    count : int, optional
-        Number of points, of which the first n are given: a lower bound, but for D.
+    `count`: number of points, of which the first n are given: a lower bound, but for D.
     """
     number = each.shape[-1] if count is None else count
     if objective == "worst":
@@ -317,10 +314,7 @@ def best_layout(
 ) -> ExchangeResult | None:
     """Return the best layout of several starts; None where beacons cannot keep their distance.
 
-    Parameters
-    ----------
-    first : tuple of int, optional
-        An initial layout, before random ones.
+    `first`: an initial layout, before random ones.
     """
     best: ExchangeResult | None = None
     for start in range(starts):

@@ -37,10 +37,7 @@ class NeededDesign:
 def worst_of(task: Task, result: Design, factor: float = 1.0) -> float:
     """Return the worst protection level or position sigma (m), by the task's objective.
 
-    Parameters
-    ----------
-    factor : float
-        On the moments of the new beacons.
+    `factor`: on the moments of the new beacons.
     """
     information = LayoutInformation(
         task.site, result.new[0], task.points, task.band.window, task.risk

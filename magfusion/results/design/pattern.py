@@ -83,10 +83,7 @@ def rotated_to(beacon: Beacon, axis_world: Array) -> Beacon:
 def axes_offered(beacon: Beacon, count: int) -> Array:
     """Return the candidate directions of a beacon, shape (axes, 3), world.
 
-    Parameters
-    ----------
-    count : {3, 7, 13}
-        The world's axes; and the diagonals of a cube; and those of its faces.
+    `count`: the world's axes; and the diagonals of a cube; and those of its faces.
     """
     axis = pattern_axis(beacon)
     if axis is None:
@@ -133,10 +130,7 @@ def peak_moment(beacon: Beacon) -> float:
 def template_of(site: Site, name: str | None) -> Beacon:
     """Return the beacon to copy, without the properties of its own place.
 
-    Raises
-    ------
-    InputError
-        Where there is none of that name.
+    Raises InputError where there is none of that name.
     """
     names = [beacon.name for beacon in site.beacons]
     if name is not None and name not in names:
@@ -152,10 +146,7 @@ def frequencies_for(
 ) -> tuple[Array, Array]:
     """Return the frequencies of each new beacon, shape (count, tones), and the free ones.
 
-    Raises
-    ------
-    InputError
-        Where there is no room for so many.
+    Raises InputError where there is no room for so many.
     """
     selected = np.concatenate([np.zeros(0), *(b.tone_frequencies_hz for b in kept)])
     allowed, tones = band.allowed(selected), len(template.tones)

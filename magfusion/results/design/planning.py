@@ -118,6 +118,8 @@ def designed(
 ) -> Design:
     """Select places, axes, moments and frequencies.
 
+    Raises InputError where there are no mounting places, or too few at this distance.
+
     Parameters
     ----------
     starts : int
@@ -126,11 +128,6 @@ def designed(
         Number of random ones to compare with.
     first : Site, optional
         Site whose beacons, of the same number, are the first start.
-
-    Raises
-    ------
-    InputError
-        Where there are no mounting places, or too few at this distance.
     """
     tones, allowed = np.zeros((0, 0)), np.zeros(0)
     if is_in_turn(task.template):
@@ -185,10 +182,7 @@ def designed(
 def candidates_of(task: Task, beacon: Beacon) -> Candidates:
     """Return copies of a beacon at every allowed place, in every direction.
 
-    Raises
-    ------
-    InputError
-        Where there are none, or too many.
+    Raises InputError where there are none, or too many.
     """
     places = task.places
     if len(places):

@@ -23,10 +23,7 @@ def divided(
 ) -> tuple[tuple[Beacon, ...], Array]:
     """Move moment from one beacon to another as long as the objective improves.
 
-    Parameters
-    ----------
-    beacons : tuple of Beacon
-        Each with an equal share.
+    `beacons`: each with an equal share.
 
     Returns
     -------

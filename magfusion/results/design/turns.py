@@ -13,14 +13,8 @@ def is_in_turn(beacon: Beacon) -> bool:
 def in_turn(template: Beacon, number: int, count: int) -> Beacon:
     """Return one of several copies of a beacon, in its own slots of the common cycle.
 
-    Silent slots come first, so that no share of a window is overestimated.
-
-    Parameters
-    ----------
-    number : int
-        Index of the copy, from zero.
-    count : int
-        Number of copies.
+    Silent slots come first, so that no share of a window is overestimated. `number`: index of the
+    copy, from zero. `count`: number of copies.
     """
     own = sorted({coil.slot for coil in template.coils if coil.slot is not None})
     slots = template.slots

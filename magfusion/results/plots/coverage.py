@@ -16,12 +16,7 @@ SLICES = 3  # heights that are drawn where there are more
 def write_plot(path: Path, site: Site, coverage: Coverage, extra: Beacon | None) -> None:
     """Write a PNG of the position sigma at the lowest, middle and highest heights.
 
-    Parameters
-    ----------
-    coverage : Coverage
-        On a regular grid.
-    extra : Beacon, optional
-        Best position of one more beacon; it is marked.
+    `coverage`: on a regular grid. `extra`: best position of one more beacon; it is marked.
     """
     places = coverage.position_world
     heights = np.unique(places[:, 2])

@@ -44,12 +44,8 @@ class Panel:
 def write_plot(path: Path, hall: Hall, panels: list[Panel]) -> None:
     """Write a PNG of the protection levels of layouts, in the same colours.
 
-    Slices are in a row for each layout, or below each other where the hall is long in x.
-
-    Parameters
-    ----------
-    panels : list of Panel
-        Of the same points.
+    Slices are in a row for each layout, or below each other where the hall is long in x. `panels`:
+    of the same points.
     """
     points = panels[0].coverage.position_world
     heights = np.unique(points[:, 2])

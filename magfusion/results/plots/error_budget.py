@@ -13,10 +13,7 @@ from magfusion.results.error_budget import ErrorBudget
 def write_budget_plot(path: Path, budget: ErrorBudget, titles: tuple[str, ...]) -> None:
     """Write a PNG with a panel for each point of the budget.
 
-    Parameters
-    ----------
-    titles : tuple of str
-        Description of each point.
+    `titles`: description of each point.
     """
     count = len(budget.sources)
     figure = Figure(figsize=(5.2 * len(titles) + 1.0, 1.9 + 0.5 * count), layout="constrained")

@@ -45,12 +45,7 @@ def slices(size: Array, rows: int, columns: int) -> tuple[Figure, list[list[Axes
 def add_legend(figure: Figure, every: Sequence[Axes], unknown: str, blank: str = "") -> None:
     """Add one legend for all axes.
 
-    Parameters
-    ----------
-    unknown : str
-        Meaning of grey.
-    blank : str
-        Meaning of white in a hall, if any.
+    `unknown`: meaning of grey. `blank`: meaning of white in a hall, if any.
     """
     entries: dict[str, Artist] = {}
     for axes in every:
@@ -112,12 +107,7 @@ def draw_beacons(
 ) -> None:
     """Draw places and axes of beacons, and their names with heights.
 
-    Parameters
-    ----------
-    size : float
-        Longer side of the hall (m).
-    marked : Beacon, optional
-        One of them, at the best place of one more.
+    `size`: longer side of the hall (m). `marked`: one of them, at the best place of one more.
     """
     if not beacons:
         return

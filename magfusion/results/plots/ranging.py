@@ -37,10 +37,7 @@ class RangePicture(NamedTuple):
 def write_range_plot(path: Path, reported: RangePicture, *, high_side: bool) -> None:
     """Write a PNG with a cross section and three curves by depth, one colour per sensor place.
 
-    Parameters
-    ----------
-    high_side : bool
-        Whether directions are from it, or from the sensor's third axis.
+    `high_side`: whether directions are from it, or from the sensor's third axis.
     """
     figure = Figure(figsize=(12.0, 8.6), layout="constrained")
     FigureCanvasAgg(figure)

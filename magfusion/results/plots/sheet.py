@@ -54,12 +54,8 @@ def write_sheet(
 ) -> None:
     """Write the sheet.
 
-    Parameters
-    ----------
-    marks_world : mapping
-        Marks on the floor by their names, shape (3,) (m).
-    drives : sequence of DriveRow
-        Of the coils, if wire and form are known.
+    `marks_world`: marks on the floor by their names, shape (3,) (m). `drives`: of the coils, if
+    wire and form are known.
     """
     with PdfPages(path, metadata={"CreationDate": None}) as pages:
         for figure in _plans(site, hall, marks_world, title):

@@ -17,12 +17,7 @@ COLUMNS = 3  # of panels
 def write_survey_plot(path: Path, site: Site, survey: Survey) -> None:
     """Write a PNG with one panel for each beacon that the survey detected.
 
-    Parameters
-    ----------
-    site : Site
-        Its beacons are marked.
-    survey : Survey
-        With at least one point.
+    `site`: its beacons are marked. `survey`: with at least one point.
     """
     panels = [(b, _amplitude_nt(survey, b.name)) for b in site.beacons]
     panels = [(b, amplitude) for b, amplitude in panels if np.isfinite(amplitude).any()]
