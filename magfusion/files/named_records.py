@@ -1,23 +1,17 @@
 """Which of several magnetometers what comes through a pipe is of."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.files.fields import on_log_clock, side_by_side
 from magfusion.files.record_samples import field_samples
-from magfusion.files.records import MagnetometerRecord
+from magfusion.files.records import FieldsRecord, MagnetometerRecord, Record
 from magfusion.model.bandpass import waveform_of_bands
 from magfusion.model.detection_range import tones_of
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
-
-if TYPE_CHECKING:
-    from magfusion.files.records import FieldsRecord, Record
 
 
 def magnetometer_number(site: Site, name: str | None, what: str) -> int:

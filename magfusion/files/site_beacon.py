@@ -1,6 +1,6 @@
 """What a site's file may hold of a beacon: its coils or its rotor, its slots, its accuracy."""
 
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -40,15 +40,12 @@ from magfusion.files.site_values import (
     zeros,
 )
 from magfusion.files.yaml_files import StrictModel
-from magfusion.model.physics.winding import Winding, wound_coil
+from magfusion.model.physics.winding import Winding, WoundCoil, wound_coil
 from magfusion.model.site import (
     Beacon,
     Coil,
 )
 from magfusion.units import DEGREE, Array
-
-if TYPE_CHECKING:
-    from magfusion.model.physics.winding import WoundCoil
 
 _Length = Annotated[AboveZero, between(1e-5, 1e3)]
 _Count = Annotated[int, Field(ge=1, le=100_000)]

@@ -1,22 +1,16 @@
 """Trajectories in the formats that others read: ROS 2 bags, TUM, KITTI, CSV, Parquet."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
 from magfusion.files.odometry_bag import Frames, write_bag
-from magfusion.files.result_states import states_of, write_csv, write_kitti
+from magfusion.files.result_states import ResultStates, states_of, write_csv, write_kitti
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
-
-if TYPE_CHECKING:
-    from magfusion.files.odometry_bag import Frames
-    from magfusion.files.result_states import ResultStates
-    from magfusion.model.trajectory import Trajectory
+from magfusion.model.trajectory import Trajectory
 
 Format = Literal["mcap", "db3", "tum", "kitti", "csv"]
 FORMATS: tuple[Format, ...] = get_args(Format)

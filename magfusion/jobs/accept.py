@@ -11,20 +11,20 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.jobs.settings import Command, LogSettings, WindowSettings, option
+from magfusion.model.aiding import AidingSensor
+from magfusion.model.check_distance import CheckDistance
 from magfusion.model.progress import Report, quiet
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
+from magfusion.units import Array, IntArray
 
 if TYPE_CHECKING:
     from magfusion.calibration.installation import BeaconCheck
     from magfusion.calibration.marked_snapshots import MarkedSnapshots
-    from magfusion.model.aiding import AidingSensor
-    from magfusion.model.check_distance import CheckDistance
     from magfusion.model.samples import Log
     from magfusion.model.site import Site
     from magfusion.receiver.windows import LockinSettings
-    from magfusion.units import Array, IntArray
 
 MIN_MARKS = 3
 TAPE_SIGMAS = 4.0  # of a distance's difference, from which it is named

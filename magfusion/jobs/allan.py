@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from magfusion.files.site import load_site, save_site
 from magfusion.jobs.settings import Command, LogSettings
 from magfusion.model.progress import Report, quiet
+from magfusion.model.site import Site
 from magfusion.model.trust import Verdict
 from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
@@ -17,7 +18,6 @@ from magfusion.results.verdict import trust_figures
 if TYPE_CHECKING:
     from magfusion.jobs.allan_noise import MeasuredNoise
     from magfusion.jobs.inputs import Job
-    from magfusion.model.site import Site
 
 AXES = "xyz"
 

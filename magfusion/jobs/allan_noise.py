@@ -1,7 +1,5 @@
 """Noise of the instruments of a log at rest, and findings that invalidate it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 

@@ -1,11 +1,8 @@
 """The fits of a tracker's bench: the probe first, then the survey with the probe's result."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,8 +12,9 @@ from magfusion.calibration.antenna import (
     prior_sigma,
     with_receiver_gain,
 )
-from magfusion.calibration.antenna_observability import observability
+from magfusion.calibration.antenna_observability import AntennaObservability, observability
 from magfusion.calibration.antenna_probe import (
+    Predict,
     bench_sigma,
     fit_by_probe,
     in_units_of_sensitivity,
@@ -24,30 +22,23 @@ from magfusion.calibration.antenna_probe import (
     read_of_beacon,
     read_of_term,
 )
-from magfusion.calibration.antenna_site import coils_of, of_site, with_fit
+from magfusion.calibration.antenna_site import BodySurvey, coils_of, of_site, with_fit
 from magfusion.calibration.antenna_tracking import (
     Expected,
+    PoseErrors,
     differences,
     expected,
     own_errors,
     turned_elsewhere,
 )
+from magfusion.files.probe import Side
 from magfusion.files.site import load_site, save_site
 from magfusion.jobs.antenna_inputs import columns_of
+from magfusion.jobs.antenna_settings import AntennaSettings
 from magfusion.model.antenna import Antenna, antenna_from_vector
+from magfusion.model.probe import ProbeReadings
 from magfusion.model.site import Beacon, Site
 from magfusion.units import DEGREE, Array
-
-if TYPE_CHECKING:
-    from magfusion.calibration.antenna import AntennaFit
-    from magfusion.calibration.antenna_observability import AntennaObservability
-    from magfusion.calibration.antenna_probe import Predict
-    from magfusion.calibration.antenna_site import BodySurvey
-    from magfusion.calibration.antenna_tracking import PoseErrors
-    from magfusion.files.probe import Side
-    from magfusion.jobs.antenna_settings import AntennaSettings
-    from magfusion.model.antenna import Antenna
-    from magfusion.model.probe import ProbeReadings
 
 FOLDS = 5  # each pose is judged by an antenna that was fitted without it
 # Prior uncertainty of a nominal antenna; wide, since the couplings are more accurate.

@@ -1,30 +1,21 @@
 """Inputs of the antenna calibration: a tracker, poses with couplings, probe readings."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.antenna_site import BodySurvey
 from magfusion.errors import EstimationError, InputError
-from magfusion.files.probe import read_probe
-from magfusion.model.antenna import CENTRES, KAPPAS, MOMENTS, SENSITIVITIES, SENSOR_CENTRES
+from magfusion.files.probe import Side, read_probe
+from magfusion.files.survey import Survey
+from magfusion.model.antenna import CENTRES, KAPPAS, MOMENTS, SENSITIVITIES, SENSOR_CENTRES, Antenna
 from magfusion.model.probe import ProbeReadings
 from magfusion.model.site import Beacon, Site
 from magfusion.papers.p000_tracker.equations import eq_09_whitened
 from magfusion.papers.p000_tracker.pose import locate_by_svd
 from magfusion.units import IntArray
-
-if TYPE_CHECKING:
-    from magfusion.calibration.antenna_site import BodySurvey
-    from magfusion.files.probe import Side
-    from magfusion.files.survey import Survey
-    from magfusion.model.antenna import Antenna
-    from magfusion.model.probe import ProbeReadings
 
 MIN_POSES = 5  # four determine the antenna; with less than one to spare nothing is tested
 

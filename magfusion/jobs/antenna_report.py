@@ -1,25 +1,17 @@
 """Figures of the antenna calibration."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.jobs.antenna_fit import declared_sigma
-from magfusion.model.antenna import CENTRES, KAPPAS, MOMENTS, SENSITIVITIES, SENSOR_CENTRES
+from magfusion.calibration.antenna import AntennaFit
+from magfusion.calibration.antenna_observability import AntennaObservability
+from magfusion.calibration.antenna_tracking import PoseErrors
+from magfusion.jobs.antenna_fit import AntennaSolution, Bench, declared_sigma
+from magfusion.jobs.antenna_settings import AntennaSettings
+from magfusion.model.antenna import CENTRES, KAPPAS, MOMENTS, SENSITIVITIES, SENSOR_CENTRES, Antenna
+from magfusion.model.site import Site
 from magfusion.results.figures import Figure, Figures, ParameterEstimate
 from magfusion.units import DEGREE
-
-if TYPE_CHECKING:
-    from magfusion.calibration.antenna import AntennaFit
-    from magfusion.calibration.antenna_observability import AntennaObservability
-    from magfusion.calibration.antenna_tracking import PoseErrors
-    from magfusion.jobs.antenna_fit import AntennaSolution, Bench
-    from magfusion.jobs.antenna_settings import AntennaSettings
-    from magfusion.model.antenna import Antenna
-    from magfusion.model.site import Site
 
 _AXES = "xyz"
 

@@ -1,7 +1,5 @@
 """Settings of the calibration of a tracker's antennas."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

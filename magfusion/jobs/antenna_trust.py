@@ -9,13 +9,13 @@ import numpy as np
 
 from magfusion.estimation.snapshot.priors import contradiction, trust_of, unexplained
 from magfusion.model.trust import Finding, Trust, Verdict
+from magfusion.results.figures import ParameterEstimate
 from magfusion.units import DEGREE, Array
 
 if TYPE_CHECKING:
     from magfusion.calibration.antenna import AntennaFit
     from magfusion.calibration.antenna_tracking import PoseErrors
     from magfusion.jobs.antenna_fit import AntennaSolution
-    from magfusion.results.figures import ParameterEstimate
 
 MAX_ERROR_RATIO = 2.0  # expected errors in any attitude, by those at surveyed poses
 WORSE = 1.5  # errors at poses left out, by those of the declared antenna

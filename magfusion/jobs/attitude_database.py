@@ -13,11 +13,13 @@ from magfusion.errors import InputError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.files.attitude_table import write_database
 from magfusion.jobs.settings import Command, LogSettings, Settings, option
+from magfusion.model.samples import Log
 from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.model.truth_poses import truth_poses
 from magfusion.papers.p001_magnetometer.matching import predict_field
-from magfusion.papers.p001_magnetometer.matching_database import build_database, prepare
+from magfusion.papers.p001_magnetometer.matching_database import Index, build_database, prepare
 from magfusion.receiver.admission import sample_rate_hz
 from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.verdict import trust_figures
@@ -25,11 +27,6 @@ from magfusion.units import DEGREE, Array
 
 if TYPE_CHECKING:
     from magfusion.jobs.inputs import Job
-    from magfusion.model.samples import Log
-    from magfusion.model.trajectory import Trajectory
-    from magfusion.model.trust import Trust
-    from magfusion.papers.p001_magnetometer.matching_database import Index
-    from magfusion.results.figures import Figures
 
 
 TABLE = "attitudes.parquet"

@@ -1,19 +1,12 @@
 """Figures of an error budget, where the position is worst and at the median point."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from magfusion.results.coverage import Coverage
 from magfusion.results.coverage_colours import length
-from magfusion.results.error_budget import limiting
+from magfusion.results.error_budget import ErrorBudget, limiting
 from magfusion.results.figures import Figure, Figures, Section
-
-if TYPE_CHECKING:
-    from magfusion.results.coverage import Coverage
-    from magfusion.results.error_budget import ErrorBudget
-    from magfusion.units import IntArray
+from magfusion.units import IntArray
 
 PLACES = ("worst", "median")
 

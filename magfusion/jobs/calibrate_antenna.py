@@ -1,14 +1,11 @@
 """The job that calibrates a tracker's antennas: bench readings in, a refined site out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magfusion.calibration.antenna_site import into_mounting, with_fit
+from magfusion.calibration.antenna_site import BodySurvey, into_mounting, with_fit
 from magfusion.calibration.antenna_tracking import PoseErrors
 from magfusion.files.site import load_site, save_site
 from magfusion.files.survey import read_survey
@@ -25,7 +22,8 @@ from magfusion.jobs.antenna_settings import AntennaSettings
 from magfusion.jobs.antenna_trust import judge_fit
 from magfusion.jobs.receiver_axes import three_axes
 from magfusion.jobs.settings import Command
-from magfusion.model.antenna import antenna_from_vector, antenna_of
+from magfusion.model.antenna import Antenna, antenna_from_vector, antenna_of
+from magfusion.model.site import Beacon
 from magfusion.results.figures import (
     Figure,
     Figures,
@@ -34,13 +32,6 @@ from magfusion.results.figures import (
     heading,
 )
 from magfusion.results.verdict import trust_figures
-
-if TYPE_CHECKING:
-    from magfusion.calibration.antenna_site import BodySurvey
-    from magfusion.model.antenna import Antenna
-    from magfusion.model.site import Beacon
-    from magfusion.results.figures import Figures
-
 
 JOB = "calibrate antenna"
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.calibration.beacon import REACH, BeaconMeasurements
-from magfusion.calibration.beacon_refined import calibrate_one
+from magfusion.calibration.beacon import REACH, BeaconFits, BeaconMeasurements
+from magfusion.calibration.beacon_refined import RefinedBeacon, calibrate_one
 from magfusion.errors import InputError
 from magfusion.estimation.snapshot.priors import contradiction, trust_of, unexplained
 from magfusion.files.site import load_site, save_site
-from magfusion.files.survey import read_survey
+from magfusion.files.survey import Survey, read_survey
 from magfusion.jobs.receiver_axes import three_axes
 from magfusion.jobs.settings import Command, Settings, argument, option, required
 from magfusion.model.field import predict
@@ -34,11 +34,6 @@ from magfusion.results.verdict import notes_of, trust_figures
 from magfusion.units import DEGREE, Array
 
 if TYPE_CHECKING:
-    from magfusion.calibration.beacon import BeaconFits, BeaconMeasurements
-    from magfusion.calibration.beacon_refined import RefinedBeacon
-    from magfusion.files.survey import Survey
-    from magfusion.model.trust import Trust
-    from magfusion.results.figures import Figures, ParameterEstimate
     from magfusion.results.plots.beacon import BeaconPanel
 
 

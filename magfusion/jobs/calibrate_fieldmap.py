@@ -1,37 +1,26 @@
 """The job that maps deviations of the field from the model: survey or log in, site out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magfusion.calibration.fieldmap import MapPoints, learn_field_map, thinned
+from magfusion.calibration.fieldmap import MapFit, MapPoints, learn_field_map, thinned
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.files.site import load_site, save_site
-from magfusion.files.survey import read_survey
+from magfusion.files.survey import Survey, read_survey
 from magfusion.jobs.receiver_axes import three_axes
 from magfusion.jobs.settings import Command, Settings, argument, option
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.progress import Report, quiet
+from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import Site
-from magfusion.model.trajectory import interpolate
+from magfusion.model.trajectory import Trajectory, interpolate
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.verdict import trust_figures
-
-if TYPE_CHECKING:
-    from magfusion.calibration.fieldmap import MapFit, MapPoints
-    from magfusion.files.survey import Survey
-    from magfusion.model.samples import FieldSamples, Log
-    from magfusion.model.trajectory import Trajectory
-    from magfusion.model.trust import Finding, Trust
-    from magfusion.results.figures import Figures
-
 
 LONGEST_GAP = 1.0  # s, of the trajectory that is interpolated across
 SAME_TIME = 1e-6  # s

@@ -18,10 +18,11 @@ from magfusion.jobs.settings import Command, EstimateSettings, LogsSettings, Win
 from magfusion.model.parameters import difference
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.progress import Report, quiet
+from magfusion.model.samples import Log
 from magfusion.model.site import Site
-from magfusion.model.trust import Finding, Trust
+from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.figures import ErrorColumn, Figure, Figures, Section, heading
-from magfusion.results.motion_coverage import missing_motion, motion_coverage
+from magfusion.results.motion_coverage import MotionCoverage, missing_motion, motion_coverage
 from magfusion.results.observability import observability
 from magfusion.results.transfer import Estimated, agreement
 from magfusion.results.verdict import trust_figures
@@ -29,10 +30,6 @@ from magfusion.results.verdict import trust_figures
 if TYPE_CHECKING:
     from magfusion.estimation.batch.batch import Smoothed, SmootherSettings
     from magfusion.jobs.inputs import Job
-    from magfusion.model.samples import Log
-    from magfusion.model.trust import Trust, Verdict
-    from magfusion.results.figures import Figures
-    from magfusion.results.motion_coverage import MotionCoverage
 
 
 JOB = "calibrate log"

@@ -12,12 +12,16 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from magfusion.calibration.magnetometer import spread
+from magfusion.calibration.turn_coverage import TurnStatus
 from magfusion.errors import InputError
 from magfusion.files.site import load_site, save_site
 from magfusion.files.standard_streams import binary_input
 from magfusion.files.stream import read_records
 from magfusion.jobs.magnetometer_trust import calibrated, calibrated_field, estimates_of
 from magfusion.jobs.settings import Command, LogSettings, argument, option
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trust import Trust
 from magfusion.results.figures import (
     Figure,
     Figures,
@@ -26,16 +30,13 @@ from magfusion.results.figures import (
     determined_figures,
     heading,
 )
+from magfusion.results.turn_guide import terminal_guide
 from magfusion.results.verdict import notes_of, trust_figures
 from magfusion.units import DEGREE, Array
 
 if TYPE_CHECKING:
     from magfusion.calibration.magnetometer_log import LogCalibration
-    from magfusion.calibration.turn_coverage import TurnStatus
     from magfusion.jobs.inputs import Job
-    from magfusion.model.samples import Log
-    from magfusion.model.site import Site
-    from magfusion.model.trust import Trust
 
 
 JOB = "calibrate magnetometer"
@@ -78,7 +79,6 @@ def run_guided(settings: MagnetometerSettings, output: Path) -> Figures:
     from magfusion.jobs.magnetometer_turns import guide
     from magfusion.jobs.result_directory import claim
     from magfusion.results.recording_turns import open_turn_view
-    from magfusion.results.turn_guide import terminal_guide
 
     if settings.site is None:
         raise InputError(f"{JOB} - requires the site's file; give it with --site SITE.yaml")

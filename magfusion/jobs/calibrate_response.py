@@ -9,18 +9,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.estimation.snapshot.priors import contradiction, trust_of, unexplained
 from magfusion.files.site import load_site, save_site
-from magfusion.files.survey import read_survey
+from magfusion.files.survey import Survey, read_survey
 from magfusion.jobs.receiver_axes import three_axes
 from magfusion.jobs.settings import Command, Settings, argument, option, required
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
 from magfusion.results.figures import Figure, Figures, determined_figures, heading
 from magfusion.results.verdict import notes_of, trust_figures
 from magfusion.units import DEGREE
 
 if TYPE_CHECKING:
     from magfusion.calibration.bench_response import BenchSnapshots
-    from magfusion.files.survey import Survey
-    from magfusion.model.site import Site
 
 JOB = "calibrate response"
 
@@ -48,9 +50,7 @@ def run_calibrate_response(settings: ResponseSettings, output: Path) -> Figures:
     A coil that is not synchronised must have had one drive phase at all points, as of a card that
     plays and records by one clock.
     """
-    from magfusion.estimation.snapshot.priors import contradiction, trust_of, unexplained
     from magfusion.jobs.result_directory import claim, found_in, refuse_failed
-    from magfusion.model.parameters import initial_calibration
     from magfusion.results.refinement import parameter_estimates, refined_site
     from magfusion.results.report import write_report
 
@@ -103,8 +103,6 @@ def run_calibrate_response(settings: ResponseSettings, output: Path) -> Figures:
 def _bench(survey: Survey, site: Site, settings: ResponseSettings) -> BenchSnapshots:
     """Return the survey's phasors of the site's channels."""
     from magfusion.calibration.bench_response import BenchSnapshots
-    from magfusion.model.parameters import initial_calibration
-    from magfusion.model.samples import FieldSamples
 
     if survey.phasor_sensor is None:
         raise InputError(

@@ -8,6 +8,7 @@ from typing import Generic, TextIO, TypeVar
 import numpy as np
 
 from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.restored import restored
 from magfusion.files.checkpoint import (
     Checkpoint,
     claim_checkpoint,
@@ -71,7 +72,6 @@ def begin(
         if place is not None:
             claim_checkpoint(place)
         return ResumedRun(Navigator(site, settings), 0, extra)
-    from magfusion.estimation.online.restored import restored
 
     with named(place):
         extra = from_plain(type(extra), result.content.get("beside"), "beside")

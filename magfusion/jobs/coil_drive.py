@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
@@ -10,8 +11,6 @@ from magfusion.jobs.coil import CoilSettings
 from magfusion.jobs.settings import Settings, option
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from magfusion.model.site import Beacon
     from magfusion.results.design.coil_drive import DriveRow
 

@@ -1,10 +1,7 @@
 """The job that plans an installation: a site in, a directory with its coverage out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +16,8 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Trust
 from magfusion.receiver.windows import default_settings
 from magfusion.results.coverage import (
+    Coverage,
+    ExtraBeacon,
     best_extra_beacon,
     coverage,
     phasor_variance,
@@ -28,11 +27,6 @@ from magfusion.results.coverage import (
 from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.verdict import trust_figures
 from magfusion.units import Array
-
-if TYPE_CHECKING:
-    from magfusion.results.coverage import Coverage, ExtraBeacon
-    from magfusion.results.figures import Figure, Figures
-
 
 MOST_POINTS = 100_000
 

@@ -1,7 +1,5 @@
 """The demonstration: simulate a walk among four beacons and smooth it."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,10 +1,7 @@
 """The job that demodulates a waveform: a log in, a log of phasors out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,14 +15,12 @@ from magfusion.jobs.rest_settings import RestSettings
 from magfusion.jobs.settings import Command, LogSettings, WindowSettings
 from magfusion.model.detection_range import MANY
 from magfusion.model.progress import Report, quiet
+from magfusion.model.samples import FieldSamples, Log
+from magfusion.model.site import Site
 from magfusion.model.trust import Trust
 from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.rest_figures import rest_figures
 from magfusion.results.verdict import trust_figures
-
-if TYPE_CHECKING:
-    from magfusion.model.samples import FieldSamples, Log
-    from magfusion.model.site import Site
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,11 +1,9 @@
 """The job that designs an installation: a hall in, a site with its beacons out."""
 
-from __future__ import annotations
-
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -32,18 +30,11 @@ from magfusion.results.design.need import (
     most_beacons,
 )
 from magfusion.results.design.pattern import ToneBand, template_of
-from magfusion.results.design.planning import Task, designed, with_moment
+from magfusion.results.design.planning import Design, Task, designed, with_moment
 from magfusion.results.design.turns import cycle_of, is_in_turn
 from magfusion.results.error_budget import error_budget
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from magfusion.model.hall import Hall
-    from magfusion.results.design.pattern import ToneBand
-    from magfusion.results.design.planning import Design, Task
-    from magfusion.results.figures import Figures
-    from magfusion.units import Array
+from magfusion.results.figures import Figures
+from magfusion.units import Array
 
 MOST_POINTS, MOST_PLACES = 10_000, 10_000
 LEAST_DRAWN = 15  # random layouts, of which the median is drawn where nothing else is "before"

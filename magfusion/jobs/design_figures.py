@@ -8,17 +8,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magfusion.jobs.coverage import finite, level_figures, need_figures
+from magfusion.jobs.design_settings import DesignSettings
+from magfusion.model.site import Beacon
+from magfusion.results.coverage import Coverage
 from magfusion.results.design.pattern import pattern_axis, peak_moment
+from magfusion.results.design.planning import Design, Task
 from magfusion.results.figures import Figure, Figures, Section, heading
+from magfusion.units import Array
 
 if TYPE_CHECKING:
-    from magfusion.jobs.design_settings import DesignSettings
-    from magfusion.model.site import Beacon
-    from magfusion.results.coverage import Coverage
-    from magfusion.results.design.planning import Design, Task
-    from magfusion.results.figures import Figure, Figures
     from magfusion.results.plots.design import Panel
-    from magfusion.units import Array
 
 
 def design_figures(

@@ -1,26 +1,19 @@
 """The part of `design` that proposes stops of the platform for a calibration."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.files.table import write_table
+from magfusion.jobs.design_settings import DesignSettings
+from magfusion.model.hall import Hall
+from magfusion.model.site import Site
 from magfusion.model.trust import Trust
-from magfusion.results.design.motion import next_motion
+from magfusion.results.design.motion import MotionPlan, Stop, next_motion
 from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
-
-if TYPE_CHECKING:
-    from magfusion.jobs.design_settings import DesignSettings
-    from magfusion.model.hall import Hall
-    from magfusion.model.site import Site
-    from magfusion.results.design.motion import MotionPlan, Stop
-    from magfusion.results.figures import Figures
-    from magfusion.units import Array
+from magfusion.units import Array
 
 
 def run_motion(

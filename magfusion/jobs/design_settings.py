@@ -1,7 +1,5 @@
 """Settings of the design of an installation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal

@@ -16,7 +16,7 @@ from magfusion.files.checkpoint import read_position
 from magfusion.jobs.settings import Command, RandomSettings, option
 from magfusion.model.progress import Report
 from magfusion.model.trust import Finding, Trust
-from magfusion.results.drift import QUANTITIES, EstimatorPlot, settled_after, worlds_text
+from magfusion.results.drift import QUANTITIES, EstimatorPlot, Verdict, settled_after, worlds_text
 from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
 from magfusion.simulation.monte_carlo import run_many
@@ -24,8 +24,6 @@ from magfusion.simulation.monte_carlo import run_many
 if TYPE_CHECKING:
     from magfusion.jobs.drift_figures import Criterion
     from magfusion.jobs.drift_world import Estimator, WorldRun, WorldTask
-    from magfusion.results.drift import EstimatorPlot, Verdict
-    from magfusion.results.figures import Figures
 
 
 ESTIMATORS: tuple[Estimator, ...] = ("ekf", "smoother")

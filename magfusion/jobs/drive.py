@@ -1,10 +1,9 @@
 """The job that writes a sound file to play for the beacons of a site."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
+from math import degrees, log10
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from magfusion.errors import InputError
 from magfusion.files.audio import write_audio
@@ -12,9 +11,6 @@ from magfusion.files.site import load_site
 from magfusion.jobs.settings import Command, Settings, argument, option
 from magfusion.model.drive_signal import DriveChannel, drive_channels, drive_samples
 from magfusion.results.figures import Figure, Figures, Section, heading
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 SOUND = "beacons.wav"
 
@@ -75,8 +71,6 @@ def run(settings: DriveSettings, output: Path) -> Figures:
 
 def _lines(channels: Sequence[DriveChannel], pulses: bool) -> list[str]:
     """Return a line for each channel, counted from 1."""
-    from math import degrees, log10
-
     lines = [
         f"channel {number}: beacon {one.beacon}, coil {one.coil}, {one.frequency_hz:g} Hz,"
         f" {20.0 * log10(one.level):.1f} dB, {degrees(one.phase):.1f} deg"

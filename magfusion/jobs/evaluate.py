@@ -1,19 +1,20 @@
 """The job that compares a trajectory with a truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
+
+from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files.bag_topics import is_bag
 from magfusion.files.open import open_log
+from magfusion.files.site_draft import numbers
 from magfusion.jobs.settings import Command, TopicSettings, argument, option
+from magfusion.model.trajectory import Trajectory
+from magfusion.results.association import associate
 from magfusion.results.figures import Figure, Figures, Section
-
-if TYPE_CHECKING:
-    from magfusion.model.trajectory import Trajectory
+from magfusion.results.truth_frame import frame_remarks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,10 +55,8 @@ class EvaluateSettings(TopicSettings):
 def run_evaluate(settings: EvaluateSettings) -> Figures:
     """Compare a trajectory with a truth."""
     from magfusion.jobs.inputs import named
-    from magfusion.results.association import associate
     from magfusion.results.errors import trajectory_errors
     from magfusion.results.report import error_figures
-    from magfusion.results.truth_frame import frame_remarks
 
     true, epoch_ns, remarks = _read_truth(settings)
     result = _read_estimate(settings, epoch_ns)
@@ -71,9 +70,6 @@ def run_evaluate(settings: EvaluateSettings) -> Figures:
 
 def _read_estimate(settings: EvaluateSettings, epoch_ns: int) -> Trajectory:
     """Return the poses of the frame that the truth tracks."""
-    from scipy.spatial.transform import Rotation
-
-    from magfusion.files.site_draft import numbers
     from magfusion.jobs.inputs import read_any_poses
     from magfusion.results.alignment import tracked_point
 
@@ -95,7 +91,6 @@ def _aligned(
 ) -> tuple[Trajectory, Figures]:
     """Return the estimate on the clock and in the world of the truth, and how it came there."""
     from magfusion.results.alignment import align_world, clock_offset
-    from magfusion.results.association import associate
 
     figures = Figures()
     if settings.align_time:

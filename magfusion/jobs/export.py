@@ -1,7 +1,5 @@
 """The job that exports a result: as a ROS 2 bag, TUM, KITTI or CSV."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import dataclass

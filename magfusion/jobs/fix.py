@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.estimation.integrity.region_test import of_place
 from magfusion.estimation.snapshot.ambiguity import relations
-from magfusion.estimation.snapshot.explained_fixes import explained_fixes
+from magfusion.estimation.snapshot.explained_fixes import ExplainedFixes, explained_fixes
+from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.fix_magnetometers import contradicting_magnetometers
 from magfusion.estimation.snapshot.problem import ESTIMABLE
 from magfusion.files.fix_table import write_hypotheses
@@ -22,31 +26,22 @@ from magfusion.files.tum import write_tum
 from magfusion.jobs.region import RegionSettings
 from magfusion.jobs.rest_settings import RestSettings
 from magfusion.jobs.settings import Command, RiskSettings, WindowSettings, option
-from magfusion.model.parameters import initial_calibration
+from magfusion.model.parameters import Calibration, initial_calibration
 from magfusion.model.progress import Report, quiet
+from magfusion.model.samples import FieldSamples, Log
+from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import Finding, Trust
+from magfusion.model.trust import Finding, Risk, StateTrust, Trust
+from magfusion.receiver.windows import LockinSettings
 from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.rest_figures import rest_figures
 from magfusion.results.verdict import level_figures, trust_figures
+from magfusion.units import Array
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from contextlib import AbstractContextManager
-
     import numpy as np
-    from numpy.typing import NDArray
 
-    from magfusion.estimation.snapshot.explained_fixes import ExplainedFixes
-    from magfusion.estimation.snapshot.fix import Fixes
     from magfusion.jobs.inputs import Job
-    from magfusion.model.parameters import Calibration
-    from magfusion.model.samples import FieldSamples, Log
-    from magfusion.model.site import Site
-    from magfusion.model.trajectory import Trajectory
-    from magfusion.model.trust import Finding, Risk, StateTrust, Trust
-    from magfusion.receiver.windows import LockinSettings
-    from magfusion.units import Array
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,10 +1,7 @@
 """The fix of a receiver of one axis: its position and direction, the roll about it unknown."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +21,7 @@ from magfusion.estimation.snapshot.coil_poses import (
 from magfusion.estimation.snapshot.coil_starts import CoilEpochs
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.parameters import initial_calibration
+from magfusion.model.progress import Report
 from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -32,9 +30,6 @@ from magfusion.results.figures import ErrorColumn, Figure, Figures, Section, hea
 from magfusion.results.report import where_found
 from magfusion.results.verdict import trust_figures
 from magfusion.units import Array
-
-if TYPE_CHECKING:
-    from magfusion.model.progress import Report
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,13 +6,13 @@ import shlex
 from typing import TYPE_CHECKING
 
 from magfusion.files.foreign.columns import FIELDS
+from magfusion.files.foreign.convert import Counts
 from magfusion.files.foreign.halves import HALVES
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.results.figures import Figure, Figures, Section
 from magfusion.units import NANOSECOND
 
 if TYPE_CHECKING:
-    from magfusion.files.foreign.convert import Counts
     from magfusion.files.foreign.gather import GatheredStreams
 
 FIELD_STREAMS = ("magnetometer", FIELDS)

@@ -1,12 +1,9 @@
 """The job that imports recordings of any names and units: a log, with the verdict of its check."""
 
-from __future__ import annotations
-
 import shlex
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow.parquet
@@ -16,13 +13,14 @@ from magfusion.files.audio import SUFFIXES, AudioEntry, describe_recording, open
 from magfusion.files.foreign.bag_table import first_stamp
 from magfusion.files.foreign.columns import FIELDS, TABLES
 from magfusion.files.foreign.convert import Counts, write_stream
-from magfusion.files.foreign.gather import gather
+from magfusion.files.foreign.gather import GatheredStreams, gather
 from magfusion.files.foreign.halves import HALVES, join_halves
 from magfusion.files.foreign.map_file import read_request
 from magfusion.files.foreign.phasor_rows import is_signed, write_phasors
-from magfusion.files.foreign.plan import Findings
+from magfusion.files.foreign.plan import Findings, ImportPlan
 from magfusion.files.log import HEADER
 from magfusion.files.site import load_site
+from magfusion.files.table import TIME, write_table
 from magfusion.files.yaml_files import write_yaml
 from magfusion.jobs.check import CheckSettings, run_check
 from magfusion.jobs.import_figures import FIELD_STREAMS, first_stamp_of, import_figures
@@ -30,10 +28,6 @@ from magfusion.jobs.settings import Command, Settings, option
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figures, Section, heading
 from magfusion.units import NANOSECOND
-
-if TYPE_CHECKING:
-    from magfusion.files.foreign.gather import GatheredStreams
-    from magfusion.files.foreign.plan import ImportPlan
 
 FIRST = "first"
 
@@ -211,7 +205,6 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
 
 def _on_even_clock(path: Path) -> bool:
     """Replace stamps of bursts by those of the samples, between which a half is interpolated."""
-    from magfusion.files.table import TIME, write_table
     from magfusion.receiver.sampling_clock import sampling_clock
 
     table = pyarrow.parquet.read_table(path)

@@ -1,20 +1,17 @@
 """The job that writes a site file: from options, a recording's tones, or questions."""
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
 
 from magfusion.errors import InputError
 from magfusion.estimation.data_checks.data_cleaning import clean_log
-from magfusion.estimation.data_checks.tones import transmitted
+from magfusion.estimation.data_checks.tones import Tone, Transmitted, transmitted
 from magfusion.files.atomic import whole_file
 from magfusion.files.instruments import UNNAMED, imus, magnetometers, named_imu, named_magnetometer
 from magfusion.files.open import open_log
@@ -25,16 +22,10 @@ from magfusion.jobs.init_questions import answered, recording
 from magfusion.jobs.init_settings import InitSettings
 from magfusion.jobs.settings import Command
 from magfusion.model.physics.earth import gravity
+from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust
 from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
-
-if TYPE_CHECKING:
-    from magfusion.estimation.data_checks.tones import Tone, Transmitted
-    from magfusion.files.site_draft import BeaconDraft
-    from magfusion.files.site_text import SiteDraft
-    from magfusion.model.site import Site
-    from magfusion.model.trust import Finding
 
 NEAR_HZ = 0.5  # of a declared frequency, a line is that beacon
 

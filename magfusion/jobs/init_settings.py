@@ -1,7 +1,5 @@
 """Description of an installation from which its site file is generated."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

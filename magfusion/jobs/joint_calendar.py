@@ -1,7 +1,5 @@
 """The calendar of several logs: changes between them, and their parameters by month."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

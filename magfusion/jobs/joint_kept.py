@@ -4,8 +4,6 @@ A rerun resumes from those that were smoothed alone.  The others are how the wor
 exchange data, so that the driver passes names of files.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar

@@ -1,15 +1,13 @@
 """The result of several logs of one site: the refined site, and their table."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from magfusion.estimation.batch.batch import SmootherSettings
 from magfusion.estimation.posterior.noise_tuning import Tuned, with_noise
 from magfusion.files.row_table import write_rows
 from magfusion.files.site import save_site
@@ -17,10 +15,12 @@ from magfusion.jobs.inputs import Job
 from magfusion.jobs.joint_run import Joint, refine, tasks_of
 from magfusion.jobs.joint_tasks import together_settings
 from magfusion.jobs.result_directory import claim, keep_results
+from magfusion.jobs.settings import LogsSettings
 from magfusion.jobs.written import CALENDAR_TABLE, LOGS, LOGS_TABLE, PLATFORMS
 from magfusion.model.parameters import Block, Calibration
 from magfusion.model.progress import Report
 from magfusion.model.site import Site
+from magfusion.model.trust import Risk
 from magfusion.results.figures import (
     Figure,
     Figures,
@@ -35,11 +35,6 @@ from magfusion.results.refinement import parameter_estimates, refined_site
 from magfusion.results.report import observability_figures, write_report
 from magfusion.results.verdict import trust_figures
 from magfusion.units import Array, Rate
-
-if TYPE_CHECKING:
-    from magfusion.estimation.batch.batch import SmootherSettings
-    from magfusion.jobs.settings import LogsSettings
-    from magfusion.model.trust import Risk
 
 
 def run_joint(

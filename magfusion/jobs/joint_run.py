@@ -4,8 +4,6 @@ The results of a log alone are stored in the output under a key; the rounds resu
 driver holds sums over the logs, and passes names of files.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

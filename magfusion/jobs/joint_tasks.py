@@ -4,8 +4,6 @@ The workers share the output directory: states and information stay in its files
 sends and receives names and figures.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache

@@ -5,10 +5,11 @@ from __future__ import annotations
 import queue
 import sys
 import time
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any, Literal, Protocol
 
 from magfusion.errors import InputError
 from magfusion.files.site import load_site
@@ -17,9 +18,6 @@ from magfusion.files.stream_contents import write_record
 from magfusion.jobs.listen_lines import LineSource, scales_of
 from magfusion.jobs.listen_sound import SoundSource
 from magfusion.jobs.settings import Command, Settings, option
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
 
 POLL = 0.1  # s; within which the process answers a signal
 

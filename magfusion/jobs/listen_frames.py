@@ -5,8 +5,6 @@ the kind (``i``, ``m``), one for the type of the values as of `struct` (``h``, `
 counter of its samples (16 bits), one of microseconds (32 bits), and the values.
 """
 
-from __future__ import annotations
-
 import struct
 from importlib.util import find_spec
 from zlib import crc32

@@ -12,6 +12,7 @@ import socket
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from functools import reduce
 from operator import xor
 from typing import TYPE_CHECKING, Any, Literal
@@ -21,12 +22,11 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.jobs.listen_frames import Parsed, check_package, parse_frame
 from magfusion.receiver.host_clock import HostClock
+from magfusion.units import Array
 
 if TYPE_CHECKING:
     import queue
-    from collections.abc import Callable, Iterator, Mapping
 
-    from magfusion.units import Array
 
 KINDS = {  # columns by the first word of a line: record, key, number of values
     "imu": ("imu", (("gyro", 3), ("accel", 3))),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import time
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,16 +14,15 @@ from magfusion.files.audio import channels_of, slip_remarks
 from magfusion.files.stream_contents import baseband_content
 from magfusion.model.bandpass import MIN_SPACING_HZ, BandFilter
 from magfusion.model.response import NOMINAL_T_PER_V
+from magfusion.model.site import Site
 from magfusion.model.slip_sampler import SlipSampler
+from magfusion.model.slips import Slip
 from magfusion.receiver.host_clock import HostClock
+from magfusion.units import Array
 
 if TYPE_CHECKING:
     import queue
-    from collections.abc import Iterator
 
-    from magfusion.model.site import Site
-    from magfusion.model.slips import Slip
-    from magfusion.units import Array
 
 BLOCK = 6e-3  # s
 WARM_UP = 2.0  # s; in which the buffers of a sound server fill, and blocks arrive unevenly

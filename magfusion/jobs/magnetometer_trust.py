@@ -10,16 +10,15 @@ import numpy as np
 
 from magfusion.calibration.magnetometer import field_from_measured, refined
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
-from magfusion.estimation.snapshot.priors import contradiction, trust_of
+from magfusion.estimation.snapshot.priors import Contradiction, contradiction, trust_of
+from magfusion.model.samples import Log
+from magfusion.model.site import Magnetometer, Site
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.figures import ParameterEstimate
 from magfusion.units import NANOTESLA, Array
 
 if TYPE_CHECKING:
     from magfusion.calibration.magnetometer_log import LogCalibration
-    from magfusion.estimation.snapshot.priors import Contradiction
-    from magfusion.model.samples import Log
-    from magfusion.model.site import Magnetometer, Site
 
 SCALE = 0.3  # of the matrix, by which it contradicts the site, however wide its sigmas
 SCALE_SIGMAS, LEAST_SCALE = 5.0, 0.01  # of the declared sigma; and what is never an error

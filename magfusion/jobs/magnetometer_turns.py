@@ -1,7 +1,5 @@
 """Guided rotation of a magnetometer: samples from a pipe until its calibration is certain."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from typing import NamedTuple, TextIO
 

@@ -12,15 +12,18 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files.attitude_table import read_database, write_attitudes
-from magfusion.jobs.attitude_database import TABLE, Sampling, steady
+from magfusion.jobs.attitude_database import TABLE, Sampling, Steady, steady
 from magfusion.jobs.match_trust import judge_matches
 from magfusion.jobs.settings import Command, LogSettings, option
 from magfusion.model.physics.earth import earth_field_world
+from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.strapdown import resting
+from magfusion.model.trajectory import Trajectory
 from magfusion.model.truth_poses import truth_poses
 from magfusion.papers.p001_magnetometer.matching import (
     THREE_ANGLES,
+    Matches,
     match_roll,
     match_roll_pitch,
     match_with_gravity,
@@ -37,12 +40,7 @@ from magfusion.results.verdict import trust_figures
 from magfusion.units import DEGREE, Array, BoolArray
 
 if TYPE_CHECKING:
-    from magfusion.jobs.attitude_database import Steady
     from magfusion.jobs.inputs import Job
-    from magfusion.model.samples import Log
-    from magfusion.model.trajectory import Trajectory
-    from magfusion.papers.p001_magnetometer.matching import Matches
-    from magfusion.results.figures import Figure, Figures
 
 
 Method = Literal["nearest", "interpolated", "closed-form"]

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Unverified, Verdict
+from magfusion.papers.p001_magnetometer.matching import Matches
 from magfusion.units import DEGREE, NANOTESLA, Array
 
 if TYPE_CHECKING:
     from magfusion.jobs.attitude_database import Steady
-    from magfusion.model.samples import Log
-    from magfusion.model.site import Site
-    from magfusion.papers.p001_magnetometer.matching import Matches
 
 FEW = 0.05  # share of epochs that may be undetermined
 OTHER_SIZE = 0.3  # of the Earth's field, by which it contradicts the site

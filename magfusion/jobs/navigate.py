@@ -17,31 +17,27 @@ from magfusion.files.checkpoint import claim_checkpoint, run_key
 from magfusion.files.row_file import RowFile, claim_rows
 from magfusion.files.site import load_site
 from magfusion.files.standard_streams import binary_output, until_closed
-from magfusion.jobs.live import state_sinks
+from magfusion.jobs.live import StateSink, state_sinks
 from magfusion.jobs.navigate_rests import run_at_rest
 from magfusion.jobs.navigate_settings import NavigateSettings
 from magfusion.jobs.rates import refuse_rate
+from magfusion.jobs.record_source import live_records
 from magfusion.jobs.replay import PIECE, Replay, feed, paced
 from magfusion.jobs.settings import Command
 from magfusion.jobs.state_rows import CURRENT, LAGGED, PROPAGATED, StateRows, row_columns
 from magfusion.model.progress import Report, quiet
+from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Trust
 from magfusion.model.without_imu import as_recorded, require_motion_prior
-from magfusion.results.figures import heading
+from magfusion.results.figures import Figures, heading
 from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
     from magfusion.estimation.online_integrity.judgement import JudgedState
     from magfusion.jobs.checkpoint import CheckpointWriter
-    from magfusion.jobs.live import StateSink
     from magfusion.jobs.navigate_results import NavigateResults
-    from magfusion.jobs.replay import Replay
-    from magfusion.jobs.state_rows import StateRows
-    from magfusion.model.samples import Log
-    from magfusion.model.trust import Trust
-    from magfusion.results.figures import Figures
 
 LONGEST_EPOCH = 60.0  # s; of a phasor that belongs to a state of now
 
@@ -69,7 +65,6 @@ def run(
 
 
 def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
-    from magfusion.jobs.record_source import live_records
     from magfusion.jobs.stream import StreamSettings, navigate_records
 
     site_path = settings.live_site(given)

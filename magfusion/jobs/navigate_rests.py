@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
@@ -13,34 +14,30 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_quality import BRIDGED_CODES, recorded
 from magfusion.files.named_records import with_waveform
+from magfusion.files.records import Record
 from magfusion.files.site import load_site, save_site
 from magfusion.files.standard_streams import binary_output, until_closed
-from magfusion.files.stream import json_line
+from magfusion.files.stream import NumberedRecord, json_line
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
+from magfusion.jobs.navigate_settings import NavigateSettings
 from magfusion.jobs.record_loop import process_records
 from magfusion.jobs.record_source import live_records
 from magfusion.jobs.stream_samples import StreamSamples
 from magfusion.model.progress import Report, quiet
 from magfusion.model.quaternion import of_matrices
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import Trust, uniform_trust
+from magfusion.model.trust import Risk, Trust, uniform_trust
+from magfusion.receiver.windows import LockinSettings
 from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.verdict import trust_figures
+from magfusion.units import Array
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from magfusion.estimation.rests.rest_stream import RestNavigator, RestState
-    from magfusion.files.records import Record
-    from magfusion.files.stream import NumberedRecord
     from magfusion.jobs.inputs import Job
-    from magfusion.jobs.navigate_settings import NavigateSettings
-    from magfusion.model.samples import Log
-    from magfusion.model.site import Site
-    from magfusion.model.trust import Risk, Trust
-    from magfusion.receiver.windows import LockinSettings
-    from magfusion.units import Array
 
 PIECE = 1.0  # s; of a log that is replayed
 # Options of `navigate` that it uses.

@@ -1,11 +1,9 @@
 """Orientation at the IMU's rate, from smooth and navigate with a site without beacons."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
+from typing import Any, BinaryIO, TextIO
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,10 +11,12 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.estimation.data_checks.stamps import uneven_stamps
 from magfusion.estimation.graph.state import GYRO_BIAS, ROTATION
+from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.estimation.orientation.layout import LAG, MICROTESLA, OFFSET, Orientation
 from magfusion.estimation.orientation.online import ANYWHERE, TIMING, OrientationNavigator
 from magfusion.estimation.orientation.remarks import doubts, remarks
 from magfusion.estimation.orientation.smoother import Oriented, oriented
+from magfusion.files.records import Record
 from magfusion.files.site import save_site
 from magfusion.files.stream import NumberedRecord, json_line
 from magfusion.files.trajectory_table import write_trajectory
@@ -37,10 +37,6 @@ from magfusion.results.recording import write_recording
 from magfusion.results.report import write_report
 from magfusion.results.verdict import trust_figures
 from magfusion.units import DEGREE, Array, Rate
-
-if TYPE_CHECKING:
-    from magfusion.estimation.online_integrity.judgement import JudgedState
-    from magfusion.files.records import Record
 
 
 def run_orientation(name: str, job: Job, rate: Rate, *, back: bool, report: Report) -> Figures:

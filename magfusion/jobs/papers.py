@@ -1,19 +1,13 @@
 """The job that shows where an equation of a paper is, whether it is right, and the evidence."""
 
-from __future__ import annotations
-
 import json
 import sys
 import textwrap
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from magfusion.jobs.settings import Command, Settings, argument, option
-from magfusion.papers.register import paper, papers
-
-if TYPE_CHECKING:
-    from magfusion.papers.register import NumberedEntry, Paper
+from magfusion.papers.register import NumberedEntry, Paper, paper, papers
 
 WIDTH = 100  # columns
 _MARGIN = 11  # of what an entry says, behind what it is

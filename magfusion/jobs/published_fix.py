@@ -1,9 +1,7 @@
 """Fixes of every epoch by an algorithm of paper 004."""
 
-from __future__ import annotations
-
 import time
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
@@ -14,12 +12,14 @@ from magfusion.files.survey import read_survey
 from magfusion.files.table import TIME, Span, write_table
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
-from magfusion.jobs.inputs import named, read_job
+from magfusion.jobs.inputs import Job, named, read_job
 from magfusion.jobs.result_directory import claim, found_in, refuse_failed
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Trust, uniform_trust
 from magfusion.model.truth_poses import truth_poses
-from magfusion.papers.p004_fingerprints.algorithms import fix_as_published
+from magfusion.papers.p004_fingerprints.algorithms import Method, PublishedFixes, fix_as_published
 from magfusion.papers.p004_fingerprints.fingerprint import fingerprint_database
 from magfusion.papers.p004_fingerprints.rotating import (
     MAX_TILT,
@@ -28,23 +28,14 @@ from magfusion.papers.p004_fingerprints.rotating import (
     rotating_beacons,
     rotating_fields,
 )
+from magfusion.receiver.windows import LockinSettings
+from magfusion.results.errors import TrajectoryErrors
 from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.page_motion import MotionPage
 from magfusion.results.recording import write_recording
 from magfusion.results.report import compared_with_truth, dropped_figures, write_report
 from magfusion.results.verdict import trust_figures
-from magfusion.units import DEGREE
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from magfusion.jobs.inputs import Job
-    from magfusion.model.samples import Log
-    from magfusion.model.site import Site
-    from magfusion.papers.p004_fingerprints.algorithms import Method, PublishedFixes
-    from magfusion.receiver.windows import LockinSettings
-    from magfusion.results.errors import TrajectoryErrors
-    from magfusion.units import Array, BoolArray
+from magfusion.units import DEGREE, Array, BoolArray
 
 
 def run_published_fix(

@@ -1,30 +1,21 @@
 """The job that ranges one well from another, with a rotating magnet in it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magfusion.estimation.ranging.ranging import find_range
-from magfusion.estimation.ranging.ranging_windows import DepthErrors, ranging_log
+from magfusion.estimation.ranging.ranging import Ranged, find_range
+from magfusion.estimation.ranging.ranging_windows import DepthErrors, RangingLog, ranging_log
 from magfusion.estimation.ranging.relative_wells import Wells
 from magfusion.estimation.snapshot.priors import trust_of, unexplained
 from magfusion.files.table import Span, write_table
 from magfusion.jobs.settings import Command, LogSettings, option
+from magfusion.model.samples import Log
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
 from magfusion.units import DEGREE
-
-if TYPE_CHECKING:
-    from magfusion.estimation.ranging.ranging import Ranged
-    from magfusion.estimation.ranging.ranging_windows import RangingLog
-    from magfusion.estimation.ranging.relative_wells import Wells
-    from magfusion.model.samples import Log
-    from magfusion.model.trust import Trust
 
 LEAST_SNR = 5.0  # of the strongest window
 VAGUE = 0.2  # of the distance

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magfusion.errors import InputError
 from magfusion.jobs.settings import Settings, option
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from magfusion.model.samples import Log
     from magfusion.units import Rate
 

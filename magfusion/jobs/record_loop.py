@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, TextIO
 
 from magfusion.errors import InputError
 from magfusion.files.standard_streams import write_message
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
     from magfusion.files.records import Record
     from magfusion.files.stream import NumberedRecord
 

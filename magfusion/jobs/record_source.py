@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, TextIO
 
 from magfusion.files.standard_streams import binary_input
-from magfusion.jobs.navigate_settings import ROS2
+from magfusion.jobs.navigate_settings import ROS2, NavigateSettings
+from magfusion.model.site import Site
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from magfusion.files.stream import NumberedRecord
-    from magfusion.jobs.navigate_settings import NavigateSettings
-    from magfusion.model.site import Site
 
 
 def live_records(

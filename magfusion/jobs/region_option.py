@@ -10,10 +10,10 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.model.region import Region
+from magfusion.units import Array
 
 if TYPE_CHECKING:
     from magfusion.model.site import Site
-    from magfusion.units import Array
 
 LARGEST = 1e6  # m
 

@@ -16,6 +16,7 @@ from magfusion.files.long_log import LongLog, long_log
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site
 from magfusion.files.standard_streams import binary_output, until_closed
+from magfusion.files.stream import Format
 from magfusion.files.stream_contents import (
     aiding_content,
     drive_content,
@@ -28,18 +29,15 @@ from magfusion.files.stream_contents import (
     write_record,
 )
 from magfusion.jobs.settings import Command, PartSettings, ReplayedSettings, option
-from magfusion.model.samples import ImuSamples, Waveform
+from magfusion.model.aiding import AidingSamples
+from magfusion.model.drive import DriveSamples
+from magfusion.model.marks import Marks
+from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
 from magfusion.model.temperature import Temperatures
 from magfusion.units import Array, IntArray
 
 if TYPE_CHECKING:
     from magfusion.estimation.online.navigator import Navigator
-    from magfusion.files.long_log import LongLog
-    from magfusion.files.stream import Format
-    from magfusion.model.aiding import AidingSamples
-    from magfusion.model.drive import DriveSamples
-    from magfusion.model.marks import Marks
-    from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
 
 
 PIECE = 0.05  # s

@@ -1,18 +1,12 @@
 """Options of the jobs that integrate whole rests."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from magfusion.estimation.rests.stationary_integration import integrate_rests
+from magfusion.estimation.rests.stationary_integration import IntegratedRests, integrate_rests
 from magfusion.jobs.settings import Settings, option
-
-if TYPE_CHECKING:
-    from magfusion.estimation.rests.stationary_integration import IntegratedRests
-    from magfusion.model.samples import Log
-    from magfusion.model.site import Site
-    from magfusion.receiver.windows import LockinSettings
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.receiver.windows import LockinSettings
 
 
 @dataclass(frozen=True, kw_only=True)

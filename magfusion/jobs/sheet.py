@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,19 +18,17 @@ from magfusion.jobs.coil_drive import DriveSettings
 from magfusion.jobs.settings import Command, argument, option
 from magfusion.model.aiding import AidingSensor
 from magfusion.model.hall import Hall, Mounts, Prism, points_of_use, prism_of
+from magfusion.model.site import Site
 from magfusion.model.trust import Trust
 from magfusion.results.coverage import usual_box
 from magfusion.results.design.check_marks import check_marks, check_pairs
 from magfusion.results.design.coil_drive import drive_figures
 from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.verdict import trust_figures
+from magfusion.units import Array
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from magfusion.model.site import Site
     from magfusion.results.plots.sheet import CheckRow
-    from magfusion.units import Array
 
 MOST_POINTS = 20_000
 

@@ -1,10 +1,8 @@
 """The job that simulates a log, with truth, in the usual file formats."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -16,6 +14,8 @@ from magfusion.files.steel_file import read_steel
 from magfusion.jobs.rotor_inputs import is_for_ranging
 from magfusion.jobs.settings import Command, option
 from magfusion.jobs.simulate_ranging import ShaftSettings, simulate_ranging
+from magfusion.model.samples import Log
+from magfusion.model.site import Magnetometer, Site
 from magfusion.model.trust import Trust
 from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
@@ -30,13 +30,7 @@ from magfusion.simulation.slots import Multiplexer
 from magfusion.simulation.steel import SteelStructure
 from magfusion.simulation.steel_worlds import KINDS, check_clear, draw_steel, structure_of
 from magfusion.simulation.waveform import usual_rate_hz
-
-if TYPE_CHECKING:
-    from magfusion.model.samples import Log
-    from magfusion.model.site import Magnetometer, Site
-    from magfusion.simulation.log import Reference, SimulationConfig
-    from magfusion.units import Array
-
+from magfusion.units import Array
 
 LARGEST_BOX, SMALLEST_BOX = 1e5, 1e-3  # m
 DRIFT_TIME = 600.0  # s

@@ -11,17 +11,19 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
-from magfusion.files.wells_file import read_wells
+from magfusion.files.wells_file import WellsEntry, read_wells
 from magfusion.jobs.settings import RandomSettings, option
 from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.samples import ImuSamples
+from magfusion.model.site import Site
 from magfusion.model.trust import Trust
 from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.verdict import trust_figures
+from magfusion.simulation.layers import Layers
 from magfusion.simulation.perturbed import perturb_site, with_earth_field
-from magfusion.simulation.pipe import Steel
+from magfusion.simulation.pipe import Pipe, Steel
 from magfusion.simulation.rails import steel_along_wells
-from magfusion.simulation.rotor import Surroundings, simulate_transits
+from magfusion.simulation.rotor import Pass, Surroundings, simulate_transits
 from magfusion.simulation.shaft import ShaftErrors, draw_shaft
 from magfusion.simulation.waveform import LEAST_SAMPLES_PER_CYCLE
 from magfusion.simulation.wells import TwoWells, drawn_steel, lean_of
@@ -30,13 +32,6 @@ from magfusion.units import DEGREE
 if TYPE_CHECKING:
     import numpy as np
 
-    from magfusion.files.wells_file import WellsEntry
-    from magfusion.model.site import Site
-    from magfusion.simulation.layers import Layers
-    from magfusion.simulation.pipe import Pipe
-    from magfusion.simulation.rotor import Pass, Surroundings
-    from magfusion.simulation.shaft import ShaftErrors
-    from magfusion.simulation.wells import TwoWells
 
 LEAST_RATE_HZ, SAMPLES_PER_TURN = 50.0, 10.0
 WAY_POINTS = 500  # of a magnet's way, where steel is too near to it

@@ -11,6 +11,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.data_quality import beyond
+from magfusion.estimation.rests.stationary_integration import IntegratedRests
 from magfusion.estimation.snapshot.coil_gain import with_found_gain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
@@ -28,20 +29,19 @@ from magfusion.jobs.settings import (
     option,
 )
 from magfusion.model.progress import Report, quiet
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trust import Risk
 from magfusion.results.figures import Figure, Figures
 from magfusion.results.rest_figures import rest_figures
+from magfusion.units import Rate
 
 if TYPE_CHECKING:
     from magfusion.estimation.batch.batch import SmootherSettings
     from magfusion.estimation.batch.outer_iterations import PassFile
-    from magfusion.estimation.rests.stationary_integration import IntegratedRests
     from magfusion.jobs.inputs import Job
     from magfusion.jobs.smooth_failure import Failure
     from magfusion.jobs.smooth_result import Finished
-    from magfusion.model.samples import Log
-    from magfusion.model.site import Site
-    from magfusion.model.trust import Risk
-    from magfusion.units import Rate
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,12 +4,8 @@ A correction is accepted only if no test contradicts the corrected result: the r
 gives is the one with which this result was made.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from magfusion.errors import InputError
-from magfusion.estimation.batch.batch import smooth
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.integrity.correction import (
     Correction,
     Trial,
@@ -19,13 +15,9 @@ from magfusion.estimation.integrity.correction import (
 from magfusion.files.site_changes import changed_keys
 from magfusion.jobs.smooth_result import Finished, finished
 from magfusion.model.progress import Report, quiet
-from magfusion.model.trust import Verdict
-
-if TYPE_CHECKING:
-    from magfusion.estimation.batch.batch import SmootherSettings
-    from magfusion.model.samples import Log
-    from magfusion.model.site import Site
-    from magfusion.model.trust import Finding, Risk
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Risk, Verdict
 
 
 def corrected(

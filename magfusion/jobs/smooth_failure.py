@@ -1,7 +1,5 @@
 """What is saved of a log that cannot be smoothed: the single-epoch fixes, and the likely cause."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The result of a smoothed log: assessed, with its figures, and written."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 

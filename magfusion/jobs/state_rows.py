@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from magfusion.estimation.online_integrity.levels import Levels, find
+from magfusion.model.site import Site
+from magfusion.units import Array
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from magfusion.estimation.online.navigator import Navigator
     from magfusion.estimation.online_integrity.judgement import JudgedState
     from magfusion.files.row_file import RowFile, RowPosition
-    from magfusion.model.site import Site
-    from magfusion.units import Array
 
 # Kind of a row: an epoch's state as first estimated, as it left the window, or propagated.
 CURRENT, LAGGED, PROPAGATED = 0.0, 1.0, 2.0

@@ -14,19 +14,16 @@ from magfusion.errors import InputError
 from magfusion.estimation.data_checks.data_quality import passed_on
 from magfusion.files.survey import Survey, write_survey
 from magfusion.jobs.settings import Command, LogSettings, WindowSettings, option
+from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import Site
 from magfusion.model.strapdown import resting
-from magfusion.model.trajectory import interpolate
+from magfusion.model.trajectory import Trajectory, interpolate
 from magfusion.results.figures import Figure, Figures, heading
 from magfusion.results.verdict import trust_figures
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 if TYPE_CHECKING:
-    from magfusion.files.survey import Survey
     from magfusion.jobs.inputs import Job
-    from magfusion.model.samples import FieldSamples, Log
-    from magfusion.model.trajectory import Trajectory
-    from magfusion.results.figures import Figures
 
 
 Points = Literal["rests", "epochs"]

@@ -12,17 +12,17 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.files.aiding_messages import NAV_SAT_FIX, SensorMessages, aiding_rows
+from magfusion.files.bag_topics import Topics
+from magfusion.files.messages import Row
 from magfusion.files.records import Record
 from magfusion.files.stream import NumberedRecord, checked_record
+from magfusion.model.aiding import AidingSensor
 from magfusion.results.dds_domain import dds_name, join_domain
 
 if TYPE_CHECKING:
     from cyclonedds.domain import DomainParticipant
     from cyclonedds.sub import DataReader
 
-    from magfusion.files.bag_topics import Topics
-    from magfusion.files.messages import Row
-    from magfusion.model.aiding import AidingSensor
     from magfusion.model.site import Site
 
 SILENCE = 5.0  # s; a topic without messages for longer is reported

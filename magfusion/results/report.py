@@ -1,18 +1,16 @@
 """Common figures of several jobs, and their output file."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.batch.hypothesis_selection import AMBIGUOUS_CHI_SQUARE
+from magfusion.estimation.batch.self_survey import Placement
 from magfusion.estimation.snapshot.ambiguity import ambiguities, relations
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.one_axis import roll_is_open
@@ -30,15 +28,11 @@ from magfusion.results.figures import (
     Value,
     determined_figures,
 )
-from magfusion.results.observability import observability
+from magfusion.results.observability import CalibrationObservability, observability
 from magfusion.results.page import write_page
 from magfusion.results.page_motion import MotionPage
 from magfusion.results.refinement import parameter_estimates
 from magfusion.units import Array
-
-if TYPE_CHECKING:
-    from magfusion.estimation.batch.self_survey import Placement
-    from magfusion.results.observability import CalibrationObservability
 
 FAILED = "failed"  # directory of what was found where the verdict is that
 POOR_FIT = 3.0  # whitened residual, one where noise and model are as declared

@@ -1,14 +1,13 @@
 """A trajectory that a program can convert to a table, a file or a figure."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from magfusion.errors import InputError
 from magfusion.estimation.graph.state import State, as_trajectory
@@ -19,9 +18,6 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.results.errors import trajectory_errors
 from magfusion.results.page_motion import MotionPage, path_charts, size_charts
 from magfusion.results.plots.drawn import draw_charts
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, eq=False, repr=False)
