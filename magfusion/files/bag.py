@@ -41,10 +41,7 @@ _NAMES = {"imu": "IMU", "magnetometer": "magnetometer", "truth": "truth"}  # of 
 class _Stream:
     """Messages of one topic as numbers, sorted by the stamps of their headers.
 
-    Parameters
-    ----------
-    name : str
-        Of its role in reports.
+    `name`: of its role in reports.
     """
 
     name: str

@@ -38,12 +38,7 @@ _OF_MESSAGE, _OF_CHUNK, _OF_CONNECTION = b"\x02", b"\x05", b"\x07"
 class Recovered(NamedTuple):
     """What the library is to read in place of a bag's file.
 
-    Parameters
-    ----------
-    whole : bool
-        Whether nothing was lost.
-    directory : TemporaryDirectory, optional
-        Of a copy: removed with this.
+    `whole`: whether nothing was lost. `directory`: of a copy: removed with this.
     """
 
     path: Path

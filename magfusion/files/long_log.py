@@ -103,11 +103,7 @@ class Samples:
 class LongLog:
     """A log with long raw streams.
 
-    Parameters
-    ----------
-    fields : FieldSamples, optional
-        Phasors of a table of them, which are few.
-    temperatures : Temperatures, optional
+    `fields`: phasors of a table of them, which are few.
     """
 
     path: Path

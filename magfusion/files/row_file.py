@@ -26,12 +26,7 @@ BATCH = 4096  # additions that wait at most
 class RowPosition:
     """How far a file of rows went when a checkpoint was made.
 
-    Parameters
-    ----------
-    size : int
-        Of the file (bytes).
-    sha256 : str
-        Of so much of it.
+    `size`: of the file (bytes). `sha256`: of so much of it.
     """
 
     rows: int
@@ -57,17 +52,9 @@ def claim_rows(path: Path) -> None:
 class RowFile:
     """Rows of numbers that are appended to a file.
 
-    Parameters
-    ----------
-    columns : mapping of str to int
-        Name of each column and how many numbers it has in a row; one without any is left out.
-    mark : RowPosition, optional
-        From which to go on; None begins again.
-
-    Raises
-    ------
-    InputError
-        Where the file does not match the mark, or, without one, is no file of rows.
+    `columns`: name of each column and how many numbers it has in a row; one without any is left
+    out. `mark`: from which to go on; None begins again. Raises InputError where the file does not
+    match the mark, or, without one, is no file of rows.
     """
 
     def __init__(

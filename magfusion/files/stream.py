@@ -24,10 +24,7 @@ LONGEST_LIST = 1 << 17
 class NumberedRecord:
     """A record with its place in the stream, or the sentence with the reason why it is none.
 
-    Parameters
-    ----------
-    source, unit : str
-        What is read, and what ``number`` counts.
+    `source`, `unit`: what is read, and what ``number`` counts.
     """
 
     number: int

@@ -30,12 +30,7 @@ LARGEST_NUMBER = 1e100  # whose square is still finite
 class Span:
     """A part of a log: start <= time < end, in seconds since the log's epoch.
 
-    Parameters
-    ----------
-    epoch_ns : int
-        The log clock's zero.
-    start, end : float, optional
-        (s); None leaves that side open.
+    `epoch_ns`: the log clock's zero. `start`, `end`: (s); None leaves that side open.
     """
 
     epoch_ns: int

@@ -43,11 +43,7 @@ AXES = "xyz"
 class Instrument:
     """Three axes of one instrument.
 
-    Parameters
-    ----------
-    key : str
-        Prefix of the keys of a site: ``gyro``, ``accel``, ``magnetometer``.
-    fits : tuple of AllanFit or None
+    `key`: prefix of the keys of a site: ``gyro``, ``accel``, ``magnetometer``.
     """
 
     key: str
@@ -79,12 +75,7 @@ class Instrument:
 class MeasuredNoise:
     """Estimated noise.
 
-    Parameters
-    ----------
-    keys : dict
-        Of a site: the worst axis.
-    intervals : dict
-        95 % interval, of that axis.
+    `keys`: of a site: the worst axis. `intervals`: 95 % interval, of that axis.
     """
 
     trust: Trust

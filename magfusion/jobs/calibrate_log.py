@@ -46,12 +46,8 @@ OVERLAP = 2.0  # windows that share their samples
 class PartScore(NamedTuple):
     """Fit of a part of a log with the calibration fixed.
 
-    Parameters
-    ----------
-    residual : float
-        Root mean square, whitened.
-    position, attitude_deg : float, optional
-        Aligned errors against the truth, where there is one (m, deg).
+    `residual`: root mean square, whitened. `position`, `attitude_deg`: aligned errors against the
+    truth, where there is one (m, deg).
     """
 
     residual: float
@@ -68,7 +64,6 @@ class Transfer(NamedTuple):
         Of each part, with the survey fixed.
     calibrated : list of PartScore
         Of each pair of parts: calibrated on the one, scored on the other.
-    pairs : list of (int, int)
     disagreement : float
         Largest difference of two parts' calibrations along a direction that both determine, in its
         sigmas.

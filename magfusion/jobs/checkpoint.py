@@ -80,12 +80,7 @@ def begin(
 
 
 class CheckpointWriter:
-    """Writes the checkpoints of a run; a failure is reported, and the run goes on.
-
-    Parameters
-    ----------
-    messages : file
-    """
+    """Writes the checkpoints of a run; a failure is reported, and the run goes on."""
 
     def __init__(self, place: Path, key: str, messages: TextIO) -> None:
         self._place, self._key, self._messages = place, key, messages

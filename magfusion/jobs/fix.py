@@ -48,10 +48,7 @@ if TYPE_CHECKING:
 class FixSettings(RegionSettings, WindowSettings, RestSettings, RiskSettings):
     """Settings of single-epoch fixes.
 
-    Parameters
-    ----------
-    survey : Path, optional
-        A survey's table, or the output directory of ``magfusion survey``.
+    `survey`: a survey's table, or the output directory of ``magfusion survey``.
     """
 
     method: Literal[

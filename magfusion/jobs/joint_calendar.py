@@ -39,8 +39,6 @@ class CalendarTask:
 
     Parameters
     ----------
-    files : SiteFiles
-    paths : tuple of Path
     at : ndarray, shape (s,), optional
         Linearisation point, from the declared calibration; the mean of the logs by default.
     """

@@ -41,7 +41,6 @@ class Sums(NamedTuple):
 
     Parameters
     ----------
-    rounds : int
     known : SharedCalibration
         By all of them.
     groups : list of list of Path
@@ -64,13 +63,7 @@ class Sums(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Driver:
-    """Rounds over the files of the logs, without a log in memory.
-
-    Parameters
-    ----------
-    tasks : list of LogTask
-    files : SiteFiles
-    """
+    """Rounds over the files of the logs, without a log in memory."""
 
     hands: WorkerPool
     tasks: list[LogTask]

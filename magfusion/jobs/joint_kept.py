@@ -41,11 +41,7 @@ _SCALARS = ("reference_time", "imu_begin", "time_offset", "clock_rate")
 class Kept(NamedTuple):
     """A log alone, or after a round.
 
-    Parameters
-    ----------
-    log : OfLog
-    facts : dict
-        Of the table of logs, when it was smoothed alone.
+    `facts`: of the table of logs, when it was smoothed alone.
     """
 
     log: OfLog
@@ -55,10 +51,7 @@ class Kept(NamedTuple):
 class StoredInformation(NamedTuple):
     """Information of a log, or of several, on the shared calibration.
 
-    Parameters
-    ----------
-    blocks : LogBlocks, optional
-        Those of one log; None of a sum, which is on the parameters of all logs.
+    `blocks`: those of one log; None of a sum, which is on the parameters of all logs.
     """
 
     information: LogInformation

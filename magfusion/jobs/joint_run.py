@@ -57,8 +57,6 @@ class Joint:
     ----------
     known : SharedCalibration
         Of the parameters of all logs.
-    calendar : Calendar
-    changes : list of ChangeReport
     months : list of dict
         Parameters by month.
     excess : float

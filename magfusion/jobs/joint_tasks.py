@@ -117,12 +117,7 @@ class Alone(NamedTuple):
 class SiteFiles:
     """Files of a site with its platforms, and its changes: the calendar, in a few bytes.
 
-    Parameters
-    ----------
-    jobs : tuple of Job
-        One of each platform.
-    smoother : SmootherSettings
-    changes : tuple of SiteChange
+    `jobs`: one of each platform.
     """
 
     jobs: tuple[Job, ...]
@@ -157,7 +152,6 @@ class RoundTask:
 
     Parameters
     ----------
-    files : SiteFiles
     rounds : int
         Number of rounds before.
     logs : tuple of Path
@@ -196,11 +190,8 @@ class SumTask:
 
     Parameters
     ----------
-    files : SiteFiles
-    parts : tuple of Path
     at : ndarray, shape (s,)
         From the declared calibration to the linearisation point.
-    result : Path
     """
 
     files: SiteFiles

@@ -84,6 +84,8 @@ class _Counted:
 class LineSource:
     """A serial port or UDP socket with records.
 
+    Raises InputError where the place is none.
+
     Parameters
     ----------
     place : str
@@ -96,11 +98,6 @@ class LineSource:
     ----------
     faults : Counter
         Records by kind and fault: lost, doubled, late, garbled, restarted.
-
-    Raises
-    ------
-    InputError
-        Where the place is none.
     """
 
     def __init__(

@@ -33,11 +33,13 @@ SERVERS = ("pulse", "default")
 class SoundSource:
     """A sound card whose channels are volts of a receiver.
 
+    Raises InputError where the channels are not those of the site's receiver, or its tones are too
+    close.
+
     Parameters
     ----------
     device : str
         Its name, or a part that only one has.
-    rate_hz : int
     channels : str
         Names of all its channels.
     full_scale_v : float
@@ -49,11 +51,6 @@ class SoundSource:
     ----------
     shift : float
         Time by its own clock, that of the log, less that of the host (s).
-
-    Raises
-    ------
-    InputError
-        Where the channels are not those of the site's receiver, or its tones are too close.
     """
 
     def __init__(

@@ -77,10 +77,7 @@ class Packet:
 class Replay:
     """The pieces of a log.
 
-    Parameters
-    ----------
-    log : Log
-        A phasor arrives when its window ends.
+    `log`: a phasor arrives when its window ends.
     """
 
     def __init__(self, log: Log) -> None:

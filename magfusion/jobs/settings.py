@@ -112,10 +112,7 @@ def options(settings: type[Settings]) -> list[tuple[dataclasses.Field[Any], Opti
 class Settings:
     """Settings of one run of a job.
 
-    Raises
-    ------
-    InputError
-        Where a number is out of its bounds.
+    Raises InputError where a number is out of its bounds.
     """
 
     def __post_init__(self) -> None:

@@ -33,13 +33,7 @@ CONTRADICTION = "the inconsistency of fields and inertial data is too large for 
 class Failure(NamedTuple):
     """A log without a trajectory.
 
-    Parameters
-    ----------
-    reason : str
-        The cause, where it is known.
-    cause : Diagnosis, optional
-    dropped : mapping of str to int
-        Windows that were left out, by reason.
+    `reason`: the cause, where it is known. `dropped`: windows that were left out, by reason.
     """
 
     reason: str

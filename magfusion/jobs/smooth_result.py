@@ -79,7 +79,6 @@ class Finished:
         Of each of its states.
     figures : Figures
         Without those of the truth.
-    errors : TrajectoryErrors, optional
     corrections : list of Correction
         What may be wrong with the site, where something is.
     continued : Correction, optional

@@ -46,10 +46,7 @@ def row_columns(site: Site) -> dict[str, int]:
 class StateRows:
     """Rows of a run, of which the newest are buffered.
 
-    Parameters
-    ----------
-    rows : RowFile
-        Of `row_columns`.
+    `rows`: of `row_columns`.
     """
 
     def __init__(self, rows: RowFile) -> None:

@@ -171,14 +171,10 @@ def _navigate(
 class _StateWriter:
     """Writes states as they are estimated, and sends them to the other outputs.
 
-    Parameters
-    ----------
-    sink : file
-        Binary.
+    `sink`: binary.
 
     Attributes
     ----------
-    navigator : Navigator
     reference : bool
         Whether samples of a reference sensor have arrived, which are not used here.
     """

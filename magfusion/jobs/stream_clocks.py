@@ -57,12 +57,8 @@ class _Clock:
 class StreamClocks:
     """Clocks of the streams of a pipe.
 
-    Parameters
-    ----------
-    delay : float
-        Largest delay of samples that are still sorted in (s).
-    last, wrapped : float
-        Of a resumed run, the last stamp (s) before it, and what counters had lost by wrapping.
+    `delay`: largest delay of samples that are still sorted in (s). `last`, `wrapped`: of a resumed
+    run, the last stamp (s) before it, and what counters had lost by wrapping.
     """
 
     def __init__(self, delay: float, last: float = -np.inf, wrapped: float = 0.0) -> None:
@@ -182,16 +178,8 @@ class StreamClocks:
 class OlderRecords:
     """Records before a checkpoint, with which the stream of a resumed run may begin.
 
-    Parameters
-    ----------
-    until : float
-        Time of the checkpoint (s); infinitely early without one.
-    restart : callable
-        Called where a clock began again: records of `NEW_CLOCK` seconds are far before it.
-
-    Attributes
-    ----------
-    count : int
+    `until`: time of the checkpoint (s); infinitely early without one. `restart`: called where a
+    clock began again: records of `NEW_CLOCK` seconds are far before it.
     """
 
     def __init__(self, until: float, restart: Callable[[], None]) -> None:

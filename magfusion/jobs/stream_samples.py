@@ -25,10 +25,7 @@ _UNITS = {"imu": "rad/s and m/s^2", "magnetometer": "tesla", "reference": "tesla
 class StreamSamples:
     """Samples of each stream: those of the IMU, and of each magnetometer by its name.
 
-    Parameters
-    ----------
-    patient : bool
-        Whether the first samples wait until their stamps and values can be tested.
+    `patient`: whether the first samples wait until their stamps and values can be tested.
     """
 
     def __init__(self, site: Site, *, patient: bool = True) -> None:

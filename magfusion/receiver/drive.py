@@ -28,10 +28,7 @@ SILENT = 0.2  # of the current; a larger noise makes the reading invalid
 class Channel(NamedTuple):
     """A tone in a current's column.
 
-    Parameters
-    ----------
-    declared : complex
-        Phasor of the current for which the moment is declared (A).
+    `declared`: phasor of the current for which the moment is declared (A).
     """
 
     column: str
@@ -92,15 +89,7 @@ def _of_beacon(beacon: Beacon, column: str) -> Iterator[Channel]:
 class DriveReceiver:
     """Windows of currents, demodulated as they become complete.
 
-    Parameters
-    ----------
-    shares : DriveShares
-        Drive shares to which windows are added.
-
-    Raises
-    ------
-    InputError
-        As `drive_channels`, at the first samples.
+    `shares`: drive shares to which windows are added.
     """
 
     # What a checkpoint holds.

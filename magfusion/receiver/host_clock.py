@@ -22,10 +22,7 @@ SETTLING = 3000.0  # s; in which the distance to the line is made up: 20 ms by 7
 class HostClock:
     """Stamps of a counter.
 
-    Parameters
-    ----------
-    step : float
-        Nominal time from one count to the next (s).
+    `step`: nominal time from one count to the next (s).
     """
 
     def __init__(self, step: float) -> None:

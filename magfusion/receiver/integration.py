@@ -120,12 +120,8 @@ def _weights(phasor: ComplexArray) -> Array:
 class FrequencySearch:
     """Result of a search for the frequency of a beacon.
 
-    Parameters
-    ----------
-    drift : float
-        Relative error of its clock.
-    trials : float
-        Searched range (Hz), times the RMS slope of a component with frequency.
+    `drift`: relative error of its clock. `trials`: searched range (Hz), times the RMS slope of a
+    component with frequency.
     """
 
     drift: float

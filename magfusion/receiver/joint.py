@@ -164,10 +164,7 @@ def _probes(frequencies_hz: Array, mains_hz: Array, nyquist_hz: float, window: f
 class JointDesigns:
     """Designs of successive windows; those with equal sample times share one.
 
-    Parameters
-    ----------
-    directions : int
-        Number kept by every design.
+    `directions`: number kept by every design.
     """
 
     settings: LockinSettings

@@ -47,7 +47,6 @@ class WindowOperator:
     ----------
     designs : Designs
         From the sample times alone.
-    channels : tuple of (str, int)
     tone_of_channel : int ndarray, shape (channels,), optional
         Tone of each channel, where several beacons share a frequency.
     body_from_measured : ndarray, shape (3, 3)

@@ -35,10 +35,7 @@ Stamping = Literal["stamps", "counted", "rounded"]
 class RunningClock:
     """Replaces the stamps of a stream by an even clock, where they are not those of its samples.
 
-    Parameters
-    ----------
-    known : str, optional
-        Kind of stamps, where it need not be found.
+    `known`: kind of stamps, where it need not be found.
 
     Attributes
     ----------

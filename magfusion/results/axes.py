@@ -68,13 +68,7 @@ def axis_figures(
 ) -> Figures:
     """Return errors and sigmas of each axis, root mean square over the same epochs.
 
-    Parameters
-    ----------
-    states : Trajectory
-    errors : TrajectoryErrors, optional
-        Of these states.
-    frame : Frame, optional
-        As from `survey_frame`.
+    `errors`: of these states. `frame`: as from `survey_frame`.
     """
     turn, place, cov = states.world_from_body, states.position_world, states.pose_cov
     if errors is not None and not errors.at_truth:

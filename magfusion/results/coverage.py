@@ -82,12 +82,8 @@ class Coverage:
 class ExtraBeacon:
     """Best placement of one more beacon, and its effect.
 
-    Parameters
-    ----------
-    beacon : Beacon
-        A copy of the site's first at its best position.
-    before, after : float
-        Position sigma met by the given share of the points, without and with it (m).
+    `beacon`: a copy of the site's first at its best position. `before`, `after`: position sigma met
+    by the given share of the points, without and with it (m).
     """
 
     beacon: Beacon

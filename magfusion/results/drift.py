@@ -74,10 +74,7 @@ class ErrorSeries:
 class Slope:
     """Growth of an error per day.
 
-    Parameters
-    ----------
-    freedom : int
-        Degrees of freedom of the standard error.
+    `freedom`: degrees of freedom of the standard error.
     """
 
     per_day: float

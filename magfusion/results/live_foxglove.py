@@ -33,7 +33,8 @@ _STATE = {
 class FoxgloveServer:
     """Serves ``/magfusion/state``, and ``/magfusion/pose`` and ``/tf`` of states not lost.
 
-    Slow clients miss messages; the server never blocks.
+    Slow clients miss messages; the server never blocks. Raises InputError where it cannot listen at
+    the address, or foxglove-sdk is not installed.
 
     Parameters
     ----------
@@ -43,11 +44,6 @@ class FoxgloveServer:
         Zero of the states' time (ns since 1970).
     frame, child : str
         Names of the frames.
-
-    Raises
-    ------
-    InputError
-        Where it cannot listen at the address, or foxglove-sdk is not installed.
     """
 
     def __init__(self, address: str, epoch_ns: int, frame: str, child: str) -> None:

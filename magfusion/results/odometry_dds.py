@@ -36,6 +36,8 @@ def odometry_message(odometry: Odometry, frame: str, child: str) -> Any:
 class RosPublisher:
     """Publishes the odometry of states that are not lost, in the domain ``ROS_DOMAIN_ID``.
 
+    Raises InputError where the topic or the domain is invalid, or cyclonedds is not installed.
+
     Parameters
     ----------
     topic : str
@@ -44,11 +46,6 @@ class RosPublisher:
         Zero of the states' time (ns since 1970).
     frame, child : str
         Names of the frames.
-
-    Raises
-    ------
-    InputError
-        Where the topic or the domain is invalid, or cyclonedds is not installed.
     """
 
     def __init__(self, topic: str, epoch_ns: int, frame: str, child: str) -> None:

@@ -66,19 +66,9 @@ def odometry_message(odometry: Odometry, quality: int, discontinuities: int) -> 
 class MavlinkSender:
     """Sends a heartbeat and the odometry of every state that is not lost.
 
-    It never blocks, and ignores missing receivers.
-
-    Parameters
-    ----------
-    address : str
-        ``udpout:HOST:PORT``.
-    epoch_ns : int
-        Zero of the states' time (ns since 1970).
-
-    Raises
-    ------
-    InputError
-        Where the address is invalid, or pymavlink is not installed.
+    It never blocks, and ignores missing receivers. `address`: ``udpout:HOST:PORT``. `epoch_ns`:
+    zero of the states' time (ns since 1970). Raises InputError where the address is invalid, or
+    pymavlink is not installed.
     """
 
     def __init__(self, address: str, epoch_ns: int) -> None:

@@ -21,10 +21,7 @@ _PIECE = 50  # states to a strip of the path
 class LiveView:
     """Draws states one by one.
 
-    Parameters
-    ----------
-    recording : rr.RecordingStream
-        Connected to a viewer, or to a file.
+    `recording`: connected to a viewer, or to a file.
     """
 
     def __init__(self, site: Site, recording: rr.RecordingStream) -> None:

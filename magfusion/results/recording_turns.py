@@ -18,10 +18,7 @@ _VISITED, _MISSING, _NOW = (90, 200, 120), (200, 70, 60), (250, 220, 90)
 class TurnView:
     """Draws statuses one by one.
 
-    Parameters
-    ----------
-    recording : rr.RecordingStream
-        Connected to a viewer, or to a file.
+    `recording`: connected to a viewer, or to a file.
     """
 
     def __init__(self, recording: rr.RecordingStream) -> None:

@@ -27,13 +27,8 @@ _TAILS = (0.975, 0.9995)  # quantiles that Student's distribution takes from the
 class Trend(NamedTuple):
     """A slope and Student's distribution of its error.
 
-    Parameters
-    ----------
-    rate : float
-        Unit of the values per unit of time.
-    standard_error : float
-    freedom : float
-        Degrees of freedom: those that give the average's quantiles of 97.5 and 99.95 %.
+    `rate`: unit of the values per unit of time. `freedom`: degrees of freedom: those that give the
+    average's quantiles of 97.5 and 99.95 %.
     """
 
     rate: float

@@ -32,7 +32,6 @@ class Extrinsics(NamedTuple):
     ----------
     position_body : ndarray, shape (3,)
         (m)
-    body_from_sensor : Rotation
     chain : str
         ``imu_link -> base_link -> mag_link``.
     """

@@ -53,12 +53,8 @@ _SI = {"imu": ("rad/s", "m/s^2"), "magnetometer": ("T",), "truth": ("m", "1", "m
 class Topic:
     """A topic that plays a role.
 
-    Parameters
-    ----------
-    frames : tuple of str, optional
-        Parent and child, of a topic of transforms.
-    unit : str
-        Of a magnetometer's field, where the publisher does not keep to tesla.
+    `frames`: parent and child, of a topic of transforms. `unit`: of a magnetometer's field, where
+    the publisher does not keep to tesla.
     """
 
     name: str

@@ -57,10 +57,7 @@ ORDERS = {"wxyz": (0, 1, 2, 3), "xyzw": (3, 0, 1, 2)}  # where w, x, y and z sta
 class ColumnMapping:
     """One ``STREAM.COLUMN=NAME[unit]``, or ``STREAM=TOPIC`` with an empty column.
 
-    Parameters
-    ----------
-    value : str
-        What is behind the equals sign.
+    `value`: what is behind the equals sign.
     """
 
     stream: str
@@ -76,10 +73,7 @@ class ColumnMapping:
 class Term:
     """A column of the file with sign and unit.
 
-    Parameters
-    ----------
-    place : int
-        Of the column in the file.
+    `place`: of the column in the file.
     """
 
     place: int
@@ -90,12 +84,7 @@ class Term:
 class Undecided(ValueError):
     """Why an entry cannot be resolved, and possible replacements.
 
-    Parameters
-    ----------
-    place : int, optional
-        The column that is meant, where only its unit is open.
-    sign : float
-        Of it.
+    `place`: the column that is meant, where only its unit is open. `sign`: of it.
     """
 
     def __init__(self, reason: str, place: int | None = None, sign: float = 1.0) -> None:

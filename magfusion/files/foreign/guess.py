@@ -74,10 +74,7 @@ _OF_FILE = {
 class Named:
     """A column recognised by its name.
 
-    Parameters
-    ----------
-    unit : SourceUnit, optional
-        Given by the name, or the file.
+    `unit`: given by the name, or the file.
     """
 
     place: int

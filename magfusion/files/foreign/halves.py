@@ -24,10 +24,7 @@ MOST_STEPS = 3.5  # of the slower half, between which it is interpolated; farthe
 class Joined:
     """The stream that two halves make.
 
-    Parameters
-    ----------
-    note : str
-        Which half was interpolated; empty where both have the same stamps.
+    `note`: which half was interpolated; empty where both have the same stamps.
     """
 
     counts: Counts

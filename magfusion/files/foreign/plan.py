@@ -61,10 +61,7 @@ class Rate:
 class ImportPlan:
     """How a table becomes a stream.
 
-    Parameters
-    ----------
-    shift_ns : int
-        Added to its times.
+    `shift_ns`: added to its times.
     """
 
     stream: str

@@ -13,12 +13,8 @@ ROWS = 1 << 17  # of a part
 class SourceColumn:
     """A column of a table.
 
-    Parameters
-    ----------
-    name : str
-        As written in the file; its place, counted from 0, where it has none.
-    unit : str
-        That the file names outside of the name: in a row of units, or as an attribute.
+    `name`: as written in the file; its place, counted from 0, where it has none. `unit`: that the
+    file names outside of the name: in a row of units, or as an attribute.
     """
 
     name: str

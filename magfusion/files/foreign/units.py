@@ -108,12 +108,8 @@ _SCALED = re.compile(r"(?P<factor>[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?)\*(?P<unit>
 class SourceUnit:
     """A unit, perhaps with a factor before it: ``0.5*nT``.
 
-    Parameters
-    ----------
-    name : str
-        As in `UNITS`; `ISO` for stamps that are dates.
-    factor : str
-        As it was written, so that stamps can be scaled without rounding.
+    `name`: as in `UNITS`; `ISO` for stamps that are dates. `factor`: as it was written, so that
+    stamps can be scaled without rounding.
     """
 
     name: str

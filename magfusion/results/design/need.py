@@ -22,11 +22,7 @@ DIGITS = 2  # of a moment
 class NeededDesign:
     """The smallest design that reaches an accuracy, or the best that was found.
 
-    Parameters
-    ----------
-    task : Task
-        With its number and moment of beacons.
-    reached : bool
+    `task`: with its number and moment of beacons.
     """
 
     task: Task

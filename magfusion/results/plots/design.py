@@ -21,10 +21,7 @@ SLICES = 2  # heights that are drawn where there are more
 class Panel:
     """One layout with its map, which includes protection levels.
 
-    Parameters
-    ----------
-    of_sigma : bool
-        Whether position sigmas are shown, instead of protection levels.
+    `of_sigma`: whether position sigmas are shown, instead of protection levels.
     """
 
     words: str

@@ -32,7 +32,6 @@ class CheckRow:
 
     Parameters
     ----------
-    begin, end : str
     distance, tolerance : float
         (m)
     """
