@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from magfusion.calibration.allan import AllanVariance
@@ -17,7 +16,6 @@ Plotted = tuple[str, str, AllanVariance, tuple[AllanFit | None, ...]]
 def write_allan_plot(path: Path, instruments: Sequence[Plotted]) -> None:
     """Write a PNG of the Allan deviation of each axis with its fit, one panel per instrument."""
     figure = Figure(figsize=(5.5 * len(instruments), 5.5))
-    FigureCanvasAgg(figure)
     panels = figure.subplots(1, len(instruments), squeeze=False)[0]
     margin = 0.8 / (5.5 * len(instruments))
     figure.subplots_adjust(left=margin, right=1.0 - 0.2 * margin, top=0.93, bottom=0.1, wspace=0.22)

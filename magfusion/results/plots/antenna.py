@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from magfusion.calibration.antenna_tracking import PoseErrors
@@ -14,7 +13,6 @@ _BEFORE, _AFTER = "tab:orange", "tab:blue"
 def write_antenna_plot(path: Path, before: PoseErrors, after: PoseErrors) -> None:
     """Write a PNG of the errors of every pose, in the survey's order."""
     figure = Figure(figsize=(10.0, 6.5), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(2, 1, sharex=True)
     for axes, kind, unit, axis in (
         (panels[0], 0, DEGREE, "attitude (deg)"),

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from magfusion.model.site import Beacon
@@ -38,7 +37,6 @@ class BeaconPanel:
 def write_beacon_plot(path: Path, panels: list[BeaconPanel]) -> None:
     """Write a PNG with one row for each beacon: plan, elevation, and the points' residuals."""
     figure = Figure(figsize=(13.0, 0.6 + 4.0 * len(panels)), layout="constrained")
-    FigureCanvasAgg(figure)
     rows = figure.subplots(len(panels), 3, squeeze=False)
     for row, panel in zip(rows, panels, strict=True):
         for axes, view in zip(row, _VIEWS, strict=False):

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from magfusion.estimation.integrity.quick_check import Look
@@ -13,7 +12,6 @@ from magfusion.estimation.integrity.quick_check import Look
 def write_check_plot(path: Path, look: Look) -> None:
     """Write a PNG of the spectrum, each beacon's signal to noise, gravity and static field."""
     figure = Figure(figsize=(10.0, 8.0), layout="constrained")
-    FigureCanvasAgg(figure)
     top, middle, bottom = figure.subplots(3, 1)
     if look.spectrum is not None:
         one = look.spectrum

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
@@ -26,7 +25,6 @@ def write_plot(path: Path, courses: list[EstimatorPlot], figures: Mapping[str, o
     """Write a PNG, a column for each estimator."""
     rows = len(QUANTITIES) + 3
     figure = Figure(figsize=(0.8 + 5.2 * len(courses), 2.4 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.subplots(rows, len(courses), squeeze=False)
     for column, course in enumerate(courses):
         for row, quantity in enumerate(QUANTITIES):
@@ -77,7 +75,6 @@ def write_stability(path: Path, courses: list[EstimatorPlot]) -> None:
     The paper shows a stationary place; here the platform walks once an hour.
     """
     figure = Figure(figsize=(0.8 + 4.6 * len(courses), 5.6), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.subplots(2, len(courses), squeeze=False, sharex=True, sharey="row")
     for row, quantity in enumerate(QUANTITIES[:2]):
         for axes, course in zip(grid[row], courses, strict=True):

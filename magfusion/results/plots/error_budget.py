@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from magfusion.results.coverage_colours import length
@@ -17,7 +16,6 @@ def write_budget_plot(path: Path, budget: ErrorBudget, titles: tuple[str, ...]) 
     """
     count = len(budget.sources)
     figure = Figure(figsize=(5.2 * len(titles) + 1.0, 1.9 + 0.5 * count), layout="constrained")
-    FigureCanvasAgg(figure)
     rows = np.arange(count)[::-1]
     every = figure.subplots(1, len(titles), squeeze=False, sharey=True)[0]
     for k, (axes, title) in enumerate(zip(every, titles, strict=True)):

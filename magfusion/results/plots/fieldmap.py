@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from magfusion.calibration.fieldmap import MapFit
@@ -18,7 +17,6 @@ def write_plot(path: Path, fit: MapFit) -> None:
     """Write a PNG: a column for each beacon; gain above, rotation below, at the survey's height."""
     beacons = fit.site.beacons
     figure = Figure(figsize=(1.5 + 4.2 * len(beacons), 8.5), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(2, len(beacons), squeeze=False, sharex=True, sharey=True)
     sheets = [_sheet(beacon) for beacon in beacons]
     maximum = max(float(np.max(np.abs(s.gain))) for s in sheets) or 1.0

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator
 
@@ -33,7 +32,6 @@ def write_log_calibration_plot(
     """
     height = min(1.5 + 0.22 * len(estimates), HIGHEST)
     figure = Figure(figsize=(12.0, height), layout="constrained")
-    FigureCanvasAgg(figure)
     remaining, right = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
     rows = np.arange(len(estimates))
     ratio = np.array([e.sigma / e.prior_sigma for e in estimates])

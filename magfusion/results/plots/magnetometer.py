@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from magfusion.units import MICROTESLA, NANOTESLA, Array
@@ -30,7 +29,6 @@ def write_magnetometer_plot(
         Nominal magnitude (T).
     """
     figure = Figure(figsize=(13.0, 8.5), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 3, height_ratios=(1.5, 1.0))
     deviation = np.max(np.abs(np.linalg.norm(before_sensor, axis=1) - field_size))
     magnified = max(1.0, DRAWN_DEVIATION * field_size / max(float(deviation), 1e-12))

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from magfusion.files.attitude_table import AttitudeDatabase
@@ -31,7 +30,6 @@ def write_match_plot(
     """
     columns = 1 if true_rpy is None else 2
     figure = Figure(figsize=(6.5 * columns, 1.0 + 2.5 * len(result)), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(len(result), columns, squeeze=False, sharex=True)
     certain = matches.determined[:, 0]
     for row, k in zip(panels, result, strict=True):
@@ -66,7 +64,6 @@ def write_database_plot(path: Path, database: AttitudeDatabase, residual: Array)
         Of each entry (T).
     """
     figure = Figure(figsize=(8.0, 5.0), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     size = np.linalg.norm(residual, axis=1) / NANOTESLA
     roll, pitch, yaw = database.rpy.T / DEGREE

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from scipy.spatial.transform import Rotation
@@ -20,7 +19,6 @@ _AXES = (("x", "tab:red"), ("y", "tab:green"), ("z", "tab:blue"))
 def write_motion_plot(path: Path, site: Site, hall: Hall, result: MotionPlan) -> None:
     """Write a PNG of stops, numbered, with the axes of the body at each, and of the sigmas."""
     figure = Figure(figsize=(15.0, 7.5), layout="constrained")
-    FigureCanvasAgg(figure)
     plan, bars = figure.subplots(1, 2, width_ratios=(1.2, 1.0))
     _draw_plan(plan, site, hall, result)
     _draw_sigmas(bars, result)

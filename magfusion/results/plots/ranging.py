@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from magfusion.units import Array
@@ -40,7 +39,6 @@ def write_range_plot(path: Path, reported: RangePicture, *, high_side: bool) -> 
     `high_side`: whether directions are from it, or from the sensor's third axis.
     """
     figure = Figure(figsize=(12.0, 8.6), layout="constrained")
-    FigureCanvasAgg(figure)
     (section, across), (along, sigmas) = figure.subplots(2, 2)
     rounded = np.round(reported.sensor_depth, 2)
     for k, depth in enumerate(np.unique(rounded)):
