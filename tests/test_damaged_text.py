@@ -14,11 +14,9 @@ from magfusion.errors import InputError
 from magfusion.files.field_map import read_field_maps, write_field_maps
 from magfusion.files.log import write_log
 from magfusion.files.open import open_log
-from magfusion.files.readings_table import PART
+from magfusion.files.readings_table import DEGC, PART, read_temperatures, write_readings
 from magfusion.files.survey import read_survey
-from magfusion.files.temperature_table import read_temperatures, write_temperatures
 from magfusion.model.samples import Log
-from magfusion.model.temperature import Temperatures
 
 
 def _damage(path: Path, name: str) -> None:
@@ -45,7 +43,7 @@ def _fields(place: Path) -> tuple[Path, str, Callable[[], object]]:
 
 def _temperatures(place: Path) -> tuple[Path, str, Callable[[], object]]:
     path = place / "temperature.parquet"
-    write_temperatures(Temperatures({"A": np.array([[0.0, 1.0], [20.0, 21.0]])}), path, 0)
+    write_readings({"A": np.array([[0.0, 1.0], [20.0, 21.0]])}, path, 0, DEGC)
     return path, PART, lambda: read_temperatures(path, 0)
 
 

@@ -18,15 +18,14 @@ from scipy.io import savemat, wavfile
 
 from magfusion.estimation.demodulation.demodulation import demodulated
 from magfusion.files.log import write_log
+from magfusion.files.readings_table import DEGC, write_readings
 from magfusion.files.site import save_site
 from magfusion.files.survey import write_survey
-from magfusion.files.temperature_table import write_temperatures
 from magfusion.files.tum import write_tum
 from magfusion.jobs.replay import run_replay
 from magfusion.jobs.survey import make_survey
 from magfusion.model.field_map import COMPONENTS, FieldMap
 from magfusion.model.samples import Log
-from magfusion.model.temperature import Temperatures
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.simulation.motion import Rests
@@ -83,7 +82,7 @@ def example_inputs(place: Path) -> Path:
         write_log(one, place / name)
         save_site(site, place / name / "site.yaml")
     degc = {"A": np.array([[0.0, 9.0], [20.0, 25.0]])}
-    write_temperatures(Temperatures(degc), place / "log" / "temperature.parquet", EPOCH_NS)
+    write_readings(degc, place / "log" / "temperature.parquet", EPOCH_NS, DEGC)
     _write_surveyed(phasors, place)
     _write_foreign(place)
     _write_bags(log, place)

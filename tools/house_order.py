@@ -42,13 +42,13 @@ ROOMS = {
             site_values standard_streams stray_stamps
             aiding_messages bag_reader bag_rows checkpoint correlation field_map kept lost_rows
             probe row_file survey table yaml_files
-            attitude_table audio distances drive_columns fields hall instruments readings_table
+            attitude_table audio distances drive_columns fields hall instruments
             site_casing site_correlation site_motion site_region site_rotor
             site_temperature
             row_stamps steel_file steel_map trajectory_table wells_file
-            aiding_tables bag depth_table fix_table marks_table result_states rotor_columns
+            bag fix_table marks_table readings_table result_states
             site_plain site_text
-            record_values site_response temperature_table tum
+            aiding_tables record_values site_response tum
             inertial_tables odometry_bag records site_magnetometer
             record_samples site_aiding stream trajectory_formats
             named_records named_samples site_beacon site_schema stream_contents

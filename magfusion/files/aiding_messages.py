@@ -13,10 +13,10 @@ from magfusion.files.messages import (
     POSE,
     POSE_WITH_COVARIANCE,
     Row,
+    components,
     odometry_row,
     pose_row,
     sure_pose_row,
-    vector_row,
 )
 from magfusion.model.aiding import LONGEST_INTERVAL, AidingSensor, Quantity
 from magfusion.model.physics.earth import east_north_up
@@ -26,38 +26,6 @@ NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 POSE_COLUMNS = 7  # position and quaternion; a twist follows
 SHORTEST_QUATERNION = 0.5  # an attitude that was left unfilled is zero
 LONGEST_STEP = 2.0  # periods of the sensor's rate between poses whose difference is a sample
-
-
-def _sure_twist_row(message: Any) -> list[float]:
-    return vector_row(message.twist.twist.linear)
-
-
-def _twist_row(message: Any) -> list[float]:
-    return vector_row(message.twist.linear)
-
-
-def _position_row(message: Any) -> list[float]:
-    return vector_row(message.pose.position)
-
-
-def _sure_position_row(message: Any) -> list[float]:
-    return vector_row(message.pose.pose.position)
-
-
-def _point_row(message: Any) -> list[float]:
-    return vector_row(message.point)
-
-
-def _pose_height_row(message: Any) -> list[float]:
-    return [message.pose.position.z]
-
-
-def _range_row(message: Any) -> list[float]:
-    return [message.range]
-
-
-def _pressure_row(message: Any) -> list[float]:
-    return [message.fluid_pressure]
 
 
 def _fix_row(sensor: AidingSensor, message: Any) -> list[float]:
@@ -75,8 +43,8 @@ def _fix_row(sensor: AidingSensor, message: Any) -> list[float]:
 _ROWS: Mapping[Quantity, Mapping[str, Row]] = {
     "velocity": {
         ODOMETRY: odometry_row,
-        "geometry_msgs/msg/TwistWithCovarianceStamped": _sure_twist_row,
-        "geometry_msgs/msg/TwistStamped": _twist_row,
+        "geometry_msgs/msg/TwistWithCovarianceStamped": components("twist.twist.linear.xyz"),
+        "geometry_msgs/msg/TwistStamped": components("twist.linear.xyz"),
         POSE: pose_row,
         POSE_WITH_COVARIANCE: sure_pose_row,
     },
@@ -85,15 +53,15 @@ _ROWS: Mapping[Quantity, Mapping[str, Row]] = {
         POSE: pose_row,
         POSE_WITH_COVARIANCE: sure_pose_row,
     },
-    "range": {"sensor_msgs/msg/Range": _range_row},
+    "range": {"sensor_msgs/msg/Range": lambda message: [message.range]},
     "position": {
-        ODOMETRY: _sure_position_row,
-        POSE: _position_row,
-        POSE_WITH_COVARIANCE: _sure_position_row,
-        "geometry_msgs/msg/PointStamped": _point_row,
+        ODOMETRY: components("pose.pose.position.xyz"),
+        POSE: components("pose.position.xyz"),
+        POSE_WITH_COVARIANCE: components("pose.pose.position.xyz"),
+        "geometry_msgs/msg/PointStamped": components("point.xyz"),
     },
-    "height": {POSE: _pose_height_row},
-    "pressure": {"sensor_msgs/msg/FluidPressure": _pressure_row},
+    "height": {POSE: lambda message: [message.pose.position.z]},
+    "pressure": {"sensor_msgs/msg/FluidPressure": lambda message: [message.fluid_pressure]},
 }
 
 

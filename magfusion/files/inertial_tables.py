@@ -9,10 +9,9 @@ import numpy as np
 import pyarrow as pa
 
 from magfusion.errors import InputError
-from magfusion.files.drive_columns import column_names, current_columns_of
+from magfusion.files.drive_columns import angle_columns_of, column_names, current_columns_of
 from magfusion.files.lost_rows import LostRows
 from magfusion.files.plausible import check_field, check_imu
-from magfusion.files.rotor_columns import angle_columns_of
 from magfusion.files.row_stamps import batches_finding, separate_stamps
 from magfusion.files.stray_stamps import stray_finding
 from magfusion.files.table import TIME, Span, Table, TableLayout, read_table, write_table

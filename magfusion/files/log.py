@@ -12,8 +12,7 @@ from magfusion.errors import InputError
 from magfusion.files.aiding_tables import read_aiding, write_aiding
 from magfusion.files.atomic import whole_directory
 from magfusion.files.audio import AudioEntry, lost_finding, read_audio
-from magfusion.files.depth_table import read_depths, write_depths
-from magfusion.files.drive_columns import read_drive
+from magfusion.files.drive_columns import read_drive, read_rotation
 from magfusion.files.fields import read_fields, write_fields
 from magfusion.files.inertial_tables import (
     read_if_there,
@@ -24,9 +23,14 @@ from magfusion.files.inertial_tables import (
 )
 from magfusion.files.marks_table import read_marks, write_marks
 from magfusion.files.named_samples import names_magnetometers, read_waveforms, write_waveforms
-from magfusion.files.rotor_columns import read_rotation
+from magfusion.files.readings_table import (
+    DEGC,
+    DEPTH,
+    read_depths,
+    read_temperatures,
+    write_readings,
+)
 from magfusion.files.table import LARGEST_TIME_NS, Span, find_table
-from magfusion.files.temperature_table import read_temperatures, write_temperatures
 from magfusion.files.trajectory_table import read_trajectory, write_trajectory
 from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
 from magfusion.model.aiding import QUANTITIES
@@ -162,10 +166,11 @@ def write_log(log: Log, path: Path, audio: AudioEntry | None = None) -> None:
         if log.reference is not None:
             write_waveform(log.reference, unfinished / "reference.parquet", log.epoch_ns)
         if log.temperatures is not None and log.temperatures.readings:
-            known = log.temperatures
-            write_temperatures(known, unfinished / "temperature.parquet", log.epoch_ns)
+            place = unfinished / "temperature.parquet"
+            write_readings(log.temperatures.readings, place, log.epoch_ns, DEGC)
         if log.depths is not None and log.depths.readings:
-            write_depths(log.depths, unfinished / "depth.parquet", log.epoch_ns)
+            place = unfinished / "depth.parquet"
+            write_readings(log.depths.readings, place, log.epoch_ns, DEPTH)
         write_aiding(log.aiding, unfinished, log.epoch_ns)
 
 

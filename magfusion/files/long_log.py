@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet
 
-from magfusion.files.drive_columns import column_names, drive_columns
+from magfusion.files.drive_columns import column_names, drive_columns, rotor_columns
 from magfusion.files.fields import read_fields
 from magfusion.files.inertial_tables import read_if_there
 from magfusion.files.log import HEADER, LogHeader, is_log
@@ -15,10 +15,9 @@ from magfusion.files.lost_rows import MOST_MISSING
 from magfusion.files.marks_table import SLOT
 from magfusion.files.named_samples import MAGNETOMETER
 from magfusion.files.plausible import beyond_range, check_field, check_imu
-from magfusion.files.rotor_columns import rotor_columns
+from magfusion.files.readings_table import read_temperatures
 from magfusion.files.table import Span, find_table
 from magfusion.files.table_stream import SampleBlock, pieces
-from magfusion.files.temperature_table import read_temperatures
 from magfusion.files.yaml_files import read_yaml
 from magfusion.model.aiding import QUANTITIES
 from magfusion.model.samples import FieldSamples, ImuSamples

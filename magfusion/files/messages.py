@@ -1,6 +1,7 @@
 """Messages of ROS, 1 and 2, as rows of numbers."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from operator import attrgetter
 from typing import Any
 
 from magfusion.errors import InputError
@@ -16,52 +17,25 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 # ROS 1 had it in a package of its own before.
 FORMER_TRANSFORMS = "tf/msg/tfMessage"
 
-Row = Callable[[Any], list[float]]
+Row = Callable[[Any], Sequence[float]]
 
 
-def vector_row(value: Any) -> list[float]:
-    """Return the components of a vector or point."""
-    return [value.x, value.y, value.z]
+def components(*paths: str) -> Row:
+    """Return how a message becomes numbers: ``twist.linear.xyz`` are three of them."""
+    parts = (path.rpartition(".") for path in paths)
+    return attrgetter(*(f"{stem}.{axis}" for stem, _, axes in parts for axis in axes))
 
 
-def _imu_row(message: Any) -> list[float]:
-    return vector_row(message.angular_velocity) + vector_row(message.linear_acceleration)
-
-
-def _field_row(message: Any) -> list[float]:
-    return vector_row(message.magnetic_field)
-
-
-def _pose(pose: Any) -> list[float]:
-    return [*vector_row(pose.position), *vector_row(pose.orientation), pose.orientation.w]
-
-
-def pose_row(message: Any) -> list[float]:
-    """Return position and quaternion, x first, of a stamped pose."""
-    return _pose(message.pose)
-
-
-def sure_pose_row(message: Any) -> list[float]:
-    """Return the same of a pose with its covariance."""
-    return _pose(message.pose.pose)
-
-
-def odometry_row(message: Any) -> list[float]:
-    """Return the same of an odometry, and its velocity in axes of its child frame."""
-    return _pose(message.pose.pose) + vector_row(message.twist.twist.linear)
-
-
-def transform_row(message: Any) -> list[float]:
-    """Return translation and quaternion, x first, of a stamped transform."""
-    turn = message.transform.rotation
-    return [*vector_row(message.transform.translation), *vector_row(turn), turn.w]
-
-
+pose_row = components("pose.position.xyz", "pose.orientation.xyzw")
+_SURE_POSE = ("pose.pose.position.xyz", "pose.pose.orientation.xyzw")
+sure_pose_row = components(*_SURE_POSE)
+odometry_row = components(*_SURE_POSE, "twist.twist.linear.xyz")
+transform_row = components("transform.translation.xyz", "transform.rotation.xyzw")
 # By role and type: a pose's quaternion has x first; of an odometry the velocity follows, in body
 # axes.
 ROWS: dict[str, dict[str, Row]] = {
-    "imu": {IMU: _imu_row},
-    "magnetometer": {FIELD: _field_row},
+    "imu": {IMU: components("angular_velocity.xyz", "linear_acceleration.xyz")},
+    "magnetometer": {FIELD: components("magnetic_field.xyz")},
     "truth": {
         ODOMETRY: odometry_row,
         POSE: pose_row,

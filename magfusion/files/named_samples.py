@@ -8,11 +8,10 @@ import numpy as np
 import pyarrow as pa
 
 from magfusion.errors import InputError
-from magfusion.files.drive_columns import column_names, drive_columns
+from magfusion.files.drive_columns import column_names, drive_columns, rotor_columns
 from magfusion.files.inertial_tables import FIELD, measured_rows
 from magfusion.files.marks_table import SLOT
 from magfusion.files.plausible import check_field
-from magfusion.files.rotor_columns import rotor_columns
 from magfusion.files.stray_stamps import stray_finding
 from magfusion.files.table import TIME, Span, TableLayout, read_table, write_table
 from magfusion.model.samples import Waveform

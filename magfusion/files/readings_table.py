@@ -1,35 +1,45 @@
-"""A table of readings: a row for each, whatever part of the installation it is of."""
+"""Tables of readings, temperatures and depths: a row for each, whatever part it is of."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from magfusion.files.site_temperature import COLDEST, HOTTEST
 from magfusion.files.table import TIME, Span, Table, TableLayout, read_table, write_table
+from magfusion.model.rotor import Depths
+from magfusion.model.temperature import Temperatures
 from magfusion.units import Array, IntArray
 
-PART = "part"
+PART, DEGC, DEPTH = "part", "temperature_degc", "depth_m"
+DEEPEST = 2e4  # m
 
 
-def read_readings(
-    path: Path, epoch_ns: int, column: str, bounds: tuple[float, float], remedy: str, what: str
-) -> dict[str, Array]:
-    """Read all readings: also those before and after the part of a log that is used.
+def read_temperatures(path: Path | None, epoch_ns: int) -> Temperatures | None:
+    """Read all readings: also those before and after the part of a log that is used."""
+    remedy = f"write degrees Celsius, from {COLDEST:g} to {HOTTEST:g}"
+    readings = _read_readings(path, epoch_ns, DEGC, (COLDEST, HOTTEST), remedy, "reading")
+    return None if readings is None else Temperatures(readings)
 
-    Parameters
-    ----------
-    column : str
-        What was read.
-    bounds : tuple of float
-        Least and largest value; what is beyond is refused with the remedy.
-    what : str
-        One reading, in words.
 
-    Returns
-    -------
-    dict
-        Of each part times (s) and values, shape (2, n).
-    """
+def read_depths(path: Path | None, epoch_ns: int) -> Depths | None:
+    """Read how far along its hole a magnet is, and the magnetometer, as `read_temperatures`."""
+    remedy = f"write measured depth in metres, from {-DEEPEST:g} to {DEEPEST:g}"
+    readings = _read_readings(path, epoch_ns, DEPTH, (-DEEPEST, DEEPEST), remedy, "depth")
+    return None if readings is None else Depths(readings)
+
+
+def _read_readings(
+    path: Path | None,
+    epoch_ns: int,
+    column: str,
+    bounds: tuple[float, float],
+    remedy: str,
+    what: str,
+) -> dict[str, Array] | None:
+    """Return of each part times (s) and values, shape (2, n); ``what`` is one reading, in words."""
+    if path is None:
+        return None
     layout = TableLayout(numbers=(column,), texts=(PART,), repeats=True)
     table = read_table(path, layout, Span(epoch_ns))
     value = table.numbers((column,))[:, 0]

@@ -96,9 +96,8 @@ class Steady(NamedTuple):
 def run_attitude_database(settings: DatabaseSettings, output: Path) -> Figures:
     """Build the database of a log with known attitudes: table, picture and report."""
     from magfusion.jobs.inputs import named, read_job
-    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
+    from magfusion.jobs.result_directory import claim, result_in
     from magfusion.results.plots.match import write_database_plot
-    from magfusion.results.report import write_report
 
     job, claimed = settings.job(output), claim(output, "calibrate attitude-database")
     log, site = read_job(job)
@@ -137,13 +136,10 @@ def run_attitude_database(settings: DatabaseSettings, output: Path) -> Figures:
             *fixed,
         )
     )
-    with claimed as whole:
-        directory = found_in(whole, trust)
+    with result_in(claimed, figures, trust, job.log_path, output) as directory:
         write_database(entries, directory / TABLE)
         remaining = entries.field_body - predict_field(entries.rpy, index.field_world)
         write_database_plot(directory / "attitudes.png", entries, remaining)
-        write_report(whole, figures)
-    refuse_failed(job.log_path, output, trust)
     return figures
 
 

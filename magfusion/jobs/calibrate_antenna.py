@@ -39,9 +39,8 @@ JOB = "calibrate antenna"
 def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
     """Calibrate the antennas of a beacon and of the magnetometer: site, picture and report."""
     from magfusion.jobs.inputs import named
-    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
+    from magfusion.jobs.result_directory import claim, result_in
     from magfusion.results.plots.antenna import write_antenna_plot
-    from magfusion.results.report import write_report
 
     claimed, site_path = claim(output, JOB), settings.site
     declared = site = three_axes(load_site(site_path), site_path)
@@ -78,13 +77,12 @@ def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
     refined = replace(
         with_fit(site, beacon, fit), calibration=calibration_record(settings.name, estimates)
     )
-    with claimed as whole:
-        directory = found_in(whole, trust)
+    with result_in(
+        claimed, figures, trust, settings.survey or settings.probe[0], output
+    ) as directory:
         save_site(refined, directory / "site.yaml")
         if errors is not None:
             write_antenna_plot(directory / "antenna.png", *errors)
-        write_report(whole, figures)
-    refuse_failed(settings.survey or settings.probe[0], output, trust)
     return figures
 
 

@@ -71,9 +71,8 @@ def run_calibrate_beacon(settings: BeaconSettings, output: Path, report: Report 
     magnetometers that record simultaneously.
     """
     from magfusion.jobs.inputs import named
-    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
+    from magfusion.jobs.result_directory import claim, result_in
     from magfusion.results.plots.beacon import write_beacon_plot
-    from magfusion.results.report import write_report
 
     claimed, survey_path = claim(output, JOB), settings.survey
     site = three_axes(load_site(settings.site), settings.site)
@@ -93,12 +92,9 @@ def run_calibrate_beacon(settings: BeaconSettings, output: Path, report: Report 
         trust |= findings
     report("done", len(beacons), len(beacons))
     figures = _figures(survey_path, survey, result, trust)
-    with claimed as whole:
-        directory = found_in(whole, trust)
+    with result_in(claimed, figures, trust, survey_path, output) as directory:
         save_site(_refined_site(site, result, survey_path), directory / "site.yaml")
         write_beacon_plot(directory / "beacon.png", [_panel(c) for c in result])
-        write_report(whole, figures)
-    refuse_failed(survey_path, output, trust)
     return figures
 
 

@@ -46,9 +46,8 @@ class MapSettings(Settings):
 
 def run_calibrate_fieldmap(settings: MapSettings, output: Path, report: Report = quiet) -> Figures:
     """Estimate the field map of a site's beacons; write the site with the map."""
-    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
+    from magfusion.jobs.result_directory import claim, result_in
     from magfusion.results.plots.fieldmap import write_plot
-    from magfusion.results.report import write_report
 
     claimed = claim(output, "calibrate fieldmap")
     report("reading", 0, 2)
@@ -72,12 +71,9 @@ def run_calibrate_fieldmap(settings: MapSettings, output: Path, report: Report =
     trust = judge_map(fit, streams)
     figures = heading("calibrate fieldmap", settings.source.stem) | trust_figures(trust)
     figures |= Figures(Figure("points", len(points))) | _figures(fit) | extra
-    with claimed as whole:
-        directory = found_in(whole, trust)
+    with result_in(claimed, figures, trust, settings.source, output) as directory:
         save_site(fit.site, directory / "site.yaml")
         write_plot(directory / "field_map.png", fit)
-        write_report(whole, figures)
-    refuse_failed(settings.source, output, trust)
     return figures
 
 

@@ -97,14 +97,13 @@ def run_calibrate_log(
     from magfusion.estimation.batch.self_survey import smooth_and_place
     from magfusion.estimation.integrity.judge import judge_result
     from magfusion.jobs.inputs import named, read_job
-    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
+    from magfusion.jobs.result_directory import claim, result_in
     from magfusion.results.plots.log_calibration import write_log_calibration_plot
     from magfusion.results.refinement import parameter_estimates, result_site
     from magfusion.results.report import (
         compared_with_truth,
         placement_figures,
         smoothed_figures,
-        write_report,
     )
 
     job = settings.job(output)
@@ -148,8 +147,7 @@ def run_calibrate_log(
     if compared is not None:
         figures |= _transfer_figures(compared)
     estimates = parameter_estimates(result.declared, *parts_of)
-    with claimed as whole:
-        directory = found_in(whole, trust)
+    with result_in(claimed, figures, trust, job.log_path, output) as directory:
         save_site(result_site(result, log.name), directory / "site.yaml")
         write_log_calibration_plot(
             directory / "calibration.png",
@@ -157,8 +155,6 @@ def run_calibrate_log(
             estimate.ratio_but_for_gauge,
             estimate.direction_ratio,
         )
-        write_report(whole, figures)
-    refuse_failed(job.log_path, output, trust)
     return figures
 
 

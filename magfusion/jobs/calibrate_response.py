@@ -50,9 +50,8 @@ def run_calibrate_response(settings: ResponseSettings, output: Path) -> Figures:
     A coil that is not synchronised must have had one drive phase at all points, as of a card that
     plays and records by one clock.
     """
-    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
+    from magfusion.jobs.result_directory import claim, result_in
     from magfusion.results.refinement import parameter_estimates, refined_site
-    from magfusion.results.report import write_report
 
     claimed, path = claim(output, JOB), settings.survey
     site, survey = three_axes(load_site(settings.site), settings.site), read_survey(path)
@@ -92,11 +91,9 @@ def run_calibrate_response(settings: ResponseSettings, output: Path) -> Figures:
         | determined_figures(estimates)
         | notes_of(trust)
     )
-    with claimed as whole:
+    with result_in(claimed, figures, trust, path, output) as directory:
         written = refined if target is None else _with_response(target, refined)
-        save_site(written, found_in(whole, trust) / "site.yaml")
-        write_report(whole, figures)
-    refuse_failed(path, output, trust)
+        save_site(written, directory / "site.yaml")
     return figures
 
 

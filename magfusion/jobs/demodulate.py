@@ -33,8 +33,8 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     from magfusion.estimation.demodulation.demodulation import phasors
     from magfusion.estimation.demodulation.separate_demodulation import demodulated_apart
     from magfusion.jobs.inputs import named, read_job
-    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
-    from magfusion.results.report import dropped_figures, write_report
+    from magfusion.jobs.result_directory import claim, result_in
+    from magfusion.results.report import dropped_figures
 
     claimed, job = claim(output, "demodulate"), settings.job(output)
     lockin = settings.lockin(job)
@@ -81,14 +81,11 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     figures |= dropped_figures(dropped)
     if rested is not None:
         figures |= rest_figures(rested)
-    with claimed as whole:
-        directory = found_in(whole, trust)
+    with result_in(claimed, figures, trust, job.log_path, job.output) as directory:
         write_log(
             replace(log, waveform=None, fields=samples, drive=None, reference=None), directory
         )
         save_site(_without_temperature(log, site), directory / "site.yaml")
-        write_report(whole, figures)
-    refuse_failed(job.log_path, job.output, trust)
     return figures
 
 

@@ -77,9 +77,8 @@ class _Matched(NamedTuple):
 def run_match(settings: MatchSettings, output: Path) -> Figures:
     """Estimate the attitude of every epoch from the Earth's field: table, picture and report."""
     from magfusion.jobs.inputs import named, read_job, require_imu
-    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
+    from magfusion.jobs.result_directory import claim, result_in
     from magfusion.results.plots.match import write_match_plot
-    from magfusion.results.report import write_report
 
     _check(settings)
     job, claimed = settings.job(output), claim(output, "match")
@@ -110,15 +109,12 @@ def run_match(settings: MatchSettings, output: Path) -> Figures:
             figures.append(Figure(f"{_NAMES[k]}_sigma_median_deg", sigma, "deg"))
     true_rpy, compared = _compared(log, selected.time, result)
     shown = heading("match", log.name) | trust_figures(trust) | Figures(*figures) | compared
-    with claimed as whole:
-        directory = found_in(whole, trust)
+    with result_in(claimed, shown, trust, job.log_path, output) as directory:
         parts = (result.matches.rpy, result.matches.sigma, result.matches.residual)
         path = directory / "attitude.parquet"
         write_attitudes(path, log.epoch_ns, selected.time, *parts, result.matches.determined)
         picture = directory / "attitude.png"
         write_match_plot(picture, selected.time, result.matches, result.angles, true_rpy)
-        write_report(whole, shown)
-    refuse_failed(job.log_path, output, trust)
     return shown
 
 

@@ -38,9 +38,8 @@ class RangeSettings(LogSettings):
 def run_range(settings: RangeSettings, output: Path) -> Figures:
     """Estimate the position of a rotating magnet's well relative to that of a sensor at rest."""
     from magfusion.jobs.inputs import named, read_job
-    from magfusion.jobs.result_directory import claim, found_in, refuse_failed
+    from magfusion.jobs.result_directory import claim, result_in
     from magfusion.results.plots.ranging import RangePicture, write_range_plot
-    from magfusion.results.report import write_report
 
     job, claimed = settings.job(output), claim(output, "range")
     log, site = read_job(job, unknown=True, rotor=True)
@@ -80,13 +79,10 @@ def run_range(settings: RangeSettings, output: Path) -> Figures:
         "speed_hz": ranging.speed_hz,
         "sensor_roll_deg": windows.roll / DEGREE,
     }
-    with claimed as whole:
-        directory = found_in(whole, trust)
+    with result_in(claimed, figures, trust, job.log_path, output) as directory:
         write_table(columns, directory / "range.parquet")
         picture = RangePicture(magnet, sensor, places.place, places.cov)
         write_range_plot(directory / "range.png", picture, high_side=ranging.high_side)
-        write_report(whole, figures)
-    refuse_failed(job.log_path, output, trust)
     return figures
 
 

@@ -5,7 +5,8 @@ import os
 import re
 import shutil
 import sys
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from itertools import count
 from pathlib import Path
 
@@ -13,9 +14,10 @@ from magfusion.errors import EstimationError
 from magfusion.files.atomic import abandoned_pattern, real, refuse_in_the_way, whole_directory
 from magfusion.jobs.written import KEPT, LOGS, UNFINISHED, WRITTEN
 from magfusion.model.trust import Trust, Verdict
+from magfusion.results.figures import Figures
 from magfusion.results.page import PAGE
 from magfusion.results.provenance import current_run
-from magfusion.results.report import FAILED
+from magfusion.results.report import FAILED, write_report
 
 
 def _may_be_replaced(path: Path, kinds: tuple[str, ...]) -> bool:
@@ -103,3 +105,14 @@ def refuse_failed(place: Path, output: Path, trust: Trust) -> None:
             f"{place}: failed: {trust.ordered[0].text} The reasons are in {output / 'report.json'},"
             f" the estimates in {output / FAILED}"
         )
+
+
+@contextmanager
+def result_in(
+    claimed: AbstractContextManager[Path], figures: Figures, trust: Trust, place: Path, output: Path
+) -> Iterator[Path]:
+    """Yield the directory of results, and write the report; raise an error for a failed verdict."""
+    with claimed as whole:
+        yield found_in(whole, trust)
+        write_report(whole, figures)
+    refuse_failed(place, output, trust)

@@ -28,6 +28,7 @@ from magfusion.files.foreign.units import SourceUnit, accepted, parse_unit
 from magfusion.files.messages import (
     ODOMETRY,
     USUAL,
+    components,
     stamp_ns,
 )
 from magfusion.files.messages import (
@@ -42,10 +43,7 @@ _COLUMNS = {
     "truth": (*_POSE, *VELOCITY),
 }
 VECTOR = "geometry_msgs/msg/Vector3Stamped"  # of drivers that publish a field in their own unit
-_ROWS = ROW_OF | {
-    "magnetometer": ROW_OF["magnetometer"]
-    | {VECTOR: lambda message: [message.vector.x, message.vector.y, message.vector.z]}
-}
+_ROWS = ROW_OF | {"magnetometer": ROW_OF["magnetometer"] | {VECTOR: components("vector.xyz")}}
 _SI = {"imu": ("rad/s", "m/s^2"), "magnetometer": ("T",), "truth": ("m", "1", "m/s")}
 
 

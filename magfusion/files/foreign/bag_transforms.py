@@ -101,7 +101,7 @@ def _series(
     The position is NaN where the rotation is none.
     """
     stamps: dict[Frames, list[int]] = defaultdict(list)
-    rows: dict[Frames, list[list[float]]] = defaultdict(list)
+    rows: dict[Frames, list[Sequence[float]]] = defaultdict(list)
     for name in _topics(reader, topic):
         for _, message in _messages(reader, name):
             for one in message.transforms:
