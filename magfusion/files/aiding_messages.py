@@ -90,13 +90,7 @@ class SensorMessages:
         """Return times (s) and values of messages; those without a value are left out.
 
         A velocity without a twist is that of the poses' differences, in the middle of each; a
-        relative pose is such a difference.
-
-        Parameters
-        ----------
-        time : ndarray, shape (n,)
-        rows : ndarray, shape (n, columns)
-            As of `aiding_rows`.
+        relative pose is such a difference. `time` (n,). `rows` (n, columns): as of `aiding_rows`.
         """
         there = ~np.isnan(rows).any(axis=1)
         self.without_value += int(np.sum(~there))

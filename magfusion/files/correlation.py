@@ -20,10 +20,7 @@ SMALLEST = 1e-14  # eigenvalue of a correlation that can be inverted
 def write_correlation(correlation: Correlation, sigma: Array, path: Path) -> None:
     """Write a correlation, with the sigmas that it was found with.
 
-    Parameters
-    ----------
-    sigma : ndarray, shape (n,)
-        SI.
+    `sigma` (n,): SI.
     """
     columns = dict(zip(_NAMES, zip(*correlation.parameters, strict=True), strict=True))
     table = pa.table(

@@ -39,11 +39,8 @@ SHORTEST_STEP = 2e-5  # s; faster than any inertial sensor
 def beyond_range(values: Array) -> BoolArray:
     """Return which rows no instrument measures, shape (n,): a bit error in a number's exponent.
 
-    Parameters
-    ----------
-    values : ndarray, shape (n, columns)
-        Rate and specific force (rad/s, m/s^2), or up to three components of a field (T); of other
-        columns no range is known.
+    `values` (n, columns): rate and specific force (rad/s, m/s^2), or up to three components of a
+    field (T); of other columns no range is known.
     """
     largest = _LARGEST_SAMPLES.get(values.shape[1], np.array(np.inf))
     return np.asarray((np.abs(values) > largest).any(axis=1))

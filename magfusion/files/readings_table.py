@@ -53,12 +53,7 @@ def rows_by_name(
 ) -> Iterator[tuple[str, IntArray]]:
     """Yield each name with its rows; refuse two of a name at one time.
 
-    Parameters
-    ----------
-    which : int ndarray, shape (n,)
-        Index of each row's name.
-    what : str
-        One row, in words.
+    `which` (n,): index of each row's name. `what`: one row, in words.
     """
     for k, name in enumerate(names):
         own = np.flatnonzero(which == k)

@@ -18,14 +18,8 @@ def separate_stamps(time_ns: IntArray, values: Array) -> IntArray | None:
     """Return the sampling times of rows that have one stamp a batch; None of others.
 
     A stamp is that of the last sample, as where a driver reads a buffer; of a coarse clock it is
-    not.
-
-    Parameters
-    ----------
-    time_ns : ndarray of int, shape (n,)
-        Sorted stamps (ns).
-    values : ndarray, shape (n, columns)
-        Rows that repeat the numbers of the one above are no other samples.
+    not. `time_ns` (n,): sorted stamps (ns). `values` (n, columns): rows that repeat the numbers of
+    the one above are no other samples.
 
     Returns
     -------
@@ -60,12 +54,7 @@ def _is_rounded(time_ns: IntArray, step: int) -> bool:
 def _stalls(time_ns: IntArray, count: IntArray) -> bool:
     """Return whether the clock stopped for a while, in which samples were taken.
 
-    Parameters
-    ----------
-    time_ns : ndarray of int, shape (batches,)
-        Stamps of batches (ns).
-    count : ndarray of int, shape (batches,)
-        Samples of each.
+    `time_ns` (batches,): stamps of batches (ns). `count` (batches,): samples of each.
     """
     between = np.diff(time_ns)
     usual, size = float(np.median(between)), float(np.median(count))

@@ -25,12 +25,8 @@ _UNIT = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 class SiteDraft:
     """All that a site's file is made of.
 
-    Parameters
-    ----------
-    gravity : float, optional
-        (m/s^2); None takes the standard one.
-    position_m, rpy_deg : tuple of float, optional
-        Of the magnetometer in body axes; None takes zero.
+    `gravity`: (m/s^2); None takes the standard one. `position_m`, `rpy_deg`: of the magnetometer in
+    body axes; None takes zero.
     """
 
     beacons: tuple[BeaconDraft, ...]

@@ -35,12 +35,8 @@ STREAMS = {"imu": IMU_LAYOUT, "magnetometer": FIELD_LAYOUT, **HALF_LAYOUTS}
 class SampleBlock:
     """Consecutive samples of a stream.
 
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Seconds since the log's epoch, sorted.
-    values : ndarray, shape (n, columns)
-        NaN where a number is missing.
+    `time` (n,): seconds since the log's epoch, sorted. `values` (n, columns): NaN where a number is
+    missing.
     """
 
     time: Array

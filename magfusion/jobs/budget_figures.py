@@ -23,10 +23,7 @@ def worst_and_median(coverage: Coverage) -> IntArray:
 def budget_figures(budget: ErrorBudget, beacons: IntArray) -> Figures:
     """Return the table of an error budget at both points, and what limits at the worst.
 
-    Parameters
-    ----------
-    beacons : int ndarray, shape (n,)
-        Number of beacons detected at each point.
+    `beacons` (n,): number of beacons detected at each point.
     """
     figures = [
         Figure(

@@ -247,11 +247,7 @@ def navigate(
 def state_errors(states: list[State], truth: Trajectory, measured: BoolArray) -> ErrorSeries:
     """Return the errors of states: attitude, position and velocity in world axes, biases in body.
 
-    Parameters
-    ----------
-    truth : Trajectory
-        At their times, with velocity and biases.
-    measured : ndarray of bool, shape (n,)
+    `truth`: at their times, with velocity and biases. `measured` (n,).
     """
     error = np.empty((len(states), 15))
     sigma, nees = np.empty_like(error), np.empty((len(states), 2))

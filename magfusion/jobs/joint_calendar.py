@@ -37,10 +37,7 @@ EXCHANGED_SIGMAS = 5.0  # of the moments, beyond which a beacon was exchanged ra
 class CalendarTask:
     """Files of the logs' information, to be searched for changes, or compared by month.
 
-    Parameters
-    ----------
-    at : ndarray, shape (s,), optional
-        Linearisation point, from the declared calibration; the mean of the logs by default.
+    `at` (s,): linearisation point, from the declared calibration; the mean of the logs by default.
     """
 
     files: SiteFiles

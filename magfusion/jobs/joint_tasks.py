@@ -188,10 +188,7 @@ class RoundTask:
 class SumTask:
     """Information of some logs, to be added.
 
-    Parameters
-    ----------
-    at : ndarray, shape (s,)
-        From the declared calibration to the linearisation point.
+    `at` (s,): from the declared calibration to the linearisation point.
     """
 
     files: SiteFiles

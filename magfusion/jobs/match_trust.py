@@ -36,13 +36,8 @@ def judge_matches(
 ) -> tuple[Matches, Trust]:
     """Return matches with sigmas consistent with their residuals, and findings.
 
-    Parameters
-    ----------
-    angles : tuple of int
-        Estimated angles, of roll, pitch and yaw.
-    field_world : ndarray, shape (3,), optional
-        The field assumed as exact (T); None with a database, which rejects unmatched fields by
-        itself.
+    `angles`: estimated angles, of roll, pitch and yaw. `field_world` (3,): the field assumed as
+    exact (T); None with a database, which rejects unmatched fields by itself.
     """
     findings = [*_undetermined(matches), *recorded(log, site, BRIDGED_CODES)]
     unverified = []

@@ -69,13 +69,9 @@ class StateSeries:
 class NavigateResults:
     """Results of a run.
 
-    Parameters
-    ----------
-    current, lagged : StateSeries
-        States as first estimated, and as they left the smoother's window, if there is one.  Lost
-        states have no pose and are excluded, unless all have failed.
-    propagated : StateSeries, optional
-        States between the epochs, if requested.
+    `current`, `lagged`: states as first estimated, and as they left the smoother's window, if there
+    is one.  Lost states have no pose and are excluded, unless all have failed. `propagated`: states
+    between the epochs, if requested.
     """
 
     trust: Trust

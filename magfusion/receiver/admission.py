@@ -255,12 +255,7 @@ def meets_silence(
 ) -> BoolArray:
     """Return which windows of a length (s) lack inertial samples.
 
-    Parameters
-    ----------
-    step : float
-        Usual time between two samples of the magnetometer (s).
-    silence : tuple of ndarray
-        As from `silences`.
+    `step`: usual time between two samples of the magnetometer (s). `silence`: as from `silences`.
     """
     begin, end = windows.centre - length / 2.0, windows.centre + length / 2.0
     return meets(*silence, begin, end - LATEST_USE * step)

@@ -18,10 +18,7 @@ MAX_SAMPLES = 32  # samples in a burst
 def spread_bursts(stamps: Array) -> Array | None:
     """Return sampling times of samples that arrived in bursts; None if they did not.
 
-    Parameters
-    ----------
-    stamps : ndarray, shape (n,)
-        Strictly increasing (s).
+    `stamps` (n,): strictly increasing (s).
 
     Returns
     -------

@@ -279,14 +279,8 @@ def variance_growth(
 ) -> Array:
     """Return the variance of a window's phasors relative to that of a whole window.
 
-    From the conditioning of the design at the available samples; the worst tone.
-
-    Parameters
-    ----------
-    time : ndarray
-        Times of all samples (s).
-    step : float
-        Sampling interval of a whole window (s).
+    From the conditioning of the design at the available samples; the worst tone. `time`: times of
+    all samples (s). `step`: sampling interval of a whole window (s).
     """
     nuisance_hz = nuisances_hz(settings, frequencies_hz, 0.5 / step)
 

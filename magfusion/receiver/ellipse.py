@@ -15,13 +15,9 @@ def plane_normal(phasor: ComplexArray) -> Array:
 
     Paper 004, Eq 5 and 8-11, corrected: the factor ``sin(w t) cos(w t)`` of Eq 5 belongs to the
     instantaneous fields of the two coils and averages to zero, and Eq 8-9, a later field times an
-    earlier one, give the opposite sign.  Of all pairs a quarter period apart the mean of
-    ``B(t) x B(t + T/4)`` is this normal, and the phasors use the samples better than the pairs.
-
-    Parameters
-    ----------
-    phasor : complex ndarray, shape (..., 3)
-        (T), in any axes.
+    earlier one, give the opposite sign.  Of all pairs a quarter period apart the mean of ``B(t) x
+    B(t + T/4)`` is this normal, and the phasors use the samples better than the pairs. `phasor`
+    (..., 3): (T), in any axes.
 
     Returns
     -------
@@ -37,11 +33,7 @@ def semi_axes(phasor: ComplexArray) -> Array:
 
     Of two equal moments m in quadrature the minor one is ``K m / r^3`` in all directions, hence a
     range, and the major one ``sqrt(1 + 3 sin^2 phi)`` times that, phi from the rotation axis.
-
-    Parameters
-    ----------
-    phasor : complex ndarray, shape (..., 3)
-        (T), in any axes.
+    `phasor` (..., 3): (T), in any axes.
 
     Returns
     -------
@@ -61,11 +53,7 @@ def rms_amplitude(phasor: ComplexArray) -> Array:
 
     Of two equal moments m in quadrature ``K m sqrt((2 + 3 sin^2 phi) / 2) / r^3``: not a function
     of the range alone, as in paper 004, Eq 14, but with a factor of 1.58 from pole to equator.
-
-    Parameters
-    ----------
-    phasor : complex ndarray, shape (..., 3)
-        (T), in any axes.
+    `phasor` (..., 3): (T), in any axes.
 
     Returns
     -------

@@ -35,10 +35,7 @@ class HostClock:
     def stamps(self, counts: Array, arrival: float) -> Array:
         """Return the times (s) of consecutive counts that have arrived at a time (s).
 
-        Parameters
-        ----------
-        counts : ndarray, shape (n,)
-            Larger than those before.
+        `counts` (n,): larger than those before.
         """
         last = float(counts[-1])
         arrival = self._earliest(last * self._step, arrival)

@@ -133,12 +133,8 @@ def searched(
 ) -> FrequencySearch:
     """Return the relative clock error that maximises the power of tones.
 
-    Parameters
-    ----------
-    frequencies_hz : ndarray, shape (tones,)
-        Demodulation frequencies of all tones.
-    largest : float
-        Largest relative error searched, on either side.
+    `frequencies_hz` (tones,): demodulation frequencies of all tones. `largest`: largest relative
+    error searched, on either side.
     """
     there = np.isfinite(result.phasor[:, tones]).all(axis=(1, 2))
     centre = result.centre[there]

@@ -96,12 +96,8 @@ class JointDesign(NamedTuple):
     ) -> "JointDesign":
         """Compute the design of a window's samples.
 
-        Parameters
-        ----------
-        elapsed : ndarray, shape (m,)
-            Times from its centre (s).
-        directions : int, optional
-            How many are kept; None for all that carry information.
+        `elapsed` (m,): times from its centre (s). `directions`: how many are kept; None for all
+        that carry information.
         """
         nyquist_hz = 0.5 / float(np.median(np.diff(elapsed)))
         mains_hz = nuisances_hz(settings, np.zeros(1), nyquist_hz)

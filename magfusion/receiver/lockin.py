@@ -109,10 +109,7 @@ class WindowOperator:
     ) -> tuple[FieldSamples, SteadyFields, ComplexArray]:
         """Return `demodulate` of a waveform, and the phasors of another at the same sample times.
 
-        Parameters
-        ----------
-        others : ndarray, shape (samples, 3), optional
-            The other waveform (T); without it the last result is empty.
+        `others` (samples, 3): the other waveform (T); without it the last result is empty.
 
         Returns
         -------

@@ -69,14 +69,8 @@ def probes_left(
 def noise_around_tones(seen: Array, dimensions: IntArray) -> Array:
     """Return the covariance per sample of the noise around each tone, in the axes of the samples.
 
-    Unobserved directions get the mean noise of the observed ones.
-
-    Parameters
-    ----------
-    seen : ndarray, shape (n, tones, 4, 3)
-        Residuals of probes (T).
-    dimensions : int ndarray, shape (n, tones)
-        As of `probes_left`.
+    Unobserved directions get the mean noise of the observed ones. `seen` (n, tones, 4, 3):
+    residuals of probes (T). `dimensions` (n, tones): as of `probes_left`.
 
     Returns
     -------
@@ -113,12 +107,8 @@ def smoothed_over_windows(
 ) -> Array:
     """Average the noise over neighbouring windows, shape (n, tones, 3, 3), never across a gap.
 
-    One window has four degrees of freedom a tone, too few to weight by.
-
-    Parameters
-    ----------
-    unseen : bool ndarray, shape (n,), optional
-        Windows in gaps of the gyro, averaged separately.
+    One window has four degrees of freedom a tone, too few to weight by. `unseen` (n,): windows in
+    gaps of the gyro, averaged separately.
     """
     if len(centre) == 1:
         return noise_cov

@@ -59,10 +59,7 @@ def reference_at(waveform: Waveform, reference: Waveform, lag: Lag) -> tuple[Arr
 def lag_of(waveform: Waveform, reference: Waveform, lines_hz: Array) -> Lag:
     """Estimate the clock error of a reference from the common noise; zero if there is none.
 
-    Parameters
-    ----------
-    lines_hz : ndarray
-        Tones and mains (Hz), which are excluded.
+    `lines_hz`: tones and mains (Hz), which are excluded.
     """
     common = common_noise(waveform, reference, lines_hz)
     if common is None:
@@ -166,10 +163,7 @@ def probes_hz(tone_hz: float, tones_hz: Array, length: float, highest_hz: float)
 class ReferenceNormalEquations:
     """Normal equations of the matrix between the noise of a sensor and a reference.
 
-    Parameters
-    ----------
-    other, both : complex ndarray, shape (3, 3)
-        Sums of the products of the reference, and of those with the sensor.
+    `other`, `both` (3, 3): sums of the products of the reference, and of those with the sensor.
     """
 
     other: ComplexArray

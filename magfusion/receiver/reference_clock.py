@@ -58,10 +58,7 @@ class ReferenceClock:
 def lag_in(waveform: Waveform, reference: Waveform, lines_hz: Array) -> tuple[float, float] | None:
     """Return the time and lag of a reference in a stretch (s); None if it is not received.
 
-    Parameters
-    ----------
-    lines_hz : ndarray
-        Tones and mains (Hz), which are excluded.
+    `lines_hz`: tones and mains (Hz), which are excluded.
     """
     common = common_noise(waveform, reference, lines_hz)
     if common is None:

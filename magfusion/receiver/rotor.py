@@ -48,12 +48,8 @@ def demodulate_rotor(
 ) -> RotorPhasors:
     """Return phasors of contiguous windows.
 
-    Parameters
-    ----------
-    angle : ndarray, shape (n,)
-        Shaft angle at each sample, unwrapped (rad); NaN where it is unknown.
-    window : float
-        (s)
+    `angle` (n,): shaft angle at each sample, unwrapped (rad); NaN where it is unknown. `window`
+    (s).
     """
     time, step = waveform.time, float(np.median(np.diff(waveform.time)))
     edges = np.arange(time[0], time[-1] + step, window)

@@ -152,10 +152,7 @@ class RunningClock:
     def _start(self, stamping: Stamping, stamps: Array, time: Array, last: IntArray) -> Array:
         """Begin a clock with approximate times (n,); return them on it (s).
 
-        Parameters
-        ----------
-        last : ndarray of int
-            Samples whose stamps determine it.
+        `last`: samples whose stamps determine it.
         """
         self.stamping, tick = stamping, np.arange(float(len(stamps)))
         if stamping == "rounded":

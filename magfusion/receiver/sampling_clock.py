@@ -64,12 +64,8 @@ class SamplingClock(NamedTuple):
 def sampling_clock(stamps: Array, bundled: bool = True) -> SamplingClock | None:
     """Return the uniform clock of scattered stamps; None if there is none or they scatter little.
 
-    Parameters
-    ----------
-    stamps : ndarray, shape (n,)
-        Strictly increasing (s).
-    bundled : bool
-        Whether a bus may deliver several samples at a time.
+    `stamps` (n,): strictly increasing (s). `bundled`: whether a bus may deliver several samples at
+    a time.
     """
     separate, size = spread_bursts(stamps) if bundled else None, stamp_resolution(stamps)
     if separate is None:
@@ -239,14 +235,8 @@ def _scatter(stamps: Array, step: float) -> float:
 def lost_ticks(late: Array, sigma: float) -> IntArray:
     """Return the most probable number of ticks lost before each sample of a piece.
 
-    Dynamic programming over the number of lost ticks, which never decreases.
-
-    Parameters
-    ----------
-    late : ndarray, shape (n,)
-        Delay of each sample relative to no loss, in ticks.
-    sigma : float
-        Scatter of the stamps, in ticks.
+    Dynamic programming over the number of lost ticks, which never decreases. `late` (n,): delay of
+    each sample relative to no loss, in ticks. `sigma`: scatter of the stamps, in ticks.
     """
     if np.max(np.abs(late)) < 0.5:
         return np.zeros(len(late), dtype=np.int64)

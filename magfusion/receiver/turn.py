@@ -66,12 +66,7 @@ def on_clock(
 ) -> ImuSamples:
     """Return an inertial stream on the clock of the waveform, corrected for the gyro bias.
 
-    Parameters
-    ----------
-    time_offset : float
-        IMU time offset (s).
-    gyro_bias_body : ndarray, shape (3,) or (len(imu), 3), optional
-        (rad/s)
+    `time_offset`: IMU time offset (s). `gyro_bias_body` (3,) (rad/s).
     """
     gyro = imu.gyro_body if gyro_bias_body is None else imu.gyro_body - gyro_bias_body
     return replace(imu, time=imu.time + time_offset, gyro_body=gyro)
@@ -80,12 +75,8 @@ def on_clock(
 def zero_rate_filler(imu: ImuSamples, silence: tuple[Array, Array]) -> ImuSamples:
     """Return a stream of angular rates that are zero in its gaps.
 
-    Parameters
-    ----------
-    imu : ImuSamples
-        As from `on_clock`.
-    silence : tuple of ndarray
-        Where the gaps begin and end (s), as from `magfusion.receiver.admission.silences`.
+    `imu`: as from `on_clock`. `silence`: where the gaps begin and end (s), as from
+    `magfusion.receiver.admission.silences`.
     """
     begin, end = silence
     inner = np.stack([0.99 * begin[:-1] + 0.01 * end[:-1], 0.01 * begin[:-1] + 0.99 * end[:-1]])

@@ -142,10 +142,7 @@ def _offset(coarse: Trajectory, fine: Trajectory) -> float:
 def _correlation(first: tuple[Array, Array], second: Array) -> Array:
     """Return the coefficient of correlation at every lag, of what both series share there.
 
-    Parameters
-    ----------
-    first : tuple of ndarray
-        Values, and where there is one; at the same even steps as ``second``.
+    `first`: values, and where there is one; at the same even steps as ``second``.
     """
     from scipy.signal import correlate  # takes as long as all else to import
 

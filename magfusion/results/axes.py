@@ -37,12 +37,8 @@ _TOLERANCE = 1.02  # of the sigma, which other sensors reduce where they determi
 class Frame(NamedTuple):
     """Uncertainty of the frame of the beacons.
 
-    Parameters
-    ----------
-    cov : ndarray, shape (4, 4)
-        Of x, y, z and yaw (m, rad).
-    survey_m : float
-        Declared sigma of the beacons' positions, per axis.
+    `cov` (4, 4): of x, y, z and yaw (m, rad). `survey_m`: declared sigma of the beacons' positions,
+    per axis.
     """
 
     cov: Array

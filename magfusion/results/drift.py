@@ -138,13 +138,7 @@ def common_slope(times: Sequence[Array], values: Sequence[Array]) -> CommonSlope
     """Return the mean slope of the components of an error over worlds.
 
     Raises ValueError with fewer than `MIN_COMMON` worlds, for which the scatter of three components
-    is unknown.
-
-    Parameters
-    ----------
-    times : sequence of ndarray, shape (n,)
-        One per world (s).
-    values : sequence of ndarray, shape (n, 3)
+    is unknown. `times` (n,): one per world (s). `values` (n, 3).
     """
     worlds = len(values)
     if worlds < MIN_COMMON:
@@ -160,13 +154,7 @@ def common_slope(times: Sequence[Array], values: Sequence[Array]) -> CommonSlope
 def slope_of_one(time: Array, value: Array) -> Slope:
     """Return the slope of one world's errors, for any correlation time.
 
-    Raises ValueError where fewer than three blocks have any value.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        (s)
-    value : ndarray, shape (n,)
+    Raises ValueError where fewer than three blocks have any value. `time` (n,) (s). `value` (n,).
     """
     return Slope(*trend(time / DAY, value))
 
@@ -174,10 +162,7 @@ def slope_of_one(time: Array, value: Array) -> Slope:
 def slope_over_worlds(times: Sequence[Array], values: Sequence[Array]) -> Slope:
     """Return the mean slope of several worlds, its standard error from their scatter.
 
-    Parameters
-    ----------
-    times, values : sequence of ndarray, shape (n,)
-        One per world (s); for a single one, see `slope_of_one`.
+    `times`, `values` (n,): one per world (s); for a single one, see `slope_of_one`.
     """
     if len(values) == 1:
         return slope_of_one(times[0], values[0])

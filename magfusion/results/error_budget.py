@@ -116,12 +116,8 @@ REMEDIES = {
 def error_budget(site: Site, position_world: Array, window: float) -> ErrorBudget:
     """Return the variance by source at some points.
 
-    Parameters
-    ----------
-    position_world : ndarray, shape (n, 3)
-        Where the position is determined (m).
-    window : float
-        Averaging time of the tones (s).
+    `position_world` (n, 3): where the position is determined (m). `window`: averaging time of the
+    tones (s).
     """
 
     def sigma(source: str, factor: float) -> Array:
@@ -142,12 +138,7 @@ def error_budget(site: Site, position_world: Array, window: float) -> ErrorBudge
 def limiting(budget: ErrorBudget, row: int, beacons: IntArray) -> str:
     """Return what limits the position at a point, and the remedy, as a sentence.
 
-    Parameters
-    ----------
-    row : int
-        Of the point.
-    beacons : int ndarray, shape (n,)
-        Number of beacons detected at each point.
+    `row`: of the point. `beacons` (n,): number of beacons detected at each point.
     """
     share = budget.share[row]
     order = np.argsort(-share)

@@ -26,12 +26,8 @@ SMALLEST_LISTED = 1e-4  # m, rad or relative; a common shift below it is of no i
 class Weakness(NamedTuple):
     """A direction of the calibration that the log does not determine.
 
-    Parameters
-    ----------
-    ratio : float
-        Posterior over prior sigma along it.
-    direction : ndarray, shape (dimension,)
-        Tangent vector, one posterior sigma long.
+    `ratio`: posterior over prior sigma along it. `direction` (dimension,): tangent vector, one
+    posterior sigma long.
     """
 
     words: str

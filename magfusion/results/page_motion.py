@@ -23,10 +23,7 @@ _GAP = 10.0  # times the usual step; a line across it would invent states
 class MotionPage:
     """A trajectory with its results; as `magfusion.results.recording.write_recording`.
 
-    Parameters
-    ----------
-    residual : ndarray, shape (n,), optional
-        Of each state, RMS over all beacons, where those of each are unknown.
+    `residual` (n,): of each state, RMS over all beacons, where those of each are unknown.
     """
 
     site: Site

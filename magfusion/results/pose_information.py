@@ -195,14 +195,8 @@ def protected(
     """Return the protection levels of position (m) and attitude (deg), shape (n, 2).
 
     Those of `magfusion.estimation.posterior.separation` with the covariances of a best estimate,
-    without measurements.  Infinite where there is none.
-
-    Parameters
-    ----------
-    whole : tuple of ndarray
-        Covariance (n, 6, 6) with all beacons, and whether the pose is determined (n,).
-    without : sequence of tuple of ndarray
-        The same without each beacon.
+    without measurements.  Infinite where there is none. `whole`: covariance (n, 6, 6) with all
+    beacons, and whether the pose is determined (n,). `without`: the same without each beacon.
     """
     cov, known = whole
     level = np.full((len(cov), 2), np.inf)

@@ -22,14 +22,8 @@ def readable_range(*shown: Array, zero: bool = False) -> tuple[float, float] | N
     """Return a range in which the viewer labels at least two values.
 
     It labels powers of ten and their multiples, and of these only sufficiently spaced ones: in a
-    low plot over +-4, only zero.
-
-    Parameters
-    ----------
-    shown : ndarray
-        The drawn values, which may be NaN.
-    zero : bool
-        Whether zero is in the range.
+    low plot over +-4, only zero. `shown`: the drawn values, which may be NaN. `zero`: whether zero
+    is in the range.
 
     Returns
     -------

@@ -18,10 +18,7 @@ def parameter_estimates(
 ) -> list[ParameterEstimate]:
     """Return every estimated parameter with its change and its sigmas.
 
-    Parameters
-    ----------
-    cov : ndarray, shape (dimension, dimension)
-        Posterior covariance.
+    `cov` (dimension, dimension): posterior covariance.
     """
     change = difference(declared, fitted, blocks)
     sigma = np.sqrt(np.diagonal(cov))

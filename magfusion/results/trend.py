@@ -39,13 +39,8 @@ class Trend(NamedTuple):
 def trend(time: Array, value: Array) -> Trend:
     """Return the slope of a series and its standard error.
 
-    Raises ValueError where fewer than three blocks have any value.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Increasing.
-    value : ndarray, shape (n,)
+    Raises ValueError where fewer than three blocks have any value. `time` (n,): increasing. `value`
+    (n,).
     """
     when, mean = _block_means(time, value)
     if len(when) < 3:

@@ -28,12 +28,7 @@ STATIC_TOPIC = "/tf_static"
 class Extrinsics(NamedTuple):
     """Pose of the magnetometer in the IMU's axes, and the chain of frames that gives it.
 
-    Parameters
-    ----------
-    position_body : ndarray, shape (3,)
-        (m)
-    chain : str
-        ``imu_link -> base_link -> mag_link``.
+    `position_body` (3,) (m). `chain`: ``imu_link -> base_link -> mag_link``.
     """
 
     position_body: Array

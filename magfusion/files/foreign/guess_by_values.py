@@ -80,12 +80,8 @@ def by_place(
 ) -> dict[str, tuple[int, SourceUnit]]:
     """Return what columns of unknown names may be, by their units, places and sizes.
 
-    Parameters
-    ----------
-    samples : sequence of ndarray
-        The first values of each column; none where they are no numbers.
-    dates : sequence of bool
-        Whether a column holds dates.
+    `samples`: the first values of each column; none where they are no numbers. `dates`: whether a
+    column holds dates.
     """
     result = _first_clock(samples, dates)
     clocks = [place for place, _ in result.values()]

@@ -25,12 +25,8 @@ class SourceColumn:
 class RowBlock:
     """Some rows: the requested columns, in that order.
 
-    Parameters
-    ----------
-    rows : ndarray of int, shape (n,)
-        Places of the rows in the table, counted from 0 at the first row of data.
-    left_out : dict
-        Rows that could not be read, by the reason, since the part before.
+    `rows` (n,): places of the rows in the table, counted from 0 at the first row of data.
+    `left_out`: rows that could not be read, by the reason, since the part before.
     """
 
     columns: list[Raw]

@@ -16,10 +16,7 @@ NEIGHBOURS = 2  # other beacons, and marks, to which a beacon's distance is tape
 def check_marks(site: Site, points_world: Array) -> dict[str, Array]:
     """Return marks, shape (3,) (m), by name: the points nearest to each beacon.
 
-    Parameters
-    ----------
-    points_world : ndarray, shape (n, 3)
-        Positions where the platform can be (m).
+    `points_world` (n, 3): positions where the platform can be (m).
     """
     chosen: list[int] = []
     for beacon in site.beacons:

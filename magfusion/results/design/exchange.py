@@ -220,11 +220,8 @@ def at_each_point(
 ) -> Array:
     """Return the objective per point, shape (n,).
 
-    Parameters
-    ----------
-    new : ndarray, shape (beacons, n, size, size)
-        Information of each new beacon.
-    standing : ndarray, shape (1 + stay, n, size, size)
+    `new` (beacons, n, size, size): information of each new beacon. `standing` (1 + stay, n, size,
+    size).
     """
     whole = standing[0] + np.sum(new, axis=0)
     cov = pose_covariance(whole)

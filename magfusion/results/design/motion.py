@@ -72,10 +72,7 @@ class Parameters:
     def worst(self, ratio: Array) -> int:
         """Return the parameter with the largest possible gain in the fields.
 
-        Parameters
-        ----------
-        ratio : ndarray, shape (k,)
-            Each sigma relative to the declared one.
+        `ratio` (k,): each sigma relative to the declared one.
         """
         return int(np.argmax(np.where(self.requested, self.excess(ratio), -1.0)))
 
@@ -113,10 +110,7 @@ class Stop:
 class MotionPlan:
     """Stops in their order, and the remaining sigmas.
 
-    Parameters
-    ----------
-    ratio : ndarray, shape (k,)
-        Sigma of each parameter after all stops, relative to the declared one.
+    `ratio` (k,): sigma of each parameter after all stops, relative to the declared one.
     """
 
     stops: tuple[Stop, ...]

@@ -65,12 +65,8 @@ def assigned(
 ) -> tuple[Beacon, ...]:
     """Exchange frequencies between beacons, and for free ones, as long as the objective improves.
 
-    It improves only where the ground conducts or the magnetometer's response is not flat.
-
-    Parameters
-    ----------
-    free_hz : ndarray, shape (k,)
-        Unused frequencies.
+    It improves only where the ground conducts or the magnetometer's response is not flat. `free_hz`
+    (k,): unused frequencies.
     """
     tones = [b.tone_frequencies_hz for b in beacons]
     allowed = free_hz[: len(free_hz) // len(tones[0]) * len(tones[0])].reshape(-1, len(tones[0]))

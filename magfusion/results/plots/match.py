@@ -58,10 +58,7 @@ def write_match_plot(
 def write_database_plot(path: Path, database: AttitudeDatabase, residual: Array) -> None:
     """Write a PNG of the attitudes in a database, and of the residuals of a uniform field.
 
-    Parameters
-    ----------
-    residual : ndarray, shape (n, 3)
-        Of each entry (T).
+    `residual` (n, 3): of each entry (T).
     """
     figure = Figure(figsize=(8.0, 5.0), layout="constrained")
     axes = figure.subplots()

@@ -25,10 +25,7 @@ BOX = {"boxstyle": "round,pad=0.15", "facecolor": "white", "alpha": 0.8, "linewi
 def slices(size: Array, rows: int, columns: int) -> tuple[Figure, list[list[Axes]]]:
     """Return a figure with axes for horizontal slices of a hall, by row and column.
 
-    Parameters
-    ----------
-    size : ndarray, shape (2,)
-        Of the hall in plan (m); slices of a long one are below each other.
+    `size` (2,): of the hall in plan (m); slices of a long one are below each other.
     """
     shape = float(size[1] / size[0])
     is_long = shape < LONG
@@ -163,10 +160,7 @@ def draw_labels(
 ) -> None:
     """Write a text at each place, towards the outside, moved until none is on another.
 
-    Parameters
-    ----------
-    stars : ndarray, shape (k, 2)
-        Places of large markers, on which no text is written (m).
+    `stars` (k, 2): places of large markers, on which no text is written (m).
     """
     figure = axes.figure
     figure.canvas.draw()  # lays out the axes, so that the sizes of texts are known

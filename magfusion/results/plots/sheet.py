@@ -30,10 +30,7 @@ TOLERANCE = 2.0  # sigmas
 class CheckRow:
     """A distance to check on site.
 
-    Parameters
-    ----------
-    distance, tolerance : float
-        (m)
+    `distance`, `tolerance` (m).
     """
 
     begin: str
